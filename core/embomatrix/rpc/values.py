@@ -1,0 +1,150 @@
+"""What trainer, manager and workers tell one another, as values; ``rpc.convert`` maps them to the wire.
+
+An outcome is a union: a failure of the infrastructure is a type without a reward, so it can't be taken for a 0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from embomatrix.reward.breakdown import RewardBreakdown
+    from embomatrix.skills.syntax import Plan
+    from embomatrix.skills.trace import Step
+
+
+@dataclass(frozen=True, slots=True)
+class Rollout:
+    """One plan to execute once. ``group_id`` is shared by the plans of one task in one batch; ``seed`` by the group."""
+
+    rollout_id: str
+    group_id: str
+    bundle_digest: str
+    task_id: str
+    plan: Plan
+    seed: int
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """What a trainer submits at once. The same id with the same content attaches again instead of executing twice."""
+
+    run_id: str
+    batch_id: str
+    step: int
+    rollouts: tuple[Rollout, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Timings:
+    """Seconds that a rollout spent waiting, loading its scene (0 when warm) and executing."""
+
+    queued_s: float = 0.0
+    load_s: float = 0.0
+    execute_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Completed:
+    """The plan was executed and scored: evidence about the policy, whatever the reward."""
+
+    reward: RewardBreakdown
+    steps: tuple[Step, ...]
+    final: tuple[str, ...]
+    trace_digest: str
+    worker_id: str
+    timings: Timings
+    warm: bool
+
+
+class InfraCode(StrEnum):
+    """Why the infrastructure could not execute a rollout. None of these says anything about the plan."""
+
+    WORKER_LOST = "worker_lost"
+    LEASE_EXPIRED = "lease_expired"
+    SLOT_CRASHED = "slot_crashed"
+    SLOT_TIMEOUT = "slot_timeout"
+    SCENE_LOAD_FAILED = "scene_load_failed"
+    BUNDLE_CORRUPT = "bundle_corrupt"
+    NO_CAPACITY = "no_capacity"
+    DEADLINE = "deadline"
+    MANAGER_RESTARTED = "manager_restarted"
+
+
+@dataclass(frozen=True, slots=True)
+class InfraFailure:
+    """The rollout has no result and no reward. ``message`` is the worker's or manager's own text."""
+
+    code: InfraCode
+    message: str
+    worker_id: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Cancelled:
+    """The trainer called it off before it ended."""
+
+
+Outcome = Completed | InfraFailure | Cancelled
+
+
+@dataclass(frozen=True, slots=True)
+class RolloutResult:
+    """The one terminal outcome of a rollout. ``cursor`` orders the results of a batch from 1."""
+
+    rollout_id: str
+    group_id: str
+    cursor: int
+    attempt: int
+    outcome: Outcome
+
+
+class Warmth(StrEnum):
+    """How far the manager is with a scene that was announced."""
+
+    WARM = "warm"
+    WARMING = "warming"
+    QUEUED = "queued"
+    UNPLACEABLE = "unplaceable"
+
+
+@dataclass(frozen=True, slots=True)
+class LookaheadEntry:
+    """One scene that a coming step needs: ``count`` rollouts of it at ``step``."""
+
+    step: int
+    bundle_digest: str
+    count: int
+
+
+@dataclass(frozen=True, slots=True)
+class Resources:
+    """What a worker offers. ``memory_mb`` is what residents may use in all; ``score`` is its measured speed."""
+
+    slots: int
+    cores: int
+    memory_mb: int
+    score: float = 1.0
+    gpu: str = ""
+    vram_mb: int = 0
+    versions: Mapping[str, str] = field(default_factory=dict)
+    """Of the package, Python, the engine's wheel, and the platform fingerprint."""
+
+
+@dataclass(frozen=True, slots=True)
+class RunStats:
+    """Counters of a run, as the manager keeps them."""
+
+    delivered: int = 0
+    infra_failures: int = 0
+    redispatched: int = 0
+    stale_results: int = 0
+    warm_starts: int = 0
+    cold_starts: int = 0
+    prewarm_hits: int = 0
+    prewarm_misses: int = 0
+    prewarm_wasted: int = 0

@@ -1,0 +1,44 @@
+"""Traces: what happened, step by step, as data that travels with the result."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from embomatrix.skills.failure import FailureReason
+    from embomatrix.skills.syntax import Plan, SkillCall
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One executed call. ``message`` says in words what happened, or why it could not."""
+
+    call: SkillCall
+    failure: FailureReason | None
+    message: str
+
+    @property
+    def ok(self) -> bool:
+        return self.failure is None
+
+
+@dataclass(frozen=True, slots=True)
+class Trace:
+    """Steps up to and with the first failure, and the state reached.
+
+    ``touched`` are the names of the objects on which a call succeeded. ``final`` describes the state of the task's
+    objects in words, one line each. ``digest`` is a hash of every pose and state after every step: equal traces of equal
+    (bundle, plan, seed) on equal platforms have equal digests.
+    """
+
+    plan: Plan
+    steps: tuple[Step, ...]
+    touched: frozenset[str]
+    final: tuple[str, ...]
+    digest: str
+
+    @property
+    def failure(self) -> FailureReason | None:
+        """Reason of the step that stopped the plan, or None when every step succeeded."""
+        return self.steps[-1].failure if self.steps else None

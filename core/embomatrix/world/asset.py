@@ -1,0 +1,94 @@
+"""Assets: the geometry and the abilities of one object model, shared by all its instances.
+
+The asset frame has its origin at the centre of the model's bounding box, x along the depth with the *front at +x*, y along
+the width, z up. Parts, joints, supports and interiors are all given in that frame with every joint at zero (closed).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from embomatrix.world.geometry import Part, Vec2, Vec3
+
+
+class JointKind(StrEnum):
+    REVOLUTE = "revolute"
+    PRISMATIC = "prismatic"
+
+
+@dataclass(frozen=True, slots=True)
+class Joint:
+    """How a link moves against the base. Position 0 is closed, ``upper`` is fully open (rad or m)."""
+
+    kind: JointKind
+    origin_m: Vec3
+    axis: Vec3
+    upper: float
+
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """Rigid group of convex parts. The first link of an asset is its base and has no joint."""
+
+    name: str
+    parts: tuple[Part, ...]
+    joint: Joint | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class SupportSurface:
+    """Horizontal rectangle that things can stand on.
+
+    ``center_m`` lies on the surface; ``size_m`` is its extent along the asset's x and y; ``clearance_m`` is the free
+    height above it. ``interior`` names the cavity that the surface is the floor of, or is empty in the open.
+    """
+
+    name: str
+    center_m: Vec3
+    size_m: Vec2
+    clearance_m: float
+    interior: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Interior:
+    """Box-shaped cavity that things can be inside of.
+
+    ``closed_by`` names the links whose joints bar the way in while they are shut; empty means that it is always open.
+    """
+
+    name: str
+    center_m: Vec3
+    size_m: Vec3
+    closed_by: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Asset:
+    """One object model: ``asset_id`` is ``category-model``, as in the scene inventories.
+
+    ``abilities`` maps an ability of the catalog ("openable", "heatSource", ...) to its parameters.
+    """
+
+    asset_id: str
+    category: str
+    synset: str
+    size_m: Vec3
+    mass_kg: float
+    links: tuple[Link, ...]
+    supports: tuple[SupportSurface, ...] = ()
+    interiors: tuple[Interior, ...] = ()
+    abilities: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+
+    def can(self, ability: str) -> bool:
+        return ability in self.abilities
+
+    @property
+    def joints(self) -> tuple[tuple[str, Joint], ...]:
+        """(link name, joint) of every moving link, in link order: the order of an object's joint positions."""
+        return tuple((link.name, link.joint) for link in self.links if link.joint is not None)

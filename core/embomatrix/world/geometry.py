@@ -1,0 +1,182 @@
+"""Frames, boxes and convex parts: the metric vocabulary of a scene.
+
+Units are metres and radians. Frames are right-handed with z up. A pose named ``pose_a_b`` is the pose of frame b in
+frame a, so products chain where the inner names meet: ``pose_world_b = pose_world_a @ pose_a_b``.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from numpy.typing import NDArray
+
+    FloatArray = NDArray[np.float64]
+
+Vec2 = tuple[float, float]
+Vec3 = tuple[float, float, float]
+Quat = tuple[float, float, float, float]
+
+IDENTITY_QUAT: Final[Quat] = (0.0, 0.0, 0.0, 1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """Rigid transform: the pose of one frame in another. The quaternion is (x, y, z, w) and has unit length."""
+
+    position_m: Vec3
+    quat_xyzw: Quat = IDENTITY_QUAT
+
+    @staticmethod
+    def from_xyz_yaw(x: float, y: float, z: float, yaw: float) -> Pose:
+        """Upright pose at (x, y, z), turned by ``yaw`` radians about z."""
+        return Pose((x, y, z), (0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)))
+
+    @property
+    def yaw(self) -> float:
+        """Rotation about z in (-pi, pi], exact for upright poses."""
+        x, y, z, w = self.quat_xyzw
+        return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+    @property
+    def rotation(self) -> FloatArray:
+        """Rotation matrix, shape (3, 3)."""
+        x, y, z, w = self.quat_xyzw
+        return np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+
+    def __matmul__(self, other: Pose) -> Pose:
+        return Pose(self.apply(other.position_m), _quat_product(self.quat_xyzw, other.quat_xyzw))
+
+    def inverse(self) -> Pose:
+        x, y, z, w = self.quat_xyzw
+        back = (-x, -y, -z, w)
+        px, py, pz = self.position_m
+        return Pose(_rotate(back, (-px, -py, -pz)), back)
+
+    def apply(self, point: Vec3) -> Vec3:
+        """Map one point of the inner frame into the outer one."""
+        x, y, z = _rotate(self.quat_xyzw, point)
+        px, py, pz = self.position_m
+        return (px + x, py + y, pz + z)
+
+    def apply_all(self, points: FloatArray) -> FloatArray:
+        """Map points, shape (n, 3), into the outer frame."""
+        return np.asarray(points @ self.rotation.T + np.asarray(self.position_m), dtype=np.float64)
+
+
+def _quat_product(a: Quat, b: Quat) -> Quat:
+    ax, ay, az, aw = a
+    bx, by, bz, bw = b
+    return (
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+        aw * bw - ax * bx - ay * by - az * bz,
+    )
+
+
+def _rotate(q: Quat, v: Vec3) -> Vec3:
+    x, y, z, w = q
+    vx, vy, vz = v
+    tx, ty, tz = 2 * (y * vz - z * vy), 2 * (z * vx - x * vz), 2 * (x * vy - y * vx)
+    return (
+        vx + w * tx + y * tz - z * ty,
+        vy + w * ty + z * tx - x * tz,
+        vz + w * tz + x * ty - y * tx,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Aabb:
+    """Axis-aligned box, ``low_m <= high_m`` on every axis."""
+
+    low_m: Vec3
+    high_m: Vec3
+
+    @property
+    def center_m(self) -> Vec3:
+        (a, b, c), (d, e, f) = self.low_m, self.high_m
+        return ((a + d) / 2, (b + e) / 2, (c + f) / 2)
+
+    @property
+    def size_m(self) -> Vec3:
+        (a, b, c), (d, e, f) = self.low_m, self.high_m
+        return (d - a, e - b, f - c)
+
+    def contains(self, point: Vec3, margin_m: float = 0.0) -> bool:
+        """True when the point lies inside, grown by ``margin_m`` on every side."""
+        return all(
+            lo - margin_m <= p <= hi + margin_m
+            for lo, p, hi in zip(self.low_m, point, self.high_m, strict=True)
+        )
+
+    def overlaps(self, other: Aabb, margin_m: float = 0.0) -> bool:
+        """True when the boxes, ``margin_m`` apart or less, share volume or a face."""
+        return all(
+            a_lo - margin_m <= b_hi and b_lo - margin_m <= a_hi
+            for a_lo, a_hi, b_lo, b_hi in zip(
+                self.low_m, self.high_m, other.low_m, other.high_m, strict=True
+            )
+        )
+
+    @staticmethod
+    def around(boxes: Iterable[Aabb]) -> Aabb:
+        """Smallest box that holds all of them. Raises ValueError when there are none."""
+        items = list(boxes)
+        if not items:
+            raise ValueError("no boxes to enclose: expected at least one")
+        low = np.min([b.low_m for b in items], axis=0)
+        high = np.max([b.high_m for b in items], axis=0)
+        return Aabb(_vec3(low), _vec3(high))
+
+
+def _vec3(values: FloatArray) -> Vec3:
+    return (float(values[0]), float(values[1]), float(values[2]))
+
+
+class Shape(StrEnum):
+    """Convex primitives that Bullet collides exactly."""
+
+    BOX = "box"
+    CYLINDER = "cylinder"  # axis along z
+    SPHERE = "sphere"
+    HULL = "hull"  # convex hull of the part's vertices
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """One convex piece of a link, in the asset's frame with every joint at zero.
+
+    ``size_m`` is the full extent: (x, y, z) of a box, (d, d, height) of a cylinder, (d, d, d) of a sphere and the
+    bounding box of a hull. ``vertices_m`` are given in the part's own frame, for hulls only.
+    """
+
+    shape: Shape
+    pose: Pose
+    size_m: Vec3
+    vertices_m: tuple[Vec3, ...] = ()
+
+    def aabb(self, pose_world_asset: Pose) -> Aabb:
+        """Bounding box in the world: exact for boxes and hulls, that of the enclosing box for the round shapes."""
+        placed = pose_world_asset @ self.pose
+        corners = np.asarray(self.vertices_m) if self.vertices_m else _corners(self.size_m)
+        world = placed.apply_all(corners)  # (n, 3)
+        return Aabb(_vec3(world.min(axis=0)), _vec3(world.max(axis=0)))
+
+
+def _corners(size_m: Vec3) -> FloatArray:
+    x, y, z = (s / 2 for s in size_m)
+    return np.array([(sx * x, sy * y, sz * z) for sx in (-1, 1) for sy in (-1, 1) for sz in (-1, 1)])

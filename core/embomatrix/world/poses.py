@@ -1,0 +1,40 @@
+"""The pre-cached language-physics interface as data: verified terminal poses, found offline, carried in the bundle."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from embomatrix.world.geometry import Pose
+    from embomatrix.world.state import Relation
+
+
+@dataclass(frozen=True, slots=True)
+class StandPose:
+    """Where the robot's base may stand to work on an object: world x, y, heading."""
+
+    x_m: float
+    y_m: float
+    yaw: float
+
+
+@dataclass(frozen=True, slots=True)
+class PlacementKey:
+    """A set of poses serves every object of the asset, on every support of that asset, by that relation."""
+
+    asset_id: str
+    support_asset_id: str
+    relation: Relation
+
+
+@dataclass(frozen=True)
+class PoseCache:
+    """``placements``: poses of the placed asset in the *support's* asset frame, each verified by settling in physics.
+    ``stands``: standing poses per object name, in the world, best first.
+    """
+
+    placements: Mapping[PlacementKey, tuple[Pose, ...]] = field(default_factory=dict)
+    stands: Mapping[str, tuple[StandPose, ...]] = field(default_factory=dict)

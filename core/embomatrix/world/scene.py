@@ -1,0 +1,116 @@
+"""Scenes: rooms and placed objects, frozen, with a content key."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from embomatrix.world.asset import Asset
+    from embomatrix.world.geometry import Part, Pose, Vec2, Vec3
+    from embomatrix.world.state import Relation, State
+
+
+@dataclass(frozen=True, slots=True)
+class Room:
+    """Axis-aligned rectangle of floor. ``low_m`` and ``high_m`` are its corners in the world's xy plane."""
+
+    name: str
+    type: str
+    low_m: Vec2
+    high_m: Vec2
+
+    @property
+    def size_m(self) -> Vec2:
+        return (self.high_m[0] - self.low_m[0], self.high_m[1] - self.low_m[1])
+
+    @property
+    def center_m(self) -> Vec2:
+        return ((self.high_m[0] + self.low_m[0]) / 2, (self.high_m[1] + self.low_m[1]) / 2)
+
+    def contains(self, x: float, y: float, margin_m: float = 0.0) -> bool:
+        return (
+            self.low_m[0] - margin_m <= x <= self.high_m[0] + margin_m
+            and self.low_m[1] - margin_m <= y <= self.high_m[1] + margin_m
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Doorway:
+    """Opening in a wall between two rooms; ``rooms[1]`` is empty where it leads outside.
+
+    ``center_m`` lies on the floor; ``along`` is "x" or "y": the axis that the wall runs along.
+    """
+
+    rooms: tuple[str, str]
+    center_m: Vec2
+    width_m: float
+    height_m: float
+    along: str
+    model: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class SceneObject:
+    """One placed object. ``name`` is unique in the scene: category and number, ``apple_1``.
+
+    ``joints`` are the positions of the asset's joints in their order, as a share of the travel: 0 closed, 1 open.
+    ``host`` is the object that it rests on or in by ``relation``; empty: it stands on the floor or hangs on a wall.
+    ``fixed`` objects never move: furniture, appliances, wall-mounted things.
+    """
+
+    name: str
+    asset_id: str
+    room: str
+    pose_world_asset: Pose
+    fixed: bool
+    joints: tuple[float, ...] = ()
+    host: str = ""
+    relation: Relation | None = None
+    states: frozenset[State] = frozenset()
+
+
+@dataclass(frozen=True, slots=True)
+class RobotStart:
+    """Base of the robot on the floor at the start: world x, y and heading."""
+
+    x_m: float
+    y_m: float
+    yaw: float
+    room: str
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Rooms, walls, doorways and objects. Order of ``objects`` is part of the content: it is the solver's order."""
+
+    scene_id: str
+    base: str
+    seed: int
+    rooms: tuple[Room, ...]
+    walls: tuple[Part, ...]
+    doorways: tuple[Doorway, ...]
+    objects: tuple[SceneObject, ...]
+    assets: Mapping[str, Asset]
+    robot: RobotStart
+    left_out: tuple[str, ...] = field(default=())
+    """Inventory items without a place, one sentence each: nothing is dropped silently."""
+
+    @cached_property
+    def by_name(self) -> Mapping[str, SceneObject]:
+        return {item.name: item for item in self.objects}
+
+    def asset_of(self, name: str) -> Asset:
+        """Asset of the object with this name; KeyError when there is none."""
+        return self.assets[self.by_name[name].asset_id]
+
+    def room_at(self, point: Vec3 | Vec2) -> str:
+        """Name of the room under a point, the nearest one in a wall's thickness; empty when outside all rooms."""
+        for margin in (0.0, 0.15):
+            for room in self.rooms:
+                if room.contains(point[0], point[1], margin):
+                    return room.name
+        return ""

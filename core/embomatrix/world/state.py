@@ -1,0 +1,39 @@
+"""Closed sets of relations and states: what a goal can say of an object."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+
+class Relation(StrEnum):
+    """Binary relations read from the engine's metric state. ``ontop(a, b)`` means that a is on b."""
+
+    ONTOP = "ontop"
+    INSIDE = "inside"
+    UNDER = "under"
+    NEXTTO = "nextto"
+    TOUCHING = "touching"
+    INROOM = "inroom"
+
+
+class State(StrEnum):
+    """Unary states. OPEN is metric (a joint past 5 % of its travel), the others are symbolic."""
+
+    OPEN = "open"
+    TOGGLED_ON = "toggled_on"
+    COOKED = "cooked"
+    FROZEN = "frozen"
+    HOT = "hot"
+    SLICED = "sliced"
+    DUSTY = "dusty"
+    STAINED = "stained"
+    SOAKED = "soaked"
+
+
+AMBIENT_C = 23.0
+HOT_C = 40.0
+COOK_C = 70.0
+FREEZE_C = 0.0
+"""Temperatures in degrees Celsius at which the states of the same name set in: BEHAVIOR-1K's defaults."""
+OPEN_FRACTION = 0.05
+"""A joint is open beyond this share of its travel: OmniGibson's definition."""

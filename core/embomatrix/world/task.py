@@ -1,0 +1,49 @@
+"""Tasks: an instruction and a goal in a scene, with the table of objects that a plan may name."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+from functools import cached_property
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from embomatrix.world.goal import Formula
+
+MAX_TABLE: Final = 60
+"""Rows of a task's object table at most: more do not fit a prompt."""
+
+
+class TaskCategory(StrEnum):
+    """The paper's four kinds of task."""
+
+    PICK_AND_PLACE = "pick_and_place"
+    APPLIANCE_USE = "appliance_use"
+    KITCHEN_OPERATION = "kitchen_operation"
+    COMPOUND = "compound"
+
+
+@dataclass(frozen=True)
+class Task:
+    """What the robot must do in a scene. All names are names of scene objects or rooms.
+
+    ``goal`` is ground but for its quantifiers, which range over ``types``: synset to object names. ``table`` is the object
+    table: a plan's ``object_index`` is a row of it; the order betrays nothing of the goal. ``goal_bddl`` is the same goal
+    as text. ``source`` says where the task came from ("writer", "behavior-1k", "embomatrix").
+    """
+
+    task_id: str
+    scene_id: str
+    instruction: str
+    category: TaskCategory
+    goal: Formula
+    goal_bddl: str
+    table: tuple[str, ...]
+    types: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    source: str = "writer"
+
+    @cached_property
+    def index_of(self) -> Mapping[str, int]:
+        return {name: index for index, name in enumerate(self.table)}
