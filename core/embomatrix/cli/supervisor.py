@@ -1,0 +1,142 @@
+"""A few child processes kept alive: restarted when they die, ended together.
+
+Used for the local cluster of `embomatrix demo`. It ends only what it started, by process id, and nothing that it started
+outlives it: children die with this process even when it is killed (PR_SET_PDEATHSIG, on Linux).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import logging
+import signal
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final, Self
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+logger = logging.getLogger(__name__)
+
+RESTART_DELAY_S: Final = 0.5
+MAX_RESTARTS_IN_A_ROW: Final = 5
+"""A child that dies this often within ten seconds each time is given up: its log says why."""
+SHORT_LIFE_S: Final = 10.0
+_PR_SET_PDEATHSIG: Final = 1
+
+
+@dataclass(frozen=True, slots=True)
+class ChildSpec:
+    """One process: its name in messages and log files, its arguments, and what its environment adds."""
+
+    name: str
+    arguments: tuple[str, ...]
+    environment: Mapping[str, str]
+
+
+@dataclass(slots=True)
+class _Child:
+    spec: ChildSpec
+    process: subprocess.Popen[bytes]
+    started_s: float
+    restarts: int = 0
+    short_lives: int = 0
+    given_up: bool = field(default=False)
+
+
+def embomatrix_command(*arguments: str) -> tuple[str, ...]:
+    """The `embomatrix` command of this very interpreter."""
+    return (sys.executable, "-m", "embomatrix.cli", *arguments)
+
+
+class Supervisor:
+    """Context manager that starts the children on entry, restarts them while it is open and ends them on exit."""
+
+    def __init__(self, specs: tuple[ChildSpec, ...], log_folder: Path, *, grace_s: float = 10.0) -> None:
+        self._specs = specs
+        self._log_folder = log_folder
+        self._grace_s = grace_s
+        self._children: dict[str, _Child] = {}
+        self._closing = threading.Event()
+        self._watcher = threading.Thread(target=self._watch, name="supervisor", daemon=True)
+        self._lock = threading.Lock()
+
+    def __enter__(self) -> Self:
+        self._log_folder.mkdir(parents=True, exist_ok=True)
+        for spec in self._specs:
+            self._children[spec.name] = _Child(spec, self._start(spec), time.monotonic())
+        self._watcher.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._closing.set()
+        self._watcher.join()
+        for child in self._children.values():
+            with contextlib.suppress(ProcessLookupError):
+                child.process.send_signal(signal.SIGTERM)
+        deadline = time.monotonic() + self._grace_s
+        for child in self._children.values():
+            try:
+                child.process.wait(timeout=max(0.1, deadline - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                child.process.kill()
+                child.process.wait()
+
+    def pid(self, name: str) -> int:
+        """Process id of the child's present incarnation."""
+        with self._lock:
+            return self._children[name].process.pid
+
+    def restarts(self, name: str) -> int:
+        """How often the child was started anew."""
+        with self._lock:
+            return self._children[name].restarts
+
+    def log_path(self, name: str) -> Path:
+        return self._log_folder / f"{name}.log"
+
+    def failed(self) -> str:
+        """Name of a child that was given up, or empty."""
+        with self._lock:
+            return next((name for name, child in self._children.items() if child.given_up), "")
+
+    def _start(self, spec: ChildSpec) -> subprocess.Popen[bytes]:
+        with self.log_path(spec.name).open("ab") as log:
+            return subprocess.Popen(
+                spec.arguments,
+                env=dict(spec.environment),
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                preexec_fn=_die_with_parent if sys.platform == "linux" else None,
+            )
+
+    def _watch(self) -> None:
+        while not self._closing.wait(0.2):
+            with self._lock:
+                for child in self._children.values():
+                    if child.process.poll() is not None and not child.given_up:
+                        self._revive(child)
+
+    def _revive(self, child: _Child) -> None:
+        lived_s = time.monotonic() - child.started_s
+        child.short_lives = child.short_lives + 1 if lived_s < SHORT_LIFE_S else 0
+        if child.short_lives > MAX_RESTARTS_IN_A_ROW:
+            child.given_up = True
+            logger.error("%s keeps dying: see %s", child.spec.name, self.log_path(child.spec.name))
+            return
+        logger.warning("%s ended with status %s: starting it anew", child.spec.name, child.process.returncode)
+        time.sleep(RESTART_DELAY_S)
+        child.process = self._start(child.spec)
+        child.started_s = time.monotonic()
+        child.restarts += 1
+
+
+def _die_with_parent() -> None:
+    """Ask the kernel for a SIGTERM when the parent thread's process ends, however it ends."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
