@@ -1,0 +1,28 @@
+"""The layout that imports rely on."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+SOURCE_ROOTS = ("core", "proto", "manager", "worker", "factory", "trainer")
+
+
+@pytest.mark.parametrize("root", SOURCE_ROOTS)
+def test_source_root_is_a_namespace_without_init(root):
+    assert not (ROOT / root / "embomatrix" / "__init__.py").exists(), "it would hide the other roots"
+
+
+def test_manager_and_trainer_import_without_a_physics_engine():
+    program = (
+        "import sys, importlib.abc\n"
+        "class Bar(importlib.abc.MetaPathFinder):\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name.split('.')[0] == 'pybullet' or name.startswith('embomatrix.sim'):\n"
+        "            raise ModuleNotFoundError(name, name=name)\n"
+        "sys.meta_path.insert(0, Bar())\n"
+        "import embomatrix.manager.cli, embomatrix.manager.app, embomatrix.trainer.cli, embomatrix.trainer.loop\n"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=120)
