@@ -1,6 +1,6 @@
 """What trainer, manager and workers tell one another, as values; ``rpc.convert`` maps them to the wire.
 
-An outcome is a union: a failure of the infrastructure is a type without a reward, so it can't be taken for a 0.
+An outcome is a union: a failure of the infrastructure is a type without a reward, so it is never a 0.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Rollout:
-    """One plan to execute once. ``group_id`` is shared by the plans of one task in one batch; ``seed`` by the group."""
+    """One plan to execute once. The plans of one task in one batch share ``group_id`` and ``seed``."""
 
     rollout_id: str
     group_id: str
@@ -31,7 +31,7 @@ class Rollout:
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """What a trainer submits at once. The same id with the same content attaches again instead of executing twice."""
+    """What a trainer submits at once. The same id and content attaches again instead of executing twice."""
 
     run_id: str
     batch_id: str
@@ -123,7 +123,7 @@ class LookaheadEntry:
 
 @dataclass(frozen=True, slots=True)
 class Resources:
-    """What a worker offers. ``memory_mb`` is what residents may use in all; ``score`` is its measured speed."""
+    """What a worker offers. ``memory_mb`` is for all residents together; ``score`` is its measured speed."""
 
     slots: int
     cores: int
@@ -148,3 +148,80 @@ class RunStats:
     prewarm_hits: int = 0
     prewarm_misses: int = 0
     prewarm_wasted: int = 0
+
+
+class ResidentState(StrEnum):
+    """How far a worker is with a scene that it should hold."""
+
+    LOADING = "loading"
+    WARM = "warm"
+    FAILED = "failed"
+
+
+@dataclass(frozen=True, slots=True)
+class Resident:
+    """A scene on a worker. ``error`` says why loading it failed; ``memory_mb`` is what it holds alone."""
+
+    bundle_digest: str
+    state: ResidentState
+    load_s: float = 0.0
+    memory_mb: float = 0.0
+    error: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class LeaseRef:
+    """Names a lease. A result counts only under the epoch that the manager holds."""
+
+    lease_id: str
+    lease_epoch: int
+
+
+@dataclass(frozen=True, slots=True)
+class Lease:
+    """The right to execute one rollout. ``deadline_s`` is how long the execution may take, from its start."""
+
+    ref: LeaseRef
+    rollout: Rollout
+    deadline_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class LeaseResult:
+    """What became of a lease."""
+
+    ref: LeaseRef
+    outcome: Completed | InfraFailure
+
+
+@dataclass(frozen=True, slots=True)
+class WorkerState:
+    """Everything that a worker holds. ``finished`` are results that no one has acknowledged yet."""
+
+    residents: tuple[Resident, ...] = ()
+    running: tuple[LeaseRef, ...] = ()
+    finished: tuple[LeaseResult, ...] = ()
+    draining: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class WorkerInfo:
+    """A worker as the manager sees it. ``state`` is "ready", "suspect", "lost" or "draining"."""
+
+    worker_id: str
+    state: str
+    resources: Resources
+    residents: tuple[Resident, ...]
+    running: int
+    completed: int
+    last_seen_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class RunInfo:
+    """An open run: its counters so far, and how many of its rollouts have no outcome yet."""
+
+    run_id: str
+    name: str
+    stats: RunStats
+    pending: int

@@ -112,7 +112,9 @@ Global___Warmth: typing_extensions.TypeAlias = Warmth
 
 @typing.final
 class SkillCall(google.protobuf.message.Message):
-    """One step of a plan. Only the arguments of the skill's signature are set."""
+    """One step of a plan. Only the arguments of the skill's signature are set. An index is signed: -1 is a step that fails, not a
+    message that breaks.
+    """
 
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 

@@ -1,0 +1,264 @@
+"""The trainer's side of the cluster: submit plans, get outcomes, whatever happens to the connection."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Self
+
+import grpc
+
+from embomatrix.proto.v1 import (
+    admin_service_pb2,
+    admin_service_pb2_grpc,
+    rollout_service_pb2,
+    rollout_service_pb2_grpc,
+    scene_service_pb2,
+    scene_service_pb2_grpc,
+)
+from embomatrix.rpc.channel import DEFAULT_ADDRESS, chunks_of, open_channel
+from embomatrix.rpc.convert import (
+    batch_to_proto,
+    each,
+    inside,
+    lookahead_entry_to_proto,
+    rollout_result_from_proto,
+    run_stats_from_proto,
+    warmth_from_proto,
+)
+from embomatrix.rpc.convert_session import run_info_from_proto, worker_info_from_proto
+from embomatrix.rpc.status import (
+    DeadlineError,
+    InternalError,
+    NotFoundError,
+    OverloadedError,
+    UnavailableError,
+    cluster_error,
+    cluster_errors,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncGenerator, AsyncIterator, Iterable, Mapping, Sequence
+
+    from embomatrix.rpc.status import ClusterError
+    from embomatrix.rpc.values import (
+        Batch,
+        LookaheadEntry,
+        RolloutResult,
+        RunInfo,
+        RunStats,
+        Warmth,
+        WorkerInfo,
+    )
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class ClientLimits:
+    """How long a client waits, in seconds."""
+
+    call_s: float = 10.0
+    """For the answer to a short call."""
+    bundle_s: float = 60.0
+    """For a whole bundle to be taken."""
+    batch_s: float = 600.0
+    """For every rollout of a batch to have its outcome."""
+    retry_first_s: float = 0.1
+    retry_longest_s: float = 2.0
+    """Wait before a broken stream is attached again: doubled from the first to the longest."""
+
+
+DEFAULT_LIMITS: Final = ClientLimits()
+_TRANSIENT: Final = (UnavailableError, InternalError, OverloadedError)
+"""Errors after which the same batch is attached again rather than given up."""
+
+
+class ClusterClient:
+    """Async context manager over one channel to the manager. Every failure is a ``ClusterError``."""
+
+    def __init__(
+        self, address: str = DEFAULT_ADDRESS, token: str = "", *, limits: ClientLimits = DEFAULT_LIMITS
+    ) -> None:
+        self._address = address
+        self._token = token
+        self._limits = limits
+
+    async def __aenter__(self) -> Self:
+        self._channel = open_channel(self._address, self._token)
+        self._rollouts = rollout_service_pb2_grpc.RolloutServiceStub(self._channel)
+        self._scenes = scene_service_pb2_grpc.SceneServiceStub(self._channel)
+        self._admin = admin_service_pb2_grpc.AdminServiceStub(self._channel)
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self._channel.close()
+
+    async def open_run(self, name: str, run_id: str = "") -> str:
+        """Open a run, or attach to the one of this id; returns its id."""
+        request = rollout_service_pb2.OpenRunRequest(name=name, run_id=run_id)
+        with cluster_errors(self._address):
+            answer = await self._rollouts.OpenRun(request, timeout=self._limits.call_s)
+        return str(answer.run_id)
+
+    async def announce_lookahead(
+        self, run_id: str, version: int, entries: Iterable[LookaheadEntry]
+    ) -> dict[str, Warmth]:
+        """Replace the run's window of coming scenes; tells by bundle digest how warm each is."""
+        request = rollout_service_pb2.AnnounceLookaheadRequest(
+            run_id=run_id, version=version, entries=[lookahead_entry_to_proto(entry) for entry in entries]
+        )
+        with cluster_errors(self._address):
+            answer = await self._rollouts.AnnounceLookahead(request, timeout=self._limits.call_s)
+            return {item.bundle_digest: warmth_from_proto(item.warmth) for item in answer.answers}
+
+    async def put_bundles(self, bundles: Mapping[str, bytes]) -> tuple[str, ...]:
+        """Give the manager the bundles (by digest) that it lacks; returns the digests that were sent."""
+        request = scene_service_pb2.MissingBundlesRequest(bundle_digests=list(bundles))
+        with cluster_errors(self._address):
+            answer = await self._scenes.MissingBundles(request, timeout=self._limits.call_s)
+            missing = tuple(digest for digest in answer.bundle_digests if digest in bundles)
+            for digest in missing:
+                chunks = _bundle_chunks(digest, bundles[digest])
+                await self._scenes.PutBundle(chunks, timeout=self._limits.bundle_s)
+        return missing
+
+    async def execute(
+        self, batch: Batch, *, deadline_s: float | None = None
+    ) -> AsyncGenerator[RolloutResult]:
+        """Execute the batch; yields each rollout's one outcome as it comes.
+
+        A broken stream is attached again from the last cursor, also across a restart of the manager, until
+        every rollout has its outcome. After ``deadline_s`` seconds (by default the limit for a batch) it
+        raises ``DeadlineError``.
+        """
+        within_s = self._limits.batch_s if deadline_s is None else deadline_s
+        attached = _AttachedBatch(batch, time.monotonic() + within_s)
+        wait_s = self._limits.retry_first_s
+        while attached.missing:
+            before = len(attached.missing)
+            try:
+                async with contextlib.aclosing(self._stream(attached)) as stream:
+                    async for results in stream:
+                        for result in attached.new(results):
+                            yield result
+                attached.submitted = True
+            except _TRANSIENT as error:
+                logger.info("batch %s: attaching again after: %s", batch.batch_id, error)
+            except NotFoundError:
+                # The manager lost the batch, or never got it: the same id and content may be submitted again.
+                if not attached.submitted:
+                    raise
+                attached.forget_cursor()
+            wait_s = self._limits.retry_first_s if len(attached.missing) < before else wait_s * 2
+            wait_s = min(wait_s, self._limits.retry_longest_s)
+            if attached.missing:
+                await asyncio.sleep(min(wait_s, attached.time_left(within_s)))
+
+    async def _stream(self, attached: _AttachedBatch) -> AsyncGenerator[Sequence[RolloutResult]]:
+        """One stream of the batch: the first submits it, later ones continue after the cursor."""
+        timeout_s = attached.time_left(self._limits.batch_s)
+        call: grpc.aio.UnaryStreamCall
+        if attached.submitted:
+            call = self._rollouts.WaitExecution(attached.wait_request(), timeout=timeout_s)
+        else:
+            call = self._rollouts.Execute(batch_to_proto(attached.batch), timeout=timeout_s)
+        try:
+            async for response in call:
+                attached.submitted = True
+                with cluster_errors(self._address):
+                    results = each("results", rollout_result_from_proto, response.results)
+                yield results
+        except grpc.aio.AioRpcError as error:
+            raise attached.explain(cluster_error(error, self._address)) from error
+        finally:
+            call.cancel()
+
+    async def cancel(self, run_id: str, batch_id: str) -> None:
+        """Call a batch off: its rollouts that have no outcome yet end as ``Cancelled``."""
+        request = rollout_service_pb2.CancelBatchRequest(run_id=run_id, batch_id=batch_id)
+        with cluster_errors(self._address):
+            await self._rollouts.CancelBatch(request, timeout=self._limits.call_s)
+
+    async def close_run(self, run_id: str) -> RunStats:
+        """End a run; the manager drops its results and look-ahead."""
+        request = rollout_service_pb2.CloseRunRequest(run_id=run_id)
+        with cluster_errors(self._address):
+            answer = await self._rollouts.CloseRun(request, timeout=self._limits.call_s)
+            return inside("stats", run_stats_from_proto, answer.stats)
+
+    async def list_workers(self) -> tuple[WorkerInfo, ...]:
+        """The workers that the manager knows."""
+        with cluster_errors(self._address):
+            request = admin_service_pb2.ListWorkersRequest()
+            answer = await self._admin.ListWorkers(request, timeout=self._limits.call_s)
+            return each("workers", worker_info_from_proto, answer.workers)
+
+    async def list_runs(self) -> tuple[RunInfo, ...]:
+        """The runs that are open."""
+        with cluster_errors(self._address):
+            request = admin_service_pb2.ListRunsRequest()
+            answer = await self._admin.ListRuns(request, timeout=self._limits.call_s)
+            return each("runs", run_info_from_proto, answer.runs)
+
+    async def drain_worker(self, worker_id: str) -> None:
+        """Ask a worker to finish what it runs and to leave."""
+        request = admin_service_pb2.DrainWorkerRequest(worker_id=worker_id)
+        with cluster_errors(self._address):
+            await self._admin.DrainWorker(request, timeout=self._limits.call_s)
+
+
+class _AttachedBatch:
+    """What a client remembers of a batch between two streams."""
+
+    def __init__(self, batch: Batch, ends_s: float) -> None:
+        self.batch = batch
+        self.missing = {rollout.rollout_id for rollout in batch.rollouts}
+        self.submitted = False
+        self._cursor = 0
+        self._ends_s = ends_s
+
+    def new(self, results: Sequence[RolloutResult]) -> Iterable[RolloutResult]:
+        """Those results that were not seen before; a repeated one is not delivered twice."""
+        for result in results:
+            self._cursor = max(self._cursor, result.cursor)
+            if result.rollout_id in self.missing:
+                self.missing.discard(result.rollout_id)
+                yield result
+
+    def forget_cursor(self) -> None:
+        self.submitted = False
+        self._cursor = 0
+
+    def wait_request(self) -> rollout_service_pb2.WaitExecutionRequest:
+        return rollout_service_pb2.WaitExecutionRequest(
+            run_id=self.batch.run_id, batch_id=self.batch.batch_id, after_cursor=self._cursor
+        )
+
+    def time_left(self, within_s: float) -> float:
+        """Seconds until the caller's deadline; past it, ``DeadlineError``."""
+        left_s = self._ends_s - time.monotonic()
+        if left_s <= 0:
+            raise self._late(within_s)
+        return left_s
+
+    def explain(self, error: ClusterError) -> ClusterError:
+        """The error of a stream; when it is the caller's own deadline, say what is missing."""
+        if isinstance(error, DeadlineError) and time.monotonic() >= self._ends_s - 0.05:
+            return self._late(None)
+        return error
+
+    def _late(self, within_s: float | None) -> DeadlineError:
+        within = "within its deadline" if within_s is None else f"within {within_s:g} s"
+        return DeadlineError(
+            f"batch {self.batch.batch_id}: {len(self.missing)} of {len(self.batch.rollouts)} rollouts "
+            f"had no outcome {within}: are workers connected? (`embomatrix manager status`)"
+        )
+
+
+async def _bundle_chunks(digest: str, data: bytes) -> AsyncIterator[scene_service_pb2.PutBundleRequest]:
+    for index, chunk in enumerate(chunks_of(data)):
+        yield scene_service_pb2.PutBundleRequest(bundle_digest=digest if index == 0 else "", chunk=chunk)

@@ -1,0 +1,384 @@
+"""Values to wire messages and back. A malformed message is a ``ConvertError`` that names the field."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final, TypeVar
+
+from embomatrix.proto.v1 import rollout_service_pb2, types_pb2
+from embomatrix.reward.breakdown import AtomResult, RewardBreakdown
+from embomatrix.rpc.values import (
+    Batch,
+    Cancelled,
+    Completed,
+    InfraCode,
+    InfraFailure,
+    LookaheadEntry,
+    Resources,
+    Rollout,
+    RolloutResult,
+    RunStats,
+    Timings,
+    Warmth,
+)
+from embomatrix.skills.failure import FailureReason
+from embomatrix.skills.syntax import MAX_STEPS, SIGNATURES, Arg, PlaceRelation, Plan, Skill, SkillCall
+from embomatrix.skills.trace import Step
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping
+
+    from embomatrix.rpc.values import Outcome
+
+WireT = TypeVar("WireT")
+ValueT = TypeVar("ValueT")
+
+SKILL_KINDS: Final[Mapping[Skill, types_pb2.SkillKind.ValueType]] = {
+    Skill.MOVE: types_pb2.SKILL_KIND_MOVE,
+    Skill.TURN: types_pb2.SKILL_KIND_TURN,
+    Skill.PICK_UP: types_pb2.SKILL_KIND_PICK_UP,
+    Skill.PLACE: types_pb2.SKILL_KIND_PLACE,
+    Skill.MOVE_FORWARD: types_pb2.SKILL_KIND_MOVE_FORWARD,
+    Skill.OPEN: types_pb2.SKILL_KIND_OPEN,
+    Skill.CLOSE: types_pb2.SKILL_KIND_CLOSE,
+    Skill.TOGGLE_ON: types_pb2.SKILL_KIND_TOGGLE_ON,
+    Skill.TOGGLE_OFF: types_pb2.SKILL_KIND_TOGGLE_OFF,
+    Skill.HEAT: types_pb2.SKILL_KIND_HEAT,
+    Skill.COOK: types_pb2.SKILL_KIND_COOK,
+    Skill.FREEZE: types_pb2.SKILL_KIND_FREEZE,
+    Skill.GO_TO_ROOM: types_pb2.SKILL_KIND_GO_TO_ROOM,
+}
+_SKILLS: Final = {kind: skill for skill, kind in SKILL_KINDS.items()}
+_INFRA_CODES: Final[Mapping[InfraCode, types_pb2.InfraCode.ValueType]] = {
+    code: types_pb2.InfraCode.Value(f"INFRA_CODE_{code.name}") for code in InfraCode
+}
+_INFRA_VALUES: Final = {number: code for code, number in _INFRA_CODES.items()}
+_WARMTHS: Final[Mapping[Warmth, types_pb2.Warmth.ValueType]] = {
+    warmth: types_pb2.Warmth.Value(f"WARMTH_{warmth.name}") for warmth in Warmth
+}
+_WARMTH_VALUES: Final = {number: warmth for warmth, number in _WARMTHS.items()}
+
+
+class ConvertError(ValueError):
+    """A message that can't be a value. ``field`` is the culprit's path: ``rollouts[3].plan[0].yaw``."""
+
+    def __init__(self, field: str, problem: str) -> None:
+        super().__init__(f"{field}: {problem}")
+        self.field = field
+        self.problem = problem
+
+    def under(self, parent: str) -> ConvertError:
+        """The same error, seen from the message that holds this one."""
+        return ConvertError(f"{parent}.{self.field}", self.problem)
+
+
+def each(field: str, convert: Callable[[WireT], ValueT], messages: Iterable[WireT]) -> tuple[ValueT, ...]:
+    """Convert a repeated field; an error tells which element it stands in."""
+    values: list[ValueT] = []
+    for index, message in enumerate(messages):
+        try:
+            values.append(convert(message))
+        except ConvertError as error:
+            raise error.under(f"{field}[{index}]") from None
+    return tuple(values)
+
+
+def inside(field: str, convert: Callable[[WireT], ValueT], message: WireT) -> ValueT:
+    """Convert a message field; an error tells in which field it stands."""
+    try:
+        return convert(message)
+    except ConvertError as error:
+        raise error.under(field) from None
+
+
+def required(field: str, text: str) -> str:
+    """The text, which may not be empty."""
+    if not text:
+        raise ConvertError(field, "is empty: it must be set")
+    return text
+
+
+def finite(field: str, number: float) -> float:
+    """The number, which may be neither NaN nor infinite."""
+    if not math.isfinite(number):
+        raise ConvertError(field, f"is {number}: it must be a finite number")
+    return number
+
+
+def skill_call_to_proto(call: SkillCall) -> types_pb2.SkillCall:
+    return types_pb2.SkillCall(
+        skill=SKILL_KINDS[call.skill],
+        object_index=call.object_index,
+        source_index=call.source_index,
+        relation=None if call.relation is None else call.relation.value,
+        yaw=call.yaw,
+        distance=call.distance,
+        room_name=call.room_name,
+    )
+
+
+def skill_call_from_proto(message: types_pb2.SkillCall) -> SkillCall:
+    """The call, with exactly the arguments that its skill takes; any other set is a ``ConvertError``."""
+    skill = _SKILLS.get(message.skill)
+    if skill is None:
+        raise ConvertError("skill", f"{message.skill} is no known skill: is the sender newer than this side?")
+    taken = SIGNATURES[skill]
+    for arg in Arg:
+        if message.HasField(arg.value) != (arg in taken):
+            problem = "is missing: {} needs it" if arg in taken else "is set: {} does not take it"
+            raise ConvertError(arg.value, problem.format(skill.value))
+    return SkillCall(
+        skill,
+        object_index=message.object_index if Arg.OBJECT in taken else None,
+        source_index=message.source_index if Arg.SOURCE in taken else None,
+        relation=_relation(message.relation) if Arg.RELATION in taken else None,
+        yaw=finite("yaw", message.yaw) if Arg.YAW in taken else None,
+        distance=finite("distance", message.distance) if Arg.DISTANCE in taken else None,
+        room_name=message.room_name if Arg.ROOM in taken else None,
+    )
+
+
+def _relation(text: str) -> PlaceRelation:
+    try:
+        return PlaceRelation(text)
+    except ValueError:
+        raise ConvertError("relation", f"{text!r} is none of {', '.join(PlaceRelation)}") from None
+
+
+def plan_to_proto(plan: Plan) -> list[types_pb2.SkillCall]:
+    return [skill_call_to_proto(call) for call in plan]
+
+
+def plan_from_proto(messages: Iterable[types_pb2.SkillCall]) -> Plan:
+    calls = tuple(messages)
+    if len(calls) > MAX_STEPS:
+        raise ConvertError("plan", f"has {len(calls)} steps: at most {MAX_STEPS} are executed")
+    return each("plan", skill_call_from_proto, calls)
+
+
+def rollout_to_proto(rollout: Rollout) -> types_pb2.Rollout:
+    return types_pb2.Rollout(
+        rollout_id=rollout.rollout_id,
+        group_id=rollout.group_id,
+        bundle_digest=rollout.bundle_digest,
+        task_id=rollout.task_id,
+        plan=plan_to_proto(rollout.plan),
+        seed=rollout.seed,
+    )
+
+
+def rollout_from_proto(message: types_pb2.Rollout) -> Rollout:
+    return Rollout(
+        rollout_id=required("rollout_id", message.rollout_id),
+        group_id=required("group_id", message.group_id),
+        bundle_digest=required("bundle_digest", message.bundle_digest),
+        task_id=required("task_id", message.task_id),
+        plan=plan_from_proto(message.plan),
+        seed=message.seed,
+    )
+
+
+def batch_to_proto(batch: Batch) -> rollout_service_pb2.ExecuteRequest:
+    return rollout_service_pb2.ExecuteRequest(
+        run_id=batch.run_id,
+        batch_id=batch.batch_id,
+        step=batch.step,
+        rollouts=[rollout_to_proto(rollout) for rollout in batch.rollouts],
+    )
+
+
+def batch_from_proto(message: rollout_service_pb2.ExecuteRequest) -> Batch:
+    """The batch; two rollouts of one id are a ``ConvertError``, since each gets exactly one outcome."""
+    rollouts = each("rollouts", rollout_from_proto, message.rollouts)
+    seen: set[str] = set()
+    for index, rollout in enumerate(rollouts):
+        if rollout.rollout_id in seen:
+            raise ConvertError(
+                f"rollouts[{index}].rollout_id", f"{rollout.rollout_id!r} stands twice in the batch"
+            )
+        seen.add(rollout.rollout_id)
+    return Batch(
+        required("run_id", message.run_id), required("batch_id", message.batch_id), message.step, rollouts
+    )
+
+
+def reward_to_proto(reward: RewardBreakdown) -> types_pb2.Reward:
+    return types_pb2.Reward(
+        format=reward.format,
+        relevance=reward.relevance,
+        goal=reward.goal,
+        atoms=[types_pb2.AtomResult(text=atom.text, holds=atom.holds) for atom in reward.atoms],
+        success=reward.success,
+    )
+
+
+def reward_from_proto(message: types_pb2.Reward) -> RewardBreakdown:
+    return RewardBreakdown(
+        format=finite("format", message.format),
+        relevance=finite("relevance", message.relevance),
+        goal=finite("goal", message.goal),
+        atoms=tuple(AtomResult(atom.text, atom.holds) for atom in message.atoms),
+        success=message.success,
+    )
+
+
+def step_to_proto(step: Step) -> types_pb2.StepResult:
+    failure = "" if step.failure is None else step.failure.value
+    return types_pb2.StepResult(call=skill_call_to_proto(step.call), failure=failure, message=step.message)
+
+
+def step_from_proto(message: types_pb2.StepResult) -> Step:
+    call = inside("call", skill_call_from_proto, message.call)
+    return Step(call, _failure_reason(message.failure), message.message)
+
+
+def _failure_reason(text: str) -> FailureReason | None:
+    if not text:
+        return None
+    try:
+        return FailureReason(text)
+    except ValueError:
+        raise ConvertError("failure", f"{text!r} is no known failure reason") from None
+
+
+def timings_to_proto(timings: Timings) -> types_pb2.Timings:
+    return types_pb2.Timings(queued_s=timings.queued_s, load_s=timings.load_s, execute_s=timings.execute_s)
+
+
+def timings_from_proto(message: types_pb2.Timings) -> Timings:
+    return Timings(
+        queued_s=finite("queued_s", message.queued_s),
+        load_s=finite("load_s", message.load_s),
+        execute_s=finite("execute_s", message.execute_s),
+    )
+
+
+def completed_to_proto(completed: Completed) -> types_pb2.Completed:
+    return types_pb2.Completed(
+        reward=reward_to_proto(completed.reward),
+        steps=[step_to_proto(step) for step in completed.steps],
+        final_state=completed.final,
+        trace_digest=completed.trace_digest,
+        worker_id=completed.worker_id,
+        timings=timings_to_proto(completed.timings),
+        warm=completed.warm,
+    )
+
+
+def completed_from_proto(message: types_pb2.Completed) -> Completed:
+    """The result. A missing reward is a ``ConvertError``, for it is no reward of 0."""
+    if not message.HasField("reward"):
+        raise ConvertError("reward", "is missing: a completed rollout has one")
+    return Completed(
+        reward=inside("reward", reward_from_proto, message.reward),
+        steps=each("steps", step_from_proto, message.steps),
+        final=tuple(message.final_state),
+        trace_digest=message.trace_digest,
+        worker_id=message.worker_id,
+        timings=inside("timings", timings_from_proto, message.timings),
+        warm=message.warm,
+    )
+
+
+def infra_failure_to_proto(failure: InfraFailure) -> types_pb2.InfraFailure:
+    return types_pb2.InfraFailure(
+        code=_INFRA_CODES[failure.code], message=failure.message, worker_id=failure.worker_id
+    )
+
+
+def infra_failure_from_proto(message: types_pb2.InfraFailure) -> InfraFailure:
+    code = _INFRA_VALUES.get(message.code)
+    if code is None:
+        raise ConvertError("code", f"{message.code} is no known code: is the sender newer than this side?")
+    return InfraFailure(code, message.message, message.worker_id)
+
+
+def rollout_result_to_proto(result: RolloutResult) -> types_pb2.RolloutResult:
+    message = types_pb2.RolloutResult(
+        rollout_id=result.rollout_id, group_id=result.group_id, cursor=result.cursor, attempt=result.attempt
+    )
+    match result.outcome:
+        case Completed() as completed:
+            message.completed.CopyFrom(completed_to_proto(completed))
+        case InfraFailure() as failure:
+            message.infra_failure.CopyFrom(infra_failure_to_proto(failure))
+        case Cancelled():
+            message.cancelled.SetInParent()
+    return message
+
+
+def rollout_result_from_proto(message: types_pb2.RolloutResult) -> RolloutResult:
+    return RolloutResult(
+        rollout_id=required("rollout_id", message.rollout_id),
+        group_id=message.group_id,
+        cursor=message.cursor,
+        attempt=message.attempt,
+        outcome=_outcome(message),
+    )
+
+
+def _outcome(message: types_pb2.RolloutResult) -> Outcome:
+    match message.WhichOneof("outcome"):
+        case "completed":
+            return inside("completed", completed_from_proto, message.completed)
+        case "infra_failure":
+            return inside("infra_failure", infra_failure_from_proto, message.infra_failure)
+        case "cancelled":
+            return Cancelled()
+        case None:
+            raise ConvertError("outcome", "is missing: a result has exactly one")
+
+
+def resources_to_proto(resources: Resources) -> types_pb2.Resources:
+    return types_pb2.Resources(
+        slots=resources.slots,
+        cores=resources.cores,
+        memory_mb=resources.memory_mb,
+        score=resources.score,
+        gpu=resources.gpu,
+        vram_mb=resources.vram_mb,
+        versions=dict(resources.versions),
+    )
+
+
+def resources_from_proto(message: types_pb2.Resources) -> Resources:
+    if message.slots == 0:
+        raise ConvertError("slots", "is 0: a worker offers at least one slot")
+    return Resources(
+        slots=message.slots,
+        cores=message.cores,
+        memory_mb=message.memory_mb,
+        score=finite("score", message.score),
+        gpu=message.gpu,
+        vram_mb=message.vram_mb,
+        versions=dict(message.versions),
+    )
+
+
+def lookahead_entry_to_proto(entry: LookaheadEntry) -> rollout_service_pb2.LookaheadEntry:
+    return rollout_service_pb2.LookaheadEntry(
+        step=entry.step, bundle_digest=entry.bundle_digest, count=entry.count
+    )
+
+
+def lookahead_entry_from_proto(message: rollout_service_pb2.LookaheadEntry) -> LookaheadEntry:
+    return LookaheadEntry(message.step, required("bundle_digest", message.bundle_digest), message.count)
+
+
+def warmth_to_proto(warmth: Warmth) -> types_pb2.Warmth.ValueType:
+    return _WARMTHS[warmth]
+
+
+def warmth_from_proto(number: types_pb2.Warmth.ValueType) -> Warmth:
+    warmth = _WARMTH_VALUES.get(number)
+    if warmth is None:
+        raise ConvertError("warmth", f"{number} is no known value: is the sender newer than this side?")
+    return warmth
+
+
+def run_stats_to_proto(stats: RunStats) -> rollout_service_pb2.RunStats:
+    return rollout_service_pb2.RunStats(**{name: getattr(stats, name) for name in RunStats.__slots__})
+
+
+def run_stats_from_proto(message: rollout_service_pb2.RunStats) -> RunStats:
+    return RunStats(**{name: getattr(message, name) for name in RunStats.__slots__})

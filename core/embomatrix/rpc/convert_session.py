@@ -1,0 +1,165 @@
+"""Values of the worker's session and of the operator's view, to wire messages and back."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.proto.v1 import admin_service_pb2, worker_service_pb2
+from embomatrix.rpc.convert import (
+    ConvertError,
+    completed_from_proto,
+    completed_to_proto,
+    each,
+    finite,
+    infra_failure_from_proto,
+    infra_failure_to_proto,
+    inside,
+    required,
+    resources_from_proto,
+    resources_to_proto,
+    rollout_from_proto,
+    rollout_to_proto,
+    run_stats_from_proto,
+    run_stats_to_proto,
+)
+from embomatrix.rpc.values import (
+    Completed,
+    InfraFailure,
+    Lease,
+    LeaseRef,
+    LeaseResult,
+    Resident,
+    ResidentState,
+    RunInfo,
+    WorkerInfo,
+    WorkerState,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+_STATES: Final[Mapping[ResidentState, worker_service_pb2.ResidentState.ValueType]] = {
+    state: worker_service_pb2.ResidentState.Value(f"RESIDENT_STATE_{state.name}") for state in ResidentState
+}
+_STATE_VALUES: Final = {number: state for state, number in _STATES.items()}
+
+
+def resident_to_proto(resident: Resident) -> worker_service_pb2.Resident:
+    return worker_service_pb2.Resident(
+        bundle_digest=resident.bundle_digest,
+        state=_STATES[resident.state],
+        load_s=resident.load_s,
+        memory_mb=resident.memory_mb,
+        error=resident.error,
+    )
+
+
+def resident_from_proto(message: worker_service_pb2.Resident) -> Resident:
+    state = _STATE_VALUES.get(message.state)
+    if state is None:
+        raise ConvertError("state", f"{message.state} is no known state: is the sender newer than this side?")
+    return Resident(
+        bundle_digest=required("bundle_digest", message.bundle_digest),
+        state=state,
+        load_s=finite("load_s", message.load_s),
+        memory_mb=finite("memory_mb", message.memory_mb),
+        error=message.error,
+    )
+
+
+def lease_ref_to_proto(ref: LeaseRef) -> worker_service_pb2.LeaseRef:
+    return worker_service_pb2.LeaseRef(lease_id=ref.lease_id, lease_epoch=ref.lease_epoch)
+
+
+def lease_ref_from_proto(message: worker_service_pb2.LeaseRef) -> LeaseRef:
+    return LeaseRef(required("lease_id", message.lease_id), message.lease_epoch)
+
+
+def lease_to_proto(lease: Lease) -> worker_service_pb2.Lease:
+    return worker_service_pb2.Lease(
+        ref=lease_ref_to_proto(lease.ref),
+        rollout=rollout_to_proto(lease.rollout),
+        deadline_s=lease.deadline_s,
+    )
+
+
+def lease_from_proto(message: worker_service_pb2.Lease) -> Lease:
+    ref = inside("ref", lease_ref_from_proto, message.ref)
+    if finite("deadline_s", message.deadline_s) <= 0:
+        raise ConvertError("deadline_s", f"is {message.deadline_s}: it must be above 0")
+    return Lease(ref, inside("rollout", rollout_from_proto, message.rollout), message.deadline_s)
+
+
+def lease_result_to_proto(result: LeaseResult) -> worker_service_pb2.LeaseResult:
+    message = worker_service_pb2.LeaseResult(lease=lease_ref_to_proto(result.ref))
+    match result.outcome:
+        case Completed() as completed:
+            message.completed.CopyFrom(completed_to_proto(completed))
+        case InfraFailure() as failure:
+            message.infra_failure.CopyFrom(infra_failure_to_proto(failure))
+    return message
+
+
+def lease_result_from_proto(message: worker_service_pb2.LeaseResult) -> LeaseResult:
+    ref = inside("lease", lease_ref_from_proto, message.lease)
+    match message.WhichOneof("outcome"):
+        case "completed":
+            return LeaseResult(ref, inside("completed", completed_from_proto, message.completed))
+        case "infra_failure":
+            return LeaseResult(ref, inside("infra_failure", infra_failure_from_proto, message.infra_failure))
+        case None:
+            raise ConvertError("outcome", "is missing: a result has exactly one")
+
+
+def worker_state_to_proto(state: WorkerState) -> worker_service_pb2.WorkerState:
+    return worker_service_pb2.WorkerState(
+        residents=[resident_to_proto(resident) for resident in state.residents],
+        running=[lease_ref_to_proto(ref) for ref in state.running],
+        finished=[lease_result_to_proto(result) for result in state.finished],
+        draining=state.draining,
+    )
+
+
+def worker_state_from_proto(message: worker_service_pb2.WorkerState) -> WorkerState:
+    return WorkerState(
+        residents=each("residents", resident_from_proto, message.residents),
+        running=each("running", lease_ref_from_proto, message.running),
+        finished=each("finished", lease_result_from_proto, message.finished),
+        draining=message.draining,
+    )
+
+
+def worker_info_to_proto(info: WorkerInfo) -> admin_service_pb2.WorkerInfo:
+    return admin_service_pb2.WorkerInfo(
+        worker_id=info.worker_id,
+        state=info.state,
+        resources=resources_to_proto(info.resources),
+        residents=[resident_to_proto(resident) for resident in info.residents],
+        running=info.running,
+        completed=info.completed,
+        last_seen_s=info.last_seen_s,
+    )
+
+
+def worker_info_from_proto(message: admin_service_pb2.WorkerInfo) -> WorkerInfo:
+    return WorkerInfo(
+        worker_id=required("worker_id", message.worker_id),
+        state=message.state,
+        resources=inside("resources", resources_from_proto, message.resources),
+        residents=each("residents", resident_from_proto, message.residents),
+        running=message.running,
+        completed=message.completed,
+        last_seen_s=finite("last_seen_s", message.last_seen_s),
+    )
+
+
+def run_info_to_proto(info: RunInfo) -> admin_service_pb2.RunInfo:
+    return admin_service_pb2.RunInfo(
+        run_id=info.run_id, name=info.name, stats=run_stats_to_proto(info.stats), pending=info.pending
+    )
+
+
+def run_info_from_proto(message: admin_service_pb2.RunInfo) -> RunInfo:
+    return RunInfo(
+        required("run_id", message.run_id), message.name, run_stats_from_proto(message.stats), message.pending
+    )
