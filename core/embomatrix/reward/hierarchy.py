@@ -1,0 +1,58 @@
+"""The hierarchical reward: format, relevance and goal, with the paper's constants as defaults."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from embomatrix.reward.breakdown import AtomResult, RewardBreakdown
+from embomatrix.world.evaluate import evaluate, objects_of, render, scored_atoms
+
+if TYPE_CHECKING:
+    from embomatrix.world.goal import Facts
+    from embomatrix.world.task import Task
+
+
+@dataclass(frozen=True, slots=True)
+class RewardSettings:
+    """Constants of the three tiers. The defaults are the paper's."""
+
+    unparsable: float = -1.0
+    """Whole reward of a text that is no plan."""
+    format: float = 0.5
+    """For a text that is a plan, whatever it does."""
+    relevance_per_object: float = 0.2
+    """For each object of the goal on which a skill call succeeded."""
+    relevance_limit: float = 1.0
+    goal: float = 30.0
+    """For a goal whose atoms all hold; each atom earns its equal share."""
+
+
+PAPER = RewardSettings()
+
+
+def score(
+    task: Task, touched: frozenset[str], facts: Facts, settings: RewardSettings = PAPER
+) -> RewardBreakdown:
+    """Reward of an executed plan: ``touched`` names the objects on which a call succeeded, ``facts`` is the final state.
+
+    Raises GoalError when the goal quantifies over a type that the task does not list.
+    """
+    relevant = len(objects_of(task.goal, task.types) & touched)
+    atoms = tuple(
+        AtomResult(render(atom), evaluate(atom, facts, task.types))
+        for atom in scored_atoms(task.goal, task.types)
+    )
+    satisfied = sum(atom.holds for atom in atoms)
+    return RewardBreakdown(
+        format=settings.format,
+        relevance=min(settings.relevance_limit, settings.relevance_per_object * relevant),
+        goal=settings.goal * satisfied / len(atoms) if atoms else 0.0,
+        atoms=atoms,
+        success=evaluate(task.goal, facts, task.types),
+    )
+
+
+def unparsable(settings: RewardSettings = PAPER) -> RewardBreakdown:
+    """Reward of a text in which no plan was found. It was never executed, so it has no atoms."""
+    return RewardBreakdown(format=settings.unparsable, relevance=0.0, goal=0.0, atoms=(), success=False)

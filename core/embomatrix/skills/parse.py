@@ -1,0 +1,289 @@
+"""From a model's text to a plan, and back. Text is data: nothing of it is ever evaluated.
+
+Two forms are read. JSON: an array of calls, or an object that holds one under "action_sequence" or "plan", in a code fence
+or among prose and reasoning; arguments stand beside the action or under "parameters". The last plan of the text counts:
+a model reasons first and answers last. Compact: one call on a line, or between semicolons, ``move 3; place 3 inside``,
+arguments in the order of ``SIGNATURES``.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from enum import StrEnum
+from typing import TYPE_CHECKING, Any, Final, cast
+
+from embomatrix.skills.syntax import (
+    MAX_PLAN_BYTES,
+    MAX_STEPS,
+    SIGNATURES,
+    Arg,
+    PlaceRelation,
+    Plan,
+    Skill,
+    SkillCall,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+
+class PlanReason(StrEnum):
+    """Why a text is no plan. Each of these earns the reward of unparsable text."""
+
+    TOO_LONG = "too_long"
+    NO_PLAN = "no_plan"
+    TOO_MANY_STEPS = "too_many_steps"
+    UNKNOWN_SKILL = "unknown_skill"
+    MISSING_ARGUMENT = "missing_argument"
+    WRONG_ARGUMENT = "wrong_argument"
+
+
+class PlanError(ValueError):
+    """A text can't be parsed. ``reason`` is of a closed set; the message is a sentence for a person."""
+
+    def __init__(self, reason: PlanReason, sentence: str) -> None:
+        super().__init__(sentence)
+        self.reason = reason
+
+
+SKILLS: Final[Mapping[str, Skill]] = {skill.value: skill for skill in Skill}
+PLAN_KEYS: Final = ("action_sequence", "plan")
+MAX_INDEX: Final = 2**63 - 1
+"""Indices beyond the wire's 64 bits name nothing."""
+MAX_ROOM_NAME: Final = 64
+_MAX_STARTS: Final = 256
+"""Brackets at which a JSON plan is looked for: bounds the work on adversarial text."""
+_JSON_START: Final = re.compile(r"\[\s*\{|\{\s*\"")
+_LIST_MARK: Final = re.compile(r"^\s*(?:\d+[.)]|[-*])\s+")
+_WORD: Final = re.compile(r"[A-Za-z_]+")
+_ARGUMENT: Final = re.compile(
+    r"[-+]?(?:\d[\d.]*(?:e[-+]?\d+)?|nan|inf|infinity)|ontop|inside|under", re.IGNORECASE
+)
+
+
+def parse_plan(text: str) -> Plan:
+    """The plan that the text ends with. Raises PlanError, and nothing else, for any text."""
+    size = len(text.encode("utf-8", errors="replace"))
+    if size > MAX_PLAN_BYTES:
+        raise PlanError(
+            PlanReason.TOO_LONG, f"the text has {size} bytes: a plan has at most {MAX_PLAN_BYTES}"
+        )
+    answer = _without_reasoning(text)
+    value = _last_json_plan(answer)
+    if value is not None:
+        return plan_from_json(value)
+    return _parse_lines(answer)
+
+
+def plan_from_json(value: object) -> Plan:
+    """A plan from decoded JSON: an array of calls, or an object that holds one. Raises PlanError."""
+    steps = _steps_in(value)
+    if steps is None:
+        raise PlanError(
+            PlanReason.NO_PLAN,
+            'expected a JSON array of calls such as [{"action": "move", "object_index": 0}]',
+        )
+    _check_length(len(steps))
+    return tuple(_call_from_json(step, number) for number, step in enumerate(steps, start=1))
+
+
+def plan_to_json(plan: Plan) -> list[dict[str, object]]:
+    """JSON values that ``plan_from_json`` reads back to an equal plan."""
+    return [
+        {
+            "action": call.skill.value,
+            **{arg.value: _plain(argument(call, arg)) for arg in SIGNATURES[call.skill]},
+        }
+        for call in plan
+    ]
+
+
+def plan_to_lines(plan: Plan) -> str:
+    """Compact text, one call on a line, that ``parse_plan`` reads back to an equal plan."""
+    return "\n".join(
+        " ".join([call.skill.value, *(str(_plain(argument(call, arg))) for arg in SIGNATURES[call.skill])])
+        for call in plan
+    )
+
+
+def argument(call: SkillCall, arg: Arg) -> int | float | str | None:
+    """The call's value for one argument, None where the skill does not take it."""
+    return cast("int | float | str | None", getattr(call, arg.value))
+
+
+def _plain(value: int | float | str | None) -> int | float | str | None:
+    return value.value if isinstance(value, PlaceRelation) else value
+
+
+def _without_reasoning(text: str) -> str:
+    """What follows the last closed <think>. Reasoning that never ends, or nothing after it, leaves the text as it is."""
+    answer = text.rpartition("</think>")[2]
+    return answer if answer.strip() else text
+
+
+def _check_length(count: int) -> None:
+    if count == 0:
+        raise PlanError(PlanReason.NO_PLAN, "the plan is empty: expected at least one skill call")
+    if count > MAX_STEPS:
+        raise PlanError(
+            PlanReason.TOO_MANY_STEPS, f"the plan has {count} steps: expected at most {MAX_STEPS}"
+        )
+
+
+def _steps_in(value: object) -> Sequence[object] | None:
+    """The array of calls in a JSON value, or None when it holds none."""
+    if isinstance(value, dict):
+        return next((value[key] for key in PLAN_KEYS if isinstance(value.get(key), list)), None)
+    if isinstance(value, list) and any(isinstance(item, dict) and "action" in item for item in value):
+        return value
+    return None
+
+
+def _last_json_plan(text: str) -> object | None:
+    """The last JSON value that holds a plan; values inside another one are part of it."""
+    decoder = json.JSONDecoder()
+    found: object | None = None
+    position = 0
+    for _ in range(_MAX_STARTS):
+        match = _JSON_START.search(text, position)
+        if match is None:
+            break
+        try:
+            value, position = decoder.raw_decode(text, match.start())
+        except (ValueError, RecursionError):
+            position = match.start() + 1
+            continue
+        if _steps_in(value) is not None:
+            found = value
+    return found
+
+
+def _call_from_json(value: object, number: int) -> SkillCall:
+    """One call. Keys that no skill knows, such as a comment, change nothing and are passed over."""
+    if not isinstance(value, dict) or "action" not in value:
+        raise PlanError(PlanReason.MISSING_ARGUMENT, f'step {number} has no "action": name the skill')
+    nested = value.get("parameters", {})
+    if not isinstance(nested, dict):
+        raise PlanError(
+            PlanReason.WRONG_ARGUMENT,
+            f'step {number}: "parameters" must be an object, found {_shown(nested)}',
+        )
+    return _build_call(_skill(value["action"], number), {**nested, **value}, number)
+
+
+def _parse_lines(text: str) -> Plan:
+    """The calls among the lines, in their order; other lines are prose."""
+    calls = [words for words in _segments(text) if _is_call(words)]
+    if not calls:
+        raise PlanError(
+            PlanReason.NO_PLAN,
+            "no plan was found: expected a JSON array of calls such as "
+            '[{"action": "move", "object_index": 0}], or lines such as "move 0"',
+        )
+    _check_length(len(calls))
+    return tuple(_call_from_words(words, number) for number, words in enumerate(calls, start=1))
+
+
+def _segments(text: str) -> Iterator[list[str]]:
+    for segment in re.split(r"[\n\r;]", text):
+        words = _LIST_MARK.sub("", segment).split()
+        if words:
+            yield words
+
+
+def _is_call(words: list[str]) -> bool:
+    """A known skill with few words after it, or any word with nothing but numbers and relations after it."""
+    skill, *arguments = words
+    if skill.lower() in SKILLS and len(arguments) <= 2:
+        return True
+    return bool(_WORD.fullmatch(skill) and arguments and all(_ARGUMENT.fullmatch(item) for item in arguments))
+
+
+def _call_from_words(words: list[str], number: int) -> SkillCall:
+    skill = _skill(words[0], number)
+    expected = SIGNATURES[skill]
+    if len(words) - 1 > len(expected):
+        raise PlanError(
+            PlanReason.WRONG_ARGUMENT,
+            f"step {number}: {skill.value} takes {_signature(skill)}, found {len(words) - 1} arguments",
+        )
+    values = {arg.value: _number_or_word(word) for arg, word in zip(expected, words[1:], strict=False)}
+    return _build_call(skill, values, number)
+
+
+def _number_or_word(word: str) -> int | float | str:
+    for number in (int, float):
+        try:
+            return number(word)
+        except ValueError:
+            continue
+    return word
+
+
+def _skill(value: object, number: int) -> Skill:
+    skill = SKILLS.get(value.strip().lower()) if isinstance(value, str) else None
+    if skill is None:
+        raise PlanError(
+            PlanReason.UNKNOWN_SKILL,
+            f"step {number}: unknown skill {_shown(value)}: expected one of {', '.join(SKILLS)}",
+        )
+    return skill
+
+
+def _build_call(skill: Skill, values: Mapping[str, object], number: int) -> SkillCall:
+    arguments: dict[str, int | float | str] = {}
+    for arg in SIGNATURES[skill]:
+        if values.get(arg.value) is None:
+            raise PlanError(
+                PlanReason.MISSING_ARGUMENT,
+                f"step {number}: {skill.value} lacks {arg.value}: it takes {_signature(skill)}",
+            )
+        arguments[arg.value] = _checked(arg, values[arg.value], number)
+    return SkillCall(skill, **cast("dict[str, Any]", arguments))
+
+
+def _checked(arg: Arg, value: object, number: int) -> int | float | str:
+    """The value in its type, or PlanError. A boolean is no number here."""
+    match arg:
+        case Arg.OBJECT | Arg.SOURCE:
+            if isinstance(value, int) and not isinstance(value, bool) and abs(value) <= MAX_INDEX:
+                return value
+            expected = "a whole number, a row of the object table"
+        case Arg.YAW | Arg.DISTANCE:
+            real = _finite(value)
+            if real is not None:
+                return real
+            expected = "a finite number"
+        case Arg.RELATION:
+            if isinstance(value, str) and value.strip().lower() in set(PlaceRelation):
+                return PlaceRelation(value.strip().lower())
+            expected = f"one of {', '.join(PlaceRelation)}"
+        case Arg.ROOM:
+            if isinstance(value, str) and 0 < len(value.strip()) <= MAX_ROOM_NAME:
+                return value.strip()
+            expected = "the name of a room"
+    raise PlanError(
+        PlanReason.WRONG_ARGUMENT, f"step {number}: {arg.value} must be {expected}, found {_shown(value)}"
+    )
+
+
+def _finite(value: object) -> float | None:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    try:
+        real = float(value)
+    except OverflowError:
+        return None
+    return real if math.isfinite(real) else None
+
+
+def _signature(skill: Skill) -> str:
+    return ", ".join(arg.value for arg in SIGNATURES[skill])
+
+
+def _shown(value: object) -> str:
+    """The value for a message, cut to a readable length."""
+    text = repr(value) if isinstance(value, str | float | bool | None) else type(value).__name__
+    return text if len(text) <= 60 else text[:57] + "..."

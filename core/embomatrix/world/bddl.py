@@ -1,0 +1,345 @@
+"""Parser of BDDL problems, in the dialects of BEHAVIOR-1K and of the paper's factory.
+
+``?`` before an object of the problem is optional, text is lower-cased but for the problem's name, ``;`` starts a comment.
+Three habits of published problems are accepted: a stray backslash at a line's end, an object declared again with the same
+type, and a room instance (``closet_0``) where an object should stand. Every error names the line and the column, from 1.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, NoReturn
+
+from embomatrix.world.evaluate import render
+from embomatrix.world.goal import (
+    And,
+    Atom,
+    Exists,
+    Forall,
+    Formula,
+    ForN,
+    ForNPairs,
+    ForPairs,
+    Imply,
+    Not,
+    Or,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+_UNARY: Final = (
+    "cooked", "frozen", "open", "folded", "unfolded", "toggled_on", "hot", "on_fire", "future", "real", "broken",
+    "dusty", "stained", "soaked", "sliced",
+)  # fmt: skip
+_BINARY: Final = (
+    "saturated", "covered", "filled", "contains", "ontop", "nextto", "under", "touching", "inside", "overlaid",
+    "attached", "draped", "insource", "inroom",
+)  # fmt: skip
+ARITIES: Final[Mapping[str, tuple[int, ...]]] = {
+    **dict.fromkeys(_UNARY, (1,)),
+    **dict.fromkeys(_BINARY, (2,)),
+    "grasped": (1, 2),  # the paper's tasks leave the agent out
+}
+"""Predicates of both dialects, with the numbers of arguments that each takes."""
+ROOM_TYPES: Final = frozenset(
+    (
+        "bar", "bathroom", "bedroom", "biology_lab", "break_room", "chemistry_lab", "childs_room",
+        "classroom", "closet", "computer_lab", "conference_hall", "copy_room", "corridor", "dining_room",
+        "empty_room", "entryway", "exercise_room", "garage", "garden", "grocery_store", "gym", "hammam",
+        "infirmary", "kitchen", "living_room", "lobby", "locker_room", "meeting_room", "pantry_room",
+        "phone_room", "playroom", "private_office", "sauna", "shared_office", "spa", "staircase",
+        "storage_room", "television_room", "utility_room",
+    )
+)  # fmt: skip
+"""Room types of the 51 base scenes; a room instance is a type and a number: ``kitchen_0``."""
+MAX_DEPTH: Final = 64
+"""Deeper nesting is no goal that anyone wrote."""
+
+
+class BddlError(ValueError):
+    """A BDDL text can't be read. ``line`` and ``column`` count from 1."""
+
+    def __init__(self, message: str, line: int, column: int) -> None:
+        super().__init__(f"line {line}, column {column}: {message}")
+        self.line = line
+        self.column = column
+
+
+@dataclass(frozen=True, slots=True)
+class Literal:
+    """An atom of ``:init``; ``positive`` is False under ``not``."""
+
+    atom: Atom
+    positive: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """One BDDL problem. ``objects`` maps the name of an object to its type, in the order of the text."""
+
+    name: str
+    objects: Mapping[str, str]
+    init: tuple[Literal, ...]
+    goal: Formula
+
+    @property
+    def types(self) -> Mapping[str, tuple[str, ...]]:
+        """Type to object names: what quantifiers range over."""
+        members: dict[str, tuple[str, ...]] = {}
+        for name, type_name in self.objects.items():
+            members[type_name] = (*members.get(type_name, ()), name)
+        return members
+
+
+@dataclass(frozen=True, slots=True)
+class _Node:
+    """A word, or a list when ``word`` is empty."""
+
+    word: str
+    items: tuple[_Node, ...]
+    line: int
+    column: int
+
+    def fail(self, message: str) -> NoReturn:
+        raise BddlError(message, self.line, self.column)
+
+    @property
+    def head(self) -> str:
+        """First word of a list in lower case, or the word itself."""
+        return self.items[0].word.lower() if self.items else self.word.lower()
+
+
+def parse_problem(text: str) -> Problem:
+    """Read a whole ``(define (problem ...) ...)``. Raises BddlError."""
+    root = _read(text)
+    if root.head != "define":
+        root.fail(f"expected '(define (problem NAME) ...)', found {root.head or '()'!r}")
+    sections: dict[str, _Node] = {}
+    for node in root.items[1:]:
+        head = node.head
+        if head not in {"problem", ":domain", ":requirements", ":objects", ":init", ":goal"} or node.word:
+            node.fail(
+                f"unknown section {head!r}: expected (problem ...), (:domain ...), (:objects ...), "
+                "(:init ...) or (:goal ...)"
+            )
+        if head in sections:
+            node.fail(f"section {head!r} stands here twice: keep one")
+        sections[head] = node
+    for needed in (":objects", ":init", ":goal"):
+        if needed not in sections:
+            root.fail(f"section ({needed} ...) is missing")
+    name_node = sections.get("problem", root)
+    if name_node is root or len(name_node.items) != 2 or not name_node.items[1].word:
+        name_node.fail("expected (problem NAME), one word")
+    objects = _parse_objects(sections[":objects"])
+    reader = _Reader(objects)
+    return Problem(
+        name=name_node.items[1].word,
+        objects=objects,
+        init=tuple(reader.literal(node) for node in sections[":init"].items[1:]),
+        goal=reader.goal(sections[":goal"]),
+    )
+
+
+def parse_formula(text: str, objects: Mapping[str, str]) -> Formula:
+    """Read one formula over ``objects`` (name to type). Raises BddlError."""
+    return _Reader(objects).formula(_read(text), {})
+
+
+def render_problem(problem: Problem) -> str:
+    """BDDL text that ``parse_problem`` reads back to an equal problem."""
+    objects = "\n".join(
+        f"        {' '.join(names)} - {type_name}" for type_name, names in problem.types.items()
+    )
+    init = "\n".join(
+        f"        {render(item.atom if item.positive else Not(item.atom))}" for item in problem.init
+    )
+    return (
+        f"(define (problem {problem.name})\n    (:domain omnigibson)\n    (:objects\n{objects}\n    )\n"
+        f"    (:init\n{init}\n    )\n    (:goal\n        {render(problem.goal)}\n    )\n)\n"
+    )
+
+
+def is_room_instance(name: str) -> bool:
+    """True for the name of one room of a scene, ``kitchen_0``; False for a bare room type."""
+    stem, _, number = name.rpartition("_")
+    return number.isdigit() and stem in ROOM_TYPES
+
+
+def _tokens(text: str) -> Iterator[tuple[str, int, int]]:
+    for line, content in enumerate(text.splitlines(), start=1):
+        for match in re.finditer(r"[()]|[^\s()\\]+", content.split(";", 1)[0]):
+            yield match.group(), line, match.start() + 1
+
+
+def _read(text: str) -> _Node:
+    """The one expression of the text. A section that opens too deep shows where a parenthesis is missing."""
+    open_lists: list[tuple[list[_Node], int, int]] = []
+    root: _Node | None = None
+    for token, line, column in _tokens(text):
+        if root is not None:
+            raise BddlError(f"unexpected {token!r} after the last closing parenthesis", line, column)
+        if token == "(":
+            if len(open_lists) >= MAX_DEPTH:
+                raise BddlError(f"nested deeper than {MAX_DEPTH} parentheses", line, column)
+            open_lists.append(([], line, column))
+            continue
+        if not open_lists:
+            raise BddlError(f"expected '(' first, found {token!r}", line, column)
+        if token == ")":
+            items, start_line, start_column = open_lists.pop()
+            node = _Node("", tuple(items), start_line, start_column)
+        else:
+            if token.startswith(":") and not open_lists[-1][0] and len(open_lists) > 2:
+                _, at_line, at_column = open_lists[-2]
+                raise BddlError(
+                    f"section {token!r} stands inside the list opened at line {at_line}, column {at_column}: "
+                    "a closing parenthesis is missing before it",
+                    line,
+                    column,
+                )
+            node = _Node(token, (), line, column)
+        if open_lists:
+            open_lists[-1][0].append(node)
+        else:
+            root = node
+    if open_lists:
+        _, line, column = open_lists[-1]
+        raise BddlError("the parenthesis opened here is never closed: add ')'", line, column)
+    if root is None:
+        raise BddlError("the text is empty: expected '(define (problem NAME) ...)'", 1, 1)
+    return root
+
+
+def _parse_objects(section: _Node) -> dict[str, str]:
+    objects: dict[str, str] = {}
+    pending: list[_Node] = []
+    items = iter(section.items[1:])
+    for node in items:
+        if not node.word:
+            node.fail("expected object names and '- TYPE' in :objects, found a list")
+        if node.word != "-":
+            pending.append(node)
+            continue
+        type_node = next(items, None)
+        if type_node is None or not type_node.word or not pending:
+            node.fail("expected 'NAME ... - TYPE' around this hyphen")
+        for name_node in pending:
+            name = name_node.word.lower()
+            type_name = type_node.word.lower()
+            if objects.setdefault(name, type_name) != type_name:
+                name_node.fail(
+                    f"object {name!r} is declared as {objects[name]!r} and as {type_name!r}: keep one"
+                )
+        pending = []
+    if pending:
+        pending[0].fail(f"object {pending[0].word!r} has no type: add '- TYPE' after it")
+    return objects
+
+
+@dataclass(frozen=True, slots=True)
+class _Reader:
+    """Formulas over declared objects. ``scope`` maps a bound variable to its type."""
+
+    objects: Mapping[str, str]
+
+    def literal(self, node: _Node) -> Literal:
+        if node.head == "not" and not node.word:
+            self._expect(node, 1)
+            return Literal(self._atom(node.items[1], {}), positive=False)
+        return Literal(self._atom(node, {}))
+
+    def goal(self, section: _Node) -> Formula:
+        parts = tuple(self.formula(node, {}) for node in section.items[1:])
+        if not parts:
+            section.fail("the goal is empty: expected one formula")
+        return parts[0] if len(parts) == 1 else And(parts)
+
+    def formula(self, node: _Node, scope: Mapping[str, str]) -> Formula:
+        rest = node.items[1:]
+        match "" if node.word else node.head:
+            case "and":
+                return And(tuple(self.formula(item, scope) for item in rest))
+            case "or":
+                return Or(tuple(self.formula(item, scope) for item in rest))
+            case "not":
+                self._expect(node, 1)
+                return Not(self.formula(rest[0], scope))
+            case "imply":
+                self._expect(node, 2)
+                return Imply(self.formula(rest[0], scope), self.formula(rest[1], scope))
+            case "forall" | "exists" | "forn" | "forpairs" | "fornpairs":
+                return self._quantified(node, scope)
+            case _:
+                return self._atom(node, scope)
+
+    def _quantified(self, node: _Node, scope: Mapping[str, str]) -> Formula:
+        counted = node.head in {"forn", "fornpairs"}
+        self._expect(node, (2 if node.head in {"forall", "exists", "forn"} else 3) + counted)
+        rest = node.items[1:]
+        count = _count(rest[0]) if counted else 0
+        binders = [self._binder(item) for item in rest[int(counted) : -1]]
+        body = self.formula(rest[-1], {**scope, **dict(binders)})
+        variable, type_name = binders[0]
+        match node.head:
+            case "forall":
+                return Forall(variable, type_name, body)
+            case "exists":
+                return Exists(variable, type_name, body)
+            case "forn":
+                return ForN(count, variable, type_name, body)
+            case "forpairs":
+                return ForPairs(*binders[0], *binders[1], body)
+            case _:
+                return ForNPairs(count, *binders[0], *binders[1], body)
+
+    def _binder(self, node: _Node) -> tuple[str, str]:
+        words = [item.word.lower() for item in node.items]
+        if len(words) != 3 or words[1] != "-" or not words[0].startswith("?") or not words[2]:
+            node.fail("expected a variable and its type: (?NAME - TYPE)")
+        if words[2] not in self.objects.values():
+            known = ", ".join(sorted(set(self.objects.values()))) or "none"
+            node.items[2].fail(f"unknown type {words[2]!r}: the types in :objects are {known}")
+        return words[0], words[2]
+
+    def _atom(self, node: _Node, scope: Mapping[str, str]) -> Atom:
+        if node.word or not node.items or not node.items[0].word:
+            node.fail(f"expected (PREDICATE ARGUMENT ...), found {node.word or 'a list'!r}")
+        predicate = node.head
+        if predicate not in ARITIES:
+            node.fail(f"unknown predicate {predicate!r}: expected one of {', '.join(sorted(ARITIES))}")
+        args = node.items[1:]
+        if len(args) not in ARITIES[predicate]:
+            expected = " or ".join(map(str, ARITIES[predicate]))
+            node.fail(f"{predicate!r} takes {expected} arguments, found {len(args)}")
+        is_room = [predicate == "inroom" and index == 1 for index in range(len(args))]
+        return Atom(
+            predicate,
+            tuple(self._name(arg, scope, room=room) for arg, room in zip(args, is_room, strict=True)),
+        )
+
+    def _name(self, node: _Node, scope: Mapping[str, str], *, room: bool) -> str:
+        if not node.word:
+            node.fail("expected a name, found a list")
+        word = node.word.lower()
+        bare = word.removeprefix("?")
+        for name in (word, f"?{bare}"):  # both dialects leave the mark out now and then
+            if name in scope:
+                return name
+        if not room and bare not in self.objects and not is_room_instance(bare):
+            node.fail(f"object {bare!r} is not declared: add it to :objects, or mend its name")
+        return bare
+
+    def _expect(self, node: _Node, count: int) -> None:
+        found = len(node.items) - 1
+        if found != count:
+            node.fail(f"{node.head!r} takes {count} parts, found {found}")
+
+
+def _count(node: _Node) -> int:
+    word = node.items[0].word if len(node.items) == 1 else node.word
+    if not word.isascii() or not word.isdigit():
+        node.fail("expected a whole number: (N)")
+    return int(word)

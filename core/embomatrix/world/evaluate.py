@@ -1,0 +1,233 @@
+"""What formulas mean: evaluation against facts, the atoms that are scored, and BDDL text.
+
+Quantifiers range over ``types``: synset to object names, by exact name. The readings are those of the ``bddl`` package,
+whose evaluator the tests compare with.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from embomatrix.world.goal import (
+    And,
+    Atom,
+    Exists,
+    Forall,
+    Formula,
+    ForN,
+    ForNPairs,
+    ForPairs,
+    Imply,
+    Not,
+    Or,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+
+    from embomatrix.world.goal import Facts
+
+    Types = Mapping[str, tuple[str, ...]]
+
+
+class GoalError(ValueError):
+    """A formula can't be evaluated: it names a type or a variable that nothing stands for."""
+
+
+def evaluate(formula: Formula, facts: Facts, types: Types) -> bool:
+    """True when the closed formula holds. Asks only for the facts that decide it. Raises GoalError for unknown types."""
+    return _holds(formula, facts, types, {})
+
+
+def _holds(formula: Formula, facts: Facts, types: Types, scope: Mapping[str, str]) -> bool:
+    match formula:
+        case Atom(predicate, args):
+            return facts.holds(predicate, tuple(_resolve(arg, scope) for arg in args))
+        case Not(body):
+            return not _holds(body, facts, types, scope)
+        case And(parts):
+            return all(_holds(part, facts, types, scope) for part in parts)
+        case Or(parts):
+            return any(_holds(part, facts, types, scope) for part in parts)
+        case Imply(premise, conclusion):
+            return not _holds(premise, facts, types, scope) or _holds(conclusion, facts, types, scope)
+        case Forall() | Exists() | ForN():
+            return _holds_quantified(formula, facts, types, scope)
+        case ForPairs() | ForNPairs():
+            return _holds_pairs(formula, facts, types, scope)
+
+
+def _holds_quantified(
+    formula: Forall | Exists | ForN, facts: Facts, types: Types, scope: Mapping[str, str]
+) -> bool:
+    members = _members(formula.type, types)
+    cases = (_holds(formula.body, facts, types, {**scope, formula.variable: name}) for name in members)
+    match formula:
+        case Forall():
+            return all(cases)
+        case Exists():
+            return any(cases)
+        case ForN(count):
+            return sum(cases) == count
+
+
+def _holds_pairs(formula: ForPairs | ForNPairs, facts: Facts, types: Types, scope: Mapping[str, str]) -> bool:
+    """Rows are the objects of the first type. A pair of an object with itself has no cell, as in ``bddl``: the columns
+    of a table over one type are the places left in a row, so there is one fewer of them than rows.
+    """
+    rows = _members(formula.type_a, types)
+    columns = _members(formula.type_b, types)
+    table = [
+        [
+            _holds(formula.body, facts, types, {**scope, formula.variable_a: a, formula.variable_b: b})
+            for b in columns
+            if b != a
+        ]
+        for a in rows
+    ]  # (rows, columns)
+    width = min((len(row) for row in table), default=0)
+    needed = formula.count if isinstance(formula, ForNPairs) else min(len(table), width)
+    true_rows = sum(any(row) for row in table)
+    true_columns = sum(any(row[index] for row in table) for index in range(width))
+    return true_rows >= needed and true_columns >= needed
+
+
+def _resolve(arg: str, scope: Mapping[str, str]) -> str:
+    if not arg.startswith("?"):
+        return arg
+    if arg not in scope:
+        raise GoalError(
+            f"variable {arg!r} is not bound: expected a quantifier around it, or an object's name"
+        )
+    return scope[arg]
+
+
+def _members(type_name: str, types: Types) -> tuple[str, ...]:
+    if type_name not in types:
+        raise GoalError(f"no objects are known of type {type_name!r}: expected one of {sorted(types)}")
+    return types[type_name]
+
+
+def scored_atoms(formula: Formula, types: Types) -> tuple[Formula, ...]:
+    """Sub-goals that are scored: the conjuncts after grounding ``forall``; any other operator is one of them."""
+    match formula:
+        case And(parts):
+            return tuple(atom for part in parts for atom in scored_atoms(part, types))
+        case Forall(variable, type_name, body):
+            return tuple(
+                atom
+                for name in _members(type_name, types)
+                for atom in scored_atoms(substitute(body, {variable: name}), types)
+            )
+        case _:
+            return (formula,)
+
+
+def substitute(formula: Formula, names: Mapping[str, str]) -> Formula:
+    """The formula with free arguments replaced: variables and objects alike. Quantifiers shadow their variables."""
+    return _rewrite(formula, names, lambda type_name: type_name)
+
+
+def rename(formula: Formula, names: Mapping[str, str], types: Mapping[str, str]) -> Formula:
+    """As ``substitute``, and the types of the quantifiers are renamed too; those not in ``types`` stay."""
+    return _rewrite(formula, names, lambda type_name: types.get(type_name, type_name))
+
+
+def _rewrite(formula: Formula, names: Mapping[str, str], retype: Callable[[str], str]) -> Formula:
+    def inner(body: Formula, *bound: str) -> Formula:
+        free = {arg: name for arg, name in names.items() if arg not in bound}
+        return _rewrite(body, free, retype)
+
+    match formula:
+        case Atom(predicate, args):
+            return Atom(predicate, tuple(names.get(arg, arg) for arg in args))
+        case Not(body):
+            return Not(inner(body))
+        case And(parts):
+            return And(tuple(inner(part) for part in parts))
+        case Or(parts):
+            return Or(tuple(inner(part) for part in parts))
+        case Imply(premise, conclusion):
+            return Imply(inner(premise), inner(conclusion))
+        case Forall(variable, type_name, body):
+            return Forall(variable, retype(type_name), inner(body, variable))
+        case Exists(variable, type_name, body):
+            return Exists(variable, retype(type_name), inner(body, variable))
+        case ForN(count, variable, type_name, body):
+            return ForN(count, variable, retype(type_name), inner(body, variable))
+        case ForPairs(a, type_a, b, type_b, body):
+            return ForPairs(a, retype(type_a), b, retype(type_b), inner(body, a, b))
+        case ForNPairs(count, a, type_a, b, type_b, body):
+            return ForNPairs(count, a, retype(type_a), b, retype(type_b), inner(body, a, b))
+
+
+def subformulas(formula: Formula) -> Iterator[Formula]:
+    """The formula and all that it is made of, outermost first."""
+    yield formula
+    match formula:
+        case Atom():
+            return
+        case And(parts) | Or(parts):
+            children = parts
+        case Imply(premise, conclusion):
+            children = (premise, conclusion)
+        case _:
+            children = (formula.body,)
+    for child in children:
+        yield from subformulas(child)
+
+
+def atoms_of(formula: Formula) -> tuple[Atom, ...]:
+    """Every atom in the order of the text, variables as they stand."""
+    return tuple(part for part in subformulas(formula) if isinstance(part, Atom))
+
+
+def types_of(formula: Formula) -> frozenset[str]:
+    """Types that the formula quantifies over."""
+    found: set[str] = set()
+    for part in subformulas(formula):
+        if isinstance(part, Forall | Exists | ForN):
+            found.add(part.type)
+        elif isinstance(part, ForPairs | ForNPairs):
+            found |= {part.type_a, part.type_b}
+    return frozenset(found)
+
+
+def objects_of(formula: Formula, types: Types) -> frozenset[str]:
+    """Objects that the goal is about: those it names, and the members of the types it quantifies over.
+
+    The room in ``inroom(object, room)`` is no object.
+    """
+    named = {
+        arg
+        for atom in atoms_of(formula)
+        for arg in (atom.args[:1] if atom.predicate == "inroom" else atom.args)
+        if not arg.startswith("?")
+    }
+    ranged = {name for type_name in types_of(formula) for name in _members(type_name, types)}
+    return frozenset(named | ranged)
+
+
+def render(formula: Formula) -> str:
+    """BDDL text on one line; ``bddl.parse_formula`` reads it back."""
+    match formula:
+        case Atom(predicate, args):
+            return f"({' '.join((predicate, *args))})"
+        case Not(body):
+            return f"(not {render(body)})"
+        case And(parts):
+            return f"(and {' '.join(map(render, parts))})" if parts else "(and)"
+        case Or(parts):
+            return f"(or {' '.join(map(render, parts))})" if parts else "(or)"
+        case Imply(premise, conclusion):
+            return f"(imply {render(premise)} {render(conclusion)})"
+        case Forall(variable, type_name, body):
+            return f"(forall ({variable} - {type_name}) {render(body)})"
+        case Exists(variable, type_name, body):
+            return f"(exists ({variable} - {type_name}) {render(body)})"
+        case ForN(count, variable, type_name, body):
+            return f"(forn ({count}) ({variable} - {type_name}) {render(body)})"
+        case ForPairs(a, type_a, b, type_b, body):
+            return f"(forpairs ({a} - {type_a}) ({b} - {type_b}) {render(body)})"
+        case ForNPairs(count, a, type_a, b, type_b, body):
+            return f"(fornpairs ({count}) ({a} - {type_a}) ({b} - {type_b}) {render(body)})"
