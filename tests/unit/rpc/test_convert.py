@@ -1,0 +1,196 @@
+"""What goes over the wire comes back equal, and a malformed message names its field."""
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from embomatrix.proto.v1 import rollout_service_pb2, types_pb2
+from embomatrix.reward.breakdown import AtomResult, RewardBreakdown
+from embomatrix.rpc import convert
+from embomatrix.rpc.convert import ConvertError
+from embomatrix.rpc.values import (
+    Batch,
+    Cancelled,
+    Completed,
+    InfraCode,
+    InfraFailure,
+    LookaheadEntry,
+    Resources,
+    Rollout,
+    RolloutResult,
+    RunStats,
+    Timings,
+    Warmth,
+)
+from embomatrix.skills.failure import FailureReason
+from embomatrix.skills.syntax import MAX_STEPS, SIGNATURES, Arg, PlaceRelation, Skill, SkillCall
+from embomatrix.skills.trace import Step
+
+UINT32 = st.integers(0, 2**32 - 1)
+UINT64 = st.integers(0, 2**64 - 1)
+NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
+TEXTS = st.text(st.characters(exclude_categories=("Cs",)), max_size=20)
+NAMES = st.text("abcdefgh-0123", min_size=1, max_size=12)
+VALUES = {
+    Arg.OBJECT: st.integers(-(2**63), 2**63 - 1),
+    Arg.SOURCE: st.integers(-(2**63), 2**63 - 1),
+    Arg.RELATION: st.sampled_from(PlaceRelation),
+    Arg.YAW: NUMBERS,
+    Arg.DISTANCE: NUMBERS,
+    Arg.ROOM: TEXTS,
+}
+
+
+def _call_of(skill):
+    arguments = {arg.value: VALUES[arg] for arg in SIGNATURES[skill]}
+    return st.builds(SkillCall, st.just(skill), **arguments)
+
+
+CALLS = st.sampled_from(Skill).flatmap(_call_of)
+ROLLOUTS = st.builds(
+    Rollout, NAMES, NAMES, NAMES, NAMES, plan=st.lists(CALLS, max_size=5).map(tuple), seed=UINT64
+)
+REWARDS = st.builds(
+    RewardBreakdown,
+    NUMBERS,
+    NUMBERS,
+    NUMBERS,
+    st.lists(st.builds(AtomResult, TEXTS, st.booleans()), max_size=4).map(tuple),
+    st.booleans(),
+)
+STEPS = st.builds(Step, CALLS, st.none() | st.sampled_from(FailureReason), TEXTS)
+COMPLETED = st.builds(
+    Completed,
+    REWARDS,
+    st.lists(STEPS, max_size=3).map(tuple),
+    st.lists(TEXTS, max_size=3).map(tuple),
+    TEXTS,
+    TEXTS,
+    st.builds(Timings, NUMBERS, NUMBERS, NUMBERS),
+    st.booleans(),
+)
+FAILURES = st.builds(InfraFailure, st.sampled_from(InfraCode), TEXTS, TEXTS)
+RESULTS = st.builds(RolloutResult, NAMES, NAMES, UINT64, UINT32, COMPLETED | FAILURES | st.just(Cancelled()))
+RESOURCES = st.builds(
+    Resources,
+    slots=st.integers(1, 512),
+    cores=UINT32,
+    memory_mb=UINT64,
+    score=NUMBERS,
+    gpu=TEXTS,
+    vram_mb=UINT64,
+    versions=st.dictionaries(NAMES, TEXTS, max_size=3),
+)
+
+
+def _over_the_wire(message):
+    return type(message).FromString(message.SerializeToString())
+
+
+@given(CALLS)
+def test_every_skill_call_comes_back_equal(call):
+    assert convert.skill_call_from_proto(_over_the_wire(convert.skill_call_to_proto(call))) == call
+
+
+@given(st.lists(ROLLOUTS, max_size=4, unique_by=lambda rollout: rollout.rollout_id).map(tuple), NAMES, UINT64)
+def test_a_batch_comes_back_equal(rollouts, name, step):
+    batch = Batch("run-1", name, step, rollouts)
+    assert convert.batch_from_proto(_over_the_wire(convert.batch_to_proto(batch))) == batch
+
+
+@given(RESULTS)
+def test_a_result_comes_back_equal_whatever_its_outcome(result):
+    message = _over_the_wire(convert.rollout_result_to_proto(result))
+    assert convert.rollout_result_from_proto(message) == result
+
+
+@given(RESOURCES)
+def test_resources_come_back_equal(resources):
+    assert convert.resources_from_proto(_over_the_wire(convert.resources_to_proto(resources))) == resources
+
+
+@given(st.builds(RunStats, *[UINT64] * len(RunStats.__slots__)))
+def test_run_counters_come_back_equal(stats):
+    assert convert.run_stats_from_proto(_over_the_wire(convert.run_stats_to_proto(stats))) == stats
+
+
+@given(st.builds(LookaheadEntry, UINT64, NAMES, UINT32))
+def test_an_announced_scene_comes_back_equal(entry):
+    message = _over_the_wire(convert.lookahead_entry_to_proto(entry))
+    assert convert.lookahead_entry_from_proto(message) == entry
+
+
+@pytest.mark.parametrize("warmth", Warmth)
+def test_every_warmth_comes_back_equal(warmth):
+    assert convert.warmth_from_proto(convert.warmth_to_proto(warmth)) is warmth
+
+
+def test_every_enum_value_of_the_wire_has_a_meaning_here():
+    assert set(convert.SKILL_KINDS) == set(Skill)
+    assert len(convert.SKILL_KINDS) == len(types_pb2.SkillKind.keys()) - 1
+    assert len(InfraCode) == len(types_pb2.InfraCode.keys()) - 1
+    assert len(Warmth) == len(types_pb2.Warmth.keys()) - 1
+
+
+def test_an_index_that_no_table_has_still_travels():
+    call = SkillCall(Skill.MOVE, object_index=-1)
+    assert convert.skill_call_from_proto(_over_the_wire(convert.skill_call_to_proto(call))) == call
+
+
+MOVE = types_pb2.SkillCall(skill=types_pb2.SKILL_KIND_MOVE, object_index=1)
+TURN_NAN = types_pb2.SkillCall(skill=types_pb2.SKILL_KIND_TURN, yaw=math.nan)
+PLACE_ABOVE = types_pb2.SkillCall(skill=types_pb2.SKILL_KIND_PLACE, object_index=1, relation="above")
+
+
+@pytest.mark.parametrize(
+    ("calls", "field"),
+    [
+        ([types_pb2.SkillCall()], "rollouts[0].plan[0].skill"),
+        ([MOVE, types_pb2.SkillCall(skill=types_pb2.SKILL_KIND_MOVE)], "rollouts[0].plan[1].object_index"),
+        (
+            [types_pb2.SkillCall(skill=types_pb2.SKILL_KIND_MOVE, object_index=1, yaw=0)],
+            "rollouts[0].plan[0].yaw",
+        ),
+        ([TURN_NAN], "rollouts[0].plan[0].yaw"),
+        ([PLACE_ABOVE], "rollouts[0].plan[0].relation"),
+        ([MOVE] * (MAX_STEPS + 1), "rollouts[0].plan"),
+    ],
+)
+def test_a_malformed_plan_names_the_field(calls, field):
+    rollout = types_pb2.Rollout(rollout_id="r", group_id="g", bundle_digest="d", task_id="t", plan=calls)
+    request = rollout_service_pb2.ExecuteRequest(run_id="run", batch_id="b", rollouts=[rollout])
+    with pytest.raises(ConvertError) as caught:
+        convert.batch_from_proto(request)
+    assert caught.value.field == field
+    assert str(caught.value).startswith(f"{field}: ")
+
+
+def test_two_rollouts_of_one_id_are_refused():
+    rollout = types_pb2.Rollout(rollout_id="r", group_id="g", bundle_digest="d", task_id="t")
+    request = rollout_service_pb2.ExecuteRequest(run_id="run", batch_id="b", rollouts=[rollout, rollout])
+    with pytest.raises(ConvertError, match=r"rollouts\[1\].rollout_id: 'r' stands twice"):
+        convert.batch_from_proto(request)
+
+
+def test_a_result_without_an_outcome_is_refused():
+    with pytest.raises(ConvertError, match="outcome: is missing"):
+        convert.rollout_result_from_proto(types_pb2.RolloutResult(rollout_id="r"))
+
+
+def test_a_completed_rollout_without_a_reward_is_refused_instead_of_scored_zero():
+    message = types_pb2.RolloutResult(rollout_id="r", completed=types_pb2.Completed(trace_digest="x"))
+    with pytest.raises(ConvertError, match=r"completed\.reward: is missing"):
+        convert.rollout_result_from_proto(message)
+
+
+def test_an_unknown_failure_reason_is_refused():
+    message = types_pb2.StepResult(call=MOVE, failure="gave_up")
+    with pytest.raises(ConvertError, match="failure: 'gave_up' is no known failure reason"):
+        convert.step_from_proto(message)
+
+
+def test_a_worker_without_slots_is_refused():
+    with pytest.raises(ConvertError, match="slots: is 0"):
+        convert.resources_from_proto(types_pb2.Resources(cores=4))

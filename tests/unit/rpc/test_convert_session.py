@@ -1,0 +1,97 @@
+"""The worker's session and the operator's view come back equal from the wire."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from embomatrix.proto.v1 import worker_service_pb2
+from embomatrix.reward.breakdown import RewardBreakdown
+from embomatrix.rpc import convert_session as convert
+from embomatrix.rpc.convert import ConvertError
+from embomatrix.rpc.values import (
+    Completed,
+    InfraCode,
+    InfraFailure,
+    Lease,
+    LeaseRef,
+    LeaseResult,
+    Resident,
+    ResidentState,
+    Resources,
+    Rollout,
+    RunInfo,
+    RunStats,
+    Timings,
+    WorkerInfo,
+    WorkerState,
+)
+from embomatrix.skills.syntax import Skill, SkillCall
+
+NAMES = st.text("abcdefgh-0123", min_size=1, max_size=12)
+SECONDS = st.floats(0.001, 1e6)
+REFS = st.builds(LeaseRef, NAMES, st.integers(0, 2**64 - 1))
+RESIDENTS = st.builds(Resident, NAMES, st.sampled_from(ResidentState), SECONDS, SECONDS, NAMES)
+COMPLETED = st.builds(
+    Completed,
+    st.just(RewardBreakdown(0.5, 0.2, 30.0, (), True)),
+    st.just(()),
+    st.just(("apple is on the table",)),
+    NAMES,
+    NAMES,
+    st.builds(Timings, SECONDS, SECONDS, SECONDS),
+    st.booleans(),
+)
+RESULTS = st.builds(
+    LeaseResult, REFS, COMPLETED | st.builds(InfraFailure, st.sampled_from(InfraCode), NAMES, NAMES)
+)
+STATES = st.builds(
+    WorkerState,
+    st.lists(RESIDENTS, max_size=3).map(tuple),
+    st.lists(REFS, max_size=3).map(tuple),
+    st.lists(RESULTS, max_size=3).map(tuple),
+    st.booleans(),
+)
+PLAN = (SkillCall(Skill.TURN, yaw=0.5),)
+
+
+def _over_the_wire(message):
+    return type(message).FromString(message.SerializeToString())
+
+
+@given(STATES)
+def test_the_state_of_a_worker_comes_back_equal(state):
+    assert convert.worker_state_from_proto(_over_the_wire(convert.worker_state_to_proto(state))) == state
+
+
+@given(
+    st.builds(Lease, REFS, st.builds(Rollout, NAMES, NAMES, NAMES, NAMES, st.just(PLAN), st.just(7)), SECONDS)
+)
+def test_a_lease_comes_back_equal(lease):
+    assert convert.lease_from_proto(_over_the_wire(convert.lease_to_proto(lease))) == lease
+
+
+@given(st.lists(RESIDENTS, max_size=2).map(tuple), SECONDS)
+def test_a_listed_worker_comes_back_equal(residents, last_seen_s):
+    info = WorkerInfo("w1", "ready", Resources(2, 4, 1024), residents, 1, 17, last_seen_s)
+    assert convert.worker_info_from_proto(_over_the_wire(convert.worker_info_to_proto(info))) == info
+
+
+def test_a_listed_run_comes_back_equal():
+    info = RunInfo("run-1", "demo", RunStats(delivered=5, stale_results=1), 3)
+    assert convert.run_info_from_proto(_over_the_wire(convert.run_info_to_proto(info))) == info
+
+
+def test_every_resident_state_of_the_wire_has_a_meaning_here():
+    assert len(ResidentState) == len(worker_service_pb2.ResidentState.keys()) - 1
+
+
+def test_a_lease_without_a_deadline_is_refused():
+    message = worker_service_pb2.Lease(ref=worker_service_pb2.LeaseRef(lease_id="l1", lease_epoch=1))
+    with pytest.raises(ConvertError, match=r"deadline_s: is 0\.0: it must be above 0"):
+        convert.lease_from_proto(message)
+
+
+def test_a_result_names_the_element_that_is_malformed():
+    message = worker_service_pb2.WorkerState(finished=[worker_service_pb2.LeaseResult()])
+    with pytest.raises(ConvertError, match=r"finished\[0\].lease.lease_id: is empty"):
+        convert.worker_state_from_proto(message)
