@@ -1,0 +1,195 @@
+"""Bodies of assets in one Bullet client: shapes made once per asset, bodies in batches.
+
+The frame of a body is its asset's frame: inertial frames lie at the asset's origin, and a link's at its joint. Bullet holds no
+hull within a compound that comes from memory, so hulls beside other parts ride on links of their own, with a fixed joint.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from embomatrix.sim.bounds import IDENTITY, joint_motion
+from embomatrix.sim.bullet.client import pybullet
+from embomatrix.world.asset import JointKind
+from embomatrix.world.geometry import Pose, Shape, Vec3
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from embomatrix.world.asset import Asset, Joint
+    from embomatrix.world.geometry import Part
+
+HULL_MARGIN_M = 0.001
+"""Bullet rounds hulls outwards by this much; their vertices are drawn in by the same."""
+PART_LIMIT = 16
+"""Parts of a compound: Bullet drops the rest silently."""
+NO_SHAPE = -1
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """One collision shape of an asset, in the frame of its link. ``parent`` is a piece's index; -1 marks the base."""
+
+    shape: int
+    origin_m: Vec3
+    parent: int
+    joint: Joint | None
+
+
+class BodyFactory:
+    """Makes bodies in one client. Shapes are shared by the bodies of an asset and live until the client is reset."""
+
+    def __init__(self, client: int) -> None:
+        self._bullet = pybullet()
+        self._client = client
+        self._pieces: dict[str, tuple[Piece, ...]] = {}
+
+    def forget_shapes(self) -> None:
+        """Drop the shapes' ids: resetting a client frees the shapes themselves."""
+        self._pieces.clear()
+
+    def jointed(self, asset: Asset, poses: Sequence[Pose]) -> tuple[int, ...]:
+        """Immovable bodies of one asset, with its joints; their ids in the order of the poses."""
+        pieces = self._pieces_of(asset)
+        if len(pieces) > 1:
+            return tuple(self._create(0.0, pieces, pose) for pose in poses)
+        ids = self._bullet.createMultiBody(
+            0.0,
+            pieces[0].shape,
+            NO_SHAPE,
+            batchPositions=[pose.position_m for pose in poses],
+            physicsClientId=self._client,
+        )
+        return (ids,) if isinstance(ids, int) else tuple(ids)
+
+    def rigid(self, asset: Asset, pose: Pose, fractions: Sequence[float], mass_kg: float) -> int:
+        """One body without joints: the links are fixed where ``fractions`` puts them. A mass of 0 makes it immovable."""
+        pieces = self._pieces_of(asset)
+        motions = [
+            joint_motion(joint, fraction)
+            for (_, joint), fraction in zip(asset.joints, fractions, strict=True)
+        ]
+        return self._create(mass_kg, pieces, pose, motions)
+
+    def walls(self, parts: Sequence[Part]) -> tuple[int, ...]:
+        """Immovable bodies that hold 16 walls each; wall ``i`` is in body ``i // 16``."""
+        chunks = [parts[i : i + PART_LIMIT] for i in range(0, len(parts), PART_LIMIT)]
+        return tuple(
+            self._create(0.0, self._link_pieces(chunk, (0.0, 0.0, 0.0), None, 0), IDENTITY)
+            for chunk in chunks
+        )
+
+    def floor(self, x_m: float, y_m: float, half_m: float) -> int:
+        """Immovable square slab with its top at height 0, centred at a point."""
+        slab = self._bullet.createCollisionShape(
+            self._bullet.GEOM_BOX, halfExtents=(half_m, half_m, 0.25), physicsClientId=self._client
+        )
+        return self._create(0.0, (Piece(slab, (0.0, 0.0, 0.0), -1, None),), Pose((x_m, y_m, -0.25)))
+
+    def joint_indices(self, asset: Asset) -> tuple[int, ...]:
+        """Bullet's index of each joint of the asset, in the asset's order."""
+        pieces = self._pieces_of(asset)
+        return tuple(i - 1 for i, piece in enumerate(pieces) if piece.joint is not None)
+
+    def _pieces_of(self, asset: Asset) -> tuple[Piece, ...]:
+        if asset.asset_id not in self._pieces:
+            pieces: list[Piece] = []
+            for link in asset.links:
+                origin = link.joint.origin_m if link.joint is not None else (0.0, 0.0, 0.0)
+                pieces += self._link_pieces(link.parts, origin, link.joint, len(pieces))
+            self._pieces[asset.asset_id] = tuple(pieces)
+        return self._pieces[asset.asset_id]
+
+    def _link_pieces(
+        self, parts: Sequence[Part], origin: Vec3, joint: Joint | None, first: int
+    ) -> tuple[Piece, ...]:
+        """Pieces of one link, the first of which takes index ``first`` and bears the joint."""
+        ox, oy, oz = origin
+        frame = Pose((-ox, -oy, -oz))
+        plain = [part for part in parts if part.shape is not Shape.HULL]
+        shapes = [self._compound(plain, frame)] if plain else []
+        shapes += [self._hull(part, frame) for part in parts if part.shape is Shape.HULL]
+        head = Piece(shapes[0] if shapes else NO_SHAPE, origin, 0 if first else -1, joint)
+        return (head, *(Piece(shape, (0.0, 0.0, 0.0), first, None) for shape in shapes[1:]))
+
+    def _compound(self, parts: Sequence[Part], frame: Pose) -> int:
+        bullet = self._bullet
+        kinds = {
+            Shape.BOX: bullet.GEOM_BOX,
+            Shape.CYLINDER: bullet.GEOM_CYLINDER,
+            Shape.SPHERE: bullet.GEOM_SPHERE,
+        }
+        poses = [frame @ part.pose for part in parts]
+        return int(
+            bullet.createCollisionShapeArray(
+                shapeTypes=[kinds[part.shape] for part in parts],
+                halfExtents=[tuple(extent / 2 for extent in part.size_m) for part in parts],
+                radii=[part.size_m[0] / 2 for part in parts],
+                lengths=[part.size_m[2] for part in parts],
+                collisionFramePositions=[pose.position_m for pose in poses],
+                collisionFrameOrientations=[pose.quat_xyzw for pose in poses],
+                physicsClientId=self._client,
+            )
+        )
+
+    def _hull(self, part: Part, frame: Pose) -> int:
+        scale = [max(0.1, 1 - 2 * HULL_MARGIN_M / extent) for extent in part.size_m]
+        pose = frame @ part.pose
+        return int(
+            self._bullet.createCollisionShape(
+                self._bullet.GEOM_MESH,
+                vertices=[[v * s for v, s in zip(vertex, scale, strict=True)] for vertex in part.vertices_m],
+                collisionFramePosition=pose.position_m,
+                collisionFrameOrientation=pose.quat_xyzw,
+                physicsClientId=self._client,
+            )
+        )
+
+    def _create(
+        self, mass_kg: float, pieces: Sequence[Piece], pose: Pose, motions: Sequence[Pose] | None = None
+    ) -> int:
+        """One body of these pieces. With ``motions`` (one per joint) the joints are fixed there, else they are free."""
+        share = mass_kg / len(pieces)
+        return int(
+            self._bullet.createMultiBody(
+                share,
+                pieces[0].shape,
+                NO_SHAPE,
+                basePosition=pose.position_m,
+                baseOrientation=pose.quat_xyzw,
+                physicsClientId=self._client,
+                **self._links(share, pieces[1:], motions),
+            )
+        )
+
+    def _links(
+        self, mass_kg: float, pieces: Sequence[Piece], motions: Sequence[Pose] | None
+    ) -> dict[str, Any]:
+        if not pieces:
+            return {}
+        bullet, still = self._bullet, (0.0, 0.0, 0.0)
+        kinds = {JointKind.REVOLUTE: bullet.JOINT_REVOLUTE, JointKind.PRISMATIC: bullet.JOINT_PRISMATIC}
+        moving = iter(motions or ())
+        poses = [
+            next(moving) @ Pose(piece.origin_m)
+            if motions is not None and piece.joint is not None
+            else Pose(piece.origin_m)
+            for piece in pieces
+        ]
+        free = motions is None
+        return {
+            "linkMasses": [mass_kg] * len(pieces),
+            "linkCollisionShapeIndices": [piece.shape for piece in pieces],
+            "linkVisualShapeIndices": [NO_SHAPE] * len(pieces),
+            "linkPositions": [pose.position_m for pose in poses],
+            "linkOrientations": [pose.quat_xyzw for pose in poses],
+            "linkInertialFramePositions": [still] * len(pieces),
+            "linkInertialFrameOrientations": [IDENTITY.quat_xyzw] * len(pieces),
+            "linkParentIndices": [piece.parent for piece in pieces],
+            "linkJointTypes": [
+                kinds[piece.joint.kind] if free and piece.joint is not None else bullet.JOINT_FIXED
+                for piece in pieces
+            ],
+            "linkJointAxis": [piece.joint.axis if piece.joint is not None else (0, 0, 1) for piece in pieces],
+        }

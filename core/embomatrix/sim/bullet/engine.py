@@ -1,0 +1,250 @@
+"""``PhysicsEngine`` on PyBullet: teleports and narrow-phase queries in one client, settling in another.
+
+The truth about poses and joints is kept here, in Python; Bullet's copy only answers questions of distance. So a reset is
+bit-exact, whatever Bullet rounds. The main client is never stepped and no body is ever removed from it.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from embomatrix.sim.bounds import AssetBounds, aabb_of
+from embomatrix.sim.bullet.bodies import PART_LIMIT, BodyFactory
+from embomatrix.sim.bullet.client import connect, pybullet
+from embomatrix.sim.bullet.mini_world import MiniWorld, Still
+from embomatrix.sim.engine import FLOOR, NOTHING, SETTLE_STEPS, TOLERANCE_M, WALL, EngineError, Settled
+from embomatrix.sim.validation import check_fractions, check_pose, check_scene
+from embomatrix.world.geometry import Aabb, Pose
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from embomatrix.world.geometry import FloatArray
+    from embomatrix.world.scene import Scene
+
+BOX_SLACK_M: Final = 0.01
+"""Boxes this far apart are still compared part by part: boxes of tilted cylinders may be a little too small."""
+SETTLE_RADIUS_M: Final = 0.05
+"""Objects whose boxes come this near take part in a settle: nothing that is stable moves a fifth as far."""
+POSE_NUMBERS: Final = 7
+
+
+class BulletEngine:
+    """One scene in one Bullet client, with a second one to settle objects in. Not for use by several threads."""
+
+    def __init__(self, scene: Scene) -> None:
+        """Load the scene. Raises EngineError when it is not valid or pybullet is missing."""
+        check_scene(scene)
+        self._scene = scene
+        self._bullet = pybullet()
+        self._client = connect()
+        self._mini = MiniWorld()
+        self._index = {item.name: number for number, item in enumerate(scene.objects)}
+        self._names = tuple(self._index)
+        self._assets = [scene.assets[item.asset_id] for item in scene.objects]
+        bounds = {asset_id: AssetBounds(asset) for asset_id, asset in scene.assets.items()}
+        self._bounds = [bounds[item.asset_id] for item in scene.objects]
+        self._poses = [item.pose_world_asset for item in scene.objects]
+        self._fractions = [tuple(item.joints) for item in scene.objects]
+        self._present = np.ones(len(self._names), dtype=np.bool_)
+        self._low = np.zeros((len(self._names), 3))
+        self._high = np.zeros((len(self._names), 3))
+        self._walls = [wall.aabb(Pose((0.0, 0.0, 0.0))) for wall in scene.walls]
+        self._wall_low = np.array([box.low_m for box in self._walls]).reshape(-1, 3)
+        self._wall_high = np.array([box.high_m for box in self._walls]).reshape(-1, 3)
+        self._state = np.zeros((len(self._names), POSE_NUMBERS))
+        self._changed: set[int] = set()
+        self._can_change = np.array(
+            [not item.fixed or bool(item.joints) for item in scene.objects], dtype=np.bool_
+        )
+        self._load()
+
+    @property
+    def scene(self) -> Scene:
+        return self._scene
+
+    def reset(self) -> None:
+        """Undo every change since loading: poses, joints and parking are bit-equal to the scene's."""
+        for number in sorted(self._changed):
+            item = self._scene.objects[number]
+            self._present[number] = True
+            self._put(number, item.pose_world_asset)
+            self._put_joints(number, tuple(item.joints))
+        self._changed.clear()
+
+    def pose(self, name: str) -> Pose:
+        """Pose of the object's asset frame in the world; of a parked object the last one that it had."""
+        return self._poses[self._number(name)]
+
+    def set_pose(self, name: str, pose: Pose) -> None:
+        """Teleport the object. One that was parked is back in the world."""
+        number = self._number(name)
+        check_pose(pose, name)
+        self._changed.add(number)
+        self._present[number] = True
+        self._put(number, pose)
+
+    def aabb(self, name: str) -> Aabb:
+        """Bounding box in the world, with the joints as they are now."""
+        number = self._number(name)
+        return aabb_of(self._low[number], self._high[number])
+
+    def joints(self, name: str) -> tuple[float, ...]:
+        """Joint positions as shares of their travel: 0 closed, 1 open, in the order of the asset's joints."""
+        return self._fractions[self._number(name)]
+
+    def set_joints(self, name: str, fractions: Sequence[float]) -> None:
+        """Set every joint of the object. Raises EngineError for a wrong number of them or one outside 0..1."""
+        number = self._number(name)
+        check_fractions(self._scene.objects[number], self._assets[number], fractions)
+        self._changed.add(number)
+        self._put_joints(number, tuple(map(float, fractions)))
+
+    def park(self, name: str) -> None:
+        """Take the object out of the world: it collides with nothing and stands in no relation, as in the robot's hand."""
+        number = self._number(name)
+        self._changed.add(number)
+        self._present[number] = False
+
+    def is_parked(self, name: str) -> bool:
+        return not self._present[self._number(name)]
+
+    def penetrates(self, name: str, margin_m: float = 0.0, ignore: frozenset[str] = NOTHING) -> str:
+        """Name of one body that the object, grown by ``margin_m``, penetrates by more than 1 mm; "" when there is none.
+
+        The floor and the walls answer by ``FLOOR`` and ``WALL``; then objects in scene order.
+        """
+        number = self._number(name)
+        limit = margin_m - TOLERANCE_M
+        low, high = self._low[number], self._high[number]
+        if FLOOR not in ignore and low[2] < limit:
+            return FLOOR
+        reach = max(limit, 0.0) + BOX_SLACK_M
+        if WALL not in ignore:
+            for body in sorted({int(wall) // PART_LIMIT for wall in self._walls_near(low, high, reach)}):
+                if self._closest(self._bodies[number], self._wall_bodies[body], limit) < limit:
+                    return WALL
+        for other in self._objects_near(low, high, reach):
+            if other == number or self._names[other] in ignore:
+                continue
+            if self._closest(self._bodies[number], self._bodies[other], limit) < limit:
+                return self._names[other]
+        return ""
+
+    def near(self, box: Aabb, ignore: frozenset[str] = NOTHING) -> tuple[str, ...]:
+        """Objects whose bounding boxes overlap the box, in scene order, without the parked ones."""
+        found = self._objects_near(np.array(box.low_m), np.array(box.high_m), 0.0)
+        return tuple(self._names[number] for number in found if self._names[number] not in ignore)
+
+    def gap(self, a: str, b: str, limit_m: float) -> float | None:
+        """Smallest signed distance between two objects (negative: depth), None when it is more than ``limit_m``.
+
+        Raises EngineError when either is parked.
+        """
+        first, second = self._number(a), self._number(b)
+        for name, number in ((a, first), (b, second)):
+            if not self._present[number]:
+                raise EngineError(f"{name!r} is parked: expected an object in the world; place it first")
+        if not 0.0 <= limit_m < 1e3:
+            raise EngineError(f"a gap up to {limit_m} m was asked for: expected a limit from 0 to 1,000 m")
+        apart = np.maximum(self._low[first] - self._high[second], self._low[second] - self._high[first])
+        if apart.max() > limit_m + BOX_SLACK_M:
+            return None
+        distance = self._closest(self._bodies[first], self._bodies[second], limit_m)
+        return distance if distance <= limit_m else None
+
+    def settle(self, name: str, steps: int = SETTLE_STEPS, ignore: frozenset[str] = NOTHING) -> Settled:
+        """Let go of the object where it is, in a copy of its neighbourhood in which all else stands still.
+
+        Changes nothing here. Depends on the present state only, not on what was simulated before.
+        """
+        number = self._number(name)
+        low, high = self._low[number], self._high[number]
+        stills = [
+            Still(self._assets[other], self._poses[other], self._fractions[other])
+            for other in self._objects_near(low, high, SETTLE_RADIUS_M)
+            if other != number and self._names[other] not in ignore
+        ]
+        walls = [self._scene.walls[int(wall)] for wall in self._walls_near(low, high, SETTLE_RADIUS_M)]
+        pose = self._poses[number]
+        self._mini.stage(self._assets[number], pose, self._fractions[number], stills, walls)
+        return self._mini.drop(pose, steps)
+
+    def state_bytes(self) -> bytes:
+        """Poses, joints and parking of all objects that can change, for the digest of a trace."""
+        joints = [value for fractions in self._fractions for value in fractions]
+        return b"".join(
+            (
+                self._state[self._can_change].tobytes(),
+                np.array(joints, dtype=np.float64).tobytes(),
+                self._present[self._can_change].tobytes(),
+            )
+        )
+
+    def close(self) -> None:
+        """Free the physics clients. The engine can't be used afterwards."""
+        self._mini.close()
+        self._bullet.disconnect(physicsClientId=self._client)
+
+    def _load(self) -> None:
+        """Create the bodies: walls, then assets in the order in which the scene's objects name them first."""
+        factory = BodyFactory(self._client)
+        self._wall_bodies = factory.walls(self._scene.walls)
+        groups: dict[str, list[int]] = {}
+        for number, item in enumerate(self._scene.objects):
+            groups.setdefault(item.asset_id, []).append(number)
+        bodies: dict[int, int] = {}
+        self._joint_ids: dict[str, tuple[int, ...]] = {}
+        for asset_id, members in groups.items():
+            asset = self._scene.assets[asset_id]
+            bodies |= zip(members, factory.jointed(asset, [self._poses[i] for i in members]), strict=True)
+            self._joint_ids[asset_id] = factory.joint_indices(asset)
+        self._bodies = [bodies[number] for number in range(len(self._names))]
+        for number in range(len(self._names)):
+            self._put(number, self._poses[number])
+            self._put_joints(number, self._fractions[number])
+
+    def _number(self, name: str) -> int:
+        number = self._index.get(name)
+        if number is None:
+            raise EngineError(
+                f"there is no object {name!r} in scene {self._scene.scene_id!r}: expected one of its "
+                f"{len(self._names)} objects, such as {', '.join(self._names[:3])}"
+            )
+        return number
+
+    def _put(self, number: int, pose: Pose) -> None:
+        self._poses[number] = pose
+        self._state[number] = (*pose.position_m, *pose.quat_xyzw)
+        self._low[number], self._high[number] = self._bounds[number].corners(pose, self._fractions[number])
+        self._bullet.resetBasePositionAndOrientation(
+            self._bodies[number], pose.position_m, pose.quat_xyzw, physicsClientId=self._client
+        )
+
+    def _put_joints(self, number: int, fractions: tuple[float, ...]) -> None:
+        if not fractions:
+            return
+        asset = self._assets[number]
+        self._fractions[number] = fractions
+        for link, (_, joint), fraction in zip(
+            self._joint_ids[asset.asset_id], asset.joints, fractions, strict=True
+        ):
+            self._bullet.resetJointState(
+                self._bodies[number], link, fraction * joint.upper, physicsClientId=self._client
+            )
+        self._low[number], self._high[number] = self._bounds[number].corners(self._poses[number], fractions)
+
+    def _objects_near(self, low: FloatArray, high: FloatArray, reach_m: float) -> Iterator[int]:
+        touching = (self._low <= high + reach_m).all(axis=1) & (self._high >= low - reach_m).all(axis=1)
+        return map(int, np.flatnonzero(touching & self._present))
+
+    def _walls_near(self, low: FloatArray, high: FloatArray, reach_m: float) -> list[int]:
+        touching = (self._wall_low <= high + reach_m) & (self._wall_high >= low - reach_m)
+        return [int(wall) for wall in np.flatnonzero(touching.all(axis=1))]
+
+    def _closest(self, body: int, other: int, limit_m: float) -> float:
+        """Smallest signed distance between two bodies, infinity when it is more than ``limit_m`` (at least 0)."""
+        contacts = self._bullet.getClosestPoints(body, other, max(limit_m, 0.0), physicsClientId=self._client)
+        return min((contact[8] for contact in contacts), default=float("inf"))
