@@ -1,0 +1,104 @@
+"""Tasks and pose caches as plain JSON values, and back, as strictly as scenes."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from embomatrix.world.bddl import BddlError, parse_formula
+from embomatrix.world.codec import pose_from_field, pose_to_json
+from embomatrix.world.evaluate import GoalError, objects_of
+from embomatrix.world.field import Field
+from embomatrix.world.poses import PlacementKey, PoseCache, StandPose
+from embomatrix.world.state import Relation
+from embomatrix.world.task import MAX_TABLE, Task, TaskCategory
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from embomatrix.world.goal import Formula
+
+    Json = dict[str, Any]
+
+
+def task_to_json(task: Task) -> Json:
+    return {
+        "task_id": task.task_id,
+        "scene_id": task.scene_id,
+        "instruction": task.instruction,
+        "category": task.category.value,
+        "goal": task.goal_bddl,
+        "table": [*task.table],
+        "types": {key: [*names] for key, names in task.types.items()},
+        "source": task.source,
+    }
+
+
+def task_from_json(value: object) -> Task:
+    """A task whose goal speaks of objects in its table only. Raises SceneInvalidError."""
+    fields = Field(value, "task").record(
+        "task_id", "scene_id", "instruction", "category", "goal", "table", "types", "source"
+    )
+    table = tuple(item.name() for item in fields["table"].items(at_most=MAX_TABLE))
+    if len(set(table)) != len(table):
+        fields["table"].fail("an object stands in it twice: expected each once")
+    types = {key: names.texts() for key, names in fields["types"].entries()}
+    return Task(
+        task_id=fields["task_id"].name(),
+        scene_id=fields["scene_id"].name(),
+        instruction=fields["instruction"].text(),
+        category=fields["category"].member(TaskCategory),
+        goal=_goal(fields["goal"], table, types),
+        goal_bddl=fields["goal"].text(),
+        table=table,
+        types=types,
+        source=fields["source"].text(),
+    )
+
+
+def _goal(field: Field, table: tuple[str, ...], types: Mapping[str, tuple[str, ...]]) -> Formula:
+    declared = {**dict.fromkeys(table, ""), **{name: key for key, names in types.items() for name in names}}
+    try:
+        goal = parse_formula(field.text(), declared)
+        missing = objects_of(goal, types) - set(table)
+    except (BddlError, GoalError) as error:
+        field.fail(str(error))
+    if missing:
+        field.fail(f"speaks of {min(missing)!r}, which is not in the object table")
+    return goal
+
+
+def poses_to_json(poses: PoseCache) -> Json:
+    return {
+        "placements": [
+            {
+                "asset_id": key.asset_id,
+                "support_asset_id": key.support_asset_id,
+                "relation": key.relation.value,
+                "poses": [pose_to_json(pose) for pose in found],
+            }
+            for key, found in poses.placements.items()
+        ],
+        "stands": {
+            name: [[float(stand.x_m), float(stand.y_m), float(stand.yaw)] for stand in stands]
+            for name, stands in poses.stands.items()
+        },
+    }
+
+
+def poses_from_json(value: object) -> PoseCache:
+    """A pose cache. Raises SceneInvalidError."""
+    fields = Field(value, "poses").record("placements", "stands")
+    placements = {}
+    for item in fields["placements"].items():
+        entry = item.record("asset_id", "support_asset_id", "relation", "poses")
+        key = PlacementKey(
+            entry["asset_id"].name(), entry["support_asset_id"].name(), entry["relation"].member(Relation)
+        )
+        if key in placements:
+            item.fail("the same placement stands in the cache twice")
+        placements[key] = tuple(pose_from_field(pose) for pose in entry["poses"].items())
+    stands = {
+        name: tuple(StandPose(*stand.vec3()) for stand in found.items())
+        for name, found in fields["stands"].entries()
+    }
+    return PoseCache(placements, stands)

@@ -1,0 +1,173 @@
+"""Data sets: a folder with the records of the tasks and the bundles that they run in.
+
+``tasks.jsonl`` holds a record a line, ``bundles/`` a file for each digest. Records carry the whole task, so that a trainer
+can write prompts without decoding a scene.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from embomatrix.world.bundle import BundleError, decode_bundle
+from embomatrix.world.codec_task import task_from_json, task_to_json
+from embomatrix.world.field import Field, SceneInvalidError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from embomatrix.world.bundle import Bundle
+    from embomatrix.world.task import Task
+
+TASKS_FILE: Final = "tasks.jsonl"
+BUNDLES_FOLDER: Final = "bundles"
+SPLITS: Final = ("train", "heldout")
+
+
+class DatasetError(ValueError):
+    """A data set can't be read. The message names the file, and the line where there is one."""
+
+
+@dataclass(frozen=True, slots=True)
+class TaskRecord:
+    """One admitted task. ``oracle`` is a plan that reaches the goal, as JSON; ``signature`` names the kind of goal."""
+
+    task: Task
+    bundle_digest: str
+    split: str
+    oracle: tuple[Mapping[str, object], ...]
+    rooms: tuple[str, ...]
+    signature: str
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """Records in the order of the file. Bundles are read when they are asked for."""
+
+    folder: Path
+    records: tuple[TaskRecord, ...]
+    _decoded: dict[str, Bundle] = field(default_factory=dict, repr=False, compare=False)
+
+    @staticmethod
+    def load(folder: Path | str) -> Dataset:
+        """Read the records. Raises DatasetError when the folder holds no data set, or a record is wrong."""
+        path = Path(folder) / TASKS_FILE
+        try:
+            lines = path.read_text(encoding="utf-8").splitlines()
+        except (OSError, UnicodeDecodeError) as error:
+            reason = getattr(error, "strerror", None) or str(error)
+            raise DatasetError(
+                f"there is no data set in {folder}: {path.name} can't be read ({reason}); "
+                "build one with 'embomatrix factory build --out DIR'"
+            ) from error
+        records = tuple(
+            _record(line, f"{path}:{number}") for number, line in enumerate(lines, start=1) if line.strip()
+        )
+        return Dataset(Path(folder), records)
+
+    @property
+    def train(self) -> tuple[TaskRecord, ...]:
+        return tuple(record for record in self.records if record.split == "train")
+
+    @property
+    def heldout(self) -> tuple[TaskRecord, ...]:
+        return tuple(record for record in self.records if record.split == "heldout")
+
+    def bundle_bytes(self, digest: str) -> bytes:
+        """Compressed bundle. Raises DatasetError when the folder lacks it."""
+        path = self.folder / BUNDLES_FOLDER / bundle_file(digest)
+        try:
+            return path.read_bytes()
+        except OSError as error:
+            raise DatasetError(
+                f"bundle {digest} is missing: {path} can't be read ({error.strerror})"
+            ) from error
+
+    def bundle(self, digest: str) -> Bundle:
+        """Decoded bundle, kept for the next call. Raises DatasetError."""
+        if digest not in self._decoded:
+            try:
+                self._decoded[digest] = decode_bundle(self.bundle_bytes(digest), digest=digest)
+            except BundleError as error:
+                raise DatasetError(f"{self.folder}: {error}") from error
+        return self._decoded[digest]
+
+    def find(self, task_id: str) -> TaskRecord:
+        """The record of a task. Raises DatasetError that names close matches."""
+        for record in self.records:
+            if record.task.task_id == task_id:
+                return record
+        raise DatasetError(
+            f"there is no task {task_id!r} in {self.folder}: "
+            f"{_closest(task_id, [record.task.task_id for record in self.records])}"
+        )
+
+
+def bundle_file(digest: str) -> str:
+    """File name of a bundle: its hash without the algorithm. Raises DatasetError for anything but a digest."""
+    algorithm, _, hexdigits = digest.partition(":")
+    if algorithm != "sha256" or len(hexdigits) != 64 or not set(hexdigits) <= set("0123456789abcdef"):
+        raise DatasetError(f"found the digest {digest[:80]!r}: expected 'sha256:' and 64 hexadecimal digits")
+    return f"{hexdigits}.bundle"
+
+
+def write_dataset(folder: Path | str, records: Sequence[TaskRecord], bundles: Mapping[str, bytes]) -> None:
+    """Write bundles first and the records last, so that a folder with records is whole."""
+    root = Path(folder)
+    (root / BUNDLES_FOLDER).mkdir(parents=True, exist_ok=True)
+    for digest, data in bundles.items():
+        _replace(root / BUNDLES_FOLDER / bundle_file(digest), data)
+    lines = [json.dumps(record_to_json(record), separators=(",", ":")) for record in records]
+    _replace(root / TASKS_FILE, "".join(f"{line}\n" for line in lines).encode("ascii"))
+
+
+def record_to_json(record: TaskRecord) -> dict[str, Any]:
+    return {
+        "task": task_to_json(record.task),
+        "bundle": record.bundle_digest,
+        "split": record.split,
+        "oracle": [dict(call) for call in record.oracle],
+        "rooms": [*record.rooms],
+        "signature": record.signature,
+    }
+
+
+def record_from_json(value: object) -> TaskRecord:
+    """A record. Raises SceneInvalidError."""
+    fields = Field(value, "record").record("task", "bundle", "split", "oracle", "rooms", "signature")
+    split = fields["split"].text()
+    if split not in SPLITS:
+        fields["split"].fail(f"found {split[:40]!r}: expected one of {', '.join(SPLITS)}")
+    oracle = [dict(call.entries()) for call in fields["oracle"].items()]
+    return TaskRecord(
+        task=task_from_json(fields["task"].value),
+        bundle_digest=fields["bundle"].name(),
+        split=split,
+        oracle=tuple({key: item.value for key, item in call.items()} for call in oracle),
+        rooms=fields["rooms"].texts(),
+        signature=fields["signature"].text(),
+    )
+
+
+def _record(line: str, place: str) -> TaskRecord:
+    try:
+        return record_from_json(json.loads(line))
+    except SceneInvalidError as error:
+        raise DatasetError(f"{place}: {error}") from error
+    except (ValueError, RecursionError) as error:
+        raise DatasetError(f"{place}: not a JSON object: {error}") from error
+
+
+def _replace(path: Path, data: bytes) -> None:
+    """Write beside and rename, so that a reader never sees half a file."""
+    part = path.with_name(f"{path.name}.part")
+    part.write_bytes(data)
+    part.replace(path)
+
+
+def _closest(name: str, known: list[str]) -> str:
+    close = difflib.get_close_matches(name, known, n=3, cutoff=0.4)
+    return f"did you mean {', '.join(close)}?" if close else f"it holds {len(known)} tasks"

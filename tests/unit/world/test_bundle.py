@@ -1,0 +1,92 @@
+"""Bundles come back equal, have one digest each, and refuse what is damaged, hostile or foreign."""
+
+import dataclasses
+import json
+import zlib
+
+import pytest
+
+from embomatrix.world.bundle import (
+    Bundle,
+    BundleError,
+    BundleLimits,
+    bundle_digest,
+    decode_bundle,
+    encode_bundle,
+)
+from embomatrix.world.task import Task
+
+
+def test_bundle_comes_back_equal(bundle: Bundle) -> None:
+    assert decode_bundle(encode_bundle(bundle)) == bundle
+
+
+def test_equal_bundles_have_equal_bytes_and_digests(bundle: Bundle) -> None:
+    again = decode_bundle(encode_bundle(bundle))
+    assert bundle_digest(encode_bundle(again)) == bundle_digest(encode_bundle(bundle))
+    assert bundle_digest(encode_bundle(bundle)).startswith("sha256:")
+
+
+def test_other_content_has_another_digest(bundle: Bundle) -> None:
+    moved = dataclasses.replace(bundle.scene, seed=8)
+    other = dataclasses.replace(bundle, scene=moved)
+    assert bundle_digest(encode_bundle(other)) != bundle_digest(encode_bundle(bundle))
+
+
+def test_wrong_digest_names_what_was_found_and_what_was_expected(bundle: Bundle) -> None:
+    data = encode_bundle(bundle)
+    expected = "sha256:" + "0" * 64
+    with pytest.raises(BundleError) as caught:
+        decode_bundle(data, digest=expected)
+    assert expected in str(caught.value)
+    assert bundle_digest(data) in str(caught.value)
+
+
+def test_damage_is_refused_wherever_it_strikes(bundle: Bundle) -> None:
+    data = encode_bundle(bundle)
+    for position in range(0, len(data), 37):
+        broken = bytearray(data)
+        broken[position] ^= 0x55
+        with pytest.raises(BundleError):
+            decode_bundle(bytes(broken))
+    for cut in (0, 1, len(data) // 2, len(data) - 1):
+        with pytest.raises(BundleError):
+            decode_bundle(data[:cut])
+    with pytest.raises(BundleError, match="bytes follow"):
+        decode_bundle(data + b"tail")
+
+
+def test_too_large_a_bundle_is_refused_before_it_is_read(bundle: Bundle) -> None:
+    with pytest.raises(BundleError, match="at most 10"):
+        decode_bundle(encode_bundle(bundle), limits=BundleLimits(compressed_bytes=10))
+
+
+def test_decompression_bomb_is_refused() -> None:
+    bomb = zlib.compress(b" " * 50_000_000)
+    with pytest.raises(BundleError, match="grows beyond"):
+        decode_bundle(bomb)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[1]", '{"format": 1}', "[" * 100_000, '{"format": NaN}', "null"])
+def test_compressed_nonsense_is_refused_in_a_sentence(text: str) -> None:
+    with pytest.raises(BundleError):
+        decode_bundle(zlib.compress(text.encode()))
+
+
+def test_bundle_of_another_format_names_both(bundle: Bundle) -> None:
+    value = json.loads(zlib.decompress(encode_bundle(bundle)))
+    value["format"] = 9
+    with pytest.raises(BundleError, match="found 9: this version reads 1"):
+        decode_bundle(zlib.compress(json.dumps(value).encode()))
+
+
+def test_task_of_another_scene_is_not_bundled(bundle: Bundle, task: Task) -> None:
+    stray = dataclasses.replace(task, scene_id="elsewhere")
+    with pytest.raises(BundleError, match="belongs to scene 'elsewhere'"):
+        encode_bundle(dataclasses.replace(bundle, tasks={stray.task_id: stray}))
+
+
+def test_table_of_unknown_objects_is_not_bundled(bundle: Bundle, task: Task) -> None:
+    stray = dataclasses.replace(task, table=("apple_1", "fridge_1", "pear_1"))
+    with pytest.raises(BundleError, match="'pear_1'"):
+        encode_bundle(dataclasses.replace(bundle, tasks={stray.task_id: stray}))

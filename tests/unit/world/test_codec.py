@@ -1,0 +1,199 @@
+"""Decoding trusts nothing: every rule that the engine needs is checked, and the error names the field."""
+
+import copy
+import json
+import math
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from embomatrix.world.bundle import Bundle
+from embomatrix.world.codec import asset_from_json, asset_to_json, check_scene, scene_from_json, scene_to_json
+from embomatrix.world.codec_task import poses_from_json, poses_to_json, task_from_json, task_to_json
+from embomatrix.world.field import SceneInvalidError
+from embomatrix.world.scene import Scene
+from embomatrix.world.task import Task
+
+
+def through_text(value: Any) -> Any:
+    return json.loads(json.dumps(value))
+
+
+def test_scene_task_assets_and_poses_survive_json(scene: Scene, task: Task, bundle: Bundle) -> None:
+    assert scene_from_json(through_text(scene_to_json(scene))) == scene
+    assert task_from_json(through_text(task_to_json(task))) == task
+    assert poses_from_json(through_text(poses_to_json(bundle.poses))) == bundle.poses
+    for asset in scene.assets.values():
+        assert asset_from_json(through_text(asset_to_json(asset))) == asset
+
+
+def test_sound_scene_passes_the_check(scene: Scene) -> None:
+    check_scene(scene)
+
+
+BREAKS: dict[str, tuple[list[str | int], Any, str]] = {
+    "nan position": (["objects", 0, "pose", 1], math.nan, "scene.objects[0].pose"),
+    "infinite size": (["assets", "apple-red", "size_m", 0], math.inf, "size_m"),
+    "quaternion of length 2": (["objects", 1, "pose", 6], 2.0, "scene.objects[1].pose"),
+    "paper-thin part": (
+        ["assets", "fridge-abc", "links", 0, "parts", 0, "size_m", 2],
+        1e-4,
+        "parts[0].size_m",
+    ),
+    "zero axis": (["assets", "fridge-abc", "links", 1, "joint", "axis"], [0.0, 0.0, 0.0], "joint.axis"),
+    "joint without travel": (["assets", "fridge-abc", "links", 1, "joint", "upper"], 0.0, "joint.upper"),
+    "unknown asset": (["objects", 1, "asset_id"], "pear-x", "scene.objects[1].asset_id"),
+    "two of a name": (["objects", 1, "name"], "fridge_1", "scene.objects"),
+    "two in one place": (["objects", 1, "pose"], [1.0, 2.5, 0.85, 0.0, 0.0, 0.0, 1.0], "scene.objects"),
+    "nameless object": (["objects", 0, "name"], "", "scene.objects[0].name"),
+    "unknown room": (["objects", 0, "room"], "attic_0", "scene.objects[0].room"),
+    "unknown host": (["objects", 1, "host"], "table_9", "scene.objects[1].host"),
+    "hosts itself": (["objects", 1, "host"], "apple_1", "scene.objects[1].host"),
+    "unknown state": (["objects", 0, "states"], ["angry"], "scene.objects[0].states[0]"),
+    "unknown shape": (["walls", 0, "shape"], "torus", "scene.walls[0].shape"),
+    "hull without vertices": (["walls", 0, "shape"], "hull", "scene.walls[0]"),
+    "joint beyond its travel": (["objects", 0, "joints"], [1.5], "scene.objects[0].joints"),
+    "joints of another asset": (["objects", 0, "joints"], [0.1, 0.2], "scene.objects[0].joints"),
+    "door of an unknown link": (
+        ["assets", "fridge-abc", "interiors", 0, "closed_by"],
+        ["lid"],
+        "interiors[0].closed_by",
+    ),
+    "surface of an unknown cavity": (
+        ["assets", "fridge-abc", "supports", 0, "interior"],
+        "attic",
+        "supports[0].interior",
+    ),
+    "massless asset": (["assets", "apple-red", "mass_kg"], 0.0, "mass_kg"),
+    "text for a number": (["robot", "x_m"], "5", "scene.robot.x_m"),
+    "truth for a number": (["robot", "yaw"], True, "scene.robot.yaw"),
+    "room inside out": (["rooms", 0, "high_m"], [-1.0, 3.0], "scene.rooms[0]"),
+    "doorway to nowhere": (["doorways", 0, "rooms"], ["kitchen_0", "attic_0"], "scene.doorways[0].rooms"),
+    "slanted wall": (["doorways", 0, "along"], "z", "scene.doorways[0]"),
+    "robot in no room": (["robot", "room"], "attic_0", "scene.robot.room"),
+    "unknown key": (["robot", "speed"], 3.0, "scene.robot"),
+    "asset under a wrong key": (["assets", "apple-red", "asset_id"], "apple-blue", "scene.assets"),
+}
+
+
+@pytest.mark.parametrize("name", BREAKS)
+def test_error_names_the_field_that_breaks_a_rule(scene: Scene, name: str) -> None:
+    path, value, field = BREAKS[name]
+    broken = through_text(scene_to_json(scene))
+    place = broken
+    for key in path[:-1]:
+        place = place[key]
+    place[path[-1]] = value
+    with pytest.raises(SceneInvalidError) as caught:
+        scene_from_json(broken)
+    assert field in caught.value.field
+    assert caught.value.field in str(caught.value)
+
+
+def test_seventeenth_part_of_a_link_is_refused(scene: Scene) -> None:
+    broken = scene_to_json(scene)
+    parts = broken["assets"]["fridge-abc"]["links"][0]["parts"]
+    parts *= 9
+    with pytest.raises(SceneInvalidError, match="at most 16"):
+        scene_from_json(broken)
+
+
+def test_every_missing_key_is_named(scene: Scene) -> None:
+    whole = scene_to_json(scene)
+    for key in whole:
+        broken = copy.deepcopy(whole)
+        del broken[key]
+        with pytest.raises(SceneInvalidError, match=f"lacks '{key}'"):
+            scene_from_json(broken)
+
+
+def test_goal_about_an_object_outside_the_table_is_refused(task: Task) -> None:
+    value = task_to_json(task) | {"table": ["apple_1"]}
+    with pytest.raises(SceneInvalidError, match="fridge_1"):
+        task_from_json(value)
+
+
+def test_table_that_names_an_object_twice_is_refused(task: Task) -> None:
+    with pytest.raises(SceneInvalidError, match="twice"):
+        task_from_json(task_to_json(task) | {"table": ["fridge_1", "fridge_1"]})
+
+
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=4),
+    max_leaves=12,
+)
+
+
+@given(json_values)
+def test_any_json_value_is_read_or_refused_by_the_one_error(value: Any) -> None:
+    for read in (scene_from_json, task_from_json, poses_from_json, asset_from_json):
+        with pytest.raises(SceneInvalidError):
+            read(value)
+
+
+@given(st.data())
+def test_scene_with_one_value_replaced_is_read_or_refused_by_the_one_error(data: st.DataObject) -> None:
+    value = through_text(SCENE_JSON)
+    place: Any = value
+    while isinstance(place, dict | list) and place:
+        key = data.draw(st.sampled_from(sorted(place) if isinstance(place, dict) else range(len(place))))
+        if not isinstance(place[key], dict | list) or data.draw(st.booleans()):
+            place[key] = data.draw(json_values)
+            break
+        place = place[key]
+    try:
+        scene_from_json(value)
+    except SceneInvalidError as error:
+        assert error.field.startswith("scene")
+
+
+SCENE_JSON: dict[str, Any] = {
+    "scene_id": "s",
+    "base": "s",
+    "seed": 1,
+    "rooms": [{"name": "r_0", "type": "r", "low_m": [0.0, 0.0], "high_m": [1.0, 1.0]}],
+    "walls": [{"shape": "box", "pose": [0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0], "size_m": [1.0, 0.1, 2.0]}],
+    "doorways": [],
+    "objects": [
+        {
+            "name": "a_1",
+            "asset_id": "a-x",
+            "room": "r_0",
+            "pose": [0.5, 0.5, 0.1, 0.0, 0.0, 0.0, 1.0],
+            "fixed": False,
+            "joints": [],
+            "host": "",
+            "relation": "",
+            "states": [],
+        }
+    ],
+    "assets": {
+        "a-x": {
+            "asset_id": "a-x",
+            "category": "a",
+            "synset": "a.n.01",
+            "size_m": [0.1, 0.1, 0.1],
+            "mass_kg": 1.0,
+            "links": [
+                {
+                    "name": "base",
+                    "parts": [
+                        {
+                            "shape": "box",
+                            "pose": [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0],
+                            "size_m": [0.1, 0.1, 0.1],
+                        }
+                    ],
+                }
+            ],
+            "supports": [],
+            "interiors": [],
+            "abilities": {},
+        }
+    },
+    "robot": {"x_m": 0.2, "y_m": 0.2, "yaw": 0.0, "room": "r_0"},
+    "left_out": [],
+}

@@ -1,0 +1,75 @@
+"""A data set survives the disk, reads bundles when asked, and says what is wrong with a folder."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from embomatrix.world.bundle import Bundle, bundle_digest, encode_bundle
+from embomatrix.world.dataset import Dataset, DatasetError, TaskRecord, record_to_json, write_dataset
+from embomatrix.world.task import Task
+
+PLAN = ({"action": "move", "object_index": 1}, {"action": "open", "object_index": 1})
+
+
+def write(folder: Path, bundle: Bundle, task: Task) -> TaskRecord:
+    data = encode_bundle(bundle)
+    record = TaskRecord(task, bundle_digest(data), "train", PLAN, ("kitchen_0",), "open(fridge)")
+    write_dataset(folder, [record], {record.bundle_digest: data})
+    return record
+
+
+def test_data_set_survives_the_disk(tmp_path: Path, bundle: Bundle, task: Task) -> None:
+    record = write(tmp_path, bundle, task)
+    dataset = Dataset.load(tmp_path)
+    assert dataset.records == (record,)
+    assert dataset.train == (record,)
+    assert dataset.heldout == ()
+    assert dataset.bundle(record.bundle_digest) == bundle
+    assert dataset.bundle(record.bundle_digest) is dataset.bundle(record.bundle_digest)
+
+
+def test_unknown_task_suggests_a_close_name(tmp_path: Path, bundle: Bundle, task: Task) -> None:
+    write(tmp_path, bundle, task)
+    with pytest.raises(DatasetError, match="did you mean tiny-1-open"):
+        Dataset.load(tmp_path).find("tiny-1-opn")
+
+
+def test_folder_without_a_data_set_tells_how_to_build_one(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="factory build"):
+        Dataset.load(tmp_path / "nothing")
+
+
+def test_broken_line_is_named_by_its_number(tmp_path: Path, bundle: Bundle, task: Task) -> None:
+    write(tmp_path, bundle, task)
+    with (tmp_path / "tasks.jsonl").open("a") as file:
+        file.write('{"task": \n')
+    with pytest.raises(DatasetError, match=r"tasks.jsonl:2"):
+        Dataset.load(tmp_path)
+
+
+def test_unknown_split_names_the_field(tmp_path: Path, bundle: Bundle, task: Task) -> None:
+    value = record_to_json(write(tmp_path, bundle, task)) | {"split": "test"}
+    (tmp_path / "tasks.jsonl").write_text(json.dumps(value))
+    with pytest.raises(DatasetError, match="record.split"):
+        Dataset.load(tmp_path)
+
+
+def test_missing_and_damaged_bundles_are_named(tmp_path: Path, bundle: Bundle, task: Task) -> None:
+    record = write(tmp_path, bundle, task)
+    file = next((tmp_path / "bundles").iterdir())
+    file.write_bytes(file.read_bytes()[:-1])
+    with pytest.raises(DatasetError, match=record.bundle_digest):
+        Dataset.load(tmp_path).bundle(record.bundle_digest)
+    file.unlink()
+    with pytest.raises(DatasetError, match="missing"):
+        Dataset.load(tmp_path).bundle(record.bundle_digest)
+
+
+@pytest.mark.parametrize("digest", ["", "sha256:../../etc/passwd", "md5:00", "sha256:" + "g" * 64])
+def test_digest_that_is_no_digest_never_becomes_a_path(
+    tmp_path: Path, bundle: Bundle, task: Task, digest: str
+) -> None:
+    write(tmp_path, bundle, task)
+    with pytest.raises(DatasetError, match="64 hexadecimal digits"):
+        Dataset.load(tmp_path).bundle_bytes(digest)
