@@ -93,9 +93,7 @@ class PhysicsEngine(Protocol):
         Raises EngineError when either is parked.
         """
 
-    def settle(
-        self, name: str, steps: int = SETTLE_STEPS, ignore: frozenset[str] = NOTHING
-    ) -> Settled:
+    def settle(self, name: str, steps: int = SETTLE_STEPS, ignore: frozenset[str] = NOTHING) -> Settled:
         """Let go of the object where it is, in a copy of its neighbourhood in which all else stands still.
 
         Changes nothing here. Depends on the present state only, not on what was simulated before.

@@ -46,6 +46,32 @@ def pybullet() -> Any:
     return module
 
 
+class ClientPool:
+    """Connected clients, kept for reuse: the memory of a fresh one costs more time than loading a scene does.
+
+    A process that forks simulators fills the pool first: its children find the clients connected.
+    """
+
+    def __init__(self, spare: int = 0) -> None:
+        """Connect ``spare`` clients at once."""
+        self._spare = [connect() for _ in range(spare)]
+
+    def take(self) -> int:
+        """An empty client. Raises EngineError when Bullet has none left."""
+        return self._spare.pop() if self._spare else connect()
+
+    def give_back(self, client: int) -> None:
+        """Empty a client and keep it for the next who asks."""
+        pybullet().resetSimulation(physicsClientId=client)
+        self._spare.append(client)
+
+    def close(self) -> None:
+        """Disconnect the spare clients."""
+        for client in self._spare:
+            pybullet().disconnect(physicsClientId=client)
+        self._spare.clear()
+
+
 def connect() -> int:
     """Open a client without a renderer and return its id. Raises EngineError when Bullet has none left."""
     bullet = pybullet()

@@ -12,7 +12,7 @@ import numpy as np
 
 from embomatrix.sim.bounds import AssetBounds, aabb_of
 from embomatrix.sim.bullet.bodies import PART_LIMIT, BodyFactory
-from embomatrix.sim.bullet.client import connect, pybullet
+from embomatrix.sim.bullet.client import ClientPool, pybullet
 from embomatrix.sim.bullet.mini_world import MiniWorld, Still
 from embomatrix.sim.engine import FLOOR, NOTHING, SETTLE_STEPS, TOLERANCE_M, WALL, EngineError, Settled
 from embomatrix.sim.validation import check_fractions, check_pose, check_scene
@@ -34,13 +34,18 @@ POSE_NUMBERS: Final = 7
 class BulletEngine:
     """One scene in one Bullet client, with a second one to settle objects in. Not for use by several threads."""
 
-    def __init__(self, scene: Scene) -> None:
-        """Load the scene. Raises EngineError when it is not valid or pybullet is missing."""
+    def __init__(self, scene: Scene, pool: ClientPool | None = None) -> None:
+        """Load the scene into clients of the pool, or into new ones that are closed with the engine.
+
+        Raises EngineError when the scene is not valid or pybullet is missing.
+        """
         check_scene(scene)
         self._scene = scene
         self._bullet = pybullet()
-        self._client = connect()
-        self._mini = MiniWorld()
+        self._owns_pool = pool is None
+        self._pool = pool or ClientPool()
+        self._client = self._pool.take()
+        self._mini = MiniWorld(self._pool)
         self._index = {item.name: number for number, item in enumerate(scene.objects)}
         self._names = tuple(self._index)
         self._assets = [scene.assets[item.asset_id] for item in scene.objects]
@@ -186,7 +191,9 @@ class BulletEngine:
     def close(self) -> None:
         """Free the physics clients. The engine can't be used afterwards."""
         self._mini.close()
-        self._bullet.disconnect(physicsClientId=self._client)
+        self._pool.give_back(self._client)
+        if self._owns_pool:
+            self._pool.close()
 
     def _load(self) -> None:
         """Create the bodies: walls, then assets in the order in which the scene's objects name them first."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.sim.bullet.bodies import BodyFactory
-from embomatrix.sim.bullet.client import connect, pybullet
+from embomatrix.sim.bullet.client import ClientPool, pybullet
 from embomatrix.sim.engine import SETTLE_STEPS, Settled
 from embomatrix.world.geometry import Pose
 
@@ -44,9 +44,10 @@ class Still:
 class MiniWorld:
     """One client, rebuilt for every stage: what it simulates does not depend on what it simulated before."""
 
-    def __init__(self) -> None:
+    def __init__(self, pool: ClientPool) -> None:
         self._bullet = pybullet()
-        self._client = connect()
+        self._pool = pool
+        self._client = pool.take()
         self._factory = BodyFactory(self._client)
         self._body = -1
         self._still: list[int] = []
@@ -110,7 +111,8 @@ class MiniWorld:
         return Settled(settled, math.dist(position, pose.position_m), tilt_between(pose, settled), at_rest)
 
     def close(self) -> None:
-        self._bullet.disconnect(physicsClientId=self._client)
+        """Give the client back to the pool. The world can't be used afterwards."""
+        self._pool.give_back(self._client)
 
     def _put(self, pose: Pose) -> None:
         zero = (0.0, 0.0, 0.0)
