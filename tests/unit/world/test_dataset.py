@@ -51,7 +51,7 @@ def test_broken_line_is_named_by_its_number(tmp_path: Path, bundle: Bundle, task
 def test_unknown_split_names_the_field(tmp_path: Path, bundle: Bundle, task: Task) -> None:
     value = record_to_json(write(tmp_path, bundle, task)) | {"split": "test"}
     (tmp_path / "tasks.jsonl").write_text(json.dumps(value))
-    with pytest.raises(DatasetError, match="record.split"):
+    with pytest.raises(DatasetError, match=r"record\.split"):
         Dataset.load(tmp_path)
 
 

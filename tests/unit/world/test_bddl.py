@@ -1,0 +1,223 @@
+"""The parser reads both dialects, and an error names the line and the column of what is wrong."""
+
+import contextlib
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from embomatrix.world.bddl import BddlError, Problem, parse_formula, parse_problem, render_problem
+from embomatrix.world.evaluate import render
+from embomatrix.world.goal import (
+    And,
+    Atom,
+    Exists,
+    Forall,
+    Formula,
+    ForN,
+    ForNPairs,
+    ForPairs,
+    Imply,
+    Not,
+    Or,
+)
+
+SAMPLE = Path(__file__).parents[4] / "shared" / "data" / "embomatrix_tasks_sample.jsonl"
+
+TIDY = """(define (problem Tidy_the_Apples)
+    (:domain omnigibson)
+    ; two apples lie about
+    (:objects
+        Apple.n.01_1 apple.n.01_2 - apple.n.01
+        basket.n.01_1 - basket.n.01
+        floor.n.01_1 - floor.n.01
+        agent.n.01_1 - agent.n.01
+    )
+    (:init
+        (ontop apple.n.01_1 floor.n.01_1)  ; the first
+        (not (open basket.n.01_1))
+        (inroom floor.n.01_1 kitchen_0)
+        (inroom basket.n.01_1 living_room)
+    )
+    (:goal
+        (and
+            (forall (?apple.n.01 - apple.n.01) (inside ?apple.n.01 ?basket.n.01_1))
+            (not (OnTop apple.n.01_1 ?floor.n.01_1))
+        )
+    )
+)
+"""
+
+
+def bddl_activities() -> Iterator[Path]:
+    bddl = pytest.importorskip("bddl", reason="the bddl package is not installed")
+    folder = Path(bddl.__file__).parent / "activity_definitions"
+    return (path for path in sorted(folder.glob("*/problem*.bddl")))
+
+
+def test_problem_is_read_into_values() -> None:
+    problem = parse_problem(TIDY)
+    assert problem.name == "Tidy_the_Apples"
+    assert problem.types["apple.n.01"] == ("apple.n.01_1", "apple.n.01_2")
+    assert [item.positive for item in problem.init] == [True, False, True, True]
+    assert problem.init[3].atom == Atom("inroom", ("basket.n.01_1", "living_room"))
+    assert problem.goal == And(
+        (
+            Forall("?apple.n.01", "apple.n.01", Atom("inside", ("?apple.n.01", "basket.n.01_1"))),
+            Not(Atom("ontop", ("apple.n.01_1", "floor.n.01_1"))),
+        )
+    )
+
+
+def test_goal_of_several_expressions_is_their_conjunction() -> None:
+    text = TIDY.replace("(:goal\n        (and", "(:goal (open basket.n.01_1) (and")
+    goal = parse_problem(text).goal
+    assert isinstance(goal, And)
+    assert goal.parts[0] == Atom("open", ("basket.n.01_1",))
+
+
+ERRORS: dict[str, tuple[str, str, str, int]] = {
+    "missing parenthesis in init": (
+        "(inroom basket.n.01_1 living_room)",
+        "(inroom basket.n.01_1 living_room",
+        "missing before",
+        16,
+    ),
+    "missing parenthesis at the end": ("        )\n    )\n)\n", "        )\n    )\n", "never closed", 1),
+    "one parenthesis too many": ("        )\n    )\n)\n", "        )\n    )\n))\n", "after the last", 22),
+    "unknown section": ("(:init", "(:initial", "unknown section ':initial'", 10),
+    "section twice": ("(:domain omnigibson)", "(:goal (open basket.n.01_1))", "twice", 16),
+    "undeclared object": (
+        "inside ?apple.n.01 ?basket.n.01_1",
+        "inside ?apple.n.01 ?box.n.01_1",
+        "'box.n.01_1' is not declared",
+        18,
+    ),
+    "unknown predicate": ("(OnTop", "(hovering", "unknown predicate 'hovering'", 19),
+    "wrong number of arguments": (
+        "(not (open basket.n.01_1))",
+        "(open basket.n.01_1 floor.n.01_1)",
+        "takes 1 arguments, found 2",
+        12,
+    ),
+    "unknown type": (
+        "(?apple.n.01 - apple.n.01)",
+        "(?pear.n.01 - pear.n.01)",
+        "unknown type 'pear.n.01'",
+        18,
+    ),
+    "object without a type": ("- agent.n.01\n", "\n", "has no type", 8),
+    "hyphen without a type": ("agent.n.01_1 - agent.n.01", "agent.n.01_1 -", "around this hyphen", 8),
+    "one name for two types": ("basket.n.01_1 - basket", "apple.n.01_2 - basket", "declared as", 6),
+    "binder without a mark": (
+        "(?apple.n.01 - apple.n.01)",
+        "(apple.n.01 - apple.n.01)",
+        "a variable and its type",
+        18,
+    ),
+    "negation of two": (
+        "(not (OnTop",
+        "(not (open basket.n.01_1) (OnTop",
+        "'not' takes 1 parts, found 2",
+        19,
+    ),
+    "word for a formula": ("(and\n", "(and apple.n.01_1\n", "expected (PREDICATE", 17),
+    "list for an argument": ("(OnTop apple.n.01_1", "(OnTop (apple.n.01_1)", "found a list", 19),
+    "no define": ("(define ", "(defun ", "expected '(define", 1),
+    "no name": ("(problem Tidy_the_Apples)", "(problem)", "(problem NAME)", 1),
+}
+
+
+@pytest.mark.parametrize("name", ERRORS)
+def test_error_names_the_line_of_what_is_wrong(name: str) -> None:
+    old, new, message, line = ERRORS[name]
+    assert old in TIDY
+    with pytest.raises(BddlError) as caught:
+        parse_problem(TIDY.replace(old, new, 1))
+    assert message in str(caught.value)
+    assert caught.value.line == line
+    assert str(caught.value).startswith(f"line {line}, column {caught.value.column}:")
+
+
+def test_column_points_at_the_word() -> None:
+    with pytest.raises(BddlError) as caught:
+        parse_formula("(and (open a)\n     (hot b))", {"a": "x"})
+    assert (caught.value.line, caught.value.column) == (2, 11)
+
+
+@pytest.mark.parametrize("text", ["", "   ; nothing\n", "apple", ")", "()", "(" * 10_000, "(define)"])
+def test_nonsense_is_refused_in_a_sentence(text: str) -> None:
+    with pytest.raises(BddlError):
+        parse_problem(text)
+
+
+@given(st.text(alphabet="()?-:;. \nandforallnotdefineobjectsgoalinit_1", max_size=200))
+def test_garbage_raises_nothing_but_the_parser_s_error(text: str) -> None:
+    with pytest.raises(BddlError):
+        parse_problem(text)
+
+
+@given(st.integers(0, len(TIDY) - 1), st.sampled_from(["", "(", ")", " ", "?", "x"]))
+def test_one_changed_character_is_read_or_refused(position: int, character: str) -> None:
+    text = TIDY[:position] + character + TIDY[position + 1 :]
+    with contextlib.suppress(BddlError):
+        parse_problem(text)
+
+
+OBJECTS = {"a_1": "a", "a_2": "a", "b_1": "b"}
+
+
+def formulas() -> st.SearchStrategy[Formula]:
+    names = st.sampled_from([*OBJECTS, "?v"])
+    atoms = st.builds(lambda p, x: Atom(p, (x,)), st.sampled_from(["open", "hot"]), names) | st.builds(
+        lambda p, x, y: Atom(p, (x, y)), st.sampled_from(["inside", "ontop"]), names, names
+    )
+    types = st.sampled_from(["a", "b"])
+
+    def grow(inner: st.SearchStrategy[Formula]) -> st.SearchStrategy[Formula]:
+        several = st.lists(inner, max_size=3).map(tuple)
+        return st.one_of(
+            st.builds(Not, inner),
+            st.builds(And, several),
+            st.builds(Or, several),
+            st.builds(Imply, inner, inner),
+            st.builds(Forall, st.just("?v"), types, inner),
+            st.builds(Exists, st.just("?w"), types, inner),
+            st.builds(ForN, st.integers(0, 9), st.just("?v"), types, inner),
+            st.builds(ForPairs, st.just("?v"), types, st.just("?w"), types, inner),
+            st.builds(ForNPairs, st.integers(0, 9), st.just("?v"), types, st.just("?w"), types, inner),
+        )
+
+    return st.recursive(atoms, grow, max_leaves=8).map(lambda body: Forall("?v", "a", body))
+
+
+@given(formulas())
+def test_rendered_formula_is_read_back_equal(formula: Formula) -> None:
+    assert parse_formula(render(formula), OBJECTS) == formula
+
+
+@given(formulas())
+def test_rendered_problem_is_read_back_equal(goal: Formula) -> None:
+    problem = Problem("p", OBJECTS, parse_problem(TIDY).init[:0], goal)
+    assert parse_problem(render_problem(problem)) == problem
+
+
+def test_every_activity_of_behavior_1k_is_read() -> None:
+    problems = [parse_problem(path.read_text()) for path in bddl_activities()]
+    assert len(problems) >= 1016
+    assert all(parse_problem(render_problem(problem)).goal == problem.goal for problem in problems)
+
+
+@pytest.mark.skipif(
+    not SAMPLE.exists(), reason="the sample of the paper's tasks is not beside the repository"
+)
+def test_every_task_of_the_paper_s_factory_is_read() -> None:
+    texts = [json.loads(line)["bddl"] for line in SAMPLE.read_text().splitlines()]
+    problems = [parse_problem(text) for text in texts]
+    assert len(problems) == 400
+    for problem in problems:
+        again = parse_problem(render_problem(problem))
+        assert (again.name, again.init, again.goal) == (problem.name, problem.init, problem.goal)

@@ -1,0 +1,202 @@
+"""Formulas mean what they mean in the bddl package, and the reward's atoms are the conjuncts of the goal."""
+
+import hashlib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from embomatrix.world.bddl import parse_formula, parse_problem
+from embomatrix.world.evaluate import (
+    GoalError,
+    atoms_of,
+    evaluate,
+    objects_of,
+    rename,
+    render,
+    scored_atoms,
+    types_of,
+)
+from embomatrix.world.goal import And, Atom, Forall, Formula
+
+OBJECTS = {"apple_1": "apple", "apple_2": "apple", "box_1": "box", "box_2": "box", "lamp_1": "lamp"}
+TYPES = {"apple": ("apple_1", "apple_2"), "box": ("box_1", "box_2"), "lamp": ("lamp_1",)}
+
+
+@dataclass
+class Table:
+    """Facts that hold; ``asked`` counts the questions."""
+
+    true: set[tuple[str, ...]] = field(default_factory=set)
+    asked: int = 0
+
+    def holds(self, predicate: str, args: tuple[str, ...]) -> bool:
+        self.asked += 1
+        return (predicate, *args) in self.true
+
+
+def facts(*atoms: str) -> Table:
+    return Table({tuple(atom.split()) for atom in atoms})
+
+
+def goal(text: str) -> Formula:
+    return parse_formula(text, OBJECTS)
+
+
+EVERY = "(forall (?x - apple) (inside ?x box_1))"
+PAIRS = "(forpairs (?x - apple) (?y - box) (inside ?x ?y))"
+
+
+@pytest.mark.parametrize(
+    ("text", "true", "expected"),
+    [
+        ("(open box_1)", ["open box_1"], True),
+        ("(not (open box_1))", [], True),
+        ("(and)", [], True),
+        ("(or)", [], False),
+        ("(or (open box_1) (open box_2))", ["open box_2"], True),
+        ("(imply (open box_1) (open box_2))", [], True),
+        ("(imply (open box_1) (open box_2))", ["open box_1"], False),
+        (EVERY, ["inside apple_1 box_1"], False),
+        (EVERY, ["inside apple_1 box_1", "inside apple_2 box_1"], True),
+        ("(exists (?x - apple) (inside ?x box_1))", ["inside apple_2 box_1"], True),
+        ("(forn (1) (?x - apple) (hot ?x))", ["hot apple_1"], True),
+        ("(forn (1) (?x - apple) (hot ?x))", ["hot apple_1", "hot apple_2"], False),
+        (PAIRS, ["inside apple_1 box_1", "inside apple_2 box_2"], True),
+        (PAIRS, ["inside apple_1 box_1", "inside apple_2 box_1"], False),
+        ("(fornpairs (1) (?x - apple) (?y - box) (inside ?x ?y))", ["inside apple_2 box_1"], True),
+        ("(forpairs (?x - apple) (?y - apple) (nextto ?x ?y))", ["nextto apple_1 apple_2"], True),
+        ("(forpairs (?x - lamp) (?y - lamp) (nextto ?x ?y))", ["nextto lamp_1 lamp_1"], True),
+    ],
+)
+def test_formula_holds_or_not(text: str, true: list[str], expected: bool) -> None:
+    assert evaluate(goal(text), facts(*true), TYPES) is expected
+
+
+def test_only_the_facts_that_decide_are_asked_for() -> None:
+    table = facts("open box_1")
+    assert evaluate(goal("(or (open box_1) (open box_2) (hot lamp_1))"), table, TYPES)
+    assert table.asked == 1
+
+
+def test_inner_variable_shadows_the_outer_one() -> None:
+    formula = goal("(forall (?x - box) (and (open ?x) (exists (?x - apple) (hot ?x))))")
+    assert evaluate(formula, facts("open box_1", "open box_2", "hot apple_1"), TYPES)
+    assert [render(atom) for atom in scored_atoms(formula, TYPES)] == [
+        "(open box_1)",
+        "(exists (?x - apple) (hot ?x))",
+        "(open box_2)",
+        "(exists (?x - apple) (hot ?x))",
+    ]
+
+
+def test_scored_atoms_are_conjuncts_after_grounding_and_other_operators_count_once() -> None:
+    formula = goal(f"(and {EVERY} (and (not (open box_1)) (or (hot lamp_1) (open box_2))) {PAIRS})")
+    assert [render(atom) for atom in scored_atoms(formula, TYPES)] == [
+        "(inside apple_1 box_1)",
+        "(inside apple_2 box_1)",
+        "(not (open box_1))",
+        "(or (hot lamp_1) (open box_2))",
+        PAIRS,
+    ]
+
+
+def test_unknown_type_and_free_variable_are_named() -> None:
+    with pytest.raises(GoalError, match="'pear'"):
+        evaluate(Forall("?x", "pear", Atom("hot", ("?x",))), facts(), TYPES)
+    with pytest.raises(GoalError, match=r"'\?x' is not bound"):
+        evaluate(Atom("hot", ("?x",)), facts(), TYPES)
+
+
+def test_objects_of_a_goal_are_those_it_names_and_those_it_ranges_over() -> None:
+    formula = goal(f"(and {EVERY} (inroom lamp_1 kitchen_0))")
+    assert objects_of(formula, TYPES) == {"apple_1", "apple_2", "box_1", "lamp_1"}
+    assert types_of(formula) == {"apple"}
+    assert [atom.predicate for atom in atoms_of(formula)] == ["inside", "inroom"]
+
+
+def test_renaming_reaches_objects_and_types_and_spares_variables() -> None:
+    renamed = rename(goal(EVERY), {"box_1": "crate_7", "?x": "wrong"}, {"apple": "fruit"})
+    assert render(renamed) == "(forall (?x - fruit) (inside ?x crate_7))"
+
+
+@given(st.sets(st.tuples(st.just("inside"), st.sampled_from(TYPES["apple"]), st.sampled_from(TYPES["box"]))))
+def test_conjunction_holds_exactly_when_all_its_scored_atoms_do(true: set[tuple[str, ...]]) -> None:
+    formula = goal(f"(and {EVERY} (exists (?y - box) (inside apple_1 ?y)))")
+    table = Table(true)
+    parts = [evaluate(atom, table, TYPES) for atom in scored_atoms(formula, TYPES)]
+    assert evaluate(formula, table, TYPES) is all(parts)
+
+
+@dataclass(frozen=True)
+class Coin:
+    """Facts by hash: every atom is true or false for good, with a chance of ``percent``."""
+
+    seed: int
+    percent: int
+
+    def holds(self, predicate: str, args: tuple[str, ...]) -> bool:
+        key = f"{self.seed} {predicate} {' '.join(args)}".encode()
+        return hashlib.sha256(key).digest()[0] % 100 < self.percent
+
+
+def judge_of_bddl(activity: str, coin: Coin) -> tuple[bool, Formula, dict[str, tuple[str, ...]]]:
+    """What the bddl package says of an activity's goal, with the goal as we read it."""
+    from bddl.activity import Conditions, evaluate_goal_conditions, get_goal_conditions, get_object_scope
+    from bddl.logic_base import BinaryAtomicFormula, UnaryAtomicFormula
+
+    class Thing:
+        def __init__(self, name: str) -> None:
+            self.name = name
+
+    class Backend:
+        def get_predicate_class(self, predicate: str) -> type[Any]:
+            def one(_: Any, a: Thing) -> bool:
+                return coin.holds(predicate, (a.name,))
+
+            def two(_: Any, a: Thing, b: Thing) -> bool:
+                return coin.holds(predicate, (a.name, b.name))
+
+            unary = predicate in {"cooked", "frozen", "open", "folded", "unfolded", "toggled_on", "hot"}
+            unary |= predicate in {"on_fire", "future", "real", "broken"}
+            parent = UnaryAtomicFormula if unary else BinaryAtomicFormula
+            body = {"STATE_NAME": predicate, "_evaluate": one if unary else two, "_sample": lambda *_: None}
+            return type(predicate, (parent,), body)
+
+    conditions = Conditions(activity, 0, "omnigibson")
+    scope = {name: Thing(name) for name in get_object_scope(conditions)}
+    compiled = get_goal_conditions(conditions, Backend(), scope, generate_ground_options=False)
+    verdict = bool(evaluate_goal_conditions(compiled)[0])
+    types = {key: tuple(dict.fromkeys(names)) for key, names in conditions.parsed_objects.items()}
+    return verdict, parse_goal(activity), types
+
+
+SEVERAL_EXPRESSIONS = "loading_the_car"
+"""Its goal has two expressions. The bddl package drops the second; we take both."""
+
+
+def parse_goal(activity: str) -> Formula:
+    import bddl
+
+    path = Path(bddl.__file__).parent / "activity_definitions" / activity / "problem0.bddl"
+    return parse_problem(path.read_text()).goal
+
+
+def test_every_activity_is_judged_as_by_the_bddl_package() -> None:
+    bddl = pytest.importorskip("bddl", reason="the bddl package is not installed")
+    folder = Path(bddl.__file__).parent / "activity_definitions"
+    activities = sorted(path.parent.name for path in folder.glob("*/problem0.bddl"))
+    verdicts: list[bool] = []
+    for number, activity in enumerate(activities):
+        coin = Coin(number, (50, 90, 97, 100)[number % 4])
+        expected, formula, types = judge_of_bddl(activity, coin)
+        if activity == SEVERAL_EXPRESSIONS:
+            assert isinstance(formula, And)
+            formula = formula.parts[0]
+        assert evaluate(formula, coin, types) is expected, activity
+        verdicts.append(expected)
+    assert len(activities) >= 1016
+    assert 100 < sum(verdicts) < len(verdicts) - 100, "both verdicts are common, so agreement means something"
