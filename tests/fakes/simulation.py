@@ -1,0 +1,69 @@
+"""A simulation without physics for the slot program: what a bundle file or a task id says, it does.
+
+Run as ``python simulation.py FD PARENT``, as the worker's daemon runs the real one.
+"""
+
+import os
+import signal
+import sys
+import time
+
+from embomatrix.reward.breakdown import AtomResult, RewardBreakdown
+from embomatrix.rpc.values import Completed, Timings
+from embomatrix.worker.slot_program import BundleCorruptError, run_program
+
+PROGRAM = (sys.executable, __file__)
+
+
+class FakeSimulation:
+    def prepare(self):
+        if os.environ.get("FAKE_SIMULATION") == "broken":
+            raise RuntimeError("the engine is missing: install it")
+
+    def load(self, path, digest):
+        match path.read_text():
+            case "corrupt":
+                raise BundleCorruptError("not what its digest says")
+            case "impossible":
+                raise ValueError("a table without legs")
+            case "crash":
+                os.kill(os.getpid(), signal.SIGSEGV)
+            case "large":
+                return FakeScene(ballast=bytearray(os.urandom(1) * (40 * 1024 * 1024)))
+        return FakeScene()
+
+
+class FakeScene:
+    def __init__(self, ballast=b""):
+        self._ballast = ballast
+        self._executed = 0
+
+    def execute(self, rollout):
+        self._executed += 1
+        match rollout.task_id:
+            case "crash":
+                os.kill(os.getpid(), signal.SIGSEGV)
+            case "hang":
+                time.sleep(600)
+            case "slow":
+                time.sleep(0.3)
+            case "raise":
+                raise ArithmeticError("x" * 600)
+            case "greedy":
+                self._ballast = bytearray(4 * 1024 * 1024 * 1024)
+            case "orphan":
+                os.kill(os.getppid(), signal.SIGKILL)
+                time.sleep(600)
+        return Completed(
+            reward=RewardBreakdown(0.5, 0.2, 30.0, (AtomResult("done", True),), True),
+            steps=(),
+            final=(f"executed {self._executed} in {os.getpid()} of {os.getppid()}",),
+            trace_digest=f"trace of {rollout.rollout_id}",
+            worker_id="",
+            timings=Timings(),
+            warm=True,
+        )
+
+
+if __name__ == "__main__":
+    run_program(FakeSimulation())

@@ -1,0 +1,313 @@
+"""Slots: whatever happens to a simulator's process, every lease ends in one result and the others don't notice."""
+
+import asyncio
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+from tests.fakes.simulation import PROGRAM
+
+from embomatrix.rpc.values import (
+    Completed,
+    InfraCode,
+    InfraFailure,
+    Lease,
+    LeaseRef,
+    ResidentState,
+    Rollout,
+)
+from embomatrix.worker.processes import ProcessGoneError
+from embomatrix.worker.residents import LoadError, SlotLimits
+from embomatrix.worker.slots import SlotPool
+
+
+class Harness:
+    """A pool whose bundles are files that say how their scene behaves."""
+
+    def __init__(self, folder, *, slots=2, memory_mb=500.0, program=PROGRAM):
+        self.folder = folder
+        self.results = []
+        self.fetched = []
+        self.pool = SlotPool(
+            SlotLimits(slots, memory_mb, slot_memory_mb=256),
+            bundle_path=self._path,
+            on_result=self.results.append,
+            on_change=lambda: None,
+            log=folder / "simulator.log",
+            program=program,
+        )
+
+    async def _path(self, digest):
+        self.fetched.append(digest)
+        if digest == "unfetchable":
+            raise LoadError(InfraCode.BUNDLE_CORRUPT, "fetched twice and damaged twice")
+        path = self.folder / digest
+        path.write_text(digest.split("-")[0])
+        return path
+
+    def submit(self, lease_id, task="ok", digest="scene", deadline_s=10.0):
+        rollout = Rollout(lease_id, "g", digest, task, (), 1)
+        lease = Lease(LeaseRef(lease_id, 1), rollout, deadline_s)
+        self.pool.submit(lease)
+        return lease
+
+    async def until(self, condition, limit_s=15.0):
+        async with asyncio.timeout(limit_s):
+            while not condition():  # noqa: ASYNC110  # what is watched belongs to the pool
+                await asyncio.sleep(0.005)
+
+    async def outcomes(self, count):
+        await self.until(lambda: len(self.results) >= count)
+        return {result.ref.lease_id: result.outcome for result in self.results}
+
+    def state(self, digest):
+        return next(
+            (resident.state for resident in self.pool.residents() if resident.bundle_digest == digest), None
+        )
+
+
+@contextlib.asynccontextmanager
+async def running(folder, **options):
+    harness = Harness(folder, **options)
+    await harness.pool.start()
+    task = asyncio.create_task(harness.pool.run())
+    try:
+        yield harness
+    finally:
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+
+
+def _simulators(parent=None):
+    return psutil.Process(parent or os.getpid()).children(recursive=True)
+
+
+async def test_a_lease_is_executed_and_scored_in_another_process(tmp_path):
+    async with running(tmp_path) as harness:
+        harness.submit("l1")
+        outcome = (await harness.outcomes(1))["l1"]
+    assert isinstance(outcome, Completed)
+    assert outcome.reward.total == 30.7
+    assert outcome.trace_digest == "trace of l1"
+    assert str(os.getpid()) not in outcome.final[0]
+    assert not outcome.warm
+    assert outcome.timings.load_s > 0
+
+
+async def test_a_wanted_scene_is_warm_before_its_first_lease(tmp_path):
+    async with running(tmp_path) as harness:
+        harness.pool.want(["a", "b"])
+        await harness.until(lambda: harness.state("a") is harness.state("b") is ResidentState.WARM)
+        harness.submit("l1", digest="b")
+        outcome = (await harness.outcomes(1))["l1"]
+    assert outcome.warm
+    assert outcome.timings.load_s == 0.0
+
+
+async def test_a_slot_is_used_again_for_the_next_lease_of_its_scene(tmp_path):
+    async with running(tmp_path, slots=1) as harness:
+        for number in range(5):
+            harness.submit(f"l{number}")
+        outcomes = await harness.outcomes(5)
+    assert [outcome.final[0].split(" in ")[0] for outcome in outcomes.values()] == [
+        f"executed {number}" for number in range(1, 6)
+    ]
+
+
+async def test_two_slots_execute_one_scene_at_the_same_time(tmp_path):
+    async with running(tmp_path, slots=2) as harness:
+        harness.pool.want(["scene"])
+        await harness.until(lambda: harness.state("scene") is ResidentState.WARM)
+        started_s = time.monotonic()
+        harness.submit("l1", "slow")
+        harness.submit("l2", "slow")
+        await harness.outcomes(2)
+    assert time.monotonic() - started_s < 0.55
+
+
+async def test_a_lease_that_is_given_twice_is_executed_once(tmp_path):
+    async with running(tmp_path) as harness:
+        harness.submit("l1", "slow")
+        harness.submit("l1", "slow")
+        harness.submit("l2")
+        await harness.outcomes(2)
+        await asyncio.sleep(0.4)
+        assert sorted(result.ref.lease_id for result in harness.results) == ["l1", "l2"]
+
+
+async def test_a_crash_costs_one_rollout_and_the_next_one_finds_a_new_slot(tmp_path):
+    async with running(tmp_path, slots=1) as harness:
+        harness.submit("l1", "crash")
+        harness.submit("l2")
+        outcomes = await harness.outcomes(2)
+    assert outcomes["l1"] == InfraFailure(
+        InfraCode.SLOT_CRASHED, "the simulator ended during the rollout: killed by SIGSEGV"
+    )
+    assert isinstance(outcomes["l2"], Completed)
+    assert harness.fetched == ["scene"]
+
+
+async def test_a_rollout_that_hangs_is_killed_at_its_deadline_while_others_go_on(tmp_path):
+    async with running(tmp_path, slots=2) as harness:
+        harness.submit("stuck", "hang", deadline_s=0.4)
+        for number in range(20):
+            harness.submit(f"l{number}")
+        outcomes = await harness.outcomes(21)
+    assert outcomes["stuck"].code is InfraCode.SLOT_TIMEOUT
+    assert "longer than its 0.4 s" in outcomes["stuck"].message
+    assert all(isinstance(outcome, Completed) for name, outcome in outcomes.items() if name != "stuck")
+
+
+async def test_an_exception_during_a_rollout_is_a_failure_of_the_infrastructure_and_no_reward(tmp_path):
+    async with running(tmp_path) as harness:
+        harness.submit("l1", "raise")
+        outcome = (await harness.outcomes(1))["l1"]
+    assert outcome.code is InfraCode.SLOT_CRASHED
+    assert outcome.message.startswith("ArithmeticError: xxx")
+    assert len(outcome.message) == 500
+
+
+async def test_a_rollout_that_takes_too_much_memory_fails_alone(tmp_path):
+    async with running(tmp_path, slots=1) as harness:
+        harness.submit("l1", "greedy")
+        harness.submit("l2")
+        outcomes = await harness.outcomes(2)
+    assert outcomes["l1"].message.startswith("MemoryError")
+    assert isinstance(outcomes["l2"], Completed)
+
+
+async def test_a_scene_whose_process_died_is_loaded_anew_for_the_next_lease(tmp_path):
+    async with running(tmp_path, slots=1) as harness:
+        harness.submit("l1", "orphan")
+        harness.submit("l2")
+        outcomes = await harness.outcomes(2)
+    assert outcomes["l1"].code is InfraCode.SLOT_CRASHED
+    assert isinstance(outcomes["l2"], Completed)
+    assert harness.fetched == ["scene", "scene"]
+
+
+async def test_a_root_that_was_killed_is_started_anew(tmp_path):
+    async with running(tmp_path, slots=1) as harness:
+        harness.submit("l1")
+        await harness.outcomes(1)
+        [root] = psutil.Process().children()
+        root.kill()
+        root.wait(5)
+        harness.submit("l2", digest="other")
+        outcomes = await harness.outcomes(2)
+    assert isinstance(outcomes["l2"], Completed)
+
+
+@pytest.mark.parametrize(
+    ("digest", "code", "text"),
+    [
+        ("corrupt", InfraCode.BUNDLE_CORRUPT, "not what its digest says"),
+        ("impossible", InfraCode.SCENE_LOAD_FAILED, "a table without legs"),
+        ("crash", InfraCode.SCENE_LOAD_FAILED, "killed by SIGSEGV"),
+        ("unfetchable", InfraCode.BUNDLE_CORRUPT, "damaged twice"),
+    ],
+)
+async def test_a_scene_that_cannot_be_loaded_fails_its_leases_with_the_reason(tmp_path, digest, code, text):
+    async with running(tmp_path) as harness:
+        harness.submit("l1", digest=digest)
+        harness.submit("l2")
+        outcomes = await harness.outcomes(2)
+        assert harness.state(digest) is ResidentState.FAILED or harness.state(digest) is None
+    assert outcomes["l1"].code is code
+    assert text in outcomes["l1"].message
+    assert isinstance(outcomes["l2"], Completed)
+
+
+async def test_scenes_that_nobody_wants_are_evicted_when_memory_is_short(tmp_path):
+    async with running(tmp_path, memory_mb=100.0) as harness:
+        harness.pool.want(["large-1"])
+        await harness.until(lambda: harness.state("large-1") is ResidentState.WARM)
+        harness.pool.want(["large-2"])
+        await harness.until(lambda: harness.state("large-2") is ResidentState.WARM)
+        harness.pool.want(["large-3"])
+        await harness.until(lambda: harness.state("large-3") is ResidentState.WARM)
+        assert harness.state("large-1") is None
+        assert harness.pool.memory_used_mb <= 100.0
+
+
+async def test_a_cancelled_lease_gives_no_result_and_frees_its_slot(tmp_path):
+    async with running(tmp_path, slots=1) as harness:
+        stuck = harness.submit("stuck", "hang", deadline_s=60.0)
+        waiting = harness.submit("waiting", "hang", deadline_s=60.0)
+        harness.submit("l1")
+        await harness.until(lambda: harness.pool.load == 1.0)
+        harness.pool.cancel([stuck.ref, waiting.ref])
+        assert list(await harness.outcomes(1)) == ["l1"]
+        assert harness.pool.held() == ()
+
+
+async def test_cancelling_right_after_the_start_does_not_lose_the_slot(tmp_path):
+    async with running(tmp_path, slots=1) as harness:
+        harness.pool.want(["scene"])
+        await harness.until(lambda: harness.state("scene") is ResidentState.WARM)
+        for number in range(30):
+            lease = harness.submit(f"c{number}")
+            for _ in range(number % 4):
+                await asyncio.sleep(0)
+            harness.pool.cancel([lease.ref])
+        harness.submit("last")
+        await harness.until(lambda: any(result.ref.lease_id == "last" for result in harness.results))
+
+
+async def test_a_simulator_that_cannot_start_says_why(tmp_path):
+    harness = Harness(tmp_path, program=("env", "FAKE_SIMULATION=broken", *PROGRAM))
+    with pytest.raises(ProcessGoneError, match="the engine is missing: install it"):
+        await harness.pool.start()
+
+
+async def test_no_process_outlives_the_pool(tmp_path):
+    async with running(tmp_path) as harness:
+        harness.submit("l1")
+        await harness.outcomes(1)
+        processes = _simulators()
+        assert len(processes) >= 3
+    assert psutil.wait_procs(processes, timeout=5)[1] == []
+
+
+def test_no_process_outlives_a_daemon_that_was_killed(tmp_path):
+    program = (
+        "import asyncio, pathlib, sys\n"
+        "from tests.unit.worker.test_slots import running\n"
+        "async def main():\n"
+        "    async with running(pathlib.Path(sys.argv[1])) as harness:\n"
+        "        harness.submit('l1', 'hang', deadline_s=600)\n"
+        "        await harness.until(lambda: harness.pool.load > 0)\n"
+        "        await asyncio.sleep(0.3)\n"
+        "        print('up', flush=True)\n"
+        "        await asyncio.sleep(600)\n"
+        "asyncio.run(main())\n"
+    )
+    root = next(parent for parent in Path(__file__).parents if (parent / "pyproject.toml").exists())
+    daemon = subprocess.Popen(
+        [sys.executable, "-c", program, str(tmp_path)], stdout=subprocess.PIPE, cwd=root
+    )
+    assert daemon.stdout.readline() == b"up\n"
+    processes = _simulators(daemon.pid)
+    assert len(processes) >= 3
+    daemon.send_signal(signal.SIGKILL)
+    daemon.wait()
+    daemon.stdout.close()
+    assert psutil.wait_procs(processes, timeout=5)[1] == []
+
+
+def test_what_is_forked_has_imported_neither_grpc_nor_pydantic():
+    check = (
+        "import sys, embomatrix.worker.slot_program, threading\n"
+        "print([name for name in ('grpc', 'pydantic', 'torch', 'fastapi') if name in sys.modules], threading.active_count())"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", check], capture_output=True, text=True, check=True, timeout=60
+    )
+    assert result.stdout == "[] 1\n"

@@ -1,0 +1,74 @@
+"""The real simulation: bundles loaded into the physics engine, plans executed and scored there.
+
+The daemon starts it as ``python -m embomatrix.worker.physics FD PARENT``.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from embomatrix.reward.hierarchy import score
+from embomatrix.rpc.values import Completed, Timings
+from embomatrix.sim.bullet.client import pybullet
+from embomatrix.sim.executor import Simulator
+from embomatrix.worker.slot_program import BundleCorruptError, run_program
+from embomatrix.world.bundle import BundleError, decode_bundle
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from embomatrix.rpc.values import Rollout
+    from embomatrix.world.bundle import Bundle
+
+
+class UnknownTaskError(Exception):
+    """A rollout names a task that its bundle lacks."""
+
+
+class Physics:
+    """Loads bundles with PyBullet."""
+
+    def prepare(self) -> None:
+        """Import the engine; raises EngineError where it is not installed."""
+        pybullet()
+
+    def load(self, path: Path, digest: str) -> PhysicsScene:
+        try:
+            bundle = decode_bundle(path.read_bytes(), digest=digest)
+        except BundleError as error:
+            raise BundleCorruptError(str(error)) from error
+        return PhysicsScene(bundle)
+
+
+class PhysicsScene:
+    """A bundle's scene in the engine. Every execution starts from the scene as it was loaded."""
+
+    def __init__(self, bundle: Bundle) -> None:
+        self._tasks = bundle.tasks
+        self._simulator = Simulator(bundle)
+        for task in list(bundle.tasks.values())[:1]:
+            # An empty plan: what the simulator makes when it is first needed is made before the slots are forked.
+            self._simulator.execute(task, (), 0)
+            score(task, frozenset(), self._simulator.facts)
+
+    def execute(self, rollout: Rollout) -> Completed:
+        task = self._tasks.get(rollout.task_id)
+        if task is None:
+            raise UnknownTaskError(
+                f"bundle {rollout.bundle_digest} has no task {rollout.task_id!r}: "
+                f"it has {len(self._tasks)}; submit the digest of the task's own bundle"
+            )
+        trace = self._simulator.execute(task, rollout.plan, rollout.seed)
+        return Completed(
+            reward=score(task, trace.touched, self._simulator.facts),
+            steps=trace.steps,
+            final=trace.final,
+            trace_digest=trace.digest,
+            worker_id="",
+            timings=Timings(),
+            warm=True,
+        )
+
+
+if __name__ == "__main__":
+    run_program(Physics())

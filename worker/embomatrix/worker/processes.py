@@ -1,0 +1,199 @@
+"""The daemon's view of the simulator's processes: start the root, have children forked, ask them, end them."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import signal
+import socket
+import sys
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.sim.zygote import PREFIX_BYTES, Frame, frame_lengths, pack, unpack
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+SIMULATOR_PROGRAM: Final = (sys.executable, "-m", "embomatrix.worker.physics")
+START_S: Final = 60.0
+"""Limit for a root to import the engine, on a machine that is busy."""
+FORK_S: Final = 10.0
+REAP_S: Final = 5.0
+
+
+class ProcessGoneError(Exception):
+    """The process at the other end has died."""
+
+
+class Peer:
+    """Asks one process, one question at a time."""
+
+    def __init__(self, connection: socket.socket) -> None:
+        connection.setblocking(False)
+        self._connection = connection
+        self._turn = asyncio.Lock()
+
+    async def ask(self, frame: Frame) -> Frame:
+        """Send the frame with its descriptors and wait for the answer. Raises ProcessGoneError.
+
+        After a cancelled question the stream is out of step: the process must be ended.
+        """
+        async with self._turn:
+            try:
+                await self._send(frame)
+                return await self.hear()
+            except OSError as error:
+                raise ProcessGoneError(str(error)) from error
+
+    async def hear(self) -> Frame:
+        """The next frame that comes unasked."""
+        header_bytes, body_bytes = frame_lengths(await self._receive(PREFIX_BYTES))
+        return unpack(await self._receive(header_bytes + body_bytes), header_bytes)
+
+    def close(self) -> None:
+        self._connection.close()
+
+    async def _send(self, frame: Frame) -> None:
+        loop = asyncio.get_running_loop()
+        data = pack(frame)
+        if not frame.fds:
+            await loop.sock_sendall(self._connection, data)
+            return
+        # Requests with descriptors are a few bytes long and find the buffer empty: they never block.
+        sent = socket.send_fds(self._connection, [data], list(frame.fds))
+        await loop.sock_sendall(self._connection, data[sent:])
+
+    async def _receive(self, count: int) -> bytes:
+        loop = asyncio.get_running_loop()
+        parts = bytearray()
+        while len(parts) < count:
+            part = await loop.sock_recv(self._connection, count - len(parts))
+            if not part:
+                raise ProcessGoneError("its stream ended")
+            parts += part
+        return bytes(parts)
+
+
+class Zygote:
+    """A process that forks children: the root, or one that holds a scene."""
+
+    def __init__(self, peer: Peer) -> None:
+        self.peer = peer
+
+    async def fork(self) -> Child:
+        """Have a child forked and speak to it. Raises ProcessGoneError when the zygote has died or does not answer."""
+        ours, theirs = socket.socketpair()
+        try:
+            with theirs:
+                answer = await self._ask(Frame({"op": "fork"}, fds=(os.dup(theirs.fileno()),)), FORK_S)
+        except BaseException:
+            ours.close()
+            raise
+        return Child(self, Peer(ours), int(answer.header["pid"]))
+
+    async def reap(self, pid: int) -> str:
+        """Collect a child that has ended and say how."""
+        answer = await self._ask(Frame({"op": "reap", "pid": pid}), REAP_S)
+        return describe_status(int(answer.header["status"]))
+
+    async def _ask(self, frame: Frame, limit_s: float) -> Frame:
+        """Ask to the end even when the caller is cancelled: other slots depend on this stream staying in step."""
+        question = asyncio.create_task(self._ask_and_close(frame))
+        try:
+            async with asyncio.timeout(limit_s):
+                return await asyncio.shield(question)
+        except TimeoutError as error:
+            raise ProcessGoneError(f"it did not answer within {limit_s:g} s") from error
+
+    async def _ask_and_close(self, frame: Frame) -> Frame:
+        try:
+            return await self.peer.ask(frame)
+        finally:
+            for fd in frame.fds:
+                os.close(fd)
+
+
+class Child(Zygote):
+    """A forked process: it answers, and it may fork children of its own."""
+
+    def __init__(self, parent: Zygote, peer: Peer, pid: int) -> None:
+        super().__init__(peer)
+        self.pid = pid
+        self._parent = parent
+
+    async def end(self) -> str:
+        """Kill the process, whatever it does, and say how it ended; one that had died before keeps its own reason."""
+        self.peer.close()
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(self.pid, signal.SIGKILL)
+        try:
+            return await self._parent.reap(self.pid)
+        except ProcessGoneError:
+            return "died with the process that it was forked from"
+
+
+class Root(Zygote):
+    """The process that imported the engine, spawned afresh: nothing of the daemon's threads or locks is in it."""
+
+    def __init__(self, peer: Peer, process: asyncio.subprocess.Process, memory_mb: float) -> None:
+        super().__init__(peer)
+        self.memory_mb = memory_mb
+        self._process = process
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    async def end(self) -> None:
+        """Kill it; its children die with it."""
+        self.peer.close()
+        with contextlib.suppress(ProcessLookupError):
+            self._process.kill()
+        await self._process.wait()
+
+
+async def start_root(log: Path, program: tuple[str, ...] = SIMULATOR_PROGRAM) -> Root:
+    """Spawn the root and wait until it has imported the engine. Raises ProcessGoneError with the reason.
+
+    What the engine prints goes to ``log``: Bullet writes warnings to standard output.
+    """
+    ours, theirs = socket.socketpair()
+    # Huge pages halve the time of a fork; the C library reads this before the first line of Python runs.
+    environment = {
+        **os.environ,
+        "GLIBC_TUNABLES": "glibc.malloc.hugetlb=1",
+        "OMP_NUM_THREADS": "1",
+        "OPENBLAS_NUM_THREADS": "1",
+    }
+    with theirs, log.open("ab") as output:
+        process = await asyncio.create_subprocess_exec(
+            *program,
+            str(theirs.fileno()),
+            str(os.getpid()),
+            pass_fds=(theirs.fileno(),),
+            env=environment,
+            stdin=asyncio.subprocess.DEVNULL,
+            stdout=output,
+            stderr=output,
+            # Ctrl-C reaches every process of the terminal's group: the simulator must outlive a drain.
+            start_new_session=True,
+        )
+    peer = Peer(ours)
+    try:
+        async with asyncio.timeout(START_S):
+            answer = await peer.hear()
+    except (ProcessGoneError, TimeoutError, OSError) as error:
+        await Root(peer, process, 0.0).end()
+        raise ProcessGoneError(f"the simulator did not start: {error}; its output is in {log}") from error
+    if "error" in answer.header:
+        await Root(peer, process, 0.0).end()
+        raise ProcessGoneError(str(answer.header["error"]))
+    return Root(peer, process, float(answer.header["memory_mb"]))
+
+
+def describe_status(status: int) -> str:
+    """A wait status in words."""
+    if os.WIFSIGNALED(status):
+        return f"killed by {signal.Signals(os.WTERMSIG(status)).name}"
+    return f"exited with status {os.WEXITSTATUS(status)}"

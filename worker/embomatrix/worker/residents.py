@@ -1,0 +1,268 @@
+"""The scenes that a worker holds: fetched, loaded into processes of their own, evicted when memory is short."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.rpc.values import InfraCode, Resident, ResidentState
+from embomatrix.sim.zygote import Frame
+from embomatrix.worker.processes import SIMULATOR_PROGRAM, ProcessGoneError, start_root
+from embomatrix.worker.residency import Held, decide, surplus
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Sequence
+    from pathlib import Path
+
+    from embomatrix.worker.processes import Child, Root
+
+logger = logging.getLogger(__name__)
+
+LOAD_S: Final = 60.0
+"""Limit for fetching and loading one scene."""
+RETRY_LOAD_S: Final = 5.0
+"""A scene that could not be loaded is tried again after this long, while it is still wanted."""
+
+
+class LoadError(Exception):
+    """A scene that can't be loaded, with the code that tells the manager why."""
+
+    def __init__(self, code: InfraCode, message: str) -> None:
+        super().__init__(message)
+        self.code = code
+
+
+@dataclass(frozen=True, slots=True)
+class SlotLimits:
+    """What a worker may use. ``memory_mb`` is for all residents; one rollout may allocate ``slot_memory_mb``."""
+
+    slots: int
+    memory_mb: float
+    slot_memory_mb: int = 2048
+
+
+@dataclass(slots=True)
+class Slot:
+    """A forked process that executes rollouts."""
+
+    child: Child
+    rollouts: int = 0
+    first_mb: float = 0.0
+
+
+@dataclass(slots=True, eq=False)
+class Scene:
+    """A scene that is loading, warm or failed. ``idle`` are slots that wait for its next rollout."""
+
+    digest: str
+    state: ResidentState = ResidentState.LOADING
+    child: Child | None = None
+    load_s: float = 0.0
+    memory_mb: float = 0.0
+    error: str = ""
+    code: InfraCode = InfraCode.SCENE_LOAD_FAILED
+    failed_s: float = 0.0
+    last_used: int = 0
+    running: int = 0
+    idle: list[Slot] = field(default_factory=list)
+
+    async def take_slot(self) -> Slot:
+        """An idle slot, or a new fork of the scene. Raises ProcessGoneError when the scene's process has died."""
+        if self.idle:
+            return self.idle.pop()
+        if self.child is None:
+            raise ProcessGoneError("the scene was evicted")
+        return Slot(await self.child.fork())
+
+
+class Residents:
+    """Owns the simulator's root and the scenes' processes.
+
+    ``bundle_path`` brings a bundle to disk and raises LoadError when it can't. ``on_change`` is called with each scene
+    that was loaded, failed, evicted or lost.
+    """
+
+    def __init__(
+        self,
+        limits: SlotLimits,
+        *,
+        bundle_path: Callable[[str], Awaitable[Path]],
+        on_change: Callable[[Scene], None],
+        log: Path,
+        program: tuple[str, ...] = SIMULATOR_PROGRAM,
+    ) -> None:
+        self._limits = limits
+        self._bundle_path = bundle_path
+        self._on_change = on_change
+        self._log = log
+        self._program = program
+        self._root: Root | None = None
+        self._root_turn = asyncio.Lock()
+        self._scenes: dict[str, Scene] = {}
+        self._known_mb: dict[str, float] = {}
+        self._ending: set[asyncio.Task[str]] = set()
+
+    @property
+    def memory_used_mb(self) -> float:
+        """Private memory of the scenes' processes."""
+        return sum(scene.memory_mb for scene in self._scenes.values())
+
+    def report(self) -> tuple[Resident, ...]:
+        return tuple(
+            Resident(scene.digest, scene.state, scene.load_s, scene.memory_mb, scene.error)
+            for scene in self._scenes.values()
+        )
+
+    def warm(self, digest: str) -> Scene | None:
+        """The scene, if rollouts can be executed in it now."""
+        scene = self._scenes.get(digest)
+        return scene if scene is not None and scene.state is ResidentState.WARM else None
+
+    def failed(self) -> bool:
+        """Whether a scene waits to be tried again."""
+        return any(scene.state is ResidentState.FAILED for scene in self._scenes.values())
+
+    def retry(self, digest: str) -> None:
+        """Forget that this scene could not be loaded."""
+        scene = self._scenes.get(digest)
+        if scene is not None and scene.state is ResidentState.FAILED:
+            del self._scenes[digest]
+
+    async def start(self) -> None:
+        """Start the root. Raises ProcessGoneError with the reason when the engine can't be imported."""
+        await self._ready_root()
+
+    async def close(self) -> None:
+        """End every process."""
+        if self._root is not None:
+            await self._root.end()
+        await asyncio.gather(*self._ending)
+
+    def settle(self, wanted: Sequence[str], tasks: asyncio.TaskGroup) -> None:
+        """Evict what is too much, and begin to load what is wanted: as many at a time as there are slots."""
+        now_s = time.monotonic()
+        for scene in list(self._scenes.values()):
+            over = scene.digest not in wanted or now_s - scene.failed_s > RETRY_LOAD_S
+            if scene.state is ResidentState.FAILED and over:
+                del self._scenes[scene.digest]
+        budget_mb = self._limits.memory_mb
+        for digest in surplus(wanted, self._held(), budget_mb=budget_mb):
+            self._evict(digest)
+        while self._loading() < self._limits.slots:
+            refused = self._scenes.keys() - self._held().keys()
+            decision = decide(
+                wanted, self._held(), budget_mb=budget_mb, known_mb=self._known_mb, refused=refused
+            )
+            for digest in decision.evict:
+                self._evict(digest)
+            if not decision.load:
+                break
+            scene = Scene(decision.load, memory_mb=self._known_mb.get(decision.load, 0.0))
+            self._scenes[scene.digest] = scene
+            self._on_change(scene)
+            tasks.create_task(self._load(scene))
+
+    def lost(self, scene: Scene) -> None:
+        """The scene's process has died: drop the scene, so that it is loaded anew when it is wanted."""
+        if self.keeps(scene):
+            logger.warning("scene lost scene=%s: its process died", scene.digest)
+            self._drop(scene)
+
+    def keeps(self, scene: Scene) -> bool:
+        """Whether this very scene is still held, not evicted or loaded anew."""
+        return self._scenes.get(scene.digest) is scene
+
+    def end_later(self, child: Child) -> None:
+        """Kill a process without waiting for its end."""
+        task = asyncio.create_task(child.end())
+        self._ending.add(task)
+        task.add_done_callback(self._ending.discard)
+
+    def _held(self) -> dict[str, Held]:
+        return {
+            scene.digest: Held(
+                scene.memory_mb, scene.last_used, scene.running > 0 or scene.state is ResidentState.LOADING
+            )
+            for scene in self._scenes.values()
+            if scene.state is not ResidentState.FAILED
+        }
+
+    def _loading(self) -> int:
+        return sum(scene.state is ResidentState.LOADING for scene in self._scenes.values())
+
+    async def _load(self, scene: Scene) -> None:
+        started_s = time.monotonic()
+        try:
+            async with asyncio.timeout(LOAD_S):
+                await self._load_child(scene)
+        except (LoadError, ProcessGoneError, TimeoutError, OSError) as error:
+            scene.state, scene.failed_s, scene.memory_mb = ResidentState.FAILED, time.monotonic(), 0.0
+            scene.code = error.code if isinstance(error, LoadError) else InfraCode.SCENE_LOAD_FAILED
+            late = f"it took longer than {LOAD_S:g} s"
+            scene.error = late if isinstance(error, TimeoutError) else str(error)
+            logger.warning("scene not loaded scene=%s: %s", scene.digest, scene.error)
+        else:
+            scene.state, scene.load_s = ResidentState.WARM, time.monotonic() - started_s
+            self._known_mb[scene.digest] = scene.memory_mb
+            logger.info(
+                "scene warm scene=%s in %.0f ms, %.1f MB", scene.digest, scene.load_s * 1e3, scene.memory_mb
+            )
+        self._on_change(scene)
+
+    async def _load_child(self, scene: Scene) -> None:
+        path = await self._bundle_path(scene.digest)
+        child = await self._fork_scene()
+        request = {
+            "path": str(path),
+            "digest": scene.digest,
+            "slot_memory_mb": self._limits.slot_memory_mb,
+        }
+        try:
+            answer = await child.peer.ask(Frame(request))
+        except ProcessGoneError as error:
+            how = await child.end()
+            raise ProcessGoneError(f"the simulator ended while loading it: {how}") from error
+        except BaseException:
+            self.end_later(child)
+            raise
+        if "error" in answer.header:
+            await child.end()
+            raise LoadError(InfraCode(answer.header["code"]), answer.header["error"])
+        scene.child = child
+        scene.memory_mb = float(answer.header["memory_mb"])
+
+    async def _fork_scene(self) -> Child:
+        root = await self._ready_root()
+        try:
+            return await root.fork()
+        except ProcessGoneError:
+            logger.warning("the simulator's root process died: starting it anew")
+            async with self._root_turn:
+                if self._root is root:
+                    await root.end()
+                    self._root = None
+            return await (await self._ready_root()).fork()
+
+    async def _ready_root(self) -> Root:
+        async with self._root_turn:
+            if self._root is None:
+                self._root = await start_root(self._log, self._program)
+            return self._root
+
+    def _evict(self, digest: str) -> None:
+        logger.info("scene evicted scene=%s", digest)
+        self._drop(self._scenes[digest])
+
+    def _drop(self, scene: Scene) -> None:
+        """Forget a scene and end its process; its slots die with it."""
+        del self._scenes[scene.digest]
+        for slot in scene.idle:
+            slot.child.peer.close()
+        scene.idle.clear()
+        if scene.child is not None:
+            self.end_later(scene.child)
+            scene.child = None
+        self._on_change(scene)

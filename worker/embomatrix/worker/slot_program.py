@@ -1,0 +1,113 @@
+"""What runs in the simulator's processes: a root that imported the engine, forks of it that hold one scene each, and
+forks of those, the slots, that execute rollouts.
+
+``embomatrix.worker.physics`` runs it with the real engine. It imports neither gRPC nor anything else that starts
+threads: a thread does not survive a fork, but the locks that it held do.
+"""
+
+from __future__ import annotations
+
+import signal
+import socket
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Protocol
+
+from embomatrix.proto.v1 import types_pb2
+from embomatrix.rpc.convert import completed_to_proto, rollout_from_proto
+from embomatrix.rpc.values import InfraCode
+from embomatrix.sim.zygote import (
+    Frame,
+    die_with_parent,
+    limit_memory,
+    private_mb,
+    receive,
+    resident_mb,
+    send,
+    serve_forks,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from embomatrix.rpc.values import Completed, Rollout
+
+MAX_ERROR_CHARS: Final = 500
+
+
+class LoadedScene(Protocol):
+    """A scene in memory, ready to execute plans. It leaves nothing behind from one rollout to the next."""
+
+    def execute(self, rollout: Rollout) -> Completed: ...
+
+
+class Simulation(Protocol):
+    """Where scenes come from: the physics engine, or a test's stand-in."""
+
+    def prepare(self) -> None:
+        """Import and connect whatever every scene needs, before the first fork."""
+
+    def load(self, path: Path, digest: str) -> LoadedScene:
+        """Load the bundle in this file. Raises BundleCorruptError when the content is not what the digest says."""
+
+
+class BundleCorruptError(Exception):
+    """The bundle's content is damaged: fetch it again."""
+
+
+def run_program(simulation: Simulation) -> None:
+    """Serve as root until the daemon goes away. Arguments: the control socket's descriptor, the daemon's process id."""
+    die_with_parent(int(sys.argv[2]))
+    # Ctrl-C is for the daemon: it drains first, and ends this process when it is done.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    control = socket.socket(fileno=int(sys.argv[1]))
+    try:
+        simulation.prepare()
+    except Exception as error:  # noqa: BLE001  # the daemon tells the person
+        send(control, Frame(_failure(InfraCode.SCENE_LOAD_FAILED, error)))
+        return
+    send(control, Frame({"memory_mb": private_mb()}))
+    serve_forks(control, lambda connection: _hold_scene(simulation, connection))
+
+
+def _hold_scene(simulation: Simulation, connection: socket.socket) -> None:
+    """Load the scene that the first frame names, then fork slots from it. It executes nothing itself: it stays pristine."""
+    request = receive(connection)
+    if request is None:
+        return
+    started_s = time.perf_counter()
+    try:
+        scene = simulation.load(Path(request.header["path"]), request.header["digest"])
+    except BundleCorruptError as error:
+        send(connection, Frame(_failure(InfraCode.BUNDLE_CORRUPT, error)))
+        return
+    except Exception as error:  # noqa: BLE001  # a scene that can't be loaded is a result
+        send(connection, Frame(_failure(InfraCode.SCENE_LOAD_FAILED, error)))
+        return
+    load_s = time.perf_counter() - started_s
+    send(connection, Frame({"load_s": load_s, "memory_mb": private_mb()}))
+    memory_mb = int(request.header["slot_memory_mb"])
+    serve_forks(connection, lambda slot: _run_slot(scene, slot, memory_mb))
+
+
+def _run_slot(scene: LoadedScene, connection: socket.socket, memory_mb: int) -> None:
+    """Execute rollouts, one after another, until the daemon closes the stream."""
+    limit_memory(memory_mb)
+    while (request := receive(connection)) is not None:
+        send(connection, _answer(scene, request.body))
+
+
+def _answer(scene: LoadedScene, body: bytes) -> Frame:
+    started_s = time.perf_counter()
+    try:
+        completed = scene.execute(rollout_from_proto(types_pb2.Rollout.FromString(body)))
+        result = completed_to_proto(completed).SerializeToString()
+    except Exception as error:  # noqa: BLE001  # a defect is a failure of the infrastructure, never a reward
+        return Frame(_failure(InfraCode.SLOT_CRASHED, error))
+    return Frame({"execute_s": time.perf_counter() - started_s, "resident_mb": resident_mb()}, result)
+
+
+def _failure(code: InfraCode, error: Exception) -> Mapping[str, Any]:
+    text = f"{type(error).__name__}: {error}"
+    return {"code": code.value, "error": text[:MAX_ERROR_CHARS]}

@@ -1,0 +1,252 @@
+"""The worker's slots: leases wait for their scene and a free permit, run in a process, and end in one result."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import time
+from collections import deque
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.proto.v1 import types_pb2
+from embomatrix.rpc.convert import completed_from_proto, rollout_to_proto
+from embomatrix.rpc.values import InfraCode, InfraFailure, LeaseResult, ResidentState, Timings
+from embomatrix.sim.zygote import Frame
+from embomatrix.worker.processes import SIMULATOR_PROGRAM, ProcessGoneError
+from embomatrix.worker.residents import Residents
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Iterable
+    from pathlib import Path
+
+    from embomatrix.rpc.values import Completed, Lease, LeaseRef, Resident
+    from embomatrix.worker.residents import Scene, Slot, SlotLimits
+
+logger = logging.getLogger(__name__)
+
+ROLLOUTS_PER_SLOT: Final = 5_000
+GROWTH_MB: Final = 128.0
+"""A slot's process is replaced after this many rollouts, or when it has grown by this much."""
+RETRY_CHECK_S: Final = 1.0
+
+
+@dataclass(slots=True, eq=False)
+class _Ticket:
+    """A lease that waits or runs here."""
+
+    lease: Lease
+    taken_s: float
+    found_warm: bool
+    requeued: bool = False
+    task: asyncio.Task[None] | None = None
+
+    @property
+    def digest(self) -> str:
+        return self.lease.rollout.bundle_digest
+
+
+class SlotPool:
+    """Executes leases. Each one that is submitted ends in exactly one result, unless it is cancelled.
+
+    ``bundle_path`` brings a bundle to disk and raises LoadError when it can't; ``on_result`` takes the results;
+    ``on_change`` is called when residents changed.
+    """
+
+    def __init__(
+        self,
+        limits: SlotLimits,
+        *,
+        bundle_path: Callable[[str], Awaitable[Path]],
+        on_result: Callable[[LeaseResult], None],
+        on_change: Callable[[], None],
+        log: Path,
+        program: tuple[str, ...] = SIMULATOR_PROGRAM,
+    ) -> None:
+        self._limits = limits
+        self._on_result = on_result
+        self._on_change = on_change
+        self._residents = Residents(
+            limits, bundle_path=bundle_path, on_change=self._scene_changed, log=log, program=program
+        )
+        self._wanted: tuple[str, ...] = ()
+        self._waiting: deque[_Ticket] = deque()
+        self._tickets: dict[LeaseRef, _Ticket] = {}
+        self._running = 0
+        self._clock = 0
+        self._wake = asyncio.Event()
+
+    @property
+    def load(self) -> float:
+        """Share of the slots that execute something, 0 to 1."""
+        return self._running / self._limits.slots
+
+    @property
+    def memory_used_mb(self) -> float:
+        return self._residents.memory_used_mb
+
+    def residents(self) -> tuple[Resident, ...]:
+        return self._residents.report()
+
+    def held(self) -> tuple[LeaseRef, ...]:
+        """Leases that wait or run here: those to renew."""
+        return tuple(self._tickets)
+
+    def want(self, digests: Iterable[str]) -> None:
+        """Replace the scenes that should be resident, the most urgent first."""
+        self._wanted = tuple(dict.fromkeys(digests))
+        self._wake.set()
+
+    def submit(self, lease: Lease) -> None:
+        """Execute this lease when a slot is free and its scene is warm. One that is held already is left alone."""
+        if lease.ref in self._tickets:
+            return
+        digest = lease.rollout.bundle_digest
+        ticket = _Ticket(lease, time.monotonic(), self._residents.warm(digest) is not None)
+        self._residents.retry(digest)
+        self._tickets[lease.ref] = ticket
+        self._waiting.append(ticket)
+        self._wake.set()
+
+    def cancel(self, refs: Iterable[LeaseRef]) -> None:
+        """Forget these leases; what runs is killed, and none of them gives a result."""
+        for ref in refs:
+            ticket = self._tickets.pop(ref, None)
+            if ticket is None:
+                continue
+            if ticket.task is None:
+                self._waiting.remove(ticket)
+            else:
+                ticket.task.cancel()
+        self._wake.set()
+
+    def cancel_all(self) -> None:
+        self.cancel(self.held())
+
+    async def start(self) -> None:
+        """Start the simulator. Raises ProcessGoneError with the reason when that can't be."""
+        await self._residents.start()
+
+    async def run(self) -> None:
+        """Load, evict and execute until cancelled; then every process is ended."""
+        try:
+            async with asyncio.TaskGroup() as tasks:
+                while True:
+                    await self._wait_for_work()
+                    leased = (ticket.digest for ticket in self._waiting)
+                    # Scenes of leases that wait come before those that are only announced.
+                    self._residents.settle(tuple(dict.fromkeys((*leased, *self._wanted))), tasks)
+                    self._start_leases(tasks)
+        finally:
+            await self._residents.close()
+
+    async def _wait_for_work(self) -> None:
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(RETRY_CHECK_S if self._residents.failed() else None):
+                await self._wake.wait()
+        self._wake.clear()
+
+    def _scene_changed(self, scene: Scene) -> None:
+        if scene.state is ResidentState.FAILED:
+            for ticket in [ticket for ticket in self._waiting if ticket.digest == scene.digest]:
+                self._waiting.remove(ticket)
+                self._finish(ticket, InfraFailure(scene.code, f"scene {scene.digest}: {scene.error}"))
+        self._on_change()
+        self._wake.set()
+
+    def _start_leases(self, tasks: asyncio.TaskGroup) -> None:
+        for ticket in list(self._waiting):
+            if self._running >= self._limits.slots:
+                return
+            scene = self._residents.warm(ticket.digest)
+            if scene is None:
+                continue
+            self._waiting.remove(ticket)
+            self._clock += 1
+            scene.last_used = self._clock
+            scene.running += 1
+            self._running += 1
+            ticket.task = tasks.create_task(self._run_lease(ticket, scene))
+            # A task that is cancelled before its first step runs no `finally` of its own.
+            ticket.task.add_done_callback(lambda _, scene=scene: self._release(scene))
+
+    def _release(self, scene: Scene) -> None:
+        scene.running -= 1
+        self._running -= 1
+        self._wake.set()
+
+    async def _run_lease(self, ticket: _Ticket, scene: Scene) -> None:
+        outcome: Completed | InfraFailure | None
+        try:
+            outcome = await self._execute(ticket, scene)
+        except Exception as error:
+            logger.exception("defect while executing lease=%s", ticket.lease.ref.lease_id)
+            outcome = InfraFailure(InfraCode.SLOT_CRASHED, f"{type(error).__name__}: {error}"[:500])
+        if outcome is not None:
+            self._finish(ticket, outcome)
+
+    async def _execute(self, ticket: _Ticket, scene: Scene) -> Completed | InfraFailure | None:
+        """Run the rollout in a slot of its scene; None when the scene had died and the lease waits again."""
+        started_s = time.monotonic()
+        try:
+            slot = await scene.take_slot()
+        except ProcessGoneError:
+            return self._scene_died(ticket, scene)
+        body = rollout_to_proto(ticket.lease.rollout).SerializeToString()
+        try:
+            async with asyncio.timeout(ticket.lease.deadline_s):
+                answer = await slot.child.peer.ask(Frame({"op": "execute"}, body))
+        except TimeoutError:
+            self._residents.end_later(slot.child)
+            late = f"the rollout took longer than its {ticket.lease.deadline_s:g} s and was killed"
+            return InfraFailure(InfraCode.SLOT_TIMEOUT, late)
+        except ProcessGoneError:
+            how = await slot.child.end()
+            return InfraFailure(InfraCode.SLOT_CRASHED, f"the simulator ended during the rollout: {how}")
+        except asyncio.CancelledError:
+            self._residents.end_later(slot.child)
+            raise
+        return self._outcome(ticket, scene, slot, answer, started_s)
+
+    def _outcome(
+        self, ticket: _Ticket, scene: Scene, slot: Slot, answer: Frame, started_s: float
+    ) -> Completed | InfraFailure:
+        header = answer.header
+        if "error" in header:
+            # What an exception left behind in the process is unknown.
+            self._residents.end_later(slot.child)
+            return InfraFailure(InfraCode(header["code"]), header["error"])
+        if _worn(slot, float(header["resident_mb"])) or not self._residents.keeps(scene):
+            self._residents.end_later(slot.child)
+        else:
+            scene.idle.append(slot)
+        timings = Timings(
+            queued_s=started_s - ticket.taken_s,
+            load_s=0.0 if ticket.found_warm else scene.load_s,
+            execute_s=float(header["execute_s"]),
+        )
+        completed = completed_from_proto(types_pb2.Completed.FromString(answer.body))
+        return replace(completed, timings=timings, warm=ticket.found_warm)
+
+    def _scene_died(self, ticket: _Ticket, scene: Scene) -> InfraFailure | None:
+        """Have the scene loaded anew for this lease, once."""
+        self._residents.lost(scene)
+        if ticket.requeued:
+            return InfraFailure(
+                InfraCode.SLOT_CRASHED, "the scene's process died twice before the rollout began"
+            )
+        ticket.requeued, ticket.found_warm, ticket.task = True, False, None
+        self._waiting.appendleft(ticket)
+        return None
+
+    def _finish(self, ticket: _Ticket, outcome: Completed | InfraFailure) -> None:
+        if self._tickets.pop(ticket.lease.ref, None) is not None:
+            self._on_result(LeaseResult(ticket.lease.ref, outcome))
+
+
+def _worn(slot: Slot, resident_mb: float) -> bool:
+    """Count a rollout, and tell whether the slot has done enough."""
+    slot.rollouts += 1
+    slot.first_mb = slot.first_mb or resident_mb
+    return slot.rollouts >= ROLLOUTS_PER_SLOT or resident_mb > slot.first_mb + GROWTH_MB
