@@ -1,0 +1,245 @@
+"""Build the catalog's package data from the ``bddl`` package: ``python -m embomatrix.factory.catalog_tables --out FOLDER``.
+
+BEHAVIOR-1K's knowledge base (``bddl`` 3.6.0, MIT) knows the box of every object model, the mass and the abilities of
+their categories, and the room-by-room inventories of 51 scenes. What the project needs of its 28 MB is written as two
+small tables, byte for byte the same on every run, beside the notice that the licence asks for.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import gzip
+import importlib.metadata
+import importlib.util
+import json
+import statistics
+from collections import defaultdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+Json = Any
+
+BDDL_VERSION: Final = "3.6.0"
+CATALOG_FILE: Final = "catalog.json.gz"
+SCENES_FILE: Final = "scenes.json.gz"
+NOTICE_FILE: Final = "NOTICE.md"
+
+DOORS: Final = frozenset({"door", "sliding_door", "garage_door", "elevator_door", "gate"})
+WINDOWS: Final = frozenset({"openable_window", "fixed_window"})
+STRUCTURE: Final = frozenset({"walls", "floors", "ceilings", "lawn", "driveway"})
+"""Categories of the building itself: its panels and its ground, which a scene lays out anew."""
+
+UNIVERSAL: Final = frozenset(
+    {
+        "disinfectable", "dustyable", "grassyable", "moldyable", "nonSubstance", "rustable", "scratchable",
+        "stainable", "stickyable", "tarnishable", "wetable", "wrinkleable",
+    }
+)  # fmt: skip
+"""Abilities that every solid thing has: they tell nothing apart and would double the table."""
+
+
+class SourceError(Exception):
+    """The ``bddl`` package is missing or is not the version that the tables are derived from."""
+
+
+def source_folder() -> Path:
+    """Folder of the installed package's generated data. Raises SourceError when it is absent or another version."""
+    spec = importlib.util.find_spec("bddl")
+    if spec is None or spec.origin is None:
+        raise SourceError(f"the package bddl is not installed: try `pip install bddl=={BDDL_VERSION}`")
+    found = importlib.metadata.version("bddl")
+    if found != BDDL_VERSION:
+        raise SourceError(f"bddl is {found}, the tables come from {BDDL_VERSION}: install that version")
+    return Path(spec.origin).parent / "generated_data"
+
+
+def build_catalog(folder: Path) -> Json:
+    """Synsets (children, abilities), categories (synset, mass) and models (box in m, meta links).
+
+    Categories are solid things only: the 601 others are particle meshes of substances, which have no mass either.
+    """
+    inventory = _read_json(folder / "object_inventory.json")
+    synsets = _taxonomy(_read_json(folder / "output_hierarchy.json"))
+    for synset, abilities in _read_json(folder / "propagated_annots_params.json").items():
+        if synset in synsets:
+            synsets[synset]["abilities"] = _abilities(abilities)
+    masses = _masses(folder / "category_mapping.csv")
+    categories: dict[str, Json] = {}
+    for synset, entry in synsets.items():
+        for category in entry.pop("categories"):
+            categories[category] = {"synset": synset, "mass_kg": masses[category], "models": {}}
+    for asset_id in inventory["providers"]:
+        category, model = asset_id.rsplit("-", 1)
+        if category in categories:
+            size = [round(extent, 4) for extent in inventory["bounding_box_sizes"][model]]
+            links = sorted(set(inventory["meta_links"].get(asset_id, [])) - {"collision"})
+            categories[category]["models"][model] = [*size, links] if links else size
+    return {"source": f"bddl {BDDL_VERSION}", "synsets": synsets, "categories": categories}
+
+
+def _taxonomy(root: Json) -> dict[str, Json]:
+    synsets: dict[str, Json] = {}
+
+    def visit(node: Json) -> None:
+        entry = synsets.setdefault(node["name"], {"children": set(), "categories": set()})
+        entry["categories"].update(node.get("categories", []))
+        for child in node.get("children", []):
+            entry["children"].add(child["name"])
+            visit(child)
+
+    visit(root)
+    return {
+        name: {key: sorted(values) for key, values in entry.items()}
+        for name, entry in sorted(synsets.items())
+    }
+
+
+def _abilities(raw: Mapping[str, Mapping[str, Json]]) -> dict[str, dict[str, float]]:
+    """Keep what tells things apart, with the parameters that are numbers."""
+    return {
+        ability: {name: float(value) for name, value in parameters.items() if isinstance(value, (int, float))}
+        for ability, parameters in raw.items()
+        if ability not in UNIVERSAL
+    }
+
+
+def _masses(path: Path) -> dict[str, float]:
+    with path.open(newline="", encoding="utf-8") as file:
+        return {
+            row["category"]: float(row["mass (auto)"]) for row in csv.DictReader(file) if row["mass (auto)"]
+        }
+
+
+def build_scenes(folder: Path) -> Json:
+    """Inventories of all scenes: per room its floor (m) and the models of doors, windows and objects with counts."""
+    boxes = _read_json(folder / "object_inventory.json")["bounding_box_sizes"]
+    scenes = _read_json(folder / "combined_room_object_list.json")["scenes"]
+    typical = _typical_floors(scenes, boxes)
+    return {
+        "source": f"bddl {BDDL_VERSION}",
+        "scenes": {scene_id: _scene(rooms, boxes, typical) for scene_id, rooms in scenes.items()},
+    }
+
+
+def _scene(rooms: Json, boxes: Json, typical: Mapping[str, list[float]]) -> Json:
+    panels = {
+        asset_id: boxes[asset_id.rsplit("-", 1)[1]]
+        for models in rooms.values()
+        for asset_id in models
+        if _category(asset_id) == "walls"
+    }
+    return {
+        "walls": [[round(extent, 3) for extent in panels[name]] for name in sorted(panels)],
+        "rooms": {name: _room(name, models, boxes, typical) for name, models in rooms.items()},
+    }
+
+
+def _room(name: str, models: Mapping[str, int], boxes: Json, typical: Mapping[str, list[float]]) -> Json:
+    floors = _floors(models, boxes)
+    room_type = _room_type(name)
+    room = {
+        "type": room_type,
+        "floors": floors or [typical[room_type]],
+        "doors": _pick(models, DOORS),
+        "windows": _pick(models, WINDOWS),
+        "objects": {key: n for key, n in models.items() if _category(key) not in DOORS | WINDOWS | STRUCTURE},
+    }
+    return room if floors else {**room, "floor_estimated": True}
+
+
+def _pick(models: Mapping[str, int], categories: frozenset[str]) -> dict[str, int]:
+    return {asset_id: count for asset_id, count in models.items() if _category(asset_id) in categories}
+
+
+def _floors(models: Iterable[str], boxes: Json) -> list[list[float]]:
+    """Depth and width of a room's floor models, the largest first."""
+    sizes = [boxes[key.rsplit("-", 1)[1]] for key in models if _category(key) == "floors"]
+    return sorted(([round(size[0], 3), round(size[1], 3)] for size in sizes), key=lambda s: (-s[0] * s[1], s))
+
+
+def _typical_floors(scenes: Json, boxes: Json) -> dict[str, list[float]]:
+    """Median floor of each room type: the size of the eleven rooms whose inventory lists no floor."""
+    seen: dict[str, list[list[float]]] = defaultdict(list)
+    for rooms in scenes.values():
+        for name, models in rooms.items():
+            seen[_room_type(name)].extend(_floors(models, boxes)[:1])
+    return {
+        room_type: [round(statistics.median(size[axis] for size in sizes), 3) for axis in (0, 1)]
+        for room_type, sizes in seen.items()
+        if sizes
+    }
+
+
+def _category(asset_id: str) -> str:
+    return asset_id.rsplit("-", 1)[0]
+
+
+def _room_type(name: str) -> str:
+    return name.rsplit("_", 1)[0]
+
+
+def _read_json(path: Path) -> Json:
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def encode(table: Json) -> bytes:
+    """Compress a table so that equal tables give equal bytes: keys sorted, no time stamp, no file name."""
+    text = json.dumps(table, sort_keys=True, separators=(",", ":"), ensure_ascii=True)
+    return gzip.compress(text.encode(), compresslevel=9, mtime=0)
+
+
+def notice(licence: str) -> str:
+    """Text that goes beside the tables: where they come from, and the licence with its copyright line."""
+    return (
+        "# NOTICE: data in this folder\n\n"
+        f"`{CATALOG_FILE}` and `{SCENES_FILE}` are derived from the Python package `bddl` {BDDL_VERSION}\n"
+        "(BEHAVIOR Domain Definition Language, https://github.com/StanfordVL/bddl, `bddl/generated_data/`) by\n"
+        "`python -m embomatrix.factory.catalog_tables`: fields were selected and re-keyed, extents rounded to 0.1 mm.\n"
+        "The package is distributed under this licence:\n\n"
+        f"```\n{licence.strip()}\n```\n"
+    )
+
+
+def _licence_text() -> str:
+    files = importlib.metadata.files("bddl") or []
+    for file in files:
+        if file.name.upper().startswith("LICENSE"):
+            return Path(str(file.locate())).read_text(encoding="utf-8")
+    raise SourceError("the installed bddl carries no licence text: reinstall it with pip")
+
+
+def write_tables(out: Path) -> tuple[Path, ...]:
+    """Derive all files into ``out`` (made when absent) and return their paths."""
+    folder = source_folder()
+    contents = {
+        CATALOG_FILE: encode(build_catalog(folder)),
+        SCENES_FILE: encode(build_scenes(folder)),
+        NOTICE_FILE: notice(_licence_text()).encode(),
+    }
+    out.mkdir(parents=True, exist_ok=True)
+    for name, data in contents.items():
+        (out / name).write_bytes(data)
+    return tuple(out / name for name in contents)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Command line: write the tables and name the files."""
+    parser = argparse.ArgumentParser(
+        description="Derive the catalog's tables from the installed bddl package."
+    )
+    parser.add_argument("--out", type=Path, required=True, help="folder to write to")
+    options = parser.parse_args(arguments)
+    try:
+        paths = write_tables(options.out)
+    except SourceError as error:
+        parser.exit(2, f"{error}\n")
+    for path in paths:
+        print(f"{path}  {path.stat().st_size} bytes")  # noqa: T201 - this is the command line
+
+
+if __name__ == "__main__":
+    main()
