@@ -1,0 +1,159 @@
+"""Where a round robot's centre may be: an occupancy grid of the floor, its components and distances along it."""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from scipy import ndimage, sparse
+from scipy.sparse import csgraph
+
+from embomatrix.skills.limits import ROBOT
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from embomatrix.world.geometry import FloatArray, Vec2
+    from embomatrix.world.scene import Scene
+
+    BoolArray = NDArray[np.bool_]
+    IntArray = NDArray[np.int32]
+
+Cell = tuple[int, int]
+
+CELL_M: Final = 0.05
+SNAP_M: Final = 0.3
+"""A robot that stands this close to a free cell counts as standing on it."""
+DOORWAY_DEPTH_M: Final = 0.4
+"""How far the floor of a doorway reaches, centred on the wall: more than any wall's thickness."""
+FIELDS_KEPT: Final = 64
+"""Distance fields in memory, 0.2 MB each in a flat of 120 m2."""
+
+
+@dataclass(frozen=True, slots=True)
+class Obstacles:
+    """Rectangles in the world's xy plane with the heights between which they stand, shape (n, 6), and whose they are.
+
+    Columns: x low, y low, x high, y high, z low, z high. ``owners`` holds the number of the scene object, -1 for walls.
+    """
+
+    boxes: FloatArray
+    owners: IntArray
+
+    def joined(self, other: Obstacles) -> Obstacles:
+        return Obstacles(
+            np.concatenate([self.boxes, other.boxes]), np.concatenate([self.owners, other.owners])
+        )
+
+
+class FloorGrid:
+    """Cells of 5 cm over the bounding rectangle of the rooms. What is not room or doorway is no floor."""
+
+    def __init__(self, scene: Scene, boxes: FloatArray) -> None:
+        """Rasterise obstacles, shape (n, 6), inflate them by the robot's radius and label what is left."""
+        lows = np.array([room.low_m for room in scene.rooms])
+        highs = np.array([room.high_m for room in scene.rooms])
+        self._origin = lows.min(axis=0) - 2 * CELL_M
+        span = highs.max(axis=0) + 2 * CELL_M - self._origin
+        self._shape = (math.ceil(span[0] / CELL_M), math.ceil(span[1] / CELL_M))
+        blocked = ~self._floor_of(scene)
+        for box in boxes:
+            blocked[self._window(box[:2], box[2:4])] = True
+        blocked[0, :] = blocked[-1, :] = True
+        blocked[:, 0] = blocked[:, -1] = True
+        clearance = np.asarray(ndimage.distance_transform_edt(~blocked)) * CELL_M
+        self.free: BoolArray = clearance >= ROBOT.radius_m
+        self.labels: IntArray = np.asarray(ndimage.label(self.free)[0], dtype=np.int32)
+        off, nearest = ndimage.distance_transform_edt(~self.free, return_indices=True)
+        self._off_m = np.asarray(off) * CELL_M
+        self._nearest = np.asarray(nearest)
+        self._field = functools.lru_cache(maxsize=FIELDS_KEPT)(self._field_from)
+
+    def cell(self, x_m: float, y_m: float) -> Cell | None:
+        """The free cell at a point, or the nearest one within 30 cm; None when there is none."""
+        if not (math.isfinite(x_m) and math.isfinite(y_m)):
+            return None
+        i, j = (
+            math.floor((value - low) / CELL_M) for value, low in zip((x_m, y_m), self._origin, strict=True)
+        )
+        if not (0 <= i < self._shape[0] and 0 <= j < self._shape[1]) or self._off_m[i, j] > SNAP_M:
+            return None
+        return (int(self._nearest[0, i, j]), int(self._nearest[1, i, j]))
+
+    def center(self, cell: Cell) -> Vec2:
+        """World coordinates of the middle of a cell."""
+        return (
+            float(self._origin[0] + (cell[0] + 0.5) * CELL_M),
+            float(self._origin[1] + (cell[1] + 0.5) * CELL_M),
+        )
+
+    def is_free(self, x_m: float, y_m: float) -> bool:
+        """Whether the robot fits at a point."""
+        i, j = (
+            math.floor((value - low) / CELL_M) for value, low in zip((x_m, y_m), self._origin, strict=True)
+        )
+        return bool(0 <= i < self._shape[0] and 0 <= j < self._shape[1] and self.free[i, j])
+
+    def label(self, cell: Cell) -> int:
+        """Number of the component that a free cell belongs to; 0 for a blocked one."""
+        return int(self.labels[cell])
+
+    def free_centers(self, low_m: Vec2, high_m: Vec2, label: int) -> FloatArray:
+        """Middles of the component's cells in a rectangle, shape (n, 2), in the world."""
+        window = self._window(np.asarray(low_m), np.asarray(high_m))
+        inside = np.argwhere(self.labels[window] == label) if label else np.zeros((0, 2), dtype=np.int64)
+        corner = np.array([window[0].start, window[1].start])
+        return np.asarray(self._origin + (inside + corner + 0.5) * CELL_M, dtype=np.float64)
+
+    def distance(self, start: Cell, end: Cell) -> float | None:
+        """Length in metres of the shortest path over free cells, None when there is none."""
+        if not self.free[start] or self.labels[start] != self.labels[end]:
+            return None
+        return float(self._field(end)[start[0] * self._shape[1] + start[1]])
+
+    def _field_from(self, cell: Cell) -> FloatArray:
+        source = cell[0] * self._shape[1] + cell[1]
+        return np.asarray(csgraph.dijkstra(self._graph, indices=source), dtype=np.float32)
+
+    @functools.cached_property
+    def _graph(self) -> sparse.csr_matrix:
+        """Eight-neighbour graph of the free cells. Diagonals cut no corners: both cells beside them must be free."""
+        rows, columns = self._shape
+        number = np.arange(rows * columns).reshape(self._shape)
+        starts, ends, lengths = [], [], []
+        for di, dj in ((1, 0), (0, 1), (1, 1), (1, -1)):
+            a = (slice(0, rows - di), slice(max(0, -dj), columns - max(0, dj)))
+            b = (slice(di, rows), slice(max(0, dj), columns - max(0, -dj)))
+            both = self.free[a] & self.free[b]
+            if di and dj:
+                both &= self.free[a[0], b[1]] & self.free[b[0], a[1]]
+            starts.append(number[a][both])
+            ends.append(number[b][both])
+            lengths.append(np.full(int(both.sum()), CELL_M * math.hypot(di, dj)))
+        source, target, weight = (np.concatenate(items) for items in (starts, ends, lengths))
+        size = rows * columns
+        one_way = sparse.coo_matrix((weight, (source, target)), shape=(size, size))
+        return (one_way + one_way.T).tocsr()
+
+    def _floor_of(self, scene: Scene) -> BoolArray:
+        floor = np.zeros(self._shape, dtype=np.bool_)
+        for room in scene.rooms:
+            floor[self._window(np.asarray(room.low_m), np.asarray(room.high_m))] = True
+        for doorway in scene.doorways:
+            half = np.array([doorway.width_m, DOORWAY_DEPTH_M]) / 2
+            if doorway.along == "y":
+                half = half[::-1]
+            if all(doorway.rooms):
+                floor[self._window(doorway.center_m - half, doorway.center_m + half)] = True
+        return floor
+
+    def _window(self, low: FloatArray, high: FloatArray) -> tuple[slice, slice]:
+        """Cells that a rectangle touches with more than its edge."""
+        first = np.floor((low - self._origin) / CELL_M + 1e-9).astype(int)
+        last = np.ceil((high - self._origin) / CELL_M - 1e-9).astype(int)
+        first = np.clip(first, 0, self._shape)
+        last = np.clip(last, 0, self._shape)
+        return slice(int(first[0]), int(last[0])), slice(int(first[1]), int(last[1]))
