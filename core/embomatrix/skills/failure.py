@@ -15,7 +15,9 @@ class FailureReason(StrEnum):
     NO_PATH = "no_path"
     NO_STANDING_POSE = "no_standing_pose"
     BLOCKED = "blocked"
+    STEP_TOO_LONG = "step_too_long"
     OUT_OF_REACH = "out_of_reach"
+    TOO_HIGH = "too_high"
     NO_LINE_OF_APPROACH = "no_line_of_approach"
     HAND_FULL = "hand_full"
     HAND_EMPTY = "hand_empty"
@@ -55,7 +57,9 @@ SENTENCES: Final[Mapping[FailureReason, str]] = {
     FailureReason.NO_PATH: "the robot can't get to {target}: no free path leads there",
     FailureReason.NO_STANDING_POSE: "there is no free place to stand from which {target} can be reached",
     FailureReason.BLOCKED: "something stands in the way {distance} m ahead: turn, or go less far",
+    FailureReason.STEP_TOO_LONG: "{distance} m is too far for one step: expected at most {limit} m",
     FailureReason.OUT_OF_REACH: "{target} is {distance} m away and the arm reaches {limit} m: move to it first",
+    FailureReason.TOO_HIGH: "{target} is {height} m above the floor and the arm reaches up to {limit} m",
     FailureReason.NO_LINE_OF_APPROACH: "a wall or furniture lies between the robot and {target}: move to it first",
     FailureReason.HAND_FULL: "the hand holds {held}: place it first",
     FailureReason.HAND_EMPTY: "the hand is empty: pick something up first",
