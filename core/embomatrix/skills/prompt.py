@@ -1,0 +1,313 @@
+"""Prompts: what a policy is told of a task, and how the plan that it writes names objects.
+
+Three codecs share one scene description, rooms as a tree with furniture first and contents after it:
+
+* ``names``: word-level policies. Objects are called by name in the plan; ``with_indices`` maps the names to rows of the
+  object table before the plan is parsed.
+* ``lines``: language models, one call a line, objects called by ``object_index``. The name stands before the index.
+* ``json``: language models, the same calls as a JSON list.
+
+A prompt tells of the rows of the task's object table only, and never of the goal formula.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.skills.syntax import SIGNATURES, Arg, PlaceRelation, Skill
+from embomatrix.world.state import OPEN_FRACTION, Relation, State
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping
+
+    from embomatrix.skills.syntax import Plan, SkillCall
+    from embomatrix.world.scene import Scene, SceneObject
+    from embomatrix.world.task import Task
+
+    _Caller = Callable[[int | None], str]
+
+
+class Codec(StrEnum):
+    """How a prompt lists objects and how a plan calls them."""
+
+    NAMES = "names"
+    LINES = "lines"
+    JSON = "json"
+
+
+PREPOSITIONS: Final[Mapping[Relation, str]] = {
+    Relation.ONTOP: "on",
+    Relation.INSIDE: "in",
+    Relation.UNDER: "under",
+}
+"""How a row's contents are introduced. Other relations host nothing."""
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One row of the object table as a prompt tells it. ``host`` is the name of another row, or empty."""
+
+    index: int
+    name: str
+    category: str
+    room: str
+    host: str = ""
+    relation: Relation | None = None
+    states: tuple[str, ...] = ()
+    fixed: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Situation:
+    """What a policy may know of a task. ``rows`` are in the order in which a prompt tells them.
+
+    ``table_size`` is the number of rows of the whole table: the first index that names nothing.
+    """
+
+    rooms: tuple[str, ...]
+    robot_room: str
+    rows: tuple[Row, ...]
+    instruction: str
+    table_size: int
+
+
+@dataclass(frozen=True, slots=True)
+class Prompt:
+    """System text, the same for every task of a codec, and the text of this task."""
+
+    system: str
+    user: str
+
+
+def situation_of(scene: Scene, task: Task) -> Situation:
+    """The task's table with each object's start: host, relation and visible states."""
+    listed = set(task.table)
+    rows = tuple(_row(index, scene.by_name[name], scene, listed) for index, name in enumerate(task.table))
+    rooms = tuple(dict.fromkeys([*(row.room for row in rows if row.room), scene.robot.room]))
+    return Situation(rooms, scene.robot.room, rows, task.instruction, len(task.table))
+
+
+def _row(index: int, item: SceneObject, scene: Scene, listed: set[str]) -> Row:
+    asset = scene.asset_of(item.name)
+    hosted = item.host in listed and item.relation in PREPOSITIONS
+    return Row(
+        index=index,
+        name=item.name,
+        category=asset.category,
+        room=item.room,
+        host=item.host if hosted else "",
+        relation=item.relation if hosted else None,
+        states=_visible(item, openable=bool(asset.joints), toggleable=asset.can("toggleable")),
+        fixed=item.fixed,
+    )
+
+
+def _visible(item: SceneObject, *, openable: bool, toggleable: bool) -> tuple[str, ...]:
+    """Words for what can be seen of an object: doors and switches in both positions, other states when they hold."""
+    words: list[str] = []
+    if openable:
+        is_open = State.OPEN in item.states or any(joint > OPEN_FRACTION for joint in item.joints)
+        words.append("open" if is_open else "closed")
+    if toggleable:
+        words.append("on" if State.TOGGLED_ON in item.states else "off")
+    return (*words, *sorted(s.value for s in item.states - {State.OPEN, State.TOGGLED_ON}))
+
+
+def limited(situation: Situation, rows: int) -> Situation:
+    """At most ``rows`` rows: those that the instruction names, then what they rest on, then the rest in order.
+
+    Only the instruction decides, never the goal: whoever asks for a plan knows no more than that.
+    """
+    if len(situation.rows) <= rows:
+        return situation
+    text = f" {' '.join(_words(situation.instruction))} "
+    by_name = {row.name: row for row in situation.rows}
+    named = [row for row in situation.rows if f" {' '.join(_words(row.category))} " in text]
+    hosts = [by_name[row.host] for row in named if row.host]
+    ranked = dict.fromkeys([*named, *hosts, *situation.rows])
+    return subset(situation, {row.index for row in list(ranked)[:rows]})
+
+
+def subset(situation: Situation, kept: Iterable[int]) -> Situation:
+    """The situation told with these rows only; what rested on a row that is left out stands in its room."""
+    wanted = set(kept)
+    names = {row.name for row in situation.rows if row.index in wanted}
+    rows = tuple(
+        row if not row.host or row.host in names else replace(row, host="", relation=None)
+        for row in situation.rows
+        if row.index in wanted
+    )
+    return replace(situation, rows=rows)
+
+
+def _words(text: str) -> list[str]:
+    return re.findall(r"[a-z0-9]+", text.lower())
+
+
+def labels(situation: Situation) -> dict[int, str]:
+    """Row index to the shortest unique name: the category where it stands alone among the rows told, else the name."""
+    counts: dict[str, int] = {}
+    for row in situation.rows:
+        counts[row.category] = counts.get(row.category, 0) + 1
+    return {row.index: row.category if counts[row.category] == 1 else row.name for row in situation.rows}
+
+
+def prompt_for(situation: Situation, codec: Codec) -> Prompt:
+    """The text that a policy completes with a plan."""
+    if codec is Codec.NAMES:
+        return Prompt("", _names_text(situation))
+    return Prompt(_SYSTEM[codec], _indexed_text(situation))
+
+
+def _tree(situation: Situation) -> dict[str, list[tuple[Row, list[Row]]]]:
+    """Room to its rows, each with its contents. A row that rests on another one is listed with it, and again
+    by itself only when it hosts something."""
+    contents: dict[str, list[Row]] = {}
+    for row in situation.rows:
+        if row.host:
+            contents.setdefault(row.host, []).append(row)
+    tree: dict[str, list[tuple[Row, list[Row]]]] = {}
+    for row in situation.rows:
+        inside = contents.get(row.name, [])
+        if inside or not row.host:
+            tree.setdefault(row.room, []).append((row, inside))
+    return tree
+
+
+def _by_relation(contents: list[Row]) -> list[tuple[str, list[Row]]]:
+    groups: dict[str, list[Row]] = {}
+    for row in contents:
+        if row.relation is not None:
+            groups.setdefault(PREPOSITIONS[row.relation], []).append(row)
+    return list(groups.items())
+
+
+def _names_text(situation: Situation) -> str:
+    label = labels(situation)
+
+    def told(row: Row) -> str:
+        return " ".join([label[row.index], *row.states])
+
+    lines: list[str] = []
+    for room, entries in _tree(situation).items():
+        lines.append(f"room {room}")
+        for row, contents in entries:
+            groups = [f"{word} {' '.join(map(told, rows))}" for word, rows in _by_relation(contents)]
+            lines.append(" ".join([told(row), *groups]))
+    return "\n".join([*lines, f"robot {situation.robot_room}", f"task {situation.instruction}"])
+
+
+def _indexed_text(situation: Situation) -> str:
+    def told(row: Row) -> str:
+        return " ".join([row.category.replace("_", " "), str(row.index), *row.states])
+
+    lines = ["Scene:"]
+    for room, entries in _tree(situation).items():
+        lines.append(f"[{room}]")
+        for row, contents in entries:
+            groups = [f"{word}: {', '.join(map(told, rows))}" for word, rows in _by_relation(contents)]
+            lines.append(" ".join([told(row), *groups]))
+    lines.append(f"Robot: {situation.robot_room or 'unknown room'}, hand empty")
+    lines.append(f"Task: {situation.instruction}")
+    return "\n".join(lines)
+
+
+_PLACEHOLDERS: Final[Mapping[Arg, str]] = {
+    Arg.OBJECT: "object",
+    Arg.SOURCE: "source",
+    Arg.RELATION: "|".join(PlaceRelation),
+    Arg.YAW: "radians",
+    Arg.DISTANCE: "metres",
+    Arg.ROOM: "room",
+}
+
+EXAMPLES: Final[Mapping[Codec, str]] = {
+    Codec.NAMES: "move apple\npick_up apple\nmove fridge\nopen fridge\nplace fridge inside\nclose fridge",
+    Codec.LINES: "move 4\npick_up 4\nmove 2\nopen 2\nplace 2 inside\nclose 2",
+    Codec.JSON: '[{"action": "move", "object_index": 4}, {"action": "pick_up", "object_index": 4}, '
+    '{"action": "move", "object_index": 2}, {"action": "open", "object_index": 2}, '
+    '{"action": "place", "object_index": 2, "relation": "inside"}, {"action": "close", "object_index": 2}]',
+}
+"""A plan in each codec: put the apple (row 4) into the fridge (row 2)."""
+
+
+def _skill_lines() -> str:
+    return " | ".join(
+        " ".join([skill.value, *(_PLACEHOLDERS[argument] for argument in SIGNATURES[skill])])
+        for skill in Skill
+    )
+
+
+def _skill_objects() -> str:
+    return "\n".join(
+        "{"
+        + ", ".join(
+            [f'"action": "{skill.value}"', *(f'"{a.value}": <{_PLACEHOLDERS[a]}>' for a in SIGNATURES[skill])]
+        )
+        + "}"
+        for skill in Skill
+    )
+
+
+_RULES: Final = (
+    "The robot has one arm and holds one object. Move to an object before you use it, open closed containers first. "
+    "Objects are called by the number that follows their name. The plan stops at the first step that fails."
+)
+_SYSTEM: Final[Mapping[Codec, str]] = {
+    Codec.LINES: "You control a home robot. Answer only with the plan, one action a line.\n"
+    f"Actions: {_skill_lines()}\n{_RULES}\nExample, put apple 4 into fridge 2:\n{EXAMPLES[Codec.LINES]}",
+    Codec.JSON: "You control a home robot. Answer only with the plan, a JSON list of actions.\n"
+    f"Actions:\n{_skill_objects()}\n{_RULES}\nExample, put apple 4 into fridge 2:\n{EXAMPLES[Codec.JSON]}",
+}
+
+
+def plan_in_names(plan: Plan, situation: Situation) -> str:
+    """A plan as the ``names`` codec writes it, one call a line. A row that is not told is called ``row_<index>``."""
+    label = labels(situation)
+
+    def called(index: int | None) -> str:
+        return label.get(-1 if index is None else index, f"row_{index}")
+
+    return "\n".join(" ".join([call.skill.value, *_arguments(call, called)]) for call in plan)
+
+
+def _arguments(call: SkillCall, called: _Caller) -> list[str]:
+    words: list[str] = []
+    for argument in SIGNATURES[call.skill]:
+        if argument is Arg.OBJECT:
+            words.append(called(call.object_index))
+        elif argument is Arg.SOURCE:
+            words.append(called(call.source_index))
+        else:
+            value = getattr(call, argument.value)
+            words.append(f"{value:g}" if isinstance(value, float) else str(value))
+    return words
+
+
+_SKILLS: Final = frozenset(skill.value for skill in Skill)
+
+
+def with_indices(text: str, situation: Situation) -> str:
+    """A plan of the ``names`` codec in the compact line form, names replaced by row indices.
+
+    A word in an object's place that names nothing becomes the first index after the table: the plan parses, and that
+    step fails as any call to an unknown object does. Text that is no plan stays no plan.
+    """
+    rows = {row.name: row.index for row in situation.rows}
+    rows |= {label: index for index, label in labels(situation).items()}
+    return "\n".join(_line_with_indices(line, rows, situation.table_size) for line in text.splitlines())
+
+
+def _line_with_indices(line: str, rows: Mapping[str, int], unknown: int) -> str:
+    words = line.split()
+    if not words or words[0] not in _SKILLS:
+        return line
+    signature = SIGNATURES[Skill(words[0])]
+    changed = [
+        str(rows.get(word, unknown)) if argument in (Arg.OBJECT, Arg.SOURCE) else word
+        for argument, word in zip(signature, words[1:], strict=False)
+    ]
+    return " ".join([words[0], *changed, *words[1 + len(signature) :]])

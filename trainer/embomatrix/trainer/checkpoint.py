@@ -1,0 +1,115 @@
+"""Checkpoints: everything that decides how training goes on, written whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from embomatrix.trainer.errors import TrainerError
+from embomatrix.trainer.settings import TrainSettings
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from embomatrix.trainer.policy.protocol import Policy
+
+SCHEMA = 1
+_STATE = "state.json"
+_TENSORS = "training.pt"
+_PREFIX = "step-"
+
+
+@dataclass
+class Progress:
+    """Where a run stands. ``cursor`` is the schedule's; seconds are of GRPO and, by activity, of the whole run."""
+
+    step: int = 0
+    cursor: int = 0
+    rollouts: int = 0
+    lost: int = 0
+    imitation_steps: int = 0
+    grpo_s: float = 0.0
+    spent_s: dict[str, float] = field(default_factory=dict)
+    before: list[dict[str, Any]] = field(default_factory=list)
+
+
+class CheckpointStore:
+    """Checkpoints of one run, a folder each: ``step-000050``. The newest ``keep`` stay."""
+
+    def __init__(self, folder: Path, *, keep: int) -> None:
+        self._folder = folder
+        self._keep = keep
+
+    def save(
+        self,
+        policy: Policy,
+        optimiser: torch.optim.Optimizer,
+        generator: torch.Generator,
+        progress: Progress,
+        settings: TrainSettings,
+    ) -> Path:
+        """Write beside, sync, then rename: a crash leaves the last checkpoint as it was."""
+        final = self._folder / f"{_PREFIX}{progress.step:06d}"
+        partial = self._folder / f".{final.name}.partial"
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir(parents=True)
+        policy.save(partial / "policy")
+        torch.save(
+            {"optimiser": optimiser.state_dict(), "generator": generator.get_state()}, partial / _TENSORS
+        )
+        state = {
+            "schema": SCHEMA,
+            "progress": asdict(progress),
+            "settings": settings.model_dump(mode="json"),
+        }
+        (partial / _STATE).write_text(json.dumps(state, indent=1), encoding="utf-8")
+        _sync(partial)
+        shutil.rmtree(final, ignore_errors=True)
+        os.replace(partial, final)
+        for old in self._all()[: -self._keep]:
+            shutil.rmtree(old, ignore_errors=True)
+        return final
+
+    def latest(self) -> Path | None:
+        """Folder of the newest whole checkpoint."""
+        found = self._all()
+        return found[-1] if found else None
+
+    def _all(self) -> list[Path]:
+        if not self._folder.is_dir():
+            return []
+        return sorted(path for path in self._folder.glob(f"{_PREFIX}*") if (path / _STATE).is_file())
+
+
+def _sync(folder: Path) -> None:
+    for path in folder.rglob("*"):
+        if path.is_file():
+            with path.open("rb") as file:
+                os.fsync(file.fileno())
+
+
+def read_state(folder: Path) -> tuple[Progress, TrainSettings]:
+    """What a checkpoint says of the run. Raises TrainerError where it is none, or of another version."""
+    try:
+        state = json.loads((folder / _STATE).read_text(encoding="utf-8"))
+        if state["schema"] != SCHEMA:
+            raise TrainerError(
+                f"the checkpoint {folder} has schema {state['schema']}, this version reads {SCHEMA}: start a new run"
+            )
+        return Progress(**state["progress"]), TrainSettings.model_validate(state["settings"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise TrainerError(
+            f"{folder} is no readable checkpoint ({error}): pass a folder such as runs/NAME/checkpoints/step-000050"
+        ) from error
+
+
+def restore(folder: Path, optimiser: torch.optim.Optimizer, generator: torch.Generator) -> None:
+    """Put the optimiser and the sampler's generator back as they were."""
+    tensors = torch.load(folder / _TENSORS, map_location="cpu", weights_only=True)
+    optimiser.load_state_dict(tensors["optimiser"])
+    generator.set_state(tensors["generator"])

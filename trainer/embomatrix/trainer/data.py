@@ -1,0 +1,142 @@
+"""Tasks to train on, and the order in which they come: a seeded permutation per epoch, known arbitrarily far ahead."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from embomatrix.skills.parse import PlanError, plan_from_json
+from embomatrix.skills.prompt import Situation, situation_of
+from embomatrix.trainer.errors import TrainerError
+from embomatrix.world.bundle import BundleError, decode_bundle
+from embomatrix.world.dataset import Dataset, DatasetError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+    from pathlib import Path
+
+    from embomatrix.skills.syntax import Plan
+    from embomatrix.world.asset import Asset
+    from embomatrix.world.dataset import TaskRecord
+    from embomatrix.world.scene import Scene
+    from embomatrix.world.task import Task
+
+
+@dataclass(frozen=True, slots=True)
+class TrainingTask:
+    """A task as the trainer needs it: what the prompt tells, where its bundle is, and the oracle's plan."""
+
+    task: Task
+    situation: Situation
+    bundle_digest: str
+    oracle: Plan
+
+
+@dataclass(frozen=True)
+class TaskSet:
+    """Training and held-out tasks; ``bundle_bytes`` gives a bundle by its digest.
+
+    ``kinds`` maps a category to all categories of its kind: those with the same abilities.
+    """
+
+    train: tuple[TrainingTask, ...]
+    heldout: tuple[TrainingTask, ...]
+    bundle_bytes: Callable[[str], bytes] = field(repr=False)
+    kinds: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+
+def load_tasks(folder: Path) -> TaskSet:
+    """Read a dataset folder. Raises TrainerError with a remedy where it is missing or broken."""
+    if not folder.is_dir():
+        raise TrainerError(
+            f"no dataset at {folder}: build one with `embomatrix factory build --out={folder}`, or pass --dataset"
+        )
+    kinds = KindTable()
+    tasks: dict[str, TrainingTask] = {}
+    try:
+        dataset = Dataset.load(folder)
+        by_bundle: dict[str, list[TaskRecord]] = {}
+        for record in dataset.records:
+            by_bundle.setdefault(record.bundle_digest, []).append(record)
+        for digest, records in by_bundle.items():
+            # One scene at a time: all of them decoded would fill the memory that simulators need.
+            scene = decode_bundle(dataset.bundle_bytes(digest), digest=digest).scene
+            kinds.add(scene)
+            tasks |= {record.task.task_id: _training_task(scene, record) for record in records}
+    except (DatasetError, BundleError, PlanError, OSError) as error:
+        raise TrainerError(f"the dataset at {folder} can't be used: {error}") from error
+    train = tuple(tasks[record.task.task_id] for record in dataset.train)
+    if not train:
+        raise TrainerError(f"the dataset at {folder} has no training tasks: build it again with more tasks")
+    heldout = tuple(tasks[record.task.task_id] for record in dataset.heldout)
+    return TaskSet(train, heldout, dataset.bundle_bytes, kinds.table())
+
+
+_TELLING: Final = ("toggleable", "heatSource", "coldSource", "cookable", "freezable")
+"""Abilities that decide what a plan may do with a thing."""
+
+
+class KindTable:
+    """Which categories a plan treats alike: same abilities, doors, cavities and surfaces, and fixed or not."""
+
+    def __init__(self) -> None:
+        self._kinds: dict[str, set[tuple[object, ...]]] = {}
+
+    def add(self, scene: Scene) -> None:
+        for item in scene.objects:
+            asset = scene.assets[item.asset_id]
+            self._kinds.setdefault(asset.category, set()).add(_kind(asset, fixed=item.fixed))
+
+    def table(self) -> dict[str, tuple[str, ...]]:
+        """Category to all of its kind. A category seen in two kinds (a fixed and a loose chair) belongs to neither."""
+        members: dict[tuple[object, ...], list[str]] = {}
+        for category, kinds in self._kinds.items():
+            if len(kinds) == 1:
+                members.setdefault(next(iter(kinds)), []).append(category)
+        return {category: tuple(alike) for alike in members.values() for category in alike}
+
+
+def _kind(asset: Asset, *, fixed: bool) -> tuple[object, ...]:
+    abilities = tuple(asset.can(ability) for ability in _TELLING)
+    return (fixed, bool(asset.joints), bool(asset.interiors), bool(asset.supports), abilities)
+
+
+def _training_task(scene: Scene, record: TaskRecord) -> TrainingTask:
+    oracle = plan_from_json(list(record.oracle)) if record.oracle else ()
+    return TrainingTask(record.task, situation_of(scene, record.task), record.bundle_digest, oracle)
+
+
+def group_seed(run_seed: int, task_id: str) -> int:
+    """Seed that all rollouts of a task share in a run, in [0, 2^31): equal plans get equal rewards."""
+    digest = hashlib.sha256(f"{run_seed}:{task_id}".encode()).digest()
+    return int.from_bytes(digest[:4], "big") >> 1
+
+
+class Schedule:
+    """Endless order of tasks. ``cursor`` is the whole state: the same seed and cursor give the same future."""
+
+    def __init__(self, tasks: Sequence[TrainingTask], *, seed: int, cursor: int = 0) -> None:
+        self._tasks = tuple(tasks)
+        self._seed = seed
+        self.cursor = cursor
+
+    def take(self, count: int) -> tuple[TrainingTask, ...]:
+        """The next tasks; moves the cursor."""
+        taken = self.peek(count)
+        self.cursor += count
+        return taken
+
+    def peek(self, count: int, *, skip: int = 0) -> tuple[TrainingTask, ...]:
+        """The tasks that ``take`` will give after ``skip`` others."""
+        begin = self.cursor + skip
+        return tuple(self._at(position) for position in range(begin, begin + count))
+
+    def _at(self, position: int) -> TrainingTask:
+        epoch, offset = divmod(position, len(self._tasks))
+        order = np.random.default_rng(np.random.SeedSequence((self._seed, epoch))).permutation(
+            len(self._tasks)
+        )
+        return self._tasks[int(order[offset])]

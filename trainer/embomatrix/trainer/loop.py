@@ -1,0 +1,206 @@
+"""A training run from end to end: imitation, held-out evaluation, GRPO, held-out evaluation, report."""
+
+from __future__ import annotations
+
+import logging
+import os
+import platform
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from embomatrix.trainer.checkpoint import CheckpointStore, Progress, restore
+from embomatrix.trainer.data import Schedule
+from embomatrix.trainer.evaluate import Evaluation, evaluate_policy
+from embomatrix.trainer.imitate import imitate
+from embomatrix.trainer.recorder import Recorder, read_metrics
+from embomatrix.trainer.report import REPORT, Summary, write_report
+from embomatrix.trainer.stopwatch import Activity, Stopwatch
+from embomatrix.trainer.update import Updater
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from embomatrix.trainer.data import TaskSet
+    from embomatrix.trainer.policy.protocol import Policy
+    from embomatrix.trainer.progress import Display
+    from embomatrix.trainer.rollout import Gateway
+    from embomatrix.trainer.settings import TrainSettings
+    from embomatrix.trainer.telling import Teller
+    from embomatrix.trainer.update import GroupLog, StepRecord
+
+logger = logging.getLogger(__name__)
+REFERENCE = "reference"
+CHECKPOINTS = "checkpoints"
+
+
+@dataclass(frozen=True)
+class Parts:
+    """What a run works with. ``reference`` is given on resuming; otherwise the policy after imitation is copied."""
+
+    policy: Policy
+    teller: Teller
+    tasks: TaskSet
+    gateway: Gateway
+    display: Display
+    reference: Policy | None = None
+
+
+class TrainingRun:
+    """One run in one folder. ``progress`` is a checkpoint's when the run is resumed."""
+
+    def __init__(
+        self, parts: Parts, settings: TrainSettings, out: Path, progress: Progress | None = None
+    ) -> None:
+        self._parts = parts
+        self._settings = settings
+        self._out = out
+        self._progress = progress or Progress()
+        self._resumed = progress is not None
+        self._stopwatch = Stopwatch()
+        self._stopwatch.spent_s.update(self._progress.spent_s)
+        self._store = CheckpointStore(out / CHECKPOINTS, keep=settings.keep_checkpoints)
+        self._recorder = Recorder(out)
+        device = next(iter(parts.policy.parameters())).device
+        self._generator = torch.Generator(device).manual_seed(settings.seed)
+
+    def run(self) -> Summary:
+        """Everything. An interrupt saves a checkpoint, from which ``--resume`` goes on, and is raised again."""
+        began_s = time.monotonic()
+        earlier_s = sum(self._progress.spent_s.values())
+        reference = self._parts.reference or self._prepare()
+        updater = Updater(
+            self._parts.policy,
+            reference,
+            self._parts.teller,
+            self._parts.gateway,
+            self._settings.grpo,
+            self._stopwatch,
+        )
+        if self._resumed:
+            newest = self._store.latest()
+            if newest is not None:
+                restore(newest, updater.optimiser, self._generator)
+            self._recorder.forget_after(self._progress.step)
+        try:
+            self._optimise(updater)
+        finally:
+            checkpoint = self._save(updater)
+        after = self._evaluate("after GRPO")
+        summary = self._summary(checkpoint, after, earlier_s + time.monotonic() - began_s)
+        write_report(summary, read_metrics(self._out), machine())
+        return summary
+
+    def _prepare(self) -> Policy:
+        """Imitation and the first evaluation; the policy as it then is becomes the reference."""
+        parts, settings = self._parts, self._settings
+        with self._stopwatch.spending(Activity.IMITATION):
+            self._progress.imitation_steps = imitate(
+                parts.policy,
+                parts.teller,
+                parts.tasks.train,
+                settings.imitation,
+                seed=settings.seed,
+                report=parts.display.imitation,
+            )
+        before = self._evaluate("before GRPO")
+        self._progress.before = before.as_json() if before else []
+        parts.policy.save(self._out / REFERENCE)
+        return parts.policy.frozen_copy()
+
+    def _evaluate(self, label: str) -> Evaluation | None:
+        parts, settings = self._parts, self._settings
+        if not parts.tasks.heldout:
+            return None
+        with self._stopwatch.spending(Activity.EVALUATION):
+            result = evaluate_policy(
+                parts.policy,
+                parts.teller,
+                parts.tasks.heldout,
+                parts.gateway,
+                settings.evaluation,
+                max_new=settings.grpo.max_new,
+                seed=settings.seed,
+                label=label.replace(" ", "-"),
+                report=lambda done, total: parts.display.evaluating(label, done, total),
+            )
+        parts.display.evaluated(label, result)
+        return result
+
+    def _optimise(self, updater: Updater) -> None:
+        settings = self._settings.grpo
+        progress = self._progress
+        schedule = Schedule(self._parts.tasks.train, seed=self._settings.seed, cursor=progress.cursor)
+        while (share := self._share()) < 1.0:
+            began_s = time.monotonic()
+            self._announce(schedule, progress.step)
+            progress.step += 1
+            record, logs = updater.take_step(
+                progress.step,
+                schedule.take(settings.tasks_per_step),
+                np.random.default_rng(np.random.SeedSequence((self._settings.seed, 2, progress.step))),
+                self._generator,
+                1.0 - (1.0 - settings.final_learning_rate_share) * share,
+            )
+            seconds = time.monotonic() - began_s
+            progress.cursor = schedule.cursor
+            progress.grpo_s += seconds
+            self._note(record, logs, seconds)
+            if progress.step % self._settings.checkpoint_every == 0:
+                self._save(updater)
+
+    def _share(self) -> float:
+        """Share of the GRPO budget that is spent."""
+        settings = self._settings.grpo
+        if settings.steps is not None:
+            return self._progress.step / settings.steps if settings.steps else 1.0
+        return self._progress.grpo_s / (60 * settings.minutes) if settings.minutes else 1.0
+
+    def _announce(self, schedule: Schedule, step: int) -> None:
+        """This step's tasks and those of the steps ahead: the whole window, every time."""
+        size = self._settings.grpo.tasks_per_step
+        window = {
+            step + 1 + ahead: schedule.peek(size, skip=ahead * size)
+            for ahead in range(self._settings.grpo.lookahead + 1)
+        }
+        self._parts.gateway.announce(window, self._settings.grpo.group)
+
+    def _note(self, record: StepRecord, logs: list[GroupLog], seconds: float) -> None:
+        self._progress.rollouts += record.rollouts
+        self._progress.lost += record.lost
+        self._recorder.step(record, seconds)
+        if record.step % self._settings.samples_every == 1 or self._settings.samples_every == 1:
+            self._recorder.samples(record.step, logs[0])
+        self._parts.display.stepped(record, self._share(), record.rollouts / max(seconds, 1e-9))
+
+    def _save(self, updater: Updater) -> Path:
+        with self._stopwatch.spending(Activity.SAVING):
+            self._progress.spent_s = dict(self._stopwatch.spent_s)
+            return self._store.save(
+                self._parts.policy, updater.optimiser, self._generator, self._progress, self._settings
+            )
+
+    def _summary(self, checkpoint: Path, after: Evaluation | None, wall_s: float) -> Summary:
+        progress = self._progress
+        return Summary(
+            model=self._parts.policy.name,
+            steps=progress.step,
+            rollouts=progress.rollouts,
+            lost=progress.lost,
+            imitation_steps=progress.imitation_steps,
+            wall_s=wall_s,
+            spent_s=dict(self._stopwatch.spent_s),
+            before=Evaluation.from_json(progress.before) if progress.before else None,
+            after=after,
+            stats=self._parts.gateway.close_run(),
+            checkpoint=checkpoint,
+            report=self._out / REPORT,
+        )
+
+
+def machine() -> str:
+    """The machine in words, for reports."""
+    return f"{os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}, torch {torch.__version__}"

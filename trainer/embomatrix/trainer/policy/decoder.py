@@ -1,0 +1,185 @@
+"""A small causal transformer in plain torch, whose prompt runs once for all samples of its group.
+
+Llama-like: RMS norms, rotary positions, gated feed-forward, tied embedding.
+
+Shapes: Q prompts, G samples of each, P prompt tokens, T new tokens, H heads of width D, C = H * D.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import nn
+from torch.nn import functional
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+_HIDDEN_KEY = -1e9
+
+
+@dataclass(frozen=True, slots=True)
+class DecoderShape:
+    """Sizes of the network. ``width`` is a multiple of ``heads``."""
+
+    vocabulary: int
+    layers: int = 4
+    width: int = 128
+    heads: int = 4
+    inner: int = 384
+    longest: int = 1024
+
+    def as_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+@dataclass(frozen=True, slots=True)
+class LayerMemory:
+    """What one layer keeps of tokens it has seen: keys and values, both (rows, H, tokens, D)."""
+
+    keys: Tensor
+    values: Tensor
+
+
+@dataclass(frozen=True, slots=True)
+class PromptMemory:
+    """A batch of prompts, run. ``hidden`` (Q, P) is true on padding; ``lengths`` (Q,); ``last`` (Q, C)."""
+
+    layers: tuple[LayerMemory, ...]
+    hidden: Tensor
+    lengths: Tensor
+    last: Tensor
+
+
+class _Block(nn.Module):
+    def __init__(self, shape: DecoderShape) -> None:
+        super().__init__()
+        self.heads = shape.heads
+        self.before_attention = nn.RMSNorm(shape.width)
+        self.qkv = nn.Linear(shape.width, 3 * shape.width, bias=False)
+        self.out = nn.Linear(shape.width, shape.width, bias=False)
+        self.before_inner = nn.RMSNorm(shape.width)
+        self.gate_up = nn.Linear(shape.width, 2 * shape.inner, bias=False)
+        self.down = nn.Linear(shape.inner, shape.width, bias=False)
+
+    def project(self, x: Tensor, rope: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+        """Queries, keys and values (rows, H, T, D) of x (rows, T, C)."""
+        rows, length, width = x.shape
+        split = self.qkv(self.before_attention(x)).view(rows, length, 3, self.heads, width // self.heads)
+        q, k, v = split.permute(2, 0, 3, 1, 4)  # each (rows, H, T, D)
+        return _rotated(q, rope), _rotated(k, rope), v
+
+    def finish(self, x: Tensor, attended: Tensor) -> Tensor:
+        """Add attention's result (rows, H, T, D) and the feed-forward to x (rows, T, C)."""
+        x = x + self.out(attended.transpose(1, 2).reshape(x.shape))
+        gate, up = self.gate_up(self.before_inner(x)).chunk(2, dim=-1)
+        return x + self.down(functional.silu(gate) * up)  # type: ignore[no-any-return]
+
+
+def _rotated(x: Tensor, rope: tuple[Tensor, Tensor]) -> Tensor:
+    cos, sin = rope
+    left, right = x.chunk(2, dim=-1)
+    return x * cos + torch.cat([-right, left], dim=-1) * sin
+
+
+class Decoder(nn.Module):
+    """The network. ``read`` runs prompts, ``extend`` runs samples that continue them."""
+
+    cos: Tensor
+    sin: Tensor
+
+    def __init__(self, shape: DecoderShape, generator: torch.Generator) -> None:
+        super().__init__()
+        self.shape = shape
+        self.embedding = nn.Embedding(shape.vocabulary, shape.width)
+        self.blocks = nn.ModuleList(_Block(shape) for _ in range(shape.layers))
+        self.norm = nn.RMSNorm(shape.width)
+        half = shape.width // shape.heads // 2
+        angles = torch.outer(torch.arange(shape.longest).float(), 10000.0 ** (-torch.arange(half) / half))
+        self.register_buffer("cos", angles.cos().repeat(1, 2), persistent=False)
+        self.register_buffer("sin", angles.sin().repeat(1, 2), persistent=False)
+        for name, parameter in self.named_parameters():
+            if parameter.dim() > 1:
+                nn.init.normal_(parameter, std=0.02, generator=generator)
+            if name.endswith(("out.weight", "down.weight")):
+                parameter.data /= (2 * shape.layers) ** 0.5
+
+    def logits(self, x: Tensor) -> Tensor:
+        """Scores over the vocabulary of hidden states (..., C)."""
+        return self.norm(x) @ self.embedding.weight.t()  # type: ignore[no-any-return]
+
+    def _rope(self, positions: Tensor) -> tuple[Tensor, Tensor]:
+        """positions: (rows, T)."""
+        return self.cos[positions][:, None], self.sin[positions][:, None]
+
+    def read(self, tokens: Tensor, hidden: Tensor) -> PromptMemory:
+        """tokens (Q, P), padded on the left; hidden (Q, P) is true on the padding."""
+        lengths = (~hidden).sum(dim=1)
+        positions = ((~hidden).cumsum(dim=1) - 1).clamp(min=0)
+        rope = self._rope(positions)
+        size = tokens.shape[1]
+        later = torch.ones(size, size, dtype=torch.bool, device=tokens.device).triu(1)
+        barred = later[None] | hidden[:, None, :]  # (Q, P, P)
+        bias = torch.zeros(barred.shape, device=tokens.device).masked_fill(barred, _HIDDEN_KEY)[:, None]
+        x = self.embedding(tokens)
+        memories = []
+        for block in self.blocks:
+            q, k, v = block.project(x, rope)  # type: ignore[operator]
+            attended = functional.scaled_dot_product_attention(q, k, v, attn_mask=bias)
+            x = block.finish(x, attended)  # type: ignore[operator]
+            memories.append(LayerMemory(k, v))
+        return PromptMemory(tuple(memories), hidden, lengths, x[:, -1])
+
+    def extend(
+        self, prompt: PromptMemory, tokens: Tensor, past: tuple[LayerMemory, ...] | None, start: int
+    ) -> tuple[Tensor, tuple[LayerMemory, ...]]:
+        """Hidden states (Q * G, T, C) of tokens (Q * G, T) that stand ``start`` tokens after their prompts.
+
+        ``past`` is the memory of the samples' own earlier tokens, None at the first.
+        """
+        rows, length = tokens.shape
+        group = rows // prompt.lengths.shape[0]
+        begin = prompt.lengths.repeat_interleave(group)[:, None] + start
+        rope = self._rope(begin + torch.arange(length, device=tokens.device))
+        bias = prompt.hidden[:, None, None, None, :].float() * _HIDDEN_KEY
+        later = torch.ones(length, length, dtype=torch.bool, device=tokens.device).triu(1)
+        x = self.embedding(tokens)
+        memories = []
+        for index, (block, shared) in enumerate(zip(self.blocks, prompt.layers, strict=True)):
+            own = past[index] if past else None
+            q, k, v = block.project(x, rope)  # type: ignore[operator]
+            if own:
+                k, v = torch.cat([own.keys, k], dim=2), torch.cat([own.values, v], dim=2)
+            attended = _attend(q, shared, k, v, bias, later)
+            x = block.finish(x, attended)  # type: ignore[operator]
+            memories.append(LayerMemory(k, v))
+        return x, tuple(memories)
+
+
+def _attend(
+    q: Tensor, shared: LayerMemory, keys: Tensor, values: Tensor, bias: Tensor, later: Tensor
+) -> Tensor:
+    """Attention over the group's prompt and the sample's own tokens; the prompt's keys are never repeated.
+
+    q: (Q G, H, T, D); keys, values: (Q G, H, S, D) with the T newest last; result as q.
+    """
+    rows, heads, length, depth = q.shape
+    prompts, _, prompt_length, _ = shared.keys.shape
+    group = rows // prompts
+    asked = (q * depth**-0.5).view(prompts, group, heads, length, depth).transpose(1, 2)  # (Q, H, G, T, D)
+    flat = asked.reshape(prompts, heads, group * length, depth)
+    to_prompt = (flat @ shared.keys.transpose(-1, -2)).view(
+        prompts, heads, group, length, prompt_length
+    ) + bias
+    own_keys = keys.view(prompts, group, heads, -1, depth).transpose(1, 2)  # (Q, H, G, S, D)
+    own_values = values.view(prompts, group, heads, -1, depth).transpose(1, 2)
+    to_own = asked @ own_keys.transpose(-1, -2)  # (Q, H, G, T, S)
+    if length > 1:
+        to_own = to_own.masked_fill(later, _HIDDEN_KEY)
+    weights = torch.softmax(torch.cat([to_prompt, to_own], dim=-1), dim=-1)
+    over_prompt = weights[..., :prompt_length].reshape(prompts, heads, group * length, prompt_length)
+    result = (over_prompt @ shared.values).view(prompts, heads, group, length, depth)
+    result = result + weights[..., prompt_length:] @ own_values
+    return result.transpose(1, 2).reshape(rows, heads, length, depth)

@@ -1,0 +1,115 @@
+"""A word-level vocabulary: small policies learn to copy words in minutes, sub-word pieces in hours.
+
+Built from the tasks at hand: skills, relations, states, the category words of the object tables, room types, small
+numbers, and the frequent words of the *training* instructions. ``apple_12`` is two tokens, ``apple`` and ``_12``.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.skills.syntax import PlaceRelation, Skill
+from embomatrix.world.state import State
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+    from embomatrix.skills.prompt import Situation
+
+PAD: Final = 0
+END: Final = 1
+GO: Final = 2
+UNKNOWN: Final = 3
+SPECIAL: Final = ("<pad>", "<end>", "<go>", "<unknown>")
+_BREAK: Final = "\n"
+_NUMBERED: Final = re.compile(r"(.+?)(_\d+)")
+_WORD: Final = re.compile(r"\n|-?\d+\.\d+|[a-z0-9_]+(?:-[a-z][a-z0-9_]*)*|-\d+")
+_LONGEST_PHRASE: Final = 4
+_FIXED_WORDS: Final = (
+    _BREAK,
+    *(skill.value for skill in Skill),
+    *(relation.value for relation in PlaceRelation),
+    *(state.value for state in State),
+    *("room", "robot", "task", "in", "on", "under", "off", "open", "closed", "and", "then", "the", "it"),
+    *("0", "0.5", "1", "1.57", "-1.57", "2", "3.14"),
+)
+
+
+def build_vocabulary(
+    situations: Iterable[Situation], instructions: Iterable[str], *, min_count: int = 2
+) -> Vocabulary:
+    """Vocabulary for tasks whose tables are told by ``situations``; ``instructions`` are those of training."""
+    words: dict[str, None] = dict.fromkeys(_FIXED_WORDS)
+    numbers = {0}
+    for situation in situations:
+        names = [*situation.rooms, *(row.name for row in situation.rows)]
+        words |= dict.fromkeys(row.category for row in situation.rows)
+        for name in names:
+            stem, number = _split_number(name)
+            words.setdefault(stem)
+            numbers |= {int(number[1:])} if number else set()
+    counts = Counter(word for text in instructions for word in _WORD.findall(text.lower()))
+    frequent = sorted(word for word, count in counts.items() if count >= min_count)
+    words |= dict.fromkeys(frequent)
+    words |= dict.fromkeys(f"_{number}" for number in range(max(numbers) + 1))
+    return Vocabulary((*SPECIAL, *words))
+
+
+def _split_number(name: str) -> tuple[str, str]:
+    match = _NUMBERED.fullmatch(name)
+    return (match[1], match[2]) if match else (name, "")
+
+
+@dataclass(frozen=True)
+class Vocabulary:
+    """Words by token id. Text that it can't spell becomes ``<unknown>``; decoding never fails."""
+
+    words: tuple[str, ...]
+    index: Mapping[str, int] = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "index", {word: token for token, word in enumerate(self.words)})
+
+    def __len__(self) -> int:
+        return len(self.words)
+
+    def encode(self, text: str) -> list[int]:
+        """Tokens of a text: the longest known phrase of up to four words first, so "chicken leg" is one token."""
+        words = _WORD.findall(text.lower())
+        tokens: list[int] = []
+        at = 0
+        while at < len(words):
+            taken, found = self._longest(words[at : at + _LONGEST_PHRASE])
+            tokens += found
+            at += taken
+        return tokens
+
+    def _longest(self, words: Sequence[str]) -> tuple[int, list[int]]:
+        for size in range(len(words), 1, -1):
+            phrase = "_".join(words[:size])
+            if _BREAK not in words[:size] and phrase in self.index:
+                return size, [self.index[phrase]]
+        return 1, self._word(words[0])
+
+    def _word(self, word: str) -> list[int]:
+        if word in self.index:
+            return [self.index[word]]
+        stem, number = _split_number(word)
+        if number and stem in self.index and number in self.index:
+            return [self.index[stem], self.index[number]]
+        singular = word.removesuffix("s")
+        return [self.index.get(singular, UNKNOWN)]
+
+    def decode(self, tokens: Iterable[int]) -> str:
+        """Text up to the end token. Numbers that belong to a name join it: ``apple`` ``_2`` is ``apple_2``."""
+        parts: list[str] = []
+        for token in tokens:
+            if token == END:
+                break
+            word = self.words[token]
+            joined = word == _BREAK or word.startswith("_") or not parts or parts[-1] == _BREAK
+            parts += [word] if joined else [" ", word]
+        return "".join(parts)

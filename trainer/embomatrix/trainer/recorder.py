@@ -1,0 +1,82 @@
+"""What a run writes as it goes: metrics and samples, a JSON object a line, so that nothing is lost with a crash."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+from embomatrix.rpc.values import Cancelled, Completed, InfraFailure
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from embomatrix.trainer.rollout import PlanOutcome
+    from embomatrix.trainer.update import GroupLog, StepRecord
+
+METRICS = "metrics.jsonl"
+SAMPLES = "samples.jsonl"
+
+
+class Recorder:
+    """Appends to the files of one run's folder. Raises OSError where that can't be written."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        folder.mkdir(parents=True, exist_ok=True)
+
+    def step(self, record: StepRecord, seconds: float) -> None:
+        """``seconds`` is the wall clock of the step."""
+        self._append(METRICS, {**asdict(record), "seconds": round(seconds, 4)})
+
+    def samples(self, step: int, log: GroupLog) -> None:
+        """One task's plans: text, verdict, reward by tier, what each step did."""
+        for outcome, advantage in zip(log.outcomes, log.advantages, strict=True):
+            described = {
+                "step": step,
+                "task": log.task.task.task_id,
+                "instruction": log.task.task.instruction,
+            }
+            self._append(SAMPLES, {**described, "advantage": round(advantage, 4), **_described(outcome)})
+
+    def forget_after(self, step: int) -> None:
+        """Drop the metrics of steps that a resumed run will take again."""
+        path = self._folder / METRICS
+        if path.exists():
+            kept = [line for line in path.read_text().splitlines() if json.loads(line)["step"] <= step]
+            path.write_text("".join(f"{line}\n" for line in kept), encoding="utf-8")
+
+    def _append(self, name: str, value: Mapping[str, Any]) -> None:
+        with (self._folder / name).open("a", encoding="utf-8") as file:
+            file.write(json.dumps(value) + "\n")
+
+
+def read_metrics(folder: Path) -> list[dict[str, Any]]:
+    """Every step's record, oldest first; empty before the first step."""
+    path = folder / METRICS
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def _described(outcome: PlanOutcome) -> dict[str, Any]:
+    described: dict[str, Any] = {"text": outcome.text}
+    if outcome.reward is not None:
+        reward = outcome.reward
+        described |= {
+            "reward": reward.total,
+            "format": reward.format,
+            "relevance": reward.relevance,
+            "goal": reward.goal,
+            "success": reward.success,
+            "atoms": [[atom.text, atom.holds] for atom in reward.atoms],
+        }
+    match outcome.outcome:
+        case Completed(steps=steps):
+            described["steps"] = [[step.call.skill.value, step.ok, step.message] for step in steps]
+        case InfraFailure(code=code, message=message):
+            described["lost"] = f"{code.value}: {message}"
+        case Cancelled():
+            described["lost"] = "cancelled"
+        case None:
+            described["unparsable"] = outcome.problem
+    return described

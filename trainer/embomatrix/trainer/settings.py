@@ -1,0 +1,146 @@
+"""Every constant of a training run, parsed once: from the command line, from a TOML file, or from a checkpoint."""
+
+from __future__ import annotations
+
+import tomllib
+from enum import StrEnum
+from typing import TYPE_CHECKING, Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from embomatrix.trainer.errors import TrainerError
+from embomatrix.trainer.grpo import LossKind, Objective, RatioLevel
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+class OnLost(StrEnum):
+    """What becomes of a group of which the infrastructure lost a rollout."""
+
+    GROUP = "group"  # the whole group is left out of the update
+    PARTIAL = "partial"  # only the lost rollout is
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class TinySettings(_Frozen):
+    """Shape of the from-scratch policy."""
+
+    layers: int = Field(default=4, ge=1)
+    width: int = Field(default=128, ge=16)
+    heads: int = Field(default=4, ge=1)
+    inner: int = Field(default=384, ge=16)
+
+
+class PromptSettings(_Frozen):
+    """What of a task's table is told, and how the telling varies during training."""
+
+    rows: int = Field(default=28, ge=1)
+    """Rows told at most: those that the instruction names come first."""
+    rename_share: float = Field(default=0.5, ge=0, le=1)
+    """Share of examples in which categories are called by those of other things of the same kind (tiny policy only)."""
+    drop_share: float = Field(default=0.5, ge=0, le=1)
+    """During imitation: up to this share of the rows that the oracle does not use is left untold."""
+
+
+class ImitationSettings(_Frozen):
+    """Teacher forcing on the oracle's plans, before GRPO."""
+
+    seconds: float = Field(default=150.0, ge=0)
+    steps: int | None = Field(default=None, ge=0)
+    """A number of steps in place of the seconds."""
+    batch: int = Field(default=32, ge=1)
+    learning_rate: float = Field(default=2e-3, gt=0)
+    warmup_steps: int = Field(default=20, ge=0)
+    weight_decay: float = Field(default=0.01, ge=0)
+
+
+class GrpoSettings(_Frozen):
+    """Group relative policy optimisation. The paper gives no values for these constants."""
+
+    minutes: float = Field(default=5.0, ge=0)
+    steps: int | None = Field(default=None, ge=0)
+    """A number of steps in place of the minutes."""
+    tasks_per_step: int = Field(default=8, ge=1)
+    group: int = Field(default=8, ge=2)
+    """Plans per task: G."""
+    chunk: int = Field(default=4, ge=1)
+    """Tasks sampled together: their plans go to the cluster while the next chunk is sampled."""
+    learning_rate: float = Field(default=3e-4, gt=0)
+    final_learning_rate_share: float = Field(default=0.2, gt=0, le=1)
+    """The rate falls linearly to this share of itself."""
+    temperature: float = Field(default=1.0, gt=0)
+    max_new: int = Field(default=72, ge=1)
+    """Tokens of a plan at most."""
+    loss: LossKind = LossKind.DAPO
+    ratio: RatioLevel = RatioLevel.TOKEN
+    clip_low: float = Field(default=0.2, gt=0, lt=1)
+    clip_high: float = Field(default=0.28, gt=0)
+    kl_coef: float = Field(default=0.005, ge=0)
+    """Weight of the KL to the policy as imitation left it: the paper's beta."""
+    entropy_coef: float = Field(default=0.0, ge=0)
+    max_grad_norm: float = Field(default=1.0, gt=0)
+    lookahead: int = Field(default=3, ge=0)
+    """Steps announced ahead."""
+    on_lost: OnLost = OnLost.GROUP
+
+    def objective(self) -> Objective:
+        return Objective(
+            self.loss, self.ratio, self.clip_low, self.clip_high, self.kl_coef, self.entropy_coef
+        )
+
+
+class EvaluationSettings(_Frozen):
+    """Success on held-out tasks."""
+
+    samples: int = Field(default=10, ge=1)
+    temperature: float = Field(default=1.0, ge=0)
+    chunk: int = Field(default=8, ge=1)
+
+
+class TrainSettings(_Frozen):
+    """One training run."""
+
+    model: str = "tiny"
+    """``tiny``, or a Hugging Face model by name or folder."""
+    codec: str = "lines"
+    """Plan form of a Hugging Face model: ``lines`` or ``json``. The tiny policy calls objects by name."""
+    seed: int = 0
+    threads: int = Field(default=1, ge=1)
+    """Threads of torch."""
+    device: str = "cpu"
+    checkpoint_every: int = Field(default=50, ge=1)
+    keep_checkpoints: int = Field(default=2, ge=1)
+    samples_every: int = Field(default=10, ge=1)
+    """Steps between two groups that are written to the sample log."""
+    tiny: TinySettings = TinySettings()
+    prompt: PromptSettings = PromptSettings()
+    imitation: ImitationSettings = ImitationSettings()
+    grpo: GrpoSettings = GrpoSettings()
+    evaluation: EvaluationSettings = EvaluationSettings()
+
+
+def read_settings(path: Path | None, changes: dict[str, Any]) -> TrainSettings:
+    """Settings of a TOML file, with ``changes`` (dotted keys, None: not given) on top. Raises TrainerError."""
+    values: dict[str, Any] = {}
+    if path is not None:
+        try:
+            values = tomllib.loads(path.read_text(encoding="utf-8"))
+        except (OSError, tomllib.TOMLDecodeError) as error:
+            raise TrainerError(f"the settings file {path} can't be read: {error}") from error
+    for key, value in changes.items():
+        if value is not None:
+            *parents, leaf = key.split(".")
+            level = values
+            for parent in parents:
+                level = level.setdefault(parent, {})
+            level[leaf] = value
+    try:
+        return TrainSettings.model_validate(values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"]))
+        raise TrainerError(f"setting {where!r}: {first['msg']} (found {first.get('input')!r})") from error
