@@ -1,0 +1,158 @@
+"""Furnishing: the inventory of every room, placed at its own sizes so that a robot can get to all that it may use."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.factory.furnish_groups import ceiling_groups, floor_groups, hung_groups, rug_groups
+from embomatrix.factory.furnish_roles import Role, importance_of
+from embomatrix.factory.furnish_solver import Placed, RoomSolver
+from embomatrix.factory.furnish_space import RoomSpace
+from embomatrix.factory.furnish_surfaces import SurfacePlacer
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import numpy as np
+
+    from embomatrix.factory.floorplan import FloorPlan
+    from embomatrix.factory.furnish_pieces import Piece
+    from embomatrix.world.scene import Doorway, Room
+
+ATTEMPTS: Final = 8
+"""Arrangements of a room that are tried before one that leaves something out is taken."""
+MAX_EQUAL: Final = 6
+"""Small things of one model in one room at most: the diner's kitchen lists 137 trays."""
+
+
+@dataclass(frozen=True, slots=True)
+class Furnishing:
+    """Placed pieces of a whole plan, hosts by position in ``placed``, and what found no place, one sentence each."""
+
+    placed: tuple[Placed, ...]
+    left_out: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Arrangement:
+    placed: tuple[Placed, ...]
+    dropped: tuple[Piece, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def loss(self) -> float:
+        return sum(importance_of(p.category, p.role) for p in self.dropped)
+
+
+def furnish(plan: FloorPlan, pieces: dict[str, list[Piece]], rng: np.random.Generator) -> Furnishing:
+    """Place the pieces of every room of the plan; ``pieces`` maps room names to their inventories.
+
+    Deterministic for a given generator state. What has no place is never dropped silently: see ``left_out``.
+    """
+    placed: list[Placed] = []
+    left_out: list[str] = []
+    small: list[tuple[str, Piece]] = []
+    for room in plan.rooms:
+        wanted, notes = _capped(pieces.get(room.name, []), room.name)
+        best = _best_arrangement(room, plan.doorways, wanted, rng)
+        start = len(placed)
+        placed += [replace(p, host=p.host + start) if p.host >= 0 else p for p in best.placed]
+        left_out += [
+            *notes,
+            *(f"{note} in {room.name}" for note in best.notes),
+            *_sentences(best.dropped, room.name, "no free place keeps the room passable"),
+        ]
+        done = {id(p.piece) for p in best.placed} | {id(p) for p in best.dropped}
+        small += [(room.name, p) for p in wanted if p.role is Role.SURFACE and id(p) not in done]
+    left_out += _set_small_things(plan, placed, small, rng)
+    return Furnishing(tuple(placed), tuple(left_out))
+
+
+def _capped(pieces: Sequence[Piece], room: str) -> tuple[list[Piece], list[str]]:
+    """At most MAX_EQUAL small things of one model, nothing that belongs to the building; with sentences on the rest."""
+    kept: list[Piece] = []
+    totals = Counter(p.asset.asset_id for p in pieces)
+    seen: Counter[str] = Counter()
+    for piece in pieces:
+        seen[piece.asset.asset_id] += 1
+        small = piece.role in (Role.SURFACE, Role.CEILING)
+        if piece.role is not Role.STRUCTURE and not (small and seen[piece.asset.asset_id] > MAX_EQUAL):
+            kept.append(piece)
+    notes = []
+    for piece in {p.asset.asset_id: p for p in pieces}.values():
+        asset_id, total = piece.asset.asset_id, totals[piece.asset.asset_id]
+        if piece.role is Role.STRUCTURE:
+            notes.append(
+                f"{total} {asset_id} in {room}: part of the building, which floor and walls stand for"
+            )
+        elif total > MAX_EQUAL and piece.role in (Role.SURFACE, Role.CEILING):
+            notes.append(
+                f"{total - MAX_EQUAL} of {total} {asset_id} in {room}: at most {MAX_EQUAL} of a model in a room"
+            )
+    return kept, notes
+
+
+def _best_arrangement(
+    room: Room, doorways: Sequence[Doorway], pieces: Sequence[Piece], rng: np.random.Generator
+) -> _Arrangement:
+    best: _Arrangement | None = None
+    for attempt in range(ATTEMPTS):
+        tried = _arrange(room, doorways, pieces, rng, wobble=0.4 + 0.2 * attempt)
+        if best is None or tried.loss < best.loss:
+            best = tried
+        if best.loss == 0:
+            break
+    if best is None:
+        raise ValueError(f"room {room.name!r} was never arranged: expected at least one attempt")
+    return best
+
+
+def _arrange(
+    room: Room,
+    doorways: Sequence[Doorway],
+    pieces: Sequence[Piece],
+    rng: np.random.Generator,
+    *,
+    wobble: float,
+) -> _Arrangement:
+    solver = RoomSolver(RoomSpace(room, doorways), rng)
+    groups, notes = floor_groups(pieces)
+    dropped: list[Piece] = []
+    for group in (*groups, *hung_groups(pieces), *ceiling_groups(pieces), *rug_groups(pieces)):
+        remaining = group
+        while not solver.place(remaining, wobble=wobble):
+            dropped.append(remaining.members[-1].piece)
+            if len(remaining.members) == 1:
+                break
+            # The last member is the least important one: a chair, a stool, the coffee table.
+            remaining = replace(remaining, members=remaining.members[:-1])
+    return _Arrangement(tuple(solver.placed), tuple(dropped), tuple(notes))
+
+
+def _set_small_things(
+    plan: FloorPlan, placed: list[Placed], small: Sequence[tuple[str, Piece]], rng: np.random.Generator
+) -> list[str]:
+    """Put small things on and in the furniture of their room, else of the room next door."""
+    placer = SurfacePlacer(placed, rng)
+    beside = {
+        r.name: [_other(d, r.name) for d in plan.doorways if r.name in d.rooms and d.rooms[1]]
+        for r in plan.rooms
+    }
+    dropped: dict[str, list[Piece]] = {}
+    for room, piece in sorted(small, key=lambda item: -item[1].size_m[0] * item[1].size_m[1]):
+        if not placer.place(piece, (room, *beside[room])):
+            dropped.setdefault(room, []).append(piece)
+    return [
+        s for room, pieces in dropped.items() for s in _sentences(pieces, room, "no surface has room for it")
+    ]
+
+
+def _other(doorway: Doorway, room: str) -> str:
+    return doorway.rooms[1] if doorway.rooms[0] == room else doorway.rooms[0]
+
+
+def _sentences(pieces: Sequence[Piece], room: str, reason: str) -> list[str]:
+    counts = Counter(p.asset.asset_id for p in pieces)
+    return [f"{count} {asset_id} in {room}: {reason}" for asset_id, count in counts.items()]

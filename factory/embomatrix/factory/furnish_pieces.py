@@ -1,0 +1,239 @@
+"""Pieces and groups: the inventory's items of a room, arranged into the units that furnishing places as a whole.
+
+A group's own frame has x towards the room and y to its left; the wall, if it stands at one, is behind it at -x.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from embomatrix.factory.furnish_roles import Role
+from embomatrix.world.geometry import Pose
+from embomatrix.world.state import Relation
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from embomatrix.world.asset import Asset, Joint
+    from embomatrix.world.geometry import Vec3
+
+REST_GAP_M: Final = 0.0005
+"""Things rest half a millimetre above what carries them: close enough to be on it, far enough not to be in it."""
+FRONT_M: Final = 0.6
+_UPENDED: Final = Pose((0.0, 0.0, 0.0), (0.0, math.sqrt(0.5), 0.0, math.sqrt(0.5)))
+"""A flat model's face, at +z of its asset frame, turned to +x."""
+
+Rect4 = tuple[float, float, float, float]
+
+
+class Access(StrEnum):
+    """What the robot must be able to reach of a piece."""
+
+    NONE = "none"
+    BESIDE = "beside"  # some free spot near it
+    FRONT = "front"  # a free strip before its front
+    HUNG = "hung"  # some free spot near it, and room before it at its own height
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """One item of a room's inventory. ``number`` tells it from its equals; ``upended`` models hang with z to the room."""
+
+    number: int
+    category: str
+    asset: Asset
+    role: Role
+    upended: bool = False
+
+    @property
+    def size_m(self) -> Vec3:
+        """Extent along x, y and z as it is placed at zero yaw."""
+        x, y, z = self.asset.size_m
+        return (z, y, x) if self.upended else (x, y, z)
+
+    def pose(self, x: float, y: float, bottom: float, yaw: float) -> Pose:
+        """Pose of the asset with its lowest point at height ``bottom``."""
+        upright = Pose.from_xyz_yaw(x, y, bottom + self.size_m[2] / 2, yaw)
+        return upright @ _UPENDED if self.upended else upright
+
+
+@dataclass(frozen=True, slots=True)
+class Member:
+    """A piece in its group's frame: centre of its footprint, underside, quarter turns; ``on`` is its host's position."""
+
+    piece: Piece
+    x: float = 0.0
+    y: float = 0.0
+    bottom: float = 0.0
+    turns: int = 0
+    on: int = -1
+
+    @property
+    def half(self) -> tuple[float, float]:
+        x, y, _ = self.piece.size_m
+        return (y / 2, x / 2) if self.turns % 2 else (x / 2, y / 2)
+
+
+class Style(StrEnum):
+    """Where a group looks for its place."""
+
+    RUN = "run"
+    CENTERED = "centered"  # at the middle of a wall
+    ALONG = "along"  # anywhere along a wall
+    CORNER = "corner"
+    FREE = "free"  # in the middle of the room
+    OVERHEAD = "overhead"
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """Pieces that are placed as one. ``near`` and ``faces`` name categories whose closeness or sight is worth something."""
+
+    members: tuple[Member, ...]
+    style: Style
+    importance: float
+    near: tuple[str, ...] = ()
+    faces: tuple[str, ...] = ()
+    spread: tuple[str, ...] = field(default=())
+
+    @property
+    def bounds(self) -> Rect4:
+        """(x0, y0, x1, y1) of all footprints in the group's frame."""
+        low = np.min([(m.x - m.half[0], m.y - m.half[1]) for m in self.members], axis=0)
+        high = np.max([(m.x + m.half[0], m.y + m.half[1]) for m in self.members], axis=0)
+        return (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+
+
+_FRONTED: Final = frozenset(
+    [
+        "fridge",
+        "freezer",
+        "oven",
+        "stove",
+        "dishwasher",
+        "washer",
+        "clothes_dryer",
+        "furniture_sink",
+        "commercial_kitchen_sink",
+        "toilet",
+        "pedestal_sink",
+        "multi_station_furniture_sink",
+        "flat_top_grill",
+        "deep_fryer",
+        "bookcase",
+        "bathtub",
+        "jukebox",
+        "wardrobe",
+        "urinal",
+        "electric_cauldron",
+        "vending_machine",
+        "grocery_shelf",
+        "photocopier",
+        "locker",
+        "wall_mounted_sink",
+    ]
+)
+_BESIDE: Final = frozenset((Role.TABLE, Role.LOW_TABLE))
+
+
+def access_of(piece: Piece) -> Access:
+    """What access the piece needs: a free front where it opens or works, a spot beside it where one puts things on it."""
+    if piece.role is Role.SURFACE:
+        return Access.NONE
+    if piece.role is Role.HUNG_CABINET:
+        return Access.HUNG if piece.asset.can("openable") else Access.NONE
+    if piece.category in _FRONTED or piece.asset.can("openable"):
+        return Access.FRONT
+    if piece.role in _BESIDE or piece.category in (
+        "bed",
+        "sofa",
+        "armchair",
+        "countertop",
+        "bar",
+        "commercial_kitchen_table",
+        "shower_stall",
+    ):
+        return Access.BESIDE
+    return Access.NONE
+
+
+def front_depth_m(asset: Asset) -> float:
+    """Free depth that the front needs: 0.6 m, or as far as its doors and drawers come out."""
+    out = 0.0
+    for link in asset.links:
+        if link.joint is None:
+            continue
+        for fraction in (0.5, 1.0):
+            moved = _joint_pose(link.joint, fraction)
+            out = max([out, *(part.aabb(moved).high_m[0] for part in link.parts)])
+    return max(FRONT_M, min(out - asset.size_m[0] / 2 + 0.02, 1.0))
+
+
+def _joint_pose(joint: Joint, fraction: float) -> Pose:
+    """Displacement of a link, in the asset's frame, at a share of its joint's travel."""
+    ax, ay, az = joint.axis
+    q = fraction * joint.upper
+    if joint.kind == "prismatic":
+        return Pose((ax * q, ay * q, az * q))
+    s = math.sin(q / 2)
+    turn = Pose((0.0, 0.0, 0.0), (ax * s, ay * s, az * s, math.cos(q / 2)))
+    ox, oy, oz = joint.origin_m
+    return Pose(joint.origin_m) @ turn @ Pose((-ox, -oy, -oz))
+
+
+def top_of(piece: Piece) -> float:
+    """Height of the piece's main top surface above its underside; its full height when it has no surface in the open."""
+    half = piece.asset.size_m[2] / 2
+    tops = [(s.size_m[0] * s.size_m[1], s.center_m[2] + half) for s in piece.asset.supports if not s.interior]
+    return max(tops)[1] if tops else piece.asset.size_m[2]
+
+
+def stacked(base: Member, piece: Piece, index: int) -> Member:
+    """The piece centred on top of the group's member at ``index``."""
+    return Member(piece, base.x, base.y, base.bottom + top_of(base.piece) + REST_GAP_M, base.turns, on=index)
+
+
+def relation_of(member: Member) -> Relation | None:
+    return Relation.ONTOP if member.on >= 0 else None
+
+
+def around_table(table: Piece, chairs: Sequence[Piece], gap_m: float = 0.04) -> tuple[Member, ...]:
+    """A table with chairs facing it: along the long sides first, then at the ends."""
+    members = [Member(table)]
+    depth, width, _ = table.size_m
+    seat = max((c.size_m[1] for c in chairs), default=0.5) + 0.08
+    side = max(1, int(width / seat))
+    ends = max(1, int(depth / seat)) if len(chairs) > 2 * side else 0
+    counts = _seats(len(chairs), (side, side, ends, ends))
+    rest = list(chairs)
+    for direction, count in zip((0, 2, 1, 3), counts, strict=True):
+        for place in range(count):
+            chair = rest.pop(0)
+            across = depth if direction % 2 == 0 else width
+            run = width if direction % 2 == 0 else depth
+            offset = across / 2 + gap_m + chair.size_m[0] / 2
+            shift = ((place + 0.5) / count - 0.5) * max(run, count * seat)
+            x, y = ((offset, shift), (shift, offset), (-offset, shift), (shift, -offset))[direction]
+            members.append(Member(chair, x, y, turns=(direction + 2) % 4))
+    return tuple(members)
+
+
+def _seats(chairs: int, places: tuple[int, int, int, int]) -> tuple[int, ...]:
+    """Chairs per side: the two long sides share them, the ends take the rest."""
+    counts = [0, 0, 0, 0]
+    for _ in range(chairs):
+        open_sides = [i for i in range(4) if counts[i] < places[i]]
+        if not open_sides:
+            break
+        pick = min(open_sides, key=lambda i: (i >= 2, counts[i]))
+        counts[pick] += 1
+    return tuple(counts)
+
+
+def shifted(members: Sequence[Member], dx: float, dy: float) -> tuple[Member, ...]:
+    return tuple(replace(m, x=m.x + dx, y=m.y + dy) for m in members)

@@ -1,0 +1,194 @@
+"""What each category is to a room: where it stands, hangs or lies, how much it matters, what it wants nearby.
+
+The tables name the categories of the 51 inventories that need a decision; every other model is judged by its size and mass.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.skills.limits import ROBOT
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from embomatrix.world.asset import Asset
+
+
+class Role(StrEnum):
+    """How a model is placed."""
+
+    RUN = "run"  # shoulder to shoulder along a wall: cabinets, appliances, sinks
+    COUNTERTOP = "countertop"  # a slab over base cabinets
+    BACKED = "backed"  # back to a wall, front to the room
+    TABLE = "table"  # free-standing with chairs around, or a desk at a wall
+    SEAT = "seat"  # goes with a table; along a wall otherwise
+    LOW_TABLE = "low_table"  # before a sofa
+    CORNER = "corner"  # in a corner or beside other furniture
+    HUNG_CABINET = "hung_cabinet"  # on the wall above a counter
+    WALL = "wall"  # on the wall at its height
+    CEILING = "ceiling"
+    RUG = "rug"
+    SURFACE = "surface"  # on or in furniture
+    STRUCTURE = "structure"  # part of the building or its surroundings: walls and floors stand for it
+
+
+_BY_ROLE: Final[Mapping[Role, str]] = {
+    Role.RUN: "bottom_cabinet bottom_cabinet_no_top metal_bottom_cabinet fridge freezer oven stove dishwasher washer "
+    "clothes_dryer furniture_sink commercial_kitchen_sink multi_station_furniture_sink flat_top_grill deep_fryer "
+    "electric_cauldron wine_fridge display_fridge grocery_fridge lab_exhaust_hood",
+    Role.COUNTERTOP: "countertop",
+    Role.BACKED: "bed sofa bookcase armchair wardrobe cedar_chest console_table nightstand standing_mirror piano toilet "
+    "pedestal_sink bathtub shower_stall grandfather_clock jukebox bar commercial_kitchen_table locker vending_machine "
+    "photocopier reception_desk checkout_counter display_case grocery_shelf hall_tree wood_fireplace gas_fireplace "
+    "treadmill crib hospital_bed magazine_stand snack_rack urinal eames_chair commercial_kitchen_shelf serving_cart",
+    Role.TABLE: "breakfast_table dining_table pedestal_table conference_table desk booth garden_coffee_table lab_table "
+    "pool_table",
+    Role.SEAT: "straight_chair swivel_chair taboret bench garden_chair music_stool rocking_chair",
+    Role.LOW_TABLE: "coffee_table",
+    Role.CORNER: "floor_lamp public_trash_can trash_can coatrack ottoman hamper standing_loudspeaker umbrella_rack "
+    "water_cooler pillar radiator electric_fan desktop_computer shredder suitcase",
+    Role.HUNG_CABINET: "top_cabinet range_hood",
+    Role.WALL: "picture painting portrait mirror electric_switch towel_rack wall_mounted_tv wall_clock whiteboard "
+    "blackboard paper_towel_dispenser toilet_paper_dispenser toilet_paper_holder hand_dryer wall_socket wall_nail hook "
+    "wall_mounted_light wall_mounted_sink wall_mounted_soap_dispenser shelf pay_phone wall_mounted_loudspeaker "
+    "information_bulletin periodic_table map decorative_sign signpost makeup_mirror showerhead scoreboard "
+    "security_camera fire_extinguisher projection_screen hanging_banners multi_station_wall_mounted_sink hanging "
+    "architectural_plan",
+    Role.CEILING: "downlight square_light room_light rectangular_light ceiling_fan ceiling_rack room_ventilator "
+    "fire_alarm fire_sprinkler track_light spotlight chandelier paper_lantern ceiling_air_conditioner hanging_plant "
+    "ceiling_mounted_projector motion_sensor",
+    Role.RUG: "carpet gym_mat",
+    Role.SURFACE: "microwave laptop coffee_maker table_lamp loudspeaker monitor keyboard printer espresso_machine standing_tv "
+    "popcorn_machine electric_mixer food_slicer crock_pot beer_tap jug stockpot saucepot frying_pan tray pillow vase",
+    Role.STRUCTURE: "structural_element baseboard background greenery paver skeletal_frame stone_wall rail_fence stairs "
+    "railing pergola arbor swimming_pool room_divider pedestal wall_panel l_shaped_handle handle classroom_mock_up "
+    "burner drop_in_sink tabletop_sink multi_station_tabletop_sink vine shower fairy_light window_blind",
+}
+_ROLE_OF: Final[Mapping[str, Role]] = {c: role for role, names in _BY_ROLE.items() for c in names.split()}
+
+_IMPORTANCE: Final[Mapping[str, float]] = {
+    "fridge": 10, "oven": 10, "stove": 10, "furniture_sink": 10, "pedestal_sink": 10, "commercial_kitchen_sink": 10,
+    "bed": 10, "toilet": 10, "sofa": 9, "dishwasher": 9, "bar": 9, "breakfast_table": 8, "dining_table": 8, "desk": 8,
+    "booth": 8, "commercial_kitchen_table": 9, "bathtub": 8, "shower_stall": 8, "washer": 8, "microwave": 8, "countertop": 6,
+    "bottom_cabinet": 6, "bookcase": 6, "top_cabinet": 5, "wardrobe": 6,
+}  # fmt: skip
+
+_WALL_HEIGHT: Final[Mapping[str, float]] = {
+    "picture": 1.55, "painting": 1.55, "portrait": 1.55, "mirror": 1.55, "electric_switch": 1.15, "towel_rack": 1.15,
+    "wall_mounted_tv": 1.6, "wall_clock": 1.9, "paper_towel_dispenser": 1.35, "toilet_paper_dispenser": 0.75,
+    "toilet_paper_holder": 0.75, "wall_socket": 0.3, "wall_nail": 1.6, "pay_phone": 1.35, "shelf": 1.45,
+    "wall_mounted_sink": 0.75, "fire_extinguisher": 1.0, "security_camera": 2.15, "hand_dryer": 1.2,
+}  # fmt: skip
+"""Height of the centre of things on a wall, in metres; the underside for what is named in ``HUNG_BOTTOM_M``."""
+
+HUNG_BOTTOM_M: Final = 1.4
+"""Underside of wall cabinets: above the counters, and no obstacle to the robot."""
+
+_WALL_DEFAULT_M: Final = 1.5
+_SMALL_EXTENT_M: Final = 0.65
+_SMALL_VOLUME_M3: Final = 0.06
+
+
+def role_of(category: str, size_m: tuple[float, float, float], mass_kg: float) -> Role:
+    """The role of a model of this size (depth, width, height) and mass."""
+    if category == "pot_plant":
+        return Role.CORNER if size_m[2] > 0.6 else Role.SURFACE
+    if category in _ROLE_OF:
+        return _ROLE_OF[category]
+    volume = size_m[0] * size_m[1] * size_m[2]
+    if max(size_m) <= _SMALL_EXTENT_M and volume <= _SMALL_VOLUME_M3 and mass_kg <= 2 * ROBOT.mass_kg:
+        return Role.SURFACE
+    if max(size_m) > 4.0 or size_m[2] > 3.0:
+        return Role.STRUCTURE
+    return Role.CORNER if max(size_m[:2]) < 0.6 else Role.BACKED
+
+
+def importance_of(category: str, role: Role) -> float:
+    """What dropping one costs: large for what makes the room what it is."""
+    if category in _IMPORTANCE:
+        return _IMPORTANCE[category]
+    return {
+        Role.RUN: 6.0,
+        Role.BACKED: 5.0,
+        Role.TABLE: 6.0,
+        Role.LOW_TABLE: 4.0,
+        Role.SEAT: 2.0,
+        Role.CORNER: 2.0,
+    }.get(role, 1.0)
+
+
+def wall_height_m(category: str) -> float:
+    """Height above the floor of the centre of a thing on a wall."""
+    return _WALL_HEIGHT.get(category, _WALL_DEFAULT_M)
+
+
+def is_portable(asset: Asset) -> bool:
+    """True when the robot can pick the model up; appliances that heat stay where they are."""
+    return (
+        asset.mass_kg <= ROBOT.mass_kg
+        and min(asset.size_m) <= ROBOT.grip_m
+        and max(asset.size_m) <= ROBOT.extent_m
+        and not (asset.interiors and asset.can("heatSource"))
+    )
+
+
+SURFACE_HOSTS: Final[Mapping[str, tuple[str, ...]]] = {
+    "microwave": ("countertop", "commercial_kitchen_table", "bottom_cabinet", "breakfast_table", "bar"),
+    "coffee_maker": ("countertop", "commercial_kitchen_table", "bar", "bottom_cabinet", "breakfast_table"),
+    "espresso_machine": ("bar", "countertop", "commercial_kitchen_table"),
+    "popcorn_machine": ("bar", "countertop", "bottom_cabinet"),
+    "beer_tap": ("bar", "countertop"),
+    "laptop": ("desk", "breakfast_table", "coffee_table", "console_table"),
+    "table_lamp": (
+        "nightstand",
+        "console_table",
+        "desk",
+        "bottom_cabinet",
+        "bookcase",
+        "breakfast_table",
+        "coffee_table",
+    ),
+    "monitor": ("desk",),
+    "keyboard": ("desk",),
+    "mouse": ("desk",),
+    "pillow": ("bed", "sofa", "armchair"),
+    "pot_plant": (
+        "console_table",
+        "bookcase",
+        "bottom_cabinet",
+        "coffee_table",
+        "breakfast_table",
+        "cedar_chest",
+    ),
+    "standing_tv": ("bottom_cabinet", "console_table", "bookcase", "coffee_table", "breakfast_table"),
+    "loudspeaker": ("bookcase", "console_table", "bottom_cabinet"),
+    "menu": ("booth", "pedestal_table", "bar"),
+    "bottle_of_mustard": ("booth", "pedestal_table", "bar"),
+    "bottle_of_catsup": ("booth", "pedestal_table", "bar"),
+    "jar_of_sugar": ("booth", "pedestal_table", "bar"),
+    "pepper_shaker": ("booth", "pedestal_table", "bar"),
+    "salt_shaker": ("booth", "pedestal_table", "bar"),
+    "phonograph_record": ("jukebox", "bar", "booth"),
+    "cloche": ("bar", "countertop"),
+    "cake_stand": ("bar", "countertop"),
+    "wrapped_hamburger": ("bar", "booth", "pedestal_table"),
+    "soda_cup": ("bar", "bookcase", "shelf", "commercial_kitchen_table"),
+    "cap": ("bar", "console_table", "bottom_cabinet"),
+    "chopping_board": ("commercial_kitchen_table", "countertop"),
+    "saucepot": ("stove", "commercial_kitchen_table", "shelf", "bookcase", "bottom_cabinet"),
+    "frying_pan": ("flat_top_grill", "stove", "commercial_kitchen_table", "bookcase"),
+    "stockpot": ("stove", "bookcase", "commercial_kitchen_table"),
+    "plate": ("bookcase", "shelf", "bottom_cabinet", "top_cabinet", "countertop", "commercial_kitchen_table"),
+    "bowl": ("bookcase", "shelf", "bottom_cabinet", "top_cabinet", "countertop", "commercial_kitchen_table"),
+    "mug": ("shelf", "bookcase", "bottom_cabinet", "top_cabinet", "countertop", "commercial_kitchen_table"),
+    "tray": ("bookcase", "commercial_kitchen_table", "bar", "freezer", "bottom_cabinet"),
+    "teapot": ("bookcase", "shelf", "commercial_kitchen_table"),
+    "jug": ("bookcase", "commercial_kitchen_table"),
+    "lid": ("shelf", "bookcase", "commercial_kitchen_table"),
+    "hardback": ("bookcase", "desk", "coffee_table"),
+    "paperback_book": ("bookcase", "desk", "coffee_table"),
+    "printer": ("desk", "bottom_cabinet", "console_table"),
+}
+"""Hosts that a small thing likes, best first; without an entry, or when those are full, any surface of the room serves."""

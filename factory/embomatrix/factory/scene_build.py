@@ -1,0 +1,137 @@
+"""Base scenes: an inventory becomes rooms, walls, doorways and furniture."""
+
+from __future__ import annotations
+
+import logging
+import zlib
+from collections import Counter
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from embomatrix.factory.assets.library import build_asset
+from embomatrix.factory.floorplan import DoorSpec, FloorPlan, RoomSpec, plan_floor
+from embomatrix.factory.furnish import furnish
+from embomatrix.factory.furnish_pieces import Piece
+from embomatrix.factory.furnish_roles import Role, is_portable, role_of
+from embomatrix.factory.furnish_space import RoomSpace
+from embomatrix.world.catalog import Catalog
+from embomatrix.world.scene import RobotStart, Scene, SceneObject
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from embomatrix.factory.furnish_solver import Placed
+    from embomatrix.world.asset import Asset
+    from embomatrix.world.catalog import RoomInventory, SceneInventory
+
+logger = logging.getLogger(__name__)
+
+_FLAT_ON_WALL: Final = frozenset(
+    {"picture", "painting", "portrait", "information_bulletin", "periodic_table", "map"}
+)
+
+
+def build_base_scene(scene_id: str, *, seed: int = 0) -> Scene:
+    """Lay out and furnish one of the catalog's inventories.
+
+    The same id and seed give the same scene. Raises CatalogError for an unknown id, FloorPlanError when its rooms can't
+    be joined.
+    """
+    catalog = Catalog.load()
+    inventory = catalog.inventory(scene_id)
+    rng = np.random.default_rng(np.random.SeedSequence((seed, zlib.crc32(scene_id.encode()))))
+    plan = plan_floor([room_spec(catalog, room) for room in inventory.rooms], rng)
+    pieces, notes = _pieces(catalog, inventory)
+    result = furnish(plan, pieces, rng)
+    objects, assets = _objects(result.placed)
+    scene = Scene(
+        scene_id=scene_id,
+        base=scene_id,
+        seed=seed,
+        rooms=plan.rooms,
+        walls=plan.walls,
+        doorways=plan.doorways,
+        objects=objects,
+        assets=assets,
+        robot=_robot_start(plan, result.placed),
+        left_out=(*notes, *result.left_out),
+    )
+    logger.info(
+        "scene built id=%s seed=%d objects=%d left_out=%d", scene_id, seed, len(objects), len(scene.left_out)
+    )
+    return scene
+
+
+def room_spec(catalog: Catalog, room: RoomInventory) -> RoomSpec:
+    """Floor and doors of an inventory's room, each door as often as it is listed."""
+    doors = []
+    for category, model, count in room.doors:
+        _, width, height = catalog.model(category, model).size_m
+        doors += [DoorSpec(model, width, height)] * count
+    return RoomSpec(room.name, room.type, room.floor_m, tuple(doors))
+
+
+def _pieces(catalog: Catalog, inventory: SceneInventory) -> tuple[dict[str, list[Piece]], list[str]]:
+    """The items of every room as pieces, and sentences on what is listed twice or not modelled."""
+    notes = [
+        f"{sum(n for _, _, n in room.windows)} windows in {room.name}: its walls are closed"
+        for room in inventory.rooms
+        if room.windows
+    ]
+    pieces: dict[str, list[Piece]] = {}
+    seen: set[str] = set()
+    number = 0
+    # Large rooms first: what spans two rooms, a bar, is listed in both and stands where it fits.
+    for room in sorted(inventory.rooms, key=lambda r: -r.floor_m[0] * r.floor_m[1]):
+        mine = pieces.setdefault(room.name, [])
+        for category, model, count in room.items:
+            asset = build_asset(catalog, category, model)
+            if asset.asset_id in seen and max(asset.size_m[:2]) > max(room.floor_m) - 0.02:
+                notes.append(
+                    f"{asset.asset_id} in {room.name}: it is listed in two rooms and stands in the larger one"
+                )
+                continue
+            seen.add(asset.asset_id)
+            role = role_of(category, asset.size_m, asset.mass_kg)
+            flat = category in _FLAT_ON_WALL and asset.size_m[2] < min(asset.size_m[:2])
+            for _ in range(count):
+                mine.append(Piece(number, category, asset, role, upended=flat and role is Role.WALL))
+                number += 1
+    return pieces, notes
+
+
+def _objects(placed: Sequence[Placed]) -> tuple[tuple[SceneObject, ...], dict[str, Asset]]:
+    counts: Counter[str] = Counter()
+    names = []
+    for item in placed:
+        counts[item.piece.category] += 1
+        names.append(f"{item.piece.category}_{counts[item.piece.category]}")
+    objects = tuple(
+        SceneObject(
+            name=name,
+            asset_id=item.piece.asset.asset_id,
+            room=item.room,
+            pose_world_asset=item.pose,
+            fixed=item.piece.role is not Role.SURFACE or not is_portable(item.piece.asset),
+            joints=(0.0,) * len(item.piece.asset.joints),
+            host=names[item.host] if item.host >= 0 else "",
+            relation=item.relation,
+        )
+        for name, item in zip(names, placed, strict=True)
+    )
+    return objects, {item.piece.asset.asset_id: item.piece.asset for item in placed}
+
+
+def _robot_start(plan: FloorPlan, placed: Sequence[Placed]) -> RobotStart:
+    """The free spot nearest to the middle of the largest public room, looking along x."""
+    public = ("living_room", "corridor", "lobby", "entryway", "dining_room", "kitchen")
+    rooms = sorted(plan.rooms, key=lambda r: (r.type not in public, -r.size_m[0] * r.size_m[1]))
+    for room in rooms:
+        space = RoomSpace(room, plan.doorways)
+        space.solids += [p.box for p in placed if p.room == room.name]
+        cells = space.free_cells()
+        if len(cells):
+            x, y = cells[np.argmin(np.hypot(*(cells - np.asarray(room.center_m)).T))]
+            return RobotStart(float(x), float(y), 0.0, room.name)
+    raise ValueError(f"no room of {[r.name for r in plan.rooms]} has a free spot for the robot: expected one")
