@@ -1,0 +1,88 @@
+"""Bundles on disk, each under the digest of its content; what does not fit its digest never gets a name."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hashlib
+import os
+import re
+import tempfile
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.rpc.channel import CHUNK_BYTES
+from embomatrix.rpc.status import InvalidRequestError, NotFoundError, OverloadedError
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+    from pathlib import Path
+
+PREFIX: Final = "sha256:"
+_DIGEST: Final = re.compile(r"sha256:[0-9a-f]{64}")
+
+
+class BundleStore:
+    """A folder of bundles. ``limit_bytes`` bounds one bundle, ``total_bytes`` the folder."""
+
+    def __init__(self, folder: Path, *, limit_bytes: int, total_bytes: int) -> None:
+        self._folder = folder
+        self._limit_bytes = limit_bytes
+        self._total_bytes = total_bytes
+        folder.mkdir(parents=True, exist_ok=True)
+
+    def has(self, digest: str) -> bool:
+        return self._path(digest).is_file()
+
+    def missing(self, digests: list[str]) -> list[str]:
+        """Those that were never put here, in the same order."""
+        return [digest for digest in dict.fromkeys(digests) if not self.has(digest)]
+
+    async def put(self, digest: str, chunks: AsyncIterator[bytes]) -> None:
+        """Take a bundle in. It appears under its name only when all of it is there and its digest is right."""
+        path = self._path(digest)
+        handle, name = tempfile.mkstemp(prefix="incoming-", dir=self._folder)
+        sha, size = hashlib.sha256(), 0
+        try:
+            with os.fdopen(handle, "wb") as file:
+                async for chunk in chunks:
+                    size += len(chunk)
+                    if size > self._limit_bytes:
+                        raise InvalidRequestError(
+                            f"bundle {digest} is larger than {self._limit_bytes} bytes: split its scene"
+                        )
+                    sha.update(chunk)
+                    await asyncio.to_thread(file.write, chunk)
+            found = PREFIX + sha.hexdigest()
+            if found != digest:
+                raise InvalidRequestError(
+                    f"the bundle's content has digest {found}, expected {digest}: it was damaged on its way, or misnamed"
+                )
+            self._check_space(size)
+            os.replace(name, path)
+        finally:
+            with contextlib.suppress(FileNotFoundError):
+                os.unlink(name)
+
+    async def get(self, digest: str) -> AsyncIterator[bytes]:
+        """The bundle in chunks; ``NotFoundError`` when it was never put."""
+        path = self._path(digest)
+        if not path.is_file():
+            raise NotFoundError(f"the manager has no bundle {digest}: put it first")
+        with path.open("rb") as file:
+            while chunk := await asyncio.to_thread(file.read, CHUNK_BYTES):
+                yield chunk
+
+    def _check_space(self, size: int) -> None:
+        used = sum(entry.stat().st_size for entry in os.scandir(self._folder) if entry.is_file())
+        if used > self._total_bytes:
+            raise OverloadedError(
+                f"the bundle folder {self._folder} holds {used} of {self._total_bytes} bytes and has no room for "
+                f"{size} more: raise bundle_total_mb or clear the folder"
+            )
+
+    def _path(self, digest: str) -> Path:
+        if not _DIGEST.fullmatch(digest):
+            raise InvalidRequestError(
+                f"{digest[:100]!r} is no digest: expected sha256: and 64 hexadecimal digits"
+            )
+        return self._folder / f"{digest.removeprefix(PREFIX)}.bundle"

@@ -1,0 +1,63 @@
+"""Orders that the manager's state machines give; the runtime carries them out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from embomatrix.rpc.values import LeaseRef, Rollout, RolloutResult
+
+
+@dataclass(frozen=True, slots=True)
+class SetDesired:
+    """The full set of scenes that the worker should hold, most urgent first; others may be evicted."""
+
+    worker_id: str
+    bundle_digests: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class GiveLease:
+    """The worker shall execute the rollout, within ``deadline_s`` seconds of execution."""
+
+    worker_id: str
+    ref: LeaseRef
+    rollout: Rollout
+    deadline_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class CancelLease:
+    """The lease is void: stop it if it runs, forget it if it waits."""
+
+    worker_id: str
+    ref: LeaseRef
+
+
+@dataclass(frozen=True, slots=True)
+class AcknowledgeLease:
+    """The worker may forget the result; it was taken, or it came too late."""
+
+    worker_id: str
+    ref: LeaseRef
+
+
+@dataclass(frozen=True, slots=True)
+class DeliverResult:
+    """The one terminal outcome of a rollout."""
+
+    run_id: str
+    batch_id: str
+    result: RolloutResult
+
+
+@dataclass(frozen=True, slots=True)
+class FinishBatch:
+    """Every rollout of the batch has its outcome."""
+
+    run_id: str
+    batch_id: str
+
+
+Command = SetDesired | GiveLease | CancelLease | AcknowledgeLease | DeliverResult | FinishBatch

@@ -1,0 +1,240 @@
+"""Task-Dispatcher: gives each rollout to a slot that has its scene warm, and gets exactly one outcome for it.
+
+A pure state machine: ``handle`` is the only way to change it, the clock is an argument, and what shall be done comes back
+as commands. The rules it keeps:
+
+* A lease goes only to a worker that *reported* the scene as warm. A rollout that waits shows in ``demand``, where the
+  Resource-Scheduler sees it and has the scene loaded.
+* Whoever has a free credit and a warm scene never waits while a rollout of that scene does.
+* Every lease has an epoch of its own. A result under any other epoch is acknowledged, counted as stale and dropped.
+* Only leases that were started cost an attempt. After ``max_attempts`` the rollout ends as an infrastructure failure.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from embomatrix.manager.assignments import Assignments, DispatchLimits
+from embomatrix.manager.commands import CancelLease, Command
+from embomatrix.manager.events import (
+    BatchCancelled,
+    BatchSubmitted,
+    DemandObserved,
+    Event,
+    LeaseFinished,
+    LeasesRenewed,
+    RunClosed,
+    ScenesUnplaceable,
+    Tick,
+    WorkerDrained,
+    WorkerJoined,
+    WorkerLost,
+    WorkerRecovered,
+    WorkerReported,
+    WorkerSuspected,
+)
+from embomatrix.rpc.values import InfraCode, InfraFailure, ResidentState
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from embomatrix.manager.ledger import LeaseRecord, RunCounters, WorkerRecord
+
+
+class Dispatcher:
+    """Batches in, leases and results out. ``boot_id`` keeps lease ids of different manager processes apart."""
+
+    def __init__(self, limits: DispatchLimits, *, boot_id: str) -> None:
+        self._limits = limits
+        self._desk = Assignments(limits, boot_id=boot_id)
+        self._unplaceable: dict[str, tuple[float, str]] = {}
+        self._alone_since_s = 0.0
+
+    def handle(self, event: Event, *, now_s: float) -> list[Command]:
+        """Take in one fact; returns what shall be done about it, in order."""
+        self._desk.now_s = now_s
+        match event:
+            case LeaseFinished():
+                self._desk.settle(event)
+            case LeasesRenewed(worker_id, held):
+                self._desk.leases.renew(worker_id, held, now_s)
+            case BatchSubmitted():
+                self._desk.submit(event)
+            case BatchCancelled(run_id, batch_id):
+                self._desk.cancel((run_id, batch_id))
+            case RunClosed(run_id):
+                self._desk.cancel_run(run_id)
+            case WorkerJoined(worker_id, resources):
+                self._on_lost(WorkerLost(worker_id, "a newer session of the same worker took over"))
+                self._desk.fleet.join(worker_id, resources.slots)
+            case WorkerReported():
+                self._on_reported(event)
+            case WorkerLost():
+                self._on_lost(event)
+            case WorkerSuspected(worker_id) | WorkerRecovered(worker_id) | WorkerDrained(worker_id):
+                self._on_standing(worker_id, event)
+            case ScenesUnplaceable(reasons):
+                known = self._unplaceable
+                self._unplaceable = {
+                    scene: (known[scene][0] if scene in known else now_s, text)
+                    for scene, text in reasons.items()
+                }
+            case Tick():
+                self._on_tick()
+            case _:
+                pass
+        commands, self._desk.commands = self._desk.commands, []
+        return commands
+
+    def demand(self) -> DemandObserved:
+        """What the Resource-Scheduler should know now. Forgets which leases were given since the last call."""
+        pending = self._desk.pending.counts()
+        heads = {scene: self._desk.pending.head(scene) for scene in pending}
+        return DemandObserved(
+            pending=pending,
+            waited_s={
+                scene: self._desk.now_s - head.submitted_s
+                for scene, head in heads.items()
+                if head is not None
+            },
+            in_use=frozenset(self._desk.leases.in_use),
+            used=self._desk.leases.take_used(),
+            idle=frozenset(worker.worker_id for worker in self._desk.fleet.idle()),
+        )
+
+    @property
+    def waiting_scenes(self) -> int:
+        """How many scenes have waiting rollouts; when it changes, the scheduler should look again."""
+        return self._desk.pending.scenes
+
+    @property
+    def queued(self) -> int:
+        """Rollouts that wait for a lease."""
+        return len(self._desk.pending)
+
+    @property
+    def live_leases(self) -> Mapping[str, LeaseRecord]:
+        return self._desk.leases.live
+
+    @property
+    def workers(self) -> Mapping[str, WorkerRecord]:
+        return self._desk.fleet.workers
+
+    def counters(self, run_id: str) -> RunCounters:
+        return self._desk.counters(run_id)
+
+    def forget_run(self, run_id: str) -> None:
+        """Drop the counters of a closed run."""
+        self._desk.forget_run(run_id)
+
+    def pending_of(self, run_id: str) -> int:
+        """Rollouts of the run without an outcome."""
+        return self._desk.pending_of(run_id)
+
+    # Workers and time
+
+    def _on_reported(self, event: WorkerReported) -> None:
+        worker = self._desk.fleet.workers.get(event.worker_id)
+        if worker is None:
+            return
+        worker.reported = True
+        worker.draining = worker.draining or event.draining
+        self._desk.fleet.set_warm(
+            worker, (r.bundle_digest for r in event.residents if r.state is ResidentState.WARM)
+        )
+        if event.resync:
+            self._reconcile(worker, event)
+        self._desk.leases.renew(worker.worker_id, event.held, self._desk.now_s)
+        for scene in worker.warm:
+            self._desk.failures.forget(scene)
+        for resident in event.residents:
+            if resident.state is ResidentState.FAILED:
+                self._desk.failures.record(
+                    resident.bundle_digest, worker.worker_id, resident.error, self._desk.now_s
+                )
+                self._desk.judge(resident.bundle_digest)
+        self._desk.fill([worker.worker_id])
+
+    def _reconcile(self, worker: WorkerRecord, event: WorkerReported) -> None:
+        """After a reconnect: what the worker does not hold never reached it; what it holds beyond our book is void."""
+        held = set(event.held)
+        failure = InfraFailure(
+            InfraCode.WORKER_LOST, "the lease was lost with a broken session", worker.worker_id
+        )
+        for lease in [lease for lease in worker.held.values() if lease.ref not in held]:
+            self._desk.give_back(lease, failure, counted=False)
+            self._desk.offer(lease.record.scene)
+        for ref in event.held:
+            if self._desk.leases.find(worker.worker_id, ref) is None:
+                self._desk.commands.append(CancelLease(worker.worker_id, ref))
+
+    def _on_lost(self, event: WorkerLost) -> None:
+        worker = self._desk.fleet.workers.get(event.worker_id)
+        if worker is None:
+            return
+        started = {lease.ref for lease in worker.started()}
+        leases = list(worker.held.values())
+        self._desk.fleet.leave(worker.worker_id)
+        failure = InfraFailure(InfraCode.WORKER_LOST, f"worker lost: {event.reason}", worker.worker_id)
+        for lease in leases:
+            self._desk.give_back(lease, failure, counted=lease.ref in started)
+        for scene in dict.fromkeys(lease.record.scene for lease in leases):
+            self._desk.offer(scene)
+
+    def _on_standing(self, worker_id: str, event: Event) -> None:
+        worker = self._desk.fleet.workers.get(worker_id)
+        if worker is None:
+            return
+        if isinstance(event, WorkerDrained):
+            worker.draining = True
+        else:
+            worker.suspect = isinstance(event, WorkerSuspected)
+        self._desk.fill([worker_id])
+
+    def _on_tick(self) -> None:
+        for lease in self._desk.leases.due(self._desk.now_s):
+            self._expire(lease)
+        for record in self._desk.overdue():
+            message = f"no outcome within {self._limits.rollout_deadline_s:g} s of its submission"
+            self._desk.finish(record, InfraFailure(InfraCode.DEADLINE, message))
+        for scene in self._desk.failures.scenes():
+            self._desk.judge(scene)
+        self._give_up_without_capacity()
+        self._desk.fill([worker.worker_id for worker in self._desk.fleet.idle()])
+
+    def _expire(self, lease: LeaseRecord) -> None:
+        worker = self._desk.fleet.workers[lease.worker_id]
+        counted = lease in worker.started()
+        if lease.expires_s <= self._desk.now_s:
+            message = f"{worker.worker_id} did not renew the lease for {self._limits.lease_ttl_s:g} s"
+        else:
+            message = f"{worker.worker_id} gave no result within {self._limits.lease_limit_s:g} s"
+        self._desk.commands.append(CancelLease(lease.worker_id, lease.ref))
+        failure = InfraFailure(InfraCode.LEASE_EXPIRED, message, worker.worker_id)
+        self._desk.give_back(lease, failure, counted=counted)
+        self._desk.offer(lease.record.scene)
+
+    def _give_up_without_capacity(self) -> None:
+        """End rollouts that waited long enough while no worker was there, or none that could hold their scene."""
+        limit_s = self._limits.no_capacity_s
+        if self._desk.fleet.live:
+            self._alone_since_s = self._desk.now_s
+            hopeless = [
+                (scene, text)
+                for scene, (since_s, text) in self._unplaceable.items()
+                if self._desk.now_s - since_s >= limit_s and self._desk.pending.count(scene)
+            ]
+        elif self._desk.now_s - self._alone_since_s >= limit_s:
+            text = f"no worker was connected for {limit_s:g} s: start one with `embomatrix worker`"
+            hopeless = [(scene, text) for scene in self._desk.pending.counts()]
+        else:
+            return
+        for scene, text in hopeless:
+            self._end_waiting(scene, InfraFailure(InfraCode.NO_CAPACITY, text))
+
+    def _end_waiting(self, scene: str, failure: InfraFailure) -> None:
+        """End those rollouts of the scene that waited for the bounded time; later ones keep their own wait."""
+        while (head := self._desk.pending.head(scene)) is not None:
+            if self._desk.now_s - head.submitted_s < self._limits.no_capacity_s:
+                return
+            self._desk.finish(self._desk.pending.pop(scene), failure)

@@ -1,0 +1,161 @@
+"""Facts that reach the manager's state machines. Nothing here does I/O; times are seconds of one monotonic clock."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from embomatrix.rpc.values import (
+        Batch,
+        Completed,
+        InfraFailure,
+        LeaseRef,
+        LookaheadEntry,
+        Resident,
+        Resources,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class WorkerJoined:
+    """A worker registered. It gets work once it has reported its state."""
+
+    worker_id: str
+    resources: Resources
+
+
+@dataclass(frozen=True, slots=True)
+class WorkerReported:
+    """The worker's full state. ``resync`` marks the first report of a stream: what it does not hold was never received."""
+
+    worker_id: str
+    residents: tuple[Resident, ...]
+    held: tuple[LeaseRef, ...] = ()
+    draining: bool = False
+    resync: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class WorkerSuspected:
+    """Heartbeats are missing: no new leases until it is heard again."""
+
+    worker_id: str
+
+
+@dataclass(frozen=True, slots=True)
+class WorkerRecovered:
+    """A suspected worker was heard again."""
+
+    worker_id: str
+
+
+@dataclass(frozen=True, slots=True)
+class WorkerLost:
+    """The worker is gone: crashed, silent for too long, or replaced by a newer session of the same id."""
+
+    worker_id: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class WorkerDrained:
+    """An operator takes the worker out: it finishes what it holds and gets nothing new."""
+
+    worker_id: str
+
+
+@dataclass(frozen=True, slots=True)
+class LeasesRenewed:
+    """A heartbeat named the leases that the worker still holds, running or waiting for a slot."""
+
+    worker_id: str
+    held: tuple[LeaseRef, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class LeaseFinished:
+    """A worker reported the end of a lease. It may be late or a repetition: the epoch tells."""
+
+    worker_id: str
+    ref: LeaseRef
+    outcome: Completed | InfraFailure
+
+
+@dataclass(frozen=True, slots=True)
+class BatchSubmitted:
+    """A trainer wants these plans executed. ``delivered`` maps rollouts to cursors that a former manager delivered."""
+
+    batch: Batch
+    delivered: Mapping[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class BatchCancelled:
+    run_id: str
+    batch_id: str
+
+
+@dataclass(frozen=True, slots=True)
+class RunClosed:
+    """The run is over: open batches are cancelled and its look-ahead is forgotten."""
+
+    run_id: str
+
+
+@dataclass(frozen=True, slots=True)
+class LookaheadAnnounced:
+    """The whole window of a run. A version at or below the last one is ignored."""
+
+    run_id: str
+    version: int
+    entries: tuple[LookaheadEntry, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class DemandObserved:
+    """What the Task-Dispatcher needs now.
+
+    ``pending`` counts waiting rollouts by scene, ``waited_s`` says how long the oldest of each has waited, ``in_use``
+    are the (worker, scene) pairs with live leases, ``used`` those that were given a lease since the last observation.
+    ``idle`` are the workers that have a free slot and nothing to do with it.
+    """
+
+    pending: Mapping[str, int]
+    waited_s: Mapping[str, float] = field(default_factory=dict)
+    in_use: frozenset[tuple[str, str]] = frozenset()
+    used: frozenset[tuple[str, str]] = frozenset()
+    idle: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True, slots=True)
+class ScenesUnplaceable:
+    """The Resource-Scheduler finds no worker for these scenes; the reason of each, in words."""
+
+    reasons: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class Tick:
+    """Time has passed: deadlines and expiries are due."""
+
+
+Event = (
+    WorkerJoined
+    | WorkerReported
+    | WorkerSuspected
+    | WorkerRecovered
+    | WorkerLost
+    | WorkerDrained
+    | LeasesRenewed
+    | LeaseFinished
+    | BatchSubmitted
+    | BatchCancelled
+    | RunClosed
+    | LookaheadAnnounced
+    | DemandObserved
+    | ScenesUnplaceable
+    | Tick
+)

@@ -1,0 +1,103 @@
+"""Live leases: given under an epoch that is never used again, renewed by heartbeats, due when silent or too old."""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+from collections import Counter, OrderedDict
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.manager.ledger import LeaseRecord, Phase, RolloutRecord, WorkerRecord
+from embomatrix.rpc.values import LeaseRef
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from embomatrix.manager.fleet import Fleet
+
+STALE_MEMORY: Final = 65_536
+"""Ended leases of which the book still knows the run, to count a late result where it belongs."""
+
+
+class LeaseBook:
+    """``boot_id`` makes the lease ids of this manager's process unlike those of any other."""
+
+    def __init__(self, fleet: Fleet, *, boot_id: str, ttl_s: float, limit_s: float) -> None:
+        self.live: dict[str, LeaseRecord] = {}
+        self.in_use: Counter[tuple[str, str]] = Counter()
+        """Live leases by (worker, scene)."""
+        self._used: set[tuple[str, str]] = set()
+        self._fleet = fleet
+        self._boot_id = boot_id
+        self._ttl_s = ttl_s
+        self._limit_s = limit_s
+        self._epochs = itertools.count(1)
+        self._due: list[tuple[float, int, LeaseRecord]] = []
+        self._ended: OrderedDict[str, str] = OrderedDict()
+
+    def give(self, record: RolloutRecord, worker: WorkerRecord, now_s: float) -> LeaseRecord:
+        """Lease a rollout that no one holds to the worker."""
+        epoch = next(self._epochs)
+        lease = LeaseRecord(
+            ref=LeaseRef(f"{self._boot_id}-{epoch}", epoch),
+            worker_id=worker.worker_id,
+            record=record,
+            given_s=now_s,
+            expires_s=now_s + self._ttl_s,
+            limit_s=now_s + self._limit_s,
+        )
+        record.phase = Phase.LEASED
+        record.lease = lease
+        self.live[lease.ref.lease_id] = lease
+        self._fleet.hold(worker, lease)
+        heapq.heappush(self._due, (lease.due_s, epoch, lease))
+        self._used.add((worker.worker_id, record.scene))
+        self.in_use[worker.worker_id, record.scene] += 1
+        return lease
+
+    def end(self, lease: LeaseRecord) -> None:
+        """The lease is over, whatever its worker still does. The rollout is nobody's until its caller decides."""
+        lease.record.lease = None
+        del self.live[lease.ref.lease_id]
+        self._fleet.release(lease)
+        pair = (lease.worker_id, lease.record.scene)
+        self.in_use[pair] -= 1
+        if not self.in_use[pair]:
+            del self.in_use[pair]
+        self._ended[lease.ref.lease_id] = lease.record.key.run_id
+        while len(self._ended) > STALE_MEMORY:
+            self._ended.popitem(last=False)
+
+    def find(self, worker_id: str, ref: LeaseRef) -> LeaseRecord | None:
+        """The live lease of that name, epoch and worker; None for a stale one."""
+        lease = self.live.get(ref.lease_id)
+        return lease if lease is not None and lease.ref == ref and lease.worker_id == worker_id else None
+
+    def run_of_ended(self, ref: LeaseRef) -> str | None:
+        return self._ended.get(ref.lease_id)
+
+    def renew(self, worker_id: str, held: Iterable[LeaseRef], now_s: float) -> None:
+        """The worker says that it still holds these."""
+        for ref in held:
+            lease = self.find(worker_id, ref)
+            if lease is not None:
+                lease.expires_s = now_s + self._ttl_s
+
+    def due(self, now_s: float) -> list[LeaseRecord]:
+        """Live leases whose time is up."""
+        late: list[LeaseRecord] = []
+        # Ended leases leave as soon as they reach the head, so that they don't pile up until their expiry.
+        while self._due and (self._due[0][0] <= now_s or self._due[0][2].ref.lease_id not in self.live):
+            _, epoch, lease = heapq.heappop(self._due)
+            if lease.ref.lease_id not in self.live:
+                continue
+            if lease.due_s > now_s:
+                heapq.heappush(self._due, (lease.due_s, epoch, lease))
+            else:
+                late.append(lease)
+        return late
+
+    def take_used(self) -> frozenset[tuple[str, str]]:
+        """The (worker, scene) pairs that were given a lease since the last call."""
+        used, self._used = frozenset(self._used), set()
+        return used

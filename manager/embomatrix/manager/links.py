@@ -1,0 +1,68 @@
+"""The way to one worker: what waits to be said to it, gathered until its stream can take it."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from embomatrix.manager.commands import AcknowledgeLease, CancelLease, GiveLease, SetDesired
+from embomatrix.rpc.values import Lease
+
+if TYPE_CHECKING:
+    from embomatrix.manager.registry import Session
+    from embomatrix.rpc.status import ClusterError
+    from embomatrix.rpc.values import LeaseRef
+
+WorkerCommand = SetDesired | GiveLease | CancelLease | AcknowledgeLease
+
+
+@dataclass(slots=True)
+class Outbox:
+    """One message to a worker. ``desired`` is None when it did not change."""
+
+    desired: tuple[str, ...] | None = None
+    leases: list[Lease] = field(default_factory=list)
+    acknowledged: list[LeaseRef] = field(default_factory=list)
+    cancelled: list[LeaseRef] = field(default_factory=list)
+    drain: bool = False
+
+
+class WorkerLink:
+    """An open session stream. Its outbox is bounded by the worker's credits; a later desired set replaces an earlier."""
+
+    def __init__(self, session: Session) -> None:
+        self.session = session
+        self._outbox = Outbox()
+        self._ready = asyncio.Event()
+        self._closed: ClusterError | None = None
+
+    def put(self, command: WorkerCommand) -> None:
+        match command:
+            case SetDesired():
+                self._outbox.desired = command.bundle_digests
+            case GiveLease():
+                self._outbox.leases.append(Lease(command.ref, command.rollout, command.deadline_s))
+            case CancelLease():
+                self._outbox.cancelled.append(command.ref)
+            case AcknowledgeLease():
+                self._outbox.acknowledged.append(command.ref)
+        self._ready.set()
+
+    def drain(self) -> None:
+        self._outbox.drain = True
+        self._ready.set()
+
+    def close(self, reason: ClusterError) -> None:
+        """The stream must end; whoever waits in ``take`` gets the reason."""
+        self._closed = reason
+        self._ready.set()
+
+    async def take(self) -> Outbox:
+        """Waits until there is something to say; the wait ends with the stream."""
+        await self._ready.wait()
+        if self._closed is not None:
+            raise self._closed
+        self._ready.clear()
+        outbox, self._outbox = self._outbox, Outbox()
+        return outbox

@@ -1,0 +1,79 @@
+"""What prewarming was worth: hits, misses, lead time, and loads that nobody used."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+LEADS_KEPT: Final = 1024
+
+
+@dataclass(slots=True)
+class PrewarmCounters:
+    """Of one run. A hit: the scene was warm when its batch came. Waste: it was loaded ahead and never used."""
+
+    hits: int = 0
+    misses: int = 0
+    wasted: int = 0
+
+
+class PrewarmLedger:
+    """Follows each (worker, scene) from the load that a look-ahead caused to its first use, or its eviction."""
+
+    def __init__(self) -> None:
+        self.lead_s: deque[float] = deque(maxlen=LEADS_KEPT)
+        """Seconds between a scene being warm and the batch that needed it, of the latest hits."""
+        self._counters: dict[str, PrewarmCounters] = {}
+        self._ahead: dict[tuple[str, str], str] = {}
+
+    def counters(self, run_id: str) -> PrewarmCounters:
+        return self._counters.setdefault(run_id, PrewarmCounters())
+
+    def ordered(self, worker_id: str, scene: str, run_id: str) -> None:
+        """The scene is to be loaded there because the run announced it."""
+        self._ahead.setdefault((worker_id, scene), run_id)
+
+    def demanded(self, run_id: str, warm_since_s: float | None, now_s: float) -> None:
+        """A batch needs a scene that has been warm since then, or is not warm anywhere (None)."""
+        counters = self.counters(run_id)
+        if warm_since_s is None:
+            counters.misses += 1
+        else:
+            counters.hits += 1
+            self.lead_s.append(now_s - warm_since_s)
+
+    def used(self, pairs: Iterable[tuple[str, str]]) -> None:
+        for pair in pairs:
+            self._ahead.pop(pair, None)
+
+    def evicted(self, worker_id: str, scene: str) -> None:
+        """A warm scene left the worker; if it was loaded ahead and never used, the load was wasted."""
+        run_id = self._ahead.pop((worker_id, scene), None)
+        if run_id is not None:
+            self.counters(run_id).wasted += 1
+
+    def withdrawn(self, worker_id: str, scene: str) -> None:
+        """The load was called off before it began: it cost nothing."""
+        self._ahead.pop((worker_id, scene), None)
+
+    def lost(self, worker_id: str) -> None:
+        """The worker went with its scenes: nobody's waste."""
+        for pair in [pair for pair in self._ahead if pair[0] == worker_id]:
+            del self._ahead[pair]
+
+    def close(self, run_id: str) -> None:
+        """The run is over: what it had loaded ahead and not used is waste."""
+        for pair in [pair for pair, owner in self._ahead.items() if owner == run_id]:
+            self.evicted(*pair)
+
+    def forget(self, run_id: str) -> None:
+        """Drop the counters of a closed run."""
+        self._counters.pop(run_id, None)
+
+    @property
+    def runs(self) -> tuple[PrewarmCounters, ...]:
+        return tuple(self._counters.values())

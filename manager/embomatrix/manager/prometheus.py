@@ -1,0 +1,110 @@
+"""The metrics page, in Prometheus' text format. No label ever carries an id of a run, rollout or scene."""
+
+from __future__ import annotations
+
+from importlib.metadata import PackageNotFoundError, version
+from typing import TYPE_CHECKING
+
+from embomatrix.manager.meter import BUCKETS_S
+from embomatrix.manager.registry import Standing
+from embomatrix.manager.views import overview
+from embomatrix.rpc.values import InfraCode, ResidentState
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from embomatrix.manager.meter import Histogram
+    from embomatrix.manager.runtime import ManagerRuntime
+
+
+class _Page:
+    """Lines of the page, one family after the other."""
+
+    def __init__(self) -> None:
+        self._lines: list[str] = []
+
+    def family(self, name: str, kind: str, text: str, values: Mapping[str, float]) -> None:
+        """One metric; ``values`` by label set as it stands between the braces, "" for none."""
+        self._lines += [f"# HELP {name} {text}", f"# TYPE {name} {kind}"]
+        self._lines += [
+            f"{name}{{{labels}}} {value:g}" if labels else f"{name} {value:g}"
+            for labels, value in values.items()
+        ]
+
+    def histogram(self, name: str, text: str, phases: Mapping[str, Histogram]) -> None:
+        self._lines += [f"# HELP {name} {text}", f"# TYPE {name} histogram"]
+        for phase, histogram in phases.items():
+            total = 0
+            for bound, count in zip((*map(str, BUCKETS_S), "+Inf"), histogram.counts, strict=True):
+                total += count
+                self._lines.append(f'{name}_bucket{{phase="{phase}",le="{bound}"}} {total}')
+            self._lines.append(f'{name}_sum{{phase="{phase}"}} {histogram.sum_s:g}')
+            self._lines.append(f'{name}_count{{phase="{phase}"}} {total}')
+
+    def text(self) -> str:
+        return "\n".join(self._lines) + "\n"
+
+
+def metrics_page(runtime: ManagerRuntime) -> str:
+    """What Prometheus scrapes."""
+    view, page = overview(runtime), _Page()
+    residents = [r for name in runtime.registry.sessions for r in runtime.cluster.scheduler.residents(name)]
+    states = {f'state="{s.value}"': float(view.workers.get(s.value, 0)) for s in Standing}
+    outcomes = ("completed", "cancelled", *(code.value for code in InfraCode))
+    page.family("embo_build_info", "gauge", "Version of the manager.", {f'version="{_version()}"': 1})
+    page.family("embo_workers", "gauge", "Workers by state.", states)
+    slots = {'state="busy"': view.slots_busy, 'state="idle"': view.slots - view.slots_busy}
+    page.family("embo_slots", "gauge", "Slots of connected workers.", slots)
+    page.family(
+        "embo_residents",
+        "gauge",
+        "Scenes on workers by state.",
+        {f'state="{state.value}"': sum(r.state is state for r in residents) for state in ResidentState},
+    )
+    page.family("embo_queue_depth", "gauge", "Rollouts that wait for a lease.", {"": view.queued})
+    page.family("embo_leases", "gauge", "Live leases.", {"": view.leased})
+    page.family("embo_runs", "gauge", "Open runs.", {"": view.runs})
+    page.family(
+        "embo_rollouts_total",
+        "counter",
+        "Rollouts by outcome.",
+        {f'outcome="{name}"': view.outcomes.get(name, 0) for name in outcomes},
+    )
+    page.histogram("embo_rollout_seconds", "Time of completed rollouts by phase.", runtime.meter.phases)
+    for name, text, value in (
+        (
+            "embo_open_run_prewarm_hits",
+            "Scenes that were warm when a batch of an open run came.",
+            view.prewarm_hits,
+        ),
+        (
+            "embo_open_run_prewarm_misses",
+            "Scenes that were not warm when a batch of an open run came.",
+            view.prewarm_misses,
+        ),
+        (
+            "embo_open_run_prewarm_wasted",
+            "Loads ahead of demand that an open run never used.",
+            view.prewarm_wasted,
+        ),
+        ("embo_open_run_redispatched", "Leases of open runs that were given again.", view.redispatched),
+        (
+            "embo_open_run_stale_results",
+            "Late results of open runs that were fenced off.",
+            view.stale_results,
+        ),
+        (
+            "embo_prewarm_lead_seconds",
+            "Median time between a scene being warm and its demand.",
+            view.prewarm_lead_s,
+        ),
+    ):
+        page.family(name, "gauge", text, {"": value})
+    return page.text()
+
+
+def _version() -> str:
+    try:
+        return version("embomatrix")
+    except PackageNotFoundError:
+        return "unknown"

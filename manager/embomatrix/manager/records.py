@@ -1,0 +1,27 @@
+"""Batches and results as bytes: what the store keeps, and what a result's stream sends without converting it again."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import TYPE_CHECKING
+
+from embomatrix.manager.store.protocol import BatchRow, ResultRow
+from embomatrix.proto.v1 import rollout_service_pb2
+from embomatrix.rpc.convert import batch_from_proto, batch_to_proto, rollout_result_to_proto
+
+if TYPE_CHECKING:
+    from embomatrix.rpc.values import Batch, RolloutResult
+
+
+def batch_row(batch: Batch) -> BatchRow:
+    """Equal batches give equal digests."""
+    payload = batch_to_proto(batch).SerializeToString(deterministic=True)
+    return BatchRow(batch.run_id, batch.batch_id, hashlib.sha256(payload).hexdigest(), payload)
+
+
+def batch_of(row: BatchRow) -> Batch:
+    return batch_from_proto(rollout_service_pb2.ExecuteRequest.FromString(row.payload))
+
+
+def result_row(result: RolloutResult) -> ResultRow:
+    return ResultRow(result.cursor, result.rollout_id, rollout_result_to_proto(result).SerializeToString())

@@ -1,0 +1,101 @@
+"""Result logs: what was delivered, by batch, for trainers to read from any cursor for as long as it is kept."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from embomatrix.manager.store.protocol import ResultRow
+
+PER_MESSAGE: Final = 64
+LINGER_S: Final = 0.005
+"""Results are sent at once when a message is full, else after this: a batch that trickles shall not send one by one."""
+
+
+class BatchLog:
+    """The results of one batch in the order of their cursors, which run from 1 without gaps."""
+
+    def __init__(self, run_id: str, batch_id: str, digest: str, rows: Sequence[ResultRow] = ()) -> None:
+        self.run_id = run_id
+        self.batch_id = batch_id
+        self.digest = digest
+        self.rows = list(rows)
+        self.finished_s: float | None = None
+        """When every rollout had its outcome; None before."""
+        self.dropped = False
+        """The run was closed, or the log was given up: nothing more will come."""
+        self._changed = asyncio.Event()
+
+    def append(self, rows: Sequence[ResultRow]) -> None:
+        self.rows.extend(rows)
+        self._wake()
+
+    def finish(self, now_s: float) -> None:
+        self.finished_s = now_s
+        self._wake()
+
+    def drop(self) -> None:
+        self.dropped = True
+        self._wake()
+
+    @property
+    def ended(self) -> bool:
+        return self.dropped or self.finished_s is not None
+
+    async def after(self, cursor: int) -> list[ResultRow]:
+        """Waits for results beyond the cursor; returns some of them, or nothing when the batch is at its end.
+
+        The wait ends with the batch, whose rollouts have deadlines, or with the caller's own.
+        """
+        while len(self.rows) <= cursor and not self.ended:
+            await self._changed.wait()
+        if len(self.rows) - cursor < PER_MESSAGE and not self.ended:
+            await asyncio.sleep(LINGER_S)
+        return self.rows[cursor : cursor + PER_MESSAGE]
+
+    def _wake(self) -> None:
+        self._changed.set()
+        self._changed = asyncio.Event()
+
+
+class ResultLogs:
+    """All logs, bounded: finished ones go after ``ttl_s``, or earlier when more than ``limit`` results are kept."""
+
+    def __init__(self, *, ttl_s: float, limit: int) -> None:
+        self._ttl_s = ttl_s
+        self._limit = limit
+        self._logs: dict[tuple[str, str], BatchLog] = {}
+
+    def __iter__(self) -> Iterator[BatchLog]:
+        return iter(self._logs.values())
+
+    def get(self, run_id: str, batch_id: str) -> BatchLog | None:
+        return self._logs.get((run_id, batch_id))
+
+    def add(self, log: BatchLog) -> None:
+        self._logs[log.run_id, log.batch_id] = log
+
+    def remove(self, log: BatchLog) -> None:
+        self._logs.pop((log.run_id, log.batch_id), None)
+        log.drop()
+
+    def close_run(self, run_id: str) -> None:
+        for log in [log for log in self if log.run_id == run_id]:
+            self.remove(log)
+
+    def outdated(self, now_s: float) -> list[BatchLog]:
+        """Finished logs that are to be given up, oldest first."""
+        finished = sorted(
+            (log for log in self if log.finished_s is not None), key=lambda log: log.finished_s or 0.0
+        )
+        kept = sum(len(log.rows) for log in self)
+        out: list[BatchLog] = []
+        for log in finished:
+            if kept <= self._limit and now_s - (log.finished_s or 0.0) < self._ttl_s:
+                break
+            kept -= len(log.rows)
+            out.append(log)
+        return out

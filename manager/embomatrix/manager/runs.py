@@ -1,0 +1,226 @@
+"""What trainers may do: open runs, announce scenes, submit batches, and read their results."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import re
+import secrets
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.manager.events import BatchCancelled, BatchSubmitted, LookaheadAnnounced
+from embomatrix.manager.records import batch_of, batch_row
+from embomatrix.manager.results import BatchLog
+from embomatrix.manager.store.protocol import PutOutcome, RunRow, StateError
+from embomatrix.rpc.status import (
+    ConflictError,
+    InvalidRequestError,
+    NotFoundError,
+    OverloadedError,
+    PreconditionError,
+    UnavailableError,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping, Sequence
+
+    from embomatrix.manager.bundles import BundleStore
+    from embomatrix.manager.cluster_state import ClusterState
+    from embomatrix.manager.commands import Command
+    from embomatrix.manager.events import Event
+    from embomatrix.manager.results import ResultLogs
+    from embomatrix.manager.store.protocol import StateStore
+    from embomatrix.rpc.values import Batch, LookaheadEntry, RunStats, Warmth
+
+logger = logging.getLogger(__name__)
+
+PAGE: Final = 4096
+_RUN_ID: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
+
+
+@dataclass(frozen=True, slots=True)
+class RunLimits:
+    """Bounds of what trainers may leave here."""
+
+    batch_rollouts: int = 65_536
+    """Of one batch."""
+    queued_rollouts: int = 262_144
+    """Of all batches together."""
+    runs: int = 1024
+    lookahead_entries: int = 65_536
+    idle_s: float = 6 * 3600.0
+    """A run that nobody spoke of for this long, and that waits for nothing, is closed."""
+
+
+class Runs:
+    """Open runs and their batches. ``carry_out`` executes commands of the cluster's state machines at once."""
+
+    def __init__(
+        self,
+        cluster: ClusterState,
+        store: StateStore,
+        bundles: BundleStore,
+        logs: ResultLogs,
+        carry_out: Callable[[Sequence[Command]], None],
+        limits: RunLimits,
+    ) -> None:
+        self._cluster = cluster
+        self._store = store
+        self._bundles = bundles
+        self._logs = logs
+        self._carry_out = carry_out
+        self._limits = limits
+        self._runs: dict[str, RunRow] = {}
+        self._heard_s: dict[str, float] = {}
+        self._dormant: dict[tuple[str, str], BatchSubmitted] = {}
+
+    @property
+    def open(self) -> Mapping[str, RunRow]:
+        """By id, oldest first."""
+        return self._runs
+
+    async def restore(self) -> None:
+        """Take up what a former manager left. Its open batches go on when their trainer asks for them again."""
+        for run in await self._store.runs():
+            self._runs[run.run_id] = run
+            self._heard_s[run.run_id] = time.monotonic()
+            for row in await self._store.batches(run.run_id):
+                log = BatchLog(run.run_id, row.batch_id, row.digest)
+                while page := await self._store.results_after(run.run_id, row.batch_id, len(log.rows), PAGE):
+                    log.append(page)
+                self._logs.add(log)
+                delivered = {result.rollout_id: result.cursor for result in log.rows}
+                self._dormant[run.run_id, row.batch_id] = BatchSubmitted(batch_of(row), delivered)
+        if self._runs:
+            logger.info("took up %d runs of a former manager", len(self._runs))
+
+    async def open_run(self, name: str, run_id: str) -> str:
+        """Open a run, or attach to the one of that id; an empty id gets a new one."""
+        run_id = run_id or f"run-{secrets.token_hex(6)}"
+        if not _RUN_ID.fullmatch(run_id):
+            raise InvalidRequestError(
+                f"run id {run_id[:140]!r}: use up to 128 letters, digits, '.', '_' and '-'"
+            )
+        if run_id not in self._runs:
+            if len(self._runs) >= self._limits.runs:
+                raise OverloadedError(f"{len(self._runs)} runs are open: close some with CloseRun")
+            run = RunRow(run_id, name[:200])
+            with _store_errors():
+                await self._store.open_run(run)
+            self._runs.setdefault(run_id, run)
+        self._heard_s[run_id] = time.monotonic()
+        return run_id
+
+    def announce(self, run_id: str, version: int, entries: tuple[LookaheadEntry, ...]) -> dict[str, Warmth]:
+        """Replace the run's window; answers how far each scene is."""
+        self._check_run(run_id)
+        if len(entries) > self._limits.lookahead_entries:
+            raise InvalidRequestError(
+                f"{len(entries)} look-ahead entries: at most {self._limits.lookahead_entries}, announce fewer steps"
+            )
+        self._feed(LookaheadAnnounced(run_id, version, entries))
+        scenes = dict.fromkeys(entry.bundle_digest for entry in entries)
+        return {scene: self._cluster.scheduler.warmth(scene) for scene in scenes}
+
+    async def submit(self, batch: Batch) -> BatchLog:
+        """Have the batch executed, or attach to it when it was submitted before; returns its results' log."""
+        self._check_run(batch.run_id)
+        row = batch_row(batch)
+        taken = ConflictError(
+            f"batch {batch.batch_id!r} was submitted before with other rollouts: use a new id"
+        )
+        log = self._logs.get(batch.run_id, batch.batch_id)
+        if log is not None:
+            if log.digest != row.digest:
+                raise taken
+            return self.log_of(batch.run_id, batch.batch_id)
+        self._check_batch(batch)
+        log = BatchLog(batch.run_id, batch.batch_id, row.digest)
+        self._logs.add(log)
+        try:
+            with _store_errors():
+                outcome = await self._store.put_batch(row)
+            if outcome is PutOutcome.CONFLICT:
+                raise taken
+            self._check_run(batch.run_id)
+        except BaseException:
+            self._logs.remove(log)
+            raise
+        self._feed(BatchSubmitted(batch))
+        return log
+
+    def log_of(self, run_id: str, batch_id: str) -> BatchLog:
+        """The results of a batch that was submitted; one of a former manager goes on from here."""
+        self._check_run(run_id)
+        log = self._logs.get(run_id, batch_id)
+        if log is None:
+            raise NotFoundError(
+                f"batch {batch_id!r} of run {run_id!r} is not known (any more): submit it again"
+            )
+        dormant = self._dormant.pop((run_id, batch_id), None)
+        if dormant is not None:
+            self._feed(dormant)
+        return log
+
+    def cancel(self, run_id: str, batch_id: str) -> None:
+        """Call a batch off: what has no outcome yet ends as cancelled."""
+        self.log_of(run_id, batch_id)
+        self._feed(BatchCancelled(run_id, batch_id))
+
+    async def close_run(self, run_id: str) -> RunStats:
+        """End the run and forget its results; returns its final counters."""
+        self._check_run(run_id)
+        del self._runs[run_id], self._heard_s[run_id]
+        for key in [key for key in self._dormant if key[0] == run_id]:
+            del self._dormant[key]
+        stats, commands = self._cluster.close_run(run_id, now_s=time.monotonic())
+        self._logs.close_run(run_id)
+        self._carry_out(commands)
+        with _store_errors():
+            await self._store.close_run(run_id)
+        return stats
+
+    async def close_idle(self, now_s: float) -> None:
+        """Close runs whose trainers went away without a word."""
+        for run_id, heard_s in list(self._heard_s.items()):
+            if now_s - heard_s > self._limits.idle_s and not self._cluster.dispatcher.pending_of(run_id):
+                logger.info("closing idle run run=%s", run_id)
+                with contextlib.suppress(UnavailableError):
+                    await self.close_run(run_id)
+
+    def _check_run(self, run_id: str) -> None:
+        if run_id not in self._runs:
+            raise NotFoundError(f"run {run_id!r} is not open: open it with OpenRun")
+        self._heard_s[run_id] = time.monotonic()
+
+    def _check_batch(self, batch: Batch) -> None:
+        count, limit = len(batch.rollouts), self._limits.batch_rollouts
+        if not 0 < count <= limit:
+            raise InvalidRequestError(f"batch {batch.batch_id!r} has {count} rollouts: expected 1 to {limit}")
+        if len({rollout.rollout_id for rollout in batch.rollouts}) < count:
+            raise InvalidRequestError(
+                f"batch {batch.batch_id!r} has a rollout id twice: every id must be unique"
+            )
+        queued = self._cluster.dispatcher.queued
+        if queued + count > self._limits.queued_rollouts:
+            raise OverloadedError(f"{queued} rollouts wait already: submit again when some have come back")
+        missing = self._bundles.missing([rollout.bundle_digest for rollout in batch.rollouts])
+        if missing:
+            raise PreconditionError(
+                f"the manager lacks {len(missing)} bundles of batch {batch.batch_id!r}, first {missing[0]}: "
+                f"put them first"
+            )
+
+    def _feed(self, event: Event) -> None:
+        self._carry_out(self._cluster.handle(event, now_s=time.monotonic()))
+
+
+@contextlib.contextmanager
+def _store_errors() -> Iterator[None]:
+    """A store that is away makes the manager unavailable; the caller may try again."""
+    try:
+        yield
+    except StateError as error:
+        raise UnavailableError(str(error)) from error

@@ -1,0 +1,173 @@
+"""The one owner of the state machines: feeds them events, carries out their commands, and keeps the clock going.
+
+Everything here runs on one event loop and never awaits between an event and its commands, so no lock is needed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import time
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.manager.commands import (
+    AcknowledgeLease,
+    CancelLease,
+    Command,
+    DeliverResult,
+    FinishBatch,
+    GiveLease,
+    SetDesired,
+)
+from embomatrix.manager.delivery import Delivery
+from embomatrix.manager.events import Event, LeaseFinished, LeasesRenewed, Tick, WorkerLost, WorkerReported
+from embomatrix.manager.links import WorkerLink
+from embomatrix.manager.meter import Meter
+from embomatrix.manager.results import ResultLogs
+from embomatrix.manager.runs import RunLimits, Runs
+from embomatrix.rpc.status import SupersededError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from embomatrix.manager.bundles import BundleStore
+    from embomatrix.manager.cluster_state import ClusterState
+    from embomatrix.manager.registry import Registry, Session
+    from embomatrix.manager.store.protocol import StateStore
+    from embomatrix.rpc.values import LeaseRef, LeaseResult, Resources, WorkerState
+
+logger = logging.getLogger(__name__)
+
+TICK_S: Final = 0.1
+CLEANUP_S: Final = 5.0
+
+
+class ManagerRuntime:
+    """What the services call. ``start`` before the first call, ``serve`` for as long as it shall work.
+
+    Results are kept for ``results_ttl_s`` after their batch ended, and at most ``results_kept`` of them.
+    """
+
+    def __init__(
+        self,
+        cluster: ClusterState,
+        registry: Registry,
+        store: StateStore,
+        bundles: BundleStore,
+        *,
+        limits: RunLimits | None = None,
+        results_ttl_s: float = 3600.0,
+        results_kept: int = 500_000,
+    ) -> None:
+        logs = ResultLogs(ttl_s=results_ttl_s, limit=results_kept)
+        self.cluster = cluster
+        self.registry = registry
+        self.bundles = bundles
+        self.meter = Meter()
+        self.runs = Runs(cluster, store, bundles, logs, self._carry_out, limits or RunLimits())
+        self.started_s = time.monotonic()
+        self._delivery = Delivery(store, logs)
+        self._links: dict[str, WorkerLink] = {}
+
+    async def start(self) -> None:
+        """Take the state up where a former manager left it."""
+        await self.runs.restore()
+
+    async def serve(self) -> None:
+        """Keep time and write results until cancelled. Ends with ``FencedError`` when another manager took over."""
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self._keep_time())
+            group.create_task(self._clean_up())
+            group.create_task(self._delivery.serve())
+
+    def register(self, worker_id: str, boot_id: str, resources: Resources) -> tuple[Session, float]:
+        """Open a session for a worker; returns it and the heartbeat's interval in seconds."""
+        session, events = self.registry.register(worker_id, boot_id, resources, now_s=time.monotonic())
+        self._close_link(worker_id)
+        self._feed(*events)
+        logger.info("worker registered worker=%s slots=%d", worker_id, resources.slots)
+        return session, self.registry.interval_s
+
+    @contextlib.contextmanager
+    def attached(self, session: Session) -> Iterator[WorkerLink]:
+        """The worker's stream is open for as long as this is held."""
+        self._close_link(session.worker_id)
+        link = self._links[session.worker_id] = WorkerLink(session)
+        self._feed(*self.registry.attach(session, now_s=time.monotonic()))
+        try:
+            yield link
+        finally:
+            if self._links.get(session.worker_id) is link:
+                del self._links[session.worker_id]
+                self.registry.detach(session, now_s=time.monotonic())
+                logger.info("session stream ended worker=%s", session.worker_id)
+
+    def take_report(
+        self, link: WorkerLink, state: WorkerState | None, results: Sequence[LeaseResult], *, resync: bool
+    ) -> None:
+        """What a worker says on its stream; ``resync`` for the first message of a stream."""
+        session = self.registry.find(link.session.session_id, link.session.epoch)
+        events: list[Event] = self.registry.heard(session, now_s=time.monotonic())
+        finished = (*(state.finished if state is not None else ()), *results)
+        events += [LeaseFinished(session.worker_id, result.ref, result.outcome) for result in finished]
+        if state is not None:
+            report = WorkerReported(session.worker_id, state.residents, state.running, state.draining, resync)
+            events.append(report)
+        self._feed(*events)
+
+    def take_heartbeat(
+        self, session_id: str, epoch: int, held: tuple[LeaseRef, ...], *, load: float, memory_mb: int
+    ) -> float:
+        """Renew the leases that the worker names; returns the seconds until the next heartbeat."""
+        session = self.registry.find(session_id, epoch)
+        session.load, session.memory_used_mb = load, memory_mb
+        events = self.registry.heard(session, now_s=time.monotonic())
+        self._feed(*events, LeasesRenewed(session.worker_id, held))
+        return self.registry.interval_s
+
+    def drain_worker(self, worker_id: str) -> None:
+        """The worker gets nothing new, and leaves when it has finished what it holds."""
+        self._feed(*self.registry.drain(worker_id))
+        if worker_id in self._links:
+            self._links[worker_id].drain()
+
+    def _feed(self, *events: Event) -> None:
+        for event in events:
+            self._carry_out(self.cluster.handle(event, now_s=time.monotonic()))
+
+    def _carry_out(self, commands: Sequence[Command]) -> None:
+        for command in commands:
+            match command:
+                case SetDesired() | GiveLease() | CancelLease() | AcknowledgeLease():
+                    # Without a stream the command is lost; the worker's next full state shows that, and it is
+                    # given again.
+                    link = self._links.get(command.worker_id)
+                    if link is not None:
+                        link.put(command)
+                case DeliverResult():
+                    self.meter.observe(command.run_id, command.result, time.monotonic())
+                    self._delivery.put(command)
+                case FinishBatch():
+                    self._delivery.put(command)
+
+    def _close_link(self, worker_id: str) -> None:
+        link = self._links.pop(worker_id, None)
+        if link is not None:
+            link.close(SupersededError(f"another session of worker {worker_id} took over: stop this one"))
+
+    async def _keep_time(self) -> None:
+        while True:
+            await asyncio.sleep(TICK_S)
+            events = self.registry.tick(now_s=time.monotonic())
+            for event in events:
+                if isinstance(event, WorkerLost):
+                    logger.warning("worker lost worker=%s: %s", event.worker_id, event.reason)
+                    self._close_link(event.worker_id)
+            self._feed(*events, Tick())
+
+    async def _clean_up(self) -> None:
+        while True:
+            await asyncio.sleep(CLEANUP_S)
+            await self._delivery.give_up_outdated(time.monotonic())
+            await self.runs.close_idle(time.monotonic())

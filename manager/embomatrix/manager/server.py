@@ -1,0 +1,75 @@
+"""The gRPC server: all services of the manager on one port, with health and reflection."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import grpc
+from grpc_health.v1 import health, health_pb2, health_pb2_grpc
+from grpc_reflection.v1alpha import reflection
+
+from embomatrix.manager.service_admin import AdminServicer
+from embomatrix.manager.service_auth import TokenInterceptor
+from embomatrix.manager.service_rollout import RolloutServicer
+from embomatrix.manager.service_scene import SceneServicer
+from embomatrix.manager.service_worker import WorkerServicer
+from embomatrix.proto.v1 import (
+    admin_service_pb2,
+    admin_service_pb2_grpc,
+    rollout_service_pb2,
+    rollout_service_pb2_grpc,
+    scene_service_pb2,
+    scene_service_pb2_grpc,
+    worker_service_pb2,
+    worker_service_pb2_grpc,
+)
+from embomatrix.rpc.channel import SERVER_OPTIONS
+
+if TYPE_CHECKING:
+    from embomatrix.manager.runtime import ManagerRuntime
+
+SERVICES: Final = tuple(
+    module.DESCRIPTOR.services_by_name[name].full_name
+    for module, name in (
+        (worker_service_pb2, "WorkerService"),
+        (rollout_service_pb2, "RolloutService"),
+        (scene_service_pb2, "SceneService"),
+        (admin_service_pb2, "AdminService"),
+    )
+)
+
+
+class PortInUseError(Exception):
+    """The address can't be bound; the sentence says which and what to do."""
+
+
+async def build_server(
+    runtime: ManagerRuntime, *, host: str, port: int, token: str, lease_ttl_s: float
+) -> tuple[grpc.aio.Server, int]:
+    """A server that is bound but not started, and its port (``port`` 0 takes a free one)."""
+    interceptors = [TokenInterceptor(token)] if token else []
+    server = grpc.aio.server(options=SERVER_OPTIONS, interceptors=interceptors)
+    worker_service_pb2_grpc.add_WorkerServiceServicer_to_server(
+        WorkerServicer(runtime, lease_ttl_s=lease_ttl_s), server
+    )
+    rollout_service_pb2_grpc.add_RolloutServiceServicer_to_server(RolloutServicer(runtime.runs), server)
+    scene_service_pb2_grpc.add_SceneServiceServicer_to_server(SceneServicer(runtime.bundles), server)
+    admin_service_pb2_grpc.add_AdminServiceServicer_to_server(AdminServicer(runtime), server)
+    await _add_health(server)
+    reflection.enable_server_reflection((*SERVICES, health.SERVICE_NAME, reflection.SERVICE_NAME), server)
+    address = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+    try:
+        bound = server.add_insecure_port(address)
+    except RuntimeError as error:
+        raise PortInUseError(
+            f"{address} can't be bound: another program uses the port, or the host is not this machine's; "
+            f"stop it, or pass another --port"
+        ) from error
+    return server, bound
+
+
+async def _add_health(server: grpc.aio.Server) -> None:
+    servicer = health.aio.HealthServicer()
+    health_pb2_grpc.add_HealthServicer_to_server(servicer, server)
+    for name in ("", *SERVICES):
+        await servicer.set(name, health_pb2.HealthCheckResponse.SERVING)

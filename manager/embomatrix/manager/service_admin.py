@@ -1,0 +1,42 @@
+"""AdminService: what the cluster is doing, and a way to take a worker out."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from embomatrix.manager.views import run_infos, worker_infos
+from embomatrix.proto.v1 import admin_service_pb2 as pb
+from embomatrix.proto.v1 import admin_service_pb2_grpc
+from embomatrix.rpc.convert_session import run_info_to_proto, worker_info_to_proto
+from embomatrix.rpc.status import translate
+
+if TYPE_CHECKING:
+    import grpc
+
+    from embomatrix.manager.runtime import ManagerRuntime
+
+
+class AdminServicer(admin_service_pb2_grpc.AdminServiceServicer):
+    def __init__(self, runtime: ManagerRuntime) -> None:
+        self._runtime = runtime
+
+    async def ListWorkers(
+        self, request: pb.ListWorkersRequest, context: grpc.aio.ServicerContext
+    ) -> pb.ListWorkersResponse:
+        async with translate(context):
+            workers = [worker_info_to_proto(info) for info in worker_infos(self._runtime)]
+        return pb.ListWorkersResponse(workers=workers)
+
+    async def ListRuns(
+        self, request: pb.ListRunsRequest, context: grpc.aio.ServicerContext
+    ) -> pb.ListRunsResponse:
+        async with translate(context):
+            runs = [run_info_to_proto(info) for info in run_infos(self._runtime)]
+        return pb.ListRunsResponse(runs=runs)
+
+    async def DrainWorker(
+        self, request: pb.DrainWorkerRequest, context: grpc.aio.ServicerContext
+    ) -> pb.DrainWorkerResponse:
+        async with translate(context):
+            self._runtime.drain_worker(request.worker_id)
+        return pb.DrainWorkerResponse()

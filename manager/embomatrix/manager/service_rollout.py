@@ -1,0 +1,90 @@
+"""RolloutService: trainers open runs, announce what comes, submit batches, and read results from a cursor."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from embomatrix.proto.v1 import rollout_service_pb2 as pb
+from embomatrix.proto.v1 import rollout_service_pb2_grpc, types_pb2
+from embomatrix.rpc.convert import (
+    batch_from_proto,
+    each,
+    lookahead_entry_from_proto,
+    run_stats_to_proto,
+    warmth_to_proto,
+)
+from embomatrix.rpc.status import NotFoundError, TrimmedError, translate
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    import grpc
+
+    from embomatrix.manager.results import BatchLog
+    from embomatrix.manager.runs import Runs
+
+
+class RolloutServicer(rollout_service_pb2_grpc.RolloutServiceServicer):
+    def __init__(self, runs: Runs) -> None:
+        self._runs = runs
+
+    async def OpenRun(
+        self, request: pb.OpenRunRequest, context: grpc.aio.ServicerContext
+    ) -> pb.OpenRunResponse:
+        async with translate(context):
+            run_id = await self._runs.open_run(request.name, request.run_id)
+        return pb.OpenRunResponse(run_id=run_id)
+
+    async def AnnounceLookahead(
+        self, request: pb.AnnounceLookaheadRequest, context: grpc.aio.ServicerContext
+    ) -> pb.AnnounceLookaheadResponse:
+        async with translate(context):
+            entries = each("entries", lookahead_entry_from_proto, request.entries)
+            answers = self._runs.announce(request.run_id, request.version, entries)
+        return pb.AnnounceLookaheadResponse(
+            answers=[
+                pb.LookaheadAnswer(bundle_digest=scene, warmth=warmth_to_proto(warmth))
+                for scene, warmth in answers.items()
+            ]
+        )
+
+    async def Execute(
+        self, request: pb.ExecuteRequest, context: grpc.aio.ServicerContext
+    ) -> AsyncIterator[pb.ExecuteResponse]:
+        async with translate(context):
+            log = await self._runs.submit(batch_from_proto(request))
+            async for results in _results(log, 0):
+                yield pb.ExecuteResponse(results=results)
+
+    async def WaitExecution(
+        self, request: pb.WaitExecutionRequest, context: grpc.aio.ServicerContext
+    ) -> AsyncIterator[pb.WaitExecutionResponse]:
+        async with translate(context):
+            log = self._runs.log_of(request.run_id, request.batch_id)
+            async for results in _results(log, request.after_cursor):
+                yield pb.WaitExecutionResponse(results=results)
+
+    async def CancelBatch(
+        self, request: pb.CancelBatchRequest, context: grpc.aio.ServicerContext
+    ) -> pb.CancelBatchResponse:
+        async with translate(context):
+            self._runs.cancel(request.run_id, request.batch_id)
+        return pb.CancelBatchResponse()
+
+    async def CloseRun(
+        self, request: pb.CloseRunRequest, context: grpc.aio.ServicerContext
+    ) -> pb.CloseRunResponse:
+        async with translate(context):
+            stats = await self._runs.close_run(request.run_id)
+        return pb.CloseRunResponse(stats=run_stats_to_proto(stats))
+
+
+async def _results(log: BatchLog, cursor: int) -> AsyncIterator[list[types_pb2.RolloutResult]]:
+    """All results beyond the cursor, as they come, to the end of the batch."""
+    if cursor > len(log.rows) and log.ended:
+        raise TrimmedError(f"batch {log.batch_id!r} ends at cursor {len(log.rows)}: {cursor} lies beyond it")
+    while rows := await log.after(cursor):
+        cursor = rows[-1].cursor
+        yield [types_pb2.RolloutResult.FromString(row.payload) for row in rows]
+    if log.dropped:
+        raise NotFoundError(f"batch {log.batch_id!r} is no longer kept: its run was closed")

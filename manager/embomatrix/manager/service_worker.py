@@ -1,0 +1,161 @@
+"""WorkerService: workers register, hold a session stream, send heartbeats, and fetch bundles."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.proto.v1 import worker_service_pb2 as pb
+from embomatrix.proto.v1 import worker_service_pb2_grpc
+from embomatrix.rpc.channel import PROTOCOL_VERSION
+from embomatrix.rpc.convert import each, inside, resources_from_proto
+from embomatrix.rpc.convert_session import (
+    lease_ref_from_proto,
+    lease_ref_to_proto,
+    lease_result_from_proto,
+    lease_to_proto,
+    worker_state_from_proto,
+)
+from embomatrix.rpc.status import DeadlineError, InvalidRequestError, PreconditionError, translate
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Coroutine
+
+    import grpc
+
+    from embomatrix.manager.links import Outbox, WorkerLink
+    from embomatrix.manager.runtime import ManagerRuntime
+
+FIRST_STATE_S: Final = 10.0
+"""A session stream must begin with the worker's state within this time."""
+LEASES_PER_MESSAGE: Final = 64
+_WORKER_ID: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._:@-]{0,127}")
+
+
+class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
+    """``lease_ttl_s`` is told to workers: whoever can't renew within it must stop."""
+
+    def __init__(self, runtime: ManagerRuntime, *, lease_ttl_s: float) -> None:
+        self._runtime = runtime
+        self._lease_ttl_s = lease_ttl_s
+
+    async def Register(
+        self, request: pb.RegisterRequest, context: grpc.aio.ServicerContext
+    ) -> pb.RegisterResponse:
+        async with translate(context):
+            _check_registration(request)
+            resources = inside("resources", resources_from_proto, request.resources)
+            session, interval_s = self._runtime.register(request.worker_id, request.boot_id, resources)
+        return pb.RegisterResponse(
+            session_id=session.session_id,
+            session_epoch=session.epoch,
+            heartbeat_interval_s=interval_s,
+            lease_ttl_s=self._lease_ttl_s,
+        )
+
+    async def Session(  # type: ignore[override]  # gRPC also takes a coroutine that writes by the context
+        self, request_iterator: AsyncIterator[pb.SessionRequest], context: grpc.aio.ServicerContext
+    ) -> None:
+        async with translate(context):
+            first = await _first_state(request_iterator)
+            session = self._runtime.registry.find(first.session_id, first.session_epoch)
+            with self._runtime.attached(session) as link:
+                self._take(link, first, resync=True)
+                await _until_one_ends(self._listen(link, request_iterator), _speak(link, context))
+
+    async def Heartbeat(
+        self, request: pb.HeartbeatRequest, context: grpc.aio.ServicerContext
+    ) -> pb.HeartbeatResponse:
+        async with translate(context):
+            interval_s = self._runtime.take_heartbeat(
+                request.session_id,
+                request.session_epoch,
+                each("running", lease_ref_from_proto, request.running),
+                load=request.load,
+                memory_mb=request.memory_used_mb,
+            )
+        return pb.HeartbeatResponse(next_interval_s=interval_s)
+
+    async def FetchBundle(
+        self, request: pb.FetchBundleRequest, context: grpc.aio.ServicerContext
+    ) -> AsyncIterator[pb.FetchBundleResponse]:
+        async with translate(context):
+            async for chunk in self._runtime.bundles.get(request.bundle_digest):
+                yield pb.FetchBundleResponse(chunk=chunk)
+
+    async def _listen(self, link: WorkerLink, requests: AsyncIterator[pb.SessionRequest]) -> None:
+        async for request in requests:
+            self._take(link, request, resync=False)
+
+    def _take(self, link: WorkerLink, request: pb.SessionRequest, *, resync: bool) -> None:
+        state = inside("state", worker_state_from_proto, request.state) if request.HasField("state") else None
+        results = each("results", lease_result_from_proto, request.results)
+        self._runtime.take_report(link, state, results, resync=resync)
+
+
+async def _speak(link: WorkerLink, context: grpc.aio.ServicerContext) -> None:
+    while True:
+        for message in _messages(await link.take()):
+            await context.write(message)
+
+
+def _messages(outbox: Outbox) -> list[pb.SessionResponse]:
+    """The outbox in messages of bounded size: leases carry plans."""
+    head = pb.SessionResponse(
+        leases=[lease_to_proto(lease) for lease in outbox.leases[:LEASES_PER_MESSAGE]],
+        acknowledged=[lease_ref_to_proto(ref) for ref in outbox.acknowledged],
+        cancelled=[lease_ref_to_proto(ref) for ref in outbox.cancelled],
+        drain=outbox.drain,
+    )
+    if outbox.desired is not None:
+        head.desired.CopyFrom(pb.DesiredResidents(bundle_digests=outbox.desired))
+    rest = outbox.leases[LEASES_PER_MESSAGE:]
+    return [head] + [
+        pb.SessionResponse(
+            leases=[lease_to_proto(lease) for lease in rest[start : start + LEASES_PER_MESSAGE]]
+        )
+        for start in range(0, len(rest), LEASES_PER_MESSAGE)
+    ]
+
+
+async def _first_state(requests: AsyncIterator[pb.SessionRequest]) -> pb.SessionRequest:
+    try:
+        async with asyncio.timeout(FIRST_STATE_S):
+            first = await anext(requests)
+    except TimeoutError:
+        raise DeadlineError(
+            f"a session begins with the worker's state: none came in {FIRST_STATE_S:g} s"
+        ) from None
+    except StopAsyncIteration:
+        raise InvalidRequestError(
+            "a session begins with the worker's state: the stream ended before it"
+        ) from None
+    if not first.HasField("state"):
+        raise InvalidRequestError("a session begins with the worker's state: the first message has none")
+    return first
+
+
+async def _until_one_ends(*parts: Coroutine[None, None, None]) -> None:
+    """Run the parts until the first ends, stop the others, and raise what the first raised."""
+    tasks = [asyncio.create_task(part) for part in parts]
+    try:
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+    for task in done:
+        task.result()
+
+
+def _check_registration(request: pb.RegisterRequest) -> None:
+    if not _WORKER_ID.fullmatch(request.worker_id):
+        raise InvalidRequestError(
+            f"worker id {request.worker_id[:140]!r}: use up to 128 letters, digits, '.', '_', ':', '@' and '-'"
+        )
+    if request.protocol_version != PROTOCOL_VERSION:
+        raise PreconditionError(
+            f"worker {request.worker_id} speaks protocol {request.protocol_version}, this manager {PROTOCOL_VERSION}: "
+            f"install the same release of embomatrix on both"
+        )

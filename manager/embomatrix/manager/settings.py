@@ -1,0 +1,87 @@
+"""Settings of the manager: parsed once, at the edge; an unknown key is an error."""
+
+from __future__ import annotations
+
+import ipaddress
+from pathlib import Path
+from typing import Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+DEFAULT_PORT = 50070
+DEFAULT_HTTP_PORT = 8070
+
+
+class ManagerSettings(BaseModel):
+    """How a manager serves. Outside loopback it needs a token."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    host: str = "127.0.0.1"
+    """Address on which workers and trainers are served."""
+    port: int = Field(DEFAULT_PORT, ge=0, le=65535)
+    """TCP port of the gRPC services; 0 takes a free one."""
+    http_host: str = "127.0.0.1"
+    """Address of the status page."""
+    http_port: int = Field(DEFAULT_HTTP_PORT, ge=0, le=65535)
+    """TCP port of the status page; 0 takes a free one."""
+    data_dir: Path = Field(
+        default_factory=lambda: Path.home() / ".local" / "share" / "embomatrix" / "manager"
+    )
+    """Folder of bundles and of the embedded state."""
+    state: str = ""
+    """``memory:``, ``sqlite:PATH`` or ``redis://HOST:PORT/DB``. Empty: a file in the data folder."""
+    token: str = Field("", repr=False)
+    """Shared secret of workers, trainers and viewers; empty: none is asked for."""
+    insecure_bind: bool = False
+    """Serve outside loopback without a token."""
+    bundle_mb: int = Field(256, ge=1)
+    """Largest size of one bundle, in MB."""
+    bundle_total_mb: int = Field(16_384, ge=1)
+    """Largest size of all bundles, in MB."""
+    heartbeat_s: float = Field(1.0, gt=0)
+    """Seconds between two heartbeats of a worker; grows with the cluster."""
+    lost_after_s: float = Field(10.0, gt=0)
+    """A worker that was silent for this long is given up."""
+    stream_grace_s: float = Field(1.0, ge=0)
+    """A worker whose connection broke may come back within this time."""
+    lease_ttl_s: float = Field(30.0, gt=0)
+    """A lease that no heartbeat renews for this long is void."""
+    lease_limit_s: float = Field(180.0, gt=0)
+    """A lease that is not answered after this long is void."""
+    execute_deadline_s: float = Field(60.0, gt=0)
+    """A worker kills a slot that executes one plan for longer."""
+    rollout_deadline_s: float = Field(600.0, gt=0)
+    """From submission to outcome."""
+    no_capacity_s: float = Field(60.0, gt=0)
+    """How long rollouts wait while no worker could take them."""
+    affinity_wait_s: float = Field(0.5, ge=0)
+    """How long rollouts wait for workers that have their scene before idle ones load it."""
+    max_attempts: int = Field(3, ge=1)
+    """Started leases of one rollout before it ends as an infrastructure failure."""
+    results_ttl_s: float = Field(3600.0, gt=0)
+    """How long results are kept after their batch ended."""
+
+    @property
+    def state_url(self) -> str:
+        return self.state or f"sqlite:{self.data_dir / 'state.sqlite'}"
+
+    @model_validator(mode="after")
+    def _guard_bind(self) -> Self:
+        for host in (self.host, self.http_host):
+            if not (is_loopback(host) or self.token or self.insecure_bind):
+                raise ValueError(
+                    f"refusing to serve on {host} without a token, where anyone could use the cluster: set --token (or "
+                    f"EMBOMATRIX_TOKEN), or pass --insecure-bind if the network is trusted"
+                )
+        return self
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine can reach the address."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False

@@ -1,0 +1,88 @@
+"""State in this process: nothing survives it. For tests, and for clusters whose trainers can start over."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from embomatrix.manager.store.protocol import BatchRow, FencedError, PutOutcome, ResultRow, RunRow
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from embomatrix.manager.store.protocol import StateStore
+
+
+class MemoryState:
+    """What several ``MemoryStore`` objects share, as managers share a database."""
+
+    def __init__(self) -> None:
+        self.epoch = 0
+        self.runs: dict[str, RunRow] = {}
+        self.batches: dict[tuple[str, str], BatchRow] = {}
+        self.results: dict[tuple[str, str], dict[str, ResultRow]] = {}
+
+
+class MemoryStore:
+    def __init__(self, state: MemoryState | None = None) -> None:
+        self._state = state or MemoryState()
+        self._epoch = 0
+
+    async def claim(self) -> int:
+        self._state.epoch += 1
+        self._epoch = self._state.epoch
+        return self._epoch
+
+    async def open_run(self, run: RunRow) -> None:
+        self._check()
+        self._state.runs.setdefault(run.run_id, run)
+
+    async def close_run(self, run_id: str) -> None:
+        self._check()
+        self._state.runs.pop(run_id, None)
+        for key in [key for key in self._state.batches if key[0] == run_id]:
+            await self.drop_batch(*key)
+
+    async def put_batch(self, batch: BatchRow) -> PutOutcome:
+        self._check()
+        if batch.run_id not in self._state.runs:
+            return PutOutcome.NO_RUN
+        known = self._state.batches.setdefault((batch.run_id, batch.batch_id), batch)
+        if known is batch:
+            return PutOutcome.CREATED
+        return PutOutcome.SAME if known.digest == batch.digest else PutOutcome.CONFLICT
+
+    async def append_results(self, run_id: str, batch_id: str, rows: Sequence[ResultRow]) -> int:
+        self._check()
+        if (run_id, batch_id) not in self._state.batches:
+            return 0
+        results = self._state.results.setdefault((run_id, batch_id), {})
+        before = len(results)
+        for row in rows:
+            results.setdefault(row.rollout_id, row)
+        return len(results) - before
+
+    async def results_after(self, run_id: str, batch_id: str, cursor: int, limit: int) -> list[ResultRow]:
+        results = self._state.results.get((run_id, batch_id), {}).values()
+        return sorted((row for row in results if row.cursor > cursor), key=lambda row: row.cursor)[:limit]
+
+    async def drop_batch(self, run_id: str, batch_id: str) -> None:
+        self._check()
+        self._state.batches.pop((run_id, batch_id), None)
+        self._state.results.pop((run_id, batch_id), None)
+
+    async def runs(self) -> list[RunRow]:
+        return list(self._state.runs.values())
+
+    async def batches(self, run_id: str) -> list[BatchRow]:
+        return [batch for key, batch in self._state.batches.items() if key[0] == run_id]
+
+    async def close(self) -> None:
+        """Nothing is held."""
+
+    def _check(self) -> None:
+        if self._epoch != self._state.epoch:
+            raise FencedError("another manager took over the in-memory state: stop this one")
+
+
+def _conforms(store: MemoryStore) -> StateStore:
+    return store

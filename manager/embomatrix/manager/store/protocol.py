@@ -1,0 +1,91 @@
+"""What the manager writes down, so that another process of it can go on: runs, batches, and delivered results.
+
+Leases are not among it: they rest on sessions, which end with the process. Rollouts without a result are executed again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+
+class StateError(Exception):
+    """The store can't be used; the sentence names it and the remedy."""
+
+
+class FencedError(StateError):
+    """A newer manager took the store over: this one must stop dispatching."""
+
+
+class PutOutcome(StrEnum):
+    """What became of a batch that was put."""
+
+    CREATED = "created"
+    SAME = "same"
+    """It was there already, with the same content."""
+    CONFLICT = "conflict"
+    """Its id is taken by other content."""
+    NO_RUN = "no_run"
+
+
+@dataclass(frozen=True, slots=True)
+class RunRow:
+    run_id: str
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class BatchRow:
+    """A batch as it was submitted: ``payload`` is opaque to the store, ``digest`` that of its content."""
+
+    run_id: str
+    batch_id: str
+    digest: str
+    payload: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class ResultRow:
+    """A delivered result, opaque to the store. Cursors of a batch rise from 1."""
+
+    cursor: int
+    rollout_id: str
+    payload: bytes
+
+
+class StateStore(Protocol):
+    """Every write belongs to the manager that claimed the store last; an older one gets ``FencedError``."""
+
+    async def claim(self) -> int:
+        """Become the one manager that writes. Returns its epoch, higher than any before."""
+
+    async def open_run(self, run: RunRow) -> None:
+        """Note a run; the same id again keeps the first name."""
+
+    async def close_run(self, run_id: str) -> None:
+        """Forget the run with its batches and results; unknown ids are no error."""
+
+    async def put_batch(self, batch: BatchRow) -> PutOutcome:
+        """Note a batch, if its run is open and its id is free."""
+
+    async def append_results(self, run_id: str, batch_id: str, rows: Sequence[ResultRow]) -> int:
+        """Add results; of each rollout only the first counts. Returns how many were new. Of an unknown batch: none."""
+
+    async def results_after(self, run_id: str, batch_id: str, cursor: int, limit: int) -> list[ResultRow]:
+        """Results with a higher cursor, in order."""
+
+    async def drop_batch(self, run_id: str, batch_id: str) -> None:
+        """Forget a batch and its results: nobody will ask for it again."""
+
+    async def runs(self) -> list[RunRow]:
+        """Open runs, oldest first."""
+
+    async def batches(self, run_id: str) -> list[BatchRow]:
+        """Batches of a run, oldest first."""
+
+    async def close(self) -> None:
+        """Let go of connections and files."""

@@ -1,0 +1,182 @@
+"""State in Redis (6.2 command set, also Valkey): for clusters, and for another manager to take over.
+
+Keys, all below one prefix: ``epoch``; ``runs`` (hash id -> name) with ``run_order`` (list); of a run ``batches:RUN`` (list of
+ids); of a batch ``batch:RUN:BATCH`` (hash digest, payload), ``done:RUN:BATCH`` (set of rollouts), ``results:RUN:BATCH`` (sorted
+set of "rollout id length:rollout id payload" by cursor). Every conditional write is one Lua script that checks the epoch first.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final, cast
+
+import redis.asyncio
+from redis.exceptions import RedisError, ResponseError
+
+from embomatrix.manager.store.protocol import (
+    BatchRow,
+    FencedError,
+    PutOutcome,
+    ResultRow,
+    RunRow,
+    StateError,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Sequence
+
+_FENCED: Final = "FENCED"
+_GUARD: Final = f"""
+if redis.call('GET', KEYS[1]) ~= ARGV[1] then return redis.error_reply('{_FENCED}') end
+"""
+_OPEN_RUN: Final = (
+    _GUARD
+    + """
+if redis.call('HSETNX', KEYS[2], ARGV[2], ARGV[3]) == 1 then redis.call('RPUSH', KEYS[3], ARGV[2]) end
+return 1
+"""
+)
+_PUT_BATCH: Final = (
+    _GUARD
+    + """
+if redis.call('HEXISTS', KEYS[2], ARGV[2]) == 0 then return 'no_run' end
+local known = redis.call('HGET', KEYS[3], 'digest')
+if known then
+    if known == ARGV[4] then return 'same' end
+    return 'conflict'
+end
+redis.call('HSET', KEYS[3], 'digest', ARGV[4], 'payload', ARGV[5])
+redis.call('RPUSH', KEYS[4], ARGV[3])
+return 'created'
+"""
+)
+_APPEND: Final = (
+    _GUARD
+    + """
+if redis.call('EXISTS', KEYS[2]) == 0 then return 0 end
+local added = 0
+for index = 2, #ARGV, 3 do
+    if redis.call('SADD', KEYS[3], ARGV[index + 1]) == 1 then
+        redis.call('ZADD', KEYS[4], ARGV[index], #ARGV[index + 1] .. ':' .. ARGV[index + 1] .. ARGV[index + 2])
+        added = added + 1
+    end
+end
+return added
+"""
+)
+_DROP_BATCH: Final = (
+    _GUARD
+    + """
+redis.call('DEL', KEYS[2], KEYS[3], KEYS[4])
+redis.call('LREM', KEYS[5], 0, ARGV[2])
+return 1
+"""
+)
+_CLOSE_RUN: Final = (
+    _GUARD
+    + """
+redis.call('HDEL', KEYS[2], ARGV[2])
+redis.call('LREM', KEYS[3], 0, ARGV[2])
+redis.call('DEL', KEYS[4])
+return 1
+"""
+)
+
+
+class RedisStore:
+    """``url`` as in ``redis://HOST:PORT/DB``. Every call is bounded by ``timeout_s``; failures are ``StateError``."""
+
+    def __init__(self, url: str, *, prefix: str = "embomatrix", timeout_s: float = 5.0) -> None:
+        self._url = url
+        self._prefix = prefix
+        self._epoch = 0
+        try:
+            self._redis = redis.asyncio.Redis.from_url(
+                url, socket_timeout=timeout_s, socket_connect_timeout=timeout_s
+            )
+        except (ValueError, RedisError) as error:
+            raise StateError(
+                f"{url!r} is no Redis address ({error}): expected redis://HOST:PORT/DB"
+            ) from error
+
+    async def claim(self) -> int:
+        self._epoch = int(await self._call(self._redis.incr(self._key("epoch"))))
+        return self._epoch
+
+    async def open_run(self, run: RunRow) -> None:
+        await self._script(_OPEN_RUN, ("runs", "run_order"), run.run_id, run.name)
+
+    async def close_run(self, run_id: str) -> None:
+        for batch_id in await self._batch_ids(run_id):
+            await self.drop_batch(run_id, batch_id)
+        await self._script(_CLOSE_RUN, ("runs", "run_order", f"batches:{run_id}"), run_id)
+
+    async def put_batch(self, batch: BatchRow) -> PutOutcome:
+        keys = ("runs", f"batch:{batch.run_id}:{batch.batch_id}", f"batches:{batch.run_id}")
+        arguments = (batch.run_id, batch.batch_id, batch.digest, batch.payload)
+        answer = await self._script(_PUT_BATCH, keys, *arguments)
+        return PutOutcome(answer.decode())
+
+    async def append_results(self, run_id: str, batch_id: str, rows: Sequence[ResultRow]) -> int:
+        flat = [value for row in rows for value in (row.cursor, row.rollout_id, row.payload)]
+        return int(await self._script(_APPEND, self._batch_keys(run_id, batch_id), *flat))
+
+    async def results_after(self, run_id: str, batch_id: str, cursor: int, limit: int) -> list[ResultRow]:
+        key = self._key(f"results:{run_id}:{batch_id}")
+        found = await self._call(
+            self._redis.zrangebyscore(key, f"({cursor}", "+inf", start=0, num=limit, withscores=True)
+        )
+        return [_row(int(score), member) for member, score in found]
+
+    async def drop_batch(self, run_id: str, batch_id: str) -> None:
+        await self._script(_DROP_BATCH, (*self._batch_keys(run_id, batch_id), f"batches:{run_id}"), batch_id)
+
+    async def runs(self) -> list[RunRow]:
+        names = await self._call(self._redis.hgetall(self._key("runs")))
+        order = await self._call(cast("Awaitable[Any]", self._redis.lrange(self._key("run_order"), 0, -1)))
+        return [RunRow(run_id.decode(), names[run_id].decode()) for run_id in order]
+
+    async def batches(self, run_id: str) -> list[BatchRow]:
+        rows: list[BatchRow] = []
+        for batch_id in await self._batch_ids(run_id):
+            fields = await self._call(self._redis.hgetall(self._key(f"batch:{run_id}:{batch_id}")))
+            if fields:
+                rows.append(BatchRow(run_id, batch_id, fields[b"digest"].decode(), fields[b"payload"]))
+        return rows
+
+    async def close(self) -> None:
+        await self._redis.aclose()
+
+    async def _batch_ids(self, run_id: str) -> list[str]:
+        ids = await self._call(self._redis.lrange(self._key(f"batches:{run_id}"), 0, -1))
+        return [batch_id.decode() for batch_id in ids]
+
+    def _batch_keys(self, run_id: str, batch_id: str) -> tuple[str, str, str]:
+        return (f"batch:{run_id}:{batch_id}", f"done:{run_id}:{batch_id}", f"results:{run_id}:{batch_id}")
+
+    def _key(self, name: str) -> str:
+        return f"{self._prefix}:{name}"
+
+    async def _script(self, source: str, names: Sequence[str], *values: str | bytes | int) -> Any:
+        keys = [self._key("epoch"), *map(self._key, names)]
+        # EVAL and not EVALSHA: nothing has to be loaded again after the server was restarted.
+        return await self._call(self._redis.eval(source, len(keys), *keys, self._epoch, *values))
+
+    async def _call(self, answer: Any) -> Any:
+        try:
+            return await answer
+        except ResponseError as error:
+            if _FENCED in str(error):
+                raise FencedError(
+                    f"another manager took over the state in {self._url}: stop this one"
+                ) from error
+            raise StateError(f"Redis at {self._url} refused a call: {error}") from error
+        except (RedisError, OSError) as error:
+            raise StateError(
+                f"Redis at {self._url} can't be reached ({error}): start it, or pass another --state"
+            ) from error
+
+
+def _row(cursor: int, member: bytes) -> ResultRow:
+    length, _, rest = member.partition(b":")
+    size = int(length)
+    return ResultRow(cursor, rest[:size].decode(), rest[size:])

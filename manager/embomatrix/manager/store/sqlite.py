@@ -1,0 +1,151 @@
+"""State in one file beside the manager: it survives a restart, and needs no server."""
+
+from __future__ import annotations
+
+import asyncio
+import sqlite3
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+from embomatrix.manager.store.protocol import (
+    BatchRow,
+    FencedError,
+    PutOutcome,
+    ResultRow,
+    RunRow,
+    StateError,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from pathlib import Path
+
+T = TypeVar("T")
+
+_SCHEMA: Final = """
+PRAGMA journal_mode = WAL;
+PRAGMA synchronous = NORMAL;
+CREATE TABLE IF NOT EXISTS manager (only_row INTEGER PRIMARY KEY CHECK (only_row = 1), epoch INTEGER NOT NULL);
+INSERT OR IGNORE INTO manager VALUES (1, 0);
+CREATE TABLE IF NOT EXISTS run (run_id TEXT PRIMARY KEY, name TEXT NOT NULL);
+CREATE TABLE IF NOT EXISTS batch (
+    run_id TEXT NOT NULL, batch_id TEXT NOT NULL, digest TEXT NOT NULL, payload BLOB NOT NULL,
+    PRIMARY KEY (run_id, batch_id)
+);
+CREATE TABLE IF NOT EXISTS result (
+    run_id TEXT NOT NULL, batch_id TEXT NOT NULL, rollout_id TEXT NOT NULL, cursor INTEGER NOT NULL,
+    payload BLOB NOT NULL, PRIMARY KEY (run_id, batch_id, rollout_id)
+) WITHOUT ROWID;
+CREATE INDEX IF NOT EXISTS result_order ON result (run_id, batch_id, cursor);
+"""
+
+
+class SqliteStore:
+    """One connection, used by one thread at a time. Opening raises ``StateError`` when the file can't be used."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._epoch = 0
+        self._lock = asyncio.Lock()
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._db = sqlite3.connect(path, timeout=5.0, check_same_thread=False, isolation_level=None)
+            self._db.executescript(_SCHEMA)
+        except (sqlite3.Error, OSError) as error:
+            raise StateError(
+                f"the state file {path} can't be used ({error}): check its folder's permissions, or pass --state"
+            ) from error
+
+    async def claim(self) -> int:
+        def claim() -> int:
+            self._db.execute("UPDATE manager SET epoch = epoch + 1")
+            return int(self._db.execute("SELECT epoch FROM manager").fetchone()[0])
+
+        self._epoch = await self._run(claim, fenced=False)
+        return self._epoch
+
+    async def open_run(self, run: RunRow) -> None:
+        await self._write("INSERT OR IGNORE INTO run VALUES (?, ?)", run.run_id, run.name)
+
+    async def close_run(self, run_id: str) -> None:
+        def delete() -> None:
+            for table in ("result", "batch", "run"):
+                self._db.execute(f"DELETE FROM {table} WHERE run_id = ?", (run_id,))
+
+        await self._run(delete)
+
+    async def put_batch(self, batch: BatchRow) -> PutOutcome:
+        def put() -> PutOutcome:
+            if self._db.execute("SELECT 1 FROM run WHERE run_id = ?", (batch.run_id,)).fetchone() is None:
+                return PutOutcome.NO_RUN
+            row = (batch.run_id, batch.batch_id, batch.digest, batch.payload)
+            if self._db.execute("INSERT OR IGNORE INTO batch VALUES (?, ?, ?, ?)", row).rowcount:
+                return PutOutcome.CREATED
+            known = self._db.execute("SELECT digest FROM batch WHERE run_id = ? AND batch_id = ?", row[:2])
+            return PutOutcome.SAME if known.fetchone()[0] == batch.digest else PutOutcome.CONFLICT
+
+        return await self._run(put)
+
+    async def append_results(self, run_id: str, batch_id: str, rows: Sequence[ResultRow]) -> int:
+        def append() -> int:
+            key = (run_id, batch_id)
+            batch = self._db.execute("SELECT 1 FROM batch WHERE run_id = ? AND batch_id = ?", key)
+            if batch.fetchone() is None:
+                return 0
+            values = [(*key, row.rollout_id, row.cursor, row.payload) for row in rows]
+            return self._db.executemany(
+                "INSERT OR IGNORE INTO result VALUES (?, ?, ?, ?, ?)", values
+            ).rowcount
+
+        return await self._run(append)
+
+    async def results_after(self, run_id: str, batch_id: str, cursor: int, limit: int) -> list[ResultRow]:
+        query = (
+            "SELECT cursor, rollout_id, payload FROM result "
+            "WHERE run_id = ? AND batch_id = ? AND cursor > ? ORDER BY cursor LIMIT ?"
+        )
+        return [ResultRow(*row) for row in await self._read(query, run_id, batch_id, cursor, limit)]
+
+    async def drop_batch(self, run_id: str, batch_id: str) -> None:
+        def delete() -> None:
+            for table in ("result", "batch"):
+                query = f"DELETE FROM {table} WHERE run_id = ? AND batch_id = ?"
+                self._db.execute(query, (run_id, batch_id))
+
+        await self._run(delete)
+
+    async def runs(self) -> list[RunRow]:
+        return [RunRow(*row) for row in await self._read("SELECT run_id, name FROM run ORDER BY rowid")]
+
+    async def batches(self, run_id: str) -> list[BatchRow]:
+        query = "SELECT run_id, batch_id, digest, payload FROM batch WHERE run_id = ? ORDER BY rowid"
+        return [BatchRow(*row) for row in await self._read(query, run_id)]
+
+    async def close(self) -> None:
+        async with self._lock:
+            self._db.close()
+
+    async def _write(self, query: str, *values: object) -> None:
+        await self._run(lambda: self._db.execute(query, values))
+
+    async def _read(self, query: str, *values: object) -> list[tuple[Any, ...]]:
+        return await self._run(lambda: self._db.execute(query, values).fetchall(), fenced=False)
+
+    async def _run(self, work: Callable[[], T], *, fenced: bool = True) -> T:
+        """The work in one transaction, on a thread: a slow disk shall not hold up heartbeats."""
+        async with self._lock:
+            try:
+                return await asyncio.to_thread(self._transaction, work, fenced)
+            except sqlite3.Error as error:
+                raise StateError(f"the state file {self._path} failed: {error}") from error
+
+    def _transaction(self, work: Callable[[], T], fenced: bool) -> T:
+        self._db.execute("BEGIN IMMEDIATE")
+        try:
+            if fenced and self._db.execute("SELECT epoch FROM manager").fetchone()[0] != self._epoch:
+                raise FencedError(f"another manager took over the state file {self._path}: stop this one")
+            answer = work()
+        except BaseException:
+            self._db.execute("ROLLBACK")
+            raise
+        self._db.execute("COMMIT")
+        return answer

@@ -1,0 +1,194 @@
+"""What people and their tools see of the cluster: plain values, made when somebody asks."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from embomatrix.manager.meter import quantile
+from embomatrix.manager.registry import Standing
+from embomatrix.rpc.values import Resident, ResidentState, RunInfo, RunStats, WorkerInfo
+
+if TYPE_CHECKING:
+    from embomatrix.manager.meter import FailureNote
+    from embomatrix.manager.runtime import ManagerRuntime
+
+
+@dataclass(frozen=True, slots=True)
+class Overview:
+    """The cluster in numbers. Seconds, except for counts; ``throughput`` is completed rollouts of each past second."""
+
+    uptime_s: float
+    workers: dict[str, int]
+    slots: int
+    slots_busy: int
+    queued: int
+    leased: int
+    runs: int
+    outcomes: dict[str, int]
+    throughput: list[int]
+    latency_p50_s: float
+    latency_p95_s: float
+    prewarm_hits: int
+    prewarm_misses: int
+    prewarm_wasted: int
+    prewarm_lead_s: float
+    """Median."""
+    redispatched: int
+    stale_results: int
+    failures: list[FailureNote]
+
+
+@dataclass(frozen=True, slots=True)
+class WorkerView:
+    """One worker. ``loads`` are scenes that it was told to load and has not reported yet."""
+
+    worker_id: str
+    state: str
+    reason: str
+    slots: int
+    busy: int
+    waiting: int
+    completed: int
+    cores: int
+    memory_mb: int
+    memory_used_mb: int
+    load: float
+    gpu: str
+    versions: dict[str, str]
+    silent_s: float
+    residents: list[Resident]
+    loads: list[str]
+
+
+@dataclass(frozen=True, slots=True)
+class LookaheadCell:
+    bundle_digest: str
+    count: int
+    warmth: str
+
+
+@dataclass(frozen=True, slots=True)
+class LookaheadStep:
+    """The scenes that a step of a run needs, and how far each is."""
+
+    run_id: str
+    step: int
+    cells: list[LookaheadCell]
+
+
+@dataclass(frozen=True, slots=True)
+class RunView:
+    run_id: str
+    name: str
+    pending: int
+    stats: RunStats
+
+
+def overview(runtime: ManagerRuntime) -> Overview:
+    """The numbers of this moment."""
+    now_s = time.monotonic()
+    cluster, meter = runtime.cluster, runtime.meter
+    stats = [cluster.stats(run_id) for run_id in runtime.runs.open]
+    leads = sorted(cluster.scheduler.prewarm.lead_s)
+    workers = list(cluster.dispatcher.workers.values())
+    return Overview(
+        uptime_s=now_s - runtime.started_s,
+        workers=dict(Counter(session.standing.value for session in runtime.registry.sessions.values())),
+        slots=sum(worker.slots for worker in workers),
+        slots_busy=sum(min(len(worker.held), worker.slots) for worker in workers),
+        queued=cluster.dispatcher.queued,
+        leased=len(cluster.dispatcher.live_leases),
+        runs=len(runtime.runs.open),
+        outcomes=dict(meter.outcomes),
+        throughput=meter.throughput(now_s),
+        latency_p50_s=meter.latency_s(0.5),
+        latency_p95_s=meter.latency_s(0.95),
+        prewarm_hits=sum(s.prewarm_hits for s in stats),
+        prewarm_misses=sum(s.prewarm_misses for s in stats),
+        prewarm_wasted=sum(s.prewarm_wasted for s in stats),
+        prewarm_lead_s=quantile(leads, 0.5),
+        redispatched=sum(s.redispatched for s in stats),
+        stale_results=sum(s.stale_results for s in stats),
+        failures=list(meter.failures),
+    )
+
+
+def workers(runtime: ManagerRuntime) -> list[WorkerView]:
+    """Every worker that is there or was there a moment ago, by id."""
+    return [_worker(runtime, worker_id) for worker_id in sorted(runtime.registry.sessions)]
+
+
+def runs(runtime: ManagerRuntime) -> list[RunView]:
+    """Open runs, oldest first."""
+    return [RunView(info.run_id, info.name, info.pending, info.stats) for info in run_infos(runtime)]
+
+
+def lookahead(runtime: ManagerRuntime) -> list[LookaheadStep]:
+    """The grid: steps by scenes, with how far each scene is."""
+    scheduler = runtime.cluster.scheduler
+    steps: dict[tuple[str, int], list[LookaheadCell]] = {}
+    for run_id, window in scheduler.windows.items():
+        for entry in window.entries:
+            cell = LookaheadCell(
+                entry.bundle_digest, entry.count, scheduler.warmth(entry.bundle_digest).value
+            )
+            steps.setdefault((run_id, entry.step), []).append(cell)
+    return [LookaheadStep(run_id, step, cells) for (run_id, step), cells in sorted(steps.items())]
+
+
+def worker_infos(runtime: ManagerRuntime) -> list[WorkerInfo]:
+    """The same for the wire."""
+    infos: list[WorkerInfo] = []
+    for session in runtime.registry.sessions.values():
+        view = _worker(runtime, session.worker_id)
+        infos.append(
+            WorkerInfo(
+                worker_id=view.worker_id,
+                state=view.state,
+                resources=session.resources,
+                residents=tuple(view.residents),
+                running=view.busy,
+                completed=view.completed,
+                last_seen_s=view.silent_s,
+            )
+        )
+    return infos
+
+
+def run_infos(runtime: ManagerRuntime) -> list[RunInfo]:
+    cluster = runtime.cluster
+    return [
+        RunInfo(run.run_id, run.name, cluster.stats(run.run_id), cluster.dispatcher.pending_of(run.run_id))
+        for run in runtime.runs.open.values()
+    ]
+
+
+def _worker(runtime: ManagerRuntime, worker_id: str) -> WorkerView:
+    session = runtime.registry.sessions[worker_id]
+    record = runtime.cluster.dispatcher.workers.get(worker_id)
+    scheduler = runtime.cluster.scheduler
+    held = len(record.held) if record else 0
+    residents = scheduler.residents(worker_id)
+    here = {r.bundle_digest for r in residents if r.state is not ResidentState.FAILED}
+    draining = record is not None and record.draining and session.standing is not Standing.LOST
+    return WorkerView(
+        worker_id=worker_id,
+        state=Standing.DRAINING.value if draining else session.standing.value,
+        reason=session.reason,
+        slots=session.resources.slots,
+        busy=min(held, record.slots) if record else 0,
+        waiting=max(0, held - record.slots) if record else 0,
+        completed=record.completed if record else 0,
+        cores=session.resources.cores,
+        memory_mb=session.resources.memory_mb,
+        memory_used_mb=session.memory_used_mb,
+        load=session.load,
+        gpu=session.resources.gpu,
+        versions=dict(session.resources.versions),
+        silent_s=time.monotonic() - session.last_seen_s,
+        residents=list(residents),
+        loads=[scene for scene in scheduler.desired(worker_id) if scene not in here],
+    )
