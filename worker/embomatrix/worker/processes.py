@@ -185,11 +185,17 @@ async def start_root(log: Path, program: tuple[str, ...] = SIMULATOR_PROGRAM) ->
             answer = await peer.hear()
     except (ProcessGoneError, TimeoutError, OSError) as error:
         await Root(peer, process, 0.0).end()
-        raise ProcessGoneError(f"the simulator did not start: {error}; its output is in {log}") from error
+        said = (await asyncio.to_thread(_last_line, log)) or str(error)
+        raise ProcessGoneError(f"the simulator did not start: {said} (its output is in {log})") from error
     if "error" in answer.header:
         await Root(peer, process, 0.0).end()
         raise ProcessGoneError(str(answer.header["error"]))
     return Root(peer, process, float(answer.header["memory_mb"]))
+
+
+def _last_line(log: Path) -> str:
+    lines = log.read_text(errors="replace").strip().splitlines()
+    return lines[-1] if lines else ""
 
 
 def describe_status(status: int) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import logging
 import time
 from collections import deque
@@ -169,9 +170,9 @@ class SlotPool:
             self._running += 1
             ticket.task = tasks.create_task(self._run_lease(ticket, scene))
             # A task that is cancelled before its first step runs no `finally` of its own.
-            ticket.task.add_done_callback(lambda _, scene=scene: self._release(scene))
+            ticket.task.add_done_callback(functools.partial(self._release, scene))
 
-    def _release(self, scene: Scene) -> None:
+    def _release(self, scene: Scene, _: asyncio.Task[None]) -> None:
         scene.running -= 1
         self._running -= 1
         self._wake.set()

@@ -1,0 +1,153 @@
+"""A manager for the worker's tests: gives the leases it is told to, keeps what comes back, and breaks on request."""
+
+import asyncio
+import contextlib
+from dataclasses import dataclass, field
+
+import grpc
+
+from embomatrix.proto.v1 import worker_service_pb2 as pb
+from embomatrix.proto.v1 import worker_service_pb2_grpc
+from embomatrix.rpc.channel import SERVER_OPTIONS, chunks_of
+from embomatrix.rpc.convert import resources_from_proto
+from embomatrix.rpc.convert_session import (
+    lease_ref_to_proto,
+    lease_result_from_proto,
+    lease_to_proto,
+    worker_state_from_proto,
+)
+from embomatrix.rpc.status import NotFoundError, SupersededError, translate
+from embomatrix.rpc.values import Lease, LeaseRef, Rollout
+from embomatrix.world.bundle import bundle_digest
+
+
+@dataclass
+class FakeManager(worker_service_pb2_grpc.WorkerServiceServicer):
+    """One worker's manager. ``results`` keeps every result that ever arrived, ``states`` every full state."""
+
+    acknowledging: bool = True
+    answering_heartbeats: bool = True
+    lease_ttl_s: float = 5.0
+    bundles: dict[str, bytes] = field(default_factory=dict)
+    damaged: set[str] = field(default_factory=set)
+    registrations: list[pb.RegisterRequest] = field(default_factory=list)
+    resources: object = None
+    states: list = field(default_factory=list)
+    results: list = field(default_factory=list)
+    renewed: list = field(default_factory=list)
+    fetches: list[str] = field(default_factory=list)
+    epoch: int = 0
+    outgoing: asyncio.Queue = field(default_factory=asyncio.Queue)
+
+    def bundle(self, content):
+        digest = bundle_digest(content)
+        self.bundles[digest] = content
+        return digest
+
+    def want(self, *digests):
+        self.outgoing.put_nowait(pb.SessionResponse(desired=pb.DesiredResidents(bundle_digests=digests)))
+
+    def lease(self, lease_id, digest, task="ok", *, deadline_s=10.0):
+        lease = Lease(LeaseRef(lease_id, self.epoch), Rollout(lease_id, "g", digest, task, (), 1), deadline_s)
+        self.outgoing.put_nowait(pb.SessionResponse(leases=[lease_to_proto(lease)]))
+        return lease.ref
+
+    def cancel(self, ref):
+        self.outgoing.put_nowait(pb.SessionResponse(cancelled=[lease_ref_to_proto(ref)]))
+
+    def acknowledge(self, ref):
+        self.outgoing.put_nowait(pb.SessionResponse(acknowledged=[lease_ref_to_proto(ref)]))
+
+    def drain(self):
+        self.outgoing.put_nowait(pb.SessionResponse(drain=True))
+
+    def break_stream(self):
+        self.outgoing.put_nowait(None)
+
+    def forget_session(self):
+        self.epoch += 1
+        self.outgoing.put_nowait(None)
+
+    def _check(self, message):
+        if message.session_epoch != self.epoch:
+            raise SupersededError("this session is not known: register again")
+
+    async def Register(self, request, context):
+        async with translate(context):
+            self.epoch += 1
+            self.registrations.append(request)
+            self.resources = resources_from_proto(request.resources)
+            return pb.RegisterResponse(
+                session_id=f"s{self.epoch}",
+                session_epoch=self.epoch,
+                heartbeat_interval_s=0.1,
+                lease_ttl_s=self.lease_ttl_s,
+            )
+
+    async def Heartbeat(self, request, context):
+        async with translate(context):
+            self._check(request)
+            if not self.answering_heartbeats:
+                await asyncio.sleep(60)
+            self.renewed.append([ref.lease_id for ref in request.running])
+            return pb.HeartbeatResponse(next_interval_s=0.1)
+
+    async def Session(self, request_iterator, context):
+        async with translate(context):
+            first = await anext(aiter(request_iterator))
+            self._check(first)
+            self._take(first)
+            reading = asyncio.create_task(self._read(request_iterator))
+            try:
+                yield pb.SessionResponse()
+                while (response := await self._next(reading)) is not None:
+                    yield response
+            finally:
+                reading.cancel()
+
+    async def _next(self, reading):
+        getting = asyncio.create_task(self.outgoing.get())
+        await asyncio.wait((getting, reading), return_when=asyncio.FIRST_COMPLETED)
+        if getting.done():
+            return getting.result()
+        getting.cancel()
+        return None
+
+    async def _read(self, requests):
+        async for request in requests:
+            self._take(request)
+
+    def _take(self, request):
+        found = list(request.results)
+        if request.HasField("state"):
+            self.states.append(worker_state_from_proto(request.state))
+            found += request.state.finished
+        for result in map(lease_result_from_proto, found):
+            self.results.append(result)
+            if self.acknowledging:
+                self.acknowledge(result.ref)
+
+    async def FetchBundle(self, request, context):
+        async with translate(context):
+            self.fetches.append(request.bundle_digest)
+            if request.bundle_digest not in self.bundles:
+                raise NotFoundError(f"there is no bundle {request.bundle_digest}")
+            data = self.bundles[request.bundle_digest]
+            if request.bundle_digest in self.damaged:
+                self.damaged.discard(request.bundle_digest)
+                data = b"damaged" + data
+            for chunk in chunks_of(data):
+                yield pb.FetchBundleResponse(chunk=chunk)
+
+
+@contextlib.asynccontextmanager
+async def serving(manager, port=0):
+    """Serve the fake on the loopback interface; yields HOST:PORT."""
+    server = grpc.aio.server(options=SERVER_OPTIONS)
+    worker_service_pb2_grpc.add_WorkerServiceServicer_to_server(manager, server)
+    port = server.add_insecure_port(f"127.0.0.1:{port}")
+    await server.start()
+    try:
+        yield f"127.0.0.1:{port}"
+    finally:
+        await server.stop(None)

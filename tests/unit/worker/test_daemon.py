@@ -1,0 +1,232 @@
+"""The daemon against a manager: it keeps results until they are taken, and comes back after every break."""
+
+import asyncio
+import contextlib
+import re
+
+import numpy as np
+import pytest
+from tests.fakes.manager import FakeManager, serving
+from tests.fakes.simulation import PROGRAM
+
+from embomatrix.rpc.status import ManagerUnreachableError, SupersededError
+from embomatrix.rpc.values import Completed, InfraCode, ResidentState, Resources
+from embomatrix.worker.daemon import Daemon
+from embomatrix.worker.settings import WorkerSettings
+
+
+def _daemon(address, folder, **options):
+    settings = WorkerSettings(manager=address, name="w1", cache_dir=folder, **options)
+    return Daemon(settings, Resources(2, 2, 500), np.random.default_rng(0), program=PROGRAM)
+
+
+@contextlib.asynccontextmanager
+async def joined(manager, folder, **options):
+    """A daemon that has joined the manager and is told to leave at the end."""
+    async with serving(manager) as address:
+        daemon = _daemon(address, folder, **options)
+        task = asyncio.create_task(daemon.run())
+        try:
+            await _until(lambda: manager.states or task.done())
+            yield daemon, task
+        finally:
+            task.cancel()
+            with contextlib.suppress(asyncio.CancelledError, SupersededError):
+                await task
+
+
+async def _until(condition, limit_s=15.0):
+    async with asyncio.timeout(limit_s):
+        while not condition():  # noqa: ASYNC110  # what is watched belongs to another task
+            await asyncio.sleep(0.005)
+
+
+def _done(manager):
+    return [result.ref.lease_id for result in manager.results]
+
+
+async def test_it_registers_with_its_resources_and_reports_its_state_first(tmp_path):
+    manager = FakeManager()
+    async with joined(manager, tmp_path):
+        assert manager.registrations[0].worker_id == "w1"
+        assert manager.resources.slots == 2
+        assert manager.states[0].residents == ()
+
+
+async def test_a_desired_scene_becomes_warm_and_a_lease_comes_back_scored(tmp_path):
+    manager = FakeManager()
+    digest = manager.bundle(b"ok")
+    async with joined(manager, tmp_path):
+        manager.want(digest)
+        await _until(lambda: any(r.state is ResidentState.WARM for s in manager.states for r in s.residents))
+        manager.lease("l1", digest)
+        await _until(lambda: manager.results)
+    outcome = manager.results[0].outcome
+    assert isinstance(outcome, Completed)
+    assert outcome.worker_id == "w1"
+    assert outcome.warm
+
+
+async def test_heartbeats_renew_what_is_held(tmp_path):
+    manager = FakeManager()
+    async with joined(manager, tmp_path):
+        manager.lease("l1", manager.bundle(b"ok"), "slow")
+        await _until(lambda: ["l1"] in manager.renewed)
+
+
+async def test_many_leases_are_executed_once_each(tmp_path):
+    manager = FakeManager()
+    digest = manager.bundle(b"ok")
+    async with joined(manager, tmp_path):
+        for number in range(200):
+            manager.lease(f"l{number}", digest)
+        await _until(lambda: len(manager.results) >= 200)
+        await asyncio.sleep(0.1)
+    assert sorted(_done(manager)) == sorted(f"l{number}" for number in range(200))
+
+
+async def test_a_broken_stream_is_opened_again_and_unacknowledged_results_come_again(tmp_path):
+    manager = FakeManager(acknowledging=False)
+    digest = manager.bundle(b"ok")
+    async with joined(manager, tmp_path):
+        manager.lease("l1", digest)
+        await _until(lambda: manager.results)
+        manager.break_stream()
+        await _until(lambda: len(manager.results) == 2)
+        assert _done(manager) == ["l1", "l1"]
+        assert len(manager.registrations) == 1
+        manager.acknowledge(manager.results[0].ref)
+        manager.lease("l2", digest)
+        await _until(lambda: "l2" in _done(manager))
+        manager.break_stream()
+        await _until(lambda: len(manager.results) == 4)
+    assert _done(manager) == ["l1", "l1", "l2", "l2"]
+
+
+async def test_leases_go_on_while_the_stream_is_broken(tmp_path):
+    manager = FakeManager()
+    async with joined(manager, tmp_path):
+        manager.lease("l1", manager.bundle(b"ok"), "slow")
+        await _until(lambda: ["l1"] in manager.renewed)
+        manager.break_stream()
+        await _until(lambda: _done(manager) == ["l1"])
+        assert [ref.lease_id for ref in manager.states[-1].running] in (["l1"], [])
+
+
+async def test_a_manager_that_forgot_the_session_is_joined_anew_and_old_leases_are_dropped(tmp_path):
+    manager = FakeManager()
+    digest = manager.bundle(b"ok")
+    async with joined(manager, tmp_path):
+        manager.lease("old", digest, "hang", deadline_s=600.0)
+        await _until(lambda: ["old"] in manager.renewed)
+        manager.forget_session()
+        await _until(lambda: len(manager.registrations) == 2)
+        manager.lease("new", digest)
+        await _until(lambda: manager.results)
+    assert _done(manager) == ["new"]
+
+
+async def test_a_manager_that_was_away_is_joined_when_it_is_back(tmp_path):
+    manager = FakeManager()
+    async with serving(manager) as address:
+        pass
+    daemon = _daemon(address, tmp_path)
+    task = asyncio.create_task(daemon.run())
+    await asyncio.sleep(0.6)
+    assert not task.done()
+    async with serving(manager, port=address.rpartition(":")[2]):
+        await _until(lambda: manager.states)
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+
+
+async def test_with_once_an_absent_manager_ends_the_daemon_with_a_sentence(tmp_path):
+    daemon = _daemon("127.0.0.1:1", tmp_path, once=True)
+    with pytest.raises(ManagerUnreachableError, match=re.escape("no manager answers at 127.0.0.1:1")):
+        await daemon.run()
+
+
+async def test_leases_that_cannot_be_renewed_are_stopped(tmp_path):
+    manager = FakeManager(lease_ttl_s=0.5, answering_heartbeats=False)
+    async with joined(manager, tmp_path) as (daemon, _):
+        manager.lease("l1", manager.bundle(b"ok"), "hang", deadline_s=600.0)
+        await _until(lambda: daemon.held == 1)
+        await _until(lambda: daemon.held == 0)
+    assert manager.results == []
+
+
+async def test_a_name_that_is_taken_over_again_and_again_ends_the_daemon(tmp_path):
+    manager = FakeManager()
+    async with joined(manager, tmp_path) as (_, task):
+        for count in range(1, 5):
+            await _until(lambda count=count: len(manager.registrations) >= count or task.done())
+            manager.forget_session()
+        with pytest.raises(SupersededError, match="another worker of that name"):
+            await asyncio.wait_for(task, 10)
+
+
+async def test_a_cancelled_lease_gives_no_result(tmp_path):
+    manager = FakeManager()
+    digest = manager.bundle(b"ok")
+    async with joined(manager, tmp_path):
+        ref = manager.lease("stuck", digest, "hang", deadline_s=600.0)
+        await _until(lambda: ["stuck"] in manager.renewed)
+        manager.cancel(ref)
+        await _until(lambda: manager.renewed[-1] == [])
+        manager.lease("l1", digest)
+        await _until(lambda: manager.results)
+    assert _done(manager) == ["l1"]
+
+
+async def test_a_bundle_damaged_on_its_way_is_fetched_once_more(tmp_path):
+    manager = FakeManager()
+    digest = manager.bundle(b"ok")
+    manager.damaged.add(digest)
+    async with joined(manager, tmp_path):
+        manager.lease("l1", digest)
+        await _until(lambda: manager.results)
+    assert isinstance(manager.results[0].outcome, Completed)
+    assert manager.fetches == [digest, digest]
+
+
+async def test_a_bundle_that_the_manager_lacks_fails_its_leases_with_the_reason(tmp_path):
+    manager = FakeManager()
+    digest = manager.bundle(b"ok")
+    del manager.bundles[digest]
+    async with joined(manager, tmp_path):
+        manager.lease("l1", digest)
+        await _until(lambda: manager.results)
+    outcome = manager.results[0].outcome
+    assert outcome.code is InfraCode.SCENE_LOAD_FAILED
+    assert "there is no bundle" in outcome.message
+
+
+async def test_a_drain_finishes_what_runs_then_leaves(tmp_path):
+    manager = FakeManager()
+    async with joined(manager, tmp_path) as (daemon, task):
+        manager.lease("l1", manager.bundle(b"ok"), "slow")
+        await _until(lambda: ["l1"] in manager.renewed)
+        daemon.stop()
+        await asyncio.wait_for(task, 10)
+    assert _done(manager) == ["l1"]
+    assert manager.states[-1].draining
+
+
+async def test_the_manager_may_ask_for_a_drain(tmp_path):
+    manager = FakeManager()
+    async with joined(manager, tmp_path) as (_, task):
+        manager.drain()
+        await asyncio.wait_for(task, 10)
+
+
+async def test_a_second_signal_leaves_at_once(tmp_path):
+    manager = FakeManager()
+    async with joined(manager, tmp_path) as (daemon, task):
+        manager.lease("l1", manager.bundle(b"ok"), "hang", deadline_s=600.0)
+        await _until(lambda: ["l1"] in manager.renewed)
+        daemon.stop()
+        await asyncio.sleep(0.05)
+        assert not task.done()
+        daemon.stop()
+        await asyncio.wait_for(task, 10)

@@ -1,0 +1,78 @@
+"""Results are kept until they are acknowledged, and carried again by the next stream."""
+
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.random import default_rng
+
+from embomatrix.rpc.values import InfraCode, InfraFailure, LeaseRef, LeaseResult
+from embomatrix.worker import outbox as module
+from embomatrix.worker.backoff import Backoff
+from embomatrix.worker.outbox import Outbox
+
+
+def _result(number):
+    return LeaseResult(LeaseRef(f"l{number}", 1), InfraFailure(InfraCode.SLOT_CRASHED, "died"))
+
+
+def _filled(count):
+    outbox = Outbox()
+    for number in range(count):
+        outbox.put(_result(number))
+    return outbox
+
+
+def test_a_result_is_sent_once_on_a_stream_and_kept():
+    outbox = _filled(3)
+    assert outbox.take_unsent(2) == (_result(0), _result(1))
+    assert outbox.take_unsent(2) == (_result(2),)
+    assert not outbox.has_unsent
+    assert len(outbox) == 3
+
+
+def test_a_new_stream_carries_what_was_not_acknowledged():
+    outbox = _filled(3)
+    outbox.take_unsent(3)
+    outbox.acknowledge(_result(1).ref)
+    outbox.begin_stream()
+    assert outbox.take_unsent(10) == (_result(0), _result(2))
+
+
+def test_an_acknowledgement_of_something_unknown_is_ignored():
+    outbox = _filled(1)
+    outbox.acknowledge(LeaseRef("other", 9))
+    assert len(outbox) == 1
+
+
+def test_the_oldest_result_goes_when_nobody_listens_for_very_long():
+    outbox = _filled(module.LIMIT + 1)
+    assert len(outbox) == module.LIMIT
+    assert outbox.take_unsent(1) == (_result(1),)
+
+
+@given(st.lists(st.sampled_from(["put", "take", "ack", "stream"]), max_size=40))
+def test_no_result_is_lost_before_it_is_acknowledged(actions):
+    outbox, kept, count = Outbox(), {}, 0
+    for action in actions:
+        match action:
+            case "put":
+                outbox.put(_result(count))
+                kept[_result(count).ref] = _result(count)
+                count += 1
+            case "take":
+                outbox.take_unsent(2)
+            case "ack" if kept:
+                ref = next(iter(kept))
+                del kept[ref]
+                outbox.acknowledge(ref)
+            case "stream":
+                outbox.begin_stream()
+    outbox.begin_stream()
+    assert outbox.take_unsent(1000) == tuple(kept.values())
+
+
+def test_waits_double_up_to_the_longest_and_start_over_after_a_success():
+    backoff = Backoff(default_rng(0))
+    waits = [backoff.next_s() for _ in range(12)]
+    assert all(0.8 <= wait / min(20.0, 0.2 * 2**n) <= 1.2 for n, wait in enumerate(waits))
+    backoff.reset()
+    assert backoff.next_s() <= 0.24

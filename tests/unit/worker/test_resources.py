@@ -1,0 +1,59 @@
+"""What a machine offers, and settings that say so."""
+
+import os
+
+import pytest
+from pydantic import ValidationError
+
+from embomatrix.worker.resources import find_gpu, fingerprint, measure
+from embomatrix.worker.settings import WorkerSettings
+
+
+def test_a_machine_offers_its_cores_and_part_of_its_memory():
+    resources = measure(WorkerSettings())
+    assert resources.slots == resources.cores == len(os.sched_getaffinity(0))
+    assert resources.memory_mb > 0
+    assert resources.score > 0
+    assert set(resources.versions) == {"embomatrix", "python", "pybullet", "numpy", "platform"}
+
+
+def test_settings_overrule_what_was_measured():
+    resources = measure(WorkerSettings(slots=3, memory_mb=77))
+    assert (resources.slots, resources.memory_mb) == (3, 77)
+
+
+def test_the_fingerprint_of_a_platform_does_not_change():
+    assert fingerprint() == fingerprint()
+    assert len(fingerprint()) == 16
+
+
+def test_a_gpu_is_found_by_nvidia_smi(tmp_path, monkeypatch):
+    program = tmp_path / "nvidia-smi"
+    program.write_text("#!/bin/sh\necho 'NVIDIA H200, 143771'\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    assert find_gpu() == ("NVIDIA H200", 143771)
+
+
+def test_a_gpu_program_that_fails_means_no_gpu(tmp_path, monkeypatch):
+    program = tmp_path / "nvidia-smi"
+    program.write_text("#!/bin/sh\necho 'driver mismatch'\nexit 9\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    assert find_gpu() == ("", 0)
+
+
+def test_two_workers_of_one_host_get_different_names():
+    assert WorkerSettings().name != WorkerSettings().name
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"manager": "nowhere"}, {"slots": -1}, {"name": "a b"}, {"nice": 20}, {"slotz": 1}]
+)
+def test_a_wrong_setting_is_refused(wrong):
+    with pytest.raises(ValidationError):
+        WorkerSettings(**wrong)
+
+
+def test_a_token_is_not_shown():
+    assert "secret" not in repr(WorkerSettings(token="secret"))

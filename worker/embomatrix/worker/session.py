@@ -1,0 +1,237 @@
+"""One registration with the manager: the session stream, the heartbeat beside it, and bundles fetched under it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.proto.v1 import worker_service_pb2 as pb
+from embomatrix.proto.v1 import worker_service_pb2_grpc
+from embomatrix.rpc.channel import PROTOCOL_VERSION, open_channel
+from embomatrix.rpc.convert import each, resources_to_proto
+from embomatrix.rpc.convert_session import (
+    lease_from_proto,
+    lease_ref_from_proto,
+    lease_ref_to_proto,
+    lease_result_to_proto,
+    worker_state_to_proto,
+)
+from embomatrix.rpc.status import (
+    DeadlineError,
+    NotFoundError,
+    UnavailableError,
+    cluster_errors,
+)
+from embomatrix.rpc.values import InfraCode, WorkerState
+from embomatrix.worker.residents import LoadError
+from embomatrix.world.bundle import DEFAULT_LIMITS
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncGenerator
+
+    import grpc
+
+    from embomatrix.rpc.values import Resources
+    from embomatrix.worker.outbox import Outbox
+    from embomatrix.worker.slots import SlotPool
+
+logger = logging.getLogger(__name__)
+
+REGISTER_S: Final = 10.0
+HEARTBEAT_S: Final = 2.0
+FETCH_S: Final = 30.0
+"""Limits for the answers to a registration, a heartbeat and a request for a bundle."""
+HEARTBEATS_MISSED: Final = 3
+"""So many heartbeats in a row without an answer mean that the connection is dead."""
+RESULTS_PER_MESSAGE: Final = 64
+
+
+@dataclass(frozen=True, slots=True)
+class Registration:
+    """What the manager knows this worker by, and the intervals it asked for."""
+
+    session_id: str
+    epoch: int
+    heartbeat_s: float
+    lease_ttl_s: float
+
+
+async def register(
+    address: str, token: str, *, worker_id: str, boot_id: str, resources: Resources
+) -> Registration:
+    """Announce this worker; an older session of the same worker id ends. Raises ClusterError."""
+    request = pb.RegisterRequest(
+        worker_id=worker_id,
+        boot_id=boot_id,
+        protocol_version=PROTOCOL_VERSION,
+        resources=resources_to_proto(resources),
+        join_token=token,
+    )
+    async with open_channel(address, token) as channel:
+        with cluster_errors(address):
+            stub = worker_service_pb2_grpc.WorkerServiceStub(channel)
+            answer = await stub.Register(request, timeout=REGISTER_S)
+    return Registration(
+        answer.session_id, answer.session_epoch, answer.heartbeat_interval_s, answer.lease_ttl_s
+    )
+
+
+class Session:
+    """The streams of one connection. ``serve`` ends with a ClusterError, or without one once the worker has drained."""
+
+    def __init__(
+        self, address: str, token: str, registration: Registration, pool: SlotPool, outbox: Outbox
+    ) -> None:
+        self._address = address
+        self._token = token
+        self._registration = registration
+        self._pool = pool
+        self._outbox = outbox
+        self._draining = False
+        self._state_due = False
+        self._news = asyncio.Event()
+        self._data_channel: grpc.aio.Channel | None = None
+        self.attached = asyncio.Event()
+        """Set once the manager was heard on the stream."""
+        self.renewed_s = time.monotonic()
+        """When the manager last renewed the leases."""
+
+    def tell(self) -> None:
+        """There are results to send."""
+        self._news.set()
+
+    def tell_state(self) -> None:
+        """Residents changed: the state is due."""
+        self._state_due = True
+        self._news.set()
+
+    def drain(self) -> None:
+        """Take nothing new; the session ends when everything held is finished and acknowledged."""
+        self._draining = True
+        self.tell_state()
+
+    async def serve(self) -> None:
+        """Keep the session until the connection breaks, the manager ends it, or the worker has drained."""
+        async with (
+            open_channel(self._address, self._token) as channel,
+            # Its own connection: no bundle on its way delays a heartbeat.
+            open_channel(self._address, self._token) as heartbeat_channel,
+        ):
+            self._data_channel = channel
+            beating = asyncio.create_task(self._beat(heartbeat_channel))
+            talking = asyncio.create_task(self._talk(channel))
+            try:
+                done, _ = await asyncio.wait((beating, talking), return_when=asyncio.FIRST_COMPLETED)
+                for task in done:
+                    task.result()
+            finally:
+                self._data_channel = None
+                for task in (beating, talking):
+                    task.cancel()
+                    with contextlib.suppress(asyncio.CancelledError, Exception):
+                        await task
+
+    async def fetch(self, digest: str) -> bytes:
+        """The bundle's bytes as the manager sends them. Raises LoadError."""
+        async with asyncio.timeout(FETCH_S):
+            await self.attached.wait()
+        if self._data_channel is None:
+            raise LoadError(InfraCode.SCENE_LOAD_FAILED, "the connection to the manager broke")
+        stub = worker_service_pb2_grpc.WorkerServiceStub(self._data_channel)
+        request = pb.FetchBundleRequest(session_id=self._registration.session_id, bundle_digest=digest)
+        data = bytearray()
+        try:
+            with cluster_errors(self._address):
+                async for response in stub.FetchBundle(request, timeout=FETCH_S):
+                    data += response.chunk
+                    if len(data) > DEFAULT_LIMITS.compressed_bytes:
+                        text = f"the bundle has more than {DEFAULT_LIMITS.compressed_bytes} bytes"
+                        raise LoadError(InfraCode.BUNDLE_CORRUPT, text)
+        except NotFoundError as error:
+            raise LoadError(InfraCode.SCENE_LOAD_FAILED, f"the manager lacks the bundle: {error}") from error
+        return bytes(data)
+
+    async def _talk(self, channel: grpc.aio.Channel) -> None:
+        stub = worker_service_pb2_grpc.WorkerServiceStub(channel)
+        with cluster_errors(self._address):
+            async for response in stub.Session(self._requests()):
+                self.attached.set()
+                self._take(response)
+        if not self._drained():
+            raise UnavailableError(f"the manager at {self._address} ended the session")
+
+    async def _requests(self) -> AsyncGenerator[pb.SessionRequest]:
+        """Full state first; then results as they come, and the state again whenever it changed."""
+        self._outbox.begin_stream()
+        finished = self._outbox.take_unsent(len(self._outbox))
+        yield self._request(
+            state=WorkerState(self._pool.residents(), self._pool.held(), finished, self._draining)
+        )
+        while not self._drained():
+            await self._news.wait()
+            self._news.clear()
+            while self._state_due or self._outbox.has_unsent:
+                results = self._outbox.take_unsent(RESULTS_PER_MESSAGE)
+                message = self._request(state=self._state() if self._state_due else None)
+                message.results.extend(lease_result_to_proto(result) for result in results)
+                self._state_due = False
+                yield message
+
+    def _state(self) -> WorkerState:
+        return WorkerState(self._pool.residents(), self._pool.held(), (), self._draining)
+
+    def _request(self, state: WorkerState | None) -> pb.SessionRequest:
+        return pb.SessionRequest(
+            session_id=self._registration.session_id,
+            session_epoch=self._registration.epoch,
+            state=None if state is None else worker_state_to_proto(state),
+        )
+
+    def _drained(self) -> bool:
+        return self._draining and not self._pool.held() and not len(self._outbox)
+
+    def _take(self, response: pb.SessionResponse) -> None:
+        if response.drain and not self._draining:
+            logger.info("the manager asks this worker to drain")
+            self.drain()
+        if response.HasField("desired"):
+            self._pool.want(response.desired.bundle_digests)
+        for ref in each("acknowledged", lease_ref_from_proto, response.acknowledged):
+            self._outbox.acknowledge(ref)
+        cancelled = each("cancelled", lease_ref_from_proto, response.cancelled)
+        self._pool.cancel(cancelled)
+        for ref in cancelled:
+            self._outbox.acknowledge(ref)
+        for lease in each("leases", lease_from_proto, response.leases):
+            self._pool.submit(lease)
+        if self._drained():
+            self._news.set()
+
+    async def _beat(self, channel: grpc.aio.Channel) -> None:
+        stub = worker_service_pb2_grpc.WorkerServiceStub(channel)
+        interval_s = self._registration.heartbeat_s
+        missed = 0
+        while True:
+            await asyncio.sleep(interval_s)
+            request = pb.HeartbeatRequest(
+                session_id=self._registration.session_id,
+                session_epoch=self._registration.epoch,
+                running=[lease_ref_to_proto(ref) for ref in self._pool.held()],
+                load=self._pool.load,
+                memory_used_mb=int(self._pool.memory_used_mb),
+            )
+            try:
+                with cluster_errors(self._address):
+                    answer = await stub.Heartbeat(request, timeout=HEARTBEAT_S)
+            except (DeadlineError, UnavailableError):
+                missed += 1
+                if missed >= HEARTBEATS_MISSED:
+                    raise
+                continue
+            missed = 0
+            self.renewed_s = time.monotonic()
+            interval_s = answer.next_interval_s or self._registration.heartbeat_s

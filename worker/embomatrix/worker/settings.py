@@ -1,0 +1,48 @@
+"""Settings of a worker daemon: parsed once, at the command line."""
+
+from __future__ import annotations
+
+import secrets
+import socket
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from embomatrix.rpc.channel import DEFAULT_ADDRESS
+
+
+class WorkerSettings(BaseModel):
+    """What a daemon is told. Zeros mean: measure this machine and decide."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    manager: str = Field(DEFAULT_ADDRESS, pattern=r"^\S+:\d{1,5}$")
+    """HOST:PORT of the manager; the worker dials out, nothing needs to reach it."""
+    token: str = Field("", repr=False)
+    """Join token; empty where the manager asks for none."""
+    name: str = Field(default_factory=lambda: default_name(), pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")
+    """Worker id. Two daemons of one name take the session from each other, so the default is never the same twice."""
+    slots: int = Field(0, ge=0, le=1024)
+    """Rollouts that may run at the same time. 0: as many as there are cores."""
+    memory_mb: int = Field(0, ge=0)
+    """Memory for all resident scenes together. 0: four tenths of what is free."""
+    slot_memory_mb: int = Field(2048, ge=64)
+    """Memory that one rollout may allocate beyond what its scene holds."""
+    cache_dir: Path = Path("~/.cache/embomatrix/worker")
+    """Folder of fetched bundles and of the simulator's log."""
+    cache_mb: int = Field(1024, ge=1)
+    """Disk space for bundles; the longest unused go first."""
+    nice: int = Field(10, ge=0, le=19)
+    """Politeness towards the machine's owner: higher leaves more to others."""
+    drain_s: float = Field(60.0, gt=0)
+    """How long running rollouts may take to end after a signal."""
+    once: bool = False
+    """End when the manager can't be reached, instead of trying again."""
+
+
+def default_name() -> str:
+    """Host name and a random part."""
+    host = "".join(
+        char if char.isalnum() or char == "-" else "-" for char in socket.gethostname().split(".")[0]
+    )
+    return f"{host.strip('-')[:40] or 'worker'}-{secrets.token_hex(3)}"
