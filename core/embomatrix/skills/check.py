@@ -133,11 +133,11 @@ def _source_in_reach(world: WorldView, call: SkillCall) -> Refusal | None:
 
 def _reachable(world: WorldView, name: str) -> Refusal | None:
     reach = world.reach(name)
-    if reach.bottom_m > ROBOT.reach_high_m:
+    if reach.height_m > ROBOT.reach_high_m:
         return refuse(
             FailureReason.TOO_HIGH,
             target=name,
-            height=metres(reach.bottom_m),
+            height=metres(reach.height_m),
             limit=metres(ROBOT.reach_high_m),
         )
     if reach.distance_m > ROBOT.reach_m:

@@ -25,12 +25,12 @@ class Refusal:
 class Reach:
     """How the robot stands to an object.
 
-    ``distance_m`` is horizontal, from the base's centre to the nearest point of the object; ``bottom_m`` is the height of
-    its lowest point; ``clear`` is false when a wall or furniture lies in between.
+    ``distance_m`` is horizontal, from the base's centre to the nearest point of the object; ``height_m`` is that of
+    its middle above the floor; ``clear`` is false when a wall or furniture lies in between.
     """
 
     distance_m: float
-    bottom_m: float
+    height_m: float
     clear: bool
 
 

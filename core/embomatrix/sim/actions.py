@@ -1,0 +1,164 @@
+"""What each skill does in cached mode once its preconditions hold: pick an outcome and instantiate it, without stepping."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.skills.failure import FailureReason
+from embomatrix.skills.syntax import Skill
+from embomatrix.skills.view import metres, preposition, refuse, target_of
+from embomatrix.world.geometry import Pose
+from embomatrix.world.poses import StandPose
+from embomatrix.world.state import Relation, State
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    import numpy as np
+
+    from embomatrix.sim.live_world import LiveWorld
+    from embomatrix.skills.syntax import SkillCall
+    from embomatrix.skills.view import Refusal
+
+    Action = Callable[[LiveWorld, SkillCall, np.random.Generator], Refusal | None]
+
+SWING: Final = (0.25, 0.5, 0.75, 1.0)
+"""Shares of its travel at which a door is checked for things in its way."""
+LEAST_OPEN: Final = 0.5
+"""A door that something stops before this share of its travel does not open."""
+
+
+def act(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+    """Carry out a call whose preconditions hold. A refusal leaves the world as it was."""
+    return ACTIONS[call.skill](world, call, rng)
+
+
+def _move(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+    target = target_of(world, call)
+    stands = world.navigator.stands(target, world.robot)
+    if stands:
+        world.drive_to(stands[0])
+        return None
+    room = world.room_of(target)
+    cut_off = room in world.rooms and world.navigator.room_entry(room, world.robot) is None
+    return refuse(FailureReason.NO_PATH if cut_off else FailureReason.NO_STANDING_POSE, target=target)
+
+
+def _turn(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+    world.drive_to(StandPose(world.robot.x_m, world.robot.y_m, _heading(world, call)))
+    return None
+
+
+def _move_forward(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+    heading, distance_m = _heading(world, call), call.distance or 0.0
+    course = heading if distance_m >= 0 else heading + math.pi
+    free_m = world.navigator.forward(world.robot, course, abs(distance_m))
+    if free_m < abs(distance_m):
+        return refuse(FailureReason.BLOCKED, distance=metres(free_m))
+    x = world.robot.x_m + math.cos(course) * abs(distance_m)
+    y = world.robot.y_m + math.sin(course) * abs(distance_m)
+    world.drive_to(StandPose(x, y, heading))
+    return None
+
+
+def _heading(world: LiveWorld, call: SkillCall) -> float:
+    """The present heading and the call's angle, in [-pi, pi]."""
+    return math.remainder(world.robot.yaw + math.remainder(call.yaw or 0.0, math.tau), math.tau)
+
+
+def _go_to_room(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+    room = call.room_name or ""
+    entry = world.navigator.room_entry(room, world.robot)
+    if entry is None:
+        return refuse(FailureReason.NO_PATH, target=room)
+    world.drive_to(entry)
+    return None
+
+
+def _pick_up(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+    world.take(target_of(world, call))
+    return None
+
+
+def _place(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+    assert call.relation is not None
+    target, held = target_of(world, call), world.carried[0]
+    found = world.placer.find(held, target, Relation(call.relation.value), world.robot, rng)
+    if isinstance(found, Pose):
+        if world.let_go(found):
+            return None
+        found = FailureReason.NO_FREE_POSE
+    return refuse(found, held=held, target=target, relation=preposition(call.relation))
+
+
+def _open(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+    target = target_of(world, call)
+    before = world.engine.joints(target)
+    in_contact = _in_contact(world, target)
+    reached, other = 0.0, ""
+    for share in SWING:
+        world.engine.set_joints(target, [max(share, fraction) for fraction in before])
+        other = world.engine.penetrates(target, ignore=in_contact)
+        if other:
+            break
+        reached = share
+    if reached < LEAST_OPEN:
+        world.engine.set_joints(target, before)
+        return refuse(FailureReason.DOOR_BLOCKED, target=target, other=other)
+    world.engine.set_joints(target, [max(reached, fraction) for fraction in before])
+    return None
+
+
+def _close(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+    target = target_of(world, call)
+    before = world.engine.joints(target)
+    in_contact = _in_contact(world, target)
+    for share in (*reversed(SWING), 0.0):
+        world.engine.set_joints(target, [min(share, fraction) for fraction in before])
+        other = world.engine.penetrates(target, ignore=in_contact)
+        if other:
+            world.engine.set_joints(target, before)
+            return refuse(FailureReason.DOOR_BLOCKED, target=target, other=other)
+    return None
+
+
+def _in_contact(world: LiveWorld, target: str) -> frozenset[str]:
+    """Bodies that the target penetrates before its doors move: built-in neighbours, not in the way of a door."""
+    found: set[str] = set()
+    while other := world.engine.penetrates(target, ignore=frozenset(found)):
+        found.add(other)
+    return frozenset(found)
+
+
+def _toggle_on(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+    world.states[target_of(world, call)].add(State.TOGGLED_ON)
+    return None
+
+
+def _toggle_off(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+    world.states[target_of(world, call)].discard(State.TOGGLED_ON)
+    return None
+
+
+def _wait(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+    """The source acts by itself as soon as its conditions hold: waiting changes nothing more."""
+    return None
+
+
+ACTIONS: Final[Mapping[Skill, Action]] = {
+    Skill.MOVE: _move,
+    Skill.TURN: _turn,
+    Skill.PICK_UP: _pick_up,
+    Skill.PLACE: _place,
+    Skill.MOVE_FORWARD: _move_forward,
+    Skill.OPEN: _open,
+    Skill.CLOSE: _close,
+    Skill.TOGGLE_ON: _toggle_on,
+    Skill.TOGGLE_OFF: _toggle_off,
+    Skill.HEAT: _wait,
+    Skill.COOK: _wait,
+    Skill.FREEZE: _wait,
+    Skill.GO_TO_ROOM: _go_to_room,
+}
+"""One action for each skill."""

@@ -1,0 +1,137 @@
+"""Execute plans in a scene, in cached mode: preconditions, actions, effects of temperature, and the trace of it all."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from embomatrix.sim.actions import act
+from embomatrix.sim.bullet.engine import BulletEngine
+from embomatrix.sim.live_world import LiveWorld
+from embomatrix.skills.check import check
+from embomatrix.skills.describe import Sight, done, final_lines, gained
+from embomatrix.skills.syntax import Skill
+from embomatrix.skills.trace import Step, Trace
+from embomatrix.skills.view import source_of, target_of
+from embomatrix.world.evaluate import objects_of
+from embomatrix.world.state import State
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from embomatrix.sim.engine import PhysicsEngine
+    from embomatrix.sim.facts import SceneFacts
+    from embomatrix.sim.thermal import Change
+    from embomatrix.skills.syntax import Plan, SkillCall
+    from embomatrix.world.bundle import Bundle
+    from embomatrix.world.task import Task
+
+CHANGING = frozenset({Skill.PLACE, Skill.OPEN, Skill.CLOSE, Skill.TOGGLE_ON, Skill.TOGGLE_OFF})
+"""Skills after which a source may act on something that it did not act on before."""
+
+
+class Simulator:
+    """A bundle's scene, loaded once and executed in many times. Not for use by several threads.
+
+    ``execute`` runs a whole plan; ``reset`` and ``run_step`` run one call at a time.
+    """
+
+    def __init__(self, bundle: Bundle, engine: PhysicsEngine | None = None) -> None:
+        """Load the scene, unless ``engine`` holds it already. Raises EngineError when it can't be loaded."""
+        self._world = LiveWorld(bundle, engine if engine is not None else BulletEngine(bundle.scene))
+        self._seed = 0
+        self._count = 0
+        self._hash = hashlib.sha256()
+        self._touched: set[str] = set()
+
+    @property
+    def facts(self) -> SceneFacts:
+        """Facts of the state reached, live until the next reset."""
+        return self._world.facts
+
+    @property
+    def world(self) -> LiveWorld:
+        """The state reached, live until the next reset. For reading only."""
+        return self._world
+
+    def reset(self, task: Task, seed: int) -> None:
+        """Back to the scene's start. ``seed`` decides between outcomes that are equally good; it is not negative."""
+        self._world.reset(task)
+        self._seed = seed
+        self._count = 0
+        self._touched = set()
+        self._hash = hashlib.sha256()
+        self._hash.update(self._world.state_bytes())
+
+    def run_step(self, call: SkillCall) -> Step:
+        """Execute one call in the state reached. A failed one changes nothing; the caller decides whether to go on."""
+        world = self._world
+        self._count += 1
+        held = world.carried[:1]
+        refusal = check(world, call)
+        if refusal is None:
+            # Equal prefixes of plans meet equal numbers: the stream depends on the step, not on what was drawn before.
+            rng = np.random.default_rng(np.random.SeedSequence((self._seed, self._count)))
+            refusal = act(world, call, rng)
+        if refusal is not None:
+            self._hash.update(refusal.reason.encode())
+            return Step(call, refusal.reason, refusal.sentence)
+        changes = world.thermal.apply() if call.skill in CHANGING else ()
+        self._touched.update(filter(None, (target_of(world, call), source_of(world, call))))
+        self._hash.update(world.state_bytes())
+        return Step(call, None, self._message(call, held, changes))
+
+    def execute(self, task: Task, plan: Plan, seed: int) -> Trace:
+        """Reset and run the plan up to its end or its first failed step."""
+        self.reset(task, seed)
+        steps: list[Step] = []
+        for call in plan:
+            steps.append(self.run_step(call))
+            if not steps[-1].ok:
+                break
+        return Trace(
+            plan=plan,
+            steps=tuple(steps),
+            touched=frozenset(self._touched),
+            final=self.describe(task),
+            digest=f"sha256:{self._hash.hexdigest()}",
+        )
+
+    def describe(self, task: Task) -> tuple[str, ...]:
+        """State of the goal's objects and of those that a call succeeded on, in the table's order, in words."""
+        told = objects_of(task.goal, task.types) | self._touched
+        names = [name for name in task.table if name in told]
+        return final_lines([self._sight(name) for name in names])
+
+    def close(self) -> None:
+        """Free the engine. The simulator can't be used afterwards."""
+        self._world.engine.close()
+
+    def _message(self, call: SkillCall, held: Sequence[str], changes: Sequence[Change]) -> str:
+        by_object: dict[str, list[str]] = {}
+        for change in changes:
+            by_object.setdefault(change.name, []).append(change.state.value)
+        cargo = self._world.carried[1:] if call.skill is Skill.PICK_UP else ()
+        sentence = done(call, target=target_of(self._world, call), held=held[0] if held else "", cargo=cargo)
+        return "; ".join(filter(None, (sentence, gained(by_object))))
+
+    def _sight(self, name: str) -> Sight:
+        world = self._world
+        host = world.host_of(name)
+        asset = world.asset(name)
+        states: list[str] = []
+        if asset.joints:
+            states.append("open" if world.is_open(name) else "closed")
+        if asset.can("toggleable"):
+            states.append("on" if world.is_on(name) else "off")
+        states += sorted(state.value for state in world.states[name] - {State.TOGGLED_ON})
+        return Sight(
+            name=name,
+            room=world.room_of(name),
+            host=host.name if host is not None else "",
+            relation=host.relation if host is not None else None,
+            held=name in world.carried,
+            states=tuple(states),
+        )

@@ -1,0 +1,158 @@
+"""The state of a rollout: the engine's scene, the symbolic states, the robot's base and what its hand holds."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from embomatrix.sim.facts import SceneFacts
+from embomatrix.sim.navigation import Navigator
+from embomatrix.sim.placement import Placer
+from embomatrix.sim.relations import Relations
+from embomatrix.sim.thermal import Thermal
+from embomatrix.skills.appliance import cold_source, heat_source
+from embomatrix.skills.view import Reach
+from embomatrix.world.state import State
+
+if TYPE_CHECKING:
+    from embomatrix.sim.engine import PhysicsEngine
+    from embomatrix.sim.relations import Host
+    from embomatrix.world.asset import Asset
+    from embomatrix.world.bundle import Bundle
+    from embomatrix.world.geometry import Pose
+    from embomatrix.world.poses import StandPose
+    from embomatrix.world.task import Task
+
+SYMBOLIC = frozenset(State) - {State.OPEN}
+
+
+class LiveWorld:
+    """Answers what preconditions ask, and carries the robot, the hand and the states along. One rollout at a time."""
+
+    def __init__(self, bundle: Bundle, engine: PhysicsEngine) -> None:
+        """``engine`` must hold the bundle's scene as it was loaded."""
+        self.scene = bundle.scene
+        self.engine = engine
+        self.relations = Relations(engine)
+        self.navigator = Navigator(engine, self.relations)
+        self.placer = Placer(engine, self.relations, bundle.poses)
+        self.states: dict[str, set[State]] = {}
+        self.thermal = Thermal(engine, self.relations, self.states)
+        self.facts = SceneFacts(self.relations, self.states)
+        self.table: tuple[str, ...] = ()
+        self.rooms = tuple(room.name for room in self.scene.rooms)
+        self.robot = self.navigator.start
+        self._hand: dict[str, Pose] = {}
+        self._take_states_from_scene()
+        self.thermal.apply()
+        self._initial = {name: frozenset(states) for name, states in self.states.items()}
+
+    def reset(self, task: Task) -> None:
+        """Back to the scene's beginning, where the sources have long acted on what lies at them."""
+        self.engine.reset()
+        for name, states in self._initial.items():
+            self.states[name] = set(states)
+        self._hand.clear()
+        self.robot = self.navigator.start
+        self.navigator.refresh()
+        self.table = task.table
+
+    @property
+    def carried(self) -> tuple[str, ...]:
+        """What the hand holds, then what lies in it; empty for an empty hand."""
+        return tuple(self._hand)
+
+    def asset(self, name: str) -> Asset:
+        return self.scene.asset_of(name)
+
+    def is_fixed(self, name: str) -> bool:
+        return self.scene.by_name[name].fixed
+
+    def is_open(self, name: str) -> bool:
+        return self.relations.open(name)
+
+    def is_on(self, name: str) -> bool:
+        return State.TOGGLED_ON in self.states[name]
+
+    def cargo(self, name: str) -> tuple[str, ...]:
+        """The object and what lies in it, and what rests on that: all that is lifted with it."""
+        return self.relations.group_of(name)
+
+    def burden(self, name: str) -> str:
+        """The first object that rests on this one without lying in it, "" when there is none."""
+        cargo = set(self.cargo(name))
+        return next((item for item in self.relations.resting_on(name) if item not in cargo), "")
+
+    def closed_around(self, name: str) -> str:
+        """The innermost closed container that the object is in, "" when there is none."""
+        return next((item.name for item in self.relations.enclosing(name) if item.closed), "")
+
+    def reach(self, name: str) -> Reach:
+        """How the robot, where it stands, reaches the object's bounding box. An object in the hand is at hand."""
+        box = self.engine.aabb(name)
+        if name in self._hand:
+            return Reach(0.0, box.center_m[2], clear=True)
+        dx = max(box.low_m[0] - self.robot.x_m, self.robot.x_m - box.high_m[0], 0.0)
+        dy = max(box.low_m[1] - self.robot.y_m, self.robot.y_m - box.high_m[1], 0.0)
+        clear = self.navigator.line_is_clear(self.robot, name)
+        return Reach(math.hypot(dx, dy), box.center_m[2], clear)
+
+    def is_at(self, name: str, source: str) -> bool:
+        """Whether the object lies where the source acts, be it as heat or as cold source."""
+        asset = self.asset(source)
+        found = heat_source(asset) or cold_source(asset)
+        return found is not None and self.thermal.is_at(name, source, found)
+
+    def host_of(self, name: str) -> Host | None:
+        return self.relations.host_of(name)
+
+    def room_of(self, name: str) -> str:
+        """Room that the object is in; of a carried one, the robot's."""
+        return self.robot_room if name in self._hand else self.relations.room_of(name)
+
+    @property
+    def robot_room(self) -> str:
+        """Room in which the robot stands."""
+        return self.scene.room_at((self.robot.x_m, self.robot.y_m))
+
+    def drive_to(self, pose: StandPose) -> None:
+        self.robot = pose
+
+    def take(self, name: str) -> None:
+        """Put the object and all that lies in it into the hand."""
+        group = self.cargo(name)
+        back = self.engine.pose(name).inverse()
+        self._hand = {item: back @ self.engine.pose(item) for item in group}
+        for item in group:
+            self.engine.park(item)
+        self.navigator.refresh()
+
+    def let_go(self, pose: Pose) -> bool:
+        """Stand what the hand holds at a pose, with what lies in it. False, and nothing changed, when that does not fit."""
+        members = dict(self._hand)
+        for item, pose_held_item in members.items():
+            self.engine.set_pose(item, pose @ pose_held_item)
+        group = frozenset(members)
+        held, *contents = members
+        if any(self.engine.penetrates(item, ignore=group) for item in contents):
+            for item in members:
+                self.engine.park(item)
+            return False
+        # The pose of the held object itself is the placer's, to the last bit.
+        self.engine.set_pose(held, pose)
+        self._hand.clear()
+        self.navigator.refresh()
+        return True
+
+    def state_bytes(self) -> bytes:
+        """All that a trace's digest depends on: the engine's state, the robot, the hand and the symbolic states."""
+        robot = f"{self.robot.x_m.hex()} {self.robot.y_m.hex()} {self.robot.yaw.hex()}"
+        symbolic = [
+            f"{name}:{','.join(sorted(states))}" for name, states in sorted(self.states.items()) if states
+        ]
+        text = "\n".join([robot, " ".join(self._hand), *symbolic])
+        return self.engine.state_bytes() + text.encode()
+
+    def _take_states_from_scene(self) -> None:
+        for item in self.scene.objects:
+            self.states[item.name] = set(item.states & SYMBOLIC)

@@ -1,0 +1,118 @@
+"""Effects of temperature: whatever lies at a working heat or cold source gets hot, cooked or frozen.
+
+The effects follow from the state alone, whichever call brought it about, and are there at once. What is hot stays hot, and
+what is frozen stays frozen, until a source undoes it: a rollout is shorter than it takes to cool down. What is cooked stays
+cooked.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from embomatrix.skills.appliance import cold_source, cooks, freezes, heat_source, heats
+from embomatrix.world.state import Relation, State
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, MutableMapping
+
+    from embomatrix.sim.engine import PhysicsEngine
+    from embomatrix.sim.relations import Relations
+    from embomatrix.skills.appliance import Source
+    from embomatrix.world.asset import Asset
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """A state that an object got."""
+
+    name: str
+    state: State
+
+
+class Thermal:
+    """The sources of a scene and what they do. ``states`` maps each object to its symbolic states, and is changed."""
+
+    def __init__(
+        self, engine: PhysicsEngine, relations: Relations, states: MutableMapping[str, set[State]]
+    ) -> None:
+        self._engine = engine
+        self._relations = relations
+        self._scene = engine.scene
+        self._states = states
+        self._sources: list[tuple[str, Source]] = []
+        for item in self._scene.objects:
+            asset = self._scene.assets[item.asset_id]
+            found = (heat_source(asset), cold_source(asset))
+            self._sources += [(item.name, source) for source in found if source is not None]
+
+    def apply(self) -> tuple[Change, ...]:
+        """Let every working source act. Returns what changed, in scene order of the sources."""
+        changes: list[Change] = []
+        for name, source in self._sources:
+            if self.works(name, source):
+                for item in self._acted_on(name, source):
+                    changes += self._expose(item, source)
+        return tuple(changes)
+
+    def works(self, name: str, source: Source) -> bool:
+        """Whether the source is on and closed, as far as it must be."""
+        if self._engine.is_parked(name):
+            return False
+        on = State.TOGGLED_ON in self._states[name]
+        return (on or not source.requires_on) and not (source.requires_closed and self._relations.open(name))
+
+    def is_at(self, item: str, name: str, source: Source) -> bool:
+        """Whether the source acts on the object where it lies: inside it, or on it, or in or on a vessel on it."""
+        if source.requires_inside:
+            return self._relations.inside(item, name)
+        if self._relations.ontop(item, name):
+            return True
+        vessels = self._above(name)
+        return any(
+            self._relations.ontop(vessel, name) and self._bears(vessel, item)
+            for vessel in vessels
+            if vessel != item
+        )
+
+    def _acted_on(self, name: str, source: Source) -> Iterator[str]:
+        for item in self._above(name):
+            if item != name and self.is_at(item, name, source):
+                yield item
+
+    def _above(self, name: str) -> tuple[str, ...]:
+        """Movable objects in or near the source's box, or above it as far as vessels reach."""
+        box = self._engine.aabb(name)
+        (x, y, z) = box.high_m
+        near = self._engine.near(type(box)(box.low_m, (x, y, z + VESSEL_M)), frozenset((name,)))
+        return tuple(item for item in near if not self._scene.by_name[item].fixed)
+
+    def _bears(self, vessel: str, item: str) -> bool:
+        return self._relations.holds(Relation.INSIDE, item, vessel) or self._relations.ontop(item, vessel)
+
+    def _expose(self, item: str, source: Source) -> list[Change]:
+        """Give the object the states of the source's temperature that its asset can have."""
+        asset = self._scene.asset_of(item)
+        states = self._states[item]
+        gained = [state for state in _states_at(asset, source) if state not in states]
+        if State.HOT in gained:
+            states.discard(State.FROZEN)
+        if State.FROZEN in gained:
+            states.discard(State.HOT)
+        states.update(gained)
+        return [Change(item, state) for state in gained]
+
+
+VESSEL_M = 0.3
+"""What stands in a vessel on a source has its underside no higher than this above it."""
+
+
+def _states_at(asset: Asset, source: Source) -> list[State]:
+    found: list[State] = []
+    if heats(source) and asset.can("heatable"):
+        found.append(State.HOT)
+    if cooks(source, asset):
+        found.append(State.COOKED)
+    if freezes(source) and asset.can("freezable"):
+        found.append(State.FROZEN)
+    return found

@@ -1,0 +1,102 @@
+"""The simulator's observations in words: what a step did, and how things stand at the end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.skills.syntax import Skill
+from embomatrix.skills.view import preposition
+from embomatrix.world.state import Relation
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from embomatrix.skills.syntax import PlaceRelation, SkillCall
+
+MAX_FINAL_LINES: Final = 24
+"""Objects of the final description at most: more do not fit a prompt."""
+
+DONE: Final[Mapping[Skill, str]] = {
+    Skill.MOVE: "stands at {target}",
+    Skill.TURN: "turned by {yaw} rad",
+    Skill.PICK_UP: "holds {target}{cargo}",
+    Skill.PLACE: "put {held} {relation} {target}",
+    Skill.MOVE_FORWARD: "drove {distance} m",
+    Skill.OPEN: "opened {target}",
+    Skill.CLOSE: "closed {target}",
+    Skill.TOGGLE_ON: "switched {target} on",
+    Skill.TOGGLE_OFF: "switched {target} off",
+    Skill.HEAT: "{target} is hot",
+    Skill.COOK: "{target} is cooked",
+    Skill.FREEZE: "{target} is frozen",
+    Skill.GO_TO_ROOM: "stands in {room}",
+}
+"""What a call that succeeded says. One sentence for each skill."""
+
+WORDS: Final[Mapping[Relation, str]] = {
+    Relation.ONTOP: "on",
+    Relation.INSIDE: "inside",
+    Relation.UNDER: "under",
+    Relation.NEXTTO: "next to",
+    Relation.TOUCHING: "touching",
+    Relation.INROOM: "in",
+}
+"""Relations as prepositions."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """One object as it is described: where it is, and ``states`` in words in the order in which they are told."""
+
+    name: str
+    room: str
+    host: str = ""
+    relation: Relation | None = None
+    held: bool = False
+    states: tuple[str, ...] = ()
+
+
+def done(call: SkillCall, *, target: str = "", held: str = "", cargo: Sequence[str] = ()) -> str:
+    """What the call did. ``held`` is what the hand held before it, ``cargo`` what lies in the object picked up."""
+    return DONE[call.skill].format(
+        target=target,
+        held=held,
+        cargo=f" with {listed(cargo)} in it" if cargo else "",
+        relation=_relation(call.relation),
+        yaw=f"{call.yaw or 0.0:.2f}",
+        distance=f"{call.distance or 0.0:.2f}",
+        room=call.room_name,
+    )
+
+
+def gained(changes: Mapping[str, Sequence[str]]) -> str:
+    """What temperature did: objects and the states that they got; "" when it did nothing."""
+    return "; ".join(f"{name} is now {listed(states)}" for name, states in changes.items())
+
+
+def line(sight: Sight) -> str:
+    """One object on one line: ``apple_1: on table_1 in kitchen_0, hot``."""
+    if sight.held:
+        place = "in the robot's hand"
+    elif sight.host and sight.relation is not None:
+        place = f"{WORDS[sight.relation]} {sight.host} in {sight.room or 'no room'}"
+    else:
+        place = f"in {sight.room or 'no room'}"
+    return f"{sight.name}: {', '.join([place, *sight.states])}"
+
+
+def final_lines(sights: Sequence[Sight]) -> tuple[str, ...]:
+    """The first objects, one a line, and how many more there are."""
+    lines = tuple(line(sight) for sight in sights[:MAX_FINAL_LINES])
+    left = len(sights) - len(lines)
+    return (*lines, f"and {left} more objects") if left > 0 else lines
+
+
+def listed(words: Sequence[str]) -> str:
+    """Words as a list in a sentence: ``a, b and c``."""
+    return " and ".join(filter(None, [", ".join(words[:-1]), words[-1]])) if words else "nothing"
+
+
+def _relation(relation: PlaceRelation | None) -> str:
+    return "" if relation is None else preposition(relation)
