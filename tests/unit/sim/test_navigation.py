@@ -1,0 +1,147 @@
+"""Navigation: where the robot fits, how far it is, and where it stands to serve a thing."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from tests.fakes.furniture import box
+from tests.fakes.scenes import kitchen_scene
+
+from embomatrix.sim.bullet.client import ClientPool
+from embomatrix.sim.bullet.engine import BulletEngine
+from embomatrix.sim.navigation import Navigator
+from embomatrix.sim.relations import Relations
+from embomatrix.skills.limits import ROBOT
+from embomatrix.world.geometry import Pose
+from embomatrix.world.poses import StandPose
+
+
+@pytest.fixture(scope="module")
+def pool():
+    pool = ClientPool()
+    yield pool
+    pool.close()
+
+
+@pytest.fixture
+def engine(pool):
+    engine = BulletEngine(kitchen_scene(), pool)
+    yield engine
+    engine.close()
+
+
+@pytest.fixture
+def navigator(engine):
+    return Navigator(engine, Relations(engine))
+
+
+def walled_off(scene):
+    """The same flat with its doorway bricked up."""
+    return dataclasses.replace(scene, walls=(*scene.walls, box((5.05, 2, 1.2), (0.1, 0.9, 2.4))))
+
+
+def test_every_object_has_standing_poses_within_reach_that_face_it(engine, navigator) -> None:
+    for name in engine.scene.by_name:
+        stands = navigator.stands(name, navigator.start)
+        assert stands, name
+        low, high = np.array(engine.aabb(name).low_m[:2]), np.array(engine.aabb(name).high_m[:2])
+        for stand in stands:
+            at = np.array((stand.x_m, stand.y_m))
+            offset = np.clip(at, low, high) - at
+            assert ROBOT.shoulder_m <= np.linalg.norm(offset) <= ROBOT.reach_m
+            assert math.atan2(offset[1], offset[0]) == pytest.approx(stand.yaw)
+            assert navigator.reachable(navigator.start, stand)
+
+
+def test_robot_never_stands_within_its_radius_of_a_part_or_wall(engine, navigator) -> None:
+    corners = [
+        (part.aabb(item.pose_world_asset))
+        for item in engine.scene.objects
+        if item.fixed
+        for part in engine.scene.asset_of(item.name).links[0].parts
+    ]
+    corners += [wall.aabb(Pose((0, 0, 0))) for wall in engine.scene.walls]
+    for name in engine.scene.by_name:
+        for stand in navigator.stands(name, navigator.start):
+            at = np.array((stand.x_m, stand.y_m))
+            for part in corners:
+                if part.low_m[2] < ROBOT.height_m:
+                    nearest = np.clip(at, part.low_m[:2], part.high_m[:2])
+                    assert np.linalg.norm(at - nearest) > ROBOT.radius_m - 0.051
+
+
+def test_what_has_a_door_is_served_from_its_front(navigator) -> None:
+    for stand in navigator.stands("cabinet_1", navigator.start):
+        assert stand.y_m > 0.45
+        assert abs(math.atan2(stand.x_m - 6.5, stand.y_m - 0.225)) <= math.radians(65.5)
+
+
+def test_what_stands_on_a_shelf_board_is_served_from_the_front_of_the_shelf(navigator) -> None:
+    assert all(stand.x_m < 8.8 for stand in navigator.stands("mug_1", navigator.start))
+
+
+def test_walls_are_not_reached_through(engine, navigator) -> None:
+    engine.set_pose("apple_1", Pose((4.9, 0.8, 0.04)))
+    navigator.refresh()
+    stands = navigator.stands("apple_1", navigator.start)
+    assert stands
+    assert all(stand.x_m < 5.0 for stand in stands)
+    assert not navigator.line_is_clear(StandPose(5.5, 0.8, math.pi), "apple_1")
+    assert navigator.line_is_clear(StandPose(4.2, 0.8, 0.0), "apple_1")
+
+
+def test_path_leads_around_furniture_and_through_the_doorway(navigator) -> None:
+    start, target = navigator.start, navigator.stands("mug_1", navigator.start)[0]
+    length = navigator.path_length(start, target)
+    straight = math.dist((start.x_m, start.y_m), (target.x_m, target.y_m))
+    assert length is not None
+    assert straight <= length <= 1.4 * straight
+    assert navigator.path_length(target, start) == pytest.approx(length, abs=1e-4)
+
+
+def test_no_path_leads_through_a_bricked_up_doorway(pool) -> None:
+    engine = BulletEngine(walled_off(kitchen_scene()), pool)
+    navigator = Navigator(engine, Relations(engine))
+    assert navigator.stands("mug_1", navigator.start) == ()
+    assert navigator.room_entry("living_room_0", navigator.start) is None
+    assert navigator.path_length(navigator.start, StandPose(7.0, 1.2, 0.0)) is None
+    assert not navigator.reachable(navigator.start, StandPose(7.0, 1.2, 0.0))
+    engine.close()
+
+
+def test_room_is_entered_just_behind_its_door(engine, navigator) -> None:
+    entry = navigator.room_entry("living_room_0", navigator.start)
+    assert entry is not None
+    assert engine.scene.room_at((entry.x_m, entry.y_m)) == "living_room_0"
+    assert math.dist((entry.x_m, entry.y_m), (5.05, 2.0)) < 0.7
+    assert navigator.room_entry("kitchen_0", navigator.start) == navigator.start
+
+
+def test_unknown_room_is_a_key_error(navigator) -> None:
+    with pytest.raises(KeyError):
+        navigator.room_entry("attic_0", navigator.start)
+
+
+@pytest.mark.parametrize(
+    ("yaw", "distance_m", "low_m", "high_m"),
+    [(0.0, 0.5, 0.5, 0.5), (0.0, 5.0, 1.1, 1.27), (math.pi / 2, 5.0, 1.5, 1.68), (math.pi, 5.0, 0.7, 0.86)],
+)
+def test_driving_forward_stops_in_front_of_obstacles(navigator, yaw, distance_m, low_m, high_m) -> None:
+    assert low_m <= navigator.forward(navigator.start, yaw, distance_m) <= high_m
+
+
+def test_thing_put_on_the_floor_bars_the_way_until_it_is_taken_up(engine, navigator) -> None:
+    before = navigator.forward(navigator.start, 0.0, 1.0)
+    engine.set_pose("bowl_1", Pose((4.2, 1.5, 0.035)))
+    navigator.refresh()
+    assert navigator.forward(navigator.start, 0.0, 1.0) < before
+    engine.park("bowl_1")
+    navigator.refresh()
+    assert navigator.forward(navigator.start, 0.0, 1.0) == before
+
+
+def test_place_off_the_map_is_not_reachable(navigator) -> None:
+    for x, y in ((-50.0, 0.0), (math.nan, 1.0), (2.0, 1.3)):
+        assert not navigator.reachable(navigator.start, StandPose(x, y, 0.0))
+        assert navigator.path_length(navigator.start, StandPose(x, y, 0.0)) is None

@@ -1,0 +1,126 @@
+"""The pose cache: verified placements by content, and standing poses."""
+
+import dataclasses
+import time
+
+import pytest
+from tests.fakes import furniture as make
+from tests.fakes.scenes import kitchen_scene
+
+from embomatrix.sim.bullet.client import ClientPool
+from embomatrix.sim.bullet.engine import BulletEngine
+from embomatrix.sim.bullet.mini_world import MiniWorld, Still
+from embomatrix.sim.candidates import candidates, stands_in
+from embomatrix.sim.pose_cache import POSES, PlacementLibrary, build_pose_cache
+from embomatrix.world.geometry import Pose
+from embomatrix.world.poses import PlacementKey
+from embomatrix.world.state import Relation
+
+MOVABLE = ("apple_1", "chicken_leg_1", "mug_1")
+SUPPORTS = ("breakfast_table_1", "fridge_1", "microwave_1", "stove_1", "bowl_1", "shelf_1")
+
+
+@pytest.fixture(scope="module")
+def pool():
+    pool = ClientPool()
+    yield pool
+    pool.close()
+
+
+@pytest.fixture(scope="module")
+def cache():
+    return build_pose_cache(kitchen_scene(), MOVABLE, SUPPORTS, seed=1)
+
+
+def test_every_sensible_pair_has_at_least_eight_poses(cache) -> None:
+    expected = {
+        ("apple", "breakfast_table", Relation.ONTOP),
+        ("apple", "breakfast_table", Relation.UNDER),
+        ("chicken_leg", "microwave", Relation.INSIDE),
+        ("chicken_leg", "bowl", Relation.INSIDE),
+        ("mug", "fridge", Relation.INSIDE),
+        ("mug", "shelf", Relation.ONTOP),
+        ("apple", "stove", Relation.ONTOP),
+    }
+    for held, support, relation in expected:
+        key = PlacementKey(f"{held}-{make.MODEL}", f"{support}-{make.MODEL}", relation)
+        assert 8 <= len(cache.placements[key]) <= POSES, key
+
+
+def test_impossible_pairs_have_no_entry(cache) -> None:
+    keys = {(key.support_asset_id, key.relation) for key in cache.placements}
+    assert (f"stove-{make.MODEL}", Relation.INSIDE) not in keys
+    assert (f"stove-{make.MODEL}", Relation.UNDER) not in keys
+    assert (f"shelf-{make.MODEL}", Relation.UNDER) not in keys
+
+
+def test_every_cached_pose_is_in_its_relation_and_stays_put(cache, pool) -> None:
+    assets = kitchen_scene().assets
+    mini = MiniWorld(pool)
+    for key, poses in cache.placements.items():
+        held, support = assets[key.asset_id], assets[key.support_asset_id]
+        base = Pose((0.0, 0.0, support.size_m[2] / 2))
+        mini.stage(held, base @ poses[0], (), [Still(support, base, (0.0,) * len(support.joints))])
+        for pose in poses[::5]:
+            assert stands_in(held, pose, support, key.relation)
+            assert mini.drop(base @ pose, steps=240).moved_m < 0.01, key
+    mini.close()
+
+
+def test_poses_are_spread_over_the_surface(cache) -> None:
+    poses = cache.placements[
+        PlacementKey(f"apple-{make.MODEL}", f"breakfast_table-{make.MODEL}", Relation.ONTOP)
+    ]
+    quadrants = {(pose.position_m[0] > 0, pose.position_m[1] > 0) for pose in poses}
+    assert len(quadrants) == 4
+    heights = {
+        round(pose.position_m[2], 1)
+        for pose in cache.placements[PlacementKey(f"mug-{make.MODEL}", f"shelf-{make.MODEL}", Relation.ONTOP)]
+    }
+    assert len(heights) == 4  # one for each board
+
+
+def test_every_named_object_has_standing_poses(cache) -> None:
+    assert set(cache.stands) == {*MOVABLE, *SUPPORTS}
+    assert all(cache.stands.values())
+
+
+def test_equal_seeds_give_equal_caches_whatever_was_built_before(cache, pool) -> None:
+    library = PlacementLibrary(pool)
+    engine = BulletEngine(kitchen_scene(), pool)
+    build_pose_cache(kitchen_scene(), ("table_lamp_1",), ("sink_1",), seed=1, engine=engine, library=library)
+    again = build_pose_cache(kitchen_scene(), MOVABLE, SUPPORTS, seed=1, engine=engine, library=library)
+    assert again == cache
+    other = build_pose_cache(
+        kitchen_scene(), MOVABLE[:1], SUPPORTS[:1], seed=2, engine=engine, library=library
+    )
+    key = PlacementKey(f"apple-{make.MODEL}", f"breakfast_table-{make.MODEL}", Relation.ONTOP)
+    assert other.placements[key] != cache.placements[key]
+    engine.close()
+    library.close()
+
+
+def test_library_knows_equal_assets_again_and_tells_changed_ones_apart(pool) -> None:
+    library = PlacementLibrary(pool)
+    first = library.poses(make.apple(), make.kitchen_table(), Relation.ONTOP, 0)
+    started = time.perf_counter()
+    assert library.poses(make.apple(), make.kitchen_table(), Relation.ONTOP, 0) is first
+    assert time.perf_counter() - started < 0.1
+    low = dataclasses.replace(make.kitchen_table(), mass_kg=21.0)
+    assert library.poses(make.apple(), low, Relation.ONTOP, 0) != first
+    library.close()
+
+
+def test_thing_too_tall_for_a_cavity_is_not_put_inside() -> None:
+    lamp, microwave = make.table_lamp(), make.microwave()
+    assert list(candidates(lamp, microwave, Relation.INSIDE, (0.5, 0.5), 20)) == []
+    assert len(list(candidates(make.apple(), microwave, Relation.INSIDE, (0.5, 0.5), 20))) == 20
+
+
+def test_relations_that_place_cannot_make_have_no_candidates() -> None:
+    assert list(candidates(make.apple(), make.kitchen_table(), Relation.NEXTTO, (0.5, 0.5), 20)) == []
+
+
+def test_unknown_name_is_a_key_error() -> None:
+    with pytest.raises(KeyError):
+        build_pose_cache(kitchen_scene(), ("unicorn_1",), SUPPORTS, seed=0)
