@@ -91,11 +91,9 @@ class Registry:
     def register(
         self, worker_id: str, boot_id: str, resources: Resources, *, now_s: float
     ) -> tuple[Session, list[Event]]:
-        """Open a session; an older one of the same worker ends."""
-        events: list[Event] = []
+        """Open a session; an older one of the same worker ends. The same process keeps its leases, another one loses them."""
         before = self._sessions.get(worker_id)
-        if before is not None and before.standing is not Standing.LOST:
-            events.append(WorkerLost(worker_id, "a newer session of the same worker took over"))
+        alive = before is not None and before.standing is not Standing.LOST
         self._epoch += 1
         session = Session(
             worker_id=worker_id,
@@ -109,7 +107,12 @@ class Registry:
         self._worker_of[session.session_id] = worker_id
         if before is not None:
             self._worker_of.pop(before.session_id, None)
-        return session, [*events, WorkerJoined(worker_id, resources)]
+            if alive and boot_id and before.boot_id == boot_id and before.resources == resources:
+                # The same process under a new session: it still holds its leases, and its full state will tell which.
+                session.standing = before.standing
+                return session, []
+        lost = [WorkerLost(worker_id, "a newer session of the same worker took over")] if alive else []
+        return session, [*lost, WorkerJoined(worker_id, resources)]
 
     def find(self, session_id: str, epoch: int) -> Session:
         """The live session of that name; raises ``SupersededError`` for one that ended, so that its worker stops."""
@@ -151,6 +154,10 @@ class Registry:
         session.standing = Standing.DRAINING
         return [WorkerDrained(worker_id)]
 
+    def draining(self, session: Session) -> None:
+        """The worker itself says that it will leave."""
+        session.standing = Standing.DRAINING
+
     def tick(self, *, now_s: float) -> list[Event]:
         """Suspect the silent, give up the lost, forget the long gone."""
         events: list[Event] = []
@@ -164,7 +171,9 @@ class Registry:
             elif silent_s >= max(self._limits.lost_after_s, suspect_s):
                 events.append(self._lose(session, f"not heard of for {silent_s:.1f} s"))
             elif session.detached_s is not None and now_s - session.detached_s >= self._limits.stream_grace_s:
-                events.append(self._lose(session, "its connection broke and it did not come back"))
+                left = session.standing is Standing.DRAINING
+                reason = "it drained and left" if left else "its connection broke and it did not come back"
+                events.append(self._lose(session, reason))
             elif silent_s >= suspect_s and session.standing is Standing.READY:
                 session.standing = Standing.SUSPECT
                 events.append(WorkerSuspected(session.worker_id))

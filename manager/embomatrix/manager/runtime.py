@@ -112,6 +112,8 @@ class ManagerRuntime:
         finished = (*(state.finished if state is not None else ()), *results)
         events += [LeaseFinished(session.worker_id, result.ref, result.outcome) for result in finished]
         if state is not None:
+            if state.draining:
+                self.registry.draining(session)
             report = WorkerReported(session.worker_id, state.residents, state.running, state.draining, resync)
             events.append(report)
         self._feed(*events)

@@ -1,0 +1,178 @@
+"""A worker for the manager's tests: speaks the whole protocol, executes nothing, and misbehaves on request."""
+
+import asyncio
+import contextlib
+from dataclasses import dataclass, field
+
+from embomatrix.proto.v1 import worker_service_pb2 as pb
+from embomatrix.proto.v1 import worker_service_pb2_grpc
+from embomatrix.reward.breakdown import RewardBreakdown
+from embomatrix.rpc.channel import PROTOCOL_VERSION, open_channel
+from embomatrix.rpc.convert import resources_to_proto
+from embomatrix.rpc.convert_session import (
+    lease_from_proto,
+    lease_ref_from_proto,
+    lease_ref_to_proto,
+    lease_result_to_proto,
+    worker_state_to_proto,
+)
+from embomatrix.rpc.values import (
+    Completed,
+    InfraCode,
+    InfraFailure,
+    LeaseResult,
+    Resident,
+    ResidentState,
+    Resources,
+    Timings,
+    WorkerState,
+)
+
+REWARD = RewardBreakdown(format=0.5, relevance=0.2, goal=15.0, atoms=(), success=False)
+
+
+def completed(worker_id="w1"):
+    return Completed(REWARD, (), (), "sha256:trace", worker_id, Timings(execute_s=0.001), warm=True)
+
+
+@dataclass
+class FakeWorker:
+    """Async context manager. ``poison`` tasks crash their slot, ``stuck`` tasks never end, ``broken`` scenes don't load."""
+
+    address: str
+    worker_id: str = "w1"
+    slots: int = 1
+    memory_mb: int = 1024
+    scene_mb: float = 10.0
+    load_s: float = 0.0
+    execute_s: float = 0.0
+    token: str = ""
+    boot_id: str = ""
+    poison: set = field(default_factory=set)
+    stuck: set = field(default_factory=set)
+    broken: set = field(default_factory=set)
+    fetched: list = field(default_factory=list)
+    executed: list = field(default_factory=list)
+    desired: tuple = ()
+    leases: dict = field(default_factory=dict)
+    acknowledged: list = field(default_factory=list)
+    cancelled: list = field(default_factory=list)
+    residents: dict = field(default_factory=dict)
+
+    async def __aenter__(self):
+        self._channel = open_channel(self.address, self.token)
+        self._stub = worker_service_pb2_grpc.WorkerServiceStub(self._channel)
+        self._outgoing = asyncio.Queue()
+        self._permits = asyncio.Semaphore(self.slots)
+        self._tasks = set()
+        answer = await self._stub.Register(
+            pb.RegisterRequest(
+                worker_id=self.worker_id,
+                boot_id=self.boot_id,
+                protocol_version=PROTOCOL_VERSION,
+                resources=resources_to_proto(Resources(self.slots, self.slots, self.memory_mb)),
+            ),
+            timeout=5,
+        )
+        self.session = (answer.session_id, answer.session_epoch)
+        self._send(state=self._state())
+        self._start(self._talk())
+        self._start(self._beat(answer.heartbeat_interval_s))
+        return self
+
+    async def __aexit__(self, *_):
+        await self.kill()
+
+    async def kill(self):
+        """Go without a word, as a process that was killed."""
+        for task in list(self._tasks):
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await self._channel.close()
+
+    def report(self, ref, outcome):
+        """Send a result, whatever became of its lease."""
+        self._send(results=[LeaseResult(ref, outcome)])
+
+    def _start(self, coroutine):
+        task = asyncio.create_task(coroutine)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    def _state(self):
+        return WorkerState(tuple(self.residents.values()), tuple(lease.ref for lease in self.leases.values()))
+
+    def _send(self, state=None, results=()):
+        session_id, epoch = self.session
+        request = pb.SessionRequest(session_id=session_id, session_epoch=epoch)
+        if state is not None:
+            request.state.CopyFrom(worker_state_to_proto(state))
+        request.results.extend(lease_result_to_proto(result) for result in results)
+        self._outgoing.put_nowait(request)
+
+    async def _requests(self):
+        while True:
+            yield await self._outgoing.get()
+
+    async def _talk(self):
+        async for response in self._stub.Session(self._requests()):
+            if response.HasField("desired"):
+                self._want(tuple(response.desired.bundle_digests))
+            for message in response.leases:
+                lease = lease_from_proto(message)
+                self.leases[lease.ref.lease_id] = lease
+                self._start(self._execute(lease))
+            self.acknowledged += map(lease_ref_from_proto, response.acknowledged)
+            for message in response.cancelled:
+                self.cancelled.append(lease_ref_from_proto(message))
+                self.leases.pop(message.lease_id, None)
+
+    def _want(self, digests):
+        self.desired = digests
+        for digest in set(self.residents) - set(digests):
+            del self.residents[digest]
+        for digest in digests:
+            if digest not in self.residents:
+                self.residents[digest] = Resident(digest, ResidentState.LOADING, 0.0, self.scene_mb)
+                self._start(self._load(digest))
+        self._send(state=self._state())
+
+    async def _load(self, digest):
+        request = pb.FetchBundleRequest(session_id=self.session[0], bundle_digest=digest)
+        with contextlib.suppress(Exception):
+            data = b"".join([part.chunk async for part in self._stub.FetchBundle(request, timeout=5)])
+            self.fetched.append((digest, data))
+        await asyncio.sleep(self.load_s)
+        if digest not in self.desired:
+            return
+        failed = digest in self.broken
+        state = ResidentState.FAILED if failed else ResidentState.WARM
+        error = "the mesh has no triangles" if failed else ""
+        self.residents[digest] = Resident(digest, state, max(self.load_s, 0.001), self.scene_mb, error)
+        self._send(state=self._state())
+
+    async def _execute(self, lease):
+        async with self._permits:
+            if lease.ref.lease_id not in self.leases:
+                return
+            self.executed.append(lease.rollout.rollout_id)
+            if lease.rollout.task_id in self.stuck:
+                await asyncio.Event().wait()
+            await asyncio.sleep(self.execute_s)
+            if self.leases.pop(lease.ref.lease_id, None) is None:
+                return
+            if lease.rollout.task_id in self.poison:
+                self.report(lease.ref, InfraFailure(InfraCode.SLOT_CRASHED, "signal 11", self.worker_id))
+            else:
+                self.report(lease.ref, completed(self.worker_id))
+
+    async def _beat(self, interval_s):
+        while True:
+            await asyncio.sleep(interval_s)
+            running = [lease_ref_to_proto(lease.ref) for lease in self.leases.values()]
+            await self._stub.Heartbeat(
+                pb.HeartbeatRequest(
+                    session_id=self.session[0], session_epoch=self.session[1], running=running
+                ),
+                timeout=5,
+            )

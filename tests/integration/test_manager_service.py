@@ -1,0 +1,310 @@
+"""A manager behind a real gRPC server on loopback, with fake workers that speak the protocol."""
+
+import asyncio
+import contextlib
+import hashlib
+import time
+
+import grpc
+import httpx
+import pytest
+
+from embomatrix.manager.app import running
+from embomatrix.manager.settings import ManagerSettings
+from embomatrix.proto.v1 import scene_service_pb2, scene_service_pb2_grpc
+from embomatrix.rpc.channel import open_channel
+from embomatrix.rpc.client import ClusterClient
+from embomatrix.rpc.status import (
+    ConflictError,
+    InvalidRequestError,
+    NotFoundError,
+    NotSignedInError,
+    PreconditionError,
+    SupersededError,
+    cluster_error,
+)
+from embomatrix.rpc.values import (
+    Batch,
+    Cancelled,
+    Completed,
+    InfraCode,
+    InfraFailure,
+    LookaheadEntry,
+    Rollout,
+    Warmth,
+)
+from tests.fakes.worker import FakeWorker, completed
+
+pytestmark = pytest.mark.timeout(60)
+
+
+def bundle_of(text):
+    data = text.encode()
+    return f"sha256:{hashlib.sha256(data).hexdigest()}", data
+
+
+KITCHEN, KITCHEN_DATA = bundle_of("a kitchen")
+BEDROOM, BEDROOM_DATA = bundle_of("a bedroom")
+BUNDLES = {KITCHEN: KITCHEN_DATA, BEDROOM: BEDROOM_DATA}
+
+
+@contextlib.asynccontextmanager
+async def manager(tmp_path, **changes):
+    options = {"port": 0, "http_port": 0, "data_dir": tmp_path, "state": "memory:", "heartbeat_s": 0.2}
+    async with running(ManagerSettings(**{**options, "stream_grace_s": 0.2, **changes})) as endpoints:
+        yield endpoints
+
+
+@contextlib.asynccontextmanager
+async def open_run(address, run_id="r1", token=""):
+    async with ClusterClient(address, token) as client:
+        await client.open_run("test", run_id)
+        await client.put_bundles(BUNDLES)
+        yield client
+
+
+def batch(count, *, batch_id="b1", scene=KITCHEN, task="t", step=1):
+    rollouts = tuple(Rollout(f"{batch_id}-{i}", f"g{i // 4}", scene, task, (), i) for i in range(count))
+    return Batch("r1", batch_id, step, rollouts)
+
+
+async def outcomes(client, submitted):
+    return {result.rollout_id: result async for result in client.execute(submitted, deadline_s=20)}
+
+
+async def until(condition, within_s=5.0):
+    async with asyncio.timeout(within_s):
+        while not condition():
+            await asyncio.sleep(0.01)
+
+
+async def test_every_rollout_of_a_batch_comes_back_with_its_reward(tmp_path):
+    async with (
+        manager(tmp_path) as at,
+        open_run(at.address) as client,
+        FakeWorker(at.address, slots=2) as worker,
+    ):
+        results = await outcomes(client, batch(100))
+        assert len(results) == 100
+        assert all(result.outcome.reward.goal == 15.0 for result in results.values())
+        assert sorted(result.cursor for result in results.values()) == list(range(1, 101))
+        assert worker.fetched == [(KITCHEN, KITCHEN_DATA)]
+        stats = await client.close_run("r1")
+        assert (stats.delivered, stats.infra_failures, stats.cold_starts) == (100, 0, 100)
+
+
+async def test_an_announced_scene_is_warm_before_its_batch_comes(tmp_path):
+    async with manager(tmp_path) as at, open_run(at.address) as client, FakeWorker(at.address) as worker:
+        first = await client.announce_lookahead("r1", 1, [LookaheadEntry(1, KITCHEN, 8)])
+        assert first[KITCHEN] in (Warmth.WARMING, Warmth.QUEUED)
+        await until(lambda: KITCHEN in worker.residents and worker.fetched)
+        await asyncio.sleep(0.05)
+        assert await client.announce_lookahead("r1", 2, [LookaheadEntry(1, KITCHEN, 8)]) == {
+            KITCHEN: Warmth.WARM
+        }
+        results = await outcomes(client, batch(8))
+        assert all(result.outcome.warm for result in results.values())
+        stats = await client.close_run("r1")
+        assert (stats.prewarm_hits, stats.prewarm_misses, stats.warm_starts) == (1, 0, 8)
+
+
+async def test_a_killed_worker_costs_time_and_nothing_else(tmp_path):
+    async with manager(tmp_path) as at, open_run(at.address) as client:
+        victim = await FakeWorker(at.address, worker_id="victim", slots=4, stuck={"t"}).__aenter__()
+        running_batch = asyncio.create_task(outcomes(client, batch(40)))
+        await until(lambda: len(victim.executed) == 4)
+        async with FakeWorker(at.address, worker_id="other", slots=4) as other:
+            killed_s = time.monotonic()
+            await victim.kill()
+            results = await running_batch
+            assert time.monotonic() - killed_s < 5.0
+        assert len(results) == 40
+        assert all(isinstance(result.outcome, Completed) for result in results.values())
+        assert len(other.executed) == 40
+        assert (await client.close_run("r1")).redispatched >= 4
+
+
+async def test_a_late_result_is_acknowledged_and_never_delivered(tmp_path):
+    async with manager(tmp_path) as at, open_run(at.address) as client:
+        async with FakeWorker(at.address, worker_id="slow", stuck={"t"}) as slow:
+            running_batch = asyncio.create_task(outcomes(client, batch(1)))
+            await until(lambda: slow.executed)
+            (old,) = slow.leases.values()
+        async with FakeWorker(at.address, worker_id="slow", execute_s=0.3) as again:
+            await until(lambda: again.executed)
+            again.report(old.ref, InfraFailure(InfraCode.SLOT_CRASHED, "late"))
+            again.report(old.ref, completed("slow"))
+            results = await running_batch
+            await until(lambda: again.acknowledged.count(old.ref) == 2)
+        assert [type(result.outcome) for result in results.values()] == [Completed]
+        assert (await client.close_run("r1")).stale_results == 2
+
+
+async def test_a_plan_that_crashes_its_slot_ends_alone(tmp_path):
+    async with manager(tmp_path) as at, open_run(at.address) as client:
+        async with FakeWorker(at.address, slots=2, poison={"poison"}):
+            good, bad = batch(20), batch(1, batch_id="b2", task="poison")
+            results = await outcomes(client, Batch("r1", "mixed", 1, good.rollouts + bad.rollouts))
+        failure = results.pop("b2-0")
+        assert failure.outcome.code is InfraCode.SLOT_CRASHED
+        assert failure.attempt == 3
+        assert all(isinstance(result.outcome, Completed) for result in results.values())
+
+
+async def test_a_scene_that_two_workers_cannot_load_fails_its_rollouts_with_their_reason(tmp_path):
+    async with manager(tmp_path) as at, open_run(at.address) as client:
+        async with (
+            FakeWorker(at.address, worker_id="w1", broken={BEDROOM}),
+            FakeWorker(at.address, worker_id="w2", broken={BEDROOM}),
+        ):
+            results = await outcomes(client, batch(4, scene=BEDROOM))
+            assert {result.outcome.code for result in results.values()} == {InfraCode.SCENE_LOAD_FAILED}
+            assert "the mesh has no triangles" in results["b1-0"].outcome.message
+            assert len(await outcomes(client, batch(4, batch_id="b2"))) == 4
+
+
+async def test_without_a_worker_rollouts_fail_after_a_bounded_wait(tmp_path):
+    async with manager(tmp_path, no_capacity_s=0.3) as at, open_run(at.address) as client:
+        results = await outcomes(client, batch(2))
+    assert {result.outcome.code for result in results.values()} == {InfraCode.NO_CAPACITY}
+    assert "embomatrix worker" in results["b1-0"].outcome.message
+
+
+async def test_a_trainer_attaches_again_from_its_cursor(tmp_path):
+    async with manager(tmp_path) as at, open_run(at.address) as client, FakeWorker(at.address) as worker:
+        first = [result async for result in client.execute(batch(30))]
+        async with ClusterClient(at.address) as another:
+            again = [result async for result in another.execute(batch(30))]
+        assert [result.cursor for result in again] == [result.cursor for result in first]
+        assert len(worker.executed) == 30
+
+
+async def test_the_same_batch_id_with_other_content_is_refused(tmp_path):
+    async with manager(tmp_path) as at, open_run(at.address) as client, FakeWorker(at.address):
+        await outcomes(client, batch(2))
+        with pytest.raises(ConflictError, match="use a new id"):
+            await outcomes(client, batch(3))
+
+
+async def test_a_cancelled_batch_ends_at_once(tmp_path):
+    async with manager(tmp_path) as at, open_run(at.address) as client:
+        async with FakeWorker(at.address, stuck={"t"}) as worker:
+            running_batch = asyncio.create_task(outcomes(client, batch(3)))
+            await until(lambda: worker.executed)
+            await client.cancel("r1", "b1")
+            results = await running_batch
+            assert all(isinstance(result.outcome, Cancelled) for result in results.values())
+            await until(lambda: len(worker.cancelled) == 2)
+
+
+async def test_a_restarted_manager_goes_on_where_the_former_one_stopped(tmp_path):
+    state = f"sqlite:{tmp_path / 'state.sqlite'}"
+    async with manager(tmp_path, state=state) as at, open_run(at.address) as client:
+        async with FakeWorker(at.address) as worker:
+            await outcomes(client, batch(5))
+            unfinished = Batch("r1", "b2", 2, batch(4, batch_id="b2").rollouts)
+            worker.stuck.add("t")
+            with contextlib.suppress(Exception):
+                await asyncio.wait_for(outcomes(client, unfinished), 0.3)
+    async with manager(tmp_path, state=state) as at, ClusterClient(at.address) as client:
+        async with FakeWorker(at.address) as fresh:
+            assert len(await outcomes(client, batch(5))) == 5
+            assert fresh.executed == []
+            assert len(await outcomes(client, unfinished)) == 4
+            assert len(fresh.executed) == 4
+
+
+async def test_a_bundle_with_a_wrong_digest_is_refused(tmp_path):
+    async with manager(tmp_path) as at, ClusterClient(at.address) as client:
+        with pytest.raises(InvalidRequestError, match="damaged"):
+            await client.put_bundles({KITCHEN: b"something else"})
+        with pytest.raises(InvalidRequestError, match="is no digest"):
+            await client.put_bundles({"../../etc/passwd": b"x"})
+        assert await client.put_bundles({KITCHEN: KITCHEN_DATA}) == (KITCHEN,)
+        assert await client.put_bundles({KITCHEN: KITCHEN_DATA}) == ()
+    assert [path.suffix for path in (tmp_path / "bundles").iterdir()] == [".bundle"]
+
+
+async def test_a_bundle_of_many_chunks_comes_back_unchanged(tmp_path):
+    digest, data = bundle_of("x" * 3_500_000)
+    async with (
+        manager(tmp_path) as at,
+        ClusterClient(at.address) as client,
+        open_channel(at.address) as channel,
+    ):
+        await client.put_bundles({digest: data})
+        stub = scene_service_pb2_grpc.SceneServiceStub(channel)
+        parts = [
+            part.chunk
+            async for part in stub.GetBundle(scene_service_pb2.GetBundleRequest(bundle_digest=digest))
+        ]
+    assert b"".join(parts) == data
+
+
+async def test_rollouts_of_a_missing_bundle_or_run_are_refused(tmp_path):
+    async with manager(tmp_path) as at, ClusterClient(at.address) as client:
+        with pytest.raises(NotFoundError, match="OpenRun"):
+            await outcomes(client, batch(1))
+        await client.open_run("test", "r1")
+        with pytest.raises(PreconditionError, match=KITCHEN):
+            await outcomes(client, batch(1))
+
+
+async def test_a_second_worker_of_the_same_id_ends_the_first_session(tmp_path):
+    async with manager(tmp_path) as at, FakeWorker(at.address) as first:
+        call = first._stub.Session(first._requests())
+        await call.read()
+        async with FakeWorker(at.address):
+            with pytest.raises(grpc.aio.AioRpcError) as caught:
+                await call.read()
+        assert isinstance(cluster_error(caught.value, at.address), SupersededError)
+
+
+async def test_a_drained_worker_gets_nothing_new(tmp_path):
+    async with manager(tmp_path) as at, open_run(at.address) as client:
+        async with (
+            FakeWorker(at.address, worker_id="old") as old,
+            FakeWorker(at.address, worker_id="new") as new,
+        ):
+            await client.drain_worker("old")
+            assert len(await outcomes(client, batch(10))) == 10
+            assert (len(old.executed), len(new.executed)) == (0, 10)
+            states = {worker.worker_id: worker.state for worker in await client.list_workers()}
+            assert states == {"old": "draining", "new": "ready"}
+
+
+async def test_calls_without_the_token_are_refused(tmp_path):
+    async with manager(tmp_path, token="secret") as at:
+        async with ClusterClient(at.address) as stranger:
+            with pytest.raises(NotSignedInError, match="EMBOMATRIX_TOKEN"):
+                await stranger.list_workers()
+        async with open_run(at.address, token="secret") as client, FakeWorker(at.address, token="secret"):
+            assert len(await outcomes(client, batch(2))) == 2
+        async with httpx.AsyncClient(base_url=at.status_url) as http:
+            assert (await http.get("/healthz")).status_code == 200
+            assert (await http.get("/api/overview")).status_code == 401
+            signed = {"authorization": "Bearer secret"}
+            assert (await http.get("/api/overview", headers=signed)).status_code == 200
+
+
+async def test_the_status_page_tells_what_happens(tmp_path):
+    async with manager(tmp_path) as at, open_run(at.address) as client, FakeWorker(at.address, slots=2):
+        await outcomes(client, batch(10))
+        await client.announce_lookahead(
+            "r1", 1, [LookaheadEntry(5, KITCHEN, 8), LookaheadEntry(6, BEDROOM, 4)]
+        )
+        async with httpx.AsyncClient(base_url=at.status_url) as http:
+            overview = (await http.get("/api/overview")).json()
+            assert overview["slots"] == 2
+            assert overview["outcomes"] == {"completed": 10}
+            (worker,) = (await http.get("/api/workers")).json()
+            assert worker["completed"] == 10
+            (run,) = (await http.get("/api/runs")).json()
+            assert run["stats"]["delivered"] == 10
+            steps = (await http.get("/api/lookahead")).json()
+            assert [step["step"] for step in steps] == [5, 6]
+            assert steps[0]["cells"][0]["warmth"] == "warm"
+            assert 'embo_rollouts_total{outcome="completed"} 10' in (await http.get("/metrics")).text
+            assert "<html" in (await http.get("/")).text
+            stranger = await http.get("/api/overview", headers={"host": "evil.example"})
+            assert stranger.status_code == 400
