@@ -5,11 +5,12 @@ The daemon starts it as ``python -m embomatrix.worker.physics FD PARENT``.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from embomatrix.reward.hierarchy import score
 from embomatrix.rpc.values import Completed, Timings
-from embomatrix.sim.bullet.client import pybullet
+from embomatrix.sim.bullet.client import ClientPool
+from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.executor import Simulator
 from embomatrix.worker.slot_program import BundleCorruptError, run_program
 from embomatrix.world.bundle import BundleError, decode_bundle
@@ -20,6 +21,9 @@ if TYPE_CHECKING:
     from embomatrix.rpc.values import Rollout
     from embomatrix.world.bundle import Bundle
 
+CLIENTS_PER_SCENE: Final = 2
+"""An engine holds its scene in one client and settles objects in another."""
+
 
 class UnknownTaskError(Exception):
     """A rollout names a task that its bundle lacks."""
@@ -29,23 +33,23 @@ class Physics:
     """Loads bundles with PyBullet."""
 
     def prepare(self) -> None:
-        """Import the engine; raises EngineError where it is not installed."""
-        pybullet()
+        """Import the engine and connect the clients that every scene needs; raises EngineError where it is missing."""
+        self._clients = ClientPool(spare=CLIENTS_PER_SCENE)
 
     def load(self, path: Path, digest: str) -> PhysicsScene:
         try:
             bundle = decode_bundle(path.read_bytes(), digest=digest)
         except BundleError as error:
             raise BundleCorruptError(str(error)) from error
-        return PhysicsScene(bundle)
+        return PhysicsScene(bundle, self._clients)
 
 
 class PhysicsScene:
     """A bundle's scene in the engine. Every execution starts from the scene as it was loaded."""
 
-    def __init__(self, bundle: Bundle) -> None:
+    def __init__(self, bundle: Bundle, clients: ClientPool) -> None:
         self._tasks = bundle.tasks
-        self._simulator = Simulator(bundle)
+        self._simulator = Simulator(bundle, BulletEngine(bundle.scene, clients))
         for task in list(bundle.tasks.values())[:1]:
             # An empty plan: what the simulator makes when it is first needed is made before the slots are forked.
             self._simulator.execute(task, (), 0)
