@@ -123,7 +123,7 @@ def cupboard(
 
 
 def open_shelf(category: str, synset: str, size: Vec3, boards: int) -> Asset:
-    """Boards between two sides and a back, open in front: what lies on a board is on top of the shelf."""
+    """Boards between two sides and a back, open in front: what lies on a board is on top of the shelf, and inside it."""
     x, y, z = size
     t = PANEL_M
     panels = [
@@ -132,13 +132,18 @@ def open_shelf(category: str, synset: str, size: Vec3, boards: int) -> Asset:
         box((-x / 2 + t / 2, 0, 0), (t, y - 2 * t, z)),
     ]
     pitch = (z - t) / (boards - 1)
-    supports = []
+    inner = (x - t, y - 2 * t)
+    supports, interiors = [], []
     for number in range(boards):
         level = -z / 2 + t + number * pitch
-        panels.append(box((t / 2, 0, level - t / 2), (x - t, y - 2 * t, t)))
-        clearance = pitch - t if number < boards - 1 else 1.0
-        supports.append(SupportSurface(f"board_{number}", (t / 2, 0, level), (x - t, y - 2 * t), clearance))
-    return asset(category, synset, size, panels, supports=supports)
+        panels.append(box((t / 2, 0, level - t / 2), (*inner, t)))
+        roofed = number < boards - 1
+        tier = f"tier_{number}" if roofed else ""
+        clearance = pitch - t if roofed else 1.0
+        supports.append(SupportSurface(f"board_{number}", (t / 2, 0, level), inner, clearance, tier))
+        if roofed:
+            interiors.append(Interior(tier, (t / 2, 0, level + clearance / 2), (*inner, clearance)))
+    return asset(category, synset, size, panels, supports=supports, interiors=interiors)
 
 
 def tub(

@@ -37,15 +37,19 @@ FIELDS_KEPT: Final = 64
 class Obstacles:
     """Rectangles in the world's xy plane with the heights between which they stand, shape (n, 6), and whose they are.
 
-    Columns: x low, y low, x high, y high, z low, z high. ``owners`` holds the number of the scene object, -1 for walls.
+    Columns: x low, y low, x high, y high, z low, z high. ``owners`` holds the number of the scene object, -1 for walls;
+    ``leaves`` marks doors and drawers.
     """
 
     boxes: FloatArray
     owners: IntArray
+    leaves: BoolArray
 
     def joined(self, other: Obstacles) -> Obstacles:
         return Obstacles(
-            np.concatenate([self.boxes, other.boxes]), np.concatenate([self.owners, other.owners])
+            np.concatenate([self.boxes, other.boxes]),
+            np.concatenate([self.owners, other.owners]),
+            np.concatenate([self.leaves, other.leaves]),
         )
 
 

@@ -16,12 +16,14 @@ from embomatrix.sim.floor_grid import CELL_M, FloorGrid, Obstacles
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.geometry import Aabb, Pose
 from embomatrix.world.poses import StandPose
-from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from embomatrix.sim.engine import PhysicsEngine
     from embomatrix.sim.floor_grid import Cell
     from embomatrix.sim.relations import Relations
+    from embomatrix.world.asset import Asset
     from embomatrix.world.geometry import FloatArray
     from embomatrix.world.scene import Room
 
@@ -41,6 +43,9 @@ APART_M: Final = 0.25
 TRIED: Final = 96
 SIDE_WEIGHT_M: Final = 0.4
 """Standing abeam of the front is as bad as standing this much farther away."""
+ROOFED_M: Final = 1.5
+"""A cavity whose floor has less free height than this can't be reached from above."""
+SLACK_M: Final = 0.005
 GRIDS_KEPT: Final = 8
 ENTRY_M: Final = 0.4
 STEP_M: Final = CELL_M / 2
@@ -133,8 +138,8 @@ class Navigator:
         """Up to eight poses from which the robot reaches the object, the nearest and most frontal first.
 
         Each is free, connected to ``origin``, between the shoulder's and the arm's reach from the object's box, faces it, and
-        no wall nor anything much taller than the object stands between. What has doors, and what stands in or on the
-        shelves of such furniture, is served from the furniture's front.
+        no wall nor anything much taller than the object stands between; nor, for things in furniture, its sides or back.
+        What has doors or roofed cavities is served from its front.
         """
         start = self._cell(origin)
         if start is None or self._engine.is_parked(name):
@@ -183,46 +188,48 @@ class Navigator:
         return tuple(chosen)
 
     def _frontality(self, name: str, centers: FloatArray) -> tuple[FloatArray, bool]:
-        """Cosines between the front and the direction to each centre, shape (n,), and whether the front is required."""
-        owner = self._front_owner(name)
-        pose = self._engine.pose(owner or name)
-        box = self._engine.aabb(name)
-        to_robot = centers - np.array(box.center_m[:2])
-        to_robot /= np.maximum(np.linalg.norm(to_robot, axis=1, keepdims=True), 1e-9)
-        front = np.array((math.cos(pose.yaw), math.sin(pose.yaw)))
-        return to_robot @ front, bool(owner)
+        """Cosines between the front and the direction to each centre, shape (n,), and whether the front is required.
 
-    def _front_owner(self, name: str) -> str:
-        """The furniture whose front must be faced: the object itself when it has doors, or what it stands in; or ""."""
-        if self._scene.asset_of(name).joints:
-            return name
-        host = self._relations.host_of(name)
-        if host is None:
-            return ""
-        asset = self._scene.asset_of(host.name)
-        fixed = self._scene.by_name[host.name].fixed
-        below = any(
-            support.name == host.spot and support.clearance_m < ROBOT.reach_m / 2
-            for support in asset.supports
-        )
-        barred = any(item.name == host.spot and item.closed_by for item in asset.interiors)
-        if fixed and (barred or (below and host.relation is Relation.ONTOP)):
-            return host.name
-        return self._front_owner(host.name) if host.relation is Relation.INSIDE else ""
+        The front is that of the fixed furniture which the object stands in or on, or its own.
+        """
+        fixed = [host for host in self._hosts_of(name) if self._scene.by_name[host].fixed]
+        yaw = self._engine.pose(fixed[0] if fixed else name).yaw
+        to_robot = centers - np.array(self._engine.aabb(name).center_m[:2])
+        to_robot /= np.maximum(np.linalg.norm(to_robot, axis=1, keepdims=True), 1e-9)
+        cosines = to_robot @ np.array((math.cos(yaw), math.sin(yaw)))
+        return cosines, has_front(self._scene.asset_of(name))
 
     def _blockers(self, name: str, box: Aabb) -> FloatArray:
-        """Rectangles, shape (n, 4), that the arm can't pass on its way to a box, without the object's own hosts."""
-        boxes, owners = self._obstacles.boxes, self._obstacles.owners
-        own = [self._numbers[item] for item in self._with_hosts(name)]
-        top = box.high_m[2]
-        between = (boxes[:, 5] > top + OVER_M) & (boxes[:, 4] < max(top, ROBOT.shoulder_m))
-        return boxes[between & ~np.isin(owners, own), :4]
+        """Rectangles, shape (n, 4), that the arm can't pass on its way to a box.
 
-    def _with_hosts(self, name: str) -> list[str]:
+        Walls and what is much taller than the object; and where a host roofs the object over, the host's own sides.
+        """
+        rows, owners = self._obstacles.boxes, self._obstacles.owners
+        low, top = box.low_m[2], box.high_m[2]
+        x, y, _ = box.center_m
+        own = [self._numbers[item] for item in (name, *self._hosts_of(name))]
+        barring = (rows[:, 5] > top + OVER_M) & (rows[:, 4] < max(top, ROBOT.shoulder_m))
+        barring &= ~np.isin(owners, own)
+        over = (
+            (rows[:, 0] <= x)
+            & (x <= rows[:, 2])
+            & (rows[:, 1] <= y)
+            & (y <= rows[:, 3])
+            & (rows[:, 4] >= top)
+        )
+        beside = (rows[:, 4] < top - SLACK_M) & (rows[:, 5] > low + SLACK_M) & ~self._obstacles.leaves
+        for number in own[1:]:
+            mine = owners == number
+            if (mine & over).any():
+                barring |= mine & beside
+        return rows[barring, :4]
+
+    def _hosts_of(self, name: str) -> list[str]:
+        """What the object stands on or in, what that stands on or in, and so on."""
         chain = [name]
         while (host := self._relations.host_of(chain[-1])) is not None and host.name not in chain:
             chain.append(host.name)
-        return chain
+        return chain[1:]
 
     def _cell(self, pose: StandPose) -> Cell | None:
         return self._grid.cell(pose.x_m, pose.y_m)
@@ -239,15 +246,29 @@ class Navigator:
     def _walls(self) -> Obstacles:
         world = Pose((0.0, 0.0, 0.0))
         rows = [_row(wall.aabb(world)) for wall in self._scene.walls]
-        return Obstacles(np.array(rows).reshape(-1, 6), np.full(len(rows), -1, dtype=np.int32))
+        return _obstacles(rows, -1, [False] * len(rows))
 
     def _parts_of(self, name: str) -> Obstacles:
         """Boxes of the object's parts with its joints shut."""
         pose = self._engine.pose(name)
-        rows = [_row(part.aabb(pose)) for link in self._scene.asset_of(name).links for part in link.parts]
-        return Obstacles(
-            np.array(rows).reshape(-1, 6), np.full(len(rows), self._numbers[name], dtype=np.int32)
-        )
+        links = self._scene.asset_of(name).links
+        rows = [_row(part.aabb(pose)) for link in links for part in link.parts]
+        leaves = [link.joint is not None for link in links for _ in link.parts]
+        return _obstacles(rows, self._numbers[name], leaves)
+
+
+def has_front(asset: Asset) -> bool:
+    """Whether a thing is served from its front only: it has doors, or cavities with a roof."""
+    roofed = any(surface.interior and surface.clearance_m < ROOFED_M for surface in asset.supports)
+    return bool(asset.joints) or roofed
+
+
+def _obstacles(rows: Sequence[tuple[float, ...]], owner: int, leaves: Sequence[bool]) -> Obstacles:
+    return Obstacles(
+        np.array(rows, dtype=np.float64).reshape(-1, 6),
+        np.full(len(rows), owner, dtype=np.int32),
+        np.array(leaves, dtype=np.bool_),
+    )
 
 
 def _row(box: Aabb) -> tuple[float, ...]:

@@ -81,6 +81,15 @@ def test_what_stands_on_a_shelf_board_is_served_from_the_front_of_the_shelf(navi
     assert all(stand.x_m < 8.8 for stand in navigator.stands("mug_1", navigator.start))
 
 
+def test_sides_of_furniture_are_not_reached_through_but_its_door_leaf_is(engine, navigator) -> None:
+    abeam, ahead = StandPose(1.3, 3.6, math.pi), StandPose(0.6, 2.9, math.pi / 2)
+    assert not navigator.line_is_clear(abeam, "chicken_leg_1")
+    assert navigator.line_is_clear(ahead, "chicken_leg_1")
+    behind = StandPose(2.0, 2.2, -math.pi / 2)
+    engine.set_pose("chicken_leg_1", Pose((2.0, 1.7, 0.025)))
+    assert navigator.line_is_clear(behind, "chicken_leg_1")  # under the table: its legs leave room
+
+
 def test_walls_are_not_reached_through(engine, navigator) -> None:
     engine.set_pose("apple_1", Pose((4.9, 0.8, 0.04)))
     navigator.refresh()

@@ -42,7 +42,7 @@ def relations(engine):
         (("ontop", "mug_1", "shelf_1"), True),
         (("ontop", "chicken_leg_1", "fridge_1"), False),
         (("inside", "chicken_leg_1", "fridge_1"), True),
-        (("inside", "mug_1", "shelf_1"), False),
+        (("inside", "mug_1", "shelf_1"), True),
         (("inside", "apple_1", "breakfast_table_1"), False),
         (("ontop", "microwave_1", "countertop_1"), True),
         (("under", "apple_1", "breakfast_table_1"), False),
