@@ -49,6 +49,8 @@ class FakeScene:
                 time.sleep(0.3)
             case "raise":
                 raise ArithmeticError("x" * 600)
+            case "grow":
+                self._ballast = bytearray(b"x" * (150 * 1024 * 1024))
             case "greedy":
                 self._ballast = bytearray(4 * 1024 * 1024 * 1024)
             case "orphan":

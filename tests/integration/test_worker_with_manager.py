@@ -10,12 +10,16 @@ from collections import Counter
 from pathlib import Path
 
 import psutil
+from tests.fakes.scenes import kitchen_scene, kitchen_tasks
 
 from embomatrix.cli.local_cluster import free_port
 from embomatrix.rpc.client import ClientLimits, ClusterClient
 from embomatrix.rpc.status import ClusterError
 from embomatrix.rpc.values import Batch, Completed, LookaheadEntry, Rollout, Warmth
-from embomatrix.world.bundle import bundle_digest
+from embomatrix.sim.pose_cache import build_pose_cache
+from embomatrix.skills.failure import FailureReason
+from embomatrix.skills.syntax import PlaceRelation, Skill, SkillCall
+from embomatrix.world.bundle import Bundle, bundle_digest, encode_bundle
 
 FAKES = Path(__file__).parents[1] / "fakes"
 LIMITS = ClientLimits(retry_first_s=0.05, retry_longest_s=0.5)
@@ -225,3 +229,62 @@ async def test_no_simulator_outlives_a_killed_worker(tmp_path):
         assert len(children) >= 3
         made.kill("w1")
         assert psutil.wait_procs(children, timeout=5)[1] == []
+
+
+def _kitchen():
+    """The flat with its tasks as a real bundle, and for each task the plan of a robot that tries something sensible."""
+    scene = kitchen_scene()
+    tasks = {task.task_id: task for task in kitchen_tasks(scene)}
+    movable = [item.name for item in scene.objects if not item.fixed]
+    supports = [item.name for item in scene.objects if item.fixed]
+    data = encode_bundle(Bundle(scene, tasks, build_pose_cache(scene, movable, supports, seed=0)))
+    index = tasks["apple_to_counter"].index_of
+    apple, counter = index["apple_1"], index["countertop_1"]
+    plan = (
+        SkillCall(Skill.MOVE, object_index=apple),
+        SkillCall(Skill.PICK_UP, object_index=apple),
+        SkillCall(Skill.MOVE, object_index=counter),
+        SkillCall(Skill.PLACE, object_index=counter, relation=PlaceRelation.ONTOP),
+    )
+    return data, plan
+
+
+async def test_real_physics_scores_every_plan_once_though_a_worker_is_killed(tmp_path):
+    data, plan = _kitchen()
+    failing = (SkillCall(Skill.PICK_UP, object_index=99),)
+    digest = bundle_digest(data)
+    rollouts = tuple(
+        Rollout(
+            f"r{number}",
+            f"g{number // 8}",
+            digest,
+            "apple_to_counter",
+            failing if number % 4 == 3 else plan,
+            number // 8,
+        )
+        for number in range(160)
+    )
+    async with cluster(tmp_path, "w1", "w2", real=True) as (made, client):
+        await client.put_bundles({digest: data})
+        run_id = await client.open_run("test")
+        results = []
+        async for result in client.execute(Batch(run_id, "b1", 0, rollouts), deadline_s=120.0):
+            results.append(result)
+            if len(results) == 20:
+                made.kill("w1")
+        await client.close_run(run_id)
+    assert Counter(result.rollout_id for result in results) == Counter(
+        rollout.rollout_id for rollout in rollouts
+    )
+    assert all(isinstance(result.outcome, Completed) for result in results)
+    by_id = {result.rollout_id: result.outcome for result in results}
+    for number in range(160):
+        outcome = by_id[f"r{number}"]
+        if number % 4 == 3:
+            assert outcome.steps[0].failure is FailureReason.UNKNOWN_INDEX
+            assert outcome.reward.total == 0.5
+        else:
+            assert outcome.reward.success
+            assert outcome.reward.total > 30
+            # One group, one seed, one plan: one trace, whichever worker executed it.
+            assert outcome.trace_digest == by_id[f"r{number // 8 * 8}"].trace_digest

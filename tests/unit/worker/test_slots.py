@@ -85,6 +85,10 @@ async def running(folder, **options):
             await task
 
 
+def _living():
+    return [process for process in _simulators() if process.status() != psutil.STATUS_ZOMBIE]
+
+
 def _simulators(parent=None):
     return psutil.Process(parent or os.getpid()).children(recursive=True)
 
@@ -119,6 +123,26 @@ async def test_a_slot_is_used_again_for_the_next_lease_of_its_scene(tmp_path):
     assert [outcome.final[0].split(" in ")[0] for outcome in outcomes.values()] == [
         f"executed {number}" for number in range(1, 6)
     ]
+
+
+async def test_idle_processes_are_bounded_over_all_scenes(tmp_path):
+    async with running(tmp_path, slots=1) as harness:
+        for number in range(8):
+            harness.submit(f"l{number}", digest=f"scene-{number}")
+            await harness.outcomes(number + 1)
+        root_and_scenes = 1 + 8
+        await harness.until(lambda: len(_living()) <= root_and_scenes + 4)
+        harness.submit("again", digest="scene-0")
+        assert isinstance((await harness.outcomes(9))["again"], Completed)
+
+
+async def test_a_slot_that_has_grown_is_replaced(tmp_path):
+    async with running(tmp_path, slots=1) as harness:
+        for number, task in enumerate(("ok", "grow", "ok")):
+            harness.submit(f"l{number}", task)
+        before, grown, after = (outcome.final[0] for outcome in (await harness.outcomes(3)).values())
+    assert (before.split(" in ")[0], grown.split(" in ")[0]) == ("executed 1", "executed 2")
+    assert after.startswith("executed 1 ")
 
 
 async def test_two_slots_execute_one_scene_at_the_same_time(tmp_path):

@@ -27,6 +27,10 @@ RETRY_LOAD_S: Final = 5.0
 """A scene that could not be loaded is tried again after this long, while it is still wanted."""
 
 
+IDLE_PER_SLOT: Final = 4
+"""Idle processes kept for each slot of the worker, over all scenes: each holds a few MB."""
+
+
 class LoadError(Exception):
     """A scene that can't be loaded, with the code that tells the manager why."""
 
@@ -174,6 +178,20 @@ class Residents:
     def keeps(self, scene: Scene) -> bool:
         """Whether this very scene is still held, not evicted or loaded anew."""
         return self._scenes.get(scene.digest) is scene
+
+    def keep_slot(self, scene: Scene, slot: Slot) -> None:
+        """Keep a slot for its scene's next rollout, unless the scene was dropped meanwhile.
+
+        When too many are idle, the scene that was not used for longest gives one up.
+        """
+        if not self.keeps(scene):
+            self.end_later(slot.child)
+            return
+        scene.idle.append(slot)
+        idle = [other for other in self._scenes.values() if other.idle]
+        if sum(len(other.idle) for other in idle) > IDLE_PER_SLOT * self._limits.slots:
+            oldest = min(idle, key=lambda other: other.last_used)
+            self.end_later(oldest.idle.pop(0).child)
 
     def end_later(self, child: Child) -> None:
         """Kill a process without waiting for its end."""

@@ -218,10 +218,10 @@ class SlotPool:
             # What an exception left behind in the process is unknown.
             self._residents.end_later(slot.child)
             return InfraFailure(InfraCode(header["code"]), header["error"])
-        if _worn(slot, float(header["resident_mb"])) or not self._residents.keeps(scene):
+        if _worn(slot, float(header["resident_mb"])):
             self._residents.end_later(slot.child)
         else:
-            scene.idle.append(slot)
+            self._residents.keep_slot(scene, slot)
         timings = Timings(
             queued_s=started_s - ticket.taken_s,
             load_s=0.0 if ticket.found_warm else scene.load_s,
