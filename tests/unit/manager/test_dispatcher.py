@@ -1,0 +1,396 @@
+"""The Task-Dispatcher, driven by hand: each test tells what happened and what should be done about it."""
+
+import pytest
+from tests.fakes.worker import completed
+
+from embomatrix.manager.assignments import DispatchLimits
+from embomatrix.manager.commands import AcknowledgeLease, CancelLease, DeliverResult, FinishBatch, GiveLease
+from embomatrix.manager.dispatcher import Dispatcher
+from embomatrix.manager.events import (
+    BatchCancelled,
+    BatchSubmitted,
+    LeaseFinished,
+    LeasesRenewed,
+    RunClosed,
+    ScenesUnplaceable,
+    Tick,
+    WorkerDrained,
+    WorkerJoined,
+    WorkerLost,
+    WorkerRecovered,
+    WorkerReported,
+    WorkerSuspected,
+)
+from embomatrix.rpc.values import (
+    Batch,
+    Cancelled,
+    Completed,
+    InfraCode,
+    InfraFailure,
+    LeaseRef,
+    Resident,
+    ResidentState,
+    Resources,
+    Rollout,
+)
+
+LIMITS = DispatchLimits(
+    lease_ttl_s=30, lease_limit_s=100, rollout_deadline_s=600, no_capacity_s=60, lone_load_failure_s=10
+)
+
+
+class Table:
+    """A dispatcher and its clock. Commands are kept by kind."""
+
+    def __init__(self, limits=LIMITS):
+        self.dispatcher = Dispatcher(limits, boot_id="boot")
+        self.now_s = 0.0
+        self.results = {}
+
+    def tell(self, *events, after_s=0.0):
+        self.now_s += after_s
+        commands = [c for event in events for c in self.dispatcher.handle(event, now_s=self.now_s)]
+        for command in commands:
+            if isinstance(command, DeliverResult):
+                assert command.result.rollout_id not in self.results, "delivered twice"
+                self.results[command.result.rollout_id] = command.result
+        return commands
+
+    def worker(self, worker_id="w1", slots=1, warm=("kitchen",)):
+        self.tell(WorkerJoined(worker_id, Resources(slots, slots, 1024)))
+        return self.report(worker_id, warm=warm, resync=True)
+
+    def report(self, worker_id="w1", warm=(), failed=(), held=(), resync=False, draining=False):
+        residents = [Resident(scene, ResidentState.WARM) for scene in warm]
+        residents += [Resident(scene, ResidentState.FAILED, error="no mesh") for scene in failed]
+        return self.tell(WorkerReported(worker_id, tuple(residents), tuple(held), draining, resync))
+
+    def submit(self, count=1, scene="kitchen", batch_id="b1"):
+        rollouts = tuple(Rollout(f"{batch_id}-{i}", "g", scene, "t", (), 0) for i in range(count))
+        return self.tell(BatchSubmitted(Batch("r1", batch_id, 1, rollouts)))
+
+    def finish(self, lease, outcome=None):
+        return self.tell(LeaseFinished(lease.worker_id, lease.ref, outcome or completed(lease.worker_id)))
+
+
+def leases(commands):
+    return [command for command in commands if isinstance(command, GiveLease)]
+
+
+def crash():
+    return InfraFailure(InfraCode.SLOT_CRASHED, "signal 11")
+
+
+@pytest.fixture
+def table():
+    return Table()
+
+
+def test_a_rollout_goes_to_the_worker_that_has_its_scene_warm(table):
+    table.worker("w1", warm=["bedroom"])
+    table.worker("w2", warm=["kitchen"])
+    (lease,) = leases(table.submit())
+    assert lease.worker_id == "w2"
+    assert table.finish(lease)[0] == AcknowledgeLease("w2", lease.ref)
+    assert isinstance(table.results["b1-0"].outcome, Completed)
+
+
+def test_a_rollout_waits_while_its_scene_is_nowhere_warm(table):
+    table.worker(warm=[])
+    assert leases(table.submit(3)) == []
+    demand = table.dispatcher.demand()
+    assert demand.pending == {"kitchen": 3}
+    assert demand.idle == {"w1"}
+    assert len(leases(table.report(warm=["kitchen"]))) == 2
+
+
+def test_a_worker_that_has_not_reported_yet_gets_nothing(table):
+    table.tell(WorkerJoined("w1", Resources(4, 4, 1024)))
+    assert leases(table.submit()) == []
+
+
+def test_a_worker_holds_one_lease_per_slot_and_one_behind_each(table):
+    table.worker(slots=2)
+    assert len(leases(table.submit(10))) == 4
+
+
+def test_a_freed_slot_is_used_in_the_same_step(table):
+    table.worker()
+    first, _ = leases(table.submit(3))
+    (third,) = leases(table.finish(first))
+    assert third.rollout.rollout_id == "b1-2"
+
+
+def test_rollouts_spread_over_the_least_busy_workers(table):
+    table.worker("w1", slots=1)
+    table.worker("w2", slots=3)
+    given = [lease.worker_id for lease in leases(table.submit(4))]
+    assert sorted(given) == ["w1", "w2", "w2", "w2"]
+
+
+def test_the_batch_ends_after_its_last_result_with_cursors_from_one(table):
+    table.worker(slots=4)
+    given = leases(table.submit(3))
+    commands = [command for lease in given for command in table.finish(lease)]
+    assert commands[-1] == FinishBatch("r1", "b1")
+    assert [result.cursor for result in table.results.values()] == [1, 2, 3]
+
+
+def test_an_empty_rest_of_a_restored_batch_ends_at_once(table):
+    rollout = Rollout("x", "g", "kitchen", "t", (), 0)
+    commands = table.tell(BatchSubmitted(Batch("r1", "b1", 1, (rollout,)), {"x": 1}))
+    assert commands == [FinishBatch("r1", "b1")]
+
+
+def test_cursors_of_a_restored_batch_continue(table):
+    table.worker()
+    rollouts = tuple(Rollout(name, "g", "kitchen", "t", (), 0) for name in ("x", "y"))
+    (lease,) = leases(table.tell(BatchSubmitted(Batch("r1", "b1", 1, rollouts), {"x": 7})))
+    table.finish(lease)
+    assert table.results["y"].cursor == 8
+
+
+def test_a_lost_worker_gives_its_rollouts_back_at_once(table):
+    table.worker("w1", slots=2)
+    table.submit(4)
+    table.worker("w2", slots=2)
+    given = leases(table.tell(WorkerLost("w1", "killed")))
+    assert {lease.worker_id for lease in given} == {"w2"}
+    assert len(given) == 4
+
+
+def test_only_started_leases_of_a_lost_worker_cost_an_attempt(table):
+    for name in ("w1", "w2", "w3"):
+        table.worker(name)
+        if name == "w1":
+            table.submit(2)
+        table.tell(WorkerLost(name, "killed"))
+    assert table.results["b1-0"].outcome.code is InfraCode.WORKER_LOST
+    assert table.results["b1-0"].attempt == 3
+    assert "b1-1" not in table.results
+
+
+def test_a_poison_rollout_ends_after_three_crashes_and_the_others_live(table):
+    table.worker()
+    given = leases(table.submit(3))
+    while given:
+        lease = given.pop(0)
+        given += leases(table.finish(lease, crash() if lease.rollout.rollout_id == "b1-0" else None))
+    assert table.results["b1-0"].outcome.code is InfraCode.SLOT_CRASHED
+    assert "attempt 3 of 3" in table.results["b1-0"].outcome.message
+    assert table.results["b1-0"].outcome.worker_id == "w1"
+    assert all(isinstance(table.results[name].outcome, Completed) for name in ("b1-1", "b1-2"))
+
+
+def test_a_late_result_is_acknowledged_counted_and_dropped(table):
+    table.worker("w1")
+    (old,) = leases(table.submit())
+    table.worker("w2")
+    (new,) = leases(table.tell(WorkerLost("w1", "silent")))
+    assert table.finish(old) == [AcknowledgeLease("w1", old.ref)]
+    assert table.results == {}
+    table.finish(new)
+    table.finish(new)
+    assert table.results["b1-0"].attempt == 2
+    assert table.dispatcher.counters("r1").stale_results == 2
+
+
+def test_a_result_under_another_epoch_or_worker_is_stale(table):
+    table.worker()
+    (lease,) = leases(table.submit())
+    for worker_id, ref in (("w1", LeaseRef(lease.ref.lease_id, 99)), ("w2", lease.ref)):
+        table.tell(LeaseFinished(worker_id, ref, completed()))
+    assert table.results == {}
+    table.finish(lease)
+    assert len(table.results) == 1
+
+
+def test_a_lease_that_nobody_renews_expires(table):
+    table.worker()
+    (lease,) = leases(table.submit())
+    table.tell(LeasesRenewed("w1", (lease.ref,)), after_s=29)
+    assert table.tell(Tick(), after_s=2) == []
+    commands = table.tell(Tick(), after_s=30)
+    assert commands[0] == CancelLease("w1", lease.ref)
+    assert leases(commands)[0].ref.lease_epoch > lease.ref.lease_epoch
+
+
+def test_a_lease_that_is_renewed_for_ever_expires_too(table):
+    table.worker()
+    (lease,) = leases(table.submit())
+    for _ in range(9):
+        table.tell(LeasesRenewed("w1", (lease.ref,)), Tick(), after_s=10)
+    assert table.dispatcher.live_leases
+    table.tell(LeasesRenewed("w1", (lease.ref,)), after_s=9)
+    commands = table.tell(Tick(), after_s=2)
+    assert CancelLease("w1", lease.ref) in commands
+
+
+def test_leases_that_a_reconnected_worker_never_got_are_given_again(table):
+    table.worker(slots=2)
+    first, second = leases(table.submit(2))
+    commands = table.report(warm=["kitchen"], held=[first.ref], resync=True)
+    (again,) = leases(commands)
+    assert again.rollout == second.rollout
+    assert first.ref.lease_id in table.dispatcher.live_leases
+
+
+def test_a_later_report_takes_no_lease_back(table):
+    table.worker(slots=2)
+    table.submit(2)
+    assert table.report(warm=["kitchen"], held=[]) == []
+
+
+def test_a_lease_of_a_former_manager_is_called_off(table):
+    table.tell(WorkerJoined("w1", Resources(1, 1, 1024)))
+    ghost = LeaseRef("other-1", 1)
+    assert table.report(held=[ghost], resync=True) == [CancelLease("w1", ghost)]
+
+
+def test_a_suspected_worker_gets_nothing_until_it_is_heard(table):
+    table.worker()
+    table.tell(WorkerSuspected("w1"))
+    assert leases(table.submit()) == []
+    assert len(leases(table.tell(WorkerRecovered("w1")))) == 1
+
+
+def test_a_drained_worker_finishes_what_it_holds_and_gets_nothing_new(table):
+    table.worker()
+    first, second = leases(table.submit(5))
+    table.tell(WorkerDrained("w1"))
+    assert leases(table.finish(first)) == leases(table.finish(second)) == []
+    assert len(table.results) == 2
+
+
+def test_an_idle_slot_takes_what_waits_behind_a_busy_one(table):
+    table.worker("w1", slots=1)
+    running, waiting = leases(table.submit(2))
+    table.worker("w2", slots=1)
+    commands = table.tell(Tick(), after_s=1.0)
+    assert commands[0] == CancelLease("w1", waiting.ref)
+    (stolen,) = leases(commands)
+    assert (stolen.worker_id, stolen.rollout) == ("w2", waiting.rollout)
+    table.finish(stolen)
+    table.finish(running)
+    assert {result.attempt for result in table.results.values()} == {1}
+
+
+def test_a_cancelled_batch_ends_at_once_and_frees_its_slots(table):
+    table.worker()
+    given = leases(table.submit(3))
+    table.submit(1, batch_id="b2")
+    commands = table.tell(BatchCancelled("r1", "b1"))
+    assert all(isinstance(table.results[f"b1-{i}"].outcome, Cancelled) for i in range(3))
+    assert {c.ref for c in commands if isinstance(c, CancelLease)} == {lease.ref for lease in given}
+    assert [lease.rollout.rollout_id for lease in leases(commands)] == ["b2-0"]
+
+
+def test_a_closed_run_cancels_its_batches_and_leaves_the_others(table):
+    table.submit(2)
+    rollout = Rollout("other", "g", "kitchen", "t", (), 0)
+    table.tell(BatchSubmitted(Batch("r2", "b1", 1, (rollout,))))
+    table.tell(RunClosed("r1"))
+    assert set(table.results) == {"b1-0", "b1-1"}
+    assert table.dispatcher.pending_of("r2") == 1
+
+
+def test_a_rollout_has_a_deadline(table):
+    table.worker(warm=[])
+    table.submit()
+    table.tell(Tick(), after_s=599)
+    assert table.results == {}
+    table.tell(Tick(), after_s=2)
+    assert table.results["b1-0"].outcome.code is InfraCode.DEADLINE
+
+
+def test_without_a_worker_rollouts_end_after_the_bounded_wait(table):
+    table.submit()
+    table.tell(Tick(), after_s=59)
+    assert table.results == {}
+    table.tell(Tick(), after_s=2)
+    assert table.results["b1-0"].outcome.code is InfraCode.NO_CAPACITY
+
+
+def test_a_rollout_that_came_late_waits_as_long_as_the_others(table):
+    table.tell(Tick(), after_s=100)
+    table.submit()
+    table.tell(Tick(), after_s=30)
+    assert table.results == {}
+
+
+def test_a_scene_that_fits_nowhere_fails_its_rollouts_with_the_reason(table):
+    table.worker(warm=[])
+    table.submit()
+    table.tell(ScenesUnplaceable({"kitchen": "needs 900 MB"}))
+    table.tell(Tick(), after_s=61)
+    assert table.results["b1-0"].outcome == InfraFailure(InfraCode.NO_CAPACITY, "needs 900 MB")
+
+
+def test_a_scene_that_fails_on_two_workers_fails_its_rollouts(table):
+    table.worker("w1", warm=[])
+    table.worker("w2", warm=[])
+    table.submit(2)
+    table.report("w1", failed=["kitchen"])
+    assert table.results == {}
+    table.report("w2", failed=["kitchen"])
+    assert {result.outcome.code for result in table.results.values()} == {InfraCode.SCENE_LOAD_FAILED}
+    assert "no mesh" in table.results["b1-0"].outcome.message
+
+
+def test_one_worker_that_fails_is_to_blame_itself_while_another_has_the_scene(table):
+    table.worker("w1", warm=[])
+    table.worker("w2")
+    table.report("w1", failed=["kitchen"])
+    (lease,) = leases(table.submit())
+    assert lease.worker_id == "w2"
+
+
+def test_the_only_worker_may_fail_for_a_while_before_its_rollouts_end(table):
+    table.worker(warm=[])
+    table.submit()
+    table.report(failed=["kitchen"])
+    table.tell(Tick(), after_s=9)
+    assert table.results == {}
+    table.tell(Tick(), after_s=2)
+    assert table.results["b1-0"].outcome.code is InfraCode.SCENE_LOAD_FAILED
+
+
+def test_a_lease_that_found_its_scene_broken_does_not_come_straight_back(table):
+    table.worker("w1")
+    table.worker("w2", warm=[])
+    (lease,) = leases(table.submit())
+    broken = InfraFailure(InfraCode.BUNDLE_CORRUPT, "digest mismatch")
+    assert leases(table.finish(lease, broken)) == []
+    assert leases(table.report("w2", warm=["kitchen"]))[0].worker_id == "w2"
+
+
+def test_a_newer_session_of_a_worker_loses_the_leases_of_the_older(table):
+    table.worker("w1")
+    (old,) = leases(table.submit())
+    (new,) = leases(table.worker("w1"))
+    assert new.ref.lease_epoch > old.ref.lease_epoch
+
+
+def test_waiting_time_is_part_of_the_result(table):
+    table.worker()
+    first, second = leases(table.submit(2))
+    table.tell(Tick(), after_s=2.0)
+    table.submit(1, batch_id="b2")
+    table.now_s += 3.0
+    (third,) = leases(table.finish(first))
+    table.finish(third)
+    assert table.results["b2-0"].outcome.timings.queued_s == 3.0
+    assert table.finish(second)
+
+
+def test_warm_and_cold_starts_are_told_apart(table):
+    table.worker(warm=[])
+    table.submit(1)
+    (cold,) = leases(table.report(warm=["kitchen"]))
+    table.finish(cold)
+    (warm,) = leases(table.submit(1, batch_id="b2"))
+    table.finish(warm)
+    assert not table.results["b1-0"].outcome.warm
+    assert table.results["b2-0"].outcome.warm
+    counters = table.dispatcher.counters("r1")
+    assert (counters.cold_starts, counters.warm_starts) == (1, 1)
