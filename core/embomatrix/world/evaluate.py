@@ -23,7 +23,7 @@ from embomatrix.world.goal import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Iterator, Mapping
 
     from embomatrix.world.goal import Facts
 
@@ -125,18 +125,9 @@ def scored_atoms(formula: Formula, types: Types) -> tuple[Formula, ...]:
 
 def substitute(formula: Formula, names: Mapping[str, str]) -> Formula:
     """The formula with free arguments replaced: variables and objects alike. Quantifiers shadow their variables."""
-    return _rewrite(formula, names, lambda type_name: type_name)
 
-
-def rename(formula: Formula, names: Mapping[str, str], types: Mapping[str, str]) -> Formula:
-    """As ``substitute``, and the types of the quantifiers are renamed too; those not in ``types`` stay."""
-    return _rewrite(formula, names, lambda type_name: types.get(type_name, type_name))
-
-
-def _rewrite(formula: Formula, names: Mapping[str, str], retype: Callable[[str], str]) -> Formula:
     def inner(body: Formula, *bound: str) -> Formula:
-        free = {arg: name for arg, name in names.items() if arg not in bound}
-        return _rewrite(body, free, retype)
+        return substitute(body, {arg: name for arg, name in names.items() if arg not in bound})
 
     match formula:
         case Atom(predicate, args):
@@ -150,15 +141,15 @@ def _rewrite(formula: Formula, names: Mapping[str, str], retype: Callable[[str],
         case Imply(premise, conclusion):
             return Imply(inner(premise), inner(conclusion))
         case Forall(variable, type_name, body):
-            return Forall(variable, retype(type_name), inner(body, variable))
+            return Forall(variable, type_name, inner(body, variable))
         case Exists(variable, type_name, body):
-            return Exists(variable, retype(type_name), inner(body, variable))
+            return Exists(variable, type_name, inner(body, variable))
         case ForN(count, variable, type_name, body):
-            return ForN(count, variable, retype(type_name), inner(body, variable))
+            return ForN(count, variable, type_name, inner(body, variable))
         case ForPairs(a, type_a, b, type_b, body):
-            return ForPairs(a, retype(type_a), b, retype(type_b), inner(body, a, b))
+            return ForPairs(a, type_a, b, type_b, inner(body, a, b))
         case ForNPairs(count, a, type_a, b, type_b, body):
-            return ForNPairs(count, a, retype(type_a), b, retype(type_b), inner(body, a, b))
+            return ForNPairs(count, a, type_a, b, type_b, inner(body, a, b))
 
 
 def subformulas(formula: Formula) -> Iterator[Formula]:

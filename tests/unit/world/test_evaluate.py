@@ -15,9 +15,9 @@ from embomatrix.world.evaluate import (
     atoms_of,
     evaluate,
     objects_of,
-    rename,
     render,
     scored_atoms,
+    substitute,
     types_of,
 )
 from embomatrix.world.goal import And, Atom, Forall, Formula
@@ -118,9 +118,9 @@ def test_objects_of_a_goal_are_those_it_names_and_those_it_ranges_over() -> None
     assert [atom.predicate for atom in atoms_of(formula)] == ["inside", "inroom"]
 
 
-def test_renaming_reaches_objects_and_types_and_spares_variables() -> None:
-    renamed = rename(goal(EVERY), {"box_1": "crate_7", "?x": "wrong"}, {"apple": "fruit"})
-    assert render(renamed) == "(forall (?x - fruit) (inside ?x crate_7))"
+def test_substitution_reaches_objects_and_spares_bound_variables() -> None:
+    renamed = substitute(goal(EVERY), {"box_1": "crate_7", "?x": "wrong"})
+    assert render(renamed) == "(forall (?x - apple) (inside ?x crate_7))"
 
 
 @given(st.sets(st.tuples(st.just("inside"), st.sampled_from(TYPES["apple"]), st.sampled_from(TYPES["box"]))))
