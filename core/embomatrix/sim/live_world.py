@@ -91,11 +91,14 @@ class LiveWorld:
         """How the robot, where it stands, reaches the object's bounding box. An object in the hand is at hand."""
         box = self.engine.aabb(name)
         if name in self._hand:
-            return Reach(0.0, box.center_m[2], clear=True)
+            return Reach(0.0, box.center_m[2])
         dx = max(box.low_m[0] - self.robot.x_m, self.robot.x_m - box.high_m[0], 0.0)
         dy = max(box.low_m[1] - self.robot.y_m, self.robot.y_m - box.high_m[1], 0.0)
-        clear = self.navigator.line_is_clear(self.robot, name)
-        return Reach(math.hypot(dx, dy), box.center_m[2], clear)
+        return Reach(math.hypot(dx, dy), box.center_m[2])
+
+    def is_approachable(self, name: str) -> bool:
+        """Whether no wall and nothing much taller than the object stands between the robot and it."""
+        return name in self._hand or self.navigator.line_is_clear(self.robot, name)
 
     def is_at(self, name: str, source: str) -> bool:
         """Whether the object lies where the source acts, be it as heat or as cold source."""

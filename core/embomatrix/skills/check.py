@@ -34,6 +34,11 @@ if TYPE_CHECKING:
     Check = Callable[[WorldView, SkillCall], Refusal | None]
 
 
+def within_reach(world: WorldView, name: str) -> Refusal | None:
+    """Why the arm does not get at an object from where the robot stands, None when it does."""
+    return _reachable(world, name) or _clear(world, name)
+
+
 def check(world: WorldView, call: SkillCall) -> Refusal | None:
     """The first precondition of the call that does not hold, as a refusal; None when all do."""
     for precondition in LIBRARY[call.skill].preconditions:
@@ -159,7 +164,7 @@ def _source_approachable(world: WorldView, call: SkillCall) -> Refusal | None:
 
 
 def _clear(world: WorldView, name: str) -> Refusal | None:
-    return None if world.reach(name).clear else refuse(FailureReason.NO_LINE_OF_APPROACH, target=name)
+    return None if world.is_approachable(name) else refuse(FailureReason.NO_LINE_OF_APPROACH, target=name)
 
 
 def _accessible(world: WorldView, call: SkillCall) -> Refusal | None:

@@ -23,15 +23,14 @@ class Refusal:
 
 @dataclass(frozen=True, slots=True)
 class Reach:
-    """How the robot stands to an object.
+    """How far an object is from the robot.
 
-    ``distance_m`` is horizontal, from the base's centre to the nearest point of the object; ``height_m`` is that of
-    its middle above the floor; ``clear`` is false when a wall or furniture lies in between.
+    ``distance_m`` is horizontal, from the base's centre to the nearest point of the object; ``height_m`` is that of its
+    middle above the floor.
     """
 
     distance_m: float
     height_m: float
-    clear: bool
 
 
 class WorldView(Protocol):
@@ -66,6 +65,9 @@ class WorldView(Protocol):
         """A closed container that the object is in; "" when there is none."""
 
     def reach(self, name: str) -> Reach: ...
+
+    def is_approachable(self, name: str) -> bool:
+        """Whether no wall and no furniture lies between the robot and the object."""
 
     def is_at(self, name: str, source: str) -> bool:
         """Whether a heat or cold source acts on the object where it lies, were the source running."""
