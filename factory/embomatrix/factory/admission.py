@@ -1,0 +1,80 @@
+"""Admission: a task enters a data set only when the simulator says so.
+
+Its goal must not hold at the start, at most half of its atoms may, and the oracle planner must find a plan that earns full
+success when it is executed. What is turned away is a value with a reason.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Protocol, TypeVar
+
+from embomatrix.factory.refusal import Refusal, RefusalReason
+from embomatrix.reward.hierarchy import score
+from embomatrix.sim.planner import PlanNotFound
+from embomatrix.world.evaluate import evaluate, render, scored_atoms
+from embomatrix.world.goal import Not
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from embomatrix.skills.syntax import Plan
+    from embomatrix.skills.trace import Trace
+    from embomatrix.world.bddl import Literal
+    from embomatrix.world.goal import Facts
+    from embomatrix.world.task import Task
+
+SEED: Final = 0
+"""Seed of the verifying executions."""
+
+
+class Stage(Protocol):
+    """What executes plans: ``sim.executor.Simulator``, or a table in a test."""
+
+    @property
+    def facts(self) -> Facts: ...
+
+    def execute(self, task: Task, plan: Plan, seed: int) -> Trace: ...
+
+
+S = TypeVar("S", bound=Stage)
+
+
+@dataclass(frozen=True, slots=True)
+class Admitted:
+    """A plan that reaches the goal, and the atoms that hold already at the start."""
+
+    plan: Plan
+    held_at_start: tuple[str, ...]
+
+
+def admit(
+    stage: S,
+    task: Task,
+    find_plan: Callable[[S, Task], Plan | PlanNotFound],
+    init: Sequence[Literal] = (),
+) -> Admitted | Refusal:
+    """Judge a task by execution. ``init`` are atoms that must hold at the start, as the task's source says."""
+    stage.execute(task, (), SEED)
+    for literal in init:
+        if stage.facts.holds(literal.atom.predicate, literal.atom.args) is not literal.positive:
+            wanted = render(literal.atom if literal.positive else Not(literal.atom))
+            return Refusal(RefusalReason.INIT_NOT_MET, f"{wanted} does not hold in the scene that was built")
+    if evaluate(task.goal, stage.facts, task.types):
+        return Refusal(RefusalReason.GOAL_HOLDS, f"the goal holds at the start: {task.goal_bddl}")
+    atoms = scored_atoms(task.goal, task.types)
+    held = tuple(render(atom) for atom in atoms if evaluate(atom, stage.facts, task.types))
+    if 2 * len(held) > len(atoms):
+        return Refusal(
+            RefusalReason.MOSTLY_DONE,
+            f"{len(held)} of {len(atoms)} atoms hold at the start, at most half may: {' '.join(held)}",
+        )
+    plan = find_plan(stage, task)
+    if isinstance(plan, PlanNotFound):
+        return Refusal(RefusalReason.NO_PLAN, f"the oracle planner found no plan: {plan.reason}")
+    trace = stage.execute(task, plan, SEED)
+    reward = score(task, trace.touched, stage.facts)
+    if trace.failure is not None or not reward.success:
+        last = trace.steps[-1].message if trace.steps else "it is empty"
+        return Refusal(RefusalReason.ORACLE_FAILED, f"the oracle's plan earns {reward.total:.1f}: {last}")
+    return Admitted(plan, held)

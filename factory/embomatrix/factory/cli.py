@@ -1,0 +1,225 @@
+"""``embomatrix factory``: build data sets of verified tasks, import BDDL, list what a data set holds."""
+
+from __future__ import annotations
+
+import contextlib
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NoReturn
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from embomatrix.factory.importer_batch import Verified, bind_first, verify
+from embomatrix.factory.importer_sources import (
+    SourceError,
+    SourceText,
+    activity_names,
+    read_activity,
+    read_file,
+    read_jsonl,
+)
+from embomatrix.factory.pipeline import DEFAULT_SCENES, BuildSettings, Summary, build_dataset
+from embomatrix.factory.refusal import Refusal
+from embomatrix.factory.scene_build import build_base_scene
+from embomatrix.sim.pose_cache import PlacementLibrary
+from embomatrix.world.bddl import BddlError
+from embomatrix.world.catalog import CatalogError
+from embomatrix.world.dataset import Dataset, DatasetError, write_dataset
+from embomatrix.world.task import TaskCategory
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from embomatrix.factory.importer import Imported
+    from embomatrix.world.scene import Scene
+
+app = typer.Typer(
+    help="Make verified tasks.", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False
+)
+EVERY_ACTIVITY = "all"
+
+Out = Annotated[Path, typer.Option(help="Folder for the data set.")]
+Seed = Annotated[int, typer.Option(min=0, help="Equal seeds give equal data sets.")]
+Scenes = Annotated[
+    list[str] | None, typer.Option("--scenes", "--scene", help="Base scene; give it again for more.")
+]
+
+
+@app.command()
+def build(
+    out: Out,
+    train: Annotated[int, typer.Option(min=0, help="Tasks to train on.")] = 480,
+    heldout: Annotated[int, typer.Option(min=0, help="Tasks to evaluate on, in other rooms.")] = 40,
+    seed: Seed = 0,
+    scenes: Scenes = None,
+) -> None:
+    """Write tasks over base scenes, keep those that the oracle solves, and save them with their scenes."""
+    settings = BuildSettings(train, heldout, seed, tuple(scenes or DEFAULT_SCENES))
+    console = Console()
+    with _mended(), _progress(console) as bars:
+        tasks = {
+            "heldout": bars.add_task("held-out tasks", total=heldout),
+            "train": bars.add_task("training tasks", total=train),
+        }
+        summary = build_dataset(
+            out, settings, lambda split, admitted: bars.update(tasks[split], completed=admitted)
+        )
+        for split, bar in tasks.items():
+            bars.update(bar, completed=summary.total(split))
+    _print_summary(console, summary)
+    console.print(f"data set: {out}", highlight=False)
+    for split, wanted in (("train", train), ("heldout", heldout)):
+        if summary.total(split) < wanted:
+            _fail(
+                f"only {summary.total(split)} of {wanted} {split} tasks were admitted: see {out}/rejections.jsonl, "
+                "or give more scenes"
+            )
+
+
+@app.command("import")
+def import_(
+    bddl: Annotated[Path | None, typer.Option(help="A BDDL problem file.")] = None,
+    activity: Annotated[str, typer.Option(help="An activity of the bddl package, or 'all'.")] = "",
+    jsonl: Annotated[Path | None, typer.Option(help="Records with 'name' and 'bddl'.")] = None,
+    scenes: Scenes = None,
+    seed: Seed = 0,
+    out: Annotated[Path | None, typer.Option(help="Folder for the admitted tasks.")] = None,
+    bind_only: Annotated[bool, typer.Option("--bind-only", help="Leave out the verification.")] = False,
+) -> None:
+    """Bind BDDL problems to base scenes and verify them, or say why not."""
+    console = Console()
+    with _mended():
+        sources = list(_sources(bddl, activity, jsonl))
+        bases = [build_base_scene(scene_id) for scene_id in scenes or DEFAULT_SCENES]
+        outcomes = _judged(console, sources, bases, seed, bind_only=bind_only)
+        if out is not None:
+            verified = [item for item in outcomes if isinstance(item, Verified)]
+            write_dataset(
+                out,
+                [item.record for item in verified],
+                {item.record.bundle_digest: item.bundle for item in verified},
+            )
+    if len(sources) == 1:
+        _print_one(console, sources[0], outcomes[0])
+        return
+    _print_outcomes(console, outcomes)
+
+
+@app.command("list")
+def list_(folder: Annotated[Path, typer.Argument(help="Folder of a data set.")]) -> None:
+    """Show the tasks of a data set."""
+    with _mended():
+        dataset = Dataset.load(folder)
+    table = Table("task", "split", "category", "rows", "steps", "instruction")
+    for record in dataset.records:
+        task = record.task
+        table.add_row(
+            task.task_id,
+            record.split,
+            task.category.value,
+            str(len(task.table)),
+            str(len(record.oracle)),
+            task.instruction,
+        )
+    Console().print(table)
+
+
+def _sources(bddl: Path | None, activity: str, jsonl: Path | None) -> Iterator[SourceText]:
+    if sum(map(bool, (bddl, activity, jsonl))) != 1:
+        raise SourceError("expected exactly one of --bddl FILE, --activity NAME and --jsonl FILE")
+    if bddl is not None:
+        yield read_file(bddl)
+    elif jsonl is not None:
+        yield from read_jsonl(jsonl)
+    elif activity == EVERY_ACTIVITY:
+        yield from map(read_activity, activity_names())
+    else:
+        yield read_activity(activity)
+
+
+def _judged(
+    console: Console, sources: list[SourceText], bases: list[Scene], seed: int, *, bind_only: bool
+) -> list[Imported | Verified | Refusal]:
+    outcomes: list[Imported | Verified | Refusal] = []
+    with _progress(console) as bars, contextlib.closing(PlacementLibrary()) as library:
+        bar = bars.add_task("problems", total=len(sources))
+        for source in sources:
+            bound = bind_first(source, bases, seed=seed)
+            if bind_only or isinstance(bound, Refusal):
+                outcomes.append(bound)
+            else:
+                outcomes.append(verify(bound, library, seed=seed))
+            bars.advance(bar)
+    return outcomes
+
+
+def _print_one(console: Console, source: SourceText, outcome: Imported | Verified | Refusal) -> None:
+    if isinstance(outcome, Refusal):
+        _fail(f"{source.name} is refused ({outcome.reason}): {outcome.sentence}")
+    task = outcome.record.task if isinstance(outcome, Verified) else outcome.task
+    console.print(
+        f"{task.task_id}: {task.instruction}\n  goal: {task.goal_bddl}", highlight=False, markup=False
+    )
+    if isinstance(outcome, Verified):
+        for call in outcome.record.oracle:
+            console.print("  " + " ".join(map(str, call.values())), highlight=False, markup=False)
+
+
+def _print_outcomes(console: Console, outcomes: list[Imported | Verified | Refusal]) -> None:
+    counts = Counter(
+        f"refused: {item.reason}" if isinstance(item, Refusal) else type(item).__name__.lower()
+        for item in outcomes
+    )
+    table = Table("outcome", "problems")
+    for outcome, count in counts.most_common():
+        table.add_row(outcome, str(count))
+    console.print(table)
+
+
+def _print_summary(console: Console, summary: Summary) -> None:
+    table = Table("category", "train", "held out")
+    for category in TaskCategory:
+        table.add_row(
+            category.value,
+            *(str(summary.admitted.get((split, category.value), 0)) for split in ("train", "heldout")),
+        )
+    table.add_row("all", str(summary.total("train")), str(summary.total("heldout")))
+    console.print(table)
+    scenes = Table("scene", "train", "held out", "held-out rooms")
+    for scene in summary.rooms["train"]:
+        counts = (str(summary.scenes.get((split, scene), 0)) for split in ("train", "heldout"))
+        scenes.add_row(scene, *counts, ", ".join(summary.rooms["heldout"][scene]))
+    console.print(scenes)
+    refused = ", ".join(f"{count} {reason}" for reason, count in sorted(summary.rejected.items())) or "none"
+    console.print(
+        f"{summary.variants} scene variants; drafts that were not admitted: {refused}", highlight=False
+    )
+
+
+def _progress(console: Console) -> Progress:
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        console=console,
+    )
+
+
+@contextlib.contextmanager
+def _mended() -> Iterator[None]:
+    """What a person can mend is one sentence and exit status 2."""
+    try:
+        yield
+    except (BddlError, CatalogError, DatasetError, SourceError) as error:
+        _fail(str(error))
+
+
+def _fail(sentence: str) -> NoReturn:
+    Console(stderr=True).print(
+        f"embomatrix factory: {sentence}", highlight=False, markup=False, soft_wrap=True
+    )
+    raise typer.Exit(2)

@@ -1,0 +1,185 @@
+"""The importer: a BDDL problem becomes a task in a scene of its own, or a refusal with a reason."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from embomatrix.factory.editor import PlacementError, SceneEditor
+from embomatrix.factory.importer_binding import AGENT, FLOORS, bind
+from embomatrix.factory.importer_scene import with_robot_in, with_states
+from embomatrix.factory.refusal import Refusal, RefusalReason, RefusedError
+from embomatrix.factory.writer import object_table
+from embomatrix.factory.writer_view import SceneView, is_liftable
+from embomatrix.world.bddl import Literal, parse_problem
+from embomatrix.world.catalog import Catalog
+from embomatrix.world.evaluate import atoms_of, objects_of, render, substitute, types_of
+from embomatrix.world.state import Relation, State
+from embomatrix.world.task import MAX_TABLE, Task, TaskCategory
+
+if TYPE_CHECKING:
+    from embomatrix.factory.importer_binding import Addition, Binding
+    from embomatrix.factory.importer_sources import SourceText
+    from embomatrix.world.bddl import Problem
+    from embomatrix.world.goal import Atom, Formula
+    from embomatrix.world.scene import Scene
+
+CATEGORY_TRIES: Final = 4
+"""Models of a type that are tried before it counts as not fitting its place."""
+THERMAL: Final = frozenset({State.COOKED, State.FROZEN, State.HOT})
+SWITCHED: Final = frozenset({State.OPEN, State.TOGGLED_ON})
+
+
+@dataclass(frozen=True, slots=True)
+class Imported:
+    """A task bound to a scene. ``init`` is what must hold at the start; the simulator has not seen it yet."""
+
+    scene: Scene
+    task: Task
+    init: tuple[Literal, ...]
+    rooms: tuple[str, ...]
+    signature: str
+
+
+def import_problem(source: SourceText, base: Scene, *, seed: int = 0) -> Imported | Refusal:
+    """Bind a problem to a base scene. Raises BddlError when the text can't be read."""
+    problem = parse_problem(source.text)
+    digest = hashlib.sha256(f"{seed} {base.scene_id} {source.text}".encode()).digest()
+    rng = np.random.default_rng(np.random.SeedSequence(list(digest[:8])))
+    try:
+        return _Binder(source, problem, base, rng, digest.hex()[:6]).imported()
+    except RefusedError as error:
+        return error.refusal
+
+
+class _Binder:
+    """One import. ``names`` grows from the found objects to all of the problem's."""
+
+    def __init__(
+        self, source: SourceText, problem: Problem, base: Scene, rng: np.random.Generator, key: str
+    ) -> None:
+        self._source = source
+        self._problem = problem
+        self._base = base
+        self._rng = rng
+        self._scene_id = f"{base.base}-{_slug(source.name)}-{key}"
+
+    def imported(self) -> Imported:
+        binding = bind(self._problem, self._base, self._rng)
+        editor = SceneEditor(self._base, self._rng)
+        names = dict(binding.found)
+        for addition in binding.additions:
+            names[addition.name] = self._add(editor, addition, names)
+        start = self._start(names, binding)
+        scene = with_states(with_robot_in(editor.freeze(self._scene_id), binding.robot_room), start)
+        return self._task(scene, names, binding, start)
+
+    def _add(self, editor: SceneEditor, addition: Addition, names: dict[str, str]) -> str:
+        catalog = Catalog.load()
+        categories = [str(name) for name in self._rng.permutation(catalog.categories_of(addition.type))]
+        host = names[addition.host] if addition.host else addition.room
+        reasons: list[str] = []
+        for category in categories[:CATEGORY_TRIES]:
+            mass = catalog.category(category).mass_kg
+            models = list(catalog.models_of(category))
+            liftable = [model for model in models if is_liftable(model.size_m, mass)]
+            pool = liftable or models
+            model = pool[int(self._rng.integers(len(pool)))].model_id
+            try:
+                return editor.add(category, model, addition.relation, host, room=addition.room)
+            except PlacementError as error:
+                reasons.append(str(error))
+        raise RefusedError(
+            RefusalReason.DOES_NOT_FIT,
+            f"{addition.name!r} has no place {addition.relation or 'on the floor of'} {host}: {reasons[-1]}",
+        )
+
+    def _task(
+        self, scene: Scene, names: dict[str, str], binding: Binding, start: tuple[Literal, ...]
+    ) -> Imported:
+        view = SceneView(scene)
+        types = {
+            type_name: tuple(names[name] for name in self._problem.types[type_name])
+            for type_name in sorted(types_of(self._problem.goal))
+        }
+        goal = substitute(self._problem.goal, {**names, **binding.rooms})
+        about = objects_of(goal, types)
+        table = object_table(view, tuple(dict.fromkeys(names.values())), self._rng)
+        missing = about - set(table)
+        if missing:
+            raise RefusedError(
+                RefusalReason.TABLE_TOO_LONG,
+                f"the goal is about {len(about)} objects: a table has at most {MAX_TABLE} rows",
+            )
+        task = Task(
+            task_id=self._scene_id,
+            scene_id=scene.scene_id,
+            instruction=instruction_of(self._source, self._problem),
+            category=category_of(goal),
+            goal=goal,
+            goal_bddl=render(goal),
+            table=table,
+            types=types,
+            source=self._source.source,
+        )
+        rooms = tuple(sorted({view.room(name) for name in about}))
+        return Imported(scene, task, start, rooms, signature_of(goal, view))
+
+    def _start(self, names: dict[str, str], binding: Binding) -> tuple[Literal, ...]:
+        """``:init`` in the scene's names, without floors, the robot and the absence of relations and heat."""
+        skipped = {
+            name
+            for name, type_name in self._problem.objects.items()
+            if type_name == AGENT or type_name in FLOORS
+        }
+        return tuple(
+            Literal(_renamed(literal, {**names, **binding.rooms}), literal.positive)
+            for literal in self._problem.init
+            if not skipped & set(literal.atom.args)
+            and (literal.positive or literal.atom.predicate in SWITCHED)
+        )
+
+
+def _renamed(literal: Literal, names: dict[str, str]) -> Atom:
+    return dataclasses.replace(literal.atom, args=tuple(names.get(arg, arg) for arg in literal.atom.args))
+
+
+def instruction_of(source: SourceText, problem: Problem) -> str:
+    """What a person asks for. The paper's tasks carry it as the problem's name, with underscores for spaces."""
+    words = source.request or problem.name
+    words = re.sub(r"-\d+$", "", words)
+    words = re.sub(r"\.n\.\d+(_\d+)?", "", words)
+    words = re.sub(r"_(?!\d+(?:_|$|\W))", " ", words)  # rooms keep their number: kitchen_0
+    words = re.sub(r"(?<=\d)_", " ", words).strip(" .")
+    return f"{words[:1].upper()}{words[1:]}."
+
+
+def category_of(goal: Formula) -> TaskCategory:
+    """Which of the paper's four kinds a goal is."""
+    predicates = {atom.predicate for atom in atoms_of(goal)}
+    moves = bool(predicates & set(Relation))
+    switches = bool(predicates & SWITCHED)
+    if predicates & THERMAL:
+        outside = {Relation.ONTOP, Relation.UNDER, Relation.NEXTTO, State.OPEN} & predicates
+        return TaskCategory.COMPOUND if outside else TaskCategory.KITCHEN_OPERATION
+    if moves and switches:
+        return TaskCategory.COMPOUND
+    return TaskCategory.APPLIANCE_USE if switches else TaskCategory.PICK_AND_PLACE
+
+
+def signature_of(goal: Formula, view: SceneView) -> str:
+    """Kind of a goal: its predicates over categories, sorted. Variables stand for their type."""
+    signs = []
+    for atom in atoms_of(goal):
+        args = (view.category(arg) if arg in view.scene.by_name else arg.lstrip("?") for arg in atom.args)
+        signs.append(f"{atom.predicate}({','.join(args)})")
+    return " ".join(sorted(signs))
+
+
+def _slug(name: str) -> str:
+    return re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")[:40]

@@ -1,0 +1,63 @@
+"""Imports of many problems: each is bound to the first scene that has what it needs, then judged in the simulator."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from embomatrix.factory.admission import Admitted, admit
+from embomatrix.factory.importer import Imported, import_problem
+from embomatrix.factory.pipeline import cache_poses
+from embomatrix.sim.executor import Simulator
+from embomatrix.sim.planner import find_plan
+from embomatrix.skills.parse import plan_to_json
+from embomatrix.world.bundle import Bundle, bundle_digest, encode_bundle
+from embomatrix.world.dataset import TaskRecord
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from embomatrix.factory.importer_sources import SourceText
+    from embomatrix.factory.refusal import Refusal
+    from embomatrix.sim.pose_cache import PlacementLibrary
+    from embomatrix.world.scene import Scene
+
+
+@dataclass(frozen=True, slots=True)
+class Verified:
+    """An imported task that was admitted, with its bundle."""
+
+    record: TaskRecord
+    bundle: bytes
+
+
+def bind_first(source: SourceText, bases: Sequence[Scene], *, seed: int = 0) -> Imported | Refusal:
+    """The problem in the first scene that it can be bound to, else the last scene's refusal. Raises BddlError."""
+    outcome: Imported | Refusal | None = None
+    for base in bases:
+        outcome = import_problem(source, base, seed=seed)
+        if isinstance(outcome, Imported):
+            return outcome
+    if outcome is None:
+        raise ValueError("no scene to bind to: expected at least one")
+    return outcome
+
+
+def verify(imported: Imported, library: PlacementLibrary, *, seed: int = 0) -> Verified | Refusal:
+    """Judge an imported task by execution, and pack it when it is admitted."""
+    poses = cache_poses(imported.scene, library, seed)
+    with contextlib.closing(Simulator(Bundle(imported.scene, {}, poses))) as stage:
+        verdict = admit(stage, imported.task, find_plan, imported.init)
+    if not isinstance(verdict, Admitted):
+        return verdict
+    data = encode_bundle(Bundle(imported.scene, {imported.task.task_id: imported.task}, poses))
+    record = TaskRecord(
+        task=imported.task,
+        bundle_digest=bundle_digest(data),
+        split="train",
+        oracle=tuple(plan_to_json(verdict.plan)),
+        rooms=imported.rooms,
+        signature=imported.signature,
+    )
+    return Verified(record, data)

@@ -1,0 +1,71 @@
+"""How a scene starts: where the robot stands, what is open, on, hot or frozen."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from embomatrix.factory.furnish_space import RoomSpace
+from embomatrix.factory.refusal import RefusalReason, RefusedError
+from embomatrix.world.geometry import Aabb
+from embomatrix.world.scene import RobotStart
+from embomatrix.world.state import State
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from embomatrix.world.asset import Asset
+    from embomatrix.world.bddl import Literal
+    from embomatrix.world.scene import Scene, SceneObject
+
+
+def with_robot_in(scene: Scene, room_name: str) -> Scene:
+    """The scene with the robot on the free floor nearest to the middle of a room. Raises RefusedError without one."""
+    if scene.robot.room == room_name:
+        return scene
+    room = next(room for room in scene.rooms if room.name == room_name)
+    space = RoomSpace(room, scene.doorways)
+    for item in scene.objects:
+        if item.room == room_name:
+            box = _box(item, scene.assets[item.asset_id])
+            space.solids.append((*box.low_m, *box.high_m))
+    cells = space.free_cells()  # (n, 2)
+    if not len(cells):
+        raise RefusedError(
+            RefusalReason.DOES_NOT_FIT, f"the robot finds no free floor in {room_name} that a door leads to"
+        )
+    x, y = cells[np.argmin(np.hypot(*(cells - np.asarray(room.center_m)).T))]
+    return dataclasses.replace(scene, robot=RobotStart(float(x), float(y), 0.0, room_name))
+
+
+def with_states(scene: Scene, literals: Iterable[Literal]) -> Scene:
+    """The scene with doors and symbolic states as the literals say. Relations are passed over."""
+    shares: dict[str, float] = {}
+    gained: dict[str, set[State]] = {}
+    lost: dict[str, set[State]] = {}
+    for literal in literals:
+        if literal.atom.predicate not in set(State):
+            continue
+        name, state = literal.atom.args[0], State(literal.atom.predicate)
+        if state is State.OPEN:
+            shares[name] = float(literal.positive)
+        else:
+            (gained if literal.positive else lost).setdefault(name, set()).add(state)
+
+    def changed(item: SceneObject) -> SceneObject:
+        joints = item.joints
+        if item.name in shares:
+            joints = (shares[item.name],) * len(scene.assets[item.asset_id].joints)
+        states = (item.states | gained.get(item.name, set())) - lost.get(item.name, set())
+        if joints == item.joints and states == item.states:
+            return item
+        return dataclasses.replace(item, joints=joints, states=states)
+
+    return dataclasses.replace(scene, objects=tuple(changed(item) for item in scene.objects))
+
+
+def _box(item: SceneObject, asset: Asset) -> Aabb:
+    """Bounding box in the world with every joint shut."""
+    return Aabb.around(part.aabb(item.pose_world_asset) for link in asset.links for part in link.parts)

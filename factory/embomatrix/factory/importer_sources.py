@@ -1,0 +1,74 @@
+"""Where BDDL problems come from: BEHAVIOR-1K's activities, a file, or a JSONL file as the paper's factory wrote it."""
+
+from __future__ import annotations
+
+import difflib
+import importlib.util
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+
+class SourceError(ValueError):
+    """A source can't be read. The message is a sentence with the remedy."""
+
+
+@dataclass(frozen=True, slots=True)
+class SourceText:
+    """One problem as text. ``request`` is what a person says, empty where the problem's own name says it."""
+
+    name: str
+    text: str
+    source: str
+    request: str = ""
+
+
+def activity_names() -> tuple[str, ...]:
+    """Names of the activities of the installed ``bddl`` package. Raises SourceError when it is not installed."""
+    return tuple(sorted(path.parent.name for path in _definitions().glob("*/problem0.bddl")))
+
+
+def read_activity(name: str) -> SourceText:
+    """One activity of BEHAVIOR-1K. Raises SourceError with close names when there is none of this name."""
+    path = _definitions() / name / "problem0.bddl"
+    if "/" in name or not path.is_file():
+        close = difflib.get_close_matches(name, activity_names(), n=3)
+        hint = f"did you mean {', '.join(close)}?" if close else "see the package's activity_manifest.txt"
+        raise SourceError(f"there is no activity {name!r} in the bddl package: {hint}")
+    return SourceText(name, path.read_text(encoding="utf-8"), "behavior-1k", request=name.replace("_", " "))
+
+
+def read_file(path: Path) -> SourceText:
+    """A ``.bddl`` file. Raises SourceError when it can't be read."""
+    try:
+        return SourceText(path.stem, path.read_text(encoding="utf-8"), "file")
+    except (OSError, UnicodeDecodeError) as error:
+        raise SourceError(f"{path} can't be read: {getattr(error, 'strerror', None) or error}") from error
+
+
+def read_jsonl(path: Path) -> Iterator[SourceText]:
+    """Problems of a JSONL file with the fields ``name`` and ``bddl``. Raises SourceError naming the line."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise SourceError(f"{path} can't be read: {getattr(error, 'strerror', None) or error}") from error
+    for number, line in enumerate(lines, start=1):
+        if not line.strip():
+            continue
+        try:
+            record = json.loads(line)
+            name, text = record["name"], record["bddl"]
+        except (ValueError, KeyError, TypeError) as error:
+            raise SourceError(f"{path}:{number}: expected an object with 'name' and 'bddl'") from error
+        yield SourceText(str(name), str(text), "embomatrix")
+
+
+def _definitions() -> Path:
+    spec = importlib.util.find_spec("bddl")
+    if spec is None or spec.origin is None:
+        raise SourceError("the activities of BEHAVIOR-1K are in the bddl package: pip install 'bddl==3.6.0'")
+    return Path(spec.origin).parent / "activity_definitions"

@@ -1,0 +1,123 @@
+"""What a build has done so far, on disk: one line a variant, so that a build that was cut short goes on from there."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Any, Final
+
+from embomatrix.factory.refusal import RefusalReason
+from embomatrix.world.dataset import (
+    BUNDLES_FOLDER,
+    DatasetError,
+    TaskRecord,
+    bundle_file,
+    record_from_json,
+    record_to_json,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+BUILD_FILE: Final = "build.jsonl"
+REJECTIONS_FILE: Final = "rejections.jsonl"
+
+
+@dataclass(frozen=True, slots=True)
+class Rejection:
+    """A draft that was not admitted."""
+
+    scene: str
+    category: str
+    instruction: str
+    goal: str
+    reason: RefusalReason
+    sentence: str
+
+
+@dataclass(frozen=True, slots=True)
+class VariantResult:
+    """What one variant yielded."""
+
+    split: str
+    number: int
+    records: tuple[TaskRecord, ...]
+    rejections: tuple[Rejection, ...]
+
+
+@dataclass
+class BuildStore:
+    """The folder of a build. The first line of its file holds the settings, each other line a variant."""
+
+    folder: Path
+    results: list[VariantResult] = field(default_factory=list)
+
+    @staticmethod
+    def open(folder: Path, settings: Mapping[str, Any]) -> BuildStore:
+        """Start a build or take one up again. Raises DatasetError when the folder holds one of other settings."""
+        wanted = json.loads(json.dumps(settings))
+        path = folder / BUILD_FILE
+        try:
+            (folder / BUNDLES_FOLDER).mkdir(parents=True, exist_ok=True)
+            if not path.exists():
+                path.write_text(json.dumps({"settings": wanted}) + "\n", encoding="utf-8")
+            first, *lines = path.read_text(encoding="utf-8").splitlines()
+            found = json.loads(first)["settings"]
+        except (OSError, ValueError, KeyError) as error:
+            raise DatasetError(f"{path} can't be used: {error}; choose another folder") from error
+        if found != wanted:
+            raise DatasetError(f"{folder} holds a build of other settings, {found}: choose another folder")
+        return BuildStore(folder, _whole(path, lines))
+
+    def has(self, split: str, number: int) -> bool:
+        return any(result.split == split and result.number == number for result in self.results)
+
+    def records_of(self, split: str) -> list[TaskRecord]:
+        return [record for result in self.results if result.split == split for record in result.records]
+
+    def add(self, result: VariantResult, bundle: bytes) -> None:
+        """Keep a variant's result. The bundle goes first: a line in the file means that it is there."""
+        if result.records:
+            path = self.folder / BUNDLES_FOLDER / bundle_file(result.records[0].bundle_digest)
+            path.write_bytes(bundle)
+        with (self.folder / BUILD_FILE).open("a", encoding="utf-8") as file:
+            file.write(json.dumps(_to_json(result)) + "\n")
+        self.results.append(result)
+
+    def write_rejections(self) -> None:
+        lines = [json.dumps(asdict(item)) for result in self.results for item in result.rejections]
+        text = "".join(f"{line}\n" for line in lines)
+        (self.folder / REJECTIONS_FILE).write_text(text, encoding="utf-8")
+
+
+def _whole(path: Path, lines: list[str]) -> list[VariantResult]:
+    """Results of the lines. A last line that was cut short is dropped from the file: its variant is made again."""
+    results: list[VariantResult] = []
+    for number, line in enumerate(lines):
+        try:
+            results.append(_from_json(json.loads(line)))
+        except ValueError as error:
+            if number != len(lines) - 1:
+                raise DatasetError(f"{path}:{number + 2}: {error}; choose another folder") from error
+            kept = path.read_text(encoding="utf-8").splitlines()[:-1]
+            path.write_text("".join(f"{item}\n" for item in kept), encoding="utf-8")
+    return results
+
+
+def _to_json(result: VariantResult) -> dict[str, Any]:
+    return {
+        "split": result.split,
+        "number": result.number,
+        "records": [record_to_json(record) for record in result.records],
+        "rejections": [asdict(item) for item in result.rejections],
+    }
+
+
+def _from_json(value: dict[str, Any]) -> VariantResult:
+    return VariantResult(
+        value["split"],
+        value["number"],
+        tuple(record_from_json(record) for record in value["records"]),
+        tuple(Rejection(**{**item, "reason": RefusalReason(item["reason"])}) for item in value["rejections"]),
+    )
