@@ -50,7 +50,7 @@ class FakeScene:
             case "raise":
                 raise ArithmeticError("x" * 600)
             case "grow":
-                self._ballast = bytearray(b"x" * (150 * 1024 * 1024))
+                self._ballast = bytearray(b"x") * (150 * 1024 * 1024)
             case "greedy":
                 self._ballast = bytearray(4 * 1024 * 1024 * 1024)
             case "orphan":

@@ -43,6 +43,12 @@ def test_a_wrong_option_is_named_with_what_was_expected():
     assert "greater than or equal to 0" in result.stderr
 
 
+def test_a_wrong_address_is_told_what_one_looks_like():
+    result = _worker("run", "--manager=nowhere")
+    assert result.returncode == 2
+    assert "--manager 'nowhere': expected HOST:PORT, as in 127.0.0.1:50070" in result.stderr
+
+
 def test_the_doctor_reports_what_it_found_and_what_is_missing():
     result = _worker("doctor", "--manager=127.0.0.1:1")
     assert result.returncode == 2

@@ -213,6 +213,27 @@ async def test_a_drain_finishes_what_runs_then_leaves(tmp_path):
     assert manager.states[-1].draining
 
 
+async def test_a_drain_without_a_manager_and_without_work_leaves_at_once(tmp_path):
+    daemon = _daemon("127.0.0.1:1", tmp_path)
+    task = asyncio.create_task(daemon.run())
+    await asyncio.sleep(1.0)
+    daemon.stop()
+    await asyncio.wait_for(task, 2)
+
+
+async def test_a_drain_delivers_its_last_results_to_a_manager_that_comes_back(tmp_path):
+    manager = FakeManager(acknowledging=False)
+    digest = manager.bundle(b"ok")
+    async with joined(manager, tmp_path) as (daemon, task):
+        manager.lease("l1", digest)
+        await _until(lambda: manager.results)
+        manager.break_stream()
+        manager.acknowledging = True
+        daemon.stop()
+        await asyncio.wait_for(task, 10)
+    assert _done(manager) == ["l1", "l1"]
+
+
 async def test_the_manager_may_ask_for_a_drain(tmp_path):
     manager = FakeManager()
     async with joined(manager, tmp_path) as (_, task):

@@ -12,7 +12,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn
 
 import numpy as np
 import typer
@@ -28,6 +28,9 @@ from embomatrix.worker.processes import ProcessGoneError, start_root
 from embomatrix.worker.resources import measure
 from embomatrix.worker.settings import WorkerSettings
 
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
 app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
@@ -35,6 +38,12 @@ app = typer.Typer(
     help="Lend this machine's cores to a manager.",
 )
 console = Console()
+
+EXPECTED: Final[Mapping[str, str]] = {
+    "manager": f"expected HOST:PORT, as in {DEFAULT_ADDRESS}",
+    "name": "expected up to 64 letters, digits, '.', '_' and '-'",
+}
+"""What to say of a wrong value where the validator only knows a pattern."""
 
 Manager = Annotated[str, typer.Option(help="HOST:PORT of the manager.")]
 Token = Annotated[
@@ -152,8 +161,9 @@ def _settings(values: dict[str, Any]) -> WorkerSettings:
         return WorkerSettings(**values)
     except ValidationError as error:
         first = error.errors()[0]
-        option = "--" + str(first["loc"][0]).replace("_", "-")
-        _fail(f"{option} {first['input']!r}: {first['msg'][:1].lower()}{first['msg'][1:]}")
+        name = str(first["loc"][0])
+        expected = EXPECTED.get(name) or first["msg"][:1].lower() + first["msg"][1:]
+        _fail(f"--{name.replace('_', '-')} {first['input']!r}: {expected}")
 
 
 def _fail(sentence: str) -> NoReturn:

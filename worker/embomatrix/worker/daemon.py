@@ -37,6 +37,8 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 FENCE_CHECK_S: Final = 0.5
+DRAIN_RETRY_S: Final = 1.0
+"""While it drains, a worker tries to deliver its last results at least this often."""
 TAKEOVERS_ALLOWED: Final = 3
 """After so many takeovers within a minute, another daemon evidently bears the same name."""
 TAKEOVER_WINDOW_S: Final = 60.0
@@ -129,7 +131,7 @@ class Daemon:
 
     async def _stay_connected(self) -> None:
         """Connect, and connect again, until the worker has drained."""
-        while True:
+        while not (self._draining.is_set() and self._owes_nothing()):
             try:
                 if self._registration is None:
                     self._registration = await self._register()
@@ -139,11 +141,23 @@ class Daemon:
                 self._give_up_leases(str(error))
                 self._count_takeover(error)
             except _PASSING as error:
-                if self._settings.once or self._draining.is_set():
+                if self._settings.once:
                     raise
-                wait_s = self._backoff.next_s()
-                logger.warning("%s (next attempt in %.1f s)", error, wait_s)
-                await asyncio.sleep(wait_s)
+                await self._wait_before_next(error)
+
+    async def _wait_before_next(self, error: ClusterError) -> None:
+        """Wait, longer each time; a drain ends the wait."""
+        wait_s = self._backoff.next_s()
+        if self._draining.is_set():
+            await asyncio.sleep(min(wait_s, DRAIN_RETRY_S))
+            return
+        logger.warning("%s (next attempt in %.1f s)", error, wait_s)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(wait_s):
+                await self._draining.wait()
+
+    def _owes_nothing(self) -> bool:
+        return not self._pool.held() and not len(self._outbox)
 
     async def _register(self) -> Registration:
         registration = await register(

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
 MEMORY_SHARE: Final = 0.4
 """Share of the free memory that residents may use when nothing else is said."""
-REFERENCE_S: Final = 0.02
-"""Seconds that the probe takes on a machine of score 1."""
+REFERENCE_S: Final = 0.0065
+"""Seconds that the probe takes on a machine of score 1: a core of a cloud machine of 2026."""
 GPU_QUERY_S: Final = 5.0
 
 
