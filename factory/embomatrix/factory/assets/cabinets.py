@@ -1,0 +1,204 @@
+"""Things with a cavity and a front: cabinets, fridges, ovens, open shelving, chests with a lid, plain open boxes."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.factory.assets.body import FIT_M, Body, Hinge, Walls, centred, clamp, hinged, region, shell
+from embomatrix.factory.assets.furniture import slab
+from embomatrix.factory.assets.shapes import box
+from embomatrix.world.geometry import Aabb
+
+if TYPE_CHECKING:
+    from embomatrix.world.geometry import Part, Vec2, Vec3
+
+MAX_PARTS: Final = 16
+"""Bullet drops further parts of one link without a word."""
+
+
+class Front(StrEnum):
+    """What closes the front."""
+
+    OPEN = "open"
+    SIDE_HINGED = "side_hinged"
+    DROP_DOWN = "drop_down"
+
+
+@dataclass(frozen=True, slots=True)
+class CabinetStyle:
+    """Proportions of a family of cabinets, in metres.
+
+    ``tier_m`` is the height that one shelf compartment should have; ``bay_m`` the greatest width of a door pair;
+    ``plinth_m`` lifts the door off the floor; ``head_m`` is a strip above it and ``panel_share`` the share of the width
+    that a control panel takes at the left.
+    """
+
+    front: Front
+    wall_m: float
+    tier_m: float
+    plinth_m: float = 0.0
+    head_m: float = 0.0
+    panel_share: float = 0.0
+    bay_m: float = 1.1
+    single_door_m: float = 0.62
+
+
+CUPBOARD: Final = CabinetStyle(Front.SIDE_HINGED, wall_m=0.018, tier_m=0.34, plinth_m=0.06)
+WALL_CUPBOARD: Final = CabinetStyle(Front.SIDE_HINGED, wall_m=0.018, tier_m=0.36)
+LOCKER: Final = CabinetStyle(Front.SIDE_HINGED, wall_m=0.018, tier_m=0.9, plinth_m=0.04, bay_m=0.5)
+FRIDGE: Final = CabinetStyle(Front.SIDE_HINGED, wall_m=0.045, tier_m=0.38, plinth_m=0.08, single_door_m=0.85)
+MICROWAVE: Final = CabinetStyle(
+    Front.SIDE_HINGED, wall_m=0.018, tier_m=1.0, panel_share=0.2, single_door_m=9.0, bay_m=9.0
+)
+WASHER: Final = CabinetStyle(
+    Front.SIDE_HINGED, wall_m=0.045, tier_m=2.0, plinth_m=0.1, head_m=0.12, single_door_m=9.0, bay_m=9.0
+)
+FREEZER: Final = CabinetStyle(Front.OPEN, wall_m=0.045, tier_m=0.4, plinth_m=0.08)
+"""Without a door: BEHAVIOR-1K does not call these categories openable, yet things are kept inside them."""
+OVEN: Final = CabinetStyle(Front.DROP_DOWN, wall_m=0.03, tier_m=0.3, plinth_m=0.05, head_m=0.07)
+DISHWASHER: Final = CabinetStyle(Front.DROP_DOWN, wall_m=0.03, tier_m=0.28, plinth_m=0.08, head_m=0.05)
+SHELVING: Final = CabinetStyle(Front.OPEN, wall_m=0.02, tier_m=0.32, plinth_m=0.05, bay_m=1.3)
+CUBBY: Final = CabinetStyle(Front.OPEN, wall_m=0.018, tier_m=0.35, plinth_m=0.06, bay_m=1.3)
+WARDROBE: Final = CabinetStyle(Front.OPEN, wall_m=0.022, tier_m=1.1, plinth_m=0.06, bay_m=1.3)
+
+
+def cabinet(size_m: Vec3, style: CabinetStyle) -> Body:
+    """Box with shelves, in bays of one or two doors; its top carries things too."""
+    body = Body()
+    outer = centred(size_m)
+    wall = min(style.wall_m, 0.08 * min(size_m))
+    door_m = 0.0 if style.front is Front.OPEN else clamp(0.06 * size_m[0], min(0.006, wall), min(0.02, wall))
+    frame = Aabb(outer.low_m, (outer.high_m[0] - door_m, *outer.high_m[1:]))
+    walls = _walls(size_m, style, wall)
+    body.parts, cavity = shell(frame, walls)
+    if style.panel_share:
+        low = (frame.high_m[0], outer.high_m[1] - walls.left, outer.low_m[2])
+        body.parts.append(box(low, outer.high_m))
+    spans = _bays(cavity, style, max(wall, 2 * door_m))
+    for (_, before), (after, _) in itertools.pairwise(spans):
+        body.parts.append(_upright(cavity, before, after))
+    opening = region(
+        (outer.high_m[0] - door_m, outer.high_m[0]),
+        (outer.low_m[1], outer.high_m[1] - (walls.left if style.panel_share else 0.0)),
+        (outer.low_m[2] + _plinth(size_m, style), outer.high_m[2] - _head(size_m, style)),
+    )
+    edges = [opening.low_m[1], *((a[1] + b[0]) / 2 for a, b in itertools.pairwise(spans)), opening.high_m[1]]
+    boards = (MAX_PARTS - len(body.parts)) // len(spans)
+    for number, (span, reach) in enumerate(zip(spans, itertools.pairwise(edges), strict=True), start=1):
+        prefix = f"bay{number}_" if len(spans) > 1 else ""
+        doors = _doors(body, style, opening, reach, prefix)
+        bay = region((cavity.low_m[0], cavity.high_m[0]), span, (cavity.low_m[2], cavity.high_m[2]))
+        _add_tiers(body, bay, style.tier_m, boards, prefix, doors)
+    body.add_support("top", frame.low_m[:2], frame.high_m[:2], frame.high_m[2])
+    return body
+
+
+def shelving(size_m: Vec3) -> Body:
+    """Open shelves; a low model is a single wall board."""
+    if size_m[2] < 0.2:
+        return slab(size_m)
+    return cabinet(size_m, SHELVING)
+
+
+def _plinth(size_m: Vec3, style: CabinetStyle) -> float:
+    return min(style.plinth_m, 0.1 * size_m[2])
+
+
+def _head(size_m: Vec3, style: CabinetStyle) -> float:
+    return min(style.head_m, 0.12 * size_m[2])
+
+
+def _walls(size_m: Vec3, style: CabinetStyle, wall: float) -> Walls:
+    return Walls(
+        back=wall,
+        front=0.0,
+        right=wall,
+        left=max(wall, style.panel_share * size_m[1]),
+        bottom=wall + _plinth(size_m, style),
+        top=wall + _head(size_m, style),
+    )
+
+
+def _bays(cavity: Aabb, style: CabinetStyle, divider_m: float) -> list[Vec2]:
+    """Intervals along y between the dividers; a divider covers the edges of two open doors."""
+    low, high = cavity.low_m[1], cavity.high_m[1]
+    count = int(clamp(round((high - low) / style.bay_m), 1, 4))
+    width = (high - low - (count - 1) * divider_m) / count
+    return [(low + k * (width + divider_m), low + k * (width + divider_m) + width) for k in range(count)]
+
+
+def _upright(cavity: Aabb, before: float, after: float) -> Part:
+    return box((cavity.low_m[0], before, cavity.low_m[2]), (cavity.high_m[0], after, cavity.high_m[2]))
+
+
+def _doors(body: Body, style: CabinetStyle, opening: Aabb, reach: Vec2, prefix: str) -> tuple[str, ...]:
+    """Add the doors of one bay and return their names."""
+    if style.front is Front.OPEN:
+        return ()
+    (x0, _, z0), (x1, _, z1) = opening.low_m, opening.high_m
+    y0, y1 = reach
+    gap = min(FIT_M, 0.2 * (x1 - x0))
+    x = (x0 + gap, x1)
+    if style.front is Front.DROP_DOWN:
+        doors = [hinged(f"{prefix}door", region(x, reach, (z0, z1)), Hinge.BOTTOM)]
+    elif y1 - y0 <= style.single_door_m:
+        doors = [hinged(f"{prefix}door", region(x, reach, (z0, z1)), Hinge.RIGHT)]
+    else:
+        middle = (y0 + y1) / 2
+        doors = [
+            hinged(f"{prefix}right_door", region(x, (y0, middle - gap / 2), (z0, z1)), Hinge.RIGHT),
+            hinged(f"{prefix}left_door", region(x, (middle + gap / 2, y1), (z0, z1)), Hinge.LEFT),
+        ]
+    body.moving.extend(doors)
+    return tuple(door.name for door in doors)
+
+
+def _add_tiers(
+    body: Body, bay: Aabb, tier_m: float, boards: int, prefix: str, doors: tuple[str, ...]
+) -> None:
+    """Divide a bay into shelf compartments of equal height, with at most ``boards`` shelf boards."""
+    (x0, y0, z0), (x1, y1, z1) = bay.low_m, bay.high_m
+    count = int(clamp(round((z1 - z0) / tier_m), 1, boards + 1))
+    board = clamp(0.02 * (z1 - z0), 0.006, 0.016)
+    height = (z1 - z0 - (count - 1) * board) / count
+    for tier in range(count):
+        floor = z0 + tier * (height + board)
+        name = f"{prefix}shelf{tier + 1}" if count > 1 else f"{prefix}inside"
+        body.add_interior(name, region((x0, x1), (y0, y1), (floor, floor + height)), doors, open_above=False)
+        if tier:
+            body.parts.append(box((x0, y0, floor - board), (x1 - FIT_M, y1, floor)))
+
+
+def chest(size_m: Vec3, lid_share: float = 0.12) -> Body:
+    """Box with a lid that is hinged at the back and opens by a quarter turn."""
+    body = Body()
+    outer = centred(size_m)
+    wall = clamp(0.05 * min(size_m[:2]), 0.003, 0.025)
+    lid = min(wall, lid_share * size_m[2])
+    z1 = outer.high_m[2] - lid
+    carcass = Aabb(outer.low_m, (*outer.high_m[:2], z1))
+    body.parts, cavity = shell(carcass, Walls(wall, wall, wall, wall, min(wall, 0.1 * size_m[2]), 0.0))
+    gap = min(FIT_M, 0.2 * lid)
+    body.moving.append(hinged("lid", Aabb((*outer.low_m[:2], z1 + gap), outer.high_m), Hinge.BACK))
+    body.add_interior("inside", cavity, ("lid",), open_above=False)
+    return body
+
+
+SHALLOW_M: Final = 0.025
+"""A rim lower than this holds nothing in: a tray has a surface, not an inside."""
+
+
+def open_box(size_m: Vec3) -> Body:
+    """Box without a lid: baskets, crates, bins, tubs, trays."""
+    body = Body()
+    wall = clamp(0.04 * min(size_m[:2]), 0.003, 0.05)
+    floor = clamp(0.06 * size_m[2], 0.002, 0.04)
+    body.parts, cavity = shell(centred(size_m), Walls(wall, wall, wall, wall, floor, 0.0))
+    if cavity.size_m[2] >= SHALLOW_M:
+        body.add_interior("inside", cavity, open_above=True)
+    else:
+        body.add_support("floor", cavity.low_m[:2], cavity.high_m[:2], cavity.low_m[2])
+    return body

@@ -1,0 +1,264 @@
+"""Sinks, baths, toilets, stoves, doors, windows, screens, plants, vehicles: what a building is equipped with."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.factory.assets.body import (
+    FIT_M,
+    Body,
+    Hinge,
+    Walls,
+    centred,
+    clamp,
+    hinged,
+    region,
+    shell,
+    sliding,
+)
+from embomatrix.factory.assets.shapes import box, frustum, lump, prism
+from embomatrix.world.geometry import Aabb
+
+if TYPE_CHECKING:
+    from embomatrix.world.geometry import Part, Vec2, Vec3
+
+_TAP_M: Final = 0.2
+_BASIN_DEPTH_M: Final = 0.18
+
+
+def furniture_sink(size_m: Vec3) -> Body:
+    """Base cabinet with a basin in its top, worktop on both sides, and a tap behind."""
+    return _sink(size_m, basins=1, basin_width_m=0.6)
+
+
+def multi_sink(size_m: Vec3) -> Body:
+    """A row of basins."""
+    return _sink(size_m, basins=int(clamp(round(size_m[1] / 0.8), 1, 3)), basin_width_m=0.5)
+
+
+def _sink(size_m: Vec3, basins: int, basin_width_m: float) -> Body:
+    """Block from the floor to the worktop with basins let in; rims and worktop carry things."""
+    outer = centred(size_m)
+    (x0, y0, z0), (x1, y1, z1) = outer.low_m, outer.high_m
+    deck = z1 - min(_TAP_M, 0.3 * size_m[2])
+    depth = min(_BASIN_DEPTH_M, 0.6 * (deck - z0))
+    back, front = x0 + 0.2 * size_m[0], x1 - 0.08 * size_m[0]
+    pitch = size_m[1] / basins
+    half = min(basin_width_m, 0.8 * pitch) / 2
+    body = Body()
+    body.parts = [
+        box((x0, y0, z0), (x1, y1, deck - depth)),
+        box((x0, y0, deck - depth), (back, y1, deck)),
+        box((front, y0, deck - depth), (x1, y1, deck)),
+    ]
+    centres = [y0 + (k + 0.5) * pitch for k in range(basins)]
+    edges = [y0, *(y for centre in centres for y in (centre - half, centre + half)), y1]
+    for number, (low, high) in enumerate(zip(edges[::2], edges[1::2], strict=True), start=1):
+        body.parts.append(box((back, low, deck - depth), (front, high, deck)))
+        body.add_support(f"worktop{number}", (x0 if number == 1 else back, low), (x1, high), deck)
+    for number, y in enumerate(centres, start=1):
+        name = "basin" if basins == 1 else f"basin{number}"
+        body.add_interior(
+            name, region((back, front), (y - half, y + half), (deck - depth, deck)), open_above=True
+        )
+        body.parts.extend(_tap((x0 + 0.06 * size_m[0], y), back + 0.35 * (front - back), (deck, z1)))
+    return body
+
+
+def _tap(foot: Vec2, reach: float, z: Vec2) -> list[Part]:
+    x, y = foot
+    r = clamp(0.08 * (z[1] - z[0]), 0.006, 0.015)
+    return [
+        box((x - r, y - r, z[0]), (x + r, y + r, z[1])),
+        box((x + r, y - r, z[1] - 2 * r), (reach, y + r, z[1])),
+    ]
+
+
+def pedestal_sink(size_m: Vec3) -> Body:
+    """A single basin on a column, or on a bracket where it hangs on a wall."""
+    outer = centred(size_m)
+    (x0, y0, z0), (x1, y1, z1) = outer.low_m, outer.high_m
+    deck = z1 - min(_TAP_M, 0.3 * size_m[2])
+    depth = min(_BASIN_DEPTH_M, 0.5 * (deck - z0))
+    wall = clamp(0.07 * min(size_m[:2]), 0.02, 0.05)
+    body = Body()
+    bowl = Aabb((x0, y0, deck - depth), (x1, y1, deck))
+    body.parts, cavity = shell(bowl, Walls(0.22 * size_m[0], wall, wall, wall, 0.03, 0.0))
+    body.parts.append(
+        box((x0, -0.12 * size_m[1], z0), (x0 + 0.5 * size_m[0], 0.12 * size_m[1], deck - depth))
+    )
+    body.parts.extend(_tap((x0 + 0.1 * size_m[0], 0.0), cavity.center_m[0], (deck, z1)))
+    body.add_interior("basin", cavity, open_above=True)
+    body.add_support("rim", (x0, y0), (x0 + 0.22 * size_m[0], y1), deck)
+    return body
+
+
+def tub(size_m: Vec3) -> Body:
+    """Bath, pool: a block with a deep basin and thick rims."""
+    outer = centred(size_m)
+    wall = clamp(0.1 * min(size_m[:2]), 0.03, 0.3)
+    body = Body()
+    body.parts, cavity = shell(outer, Walls(wall, wall, wall, wall, clamp(0.15 * size_m[2], 0.02, 0.2), 0.0))
+    body.add_interior("basin", cavity, open_above=True)
+    (x0, y0, _), (x1, _, z1) = outer.low_m, outer.high_m
+    body.add_support("rim", (x0, y0), (x1, cavity.low_m[1]), z1)
+    return body
+
+
+def toilet(size_m: Vec3) -> Body:
+    """Bowl with a closed seat, cistern behind."""
+    (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
+    seat = z0 + clamp(0.42, 0.5 * size_m[2], 0.75 * size_m[2])
+    tank = x0 + 0.28 * size_m[0]
+    body = Body(parts=[box((tank, y0, z0), (x1, y1, seat)), box((x0, y0, z0), (tank, y1, z1))])
+    body.add_support("seat", (tank, y0), (x1, y1), seat)
+    body.add_support("cistern", (x0, y0), (tank, y1), z1)
+    return body
+
+
+def shower_stall(size_m: Vec3) -> Body:
+    """Tray with walls on three sides and an open front."""
+    outer = centred(size_m)
+    body = Body()
+    tray = clamp(0.03 * size_m[2], 0.02, 0.08)
+    body.parts, cavity = shell(outer, Walls(0.04, 0.0, 0.04, 0.04, tray, 0.0))
+    body.add_support("tray", cavity.low_m[:2], cavity.high_m[:2], cavity.low_m[2])
+    return body
+
+
+def cooktop(size_m: Vec3) -> Body:
+    """A stove, grill plate or burner: a block whose whole top is the hot surface."""
+    outer = centred(size_m)
+    body = Body(parts=[box(outer.low_m, outer.high_m)])
+    body.add_support("cooktop", outer.low_m[:2], outer.high_m[:2], outer.high_m[2])
+    return body
+
+
+def coffee_machine(size_m: Vec3) -> Body:
+    """A back with a head, over a tray that a cup stands on."""
+    outer = centred(size_m)
+    (x0, y0, z0), (x1, y1, z1) = outer.low_m, outer.high_m
+    foot, head, back = z0 + 0.08 * size_m[2], z1 - 0.3 * size_m[2], x0 + 0.4 * size_m[0]
+    body = Body(
+        parts=[
+            box((x0, y0, foot), (back, y1, z1)),
+            box((x0, y0, z0), (x1, y1, foot)),
+            box((back, y0, head), (x1, y1, z1)),
+        ]
+    )
+    body.add_interior("bay", region((back, x1), (y0, y1), (foot, head)), open_above=False)
+    body.add_support("top", (x0, y0), (x1, y1), z1)
+    return body
+
+
+def door(size_m: Vec3) -> Body:
+    """Frame of two posts and a lintel with a leaf that turns about its right edge."""
+    outer = centred(size_m)
+    body, gap = _frame(outer)
+    depth = min(0.05, 0.5 * size_m[0])
+    leaf = Aabb((gap.high_m[0] - depth, gap.low_m[1] + FIT_M, gap.low_m[2] + FIT_M), gap.high_m)
+    leaf = Aabb(leaf.low_m, (leaf.high_m[0], leaf.high_m[1] - FIT_M, leaf.high_m[2] - FIT_M))
+    body.moving.append(hinged("leaf", leaf, Hinge.RIGHT))
+    return body
+
+
+def sliding_door(size_m: Vec3) -> Body:
+    """Frame with a fixed pane on the right half and one on the left that slides before it."""
+    outer = centred(size_m)
+    body, gap = _frame(outer)
+    (x0, y0, z0), (x1, y1, z1) = gap.low_m, gap.high_m
+    third = (x1 - x0) / 3
+    body.parts.append(box((x0, y0, z0), (x0 + third, 0.0, z1)))
+    pane = Aabb((x1 - third, FIT_M, z0 + FIT_M), (x1, y1 - FIT_M, z1 - FIT_M))
+    body.moving.append(sliding("pane", pane, (0.0, -1.0, 0.0), y1 - 2 * FIT_M))
+    return body
+
+
+def garage_door(size_m: Vec3) -> Body:
+    """Frame with a leaf that is drawn up."""
+    outer = centred(size_m)
+    body, gap = _frame(outer)
+    x1 = outer.high_m[0]
+    low = (x1 - min(0.06, 0.4 * size_m[0]), gap.low_m[1] + FIT_M, gap.low_m[2] + FIT_M)
+    leaf = Aabb(low, (x1, gap.high_m[1] - FIT_M, gap.high_m[2] - FIT_M))
+    body.moving.append(sliding("leaf", leaf, (0.0, 0.0, 1.0), 0.9 * gap.size_m[2]))
+    return body
+
+
+def window(size_m: Vec3) -> Body:
+    """Frame and sill with a sash that opens to the front."""
+    outer = centred(size_m)
+    body, gap = _frame(outer, sill_m=clamp(0.05 * size_m[2], 0.02, 0.1))
+    depth = min(0.04, 0.5 * size_m[0])
+    low = (gap.high_m[0] - depth, gap.low_m[1] + FIT_M, gap.low_m[2] + FIT_M)
+    sash = Aabb(low, (gap.high_m[0], gap.high_m[1] - FIT_M, gap.high_m[2] - FIT_M))
+    body.moving.append(hinged("sash", sash, Hinge.RIGHT))
+    return body
+
+
+def _frame(outer: Aabb, sill_m: float = 0.0) -> tuple[Body, Aabb]:
+    """Two posts, a lintel and perhaps a sill, and the opening between them."""
+    post = clamp(0.05 * outer.size_m[1], 0.02, 0.1)
+    parts, gap = shell(outer, Walls(0.0, 0.0, post, post, sill_m, post))
+    return Body(parts=parts), gap
+
+
+def laptop(size_m: Vec3) -> Body:
+    """A keyboard with a screen that folds up."""
+    outer = centred(size_m)
+    half = 0.55 * size_m[2]
+    z = outer.low_m[2] + half
+    gap = 0.05 * size_m[2]
+    body = Body(parts=[box(outer.low_m, (*outer.high_m[:2], z))])
+    body.moving.append(hinged("screen", Aabb((*outer.low_m[:2], z + gap), outer.high_m), Hinge.BACK))
+    return body
+
+
+def screen(size_m: Vec3) -> Body:
+    """A panel on a foot: televisions, monitors."""
+    (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
+    panel, foot, neck = 0.25 * size_m[0], 0.03 * size_m[2], 0.15 * size_m[2]
+    return Body(
+        parts=[
+            box((x0, 0.6 * y0, z0), (x1, 0.6 * y1, z0 + foot)),
+            box((-0.5 * panel, 0.1 * y0, z0 + foot), (0.5 * panel, 0.1 * y1, z0 + neck)),
+            box((-0.5 * panel, y0, z0 + neck), (0.5 * panel, y1, z1)),
+        ]
+    )
+
+
+def plant(size_m: Vec3) -> Body:
+    """A pot with a crown of leaves."""
+    (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
+    rim = z0 + 0.3 * size_m[2]
+    return Body(
+        parts=[
+            frustum((0.0, 0.0), (0.45 * x1, 0.45 * y1), (0.62 * x1, 0.62 * y1), (z0, rim)),
+            lump(Aabb((x0, y0, rim), (x1, y1, z1))),
+        ]
+    )
+
+
+def tree(size_m: Vec3) -> Body:
+    """A trunk and a crown."""
+    (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
+    trunk, r = z0 + 0.35 * size_m[2], clamp(0.05 * min(size_m[:2]), 0.01, 0.2)
+    return Body(parts=[prism((0.0, 0.0), (r, r), (z0, trunk)), lump(Aabb((x0, y0, trunk), (x1, y1, z1)))])
+
+
+def car(size_m: Vec3) -> Body:
+    """Bonnet and cabin as blocks, and a boot behind with a lid that is hinged at the cabin."""
+    outer = centred(size_m)
+    (x0, y0, z0), (x1, y1, z1) = outer.low_m, outer.high_m
+    waist, boot = z0 + 0.62 * size_m[2], x0 + 0.22 * size_m[0]
+    lid = 0.04
+    body = Body()
+    body.parts, cavity = shell(
+        Aabb((x0, y0, z0 + 0.12 * size_m[2]), (boot, y1, waist - lid)), Walls(0.1, 0.1, 0.1, 0.1, 0.15, 0.0)
+    )
+    body.parts.append(box((boot, y0, z0), (x1, y1, waist)))
+    body.parts.append(box((boot, 0.9 * y0, waist), (x0 + 0.7 * size_m[0], 0.9 * y1, z1)))
+    panel = Aabb((x0, y0, waist - lid + FIT_M), (boot - FIT_M, y1, waist))
+    body.moving.append(hinged("boot_lid", panel, Hinge.FRONT))
+    body.add_interior("boot", cavity, ("boot_lid",), open_above=False)
+    return body

@@ -1,0 +1,190 @@
+"""Tables, seats, beds, lamps and the like: boards on legs with true free space below."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from embomatrix.factory.assets.body import Body, centred, clamp
+from embomatrix.factory.assets.shapes import box, frustum, prism
+
+if TYPE_CHECKING:
+    from embomatrix.world.geometry import Part, Vec2, Vec3
+
+
+def _legs(low: Vec2, high: Vec2, z: Vec2, thickness_m: float) -> list[Part]:
+    """Four square legs at the corners of a rectangle."""
+    (x0, y0), (x1, y1), t = low, high, thickness_m
+    return [box((x, y, z[0]), (x + t, y + t, z[1])) for x in (x0, x1 - t) for y in (y0, y1 - t)]
+
+
+def table(size_m: Vec3) -> Body:
+    """A top on four legs."""
+    (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
+    body = Body()
+    top = clamp(0.05 * size_m[2], 0.006, 0.04)
+    leg = clamp(0.07 * min(size_m[:2]), 0.008, 0.07)
+    body.parts = [box((x0, y0, z1 - top), (x1, y1, z1)), *_legs((x0, y0), (x1, y1), (z0, z1 - top), leg)]
+    body.add_support("top", (x0, y0), (x1, y1), z1)
+    return body
+
+
+def table_with_shelf(size_m: Vec3) -> Body:
+    """A table whose legs carry a second board near the floor: kitchen work tables, carts, consoles."""
+    body = table(size_m)
+    (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
+    board = clamp(0.03 * size_m[2], 0.006, 0.025)
+    z = z0 + 0.25 * size_m[2]
+    body.parts.append(box((x0, y0, z - board), (x1, y1, z)))
+    inset = clamp(0.07 * min(size_m[:2]), 0.008, 0.07)
+    under_top = z1 - clamp(0.05 * size_m[2], 0.006, 0.04)
+    body.add_support("shelf", (x0 + inset, y0 + inset), (x1 - inset, y1 - inset), z, under_top - z)
+    return body
+
+
+def pedestal_table(size_m: Vec3) -> Body:
+    """A round or oval top on a column with a broad foot."""
+    (_, _, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
+    body = Body()
+    top, foot = clamp(0.05 * size_m[2], 0.006, 0.04), clamp(0.04 * size_m[2], 0.006, 0.03)
+    body.parts = [
+        prism((0.0, 0.0), (x1, y1), (z1 - top, z1), sides=16),
+        prism((0.0, 0.0), (0.12 * x1, 0.12 * y1), (z0 + foot, z1 - top)),
+        prism((0.0, 0.0), (0.6 * x1, 0.6 * y1), (z0, z0 + foot)),
+    ]
+    # the square that fits the ellipse: corners of a larger one would hang over
+    body.add_support("top", (-0.7 * x1, -0.7 * y1), (0.7 * x1, 0.7 * y1), z1)
+    return body
+
+
+def counter(size_m: Vec3) -> Body:
+    """A closed block with a working top: bars, desks of a reception, display cases."""
+    outer = centred(size_m)
+    body = Body()
+    (x0, y0, z0), (x1, y1, z1) = outer.low_m, outer.high_m
+    top = clamp(0.05 * size_m[2], 0.006, 0.05)
+    overhang = 0.06 * size_m[0]
+    body.parts = [box((x0, y0, z0), (x1 - overhang, y1, z1 - top)), box((x0, y0, z1 - top), (x1, y1, z1))]
+    body.add_support("top", (x0, y0), (x1, y1), z1)
+    return body
+
+
+def slab(size_m: Vec3) -> Body:
+    """A solid board or block with a flat top: counters' plates, mattresses, books, boards, boxes."""
+    outer = centred(size_m)
+    body = Body(parts=[box(outer.low_m, outer.high_m)])
+    body.add_support("top", outer.low_m[:2], outer.high_m[:2], outer.high_m[2])
+    return body
+
+
+def block(size_m: Vec3) -> Body:
+    """A solid box that is no place for other things; its top is where its box ends."""
+    outer = centred(size_m)
+    return Body(parts=[box(outer.low_m, outer.high_m)])
+
+
+def _seat_height(height_m: float) -> float:
+    """Seats are 0.42 m high; stools and children's chairs follow their own height."""
+    return clamp(0.42, 0.35 * height_m, 0.62 * height_m)
+
+
+def chair(size_m: Vec3) -> Body:
+    """Seat on four legs with a back."""
+    (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
+    body = Body()
+    z = z0 + _seat_height(size_m[2])
+    leg, seat, back = clamp(0.08 * min(size_m[:2]), 0.008, 0.045), 0.04, clamp(0.1 * size_m[0], 0.01, 0.05)
+    body.parts = [
+        box((x0, y0, z - seat), (x1, y1, z)),
+        box((x0, y0, z), (x0 + back, y1, z1)),
+        *_legs((x0, y0), (x1, y1), (z0, z - seat), leg),
+    ]
+    body.add_support("seat", (x0 + back, y0), (x1, y1), z)
+    return body
+
+
+def swivel_chair(size_m: Vec3) -> Body:
+    """Seat and back on a column with a cross of feet."""
+    (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
+    body = Body()
+    z, seat, foot = z0 + _seat_height(size_m[2]), 0.06, 0.06
+    back, arm = 0.12 * size_m[0], 0.05
+    body.parts = [
+        box((x0, y0, z - seat), (x1, y1, z)),
+        box((x0, y0, z), (x0 + back, y1, z1)),
+        box((-0.04, -0.04, z0 + foot), (0.04, 0.04, z - seat)),
+        box((x0, -arm, z0), (x1, arm, z0 + foot)),
+        box((-arm, y0, z0), (arm, y1, z0 + foot)),
+    ]
+    body.add_support("seat", (x0 + back, y0), (x1, y1), z)
+    return body
+
+
+def stool(size_m: Vec3) -> Body:
+    """Seat on four legs without a back: stools, benches, footrests."""
+    body = table(size_m)
+    body.supports.clear()
+    outer = centred(size_m)
+    body.add_support("seat", outer.low_m[:2], outer.high_m[:2], outer.high_m[2])
+    return body
+
+
+def sofa(size_m: Vec3) -> Body:
+    """Upholstered base on short feet, with back and arms: armchairs to corner sofas."""
+    (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
+    body = Body()
+    z, feet = z0 + _seat_height(size_m[2]), 0.1 * size_m[2]
+    back = clamp(0.22 * size_m[0], 0.05, 0.3)
+    arm = clamp(0.12 * size_m[1], 0.05, 0.2)
+    rest = z + 0.4 * (z1 - z)
+    body.parts = [
+        box((x0, y0, z0 + feet), (x1, y1, z)),
+        box((x0, y0, z), (x0 + back, y1, z1)),
+        box((x0 + back, y0, z), (x1, y0 + arm, rest)),
+        box((x0 + back, y1 - arm, z), (x1, y1, rest)),
+        *_legs((x0, y0), (x1, y1), (z0, z0 + feet), clamp(0.08 * min(size_m[:2]), 0.02, 0.08)),
+    ]
+    body.add_support("seat", (x0 + back, y0 + arm), (x1, y1 - arm), z)
+    return body
+
+
+def bed(size_m: Vec3) -> Body:
+    """Mattress on a frame with legs, headboard at the back: the foot of the bed is its front."""
+    (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
+    body = Body()
+    z = z0 + clamp(0.55, 0.3 * size_m[2], 0.72 * size_m[2])
+    feet = 0.3 * (z - z0)
+    head = clamp(0.03 * size_m[0], 0.02, 0.08)
+    body.parts = [
+        box((x0 + head, y0, z0 + feet), (x1, y1, z)),
+        box((x0, y0, z0), (x0 + head, y1, z1)),
+        *_legs((x0 + head, y0), (x1, y1), (z0, z0 + feet), clamp(0.06 * min(size_m[:2]), 0.03, 0.1)),
+    ]
+    body.add_support("mattress", (x0 + head, y0), (x1, y1), z)
+    return body
+
+
+def bunk_bed(size_m: Vec3) -> Body:
+    """Two mattresses between four posts."""
+    (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
+    body = Body()
+    post, thickness = 0.06, 0.18
+    lower, upper = z0 + 0.28 * size_m[2], z0 + 0.8 * size_m[2]
+    body.parts = _legs((x0, y0), (x1, y1), (z0, z1), post)
+    for name, z, clearance in (("lower", lower, upper - thickness - lower), ("upper", upper, 2.0)):
+        body.parts.append(box((x0 + post, y0, z - thickness), (x1 - post, y1, z)))
+        body.add_support(name, (x0 + post, y0), (x1 - post, y1), z, clearance)
+    return body
+
+
+def lamp(size_m: Vec3) -> Body:
+    """Foot, pole and shade."""
+    (_, _, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
+    shade, foot = 0.28 * size_m[2], clamp(0.04 * size_m[2], 0.008, 0.05)
+    pole = clamp(0.06 * min(size_m[:2]), 0.004, 0.03)
+    return Body(
+        parts=[
+            prism((0.0, 0.0), (0.75 * x1, 0.75 * y1), (z0, z0 + foot)),
+            prism((0.0, 0.0), (pole, pole), (z0 + foot, z1 - shade)),
+            frustum((0.0, 0.0), (x1, y1), (0.7 * x1, 0.7 * y1), (z1 - shade, z1)),
+        ]
+    )

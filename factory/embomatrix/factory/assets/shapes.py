@@ -1,0 +1,165 @@
+"""Convex pieces of assets: boxes, prisms, ring sectors and rounded lumps, in the asset's frame, in metres.
+
+The unit shapes are hulls computed once with trimesh; a piece of an asset is a scaled copy. `mesh_of` turns any part
+back into a mesh, for pictures and for checks of volume and closedness.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+import trimesh
+
+from embomatrix.world.geometry import Aabb, Part, Pose, Shape
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from embomatrix.world.geometry import FloatArray, Vec2, Vec3
+
+DECIMALS: Final = 6
+"""Coordinates are rounded to a micrometre, so that equal models give equal bytes on every machine."""
+
+RING_SIDES: Final = 8
+"""Walls of a round vessel: with its bottom and a handle it stays below the 16 parts that a link may have."""
+
+
+def rounded(*values: float) -> Vec3:
+    """Three coordinates, rounded; negative zero becomes zero."""
+    x, y, z = (round(float(value), DECIMALS) + 0.0 for value in values)
+    return (x, y, z)
+
+
+def box(low: Sequence[float], high: Sequence[float]) -> Part:
+    """Axis-aligned box between two corners. Raises ValueError when it is thinner than 0.1 mm somewhere."""
+    size = [b - a for a, b in zip(low, high, strict=True)]
+    if min(size) < 1e-4:
+        raise ValueError(f"box from {tuple(low)} to {tuple(high)} m has no volume: expected low < high")
+    centre = rounded(*((a + b) / 2 for a, b in zip(low, high, strict=True)))
+    return Part(Shape.BOX, Pose(centre), rounded(*size))
+
+
+def box_of(region: Aabb) -> Part:
+    return box(region.low_m, region.high_m)
+
+
+def hull(points: FloatArray) -> Part:
+    """Convex part from points, shape (n, 3), that are all corners of their hull; its own origin is their box's centre."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    centre = rounded(*((low + high) / 2))
+    vertices = tuple(rounded(*point) for point in (points - np.asarray(centre)))
+    return Part(Shape.HULL, Pose(centre), rounded(*(high - low)), vertices)
+
+
+def frustum(centre: Vec2, low_radii: Vec2, high_radii: Vec2, z: Vec2, *, sides: int = 12) -> Part:
+    """Elliptic cone stump between the heights ``z``; ``radii`` are its half extents along x and y.
+
+    With ``sides`` a multiple of four its box is exactly twice the larger radii.
+    """
+    rims = [
+        np.column_stack((_polygon(sides) * radii + centre, np.full(sides, height)))
+        for radii, height in zip((low_radii, high_radii), z, strict=True)
+    ]
+    return hull(np.vstack(rims))
+
+
+def prism(centre: Vec2, radii: Vec2, z: Vec2, *, sides: int = 12) -> Part:
+    """Upright elliptic cylinder as a polygon prism: it lies flat and does not roll when tipped."""
+    return frustum(centre, radii, radii, z, sides=sides)
+
+
+def ring(centre: Vec2, low_radii: Vec2, high_radii: Vec2, z: Vec2, wall_m: float) -> list[Part]:
+    """Wall of a round vessel: eight convex sectors between an outer and an inner cone stump."""
+    angles = _polygon(RING_SIDES)
+    levels = []
+    for radii, height in zip((low_radii, high_radii), z, strict=True):
+        inner = (radii[0] - wall_m, radii[1] - wall_m)
+        levels.append(
+            [np.column_stack((angles * r + centre, np.full(RING_SIDES, height))) for r in (radii, inner)]
+        )
+    sectors = []
+    for side in range(RING_SIDES):
+        pair = (side, (side + 1) % RING_SIDES)
+        sectors.append(hull(np.array([level[skin][i] for level in levels for skin in (0, 1) for i in pair])))
+    return sectors
+
+
+def lump(region: Aabb) -> Part:
+    """Ellipsoid-like hull that fills a box, with a flat base.
+
+    A true ellipsoid would roll for ever on a table in a rigid-body engine; a fruit rests in a dent of its own.
+    """
+    return _stretched(_unit_lump(), region)
+
+
+def dome(region: Aabb) -> Part:
+    """Half an ellipsoid on its cut face: halves of fruit, buns, heaps."""
+    return _stretched(_unit_dome(), region)
+
+
+def cushion(region: Aabb) -> Part:
+    """Box with its edges cut: pillows, bags, shoes."""
+    return _stretched(_unit_cushion(), region)
+
+
+def _stretched(unit: FloatArray, region: Aabb) -> Part:
+    return hull(unit * np.asarray(region.size_m) + np.asarray(region.center_m))
+
+
+@functools.cache
+def _polygon(sides: int) -> FloatArray:
+    """Corners of the regular polygon in the unit circle, shape (sides, 2), the first at +x."""
+    turn = 2 * math.pi * np.arange(sides) / sides
+    return np.column_stack((np.cos(turn), np.sin(turn)))
+
+
+@functools.cache
+def _unit_lump() -> FloatArray:
+    return _lathe(((-0.5, 0.26), (-0.33, 0.42), (-0.05, 0.5), (0.25, 0.43), (0.5, 0.16)))
+
+
+@functools.cache
+def _unit_dome() -> FloatArray:
+    return _lathe(((-0.5, 0.5), (-0.1, 0.48), (0.3, 0.34), (0.5, 0.12)))
+
+
+@functools.cache
+def _unit_cushion() -> FloatArray:
+    inset = 0.34
+    rims = [(-0.5, inset), (-0.15, 0.5), (0.15, 0.5), (0.5, inset)]
+    corners = [(sx, sy) for sx in (-1, 1) for sy in (-1, 1)]
+    return _hull_corners(np.array([(sx * half, sy * half, z) for z, half in rims for sx, sy in corners]))
+
+
+def _lathe(profile: Sequence[Vec2], sides: int = 12) -> FloatArray:
+    """Corners of a solid of revolution in the unit box; ``profile`` lists (height, radius)."""
+    rims = [np.column_stack((_polygon(sides) * radius, np.full(sides, z))) for z, radius in profile]
+    return _hull_corners(np.vstack(rims))
+
+
+def _hull_corners(points: FloatArray) -> FloatArray:
+    """Corners of the convex hull in the order given: the profile may not be convex everywhere."""
+    corners = trimesh.convex.convex_hull(points).vertices
+    kept = [point for point in points if np.abs(corners - point).max(axis=1).min() < 1e-9]
+    return np.asarray(kept, dtype=np.float64)
+
+
+def mesh_of(part: Part) -> trimesh.Trimesh:
+    """Closed triangle mesh of a part in the asset's frame."""
+    match part.shape:
+        case Shape.BOX:
+            mesh: trimesh.Trimesh = trimesh.creation.box(extents=part.size_m)
+        case Shape.CYLINDER:
+            mesh = trimesh.creation.cylinder(radius=part.size_m[0] / 2, height=part.size_m[2], sections=24)
+        case Shape.SPHERE:
+            mesh = trimesh.creation.icosphere(radius=part.size_m[0] / 2, subdivisions=2)
+        case Shape.HULL:
+            mesh = trimesh.convex.convex_hull(np.asarray(part.vertices_m))
+    transform = np.eye(4)
+    transform[:3, :3] = part.pose.rotation
+    transform[:3, 3] = part.pose.position_m
+    mesh.apply_transform(transform)
+    return mesh

@@ -1,0 +1,205 @@
+"""Round things: bowls, pots, pans, cups, glasses, plates, bottles, jars and pots with a lid."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.factory.assets.body import FIT_M, Body, Hinge, centred, clamp, hinged, region
+from embomatrix.factory.assets.cabinets import SHALLOW_M
+from embomatrix.factory.assets.shapes import box, frustum, prism, ring, rounded
+from embomatrix.world.asset import Link
+from embomatrix.world.geometry import Aabb, Pose
+
+if TYPE_CHECKING:
+    from embomatrix.world.geometry import Part, Vec2, Vec3
+
+INSCRIBED: Final = 0.7
+"""Half side of the square in a circle of radius one, a little less than the root of one half."""
+
+
+class Handle(StrEnum):
+    """Where a vessel is held. A handle takes the part of the box that the round body leaves over."""
+
+    NONE = "none"
+    ONE = "one"  # at one end of the longer side: mugs, pans, jugs
+    BOTH = "both"  # at both ends: pots, casseroles, teapots with their spout
+
+
+@dataclass(frozen=True, slots=True)
+class VesselStyle:
+    """``base_share`` is the outer radius of the bottom against that of the rim, ``wall_share`` the wall's thickness
+    against the smaller diameter, ``stem_share`` the height of foot and stem against the whole."""
+
+    base_share: float
+    handle: Handle = Handle.NONE
+    wall_share: float = 0.04
+    stem_share: float = 0.0
+
+
+BOWL: Final = VesselStyle(0.8)
+CUP: Final = VesselStyle(0.88, Handle.ONE)
+GLASS: Final = VesselStyle(0.9)
+GOBLET: Final = VesselStyle(0.85, stem_share=0.45)
+PAN: Final = VesselStyle(0.9, Handle.ONE, wall_share=0.02)
+POT: Final = VesselStyle(0.96, Handle.BOTH, wall_share=0.025)
+JUG: Final = VesselStyle(0.94, Handle.ONE)
+BASKET: Final = VesselStyle(0.9, wall_share=0.03)
+
+
+@dataclass(frozen=True, slots=True)
+class _Round:
+    """The round body of a vessel: centre and outer radii at the rim."""
+
+    centre: Vec2
+    radii: Vec2
+
+
+def vessel(size_m: Vec3, style: VesselStyle) -> Body:
+    """Bottom, a wall of eight sectors, handles; the cavity is open above."""
+    outer = centred(size_m)
+    body = Body()
+    shape = _round(outer, style.handle)
+    z0, z1 = outer.low_m[2], outer.high_m[2]
+    if style.stem_share:
+        z0 = _stem(body, shape, (z0, z1), style.stem_share)
+    _cup(body, shape, (z0, z1), style)
+    body.parts.extend(_handles(outer, shape, style.handle))
+    return body
+
+
+def _cup(body: Body, shape: _Round, z: Vec2, style: VesselStyle, closed_by: tuple[str, ...] = ()) -> None:
+    """Bottom, wall and cavity between two heights."""
+    z0, z1 = z
+    thin = min(shape.radii)
+    wall = clamp(2 * style.wall_share * thin, min(0.003, 0.2 * thin), 0.03)
+    floor = z0 + clamp(0.08 * (z1 - z0), 0.0015, 0.012)
+    base = (shape.radii[0] * style.base_share, shape.radii[1] * style.base_share)
+    body.parts.append(prism(shape.centre, base, (z0, floor), sides=8))
+    body.parts.extend(ring(shape.centre, base, shape.radii, (floor, z1), wall))
+    half_x, half_y = (INSCRIBED * (radius - wall) for radius in base)
+    cx, cy = shape.centre
+    if z1 - floor >= SHALLOW_M:
+        cavity = region((cx - half_x, cx + half_x), (cy - half_y, cy + half_y), (floor, z1))
+        body.add_interior("inside", cavity, closed_by, open_above=not closed_by)
+    else:
+        body.add_support("floor", (cx - half_x, cy - half_y), (cx + half_x, cy + half_y), floor)
+
+
+def _round(outer: Aabb, handle: Handle) -> _Round:
+    """Round body within the box; what the handles take is at most 40 % of the longer side, so that it stands."""
+    half = list(outer.high_m[:2])
+    long = 0 if half[0] > half[1] else 1
+    if handle is Handle.NONE or half[long] < 1.08 * half[1 - long]:
+        return _Round((0.0, 0.0), (half[0], half[1]))
+    body_half = max(half[1 - long], 0.6 * half[long])
+    centre = [0.0, 0.0]
+    if handle is Handle.ONE:
+        centre[long] = body_half - half[long]
+    half[long] = body_half
+    return _Round((centre[0], centre[1]), (half[0], half[1]))
+
+
+def _handles(outer: Aabb, shape: _Round, handle: Handle) -> list[Part]:
+    """Bars from the body to the ends of the box, near the rim."""
+    long = 0 if outer.size_m[0] > outer.size_m[1] else 1
+    reach = shape.centre[long] + shape.radii[long]
+    if handle is Handle.NONE or outer.high_m[long] - reach < 1e-3:
+        return []
+    height, width = outer.size_m[2], clamp(0.12 * min(outer.size_m[:2]), 0.004, 0.03)
+    z = (outer.high_m[2] - 0.45 * height, outer.high_m[2] - 0.15 * height)
+    # the wall leans: a handle that starts a little within it touches it at every height
+    spans = [(reach - 0.02 * shape.radii[long], outer.high_m[long])]
+    if handle is Handle.BOTH:
+        spans.append((-spans[0][1], -spans[0][0]))
+    bars = []
+    for low, high in spans:
+        along, across = (low, high), (-width / 2, width / 2)
+        x, y = (along, across) if long == 0 else (across, along)
+        bars.append(box((x[0], y[0], z[0]), (x[1], y[1], z[1])))
+    return bars
+
+
+def _stem(body: Body, shape: _Round, z: Vec2, share: float) -> float:
+    """Foot and stem of a goblet; returns the height where its cup begins."""
+    z0, z1 = z
+    top = z0 + share * (z1 - z0)
+    foot = z0 + 0.05 * (z1 - z0)
+    thin = 0.16 * min(shape.radii)
+    wide = (0.85 * shape.radii[0], 0.85 * shape.radii[1])
+    body.parts.extend([prism((0.0, 0.0), wide, (z0, foot)), prism((0.0, 0.0), (thin, thin), (foot, top))])
+    return top
+
+
+def lidded_vessel(size_m: Vec3) -> Body:
+    """A pot or jar with a lid that is hinged at the back."""
+    outer = centred(size_m)
+    body = Body()
+    shape = _Round((0.0, 0.0), outer.high_m[:2])
+    lid = clamp(0.1 * size_m[2], 0.004, 0.04)
+    style = VesselStyle(1.0, wall_share=max(0.03, lid / min(size_m[:2])))
+    z1 = outer.high_m[2] - lid
+    _cup(body, shape, (outer.low_m[2], z1), style, ("lid",))
+    panel = Aabb((*outer.low_m[:2], z1 + min(FIT_M, 0.2 * lid)), outer.high_m)
+    body.moving.append(hinged("lid", panel, Hinge.BACK))
+    return body
+
+
+def blender(size_m: Vec3) -> Body:
+    """A motor block that carries a lidded jar."""
+    outer = centred(size_m)
+    motor = 0.35 * size_m[2]
+    jar = lidded_vessel((size_m[0], size_m[1], size_m[2] - motor))
+    body = Body(parts=[box(outer.low_m, (*outer.high_m[:2], outer.low_m[2] + motor))])
+    return stacked(body, jar, motor / 2)
+
+
+def stacked(lower: Body, upper: Body, lift_m: float) -> Body:
+    """Both bodies as one, the upper one raised."""
+    lower.parts += [_raised_part(part, lift_m) for part in upper.parts]
+    for link in upper.moving:
+        joint = link.joint and replace(link.joint, origin_m=_raised(link.joint.origin_m, lift_m))
+        parts = tuple(_raised_part(part, lift_m) for part in link.parts)
+        lower.moving.append(Link(link.name, parts, joint))
+    lower.supports += [replace(item, center_m=_raised(item.center_m, lift_m)) for item in upper.supports]
+    lower.interiors += [replace(item, center_m=_raised(item.center_m, lift_m)) for item in upper.interiors]
+    return lower
+
+
+def _raised(point: Vec3, lift_m: float) -> Vec3:
+    return rounded(point[0], point[1], point[2] + lift_m)
+
+
+def _raised_part(part: Part, lift_m: float) -> Part:
+    return replace(part, pose=Pose(_raised(part.pose.position_m, lift_m)))
+
+
+def plate(size_m: Vec3) -> Body:
+    """A flat disc that things lie on; deep ones have a rim."""
+    if size_m[2] >= 0.02:
+        return vessel(size_m, VesselStyle(0.75, wall_share=0.03))
+    (_, _, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
+    body = Body(parts=[prism((0.0, 0.0), (x1, y1), (z0, z1), sides=16)])
+    body.add_support("top", (-0.7 * x1, -0.7 * y1), (0.7 * x1, 0.7 * y1), z1)
+    return body
+
+
+def bottle(size_m: Vec3) -> Body:
+    """Closed body with a neck; one that lies on its side in the catalog is a bar."""
+    (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
+    if size_m[2] < 0.8 * max(size_m[:2]):
+        return Body(parts=[box((x0, y0, z0), (x1, y1, z1))])
+    shoulder = z0 + 0.68 * size_m[2]
+    return Body(
+        parts=[
+            prism((0.0, 0.0), (x1, y1), (z0, shoulder)),
+            frustum((0.0, 0.0), (x1, y1), (0.35 * x1, 0.35 * y1), (shoulder, z1)),
+        ]
+    )
+
+
+def can(size_m: Vec3) -> Body:
+    """Closed cylinder with a flat top: cans, jars, candles, cakes, rolls standing up."""
+    (_, _, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
+    return Body(parts=[prism((0.0, 0.0), (x1, y1), (z0, z1))])
