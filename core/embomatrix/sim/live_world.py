@@ -88,8 +88,8 @@ class LiveWorld:
         return next((item.name for item in self.relations.enclosing(name) if item.closed), "")
 
     def reach(self, name: str) -> Reach:
-        """How the robot, where it stands, reaches the object's bounding box. An object in the hand is at hand."""
-        box = self.engine.aabb(name)
+        """How the robot, where it stands, reaches the object's box with doors shut. What is in the hand is at hand."""
+        box = self.relations.body(name)
         if name in self._hand:
             return Reach(0.0, box.center_m[2])
         dx = max(box.low_m[0] - self.robot.x_m, self.robot.x_m - box.high_m[0], 0.0)

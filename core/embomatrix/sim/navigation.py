@@ -144,7 +144,7 @@ class Navigator:
         start = self._cell(origin)
         if start is None or self._engine.is_parked(name):
             return ()
-        box = self._engine.aabb(name)
+        box = self._relations.body(name)
         low, high = np.array(box.low_m[:2]), np.array(box.high_m[:2])
         reach = ROBOT.reach_m - REACH_SLACK_M
         window_low, window_high = (low - reach).tolist(), (high + reach).tolist()
@@ -162,7 +162,7 @@ class Navigator:
 
     def line_is_clear(self, origin: StandPose, name: str) -> bool:
         """Whether no wall nor anything much taller than the object stands between the robot and the object's box."""
-        box = self._engine.aabb(name)
+        box = self._relations.body(name)
         point = np.array((origin.x_m, origin.y_m))
         nearest = np.clip(point, box.low_m[:2], box.high_m[:2])
         return not _crosses(point, nearest, self._blockers(name, box))
@@ -194,7 +194,7 @@ class Navigator:
         """
         fixed = [host for host in self._hosts_of(name) if self._scene.by_name[host].fixed]
         yaw = self._engine.pose(fixed[0] if fixed else name).yaw
-        to_robot = centers - np.array(self._engine.aabb(name).center_m[:2])
+        to_robot = centers - np.array(self._relations.body(name).center_m[:2])
         to_robot /= np.maximum(np.linalg.norm(to_robot, axis=1, keepdims=True), 1e-9)
         cosines = to_robot @ np.array((math.cos(yaw), math.sin(yaw)))
         return cosines, has_front(self._scene.asset_of(name))

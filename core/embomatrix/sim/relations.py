@@ -212,9 +212,14 @@ class Relations:
         """Any joint of ``a`` is past 5 % of its travel."""
         return any(fraction > OPEN_FRACTION for fraction in self._engine.joints(a))
 
+    def body(self, name: str) -> Aabb:
+        """Box of the object with its joints shut: an open door neither brings it nearer nor pushes the robot away."""
+        shut = (0.0,) * len(self._engine.joints(name))
+        return self._bounds[self._scene.by_name[name].asset_id].box(self._engine.pose(name), shut)
+
     def room_of(self, name: str) -> str:
         """Room that the object's centre is over, "" when it is in none."""
-        return self._scene.room_at(self._engine.aabb(name).center_m)
+        return self._scene.room_at(self.body(name).center_m)
 
     def host_of(self, name: str) -> Host | None:
         """What the object rests on or in; None on the floor, at a wall or in the hand.
