@@ -21,8 +21,12 @@ if TYPE_CHECKING:
     from embomatrix.factory.furnish_pieces import Piece
     from embomatrix.world.scene import Doorway, Room
 
-ATTEMPTS: Final = 8
-"""Arrangements of a room that are tried before one that leaves something out is taken."""
+ATTEMPTS: Final = 24
+CROWDED_ATTEMPTS: Final = 6
+"""Arrangements of a room that are tried before one that leaves something out is taken; fewer where there is much to place."""
+CROWD: Final = 30
+GOOD_ENOUGH: Final = 2.0
+"""After CROWDED_ATTEMPTS an arrangement that loses no more than this is taken: a trash can, a picture."""
 MAX_EQUAL: Final = 6
 """Small things of one model in one room at most: the diner's kitchen lists 137 trays."""
 
@@ -98,11 +102,15 @@ def _best_arrangement(
     room: Room, doorways: Sequence[Doorway], pieces: Sequence[Piece], rng: np.random.Generator
 ) -> _Arrangement:
     best: _Arrangement | None = None
-    for attempt in range(ATTEMPTS):
-        tried = _arrange(room, doorways, pieces, rng, wobble=0.4 + 0.2 * attempt)
+    first: set[int] = set()
+    standing = [p for p in pieces if p.role is not Role.SURFACE]
+    for attempt in range(ATTEMPTS if len(standing) < CROWD else CROWDED_ATTEMPTS):
+        tried = _arrange(room, doorways, pieces, rng, first, wobble=0.4 + 0.2 * attempt)
+        # What found no place comes first the next time.
+        first |= {p.number for p in tried.dropped if p.role not in (Role.WALL, Role.CEILING, Role.RUG)}
         if best is None or tried.loss < best.loss:
             best = tried
-        if best.loss == 0:
+        if best.loss == 0 or (attempt >= CROWDED_ATTEMPTS and best.loss <= GOOD_ENOUGH):
             break
     if best is None:
         raise ValueError(f"room {room.name!r} was never arranged: expected at least one attempt")
@@ -114,11 +122,13 @@ def _arrange(
     doorways: Sequence[Doorway],
     pieces: Sequence[Piece],
     rng: np.random.Generator,
+    first: set[int],
     *,
     wobble: float,
 ) -> _Arrangement:
     solver = RoomSolver(RoomSpace(room, doorways), rng)
     groups, notes = floor_groups(pieces)
+    groups.sort(key=lambda g: all(m.piece.number not in first for m in g.members))
     dropped: list[Piece] = []
     for group in (*groups, *hung_groups(pieces), *ceiling_groups(pieces), *rug_groups(pieces)):
         remaining = group

@@ -169,7 +169,7 @@ def _counters(pool: _Pool, left_out: list[str]) -> list[Group]:
         slabs.pop(0)
         members = _counter_members(slab, row)
         groups.append(
-            Group(members, Style.RUN, 9.0 + _worth(members) / 100, near=(*_SINKS, "stove", "countertop"))
+            Group(members, Style.RUN, 10.5 + _worth(members) / 100, near=(*_SINKS, "stove", "countertop"))
         )
     if slabs:
         pool.take(slabs)

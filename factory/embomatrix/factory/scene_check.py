@@ -1,0 +1,165 @@
+"""What a scene must keep: nothing interpenetrates, everything rests or hangs, the robot gets to all that it may use."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.factory.furnish_pieces import Access, Piece, access_of
+from embomatrix.factory.furnish_roles import role_of
+from embomatrix.factory.scene_floor import ReachableFloor, box_of
+from embomatrix.factory.scene_solids import Solids, placed_parts
+from embomatrix.sim.bullet.engine import BulletEngine
+from embomatrix.sim.engine import FLOOR
+from embomatrix.world.state import Relation
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from embomatrix.world.geometry import Aabb
+    from embomatrix.world.scene import Scene, SceneObject
+
+REST_M: Final = 0.002
+HANG_M: Final = 0.03
+CEILING_M: Final = 2.4
+_EDGE_M: Final = 0.005
+
+
+class ProblemKind(StrEnum):
+    NAME = "name"
+    PENETRATION = "penetration"
+    FLOATING = "floating"
+    ROOM = "room"
+    ACCESS = "access"
+    UNREACHABLE_ROOM = "unreachable_room"
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """One broken rule: which objects (or rooms) break it and by how much, in words."""
+
+    kind: ProblemKind
+    names: tuple[str, ...]
+    detail: str
+
+
+def check_scene(scene: Scene) -> tuple[Problem, ...]:
+    """All broken rules by geometry alone; empty for a good scene."""
+    return (
+        *_names(scene),
+        *_penetrations(scene),
+        *_supports(scene),
+        *_rooms(scene),
+        *_reach(scene),
+    )
+
+
+def check_in_engine(scene: Scene) -> tuple[Problem, ...]:
+    """Penetrations of more than 1 mm that Bullet finds. Raises EngineError where the engine is missing."""
+    engine = BulletEngine(scene)
+    try:
+        found = []
+        for item in scene.objects:
+            other = engine.penetrates(item.name, ignore=frozenset({FLOOR}))
+            if other:
+                found.append(Problem(ProblemKind.PENETRATION, (item.name, other), "found by the engine"))
+        return tuple(found)
+    finally:
+        engine.close()
+
+
+def _names(scene: Scene) -> Iterator[Problem]:
+    for name, count in Counter(item.name for item in scene.objects).items():
+        if count > 1:
+            yield Problem(ProblemKind.NAME, (name,), f"the name stands {count} times: expected unique names")
+    known = {item.name for item in scene.objects}
+    for item in scene.objects:
+        if item.host and item.host not in known:
+            yield Problem(ProblemKind.NAME, (item.name,), f"its host {item.host!r} is not in the scene")
+
+
+def _penetrations(scene: Scene) -> Iterator[Problem]:
+    solids = Solids.of_scene(scene)
+    seen: set[frozenset[str]] = set()
+    for item in scene.objects:
+        parts = placed_parts(scene.assets[item.asset_id], item.pose_world_asset)
+        for other, depth in solids.overlaps(parts, ignore=item.name).items():
+            pair = frozenset((item.name, other))
+            if pair not in seen:
+                seen.add(pair)
+                detail = f"{item.name} and {other} overlap by {depth * 1000:.1f} mm"
+                yield Problem(ProblemKind.PENETRATION, (item.name, other), detail)
+
+
+def _supports(scene: Scene) -> Iterator[Problem]:
+    for item in scene.objects:
+        box = box_of(scene, item)
+        if box.low_m[2] < -REST_M:
+            yield Problem(ProblemKind.FLOATING, (item.name,), f"{-box.low_m[2]:.3f} m below the floor")
+        elif item.host:
+            if item.host in scene.by_name and not _rests(scene, item, box):
+                detail = f"underside at {box.low_m[2]:.3f} m rests on no surface of {item.host}"
+                yield Problem(ProblemKind.FLOATING, (item.name, item.host), detail)
+        elif box.low_m[2] > REST_M and not _hangs(scene, item, box):
+            detail = f"underside at {box.low_m[2]:.3f} m, no host, no wall or ceiling within {HANG_M} m"
+            yield Problem(ProblemKind.FLOATING, (item.name,), detail)
+
+
+def _rests(scene: Scene, item: SceneObject, box: Aabb) -> bool:
+    """Whether the underside lies on a surface of the host with the box's middle above it."""
+    host = scene.by_name[item.host]
+    for support in scene.assets[host.asset_id].supports:
+        if bool(support.interior) < (item.relation is Relation.INSIDE):
+            continue
+        x, y, z = host.pose_world_asset.inverse().apply((*box.center_m[:2], box.low_m[2]))
+        cx, cy, cz = support.center_m
+        on = abs(x - cx) <= support.size_m[0] / 2 + _EDGE_M and abs(y - cy) <= support.size_m[1] / 2 + _EDGE_M
+        if on and -1e-6 <= z - cz <= REST_M:
+            return True
+    top = box_of(scene, host).high_m[2]
+    return item.relation is Relation.ONTOP and -1e-6 <= box.low_m[2] - top <= REST_M
+
+
+def _hangs(scene: Scene, item: SceneObject, box: Aabb) -> bool:
+    if not item.fixed:
+        return False
+    room = next((r for r in scene.rooms if r.name == item.room), None)
+    if room is None or box.high_m[2] > CEILING_M - HANG_M:
+        return room is not None
+    gaps = (
+        *(abs(low - edge) for low, edge in zip(box.low_m, room.low_m, strict=False)),
+        *(abs(high - edge) for high, edge in zip(box.high_m, room.high_m, strict=False)),
+    )
+    return min(gaps) <= HANG_M
+
+
+def _rooms(scene: Scene) -> Iterator[Problem]:
+    rooms = {room.name: room for room in scene.rooms}
+    for item in scene.objects:
+        x, y, _ = item.pose_world_asset.position_m
+        if item.room not in rooms or not rooms[item.room].contains(x, y):
+            yield Problem(ProblemKind.ROOM, (item.name,), f"its middle lies outside its room {item.room!r}")
+
+
+def _reach(scene: Scene) -> Iterator[Problem]:
+    floor = ReachableFloor(scene)
+    if not floor.has_start:
+        yield Problem(
+            ProblemKind.UNREACHABLE_ROOM, (scene.robot.room,), "the robot's start is not free floor"
+        )
+        return
+    for room in scene.rooms:
+        if not floor.enters(room):
+            yield Problem(ProblemKind.UNREACHABLE_ROOM, (room.name,), "no free floor leads into it")
+    for item in scene.objects:
+        asset = scene.assets[item.asset_id]
+        role = role_of(asset.category, asset.size_m, asset.mass_kg)
+        access = access_of(Piece(0, asset.category, asset, role))
+        if access is Access.NONE:
+            continue
+        front = None if access is Access.BESIDE else item.pose_world_asset
+        if not len(floor.spots(box_of(scene, item), front_of=front)):
+            where = "beside it" if front is None else "before its front"
+            yield Problem(ProblemKind.ACCESS, (item.name,), f"no reachable spot {where}")

@@ -1,0 +1,120 @@
+"""``embomatrix scene``: build, list, show, draw and check base scenes."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+import typer
+from PIL import Image
+from rich.console import Console
+from rich.table import Table
+
+from embomatrix.factory.floorplan import FloorPlanError
+from embomatrix.factory.pictures import draw_plan
+from embomatrix.factory.scene_build import build_base_scene
+from embomatrix.factory.scene_check import check_in_engine, check_scene
+from embomatrix.sim.bullet.camera import render_oblique
+from embomatrix.sim.engine import EngineError
+from embomatrix.world.catalog import Catalog, CatalogError
+from embomatrix.world.codec import scene_to_json
+
+if TYPE_CHECKING:
+    from embomatrix.world.scene import Scene
+
+app = typer.Typer(
+    help="Build, check and draw base scenes.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+SceneId = Annotated[str, typer.Argument(help="Name of a scene, as `embomatrix scene list` shows it.")]
+Seed = Annotated[int, typer.Option(help="Another seed gives another arrangement of the same inventory.")]
+Out = Annotated[Path, typer.Option(help="Folder for the files.")]
+
+
+@app.command("list")
+def list_scenes() -> None:
+    """Name the scenes whose inventories are known."""
+    catalog = Catalog.load()
+    for scene_id in catalog.scene_ids:
+        Console().print(catalog.inventory(scene_id).description, highlight=False)
+
+
+@app.command()
+def build(scene_id: SceneId, seed: Seed = 0, out: Out = Path()) -> None:
+    """Lay out and furnish a scene, and write it as JSON."""
+    import json
+
+    scene = _built(scene_id, seed)
+    path = _folder(out) / f"{scene_id}.json"
+    path.write_text(json.dumps(scene_to_json(scene)), encoding="utf-8")
+    Console().print(f"{len(scene.rooms)} rooms, {len(scene.objects)} objects: {path}", highlight=False)
+
+
+@app.command()
+def show(scene_id: SceneId, seed: Seed = 0) -> None:
+    """Print rooms, doorways, objects and what was left out."""
+    scene = _built(scene_id, seed)
+    console = Console()
+    table = Table("room", "size (m)", "doors to", "objects")
+    for room in scene.rooms:
+        doors = [d for d in scene.doorways if room.name in d.rooms]
+        beyond = [next((r or "outside" for r in d.rooms if r != room.name), "outside") for d in doors]
+        counts = Counter(scene.assets[o.asset_id].category for o in scene.objects if o.room == room.name)
+        listed = ", ".join(f"{n} {c}" if n > 1 else c for c, n in sorted(counts.items()))
+        table.add_row(room.name, f"{room.size_m[0]:.2f} x {room.size_m[1]:.2f}", ", ".join(beyond), listed)
+    console.print(table)
+    for sentence in scene.left_out:
+        console.print(f"left out: {sentence}", highlight=False, markup=False)
+
+
+@app.command()
+def render(scene_id: SceneId, seed: Seed = 0, out: Out = Path()) -> None:
+    """Draw a plan from above and an oblique view, as PNG files."""
+    scene = _built(scene_id, seed)
+    folder = _folder(out)
+    plan, oblique = folder / f"{scene_id}_plan.png", folder / f"{scene_id}_view.png"
+    draw_plan(scene).save(plan)
+    try:
+        Image.fromarray(np.asarray(render_oblique(scene))).save(oblique)
+    except EngineError as error:
+        raise _refused(str(error)) from None
+    Console().print(f"{plan}\n{oblique}", highlight=False)
+
+
+@app.command()
+def check(scene_id: SceneId, seed: Seed = 0) -> None:
+    """Test a scene for penetration, floating things and blocked ways; exit status 1 when something is wrong."""
+    scene = _built(scene_id, seed)
+    try:
+        problems = (*check_scene(scene), *check_in_engine(scene))
+    except EngineError as error:
+        raise _refused(str(error)) from None
+    for problem in problems:
+        Console().print(f"{problem.kind}: {', '.join(problem.names)}: {problem.detail}", highlight=False)
+    if problems:
+        raise typer.Exit(1)
+    Console().print(f"{scene_id}: {len(scene.objects)} objects, nothing wrong", highlight=False)
+
+
+def _built(scene_id: str, seed: int) -> Scene:
+    try:
+        return build_base_scene(scene_id, seed=seed)
+    except (CatalogError, FloorPlanError) as error:
+        raise _refused(str(error)) from None
+
+
+def _folder(out: Path) -> Path:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise _refused(f"can't write to {out}: {error.strerror}: name another folder with --out") from None
+    return out
+
+
+def _refused(sentence: str) -> typer.Exit:
+    Console(stderr=True).print(sentence, highlight=False, markup=False)
+    return typer.Exit(2)

@@ -1,0 +1,81 @@
+"""The floor that the robot can reach in a scene, and where on it the robot could stand to work."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from embomatrix.sim.floor_grid import FloorGrid
+from embomatrix.skills.limits import ROBOT
+from embomatrix.world.geometry import Aabb, Pose
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from embomatrix.world.geometry import FloatArray
+    from embomatrix.world.scene import Room, Scene, SceneObject
+
+_ORIGIN: Final = Pose((0.0, 0.0, 0.0))
+_FLAT_M: Final = 0.03
+_REACH_SLACK_M: Final = 0.05
+_FRONT_COSINE: Final = math.cos(math.radians(65.0))
+
+
+class ReachableFloor:
+    """Free floor connected to the robot's start, with all joints shut."""
+
+    def __init__(self, scene: Scene) -> None:
+        rows = [_row(wall.aabb(_ORIGIN)) for wall in scene.walls]
+        for item in scene.objects:
+            asset = scene.assets[item.asset_id]
+            parts = (part for link in asset.links for part in link.parts)
+            rows += [_row(part.aabb(item.pose_world_asset)) for part in parts]
+        boxes = np.array(rows).reshape(-1, 6)
+        barring = (boxes[:, 4] < ROBOT.height_m) & (boxes[:, 5] > _FLAT_M)
+        self._grid = FloorGrid(scene, boxes[barring])
+        cell = self._grid.cell(scene.robot.x_m, scene.robot.y_m)
+        self._label = self._grid.label(cell) if cell is not None else 0
+
+    @property
+    def has_start(self) -> bool:
+        """Whether the robot's start is free floor."""
+        return self._label > 0
+
+    def cells(self, low: tuple[float, float], high: tuple[float, float]) -> FloatArray:
+        """Centres of the reachable cells in a rectangle, shape (n, 2)."""
+        if not self.has_start:
+            return np.empty((0, 2))
+        return self._grid.free_centers(low, high, self._label)
+
+    def enters(self, room: Room) -> bool:
+        """Whether any floor of the room is reachable."""
+        return len(self.cells(room.low_m, room.high_m)) > 0
+
+    def spots(self, box: Aabb, *, front_of: Pose | None = None) -> FloatArray:
+        """Cells from which the arm reaches a box, shape (n, 2); with ``front_of`` only those before that pose's front."""
+        low, high = np.asarray(box.low_m[:2]), np.asarray(box.high_m[:2])
+        reach = ROBOT.reach_m - _REACH_SLACK_M
+        cells = self.cells(_pair(low - reach), _pair(high + reach))
+        away = np.linalg.norm(cells - np.clip(cells, low, high), axis=1)
+        fits = (away >= ROBOT.shoulder_m) & (away <= reach)
+        if front_of is not None:
+            delta = cells - np.asarray(box.center_m[:2])
+            cosine = delta @ np.array([math.cos(front_of.yaw), math.sin(front_of.yaw)])
+            fits &= cosine >= _FRONT_COSINE * np.linalg.norm(delta, axis=1)
+        return np.asarray(cells[fits])
+
+
+def box_of(scene: Scene, item: SceneObject) -> Aabb:
+    """Bounding box of an object in the world, joints shut."""
+    asset = scene.assets[item.asset_id]
+    return Aabb.around(part.aabb(item.pose_world_asset) for link in asset.links for part in link.parts)
+
+
+def _row(box: Aabb) -> Sequence[float]:
+    return (*box.low_m[:2], *box.high_m[:2], box.low_m[2], box.high_m[2])
+
+
+def _pair(values: FloatArray) -> tuple[float, float]:
+    return (float(values[0]), float(values[1]))

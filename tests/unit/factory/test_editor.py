@@ -1,0 +1,117 @@
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from embomatrix.factory.editor import PlacementError, PlacementReason, SceneEditor
+from embomatrix.factory.scene_check import check_scene
+from embomatrix.factory.scene_floor import ReachableFloor, box_of
+from embomatrix.world.state import Relation, State
+
+if TYPE_CHECKING:
+    from embomatrix.world.scene import Scene
+
+
+def editor(scene: Scene, seed: int = 0) -> SceneEditor:
+    return SceneEditor(scene, np.random.default_rng(seed))
+
+
+def a_host(scene: Scene, prefix: str) -> str:
+    return next(item.name for item in scene.objects if item.name.startswith(prefix))
+
+
+@pytest.mark.parametrize(
+    ("relation", "host"),
+    [(Relation.ONTOP, "breakfast_table"), (Relation.INSIDE, "fridge"), (Relation.INSIDE, "bottom_cabinet")],
+)
+def test_added_things_rest_where_they_were_asked_for(flat: Scene, relation: Relation, host: str) -> None:
+    edit = editor(flat)
+    names = [edit.add("apple", None, relation, a_host(flat, host)) for _ in range(2)]
+    scene = edit.freeze("task-scene")
+    assert check_scene(scene) == ()
+    assert names == ["apple_1", "apple_2"]
+    assert all(
+        scene.by_name[n].host == a_host(flat, host) and scene.by_name[n].relation is relation for n in names
+    )
+    assert not any(scene.by_name[n].fixed for n in names)
+
+
+def test_a_thing_on_the_floor_of_a_room_is_in_that_room_and_in_reach(flat: Scene) -> None:
+    edit = editor(flat)
+    name = edit.add("bucket", None, None, "living_room_0")
+    scene = edit.freeze("task-scene")
+    assert scene.by_name[name].room == "living_room_0"
+    assert box_of(scene, scene.by_name[name]).low_m[2] == pytest.approx(0.0, abs=0.005)
+    assert len(ReachableFloor(flat).spots(box_of(scene, scene.by_name[name]))) > 0
+    assert check_scene(scene) == ()
+
+
+def test_next_to_means_on_the_same_surface(flat: Scene) -> None:
+    edit = editor(flat)
+    table = a_host(flat, "breakfast_table")
+    first = edit.add("bowl", None, Relation.ONTOP, table)
+    second = edit.add("apple", None, Relation.NEXTTO, first)
+    assert edit.objects[second].host == table
+    assert check_scene(edit.freeze("task-scene")) == ()
+
+
+def test_the_base_scene_is_left_alone_and_assets_in_use_travel(flat: Scene) -> None:
+    before = flat.objects
+    edit = editor(flat)
+    name = edit.add("apple", None, Relation.ONTOP, a_host(flat, "breakfast_table"))
+    scene = edit.freeze("task-scene")
+    assert flat.objects == before
+    assert scene.scene_id == "task-scene"
+    assert scene.base == flat.base
+    assert set(scene.assets) == {item.asset_id for item in scene.objects}
+    assert scene.by_name[name].asset_id in scene.assets
+
+
+def test_the_same_seed_puts_a_thing_in_the_same_place(flat: Scene) -> None:
+    def pose(seed: int) -> object:
+        edit = editor(flat, seed)
+        return edit.objects[
+            edit.add("apple", None, Relation.ONTOP, a_host(flat, "breakfast_table"))
+        ].pose_world_asset
+
+    assert pose(5) == pose(5)
+    assert pose(5) != pose(6)
+
+
+def test_states_and_joints_are_set_by_name(flat: Scene) -> None:
+    edit = editor(flat)
+    fridge = a_host(flat, "fridge")
+    edit.set_states(fridge, frozenset({State.DUSTY}))
+    edit.set_joints(fridge, (1.0,) * len(edit.objects[fridge].joints))
+    item = edit.freeze("task-scene").by_name[fridge]
+    assert item.states == {State.DUSTY}
+    assert set(item.joints) == {1.0}
+    with pytest.raises(ValueError, match="between 0 and 1"):
+        edit.set_joints(fridge, (2.0,) * len(item.joints))
+
+
+@pytest.mark.parametrize(
+    ("category", "relation", "host", "reason"),
+    [
+        ("apple", Relation.ONTOP, "throne_1", PlacementReason.UNKNOWN_HOST),
+        ("apple", None, "ballroom_0", PlacementReason.UNKNOWN_HOST),
+        ("aple", Relation.ONTOP, "bed_1", PlacementReason.UNKNOWN_MODEL),
+        ("sofa", Relation.INSIDE, "fridge_1", PlacementReason.TOO_LARGE),
+    ],
+)
+def test_what_can_not_be_placed_says_why(
+    flat: Scene, category: str, relation: Relation | None, host: str, reason: PlacementReason
+) -> None:
+    with pytest.raises(PlacementError) as caught:
+        editor(flat).add(category, None, relation, host)
+    assert caught.value.reason is reason
+
+
+def test_a_full_shelf_says_so(flat: Scene) -> None:
+    edit = editor(flat)
+    with pytest.raises(PlacementError) as caught:
+        for _ in range(200):
+            edit.add("bowl", None, Relation.ONTOP, a_host(flat, "breakfast_table"))
+    assert caught.value.reason in (PlacementReason.NO_FREE_SPOT, PlacementReason.OUT_OF_REACH)

@@ -1,0 +1,126 @@
+from __future__ import annotations
+
+import itertools
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from embomatrix.factory.floorplan import MIN_DOOR_M, DoorSpec, FloorPlan, FloorPlanError, RoomSpec, plan_floor
+from embomatrix.factory.floorplan_walls import WALL_HEIGHT_M, WALL_M
+from embomatrix.factory.scene_build import room_spec
+from embomatrix.world.catalog import Catalog
+from embomatrix.world.geometry import Pose
+
+DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
+ORIGIN = Pose((0.0, 0.0, 0.0))
+BASE_SCENES = ("Rs_int", "Wainscott_0_int", "restaurant_diner")
+
+
+def plan_of(scene_id: str, seed: int = 0) -> FloorPlan:
+    catalog = Catalog.load()
+    rooms = [room_spec(catalog, room) for room in catalog.inventory(scene_id).rooms]
+    return plan_floor(rooms, np.random.default_rng(seed))
+
+
+def reached(plan: FloorPlan) -> set[str]:
+    """Rooms that doorways lead to from the first one."""
+    found = {plan.rooms[0].name}
+    for _ in plan.rooms:
+        for door in plan.doorways:
+            if found & set(door.rooms):
+                found |= {name for name in door.rooms if name}
+    return found
+
+
+def apart_m(a: object, b: object) -> float:
+    """Gap between two rooms along the axis that separates them best; negative when they overlap."""
+    return max(
+        max(a.low_m[i] - b.high_m[i], b.low_m[i] - a.high_m[i])  # type: ignore[attr-defined]
+        for i in (0, 1)
+    )
+
+
+@pytest.mark.parametrize("scene_id", BASE_SCENES)
+def test_rooms_keep_their_true_size_and_lie_a_wall_apart(scene_id: str) -> None:
+    plan = plan_of(scene_id)
+    floors = {room.name: room.floor_m for room in Catalog.load().inventory(scene_id).rooms}
+    for room in plan.rooms:
+        assert sorted(room.size_m) == pytest.approx(sorted(floors[room.name]))
+    for a, b in itertools.combinations(plan.rooms, 2):
+        assert apart_m(a, b) >= WALL_M - 1e-6
+
+
+@pytest.mark.parametrize("scene_id", BASE_SCENES)
+def test_doorways_join_all_rooms_and_one_leads_outside(scene_id: str) -> None:
+    plan = plan_of(scene_id)
+    assert reached(plan) == {room.name for room in plan.rooms}
+    assert [door.rooms[1] for door in plan.doorways].count("") == 1
+    assert all(door.width_m >= MIN_DOOR_M - 1e-9 for door in plan.doorways)
+
+
+@pytest.mark.parametrize("scene_id", BASE_SCENES)
+def test_walls_stand_on_no_floor_and_leave_inner_doorways_open(scene_id: str) -> None:
+    plan = plan_of(scene_id)
+    boxes = [wall.aabb(ORIGIN) for wall in plan.walls]
+    for room in plan.rooms:
+        for box in boxes:
+            covered = [min(box.high_m[i], room.high_m[i]) - max(box.low_m[i], room.low_m[i]) for i in (0, 1)]
+            assert min(covered) < 1e-6
+    for door in plan.doorways:
+        barred = any(box.contains((*door.center_m, 1.0)) for box in boxes)
+        assert barred == (door.rooms[1] == "")
+        assert any(box.contains((*door.center_m, WALL_HEIGHT_M - 0.05)) for box in boxes)
+
+
+def test_plans_are_about_as_compact_as_the_real_one() -> None:
+    path = DATA / "beechwood_0_int_layout.json"
+    if not path.exists():
+        pytest.skip("the measured layout of Beechwood_0_int lies beside the repository, in ../shared/data")
+    rooms = json.loads(path.read_text())["rooms"]
+    low = np.min([np.subtract(r["center"], np.divide(r["size"], 2)) for r in rooms], axis=0)
+    high = np.max([np.add(r["center"], np.divide(r["size"], 2)) for r in rooms], axis=0)
+    true_extent = float(np.prod(high - low))
+    plan = plan_of("Beechwood_0_int")
+    ours = np.max([r.high_m for r in plan.rooms], axis=0) - np.min([r.low_m for r in plan.rooms], axis=0)
+    assert float(np.prod(ours)) < 1.35 * true_extent
+    assert plan.compactness > 0.7
+
+
+def test_a_seed_decides_the_plan() -> None:
+    assert plan_of("Rs_int", 3) == plan_of("Rs_int", 3)
+    assert any(plan_of("Rs_int", 3) != plan_of("Rs_int", other) for other in (4, 5, 6))
+
+
+def test_an_inner_door_is_taken_from_both_rooms_that_list_it() -> None:
+    wide = DoorSpec("wide", 1.5, 2.0)
+    rooms = [
+        RoomSpec("kitchen_0", "kitchen", (3, 3), (wide,)),
+        RoomSpec("dining_room_0", "dining_room", (4, 3), (wide,)),
+    ]
+    plan = plan_floor(rooms, np.random.default_rng(0))
+    inner = [door for door in plan.doorways if door.rooms[1]]
+    assert [(door.model, door.width_m) for door in inner] == [("wide", pytest.approx(1.5))]
+
+
+def test_no_rooms_are_refused() -> None:
+    with pytest.raises(FloorPlanError, match="at least one"):
+        plan_floor([], np.random.default_rng(0))
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.lists(st.tuples(st.floats(1.0, 9.0), st.floats(1.0, 9.0)), min_size=1, max_size=7),
+    st.integers(0, 2**32 - 1),
+)
+def test_any_rooms_are_packed_without_overlap_and_all_reached(
+    floors: list[tuple[float, float]], seed: int
+) -> None:
+    types = ("corridor", "bedroom", "kitchen", "bathroom", "living_room", "storage_room", "garage")
+    rooms = [RoomSpec(f"room_{i}", types[i], floor) for i, floor in enumerate(floors)]
+    plan = plan_floor(rooms, np.random.default_rng(seed), trials=6)
+    assert all(apart_m(a, b) >= WALL_M - 1e-6 for a, b in itertools.combinations(plan.rooms, 2))
+    assert reached(plan) == {room.name for room in plan.rooms}

@@ -1,0 +1,167 @@
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from embomatrix.factory.floorplan import RoomSpec, plan_floor
+from embomatrix.factory.furnish import MAX_EQUAL, furnish
+from embomatrix.factory.furnish_groups import floor_groups
+from embomatrix.factory.furnish_pieces import REST_GAP_M, Piece, around_table, front_depth_m
+from embomatrix.factory.furnish_roles import HUNG_BOTTOM_M, Role, role_of
+from embomatrix.factory.furnish_space import RoomSpace, Target
+from embomatrix.factory.scene_build import build_base_scene
+from embomatrix.factory.scene_floor import box_of
+from embomatrix.world.asset import Asset, Joint, JointKind, Link, SupportSurface
+from embomatrix.world.geometry import Part, Pose, Shape, Vec3
+from embomatrix.world.scene import Doorway, Room, Scene
+from embomatrix.world.state import Relation
+
+if TYPE_CHECKING:
+    from embomatrix.factory.furnish import Furnishing
+
+ROOM = Room("kitchen_0", "kitchen", (0.0, 0.0), (4.0, 3.0))
+DOOR = Doorway(("kitchen_0", "hall_0"), (2.0, -0.06), 0.9, 2.0, "x")
+
+
+def block(category: str, size: Vec3, *, door: bool = False) -> Asset:
+    """A solid box with a top to put things on, and a hinged front if it opens."""
+    links = [Link("base", (Part(Shape.BOX, Pose((0.0, 0.0, 0.0)), size),))]
+    if door:
+        leaf = Part(Shape.BOX, Pose((size[0] / 2 - 0.01, 0.0, 0.0)), (0.02, size[1], size[2]))
+        hinge = Joint(JointKind.REVOLUTE, (size[0] / 2, size[1] / 2, 0.0), (0.0, 0.0, 1.0), math.pi / 2)
+        links.append(Link("door", (leaf,), hinge))
+    top = SupportSurface("top", (0.0, 0.0, size[2] / 2), size[:2], 1.0)
+    abilities: dict[str, dict[str, float]] = {"openable": {}} if door else {}
+    return Asset(
+        f"{category}-box", category, f"{category}.n.01", size, 5.0, tuple(links), (top,), (), abilities
+    )
+
+
+def pieces(*assets: Asset) -> list[Piece]:
+    return [Piece(i, a.category, a, role_of(a.category, a.size_m, a.mass_kg)) for i, a in enumerate(assets)]
+
+
+def furnished(*assets: Asset, floor: tuple[float, float] = (4.0, 3.0), seed: int = 0) -> Furnishing:
+    rng = np.random.default_rng(seed)
+    plan = plan_floor([RoomSpec("kitchen_0", "kitchen", floor)], rng)
+    return furnish(plan, {"kitchen_0": pieces(*assets)}, rng)
+
+
+def test_chairs_face_the_table_from_outside_it() -> None:
+    table, *chairs = pieces(
+        block("breakfast_table", (0.8, 1.4, 0.75)), *[block("straight_chair", (0.45, 0.45, 0.8))] * 6
+    )
+    for member in around_table(table, chairs)[1:]:
+        ahead = (round(math.cos(member.turns * math.pi / 2)), round(math.sin(member.turns * math.pi / 2)))
+        toward = (-member.x, -member.y)
+        assert ahead[0] * toward[0] + ahead[1] * toward[1] > 0
+        assert abs(member.x) >= 0.4 + 0.225 or abs(member.y) >= 0.7 + 0.225
+
+
+def test_a_counter_slab_lies_on_its_tallest_cabinet() -> None:
+    cabinet, lower = (
+        block("bottom_cabinet", (0.5, 0.5, 0.55), door=True),
+        block("bottom_cabinet", (0.5, 0.45, 0.53), door=True),
+    )
+    groups, left_out = floor_groups(pieces(block("countertop", (0.6, 1.0, 0.03)), cabinet, lower))
+    (counter,) = groups
+    slab = counter.members[-1]
+    assert slab.piece.category == "countertop"
+    assert slab.bottom == pytest.approx(0.55 + REST_GAP_M)
+    assert counter.members[slab.on].piece.size_m[2] == 0.55
+    assert not left_out
+
+
+def test_a_slab_without_cabinets_is_left_out_with_a_sentence() -> None:
+    groups, left_out = floor_groups(pieces(block("countertop", (0.6, 1.0, 0.03))))
+    assert groups == []
+    assert left_out == ["1 of the countertop-box slabs: no base cabinets are left to carry them"]
+
+
+def test_a_door_leaf_needs_its_own_width_before_it() -> None:
+    assert front_depth_m(block("fridge", (0.7, 0.9, 1.8), door=True)) == pytest.approx(0.9, abs=0.05)
+    assert front_depth_m(block("stove", (0.6, 0.9, 0.9))) == pytest.approx(0.6)
+
+
+def test_a_room_cut_in_two_is_not_passable() -> None:
+    space = RoomSpace(ROOM, [DOOR])
+    beyond = Target((1.0, 2.4, 3.0, 3.0))
+    assert space.reachable(targets=[beyond])
+    assert space.reachable([(0.0, 1.5, 0.0, 3.0, 1.7, 0.9)], [beyond])
+    assert not space.reachable([(0.0, 1.5, 0.0, 4.0, 1.7, 0.9)], [beyond])
+    assert space.reachable([(0.0, 1.5, 1.5, 4.0, 1.7, 1.9)], [beyond]), (
+        "what hangs above the robot bars no way"
+    )
+
+
+def test_the_floor_before_a_doorway_stays_free() -> None:
+    space = RoomSpace(ROOM, [DOOR])
+    before, aside = (1.9, 0.1, 0.0, 2.1, 0.5, 0.8), (0.1, 0.1, 0.0, 0.5, 0.5, 0.8)
+    assert space.blocks_zone(np.array([before, aside])).tolist() == [True, False]
+
+
+def test_backed_furniture_looks_away_from_its_wall() -> None:
+    result = furnished(block("bookcase", (0.3, 1.0, 2.0)), block("sofa", (0.9, 1.8, 0.8)))
+    assert len(result.placed) == 2
+    for item in result.placed:
+        ahead = item.pose.apply((1.0, 0.0, 0.0))
+        center = (2.06, 1.56)
+        before, after = (math.dist((x, y), center) for x, y in ((item.x, item.y), ahead[:2]))
+        assert after < before or before < 1.2
+
+
+def test_what_does_not_fit_is_named_and_nothing_else_is_lost() -> None:
+    result = furnished(*[block("fridge", (0.8, 0.9, 1.8), door=True)] * 9, floor=(2.5, 2.5))
+    kept = len(result.placed)
+    assert 0 < kept < 9
+    assert result.left_out == (f"{9 - kept} fridge-box in kitchen_0: no free place keeps the room passable",)
+
+
+def test_small_things_of_one_model_are_capped() -> None:
+    result = furnished(block("breakfast_table", (0.9, 1.6, 0.75)), *[block("mug", (0.08, 0.1, 0.1))] * 40)
+    mugs = [item for item in result.placed if item.piece.category == "mug"]
+    assert len(mugs) == MAX_EQUAL
+    assert all(
+        item.relation is Relation.ONTOP and item.bottom == pytest.approx(0.75 + REST_GAP_M) for item in mugs
+    )
+    assert result.left_out == (
+        f"{40 - MAX_EQUAL} of 40 mug-box in kitchen_0: at most {MAX_EQUAL} of a model in a room",
+    )
+
+
+def test_an_unknown_category_gets_a_role_by_its_size() -> None:
+    assert role_of("gadget", (0.1, 0.1, 0.1), 0.2) is Role.SURFACE
+    assert role_of("contraption", (0.6, 1.4, 1.0), 40.0) is Role.BACKED
+    assert role_of("obelisk", (5.0, 5.0, 9.0), 4000.0) is Role.STRUCTURE
+
+
+def test_the_same_seed_builds_the_same_scene(flat: Scene) -> None:
+    again = build_base_scene("Rs_int", seed=0)
+    assert again.objects == flat.objects
+    assert build_base_scene("Rs_int", seed=1).objects != flat.objects
+
+
+def test_names_count_from_one_within_a_category(flat: Scene) -> None:
+    for category in {flat.assets[item.asset_id].category for item in flat.objects}:
+        names = [item.name for item in flat.objects if flat.assets[item.asset_id].category == category]
+        assert names == [f"{category}_{i + 1}" for i in range(len(names))]
+
+
+def test_wall_cabinets_hang_above_the_robots_way_and_everything_is_shut(flat: Scene) -> None:
+    cabinets = [item for item in flat.objects if item.name.startswith("top_cabinet")]
+    assert cabinets
+    assert all(box_of(flat, item).low_m[2] == pytest.approx(HUNG_BOTTOM_M, abs=0.01) for item in cabinets)
+    assert all(fraction == 0.0 for item in flat.objects for fraction in item.joints)
+
+
+def test_every_inventory_item_is_placed_or_accounted_for(flat: Scene) -> None:
+    from embomatrix.world.catalog import Catalog
+
+    placed = {item.asset_id for item in flat.objects}
+    for room in Catalog.load().inventory("Rs_int").rooms:
+        for category, model, _ in room.items:
+            asset_id = f"{category}-{model}"
+            assert asset_id in placed or any(asset_id in sentence for sentence in flat.left_out), asset_id

@@ -1,0 +1,50 @@
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from typer.testing import CliRunner
+
+from embomatrix.factory.pictures import draw_plan
+from embomatrix.factory.scene_cli import app
+from embomatrix.sim.bullet.camera import render_oblique
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from embomatrix.world.scene import Scene
+
+
+def test_the_plan_shows_more_than_walls(flat: Scene) -> None:
+    pixels = np.asarray(draw_plan(flat))
+    assert pixels.ndim == 3
+    assert min(pixels.shape[:2]) > 500
+    assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > 12
+
+
+def test_the_oblique_view_holds_the_whole_scene(flat: Scene) -> None:
+    pixels = render_oblique(flat, width_px=320, height_px=240)
+    assert pixels.shape == (240, 320, 3)
+    background = (pixels == pixels[0, 0]).all(axis=2)
+    assert 0.15 < background.mean() < 0.85
+    edge = np.concatenate([background[0], background[-1], background[:, 0], background[:, -1]])
+    assert edge.mean() > 0.95, "nothing is cut off at the edge of the picture"
+
+
+def test_an_unknown_scene_gets_one_sentence_with_close_names() -> None:
+    result = CliRunner().invoke(app, ["show", "Rs_itn"])
+    assert result.exit_code == 2
+    assert "Rs_int" in result.output
+    assert "Traceback" not in result.output
+
+
+def test_render_writes_both_pictures(tmp_path: Path) -> None:
+    result = CliRunner().invoke(app, ["render", "Rs_int", "--out", str(tmp_path)])
+    assert result.exit_code == 0, result.output
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["Rs_int_plan.png", "Rs_int_view.png"]
+
+
+def test_check_finds_a_base_scene_in_order() -> None:
+    result = CliRunner().invoke(app, ["check", "Rs_int"])
+    assert result.exit_code == 0, result.output
+    assert "nothing wrong" in result.output
