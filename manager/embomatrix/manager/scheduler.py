@@ -63,6 +63,15 @@ class _Holder:
     def usable(self) -> bool:
         return self.reported and not self.draining and not self.suspect
 
+    def standing(self) -> tuple[str, ...]:
+        """Scenes that it has or was told to have, by last use. What it was told counts: its reports lag behind."""
+        known = dict.fromkeys([*self.residents, *(self.desired or ())])
+        failed = {s for s, resident in self.residents.items() if resident.state is ResidentState.FAILED}
+        told = set(known if self.desired is None else self.desired)
+        return tuple(
+            sorted((scene for scene in known if scene not in failed), key=lambda scene: scene not in told)
+        )
+
     def to_load(self, scenes: Iterable[str]) -> list[str]:
         """Those that are not warm here yet, in the same order."""
         return [scene for scene in scenes if scene not in self.warm_since_s]
@@ -87,6 +96,8 @@ class Scheduler:
         self._limits = limits
         self._holders: dict[str, _Holder] = {}
         self._demand = DemandObserved({})
+        self._peaks: dict[str, int] = {}
+        self._copies: dict[str, int] = {}
         self._size_mb: dict[str, float] = {}
         self._load_s: dict[str, float] = {}
         self._now_s = 0.0
@@ -97,6 +108,13 @@ class Scheduler:
         match event:
             case DemandObserved():
                 self._demand = event
+                # By its peak and not by what is left: a scene's copies shall not come and go while a batch runs down.
+                self._peaks = {
+                    scene: max(count, self._peaks.get(scene, 0)) for scene, count in event.pending.items()
+                }
+                self._copies = {
+                    scene: self._copies[scene] for scene in event.pending if scene in self._copies
+                }
                 self.prewarm.used(event.used)
                 self._touch(event.used)
             case LookaheadAnnounced(run_id, version, entries):
@@ -217,7 +235,7 @@ class Scheduler:
 
     def _place(self) -> list[Command]:
         usable = {name: holder for name, holder in self._holders.items() if holder.usable}
-        needs = needs_of(self._demand.pending, [window.entries for window in self.windows.values()])
+        needs = needs_of(self._peaks, [window.entries for window in self.windows.values()])
         needs = [self._spread(need, usable) for need in needs]
         sites = [self._site(name, holder, needs) for name, holder in usable.items()]
         self.unplaceable = {
@@ -236,13 +254,13 @@ class Scheduler:
             scene for scene, at_s in holder.failed_s.items() if self._now_s - at_s < self._limits.retry_load_s
         }
         refused.update(n.bundle_digest for n in needs if self._size_mb.get(n.bundle_digest, 0.0) > memory_mb)
-        held = [s for s, resident in holder.residents.items() if resident.state is not ResidentState.FAILED]
+        held = holder.standing()
         return Site(
             worker_id=name,
             slots=max(holder.resources.slots, 1),
             score=holder.resources.score,
             memory_mb=memory_mb,
-            residents=tuple(held),
+            residents=held,
             pinned=frozenset(scene for scene in held if (name, scene) in self._demand.in_use),
             refused=frozenset(refused),
         )
@@ -251,12 +269,12 @@ class Scheduler:
         """One worker more for a scene whose rollouts wait while others are idle, unless one is loading it already."""
         scene = need.bundle_digest
         patience_s = max(self._limits.affinity_wait_s, self.load_s(scene))
-        if self._demand.waited_s.get(scene, 0.0) < patience_s:
-            return need
-        holders = {name for name, holder in usable.items() if scene in (holder.desired or ())}
-        loading = any(scene not in usable[name].warm_since_s for name in holders)
-        more = 0 if loading or not self._demand.idle - holders else 1
-        return dataclasses.replace(need, at_least=max(1, len(holders) + more))
+        if self._demand.waited_s.get(scene, 0.0) >= patience_s:
+            holders = {name for name, holder in usable.items() if scene in (holder.desired or ())}
+            loading = any(scene not in usable[name].warm_since_s for name in holders)
+            if not loading and self._demand.idle - holders:
+                self._copies[scene] = len(holders) + 1
+        return dataclasses.replace(need, at_least=self._copies.get(scene, 1))
 
     def _estimate(self, scene: str) -> float:
         return self._size_mb.get(scene, self._limits.scene_mb)

@@ -1,0 +1,169 @@
+"""What the manager keeps: result logs, bundles, figures; and the settings it is started with."""
+
+import asyncio
+import hashlib
+from pathlib import Path
+
+import pytest
+from pydantic import ValidationError
+from tests.fakes.worker import completed
+from typer.testing import CliRunner
+
+from embomatrix.manager.bundles import BundleStore
+from embomatrix.manager.cli import app
+from embomatrix.manager.meter import Meter, quantile
+from embomatrix.manager.results import BatchLog, ResultLogs
+from embomatrix.manager.settings import ManagerSettings
+from embomatrix.manager.store.protocol import ResultRow
+from embomatrix.rpc.status import InvalidRequestError, NotFoundError, OverloadedError
+from embomatrix.rpc.values import Cancelled, InfraCode, InfraFailure, RolloutResult
+
+
+def rows(first, last):
+    return [ResultRow(cursor, f"x{cursor}", b"") for cursor in range(first, last + 1)]
+
+
+async def test_a_reader_waits_for_results_and_ends_with_the_batch():
+    log = BatchLog("r1", "b1", "d")
+    reader = asyncio.create_task(log.after(0))
+    await asyncio.sleep(0)
+    log.append(rows(1, 2))
+    assert await reader == rows(1, 2)
+    log.finish(0.0)
+    assert await log.after(2) == []
+
+
+async def test_a_message_takes_what_came_while_it_lingered_and_no_more_than_it_can_hold():
+    log = BatchLog("r1", "b1", "d", rows(1, 1))
+    reader = asyncio.create_task(log.after(0))
+    await asyncio.sleep(0)
+    log.append(rows(2, 200))
+    assert [row.cursor for row in await reader] == list(range(1, 65))
+    assert len(await log.after(190)) == 10
+
+
+async def test_a_dropped_log_lets_its_readers_go():
+    log = BatchLog("r1", "b1", "d")
+    reader = asyncio.create_task(log.after(0))
+    await asyncio.sleep(0)
+    log.drop()
+    assert await reader == []
+
+
+async def test_finished_logs_go_when_old_or_too_many():
+    logs = ResultLogs(ttl_s=100, limit=25)
+    for name, finished_s in (("old", 0.0), ("mid", 60.0), ("new", 70.0)):
+        log = BatchLog("r1", name, "d", rows(1, 10))
+        log.finish(finished_s)
+        logs.add(log)
+    logs.add(BatchLog("r1", "open", "d"))
+    assert [log.batch_id for log in logs.outdated(80.0)] == ["old"]
+    assert [log.batch_id for log in logs.outdated(165.0)] == ["old", "mid"]
+
+
+async def pieces(*parts):
+    for part in parts:
+        yield part
+
+
+def digest_of(data):
+    return f"sha256:{hashlib.sha256(data).hexdigest()}"
+
+
+async def test_a_bundle_appears_only_when_its_digest_is_right(tmp_path):
+    store = BundleStore(tmp_path, limit_bytes=100, total_bytes=1000)
+    with pytest.raises(InvalidRequestError, match="expected sha256:"):
+        await store.put(digest_of(b"other"), pieces(b"some", b"thing"))
+    assert list(tmp_path.iterdir()) == []
+    await store.put(digest_of(b"something"), pieces(b"some", b"thing"))
+    assert b"".join([part async for part in store.get(digest_of(b"something"))]) == b"something"
+
+
+async def test_a_bundle_that_is_too_large_is_refused_before_it_is_whole(tmp_path):
+    store = BundleStore(tmp_path, limit_bytes=10, total_bytes=1000)
+    with pytest.raises(InvalidRequestError, match="larger than 10 bytes"):
+        await store.put(digest_of(b"x" * 40), pieces(*[b"x" * 8] * 5))
+    assert list(tmp_path.iterdir()) == []
+
+
+async def test_a_full_folder_takes_no_more(tmp_path):
+    store = BundleStore(tmp_path, limit_bytes=100, total_bytes=50)
+    await store.put(digest_of(b"a" * 40), pieces(b"a" * 40))
+    with pytest.raises(OverloadedError, match="no room"):
+        await store.put(digest_of(b"b" * 40), pieces(b"b" * 40))
+
+
+async def test_a_bundle_that_was_never_put_is_not_found(tmp_path):
+    store = BundleStore(tmp_path, limit_bytes=100, total_bytes=1000)
+    with pytest.raises(NotFoundError, match="put it first"):
+        await anext(store.get(digest_of(b"nothing")))
+
+
+def test_the_meter_counts_outcomes_and_keeps_reasons():
+    meter = Meter()
+    failure = InfraFailure(InfraCode.SLOT_CRASHED, "signal 11", "w1")
+    for cursor, outcome in enumerate([completed(), completed(), failure, Cancelled()]):
+        meter.observe("r1", RolloutResult(f"x{cursor}", "g", cursor, 1, outcome), 10.5)
+    assert meter.outcomes == {"completed": 2, "slot_crashed": 1, "cancelled": 1}
+    assert meter.throughput(11.0)[-1] == 2
+    assert meter.throughput(12.0)[-2:] == [2, 0]
+    assert meter.latency_s(0.5) == pytest.approx(0.001)
+    assert meter.failures[0].message == "signal 11"
+
+
+def test_quantiles_of_few_values():
+    assert quantile([], 0.5) == 0.0
+    assert [quantile([1.0, 2.0, 3.0], share) for share in (0.0, 0.5, 0.95, 1.0)] == [1.0, 2.0, 3.0, 3.0]
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "192.168.1.5", "manager", "::"])
+def test_outside_loopback_a_token_is_needed(host):
+    with pytest.raises(ValidationError, match="--insecure-bind"):
+        ManagerSettings(host=host)
+    assert ManagerSettings(host=host, token="secret").host == host
+    assert ManagerSettings(host=host, insecure_bind=True).host == host
+
+
+def test_unknown_settings_are_refused_and_the_token_is_never_shown():
+    with pytest.raises(ValidationError, match="Extra inputs"):
+        ManagerSettings(prot=1)
+    assert "secret" not in repr(ManagerSettings(token="secret"))
+
+
+def test_the_state_lies_in_the_data_folder_unless_told_otherwise():
+    assert ManagerSettings(data_dir=Path("/d")).state_url == "sqlite:/d/state.sqlite"
+    assert ManagerSettings(state="memory:").state_url == "memory:"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["--host", "0.0.0.0"], "without a token"),
+        (["--port", "70000"], "--port"),
+        (["--state", "mysql://x"], "expected memory:, sqlite:PATH or redis://"),
+        (["--state", "redis://127.0.0.1:1/0"], "can't be reached"),
+        (["--log-level", "loud"], "expected debug, info"),
+    ],
+)
+def test_bad_options_get_one_sentence_and_status_2(arguments, sentence, tmp_path):
+    result = CliRunner().invoke(
+        app, ["serve", "--data-dir", str(tmp_path), "--port", "0", "--http-port", "0", *arguments]
+    )
+    assert result.exit_code == 2
+    assert sentence in result.output
+    assert "Traceback" not in result.output
+
+
+def test_a_data_folder_that_is_a_file_is_explained(tmp_path):
+    (tmp_path / "file").write_text("")
+    result = CliRunner().invoke(
+        app, ["serve", "--data-dir", str(tmp_path / "file"), "--port", "0", "--http-port", "0"]
+    )
+    assert result.exit_code == 2
+    assert "--data-dir" in result.output
+
+
+def test_asking_a_manager_that_is_not_there_says_how_to_start_one():
+    result = CliRunner().invoke(app, ["status", "--address", "127.0.0.1:1"])
+    assert result.exit_code == 2
+    assert "embomatrix manager serve" in result.output

@@ -1,0 +1,118 @@
+"""Sessions: superseded, suspected, lost, and back again."""
+
+import pytest
+
+from embomatrix.manager.events import (
+    WorkerDrained,
+    WorkerJoined,
+    WorkerLost,
+    WorkerRecovered,
+    WorkerSuspected,
+)
+from embomatrix.manager.registry import LivenessLimits, Registry, Standing
+from embomatrix.rpc.status import NotFoundError, SupersededError
+from embomatrix.rpc.values import Resources
+
+RESOURCES = Resources(2, 2, 1024)
+LIMITS = LivenessLimits(heartbeat_s=1.0, lost_after_s=10.0, stream_grace_s=1.0, remember_lost_s=60.0)
+
+
+@pytest.fixture
+def registry():
+    return Registry(LIMITS)
+
+
+def join(registry, worker_id="w1", boot_id="boot-1", now_s=0.0):
+    return registry.register(worker_id, boot_id, RESOURCES, now_s=now_s)
+
+
+def test_a_registered_worker_is_found_by_its_session(registry):
+    session, events = join(registry)
+    assert events == [WorkerJoined("w1", RESOURCES)]
+    assert registry.find(session.session_id, session.epoch) is session
+
+
+def test_another_process_of_the_same_worker_ends_the_first(registry):
+    old, _ = join(registry)
+    new, events = join(registry, boot_id="boot-2")
+    assert [type(event) for event in events] == [WorkerLost, WorkerJoined]
+    assert new.epoch > old.epoch
+    with pytest.raises(SupersededError, match="register again"):
+        registry.find(old.session_id, old.epoch)
+
+
+def test_the_same_process_keeps_its_leases_under_a_new_session(registry):
+    old, _ = join(registry)
+    new, events = join(registry)
+    assert events == []
+    with pytest.raises(SupersededError):
+        registry.find(old.session_id, old.epoch)
+    assert registry.find(new.session_id, new.epoch) is new
+
+
+def test_a_session_with_a_wrong_epoch_is_refused(registry):
+    session, _ = join(registry)
+    with pytest.raises(SupersededError):
+        registry.find(session.session_id, session.epoch + 1)
+
+
+def test_three_missed_heartbeats_make_a_suspect_and_a_word_clears_it(registry):
+    session, _ = join(registry)
+    assert registry.tick(now_s=2.9) == []
+    assert registry.tick(now_s=3.0) == [WorkerSuspected("w1")]
+    assert registry.tick(now_s=3.1) == []
+    assert registry.heard(session, now_s=4.0) == [WorkerRecovered("w1")]
+
+
+def test_ten_silent_seconds_lose_a_worker(registry):
+    session, _ = join(registry)
+    registry.tick(now_s=5.0)
+    (lost,) = registry.tick(now_s=10.0)
+    assert isinstance(lost, WorkerLost)
+    with pytest.raises(SupersededError, match="given up"):
+        registry.find(session.session_id, session.epoch)
+
+
+def test_a_broken_stream_loses_a_worker_after_a_second(registry):
+    session, _ = join(registry)
+    registry.attach(session, now_s=0.0)
+    registry.detach(session, now_s=1.0)
+    assert registry.tick(now_s=1.9) == []
+    assert [type(event) for event in registry.tick(now_s=2.0)] == [WorkerLost]
+
+
+def test_a_stream_that_comes_back_in_time_costs_nothing(registry):
+    session, _ = join(registry)
+    registry.attach(session, now_s=0.0)
+    registry.detach(session, now_s=1.0)
+    registry.attach(session, now_s=1.5)
+    assert registry.tick(now_s=2.5) == []
+
+
+def test_heartbeats_slow_down_in_a_large_cluster(registry):
+    assert registry.interval_s == 1.0
+    for index in range(400):
+        join(registry, f"w{index}")
+    assert registry.interval_s == 4.0
+
+
+def test_a_lost_worker_is_remembered_for_a_while(registry):
+    join(registry)
+    registry.tick(now_s=10.0)
+    assert registry.sessions["w1"].standing is Standing.LOST
+    registry.tick(now_s=61.0)
+    assert not registry.sessions
+
+
+def test_a_lost_worker_may_register_again(registry):
+    join(registry)
+    registry.tick(now_s=10.0)
+    _, events = join(registry, now_s=11.0)
+    assert events == [WorkerJoined("w1", RESOURCES)]
+
+
+def test_draining_names_the_worker_or_the_ones_there_are(registry):
+    join(registry)
+    assert registry.drain("w1") == [WorkerDrained("w1")]
+    with pytest.raises(NotFoundError, match="connected are w1"):
+        registry.drain("w2")

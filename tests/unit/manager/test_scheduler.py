@@ -1,0 +1,327 @@
+"""The Resource-Scheduler: who holds which scene, when, and what that was worth."""
+
+import hypothesis.strategies as st
+import pytest
+from hypothesis import given
+
+from embomatrix.manager.commands import SetDesired
+from embomatrix.manager.events import (
+    BatchSubmitted,
+    DemandObserved,
+    LookaheadAnnounced,
+    RunClosed,
+    Tick,
+    WorkerDrained,
+    WorkerJoined,
+    WorkerLost,
+    WorkerReported,
+    WorkerSuspected,
+)
+from embomatrix.manager.placement import Need, Site, needs_of, place
+from embomatrix.manager.scheduler import ScheduleLimits, Scheduler
+from embomatrix.rpc.values import (
+    Batch,
+    LookaheadEntry,
+    Resident,
+    ResidentState,
+    Resources,
+    Rollout,
+    Warmth,
+)
+
+MB = 100.0
+
+
+class Cluster:
+    """A scheduler with obedient workers: what they are told to hold they report, loading first and warm when asked."""
+
+    def __init__(self):
+        self.scheduler = Scheduler(ScheduleLimits(scene_mb=MB, affinity_wait_s=0.5, retry_load_s=10))
+        self.now_s = 0.0
+        self.desired = {}
+
+    def tell(self, event, after_s=0.0):
+        self.now_s += after_s
+        commands = self.scheduler.handle(event, now_s=self.now_s)
+        for command in commands:
+            assert isinstance(command, SetDesired)
+            self.desired[command.worker_id] = command.bundle_digests
+        return commands
+
+    def worker(self, name="w1", slots=1, memory_mb=1000, score=1.0):
+        self.tell(WorkerJoined(name, Resources(slots, slots, memory_mb, score)))
+        return self.report(name, resync=True)
+
+    def report(self, name="w1", state=ResidentState.WARM, scenes=None, resync=False, memory_mb=MB):
+        scenes = self.desired.get(name, ()) if scenes is None else scenes
+        residents = tuple(Resident(scene, state, 1.0, memory_mb, "no mesh") for scene in scenes)
+        return self.tell(WorkerReported(name, residents, resync=resync))
+
+    def announce(self, *steps, version=1, run_id="r1", count=4):
+        entries = [LookaheadEntry(i + 1, scene, count) for i, scenes in enumerate(steps) for scene in scenes]
+        return self.tell(LookaheadAnnounced(run_id, version, tuple(entries)))
+
+    def demand(self, after_s=0.0, **pending):
+        return self.tell(DemandObserved(pending), after_s)
+
+    def submit(self, scene, step=1, after_s=0.0):
+        self.tell(
+            BatchSubmitted(Batch("r1", f"b{step}", step, (Rollout("x", "g", scene, "t", (), 0),))), after_s
+        )
+
+
+@pytest.fixture
+def cluster():
+    return Cluster()
+
+
+def test_announced_scenes_are_loaded_nearest_step_first(cluster):
+    cluster.worker()
+    cluster.announce(["a"], ["b"], ["c"])
+    assert cluster.desired["w1"] == ("a", "b", "c")
+
+
+def test_memory_bounds_what_is_loaded_and_the_furthest_use_is_left_out(cluster):
+    cluster.worker(memory_mb=250)
+    cluster.announce(["a"], ["b"], ["c"])
+    assert cluster.desired["w1"] == ("a", "b")
+    assert [cluster.scheduler.warmth(scene) for scene in "abc"] == [
+        Warmth.WARMING,
+        Warmth.WARMING,
+        Warmth.QUEUED,
+    ]
+
+
+def test_the_scene_that_is_needed_last_is_evicted(cluster):
+    cluster.worker(memory_mb=250)
+    cluster.announce(["a"], ["b"])
+    cluster.report()
+    cluster.announce(["c"], ["a"], ["b"], version=2)
+    assert cluster.desired["w1"] == ("c", "a")
+
+
+def test_what_rollouts_wait_for_comes_before_what_was_announced(cluster):
+    cluster.worker(memory_mb=250)
+    cluster.announce(["a"], ["b"])
+    cluster.demand(z=3)
+    assert cluster.desired["w1"] == ("z", "a")
+
+
+def test_a_desired_set_is_told_only_when_it_changes(cluster):
+    cluster.worker()
+    assert len(cluster.announce(["a", "b"])) == 1
+    assert cluster.announce(["a", "b"], version=2) == []
+    cluster.report(state=ResidentState.LOADING)
+    assert cluster.report() == []
+    assert cluster.tell(Tick()) == []
+
+
+def test_a_window_of_a_lower_version_is_ignored(cluster):
+    cluster.worker()
+    cluster.announce(["a"], version=5)
+    cluster.announce(["b"], version=4)
+    cluster.announce(["b"], version=5)
+    assert cluster.desired["w1"] == ("a",)
+
+
+def test_scenes_spread_over_workers_by_slots(cluster):
+    cluster.worker("w1", slots=3)
+    cluster.worker("w2", slots=1)
+    cluster.announce(["a", "b", "c", "d"], count=1)
+    assert len(cluster.desired["w1"]) == 3
+    assert len(cluster.desired["w2"]) == 1
+
+
+def test_a_faster_worker_gets_more(cluster):
+    cluster.worker("w1", score=1.0)
+    cluster.worker("w2", score=3.0)
+    cluster.announce(["a", "b", "c", "d"], count=1)
+    assert len(cluster.desired["w2"]) == 3
+
+
+def test_a_big_group_gets_its_scene_on_several_workers(cluster):
+    for name in ("w1", "w2", "w3"):
+        cluster.worker(name, slots=2)
+    cluster.demand(big=16)
+    assert all("big" in cluster.desired[name] for name in ("w1", "w2", "w3"))
+
+
+def test_a_small_group_stays_on_one_worker(cluster):
+    for name in ("w1", "w2"):
+        cluster.worker(name, slots=4)
+    cluster.demand(small=2)
+    assert sum("small" in scenes for scenes in cluster.desired.values()) == 1
+
+
+def test_idle_workers_load_a_scene_whose_rollouts_waited_too_long(cluster):
+    cluster.worker("w1", slots=1)
+    cluster.worker("w2", slots=1)
+    cluster.demand(a=1, b=1)
+    for name in ("w1", "w2"):
+        cluster.report(name)
+    (first,) = [name for name, scenes in cluster.desired.items() if "a" in scenes]
+    other = {"w1": "w2", "w2": "w1"}[first]
+    cluster.tell(DemandObserved({"a": 1}, {"a": 0.4}, idle=frozenset([other])))
+    assert "a" not in cluster.desired[other]
+    cluster.tell(DemandObserved({"a": 1}, {"a": 1.1}, idle=frozenset([other])))
+    assert "a" in cluster.desired[other]
+
+
+def test_copies_do_not_come_and_go_while_a_batch_runs_down(cluster):
+    for name in ("w1", "w2"):
+        cluster.worker(name, slots=1, memory_mb=150)
+    cluster.announce(["next"])
+    cluster.demand(big=16)
+    for name in ("w1", "w2"):
+        cluster.report(name)
+    changes = [cluster.demand(big=left) for left in range(15, 0, -1)]
+    assert changes == [[]] * 15
+
+
+def test_a_report_that_lags_behind_changes_nothing(cluster):
+    cluster.worker("w1", memory_mb=250)
+    cluster.worker("w2", memory_mb=250)
+    cluster.announce(["a", "b"], ["c", "d"])
+    told = dict(cluster.desired)
+    assert cluster.report("w1", scenes=[]) == []
+    assert cluster.report("w2", state=ResidentState.LOADING, scenes=told["w2"][:1]) == []
+    assert cluster.desired == told
+
+
+def test_scenes_with_running_rollouts_are_not_evicted(cluster):
+    cluster.worker(memory_mb=150)
+    cluster.demand(a=2)
+    cluster.report()
+    cluster.tell(DemandObserved({"b": 4}, in_use=frozenset([("w1", "a")])))
+    assert cluster.desired["w1"] == ("a",)
+    cluster.tell(DemandObserved({"b": 4}))
+    assert cluster.desired["w1"] == ("b",)
+
+
+def test_what_nobody_needs_stays_while_there_is_room_and_the_oldest_goes_first(cluster):
+    cluster.worker(memory_mb=250)
+    cluster.demand(a=1, b=1)
+    cluster.report()
+    cluster.tell(DemandObserved({}, used=frozenset([("w1", "a")])))
+    assert set(cluster.desired["w1"]) == {"a", "b"}
+    cluster.demand(c=1)
+    assert cluster.desired["w1"] == ("c", "a")
+
+
+def test_measured_memory_replaces_the_guess(cluster):
+    cluster.worker(memory_mb=1000)
+    cluster.announce(["a", "b", "c"])
+    cluster.report(memory_mb=400.0)
+    cluster.tell(Tick())
+    assert len(cluster.desired["w1"]) == 2
+
+
+def test_a_scene_larger_than_every_worker_is_unplaceable_and_says_why(cluster):
+    cluster.worker(memory_mb=300)
+    cluster.announce(["a"])
+    cluster.report(memory_mb=900.0)
+    cluster.tell(Tick())
+    assert cluster.scheduler.warmth("a") is Warmth.WARM
+    cluster.report(scenes=[])
+    assert cluster.scheduler.warmth("a") is Warmth.UNPLACEABLE
+    assert "900 MB" in cluster.scheduler.unplaceable["a"]
+
+
+def test_a_failed_load_moves_to_another_worker_and_comes_back_later(cluster):
+    cluster.worker("w1")
+    cluster.worker("w2")
+    cluster.demand(a=1)
+    (first,) = [name for name, scenes in cluster.desired.items() if scenes]
+    other = {"w1": "w2", "w2": "w1"}[first]
+    cluster.report(first, state=ResidentState.FAILED, scenes=["a"])
+    assert cluster.desired[first] == ()
+    assert cluster.desired[other] == ("a",)
+    cluster.report(other, state=ResidentState.FAILED, scenes=["a"])
+    assert cluster.desired[other] == ()
+    cluster.tell(Tick(), after_s=11)
+    assert "a" in cluster.desired[first] + cluster.desired[other]
+
+
+@pytest.mark.parametrize("event", [WorkerDrained("w1"), WorkerSuspected("w1"), WorkerLost("w1", "killed")])
+def test_scenes_move_away_from_a_worker_that_cannot_work(cluster, event):
+    cluster.worker("w1")
+    cluster.announce(["a"])
+    cluster.worker("w2")
+    cluster.tell(event)
+    assert cluster.desired["w2"] == ("a",)
+
+
+def test_a_reconnected_worker_is_told_again(cluster):
+    cluster.worker()
+    cluster.announce(["a"])
+    assert cluster.report(resync=True) == [SetDesired("w1", ("a",))]
+
+
+def test_a_scene_that_was_warm_in_time_is_a_hit_with_its_lead(cluster):
+    cluster.worker()
+    cluster.announce(["a"])
+    cluster.report()
+    cluster.submit("a", after_s=3.0)
+    cluster.submit("b", step=2)
+    counters = cluster.scheduler.prewarm.counters("r1")
+    assert (counters.hits, counters.misses) == (1, 1)
+    assert list(cluster.scheduler.prewarm.lead_s) == [3.0]
+
+
+def test_a_load_ahead_that_nobody_used_is_waste(cluster):
+    cluster.worker(memory_mb=150)
+    cluster.announce(["a"])
+    cluster.report()
+    cluster.announce(["b"], version=2)
+    cluster.report()
+    assert cluster.scheduler.prewarm.counters("r1").wasted == 1
+
+
+def test_a_load_ahead_that_was_used_is_no_waste(cluster):
+    cluster.worker()
+    cluster.announce(["a", "b"])
+    cluster.report()
+    cluster.tell(DemandObserved({}, used=frozenset([("w1", "a")])))
+    cluster.tell(RunClosed("r1"))
+    cluster.scheduler.prewarm.close("r1")
+    assert cluster.scheduler.prewarm.counters("r1").wasted == 1
+
+
+def test_steps_that_came_leave_the_window(cluster):
+    cluster.worker()
+    cluster.announce(["a"], ["b"], ["c"])
+    cluster.submit("b", step=2)
+    assert [entry.bundle_digest for entry in cluster.scheduler.windows["r1"].entries] == ["c"]
+
+
+def test_a_scene_counts_at_its_next_use():
+    entries = [LookaheadEntry(7, "a", 4), LookaheadEntry(5, "a", 2), LookaheadEntry(5, "b", 1)]
+    assert needs_of({"c": 3}, [entries]) == [Need("c", 0, 3), Need("a", 1, 2), Need("b", 1, 1)]
+
+
+scene_names = st.sampled_from("abcdefgh")
+
+
+@given(
+    needs=st.lists(
+        st.builds(Need, scene_names, st.integers(0, 3), st.integers(1, 40)),
+        unique_by=lambda n: n.bundle_digest,
+    ),
+    memories=st.lists(st.integers(0, 600), min_size=1, max_size=4),
+    residents=st.lists(st.lists(scene_names, unique=True, max_size=5), min_size=4, max_size=4),
+)
+def test_placement_keeps_to_memory_and_prefers_the_sooner_use(needs, memories, residents):
+    sites = [Site(f"w{i}", 2, 1.0, mb, tuple(residents[i])) for i, mb in enumerate(memories)]
+    desired = place(sites, needs, lambda _: MB)
+    for site in sites:
+        assert len(desired[site.worker_id]) <= max(1, site.memory_mb // MB)
+        assert set(desired[site.worker_id]) <= {n.bundle_digest for n in needs} | set(site.residents)
+    placed = {scene for scenes in desired.values() for scene in scenes}
+    left = [need.rank for need in needs if need.bundle_digest not in placed]
+    if left and not any(site.residents for site in sites):
+        extra = sum(len(scenes) for scenes in desired.values()) - len(placed)
+        assert max((n.rank for n in needs if n.bundle_digest in placed), default=0) <= min(left) or extra == 0
+    again = [Site(s.worker_id, 2, 1.0, s.memory_mb, desired[s.worker_id]) for s in sites]
+    after = place(again, needs, lambda _: MB)
+    lost = {scene for scenes in desired.values() for scene in scenes} - {s for d in after.values() for s in d}
+    assert not lost & {need.bundle_digest for need in needs if need.rank == 0}
