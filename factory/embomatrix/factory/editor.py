@@ -153,11 +153,11 @@ class SceneEditor:
             for local in candidates(asset, self._assets[target.asset_id], relation, self._shift(), TRIES)
         ]
         if not poses:
-            fits = self._assets[target.asset_id].supports
-            reason = PlacementReason.TOO_LARGE if fits else PlacementReason.NO_SURFACE
+            carrier = self._assets[target.asset_id]
+            reason = PlacementReason.TOO_LARGE if carrier.supports else PlacementReason.NO_SURFACE
             raise PlacementError(
                 reason,
-                f"{asset.asset_id}, {_metres(asset)}, fits nowhere {relation.value} {host} ({_metres(self._assets[target.asset_id])}): "
+                f"{asset.asset_id}, {_metres(asset)}, fits nowhere {relation.value} {host} ({_metres(carrier)}): "
                 "try a smaller model or another host",
             )
         order = self._rng.permutation(len(poses))

@@ -152,9 +152,12 @@ class RoomSolver:
 
     def _open_floor(self, group: Group) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
         (x0, y0), (x1, y1) = self.space.room.low_m, self.space.room.high_m
-        gx, gy = np.meshgrid(np.arange(x0 + 0.1, x1, 0.1), np.arange(y0 + 0.1, y1, 0.1), indexing="ij")
-        turns = np.repeat(np.arange(4), gx.size)
-        return np.tile(gx.ravel(), 4), np.tile(gy.ravel(), 4), turns
+        # About 60 x 60 places at most, so that a hall takes no longer than a parlour.
+        step = max(0.1, math.sqrt((x1 - x0) * (y1 - y0)) / 60)
+        gx, gy = np.meshgrid(np.arange(x0 + 0.1, x1, step), np.arange(y0 + 0.1, y1, step), indexing="ij")
+        ways = 2 if group.style is Style.OVERHEAD else 4
+        turns = np.repeat(np.arange(ways), gx.size)
+        return np.tile(gx.ravel(), ways), np.tile(gy.ravel(), ways), turns
 
     def _costs(self, group: Group, x: FloatArray, y: FloatArray, turns: NDArray[np.int64]) -> FloatArray:
         """Lower is better; the unit is about a metre."""
@@ -213,15 +216,19 @@ class RoomSolver:
     def _sight(
         self, categories: tuple[str, ...], x: FloatArray, y: FloatArray, turns: NDArray[np.int64]
     ) -> FloatArray:
-        """Sideways distance of the nearest partner from the line of sight; a partner behind costs more."""
-        partners = np.array([(p.x, p.y) for p in self.placed if p.piece.category in categories])
+        """Sideways distance of the best partner from the line of sight, theirs and ours; one that is behind costs more."""
+        partners = np.array([(p.x, p.y, p.yaw) for p in self.placed if p.piece.category in categories])
         if not len(partners):
             return np.zeros(len(x))
         ahead = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])[turns]  # (n, 2)
-        delta = partners[None] - np.stack([x, y], axis=1)[:, None]  # (n, k, 2)
+        delta = partners[None, :, :2] - np.stack([x, y], axis=1)[:, None]  # (n, k, 2)
         forward = np.einsum("nkd,nd->nk", delta, ahead)
         aside = np.abs(delta[..., 0] * ahead[:, None, 1] - delta[..., 1] * ahead[:, None, 0])
-        return np.asarray(np.where(forward > 0.8, 1.2 * aside, 6.0).min(axis=1))
+        theirs = np.stack([np.cos(partners[:, 2]), np.sin(partners[:, 2])], axis=1)  # (k, 2)
+        back = -np.einsum("nkd,kd->nk", delta, theirs)
+        off = np.abs(delta[..., 0] * theirs[:, 1] - delta[..., 1] * theirs[:, 0])
+        cost = np.where(forward > 0.8, 1.2 * aside, 6.0) + np.where(back > 0.8, off, 4.0)
+        return np.asarray(cost.min(axis=1))
 
     # Feasibility
 

@@ -141,7 +141,10 @@ def _meet(boxes: FloatArray, others: Sequence[Box]) -> BoolArray:
     if not others or not len(boxes):
         return np.zeros(len(boxes), dtype=bool)
     rest = np.asarray(others)  # (m, 6)
-    apart = (boxes[:, None, :3] >= rest[None, :, 3:] - _TOUCH_M) | (
-        rest[None, :, :3] >= boxes[:, None, 3:] - _TOUCH_M
-    )
-    return np.asarray(np.any(~np.any(apart, axis=2), axis=1))
+    low, high = boxes[:, :3].min(axis=0), boxes[:, 3:].max(axis=0)
+    rest = rest[~np.any((rest[:, 3:] <= low) | (rest[:, :3] >= high), axis=1)]
+    meets = np.ones((len(boxes), len(rest)), dtype=bool)
+    for axis in range(3):
+        meets &= boxes[:, None, axis] < rest[None, :, axis + 3] - _TOUCH_M
+        meets &= rest[None, :, axis] < boxes[:, None, axis + 3] - _TOUCH_M
+    return np.asarray(meets.any(axis=1))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections import Counter
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -16,7 +17,11 @@ from embomatrix.world.state import Relation
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
+    from numpy.typing import NDArray
+
     from embomatrix.factory.furnish_pieces import Piece
+
+    FloatArray = NDArray[np.float64]
 
 TOP_ROOM_M: Final = 1.0
 """Clearance at least assumed over a surface in the open; what stands above it is tested as a solid."""
@@ -108,6 +113,7 @@ class SurfacePlacer:
         self._rng = rng
         self._surfaces = [s for i, p in enumerate(placed) for s in self._usable(p, i)]
         self._boxes = [p.box for p in placed]
+        self._used = Counter(p.host for p in placed)
 
     def place(self, piece: Piece, rooms: Sequence[str]) -> bool:
         """Set the piece on the best surface with room, in the first of the rooms that has one. False when none has."""
@@ -140,51 +146,73 @@ class SurfacePlacer:
                 continue
             else:
                 rank = len(wanted) + 3
-            used = sum(1 for p in self.placed if p.host == surface.host)
-            ranked.append((rank + 0.35 * used + self._rng.uniform(0.0, 0.8), surface))
+            ranked.append((rank + 0.35 * self._used[surface.host] + self._rng.uniform(0.0, 0.8), surface))
         return [s for _, s in sorted(ranked, key=lambda item: item[0])]
 
     def _set_on(self, piece: Piece, surface: Surface) -> bool:
-        height = piece.size_m[2]
-        if surface.interior and height + 0.01 > surface.clearance_m:
+        """Try sampled spots on the surface and take the first that is free."""
+        if surface.interior and piece.size_m[2] + 0.01 > surface.clearance_m:
             return False
         host = self.placed[surface.host]
-        overhang = 0.2 if piece.category == "standing_tv" else 0.0
         # Screens and machines look where their host looks; loose things lie as they were put down.
         square = max(piece.size_m[:2]) > 0.3 or (piece.category in SURFACE_HOSTS and piece.asset.joints)
-        for _ in range(_SAMPLES):
-            yaw = host.yaw if square else host.yaw + float(self._rng.uniform(-0.6, 0.6))
-            trial = Placed(
-                piece, host.room, 0.0, 0.0, surface.z + REST_GAP_M, yaw, surface.host,
-                Relation.INSIDE if surface.interior else Relation.ONTOP, surface.interior,
-            )  # fmt: skip
-            spot = self._spot(trial, surface, overhang)
-            if spot is None:
-                return False
-            item = replace(trial, x=spot[0], y=spot[1])
-            if not self._hits(item):
-                self.placed.append(item)
-                self._boxes.append(item.box)
-                return True
-        return False
+        turn = np.zeros(_SAMPLES) if square else self._rng.uniform(-0.6, 0.6, _SAMPLES)
+        x, y, half, fits = self._spots(piece, surface, host.yaw + turn)
+        bottom = surface.z + REST_GAP_M
+        low = np.column_stack([x - half[:, 0], y - half[:, 1], np.full(_SAMPLES, bottom)])
+        high = np.column_stack([x + half[:, 0], y + half[:, 1], np.full(_SAMPLES, bottom + piece.size_m[2])])
+        free = np.flatnonzero(fits & ~self._hits(low, high, surface.host))
+        if not len(free):
+            return False
+        pick = int(free[0])
+        relation = Relation.INSIDE if surface.interior else Relation.ONTOP
+        yaw = host.yaw + float(turn[pick])
+        self._add(
+            Placed(
+                piece,
+                host.room,
+                float(x[pick]),
+                float(y[pick]),
+                bottom,
+                yaw,
+                surface.host,
+                relation,
+                surface.interior,
+            )
+        )
+        return True
 
-    def _spot(self, trial: Placed, surface: Surface, overhang: float) -> tuple[float, float] | None:
-        x0, y0, _, x1, y1, _ = trial.box  # around the origin
-        slack_x = surface.x1 - surface.x0 - (x1 - x0) * (1 - 2 * overhang) - 2 * _EDGE_M
-        slack_y = surface.y1 - surface.y0 - (y1 - y0) * (1 - 2 * overhang) - 2 * _EDGE_M
-        if min(slack_x, slack_y) < 0:
-            return None
-        cx, cy = (surface.x0 + surface.x1) / 2, (surface.y0 + surface.y1) / 2
-        dx, dy = self._rng.uniform(-0.5, 0.5, 2)
-        return (float(cx + dx * slack_x), float(cy + dy * slack_y))
+    def _spots(
+        self, piece: Piece, surface: Surface, yaw: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
+        """Random middles on the surface, the half extents there (n, 2), and which of them keep to its edges."""
+        overhang = 0.2 if piece.category == "standing_tv" else 0.0
+        depth, width, _ = piece.size_m
+        cos, sin = np.abs(np.cos(yaw)), np.abs(np.sin(yaw))
+        half = np.column_stack([depth * cos + width * sin, depth * sin + width * cos]) / 2
+        room = np.array([surface.x1 - surface.x0, surface.y1 - surface.y0])
+        slack = room - 2 * half * (1 - 2 * overhang) - 2 * _EDGE_M  # (n, 2)
+        middle = np.array([surface.x0 + surface.x1, surface.y0 + surface.y1]) / 2
+        spots = middle + self._rng.uniform(-0.5, 0.5, (len(yaw), 2)) * slack
+        return spots[:, 0], spots[:, 1], half, np.asarray(slack.min(axis=1) >= 0)
 
-    def _hits(self, item: Placed) -> bool:
+    def _hits(self, low: FloatArray, high: FloatArray, host: int) -> NDArray[np.bool_]:
+        """Which of the boxes, given by corners of shape (n, 3), meet anything but their host and what carries it."""
         boxes = np.asarray(self._boxes)
-        mine = np.asarray(item.box)
-        apart = (boxes[:, 3:] <= mine[:3] - _SPACING_M) | (boxes[:, :3] >= mine[3:] + _SPACING_M)
-        meets = ~np.any(apart, axis=1)
-        host = item.host
+        near = ~np.any(
+            (boxes[:, 3:] <= low.min(axis=0) - _SPACING_M) | (boxes[:, :3] >= high.max(axis=0) + _SPACING_M),
+            axis=1,
+        )
         while host >= 0:
-            meets[host] = False
+            near[host] = False
             host = self.placed[host].host
-        return bool(np.any(meets))
+        others = boxes[near]  # (m, 6)
+        apart = (others[None, :, 3:] <= low[:, None] - _SPACING_M) | (
+            others[None, :, :3] >= high[:, None] + _SPACING_M
+        )
+        return np.asarray(np.any(~np.any(apart, axis=2), axis=1))
+
+    def _add(self, item: Placed) -> None:
+        self.placed.append(item)
+        self._boxes.append(item.box)
+        self._used[item.host] += 1

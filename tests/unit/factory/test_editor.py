@@ -111,7 +111,11 @@ def test_what_can_not_be_placed_says_why(
 
 def test_a_full_shelf_says_so(flat: Scene) -> None:
     edit = editor(flat)
-    with pytest.raises(PlacementError) as caught:
+
+    def fill() -> None:
         for _ in range(200):
             edit.add("bowl", None, Relation.ONTOP, a_host(flat, "breakfast_table"))
+
+    with pytest.raises(PlacementError) as caught:
+        fill()
     assert caught.value.reason in (PlacementReason.NO_FREE_SPOT, PlacementReason.OUT_OF_REACH)

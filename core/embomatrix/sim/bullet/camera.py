@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from embomatrix.world.geometry import Part
     from embomatrix.world.scene import Room, Scene
 
+    FloatArray = NDArray[np.float64]
     Rgba = tuple[float, float, float, float]
 
 CUT_M: Final = 0.45
@@ -101,10 +102,8 @@ class _Stage:
         low = np.min([room.low_m for room in scene.rooms], axis=0)
         high = np.max([room.high_m for room in scene.rooms], axis=0)
         aspect = width_px / height_px
-        target = np.array([*(low + high) / 2, 0.3])
-        look = _direction()
-        distance = _distance(low, high, target, look, aspect)
-        eye = target + look * distance
+        target, distance = _framing(low, high, aspect)
+        eye = target + _direction() * distance
         bullet = self._bullet
         view = bullet.computeViewMatrix(eye.tolist(), target.tolist(), [0.0, 0.0, 1.0])
         lens = bullet.computeProjectionMatrixFOV(FIELD_OF_VIEW, aspect, 0.5 * distance, 2.0 * distance)
@@ -202,7 +201,7 @@ class _Stage:
                 return int(bullet.createVisualShape(bullet.GEOM_MESH, **mesh, **look))
 
 
-def _faces(points: NDArray[np.float64]) -> dict[str, list[Any]]:
+def _faces(points: FloatArray) -> dict[str, list[Any]]:
     """Outward triangles of a convex hull, each with its own three vertices and its normal."""
     hull = ConvexHull(points)
     triangles = points[hull.simplices]  # (f, 3, 3)
@@ -224,33 +223,33 @@ def _faces(points: NDArray[np.float64]) -> dict[str, list[Any]]:
     }
 
 
-def _direction() -> NDArray[np.float64]:
+def _direction() -> FloatArray:
     """Unit vector from the scene to the camera."""
     flat = math.cos(ELEVATION)
     return np.array([flat * math.cos(AZIMUTH), flat * math.sin(AZIMUTH), math.sin(ELEVATION)])
 
 
-def _distance(
-    low: NDArray[np.float64],
-    high: NDArray[np.float64],
-    target: NDArray[np.float64],
-    look: NDArray[np.float64],
-    aspect: float,
-) -> float:
-    """How far away the camera must be for all corners of the scene to be in the picture."""
-    corners = (
-        np.array([(x, y, z) for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (0.0, 2.4)])
-        - target
-    )
+def _framing(low: FloatArray, high: FloatArray, aspect: float) -> tuple[FloatArray, float]:
+    """The point to look at and the distance from it at which all corners of the rooms just fit into the picture."""
+    look = _direction()
     right = np.cross([0.0, 0.0, 1.0], look)
     right /= np.linalg.norm(right)
     up = np.cross(look, right)
+    corners = np.array([(x, y, z) for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (0.0, 2.4)])
     tangent = math.tan(math.radians(FIELD_OF_VIEW / 2))
-    need = (
-        np.maximum(np.abs(corners @ right) / (tangent * aspect), np.abs(corners @ up) / tangent)
-        + corners @ look
-    )
-    return float(need.max()) * 1.04
+    target = corners.mean(axis=0)
+    distance = 1.0
+    # A few rounds: moving the target changes the perspective, and that the extent.
+    for _ in range(8):
+        local = corners - target
+        distance = float(
+            np.max(np.maximum(np.abs(local @ right) / aspect, np.abs(local @ up)) / tangent + local @ look)
+        )
+        depth = distance - local @ look
+        across, along = local @ right / depth, local @ up / depth
+        middle = (right * (across.max() + across.min()) + up * (along.max() + along.min())) / 2
+        target = target + middle * distance
+    return target, distance * 1.04
 
 
 def _color_of(asset: Asset) -> Rgba:
