@@ -42,6 +42,8 @@ class Imported:
     scene: Scene
     task: Task
     init: tuple[Literal, ...]
+    about: tuple[str, ...]
+    """The problem's objects, by their names in the scene."""
     rooms: tuple[str, ...]
     signature: str
 
@@ -128,7 +130,7 @@ class _Binder:
             source=self._source.source,
         )
         rooms = tuple(sorted({view.room(name) for name in about}))
-        return Imported(scene, task, start, rooms, signature_of(goal, view))
+        return Imported(scene, task, start, tuple(names.values()), rooms, signature_of(goal, view))
 
     def _start(self, names: dict[str, str], binding: Binding) -> tuple[Literal, ...]:
         """``:init`` in the scene's names, without floors, the robot and the absence of relations and heat."""

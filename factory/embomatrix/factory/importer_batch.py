@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 from embomatrix.factory.admission import Admitted, admit
 from embomatrix.factory.importer import Imported, import_problem
-from embomatrix.factory.pipeline import cache_poses
+from embomatrix.factory.pipeline_poses import Needs, cache_poses
+from embomatrix.factory.writer_view import SceneView
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.planner import find_plan
 from embomatrix.skills.parse import plan_to_json
@@ -46,7 +47,8 @@ def bind_first(source: SourceText, bases: Sequence[Scene], *, seed: int = 0) -> 
 
 def verify(imported: Imported, library: PlacementLibrary, *, seed: int = 0) -> Verified | Refusal:
     """Judge an imported task by execution, and pack it when it is admitted."""
-    poses = cache_poses(imported.scene, library, seed)
+    needs = Needs(imported.about, imported.task.table)
+    poses = cache_poses(SceneView(imported.scene), [needs], library, seed)
     with contextlib.closing(Simulator(Bundle(imported.scene, {}, poses))) as stage:
         verdict = admit(stage, imported.task, find_plan, imported.init)
     if not isinstance(verdict, Admitted):

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.factory.admission import Admitted, admit
+from embomatrix.factory.pipeline_poses import Needs, cache_poses
 from embomatrix.factory.pipeline_store import BuildStore, Rejection, VariantResult
 from embomatrix.factory.scene_build import build_base_scene
 from embomatrix.factory.writer import Draft, is_heldout_signature, write_task
@@ -19,7 +20,7 @@ from embomatrix.factory.writer_variant import Variant, build_variant
 from embomatrix.factory.writer_view import SceneView
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.planner import find_plan
-from embomatrix.sim.pose_cache import PlacementLibrary, build_pose_cache
+from embomatrix.sim.pose_cache import PlacementLibrary
 from embomatrix.skills.parse import plan_to_json
 from embomatrix.world.bundle import Bundle, bundle_digest, encode_bundle
 from embomatrix.world.dataset import TaskRecord, write_dataset
@@ -30,14 +31,15 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from embomatrix.skills.syntax import Plan
-    from embomatrix.world.poses import PoseCache
     from embomatrix.world.scene import Scene
 
 DEFAULT_SCENES: Final = ("Rs_int", "Wainscott_0_int", "restaurant_diner")
 TASKS_EACH: Final = 8
 """Tasks that one variant is to yield."""
-DRAFTS_EACH: Final = 5
-"""Drafts that are written for a task before the variant is left with fewer."""
+DRAFTS: Final = 14
+"""Drafts that are written for a variant: some are not admitted."""
+WRITE_TRIES: Final = 120
+"""Tasks that are written for the drafts: those of the other split's kinds are thrown away."""
 FOCUS_ROOMS: Final = 3
 """Rooms that a variant furnishes with small things, and whose things its tasks are about."""
 VARIANTS_FOR: Final = 4
@@ -188,46 +190,54 @@ class _VariantJob:
         self._split = split
         self._number = number
         self._seed = seed
+        self._library = library
         self._known = set(known)
         self._view = SceneView(variant.scene)
-        self._poses = cache_poses(variant.scene, library, seed)
         self._admitted: list[tuple[Draft, Plan]] = []
         self._rejections: list[Rejection] = []
 
     def run(
         self, missing: Mapping[TaskCategory, int], rng: np.random.Generator
     ) -> tuple[VariantResult, bytes]:
-        """The variant's records with their bundle, the most wanted categories first."""
-        with contextlib.closing(Simulator(Bundle(self._variant.scene, {}, self._poses))) as stage:
-            left = dict(missing)
-            drafts = 0
-            while len(self._admitted) < TASKS_EACH and drafts < DRAFTS_EACH * TASKS_EACH:
-                drafts += 1
-                wanted = [category for category, count in left.items() if count > 0]
-                if not wanted:
+        """The variant's records with their bundle, the missing categories in turns."""
+        drafts = self._write(missing, rng)
+        needs = [Needs(draft.about, draft.task.table) for draft in drafts]
+        poses = cache_poses(self._view, needs, self._library, self._seed)
+        left = dict(missing)
+        with contextlib.closing(Simulator(Bundle(self._variant.scene, {}, poses))) as stage:
+            for draft in drafts:
+                if len(self._admitted) == TASKS_EACH:
                     break
-                category = wanted[drafts % len(wanted)]
-                task_id = f"{self._variant.scene.scene_id}-{len(self._admitted):02d}"
-                draft = write_task(self._variant, self._view, category, task_id, rng)
-                if draft is not None and self._is_new(draft) and self._judge(stage, draft):
-                    left[category] -= 1
+                if left[draft.task.category] > 0 and self._judge(stage, draft):
+                    left[draft.task.category] -= 1
         tasks = {draft.task.task_id: draft.task for draft, _ in self._admitted}
-        data = encode_bundle(Bundle(self._variant.scene, tasks, self._poses))
+        data = encode_bundle(Bundle(self._variant.scene, tasks, poses))
         return self._result(bundle_digest(data)), data
+
+    def _write(self, missing: Mapping[TaskCategory, int], rng: np.random.Generator) -> list[Draft]:
+        """Drafts whose kinds of goal belong to this split, all different, the missing categories in turns."""
+        wanted = [category for category, count in missing.items() if count > 0]
+        drafts: list[Draft] = []
+        for attempt in range(WRITE_TRIES):
+            if len(drafts) == DRAFTS:
+                break
+            task_id = f"{self._variant.scene.scene_id}-{len(drafts):02d}"
+            draft = write_task(self._variant, self._view, wanted[attempt % len(wanted)], task_id, rng)
+            if draft is not None and self._is_new(draft):
+                drafts.append(draft)
+                self._known.add(f"{draft.signature}|{draft.task.instruction}")
+        return drafts
 
     def _is_new(self, draft: Draft) -> bool:
         """Whether the goal's kind belongs to this split, and nothing like it was asked for in these words."""
         key = f"{draft.signature}|{draft.task.instruction}"
         mine = is_heldout_signature(draft.signature, self._seed) is (self._split == "heldout")
-        if not mine or key in self._known:
-            return False
-        return all(draft.task.goal != other.task.goal for other, _ in self._admitted)
+        return mine and key not in self._known
 
     def _judge(self, stage: Simulator, draft: Draft) -> bool:
         verdict = admit(stage, draft.task, find_plan)
         if isinstance(verdict, Admitted):
             self._admitted.append((draft, verdict.plan))
-            self._known.add(f"{draft.signature}|{draft.task.instruction}")
             return True
         self._rejections.append(
             Rejection(
@@ -249,19 +259,6 @@ class _VariantJob:
             for draft, plan in self._admitted
         )
         return VariantResult(self._split, self._number, records, tuple(self._rejections))
-
-
-def cache_poses(scene: Scene, library: PlacementLibrary, seed: int) -> PoseCache:
-    """Pose cache of a scene: whatever can be carried, on and in whatever can hold it."""
-    view = SceneView(scene)
-    names = [item.name for item in scene.objects]
-    return build_pose_cache(
-        scene,
-        [name for name in names if view.is_portable(name)],
-        [name for name in names if view.is_surface(name) or view.is_container(name) or view.is_basket(name)],
-        seed=seed,
-        library=library,
-    )
 
 
 def _summary(store: BuildStore, rooms: Mapping[str, Mapping[str, tuple[str, ...]]]) -> Summary:

@@ -15,7 +15,7 @@ from embomatrix.factory.writer_goals import (
     thermal_piece,
 )
 from embomatrix.factory.writer_words import sentence
-from embomatrix.world.evaluate import objects_of, render
+from embomatrix.world.evaluate import render
 from embomatrix.world.goal import And, Formula
 from embomatrix.world.task import MAX_TABLE, Task, TaskCategory
 
@@ -61,9 +61,13 @@ _RECIPES: Final[Mapping[TaskCategory, tuple[tuple[Maker, ...], ...]]] = {
 
 @dataclass(frozen=True, slots=True)
 class Draft:
-    """A written task, not yet known to be feasible. ``rooms`` are those of the goal's objects."""
+    """A written task, not yet known to be feasible.
+
+    ``about`` are the goal's objects and the appliances that it takes, ``rooms`` the rooms that they are in.
+    """
 
     task: Task
+    about: tuple[str, ...]
     rooms: tuple[str, ...]
     signature: str
 
@@ -110,7 +114,6 @@ def _draft(
 ) -> Draft:
     goal = _conjunction([piece.goal for piece in pieces])
     types = {key: names for piece in pieces for key, names in piece.types.items()}
-    about = objects_of(goal, types)
     needed = dict.fromkeys(name for piece in pieces for name in piece.objects)
     task = Task(
         task_id=task_id,
@@ -125,7 +128,8 @@ def _draft(
     )
     return Draft(
         task=task,
-        rooms=tuple(sorted({view.room(name) for name in about})),
+        about=tuple(needed),
+        rooms=tuple(sorted({view.room(name) for name in needed})),
         signature=" ".join(sorted(sign for piece in pieces for sign in piece.signs)),
     )
 
