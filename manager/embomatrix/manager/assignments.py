@@ -79,6 +79,10 @@ class Assignments:
         self._sequences = itertools.count(1)
         self._due: list[tuple[float, int, RolloutRecord]] = []
 
+    @property
+    def runs(self) -> tuple[str, ...]:
+        return tuple(self._counters)
+
     def counters(self, run_id: str) -> RunCounters:
         return self._counters.setdefault(run_id, RunCounters())
 

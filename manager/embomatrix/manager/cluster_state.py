@@ -3,17 +3,31 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.assignments import DispatchLimits
 from embomatrix.manager.dispatcher import Dispatcher
-from embomatrix.manager.events import LeaseFinished, LeasesRenewed, RunClosed, ScenesUnplaceable
+from embomatrix.manager.events import (
+    BatchSubmitted,
+    LookaheadAnnounced,
+    RunClosed,
+    ScenesUnplaceable,
+    Tick,
+    WorkerLost,
+)
 from embomatrix.manager.scheduler import ScheduleLimits, Scheduler
+from embomatrix.rpc.values import RunStats
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from embomatrix.manager.commands import Command
     from embomatrix.manager.events import Event
-    from embomatrix.rpc.values import RunStats
+
+PLACE_EVERY_S: Final = 0.02
+"""Reports and results come by the thousand: between two placements of their kind there is at least this."""
+PROMPT: Final = (BatchSubmitted, LookaheadAnnounced, WorkerLost, RunClosed, Tick)
+"""Events that are answered with a placement at once; what others leave open, the next tick decides."""
 
 
 class ClusterState:
@@ -32,27 +46,26 @@ class ClusterState:
         self.dispatcher = Dispatcher(dispatch or DispatchLimits(), boot_id=boot_id)
         self.scheduler = Scheduler(schedule or ScheduleLimits())
         self._waiting = 0
+        self._placed_s = -PLACE_EVERY_S
+        self._closed = RunStats()
         self._unplaceable: dict[str, str] = {}
 
     def handle(self, event: Event, *, now_s: float) -> list[Command]:
         """Take in one fact; returns what shall be done about it, in order."""
-        if isinstance(event, LeasesRenewed):
-            return self.dispatcher.handle(event, now_s=now_s)
-        if isinstance(event, LeaseFinished):
-            commands = self.dispatcher.handle(event, now_s=now_s)
-            # The hot path: residents are looked at again only when a scene has nobody waiting for it any more.
-            if self.dispatcher.waiting_scenes != self._waiting:
-                commands += self._reschedule(now_s)
-            return commands
-        commands = self.scheduler.handle(event, now_s=now_s)
-        commands += self.dispatcher.handle(event, now_s=now_s)
-        return commands + self._reschedule(now_s)
+        commands = self.dispatcher.handle(event, now_s=now_s)
+        worth = self.scheduler.note(event, now_s=now_s)
+        # On the hot path residents matter only when a scene gets its first waiting rollout, or loses its last.
+        worth = worth or self.dispatcher.waiting_scenes != self._waiting
+        if worth and (isinstance(event, PROMPT) or now_s - self._placed_s >= PLACE_EVERY_S):
+            commands += self._place(now_s)
+        return commands
 
     def close_run(self, run_id: str, *, now_s: float) -> tuple[RunStats, list[Command]]:
         """End a run: its final counters, and the commands that call off what was open."""
         commands = self.handle(RunClosed(run_id), now_s=now_s)
         self.scheduler.prewarm.close(run_id)
         stats = self.stats(run_id)
+        self._closed = _sum([self._closed, stats])
         self.scheduler.prewarm.forget(run_id)
         self.dispatcher.forget_run(run_id)
         return stats, commands
@@ -67,10 +80,21 @@ class ClusterState:
             prewarm_wasted=prewarm.wasted,
         )
 
-    def _reschedule(self, now_s: float) -> list[Command]:
+    def totals(self) -> RunStats:
+        """The counters of all runs, also of those that were closed."""
+        open_runs = [self.stats(run_id) for run_id in self.dispatcher.runs]
+        return _sum([self._closed, *open_runs])
+
+    def _place(self, now_s: float) -> list[Command]:
+        self._placed_s = now_s
         self._waiting = self.dispatcher.waiting_scenes
-        commands = self.scheduler.handle(self.dispatcher.demand(), now_s=now_s)
+        self.scheduler.note(self.dispatcher.demand(), now_s=now_s)
+        commands = self.scheduler.place(now_s=now_s)
         if self.scheduler.unplaceable != self._unplaceable:
             self._unplaceable = dict(self.scheduler.unplaceable)
             commands += self.dispatcher.handle(ScenesUnplaceable(self._unplaceable), now_s=now_s)
         return commands
+
+
+def _sum(parts: Sequence[RunStats]) -> RunStats:
+    return RunStats(*(sum(column) for column in zip(*map(dataclasses.astuple, parts), strict=True)))

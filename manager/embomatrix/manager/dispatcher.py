@@ -120,6 +120,11 @@ class Dispatcher:
     def workers(self) -> Mapping[str, WorkerRecord]:
         return self._desk.fleet.workers
 
+    @property
+    def runs(self) -> tuple[str, ...]:
+        """Runs with counters."""
+        return self._desk.runs
+
     def counters(self, run_id: str) -> RunCounters:
         return self._desk.counters(run_id)
 

@@ -7,6 +7,7 @@ furthest next use (Belady), which is possible here because the trainer says what
 
 from __future__ import annotations
 
+import heapq
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -77,6 +78,9 @@ class _Shelf:
         """The first scene always fits: an estimate shall not keep a small worker from trying."""
         return not self.chosen or self._size_mb(scene) <= self._free_mb
 
+    def accepts(self, scene: str) -> bool:
+        return scene not in self.site.refused and self.has_room_for(scene)
+
     def take(self, scene: str) -> None:
         self.chosen[scene] = None
         self._free_mb -= self._size_mb(scene)
@@ -92,15 +96,19 @@ def place(
 ) -> dict[str, tuple[str, ...]]:
     """What each worker should hold, most urgent first. ``size_mb`` estimates the memory of a scene. Deterministic."""
     shelves = [_Shelf(site, size_mb) for site in sorted(sites, key=lambda site: site.worker_id)]
-    resident = {scene for site in sites for scene in site.residents}
+    having: dict[str, list[_Shelf]] = {}
+    for shelf in shelves:
+        for scene in (*shelf.site.residents, *shelf.chosen):
+            if shelf not in having.setdefault(scene, []):
+                having[scene].append(shelf)
     totals: dict[int, int] = {}
     for need in needs:
         totals[need.rank] = totals.get(need.rank, 0) + need.count
     # Among what is needed now, what is resident goes first: evicting it to load another would only cost a load.
     for need in sorted(
-        needs, key=lambda n: (n.rank, n.bundle_digest not in resident, -n.count, n.bundle_digest)
+        needs, key=lambda n: (n.rank, n.bundle_digest not in having, -n.count, n.bundle_digest)
     ):
-        _place_copies(need, shelves, _copies(need, sites, totals[need.rank]))
+        _place_copies(need, shelves, having, _copies(need, sites, totals[need.rank]))
     for shelf in shelves:
         for scene in shelf.site.residents:
             if scene not in shelf.chosen and shelf.has_room_for(scene):
@@ -119,16 +127,20 @@ def _copies(need: Need, sites: Sequence[Site], total: int) -> int:
     return min(len(sites), max(1, need.at_least, min(math.ceil(share - 1e-9), busy)))
 
 
-def _place_copies(need: Need, shelves: Sequence[_Shelf], copies: int) -> None:
-    """Put the scene on up to that many workers."""
+def _place_copies(
+    need: Need, shelves: Sequence[_Shelf], having: Mapping[str, list[_Shelf]], copies: int
+) -> None:
+    """Put the scene on up to that many workers: where it is first, then where there is least to do."""
     scene = need.bundle_digest
-    placed = [shelf for shelf in shelves if scene in shelf.chosen]
-    rest = [shelf for shelf in shelves if scene not in shelf.chosen and scene not in shelf.site.refused]
-    rest.sort(key=lambda shelf: (scene not in shelf.site.residents, shelf.load, shelf.site.worker_id))
-    for shelf in rest:
-        if len(placed) >= copies:
-            break
-        if shelf.has_room_for(scene):
+    here = having.get(scene, [])
+    placed = [shelf for shelf in here if scene in shelf.chosen]
+    for shelf in sorted(here, key=lambda shelf: (shelf.load, shelf.site.worker_id)):
+        if len(placed) < copies and shelf not in placed and shelf.accepts(scene):
+            shelf.take(scene)
+            placed.append(shelf)
+    if len(placed) < copies:
+        others = (shelf for shelf in shelves if scene not in shelf.chosen and shelf.accepts(scene))
+        for shelf in heapq.nsmallest(copies - len(placed), others, key=lambda s: (s.load, s.site.worker_id)):
             shelf.take(scene)
             placed.append(shelf)
     for shelf in placed:

@@ -71,35 +71,22 @@ def metrics_page(runtime: ManagerRuntime) -> str:
         {f'outcome="{name}"': view.outcomes.get(name, 0) for name in outcomes},
     )
     page.histogram("embo_rollout_seconds", "Time of completed rollouts by phase.", runtime.meter.phases)
+    lead = {"": view.prewarm_lead_s}
+    page.family(
+        "embo_prewarm_lead_seconds", "gauge", "Median time between a scene being warm and its demand.", lead
+    )
     for name, text, value in (
+        ("embo_prewarm_hits_total", "Scenes that were warm when their batch came.", view.prewarm_hits),
         (
-            "embo_open_run_prewarm_hits",
-            "Scenes that were warm when a batch of an open run came.",
-            view.prewarm_hits,
-        ),
-        (
-            "embo_open_run_prewarm_misses",
-            "Scenes that were not warm when a batch of an open run came.",
+            "embo_prewarm_misses_total",
+            "Scenes that were not warm when their batch came.",
             view.prewarm_misses,
         ),
-        (
-            "embo_open_run_prewarm_wasted",
-            "Loads ahead of demand that an open run never used.",
-            view.prewarm_wasted,
-        ),
-        ("embo_open_run_redispatched", "Leases of open runs that were given again.", view.redispatched),
-        (
-            "embo_open_run_stale_results",
-            "Late results of open runs that were fenced off.",
-            view.stale_results,
-        ),
-        (
-            "embo_prewarm_lead_seconds",
-            "Median time between a scene being warm and its demand.",
-            view.prewarm_lead_s,
-        ),
+        ("embo_prewarm_wasted_total", "Loads ahead of demand that were never used.", view.prewarm_wasted),
+        ("embo_redispatched_total", "Leases that were given again.", view.redispatched),
+        ("embo_stale_results_total", "Late results that were fenced off.", view.stale_results),
     ):
-        page.family(name, "gauge", text, {"": value})
+        page.family(name, "counter", text, {"": value})
     return page.text()
 
 

@@ -104,27 +104,20 @@ class Scheduler:
 
     def handle(self, event: Event, *, now_s: float) -> list[Command]:
         """Take in one fact; returns the desired sets that changed."""
+        return self.place(now_s=now_s) if self.note(event, now_s=now_s) else []
+
+    def note(self, event: Event, *, now_s: float) -> bool:
+        """Take in one fact without deciding on it yet; returns whether it may change what should be where."""
         self._now_s = now_s
         match event:
             case DemandObserved():
-                self._demand = event
-                # By its peak and not by what is left: a scene's copies shall not come and go while a batch runs down.
-                self._peaks = {
-                    scene: max(count, self._peaks.get(scene, 0)) for scene, count in event.pending.items()
-                }
-                self._copies = {
-                    scene: self._copies[scene] for scene in event.pending if scene in self._copies
-                }
-                self.prewarm.used(event.used)
-                self._touch(event.used)
+                self._on_demand(event)
             case LookaheadAnnounced(run_id, version, entries):
                 if run_id in self.windows and version <= self.windows[run_id].version:
-                    return []
+                    return False
                 self.windows[run_id] = Window(version, entries)
             case BatchSubmitted():
-                # The demand that follows it says what is pending now; placing twice would load on stale numbers.
                 self._on_submitted(event)
-                return []
             case RunClosed(run_id):
                 self.windows.pop(run_id, None)
             case WorkerReported():
@@ -134,8 +127,24 @@ class Scheduler:
             case Tick():
                 pass
             case _:
-                return []
-        return self._place()
+                return False
+        return True
+
+    def place(self, *, now_s: float) -> list[Command]:
+        """Decide where every scene should be; returns the desired sets that changed."""
+        self._now_s = now_s
+        usable = {name: holder for name, holder in self._holders.items() if holder.usable}
+        needs = needs_of(self._peaks, [window.entries for window in self.windows.values()])
+        needs = [self._spread(need, usable) for need in needs]
+        sites = [self._site(name, holder, needs) for name, holder in usable.items()]
+        self.unplaceable = {
+            need.bundle_digest: self._why_not(need.bundle_digest)
+            for need in needs
+            if sites and all(need.bundle_digest in site.refused for site in sites)
+        }
+        desired = place(sites, needs, self._estimate)
+        orders = (self._order(name, scenes) for name, scenes in desired.items())
+        return [order for order in orders if order is not None]
 
     def warmth(self, scene: str) -> Warmth:
         """How far the scene is, seen from its trainer."""
@@ -159,6 +168,14 @@ class Scheduler:
         """The last desired set that was given for the worker."""
         holder = self._holders.get(worker_id)
         return (holder.desired or ()) if holder else ()
+
+    def _on_demand(self, event: DemandObserved) -> None:
+        self._demand = event
+        self.prewarm.used(event.used)
+        self._touch(event.used)
+        # By its peak and not by what is left: a scene's copies shall not come and go while a batch runs down.
+        self._peaks = {scene: max(count, self._peaks.get(scene, 0)) for scene, count in event.pending.items()}
+        self._copies = {scene: self._copies[scene] for scene in event.pending if scene in self._copies}
 
     def _on_submitted(self, event: BatchSubmitted) -> None:
         batch = event.batch
@@ -232,21 +249,6 @@ class Scheduler:
     def _warm_since(self, scene: str) -> float | None:
         times = [h.warm_since_s[scene] for h in self._holders.values() if scene in h.warm_since_s]
         return min(times, default=None)
-
-    def _place(self) -> list[Command]:
-        usable = {name: holder for name, holder in self._holders.items() if holder.usable}
-        needs = needs_of(self._peaks, [window.entries for window in self.windows.values()])
-        needs = [self._spread(need, usable) for need in needs]
-        sites = [self._site(name, holder, needs) for name, holder in usable.items()]
-        self.unplaceable = {
-            need.bundle_digest: self._why_not(need.bundle_digest)
-            for need in needs
-            if sites and all(need.bundle_digest in site.refused for site in sites)
-        }
-        desired = place(sites, needs, self._estimate)
-        return [
-            command for name, scenes in desired.items() if (command := self._order(name, scenes)) is not None
-        ]
 
     def _site(self, name: str, holder: _Holder, needs: Iterable[Need]) -> Site:
         memory_mb = holder.resources.memory_mb

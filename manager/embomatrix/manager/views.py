@@ -91,7 +91,7 @@ def overview(runtime: ManagerRuntime) -> Overview:
     """The numbers of this moment."""
     now_s = time.monotonic()
     cluster, meter = runtime.cluster, runtime.meter
-    stats = [cluster.stats(run_id) for run_id in runtime.runs.open]
+    totals = cluster.totals()
     leads = sorted(cluster.scheduler.prewarm.lead_s)
     workers = list(cluster.dispatcher.workers.values())
     return Overview(
@@ -106,12 +106,12 @@ def overview(runtime: ManagerRuntime) -> Overview:
         throughput=meter.throughput(now_s),
         latency_p50_s=meter.latency_s(0.5),
         latency_p95_s=meter.latency_s(0.95),
-        prewarm_hits=sum(s.prewarm_hits for s in stats),
-        prewarm_misses=sum(s.prewarm_misses for s in stats),
-        prewarm_wasted=sum(s.prewarm_wasted for s in stats),
+        prewarm_hits=totals.prewarm_hits,
+        prewarm_misses=totals.prewarm_misses,
+        prewarm_wasted=totals.prewarm_wasted,
         prewarm_lead_s=quantile(leads, 0.5),
-        redispatched=sum(s.redispatched for s in stats),
-        stale_results=sum(s.stale_results for s in stats),
+        redispatched=totals.redispatched,
+        stale_results=totals.stale_results,
         failures=list(meter.failures),
     )
 
