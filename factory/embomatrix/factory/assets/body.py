@@ -39,14 +39,14 @@ class Body:
         self.supports.append(_surface(name, low, high, z, clearance_m, ""))
 
     def add_interior(
-        self, name: str, cavity: Aabb, closed_by: tuple[str, ...] = (), *, open_above: bool
+        self, name: str, cavity: Aabb, closed_by: tuple[str, ...] = (), clearance_m: float = 0.0
     ) -> None:
-        """A cavity and its floor; ``open_above`` where things may stick out at the top."""
+        """A cavity and its floor; ``clearance_m`` exceeds its height where things may stick out at the top."""
         (x0, y0, z0), (x1, y1, z1) = cavity.low_m, cavity.high_m
         x0, y0, x1, y1 = x0 + FIT_M, y0 + FIT_M, x1 - FIT_M, y1 - FIT_M
         centre, size = ((x0 + x1) / 2, (y0 + y1) / 2, (z0 + z1) / 2), (x1 - x0, y1 - y0, z1 - z0)
         self.interiors.append(Interior(name, rounded(*centre), rounded(*size), closed_by))
-        clearance = OPEN_ABOVE_M if open_above else z1 - z0
+        clearance = max(clearance_m, z1 - z0)
         self.supports.append(_surface(f"{name}_floor", (x0, y0), (x1, y1), z0, clearance, name))
 
 

@@ -7,7 +7,18 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.assets.body import FIT_M, Body, Hinge, Walls, centred, clamp, hinged, region, shell
+from embomatrix.factory.assets.body import (
+    FIT_M,
+    OPEN_ABOVE_M,
+    Body,
+    Hinge,
+    Walls,
+    centred,
+    clamp,
+    hinged,
+    region,
+    shell,
+)
 from embomatrix.factory.assets.furniture import slab
 from embomatrix.factory.assets.shapes import box
 from embomatrix.world.geometry import Aabb
@@ -167,7 +178,7 @@ def _add_tiers(
     for tier in range(count):
         floor = z0 + tier * (height + board)
         name = f"{prefix}shelf{tier + 1}" if count > 1 else f"{prefix}inside"
-        body.add_interior(name, region((x0, x1), (y0, y1), (floor, floor + height)), doors, open_above=False)
+        body.add_interior(name, region((x0, x1), (y0, y1), (floor, floor + height)), doors)
         if tier:
             body.parts.append(box((x0, y0, floor - board), (x1 - FIT_M, y1, floor)))
 
@@ -183,7 +194,7 @@ def chest(size_m: Vec3, lid_share: float = 0.12) -> Body:
     body.parts, cavity = shell(carcass, Walls(wall, wall, wall, wall, min(wall, 0.1 * size_m[2]), 0.0))
     gap = min(FIT_M, 0.2 * lid)
     body.moving.append(hinged("lid", Aabb((*outer.low_m[:2], z1 + gap), outer.high_m), Hinge.BACK))
-    body.add_interior("inside", cavity, ("lid",), open_above=False)
+    body.add_interior("inside", cavity, ("lid",))
     return body
 
 
@@ -198,7 +209,7 @@ def open_box(size_m: Vec3) -> Body:
     floor = clamp(0.06 * size_m[2], 0.002, 0.04)
     body.parts, cavity = shell(centred(size_m), Walls(wall, wall, wall, wall, floor, 0.0))
     if cavity.size_m[2] >= SHALLOW_M:
-        body.add_interior("inside", cavity, open_above=True)
+        body.add_interior("inside", cavity, clearance_m=OPEN_ABOVE_M)
     else:
         body.add_support("floor", cavity.low_m[:2], cavity.high_m[:2], cavity.low_m[2])
     return body

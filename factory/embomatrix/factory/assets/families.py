@@ -52,14 +52,11 @@ class Family(StrEnum):
     LAMP = "lamp"
     SLAB = "slab"
     BLOCK = "block"
-    BOWL = "bowl"
+    ROUND = "round"
     CUP = "cup"
-    GLASS = "glass"
     GOBLET = "goblet"
     PAN = "pan"
     POT = "pot"
-    JUG = "jug"
-    BASKET = "basket"
     LIDDED_VESSEL = "lidded_vessel"
     BLENDER = "blender"
     PLATE = "plate"
@@ -125,14 +122,11 @@ GENERATORS: Final[Mapping[Family, Generator]] = {
     Family.LAMP: furniture.lamp,
     Family.SLAB: furniture.slab,
     Family.BLOCK: furniture.block,
-    Family.BOWL: _vessel(vessels.BOWL),
+    Family.ROUND: _vessel(vessels.OPEN_ROUND),
     Family.CUP: _vessel(vessels.CUP),
-    Family.GLASS: _vessel(vessels.GLASS),
     Family.GOBLET: _vessel(vessels.GOBLET),
     Family.PAN: _vessel(vessels.PAN),
     Family.POT: _vessel(vessels.POT),
-    Family.JUG: _vessel(vessels.JUG),
-    Family.BASKET: _vessel(vessels.BASKET),
     Family.LIDDED_VESSEL: vessels.lidded_vessel,
     Family.BLENDER: vessels.blender,
     Family.PLATE: vessels.plate,
@@ -186,14 +180,14 @@ _NAMES: Final[Mapping[Family, str]] = {
     "cash_register sandbox soap_dish dustpan waffle_maker toaster french_fry_holder knife_block "
     "umbrella_rack first_aid_kit deep_fryer shoe_box pet_bed",
     Family.TABLE: "breakfast_table coffee_table desk conference_table console_table "
-    "garden_coffee_table lab_table pool_table gaming_table ironing_board farm_stand massage_bed "
+    "garden_coffee_table lab_table pool_table booth gaming_table ironing_board farm_stand massage_bed "
     "trampoline",
     Family.SHELF_TABLE: "commercial_kitchen_table serving_cart",
     Family.PEDESTAL_TABLE: "pedestal_table cake_stand garden_umbrella",
     Family.COUNTER: "bar reception_desk checkout_counter display_case chopping_block pedestal",
-    Family.CHAIR: "straight_chair folding_chair garden_chair rocking_chair highchair booth eames_chair",
+    Family.CHAIR: "straight_chair folding_chair garden_chair rocking_chair highchair bench eames_chair",
     Family.SWIVEL_CHAIR: "swivel_chair",
-    Family.STOOL: "taboret bar_stool music_stool bench footstool ottoman hammam_bench "
+    Family.STOOL: "taboret bar_stool music_stool footstool ottoman hammam_bench "
     "sauna_bench flat_bench bench_press_machine stadium_stand",
     Family.SOFA: "sofa armchair infant_car_seat",
     Family.BED: "bed hospital_bed chaise_longue",
@@ -208,20 +202,17 @@ _NAMES: Final[Mapping[Family, str]] = {
     "cheddar mozzarella swiss_cheese bleu brownie lasagna tiramisu toast bread_slice french_toast "
     "gelatin fruitcake chocolate_bar granola_bar sushi club_sandwich banana_bread bar_soap sponge waffle "
     "wafer ramen sugar_cube bouillon_cube ice_cube",
-    Family.BOWL: "bowl mixing_bowl wok petri_dish ashtray mortar sieve colander steamer_basket "
-    "china jigger cauldron crock_pot",
-    Family.CUP: "mug coffee_cup teacup measuring_cup dipper",
-    Family.GLASS: "water_glass beer_glass paper_cup soda_cup beaker graduated_cylinder "
+    Family.ROUND: "bowl mixing_bowl wok petri_dish ashtray mortar sieve colander steamer_basket china "
+    "jigger cauldron crock_pot water_glass beer_glass paper_cup soda_cup beaker graduated_cylinder "
     "test_tube vase outline_vase bucket plant_pot canister pencil_holder candle_holder hingeless_jar "
     "bucket_of_paint cup_of_ranch cup_of_yogurt cast glass_lantern erlenmeyer_flask round_bottom_flask "
-    "specimen_bottle shaker hourglass funnel cup_holder",
+    "specimen_bottle shaker hourglass funnel cup_holder wicker_basket frail bird_feeder hanging_basket",
+    Family.CUP: "mug coffee_cup teacup measuring_cup dipper jug pitcher cream_pitcher carafe decanter "
+    "electric_kettle watering_can jug_of_milk cruet coffee_grinder",
     Family.GOBLET: "wineglass goblet chalice cocktail_glass",
     Family.PAN: "frying_pan saucepan",
     Family.POT: "saucepot stockpot casserole copper_pot dutch_oven teapot pewter_teapot "
     "kettle gravy_boat instant_pot pressure_cooker drip_pot food_processor electric_mixer",
-    Family.JUG: "jug pitcher cream_pitcher carafe decanter electric_kettle watering_can "
-    "jug_of_milk cruet coffee_grinder",
-    Family.BASKET: "wicker_basket frail bird_feeder hanging_basket",
     Family.LIDDED_VESSEL: "electric_cauldron hinged_jar rice_cooker",
     Family.BLENDER: "blender",
     Family.PLATE: "plate platter saucer",

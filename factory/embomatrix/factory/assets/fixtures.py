@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.assets.body import (
     FIT_M,
+    OPEN_ABOVE_M,
     Body,
     Hinge,
     Walls,
@@ -16,7 +17,7 @@ from embomatrix.factory.assets.body import (
     shell,
     sliding,
 )
-from embomatrix.factory.assets.shapes import box, frustum, lump, prism
+from embomatrix.factory.assets.shapes import box, lump, octagon
 from embomatrix.world.geometry import Aabb
 
 if TYPE_CHECKING:
@@ -58,20 +59,29 @@ def _sink(size_m: Vec3, basins: int, basin_width_m: float) -> Body:
         body.add_support(f"worktop{number}", (x0 if number == 1 else back, low), (x1, high), deck)
     for number, y in enumerate(centres, start=1):
         name = "basin" if basins == 1 else f"basin{number}"
-        body.add_interior(
-            name, region((back, front), (y - half, y + half), (deck - depth, deck)), open_above=True
-        )
+        cavity = region((back, front), (y - half, y + half), (deck - depth, deck))
+        body.add_interior(name, cavity, clearance_m=_under_tap((deck, z1)) - cavity.low_m[2])
         body.parts.extend(_tap((x0 + 0.06 * size_m[0], y), back + 0.35 * (front - back), (deck, z1)))
     return body
 
 
 def _tap(foot: Vec2, reach: float, z: Vec2) -> list[Part]:
+    """A post behind the basin and a spout over it."""
     x, y = foot
-    r = clamp(0.08 * (z[1] - z[0]), 0.006, 0.015)
+    r = _tap_radius(z)
     return [
         box((x - r, y - r, z[0]), (x + r, y + r, z[1])),
-        box((x + r, y - r, z[1] - 2 * r), (reach, y + r, z[1])),
+        box((x + r, y - r, _under_tap(z)), (reach, y + r, z[1])),
     ]
+
+
+def _tap_radius(z: Vec2) -> float:
+    return clamp(0.08 * (z[1] - z[0]), 0.006, 0.015)
+
+
+def _under_tap(z: Vec2) -> float:
+    """Height of the spout's underside."""
+    return z[1] - 2 * _tap_radius(z)
 
 
 def pedestal_sink(size_m: Vec3) -> Body:
@@ -88,8 +98,10 @@ def pedestal_sink(size_m: Vec3) -> Body:
         box((x0, -0.12 * size_m[1], z0), (x0 + 0.5 * size_m[0], 0.12 * size_m[1], deck - depth))
     )
     body.parts.extend(_tap((x0 + 0.1 * size_m[0], 0.0), cavity.center_m[0], (deck, z1)))
-    body.add_interior("basin", cavity, open_above=True)
-    body.add_support("rim", (x0, y0), (x0 + 0.22 * size_m[0], y1), deck)
+    body.add_interior("basin", cavity, clearance_m=_under_tap((deck, z1)) - cavity.low_m[2])
+    edge, tap = x0 + 0.22 * size_m[0], 2 * _tap_radius((deck, z1))
+    body.add_support("right_rim", (x0, y0), (edge, -tap), deck)
+    body.add_support("left_rim", (x0, tap), (edge, y1), deck)
     return body
 
 
@@ -99,7 +111,7 @@ def tub(size_m: Vec3) -> Body:
     wall = clamp(0.1 * min(size_m[:2]), 0.03, 0.3)
     body = Body()
     body.parts, cavity = shell(outer, Walls(wall, wall, wall, wall, clamp(0.15 * size_m[2], 0.02, 0.2), 0.0))
-    body.add_interior("basin", cavity, open_above=True)
+    body.add_interior("basin", cavity, clearance_m=OPEN_ABOVE_M)
     (x0, y0, _), (x1, _, z1) = outer.low_m, outer.high_m
     body.add_support("rim", (x0, y0), (x1, cavity.low_m[1]), z1)
     return body
@@ -146,7 +158,7 @@ def coffee_machine(size_m: Vec3) -> Body:
             box((back, y0, head), (x1, y1, z1)),
         ]
     )
-    body.add_interior("bay", region((back, x1), (y0, y1), (foot, head)), open_above=False)
+    body.add_interior("bay", region((back, x1), (y0, y1), (foot, head)))
     body.add_support("top", (x0, y0), (x1, y1), z1)
     return body
 
@@ -175,12 +187,12 @@ def sliding_door(size_m: Vec3) -> Body:
 
 
 def garage_door(size_m: Vec3) -> Body:
-    """Frame with a leaf that is drawn up."""
+    """Frame with a leaf before it that is drawn up."""
     outer = centred(size_m)
-    body, gap = _frame(outer)
+    leaf_m = min(0.06, 0.4 * size_m[0])
     x1 = outer.high_m[0]
-    low = (x1 - min(0.06, 0.4 * size_m[0]), gap.low_m[1] + FIT_M, gap.low_m[2] + FIT_M)
-    leaf = Aabb(low, (x1, gap.high_m[1] - FIT_M, gap.high_m[2] - FIT_M))
+    body, gap = _frame(Aabb(outer.low_m, (x1 - leaf_m, *outer.high_m[1:])))
+    leaf = Aabb((x1 - leaf_m + FIT_M, outer.low_m[1], outer.low_m[2] + FIT_M), outer.high_m)
     body.moving.append(sliding("leaf", leaf, (0.0, 0.0, 1.0), 0.9 * gap.size_m[2]))
     return body
 
@@ -233,7 +245,7 @@ def plant(size_m: Vec3) -> Body:
     rim = z0 + 0.3 * size_m[2]
     return Body(
         parts=[
-            frustum((0.0, 0.0), (0.45 * x1, 0.45 * y1), (0.62 * x1, 0.62 * y1), (z0, rim)),
+            *octagon((0.0, 0.0), (0.6 * x1, 0.6 * y1), (z0, rim)),
             lump(Aabb((x0, y0, rim), (x1, y1, z1))),
         ]
     )
@@ -243,7 +255,7 @@ def tree(size_m: Vec3) -> Body:
     """A trunk and a crown."""
     (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
     trunk, r = z0 + 0.35 * size_m[2], clamp(0.05 * min(size_m[:2]), 0.01, 0.2)
-    return Body(parts=[prism((0.0, 0.0), (r, r), (z0, trunk)), lump(Aabb((x0, y0, trunk), (x1, y1, z1)))])
+    return Body(parts=[box((-r, -r, z0), (r, r, trunk)), lump(Aabb((x0, y0, trunk), (x1, y1, z1)))])
 
 
 def car(size_m: Vec3) -> Body:
@@ -260,5 +272,5 @@ def car(size_m: Vec3) -> Body:
     body.parts.append(box((boot, 0.9 * y0, waist), (x0 + 0.7 * size_m[0], 0.9 * y1, z1)))
     panel = Aabb((x0, y0, waist - lid + FIT_M), (boot - FIT_M, y1, waist))
     body.moving.append(hinged("boot_lid", panel, Hinge.FRONT))
-    body.add_interior("boot", cavity, ("boot_lid",), open_above=False)
+    body.add_interior("boot", cavity, ("boot_lid",))
     return body

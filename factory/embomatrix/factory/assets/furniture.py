@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from embomatrix.factory.assets.body import Body, centred, clamp
-from embomatrix.factory.assets.shapes import box, frustum, prism
+from embomatrix.factory.assets.shapes import box, octagon
 
 if TYPE_CHECKING:
     from embomatrix.world.geometry import Part, Vec2, Vec3
@@ -47,11 +47,11 @@ def pedestal_table(size_m: Vec3) -> Body:
     body = Body()
     top, foot = clamp(0.05 * size_m[2], 0.006, 0.04), clamp(0.04 * size_m[2], 0.006, 0.03)
     body.parts = [
-        prism((0.0, 0.0), (x1, y1), (z1 - top, z1), sides=16),
-        prism((0.0, 0.0), (0.12 * x1, 0.12 * y1), (z0 + foot, z1 - top)),
-        prism((0.0, 0.0), (0.6 * x1, 0.6 * y1), (z0, z0 + foot)),
+        *octagon((0.0, 0.0), (x1, y1), (z1 - top, z1)),
+        box((-0.12 * x1, -0.12 * y1, z0 + foot), (0.12 * x1, 0.12 * y1, z1 - top)),
+        *octagon((0.0, 0.0), (0.6 * x1, 0.6 * y1), (z0, z0 + foot)),
     ]
-    # the square that fits the ellipse: corners of a larger one would hang over
+    # the square that fits the octagon: corners of a larger one would hang over
     body.add_support("top", (-0.7 * x1, -0.7 * y1), (0.7 * x1, 0.7 * y1), z1)
     return body
 
@@ -183,8 +183,8 @@ def lamp(size_m: Vec3) -> Body:
     pole = clamp(0.06 * min(size_m[:2]), 0.004, 0.03)
     return Body(
         parts=[
-            prism((0.0, 0.0), (0.75 * x1, 0.75 * y1), (z0, z0 + foot)),
-            prism((0.0, 0.0), (pole, pole), (z0 + foot, z1 - shade)),
-            frustum((0.0, 0.0), (x1, y1), (0.7 * x1, 0.7 * y1), (z1 - shade, z1)),
+            *octagon((0.0, 0.0), (0.75 * x1, 0.75 * y1), (z0, z0 + foot)),
+            box((-pole, -pole, z0 + foot), (pole, pole, z1 - shade)),
+            *octagon((0.0, 0.0), (x1, y1), (z1 - shade, z1)),
         ]
     )

@@ -1,4 +1,4 @@
-"""Convex pieces of assets: boxes, prisms, ring sectors and rounded lumps, in the asset's frame, in metres.
+"""Convex pieces of assets: boxes, octagons and rings of boxes, prisms and rounded lumps, in the asset's frame, in metres.
 
 The unit shapes are hulls computed once with trimesh; a piece of an asset is a scaled copy. `mesh_of` turns any part
 back into a mesh, for pictures and for checks of volume and closedness.
@@ -23,8 +23,13 @@ if TYPE_CHECKING:
 DECIMALS: Final = 6
 """Coordinates are rounded to a micrometre, so that equal models give equal bytes on every machine."""
 
-RING_SIDES: Final = 8
-"""Walls of a round vessel: with its bottom and a handle it stays below the 16 parts that a link may have."""
+_SLANT: Final = math.tan(math.pi / 8)
+_OCTAGON: Final = (
+    (1.0, -_SLANT), (1.0, _SLANT), (_SLANT, 1.0), (-_SLANT, 1.0),
+    (-1.0, _SLANT), (-1.0, -_SLANT), (-_SLANT, -1.0), (_SLANT, -1.0),
+)  # fmt: skip
+"""Corners of the octagon about the unit circle, anticlockwise: a vessel's bottom (3 boxes), its wall (8) and handles stay
+below the 16 parts that a link may have."""
 
 
 def rounded(*values: float) -> Vec3:
@@ -54,37 +59,55 @@ def hull(points: FloatArray) -> Part:
     return Part(Shape.HULL, Pose(centre), rounded(*(high - low)), vertices)
 
 
-def frustum(centre: Vec2, low_radii: Vec2, high_radii: Vec2, z: Vec2, *, sides: int = 12) -> Part:
-    """Elliptic cone stump between the heights ``z``; ``radii`` are its half extents along x and y.
-
-    With ``sides`` a multiple of four its box is exactly twice the larger radii.
-    """
-    rims = [
-        np.column_stack((_polygon(sides) * radii + centre, np.full(sides, height)))
-        for radii, height in zip((low_radii, high_radii), z, strict=True)
-    ]
-    return hull(np.vstack(rims))
-
-
 def prism(centre: Vec2, radii: Vec2, z: Vec2, *, sides: int = 12) -> Part:
-    """Upright elliptic cylinder as a polygon prism: it lies flat and does not roll when tipped."""
-    return frustum(centre, radii, radii, z, sides=sides)
+    """Upright elliptic cylinder as a polygon prism; ``radii`` are its half extents along x and y.
+
+    With ``sides`` a multiple of four its box is exactly twice the radii.
+    """
+    rim = _polygon(sides) * radii + centre
+    return hull(np.vstack([np.column_stack((rim, np.full(sides, height))) for height in z]))
 
 
-def ring(centre: Vec2, low_radii: Vec2, high_radii: Vec2, z: Vec2, wall_m: float) -> list[Part]:
-    """Wall of a round vessel: eight convex sectors between an outer and an inner cone stump."""
-    angles = _polygon(RING_SIDES)
-    levels = []
-    for radii, height in zip((low_radii, high_radii), z, strict=True):
-        inner = (radii[0] - wall_m, radii[1] - wall_m)
-        levels.append(
-            [np.column_stack((angles * r + centre, np.full(RING_SIDES, height))) for r in (radii, inner)]
-        )
-    sectors = []
-    for side in range(RING_SIDES):
-        pair = (side, (side + 1) % RING_SIDES)
-        sectors.append(hull(np.array([level[skin][i] for level in levels for skin in (0, 1) for i in pair])))
-    return sectors
+def shouldered(radii: Vec2, neck_share: float, z: Vec3) -> Part:
+    """Bottle: upright to the shoulder at the second height, then narrowing to the neck's share of the radii."""
+    rims = ((1.0, z[0]), (1.0, z[1]), (neck_share, z[2]))
+    levels = [np.column_stack((_polygon(12) * radii * share, np.full(12, height))) for share, height in rims]
+    return hull(np.vstack(levels))
+
+
+def octagon(centre: Vec2, radii: Vec2, z: Vec2) -> list[Part]:
+    """Flat disc as three boxes that cover an octagon, its flats at the ends of both axes, but for slivers at its slants.
+
+    Boxes share one compound in Bullet and rest on each other without rocking; hulls and cylinders do neither.
+    """
+    (cx, cy), (rx, ry), (z0, z1) = centre, radii, z
+    return [
+        box((cx - a * rx, cy - b * ry, z0), (cx + a * rx, cy + b * ry, z1))
+        for a, b in ((1.0, _SLANT), (_SLANT, 1.0), (math.sqrt(0.5), math.sqrt(0.5)))
+    ]
+
+
+def ring(centre: Vec2, radii: Vec2, z: Vec2, wall_m: float) -> list[Part]:
+    """Wall of a round vessel: eight turned boards whose outer faces are the sides of the octagon."""
+    corners = np.array(_OCTAGON) * radii + centre  # (8, 2)
+    boards = []
+    for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        along = end - start
+        length = float(np.hypot(*along))
+        outward = np.array((along[1], -along[0])) / length
+        x, y = (start + end) / 2 - outward * wall_m / 2
+        yaw = math.atan2(outward[1], outward[0])
+        turn = (0.0, 0.0, round(math.sin(yaw / 2), 9), round(math.cos(yaw / 2), 9))
+        size = rounded(wall_m, length, z[1] - z[0])
+        boards.append(Part(Shape.BOX, Pose(rounded(x, y, (z[0] + z[1]) / 2), turn), size))
+    return boards
+
+
+def inscribed(radii: Vec2, wall_m: float) -> Vec2:
+    """Half extents of a rectangle that fits the octagon within a ring of such walls."""
+    rx, ry = radii
+    share = math.sqrt(0.5) - wall_m / 2 * math.hypot(1 / rx, 1 / ry)
+    return (share * rx, share * ry)
 
 
 def lump(region: Aabb) -> Part:

@@ -6,17 +6,14 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.assets.body import FIT_M, Body, Hinge, centred, clamp, hinged, region
+from embomatrix.factory.assets.body import FIT_M, OPEN_ABOVE_M, Body, Hinge, centred, clamp, hinged, region
 from embomatrix.factory.assets.cabinets import SHALLOW_M
-from embomatrix.factory.assets.shapes import box, frustum, prism, ring, rounded
+from embomatrix.factory.assets.shapes import box, inscribed, octagon, prism, ring, rounded, shouldered
 from embomatrix.world.asset import Link
 from embomatrix.world.geometry import Aabb, Pose
 
 if TYPE_CHECKING:
     from embomatrix.world.geometry import Part, Vec2, Vec3
-
-INSCRIBED: Final = 0.7
-"""Half side of the square in a circle of radius one, a little less than the root of one half."""
 
 
 class Handle(StrEnum):
@@ -29,23 +26,19 @@ class Handle(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class VesselStyle:
-    """``base_share`` is the outer radius of the bottom against that of the rim, ``wall_share`` the wall's thickness
-    against the smaller diameter, ``stem_share`` the height of foot and stem against the whole."""
+    """``wall_share`` is the wall's thickness against the smaller radius, ``stem_share`` the height of foot and stem
+    against the whole."""
 
-    base_share: float
     handle: Handle = Handle.NONE
-    wall_share: float = 0.04
+    wall_share: float = 0.08
     stem_share: float = 0.0
 
 
-BOWL: Final = VesselStyle(0.8)
-CUP: Final = VesselStyle(0.88, Handle.ONE)
-GLASS: Final = VesselStyle(0.9)
-GOBLET: Final = VesselStyle(0.85, stem_share=0.45)
-PAN: Final = VesselStyle(0.9, Handle.ONE, wall_share=0.02)
-POT: Final = VesselStyle(0.96, Handle.BOTH, wall_share=0.025)
-JUG: Final = VesselStyle(0.94, Handle.ONE)
-BASKET: Final = VesselStyle(0.9, wall_share=0.03)
+OPEN_ROUND: Final = VesselStyle()
+CUP: Final = VesselStyle(Handle.ONE)
+GOBLET: Final = VesselStyle(stem_share=0.45)
+PAN: Final = VesselStyle(Handle.ONE, wall_share=0.04)
+POT: Final = VesselStyle(Handle.BOTH, wall_share=0.05)
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,16 +66,15 @@ def _cup(body: Body, shape: _Round, z: Vec2, style: VesselStyle, closed_by: tupl
     """Bottom, wall and cavity between two heights."""
     z0, z1 = z
     thin = min(shape.radii)
-    wall = clamp(2 * style.wall_share * thin, min(0.003, 0.2 * thin), 0.03)
+    wall = clamp(style.wall_share * thin, min(0.003, 0.2 * thin), 0.03)
     floor = z0 + clamp(0.08 * (z1 - z0), 0.0015, 0.012)
-    base = (shape.radii[0] * style.base_share, shape.radii[1] * style.base_share)
-    body.parts.append(prism(shape.centre, base, (z0, floor), sides=8))
-    body.parts.extend(ring(shape.centre, base, shape.radii, (floor, z1), wall))
-    half_x, half_y = (INSCRIBED * (radius - wall) for radius in base)
+    body.parts.extend(octagon(shape.centre, shape.radii, (z0, floor)))
+    body.parts.extend(ring(shape.centre, shape.radii, (floor, z1), wall))
+    half_x, half_y = inscribed(shape.radii, wall)
     cx, cy = shape.centre
     if z1 - floor >= SHALLOW_M:
         cavity = region((cx - half_x, cx + half_x), (cy - half_y, cy + half_y), (floor, z1))
-        body.add_interior("inside", cavity, closed_by, open_above=not closed_by)
+        body.add_interior("inside", cavity, closed_by, 0.0 if closed_by else OPEN_ABOVE_M)
     else:
         body.add_support("floor", (cx - half_x, cy - half_y), (cx + half_x, cy + half_y), floor)
 
@@ -109,8 +101,7 @@ def _handles(outer: Aabb, shape: _Round, handle: Handle) -> list[Part]:
         return []
     height, width = outer.size_m[2], clamp(0.12 * min(outer.size_m[:2]), 0.004, 0.03)
     z = (outer.high_m[2] - 0.45 * height, outer.high_m[2] - 0.15 * height)
-    # the wall leans: a handle that starts a little within it touches it at every height
-    spans = [(reach - 0.02 * shape.radii[long], outer.high_m[long])]
+    spans = [(reach, outer.high_m[long])]
     if handle is Handle.BOTH:
         spans.append((-spans[0][1], -spans[0][0]))
     bars = []
@@ -128,7 +119,7 @@ def _stem(body: Body, shape: _Round, z: Vec2, share: float) -> float:
     foot = z0 + 0.05 * (z1 - z0)
     thin = 0.16 * min(shape.radii)
     wide = (0.85 * shape.radii[0], 0.85 * shape.radii[1])
-    body.parts.extend([prism((0.0, 0.0), wide, (z0, foot)), prism((0.0, 0.0), (thin, thin), (foot, top))])
+    body.parts.extend([*octagon((0.0, 0.0), wide, (z0, foot)), box((-thin, -thin, foot), (thin, thin, top))])
     return top
 
 
@@ -138,7 +129,7 @@ def lidded_vessel(size_m: Vec3) -> Body:
     body = Body()
     shape = _Round((0.0, 0.0), outer.high_m[:2])
     lid = clamp(0.1 * size_m[2], 0.004, 0.04)
-    style = VesselStyle(1.0, wall_share=max(0.03, lid / min(size_m[:2])))
+    style = VesselStyle(wall_share=max(0.06, 2 * lid / min(size_m[:2])))
     z1 = outer.high_m[2] - lid
     _cup(body, shape, (outer.low_m[2], z1), style, ("lid",))
     panel = Aabb((*outer.low_m[:2], z1 + min(FIT_M, 0.2 * lid)), outer.high_m)
@@ -172,15 +163,15 @@ def _raised(point: Vec3, lift_m: float) -> Vec3:
 
 
 def _raised_part(part: Part, lift_m: float) -> Part:
-    return replace(part, pose=Pose(_raised(part.pose.position_m, lift_m)))
+    return replace(part, pose=Pose(_raised(part.pose.position_m, lift_m), part.pose.quat_xyzw))
 
 
 def plate(size_m: Vec3) -> Body:
     """A flat disc that things lie on; deep ones have a rim."""
     if size_m[2] >= 0.02:
-        return vessel(size_m, VesselStyle(0.75, wall_share=0.03))
+        return vessel(size_m, OPEN_ROUND)
     (_, _, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
-    body = Body(parts=[prism((0.0, 0.0), (x1, y1), (z0, z1), sides=16)])
+    body = Body(parts=octagon((0.0, 0.0), (x1, y1), (z0, z1)))
     body.add_support("top", (-0.7 * x1, -0.7 * y1), (0.7 * x1, 0.7 * y1), z1)
     return body
 
@@ -190,13 +181,7 @@ def bottle(size_m: Vec3) -> Body:
     (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
     if size_m[2] < 0.8 * max(size_m[:2]):
         return Body(parts=[box((x0, y0, z0), (x1, y1, z1))])
-    shoulder = z0 + 0.68 * size_m[2]
-    return Body(
-        parts=[
-            prism((0.0, 0.0), (x1, y1), (z0, shoulder)),
-            frustum((0.0, 0.0), (x1, y1), (0.35 * x1, 0.35 * y1), (shoulder, z1)),
-        ]
-    )
+    return Body(parts=[shouldered((x1, y1), 0.35, (z0, z0 + 0.68 * size_m[2], z1))])
 
 
 def can(size_m: Vec3) -> Body:
