@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import asyncio
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.reward.hierarchy import score
 from embomatrix.rpc.values import Completed, InfraCode, InfraFailure, RolloutResult, RunStats, Timings
 from embomatrix.skills.failure import FailureReason
@@ -22,13 +22,38 @@ from embomatrix.world.goal import And, Atom, Not
 from embomatrix.world.state import Relation
 from embomatrix.world.task import Task, TaskCategory
 
+if TYPE_CHECKING:
+    from embomatrix.reward.breakdown import RewardBreakdown
+
 CONTAINERS = ("fridge", "microwave", "oven", "cabinet", "dishwasher", "drawer", "wardrobe", "washer")
 SURFACES = ("countertop", "table", "desk", "shelf", "sofa", "bed", "stool", "bench")
 SWITCHES = ("lamp", "television", "radio", "fan")
 SMALL = (
-    "apple chicken_leg bowl plate mug notebook remote towel book bottle sandwich knife toy candle glass pillow pan "
-    "carton pen sponge vase hammer scarf tray"
-).split()
+    "apple",
+    "chicken_leg",
+    "bowl",
+    "plate",
+    "mug",
+    "notebook",
+    "remote",
+    "towel",
+    "book",
+    "bottle",
+    "sandwich",
+    "knife",
+    "toy",
+    "candle",
+    "glass",
+    "pillow",
+    "pan",
+    "carton",
+    "pen",
+    "sponge",
+    "vase",
+    "hammer",
+    "scarf",
+    "tray",
+)
 RUNNING = frozenset({"microwave", "oven", "dishwasher", "washer"})
 ROOMS = ("kitchen_0", "living_room_0", "bedroom_0")
 
@@ -231,17 +256,21 @@ def make_tasks(train: int, heldout: int, *, seed: int = 0, objects: int = 16) ->
         train=tuple(made[:train]),
         heldout=tuple(made[train:]),
         bundle_bytes=lambda digest: digest.encode(),
-        kinds={word: kind for kind in (*kinds, SURFACES, SWITCHES, tuple(SMALL)) for word in kind},
+        kinds={word: kind for kind in (*kinds, SURFACES, SWITCHES, SMALL) for word in kind},
     )
 
 
 @dataclass
 class SymbolicCluster:
-    """The client's interface over the symbolic rules. ``lost`` names rollouts that the infrastructure loses."""
+    """The client's interface over the symbolic rules.
+
+    The infrastructure loses rollouts whose id holds a mark of ``lost``, and with ``lose_first`` one of every batch.
+    """
 
     tasks: TaskSet
     delay_s: float = 0.0
     lost: frozenset[str] = frozenset()
+    lose_first: bool = False
     announced: list[tuple[int, list[int]]] = field(default_factory=list)
     batches: list[str] = field(default_factory=list)
     sent: set[str] = field(default_factory=set)
@@ -270,10 +299,12 @@ class SymbolicCluster:
         await asyncio.sleep(self.delay_s)
         for cursor, rollout in enumerate(batch.rollouts, start=1):
             assert rollout.bundle_digest in self.sent
-            yield RolloutResult(rollout.rollout_id, rollout.group_id, cursor, 1, self._outcome(rollout))
+            yield RolloutResult(
+                rollout.rollout_id, rollout.group_id, cursor, 1, self._outcome(rollout, cursor)
+            )
 
-    def _outcome(self, rollout):
-        if any(mark in rollout.rollout_id for mark in self.lost):
+    def _outcome(self, rollout, cursor):
+        if (self.lose_first and cursor == 1) or any(mark in rollout.rollout_id for mark in self.lost):
             return InfraFailure(InfraCode.WORKER_LOST, "the worker was lost")
         self.executed += 1
         reward, steps = run_plan(self._by_id[rollout.task_id], rollout.plan)

@@ -126,7 +126,7 @@ def limited(situation: Situation, rows: int) -> Situation:
     text = f" {' '.join(_words(situation.instruction))} "
     by_name = {row.name: row for row in situation.rows}
     named = [row for row in situation.rows if f" {' '.join(_words(row.category))} " in text]
-    hosts = [by_name[row.host] for row in named if row.host]
+    hosts = [by_name[row.host] for row in named if row.host in by_name]
     ranked = dict.fromkeys([*named, *hosts, *situation.rows])
     return subset(situation, {row.index for row in list(ranked)[:rows]})
 

@@ -117,9 +117,12 @@ def _with_names(situation: Situation, names: Mapping[str, str], categories: Mapp
 
 
 def _replaced(text: str, words: Mapping[str, str]) -> str:
-    """All replacements at once, longest first: a word that was put in is not replaced again."""
+    """All replacements at once, longest first: a word that was put in is not replaced again.
+
+    Spoken words stay spoken ("pen" becomes "chicken leg") and names stay names ("pen_1" becomes "chicken_leg_1").
+    """
     spoken = {old.replace("_", " "): new.replace("_", " ") for old, new in words.items()}
-    changes = {**spoken, **words}
+    changes = {**words, **spoken}
     if not changes:
         return text
     choices = "|".join(re.escape(old) for old in sorted(changes, key=len, reverse=True))

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import tomllib
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from embomatrix.skills.prompt import Codec
 from embomatrix.trainer.errors import TrainerError
 from embomatrix.trainer.grpo import LossKind, Objective, RatioLevel
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
 
@@ -106,7 +108,7 @@ class TrainSettings(_Frozen):
 
     model: str = "tiny"
     """``tiny``, or a Hugging Face model by name or folder."""
-    codec: str = "lines"
+    codec: Codec = Codec.LINES
     """Plan form of a Hugging Face model: ``lines`` or ``json``. The tiny policy calls objects by name."""
     seed: int = 0
     threads: int = Field(default=1, ge=1)
@@ -123,14 +125,44 @@ class TrainSettings(_Frozen):
     evaluation: EvaluationSettings = EvaluationSettings()
 
 
-def read_settings(path: Path | None, changes: dict[str, Any]) -> TrainSettings:
-    """Settings of a TOML file, with ``changes`` (dotted keys, None: not given) on top. Raises TrainerError."""
+LANGUAGE_MODEL_DEFAULTS: Final[Mapping[str, Any]] = {
+    "prompt.rename_share": 0.0,
+    "imitation.batch": 4,
+    "imitation.learning_rate": 5e-5,
+    "grpo.tasks_per_step": 4,
+    "grpo.chunk": 1,
+    "grpo.learning_rate": 1e-5,
+    "grpo.max_new": 96,
+}
+"""What differs by default for a pretrained model: it knows words and needs memory."""
+
+
+def read_settings(
+    path: Path | None, changes: Mapping[str, Any], defaults: Mapping[str, Any] | None = None
+) -> TrainSettings:
+    """``defaults``, then a TOML file, then ``changes`` (dotted keys; None: not given). Raises TrainerError."""
     values: dict[str, Any] = {}
+    _set_all(values, defaults or {})
     if path is not None:
         try:
-            values = tomllib.loads(path.read_text(encoding="utf-8"))
+            _merge(values, tomllib.loads(path.read_text(encoding="utf-8")))
         except (OSError, tomllib.TOMLDecodeError) as error:
             raise TrainerError(f"the settings file {path} can't be read: {error}") from error
+    return with_changes(values, changes)
+
+
+def with_changes(values: dict[str, Any], changes: Mapping[str, Any]) -> TrainSettings:
+    """Settings of nested ``values`` with ``changes`` on top. Raises TrainerError that names the field."""
+    _set_all(values, changes)
+    try:
+        return TrainSettings.model_validate(values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"]))
+        raise TrainerError(f"setting {where!r}: {first['msg']} (found {first.get('input')!r})") from error
+
+
+def _set_all(values: dict[str, Any], changes: Mapping[str, Any]) -> None:
     for key, value in changes.items():
         if value is not None:
             *parents, leaf = key.split(".")
@@ -138,9 +170,11 @@ def read_settings(path: Path | None, changes: dict[str, Any]) -> TrainSettings:
             for parent in parents:
                 level = level.setdefault(parent, {})
             level[leaf] = value
-    try:
-        return TrainSettings.model_validate(values)
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(map(str, first["loc"]))
-        raise TrainerError(f"setting {where!r}: {first['msg']} (found {first.get('input')!r})") from error
+
+
+def _merge(values: dict[str, Any], more: Mapping[str, Any]) -> None:
+    for key, value in more.items():
+        if isinstance(value, dict) and isinstance(values.get(key), dict):
+            _merge(values[key], value)
+        else:
+            values[key] = value

@@ -1,6 +1,8 @@
 """A small causal transformer in plain torch, whose prompt runs once for all samples of its group.
 
-Llama-like: RMS norms, rotary positions, gated feed-forward, tied embedding.
+Llama-like: RMS norms, rotary positions, gated feed-forward, tied embedding. The last layer may also *point*: a part of the
+probability goes to words of the prompt by attention (pointer networks; See et al. 2017, eq. 9). Naming an object that the
+instruction names is then a matter of looking, for words seldom met as for frequent ones.
 
 Shapes: Q prompts, G samples of each, P prompt tokens, T new tokens, H heads of width D, C = H * D.
 """
@@ -18,6 +20,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 _HIDDEN_KEY = -1e9
+_LEAST = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,12 +48,14 @@ class LayerMemory:
 
 @dataclass(frozen=True, slots=True)
 class PromptMemory:
-    """A batch of prompts, run. ``hidden`` (Q, P) is true on padding; ``lengths`` (Q,); ``last`` (Q, C)."""
+    """A batch of prompts, run. ``tokens`` (Q, P); ``hidden`` (Q, P) is true on padding; ``lengths`` (Q,); ``states``
+    (Q, P, C) of the last layer."""
 
     layers: tuple[LayerMemory, ...]
+    tokens: Tensor
     hidden: Tensor
     lengths: Tensor
-    last: Tensor
+    states: Tensor
 
 
 class _Block(nn.Module):
@@ -96,6 +101,9 @@ class Decoder(nn.Module):
         self.embedding = nn.Embedding(shape.vocabulary, shape.width)
         self.blocks = nn.ModuleList(_Block(shape) for _ in range(shape.layers))
         self.norm = nn.RMSNorm(shape.width)
+        self.point_from = nn.Linear(shape.width, shape.width, bias=False)
+        self.point_to = nn.Linear(shape.width, shape.width, bias=False)
+        self.point_share = nn.Linear(shape.width, 1)
         half = shape.width // shape.heads // 2
         angles = torch.outer(torch.arange(shape.longest).float(), 10000.0 ** (-torch.arange(half) / half))
         self.register_buffer("cos", angles.cos().repeat(1, 2), persistent=False)
@@ -105,10 +113,24 @@ class Decoder(nn.Module):
                 nn.init.normal_(parameter, std=0.02, generator=generator)
             if name.endswith(("out.weight", "down.weight")):
                 parameter.data /= (2 * shape.layers) ** 0.5
+        nn.init.zeros_(self.point_share.bias)
 
-    def logits(self, x: Tensor) -> Tensor:
-        """Scores over the vocabulary of hidden states (..., C)."""
-        return self.norm(x) @ self.embedding.weight.t()  # type: ignore[no-any-return]
+    def scores(self, states: Tensor, prompt: PromptMemory, barred: Tensor) -> Tensor:
+        """Log-probabilities (Q * G, T, V) after hidden states (Q * G, T, C); words in ``barred`` (V,) get none."""
+        rows, length, width = states.shape
+        prompts, prompt_length = prompt.tokens.shape
+        x = self.norm(states)
+        generated = torch.softmax((x @ self.embedding.weight.t()).masked_fill(barred, _HIDDEN_KEY), dim=-1)
+        asked = self.point_from(x).view(prompts, -1, width)  # (Q, G T, C)
+        looked = asked @ self.point_to(self.norm(prompt.states)).transpose(1, 2) * width**-0.5  # (Q, G T, P)
+        nowhere = (prompt.hidden | barred[prompt.tokens])[:, None]  # (Q, 1, P)
+        attention = torch.softmax(looked.masked_fill(nowhere, _HIDDEN_KEY), dim=-1)
+        index = prompt.tokens[:, None].expand(prompts, asked.shape[1], prompt_length)
+        empty = attention.new_zeros(prompts, asked.shape[1], generated.shape[-1])
+        pointed = empty.scatter_add(2, index, attention).view(rows, length, -1)  # (Q G, T, V)
+        share = torch.sigmoid(self.point_share(x))  # (Q G, T, 1)
+        mixed = torch.lerp(generated, pointed, share)
+        return mixed.clamp(min=_LEAST).log().masked_fill(barred, _HIDDEN_KEY)
 
     def _rope(self, positions: Tensor) -> tuple[Tensor, Tensor]:
         """positions: (rows, T)."""
@@ -130,7 +152,7 @@ class Decoder(nn.Module):
             attended = functional.scaled_dot_product_attention(q, k, v, attn_mask=bias)
             x = block.finish(x, attended)  # type: ignore[operator]
             memories.append(LayerMemory(k, v))
-        return PromptMemory(tuple(memories), hidden, lengths, x[:, -1])
+        return PromptMemory(tuple(memories), tokens, hidden, lengths, x)
 
     def extend(
         self, prompt: PromptMemory, tokens: Tensor, past: tuple[LayerMemory, ...] | None, start: int

@@ -10,6 +10,7 @@ import torch
 
 from embomatrix.skills.prompt import Codec
 from embomatrix.trainer.policy.decoder import Decoder, DecoderShape
+from embomatrix.trainer.policy.drawing import draw
 from embomatrix.trainer.policy.protocol import Samples, Scored
 from embomatrix.trainer.policy.words import END, GO, PAD, Vocabulary
 
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from torch import Tensor, nn
 
     from embomatrix.skills.prompt import Prompt
+    from embomatrix.trainer.policy.decoder import PromptMemory
     from embomatrix.trainer.policy.protocol import Tokens
 
 _WEIGHTS = "weights.pt"
@@ -70,13 +72,13 @@ class TinyPolicy:
         generator: torch.Generator,
     ) -> Samples:
         memory = self.network.read(*self._padded(prompts))
-        state = memory.last.repeat_interleave(group, dim=0)  # (rows, C)
+        state = memory.states[:, -1:].repeat_interleave(group, dim=0)  # (rows, 1, C)
         rows = state.shape[0]
         own = None
         done = torch.zeros(rows, dtype=torch.bool, device=self.device)
         tokens, masks, logprobs = [], [], []
         for at in range(max_new):
-            choice, logprob = _draw(self._scores(state), temperature, generator)
+            choice, logprob = draw(self._scores(state, memory)[:, 0], temperature, generator)
             choice = torch.where(done, PAD, choice)
             tokens.append(choice)
             masks.append(~done)
@@ -84,8 +86,7 @@ class TinyPolicy:
             done = done | (choice == END)
             if bool(done.all()):
                 break
-            hidden, own = self.network.extend(memory, choice[:, None], own, at)
-            state = hidden[:, 0]
+            state, own = self.network.extend(memory, choice[:, None], own, at)
         drawn = torch.stack(tokens, dim=1)
         texts = tuple(self.vocabulary.decode(row) for row in drawn.tolist())
         return Samples(drawn, torch.stack(masks, dim=1), torch.stack(logprobs, dim=1), texts)
@@ -94,22 +95,23 @@ class TinyPolicy:
         self, prompts: Sequence[Tokens], tokens: Tensor, mask: Tensor, group: int, temperature: float
     ) -> Scored:
         memory = self.network.read(*self._padded(prompts))
-        first = memory.last.repeat_interleave(group, dim=0)[:, None]  # (rows, 1, C)
+        first = memory.states[:, -1:].repeat_interleave(group, dim=0)  # (rows, 1, C)
         states = first
         if tokens.shape[1] > 1:
             rest, _ = self.network.extend(memory, tokens[:, :-1], None, 0)
             states = torch.cat([first, rest], dim=1)  # (rows, T, C)
-        scores = torch.log_softmax(self._scores(states) / (temperature or 1.0), dim=-1)  # (rows, T, V)
+        scores = torch.log_softmax(
+            self._scores(states, memory) / (temperature or 1.0), dim=-1
+        )  # (rows, T, V)
         chosen = scores.gather(-1, tokens[..., None])[..., 0]
         entropy = -(scores.exp() * scores.clamp(min=-1e4)).sum(dim=-1)
         return Scored(chosen * mask, entropy * mask)
 
-    def _scores(self, states: Tensor) -> Tensor:
-        """Logits without padding and prompt marks: tokens that no plan holds."""
-        scores = self.network.logits(states).float()
-        barred = torch.zeros(scores.shape[-1], device=scores.device)
-        barred[[PAD, GO]] = -1e9
-        return scores + barred
+    def _scores(self, states: Tensor, memory: PromptMemory) -> Tensor:
+        """Log-probabilities without padding and prompt marks: tokens that no plan holds."""
+        barred = torch.zeros(len(self.vocabulary), dtype=torch.bool, device=self.device)
+        barred[[PAD, GO]] = True
+        return self.network.scores(states, memory, barred)
 
     def _padded(self, prompts: Sequence[Tokens]) -> tuple[Tensor, Tensor]:
         longest = max(len(prompt) for prompt in prompts)
@@ -143,14 +145,3 @@ class TinyPolicy:
     @staticmethod
     def is_saved_in(folder: Path) -> bool:
         return (folder / _DESCRIPTION).is_file()
-
-
-def _draw(scores: Tensor, temperature: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """One token per row and its log-probability; scores: (rows, V). The Gumbel trick needs no cumulative sum."""
-    logprobs = torch.log_softmax(scores / (temperature or 1.0), dim=-1)
-    if temperature == 0:
-        choice = logprobs.argmax(dim=-1)
-    else:
-        noise = torch.empty_like(logprobs).exponential_(generator=generator).log()
-        choice = (logprobs - noise).argmax(dim=-1)
-    return choice, logprobs.gather(-1, choice[:, None])[:, 0]

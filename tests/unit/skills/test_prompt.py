@@ -1,0 +1,135 @@
+"""Prompts: the scene as a tree, names that are unique, and examples that parse."""
+
+import pytest
+
+from embomatrix.skills.parse import parse_plan
+from embomatrix.skills.prompt import (
+    EXAMPLES,
+    Codec,
+    Row,
+    Situation,
+    labels,
+    limited,
+    plan_in_names,
+    prompt_for,
+    subset,
+    with_indices,
+)
+from embomatrix.skills.syntax import PlaceRelation, Skill, SkillCall
+from embomatrix.world.state import Relation
+
+FRIDGE = Row(2, "fridge_1", "fridge", "kitchen_0", states=("closed",), fixed=True)
+COUNTER = Row(0, "countertop_1", "countertop", "kitchen_0", fixed=True)
+OVEN = Row(6, "oven_1", "oven", "kitchen_0", states=("closed", "off"), fixed=True)
+APPLE = Row(4, "apple_1", "apple", "kitchen_0", "countertop_1", Relation.ONTOP)
+LEG = Row(1, "chicken_leg_1", "chicken_leg", "kitchen_0", "fridge_1", Relation.INSIDE, ("frozen",))
+BOWL = Row(3, "bowl_1", "bowl", "kitchen_0", "countertop_1", Relation.ONTOP)
+OTHER_BOWL = Row(5, "bowl_2", "bowl", "den_0")
+SITUATION = Situation(
+    ("kitchen_0", "den_0"),
+    "den_0",
+    (COUNTER, LEG, FRIDGE, BOWL, APPLE, OTHER_BOWL, OVEN),
+    "Put the apple into the fridge.",
+    7,
+)
+
+
+def test_names_prompt_tells_rooms_furniture_contents_and_states():
+    assert prompt_for(SITUATION, Codec.NAMES).user.splitlines() == [
+        "room kitchen_0",
+        "countertop on bowl_1 apple",
+        "fridge closed in chicken_leg frozen",
+        "oven closed off",
+        "room den_0",
+        "bowl_2",
+        "robot den_0",
+        "task Put the apple into the fridge.",
+    ]
+
+
+def test_indexed_prompt_puts_the_name_before_the_index():
+    user = prompt_for(SITUATION, Codec.LINES).user
+    assert "fridge 2 closed in: chicken leg 1 frozen" in user
+    assert "countertop 0 on: bowl 3, apple 4" in user
+    assert user.endswith("Robot: den_0, hand empty\nTask: Put the apple into the fridge.")
+
+
+@pytest.mark.parametrize("codec", [Codec.LINES, Codec.JSON])
+def test_system_text_lists_every_skill_and_its_own_example(codec):
+    system = prompt_for(SITUATION, codec).system
+    assert all(skill.value in system for skill in Skill)
+    assert EXAMPLES[codec] in system
+
+
+@pytest.mark.parametrize("codec", Codec)
+def test_the_example_of_every_codec_parses_to_the_same_plan(codec):
+    text = EXAMPLES[codec]
+    plan = parse_plan(with_indices(text, SITUATION) if codec is Codec.NAMES else text)
+    assert plan == parse_plan(EXAMPLES[Codec.JSON])
+    assert [call.skill for call in plan][:2] == [Skill.MOVE, Skill.PICK_UP]
+
+
+def test_a_name_is_short_only_where_it_is_unique():
+    assert labels(SITUATION) == {
+        0: "countertop",
+        1: "chicken_leg",
+        2: "fridge",
+        3: "bowl_1",
+        4: "apple",
+        5: "bowl_2",
+        6: "oven",
+    }
+
+
+def test_every_kind_of_call_survives_the_names_codec():
+    plan = (
+        SkillCall(Skill.GO_TO_ROOM, room_name="kitchen_0"),
+        SkillCall(Skill.MOVE, object_index=3),
+        SkillCall(Skill.PLACE, object_index=2, relation=PlaceRelation.INSIDE),
+        SkillCall(Skill.HEAT, object_index=1, source_index=6),
+        SkillCall(Skill.TURN, yaw=1.57),
+        SkillCall(Skill.MOVE_FORWARD, distance=0.5, yaw=-1.57),
+    )
+    text = plan_in_names(plan, SITUATION)
+    assert text.splitlines()[3] == "heat_object_with_source chicken_leg oven"
+    assert parse_plan(with_indices(text, SITUATION)) == plan
+
+
+def test_full_names_are_understood_beside_short_ones():
+    assert with_indices("move apple_1", SITUATION) == with_indices("move apple", SITUATION) == "move 4"
+
+
+def test_an_unknown_name_parses_to_an_index_that_no_row_has():
+    assert parse_plan(with_indices("move unicorn", SITUATION)) == (SkillCall(Skill.MOVE, object_index=7),)
+
+
+@pytest.mark.parametrize("text", ["", "hello there", "fly apple"])
+def test_text_that_is_no_plan_stays_as_it_is(text):
+    assert with_indices(text, SITUATION) == text
+
+
+def test_limit_keeps_what_the_instruction_names_and_what_it_rests_on():
+    told = limited(SITUATION, 3)
+    assert {row.name for row in told.rows} == {"apple_1", "fridge_1", "countertop_1"}
+    assert limited(SITUATION, 7) is SITUATION
+
+
+def test_limit_does_not_take_a_part_of_a_word_for_a_name():
+    told = limited(
+        Situation(
+            (), "", (OTHER_BOWL, Row(8, "tablebowls_1", "ta", "den_0"), APPLE), "fetch an apple table", 9
+        ),
+        1,
+    )
+    assert [row.name for row in told.rows] == ["apple_1"]
+
+
+def test_contents_of_a_row_that_is_not_told_stand_in_the_room():
+    told = subset(SITUATION, {4, 2})
+    assert prompt_for(told, Codec.NAMES).user.splitlines()[:3] == ["room kitchen_0", "fridge closed", "apple"]
+
+
+def test_a_prompt_never_holds_the_goal():
+    for codec in Codec:
+        prompt = prompt_for(SITUATION, codec)
+        assert "inside(" not in prompt.system + prompt.user

@@ -1,0 +1,63 @@
+"""Held-out success: intervals over tasks, paired differences, lost rollouts counted nowhere."""
+
+import math
+
+import numpy as np
+import pytest
+
+from embomatrix.trainer.evaluate import Evaluation, TaskScore, bootstrap, improvement
+
+
+def scored(successes, samples=10, prefix="t", category="pick_and_place"):
+    return Evaluation(
+        tuple(
+            TaskScore(f"{prefix}{at}", category, samples, count, samples, 3.0 * count, 10 - samples)
+            for at, count in enumerate(successes)
+        )
+    )
+
+
+def test_interval_holds_the_mean_and_narrows_with_more_tasks():
+    few, many = scored([0, 10] * 5).success(), scored([0, 10] * 50).success()
+    assert few.low < few.value == many.value == 0.5 < few.high
+    assert many.high - many.low < few.high - few.low
+
+
+def test_interval_covers_the_truth_about_as_often_as_it_says():
+    rng = np.random.default_rng(0)
+    hits = 0
+    for _ in range(200):
+        interval = bootstrap(list(rng.binomial(10, rng.beta(2, 3, size=40)) / 10))
+        hits += interval.low <= 0.4 <= interval.high
+    assert 0.88 <= hits / 200 <= 0.99
+
+
+def test_pairing_sees_a_difference_that_lies_within_both_intervals():
+    before, after = scored([0, 2, 8, 9] * 10), scored([1, 3, 9, 10] * 10)
+    assert before.success().high > after.success().low
+    change = improvement(before, after)
+    assert change.value == pytest.approx(0.1)
+    assert change.low > 0
+
+
+def test_only_tasks_of_both_evaluations_are_paired():
+    assert improvement(scored([0, 0]), scored([10, 10, 10])).value == 1.0
+    assert math.isnan(improvement(scored([5]), scored([5], prefix="other")).value)
+
+
+def test_a_task_whose_rollouts_were_all_lost_is_left_out():
+    known = scored([5, 5])
+    lost = scored([0], samples=0, prefix="lost")
+    assert Evaluation((*known.scores, *lost.scores)).success().value == 0.5
+
+
+def test_categories_are_reported_apart():
+    both = Evaluation((*scored([10]).scores, *scored([0], prefix="c", category="compound").scores))
+    assert both.categories == ("compound", "pick_and_place")
+    assert both.success("compound").value == 0
+    assert both.success("pick_and_place").value == 1
+
+
+def test_scores_survive_their_file():
+    result = scored([1, 2, 3])
+    assert Evaluation.from_json(result.as_json()) == result

@@ -1,0 +1,174 @@
+"""Group relative policy optimisation against the formulas written out in plain Python."""
+
+import itertools
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from embomatrix.trainer.grpo import (
+    LossKind,
+    Objective,
+    RatioLevel,
+    Scale,
+    Terms,
+    group_advantages,
+    surrogate_loss,
+)
+
+LOST = math.nan
+REWARD = st.one_of(st.floats(-1, 32), st.just(LOST), st.sampled_from([-1.0, 0.5, 31.5]))
+GROUPS = st.integers(2, 8).flatmap(
+    lambda size: st.lists(st.lists(REWARD, min_size=size, max_size=size), min_size=1, max_size=4)
+)
+
+NEW = [[-1.0, -0.5], [-2.0, -1.0], [-0.3, -0.7], [-1.2, -0.1]]
+OLD = [[-1.1, -0.9], [-1.5, -1.0], [-0.3, -0.2], [-1.2, -0.6]]
+REFERENCE = [[-1.0, -0.6], [-1.8, -1.1], [-0.5, -0.7], [-1.0, -0.4]]
+MASK = [[True, True], [True, False], [True, True], [True, True]]
+ADVANTAGES = [1.0, -1.0, 0.5, -0.5]
+
+
+def terms(new=NEW, **changes):
+    values = {
+        "logprobs": torch.tensor(new, dtype=torch.float64, requires_grad=True),
+        "old_logprobs": torch.tensor(OLD, dtype=torch.float64),
+        "mask": torch.tensor(MASK),
+        "advantages": torch.tensor(ADVANTAGES, dtype=torch.float64),
+        "reference": torch.tensor(REFERENCE, dtype=torch.float64),
+    }
+    return Terms(**{**values, **changes})
+
+
+def by_hand(kind, ratio, low, high, kl_coef):
+    """The objective as a person would compute it, plan by plan and token by token."""
+    plans = []
+    for new, old, reference, mask, advantage in zip(NEW, OLD, REFERENCE, MASK, ADVANTAGES, strict=True):
+        own = [at for at, present in enumerate(mask) if present]
+        whole = math.exp(sum(new[at] - old[at] for at in own))
+        tokens = []
+        for at in own:
+            rho = whole if ratio is RatioLevel.SEQUENCE else math.exp(new[at] - old[at])
+            gain = min(rho * advantage, min(max(rho, 1 - low), 1 + high) * advantage)
+            gap = reference[at] - new[at]
+            tokens.append((gain, kl_coef * (math.exp(gap) - gap - 1)))
+        plans.append(tokens)
+    count = sum(map(len, plans))
+    if kind is LossKind.DAPO:
+        return sum(cost - gain for plan in plans for gain, cost in plan) / count
+    share = [1.0 if kind is LossKind.PAPER else 1 / len(plan) for plan in plans]
+    costs = [sum(cost for _, cost in plan) * part for plan, part in zip(plans, share, strict=True)]
+    if ratio is RatioLevel.SEQUENCE:
+        gains = [plan[0][0] for plan in plans]
+    else:
+        gains = [sum(gain for gain, _ in plan) * part for plan, part in zip(plans, share, strict=True)]
+    return (sum(costs) - sum(gains)) / len(plans)
+
+
+@pytest.mark.parametrize(("kind", "ratio"), list(itertools.product(LossKind, RatioLevel)))
+def test_loss_is_the_formula_written_out(kind, ratio):
+    objective = Objective(kind, ratio, clip_low=0.2, clip_high=0.28, kl_coef=0.1)
+    loss, _ = surrogate_loss(terms(), objective, Scale(4, 7))
+    assert loss.item() == pytest.approx(by_hand(kind, ratio, 0.2, 0.28, 0.1), abs=1e-12)
+
+
+def test_paper_objective_keeps_its_golden_value():
+    objective = Objective(LossKind.PAPER, RatioLevel.SEQUENCE, clip_low=0.2, clip_high=0.2, kl_coef=0.1)
+    # ratios exp(0.5), exp(-0.5), exp(-0.5), exp(0.5); clipped at 1.2 and 0.8 where that lowers the gain
+    gain = (1.2 - 0.8 + 0.5 * math.exp(-0.5) - 0.5 * math.exp(0.5)) / 4
+    loss, _ = surrogate_loss(terms(reference=None), objective, Scale(4, 7))
+    assert loss.item() == pytest.approx(-gain, abs=1e-12)
+
+
+@pytest.mark.parametrize(("kind", "ratio"), list(itertools.product(LossKind, RatioLevel)))
+def test_parts_of_a_step_add_up_to_the_whole(kind, ratio):
+    objective = Objective(kind, ratio, kl_coef=0.05, entropy_coef=0.01)
+    entropy = torch.full((4, 2), 0.3, dtype=torch.float64)
+    whole = terms(entropy=entropy)
+    loss, _ = surrogate_loss(whole, objective, Scale(4, 7))
+    loss.backward()
+    pieces = terms(entropy=entropy)
+    for rows in (slice(0, 2), slice(2, 4)):
+        part = Terms(
+            pieces.logprobs[rows],
+            pieces.old_logprobs[rows],
+            pieces.mask[rows],
+            pieces.advantages[rows],
+            pieces.reference[rows],
+            entropy[rows],
+        )
+        surrogate_loss(part, objective, Scale(4, 7))[0].backward()
+    assert torch.allclose(whole.logprobs.grad, pieces.logprobs.grad)
+
+
+@pytest.mark.parametrize(("kind", "ratio"), list(itertools.product(LossKind, RatioLevel)))
+def test_gradient_raises_good_plans_and_lowers_bad_ones(kind, ratio):
+    start = terms(new=OLD, reference=None)
+    loss, metrics = surrogate_loss(start, Objective(kind, ratio), Scale(4, 7))
+    loss.backward()
+    for row, advantage in enumerate(ADVANTAGES):
+        for at, own in enumerate(MASK[row]):
+            slope = -start.logprobs.grad[row, at].item()
+            assert math.copysign(1, slope) == math.copysign(1, advantage) if own else slope == 0
+    assert metrics.clip_fraction == 0
+    assert metrics.kl_to_old == pytest.approx(0)
+
+
+def test_ratio_beyond_the_clip_gives_no_more_gradient():
+    far = terms(new=[[0.9, 0.9]] * 4, reference=None, advantages=torch.ones(4, dtype=torch.float64))
+    loss, metrics = surrogate_loss(far, Objective(), Scale(4, 7))
+    loss.backward()
+    assert far.logprobs.grad.abs().max() == 0
+    assert metrics.clip_fraction == 1
+
+
+def test_lost_rows_move_nothing():
+    mask = torch.tensor(MASK)
+    mask[2] = False
+    part = terms(mask=mask)
+    loss, _ = surrogate_loss(part, Objective(LossKind.PAPER, RatioLevel.SEQUENCE, kl_coef=0.1), Scale(4, 7))
+    loss.backward()
+    assert part.logprobs.grad[2].abs().max() == 0
+
+
+def test_kl_pulls_towards_the_reference():
+    part = terms(new=OLD, advantages=torch.zeros(4, dtype=torch.float64))
+    loss, metrics = surrogate_loss(part, Objective(kl_coef=1.0), Scale(4, 7))
+    loss.backward()
+    own = torch.tensor(MASK)
+    wanted = torch.sign(torch.tensor(REFERENCE) - torch.tensor(OLD))[own]
+    assert torch.equal(torch.sign(-part.logprobs.grad)[own].float(), wanted)
+    assert metrics.kl_to_reference > 0
+
+
+def test_advantages_are_centred_and_scaled_by_the_group():
+    values = group_advantages(torch.tensor([[0.0, 1.0, 2.0, 3.0]]), eps=0.0).values[0]
+    sigma = math.sqrt(5 / 3)
+    assert values.tolist() == pytest.approx([-1.5 / sigma, -0.5 / sigma, 0.5 / sigma, 1.5 / sigma])
+
+
+@given(GROUPS)
+def test_advantages_of_a_group_sum_to_zero_and_lost_rollouts_get_none(rows):
+    rewards = torch.tensor(rows, dtype=torch.float64)
+    result = group_advantages(rewards)
+    assert torch.isfinite(result.values).all()
+    assert result.values.sum(dim=1).abs().max().item() < 1e-6
+    assert (result.values[torch.isnan(rewards)] == 0).all()
+
+
+@given(st.lists(st.floats(-1, 32), min_size=2, max_size=7), st.integers(0, 6))
+def test_a_lost_rollout_changes_nothing_for_the_others(rewards, place):
+    place = min(place, len(rewards))
+    alone = group_advantages(torch.tensor([rewards], dtype=torch.float64)).values[0].tolist()
+    padded = [*rewards[:place], LOST, *rewards[place:]]
+    among = group_advantages(torch.tensor([padded], dtype=torch.float64)).values[0].tolist()
+    assert [*among[:place], *among[place + 1 :]] == pytest.approx(alone, abs=1e-9)
+
+
+@pytest.mark.parametrize("rewards", [[31.5] * 4, [LOST] * 4, [LOST, LOST, 0.5, LOST]])
+def test_groups_without_signal_are_dead(rewards):
+    result = group_advantages(torch.tensor([rewards]))
+    assert result.dead.tolist() == [True]
+    assert result.values.abs().max() == 0

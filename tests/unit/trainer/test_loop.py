@@ -1,0 +1,195 @@
+"""The loop learns, can be stopped and resumed exactly, and says where its time went."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+from rich.console import Console
+from tests.fakes.symbolic_household import SymbolicCluster, make_tasks
+
+from embomatrix.trainer.augment import Variation
+from embomatrix.trainer.checkpoint import CheckpointStore, read_state
+from embomatrix.trainer.errors import TrainerError
+from embomatrix.trainer.loop import CHECKPOINTS, REFERENCE, Parts, TrainingRun
+from embomatrix.trainer.policy.choice import new_policy, saved_policy
+from embomatrix.trainer.progress import LineDisplay, LiveDisplay
+from embomatrix.trainer.recorder import read_metrics
+from embomatrix.trainer.report import success_rows, time_rows
+from embomatrix.trainer.rollout import Gateway
+from embomatrix.trainer.settings import OnLost, read_settings
+from embomatrix.trainer.telling import Teller
+
+TINY = {"tiny.layers": 2, "tiny.width": 32, "tiny.heads": 2, "tiny.inner": 64}
+SHORT = {
+    "imitation.steps": 60,
+    "imitation.batch": 8,
+    "imitation.learning_rate": 8e-3,
+    "grpo.steps": 6,
+    "grpo.tasks_per_step": 4,
+    "grpo.group": 4,
+    "grpo.chunk": 2,
+    "grpo.max_new": 24,
+    "evaluation.samples": 2,
+    "checkpoint_every": 3,
+    "samples_every": 1,
+}
+TASKS = make_tasks(10, 4, objects=10)
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    torch.set_num_threads(1)
+
+
+def run(out, cluster=None, tasks=TASKS, resume=False, display=None, **changes):
+    settings = read_settings(None, {**TINY, **SHORT, **{k.replace("__", "."): v for k, v in changes.items()}})
+    cluster = cluster or SymbolicCluster(tasks)
+    progress = reference = None
+    policy = new_policy(settings, tasks)
+    if resume:
+        newest = CheckpointStore(out / CHECKPOINTS, keep=9).latest()
+        progress, settings = read_state(newest)
+        policy = saved_policy(newest / "policy", settings)
+        reference = saved_policy(out / REFERENCE, settings).frozen_copy()
+    teller = Teller(policy, settings.prompt.rows, Variation(tasks.kinds, 0.5, 0.5))
+    display = display or LineDisplay(Console(quiet=True))
+    with (
+        Gateway(lambda: cluster, tasks.bundle_bytes, run_name="test", run_seed=0) as gateway,
+        display,
+    ):
+        parts = Parts(policy, teller, tasks, gateway, display, reference)
+        return TrainingRun(parts, settings, out, progress).run(), policy
+
+
+def weights(policy):
+    return torch.cat([parameter.detach().flatten() for parameter in policy.parameters()])
+
+
+def without_time(metrics):
+    return [{key: value for key, value in row.items() if key != "seconds"} for row in metrics]
+
+
+def test_six_steps_are_three_and_three_after_a_resume(tmp_path):
+    _, whole = run(tmp_path / "whole")
+    run(tmp_path / "halves")
+    newest = CheckpointStore(tmp_path / "halves" / CHECKPOINTS, keep=9).latest()
+    for path in sorted(newest.rglob("*"), reverse=True):  # as if the run had been killed after its third step
+        path.unlink() if path.is_file() else path.rmdir()
+    newest.rmdir()
+    _, resumed = run(tmp_path / "halves", resume=True)
+    assert torch.equal(weights(whole), weights(resumed))
+    assert without_time(read_metrics(tmp_path / "whole")) == without_time(read_metrics(tmp_path / "halves"))
+
+
+def test_a_slow_cluster_changes_when_results_come_and_not_what_is_learnt(tmp_path):
+    _, fast = run(tmp_path / "fast")
+    _, slow = run(tmp_path / "slow", SymbolicCluster(TASKS, delay_s=0.02))
+    assert torch.equal(weights(fast), weights(slow))
+
+
+def test_a_run_leaves_report_metrics_samples_and_the_newest_checkpoints(tmp_path):
+    summary, _ = run(tmp_path, keep_checkpoints=1)
+    page = summary.report.read_text()
+    assert page.count("<svg") == 5
+    assert "Where the time went" in page
+    assert [row["step"] for row in read_metrics(tmp_path)] == [1, 2, 3, 4, 5, 6]
+    sample = json.loads((tmp_path / "samples.jsonl").read_text().splitlines()[0])
+    assert {"step", "task", "instruction", "text", "reward", "advantage"} <= set(sample)
+    assert [path.name for path in (tmp_path / CHECKPOINTS).iterdir()] == ["step-000006"]
+    assert summary.checkpoint.name == "step-000006"
+    assert sum(seconds for _, seconds, _ in time_rows(summary)) == pytest.approx(summary.wall_s)
+    assert success_rows(summary)[0][0] == "all tasks"
+
+
+def test_the_window_of_every_step_is_announced_with_the_steps_ahead(tmp_path):
+    cluster = SymbolicCluster(TASKS)
+    run(tmp_path, cluster, grpo__lookahead=2)
+    windows = [sorted(set(steps)) for _, steps in cluster.announced]
+    assert [1, 2, 3] in windows or [2, 3, 4] in windows
+    assert [version for version, _ in cluster.announced] == sorted(
+        version for version, _ in cluster.announced
+    )
+
+
+def test_a_group_with_a_lost_rollout_is_left_out_of_the_update(tmp_path):
+    summary, policy = run(tmp_path / "a", SymbolicCluster(TASKS, lose_first=True))
+    reference = saved_policy(tmp_path / "a" / REFERENCE, read_settings(None, {}))
+    assert summary.lost > 0
+    assert torch.equal(weights(policy), weights(reference))
+    _, moved = run(tmp_path / "b", SymbolicCluster(TASKS, lose_first=True), grpo__on_lost=OnLost.PARTIAL)
+    assert not torch.equal(weights(moved), weights(reference))
+
+
+def test_a_cluster_that_fails_ends_the_run_with_a_checkpoint(tmp_path):
+    class Failing(SymbolicCluster):
+        async def execute(self, batch):
+            if batch.batch_id.startswith("step-4"):
+                from embomatrix.rpc.status import OverloadedError
+
+                raise OverloadedError("the queue is full: try again later")
+            async for result in super().execute(batch):
+                yield result
+
+    with pytest.raises(TrainerError, match="queue is full"):
+        run(tmp_path, Failing(TASKS))
+    progress, _ = read_state(CheckpointStore(tmp_path / CHECKPOINTS, keep=9).latest())
+    assert progress.step in (3, 4)
+
+
+def test_a_live_display_draws_every_phase(tmp_path):
+    console = Console(force_terminal=True, width=120, record=True)
+    run(tmp_path, display=LiveDisplay(console))
+    text = console.export_text()
+    assert "held-out success before GRPO" in text
+    assert "held-out success after GRPO" in text
+
+
+def test_damaged_checkpoints_are_named(tmp_path):
+    run(tmp_path)
+    newest = CheckpointStore(tmp_path / CHECKPOINTS, keep=9).latest()
+    (newest / "state.json").write_text("{}")
+    with pytest.raises(TrainerError, match="no readable checkpoint"):
+        read_state(newest)
+    (newest / "policy" / "weights.pt").write_bytes(b"rubbish")
+    with pytest.raises(TrainerError, match=r"damaged|no policy"):
+        saved_policy(newest / "policy", read_settings(None, {}))
+
+
+def test_imitation_alone_teaches_a_small_world(tmp_path):
+    tasks = make_tasks(40, 20, objects=7)
+    summary, _ = run(
+        tmp_path,
+        tasks=tasks,
+        imitation__steps=150,
+        imitation__batch=24,
+        imitation__learning_rate=8e-3,
+        grpo__steps=0,
+        grpo__max_new=40,
+        tiny__width=64,
+        tiny__inner=128,
+        evaluation__samples=5,
+    )
+    assert summary.after.success().value > 0.15
+
+
+@pytest.mark.slow
+def test_grpo_raises_held_out_success(tmp_path):
+    tasks = make_tasks(120, 40, objects=7)
+    summary, _ = run(
+        tmp_path,
+        tasks=replace(tasks),
+        imitation__steps=250,
+        imitation__batch=24,
+        imitation__learning_rate=5e-3,
+        grpo__steps=150,
+        grpo__tasks_per_step=8,
+        grpo__group=8,
+        grpo__chunk=4,
+        grpo__max_new=40,
+        tiny__width=64,
+        tiny__inner=128,
+        evaluation__samples=10,
+    )
+    rows = success_rows(summary)
+    assert summary.after.success().value > summary.before.success().value + 0.05, rows

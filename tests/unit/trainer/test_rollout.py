@@ -1,0 +1,111 @@
+"""The gateway: what is executed, what is not, and what a lost rollout is worth."""
+
+import math
+import time
+
+import pytest
+from tests.fakes.symbolic_household import SymbolicCluster, make_tasks
+
+from embomatrix.rpc.status import ManagerUnreachableError
+from embomatrix.skills.prompt import Codec, plan_in_names
+from embomatrix.trainer.data import Schedule, group_seed
+from embomatrix.trainer.errors import TrainerError
+from embomatrix.trainer.rollout import Gateway, waited
+
+TASKS = make_tasks(6, 2)
+TASK = TASKS.train[0]
+ORACLE = plan_in_names(TASK.oracle, TASK.situation)
+
+
+def gateway(cluster):
+    return Gateway(lambda: cluster, TASKS.bundle_bytes, run_name="test", run_seed=7)
+
+
+def outcomes(cluster, *texts):
+    with gateway(cluster) as gate:
+        return waited(gate.submit("b", 1, TASK, TASK.situation, texts, Codec.NAMES))
+
+
+def until(condition, seconds=10.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.005)
+
+
+def test_outcomes_come_in_the_order_of_the_texts():
+    wrong, right = outcomes(SymbolicCluster(TASKS), "toggle_on countertop", ORACLE)
+    assert right.success
+    assert right.value > 30
+    assert not wrong.success
+    assert wrong.value == 0.5
+
+
+def test_text_that_is_no_plan_is_scored_here_and_never_executed():
+    cluster = SymbolicCluster(TASKS)
+    (verdict,) = outcomes(cluster, "no idea")
+    assert verdict.value == -1
+    assert verdict.problem
+    assert cluster.executed == 0
+    assert cluster.batches == []
+
+
+def test_a_lost_rollout_has_no_reward_rather_than_a_zero():
+    lost, kept = outcomes(SymbolicCluster(TASKS, lost=frozenset({"b/0"})), ORACLE, ORACLE)
+    assert lost.reward is None
+    assert math.isnan(lost.value)
+    assert kept.success
+
+
+def test_a_bundle_is_sent_once_and_before_its_first_rollout():
+    cluster = SymbolicCluster(TASKS)
+    with gateway(cluster) as gate:
+        gate.announce({1: TASKS.train[:2], 2: TASKS.train[2:4]}, 8)
+        futures = [gate.submit(f"b{at}", 1, TASK, TASK.situation, [ORACLE], Codec.NAMES) for at in range(3)]
+        assert all(waited(future)[0].success for future in futures)
+        until(lambda: cluster.announced)
+    assert cluster.sent == {task.bundle_digest for task in (*TASKS.train[:4], TASK)}
+    assert cluster.announced == [(1, [1, 1, 2, 2])]
+
+
+def test_leaving_closes_the_run_with_work_under_way():
+    cluster = SymbolicCluster(TASKS, delay_s=60)
+    with gateway(cluster) as gate:
+        gate.submit("b", 1, TASK, TASK.situation, [ORACLE], Codec.NAMES)
+    assert cluster.closed
+
+
+class Unreachable(SymbolicCluster):
+    async def open_run(self, name, run_id=""):
+        raise ManagerUnreachableError("no manager answers at nowhere:1: start one, or pass --manager")
+
+
+def test_an_unreachable_manager_is_one_sentence():
+    with pytest.raises(TrainerError, match=r"no manager answers at nowhere:1"), gateway(Unreachable(TASKS)):
+        pass
+
+
+def test_all_rollouts_of_a_task_share_a_seed_that_other_tasks_and_runs_do_not():
+    assert group_seed(0, "a") == group_seed(0, "a")
+    assert len({group_seed(0, "a"), group_seed(0, "b"), group_seed(1, "a")}) == 3
+    assert 0 <= group_seed(0, "a") < 2**31
+
+
+def test_peek_tells_exactly_what_take_will_give():
+    schedule = Schedule(TASKS.train, seed=3)
+    schedule.take(4)
+    ahead = schedule.peek(5, skip=2)
+    assert schedule.take(7)[2:] == ahead
+
+
+def test_every_epoch_has_every_task_once_in_another_order():
+    schedule = Schedule(TASKS.train, seed=3)
+    first, second = schedule.take(6), schedule.take(6)
+    assert {task.task.task_id for task in first} == {task.task.task_id for task in second}
+    assert first != second
+
+
+def test_a_schedule_goes_on_from_its_cursor():
+    whole = Schedule(TASKS.train, seed=3)
+    whole.take(4)
+    assert Schedule(TASKS.train, seed=3, cursor=4).take(9) == whole.take(9)

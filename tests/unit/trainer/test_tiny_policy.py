@@ -1,0 +1,143 @@
+"""The word-level policy: shared prompts change nothing, names survive the round trip, files bring it back."""
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from tests.fakes.symbolic_household import make_tasks
+
+from embomatrix.skills.prompt import Codec, plan_in_names, prompt_for
+from embomatrix.trainer.policy.decoder import DecoderShape
+from embomatrix.trainer.policy.tiny import TinyPolicy
+from embomatrix.trainer.policy.words import END, UNKNOWN, build_vocabulary
+from embomatrix.trainer.rollout import parsed
+
+TASKS = make_tasks(12, 3)
+WORDS = build_vocabulary(
+    [task.situation for task in (*TASKS.train, *TASKS.heldout)],
+    [task.task.instruction for task in TASKS.train],
+)
+SHAPE = DecoderShape(len(WORDS), layers=2, width=32, heads=2, inner=64)
+
+
+def policy(seed=0):
+    made = TinyPolicy(WORDS, SHAPE, seed=seed)
+    with torch.no_grad():
+        for parameter in made.parameters():  # far from uniform, so that differences would show
+            parameter.mul_(4 if parameter.dim() > 1 else 1)
+    return made
+
+
+def prompts(made, count=3):
+    return [made.encode(prompt_for(task.situation, Codec.NAMES)) for task in TASKS.train[:count]]
+
+
+def draw(made, told, group=4, temperature=1.3, seed=0):
+    return made.sample(told, group, temperature, 12, torch.Generator().manual_seed(seed))
+
+
+def test_sampler_and_update_agree_on_log_probabilities():
+    made = policy()
+    told = prompts(made)
+    samples = draw(made, told)
+    scored = made.logprobs(told, samples.tokens, samples.mask, 4, 1.3)
+    assert torch.allclose(scored.logprobs, samples.logprobs * samples.mask, atol=1e-5)
+    assert (scored.entropy[samples.mask] > 0).all()
+
+
+def test_padding_and_sharing_the_prompt_change_neither_value_nor_gradient():
+    made = policy()
+    told = [prompts(made)[0][:9], *prompts(made)[1:]]
+    samples = draw(made, told)
+
+    def gradient(scored):
+        made.module.zero_grad()
+        scored.sum().backward()
+        return torch.cat([parameter.grad.flatten() for parameter in made.parameters()])
+
+    together = made.logprobs(told, samples.tokens, samples.mask, 4, 1.0).logprobs
+    shared = gradient(together)
+    alone = torch.cat(
+        [
+            made.logprobs(
+                [told[row // 4]], samples.tokens[row, None], samples.mask[row, None], 1, 1.0
+            ).logprobs
+            for row in range(12)
+        ]
+    )
+    assert torch.allclose(together, alone, atol=1e-5)
+    assert torch.allclose(shared, gradient(alone), atol=1e-3, rtol=1e-3)
+
+
+def test_samples_depend_on_the_generator_alone():
+    made = policy()
+    first, again, other = (draw(made, prompts(made), seed=seed).texts for seed in (1, 1, 2))
+    assert first == again
+    assert first != other
+
+
+def test_temperature_zero_takes_the_likeliest_plan():
+    made = policy()
+    texts = draw(made, prompts(made, 1), group=3, temperature=0.0).texts
+    assert len(set(texts)) == 1
+
+
+def test_mask_ends_with_the_end_token():
+    made = policy()
+    samples = draw(made, prompts(made))
+    for tokens, own in zip(samples.tokens.tolist(), samples.mask.tolist(), strict=True):
+        length = sum(own)
+        assert own == [True] * length + [False] * (len(own) - length)
+        assert END not in tokens[: length - 1]
+
+
+@pytest.mark.parametrize("task", TASKS.train, ids=lambda task: task.task.task_id)
+def test_oracle_plans_survive_the_vocabulary(task):
+    text = plan_in_names(task.oracle, task.situation)
+    assert parsed(WORDS.decode(WORDS.encode(text)), task.situation, Codec.NAMES) == task.oracle
+
+
+def test_phrases_of_an_instruction_meet_the_names_of_the_table():
+    assert WORDS.encode("the chicken leg") == WORDS.encode("the chicken_leg")
+    assert WORDS.decode(WORDS.encode("move apple_1\npick_up apple_1")) == "move apple_1\npick_up apple_1"
+    assert WORDS.encode("apples") == WORDS.encode("apple")
+    assert WORDS.encode("xylophone") == [UNKNOWN]
+
+
+@given(st.text(max_size=200))
+def test_any_text_can_be_encoded(text):
+    assert all(0 <= token < len(WORDS) for token in WORDS.encode(text))
+
+
+@given(st.lists(st.integers(0, len(WORDS) - 1), max_size=40))
+def test_any_tokens_can_be_decoded(tokens):
+    assert isinstance(WORDS.decode(tokens), str)
+
+
+def test_saved_policy_comes_back_equal(tmp_path):
+    made = policy(seed=3)
+    made.save(tmp_path)
+    assert TinyPolicy.is_saved_in(tmp_path)
+    back = TinyPolicy.load(tmp_path)
+    assert draw(back, prompts(back)).texts == draw(made, prompts(made)).texts
+
+
+def test_reference_stays_when_the_policy_moves():
+    made = policy()
+    reference = made.frozen_copy()
+    before = draw(reference, prompts(made)).texts
+    with torch.no_grad():
+        for parameter in made.parameters():
+            parameter.add_(1.0)
+    assert draw(reference, prompts(made)).texts == before
+    assert not any(parameter.requires_grad for parameter in reference.parameters())
+
+
+def test_a_prompt_too_long_keeps_its_end():
+    made = policy()
+    told = made.encode(prompt_for(TASKS.train[0].situation, Codec.NAMES))
+    situation = TASKS.train[0].situation
+    rows = situation.rows * 40
+    long = made.encode(prompt_for(type(situation)((), "", rows, situation.instruction, 16), Codec.NAMES))
+    assert len(long) <= SHAPE.longest
+    assert long[-4:] == told[-4:]

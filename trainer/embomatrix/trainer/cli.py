@@ -1,0 +1,275 @@
+"""`embomatrix train` and `embomatrix eval`. torch is imported after the arguments are read."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from embomatrix.rpc.channel import DEFAULT_ADDRESS
+from embomatrix.trainer.errors import TrainerError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from embomatrix.trainer.data import TaskSet
+    from embomatrix.trainer.evaluate import Evaluation
+    from embomatrix.trainer.policy.protocol import Policy
+    from embomatrix.trainer.report import Summary
+    from embomatrix.trainer.rollout import Gateway
+    from embomatrix.trainer.settings import TrainSettings
+    from embomatrix.trainer.telling import Teller
+
+_DATASET = Annotated[Path, typer.Option(help="Folder that `embomatrix factory build` wrote.")]
+_MANAGER = Annotated[
+    str, typer.Option(help="HOST:PORT of the Simulation Manager.", envvar="EMBOMATRIX_MANAGER")
+]
+_TOKEN = Annotated[str, typer.Option(help="Token of the trainer role.", envvar="EMBOMATRIX_TOKEN")]
+_THREADS = Annotated[int | None, typer.Option(min=1, help="Threads of torch; default: half of the cores.")]
+
+
+def train(
+    dataset: _DATASET = Path("build/dataset"),
+    manager: _MANAGER = DEFAULT_ADDRESS,
+    model: Annotated[str, typer.Option(help="`tiny`, or a Hugging Face model by name or folder.")] = "tiny",
+    out: Annotated[Path, typer.Option(help="Folder for checkpoints, logs and report.")] = Path("runs/train"),
+    minutes: Annotated[float | None, typer.Option(min=0, help="Minutes of GRPO; default 5.")] = None,
+    steps: Annotated[int | None, typer.Option(min=0, help="Steps of GRPO, in place of minutes.")] = None,
+    imitate_seconds: Annotated[
+        float | None, typer.Option(min=0, help="Seconds of imitation; default 150.")
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on from the newest checkpoint in --out.")
+    ] = False,
+    seed: Annotated[int | None, typer.Option(help="Seed of policy, task order and sampling.")] = None,
+    settings_file: Annotated[
+        Path | None, typer.Option("--settings", help="TOML file with any setting.")
+    ] = None,
+    threads: _THREADS = None,
+    device: Annotated[str | None, typer.Option(help="torch device: cpu, cuda.")] = None,
+    token: _TOKEN = "",
+) -> None:
+    """Train a policy: imitation of the oracle, then GRPO on the cluster, measured on held-out tasks."""
+    with _problems_shown("train"):
+        changes = {
+            "seed": seed,
+            "device": device,
+            "threads": threads,
+            "grpo.minutes": minutes,
+            "grpo.steps": steps,
+            "imitation.seconds": imitate_seconds,
+        }
+        if resume:
+            summary = _resumed(dataset, manager, token, out, changes)
+        else:
+            summary = _started(dataset, manager, token, out, model, settings_file, changes)
+        _show_summary(summary)
+
+
+def evaluate(
+    checkpoint: Annotated[
+        Path, typer.Argument(help="A checkpoint folder: runs/NAME/checkpoints/step-000050.")
+    ],
+    dataset: _DATASET = Path("build/dataset"),
+    manager: _MANAGER = DEFAULT_ADDRESS,
+    split: Annotated[str, typer.Option(help="`heldout` or `train`.")] = "heldout",
+    samples: Annotated[int | None, typer.Option(min=1, help="Plans per task; default 10.")] = None,
+    temperature: Annotated[float | None, typer.Option(min=0, help="0 takes the likeliest plan.")] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write every task's score here.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of sampling.")] = None,
+    threads: _THREADS = None,
+    token: _TOKEN = "",
+) -> None:
+    """Measure a trained policy: success per category with 95 % intervals."""
+    with _problems_shown("eval"):
+        from embomatrix.trainer.checkpoint import read_state
+        from embomatrix.trainer.policy.choice import saved_policy
+
+        _, settings = read_state(checkpoint)
+        changes = {
+            "seed": seed,
+            "threads": threads,
+            "evaluation.samples": samples,
+            "evaluation.temperature": temperature,
+        }
+        settings = _changed(settings, changes)
+        tasks = _loaded(dataset, settings)
+        chosen = {"heldout": tasks.heldout, "train": tasks.train}.get(split)
+        if not chosen:
+            raise TrainerError(f"the data set has no tasks of split {split!r}: expected `heldout` or `train`")
+        policy = saved_policy(checkpoint / "policy", settings)
+        result = _evaluated(policy, chosen, tasks, manager, token, settings)
+        _show_evaluation(result)
+        if json_file is not None:
+            json_file.write_text(json.dumps(result.as_json(), indent=1), encoding="utf-8")
+
+
+@contextlib.contextmanager
+def _problems_shown(command: str) -> Iterator[None]:
+    """What a person can mend is one sentence and status 2."""
+    from embomatrix.rpc.status import ClusterError
+
+    logging.getLogger("embomatrix").addHandler(logging.NullHandler())
+    try:
+        yield
+    except (TrainerError, ClusterError) as error:
+        Console(stderr=True).print(f"embomatrix {command}: {error}", highlight=False, markup=False)
+        raise typer.Exit(2) from None
+
+
+def _started(
+    dataset: Path,
+    manager: str,
+    token: str,
+    out: Path,
+    model: str,
+    settings_file: Path | None,
+    changes: dict[str, Any],
+) -> Summary:
+    from embomatrix.trainer.policy.choice import TINY, new_policy
+    from embomatrix.trainer.settings import LANGUAGE_MODEL_DEFAULTS, read_settings
+
+    threads = changes["threads"] or max(1, (os.cpu_count() or 2) // 2)
+    defaults = {} if model == TINY else LANGUAGE_MODEL_DEFAULTS
+    settings = read_settings(settings_file, {**changes, "model": model, "threads": threads}, defaults)
+    if (out / "checkpoints").exists():
+        raise TrainerError(f"{out} holds another run: pass --resume to go on with it, or another --out")
+    tasks = _loaded(dataset, settings)
+    policy = new_policy(settings, tasks)
+    return _run(policy, tasks, manager, token, settings, out)
+
+
+def _resumed(dataset: Path, manager: str, token: str, out: Path, changes: dict[str, Any]) -> Summary:
+    from embomatrix.trainer.checkpoint import CheckpointStore, read_state
+    from embomatrix.trainer.loop import CHECKPOINTS, REFERENCE
+    from embomatrix.trainer.policy.choice import saved_policy
+
+    newest = CheckpointStore(out / CHECKPOINTS, keep=1).latest()
+    if newest is None:
+        raise TrainerError(
+            f"there is no checkpoint in {out} to resume from: leave out --resume, or pass its --out"
+        )
+    progress, settings = read_state(newest)
+    settings = _changed(settings, changes)
+    tasks = _loaded(dataset, settings)
+    policy = saved_policy(newest / "policy", settings)
+    reference = saved_policy(out / REFERENCE, settings).frozen_copy()
+    return _run(policy, tasks, manager, token, settings, out, progress=progress, reference=reference)
+
+
+def _changed(settings: TrainSettings, changes: dict[str, Any]) -> TrainSettings:
+    from embomatrix.trainer.settings import with_changes
+
+    return with_changes(settings.model_dump(), changes)
+
+
+def _loaded(dataset: Path, settings: TrainSettings) -> TaskSet:
+    import torch
+
+    from embomatrix.trainer.data import load_tasks
+
+    torch.set_num_threads(settings.threads)
+    return load_tasks(dataset)
+
+
+def _teller(policy: Policy, tasks: TaskSet, settings: TrainSettings) -> Teller:
+    from embomatrix.trainer.augment import Variation
+    from embomatrix.trainer.telling import Teller
+
+    told = settings.prompt
+    return Teller(policy, told.rows, Variation(tasks.kinds, told.rename_share, told.drop_share))
+
+
+def _gateway(tasks: TaskSet, manager: str, token: str, name: str, seed: int) -> Gateway:
+    from embomatrix.rpc.client import ClusterClient
+    from embomatrix.trainer.rollout import Gateway
+
+    return Gateway(lambda: ClusterClient(manager, token), tasks.bundle_bytes, run_name=name, run_seed=seed)
+
+
+def _run(
+    policy: Policy,
+    tasks: TaskSet,
+    manager: str,
+    token: str,
+    settings: TrainSettings,
+    out: Path,
+    **resumed: Any,
+) -> Summary:
+    from embomatrix.trainer.loop import Parts, TrainingRun
+    from embomatrix.trainer.progress import display_for
+
+    console = Console()
+    reference = resumed.pop("reference", None)
+    with (
+        _gateway(tasks, manager, token, out.name, settings.seed) as gateway,
+        display_for(console) as display,
+    ):
+        parts = Parts(policy, _teller(policy, tasks, settings), tasks, gateway, display, reference)
+        return TrainingRun(parts, settings, out, **resumed).run()
+
+
+def _evaluated(
+    policy: Policy, chosen: Sequence[Any], tasks: TaskSet, manager: str, token: str, settings: TrainSettings
+) -> Evaluation:
+    from embomatrix.trainer.evaluate import evaluate_policy
+    from embomatrix.trainer.progress import display_for
+
+    with (
+        _gateway(tasks, manager, token, "eval", settings.seed) as gateway,
+        display_for(Console()) as display,
+    ):
+        return evaluate_policy(
+            policy,
+            _teller(policy, tasks, settings),
+            chosen,
+            gateway,
+            settings.evaluation,
+            max_new=settings.grpo.max_new,
+            seed=settings.seed,
+            label="eval",
+            report=lambda done, total: display.evaluating("", done, total),
+        )
+
+
+def _show_summary(summary: Summary) -> None:
+    from embomatrix.trainer.report import prewarm_share, success_rows, time_rows
+
+    console = Console()
+    rows = success_rows(summary)
+    if rows:
+        _table(
+            console, "held-out success, 95 % intervals", ("tasks", "before GRPO", "after", "difference"), rows
+        )
+    times = [(name, f"{spent:.0f} s", f"{share:.0%}") for name, spent, share in time_rows(summary)]
+    _table(console, "where the time went", ("activity", "time", "share"), times)
+    stats = summary.stats
+    console.print(
+        f"{summary.imitation_steps} imitation steps, {summary.steps} GRPO steps, {summary.rollouts} rollouts, "
+        f"{summary.lost} lost and masked; {stats.redispatched} re-dispatched, "
+        f"{stats.warm_starts} warm and {stats.cold_starts} cold starts, prewarm hits {prewarm_share(stats):.0%}",
+        highlight=False,
+    )
+    console.print(f"report      {summary.report}\ncheckpoint  {summary.checkpoint}", highlight=False)
+
+
+def _show_evaluation(result: Evaluation) -> None:
+    rows = [("all tasks", str(len(result.scores)), result.success().as_percent())]
+    for category in result.categories:
+        count = sum(score.category == category for score in result.scores)
+        rows.append((category, str(count), result.success(category).as_percent()))
+    _table(Console(), "success, 95 % intervals", ("category", "tasks", "success"), rows)
+
+
+def _table(console: Console, title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    table = Table(*head, title=title, title_justify="left")
+    for row in rows:
+        table.add_row(*row)
+    console.print(table)

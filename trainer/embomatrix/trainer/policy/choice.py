@@ -1,0 +1,47 @@
+"""From a model's name to a policy, new or saved."""
+
+from __future__ import annotations
+
+import pickle
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.trainer.errors import TrainerError
+from embomatrix.trainer.policy.decoder import DecoderShape
+from embomatrix.trainer.policy.hf import HfPolicy
+from embomatrix.trainer.policy.tiny import TinyPolicy
+from embomatrix.trainer.policy.words import build_vocabulary
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from embomatrix.trainer.data import TaskSet
+    from embomatrix.trainer.policy.protocol import Policy
+    from embomatrix.trainer.settings import TrainSettings
+
+TINY: Final = "tiny"
+DAMAGE: Final = (OSError, ValueError, LookupError, TypeError, RuntimeError, EOFError, pickle.UnpicklingError)
+"""What reading a damaged file may raise: torch's reader lets its own slips through."""
+
+
+def new_policy(settings: TrainSettings, tasks: TaskSet) -> Policy:
+    """The policy that a run starts from. Raises TrainerError where the model is unknown or can't be loaded."""
+    if settings.model != TINY:
+        return HfPolicy.load(settings.model, settings.codec, device=settings.device)
+    situations = [task.situation for task in (*tasks.train, *tasks.heldout)]
+    vocabulary = build_vocabulary(situations, [task.task.instruction for task in tasks.train])
+    shape = DecoderShape(len(vocabulary), **settings.tiny.model_dump())
+    return TinyPolicy(vocabulary, shape, seed=settings.seed, device=settings.device)
+
+
+def saved_policy(folder: Path, settings: TrainSettings) -> Policy:
+    """A policy that was saved in a folder. Raises TrainerError where there is none."""
+    try:
+        if TinyPolicy.is_saved_in(folder):
+            return TinyPolicy.load(folder, device=settings.device)
+    except DAMAGE as error:
+        raise TrainerError(f"the policy in {folder} is damaged ({error}): use another checkpoint") from error
+    if HfPolicy.is_saved_in(folder):
+        return HfPolicy.load(folder, settings.codec, device=settings.device, label=settings.model)
+    raise TrainerError(
+        f"there is no policy in {folder}: pass a checkpoint folder, runs/NAME/checkpoints/step-000050"
+    )

@@ -1,0 +1,200 @@
+"""Any causal language model of Hugging Face, by name or folder. transformers is imported when one is asked for.
+
+A group's prompt runs once, in sampling and in the update: its cache is repeated for the samples inside autograd, which gives
+the gradients of the plain computation at a third of the time.
+"""
+
+from __future__ import annotations
+
+import copy
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from embomatrix.trainer.errors import TrainerError
+from embomatrix.trainer.policy.drawing import draw
+from embomatrix.trainer.policy.protocol import Samples, Scored
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from pathlib import Path
+
+    from torch import Tensor, nn
+
+    from embomatrix.skills.prompt import Codec, Prompt
+    from embomatrix.trainer.policy.protocol import Tokens
+
+
+class HfPolicy:
+    """``model`` and ``tokenizer`` as transformers loads them; plans are written in ``codec``."""
+
+    def __init__(self, model: Any, tokenizer: Any, codec: Codec, name: str) -> None:
+        self._model = model.eval()
+        self._tokenizer = tokenizer
+        self._codec = codec
+        self._name = name
+        self._end = _end_tokens(model, tokenizer)
+        self._pad = self._end[0] if tokenizer.pad_token_id is None else int(tokenizer.pad_token_id)
+
+    @classmethod
+    def load(cls, name: str | Path, codec: Codec, *, device: str = "cpu", label: str = "") -> HfPolicy:
+        """Read a model by name or folder. Raises TrainerError with a remedy where that fails."""
+        try:
+            from transformers import AutoModelForCausalLM, AutoTokenizer
+        except ImportError as error:
+            raise TrainerError(
+                f"the model {str(name)!r} needs transformers: `pip install 'embomatrix[hf]'`, or --model tiny"
+            ) from error
+        dtype = torch.float32 if device == "cpu" else torch.bfloat16
+        try:
+            tokenizer = AutoTokenizer.from_pretrained(str(name))
+            model: Any = AutoModelForCausalLM.from_pretrained(str(name), dtype=dtype)
+            model.to(device)
+        except (OSError, ValueError, KeyError) as error:
+            raise TrainerError(
+                f"the model {str(name)!r} can't be loaded ({str(error).splitlines()[0]}): pass `tiny`, a folder with "
+                "config.json, or a Hugging Face name; `embomatrix model import-gguf` makes such a folder"
+            ) from error
+        return cls(model, tokenizer, codec, label or str(name))
+
+    @property
+    def name(self) -> str:
+        return self._name
+
+    @property
+    def codec(self) -> Codec:
+        return self._codec
+
+    @property
+    def module(self) -> nn.Module:
+        return self._model  # type: ignore[no-any-return]
+
+    def parameters(self) -> Iterator[nn.Parameter]:
+        return self.module.parameters()
+
+    def encode(self, prompt: Prompt) -> Tokens:
+        """The chat template's text where the model has one, else system and user text and a cue."""
+        if getattr(self._tokenizer, "chat_template", None):
+            messages = [
+                {"role": "system", "content": prompt.system},
+                {"role": "user", "content": prompt.user},
+            ]
+            text = self._tokenizer.apply_chat_template(messages, tokenize=False, add_generation_prompt=True)
+        else:
+            text = f"{prompt.system}\n\n{prompt.user}\nPlan:\n"
+        return self._tokens(text)
+
+    def encode_plan(self, text: str) -> Tokens:
+        return (*self._tokens(text), self._end[0])
+
+    def _tokens(self, text: str) -> Tokens:
+        return tuple(self._tokenizer(text, add_special_tokens=False)["input_ids"])
+
+    @torch.no_grad()
+    def sample(
+        self,
+        prompts: Sequence[Tokens],
+        group: int,
+        temperature: float,
+        max_new: int,
+        generator: torch.Generator,
+    ) -> Samples:
+        cache, mask, scores = self._read(prompts, group)
+        rows = scores.shape[0]
+        lengths = mask.sum(dim=1)  # (rows,)
+        end = torch.tensor(self._end, device=scores.device)
+        done = torch.zeros(rows, dtype=torch.bool, device=scores.device)
+        tokens, masks, logprobs = [], [], []
+        for at in range(max_new):
+            choice, logprob = draw(scores, temperature, generator)
+            choice = torch.where(done, self._pad, choice)
+            tokens.append(choice)
+            masks.append(~done)
+            logprobs.append(torch.where(done, 0.0, logprob))
+            done = done | torch.isin(choice, end)
+            if bool(done.all()) or at == max_new - 1:
+                break
+            mask = torch.cat([mask, mask.new_ones(rows, 1)], dim=1)
+            scores = self._extend(choice[:, None], mask, (lengths + at)[:, None], cache)[:, -1]
+        drawn, own = torch.stack(tokens, dim=1), torch.stack(masks, dim=1)
+        return Samples(drawn, own, torch.stack(logprobs, dim=1), self._texts(drawn, own))
+
+    def logprobs(
+        self, prompts: Sequence[Tokens], tokens: Tensor, mask: Tensor, group: int, temperature: float
+    ) -> Scored:
+        cache, prompt_mask, first = self._read(prompts, group)
+        scores = first[:, None]  # (rows, 1, V)
+        length = tokens.shape[1]
+        if length > 1:
+            seen = torch.cat([prompt_mask, prompt_mask.new_ones(tokens.shape[0], length - 1)], dim=1)
+            begin = prompt_mask.sum(dim=1, keepdim=True)
+            positions = begin + torch.arange(length - 1, device=tokens.device)
+            scores = torch.cat([scores, self._extend(tokens[:, :-1], seen, positions, cache)], dim=1)
+        spread = torch.log_softmax(scores / (temperature or 1.0), dim=-1)  # (rows, T, V)
+        chosen = spread.gather(-1, tokens[..., None])[..., 0]
+        entropy = -(spread.exp() * spread).sum(dim=-1)
+        return Scored(chosen * mask, entropy * mask)
+
+    def _read(self, prompts: Sequence[Tokens], group: int) -> tuple[Any, Tensor, Tensor]:
+        """Run the prompts once; cache, mask (rows, P) and next-token scores (rows, V) are repeated for the samples."""
+        from transformers import DynamicCache
+
+        longest = max(len(prompt) for prompt in prompts)
+        ids = torch.full((len(prompts), longest), self._pad)
+        mask = torch.zeros(len(prompts), longest, dtype=torch.long)
+        for row, prompt in enumerate(prompts):
+            ids[row, longest - len(prompt) :] = torch.tensor(prompt)
+            mask[row, longest - len(prompt) :] = 1
+        ids, mask = ids.to(self._model.device), mask.to(self._model.device)
+        cache = DynamicCache(config=self._model.config)
+        result = self._model(
+            ids,
+            attention_mask=mask,
+            position_ids=(mask.cumsum(dim=1) - 1).clamp(min=0),
+            past_key_values=cache,
+            use_cache=True,
+            logits_to_keep=1,
+        )
+        cache.batch_repeat_interleave(group)
+        scores = result.logits[:, -1].float().repeat_interleave(group, dim=0)
+        return cache, mask.repeat_interleave(group, dim=0), scores
+
+    def _extend(self, tokens: Tensor, mask: Tensor, positions: Tensor, cache: Any) -> Tensor:
+        """Scores (rows, T, V) after tokens (rows, T) that follow what is cached."""
+        result = self._model(
+            tokens, attention_mask=mask, position_ids=positions, past_key_values=cache, use_cache=True
+        )
+        return result.logits.float()  # type: ignore[no-any-return]
+
+    def _texts(self, tokens: Tensor, mask: Tensor) -> tuple[str, ...]:
+        """Text of each sample without special tokens. The end is found by the mask: it may equal the padding."""
+        return tuple(
+            self._tokenizer.decode(row[own].tolist(), skip_special_tokens=True)
+            for row, own in zip(tokens, mask, strict=True)
+        )
+
+    def frozen_copy(self) -> HfPolicy:
+        twin = copy.copy(self)
+        twin._model = copy.deepcopy(self._model).requires_grad_(False)
+        return twin
+
+    def save(self, folder: Path) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self._model.save_pretrained(folder)
+        self._tokenizer.save_pretrained(folder)
+
+    @staticmethod
+    def is_saved_in(folder: Path) -> bool:
+        return (folder / "config.json").is_file()
+
+
+def _end_tokens(model: Any, tokenizer: Any) -> list[int]:
+    """Tokens that end a plan, the tokenizer's own first."""
+    configured = getattr(getattr(model, "generation_config", None), "eos_token_id", None)
+    others = configured if isinstance(configured, list) else [configured]
+    found = dict.fromkeys(token for token in (tokenizer.eos_token_id, *others) if token is not None)
+    if not found:
+        raise TrainerError(
+            "the model has no end-of-text token: a plan could never end; set one in its tokenizer"
+        )
+    return [int(token) for token in found]
