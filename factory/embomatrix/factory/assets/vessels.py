@@ -167,9 +167,7 @@ def _raised_part(part: Part, lift_m: float) -> Part:
 
 
 def plate(size_m: Vec3) -> Body:
-    """A flat disc that things lie on; deep ones have a rim."""
-    if size_m[2] >= 0.02:
-        return vessel(size_m, OPEN_ROUND)
+    """A flat disc that things lie on, and over whose edge they may hang; a rim would keep a steak off most plates."""
     (_, _, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
     body = Body(parts=octagon((0.0, 0.0), (x1, y1), (z0, z1)))
     body.add_support("top", (-0.7 * x1, -0.7 * y1), (0.7 * x1, 0.7 * y1), z1)

@@ -1,0 +1,50 @@
+"""Small things rest where they are put: the engine's own bodies, stepped for a second and a half."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import pytest
+
+from embomatrix.factory.assets.library import build_asset
+from embomatrix.world.catalog import Catalog
+from embomatrix.world.geometry import Pose
+
+bullet_bodies = pytest.importorskip("embomatrix.sim.bullet.bodies", reason="needs pybullet")
+pybullet = pytest.importorskip("pybullet", reason="PyBullet has wheels up to Python 3.11 on x86-64")
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+THINGS = (
+    "apple banana bell_pepper bottle_of_wine bowl can_of_soda carrot chicken chopping_board cupcake egg frying_pan "
+    "half_apple hardback laptop lemon mug pillow plate potato saucepot stockpot table_knife tablefork teapot tray vase "
+    "water_glass watermelon wineglass wok"
+)
+STEPS = 360
+
+
+@pytest.fixture(scope="module")
+def client() -> Iterator[int]:
+    number = pybullet.connect(pybullet.DIRECT)
+    yield number
+    pybullet.disconnect(physicsClientId=number)
+
+
+@pytest.mark.parametrize("category", THINGS.split())
+def test_thing_stays_upright_where_it_is_put(client: int, category: str) -> None:
+    catalog = Catalog.load()
+    asset = build_asset(catalog, category, catalog.models_of(category)[0].model_id)
+    half = asset.size_m[2] / 2
+    pybullet.resetSimulation(physicsClientId=client)
+    pybullet.setGravity(0.0, 0.0, -9.81, physicsClientId=client)
+    bodies = bullet_bodies.BodyFactory(client)
+    bodies.floor(0.0, 0.0, 5.0)
+    body = bodies.rigid(asset, Pose((0.0, 0.0, half + 5e-4)), [0.0] * len(asset.joints), asset.mass_kg)
+    for _ in range(STEPS):
+        pybullet.stepSimulation(physicsClientId=client)
+    (x, y, z), (qx, qy, _, _) = pybullet.getBasePositionAndOrientation(body, physicsClientId=client)
+    assert math.hypot(x, y) < 0.005
+    assert z == pytest.approx(half, abs=0.002)
+    assert math.degrees(math.acos(1 - 2 * (qx * qx + qy * qy))) < 1.5
