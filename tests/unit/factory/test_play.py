@@ -1,0 +1,128 @@
+"""`embomatrix play`: what a person sees for a plan that works, one that fails, and one that is none."""
+
+import json
+
+import pytest
+import typer
+from tests.fakes.scenes import kitchen_scene, kitchen_tasks
+from typer.testing import CliRunner
+
+from embomatrix.factory.play_cli import play
+from embomatrix.world.bundle import Bundle, bundle_digest, encode_bundle
+from embomatrix.world.dataset import TaskRecord, write_dataset
+
+GOOD = [
+    {"action": "move", "object_index": 10},
+    {"action": "pick_up", "object_index": 10},
+    {"action": "move", "object_index": 0},
+    {"action": "place", "object_index": 0, "relation": "ontop"},
+]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    scene = kitchen_scene()
+    tasks = {task.task_id: task for task in kitchen_tasks(scene)}
+    bundle = encode_bundle(Bundle(scene, tasks))
+    digest = bundle_digest(bundle)
+    root = tmp_path_factory.mktemp("dataset")
+    records = [TaskRecord(task, digest, "train", (), ("kitchen_0",), "x") for task in tasks.values()]
+    write_dataset(root, records, {digest: bundle})
+    return root
+
+
+@pytest.fixture
+def run(folder):
+    app = typer.Typer()
+    app.command()(play)
+
+    def call(*arguments, text=None, env=None):
+        values = {"COLUMNS": "160", "EMBOMATRIX_DATASET": str(folder), **(env or {})}
+        return CliRunner().invoke(app, arguments, input=text, env=values)
+
+    return call
+
+
+def test_a_plan_that_works_is_shown_step_by_step_with_its_reward(run, tmp_path):
+    plan = tmp_path / "plan.json"
+    plan.write_text(json.dumps(GOOD))
+    result = run("apple_to_counter", "--plan", str(plan))
+    assert result.exit_code == 0
+    assert "put apple_1 on top of countertop_1" in result.output
+    assert "✓ (ontop apple_1 countertop_1)" in result.output
+    assert "success" in result.output
+    assert "30.90" in result.output
+
+
+def test_the_plan_is_read_from_standard_input(run):
+    assert "success" in run("apple_to_counter", "--plan", "-", text=json.dumps(GOOD)).output
+
+
+def test_a_step_that_fails_is_marked_with_its_reason_and_the_rest_is_not_executed(run):
+    result = run("apple_to_counter", "--plan", "-", text="pick_up 10\nmove 0")
+    assert result.exit_code == 0
+    assert "✗ pick_up apple_1" in " ".join(result.output.split())
+    assert "out_of_reach: apple_1 is" in result.output
+    assert "not executed" in result.output
+    assert "the goal is not reached" in result.output
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("I would rather not.", "no plan was found"),
+        ("dance 3", "unknown skill 'dance'"),
+        ('[{"action": "move"}]', "move lacks object_index"),
+        ("turn nan", "yaw must be a finite number"),
+        ("turn 1\n" * 65, "expected at most 64"),
+        ("x" * 70_000, "a plan has at most 65536"),
+    ],
+)
+def test_a_text_that_is_no_plan_is_explained_and_earns_minus_one(run, text, words):
+    result = run("apple_to_counter", "--plan", "-", text=text)
+    assert result.exit_code == 1
+    assert words in " ".join(result.output.split())
+    assert "-1.00" in result.output
+
+
+def test_an_index_outside_the_table_is_a_failed_step_and_not_a_bad_plan(run):
+    result = run("apple_to_counter", "--plan", "-", text="move 9999")
+    assert result.exit_code == 0
+    assert "unknown_index: there is no object with index 9999: the table has indices 0 to 14" in result.output
+
+
+def test_the_oracle_shows_that_the_task_can_be_done(run):
+    result = run("cook_chicken", "--oracle")
+    assert result.exit_code == 0
+    assert "toggle_on microwave_1" in result.output
+    assert "success" in result.output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "env", "words"),
+    [
+        (("cook_chiken", "--oracle"), {}, "there is no task 'cook_chiken'"),
+        (("cook_chicken",), {}, "expected either --plan FILE or --oracle"),
+        (("cook_chicken", "--oracle", "--plan", "-"), {}, "expected either --plan FILE or --oracle"),
+        (("cook_chicken", "--plan", "/no/such/plan"), {}, "No such file or directory"),
+        (
+            ("cook_chicken", "--oracle"),
+            {"EMBOMATRIX_DATASET": "/no/such"},
+            "there is no data set in /no/such",
+        ),
+    ],
+)
+def test_bad_input_gets_one_sentence_and_no_traceback(run, arguments, env, words):
+    result = run(*arguments, env=env)
+    assert result.exit_code == 2
+    assert words in " ".join(result.output.split())
+    assert "Traceback" not in result.output
+
+
+def test_an_unknown_task_is_answered_with_close_ones(run):
+    assert "did you mean cook_chicken?" in run("cook_chiken", "--oracle").output
+
+
+def test_the_folder_can_be_given_as_an_option(run, folder):
+    result = run("cook_chicken", "--oracle", "--dataset", str(folder), env={"EMBOMATRIX_DATASET": "/no/such"})
+    assert result.exit_code == 0

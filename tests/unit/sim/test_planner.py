@@ -1,0 +1,226 @@
+"""The oracle: for every kind of goal a plan that works, without a call too many, or the reason why there is none."""
+
+from dataclasses import replace
+
+import pytest
+from tests.fakes.plans import awkward_scene, task_over, words_of
+from tests.fakes.scenes import kitchen_scene, kitchen_tasks
+
+from embomatrix.sim.executor import Simulator
+from embomatrix.sim.planner import PROOF_SEEDS, PlanNotFound, find_plan
+from embomatrix.sim.pose_cache import build_pose_cache
+from embomatrix.skills.syntax import MAX_STEPS, Skill
+from embomatrix.world.bundle import Bundle
+from embomatrix.world.evaluate import evaluate
+from embomatrix.world.goal import And, Atom, Exists, Forall, ForN, ForPairs, Imply, Not, Or
+
+FETCH_CHICKEN = "move microwave_1; open microwave_1; move fridge_1; open fridge_1; pick_up chicken_leg_1; "
+HEAT_CHICKEN = (
+    f"{FETCH_CHICKEN}move microwave_1; place microwave_1 inside; close microwave_1; toggle_on microwave_1"
+)
+
+
+def atom(predicate, *args):
+    return Atom(predicate, args)
+
+
+@pytest.fixture(scope="module")
+def flat():
+    scene = kitchen_scene()
+    small = [item.name for item in scene.objects if not item.fixed]
+    cache = build_pose_cache(scene, small, [item.name for item in scene.objects], seed=0)
+    simulator = Simulator(Bundle(scene, {}, cache))
+    yield simulator
+    simulator.close()
+
+
+def oracle(simulator, goal):
+    """The plan in words, checked with seeds that the oracle has not seen; or the reason."""
+    task = task_over(simulator.world.scene, goal)
+    found = find_plan(simulator, task)
+    if isinstance(found, PlanNotFound):
+        return found.reason
+    for seed in (11, 12):
+        assert simulator.execute(task, found, seed).failure is None
+        assert evaluate(goal, simulator.facts, task.types)
+    return words_of(found, task)
+
+
+@pytest.mark.parametrize(
+    ("goal", "plan"),
+    [
+        (
+            atom("ontop", "apple_1", "countertop_1"),
+            "move apple_1; pick_up apple_1; move countertop_1; place countertop_1 ontop",
+        ),
+        (
+            atom("under", "mug_1", "breakfast_table_1"),
+            "move mug_1; pick_up mug_1; move breakfast_table_1; place breakfast_table_1 under",
+        ),
+        (
+            atom("inside", "apple_1", "cabinet_1"),
+            "move cabinet_1; open cabinet_1; move apple_1; pick_up apple_1; move cabinet_1; place cabinet_1 inside",
+        ),
+        (atom("open", "fridge_1"), "move fridge_1; open fridge_1"),
+        (atom("toggled_on", "table_lamp_1"), "move table_lamp_1; toggle_on table_lamp_1"),
+        (
+            And((atom("inside", "chicken_leg_1", "microwave_1"), atom("cooked", "chicken_leg_1"))),
+            HEAT_CHICKEN,
+        ),
+        (
+            And(
+                (
+                    atom("inside", "chicken_leg_1", "microwave_1"),
+                    Not(atom("open", "microwave_1")),
+                    atom("toggled_on", "microwave_1"),
+                )
+            ),
+            HEAT_CHICKEN,
+        ),
+        (
+            And((atom("inside", "apple_1", "fridge_1"), Not(atom("open", "fridge_1")))),
+            "move fridge_1; open fridge_1; move apple_1; pick_up apple_1; move fridge_1; place fridge_1 inside; "
+            "close fridge_1",
+        ),
+        (
+            Not(atom("frozen", "chicken_leg_1")),
+            "move fridge_1; open fridge_1; pick_up chicken_leg_1; move stove_1; place stove_1 ontop; toggle_on stove_1",
+        ),
+        (
+            And((atom("frozen", "apple_1"), atom("ontop", "apple_1", "countertop_1"))),
+            "move fridge_1; open fridge_1; move apple_1; pick_up apple_1; move fridge_1; place fridge_1 inside; "
+            "close fridge_1; open fridge_1; pick_up apple_1; move countertop_1; place countertop_1 ontop",
+        ),
+        (
+            And((atom("inside", "apple_1", "bowl_1"), atom("ontop", "bowl_1", "coffee_table_1"))),
+            "move bowl_1; pick_up bowl_1; move coffee_table_1; place coffee_table_1 ontop; move apple_1; "
+            "pick_up apple_1; move bowl_1; place bowl_1 inside",
+        ),
+        (
+            And((atom("hot", "mug_1"), Not(atom("toggled_on", "stove_1")))),
+            "move mug_1; pick_up mug_1; move stove_1; place stove_1 ontop; toggle_on stove_1; toggle_off stove_1",
+        ),
+        (
+            Not(atom("ontop", "bowl_1", "breakfast_table_1")),
+            "move bowl_1; pick_up bowl_1; move countertop_1; place countertop_1 ontop",
+        ),
+    ],
+)
+def test_the_plan_for_the_goal_is_the_shortest_that_a_person_would_write(flat, goal, plan):
+    assert oracle(flat, goal) == plan
+
+
+def test_the_open_door_of_what_is_fetched_ends_closed_when_the_goal_says_so(flat):
+    goal = And((atom("ontop", "chicken_leg_1", "coffee_table_1"), Not(atom("open", "fridge_1"))))
+    assert oracle(flat, goal) == (
+        "move fridge_1; open fridge_1; pick_up chicken_leg_1; move coffee_table_1; place coffee_table_1 ontop; "
+        "move fridge_1; close fridge_1"
+    )
+
+
+def test_what_is_cooked_is_served_elsewhere(flat):
+    goal = And(
+        (
+            atom("cooked", "chicken_leg_1"),
+            atom("inside", "chicken_leg_1", "bowl_1"),
+            atom("ontop", "bowl_1", "coffee_table_1"),
+        )
+    )
+    plan = oracle(flat, goal)
+    assert (
+        plan.index("toggle_on") < plan.index("place coffee_table_1 ontop") < plan.index("place bowl_1 inside")
+    )
+
+
+def test_a_microwave_is_switched_off_before_the_food_is_taken_out(flat):
+    task = task_over(
+        flat.world.scene, And((atom("hot", "apple_1"), atom("ontop", "apple_1", "coffee_table_1")))
+    )
+    without_stove = tuple(name for name in task.table if name != "stove_1")
+    task = replace(task, table=without_stove)
+    plan = words_of(find_plan(flat, task), task)
+    assert plan.endswith(
+        "close microwave_1; toggle_on microwave_1; toggle_off microwave_1; open microwave_1; pick_up apple_1; "
+        "move coffee_table_1; place coffee_table_1 ontop"
+    )
+
+
+@pytest.mark.parametrize(
+    "goal",
+    [
+        Forall("?a", "apple.n.01", atom("inside", "?a", "fridge_1")),
+        Exists("?a", "apple.n.01", atom("inside", "?a", "bowl_1")),
+        ForN(1, "?a", "apple.n.01", atom("inside", "?a", "cabinet_1")),
+        ForPairs("?a", "apple.n.01", "?b", "bowl.n.01", atom("inside", "?a", "?b")),
+        Or((atom("sliced", "apple_1"), atom("open", "cabinet_1"))),
+        Imply(atom("inside", "chicken_leg_1", "fridge_1"), atom("open", "fridge_1")),
+        atom("inroom", "apple_1", "living_room_0"),
+        And((atom("hot", "apple_1"), atom("cooked", "chicken_leg_1"), atom("ontop", "mug_1", "sink_1"))),
+        And((atom("touching", "apple_1", "coffee_table_1"),)),
+    ],
+)
+def test_a_plan_is_found_for_the_goal(flat, goal):
+    assert oracle(flat, goal).startswith("move")
+
+
+def test_the_tasks_of_the_flat_can_be_done_with_several_seeds(flat):
+    for task in kitchen_tasks(flat.world.scene):
+        plan = find_plan(flat, task)
+        assert not isinstance(plan, PlanNotFound), plan
+        assert len(plan) <= MAX_STEPS
+        for seed in (*PROOF_SEEDS, 99):
+            flat.execute(task, plan, seed)
+            assert evaluate(task.goal, flat.facts, task.types)
+
+
+def test_no_call_of_a_plan_can_be_left_out(flat):
+    for task in kitchen_tasks(flat.world.scene):
+        plan = find_plan(flat, task)
+        for number, call in enumerate(plan):
+            if call.skill is Skill.MOVE:
+                continue
+            shorter = (*plan[:number], *plan[number + 1 :])
+            trace = flat.execute(task, shorter, 0)
+            done = trace.failure is None and evaluate(task.goal, flat.facts, task.types)
+            assert not done, words_of(shorter, task)
+
+
+@pytest.mark.parametrize(
+    ("goal", "reason"),
+    [
+        (atom("ontop", "bowl_1", "breakfast_table_1"), "the goal holds at the start: there is nothing to do"),
+        (atom("sliced", "apple_1"), "none of the skills can do this: apple_1 must be made sliced"),
+        (And((atom("open", "sink_1"), Not(atom("open", "sink_1")))), "the goal contradicts itself"),
+        (
+            atom("ontop", "fridge_1", "countertop_1"),
+            "pick_up fails: fridge_1 is fixed and can't be picked up",
+        ),
+        (
+            atom("cooked", "mug_1"),
+            "no object in the table makes mug_1 cooked: expected a heat or cold source",
+        ),
+    ],
+)
+def test_a_goal_without_a_plan_is_refused_with_the_reason(flat, goal, reason):
+    assert oracle(flat, goal) == reason
+
+
+def test_a_goal_that_needs_an_object_outside_the_table_has_no_plan(flat):
+    task = task_over(flat.world.scene, atom("ontop", "apple_1", "countertop_1"))
+    task = replace(task, table=task.table[:5])
+    assert find_plan(flat, task) == PlanNotFound("apple_1 is not in the object table: no plan can name it")
+
+
+def test_a_running_microwave_can_not_end_open_and_on(flat):
+    goal = And((atom("open", "microwave_1"), atom("toggled_on", "microwave_1")))
+    assert "goal does not hold" in oracle(flat, goal)
+
+
+def test_what_is_stacked_is_taken_off_first():
+    simulator = Simulator(Bundle(awkward_scene(), {}))
+    plan = oracle(simulator, atom("ontop", "tray_1", "coffee_table_1"))
+    simulator.close()
+    assert plan == (
+        "move apple_3; pick_up apple_3; move countertop_1; place countertop_1 ontop; "
+        "move tray_1; pick_up tray_1; move coffee_table_1; place coffee_table_1 ontop"
+    )

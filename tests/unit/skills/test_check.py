@@ -1,0 +1,248 @@
+"""Preconditions on a world of words: no engine, no geometry, one rule at a time."""
+
+from dataclasses import dataclass, field, replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from tests.fakes import furniture as make
+
+from embomatrix.skills.check import check
+from embomatrix.skills.failure import FailureReason
+from embomatrix.skills.library import reasons_of
+from embomatrix.skills.limits import ROBOT
+from embomatrix.skills.syntax import PlaceRelation, Skill, SkillCall
+from embomatrix.skills.view import Reach
+from embomatrix.world.asset import Asset
+
+ASSETS = {
+    "apple": make.apple(),
+    "bowl": make.bowl(),
+    "fridge": make.fridge(),
+    "microwave": make.microwave(),
+    "stove": make.stove(),
+    "table": make.kitchen_table(),
+}
+TABLE = tuple(ASSETS)
+AT_HAND = Reach(0.5, 0.8)
+
+
+@dataclass
+class WordWorld:
+    """Everything is at hand, closed, off and empty, unless it is said otherwise."""
+
+    table: tuple[str, ...] = TABLE
+    rooms: tuple[str, ...] = ("kitchen_0", "bedroom_0")
+    carried: tuple[str, ...] = ()
+    assets: dict[str, Asset] = field(default_factory=lambda: dict(ASSETS))
+    open: set[str] = field(default_factory=set)
+    on: set[str] = field(default_factory=set)
+    inside: dict[str, str] = field(default_factory=dict)
+    burdens: dict[str, str] = field(default_factory=dict)
+    reaches: dict[str, Reach] = field(default_factory=dict)
+    hidden: set[str] = field(default_factory=set)
+    at: set[tuple[str, str]] = field(default_factory=set)
+
+    def asset(self, name):
+        return self.assets[name]
+
+    def is_fixed(self, name):
+        return name in {"fridge", "microwave", "stove", "table"}
+
+    def is_open(self, name):
+        return name in self.open
+
+    def is_on(self, name):
+        return name in self.on
+
+    def cargo(self, name):
+        return (name, *(item for item, host in self.inside.items() if host == name))
+
+    def burden(self, name):
+        return self.burdens.get(name, "")
+
+    def closed_around(self, name):
+        host = self.inside.get(name, "")
+        return host if host and self.asset(host).joints and host not in self.open else ""
+
+    def reach(self, name):
+        return self.reaches.get(name, AT_HAND)
+
+    def is_approachable(self, name):
+        return name not in self.hidden
+
+    def is_at(self, name, source):
+        return (name, source) in self.at
+
+
+def call(skill, target="", source="", relation=None):
+    return SkillCall(
+        skill,
+        object_index=TABLE.index(target) if target else None,
+        source_index=TABLE.index(source) if source else None,
+        relation=relation,
+    )
+
+
+def reason(world, skill, *args, **kwargs):
+    refusal = check(world, call(skill, *args, **kwargs))
+    return refusal.reason if refusal else None
+
+
+def test_a_call_whose_preconditions_hold_is_not_refused():
+    assert reason(WordWorld(), Skill.PICK_UP, "apple") is None
+
+
+@pytest.mark.parametrize("index", [-1, len(TABLE), 10**15])
+def test_an_index_outside_the_table_is_refused_and_its_range_told(index):
+    refusal = check(WordWorld(), SkillCall(Skill.MOVE, object_index=index))
+    assert refusal.reason is FailureReason.UNKNOWN_INDEX
+    assert refusal.sentence == f"there is no object with index {index}: the table has indices 0 to 5"
+
+
+def test_an_unknown_room_is_answered_with_the_rooms_there_are():
+    refusal = check(WordWorld(), SkillCall(Skill.GO_TO_ROOM, room_name="attic"))
+    assert refusal.sentence == "there is no room attic: the rooms are kitchen_0, bedroom_0"
+
+
+@given(st.floats(allow_nan=False, allow_infinity=False))
+def test_steps_up_to_five_metres_either_way_are_allowed(distance):
+    refused = check(WordWorld(), SkillCall(Skill.MOVE_FORWARD, distance=distance, yaw=0.0)) is not None
+    assert refused == (abs(distance) > ROBOT.max_step_m)
+
+
+def test_reach_is_checked_to_the_centimetre():
+    near = WordWorld(reaches={"apple": Reach(ROBOT.reach_m, 0.8)})
+    far = WordWorld(reaches={"apple": Reach(ROBOT.reach_m + 0.01, 0.8)})
+    assert reason(near, Skill.PICK_UP, "apple") is None
+    assert check(far, call(Skill.PICK_UP, "apple")).sentence == (
+        "apple is 1.11 m away and the arm reaches 1.10 m: move to it first"
+    )
+
+
+def test_what_is_too_high_is_not_called_too_far():
+    world = WordWorld(reaches={"apple": Reach(3.0, 2.3)})
+    assert reason(world, Skill.PICK_UP, "apple") is FailureReason.TOO_HIGH
+
+
+def test_reach_without_a_line_of_approach_is_not_enough():
+    assert reason(WordWorld(hidden={"apple"}), Skill.PICK_UP, "apple") is FailureReason.NO_LINE_OF_APPROACH
+
+
+def test_the_load_in_a_bowl_counts_when_the_bowl_is_lifted():
+    heavy = {**ASSETS, "apple": replace(ASSETS["apple"], mass_kg=7.7)}
+    assert reason(WordWorld(assets=heavy), Skill.PICK_UP, "bowl") is None
+    loaded = WordWorld(assets=heavy, inside={"apple": "bowl"})
+    assert reason(loaded, Skill.PICK_UP, "bowl") is FailureReason.TOO_HEAVY
+
+
+@pytest.mark.parametrize(
+    ("size", "expected"),
+    [
+        ((0.3, 0.9, 0.9), None),
+        ((0.31, 0.9, 0.9), FailureReason.TOO_LARGE),
+        ((0.1, 0.1, 0.91), FailureReason.TOO_LARGE),
+    ],
+)
+def test_the_gripper_takes_a_thing_by_its_smallest_side(size, expected):
+    world = WordWorld(assets={**ASSETS, "apple": replace(ASSETS["apple"], size_m=size)})
+    assert reason(world, Skill.PICK_UP, "apple") is expected
+
+
+def test_what_others_rest_on_is_not_lifted():
+    world = WordWorld(burdens={"bowl": "apple"})
+    assert check(world, call(Skill.PICK_UP, "bowl")).sentence == "apple rests on bowl: take it off first"
+
+
+def test_nothing_passes_through_a_closed_door_either_way():
+    shut_in = WordWorld(inside={"apple": "fridge"})
+    assert reason(shut_in, Skill.PICK_UP, "apple") is FailureReason.CONTAINER_CLOSED
+    holding = WordWorld(carried=("apple",))
+    assert (
+        reason(holding, Skill.PLACE, "fridge", relation=PlaceRelation.INSIDE)
+        is FailureReason.CONTAINER_CLOSED
+    )
+
+
+def test_an_open_door_lets_things_through():
+    world = WordWorld(inside={"apple": "fridge"}, open={"fridge"})
+    assert reason(world, Skill.PICK_UP, "apple") is None
+
+
+def test_the_top_of_a_closed_fridge_is_a_place():
+    world = WordWorld(carried=("apple",))
+    assert reason(world, Skill.PLACE, "fridge", relation=PlaceRelation.ONTOP) is None
+
+
+def test_a_running_microwave_is_not_opened_but_a_running_stove_is_no_matter():
+    assert reason(WordWorld(on={"microwave"}), Skill.OPEN, "microwave") is FailureReason.OPENED_WHILE_ON
+    assert reason(WordWorld(on={"microwave"}), Skill.TOGGLE_OFF, "microwave") is None
+
+
+def test_a_microwave_starts_only_when_closed():
+    assert reason(WordWorld(open={"microwave"}), Skill.TOGGLE_ON, "microwave") is FailureReason.MUST_BE_CLOSED
+    assert reason(WordWorld(), Skill.TOGGLE_ON, "microwave") is None
+
+
+def test_an_oven_whose_switch_does_not_mind_may_be_opened_while_it_runs():
+    oven = make.microwave()
+    assets = {
+        **ASSETS,
+        "microwave": replace(oven, abilities={**oven.abilities, "toggleable": {"requires_closed": 0.0}}),
+    }
+    assert reason(WordWorld(assets=assets, on={"microwave"}), Skill.OPEN, "microwave") is None
+    opened = WordWorld(assets=assets, on={"microwave"}, open={"microwave"}, at={("apple", "microwave")})
+    assert reason(opened, Skill.HEAT, "apple", "microwave") is FailureReason.SOURCE_OPEN
+
+
+def test_the_heat_skills_ask_for_the_food_the_switch_and_the_door_in_turn():
+    world = WordWorld()
+    assert reason(world, Skill.COOK, "apple", "microwave") is FailureReason.NOT_AT_SOURCE
+    world.at.add(("apple", "microwave"))
+    assert reason(world, Skill.COOK, "apple", "microwave") is FailureReason.SOURCE_OFF
+    world.on.add("microwave")
+    assert reason(world, Skill.COOK, "apple", "microwave") is None
+
+
+def test_where_food_must_lie_is_told_by_the_source():
+    inside = check(WordWorld(), call(Skill.HEAT, "apple", "microwave")).sentence
+    ontop = check(WordWorld(), call(Skill.HEAT, "apple", "stove")).sentence
+    assert inside == "apple is not inside microwave"
+    assert ontop == "apple is not on top of stove"
+
+
+def test_food_tells_at_which_temperature_it_cooks():
+    apple = ASSETS["apple"]
+    tough = replace(apple, abilities={**apple.abilities, "cookable": {"cook_temperature": 120.0}})
+    world = WordWorld(assets={**ASSETS, "apple": tough}, on={"microwave"}, at={("apple", "microwave")})
+    assert check(world, call(Skill.COOK, "apple", "microwave")).sentence == (
+        "microwave reaches 100 C and apple needs 120 C"
+    )
+
+
+def test_an_ability_without_a_temperature_makes_no_source():
+    stove = replace(ASSETS["stove"], abilities={"heatSource": {}})
+    world = WordWorld(assets={**ASSETS, "stove": stove})
+    assert reason(world, Skill.HEAT, "apple", "stove") is FailureReason.NOT_A_HEAT_SOURCE
+
+
+@given(
+    skill=st.sampled_from([skill for skill in Skill if skill not in (Skill.TURN, Skill.MOVE_FORWARD)]),
+    target=st.integers(-1, len(TABLE)),
+    source=st.integers(-1, len(TABLE)),
+    relation=st.sampled_from(PlaceRelation),
+    carried=st.sampled_from([(), ("apple",), ("bowl", "apple")]),
+    opened=st.sets(st.sampled_from(["fridge", "microwave"])),
+    running=st.sets(st.sampled_from(["microwave", "stove"])),
+)
+def test_every_refusal_is_one_that_the_library_lists_and_a_whole_sentence(
+    skill, target, source, relation, carried, opened, running
+):
+    world = WordWorld(carried=carried, open=opened, on=running, inside={"bowl": "microwave"})
+    refusal = check(
+        world,
+        SkillCall(skill, object_index=target, source_index=source, relation=relation, room_name="kitchen_0"),
+    )
+    if refusal is not None:
+        assert refusal.reason in reasons_of(skill)
+        assert "{" not in refusal.sentence
