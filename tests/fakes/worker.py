@@ -4,6 +4,8 @@ import asyncio
 import contextlib
 from dataclasses import dataclass, field
 
+import grpc
+
 from embomatrix.proto.v1 import worker_service_pb2 as pb
 from embomatrix.proto.v1 import worker_service_pb2_grpc
 from embomatrix.reward.breakdown import RewardBreakdown
@@ -95,9 +97,13 @@ class FakeWorker:
         self._send(results=[LeaseResult(ref, outcome)])
 
     def _start(self, coroutine):
-        task = asyncio.create_task(coroutine)
+        task = asyncio.create_task(self._until_the_manager_goes(coroutine))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
+
+    async def _until_the_manager_goes(self, coroutine):
+        with contextlib.suppress(grpc.aio.AioRpcError):
+            await coroutine
 
     def _state(self):
         return WorkerState(tuple(self.residents.values()), tuple(lease.ref for lease in self.leases.values()))

@@ -12,6 +12,7 @@ from tests.fakes.worker import FakeWorker, completed
 
 from embomatrix.manager.app import running
 from embomatrix.manager.settings import ManagerSettings
+from embomatrix.manager.store.protocol import FencedError
 from embomatrix.proto.v1 import scene_service_pb2, scene_service_pb2_grpc
 from embomatrix.rpc.channel import open_channel
 from embomatrix.rpc.client import ClusterClient
@@ -222,6 +223,30 @@ async def test_a_restarted_manager_goes_on_where_the_former_one_stopped(tmp_path
         assert fresh.executed == []
         assert len(await outcomes(client, unfinished)) == 4
         assert len(fresh.executed) == 4
+
+
+async def test_a_manager_whose_state_was_taken_over_stops(tmp_path):
+    state = f"sqlite:{tmp_path / 'state.sqlite'}"
+
+    async def serve_until_fenced():
+        async with (
+            manager(tmp_path, state=state) as at,
+            open_run(at.address) as client,
+            FakeWorker(at.address, stuck={"t"}) as worker,
+        ):
+            running_batch = asyncio.create_task(outcomes(client, batch(1)))
+            await until(lambda: worker.executed)
+            async with manager(tmp_path, state=state):
+                (lease,) = worker.leases.values()
+                worker.report(lease.ref, completed())
+                try:
+                    await running_batch
+                finally:
+                    running_batch.cancel()
+
+    with pytest.raises(BaseExceptionGroup) as caught:
+        await serve_until_fenced()
+    assert caught.group_contains(FencedError, match="another manager took over")
 
 
 async def test_a_bundle_with_a_wrong_digest_is_refused(tmp_path):

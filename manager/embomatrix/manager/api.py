@@ -6,7 +6,7 @@ import dataclasses
 from importlib.resources import files
 from typing import TYPE_CHECKING, Annotated
 
-from fastapi import Depends, FastAPI, Header, HTTPException
+from fastapi import APIRouter, Depends, FastAPI, Header, HTTPException
 from fastapi.middleware.trustedhost import TrustedHostMiddleware
 from fastapi.responses import HTMLResponse, JSONResponse, PlainTextResponse
 
@@ -16,7 +16,7 @@ from embomatrix.manager.service_auth import token_fits
 from embomatrix.manager.settings import is_loopback
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from embomatrix.manager.runtime import ManagerRuntime
     from embomatrix.manager.settings import ManagerSettings
@@ -31,12 +31,6 @@ def build_api(runtime: ManagerRuntime, settings: ManagerSettings) -> FastAPI:
             TrustedHostMiddleware, allowed_hosts=["localhost", "127.0.0.1", "[::1]", "testserver"]
         )
 
-    def check(authorization: Annotated[str, Header()] = "") -> None:
-        if settings.token and not token_fits(authorization, settings.token):
-            raise HTTPException(401, "no token, or a wrong one: send `Authorization: Bearer TOKEN`")
-
-    guarded = [Depends(check)]
-
     @app.get("/", response_class=HTMLResponse)
     def page() -> str:
         return files("embomatrix.manager").joinpath("dashboard/index.html").read_text(encoding="utf-8")
@@ -45,27 +39,43 @@ def build_api(runtime: ManagerRuntime, settings: ManagerSettings) -> FastAPI:
     async def health() -> dict[str, str]:
         return {"status": "ok"}
 
-    @app.get("/api/overview", dependencies=guarded)
+    app.include_router(_figures(runtime), dependencies=[Depends(_token_check(settings.token))])
+    return app
+
+
+def _figures(runtime: ManagerRuntime) -> APIRouter:
+    """What tells something about the cluster."""
+    router = APIRouter()
+
+    @router.get("/api/overview")
     async def overview() -> JSONResponse:
         return JSONResponse(dataclasses.asdict(views.overview(runtime)))
 
-    @app.get("/api/workers", dependencies=guarded)
+    @router.get("/api/workers")
     async def workers() -> JSONResponse:
         return _rows(views.workers(runtime))
 
-    @app.get("/api/runs", dependencies=guarded)
+    @router.get("/api/runs")
     async def runs() -> JSONResponse:
         return _rows(views.runs(runtime))
 
-    @app.get("/api/lookahead", dependencies=guarded)
+    @router.get("/api/lookahead")
     async def lookahead() -> JSONResponse:
         return _rows(views.lookahead(runtime))
 
-    @app.get("/metrics", dependencies=guarded, response_class=PlainTextResponse)
+    @router.get("/metrics", response_class=PlainTextResponse)
     async def metrics() -> str:
         return metrics_page(runtime)
 
-    return app
+    return router
+
+
+def _token_check(token: str) -> Callable[[str], None]:
+    def check(authorization: Annotated[str, Header()] = "") -> None:
+        if token and not token_fits(authorization, token):
+            raise HTTPException(401, "no token, or a wrong one: send `Authorization: Bearer TOKEN`")
+
+    return check
 
 
 def _rows(rows: Sequence[views.WorkerView | views.RunView | views.LookaheadStep]) -> JSONResponse:

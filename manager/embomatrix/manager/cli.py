@@ -112,9 +112,15 @@ def _serve(settings: ManagerSettings) -> None:
     try:
         asyncio.run(serve(settings, on_ready))
     except* (PortInUseError, StateError) as group:
-        problem = str(group.exceptions[0])
+        problem = str(_first_of(group))
     if problem:
         _refuse(problem)
+
+
+def _first_of(group: BaseExceptionGroup[BaseException]) -> BaseException:
+    """The first failure, however deep task groups have wrapped it."""
+    first = group.exceptions[0]
+    return _first_of(first) if isinstance(first, BaseExceptionGroup) else first
 
 
 def _log_to_stderr(level: str) -> None:

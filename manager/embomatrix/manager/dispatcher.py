@@ -230,7 +230,7 @@ class Dispatcher:
                 if self._desk.now_s - since_s >= limit_s and self._desk.pending.count(scene)
             ]
         elif self._desk.now_s - self._alone_since_s >= limit_s:
-            text = f"no worker was connected for {limit_s:g} s: start one with `embomatrix worker`"
+            text = f"no worker was connected for {limit_s:g} s: start one with `embomatrix worker run`"
             hopeless = [(scene, text) for scene in self._desk.pending.counts()]
         else:
             return

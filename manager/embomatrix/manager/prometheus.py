@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING
 
@@ -48,19 +49,13 @@ class _Page:
 def metrics_page(runtime: ManagerRuntime) -> str:
     """What Prometheus scrapes."""
     view, page = overview(runtime), _Page()
-    residents = [r for name in runtime.registry.sessions for r in runtime.cluster.scheduler.residents(name)]
     states = {f'state="{s.value}"': float(view.workers.get(s.value, 0)) for s in Standing}
     outcomes = ("completed", "cancelled", *(code.value for code in InfraCode))
     page.family("embo_build_info", "gauge", "Version of the manager.", {f'version="{_version()}"': 1})
     page.family("embo_workers", "gauge", "Workers by state.", states)
     slots = {'state="busy"': view.slots_busy, 'state="idle"': view.slots - view.slots_busy}
     page.family("embo_slots", "gauge", "Slots of connected workers.", slots)
-    page.family(
-        "embo_residents",
-        "gauge",
-        "Scenes on workers by state.",
-        {f'state="{state.value}"': sum(r.state is state for r in residents) for state in ResidentState},
-    )
+    page.family("embo_residents", "gauge", "Scenes on workers by state.", _resident_states(runtime))
     page.family("embo_queue_depth", "gauge", "Rollouts that wait for a lease.", {"": view.queued})
     page.family("embo_leases", "gauge", "Live leases.", {"": view.leased})
     page.family("embo_runs", "gauge", "Open runs.", {"": view.runs})
@@ -88,6 +83,12 @@ def metrics_page(runtime: ManagerRuntime) -> str:
     ):
         page.family(name, "counter", text, {"": value})
     return page.text()
+
+
+def _resident_states(runtime: ManagerRuntime) -> dict[str, float]:
+    scheduler = runtime.cluster.scheduler
+    states = Counter(r.state for name in runtime.registry.sessions for r in scheduler.residents(name))
+    return {f'state="{state.value}"': float(states[state]) for state in ResidentState}
 
 
 def _version() -> str:

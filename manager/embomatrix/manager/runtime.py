@@ -24,6 +24,7 @@ from embomatrix.manager.delivery import Delivery
 from embomatrix.manager.events import Event, LeaseFinished, LeasesRenewed, Tick, WorkerLost, WorkerReported
 from embomatrix.manager.links import WorkerLink
 from embomatrix.manager.meter import Meter
+from embomatrix.manager.registry import Standing
 from embomatrix.manager.results import ResultLogs
 from embomatrix.manager.runs import RunLimits, Runs
 from embomatrix.rpc.status import SupersededError
@@ -95,6 +96,8 @@ class ManagerRuntime:
         self._close_link(session.worker_id)
         link = self._links[session.worker_id] = WorkerLink(session)
         self._feed(*self.registry.attach(session, now_s=time.monotonic()))
+        if session.standing is Standing.DRAINING:
+            link.drain()
         try:
             yield link
         finally:

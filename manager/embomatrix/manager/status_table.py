@@ -19,7 +19,7 @@ async def show_status(address: str, token: str) -> None:
     async with ClusterClient(address, token) as client:
         workers, runs = await client.list_workers(), await client.list_runs()
     console = Console()
-    console.print(_worker_table(workers) if workers else "no workers: start one with `embomatrix worker`")
+    console.print(_worker_table(workers) if workers else "no workers: start one with `embomatrix worker run`")
     console.print(_run_table(runs) if runs else "no open runs")
 
 
