@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.assets.library import build_asset
 from embomatrix.factory.furnish_roles import is_portable
+from embomatrix.factory.scene_check import reach_problems
 from embomatrix.factory.scene_floor import ReachableFloor, box_of
 from embomatrix.factory.scene_solids import Solids, placed_parts
 from embomatrix.sim.candidates import candidates
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
 TRIES: Final = 64
 _FLOOR_TRIES: Final = 200
 _REST_GAP_M: Final = 0.0005
+_ON_FLOOR_M: Final = 0.05
+_FLAT_M: Final = 0.03
 
 
 class PlacementReason(StrEnum):
@@ -70,6 +73,7 @@ class SceneEditor:
         self._rooms = {room.name: room for room in scene.rooms}
         self._solids = Solids.of_scene(scene)
         self._floor = ReachableFloor(scene)
+        self._unreached = {problem.names for problem in reach_problems(scene)}
         self._counts = Counter(self._assets[item.asset_id].category for item in scene.objects)
 
     @property
@@ -175,13 +179,13 @@ class SceneEditor:
             tally.free += 1
             box = Aabb.around(part.aabb(pose) for link in asset.links for part in link.parts)
             room = self._scene.room_at(box.center_m)
-            if room and self._in_reach(box, target):
+            if room and self._in_reach(box, target) and self._leaves_ways(asset, pose, box, room):
                 return pose, room
         reason = PlacementReason.OUT_OF_REACH if tally.free else PlacementReason.NO_FREE_SPOT
         raise PlacementError(
             reason,
             f"no place for {asset.asset_id}, {_metres(asset)}, at {host}: of {tally.seen} poses {tally.free} were free, "
-            "none of them in the robot's reach: try another host",
+            "none of them in the robot's reach without barring its way: try another host",
         )
 
     def _in_reach(self, box: Aabb, target: SceneObject | None) -> bool:
@@ -189,6 +193,15 @@ class SceneEditor:
             return False
         front = target.pose_world_asset if target and self._assets[target.asset_id].joints else None
         return len(self._floor.spots(box, front_of=front)) > 0
+
+    def _leaves_ways(self, asset: Asset, pose: Pose, box: Aabb, room: str) -> bool:
+        """Whether, with the object on the floor, the robot still gets to all that it got to before."""
+        if box.low_m[2] > _ON_FLOOR_M or box.high_m[2] < _FLAT_M:
+            return True
+        item = SceneObject("candidate", asset.asset_id, room, pose, fixed=False)
+        assets = {**self._assets, asset.asset_id: asset}
+        trial = replace(self._scene, objects=(*self._objects.values(), item), assets=assets)
+        return {p.names for p in reach_problems(trial)} <= self._unreached
 
     def _on_floor(self, asset: Asset, room: Room) -> Iterator[Pose]:
         (x0, y0), (x1, y1) = room.low_m, room.high_m
@@ -253,6 +266,9 @@ class SceneEditor:
         )
         self._assets[asset.asset_id] = asset
         self._solids.add(name, placed_parts(asset, pose))
+        if pose.position_m[2] - asset.size_m[2] / 2 < _ON_FLOOR_M:
+            objects = tuple(self._objects.values())
+            self._floor = ReachableFloor(replace(self._scene, objects=objects, assets=self._assets))
         return name
 
 

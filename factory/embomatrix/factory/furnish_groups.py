@@ -18,7 +18,7 @@ from embomatrix.factory.furnish_pieces import (
 from embomatrix.factory.furnish_roles import HUNG_BOTTOM_M, Role, importance_of, wall_height_m
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
 _KNEE_M: Final = 0.05
 _COFFEE_GAP_M: Final = 0.38
@@ -32,6 +32,10 @@ _UNDER_COUNTER: Final = (
 _TV_STANDS: Final = ("console_table", "bottom_cabinet", "bookcase", "coffee_table", "breakfast_table")
 _COOKERS: Final = ("stove", "flat_top_grill", "oven")
 _SINKS: Final = ("furniture_sink", "pedestal_sink", "commercial_kitchen_sink", "wall_mounted_sink")
+_NEAR_ON_WALL: Final[Mapping[str, tuple[str, ...]]] = {
+    "mirror": _SINKS,
+    "toilet_paper_dispenser": ("toilet",),
+}
 _HEAD_ROOM_M: Final = 1.45
 _ISLAND_M: Final = 2.0
 """Longer kitchen tables stand in the middle of the kitchen."""
@@ -79,15 +83,13 @@ def hung_groups(pieces: Sequence[Piece]) -> list[Group]:
     for piece in pieces:
         if piece.role is Role.HUNG_CABINET:
             hood = piece.category == "range_hood"
-            near = _COOKERS if hood else ("countertop", *_SINKS, *_UNDER_COUNTER)
+            near: tuple[str, ...] = _COOKERS if hood else ("countertop", *_SINKS, *_UNDER_COUNTER)
             bottom = min(HUNG_BOTTOM_M + 0.1 * hood, WALL_HEIGHT_M - piece.size_m[2] - 0.01)
             groups.append(Group((Member(piece, bottom=bottom),), Style.RUN, 8.0 if hood else 5.0, near))
         elif piece.role is Role.WALL:
             height = piece.size_m[2]
             bottom = min(max(0.05, wall_height_m(piece.category) - height / 2), WALL_HEIGHT_M - height - 0.02)
-            near: tuple[str, ...] = {"mirror": _SINKS, "toilet_paper_dispenser": ("toilet",)}.get(
-                piece.category, ()
-            )
+            near = _NEAR_ON_WALL.get(piece.category, ())
             faces = ("sofa", "bar") if piece.category == "wall_mounted_tv" else ()
             style = Style.ALONG if near or faces or piece.size_m[1] < 0.3 else Style.CENTERED
             spread = (piece.category,)
@@ -147,7 +149,7 @@ def _television(pool: _Pool) -> list[Group]:
             stand = pool.take([stands[0]])[0]
             base = Member(stand)
             members = (base, stacked(base, pool.take([tv])[0], 0))
-            groups.append(Group(members, Style.CENTERED, 8.5, faces=("sofa", "armchair")))
+            groups.append(Group(members, Style.CENTERED, 9.05, faces=("sofa", "armchair")))
     return groups
 
 
@@ -183,7 +185,8 @@ def _best_row(candidates: Sequence[Piece], width: float) -> list[Piece]:
     """The fullest row of pieces of about one height that fits under a slab."""
     best: list[Piece] = []
     for first in range(len(candidates)):
-        row, used = [], 0.0
+        row: list[Piece] = []
+        used = 0.0
         for piece in candidates[first:]:
             level = row[0].size_m[2] if row else piece.size_m[2]
             if used + piece.size_m[1] + 0.003 <= width and abs(piece.size_m[2] - level) <= 0.035:

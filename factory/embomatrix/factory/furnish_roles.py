@@ -192,3 +192,33 @@ SURFACE_HOSTS: Final[Mapping[str, tuple[str, ...]]] = {
     "printer": ("desk", "bottom_cabinet", "console_table"),
 }
 """Hosts that a small thing likes, best first; without an entry, or when those are full, any surface of the room serves."""
+
+CUPBOARD: Final = frozenset(
+    [
+        "plate",
+        "bowl",
+        "mug",
+        "tray",
+        "saucepot",
+        "stockpot",
+        "frying_pan",
+        "lid",
+        "jug",
+        "teapot",
+        "teacup",
+        "saucer",
+        "wineglass",
+        "water_glass",
+        "casserole",
+        "gravy_boat",
+        "box_of_cereal",
+        "canned_food",
+        "bag_of_rice",
+        "bag_of_flour",
+        "box_of_cookies",
+        "towel",
+        "hand_towel",
+        "toilet_paper",
+    ]
+)
+"""What people keep behind doors; a lamp or a plant doesn't belong there."""

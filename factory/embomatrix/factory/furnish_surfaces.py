@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.factory.furnish_pieces import REST_GAP_M
-from embomatrix.factory.furnish_roles import SURFACE_HOSTS, Role
+from embomatrix.factory.furnish_roles import CUPBOARD, SURFACE_HOSTS, Role
 from embomatrix.factory.furnish_solver import Placed
 from embomatrix.world.state import Relation
 
@@ -30,38 +30,35 @@ _SAMPLES: Final = 60
 _SPACING_M: Final = np.array([0.01, 0.01, 0.0])
 """Free space to other things along each axis."""
 _NO_HOSTS: Final = frozenset(
-    {
-        *(
-            "toilet",
-            "taboret",
-            "straight_chair",
-            "swivel_chair",
-            "bench",
-            "ottoman",
-            "bathtub",
-            "urinal",
-            "fridge",
-        ),
-        *(
-            "furniture_sink",
-            "pedestal_sink",
-            "commercial_kitchen_sink",
-            "public_trash_can",
-            "trash_can",
-            "floor_lamp",
-        ),
-        *(
-            "bed",
-            "sofa",
-            "armchair",
-            "stove",
-            "flat_top_grill",
-            "deep_fryer",
-            "jukebox",
-            "shower_stall",
-            "oven",
-        ),
-    }
+    [
+        "toilet",
+        "taboret",
+        "straight_chair",
+        "swivel_chair",
+        "eames_chair",
+        "bench",
+        "ottoman",
+        "bathtub",
+        "urinal",
+        "fridge",
+        "furniture_sink",
+        "pedestal_sink",
+        "commercial_kitchen_sink",
+        "public_trash_can",
+        "trash_can",
+        "floor_lamp",
+        "bed",
+        "sofa",
+        "armchair",
+        "stove",
+        "flat_top_grill",
+        "deep_fryer",
+        "jukebox",
+        "shower_stall",
+        "oven",
+        "crib",
+        "treadmill",
+    ]
 )
 """Nothing is put down on these unless SURFACE_HOSTS names them."""
 _HIGHEST_M: Final = 1.7
@@ -80,28 +77,21 @@ class Surface:
     y1: float
     z: float
     clearance_m: float
+    shut: bool
 
 
 def surfaces_of(placed: Placed, number: int) -> list[Surface]:
     """The support surfaces of a placed piece at a quarter turn."""
     found = []
     turned = abs(math.sin(placed.yaw)) > 0.5
-    for support in placed.piece.asset.supports:
+    asset = placed.piece.asset
+    doored = {interior.name for interior in asset.interiors if interior.closed_by}
+    for support in asset.supports:
         cx, cy, cz = placed.pose.apply(support.center_m)
         sx, sy = support.size_m[::-1] if turned else support.size_m
-        found.append(
-            Surface(
-                number,
-                support.name,
-                support.interior,
-                cx - sx / 2,
-                cy - sy / 2,
-                cx + sx / 2,
-                cy + sy / 2,
-                cz,
-                support.clearance_m,
-            )
-        )
+        edges = (cx - sx / 2, cy - sy / 2, cx + sx / 2, cy + sy / 2)
+        inner = support.interior
+        found.append(Surface(number, support.name, inner, *edges, cz, support.clearance_m, inner in doored))
     return found
 
 
@@ -140,6 +130,8 @@ class SurfacePlacer:
             if host.room != room:
                 continue
             category = host.piece.category
+            if surface.shut and piece.category not in CUPBOARD:
+                continue
             if category in wanted:
                 rank = wanted.index(category)
             elif category in _NO_HOSTS or surface.interior:
@@ -151,7 +143,7 @@ class SurfacePlacer:
 
     def _set_on(self, piece: Piece, surface: Surface) -> bool:
         """Try sampled spots on the surface and take the first that is free."""
-        if surface.interior and piece.size_m[2] + 0.01 > surface.clearance_m:
+        if piece.size_m[2] + 0.01 > surface.clearance_m:
             return False
         host = self.placed[surface.host]
         # Screens and machines look where their host looks; loose things lie as they were put down.

@@ -52,7 +52,7 @@ def check_scene(scene: Scene) -> tuple[Problem, ...]:
         *_penetrations(scene),
         *_supports(scene),
         *_rooms(scene),
-        *_reach(scene),
+        *reach_problems(scene),
     )
 
 
@@ -143,7 +143,8 @@ def _rooms(scene: Scene) -> Iterator[Problem]:
             yield Problem(ProblemKind.ROOM, (item.name,), f"its middle lies outside its room {item.room!r}")
 
 
-def _reach(scene: Scene) -> Iterator[Problem]:
+def reach_problems(scene: Scene) -> Iterator[Problem]:
+    """Rooms that no free floor leads into, and furniture that the robot can't get at."""
     floor = ReachableFloor(scene)
     if not floor.has_start:
         yield Problem(
