@@ -16,7 +16,7 @@ from embomatrix.factory.importer_scene import with_robot_in, with_states
 from embomatrix.factory.refusal import Refusal, RefusalReason, RefusedError
 from embomatrix.factory.writer import object_table
 from embomatrix.factory.writer_view import SceneView, is_liftable
-from embomatrix.world.bddl import Literal, parse_problem
+from embomatrix.world.bddl import ROOM_TYPES, Literal, is_room_instance, parse_problem
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.evaluate import atoms_of, objects_of, render, substitute, types_of
 from embomatrix.world.state import Relation, State
@@ -29,6 +29,10 @@ if TYPE_CHECKING:
     from embomatrix.world.goal import Atom, Formula
     from embomatrix.world.scene import Scene
 
+_ROOM_OR_TEXT: Final = re.compile(
+    rf"(?:{'|'.join(sorted(ROOM_TYPES, key=len, reverse=True))})_\d+|.+?(?=(?:{'|'.join(sorted(ROOM_TYPES))})_\d|$)",
+    re.IGNORECASE,
+)
 CATEGORY_TRIES: Final = 4
 """Models of a type that are tried before it counts as not fitting its place."""
 THERMAL: Final = frozenset({State.COOKED, State.FROZEN, State.HOT})
@@ -156,8 +160,11 @@ def instruction_of(source: SourceText, problem: Problem) -> str:
     words = source.request or problem.name
     words = re.sub(r"-\d+$", "", words)
     words = re.sub(r"\.n\.\d+(_\d+)?", "", words)
-    words = re.sub(r"_(?!\d+(?:_|$|\W))", " ", words)  # rooms keep their number: kitchen_0
-    words = re.sub(r"(?<=\d)_", " ", words).strip(" .")
+    spaced = " ".join(
+        word if is_room_instance(word.lower()) else word.replace("_", " ")
+        for word in _ROOM_OR_TEXT.findall(words)
+    )
+    words = re.sub(r"\s+([.,]|$)", r"\1", re.sub(r"\s+", " ", spaced)).strip(" .")
     return f"{words[:1].upper()}{words[1:]}."
 
 

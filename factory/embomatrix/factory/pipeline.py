@@ -135,7 +135,7 @@ def _fill_split(
 ) -> None:
     """Variant after variant until the split has its tasks, the scenes taking turns."""
     quota = {category: _share(target, index) for index, category in enumerate(TaskCategory)}
-    homes = [base for base in bases if rooms[base.base]]
+    homes = [base for base in bases if _is_home(base, rooms[base.base])]
     for number in range(VARIANTS_FOR * (target // TASKS_EACH + 1)):
         done = Counter(record.task.category for record in store.records_of(split))
         progress(split, done.total())
@@ -155,6 +155,15 @@ def _fill_split(
         )
         result, data = _VariantJob(variant, split, number, settings.seed, library, known).run(missing, rng)
         store.add(result, data)
+
+
+def _is_home(base: Scene, rooms: Sequence[str]) -> bool:
+    """Whether the rooms hold enough furniture to write tasks about: empty corridors and storage rooms do not."""
+    view = SceneView(base)
+    return (
+        sum(view.is_surface(name) or view.is_container(name) for room in rooms for name in view.in_room[room])
+        >= 3
+    )
 
 
 def _share(target: int, index: int) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.factory.writer_tables import suits
 from embomatrix.factory.writer_words import phrase, refer, spoken
 from embomatrix.world.goal import And, Atom, Exists, Formula, Not
 
@@ -76,11 +77,14 @@ def _placed(shop: Workshop, thing: str, called: str) -> Piece | None:
         [*shop.fixtures(view.is_container), *baskets, *baskets] if inside else shop.fixtures(view.is_surface)
     )
     here = {view.category(host) for host in view.hosts(thing)}
+    category = view.category(thing)
     target = shop.pick(
         [
             name
             for name in targets
-            if view.category(name) not in here and view.takes(name, thing, inside=inside)
+            if view.category(name) not in here
+            and suits(category, view.category(name))
+            and view.takes(name, thing, inside=inside)
         ]
     )
     if target is None:
@@ -106,19 +110,18 @@ def _one_of(
         return atom(target), {}, (target,), refer(view, target, shop.rng)
     synset = view.asset(target).synset
     variable = f"?{synset}"
-    article = "an" if view.category(target)[0] in "aeiou" else "a"
     return (
         Exists(variable, synset, atom(variable)),
         {synset: alike},
         alike,
-        refer(view, target, shop.rng, article=article),
+        refer(view, target, shop.rng),
     )
 
 
 def switch_piece(shop: Workshop) -> Piece | None:
     """Open or close a door, switch an appliance or a light on or off."""
     view, rng = shop.view, shop.rng
-    name = shop.pick(shop.fixtures(lambda name: view.is_openable(name) or view.is_toggleable(name)))
+    name = shop.pick(shop.fixtures(view.is_switchable))
     if name is None:
         return None
     options = [("open", view.is_open(name))] * view.is_openable(name)
@@ -157,7 +160,7 @@ def thermal_piece(shop: Workshop) -> Piece | None:
 
 def _thermal(shop: Workshop, food: str, source: str, predicate: str) -> Piece:
     view, rng = shop.view, shop.rng
-    place = refer(view, source, rng, article="the" if len(view.alike(source)) == 1 else "a")
+    place = refer(view, source, rng)
     goal: Formula = Atom(predicate, (food,))
     objects: tuple[str, ...] = (food,)
     signs: tuple[str, ...] = (f"{predicate}({view.category(food)})",)

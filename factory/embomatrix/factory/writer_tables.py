@@ -86,6 +86,45 @@ ROOM_GROUPS: Final[Mapping[str, tuple[Group, ...]]] = {
 }
 DEFAULT_GROUPS: Final = (Group.DECORATION, Group.BOOKS, Group.OFFICE)
 
+_KITCHEN_GOODS: Final = frozenset({Group.FOOD, Group.FRUIT, Group.TABLEWARE, Group.PACKAGES})
+_SOFT_GOODS: Final = frozenset({Group.BOOKS, Group.TOYS, Group.DEVICES, Group.OFFICE, Group.DECORATION})
+_WASHABLE: Final = frozenset({Group.FRUIT, Group.FOOD, Group.TABLEWARE, Group.TOILETRIES})
+_COOKING: Final = frozenset({Group.FOOD, Group.FRUIT, Group.TABLEWARE})
+_NOTHING: Final[frozenset[Group]] = frozenset()
+
+HOST_GROUPS: Final[Mapping[str, frozenset[Group]]] = {
+    **dict.fromkeys(
+        (
+            "sofa", "armchair", "bed", "straight_chair", "swivel_chair", "ottoman", "taboret", "bench", "booth",
+            "stool", "folding_chair", "carpet",
+        ),
+        _SOFT_GOODS,
+    ),
+    **dict.fromkeys(("furniture_sink", "pedestal_sink", "commercial_kitchen_sink", "sink"), _WASHABLE),
+    **dict.fromkeys(("stove", "flat_top_grill", "microwave", "oven", "toaster_oven"), _COOKING),
+    **dict.fromkeys(("fridge", "freezer", "cooler", "wine_fridge"), _KITCHEN_GOODS),
+    "dishwasher": frozenset({Group.TABLEWARE}),
+    **dict.fromkeys(
+        (
+            "coffee_maker", "deep_fryer", "popcorn_machine", "toilet", "shower_stall", "bathtub", "pot_plant",
+            "loudspeaker", "standing_loudspeaker", "laptop", "standing_tv", "wall_mounted_tv", "jukebox", "pay_phone",
+            "grandfather_clock", "table_lamp", "floor_lamp", "towel_rack", "range_hood", "public_trash_can",
+            "trash_can", "electric_switch", "picture", "mirror", "fire_extinguisher", "beer_tap", "cash_register",
+            "washer", "clothes_dryer", "hat", "cap", "ceiling_rack", "coatrack",
+        ),
+        _NOTHING,
+    ),
+}  # fmt: skip
+"""What a person would put on or in these hosts. Hosts that are not listed take anything."""
+
+NEVER_SWITCHED: Final = frozenset(
+    {
+        "electric_switch", "fire_alarm", "ceiling_fan", "room_light", "downlight", "square_light", "wall_mounted_light",
+        "room_ventilator", "hand_dryer",
+    }
+)  # fmt: skip
+"""Things with a switch that no task asks for: out of reach, or no words tell one from another."""
+
 BASKETS: Final = ("wicker_basket", "storage_box")
 """Open containers that a variant may put on the floor or on a table."""
 
@@ -93,3 +132,9 @@ BASKETS: Final = ("wicker_basket", "storage_box")
 def groups_for(room_type: str) -> tuple[Group, ...]:
     """Groups of small things that suit a room; the first are the most likely."""
     return ROOM_GROUPS.get(room_type, DEFAULT_GROUPS)
+
+
+def suits(category: str, host_category: str) -> bool:
+    """Whether a person would put a thing of the category on or in such a host."""
+    allowed = HOST_GROUPS.get(host_category)
+    return allowed is None or any(category in MEMBERS[group] for group in allowed)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.editor import PlacementError, SceneEditor
-from embomatrix.factory.writer_tables import BASKETS, MEMBERS, Group, groups_for
+from embomatrix.factory.writer_tables import BASKETS, MEMBERS, Group, groups_for, suits
 from embomatrix.factory.writer_view import SceneView, is_liftable
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.state import Relation, State
@@ -80,9 +80,13 @@ def _add_things(
             break
         if category in present:
             continue
-        for _ in range(TRIES):
-            inside = bool(containers) and (not surfaces or rng.random() < INSIDE_SHARE)
-            pool = containers if inside else surfaces
+        fit_surfaces, fit_containers = (
+            [host for host in hosts if suits(category, view.category(host))]
+            for hosts in (surfaces, containers)
+        )
+        for _ in range(TRIES if fit_surfaces or fit_containers else 0):
+            inside = bool(fit_containers) and (not fit_surfaces or rng.random() < INSIDE_SHARE)
+            pool = fit_containers if inside else fit_surfaces
             host = pool[int(rng.integers(len(pool)))]
             relation = Relation.INSIDE if inside else Relation.ONTOP
             try:

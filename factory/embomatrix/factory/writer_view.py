@@ -6,6 +6,7 @@ from collections import Counter
 from functools import cached_property
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.factory.writer_tables import NEVER_SWITCHED
 from embomatrix.skills.appliance import cold_source, cooks, freezes, heat_source, heats
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.state import OPEN_FRACTION, Relation, State
@@ -111,6 +112,15 @@ class SceneView:
 
     def is_openable(self, name: str) -> bool:
         return bool(self.asset(name).joints) and self.asset(name).can("openable")
+
+    def is_switchable(self, name: str) -> bool:
+        """Whether a task may ask to open it or to switch it on: in reach, and telling by its words."""
+        low = self.item(name).pose_world_asset.position_m[2] - self.asset(name).size_m[2] / 2
+        return (
+            self.category(name) not in NEVER_SWITCHED
+            and low <= HIGH_SURFACE_M
+            and (self.is_openable(name) or self.is_toggleable(name))
+        )
 
     def is_open(self, name: str) -> bool:
         return any(share > OPEN_FRACTION for share in self.item(name).joints)

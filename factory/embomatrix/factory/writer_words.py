@@ -57,9 +57,14 @@ def room_words(view: SceneView, room: str) -> str:
     return f"the {spoken(stem)}" if types.count(stem) == 1 else room
 
 
-def refer(view: SceneView, name: str, rng: np.random.Generator, *, article: str = "the") -> str:
-    """A noun phrase for an object. The room is named where the category does not tell which one is meant."""
-    words = f"{article} {spoken(view.category(name))}"
+def refer(view: SceneView, name: str, rng: np.random.Generator) -> str:
+    """A noun phrase for an object, or for any of those of its category in its room.
+
+    The room is named where the category does not tell which one is meant.
+    """
+    noun = spoken(view.category(name))
+    article = "the" if len(view.alike(name)) == 1 else "an" if noun[0] in "aeiou" else "a"
+    words = f"{article} {noun}"
     ambiguous = len(view.rooms_with(view.category(name))) > 1
     if ambiguous or rng.random() < 0.35:
         words += f" in {room_words(view, view.room(name))}"
