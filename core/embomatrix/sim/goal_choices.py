@@ -22,7 +22,7 @@ from embomatrix.world.goal import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from embomatrix.world.goal import Facts
 
@@ -43,18 +43,22 @@ class Literal:
 Choice = tuple[Literal, ...]
 
 
-def choices(goal: Formula, types: Types, facts: Facts) -> tuple[Choice, ...]:
+def choices(
+    goal: Formula, types: Types, facts: Facts, liking: Callable[[str], int] = lambda name: 0
+) -> tuple[Choice, ...]:
     """Up to ``WIDTH`` ways to make the goal true, by how many of their literals do not hold yet.
 
-    Each is enough for the goal; together they need not be all there are. A way that contradicts itself is left out.
+    Of equal ones those come first whose objects are liked most. Each is enough for the goal; together they need not be
+    all there are. A way that contradicts itself is left out.
     """
-    return tuple(_Choices(types, facts).of(goal, positive=True))
+    return tuple(_Choices(types, facts, liking).of(goal, positive=True))
 
 
 class _Choices:
-    def __init__(self, types: Types, facts: Facts) -> None:
+    def __init__(self, types: Types, facts: Facts, liking: Callable[[str], int]) -> None:
         self._types = types
         self._facts = facts
+        self._liking = liking
 
     def of(self, formula: Formula, *, positive: bool) -> list[Choice]:
         match formula:
@@ -129,7 +133,10 @@ class _Choices:
 
     def _best(self, found: Iterable[Choice | None]) -> list[Choice]:
         kept = [choice for choice in found if choice is not None]
-        return sorted(kept, key=self._cost)[:WIDTH]
+        return sorted(kept, key=lambda choice: (self._cost(choice), -self._liked(choice)))[:WIDTH]
+
+    def _liked(self, choice: Choice) -> int:
+        return sum(self._liking(name) for item in choice for name in item.atom.args if item.positive)
 
 
 def _merge(left: Choice, right: Choice) -> Choice | None:

@@ -47,6 +47,8 @@ ROOFED_M: Final = 1.5
 """A cavity whose floor has less free height than this can't be reached from above."""
 SLACK_M: Final = 0.005
 GRIDS_KEPT: Final = 8
+STANDS_KEPT: Final = 4096
+"""Answers in memory, about 1 KB each."""
 ENTRY_M: Final = 0.4
 STEP_M: Final = CELL_M / 2
 
@@ -64,6 +66,7 @@ class Navigator:
             if item.fixed:
                 self._base = self._base.joined(self._parts_of(item.name))
         self._grids: OrderedDict[tuple[object, ...], tuple[FloorGrid, Obstacles]] = OrderedDict()
+        self._stands: dict[tuple[object, ...], tuple[StandPose, ...]] = {}
         self.refresh()
 
     def refresh(self) -> None:
@@ -78,6 +81,7 @@ class Navigator:
             barring = (boxes[:, 4] < ROBOT.height_m) & (boxes[:, 5] > FLAT_M)
             self._grids[key] = (FloorGrid(self._scene, boxes[barring]), obstacles)
         self._grids.move_to_end(key)
+        self._floor = key
         if len(self._grids) > GRIDS_KEPT:
             self._grids.popitem(last=False)
         self._grid, self._obstacles = self._grids[key]
@@ -144,6 +148,16 @@ class Navigator:
         start = self._cell(origin)
         if start is None or self._engine.is_parked(name):
             return ()
+        # All that the answer depends on: plans of a group ask the same again and again.
+        hosts = tuple(self._hosts_of(name))
+        key = (self._floor, self._grid.label(start), name, self._engine.pose(name), hosts)
+        if key not in self._stands:
+            if len(self._stands) == STANDS_KEPT:
+                self._stands.clear()
+            self._stands[key] = self._find_stands(name, start)
+        return self._stands[key]
+
+    def _find_stands(self, name: str, start: Cell) -> tuple[StandPose, ...]:
         box = self._relations.body(name)
         low, high = np.array(box.low_m[:2]), np.array(box.high_m[:2])
         reach = ROBOT.reach_m - REACH_SLACK_M

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.sim.goal_choices import choices
 from embomatrix.sim.plan_errands import Errands, Placement, Warming
 from embomatrix.sim.plan_script import PlanScript, StuckError
+from embomatrix.sim.plan_wording import Wording
 from embomatrix.skills.appliance import cold_source, cooks, freezes, heat_source, heats
 from embomatrix.world.evaluate import evaluate
 from embomatrix.world.state import Relation, State
@@ -59,7 +60,8 @@ def find_plan(simulator: Simulator, task: Task) -> Plan | PlanNotFound:
     simulator.reset(task, PROOF_SEEDS[0])
     if evaluate(task.goal, simulator.facts, task.types):
         return PlanNotFound("the goal holds at the start: there is nothing to do")
-    options = choices(task.goal, task.types, simulator.facts)
+    wording = Wording(task, simulator.world.scene)
+    options = choices(task.goal, task.types, simulator.facts, wording.names)
     if not options:
         return PlanNotFound("the goal contradicts itself")
     reason = ""
@@ -175,7 +177,10 @@ def _source_for(
     home: str,
     strategy: Strategy,
 ) -> str:
-    """A source in the object table that brings the states about: where the object must end, else one in its room."""
+    """A source in the object table that brings the states about.
+
+    The one that the instruction names goes first, then where the object must end, then those in its room.
+    """
     world = simulator.world
     item = world.asset(name)
     able = [other for other in task.table if other != name and _does(world.asset(other), item, hot, states)]
@@ -184,7 +189,15 @@ def _source_for(
             f"no object in the table makes {name} {' and '.join(sorted(states))}: expected a heat or cold source"
         )
     room = world.room_of(name)
-    able.sort(key=lambda other: (other != home, not world.is_fixed(other), world.room_of(other) != room))
+    wording = Wording(task, world.scene)
+    able.sort(
+        key=lambda other: (
+            -wording.names(other),
+            other != home,
+            not world.is_fixed(other),
+            world.room_of(other) != room,
+        )
+    )
     return able[strategy.source_rank % len(able)]
 
 

@@ -173,6 +173,21 @@ def test_the_tasks_of_the_flat_can_be_done_with_several_seeds(flat):
             assert evaluate(task.goal, flat.facts, task.types)
 
 
+def test_the_source_that_the_instruction_names_is_used_though_another_would_do(flat):
+    task = task_over(flat.world.scene, atom("cooked", "apple_1"))
+    by_stove = words_of(find_plan(flat, replace(task, instruction="Cook the apple.")), task)
+    told = replace(task, instruction="Cook the apple in the microwave, please.")
+    assert by_stove.endswith("place stove_1 ontop; toggle_on stove_1")
+    assert words_of(find_plan(flat, told), task).endswith("close microwave_1; toggle_on microwave_1")
+
+
+def test_of_two_apples_the_one_in_the_room_that_the_instruction_names_is_taken(flat):
+    task = task_over(flat.world.scene, Exists("?a", "apple.n.01", atom("inside", "?a", "bowl_1")))
+    told = replace(task, instruction="Put the apple in the living room into the bowl.")
+    assert words_of(find_plan(flat, task), task).startswith("move apple_1")
+    assert words_of(find_plan(flat, told), task).startswith("move apple_2")
+
+
 def test_no_call_of_a_plan_can_be_left_out(flat):
     for task in kitchen_tasks(flat.world.scene):
         plan = find_plan(flat, task)
