@@ -1,0 +1,110 @@
+"""A task is admitted only when executing the oracle's plan shows that it can be done, and was not done already."""
+
+import pytest
+
+from embomatrix.factory.admission import Admitted, admit
+from embomatrix.factory.refusal import Refusal, RefusalReason
+from embomatrix.sim.planner import PlanNotFound
+from embomatrix.skills.failure import FailureReason
+from embomatrix.skills.syntax import Plan, Skill, SkillCall
+from embomatrix.skills.trace import Step, Trace
+from embomatrix.world.bddl import Literal, parse_formula
+from embomatrix.world.goal import Atom
+from embomatrix.world.task import Task, TaskCategory
+
+NAMES = {"box_1": "box", "box_2": "box", "box_3": "box", "lamp_1": "lamp"}
+OPEN_1 = SkillCall(Skill.OPEN, object_index=0)
+OPEN_2 = SkillCall(Skill.OPEN, object_index=1)
+
+
+def task(goal: str) -> Task:
+    formula = parse_formula(goal, NAMES)
+    types = {"box": ("box_1", "box_2", "box_3")}
+    return Task("t", "s", "", TaskCategory.APPLIANCE_USE, formula, goal, tuple(NAMES), types)
+
+
+class Boxes:
+    """A stage on which ``open`` works, and nothing else does."""
+
+    def __init__(self, *opened: str) -> None:
+        self._start = set(opened)
+        self._open = set(opened)
+
+    @property
+    def facts(self) -> "Boxes":
+        return self
+
+    def holds(self, predicate: str, args: tuple[str, ...]) -> bool:
+        return predicate == "open" and args[0] in self._open
+
+    def execute(self, task: Task, plan: Plan, seed: int) -> Trace:
+        self._open = set(self._start)
+        steps: list[Step] = []
+        for call in plan:
+            failure = None if call.skill is Skill.OPEN else FailureReason.NOT_TOGGLEABLE
+            steps.append(Step(call, failure, "opened" if failure is None else "it has no switch"))
+            if failure is not None:
+                break
+            self._open.add(task.table[call.object_index or 0])
+        return Trace(plan, tuple(steps), frozenset(self._open), (), "")
+
+
+def oracle(*plan: SkillCall):
+    return lambda _stage, _task: plan
+
+
+def test_task_that_the_oracle_solves_is_admitted_with_its_plan() -> None:
+    verdict = admit(Boxes(), task("(and (open box_1) (open box_2))"), oracle(OPEN_1, OPEN_2))
+    assert verdict == Admitted((OPEN_1, OPEN_2), ())
+
+
+def test_atoms_that_hold_at_the_start_are_listed() -> None:
+    verdict = admit(Boxes("box_2"), task("(and (open box_1) (open box_2))"), oracle(OPEN_1))
+    assert verdict == Admitted((OPEN_1,), ("(open box_2)",))
+
+
+@pytest.mark.parametrize(
+    ("stage", "goal", "plan", "reason"),
+    [
+        (Boxes("box_1"), "(open box_1)", (OPEN_1,), RefusalReason.GOAL_HOLDS),
+        (Boxes(), "(not (open box_1))", (OPEN_1,), RefusalReason.GOAL_HOLDS),
+        (
+            Boxes("box_2", "box_3"),
+            "(forall (?b - box) (open ?b))",
+            (OPEN_1,),
+            RefusalReason.MOSTLY_DONE,
+        ),
+        (Boxes(), "(open box_1)", (OPEN_2,), RefusalReason.ORACLE_FAILED),
+        (Boxes(), "(open box_1)", (), RefusalReason.ORACLE_FAILED),
+        (
+            Boxes(),
+            "(open box_1)",
+            (OPEN_1, SkillCall(Skill.TOGGLE_ON, object_index=3)),
+            RefusalReason.ORACLE_FAILED,
+        ),
+    ],
+)
+def test_task_is_turned_away_for_one_reason(
+    stage: Boxes, goal: str, plan: Plan, reason: RefusalReason
+) -> None:
+    verdict = admit(stage, task(goal), oracle(*plan))
+    assert isinstance(verdict, Refusal)
+    assert verdict.reason is reason
+    assert len(verdict.sentence) > 20
+
+
+def test_planner_s_own_reason_is_passed_on() -> None:
+    verdict = admit(
+        Boxes(), task("(open box_1)"), lambda _stage, _task: PlanNotFound("box_1 is behind a wall")
+    )
+    assert verdict == Refusal(
+        RefusalReason.NO_PLAN, "the oracle planner found no plan: box_1 is behind a wall"
+    )
+
+
+def test_start_that_is_not_as_the_source_says_is_turned_away() -> None:
+    init = (Literal(Atom("open", ("box_1",)), positive=False), Literal(Atom("open", ("box_2",))))
+    verdict = admit(Boxes("box_1"), task("(open box_3)"), oracle(OPEN_1), init)
+    assert isinstance(verdict, Refusal)
+    assert verdict.reason is RefusalReason.INIT_NOT_MET
+    assert "(not (open box_1))" in verdict.sentence

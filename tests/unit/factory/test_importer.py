@@ -1,0 +1,267 @@
+"""BDDL is bound to a scene, or refused for one reason of a closed set with a sentence about the case."""
+
+import json
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.fakes.scenes import kitchen_scene
+
+from embomatrix.factory.importer import Imported, category_of, import_problem, instruction_of
+from embomatrix.factory.importer_batch import Verified, bind_first, verify
+from embomatrix.factory.importer_binding import bind
+from embomatrix.factory.importer_scene import with_states
+from embomatrix.factory.importer_sources import (
+    SourceError,
+    SourceText,
+    activity_names,
+    read_activity,
+    read_file,
+    read_jsonl,
+)
+from embomatrix.factory.refusal import Refusal, RefusalReason, RefusedError
+from embomatrix.factory.scene_build import build_base_scene
+from embomatrix.sim.pose_cache import PlacementLibrary
+from embomatrix.world.bddl import BddlError, Literal, parse_formula, parse_problem
+from embomatrix.world.goal import Atom
+from embomatrix.world.scene import Scene
+from embomatrix.world.state import State
+from embomatrix.world.task import TaskCategory
+
+SAMPLE = Path(__file__).parents[4] / "shared" / "data" / "embomatrix_tasks_sample.jsonl"
+
+PROBLEM = """(define (problem Put_the_apples_in_the_fridge_in_kitchen_0)
+    (:domain omnigibson)
+    (:objects
+        apple.n.01_1 apple.n.01_2 - apple.n.01
+        electric_refrigerator.n.01_1 - electric_refrigerator.n.01
+        breakfast_table.n.01_1 - breakfast_table.n.01
+        floor.n.01_1 - floor.n.01
+        agent.n.01_1 - agent.n.01
+    )
+    (:init
+        (ontop apple.n.01_1 breakfast_table.n.01_1)
+        (ontop apple.n.01_2 breakfast_table.n.01_1)
+        (inroom electric_refrigerator.n.01_1 kitchen)
+        (inroom breakfast_table.n.01_1 kitchen)
+        (open electric_refrigerator.n.01_1)
+        (inroom floor.n.01_1 kitchen)
+        (ontop agent.n.01_1 floor.n.01_1)
+    )
+    (:goal
+        (and
+            (forall (?apple.n.01 - apple.n.01) (inside ?apple.n.01 ?electric_refrigerator.n.01_1))
+            (not (open ?electric_refrigerator.n.01_1))
+        )
+    )
+)
+"""
+
+
+def source(text: str = PROBLEM) -> SourceText:
+    return SourceText("apples", text, "file")
+
+
+@pytest.fixture(scope="module")
+def home() -> Scene:
+    return kitchen_scene()
+
+
+def refusal(text: str, scene: Scene) -> Refusal:
+    outcome = import_problem(source(text), scene)
+    assert isinstance(outcome, Refusal)
+    return outcome
+
+
+def test_problem_becomes_a_task_in_a_scene_of_its_own(home: Scene) -> None:
+    imported = import_problem(source(), home)
+    assert isinstance(imported, Imported)
+    task, scene = imported.task, imported.scene
+    added = [item for item in scene.objects if item.name not in home.by_name]
+    assert [(item.name, item.host) for item in added] == [
+        ("apple_3", "breakfast_table_1"),
+        ("apple_4", "breakfast_table_1"),
+    ]
+    assert task.types == {"apple.n.01": ("apple_3", "apple_4")}
+    assert task.goal_bddl == (
+        "(and (forall (?apple.n.01 - apple.n.01) (inside ?apple.n.01 fridge_1)) (not (open fridge_1)))"
+    )
+    assert scene.by_name["fridge_1"].joints == (1.0,)
+    assert scene.robot.room == "kitchen_0"
+    assert {"apple_3", "apple_4", "fridge_1", "breakfast_table_1"} <= set(task.table)
+    assert task.category is TaskCategory.COMPOUND
+    assert task.instruction == "Put the apples in the fridge in kitchen_0."
+    assert imported.rooms == ("kitchen_0",)
+
+
+def test_equal_seeds_bind_equally(home: Scene) -> None:
+    assert import_problem(source(), home, seed=3) == import_problem(source(), home, seed=3)
+
+
+def test_room_instance_pins_the_room(home: Scene) -> None:
+    outcome = refusal(PROBLEM.replace("_1 kitchen)", "_1 kitchen_7)"), home)
+    assert outcome.reason is RefusalReason.ROOM_MISSING
+    assert "'kitchen_7'" in outcome.sentence
+    assert "kitchen_0" in outcome.sentence
+
+
+REFUSALS: dict[RefusalReason, tuple[str, str]] = {
+    RefusalReason.UNKNOWN_TYPE: ("breakfast_table.n.01", "breakfast_tabel.n.01"),
+    RefusalReason.SUBSTANCE: ("apple.n.01", "water.n.06"),
+    RefusalReason.INEXPRESSIBLE: ("(not (open ?", "(not (dusty ?"),
+    RefusalReason.ROOM_MISSING: ("_1 kitchen)", "_1 sauna)"),
+    RefusalReason.ROOM_AS_OBJECT: ("(not (open ?electric_refrigerator.n.01_1))", "(not (open closet_0))"),
+    RefusalReason.FLOOR_IN_GOAL: ("?apple.n.01 ?electric_refrigerator.n.01_1", "?apple.n.01 floor.n.01_1"),
+    RefusalReason.AGENT_IN_GOAL: ("(not (open ?electric", "(nextto agent.n.01_1 electric"),
+    RefusalReason.NO_SCENE_OBJECT: ("breakfast_table.n.01", "bed.n.01"),
+    RefusalReason.NO_PLACE_GIVEN: ("(ontop apple.n.01_2 breakfast_table.n.01_1)\n", "\n"),
+    RefusalReason.DOES_NOT_FIT: ("apple.n.01", "sofa.n.01"),
+}
+
+
+@pytest.mark.parametrize("reason", REFUSALS)
+def test_what_can_t_be_bound_is_refused_for_its_reason(home: Scene, reason: RefusalReason) -> None:
+    old, new = REFUSALS[reason]
+    text = PROBLEM.replace(old, new)
+    if reason is RefusalReason.AGENT_IN_GOAL:
+        text = text.replace(
+            "electric_refrigerator.n.01_1))\n        )", "electric_refrigerator.n.01_1)\n        )"
+        )
+    assert text != PROBLEM
+    outcome = refusal(text, home)
+    assert outcome.reason is reason
+    assert len(outcome.sentence) > 25
+
+
+def test_misspelt_type_suggests_the_right_one(home: Scene) -> None:
+    outcome = refusal(PROBLEM.replace("breakfast_table.n.01", "breakfast_tabel.n.01"), home)
+    assert "did you mean breakfast_table.n.01" in outcome.sentence
+
+
+def test_broken_text_is_an_error_with_its_line(home: Scene) -> None:
+    with pytest.raises(BddlError, match="line"):
+        import_problem(source(PROBLEM.replace("kitchen)", "kitchen", 1)), home)
+
+
+def test_two_objects_of_a_type_need_two_of_the_scene_s(home: Scene) -> None:
+    text = PROBLEM.replace("breakfast_table.n.01_1 -", "breakfast_table.n.01_1 breakfast_table.n.01_2 -")
+    text = text.replace("(open elec", "(inroom breakfast_table.n.01_2 kitchen)\n        (open elec")
+    assert refusal(text, home).reason is RefusalReason.NO_SCENE_OBJECT
+
+
+def test_binding_is_by_ability_as_well_as_by_type(home: Scene) -> None:
+    on = "(toggled_on electric_refrigerator.n.01_1)"
+    problem = parse_problem(PROBLEM.replace("(not (open ?electric_refrigerator.n.01_1))", on))
+    with pytest.raises(RefusedError, match="electric_refrigerator"):
+        bind(problem, home, np.random.default_rng(0))
+
+
+def test_small_thing_of_the_room_that_the_scene_lacks_is_added_on_its_floor(home: Scene) -> None:
+    text = PROBLEM.replace("(ontop apple.n.01_2 breakfast_table.n.01_1)", "(inroom apple.n.01_2 living_room)")
+    text = text.replace("apple.n.01_2", "tennis_ball.n.01_1").replace(
+        "tennis_ball.n.01_1 - apple.n.01", "- apple.n.01\n        tennis_ball.n.01_1 - tennis_ball.n.01"
+    )
+    imported = import_problem(source(text), home)
+    assert isinstance(imported, Imported)
+    ball = imported.scene.by_name["tennis_ball_1"]
+    assert (ball.room, ball.host) == ("living_room_0", "")
+
+
+def test_states_of_the_start_are_set_and_taken_away(home: Scene) -> None:
+    literals = [
+        Literal(Atom("hot", ("apple_1",))),
+        Literal(Atom("open", ("fridge_1",))),
+        Literal(Atom("open", ("microwave_1",)), positive=False),
+        Literal(Atom("ontop", ("apple_1", "fridge_1"))),
+    ]
+    changed = with_states(home, literals)
+    assert changed.by_name["apple_1"].states == {State.HOT}
+    assert changed.by_name["fridge_1"].joints == (1.0,)
+    assert changed.by_name["microwave_1"].joints == (0.0,)
+    assert (
+        with_states(changed, [Literal(Atom("hot", ("apple_1",)), positive=False)]).by_name["apple_1"].states
+        == set()
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("pick_up_the_mug.n.04_from_the_desk_in_kitchen_0", "Pick up the mug from the desk in kitchen_0."),
+        ("go_to_the_living_room_0._Then_rest-0", "Go to the living_room_0. Then rest."),
+        ("heat_the_bread_slice.n.01_1", "Heat the bread slice."),
+        ("clean_all_4_frames", "Clean all 4 frames."),
+    ],
+)
+def test_instruction_is_the_problem_s_name_in_words(name: str, expected: str) -> None:
+    problem = parse_problem(PROBLEM.replace("Put_the_apples_in_the_fridge_in_kitchen_0", name))
+    assert instruction_of(source(), problem) == expected
+
+
+@pytest.mark.parametrize(
+    ("goal", "category"),
+    [
+        ("(ontop a_1 b_1)", TaskCategory.PICK_AND_PLACE),
+        ("(not (open b_1))", TaskCategory.APPLIANCE_USE),
+        ("(cooked a_1)", TaskCategory.KITCHEN_OPERATION),
+        ("(and (hot a_1) (inside a_1 b_1) (toggled_on b_1))", TaskCategory.KITCHEN_OPERATION),
+        ("(and (hot a_1) (ontop a_1 b_1))", TaskCategory.COMPOUND),
+        ("(and (open b_1) (ontop a_1 b_1))", TaskCategory.COMPOUND),
+    ],
+)
+def test_goal_tells_which_of_the_four_kinds_a_task_is(goal: str, category: TaskCategory) -> None:
+    assert category_of(parse_formula(goal, {"a_1": "a", "b_1": "b"})) is category
+
+
+def test_imported_task_is_verified_by_execution(home: Scene) -> None:
+    text = PROBLEM.replace("electric_refrigerator.n.01", "microwave.n.02").replace(
+        "apple.n.01_1 apple.n.01_2", "apple.n.01_1"
+    )
+    text = text.replace("(ontop apple.n.01_2 breakfast_table.n.01_1)\n", "")
+    imported = import_problem(source(text), home)
+    assert isinstance(imported, Imported)
+    outcome = verify(imported, PlacementLibrary())
+    assert isinstance(outcome, Verified), outcome
+    assert [call["action"] for call in outcome.record.oracle][-1] == "close"
+
+
+def test_unknown_activity_suggests_a_close_name() -> None:
+    pytest.importorskip("bddl", reason="the bddl package is not installed")
+    with pytest.raises(SourceError, match="did you mean bringing_water"):
+        read_activity("bringin_water")
+    assert read_activity("bringing_water").request == "bringing water"
+    assert len(activity_names()) >= 1016
+
+
+def test_unreadable_sources_are_one_sentence(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match="can't be read"):
+        read_file(tmp_path / "missing.bddl")
+    with pytest.raises(SourceError, match="can't be read"):
+        list(read_jsonl(tmp_path / "missing.jsonl"))
+    (tmp_path / "bad.jsonl").write_text(json.dumps({"name": "a", "bddl": PROBLEM}) + "\n{}\n")
+    with pytest.raises(SourceError, match=r"bad.jsonl:2: expected an object"):
+        list(read_jsonl(tmp_path / "bad.jsonl"))
+
+
+@pytest.mark.skipif(
+    not SAMPLE.exists(), reason="the sample of the paper's tasks is not beside the repository"
+)
+def test_tasks_of_the_paper_s_factory_are_bound_or_refused() -> None:
+    bases = [build_base_scene("Rs_int"), build_base_scene("Wainscott_0_int")]
+    outcomes = [bind_first(item, bases) for item in list(read_jsonl(SAMPLE))[::4]]
+    counts = Counter(item.reason if isinstance(item, Refusal) else "bound" for item in outcomes)
+    assert counts["bound"] >= 5
+    assert sum(counts.values()) == 100
+
+
+def test_activities_of_behavior_1k_are_bound_or_refused() -> None:
+    pytest.importorskip("bddl", reason="the bddl package is not installed")
+    base = build_base_scene("Wainscott_0_int")
+    names = activity_names()[::16]
+    outcomes = [import_problem(read_activity(name), base) for name in names]
+    bound = [item for item in outcomes if isinstance(item, Imported)]
+    assert len(bound) >= 2
+    for item in bound:
+        assert item.task.source == "behavior-1k"
+        assert set(item.task.table) <= set(item.scene.by_name)

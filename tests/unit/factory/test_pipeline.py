@@ -1,0 +1,173 @@
+"""A build is balanced, verified, split by rooms and kinds of goal, equal for equal seeds, and goes on where it stopped."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from embomatrix.factory.cli import app
+from embomatrix.factory.pipeline import BuildSettings, Summary, build_dataset, split_rooms
+from embomatrix.factory.pipeline_store import BuildStore
+from embomatrix.factory.scene_build import build_base_scene
+from embomatrix.factory.writer import is_heldout_signature
+from embomatrix.reward.hierarchy import score
+from embomatrix.sim.executor import Simulator
+from embomatrix.skills.parse import plan_from_json
+from embomatrix.world.dataset import Dataset, DatasetError
+from embomatrix.world.task import TaskCategory
+
+SETTINGS = BuildSettings(train=8, heldout=4, seed=0, scenes=("Rs_int", "Wainscott_0_int"))
+
+BDDL = """(define (problem Put_the_apple_in_the_fridge)
+    (:domain omnigibson)
+    (:objects apple.n.01_1 - apple.n.01 countertop.n.01_1 - countertop.n.01 floor.n.01_1 - floor.n.01
+        agent.n.01_1 - agent.n.01)
+    (:init (ontop apple.n.01_1 countertop.n.01_1) (inroom countertop.n.01_1 kitchen)
+        (inroom floor.n.01_1 kitchen) (ontop agent.n.01_1 floor.n.01_1))
+    (:goal (not (ontop apple.n.01_1 countertop.n.01_1)))
+)
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("data")
+
+
+@pytest.fixture(scope="module")
+def summary(folder: Path) -> Summary:
+    return build_dataset(folder, SETTINGS)
+
+
+@pytest.fixture(scope="module")
+def dataset(folder: Path, summary: Summary) -> Dataset:
+    assert summary.total("train") == 8
+    return Dataset.load(folder)
+
+
+def test_every_category_has_its_share(dataset: Dataset, summary: Summary) -> None:
+    assert (len(dataset.train), len(dataset.heldout)) == (8, 4)
+    for category in TaskCategory:
+        assert summary.admitted["train", category.value] == 2
+        assert summary.admitted["heldout", category.value] == 1
+
+
+def test_heldout_tasks_are_in_other_rooms_and_ask_for_other_kinds_of_goal(
+    dataset: Dataset, summary: Summary
+) -> None:
+    for record in dataset.records:
+        rooms = summary.rooms[record.split][record.task.scene_id.split("-")[0]]
+        assert set(record.rooms) <= set(rooms)
+        assert is_heldout_signature(record.signature, SETTINGS.seed) is (record.split == "heldout")
+    assert not {r.signature for r in dataset.train} & {r.signature for r in dataset.heldout}
+
+
+def test_every_oracle_plan_earns_full_success_from_the_bundle_on_disk(dataset: Dataset) -> None:
+    for record in dataset.records:
+        bundle = dataset.bundle(record.bundle_digest)
+        assert bundle.tasks[record.task.task_id] == record.task
+        simulator = Simulator(bundle)
+        simulator.execute(record.task, (), 0)
+        assert not score(record.task, frozenset(), simulator.facts).success
+        trace = simulator.execute(record.task, plan_from_json(list(record.oracle)), 0)
+        assert score(record.task, trace.touched, simulator.facts).success
+        simulator.close()
+
+
+def test_build_that_was_cut_short_goes_on_to_the_same_end(
+    folder: Path, dataset: Dataset, tmp_path: Path
+) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(folder, copy)
+    lines = (copy / "build.jsonl").read_text().splitlines(keepends=True)
+    (copy / "build.jsonl").write_text("".join(lines[:-1]) + lines[-1][:40])
+    (copy / "tasks.jsonl").unlink()
+    build_dataset(copy, SETTINGS)
+    assert (copy / "tasks.jsonl").read_bytes() == (folder / "tasks.jsonl").read_bytes()
+    assert (copy / "build.jsonl").read_bytes() == (folder / "build.jsonl").read_bytes()
+
+
+def test_folder_of_another_build_is_left_alone(folder: Path, dataset: Dataset) -> None:
+    with pytest.raises(DatasetError, match="other settings"):
+        BuildStore.open(folder, {"seed": 99})
+
+
+def test_rejections_are_kept_with_their_reasons(folder: Path, summary: Summary) -> None:
+    lines = (folder / "rejections.jsonl").read_text().splitlines()
+    assert len(lines) == sum(summary.rejected.values())
+    assert all({"reason", "sentence", "goal"} <= set(json.loads(line)) for line in lines)
+
+
+def test_every_room_is_on_one_side_and_every_kind_with_two_rooms_on_both() -> None:
+    scenes = [build_base_scene("Rs_int"), build_base_scene("Wainscott_0_int")]
+    types = {(scene.base, room.name): room.type for scene in scenes for room in scene.rooms}
+    for seed in range(4):
+        split = split_rooms(scenes, seed)
+        sides = {
+            side: {(base, room) for base, rooms in split[side].items() for room in rooms} for side in split
+        }
+        assert not sides["train"] & sides["heldout"]
+        assert sides["train"] | sides["heldout"] == set(types)
+        for kind in ("kitchen", "bathroom", "bedroom", "living_room"):
+            assert all(any(types[room] == kind for room in side) for side in sides.values())
+
+
+def run(*arguments: str) -> tuple[int, str]:
+    result = CliRunner().invoke(app, list(arguments))
+    return result.exit_code, result.output + result.stderr
+
+
+def test_list_shows_the_tasks(folder: Path, dataset: Dataset) -> None:
+    code, output = run("list", str(folder))
+    assert code == 0
+    assert "heldout" in output
+
+
+def test_bddl_file_is_imported_and_its_plan_shown(tmp_path: Path) -> None:
+    (tmp_path / "apple.bddl").write_text(BDDL)
+    code, output = run(
+        "import", "--bddl", str(tmp_path / "apple.bddl"), "--scene", "Rs_int", "--out", str(tmp_path / "d")
+    )
+    assert code == 0, output
+    assert "Put the apple in the fridge." in output
+    assert "pick_up" in output
+    assert len(Dataset.load(tmp_path / "d").records) == 1
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("(inroom floor", "inroom floor", "parenthesis"),
+        ("- apple.n.01", "- appel.n.01", "did you mean"),
+        ("(not (ontop apple.n.01_1", "(not (ontop pear.n.01_1", "'pear.n.01_1' is not declared"),
+        ("kitchen", "sauna", "has no 'sauna'"),
+        (":goal", ":gaol", "unknown section ':gaol'"),
+    ],
+)
+def test_bad_bddl_is_one_sentence_and_exit_2(tmp_path: Path, old: str, new: str, message: str) -> None:
+    (tmp_path / "bad.bddl").write_text(BDDL.replace(old, new))
+    code, output = run("import", "--bddl", str(tmp_path / "bad.bddl"), "--scene", "Rs_int")
+    assert code == 2
+    assert message in output
+    assert "Traceback" not in output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["build", "--out", "OUT", "--scene", "Rs_imt"], "did you mean Rs_int"),
+        (["import", "--activity", "bringin_water"], "did you mean bringing_water"),
+        (["import"], "exactly one of"),
+        (["import", "--bddl", "OUT/none.bddl"], "can't be read"),
+        (["list", "OUT/none"], "no data set"),
+    ],
+)
+def test_unknown_names_are_one_sentence_and_exit_2(
+    tmp_path: Path, arguments: list[str], message: str
+) -> None:
+    code, output = run(*(argument.replace("OUT", str(tmp_path)) for argument in arguments))
+    assert code == 2
+    assert message in " ".join(output.split())
+    assert "Traceback" not in output
