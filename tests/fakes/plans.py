@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING
 from tests.fakes import furniture as make
 from tests.fakes.scenes import kitchen_scene, placed, upright
 
+from embomatrix.sim.executor import Simulator
 from embomatrix.skills.parse import parse_plan
+from embomatrix.world.bundle import Bundle
 from embomatrix.world.evaluate import render
 from embomatrix.world.goal import And, Formula
 from embomatrix.world.task import Task, TaskCategory
@@ -17,6 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from embomatrix.skills.syntax import Plan
+    from embomatrix.skills.trace import Trace
     from embomatrix.world.asset import Asset
     from embomatrix.world.scene import Scene, SceneObject
 
@@ -91,3 +94,18 @@ def awkward_scene() -> Scene:
             (placed("cooler_1", cooler, kitchen, upright(2.0, 3.7, counter, cooler), fixed=True), cooler),
         ],
     )
+
+
+def executed(simulator: Simulator, text: str, goal: Formula = NOTHING, seed: int = 0) -> Trace:
+    """Trace of a plan in words. The facts of the state reached are the simulator's."""
+    task = task_over(simulator.world.scene, goal)
+    return simulator.execute(task, plan_of(task, text), seed)
+
+
+def executed_alone(scene: Scene, text: str) -> Trace:
+    """Trace of a plan in words, in a simulator of its own."""
+    simulator = Simulator(Bundle(scene, {}))
+    try:
+        return executed(simulator, text)
+    finally:
+        simulator.close()

@@ -38,7 +38,7 @@ def _move(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusa
     target = target_of(world, call)
     stands = world.navigator.stands(target, world.robot)
     if stands:
-        world.drive_to(stands[0])
+        world.robot = stands[0]
         return None
     room = world.room_of(target)
     cut_off = room in world.rooms and world.navigator.room_entry(room, world.robot) is None
@@ -46,7 +46,7 @@ def _move(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusa
 
 
 def _turn(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
-    world.drive_to(StandPose(world.robot.x_m, world.robot.y_m, _heading(world, call)))
+    world.robot = StandPose(world.robot.x_m, world.robot.y_m, _heading(world, call))
     return None
 
 
@@ -58,7 +58,7 @@ def _move_forward(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -
         return refuse(FailureReason.BLOCKED, distance=metres(free_m))
     x = world.robot.x_m + math.cos(course) * abs(distance_m)
     y = world.robot.y_m + math.sin(course) * abs(distance_m)
-    world.drive_to(StandPose(x, y, heading))
+    world.robot = StandPose(x, y, heading)
     return None
 
 
@@ -72,12 +72,13 @@ def _go_to_room(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> 
     entry = world.navigator.room_entry(room, world.robot)
     if entry is None:
         return refuse(FailureReason.NO_PATH, target=room)
-    world.drive_to(entry)
+    world.robot = entry
     return None
 
 
 def _pick_up(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
-    world.take(target_of(world, call))
+    world.hand.take(world.cargo(target_of(world, call)))
+    world.navigator.refresh()
     return None
 
 
@@ -86,7 +87,8 @@ def _place(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refus
     target, held = target_of(world, call), world.carried[0]
     found = world.placer.find(held, target, Relation(call.relation.value), world.robot, rng)
     if isinstance(found, Pose):
-        if world.let_go(found):
+        if world.hand.let_go(found):
+            world.navigator.refresh()
             return None
         found = FailureReason.NO_FREE_POSE
     return refuse(found, held=held, target=target, relation=preposition(call.relation))

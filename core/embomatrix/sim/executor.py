@@ -119,7 +119,7 @@ class Simulator:
 
     def _sight(self, name: str) -> Sight:
         world = self._world
-        host = world.host_of(name)
+        host = world.relations.host_of(name)
         asset = world.asset(name)
         states: list[str] = []
         if asset.joints:

@@ -6,6 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 from embomatrix.sim.facts import SceneFacts
+from embomatrix.sim.hand import Hand
 from embomatrix.sim.navigation import Navigator
 from embomatrix.sim.placement import Placer
 from embomatrix.sim.relations import Relations
@@ -16,11 +17,8 @@ from embomatrix.world.state import State
 
 if TYPE_CHECKING:
     from embomatrix.sim.engine import PhysicsEngine
-    from embomatrix.sim.relations import Host
     from embomatrix.world.asset import Asset
     from embomatrix.world.bundle import Bundle
-    from embomatrix.world.geometry import Pose
-    from embomatrix.world.poses import StandPose
     from embomatrix.world.task import Task
 
 SYMBOLIC = frozenset(State) - {State.OPEN}
@@ -42,7 +40,7 @@ class LiveWorld:
         self.table: tuple[str, ...] = ()
         self.rooms = tuple(room.name for room in self.scene.rooms)
         self.robot = self.navigator.start
-        self._hand: dict[str, Pose] = {}
+        self.hand = Hand(engine)
         self._take_states_from_scene()
         self.thermal.apply()
         self._initial = {name: frozenset(states) for name, states in self.states.items()}
@@ -52,7 +50,7 @@ class LiveWorld:
         self.engine.reset()
         for name, states in self._initial.items():
             self.states[name] = set(states)
-        self._hand.clear()
+        self.hand.forget()
         self.robot = self.navigator.start
         self.navigator.refresh()
         self.table = task.table
@@ -60,7 +58,7 @@ class LiveWorld:
     @property
     def carried(self) -> tuple[str, ...]:
         """What the hand holds, then what lies in it; empty for an empty hand."""
-        return tuple(self._hand)
+        return self.hand.carried
 
     def asset(self, name: str) -> Asset:
         return self.scene.asset_of(name)
@@ -90,7 +88,7 @@ class LiveWorld:
     def reach(self, name: str) -> Reach:
         """How the robot, where it stands, reaches the object's box with doors shut. What is in the hand is at hand."""
         box = self.relations.body(name)
-        if name in self._hand:
+        if name in self.carried:
             return Reach(0.0, box.center_m[2])
         dx = max(box.low_m[0] - self.robot.x_m, self.robot.x_m - box.high_m[0], 0.0)
         dy = max(box.low_m[1] - self.robot.y_m, self.robot.y_m - box.high_m[1], 0.0)
@@ -98,7 +96,7 @@ class LiveWorld:
 
     def is_approachable(self, name: str) -> bool:
         """Whether no wall and nothing much taller than the object stands between the robot and it."""
-        return name in self._hand or self.navigator.line_is_clear(self.robot, name)
+        return name in self.carried or self.navigator.line_is_clear(self.robot, name)
 
     def is_at(self, name: str, source: str) -> bool:
         """Whether the object lies where the source acts, be it as heat or as cold source."""
@@ -106,46 +104,14 @@ class LiveWorld:
         found = heat_source(asset) or cold_source(asset)
         return found is not None and self.thermal.is_at(name, source, found)
 
-    def host_of(self, name: str) -> Host | None:
-        return self.relations.host_of(name)
-
     def room_of(self, name: str) -> str:
         """Room that the object is in; of a carried one, the robot's."""
-        return self.robot_room if name in self._hand else self.relations.room_of(name)
+        return self.robot_room if name in self.carried else self.relations.room_of(name)
 
     @property
     def robot_room(self) -> str:
         """Room in which the robot stands."""
         return self.scene.room_at((self.robot.x_m, self.robot.y_m))
-
-    def drive_to(self, pose: StandPose) -> None:
-        self.robot = pose
-
-    def take(self, name: str) -> None:
-        """Put the object and all that lies in it into the hand."""
-        group = self.cargo(name)
-        back = self.engine.pose(name).inverse()
-        self._hand = {item: back @ self.engine.pose(item) for item in group}
-        for item in group:
-            self.engine.park(item)
-        self.navigator.refresh()
-
-    def let_go(self, pose: Pose) -> bool:
-        """Stand what the hand holds at a pose, with what lies in it. False, and nothing changed, when that does not fit."""
-        members = dict(self._hand)
-        for item, pose_held_item in members.items():
-            self.engine.set_pose(item, pose @ pose_held_item)
-        group = frozenset(members)
-        held, *contents = members
-        if any(self.engine.penetrates(item, ignore=group) for item in contents):
-            for item in members:
-                self.engine.park(item)
-            return False
-        # The pose of the held object itself is the placer's, to the last bit.
-        self.engine.set_pose(held, pose)
-        self._hand.clear()
-        self.navigator.refresh()
-        return True
 
     def state_bytes(self) -> bytes:
         """All that a trace's digest depends on: the engine's state, the robot, the hand and the symbolic states."""
@@ -153,7 +119,7 @@ class LiveWorld:
         symbolic = [
             f"{name}:{','.join(sorted(states))}" for name, states in sorted(self.states.items()) if states
         ]
-        text = "\n".join([robot, " ".join(self._hand), *symbolic])
+        text = "\n".join([robot, " ".join(self.carried), *symbolic])
         return self.engine.state_bytes() + text.encode()
 
     def _take_states_from_scene(self) -> None:

@@ -112,7 +112,7 @@ class Errands:
 
     def _place_beside(self, item: Placement, script: PlanScript, world: LiveWorld) -> None:
         """On or in what the other thing stands on or in: next to it, if there is not much room."""
-        host = world.host_of(item.target)
+        host = world.relations.host_of(item.target)
         if host is None or host.name == item.name:
             raise StuckError(f"nothing can be put beside {item.target}: it stands on the floor")
         script.transfer(item.name, host.name, PlaceRelation(host.relation.value))

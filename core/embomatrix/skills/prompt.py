@@ -225,11 +225,12 @@ _PLACEHOLDERS: Final[Mapping[Arg, str]] = {
 }
 
 EXAMPLES: Final[Mapping[Codec, str]] = {
-    Codec.NAMES: "move apple\npick_up apple\nmove fridge\nopen fridge\nplace fridge inside\nclose fridge",
-    Codec.LINES: "move 4\npick_up 4\nmove 2\nopen 2\nplace 2 inside\nclose 2",
-    Codec.JSON: '[{"action": "move", "object_index": 4}, {"action": "pick_up", "object_index": 4}, '
-    '{"action": "move", "object_index": 2}, {"action": "open", "object_index": 2}, '
-    '{"action": "place", "object_index": 2, "relation": "inside"}, {"action": "close", "object_index": 2}]',
+    Codec.NAMES: "move fridge\nopen fridge\nmove apple\npick_up apple\nmove fridge\nplace fridge inside\nclose fridge",
+    Codec.LINES: "move 2\nopen 2\nmove 4\npick_up 4\nmove 2\nplace 2 inside\nclose 2",
+    Codec.JSON: '[{"action": "move", "object_index": 2}, {"action": "open", "object_index": 2}, '
+    '{"action": "move", "object_index": 4}, {"action": "pick_up", "object_index": 4}, '
+    '{"action": "move", "object_index": 2}, {"action": "place", "object_index": 2, "relation": "inside"}, '
+    '{"action": "close", "object_index": 2}]',
 }
 """A plan in each codec: put the apple (row 4) into the fridge (row 2)."""
 
@@ -253,7 +254,8 @@ def _skill_objects() -> str:
 
 
 _RULES: Final = (
-    "The robot has one arm and holds one object. Move to an object before you use it, open closed containers first. "
+    "The robot has one arm and holds one object; doors and switches need the empty hand. Move to an object before you "
+    "use it, open closed containers before you pick up what goes inside. "
     "Objects are called by the number that follows their name. The plan stops at the first step that fails."
 )
 _SYSTEM: Final[Mapping[Codec, str]] = {

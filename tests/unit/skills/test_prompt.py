@@ -66,7 +66,7 @@ def test_the_example_of_every_codec_parses_to_the_same_plan(codec):
     text = EXAMPLES[codec]
     plan = parse_plan(with_indices(text, SITUATION) if codec is Codec.NAMES else text)
     assert plan == parse_plan(EXAMPLES[Codec.JSON])
-    assert [call.skill for call in plan][:2] == [Skill.MOVE, Skill.PICK_UP]
+    assert [call.skill for call in plan][:3] == [Skill.MOVE, Skill.OPEN, Skill.MOVE]
 
 
 def test_a_name_is_short_only_where_it_is_unique():

@@ -1,0 +1,182 @@
+"""Every reason of failure, each met by the shortest plan that leads to it."""
+
+from dataclasses import replace
+
+import pytest
+from tests.fakes import furniture as make
+from tests.fakes.plans import awkward_scene, executed, executed_alone
+from tests.fakes.scenes import kitchen_scene, placed, scene_of, upright
+
+from embomatrix.sim.executor import Simulator
+from embomatrix.skills.failure import FailureReason
+from embomatrix.skills.library import reasons_of
+from embomatrix.world.bundle import Bundle
+from embomatrix.world.scene import RobotStart
+
+
+@pytest.fixture(scope="module")
+def flat():
+    simulator = Simulator(Bundle(kitchen_scene(), {}))
+    yield simulator
+    simulator.close()
+
+
+@pytest.fixture(scope="module")
+def awkward():
+    simulator = Simulator(Bundle(awkward_scene(), {}))
+    yield simulator
+    simulator.close()
+
+
+REACHED = {
+    FailureReason.UNKNOWN_INDEX: "pick_up 99",
+    FailureReason.UNKNOWN_ROOM: "go_to_room attic_0",
+    FailureReason.BLOCKED: "move_forward 4.9 0",
+    FailureReason.STEP_TOO_LONG: "move_forward 6 0",
+    FailureReason.OUT_OF_REACH: "pick_up mug_1",
+    FailureReason.TOO_HIGH: "pick_up apple_4",
+    FailureReason.HAND_FULL: "move apple_1; pick_up apple_1; move fridge_1; open fridge_1",
+    FailureReason.HAND_EMPTY: "move fridge_1; place fridge_1 ontop",
+    FailureReason.NOT_PORTABLE: "move fridge_1; pick_up fridge_1",
+    FailureReason.TOO_HEAVY: "move anvil_1; pick_up anvil_1",
+    FailureReason.SUPPORTS_OTHERS: "move tray_1; pick_up tray_1",
+    FailureReason.CONTAINER_CLOSED: "move chicken_leg_1; pick_up chicken_leg_1",
+    FailureReason.NOT_OPENABLE: "move stove_1; open stove_1",
+    FailureReason.ALREADY_OPEN: "move fridge_1; open fridge_1; open fridge_1",
+    FailureReason.ALREADY_CLOSED: "move fridge_1; close fridge_1",
+    FailureReason.OPENED_WHILE_ON: "move microwave_1; toggle_on microwave_1; open microwave_1",
+    FailureReason.NOT_TOGGLEABLE: "move fridge_1; toggle_on fridge_1",
+    FailureReason.ALREADY_ON: "move stove_1; toggle_on stove_1; toggle_on stove_1",
+    FailureReason.ALREADY_OFF: "move stove_1; toggle_off stove_1",
+    FailureReason.MUST_BE_CLOSED: "move microwave_1; open microwave_1; toggle_on microwave_1",
+    FailureReason.NO_SURFACE: "move bowl_1; pick_up bowl_1; move apple_1; place apple_1 ontop",
+    FailureReason.NO_CAVITY: "move apple_1; pick_up apple_1; move countertop_1; place countertop_1 inside",
+    FailureReason.PLACE_ON_ITSELF: "move apple_1; pick_up apple_1; place apple_1 ontop",
+    FailureReason.NOT_A_HEAT_SOURCE: "heat_object_with_source apple_1 fridge_1",
+    FailureReason.NOT_A_COLD_SOURCE: "froze_object_with_source apple_1 stove_1",
+    FailureReason.NOT_HEATABLE: "heat_object_with_source table_lamp_1 stove_1",
+    FailureReason.NOT_COOKABLE: "cook_object_with_tool mug_1 stove_1",
+    FailureReason.NOT_FREEZABLE: "froze_object_with_source mug_1 fridge_1",
+    FailureReason.SOURCE_OFF: "move apple_1; pick_up apple_1; move stove_1; place stove_1 ontop; "
+    "heat_object_with_source apple_1 stove_1",
+    FailureReason.SOURCE_OPEN: "move fridge_1; open fridge_1; froze_object_with_source chicken_leg_1 fridge_1",
+    FailureReason.NOT_AT_SOURCE: "move stove_1; heat_object_with_source apple_1 stove_1",
+    FailureReason.NOT_HOT_ENOUGH: "move apple_1; pick_up apple_1; move warmer_1; place warmer_1 ontop; "
+    "cook_object_with_tool apple_1 warmer_1",
+    FailureReason.NOT_COLD_ENOUGH: "move apple_1; pick_up apple_1; move cooler_1; place cooler_1 inside; "
+    "froze_object_with_source apple_1 cooler_1",
+}
+ELSEWHERE = {
+    FailureReason.NO_PATH,
+    FailureReason.NO_STANDING_POSE,
+    FailureReason.NO_LINE_OF_APPROACH,
+    FailureReason.TOO_LARGE,
+    FailureReason.DOOR_BLOCKED,
+    FailureReason.NO_FREE_POSE,
+}
+"""Reasons that the tests below this table meet in scenes of their own."""
+
+
+@pytest.mark.parametrize("reason", list(REACHED))
+def test_a_plan_meets_the_reason(awkward, reason):
+    trace = executed(awkward, REACHED[reason])
+    assert trace.failure is reason, trace.steps[-1].message
+    assert trace.steps[-1].failure in reasons_of(trace.steps[-1].call.skill)
+
+
+def test_every_reason_is_met_by_some_test():
+    assert set(REACHED) | ELSEWHERE == set(FailureReason)
+    assert not set(REACHED) & ELSEWHERE
+
+
+def test_no_path_leads_into_a_room_without_a_door():
+    trace = executed_alone(replace(kitchen_scene(), doorways=()), "move apple_2")
+    assert trace.failure is FailureReason.NO_PATH
+    assert trace.steps[0].message == "the robot can't get to apple_2: no free path leads there"
+
+
+def test_a_room_without_a_door_can_not_be_entered():
+    trace = executed_alone(replace(kitchen_scene(), doorways=()), "go_to_room living_room_0")
+    assert trace.failure is FailureReason.NO_PATH
+
+
+def test_what_lies_in_the_middle_of_a_huge_table_can_not_be_reached():
+    island, apple = make.block("island", "island.n.01", (2.6, 2.6, 0.5), {}), make.apple()
+    scene = scene_of(
+        "island",
+        [
+            (placed("island_1", island, "kitchen_0", upright(2.5, 2.0, 0, island), fixed=True), island),
+            (placed("apple_1", apple, "kitchen_0", upright(2.5, 2.0, 0.5, apple)), apple),
+        ],
+    )
+    trace = executed_alone(replace(scene, robot=RobotStart(0.5, 0.5, 0.0, "kitchen_0")), "move apple_1")
+    assert trace.failure is FailureReason.NO_STANDING_POSE
+
+
+def test_the_arm_does_not_reach_through_a_wall():
+    low, apple = make.coffee_table(), make.apple()
+    scene = scene_of(
+        "wall",
+        [
+            (placed("table_1", low, "living_room_0", upright(5.5, 0.7, 0, low), fixed=True), low),
+            (placed("apple_1", apple, "living_room_0", upright(5.4, 0.7, 0.45, apple)), apple),
+        ],
+    )
+    trace = executed_alone(replace(scene, robot=RobotStart(4.7, 0.7, 0.0, "kitchen_0")), "pick_up apple_1")
+    assert trace.failure is FailureReason.NO_LINE_OF_APPROACH
+
+
+def test_a_chest_is_too_large_for_the_gripper():
+    chest = replace(make.block("chest", "chest.n.01", (0.5, 0.5, 0.5), {}), mass_kg=3.0)
+    scene = scene_of("chest", [(placed("chest_1", chest, "kitchen_0", upright(1.5, 1.5, 0, chest)), chest)])
+    trace = executed_alone(scene, "move chest_1; pick_up chest_1")
+    assert trace.failure is FailureReason.TOO_LARGE
+    assert trace.steps[-1].message == "chest_1 measures 0.50 m and the gripper takes at most 0.30 m"
+
+
+def in_front_of_the_microwave():
+    counter, microwave, mug = make.counter(), make.microwave(), make.mug()
+    south = -1.5707963267948966
+    return scene_of(
+        "door",
+        [
+            (
+                placed("counter_1", counter, "kitchen_0", upright(2.2, 3.7, 0, counter, south), fixed=True),
+                counter,
+            ),
+            (
+                placed(
+                    "microwave_1",
+                    microwave,
+                    "kitchen_0",
+                    upright(2.6, 3.79, 0.9, microwave, south),
+                    fixed=True,
+                ),
+                microwave,
+            ),
+            (placed("mug_1", mug, "kitchen_0", upright(2.6, 3.47, 0.9, mug)), mug),
+        ],
+    )
+
+
+def test_a_mug_in_front_of_the_microwave_keeps_its_door_shut():
+    trace = executed_alone(in_front_of_the_microwave(), "move microwave_1; open microwave_1")
+    assert trace.failure is FailureReason.DOOR_BLOCKED
+    assert trace.steps[-1].message == "mug_1 is in the way of the door of microwave_1"
+
+
+def test_a_door_that_is_blocked_stays_as_it_was():
+    simulator = Simulator(Bundle(in_front_of_the_microwave(), {}))
+    executed(simulator, "move microwave_1; open microwave_1")
+    assert not simulator.facts.holds("open", ("microwave_1",))
+    simulator.close()
+
+
+def test_a_full_bowl_takes_nothing_more(flat):
+    trace = executed(
+        flat,
+        "move apple_1; pick_up apple_1; move bowl_1; place bowl_1 inside; move mug_1; pick_up mug_1; "
+        "move bowl_1; place bowl_1 inside; move apple_2; pick_up apple_2; move bowl_1; place bowl_1 inside; "
+        "move table_lamp_1; pick_up table_lamp_1; move bowl_1; place bowl_1 inside",
+    )
+    assert trace.failure is FailureReason.NO_FREE_POSE
