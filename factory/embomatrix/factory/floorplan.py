@@ -311,8 +311,10 @@ def _join(
         width, height = 0.9, 2.05
     width = min(max(width, MIN_DOOR_M), edge.length)
     slack = edge.length - width
-    # Doors hang near a corner, which keeps the walls long; wide passages sit in the middle.
-    ends = (slack / 2,) if width > 1.2 or slack < 0.5 else (0.2, slack - 0.2)
+    # Doors hang near a corner, which keeps the walls long; wide passages may sit in the middle too.
+    ends = (
+        (slack / 2,) if slack < 0.5 else (0.2, slack - 0.2) if width <= 1.2 else (0.1, slack / 2, slack - 0.1)
+    )
     start = edge.start + float(rng.choice(ends))
     return edge.cut((a, b), start, width, min(height, MAX_DOOR_HEIGHT_M), door.model if door else "")
 

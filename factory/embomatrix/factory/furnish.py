@@ -37,6 +37,8 @@ class Furnishing:
 
     placed: tuple[Placed, ...]
     left_out: tuple[str, ...]
+    loss: float = 0.0
+    """Importance of what found no place on floor, walls and ceilings, summed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,10 +60,12 @@ def furnish(plan: FloorPlan, pieces: dict[str, list[Piece]], rng: np.random.Gene
     placed: list[Placed] = []
     left_out: list[str] = []
     small: list[tuple[str, Piece]] = []
+    loss = 0.0
     for room in plan.rooms:
         wanted, notes = _capped(pieces.get(room.name, []), room.name)
         best = _best_arrangement(room, plan.doorways, wanted, rng)
         start = len(placed)
+        loss += best.loss
         placed += [replace(p, host=p.host + start) if p.host >= 0 else p for p in best.placed]
         left_out += [
             *notes,
@@ -71,7 +75,7 @@ def furnish(plan: FloorPlan, pieces: dict[str, list[Piece]], rng: np.random.Gene
         done = {id(p.piece) for p in best.placed} | {id(p) for p in best.dropped}
         small += [(room.name, p) for p in wanted if p.role is Role.SURFACE and id(p) not in done]
     left_out += _set_small_things(plan, placed, small, rng)
-    return Furnishing(tuple(placed), tuple(left_out))
+    return Furnishing(tuple(placed), tuple(left_out), loss)
 
 
 def _capped(pieces: Sequence[Piece], room: str) -> tuple[list[Piece], list[str]]:

@@ -109,35 +109,12 @@ class Group:
         return (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
 
 
-_FRONTED: Final = frozenset(
-    [
-        "fridge",
-        "freezer",
-        "oven",
-        "stove",
-        "dishwasher",
-        "washer",
-        "clothes_dryer",
-        "furniture_sink",
-        "commercial_kitchen_sink",
-        "toilet",
-        "pedestal_sink",
-        "multi_station_furniture_sink",
-        "flat_top_grill",
-        "deep_fryer",
-        "bookcase",
-        "bathtub",
-        "jukebox",
-        "wardrobe",
-        "urinal",
-        "electric_cauldron",
-        "vending_machine",
-        "grocery_shelf",
-        "photocopier",
-        "locker",
-        "wall_mounted_sink",
-    ]
+_FRONTED_NAMES: Final = (
+    "fridge freezer oven stove dishwasher washer clothes_dryer furniture_sink commercial_kitchen_sink toilet pedestal_sink "
+    "multi_station_furniture_sink flat_top_grill deep_fryer bookcase bathtub jukebox wardrobe urinal electric_cauldron "
+    "vending_machine grocery_shelf photocopier locker wall_mounted_sink"
 )
+_FRONTED: Final = frozenset(_FRONTED_NAMES.split())
 _BESIDE: Final = frozenset((Role.TABLE, Role.LOW_TABLE))
 
 

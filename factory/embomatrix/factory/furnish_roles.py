@@ -69,8 +69,8 @@ _BY_ROLE: Final[Mapping[Role, str]] = {
 _ROLE_OF: Final[Mapping[str, Role]] = {c: role for role, names in _BY_ROLE.items() for c in names.split()}
 
 _IMPORTANCE: Final[Mapping[str, float]] = {
-    "fridge": 10, "oven": 10, "stove": 10, "furniture_sink": 10, "pedestal_sink": 10, "commercial_kitchen_sink": 10,
-    "bed": 10, "toilet": 10, "sofa": 9, "dishwasher": 9, "bar": 9, "breakfast_table": 8, "dining_table": 8, "desk": 8,
+    "fridge": 20, "oven": 14, "stove": 14, "furniture_sink": 20, "pedestal_sink": 20, "commercial_kitchen_sink": 20,
+    "bed": 25, "toilet": 25, "sofa": 9, "dishwasher": 6, "bar": 9, "breakfast_table": 8, "dining_table": 8, "desk": 8,
     "booth": 8, "commercial_kitchen_table": 9, "bathtub": 8, "shower_stall": 8, "washer": 8, "microwave": 8, "countertop": 6,
     "bottom_cabinet": 6, "bookcase": 6, "top_cabinet": 5, "wardrobe": 6,
 }  # fmt: skip
@@ -193,32 +193,9 @@ SURFACE_HOSTS: Final[Mapping[str, tuple[str, ...]]] = {
 }
 """Hosts that a small thing likes, best first; without an entry, or when those are full, any surface of the room serves."""
 
-CUPBOARD: Final = frozenset(
-    [
-        "plate",
-        "bowl",
-        "mug",
-        "tray",
-        "saucepot",
-        "stockpot",
-        "frying_pan",
-        "lid",
-        "jug",
-        "teapot",
-        "teacup",
-        "saucer",
-        "wineglass",
-        "water_glass",
-        "casserole",
-        "gravy_boat",
-        "box_of_cereal",
-        "canned_food",
-        "bag_of_rice",
-        "bag_of_flour",
-        "box_of_cookies",
-        "towel",
-        "hand_towel",
-        "toilet_paper",
-    ]
+_CUPBOARD_NAMES: Final = (
+    "plate bowl mug tray saucepot stockpot frying_pan lid jug teapot teacup saucer wineglass water_glass casserole gravy_boat "
+    "box_of_cereal canned_food bag_of_rice bag_of_flour box_of_cookies towel hand_towel toilet_paper"
 )
+CUPBOARD: Final = frozenset(_CUPBOARD_NAMES.split())
 """What people keep behind doors; a lamp or a plant doesn't belong there."""

@@ -27,7 +27,8 @@ LOW_M: Final = 0.03
 """What is no higher than this is floor to the robot: a rug."""
 _TOUCH_M: Final = 1e-4
 _MARGIN_M: Final = 0.3
-_BASE_CLEAR_M: Final = ROBOT.radius_m + 0.03
+_BASE_CLEAR_M: Final = ROBOT.radius_m + 0.01
+_HALF: Final = CELL_M / 2
 
 Box = tuple[float, float, float, float, float, float]
 """(x0, y0, z0, x1, y1, z1) in the world."""
@@ -87,9 +88,12 @@ class RoomSpace:
         free = self._floor.copy()
         for x0, y0, z0, x1, y1, z1 in (*self.solids, *extra):
             if z0 < ROBOT.height_m and z1 > LOW_M:
-                free[self._span(self._x, x0, x1), self._span(self._y, y0, y1)] = False
+                # Every cell that the box touches, so that no other grid over the same room finds less floor.
+                free[
+                    self._span(self._x, x0 - _HALF, x1 + _HALF), self._span(self._y, y0 - _HALF, y1 + _HALF)
+                ] = False
         distance = ndimage.distance_transform_edt(free) * CELL_M
-        labels: NDArray[np.int32] = ndimage.label(distance - CELL_M / 2 >= _BASE_CLEAR_M - 0.02)[0]
+        labels: NDArray[np.int32] = ndimage.label(distance - _HALF >= _BASE_CLEAR_M)[0]
         return labels
 
     def _touches(self, labels: NDArray[np.int32], target: Target, main: int) -> bool:

@@ -113,8 +113,8 @@ def test_a_full_shelf_says_so(flat: Scene) -> None:
     edit = editor(flat)
 
     def fill() -> None:
-        for _ in range(200):
-            edit.add("bowl", None, Relation.ONTOP, a_host(flat, "breakfast_table"))
+        for _ in range(9):
+            edit.add("tray", "txcjux", Relation.ONTOP, a_host(flat, "breakfast_table"))
 
     with pytest.raises(PlacementError) as caught:
         fill()

@@ -39,12 +39,15 @@ def test_an_unknown_scene_gets_one_sentence_with_close_names() -> None:
 
 
 def test_render_writes_both_pictures(tmp_path: Path) -> None:
-    result = CliRunner().invoke(app, ["render", "Rs_int", "--out", str(tmp_path)])
+    result = CliRunner().invoke(app, ["render", "hotel_suite_small", "--out", str(tmp_path)])
     assert result.exit_code == 0, result.output
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["Rs_int_plan.png", "Rs_int_view.png"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "hotel_suite_small_plan.png",
+        "hotel_suite_small_view.png",
+    ]
 
 
 def test_check_finds_a_base_scene_in_order() -> None:
-    result = CliRunner().invoke(app, ["check", "Rs_int"])
+    result = CliRunner().invoke(app, ["check", "hotel_suite_small"])
     assert result.exit_code == 0, result.output
     assert "nothing wrong" in result.output
