@@ -18,7 +18,7 @@ from embomatrix.factory.furnish_pieces import (
 from embomatrix.factory.furnish_roles import HUNG_BOTTOM_M, Role, importance_of, wall_height_m
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
 _KNEE_M: Final = 0.05
 _COFFEE_GAP_M: Final = 0.38
@@ -310,9 +310,8 @@ def _singles(pool: _Pool) -> list[Group]:
         "public_trash_can": _SINKS,
         "trash_can": _SINKS,
     }
-    wanted: Callable[[Piece], bool] = lambda p: p.role not in (Role.SURFACE, Role.STRUCTURE)  # noqa: E731
     groups = []
-    for piece in pool.take(p for p in pool.rest if wanted(p)):
+    for piece in pool.take(p for p in pool.rest if p.role not in (Role.SURFACE, Role.STRUCTURE)):
         style = styles.get(piece.role, Style.ALONG)
         if piece.category == "commercial_kitchen_table" and piece.size_m[1] > _ISLAND_M:
             style = Style.FREE
