@@ -1,0 +1,123 @@
+"""The real compose file on a real Docker engine: redis, manager and workers come up, and a batch runs through them."""
+
+import json
+import os
+import shutil
+import subprocess
+import time
+import urllib.request
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+TOKEN = "a-secret-for-this-test"
+
+pytestmark = [pytest.mark.docker, pytest.mark.timeout(1800)]
+
+
+def _compose(*arguments, check=True):
+    program = ["docker", "compose"] if _has_plugin() else ["docker-compose"]
+    return subprocess.run(
+        [*program, "-p", "embomatrix-check", "-f", str(ROOT / "docker-compose.yml"), *arguments],
+        cwd=ROOT,
+        env={**os.environ, "EMBOMATRIX_TOKEN": TOKEN},
+        capture_output=True,
+        text=True,
+        check=check,
+        timeout=1500,
+    )
+
+
+def _has_plugin():
+    return subprocess.run(["docker", "compose", "version"], capture_output=True, check=False).returncode == 0
+
+
+def _engine_answers():
+    return (
+        shutil.which("docker") is not None
+        and subprocess.run(["docker", "info"], capture_output=True, check=False).returncode == 0
+    )
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    if not _engine_answers():
+        pytest.skip("no Docker engine answers: start one to check the compose file")
+    for service, target in (("manager", "manager"), ("worker", "worker"), ("trainer", "trainer")):
+        subprocess.run(
+            [
+                "docker",
+                "build",
+                "--network=host",
+                "--target",
+                target,
+                "-t",
+                f"embomatrix-check-{service}",
+                "-t",
+                f"embomatrix-check_{service}",
+                "-f",
+                "deploy/docker/Dockerfile",
+                ".",
+            ],
+            cwd=ROOT,
+            check=True,
+            timeout=1500,
+        )
+    _compose("up", "-d", "--no-build")
+    yield
+    _compose("down", "--volumes", "--timeout", "20", check=False)
+
+
+def _status(path):
+    request = urllib.request.Request(
+        f"http://127.0.0.1:8070{path}", headers={"Authorization": f"Bearer {TOKEN}"}
+    )
+    with urllib.request.urlopen(request, timeout=5) as answer:
+        return json.load(answer)
+
+
+def _until(condition, limit_s=90.0):
+    deadline = time.monotonic() + limit_s
+    while True:
+        try:
+            if condition():
+                return
+        except OSError:
+            pass
+        assert time.monotonic() < deadline, _compose("logs", "--tail=50", check=False).stdout
+        time.sleep(1.0)
+
+
+def test_two_workers_register_with_the_manager(cluster):
+    _until(lambda: len(_status("/api/workers")["workers"]) == 2)
+
+
+def test_a_trainer_in_a_container_trains_on_tasks_made_in_a_container(cluster):
+    _until(lambda: len(_status("/api/workers")["workers"]) == 2)
+    _compose(
+        "run",
+        "--rm",
+        "-T",
+        "trainer",
+        "factory",
+        "build",
+        "--out=/dataset/small",
+        "--train=12",
+        "--heldout=4",
+    )
+    result = _compose(
+        "run",
+        "--rm",
+        "-T",
+        "trainer",
+        "train",
+        "--dataset=/dataset/small",
+        "--manager=manager:50070",
+        "--steps=3",
+        "--imitate-seconds=5",
+        "--out=/runs/check",
+    )
+    assert "success" in result.stdout
+    overview = _status("/api/runs")
+    assert overview["runs"], "the run is not known to the manager"
