@@ -30,7 +30,6 @@ STEP_M: Final = 0.05
 TRIES: Final = 12
 """Candidates of a group whose access is checked before the group is given up."""
 _ACCESS_TOP_M: Final = 1.35
-_EXEMPT: Final = (Style.OVERHEAD,)
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +100,8 @@ class RoomSolver:
             )
             boxes = [item.box for item in items]
             targets, zones = self._access(items)
-            if group.style in _EXEMPT or self.space.reachable(boxes, targets):
+            bars_no_way = not targets and all(box[2] >= ROBOT.height_m for box in boxes)
+            if bars_no_way or self.space.reachable(boxes, targets):
                 self.placed += items
                 self.space.solids += boxes
                 self.space.zones += zones
