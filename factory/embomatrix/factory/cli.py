@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from embomatrix.factory.importer_batch import Verified, bind_first, verify
+from embomatrix.factory.importer_batch import Verified, bind_first, verify_first
 from embomatrix.factory.importer_sources import (
     SourceError,
     SourceText,
@@ -147,11 +147,10 @@ def _judged(
     with _progress(console) as bars, contextlib.closing(PlacementLibrary()) as library:
         bar = bars.add_task("problems", total=len(sources))
         for source in sources:
-            bound = bind_first(source, bases, seed=seed)
-            if bind_only or isinstance(bound, Refusal):
-                outcomes.append(bound)
+            if bind_only:
+                outcomes.append(bind_first(source, bases, seed=seed))
             else:
-                outcomes.append(verify(bound, library, seed=seed))
+                outcomes.append(verify_first(source, bases, library, seed=seed))
             bars.advance(bar)
     return outcomes
 

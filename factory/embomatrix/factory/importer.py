@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import math
 import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from embomatrix.factory.importer_binding import Addition, Binding
     from embomatrix.factory.importer_sources import SourceText
     from embomatrix.world.bddl import Problem
+    from embomatrix.world.catalog import Model
     from embomatrix.world.goal import Atom, Formula
     from embomatrix.world.scene import Scene
 
@@ -33,7 +35,7 @@ _ROOM_OR_TEXT: Final = re.compile(
     rf"(?:{'|'.join(sorted(ROOM_TYPES, key=len, reverse=True))})_\d+|.+?(?=(?:{'|'.join(sorted(ROOM_TYPES))})_\d|$)",
     re.IGNORECASE,
 )
-CATEGORY_TRIES: Final = 4
+MODEL_TRIES: Final = 5
 """Models of a type that are tried before it counts as not fitting its place."""
 THERMAL: Final = frozenset({State.COOKED, State.FROZEN, State.HOT})
 SWITCHED: Final = frozenset({State.OPEN, State.TOGGLED_ON})
@@ -74,6 +76,12 @@ class _Binder:
         self._base = base
         self._rng = rng
         self._scene_id = f"{base.base}-{_slug(source.name)}-{key}"
+        self._hosts = {
+            atom.args[1].lstrip("?")
+            for atom in (*atoms_of(problem.goal), *(item.atom for item in problem.init))
+            if atom.predicate in {Relation.INSIDE, Relation.ONTOP}
+        }
+        """Objects, and types that variables range over, on or in which something is or is to be."""
 
     def imported(self) -> Imported:
         binding = bind(self._problem, self._base, self._rng)
@@ -86,24 +94,29 @@ class _Binder:
         return self._task(scene, names, binding, start)
 
     def _add(self, editor: SceneEditor, addition: Addition, names: dict[str, str]) -> str:
-        catalog = Catalog.load()
-        categories = [str(name) for name in self._rng.permutation(catalog.categories_of(addition.type))]
         host = names[addition.host] if addition.host else addition.room
-        reasons: list[str] = []
-        for category in categories[:CATEGORY_TRIES]:
-            mass = catalog.category(category).mass_kg
-            models = list(catalog.models_of(category))
-            liftable = [model for model in models if is_liftable(model.size_m, mass)]
-            pool = liftable or models
-            model = pool[int(self._rng.integers(len(pool)))].model_id
+        reason = "its type has no model"
+        for model in self._models(addition)[:MODEL_TRIES]:
             try:
-                return editor.add(category, model, addition.relation, host, room=addition.room)
+                return editor.add(model.category, model.model_id, addition.relation, host, room=addition.room)
             except PlacementError as error:
-                reasons.append(str(error))
+                reason = str(error)
         raise RefusedError(
             RefusalReason.DOES_NOT_FIT,
-            f"{addition.name!r} has no place {addition.relation or 'on the floor of'} {host}: {reasons[-1]}",
+            f"{addition.name!r} has no place {addition.relation or 'on the floor of'} {host}: {reason}",
         )
+
+    def _models(self, addition: Addition) -> list[Model]:
+        """Models of the type: liftable ones first; large ones for what must hold others, else small ones."""
+        catalog = Catalog.load()
+        ranked: list[tuple[bool, float, Model]] = []
+        for category in catalog.categories_of(addition.type):
+            mass = catalog.category(category).mass_kg
+            for model in catalog.models_of(category):
+                volume = math.prod(model.size_m) * float(self._rng.uniform(0.7, 1.4))
+                holds = addition.name in self._hosts or addition.type in self._hosts
+                ranked.append((not is_liftable(model.size_m, mass), -volume if holds else volume, model))
+        return [model for _, _, model in sorted(ranked, key=lambda item: item[:2])]
 
     def _task(
         self, scene: Scene, names: dict[str, str], binding: Binding, start: tuple[Literal, ...]

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import contextlib
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from embomatrix.factory.admission import Admitted, admit
 from embomatrix.factory.importer import Imported, import_problem
 from embomatrix.factory.pipeline_poses import Needs, cache_poses
+from embomatrix.factory.refusal import Refusal, RefusalReason
 from embomatrix.factory.writer_view import SceneView
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.planner import find_plan
@@ -17,10 +18,9 @@ from embomatrix.world.bundle import Bundle, bundle_digest, encode_bundle
 from embomatrix.world.dataset import TaskRecord
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
     from embomatrix.factory.importer_sources import SourceText
-    from embomatrix.factory.refusal import Refusal
     from embomatrix.sim.pose_cache import PlacementLibrary
     from embomatrix.world.scene import Scene
 
@@ -34,15 +34,35 @@ class Verified:
 
 
 def bind_first(source: SourceText, bases: Sequence[Scene], *, seed: int = 0) -> Imported | Refusal:
-    """The problem in the first scene that it can be bound to, else the last scene's refusal. Raises BddlError."""
-    outcome: Imported | Refusal | None = None
-    for base in bases:
-        outcome = import_problem(source, base, seed=seed)
-        if isinstance(outcome, Imported):
+    """The problem in the first scene that it can be bound to, else the refusal that came furthest. Raises BddlError."""
+    return _first(import_problem(source, base, seed=seed) for base in bases)
+
+
+def verify_first(
+    source: SourceText, bases: Sequence[Scene], library: PlacementLibrary, *, seed: int = 0
+) -> Verified | Refusal:
+    """The problem in the first scene in which it is admitted, else the refusal that came furthest. Raises BddlError."""
+
+    def judged(base: Scene) -> Verified | Refusal:
+        imported = import_problem(source, base, seed=seed)
+        return imported if isinstance(imported, Refusal) else verify(imported, library, seed=seed)
+
+    return _first(judged(base) for base in bases)
+
+
+T = TypeVar("T", Imported, Verified)
+
+
+def _first(outcomes: Iterable[T | Refusal]) -> T | Refusal:
+    refusals: list[Refusal] = []
+    for outcome in outcomes:
+        if not isinstance(outcome, Refusal):
             return outcome
-    if outcome is None:
+        refusals.append(outcome)
+    if not refusals:
         raise ValueError("no scene to bind to: expected at least one")
-    return outcome
+    order = list(RefusalReason)
+    return max(refusals, key=lambda refusal: order.index(refusal.reason))
 
 
 def verify(imported: Imported, library: PlacementLibrary, *, seed: int = 0) -> Verified | Refusal:

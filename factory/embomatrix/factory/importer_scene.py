@@ -7,16 +7,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from embomatrix.factory.furnish_space import RoomSpace
 from embomatrix.factory.refusal import RefusalReason, RefusedError
-from embomatrix.world.geometry import Aabb
+from embomatrix.factory.scene_floor import ReachableFloor
 from embomatrix.world.scene import RobotStart
 from embomatrix.world.state import State
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from embomatrix.world.asset import Asset
     from embomatrix.world.bddl import Literal
     from embomatrix.world.scene import Scene, SceneObject
 
@@ -26,15 +24,10 @@ def with_robot_in(scene: Scene, room_name: str) -> Scene:
     if scene.robot.room == room_name:
         return scene
     room = next(room for room in scene.rooms if room.name == room_name)
-    space = RoomSpace(room, scene.doorways)
-    for item in scene.objects:
-        if item.room == room_name:
-            box = _box(item, scene.assets[item.asset_id])
-            space.solids.append((*box.low_m, *box.high_m))
-    cells = space.free_cells()  # (n, 2)
+    cells = ReachableFloor(scene).cells(room.low_m, room.high_m)  # (n, 2)
     if not len(cells):
         raise RefusedError(
-            RefusalReason.DOES_NOT_FIT, f"the robot finds no free floor in {room_name} that a door leads to"
+            RefusalReason.DOES_NOT_FIT, f"no free floor of {room_name} can be reached by the robot"
         )
     x, y = cells[np.argmin(np.hypot(*(cells - np.asarray(room.center_m)).T))]
     return dataclasses.replace(scene, robot=RobotStart(float(x), float(y), 0.0, room_name))
@@ -64,8 +57,3 @@ def with_states(scene: Scene, literals: Iterable[Literal]) -> Scene:
         return dataclasses.replace(item, joints=joints, states=states)
 
     return dataclasses.replace(scene, objects=tuple(changed(item) for item in scene.objects))
-
-
-def _box(item: SceneObject, asset: Asset) -> Aabb:
-    """Bounding box in the world with every joint shut."""
-    return Aabb.around(part.aabb(item.pose_world_asset) for link in asset.links for part in link.parts)

@@ -7,7 +7,7 @@ from enum import StrEnum
 
 
 class RefusalReason(StrEnum):
-    """The first eleven stop a binding, the others an admission."""
+    """In the order in which they are looked for: the first eleven stop a binding, the others an admission."""
 
     UNKNOWN_TYPE = "unknown_type"
     SUBSTANCE = "substance"
