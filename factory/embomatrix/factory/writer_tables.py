@@ -104,6 +104,8 @@ HOST_GROUPS: Final[Mapping[str, frozenset[Group]]] = {
     **dict.fromkeys(("stove", "flat_top_grill", "microwave", "oven", "toaster_oven"), _COOKING),
     **dict.fromkeys(("fridge", "freezer", "cooler", "wine_fridge"), _KITCHEN_GOODS),
     "dishwasher": frozenset({Group.TABLEWARE}),
+    **dict.fromkeys(MEMBERS[Group.TABLEWARE], frozenset({Group.FOOD, Group.FRUIT})),
+    **dict.fromkeys(MEMBERS[Group.DECORATION], _NOTHING),
     **dict.fromkeys(
         (
             "coffee_maker", "deep_fryer", "popcorn_machine", "toilet", "shower_stall", "bathtub", "pot_plant",
