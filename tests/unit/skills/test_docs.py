@@ -1,0 +1,112 @@
+"""docs/skills.md says what the code does: its tables are compared with the library's, its plans are parsed."""
+
+import dataclasses
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from embomatrix.sim import relations, thermal
+from embomatrix.skills.failure import SENTENCES
+from embomatrix.skills.library import LIBRARY, REASONS
+from embomatrix.skills.limits import ROBOT
+from embomatrix.skills.parse import MAX_ROOM_NAME, PlanReason, parse_plan, plan_from_json
+from embomatrix.skills.syntax import MAX_PLAN_BYTES, MAX_STEPS, SIGNATURES, Arg, Skill
+from embomatrix.world import state
+from embomatrix.world.state import Relation, State
+
+PAGE = (Path(__file__).parents[3] / "docs" / "skills.md").read_text(encoding="utf-8")
+
+
+def fences(language: str) -> list[str]:
+    """What stands in the page's code blocks of this language."""
+    return re.findall(rf"^```{language}\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
+
+
+def rows(first_heading: str) -> dict[str, list[str]]:
+    """The table whose first column has this heading: name of each row to the other cells, without code marks."""
+    found = re.search(rf"^\| {first_heading} \|.*\n\| ---.*\n((?:\|.*\n)+)", PAGE, re.MULTILINE)
+    assert found, f"docs/skills.md has no table of {first_heading}"
+    cells = [
+        [cell.strip().replace("`", "") for cell in line.strip("|").split(" | ")]
+        for line in found[1].splitlines()
+    ]
+    return {name: rest for name, *rest in cells}
+
+
+def listed(cell: str) -> list[str]:
+    return [] if cell == "–" else cell.split(", ")
+
+
+def test_every_skill_stands_there_with_its_arguments_conditions_effect_and_outcomes():
+    assert rows("skill") == {
+        skill.value: [
+            ", ".join(SIGNATURES[skill]),
+            ", ".join(item.name.lower() for item in LIBRARY[skill].preconditions) or "–",
+            LIBRARY[skill].effect,
+            ", ".join(LIBRARY[skill].outcomes) or "–",
+        ]
+        for skill in Skill
+    }
+
+
+def test_every_argument_stands_there():
+    assert list(rows("argument")) == [*Arg]
+    assert f"at most {MAX_ROOM_NAME} characters" in rows("argument")[Arg.ROOM][0]
+
+
+def test_every_condition_stands_there_with_what_it_asks_and_its_reasons():
+    assert {name: (asks, listed(reasons)) for name, (asks, reasons) in rows("condition").items()} == {
+        item.name.lower(): (item.value, [*reasons]) for item, reasons in REASONS.items()
+    }
+
+
+def test_every_reason_of_failure_stands_there_with_its_sentence():
+    table = re.search(r"### Reasons of failure\n\n(.*?)\n\n", PAGE, re.DOTALL)
+    assert table
+    written = dict(re.findall(r"^\| `(\w+)` \| (.*) \|$", table[1], re.MULTILINE))
+    assert written == {reason.value: sentence for reason, sentence in SENTENCES.items()}
+
+
+def test_every_reason_for_which_a_text_is_no_plan_stands_there():
+    said = rows("reason")
+    assert set(said) == set(PlanReason)
+    assert f"{MAX_PLAN_BYTES:,} bytes" in said[PlanReason.TOO_LONG][0]
+    assert f"{MAX_STEPS} calls" in said[PlanReason.TOO_MANY_STEPS][0]
+
+
+def test_every_limit_of_the_robot_stands_there_with_its_value():
+    assert {name: float(value) for name, (value, _) in rows("limit").items()} == dataclasses.asdict(ROBOT)
+
+
+def test_every_relation_and_state_stands_there():
+    assert set(rows("relation")) == set(Relation)
+    assert set(rows("state")) == set(State)
+
+
+def test_every_tolerance_of_a_relation_stands_there_with_its_value():
+    tolerances = {
+        name: value
+        for name, value in vars(relations).items()
+        if name.isupper() and isinstance(value, float) and name not in vars(state)
+    }
+    written = {name: float(value) for name, (value, _) in rows("tolerance").items()}
+    assert written == pytest.approx(tolerances, rel=1e-3)
+
+
+def test_every_threshold_of_a_state_stands_there_with_its_value():
+    known = {**vars(state), **vars(thermal)}
+    written = {name: float(value) for name, (value, _) in rows("constant").items()}
+    assert written == {name: known[name] for name in written}
+    assert {"HOT_C", "COOK_C", "FREEZE_C", "OPEN_FRACTION"} <= set(written)
+
+
+def test_json_plan_on_the_page_parses_whole():
+    (text,) = fences("json")
+    assert parse_plan(text) == plan_from_json(json.loads(text))
+
+
+def test_plan_in_lines_on_the_page_parses_whole():
+    (text,) = fences("plan")
+    assert len(parse_plan(text)) == len(re.split(r"[;\n]", text.strip()))
