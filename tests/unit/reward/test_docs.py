@@ -1,0 +1,63 @@
+"""docs/rewards.md says what the code does: its constants are the defaults, its example is computed anew."""
+
+import dataclasses
+import re
+from pathlib import Path
+
+import pytest
+
+from embomatrix.reward.hierarchy import PAPER, score
+from embomatrix.world.bddl import parse_problem
+from embomatrix.world.evaluate import evaluate
+from embomatrix.world.task import Task, TaskCategory
+
+PAGE = (Path(__file__).parents[3] / "docs" / "rewards.md").read_text(encoding="utf-8")
+
+
+def rows(first_heading: str) -> list[list[str]]:
+    """Cells of the table whose first column has this heading."""
+    found = re.search(rf"^\| {first_heading} \|.*\n\| ---.*\n((?:\|.*\n)+)", PAGE, re.MULTILINE)
+    assert found, f"docs/rewards.md has no table of {first_heading}"
+    return [line.strip("|").split(" | ") for line in found[1].splitlines()]
+
+
+def example() -> Task:
+    """The problem of the page as a task whose table holds all of its objects."""
+    text = re.search(r"```lisp\n(.*?)```", PAGE, re.DOTALL)
+    assert text
+    problem = parse_problem(text[1])
+    table = tuple(problem.objects)
+    return Task("t", "s", "", TaskCategory.PICK_AND_PLACE, problem.goal, text[1], table, types=problem.types)
+
+
+class Holding:
+    """Facts: these atoms hold, written as on the page, and no others."""
+
+    def __init__(self, atoms: list[str]) -> None:
+        self.atoms = atoms
+
+    def holds(self, predicate: str, args: tuple[str, ...]) -> bool:
+        return " ".join((predicate, *args)) in self.atoms
+
+
+def test_every_constant_stands_there_with_its_value():
+    written = {name.strip(" `"): float(value) for name, value, _ in rows("constant")}
+    assert written == dataclasses.asdict(PAPER)
+
+
+@pytest.mark.parametrize("row", rows("what the plan does"), ids=lambda row: row[0].strip())
+def test_example_earns_what_the_page_says(row: list[str]):
+    story, touched, true, *numbers = row
+    facts = Holding(re.findall(r"`(.+?)`", true))
+    task = example()
+    breakdown = score(task, frozenset(re.findall(r"`(.+?)`", touched)), facts)
+    found = (breakdown.format, breakdown.relevance, breakdown.goal, breakdown.total)
+    assert found == pytest.approx([float(number) for number in numbers])
+    assert breakdown.success is ("success" in story)
+
+
+def test_task_of_the_example_could_be_admitted():
+    task = example()
+    assert not evaluate(task.goal, Holding([]), task.types)
+    atoms = score(task, frozenset(), Holding([])).atoms
+    assert 2 * sum(atom.holds for atom in atoms) <= len(atoms)
