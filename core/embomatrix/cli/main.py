@@ -41,6 +41,7 @@ COMMANDS: Final[Mapping[str, Command]] = {
     "train": Command("train a policy with imitation and GRPO on a cluster", "trainer"),
     "eval": Command("measure a trained policy on held-out tasks", "trainer"),
     "model": Command("bring a packaged language model into a folder to train", "hf"),
+    "bench": Command("measure rollouts and the cluster on this machine", "worker"),
 }
 
 

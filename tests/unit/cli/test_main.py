@@ -17,7 +17,7 @@ def _run(*arguments):
 def test_help_lists_every_subcommand():
     result = _run("--help")
     assert result.returncode == 0
-    for name in ("demo", "factory", "scene", "play", "manager", "worker", "train", "eval", "model"):
+    for name in ("demo", "factory", "scene", "play", "manager", "worker", "train", "eval", "model", "bench"):
         assert f" {name} " in result.stdout
 
 
@@ -41,7 +41,7 @@ def test_misspelt_command_names_the_nearest_one():
 
 
 def test_every_command_explains_itself():
-    for name in ("demo", "factory", "scene", "play", "manager", "worker", "train", "eval", "model"):
+    for name in ("demo", "factory", "scene", "play", "manager", "worker", "train", "eval", "model", "bench"):
         result = _run(name, "--help")
         assert result.returncode == 0, result.stderr
         assert "Usage" in result.stdout

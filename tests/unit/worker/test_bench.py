@@ -1,0 +1,276 @@
+"""Benches hand in figures of one format, show them, and never lose what people wrote on the page. No time is asserted."""
+
+import json
+import os
+import re
+import time
+from dataclasses import replace
+
+import psutil
+import pytest
+from tests.fakes.plans import plan_of
+from tests.fakes.scenes import kitchen_scene, kitchen_tasks
+from typer.testing import CliRunner
+
+from embomatrix.skills.parse import plan_to_json
+from embomatrix.worker.bench_cli import app
+from embomatrix.worker.bench_figures import (
+    BenchError,
+    BenchResult,
+    Better,
+    Figure,
+    commit_here,
+    is_shared,
+    quantile_figure,
+    result_to_json,
+    shown,
+)
+from embomatrix.worker.bench_page import END, render_page
+from embomatrix.worker.bench_processes import bench_cluster
+from embomatrix.worker.bench_scenes import scenes_of
+from embomatrix.world.bundle import Bundle, bundle_digest, encode_bundle
+from embomatrix.world.dataset import Dataset, TaskRecord, write_dataset
+
+PLANS = {
+    "apple_to_counter": "move apple_1; pick_up apple_1; move countertop_1; place countertop_1 ontop",
+    "light_and_air": "move table_lamp_1; toggle_on table_lamp_1; move fridge_1; open fridge_1",
+}
+SCENES = 5
+MACHINE = {"cpu": "a core", "cores": 2, "load_before": 0.1, "gpu": ""}
+FIGURE_KEYS = {"name", "value", "unit", "goal", "better", "n"}
+MAY_BE_ZERO = {"share", "count"}
+
+pytestmark = pytest.mark.timeout(240)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    """The flat five times, under five names, with two tasks each."""
+    folder = tmp_path_factory.mktemp("dataset")
+    records, bundles = [], {}
+    for number in range(SCENES):
+        scene = replace(kitchen_scene(), scene_id=f"flat_{number}")
+        tasks = [task for task in kitchen_tasks(scene) if task.task_id in PLANS]
+        data = encode_bundle(Bundle(scene, {task.task_id: task for task in tasks}))
+        bundles[bundle_digest(data)] = data
+        records += [
+            TaskRecord(
+                task,
+                bundle_digest(data),
+                "train",
+                tuple(plan_to_json(plan_of(task, PLANS[task.task_id]))),
+                ("kitchen_0",),
+                "",
+            )
+            for task in tasks
+        ]
+    write_dataset(folder, records, bundles)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def everything(dataset, tmp_path_factory):
+    """What `bench all` printed, and the folder that it wrote to."""
+    out = tmp_path_factory.mktemp("out")
+    page = f"{out / 'benchmarks.md'}"
+    result = _bench("all", f"--dataset={dataset}", f"--out={page}", f"--json-dir={out}", "--limit-s=200")
+    assert result.exit_code == 0, result.output
+    return result.output, out
+
+
+def _bench(*arguments):
+    return CliRunner().invoke(app, arguments)
+
+
+def _figures(folder, bench):
+    written = json.loads((folder / f"{bench}.json").read_text())
+    return {figure["name"]: figure for figure in written["figures"]}
+
+
+@pytest.mark.parametrize("bench", ["rollout", "cluster"])
+def test_every_bench_writes_the_one_format_and_prints_the_same(everything, bench):
+    printed, folder = everything
+    written = json.loads((folder / f"{bench}.json").read_text())
+    assert set(written) == {"bench", "commit", "machine", "figures"}
+    assert written["bench"] == bench
+    assert written["commit"] == commit_here()
+    assert {"cpu", "cores", "memory_gb", "load_before", "python", "pybullet"} <= set(written["machine"])
+    assert f"bench {bench} at" in printed
+    for figure in written["figures"]:
+        assert set(figure) == FIGURE_KEYS
+        assert figure["better"] in ("higher", "lower")
+        assert figure["n"] > 0
+        assert figure["value"] > 0 or (figure["value"] == 0 and figure["unit"] in MAY_BE_ZERO), figure
+        assert figure["name"].split()[0] in printed
+
+
+def test_rollouts_are_measured_skill_by_skill_and_reach_their_goals(everything):
+    figures = _figures(everything[1], "rollout")
+    for skill in ("move", "pick_up", "open", "toggle_on", "place with settling"):
+        assert f"skill {skill}, p50" in figures
+    assert "skill close, p50" not in figures
+    assert figures["oracle plans that reach their goal"]["value"] == 1.0
+    assert figures["rollout, p50"]["n"] == SCENES * len(PLANS) * 3
+    # The bundles have no pose cache: every pose is verified when it is asked for.
+    assert figures["places that needed a settle"]["value"] == 1.0
+
+
+def test_scenes_are_cold_unless_they_were_announced_or_used(everything):
+    figures = _figures(everything[1], "cluster")
+    assert figures["cold: scenes warm on arrival"]["value"] == 0.0
+    assert figures["prewarmed: scenes warm on arrival"]["value"] == 1.0
+    assert figures["repeated: scenes warm on arrival"]["value"] == 1.0
+    assert figures["rollouts without a result"]["value"] == 0.0
+    assert figures["latency, cold over prewarmed"]["unit"] == "×"
+
+
+def test_the_page_has_the_machine_a_table_for_each_bench_and_a_part_for_people(everything):
+    page = (everything[1] / "benchmarks.md").read_text()
+    assert f"| commit | `{commit_here()}` |" in page
+    assert (
+        page.index("## One process") < page.index("## Cluster on loopback") < page.index("## Training runs")
+    )
+    assert page.count("| figure | value | goal | | n |") == 2
+    assert "<!-- by hand: training -->\n" + END in page
+    assert not re.search(r"20\d\d-\d\d", page), "a page without a date changes only when its figures do"
+
+
+def test_one_bench_alone_writes_no_file_unless_asked(dataset, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = _bench("rollout", f"--dataset={dataset}", "--scenes=1", "--repeats=1")
+    assert result.exit_code == 0, result.output
+    assert "rollouts on one core" in result.output
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_folder_without_a_data_set_is_told_how_to_build_one(tmp_path):
+    result = _bench("rollout", f"--dataset={tmp_path}")
+    assert result.exit_code == 2
+    assert "there is no data set in" in result.stderr
+    assert "embomatrix factory build" in result.stderr
+
+
+def test_too_few_scenes_for_a_cold_and_a_warm_phase_are_refused_at_once(dataset, tmp_path):
+    whole = Dataset.load(dataset)
+    first = whole.records[0]
+    write_dataset(tmp_path, [first], {first.bundle_digest: whole.bundle_bytes(first.bundle_digest)})
+    result = _bench("cluster", f"--dataset={tmp_path}")
+    assert result.exit_code == 2
+    assert "the data set has too few scenes, 1: expected at least 3" in " ".join(result.stderr.split())
+
+
+def test_an_empty_data_set_is_named(tmp_path):
+    write_dataset(tmp_path, [], {})
+    with pytest.raises(BenchError, match="has no tasks"):
+        scenes_of(Dataset.load(tmp_path), 3)
+
+
+def test_scenes_are_spread_over_the_data_set(dataset):
+    whole = Dataset.load(dataset)
+    digests = list(dict.fromkeys(record.bundle_digest for record in whole.records))
+    assert [scene.bundle_digest for scene in scenes_of(whole, 3)] == [digests[0], digests[2], digests[4]]
+    assert [scene.bundle_digest for scene in scenes_of(whole, 99)] == digests
+    assert all(len(scene.demonstrations) == len(PLANS) for scene in scenes_of(whole, 3))
+
+
+def test_processes_of_the_cluster_end_with_the_bench(tmp_path):
+    with bench_cluster(tmp_path, workers=1, slots=1, deadline_s=time.monotonic() + 60) as cluster:
+        pids = [process.child.pid for process in cluster.processes]
+        assert cluster.workers == {"worker-1"}
+        cluster.check()
+        cluster.processes[1].child.kill()
+        cluster.processes[1].child.wait()
+        with pytest.raises(BenchError, match="worker-1 ended with status -9"):
+            cluster.check()
+    assert not any(psutil.pid_exists(pid) for pid in pids)
+
+
+def test_a_manager_that_can_not_serve_is_told_with_the_end_of_its_log(tmp_path):
+    (tmp_path / "manager").write_text("a file where its folder should be")
+    with (
+        pytest.raises(BenchError, match=r"manager ended with status \d+: "),
+        bench_cluster(tmp_path, workers=1, slots=1, deadline_s=time.monotonic() + 60),
+    ):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("value", "goal", "better", "verdict"),
+    [
+        (4.0, 5.0, Better.LOWER, "reached"),
+        (9.0, 5.0, Better.LOWER, "1.8 × the goal"),
+        (600.0, 500.0, Better.HIGHER, "reached"),
+        (250.0, 500.0, Better.HIGHER, "0.5 × the goal"),
+        (1.0, 0.0, Better.LOWER, "missed"),
+        (4.0, None, Better.LOWER, ""),
+    ],
+)
+def test_a_figure_says_how_it_stands_to_its_goal(value, goal, better, verdict):
+    assert Figure("x", value, "ms", better, 1, goal).verdict == verdict
+
+
+def test_quantiles_are_told_in_their_unit_and_nothing_measured_is_an_error():
+    assert quantile_figure("x", [0.001, 0.002, 0.009], 0.5, "ms") == Figure(
+        "x, p50", 2.0, "ms", Better.LOWER, 3
+    )
+    assert quantile_figure("x", [2e-6], 0.95, "µs").value == pytest.approx(2.0)
+    with pytest.raises(BenchError, match="nothing was measured"):
+        quantile_figure("x", [], 0.5, "ms")
+
+
+def test_numbers_are_short_where_people_read_them_and_exact_enough_in_files():
+    assert [shown(value) for value in (0.01234, 12.345, 1234.5)] == ["0.0123", "12.3", "1,234"]
+    written = result_to_json(_result(Figure("x", 1.23456789, "ms", Better.LOWER, 3)))
+    assert written["figures"] == [
+        {"name": "x", "value": 1.23457, "unit": "ms", "goal": None, "better": "lower", "n": 3}
+    ]
+
+
+def test_parts_written_by_hand_survive_a_new_page():
+    first = render_page([_result(Figure("x", 1.0, "ms", Better.LOWER, 1))], "")
+    marks = "<!-- by hand: training -->\n"
+    own = f"<!-- by hand: remarks -->\nWhat we saw.\n{END}\n"
+    edited = first.replace(marks, f"{marks}12 % before, 48 % after.\n\n| a | table |\n") + own
+    second = render_page([_result(Figure("x", 2.0, "ms", Better.LOWER, 1))], edited)
+    assert "12 % before, 48 % after.\n\n| a | table |\n" in second
+    assert "What we saw." in second
+    assert "| x | 2 ms |" in second
+    assert "| x | 1 ms |" not in second
+    assert render_page([_result(Figure("x", 2.0, "ms", Better.LOWER, 1))], second) == second
+
+
+def test_a_page_of_someone_else_is_not_overwritten():
+    with pytest.raises(BenchError, match="not written by this command"):
+        render_page([_result()], "# My notes\n")
+
+
+@pytest.mark.parametrize("broken", [END, "<!-- by hand: training -->"])
+def test_marks_that_do_not_pair_are_refused_before_text_is_lost(broken):
+    page = render_page([_result()], "")
+    with pytest.raises(BenchError, match="mend them"):
+        render_page([_result()], page.replace(broken, "", 1))
+
+
+def test_a_page_that_can_not_be_replaced_is_refused_before_anything_is_measured(dataset, tmp_path):
+    page = tmp_path / "notes.md"
+    page.write_text("# My notes\n")
+    result = _bench("all", f"--dataset={dataset}", f"--out={page}")
+    assert result.exit_code == 2
+    assert "not written by this command" in result.stderr
+    assert page.read_text() == "# My notes\n"
+
+
+def test_a_busy_machine_and_missed_goals_are_said_on_the_page():
+    busy = MACHINE | {"load_before": 3.0}
+    assert is_shared(busy)
+    assert not is_shared(MACHINE)
+    slow = Figure("slow", 9.0, "ms", Better.LOWER, 1, 3.0)
+    page = render_page([BenchResult("rollout", "abc", busy, (slow,))], "")
+    assert "The machine was shared: a load of 3.0 on 2 cores" in page
+    assert "| slow | 9 ms | ≤ 3 | 3 × the goal | 1 |" in page
+    assert "Short of their goals: slow." in page
+    assert "shared" not in render_page([_result(replace(slow, value=2.0))], "")
+
+
+def _result(*figures):
+    return BenchResult("rollout", "abc", MACHINE, figures)

@@ -1,0 +1,164 @@
+"""`embomatrix bench`: measure this machine, write figures as JSON, show them as a table, render the page."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from embomatrix.rpc.status import ClusterError
+from embomatrix.sim.engine import EngineError
+from embomatrix.worker.bench_cluster import ClusterLoad, bench_cluster_load
+from embomatrix.worker.bench_figures import (
+    BenchError,
+    BenchResult,
+    commit_here,
+    describe_machine,
+    is_shared,
+    result_to_json,
+    shown,
+)
+from embomatrix.worker.bench_page import hand_parts, render_page
+from embomatrix.worker.bench_rollout import bench_rollout
+from embomatrix.worker.bench_scenes import scenes_of
+from embomatrix.world.bundle import BundleError
+from embomatrix.world.dataset import Dataset, DatasetError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Measure rollouts and the cluster on this machine.",
+)
+console = Console()
+errors = Console(stderr=True, soft_wrap=True)
+
+DataSet = Annotated[Path, typer.Option("--dataset", help="Folder that `embomatrix factory build` wrote.")]
+Json = Annotated[Path | None, typer.Option("--json", help="File for the figures.")]
+Scenes = Annotated[int, typer.Option(min=1, help="Scenes to measure in.")]
+PhaseScenes = Annotated[int, typer.Option(min=1, help="Scenes of each phase, at most.")]
+Repeats = Annotated[int, typer.Option(min=1, help="Executions of each plan.")]
+Workers = Annotated[int, typer.Option(min=1, max=64, help="Worker daemons.")]
+Slots = Annotated[int, typer.Option(min=1, max=64, help="Slots of each worker.")]
+LimitS = Annotated[float, typer.Option(min=5.0, help="Seconds for the whole bench of the cluster.")]
+
+DATASET = Path("build/dataset")
+
+
+@app.command()
+def rollout(
+    dataset: DataSet = DATASET, json_file: Json = None, scenes: Scenes = 24, repeats: Repeats = 3
+) -> None:
+    """Measure loading, skills, rollouts, reset and reward in one process."""
+    with _refusals():
+        _hand_in(_rollout(dataset, scenes, repeats), json_file)
+
+
+@app.command()
+def cluster(
+    dataset: DataSet = DATASET,
+    json_file: Json = None,
+    workers: Workers = 2,
+    slots: Slots = 1,
+    scenes: PhaseScenes = 16,
+    limit_s: LimitS = 60.0,
+) -> None:
+    """Measure a manager and workers on loopback: cold, prewarmed and warm."""
+    load = ClusterLoad(workers=workers, slots=slots, scenes=scenes, limit_s=limit_s)
+    with _refusals():
+        _hand_in(_cluster(dataset, load), json_file)
+
+
+@app.command(name="all")
+def everything(
+    dataset: DataSet = DATASET,
+    out: Annotated[Path, typer.Option(help="Page to write; parts written by hand are kept.")] = Path(
+        "docs/benchmarks.md"
+    ),
+    json_dir: Annotated[Path | None, typer.Option(help="Folder for one JSON file for each bench.")] = None,
+    limit_s: LimitS = 60.0,
+) -> None:
+    """Run every bench and render the page."""
+    with _refusals():
+        hand_parts(_present(out))  # a page that can't be replaced is refused before minutes are spent
+        results = [_rollout(dataset, scenes=24, repeats=3), _cluster(dataset, ClusterLoad(limit_s=limit_s))]
+        for result in results:
+            _hand_in(result, json_dir / f"{result.bench}.json" if json_dir is not None else None)
+        _write(out, render_page(results, _present(out)))
+        console.print(f"wrote {out}", highlight=False)
+
+
+def _rollout(dataset: Path, scenes: int, repeats: int) -> BenchResult:
+    machine = describe_machine()
+    chosen = scenes_of(Dataset.load(dataset), scenes)
+    with errors.status("one process") as status:
+
+        def on_scene(number: int) -> None:
+            status.update(f"one process: {number} of {len(chosen)} scenes")
+
+        return BenchResult("rollout", commit_here(), machine, bench_rollout(chosen, repeats, on_scene))
+
+
+def _cluster(dataset: Path, load: ClusterLoad) -> BenchResult:
+    machine = describe_machine() | {"workers": load.workers, "slots_each": load.slots}
+    chosen = scenes_of(Dataset.load(dataset), 2 * load.scenes + load.all_slots)
+    with errors.status("cluster") as status:
+
+        def on_phase(what: str) -> None:
+            status.update(f"cluster: {what}")
+
+        return BenchResult("cluster", commit_here(), machine, bench_cluster_load(chosen, load, on_phase))
+
+
+def _hand_in(result: BenchResult, json_file: Path | None) -> None:
+    """Show the table, and write the file when one is asked for."""
+    cores, load = result.machine["cores"], result.machine["load_before"]
+    table = Table(
+        title=f"bench {result.bench} at {result.commit}, {cores} cores, load before {load}",
+        title_justify="left",
+    )
+    table.add_column("figure")
+    for heading in ("value", "goal"):
+        table.add_column(heading, justify="right")
+    table.add_column("")
+    table.add_column("n", justify="right")
+    for figure in result.figures:
+        goal = "" if figure.goal is None else shown(figure.goal)
+        table.add_row(
+            figure.name, f"{shown(figure.value)} {figure.unit}", goal, figure.verdict, f"{figure.n:,}"
+        )
+    console.print(table)
+    if is_shared(result.machine):
+        console.print("The machine was busy before the bench began: the figures are worse than they need be.")
+    if json_file is not None:
+        _write(json_file, json.dumps(result_to_json(result), indent=2, ensure_ascii=False) + "\n")
+
+
+def _present(page: Path) -> str:
+    return page.read_text(encoding="utf-8") if page.exists() else ""
+
+
+def _write(path: Path, text: str) -> None:
+    """Write beside and rename, so that a page with parts written by hand is never half a page."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f"{path.name}.part")
+    part.write_text(text, encoding="utf-8")
+    part.replace(path)
+
+
+@contextlib.contextmanager
+def _refusals() -> Iterator[None]:
+    """One sentence and status 2 for what a person can mend."""
+    try:
+        yield
+    except (BenchError, BundleError, ClusterError, DatasetError, EngineError, OSError) as error:
+        errors.print(f"embomatrix bench: {error}", highlight=False, markup=False)
+        raise typer.Exit(2) from None

@@ -1,0 +1,161 @@
+"""What every bench hands in: figures with their goals, the machine and the commit they were measured on."""
+
+from __future__ import annotations
+
+import os
+import platform
+import subprocess
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import psutil
+
+from embomatrix.sim.zygote import MIB
+from embomatrix.worker.resources import find_gpu, measure_score, versions
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+BUSY_SHARE: Final = 0.25
+"""A machine whose cores are busier than this before a bench begins is shared: its figures are worse than they need be."""
+GIT_S: Final = 10.0
+
+
+class BenchError(Exception):
+    """A bench can't be run or has no result. One sentence that names the remedy."""
+
+
+class Better(StrEnum):
+    """Which way a figure improves."""
+
+    HIGHER = "higher"
+    LOWER = "lower"
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """One measured number of ``n`` measurements. ``goal`` is in the same unit, None where none is set."""
+
+    name: str
+    value: float
+    unit: str
+    better: Better
+    n: int
+    goal: float | None = None
+
+    @property
+    def verdict(self) -> str:
+        """How the value stands to its goal, in words; empty without a goal."""
+        if self.goal is None:
+            return ""
+        reached = self.value <= self.goal if self.better is Better.LOWER else self.value >= self.goal
+        if reached:
+            return "reached"
+        return f"{self.value / self.goal:.2g} × the goal" if self.goal else "missed"
+
+
+@dataclass(frozen=True, slots=True)
+class BenchResult:
+    """Outcome of one bench. ``machine`` says where it ran, as plain JSON values."""
+
+    bench: str
+    commit: str
+    machine: Mapping[str, Any]
+    figures: tuple[Figure, ...]
+
+    def figure(self, name: str) -> Figure:
+        """The figure of that name. Raises KeyError."""
+        return {figure.name: figure for figure in self.figures}[name]
+
+
+def result_to_json(result: BenchResult) -> dict[str, Any]:
+    """Plain JSON values; numbers with six digits."""
+    return {
+        "bench": result.bench,
+        "commit": result.commit,
+        "machine": dict(result.machine),
+        "figures": [
+            {
+                "name": figure.name,
+                "value": float(f"{figure.value:.6g}"),
+                "unit": figure.unit,
+                "goal": figure.goal,
+                "better": figure.better.value,
+                "n": figure.n,
+            }
+            for figure in result.figures
+        ],
+    }
+
+
+def quantile(values: Sequence[float], share: float) -> float:
+    """The value below which ``share`` of the measurements lie. Raises BenchError when there are none."""
+    if not values:
+        raise BenchError("nothing was measured: expected a data set with at least one task")
+    return float(np.quantile(np.asarray(values), share))
+
+
+def quantile_figure(
+    name: str, seconds: Sequence[float], share: float, unit: str, goal: float | None = None
+) -> Figure:
+    """A quantile of durations, told in ``unit``: "ms" or "µs"."""
+    value = quantile(seconds, share) * {"ms": 1e3, "µs": 1e6}[unit]
+    return Figure(f"{name}, p{share * 100:.0f}", value, unit, Better.LOWER, len(seconds), goal)
+
+
+def shown(value: float) -> str:
+    """Three digits, or all of them left of the point."""
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+
+
+def describe_machine() -> dict[str, Any]:
+    """Where the bench runs, and how busy that machine is before it begins."""
+    gpu, _ = find_gpu()
+    return {
+        "cpu": _cpu_model(),
+        "cores": _cores(),
+        "memory_gb": round(psutil.virtual_memory().total / MIB / 1024, 1),
+        "gpu": gpu,
+        "system": f"{platform.system()} {platform.machine()}",
+        "speed": measure_score(),
+        "load_before": round(os.getloadavg()[0], 2),
+        **{name: text for name, text in versions().items() if name != "embomatrix"},
+    }
+
+
+def is_shared(machine: Mapping[str, Any]) -> bool:
+    """Whether others kept the machine busy before the bench began."""
+    return bool(machine["load_before"] > BUSY_SHARE * machine["cores"])
+
+
+def commit_here() -> str:
+    """Commit of the checkout that this code runs from, with ``-dirty`` for changes; else the package's version."""
+    here = Path(__file__).resolve()
+    try:
+        # Without this an install inside another repository's folder would name that repository's commit.
+        _git(here.parent, "ls-files", "--error-unmatch", here.name)
+        return _git(here.parent, "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*")
+    except (OSError, subprocess.SubprocessError):
+        return f"version {versions()['embomatrix']}"
+
+
+def _git(folder: Path, *arguments: str) -> str:
+    command = ("git", "-C", str(folder), *arguments)
+    answer = subprocess.run(command, capture_output=True, text=True, timeout=GIT_S, check=True)
+    return answer.stdout.strip()
+
+
+def _cpu_model() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    models = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(models, platform.processor() or "unknown")
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

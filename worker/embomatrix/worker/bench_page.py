@@ -1,0 +1,115 @@
+"""The page of benchmarks: tables that are written anew every time, and parts that people write, which are kept."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.worker.bench_figures import BenchError, is_shared, shown
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from typing import Any
+
+    from embomatrix.worker.bench_figures import BenchResult, Figure
+
+HEAD: Final = "<!-- Written by `embomatrix bench all`: edit the parts between the marks `by hand` only, they are kept. -->"
+END: Final = "<!-- end by hand -->"
+_PART: Final = re.compile(r"<!-- by hand: ([a-z-]+) -->\n(.*?)<!-- end by hand -->", re.DOTALL)
+_MARK: Final = re.compile(r"<!-- (?:by hand: [a-z-]+|end by hand) -->")
+
+TITLES: Final[Mapping[str, tuple[str, str]]] = {
+    "rollout": (
+        "One process",
+        "`embomatrix bench rollout`: oracle plans of the data set, executed and scored in one simulator, without a cluster. "
+        "A worker builds scenes in clients that are connected before. *First* is a scene's first rollout, *cold* is decoding, "
+        "loading and the first rollout together.",
+    ),
+    "cluster": (
+        "Cluster on loopback",
+        "`embomatrix bench cluster`: a manager and workers as processes of this machine, driven as a trainer drives them: "
+        "steps of one group of eight for each slot. *Cold* scenes are new and unannounced, *prewarmed* ones were announced "
+        "and loaded before their batches came, *repeated* ones were executed in before. *Steady* is one large group for each "
+        "slot, *alone* one rollout with nothing else under way. Latency is from submission to result, so it includes waiting "
+        "for the group's other rollouts. Overhead is the share of the slots' time in which they executed nothing. The manager "
+        "holds every bundle before the clock starts.",
+    ),
+}
+"""Heading and explanation of each bench, in the order of the page."""
+INTRODUCTION: Final = (
+    "`embomatrix bench all --dataset DIR --out docs/benchmarks.md` measures and writes this page. Ratios compare numbers of "
+    "one run on one machine. Goals are for one core and scenes of up to 300 bodies; they come from what the physics engine "
+    "needs at the least."
+)
+HAND_PARTS: Final = (("training", "Training runs"),)
+"""Name and heading of the parts that people write."""
+
+
+def render_page(results: Sequence[BenchResult], before: str) -> str:
+    """The page in Markdown. ``before`` is the page that it replaces, empty when there is none. Raises BenchError."""
+    parts = hand_parts(before)
+    lines = [HEAD, "# Benchmarks", "", INTRODUCTION, "", *_machine_lines(results)]
+    for result in sorted(results, key=lambda result: [*TITLES].index(result.bench)):
+        heading, explanation = TITLES[result.bench]
+        lines += ["", f"## {heading}", "", explanation, "", *_table(result.figures)]
+    headings = dict(HAND_PARTS)
+    for name in dict.fromkeys([*headings, *parts]):
+        lines += [""] + ([f"## {headings[name]}", ""] if name in headings else [])
+        lines += [f"<!-- by hand: {name} -->\n{parts.get(name, '')}{END}"]
+    return "\n".join(lines) + "\n"
+
+
+def hand_parts(page: str) -> dict[str, str]:
+    """What people wrote on a page, by the name of the part; an empty page has none.
+
+    Raises BenchError when it is another page, or its marks don't pair: replacing it would lose text.
+    """
+    if page.strip() and not page.startswith(HEAD):
+        raise BenchError(
+            "the page to replace was not written by this command: name another file with --out, or move it away"
+        )
+    found = _PART.findall(page)
+    parts = dict(found)
+    marks = len(_MARK.findall(page))
+    if len(parts) * 2 != marks:
+        raise BenchError(
+            f"the page to replace has {marks} marks 'by hand' that make {len(parts)} parts: expected '<!-- by hand: NAME -->' "
+            f"and '{END}' in turn, each name once; mend them, so that nothing is lost"
+        )
+    return parts
+
+
+def _machine_lines(results: Sequence[BenchResult]) -> list[str]:
+    first = results[0]
+    machine: Mapping[str, Any] = first.machine
+    lines = ["| machine | |", "| --- | --- |", f"| commit | `{first.commit}` |"]
+    lines += [
+        f"| {name.replace('_', ' ')} | {_cell(value)} |" for name, value in machine.items() if value != ""
+    ]
+    busiest = max((result.machine for result in results), key=lambda machine: float(machine["load_before"]))
+    if is_shared(busiest):
+        lines += [
+            "",
+            f"The machine was shared: a load of {busiest['load_before']} on {busiest['cores']} cores before a bench began. "
+            "Alone it is faster; ratios suffer less than times.",
+        ]
+    return lines
+
+
+def _table(figures: Sequence[Figure]) -> list[str]:
+    lines = ["| figure | value | goal | | n |", "| --- | ---: | ---: | --- | ---: |"]
+    for figure in figures:
+        goal = (
+            "" if figure.goal is None else f"{'≤' if figure.better == 'lower' else '≥'} {shown(figure.goal)}"
+        )
+        lines.append(
+            f"| {_cell(figure.name)} | {shown(figure.value)} {figure.unit} | {goal} | {figure.verdict} | {figure.n:,} |"
+        )
+    short = [figure.name for figure in figures if figure.verdict not in ("", "reached")]
+    goals = sum(figure.goal is not None for figure in figures)
+    told = f"Short of their goals: {'; '.join(short)}." if short else "Every goal is reached."
+    return [*lines, "", told] if goals else lines
+
+
+def _cell(value: object) -> str:
+    return str(value).replace("|", "\\|")
