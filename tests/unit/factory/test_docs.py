@@ -1,0 +1,71 @@
+"""docs/tasks.md names every refusal, field and option, and its problem can be bound."""
+
+import re
+from pathlib import Path
+
+import typer
+from tests.fakes.scenes import kitchen_scene
+
+from embomatrix.factory import cli, play_cli, scene_cli
+from embomatrix.factory.importer import Imported, import_problem
+from embomatrix.factory.importer_binding import GOAL_PREDICATES
+from embomatrix.factory.importer_sources import SourceText
+from embomatrix.factory.refusal import RefusalReason
+from embomatrix.skills.parse import plan_to_json
+from embomatrix.skills.syntax import Skill, SkillCall
+from embomatrix.world.codec_task import task_to_json
+from embomatrix.world.dataset import SPLITS, TaskRecord, record_to_json
+from embomatrix.world.task import MAX_TABLE, TaskCategory
+
+PAGE = (Path(__file__).parents[3] / "docs" / "tasks.md").read_text(encoding="utf-8")
+
+
+def rows(first_heading: str) -> dict[str, str]:
+    """The table whose first column has this heading: name of each row to the next cell."""
+    found = re.search(rf"^\| {first_heading} \|.*\n\| ---.*\n((?:\|.*\n)+)", PAGE, re.MULTILINE)
+    assert found, f"docs/tasks.md has no table of {first_heading}"
+    cells = [line.strip("|").split(" | ") for line in found[1].splitlines()]
+    return {name.strip(" `"): value for name, value in cells}
+
+
+def imported() -> Imported:
+    """The problem of the page, bound to a kitchen."""
+    text = re.search(r"```lisp\n(.*?)```", PAGE, re.DOTALL)
+    assert text
+    outcome = import_problem(SourceText("apple", text[1], "file"), kitchen_scene())
+    assert isinstance(outcome, Imported), outcome
+    return outcome
+
+
+def test_every_refusal_stands_there_in_the_order_in_which_it_is_looked_for():
+    assert list(rows("refusal")) == [*RefusalReason]
+
+
+def test_fields_of_records_and_tasks_stand_there():
+    task = imported().task
+    oracle = tuple(plan_to_json((SkillCall(Skill.MOVE, object_index=0),)))
+    record = TaskRecord(task, "sha256:", "train", oracle, ("kitchen_0",), "")
+    assert list(rows("field of a record")) == list(record_to_json(record))
+    assert list(rows("field of a task")) == list(task_to_json(task))
+    assert f"at most {MAX_TABLE} names" in rows("field of a task")["table"]
+
+
+def test_categories_splits_and_predicates_stand_there():
+    for name in (*TaskCategory, *SPLITS):
+        assert f"`{name}`" in PAGE
+    (predicates,) = re.findall(r"A goal may use `([\w\s]+)`", PAGE)
+    assert set(predicates.split()) == GOAL_PREDICATES
+
+
+def test_problem_on_the_page_can_be_bound():
+    assert imported().task.instruction == "Put the apple in the fridge."
+
+
+def test_commands_on_the_page_have_the_options_they_are_shown_with():
+    apps = {"factory": cli.app, "scene": scene_cli.app, "play": typer.Typer()}
+    apps["play"].command()(play_cli.play)
+    for name, subcommand, rest in re.findall(r"^embomatrix (\w+) (\w+) ?(.*?)(?:#.*)?$", PAGE, re.MULTILINE):
+        command = typer.main.get_command(apps[name])
+        command = getattr(command, "commands", {}).get(subcommand, command)
+        known = {option for parameter in command.params for option in parameter.opts}
+        assert set(re.findall(r"--[\w-]+", rest)) <= known, (name, subcommand)
