@@ -54,7 +54,7 @@ class Figure:
         reached = self.value <= self.goal if self.better is Better.LOWER else self.value >= self.goal
         if reached:
             return "reached"
-        return f"{self.value / self.goal:.2g} × the goal" if self.goal else "missed"
+        return f"{self.value / self.goal:.3g} × the goal" if self.goal else "missed"
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import textwrap
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.worker.bench_figures import BenchError, is_shared, shown
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     from embomatrix.worker.bench_figures import BenchResult, Figure
 
 HEAD: Final = "<!-- Written by `embomatrix bench all`: edit the parts between the marks `by hand` only, they are kept. -->"
+WIDTH: Final = 128
 END: Final = "<!-- end by hand -->"
 _PART: Final = re.compile(r"<!-- by hand: ([a-z-]+) -->\n(.*?)<!-- end by hand -->", re.DOTALL)
 _MARK: Final = re.compile(r"<!-- (?:by hand: [a-z-]+|end by hand) -->")
@@ -48,10 +50,10 @@ HAND_PARTS: Final = (("training", "Training runs"),)
 def render_page(results: Sequence[BenchResult], before: str) -> str:
     """The page in Markdown. ``before`` is the page that it replaces, empty when there is none. Raises BenchError."""
     parts = hand_parts(before)
-    lines = [HEAD, "# Benchmarks", "", INTRODUCTION, "", *_machine_lines(results)]
+    lines = [HEAD, "# Benchmarks", "", _paragraph(INTRODUCTION), "", *_machine_lines(results)]
     for result in sorted(results, key=lambda result: [*TITLES].index(result.bench)):
         heading, explanation = TITLES[result.bench]
-        lines += ["", f"## {heading}", "", explanation, "", *_table(result.figures)]
+        lines += ["", f"## {heading}", "", _paragraph(explanation), "", *_table(result.figures)]
     headings = dict(HAND_PARTS)
     for name in dict.fromkeys([*headings, *parts]):
         lines += [""] + ([f"## {headings[name]}", ""] if name in headings else [])
@@ -90,8 +92,10 @@ def _machine_lines(results: Sequence[BenchResult]) -> list[str]:
     if is_shared(busiest):
         lines += [
             "",
-            f"The machine was shared: a load of {busiest['load_before']} on {busiest['cores']} cores before a bench began. "
-            "Alone it is faster; ratios suffer less than times.",
+            _paragraph(
+                f"The machine was shared: a load of {busiest['load_before']} on {busiest['cores']} cores before a bench "
+                "began. Alone it is faster; ratios suffer less than times."
+            ),
         ]
     return lines
 
@@ -108,7 +112,11 @@ def _table(figures: Sequence[Figure]) -> list[str]:
     short = [figure.name for figure in figures if figure.verdict not in ("", "reached")]
     goals = sum(figure.goal is not None for figure in figures)
     told = f"Short of their goals: {'; '.join(short)}." if short else "Every goal is reached."
-    return [*lines, "", told] if goals else lines
+    return [*lines, "", _paragraph(told)] if goals else lines
+
+
+def _paragraph(text: str) -> str:
+    return textwrap.fill(text, WIDTH, break_long_words=False, break_on_hyphens=False)
 
 
 def _cell(value: object) -> str:
