@@ -2,24 +2,36 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
+import signal
 import subprocess
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 from rich.console import Console
 from rich.logging import RichHandler
 
+from embomatrix.cli.failure import INTERRUPTED, fail
 from embomatrix.cli.local_cluster import LocalCluster, local_cluster
-from embomatrix.cli.supervisor import embomatrix_command
+from embomatrix.cli.supervisor import DIE_WITH_PARENT, embomatrix_command
 
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+DEFAULT_OUT: Final = Path("runs/demo")
+STOP_S: Final = 60.0
+"""An interrupted command may take this long to write what it keeps."""
 console = Console()
 
 
 def demo(
-    out: Annotated[Path, typer.Option(help="Folder for everything that the run writes.")] = Path("runs/demo"),
+    out: Annotated[
+        Path | None,
+        typer.Option(help=f"Folder for everything that the run writes; else {DEFAULT_OUT}, or -2, -3 ..."),
+    ] = None,
     dataset: Annotated[Path, typer.Option(help="Dataset folder; built first when it is missing.")] = Path(
         "build/dataset"
     ),
@@ -32,12 +44,13 @@ def demo(
 ) -> None:
     """Bring up a local cluster and train on real tasks, from nothing to a report."""
     logging.basicConfig(level=logging.WARNING, format="%(message)s", handlers=[RichHandler(show_path=False)])
+    folder = _folder(out)
     started_s = time.monotonic()
     if not (dataset / "tasks.jsonl").exists():
         console.rule("tasks")
-        _run("factory", "build", f"--out={dataset}", f"--seed={seed}")
+        _run(_no_problem, "factory", "build", f"--out={dataset}", f"--seed={seed}")
     built_s = time.monotonic()
-    cluster = local_cluster(out / "cluster", workers=workers, slots=slots)
+    cluster = local_cluster(folder / "cluster", workers=workers, slots=slots)
     with cluster.supervisor:
         console.rule("training")
         console.print(
@@ -45,19 +58,20 @@ def demo(
             highlight=False,
         )
         _run(
+            lambda: _problem(cluster),
             "train",
             f"--dataset={dataset}",
             f"--manager={cluster.address}",
             f"--model={model}",
             f"--minutes={minutes}",
             f"--imitate-seconds={imitate_seconds}",
-            f"--out={out}",
+            f"--out={folder}",
             f"--seed={seed}",
         )
         _report_restarts(cluster)
     ended_s = time.monotonic()
     console.print(
-        f"tasks {built_s - started_s:.0f} s, training {ended_s - built_s:.0f} s, logs in {out / 'cluster' / 'logs'}",
+        f"tasks {built_s - started_s:.0f} s, training {ended_s - built_s:.0f} s, logs in {folder / 'cluster' / 'logs'}",
         highlight=False,
     )
 
@@ -69,8 +83,71 @@ def _report_restarts(cluster: LocalCluster) -> None:
             console.print(f"{name} died and was started anew {count} times", highlight=False)
 
 
-def _run(*arguments: str) -> None:
-    """Run one `embomatrix` command in the foreground; its failure is ours, with its own message and status."""
-    status = subprocess.run(embomatrix_command(*arguments), check=False).returncode
+def _folder(wanted: Path | None) -> Path:
+    """A folder without a run in it: the one that is wanted, or the first free one of the default's name."""
+    if wanted is not None:
+        if _holds_run(wanted):
+            fail("demo", f"{wanted} holds another run: pass another --out, or remove the folder")
+        folder = wanted
+    else:
+        names = (DEFAULT_OUT.with_name(f"{DEFAULT_OUT.name}-{number}") for number in itertools.count(2))
+        folder = next(name for name in itertools.chain([DEFAULT_OUT], names) if not _holds_run(name))
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        fail("demo", f"the folder {folder} can't be made ({error.strerror}): pass another --out")
+    return folder
+
+
+def _holds_run(folder: Path) -> bool:
+    return (folder / "checkpoints").exists()
+
+
+def _problem(cluster: LocalCluster) -> str:
+    """Why training can't go on: the manager is gone for good, or the last worker is."""
+    failed = cluster.supervisor.failed()
+    if "manager" not in failed and not set(cluster.workers) <= set(failed):
+        return ""
+    name = "manager" if "manager" in failed else failed[0]
+    log = cluster.supervisor.log_path(name)
+    return f"the cluster can't work, {name} ended with: {cluster.supervisor.last_words(name)} (log: {log})"
+
+
+def _no_problem() -> str:
+    return ""
+
+
+def _run(problem: Callable[[], str], *arguments: str) -> None:
+    """Run one `embomatrix` command in the foreground; its failure is ours, with its own message and status.
+
+    It is stopped when there is a ``problem``. An interrupt is handed on to it once, whoever it was sent to, so that it can
+    write what it keeps.
+    """
+    with subprocess.Popen(
+        embomatrix_command(*arguments), start_new_session=True, preexec_fn=DIE_WITH_PARENT
+    ) as child:
+        try:
+            while (status := _status_of(child)) is None:
+                if sentence := problem():
+                    child.send_signal(signal.SIGTERM)
+                    fail("demo", sentence)
+        except KeyboardInterrupt:
+            child.send_signal(signal.SIGINT)
+            _end(child)
+            raise SystemExit(INTERRUPTED) from None
     if status:
         raise SystemExit(status)
+
+
+def _status_of(child: subprocess.Popen[bytes]) -> int | None:
+    try:
+        return child.wait(timeout=0.5)
+    except subprocess.TimeoutExpired:
+        return None
+
+
+def _end(child: subprocess.Popen[bytes]) -> None:
+    try:
+        child.wait(timeout=STOP_S)
+    except (subprocess.TimeoutExpired, KeyboardInterrupt):
+        child.kill()

@@ -6,6 +6,8 @@ install with one extra shows the command of every part and says which extra a mi
 
 from __future__ import annotations
 
+import contextlib
+import os
 import sys
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
@@ -15,10 +17,10 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from embomatrix.cli.failure import shown
+from embomatrix.cli.failure import fail, shown
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
 GROUP: Final = "embomatrix.commands"
 
@@ -47,6 +49,8 @@ COMMANDS: Final[Mapping[str, Command]] = {
 
 def main() -> None:
     """Entry point of the console script."""
+    # Read when grpc is first imported: a person needs its errors at most, which our own sentences explain.
+    os.environ.setdefault("GRPC_VERBOSITY", "ERROR")
     arguments = sys.argv[1:]
     if not arguments or arguments[0] in ("-h", "--help"):
         _show_help()
@@ -58,38 +62,40 @@ def main() -> None:
         return
     name, *rest = arguments
     point = _find(name)
-    with shown():
+    with shown(name), _missing_package_shown(name):
         app = _load(point)
         app(args=rest, prog_name=f"embomatrix {name}")
 
 
 def _find(name: str) -> EntryPoint:
     points = {point.name: point for point in entry_points(group=GROUP)}
-    if name in points:
-        return points[name]
-    import difflib
+    if name not in points:
+        import difflib
 
-    close = difflib.get_close_matches(name, points, n=1)
-    hint = f"did you mean `{close[0]}`?" if close else f"expected one of {', '.join(sorted(points))}"
-    Console(stderr=True).print(f"embomatrix: there is no command {name!r}: {hint}", highlight=False)
-    raise SystemExit(2)
+        close = difflib.get_close_matches(name, points, n=1)
+        hint = f"did you mean `{close[0]}`?" if close else f"expected one of {', '.join(sorted(points))}"
+        fail("", f"there is no command {name!r}: {hint}")
+    return points[name]
+
+
+@contextlib.contextmanager
+def _missing_package_shown(name: str) -> Iterator[None]:
+    """A package that is missing, now or when the command first needs it, names the extra that brings it."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if (error.name or "embomatrix").startswith("embomatrix"):
+            raise
+        extra = COMMANDS[name].extra if name in COMMANDS else "all"
+        fail(
+            name,
+            f"the package {error.name!r} is not installed: install it with `pip install 'embomatrix[{extra}]'`",
+        )
 
 
 def _load(point: EntryPoint) -> Callable[..., object]:
-    """The command as something callable on an argument list; a missing package names the extra that brings it."""
-    try:
-        target = point.load()
-    except ModuleNotFoundError as error:
-        if (error.name or "").startswith("embomatrix"):
-            raise
-        extra = COMMANDS[point.name].extra if point.name in COMMANDS else "all"
-        Console(stderr=True).print(
-            f"embomatrix {point.name}: the package {error.name!r} is not installed: "
-            f"install it with `pip install 'embomatrix[{extra}]'`",
-            highlight=False,
-            markup=False,
-        )
-        raise SystemExit(2) from None
+    """The command as something callable on an argument list."""
+    target = point.load()
     if isinstance(target, typer.Typer):
         return typer.main.get_command(target)
     single = typer.Typer(add_completion=False, pretty_exceptions_enable=False)

@@ -1,5 +1,7 @@
 """A few child processes kept alive: restarted when they die, ended together.
 
+A child that ends with the status for what a person can mend is not restarted: it would only say the same again.
+
 Used for the local cluster of `embomatrix demo`. It ends only what it started, by process id, and nothing that it started
 outlives it: children die with this process even when it is killed (PR_SET_PDEATHSIG, on Linux).
 """
@@ -16,6 +18,8 @@ import threading
 import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, Self
+
+from embomatrix.cli.failure import MENDABLE
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -100,10 +104,15 @@ class Supervisor:
     def log_path(self, name: str) -> Path:
         return self._log_folder / f"{name}.log"
 
-    def failed(self) -> str:
-        """Name of a child that was given up, or empty."""
+    def failed(self) -> tuple[str, ...]:
+        """Names of the children that were given up."""
         with self._lock:
-            return next((name for name, child in self._children.items() if child.given_up), "")
+            return tuple(name for name, child in self._children.items() if child.given_up)
+
+    def last_words(self, name: str) -> str:
+        """The last line that the child wrote, empty where it wrote none."""
+        lines = self.log_path(name).read_text(encoding="utf-8", errors="replace").split("\n")
+        return next((line.strip() for line in reversed(lines) if line.strip()), "")
 
     def _start(self, spec: ChildSpec) -> subprocess.Popen[bytes]:
         with self.log_path(spec.name).open("ab") as log:
@@ -113,7 +122,9 @@ class Supervisor:
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,
-                preexec_fn=_die_with_parent if sys.platform == "linux" else None,
+                # Ctrl-C in a terminal is for the command in front; what it needs ends after it, in order.
+                start_new_session=True,
+                preexec_fn=DIE_WITH_PARENT,
             )
 
     def _watch(self) -> None:
@@ -126,9 +137,9 @@ class Supervisor:
     def _revive(self, child: _Child) -> None:
         lived_s = time.monotonic() - child.started_s
         child.short_lives = child.short_lives + 1 if lived_s < SHORT_LIFE_S else 0
-        if child.short_lives > MAX_RESTARTS_IN_A_ROW:
+        if child.process.returncode == MENDABLE or child.short_lives > MAX_RESTARTS_IN_A_ROW:
             child.given_up = True
-            logger.error("%s keeps dying: see %s", child.spec.name, self.log_path(child.spec.name))
+            logger.error("%s ended with status %s and is given up", child.spec.name, child.process.returncode)
             return
         logger.warning("%s ended with status %s: starting it anew", child.spec.name, child.process.returncode)
         time.sleep(RESTART_DELAY_S)
@@ -140,3 +151,7 @@ class Supervisor:
 def _die_with_parent() -> None:
     """Ask the kernel for a SIGTERM when the parent thread's process ends, however it ends."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+
+
+DIE_WITH_PARENT: Final = _die_with_parent if sys.platform == "linux" else None
+"""What a child process runs first, so that it does not outlive the one that started it."""

@@ -60,8 +60,22 @@ def test_child_that_ignores_the_request_to_end_is_killed(tmp_path):
 def test_child_that_keeps_dying_is_given_up_and_its_log_kept(tmp_path):
     broken = (sys.executable, "-c", "raise SystemExit('no such scene')")
     with Supervisor((_child("broken", broken),), tmp_path) as children:
-        _until(lambda: children.failed() == "broken", limit_s=30.0)
-        assert "no such scene" in children.log_path("broken").read_text()
+        _until(lambda: children.failed() == ("broken",), limit_s=30.0)
+        assert children.restarts("broken") > 1
+        assert children.last_words("broken") == "no such scene"
+
+
+def test_child_that_needs_a_person_is_given_up_at_once(tmp_path):
+    told = (sys.executable, "-c", "print('no engine: install it', flush=True); raise SystemExit(2)")
+    with Supervisor((_child("told", told), _child("one", SLEEPER)), tmp_path) as children:
+        _until(lambda: children.failed() == ("told",))
+        assert children.restarts("told") == 0
+        assert children.last_words("told") == "no engine: install it"
+
+
+def test_interrupt_of_the_terminal_does_not_reach_the_children(tmp_path):
+    with Supervisor((_child("one", SLEEPER),), tmp_path) as children:
+        assert os.getpgid(children.pid("one")) != os.getpgid(0)
 
 
 def test_output_of_every_life_is_kept_in_one_log(tmp_path):
