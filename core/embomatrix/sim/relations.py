@@ -205,7 +205,7 @@ class Relations:
         return self._apart(a, b) and self._engine.gap(a, b, TOUCH_M) is not None
 
     def inroom(self, a: str, room: str) -> bool:
-        """The centre of ``a`` is over the floor of the room; in the thickness of a wall, over the nearer one."""
+        """The centre of ``a`` is over the floor of the room; in a wall, of the first room within 15 cm."""
         return not self._engine.is_parked(a) and self.room_of(a) == room
 
     def open(self, a: str) -> bool:

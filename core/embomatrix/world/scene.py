@@ -108,7 +108,7 @@ class Scene:
         return self.assets[self.by_name[name].asset_id]
 
     def room_at(self, point: Vec3 | Vec2) -> str:
-        """Name of the room under a point, the nearest one in a wall's thickness; empty when outside all rooms."""
+        """Name of the room under a point; in a wall, of the first room within 15 cm; empty when outside all rooms."""
         for margin in (0.0, 0.15):
             for room in self.rooms:
                 if room.contains(point[0], point[1], margin):

@@ -31,7 +31,7 @@ class Task:
 
     ``goal`` is ground but for its quantifiers, which range over ``types``: synset to object names. ``table`` is the object
     table: a plan's ``object_index`` is a row of it; the order betrays nothing of the goal. ``goal_bddl`` is the same goal
-    as text. ``source`` says where the task came from ("writer", "behavior-1k", "embomatrix").
+    as text. ``source`` says where the task came from ("writer", "behavior-1k", "embomatrix", "file").
     """
 
     task_id: str
