@@ -76,7 +76,7 @@ def decode_bundle(data: bytes, *, digest: str = "", limits: BundleLimits = DEFAU
         raise BundleError(f"the bundle has {len(data)} bytes: expected at most {limits.compressed_bytes}")
     found = bundle_digest(data)
     if digest and found != digest:
-        raise BundleError(f"the bundle's digest is {found}, expected {digest}: fetch it again")
+        raise BundleError(f"the bundle's digest is {found}, expected {digest}")
     try:
         value = json.loads(_decompress(data, limits), parse_constant=_refuse_constant)
         fields = Field(value, "bundle").record("format", "scene", "tasks", "poses")

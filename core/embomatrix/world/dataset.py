@@ -1,4 +1,4 @@
-"""Data sets: a folder with the records of the tasks and the bundles that they run in.
+"""Datasets: a folder with the records of the tasks and the bundles that they run in.
 
 ``tasks.jsonl`` holds a record a line, ``bundles/`` a file for each digest. Records carry the whole task, so that a trainer
 can write prompts without decoding a scene.
@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 from embomatrix.world.bundle import BundleError, decode_bundle
 from embomatrix.world.codec_task import task_from_json, task_to_json
 from embomatrix.world.field import Field, SceneInvalidError
+from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -25,10 +26,11 @@ if TYPE_CHECKING:
 TASKS_FILE: Final = "tasks.jsonl"
 BUNDLES_FOLDER: Final = "bundles"
 SPLITS: Final = ("train", "heldout")
+_REMEDY: Final = "copy the dataset again, or build one with `embomatrix factory build`"
 
 
 class DatasetError(ValueError):
-    """A data set can't be read. The message names the file, and the line where there is one."""
+    """A dataset can't be read. The message names the file, the line where there is one, and the remedy."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,15 +55,18 @@ class Dataset:
 
     @staticmethod
     def load(folder: Path | str) -> Dataset:
-        """Read the records. Raises DatasetError when the folder holds no data set, or a record is wrong."""
+        """Read the records. Raises DatasetError when the folder holds no dataset, or a record is wrong."""
         path = Path(folder) / TASKS_FILE
         try:
             lines = path.read_text(encoding="utf-8").splitlines()
-        except (OSError, UnicodeDecodeError) as error:
-            reason = getattr(error, "strerror", None) or str(error)
+        except OSError as error:
             raise DatasetError(
-                f"there is no data set in {folder}: {path.name} can't be read ({reason}); "
-                "build one with 'embomatrix factory build --out DIR'"
+                f"there is no dataset in {folder}: {path} can't be read ({error.strerror}); "
+                f"build one with `embomatrix factory build --out={folder}`, or name another folder with --dataset"
+            ) from error
+        except UnicodeDecodeError as error:
+            raise DatasetError(
+                f"{path} is damaged: expected text in UTF-8, found other bytes; {_REMEDY}"
             ) from error
         records = tuple(
             _record(line, f"{path}:{number}") for number, line in enumerate(lines, start=1) if line.strip()
@@ -83,17 +88,23 @@ class Dataset:
             return path.read_bytes()
         except OSError as error:
             raise DatasetError(
-                f"bundle {digest} is missing: {path} can't be read ({error.strerror})"
+                f"the bundle {path} of the dataset can't be read ({error.strerror}): {_REMEDY}"
             ) from error
 
     def bundle(self, digest: str) -> Bundle:
         """Decoded bundle, kept for the next call. Raises DatasetError."""
         if digest not in self._decoded:
-            try:
-                self._decoded[digest] = decode_bundle(self.bundle_bytes(digest), digest=digest)
-            except BundleError as error:
-                raise DatasetError(f"{self.folder}: {error}") from error
+            self._decoded[digest] = self.read_bundle(digest)
         return self._decoded[digest]
+
+    def read_bundle(self, digest: str) -> Bundle:
+        """Decoded bundle, for who needs it once: many of them fill the memory. Raises DatasetError."""
+        data = self.bundle_bytes(digest)
+        try:
+            return decode_bundle(data, digest=digest)
+        except BundleError as error:
+            path = self.folder / BUNDLES_FOLDER / bundle_file(digest)
+            raise DatasetError(f"the bundle {path} of the dataset is damaged ({error}): {_REMEDY}") from error
 
     def find(self, task_id: str) -> TaskRecord:
         """The record of a task. Raises DatasetError that names close matches."""
@@ -102,7 +113,8 @@ class Dataset:
                 return record
         raise DatasetError(
             f"there is no task {task_id!r} in {self.folder}: "
-            f"{_closest(task_id, [record.task.task_id for record in self.records])}"
+            f"{_closest(task_id, [record.task.task_id for record in self.records])} "
+            f"(`embomatrix factory list {self.folder}` shows them)"
         )
 
 
@@ -119,9 +131,9 @@ def write_dataset(folder: Path | str, records: Sequence[TaskRecord], bundles: Ma
     root = Path(folder)
     (root / BUNDLES_FOLDER).mkdir(parents=True, exist_ok=True)
     for digest, data in bundles.items():
-        _replace(root / BUNDLES_FOLDER / bundle_file(digest), data)
+        write_whole(root / BUNDLES_FOLDER / bundle_file(digest), data)
     lines = [json.dumps(record_to_json(record), separators=(",", ":")) for record in records]
-    _replace(root / TASKS_FILE, "".join(f"{line}\n" for line in lines).encode("ascii"))
+    write_whole(root / TASKS_FILE, "".join(f"{line}\n" for line in lines).encode("ascii"))
 
 
 def record_to_json(record: TaskRecord) -> dict[str, Any]:
@@ -156,18 +168,11 @@ def _record(line: str, place: str) -> TaskRecord:
     try:
         return record_from_json(json.loads(line))
     except SceneInvalidError as error:
-        raise DatasetError(f"{place}: {error}") from error
+        raise DatasetError(f"{place} is damaged: {error}; {_REMEDY}") from error
     except (ValueError, RecursionError) as error:
-        raise DatasetError(f"{place}: not a JSON object: {error}") from error
-
-
-def _replace(path: Path, data: bytes) -> None:
-    """Write beside and rename, so that a reader never sees half a file."""
-    part = path.with_name(f"{path.name}.part")
-    part.write_bytes(data)
-    part.replace(path)
+        raise DatasetError(f"{place} is damaged: expected a JSON object ({error}); {_REMEDY}") from error
 
 
 def _closest(name: str, known: list[str]) -> str:
     close = difflib.get_close_matches(name, known, n=3, cutoff=0.4)
-    return f"did you mean {', '.join(close)}?" if close else f"it holds {len(known)} tasks"
+    return f"did you mean {', '.join(close)}?" if close else f"it holds {len(known)} others"

@@ -1,4 +1,4 @@
-"""A data set survives the disk, reads bundles when asked, and says what is wrong with a folder."""
+"""A dataset survives the disk, reads bundles when asked, and says what is wrong with a folder."""
 
 import json
 from pathlib import Path
@@ -19,7 +19,7 @@ def write(folder: Path, bundle: Bundle, task: Task) -> TaskRecord:
     return record
 
 
-def test_data_set_survives_the_disk(tmp_path: Path, bundle: Bundle, task: Task) -> None:
+def test_dataset_survives_the_disk(tmp_path: Path, bundle: Bundle, task: Task) -> None:
     record = write(tmp_path, bundle, task)
     dataset = Dataset.load(tmp_path)
     assert dataset.records == (record,)
@@ -35,7 +35,7 @@ def test_unknown_task_suggests_a_close_name(tmp_path: Path, bundle: Bundle, task
         Dataset.load(tmp_path).find("tiny-1-opn")
 
 
-def test_folder_without_a_data_set_tells_how_to_build_one(tmp_path: Path) -> None:
+def test_folder_without_a_dataset_tells_how_to_build_one(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="factory build"):
         Dataset.load(tmp_path / "nothing")
 
@@ -59,10 +59,12 @@ def test_missing_and_damaged_bundles_are_named(tmp_path: Path, bundle: Bundle, t
     record = write(tmp_path, bundle, task)
     file = next((tmp_path / "bundles").iterdir())
     file.write_bytes(file.read_bytes()[:-1])
-    with pytest.raises(DatasetError, match=record.bundle_digest):
+    with pytest.raises(
+        DatasetError, match=rf"{file} of the dataset is damaged .* expected {record.bundle_digest}"
+    ):
         Dataset.load(tmp_path).bundle(record.bundle_digest)
     file.unlink()
-    with pytest.raises(DatasetError, match="missing"):
+    with pytest.raises(DatasetError, match=r"can't be read.*: copy the dataset again, or build one"):
         Dataset.load(tmp_path).bundle(record.bundle_digest)
 
 

@@ -11,7 +11,6 @@ import numpy as np
 from embomatrix.skills.parse import PlanError, plan_from_json
 from embomatrix.skills.prompt import Situation, situation_of
 from embomatrix.trainer.errors import TrainerError
-from embomatrix.world.bundle import BundleError, decode_bundle
 from embomatrix.world.dataset import Dataset, DatasetError
 
 if TYPE_CHECKING:
@@ -20,6 +19,7 @@ if TYPE_CHECKING:
 
     from embomatrix.skills.syntax import Plan
     from embomatrix.world.asset import Asset
+    from embomatrix.world.bundle import Bundle
     from embomatrix.world.dataset import TaskRecord
     from embomatrix.world.scene import Scene
     from embomatrix.world.task import Task
@@ -63,11 +63,11 @@ def load_tasks(folder: Path) -> TaskSet:
             by_bundle.setdefault(record.bundle_digest, []).append(record)
         for digest, records in by_bundle.items():
             # One scene at a time: all of them decoded would fill the memory that simulators need.
-            scene = decode_bundle(dataset.bundle_bytes(digest), digest=digest).scene
-            kinds.add(scene)
-            tasks |= {record.task.task_id: _training_task(scene, record) for record in records}
-    except (DatasetError, BundleError, PlanError, OSError) as error:
-        raise TrainerError(f"the dataset at {folder} can't be used: {error}") from error
+            bundle = dataset.read_bundle(digest)
+            kinds.add(bundle.scene)
+            tasks |= {record.task.task_id: _training_task(bundle, record) for record in records}
+    except DatasetError as error:
+        raise TrainerError(str(error)) from error
     train = tuple(tasks[record.task.task_id] for record in dataset.train)
     if not train:
         raise TrainerError(f"the dataset at {folder} has no training tasks: build it again with more tasks")
@@ -104,9 +104,20 @@ def _kind(asset: Asset, *, fixed: bool) -> tuple[object, ...]:
     return (fixed, bool(asset.joints), bool(asset.interiors), bool(asset.supports), abilities)
 
 
-def _training_task(scene: Scene, record: TaskRecord) -> TrainingTask:
-    oracle = plan_from_json(list(record.oracle)) if record.oracle else ()
-    return TrainingTask(record.task, situation_of(scene, record.task), record.bundle_digest, oracle)
+def _training_task(bundle: Bundle, record: TaskRecord) -> TrainingTask:
+    task = record.task
+    if bundle.tasks.get(task.task_id) != task:
+        raise TrainerError(
+            f"the dataset's task {task.task_id!r} is not the one of that name in its bundle {record.bundle_digest}: "
+            "build the dataset again"
+        )
+    try:
+        oracle = plan_from_json(list(record.oracle)) if record.oracle else ()
+    except PlanError as error:
+        raise TrainerError(
+            f"the oracle plan of the dataset's task {task.task_id!r} is damaged ({error}): build the dataset again"
+        ) from error
+    return TrainingTask(task, situation_of(bundle.scene, task), record.bundle_digest, oracle)
 
 
 def group_seed(run_seed: int, task_id: str) -> int:

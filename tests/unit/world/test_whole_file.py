@@ -1,0 +1,20 @@
+"""A file is there whole, or as it was."""
+
+from pathlib import Path
+
+import pytest
+
+from embomatrix.world.whole_file import write_whole
+
+
+def test_file_is_written_and_nothing_else_remains(tmp_path: Path) -> None:
+    write_whole(tmp_path / "a.json", b"new")
+    assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("a.json", b"new")]
+
+
+def test_failure_leaves_what_was_there(tmp_path: Path) -> None:
+    target = tmp_path / "taken"
+    (target / "inner").mkdir(parents=True)
+    with pytest.raises(OSError):
+        write_whole(target, b"new")
+    assert [path.name for path in tmp_path.iterdir()] == ["taken"]
