@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING, Any, Final
 
 import grpc
+
+from embomatrix.rpc.status import InvalidRequestError
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
@@ -15,6 +18,9 @@ MAX_MESSAGE_BYTES: Final = 32 * 1024 * 1024
 CHUNK_BYTES: Final = 1024 * 1024
 """Bundles travel in chunks of this size."""
 TOKEN_KEY: Final = "authorization"
+TOKEN_PATTERN: Final = r"^[!-~]*$"
+"""Visible ASCII without spaces: what a call's metadata can carry."""
+_ADDRESS: Final = re.compile(r"(?:\[[0-9A-Fa-f:.%\w]+\]|[^\s:/\[\]]+):(\d{1,5})")
 
 KEEPALIVE_TIME_MS: Final = 30_000
 KEEPALIVE_TIMEOUT_MS: Final = 10_000
@@ -49,9 +55,24 @@ SERVER_OPTIONS: Final[tuple[tuple[str, int], ...]] = (
 
 
 def open_channel(address: str, token: str = "") -> grpc.aio.Channel:
-    """A channel to HOST:PORT that sends the token with every call; it connects when it is first used."""
+    """A channel to HOST:PORT that sends the token with every call; it connects when it is first used.
+
+    Raises InvalidRequestError for an address or a token that can't be one.
+    """
+    if not is_address(address):
+        raise InvalidRequestError(
+            f"{address!r} is no address of a manager: expected HOST:PORT, as in {DEFAULT_ADDRESS}"
+        )
+    if not re.fullmatch(TOKEN_PATTERN, token):
+        raise InvalidRequestError("the token can't be sent: expected visible ASCII characters without spaces")
     interceptors = [interceptor(token) for interceptor in _INTERCEPTORS] if token else None
     return grpc.aio.insecure_channel(address, options=CHANNEL_OPTIONS, interceptors=interceptors)
+
+
+def is_address(text: str) -> bool:
+    """Whether the text is HOST:PORT; an IPv6 host stands in brackets."""
+    found = _ADDRESS.fullmatch(text)
+    return found is not None and 0 < int(found[1]) <= 65535
 
 
 def bearer(token: str) -> str:

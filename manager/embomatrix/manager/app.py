@@ -7,7 +7,6 @@ import contextlib
 import logging
 import secrets
 import signal
-import socket
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -17,14 +16,16 @@ from embomatrix.manager.api import build_api
 from embomatrix.manager.assignments import DispatchLimits
 from embomatrix.manager.bundles import BundleStore
 from embomatrix.manager.cluster_state import ClusterState
+from embomatrix.manager.listen import bound_socket
 from embomatrix.manager.registry import LivenessLimits, Registry
 from embomatrix.manager.runtime import ManagerRuntime
 from embomatrix.manager.scheduler import ScheduleLimits
-from embomatrix.manager.server import PortInUseError, build_server
+from embomatrix.manager.server import build_server
 from embomatrix.manager.store.protocol import StateError
 from embomatrix.manager.store.url import open_store
 
 if TYPE_CHECKING:
+    import socket
     from collections.abc import AsyncIterator, Callable, Iterator
 
     from fastapi import FastAPI
@@ -69,6 +70,12 @@ async def running(settings: ManagerSettings) -> AsyncIterator[Endpoints]:
             total_bytes=settings.bundle_total_mb * MEGABYTE,
         )
     async with contextlib.AsyncExitStack() as stack:
+        # Ports first: a manager that can't serve must not take the state from one that does.
+        http_socket = stack.enter_context(
+            bound_socket(settings.http_host, settings.http_port, option="http-")
+        )
+        with bound_socket(settings.host, settings.port):
+            pass  # gRPC binds it again below, and would not tell why it can't
         store = open_store(settings.state_url)
         stack.push_async_callback(store.close)
         runtime = await _start_runtime(settings, store, bundles)
@@ -79,7 +86,6 @@ async def running(settings: ManagerSettings) -> AsyncIterator[Endpoints]:
             token=settings.token,
             lease_ttl_s=settings.lease_ttl_s,
         )
-        http_socket = stack.enter_context(_listen(settings.http_host, settings.http_port))
         http = _HttpServer(build_api(runtime, settings), http_socket)
         group = await stack.enter_async_context(_stopped_at_exit())
         group.create_task(runtime.serve())
@@ -144,21 +150,6 @@ async def _stopped_at_exit() -> AsyncIterator[asyncio.TaskGroup]:
 
 class _BlockEndedError(Exception):
     """The block ended; not an error."""
-
-
-@contextlib.contextmanager
-def _listen(host: str, port: int) -> Iterator[socket.socket]:
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    with socket.socket(family, socket.SOCK_STREAM) as bound:
-        bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            bound.bind((host, port))
-        except OSError as error:
-            raise PortInUseError(
-                f"{host}:{port} can't be bound for the status page ({error.strerror}): stop what uses it, or pass "
-                f"another --http-port"
-            ) from error
-        yield bound
 
 
 @contextlib.contextmanager

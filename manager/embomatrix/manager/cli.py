@@ -62,7 +62,10 @@ def serve(
 
 @app.command()
 def status(
-    address: Annotated[str, typer.Option(help="HOST:PORT of the manager.")] = "127.0.0.1:50070",
+    manager: Annotated[
+        str,
+        typer.Option("--manager", "--address", help="HOST:PORT of the manager.", envvar="EMBOMATRIX_MANAGER"),
+    ] = "127.0.0.1:50070",
     token: Token = "",
 ) -> None:
     """Show workers and runs of a manager."""
@@ -72,7 +75,7 @@ def status(
     from embomatrix.rpc.status import ClusterError
 
     try:
-        asyncio.run(show_status(address, token))
+        asyncio.run(show_status(manager, token))
     except ClusterError as error:
         _refuse(str(error))
 
@@ -86,22 +89,29 @@ def _settings(options: Mapping[str, object]) -> ManagerSettings:
         return ManagerSettings.model_validate(options)
     except ValidationError as error:
         first = error.errors()[0]
-        name = "".join(f"--{part} ".replace("_", "-") for part in first["loc"])
-        _refuse(f"{name}{first['msg'].removeprefix('Value error, ')}")
+        expected = first["msg"].removeprefix("Value error, ")
+        if not first["loc"]:
+            _refuse(expected)
+        name = str(first["loc"][0])
+        if name == "token":
+            # What was found stays untold: it may be nearly the secret.
+            _refuse("--token: expected visible ASCII characters without spaces")
+        _refuse(f"--{name.replace('_', '-')} {first['input']!r}: {expected[:1].lower()}{expected[1:]}")
 
 
 def _serve(settings: ManagerSettings) -> None:
     import asyncio
 
     from embomatrix.manager.app import Endpoints, serve
-    from embomatrix.manager.server import PortInUseError
+    from embomatrix.manager.listen import PortInUseError
     from embomatrix.manager.store.protocol import StateError
+    from embomatrix.manager.store.url import without_password
 
     def on_ready(endpoints: Endpoints) -> None:
         kept = (
             "nowhere: it is lost on restart"
             if settings.state_url == "memory:"
-            else f"in {settings.state_url}"
+            else f"in {without_password(settings.state_url)}"
         )
         print(
             f"manager serves at {endpoints.address}, status page {endpoints.status_url}, state {kept}",

@@ -8,6 +8,7 @@ import grpc
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
+from embomatrix.manager.listen import PortInUseError
 from embomatrix.manager.service_admin import AdminServicer
 from embomatrix.manager.service_auth import TokenInterceptor
 from embomatrix.manager.service_rollout import RolloutServicer
@@ -39,14 +40,10 @@ SERVICES: Final = tuple(
 )
 
 
-class PortInUseError(Exception):
-    """The address can't be bound; the sentence says which and what to do."""
-
-
 async def build_server(
     runtime: ManagerRuntime, *, host: str, port: int, token: str, lease_ttl_s: float
 ) -> tuple[grpc.aio.Server, int]:
-    """A server that is bound but not started, and its port (``port`` 0 takes a free one)."""
+    """A server that is bound but not started, and its port (``port`` 0 takes a free one). Raises PortInUseError."""
     interceptors = [TokenInterceptor(token)] if token else []
     server = grpc.aio.server(options=SERVER_OPTIONS, interceptors=interceptors)
     worker_service_pb2_grpc.add_WorkerServiceServicer_to_server(
@@ -61,10 +58,7 @@ async def build_server(
     try:
         bound = server.add_insecure_port(address)
     except RuntimeError as error:
-        raise PortInUseError(
-            f"{address} can't be bound: another program uses the port, or the host is not this machine's; "
-            f"stop it, or pass another --port"
-        ) from error
+        raise PortInUseError(f"{address} can't be bound ({error}): pass another --port") from error
     return server, bound
 
 

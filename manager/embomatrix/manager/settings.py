@@ -8,6 +8,8 @@ from typing import Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from embomatrix.rpc.channel import TOKEN_PATTERN
+
 DEFAULT_PORT = 50070
 DEFAULT_HTTP_PORT = 8070
 
@@ -31,7 +33,7 @@ class ManagerSettings(BaseModel):
     """Folder of bundles and of the embedded state."""
     state: str = ""
     """``memory:``, ``sqlite:PATH`` or ``redis://HOST:PORT/DB``. Empty: a file in the data folder."""
-    token: str = Field("", repr=False)
+    token: str = Field("", repr=False, pattern=TOKEN_PATTERN)
     """Shared secret of workers, trainers and viewers; empty: none is asked for."""
     insecure_bind: bool = False
     """Serve outside loopback without a token."""

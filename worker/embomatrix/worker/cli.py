@@ -45,7 +45,7 @@ EXPECTED: Final[Mapping[str, str]] = {
 }
 """What to say of a wrong value where the validator only knows a pattern."""
 
-Manager = Annotated[str, typer.Option(help="HOST:PORT of the manager.")]
+Manager = Annotated[str, typer.Option(help="HOST:PORT of the manager.", envvar="EMBOMATRIX_MANAGER")]
 Token = Annotated[
     str, typer.Option(envvar="EMBOMATRIX_TOKEN", help="Join token, if the manager asks for one.")
 ]
@@ -88,8 +88,11 @@ def run(
     os.nice(settings.nice)
     try:
         asyncio.run(_serve(settings))
-    except (ClusterError, ProcessGoneError, OSError) as error:
+    except (ClusterError, ProcessGoneError) as error:
         _fail(str(error))
+    except OSError as error:
+        where = error.filename or settings.cache_dir
+        _fail(f"{where} can't be used ({error.strerror or error}): name another folder with --cache-dir")
 
 
 async def _serve(settings: WorkerSettings) -> None:
@@ -162,6 +165,9 @@ def _settings(values: dict[str, Any]) -> WorkerSettings:
     except ValidationError as error:
         first = error.errors()[0]
         name = str(first["loc"][0])
+        if name == "token":
+            # What was found stays untold: it may be nearly the secret.
+            _fail("--token: expected visible ASCII characters without spaces")
         expected = EXPECTED.get(name) or first["msg"][:1].lower() + first["msg"][1:]
         _fail(f"--{name.replace('_', '-')} {first['input']!r}: {expected}")
 

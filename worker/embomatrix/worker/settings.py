@@ -6,9 +6,9 @@ import secrets
 import socket
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from embomatrix.rpc.channel import DEFAULT_ADDRESS
+from embomatrix.rpc.channel import DEFAULT_ADDRESS, TOKEN_PATTERN, is_address
 
 
 class WorkerSettings(BaseModel):
@@ -16,9 +16,9 @@ class WorkerSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    manager: str = Field(DEFAULT_ADDRESS, pattern=r"^\S+:\d{1,5}$")
+    manager: str = DEFAULT_ADDRESS
     """HOST:PORT of the manager; the worker dials out, nothing needs to reach it."""
-    token: str = Field("", repr=False)
+    token: str = Field("", repr=False, pattern=TOKEN_PATTERN)
     """Join token; empty where the manager asks for none."""
     name: str = Field(default_factory=lambda: default_name(), pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")
     """Worker id. Two daemons of one name take the session from each other, so the default is never the same twice."""
@@ -38,6 +38,13 @@ class WorkerSettings(BaseModel):
     """How long running rollouts may take to end after a signal."""
     once: bool = False
     """End when the manager can't be reached, instead of trying again."""
+
+    @field_validator("manager")
+    @classmethod
+    def _check_address(cls, value: str) -> str:
+        if not is_address(value):
+            raise ValueError("not HOST:PORT")
+        return value
 
 
 def default_name() -> str:

@@ -20,6 +20,7 @@ from embomatrix.manager.store.protocol import (
     RunRow,
     StateError,
 )
+from embomatrix.manager.store.url import without_password
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Sequence
@@ -86,7 +87,7 @@ class RedisStore:
     """``url`` as in ``redis://HOST:PORT/DB``. Every call is bounded by ``timeout_s``; failures are ``StateError``."""
 
     def __init__(self, url: str, *, prefix: str = "embomatrix", timeout_s: float = 5.0) -> None:
-        self._url = url
+        self._shown = without_password(url)
         self._prefix = prefix
         self._epoch = 0
         try:
@@ -95,7 +96,7 @@ class RedisStore:
             )
         except (ValueError, RedisError) as error:
             raise StateError(
-                f"{url!r} is no Redis address ({error}): expected redis://HOST:PORT/DB"
+                f"--state {self._shown!r} is no Redis address ({error}): expected redis://HOST:PORT/DB"
             ) from error
 
     async def claim(self) -> int:
@@ -167,12 +168,12 @@ class RedisStore:
         except ResponseError as error:
             if _FENCED in str(error):
                 raise FencedError(
-                    f"another manager took over the state in {self._url}: stop this one"
+                    f"another manager took over the state in {self._shown}: stop this one"
                 ) from error
-            raise StateError(f"Redis at {self._url} refused a call: {error}") from error
+            raise StateError(f"Redis at {self._shown} refused a call: {error}") from error
         except (RedisError, OSError) as error:
             raise StateError(
-                f"Redis at {self._url} can't be reached ({error}): start it, or pass another --state"
+                f"Redis at {self._shown} can't be reached ({error}): start it, or pass another --state"
             ) from error
 
 

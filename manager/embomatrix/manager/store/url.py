@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,6 +10,11 @@ from embomatrix.manager.store.protocol import StateError
 
 if TYPE_CHECKING:
     from embomatrix.manager.store.protocol import StateStore
+
+
+def without_password(url: str) -> str:
+    """The URL as it may be shown: a password in it becomes ``***``."""
+    return re.sub(r"(://[^/@:]*:)[^/@]*@", r"\1***@", url)
 
 
 def open_store(url: str) -> StateStore:
@@ -26,4 +32,6 @@ def open_store(url: str) -> StateStore:
         from embomatrix.manager.store.redis import RedisStore
 
         return RedisStore(url)
-    raise StateError(f"{url!r} is no state: expected memory:, sqlite:PATH or redis://HOST:PORT/DB")
+    raise StateError(
+        f"--state {without_password(url)!r}: expected memory:, sqlite:PATH or redis://HOST:PORT/DB"
+    )
