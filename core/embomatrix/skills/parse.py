@@ -179,11 +179,27 @@ def _parse_lines(text: str) -> Plan:
     if not calls:
         raise PlanError(
             PlanReason.NO_PLAN,
-            "no plan was found: expected a JSON array of calls such as "
+            f"no plan was found ({_found_instead(text)}): expected a JSON array of calls such as "
             '[{"action": "move", "object_index": 0}], or lines such as "move 0"',
         )
     _check_length(len(calls))
     return tuple(_call_from_words(words, number) for number, words in enumerate(calls, start=1))
+
+
+def _found_instead(text: str) -> str:
+    """What a text is that holds no plan, for a message."""
+    content = text.strip()
+    if not content:
+        return "the text is empty"
+    if content[0] not in "[{":
+        return f"the text begins with {_shown(content)}"
+    try:
+        json.loads(content)
+    except json.JSONDecodeError as error:
+        return f"its JSON is wrong at line {error.lineno}, column {error.colno}: {error.msg}"
+    except (ValueError, RecursionError):
+        return "its JSON can't be read"
+    return "its JSON holds no array of calls"
 
 
 def _segments(text: str) -> Iterator[list[str]]:
@@ -285,5 +301,7 @@ def _signature(skill: Skill) -> str:
 
 def _shown(value: object) -> str:
     """The value for a message, cut to a readable length."""
-    text = repr(value) if isinstance(value, str | float | bool | None) else type(value).__name__
+    if isinstance(value, int) and abs(value) > MAX_INDEX:
+        return "a number beyond 64 bits"
+    text = repr(value) if isinstance(value, str | int | float | bool | None) else type(value).__name__
     return text if len(text) <= 60 else text[:57] + "..."

@@ -139,6 +139,27 @@ def test_message_names_the_step_and_what_was_found() -> None:
         parse_plan('[{"action": "move", "object_index": 3}, {"action": "open", "object_index": "cup"}]')
 
 
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        (" \n", "the text is empty"),
+        ("I would rather not.", "the text begins with 'I would rather not.'"),
+        ('[{"action": "move", "object_index": 3}', "its JSON is wrong at line 1, column 39: "),
+        ('{"action": "move", "object_index": 3}', "its JSON holds no array of calls"),
+        ("[" * 30_000, "its JSON can't be read"),
+    ],
+)
+def test_message_tells_what_stood_in_place_of_a_plan(text: str, found: str) -> None:
+    with pytest.raises(PlanError) as refusal:
+        parse_plan(text)
+    assert str(refusal.value).startswith(f"no plan was found ({found}")
+
+
+def test_index_beyond_the_wire_is_told_as_what_it_is() -> None:
+    with pytest.raises(PlanError, match="found a number beyond 64 bits"):
+        parse_plan(f"move {10**30}")
+
+
 numbers = st.floats(-100, 100)
 ARGUMENTS: dict[Arg, st.SearchStrategy[Any]] = {
     Arg.OBJECT: st.integers(-5, 100),
