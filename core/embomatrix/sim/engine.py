@@ -32,6 +32,10 @@ class EngineError(Exception):
     """A scene that can't be loaded, an unknown name or a value that physics can't take. The sentence names the remedy."""
 
 
+class EngineMissingError(EngineError):
+    """No physics engine is installed."""
+
+
 @dataclass(frozen=True, slots=True)
 class Settled:
     """Where an object ends up when it is let go.

@@ -1,4 +1,4 @@
-"""``embomatrix factory``: build data sets of verified tasks, import BDDL, list what a data set holds."""
+"""``embomatrix factory``: build datasets of verified tasks, import BDDL, list what a dataset holds."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ from embomatrix.factory.importer_sources import (
 from embomatrix.factory.pipeline import DEFAULT_SCENES, BuildSettings, Summary, build_dataset
 from embomatrix.factory.refusal import Refusal
 from embomatrix.factory.scene_build import build_base_scene
+from embomatrix.sim.engine import EngineMissingError
 from embomatrix.sim.pose_cache import PlacementLibrary
 from embomatrix.world.bddl import BddlError
 from embomatrix.world.catalog import CatalogError
@@ -41,8 +42,8 @@ app = typer.Typer(
 )
 EVERY_ACTIVITY = "all"
 
-Out = Annotated[Path, typer.Option(help="Folder for the data set.")]
-Seed = Annotated[int, typer.Option(min=0, help="Equal seeds give equal data sets.")]
+Out = Annotated[Path, typer.Option(help="Folder for the dataset.")]
+Seed = Annotated[int, typer.Option(min=0, help="Equal seeds give equal datasets.")]
 Scenes = Annotated[
     list[str] | None, typer.Option("--scenes", "--scene", help="Base scene; give it again for more.")
 ]
@@ -59,7 +60,8 @@ def build(
     """Write tasks over base scenes, keep those that the oracle solves, and save them with their scenes."""
     settings = BuildSettings(train, heldout, seed, tuple(scenes or DEFAULT_SCENES))
     console = Console()
-    with _mended(), _progress(console) as bars:
+    kept = f": what was built is kept in {out}, and the same command goes on from there"
+    with _mended(out, kept), _progress(console) as bars:
         tasks = {
             "heldout": bars.add_task("held-out tasks", total=heldout),
             "train": bars.add_task("training tasks", total=train),
@@ -70,7 +72,7 @@ def build(
         for split, bar in tasks.items():
             bars.update(bar, completed=summary.total(split))
     _print_summary(console, summary)
-    console.print(f"data set: {out}", highlight=False)
+    console.print(f"dataset: {out}", highlight=False)
     for split, wanted in (("train", train), ("heldout", heldout)):
         if summary.total(split) < wanted:
             _fail(
@@ -91,7 +93,7 @@ def import_(
 ) -> None:
     """Bind BDDL problems to base scenes and verify them, or say why not."""
     console = Console()
-    with _mended():
+    with _mended(out):
         sources = list(_sources(bddl, activity, jsonl))
         bases = [build_base_scene(scene_id) for scene_id in scenes or DEFAULT_SCENES]
         outcomes = _judged(console, sources, bases, seed, bind_only=bind_only)
@@ -109,8 +111,8 @@ def import_(
 
 
 @app.command("list")
-def list_(folder: Annotated[Path, typer.Argument(help="Folder of a data set.")]) -> None:
-    """Show the tasks of a data set."""
+def list_(folder: Annotated[Path, typer.Argument(help="Folder of a dataset.")]) -> None:
+    """Show the tasks of a dataset."""
     with _mended():
         dataset = Dataset.load(folder)
     table = Table("task", "split", "category", "rows", "steps", "instruction")
@@ -129,7 +131,10 @@ def list_(folder: Annotated[Path, typer.Argument(help="Folder of a data set.")])
 
 def _sources(bddl: Path | None, activity: str, jsonl: Path | None) -> Iterator[SourceText]:
     if sum(map(bool, (bddl, activity, jsonl))) != 1:
-        raise SourceError("expected exactly one of --bddl FILE, --activity NAME and --jsonl FILE")
+        raise SourceError(
+            f"found {sum(map(bool, (bddl, activity, jsonl)))} sources: expected exactly one of --bddl FILE, "
+            "--activity NAME and --jsonl FILE"
+        )
     if bddl is not None:
         yield read_file(bddl)
     elif jsonl is not None:
@@ -147,10 +152,13 @@ def _judged(
     with _progress(console) as bars, contextlib.closing(PlacementLibrary()) as library:
         bar = bars.add_task("problems", total=len(sources))
         for source in sources:
-            if bind_only:
-                outcomes.append(bind_first(source, bases, seed=seed))
-            else:
-                outcomes.append(verify_first(source, bases, library, seed=seed))
+            try:
+                if bind_only:
+                    outcomes.append(bind_first(source, bases, seed=seed))
+                else:
+                    outcomes.append(verify_first(source, bases, library, seed=seed))
+            except BddlError as error:
+                raise SourceError(f"{source.name}: {error}") from error
             bars.advance(bar)
     return outcomes
 
@@ -209,16 +217,25 @@ def _progress(console: Console) -> Progress:
 
 
 @contextlib.contextmanager
-def _mended() -> Iterator[None]:
-    """What a person can mend is one sentence and exit status 2."""
+def _mended(out: Path | None = None, kept: str = "") -> Iterator[None]:
+    """What a person can mend is one sentence and exit status 2, an interrupt one and 130.
+
+    ``out`` is the folder that is written, ``kept`` what an interrupt leaves in it.
+    """
     try:
         yield
-    except (BddlError, CatalogError, DatasetError, SourceError) as error:
+    except (CatalogError, DatasetError, EngineMissingError, SourceError) as error:
         _fail(str(error))
+    except OSError as error:
+        if out is None:
+            raise
+        _fail(f"the folder {out} can't be written ({error.strerror}): make room, or name another with --out")
+    except KeyboardInterrupt:
+        _fail(f"interrupted{kept}", status=130)
 
 
-def _fail(sentence: str) -> NoReturn:
+def _fail(sentence: str, status: int = 2) -> NoReturn:
     Console(stderr=True).print(
         f"embomatrix factory: {sentence}", highlight=False, markup=False, soft_wrap=True
     )
-    raise typer.Exit(2)
+    raise typer.Exit(status) from None

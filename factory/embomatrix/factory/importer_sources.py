@@ -44,19 +44,12 @@ def read_activity(name: str) -> SourceText:
 
 def read_file(path: Path) -> SourceText:
     """A ``.bddl`` file. Raises SourceError when it can't be read."""
-    try:
-        return SourceText(path.stem, path.read_text(encoding="utf-8"), "file")
-    except (OSError, UnicodeDecodeError) as error:
-        raise SourceError(f"{path} can't be read: {getattr(error, 'strerror', None) or error}") from error
+    return SourceText(path.stem, _read(path), "file")
 
 
 def read_jsonl(path: Path) -> Iterator[SourceText]:
     """Problems of a JSONL file with the fields ``name`` and ``bddl``. Raises SourceError naming the line."""
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise SourceError(f"{path} can't be read: {getattr(error, 'strerror', None) or error}") from error
-    for number, line in enumerate(lines, start=1):
+    for number, line in enumerate(_read(path).splitlines(), start=1):
         if not line.strip():
             continue
         try:
@@ -65,6 +58,15 @@ def read_jsonl(path: Path) -> Iterator[SourceText]:
         except (ValueError, KeyError, TypeError) as error:
             raise SourceError(f"{path}:{number}: expected an object with 'name' and 'bddl'") from error
         yield SourceText(str(name), str(text), "embomatrix")
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise SourceError(f"{path} can't be read ({error.strerror}): name a file that is there") from error
+    except UnicodeDecodeError as error:
+        raise SourceError(f"{path} is no text in UTF-8: expected BDDL problems") from error
 
 
 def _definitions() -> Path:

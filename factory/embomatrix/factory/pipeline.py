@@ -108,8 +108,9 @@ def build_dataset(
 
     Raises CatalogError for an unknown scene, DatasetError when the folder holds a build of other settings.
     """
-    store = BuildStore.open(folder, dataclasses.asdict(settings))
+    # Scenes first: a wrong name shall leave no folder behind.
     bases = [build_base_scene(scene_id, seed=settings.seed) for scene_id in settings.scenes]
+    store = BuildStore.open(folder, dataclasses.asdict(settings))
     rooms = split_rooms(bases, settings.seed)
     library = PlacementLibrary()
     try:

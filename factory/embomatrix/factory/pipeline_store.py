@@ -15,6 +15,7 @@ from embomatrix.world.dataset import (
     record_from_json,
     record_to_json,
 )
+from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -61,13 +62,22 @@ class BuildStore:
         try:
             (folder / BUNDLES_FOLDER).mkdir(parents=True, exist_ok=True)
             if not path.exists():
-                path.write_text(json.dumps({"settings": wanted}) + "\n", encoding="utf-8")
+                write_whole(path, (json.dumps({"settings": wanted}) + "\n").encode("ascii"))
             first, *lines = path.read_text(encoding="utf-8").splitlines()
             found = json.loads(first)["settings"]
-        except (OSError, ValueError, KeyError) as error:
-            raise DatasetError(f"{path} can't be used: {error}; choose another folder") from error
+        except OSError as error:
+            raise DatasetError(
+                f"the folder {folder} can't be written ({error.strerror}): choose another one"
+            ) from error
+        except (ValueError, LookupError, TypeError) as error:
+            raise DatasetError(
+                f"{path} is damaged: expected the settings of the build in its first line; choose another folder"
+            ) from error
         if found != wanted:
-            raise DatasetError(f"{folder} holds a build of other settings, {found}: choose another folder")
+            raise DatasetError(
+                f"{folder} holds a build of other settings ({_differences(found, wanted)}): give the same again, or choose "
+                "another folder"
+            )
         return BuildStore(folder, _whole(path, lines))
 
     def has(self, split: str, number: int) -> bool:
@@ -80,7 +90,7 @@ class BuildStore:
         """Keep a variant's result. The bundle goes first: a line in the file means that it is there."""
         if result.records:
             path = self.folder / BUNDLES_FOLDER / bundle_file(result.records[0].bundle_digest)
-            path.write_bytes(bundle)
+            write_whole(path, bundle)
         with (self.folder / BUILD_FILE).open("a", encoding="utf-8") as file:
             file.write(json.dumps(_to_json(result)) + "\n")
         self.results.append(result)
@@ -88,7 +98,14 @@ class BuildStore:
     def write_rejections(self) -> None:
         lines = [json.dumps(asdict(item)) for result in self.results for item in result.rejections]
         text = "".join(f"{line}\n" for line in lines)
-        (self.folder / REJECTIONS_FILE).write_text(text, encoding="utf-8")
+        write_whole(self.folder / REJECTIONS_FILE, text.encode("utf-8"))
+
+
+def _differences(found: object, wanted: Mapping[str, Any]) -> str:
+    known = found if isinstance(found, dict) else {}
+    return ", ".join(
+        f"{name} {known.get(name)}, now {value}" for name, value in wanted.items() if known.get(name) != value
+    )
 
 
 def _whole(path: Path, lines: list[str]) -> list[VariantResult]:

@@ -40,14 +40,14 @@ class PlayError(Exception):
 
 
 def play(
-    task: Annotated[str, typer.Argument(help="Id of a task of the data set.")],
+    task: Annotated[str, typer.Argument(help="Id of a task of the dataset.")],
     plan: Annotated[
         str, typer.Option("--plan", help="File with a plan, JSON or one call a line; - reads standard input.")
     ] = "",
     oracle: Annotated[bool, typer.Option("--oracle", help="Find a plan with the oracle and run it.")] = False,
     dataset: Annotated[
         Path | None,
-        typer.Option(help=f"Folder of the data set; else $EMBOMATRIX_DATASET, else {DEFAULT_DATASET}."),
+        typer.Option(help=f"Folder of the dataset; else $EMBOMATRIX_DATASET, else {DEFAULT_DATASET}."),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Decides between outcomes that are equally good.")] = 0,
 ) -> None:
@@ -92,12 +92,15 @@ def _text_of(plan: str) -> str:
     """The plan's text. One byte more than a plan may have is read at most."""
     try:
         if plan == "-":
+            if sys.stdin is None:
+                raise PlayError("there is no standard input to read a plan from: expected --plan FILE")
             raw = sys.stdin.buffer.read(MAX_PLAN_BYTES + 1)
         else:
             with Path(plan).open("rb") as file:
                 raw = file.read(MAX_PLAN_BYTES + 1)
     except OSError as error:
         raise PlayError(f"the plan {plan!r} can't be read ({error.strerror}): expected a text file") from None
+    # No byte is refused here: what the text means, or that it means nothing, is the parser's to say.
     return raw.decode("utf-8", errors="replace")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -20,6 +21,7 @@ from embomatrix.sim.bullet.camera import render_oblique
 from embomatrix.sim.engine import EngineError
 from embomatrix.world.catalog import Catalog, CatalogError
 from embomatrix.world.codec import scene_to_json
+from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:
     from embomatrix.world.scene import Scene
@@ -50,7 +52,7 @@ def build(scene_id: SceneId, seed: Seed = 0, out: Out = Path()) -> None:
 
     scene = _built(scene_id, seed)
     path = _folder(out) / f"{scene_id}.json"
-    path.write_text(json.dumps(scene_to_json(scene)), encoding="utf-8")
+    _write(path, json.dumps(scene_to_json(scene)).encode("utf-8"))
     Console().print(f"{len(scene.rooms)} rooms, {len(scene.objects)} objects: {path}", highlight=False)
 
 
@@ -77,11 +79,12 @@ def render(scene_id: SceneId, seed: Seed = 0, out: Out = Path()) -> None:
     scene = _built(scene_id, seed)
     folder = _folder(out)
     plan, oblique = folder / f"{scene_id}_plan.png", folder / f"{scene_id}_view.png"
-    draw_plan(scene).save(plan)
+    _write(plan, _png(draw_plan(scene)))
     try:
-        Image.fromarray(np.asarray(render_oblique(scene))).save(oblique)
+        view = render_oblique(scene)
     except EngineError as error:
         raise _refused(str(error)) from None
+    _write(oblique, _png(Image.fromarray(np.asarray(view))))
     Console().print(f"{plan}\n{oblique}", highlight=False)
 
 
@@ -111,10 +114,29 @@ def _folder(out: Path) -> Path:
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise _refused(f"can't write to {out}: {error.strerror}: name another folder with --out") from None
+        raise _unwritable(out, error) from None
     return out
 
 
+def _write(path: Path, data: bytes) -> None:
+    try:
+        write_whole(path, data)
+    except OSError as error:
+        raise _unwritable(path, error) from None
+
+
+def _png(image: Image.Image) -> bytes:
+    buffer = io.BytesIO()
+    image.save(buffer, format="PNG")
+    return buffer.getvalue()
+
+
+def _unwritable(path: Path, error: OSError) -> typer.Exit:
+    return _refused(
+        f"{path} can't be written ({error.strerror}): make room, or name another folder with --out"
+    )
+
+
 def _refused(sentence: str) -> typer.Exit:
-    Console(stderr=True).print(sentence, highlight=False, markup=False)
+    Console(stderr=True, soft_wrap=True).print(f"embomatrix scene: {sentence}", highlight=False, markup=False)
     return typer.Exit(2)

@@ -94,6 +94,21 @@ def test_folder_of_another_build_is_left_alone(folder: Path, dataset: Dataset) -
         BuildStore.open(folder, {"seed": 99})
 
 
+def test_difference_to_the_build_of_a_folder_is_told(tmp_path: Path) -> None:
+    BuildStore.open(tmp_path, {"seed": 1, "train": 8})
+    with pytest.raises(DatasetError, match=r"other settings \(seed 1, now 2\): give the same again"):
+        BuildStore.open(tmp_path, {"seed": 2, "train": 8})
+
+
+@pytest.mark.parametrize("content", ["", "{}", "[1]\n", "not json"])
+def test_build_file_without_settings_is_damaged(tmp_path: Path, content: str) -> None:
+    (tmp_path / "build.jsonl").write_text(content)
+    with pytest.raises(
+        DatasetError, match="is damaged: expected the settings of the build in its first line"
+    ):
+        BuildStore.open(tmp_path, {"seed": 2})
+
+
 def test_rejections_are_kept_with_their_reasons(folder: Path, summary: Summary) -> None:
     lines = (folder / "rejections.jsonl").read_text().splitlines()
     assert len(lines) == sum(summary.rejected.values())
@@ -161,7 +176,7 @@ def test_bad_bddl_is_one_sentence_and_exit_2(tmp_path: Path, old: str, new: str,
         (["import", "--activity", "bringin_water"], "did you mean bringing_water"),
         (["import"], "exactly one of"),
         (["import", "--bddl", "OUT/none.bddl"], "can't be read"),
-        (["list", "OUT/none"], "no data set"),
+        (["list", "OUT/none"], "no dataset"),
     ],
 )
 def test_unknown_names_are_one_sentence_and_exit_2(

@@ -108,7 +108,7 @@ def test_the_oracle_shows_that_the_task_can_be_done(run):
         (
             ("cook_chicken", "--oracle"),
             {"EMBOMATRIX_DATASET": "/no/such"},
-            "there is no data set in /no/such",
+            "there is no dataset in /no/such",
         ),
     ],
 )

@@ -47,7 +47,7 @@ def test_only_eleven_rooms_have_an_estimated_floor(catalog: Catalog) -> None:
 
 def test_description_counts_rooms_and_objects(catalog: Catalog) -> None:
     text = catalog.inventory("Rs_int").description
-    assert text.startswith("Rs int: 5 rooms (bathroom, bedroom, entryway, kitchen, living room), ")
+    assert text.startswith("Rs_int: 5 rooms (bathroom, bedroom, entryway, kitchen, living room), ")
     assert "objects" in text
 
 

@@ -8,7 +8,7 @@ import os
 import sys
 from typing import TYPE_CHECKING, Any, Final
 
-from embomatrix.sim.engine import EngineError
+from embomatrix.sim.engine import EngineError, EngineMissingError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -34,12 +34,12 @@ def _stderr_closed() -> Iterator[None]:
 
 @functools.cache
 def pybullet() -> Any:
-    """The module, imported at the first call. Raises EngineError where it is not installed."""
+    """The module, imported at the first call. Raises EngineMissingError where it is not installed."""
     try:
         with _stderr_closed():
             import pybullet as module
     except ImportError as error:
-        raise EngineError(
+        raise EngineMissingError(
             "the physics engine is missing: expected the package pybullet 3.2.7, which has wheels for Python up to "
             "3.11 on x86-64 Linux; install embomatrix[worker] there"
         ) from error
