@@ -143,7 +143,7 @@ class TrainingRun:
                 schedule.take(settings.tasks_per_step),
                 np.random.default_rng(np.random.SeedSequence((self._settings.seed, 2, progress.step))),
                 self._generator,
-                1.0 - (1.0 - settings.final_learning_rate_share) * share,
+                self._rate_factor(share),
             )
             seconds = time.monotonic() - began_s
             progress.cursor = schedule.cursor
@@ -158,6 +158,12 @@ class TrainingRun:
         if settings.steps is not None:
             return self._progress.step / settings.steps if settings.steps else 1.0
         return self._progress.grpo_s / (60 * settings.minutes) if settings.minutes else 1.0
+
+    def _rate_factor(self, share: float) -> float:
+        """Of the learning rate: a linear rise over the warm-up, then a linear fall with the budget."""
+        settings = self._settings.grpo
+        rise = min(1.0, self._progress.step / (settings.warmup_steps + 1))
+        return rise * (1.0 - (1.0 - settings.final_learning_rate_share) * share)
 
     def _announce(self, schedule: Schedule, step: int) -> None:
         """This step's tasks and those of the steps ahead: the whole window, every time."""

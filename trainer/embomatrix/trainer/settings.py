@@ -72,6 +72,9 @@ class GrpoSettings(_Frozen):
     chunk: int = Field(default=4, ge=1)
     """Tasks sampled together: their plans go to the cluster while the next chunk is sampled."""
     learning_rate: float = Field(default=3e-4, gt=0)
+    warmup_steps: int = Field(default=20, ge=0)
+    """Adam's first steps have the full length of the rate whatever the gradient: unless it rises slowly, the first few small
+    batches undo what imitation taught."""
     final_learning_rate_share: float = Field(default=0.2, gt=0, le=1)
     """The rate falls linearly to this share of itself."""
     temperature: float = Field(default=1.0, gt=0)

@@ -27,8 +27,10 @@ RETRY_LOAD_S: Final = 5.0
 """A scene that could not be loaded is tried again after this long, while it is still wanted."""
 
 
-IDLE_PER_SLOT: Final = 4
-"""Idle processes kept for each slot of the worker, over all scenes: each holds a few MB."""
+SLOT_MB: Final = 8.0
+IDLE_MEMORY_SHARE: Final = 0.25
+"""Idle processes may hold this share of the worker's memory, at about 8 MB each. A step's scenes come back step after step,
+and a fork with its page faults costs ten times what a short plan does: 36 ms of system time on a small virtual machine."""
 
 
 class LoadError(Exception):
@@ -46,6 +48,11 @@ class SlotLimits:
     slots: int
     memory_mb: float
     slot_memory_mb: int = 2048
+
+    @property
+    def idle_slots(self) -> int:
+        """Processes that may wait for a next rollout, over all scenes: as many as there are slots at least."""
+        return max(self.slots, int(self.memory_mb * IDLE_MEMORY_SHARE / SLOT_MB))
 
 
 @dataclass(slots=True)
@@ -189,7 +196,7 @@ class Residents:
             return
         scene.idle.append(slot)
         idle = [other for other in self._scenes.values() if other.idle]
-        if sum(len(other.idle) for other in idle) > IDLE_PER_SLOT * self._limits.slots:
+        if sum(len(other.idle) for other in idle) > self._limits.idle_slots:
             oldest = min(idle, key=lambda other: other.last_used)
             self.end_later(oldest.idle.pop(0).child)
 

@@ -45,6 +45,9 @@ class LayerMemory:
     keys: Tensor
     values: Tensor
 
+    def of_rows(self, rows: Tensor) -> LayerMemory:
+        return LayerMemory(self.keys[rows], self.values[rows])
+
 
 @dataclass(frozen=True, slots=True)
 class PromptMemory:
@@ -56,6 +59,19 @@ class PromptMemory:
     hidden: Tensor
     lengths: Tensor
     states: Tensor
+
+    def of_rows(self, prompts: Tensor) -> PromptMemory:
+        """The prompts with these indices (rows,), each as often as it is named: a memory for groups of one.
+
+        Rows that end at different lengths can then be run apart, without the padding of the longest.
+        """
+        return PromptMemory(
+            tuple(layer.of_rows(prompts) for layer in self.layers),
+            self.tokens[prompts],
+            self.hidden[prompts],
+            self.lengths[prompts],
+            self.states[prompts],
+        )
 
 
 class _Block(nn.Module):

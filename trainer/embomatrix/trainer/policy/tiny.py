@@ -7,6 +7,7 @@ import json
 from typing import TYPE_CHECKING, Self
 
 import torch
+from torch.nn import functional
 
 from embomatrix.skills.prompt import Codec
 from embomatrix.trainer.policy.decoder import Decoder, DecoderShape
@@ -21,9 +22,13 @@ if TYPE_CHECKING:
     from torch import Tensor, nn
 
     from embomatrix.skills.prompt import Prompt
-    from embomatrix.trainer.policy.decoder import PromptMemory
+    from embomatrix.trainer.policy.decoder import LayerMemory, PromptMemory
     from embomatrix.trainer.policy.protocol import Tokens
 
+_COMPACT_SHARE = 0.6
+"""Rows that have ended are dropped from the sampling loop once so few go on: most plans are much shorter than the longest."""
+_LENGTH_CLASSES = 4
+"""Plans are scored in this many batches of like length, each padded to its own longest."""
 _WEIGHTS = "weights.pt"
 _DESCRIPTION = "tiny.json"
 
@@ -72,40 +77,67 @@ class TinyPolicy:
         generator: torch.Generator,
     ) -> Samples:
         memory = self.network.read(*self._padded(prompts))
+        rows = torch.arange(len(prompts) * group, device=self.device)  # those that go on
         state = memory.states[:, -1:].repeat_interleave(group, dim=0)  # (rows, 1, C)
-        rows = state.shape[0]
-        own = None
-        done = torch.zeros(rows, dtype=torch.bool, device=self.device)
-        tokens, masks, logprobs = [], [], []
+        own: tuple[LayerMemory, ...] | None = None
+        tokens = torch.full((len(rows), max_new), PAD, device=self.device)
+        logprobs = torch.zeros(len(rows), max_new, device=self.device)
+        mask = torch.zeros(len(rows), max_new, dtype=torch.bool, device=self.device)
+        going = torch.ones(len(rows), dtype=torch.bool, device=self.device)
+        length = 0
         for at in range(max_new):
             choice, logprob = draw(self._scores(state, memory)[:, 0], temperature, generator)
-            choice = torch.where(done, PAD, choice)
-            tokens.append(choice)
-            masks.append(~done)
-            logprobs.append(torch.where(done, 0.0, logprob))
-            done = done | (choice == END)
-            if bool(done.all()):
+            tokens[rows, at] = torch.where(going, choice, PAD)
+            logprobs[rows, at] = torch.where(going, logprob, 0.0)
+            mask[rows, at] = going
+            length = at + 1
+            going = going & (choice != END)
+            left = int(going.sum())
+            if left == 0:
                 break
+            if left <= _COMPACT_SHARE * len(going):
+                kept = going.nonzero()[:, 0]
+                memory = memory.of_rows(kept * len(memory.lengths) // len(going))
+                own = tuple(layer.of_rows(kept) for layer in own) if own else None
+                rows, choice, going = rows[kept], choice[kept], going[kept]
             state, own = self.network.extend(memory, choice[:, None], own, at)
-        drawn = torch.stack(tokens, dim=1)
+        drawn = tokens[:, :length]
         texts = tuple(self.vocabulary.decode(row) for row in drawn.tolist())
-        return Samples(drawn, torch.stack(masks, dim=1), torch.stack(logprobs, dim=1), texts)
+        return Samples(drawn, mask[:, :length], logprobs[:, :length], texts)
 
     def logprobs(
         self, prompts: Sequence[Tokens], tokens: Tensor, mask: Tensor, group: int, temperature: float
     ) -> Scored:
         memory = self.network.read(*self._padded(prompts))
-        first = memory.states[:, -1:].repeat_interleave(group, dim=0)  # (rows, 1, C)
-        states = first
+        lengths = mask.sum(dim=1)
+        order = torch.argsort(lengths, stable=True)
+        parts = [
+            self._scored(memory, tokens[rows, : max(1, int(lengths[rows].max()))], rows // group, temperature)
+            for rows in order.tensor_split(min(_LENGTH_CLASSES, len(order)))
+        ]
+        back = torch.argsort(order)
+        size = tokens.shape[1]
+        chosen, entropy = (
+            torch.cat([functional.pad(part, (0, size - part.shape[1])) for part in column])[back]
+            for column in zip(*parts, strict=True)
+        )
+        return Scored(chosen * mask, entropy * mask)
+
+    def _scored(
+        self, memory: PromptMemory, tokens: Tensor, prompts: Tensor, temperature: float
+    ) -> tuple[Tensor, Tensor]:
+        """Log-probability and entropy (rows, T) of each token (rows, T), after the prompts with these indices (rows,)."""
+        memory = memory.of_rows(prompts)
+        states = memory.states[:, -1:]  # (rows, 1, C)
         if tokens.shape[1] > 1:
             rest, _ = self.network.extend(memory, tokens[:, :-1], None, 0)
-            states = torch.cat([first, rest], dim=1)  # (rows, T, C)
+            states = torch.cat([states, rest], dim=1)  # (rows, T, C)
         scores = torch.log_softmax(
             self._scores(states, memory) / (temperature or 1.0), dim=-1
         )  # (rows, T, V)
         chosen = scores.gather(-1, tokens[..., None])[..., 0]
         entropy = -(scores.exp() * scores.clamp(min=-1e4)).sum(dim=-1)
-        return Scored(chosen * mask, entropy * mask)
+        return chosen, entropy
 
     def _scores(self, states: Tensor, memory: PromptMemory) -> Tensor:
         """Log-probabilities without padding and prompt marks: tokens that no plan holds."""
