@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import logging
+import os
 import signal
 import subprocess
 import time
@@ -37,13 +38,16 @@ def demo(
     ),
     workers: Annotated[int, typer.Option(min=1, max=64, help="Worker daemons on this machine.")] = 2,
     slots: Annotated[int, typer.Option(min=1, max=64, help="Slots of each worker.")] = 1,
-    minutes: Annotated[float, typer.Option(min=0.1, help="Minutes of GRPO.")] = 5.0,
-    imitate_seconds: Annotated[float, typer.Option(min=0.0, help="Seconds of imitation before it.")] = 150.0,
+    minutes: Annotated[float, typer.Option(min=0.1, help="Minutes of GRPO.")] = 6.0,
+    imitate_seconds: Annotated[float, typer.Option(min=0.0, help="Seconds of imitation before it.")] = 180.0,
     model: Annotated[str, typer.Option(help="`tiny`, or a Hugging Face name or folder.")] = "tiny",
     seed: Annotated[int, typer.Option(help="Seed of tasks, policy and sampling.")] = 0,
+    threads: Annotated[int, typer.Option(min=0, help="Threads of torch; 0: one a core.")] = 0,
 ) -> None:
     """Bring up a local cluster and train on real tasks, from nothing to a report."""
     logging.basicConfig(level=logging.WARNING, format="%(message)s", handlers=[RichHandler(show_path=False)])
+    # Threads that spin while they wait would take the cores from the simulators.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     folder = _folder(out)
     started_s = time.monotonic()
     if not (dataset / "tasks.jsonl").exists():
@@ -67,6 +71,8 @@ def demo(
             f"--imitate-seconds={imitate_seconds}",
             f"--out={folder}",
             f"--seed={seed}",
+            # The workers are niced and far from busy: the trainer may have every core.
+            f"--threads={threads or os.cpu_count() or 1}",
         )
         _report_restarts(cluster)
     ended_s = time.monotonic()

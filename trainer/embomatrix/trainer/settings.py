@@ -40,11 +40,11 @@ class TinySettings(_Frozen):
 class PromptSettings(_Frozen):
     """What of a task's table is told, and how the telling varies during training."""
 
-    rows: int = Field(default=28, ge=1)
+    rows: int = Field(default=16, ge=1)
     """Rows told at most: those that the instruction names come first."""
     rename_share: float = Field(default=0.5, ge=0, le=1)
     """Share of examples in which categories are called by those of other things of the same kind (tiny policy only)."""
-    drop_share: float = Field(default=0.5, ge=0, le=1)
+    drop_share: float = Field(default=0.7, ge=0, le=1)
     """During imitation: up to this share of the rows that the oracle does not use is left untold."""
 
 
@@ -66,12 +66,12 @@ class GrpoSettings(_Frozen):
     minutes: float = Field(default=5.0, ge=0)
     steps: int | None = Field(default=None, ge=0)
     """A number of steps in place of the minutes."""
-    tasks_per_step: int = Field(default=8, ge=1)
+    tasks_per_step: int = Field(default=16, ge=1)
     group: int = Field(default=8, ge=2)
     """Plans per task: G."""
-    chunk: int = Field(default=4, ge=1)
+    chunk: int = Field(default=8, ge=1)
     """Tasks sampled together: their plans go to the cluster while the next chunk is sampled."""
-    learning_rate: float = Field(default=3e-4, gt=0)
+    learning_rate: float = Field(default=2e-4, gt=0)
     warmup_steps: int = Field(default=20, ge=0)
     """Adam's first steps have the full length of the rate whatever the gradient: unless it rises slowly, the first few small
     batches undo what imitation taught."""
@@ -84,7 +84,7 @@ class GrpoSettings(_Frozen):
     ratio: RatioLevel = RatioLevel.TOKEN
     clip_low: float = Field(default=0.2, gt=0, lt=1)
     clip_high: float = Field(default=0.28, gt=0)
-    kl_coef: float = Field(default=0.005, ge=0)
+    kl_coef: float = Field(default=0.02, ge=0)
     """Weight of the KL to the policy as imitation left it: the paper's beta."""
     entropy_coef: float = Field(default=0.0, ge=0)
     max_grad_norm: float = Field(default=1.0, gt=0)
@@ -129,6 +129,7 @@ class TrainSettings(_Frozen):
 
 
 LANGUAGE_MODEL_DEFAULTS: Final[Mapping[str, Any]] = {
+    "prompt.rows": 28,
     "prompt.rename_share": 0.0,
     "imitation.batch": 4,
     "imitation.learning_rate": 5e-5,
