@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
@@ -10,10 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from embomatrix.trainer.errors import TrainerError
+from embomatrix.trainer.errors import DAMAGE, TrainerError
 from embomatrix.trainer.settings import TrainSettings
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from embomatrix.trainer.policy.protocol import Policy
@@ -53,24 +55,21 @@ class CheckpointStore:
         progress: Progress,
         settings: TrainSettings,
     ) -> Path:
-        """Write beside, sync, then rename: a crash leaves the last checkpoint as it was."""
+        """Write beside, sync, then rename: a crash leaves the last checkpoint as it was. Raises TrainerError."""
         final = self._folder / f"{_PREFIX}{progress.step:06d}"
         partial = self._folder / f".{final.name}.partial"
-        shutil.rmtree(partial, ignore_errors=True)
-        partial.mkdir(parents=True)
-        policy.save(partial / "policy")
-        torch.save(
-            {"optimiser": optimiser.state_dict(), "generator": generator.get_state()}, partial / _TENSORS
-        )
-        state = {
-            "schema": SCHEMA,
-            "progress": asdict(progress),
-            "settings": settings.model_dump(mode="json"),
-        }
-        (partial / _STATE).write_text(json.dumps(state, indent=1), encoding="utf-8")
-        _sync(partial)
-        shutil.rmtree(final, ignore_errors=True)
-        os.replace(partial, final)
+        with _whole_or_nothing(partial, final):
+            policy.save(partial / "policy")
+            torch.save(
+                {"optimiser": optimiser.state_dict(), "generator": generator.get_state()}, partial / _TENSORS
+            )
+            state = {
+                "schema": SCHEMA,
+                "progress": asdict(progress),
+                "settings": settings.model_dump(mode="json"),
+            }
+            (partial / _STATE).write_text(json.dumps(state, indent=1), encoding="utf-8")
+            _sync(partial)
         for old in self._all()[: -self._keep]:
             shutil.rmtree(old, ignore_errors=True)
         return final
@@ -84,6 +83,24 @@ class CheckpointStore:
         if not self._folder.is_dir():
             return []
         return sorted(path for path in self._folder.glob(f"{_PREFIX}*") if (path / _STATE).is_file())
+
+
+@contextlib.contextmanager
+def _whole_or_nothing(partial: Path, final: Path) -> Iterator[None]:
+    """An empty folder ``partial`` to fill, which becomes ``final`` at the end; what can't be filled is removed."""
+    shutil.rmtree(partial, ignore_errors=True)
+    try:
+        partial.mkdir(parents=True)
+        yield
+        shutil.rmtree(final, ignore_errors=True)
+        os.replace(partial, final)
+    except (OSError, RuntimeError) as error:  # torch's writer raises RuntimeError where a disk is full
+        raise TrainerError(
+            f"the checkpoint {final} can't be written ({str(error).splitlines()[0]}): make room there; those before it are "
+            "whole, and --resume goes on from the newest"
+        ) from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
 
 
 def _sync(folder: Path) -> None:
@@ -103,13 +120,20 @@ def read_state(folder: Path) -> tuple[Progress, TrainSettings]:
             )
         return Progress(**state["progress"]), TrainSettings.model_validate(state["settings"])
     except (OSError, ValueError, KeyError, TypeError) as error:
+        reason = f"{_STATE}: {error.strerror}" if isinstance(error, OSError) else str(error).splitlines()[0]
         raise TrainerError(
-            f"{folder} is no readable checkpoint ({error}): pass a folder such as runs/NAME/checkpoints/step-000050"
+            f"{folder} is no readable checkpoint ({reason}): pass a folder such as runs/NAME/checkpoints/step-000050"
         ) from error
 
 
 def restore(folder: Path, optimiser: torch.optim.Optimizer, generator: torch.Generator) -> None:
-    """Put the optimiser and the sampler's generator back as they were."""
-    tensors = torch.load(folder / _TENSORS, map_location="cpu", weights_only=True)
-    optimiser.load_state_dict(tensors["optimiser"])
-    generator.set_state(tensors["generator"])
+    """Put the optimiser and the sampler's generator back as they were. Raises TrainerError where the file is damaged."""
+    try:
+        tensors = torch.load(folder / _TENSORS, map_location="cpu", weights_only=True)
+        optimiser.load_state_dict(tensors["optimiser"])
+        generator.set_state(tensors["generator"])
+    except DAMAGE as error:
+        raise TrainerError(
+            f"{folder / _TENSORS} is damaged ({str(error).splitlines()[0]}): remove {folder}, and --resume goes on from the "
+            "checkpoint before it"
+        ) from error

@@ -7,7 +7,7 @@ import json
 import logging
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 from rich.console import Console
@@ -15,6 +15,7 @@ from rich.table import Table
 
 from embomatrix.rpc.channel import DEFAULT_ADDRESS
 from embomatrix.trainer.errors import TrainerError
+from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -57,7 +58,7 @@ def train(
     token: _TOKEN = "",
 ) -> None:
     """Train a policy: imitation of the oracle, then GRPO on the cluster, measured on held-out tasks."""
-    with _problems_shown("train"):
+    with _problems_shown("train", out):
         changes = {
             "seed": seed,
             "device": device,
@@ -108,20 +109,29 @@ def evaluate(
         result = _evaluated(policy, chosen, tasks, manager, token, settings)
         _show_evaluation(result)
         if json_file is not None:
-            json_file.write_text(json.dumps(result.as_json(), indent=1), encoding="utf-8")
+            _write(json_file, json.dumps(result.as_json(), indent=1))
 
 
 @contextlib.contextmanager
-def _problems_shown(command: str) -> Iterator[None]:
-    """What a person can mend is one sentence and status 2."""
+def _problems_shown(command: str, out: Path | None = None) -> Iterator[None]:
+    """What a person can mend is one sentence and status 2, an interrupt one and 130. ``out`` is the run's folder."""
     from embomatrix.rpc.status import ClusterError
 
     logging.getLogger("embomatrix").addHandler(logging.NullHandler())
     try:
         yield
     except (TrainerError, ClusterError) as error:
-        Console(stderr=True).print(f"embomatrix {command}: {error}", highlight=False, markup=False)
-        raise typer.Exit(2) from None
+        _leave(command, str(error), 2)
+    except KeyboardInterrupt:
+        saved = out is not None and any((out / "checkpoints").glob("step-*"))
+        _leave(command, f"interrupted: go on with `--resume --out={out}`" if saved else "interrupted", 130)
+
+
+def _leave(command: str, sentence: str, status: int) -> NoReturn:
+    Console(stderr=True, soft_wrap=True).print(
+        f"embomatrix {command}: {sentence}", highlight=False, markup=False
+    )
+    raise typer.Exit(status) from None
 
 
 def _started(
@@ -176,7 +186,21 @@ def _loaded(dataset: Path, settings: TrainSettings) -> TaskSet:
     from embomatrix.trainer.data import load_tasks
 
     torch.set_num_threads(settings.threads)
+    try:
+        torch.empty(0, device=settings.device)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0].split(". ")[0]
+        raise TrainerError(
+            f"the device {settings.device!r} can't be used ({reason}): expected cpu, or cuda where torch finds a GPU"
+        ) from error
     return load_tasks(dataset)
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        write_whole(path, text.encode("utf-8"))
+    except OSError as error:
+        raise TrainerError(f"{path} can't be written ({error.strerror}): name another file") from error
 
 
 def _teller(policy: Policy, tasks: TaskSet, settings: TrainSettings) -> Teller:
@@ -207,6 +231,12 @@ def _run(
     from embomatrix.trainer.progress import display_for
 
     console = Console()
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise TrainerError(
+            f"the folder {out} can't be made ({error.strerror}): pass another --out"
+        ) from error
     reference = resumed.pop("reference", None)
     with (
         _gateway(tasks, manager, token, out.name, settings.seed) as gateway,

@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+import pickle
+from typing import Final
+
+DAMAGE: Final = (OSError, ValueError, LookupError, TypeError, RuntimeError, EOFError, pickle.UnpicklingError)
+"""What reading a damaged file may raise: torch's reader lets its own slips through."""
+
 
 class TrainerError(Exception):
     """One sentence for a person; commands show it and end with status 2."""

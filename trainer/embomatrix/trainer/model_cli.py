@@ -32,7 +32,9 @@ def import_gguf_command(
     try:
         import_gguf(source, out)
     except TrainerError as error:
-        Console(stderr=True).print(f"embomatrix model: {error}", highlight=False, markup=False)
+        Console(stderr=True, soft_wrap=True).print(
+            f"embomatrix model: {error}", highlight=False, markup=False
+        )
         raise typer.Exit(2) from None
     Console().print(
         f"model written to {out}: train it with `embomatrix train --model {out}`", highlight=False

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import pickle
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.trainer.errors import TrainerError
+from embomatrix.trainer.errors import DAMAGE, TrainerError
 from embomatrix.trainer.policy.decoder import DecoderShape
 from embomatrix.trainer.policy.hf import HfPolicy
 from embomatrix.trainer.policy.tiny import TinyPolicy
@@ -19,8 +18,6 @@ if TYPE_CHECKING:
     from embomatrix.trainer.settings import TrainSettings
 
 TINY: Final = "tiny"
-DAMAGE: Final = (OSError, ValueError, LookupError, TypeError, RuntimeError, EOFError, pickle.UnpicklingError)
-"""What reading a damaged file may raise: torch's reader lets its own slips through."""
 
 
 def new_policy(settings: TrainSettings, tasks: TaskSet) -> Policy:

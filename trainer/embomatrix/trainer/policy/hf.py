@@ -7,7 +7,8 @@ the gradients of the plain computation at a third of the time.
 from __future__ import annotations
 
 import copy
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
 
 import torch
 
@@ -17,12 +18,14 @@ from embomatrix.trainer.policy.protocol import Samples, Scored
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
-    from pathlib import Path
 
     from torch import Tensor, nn
 
     from embomatrix.skills.prompt import Codec, Prompt
     from embomatrix.trainer.policy.protocol import Tokens
+
+LOOK_UP_S: Final = 10.0
+REMEDY: Final = "pass `tiny`, a folder with config.json, or a Hugging Face name; `embomatrix model import-gguf` makes a folder"
 
 
 class HfPolicy:
@@ -45,6 +48,7 @@ class HfPolicy:
             raise TrainerError(
                 f"the model {str(name)!r} needs transformers: `pip install 'embomatrix[hf]'`, or --model tiny"
             ) from error
+        _look_up(str(name))
         dtype = torch.float32 if device == "cpu" else torch.bfloat16
         try:
             tokenizer = AutoTokenizer.from_pretrained(str(name))
@@ -52,8 +56,7 @@ class HfPolicy:
             model.to(device)
         except (OSError, ValueError, KeyError) as error:
             raise TrainerError(
-                f"the model {str(name)!r} can't be loaded ({str(error).splitlines()[0]}): pass `tiny`, a folder with "
-                "config.json, or a Hugging Face name; `embomatrix model import-gguf` makes such a folder"
+                f"the model {str(name)!r} can't be loaded ({_first_line(error)}): {REMEDY}"
             ) from error
         return cls(model, tokenizer, codec, label or str(name))
 
@@ -198,3 +201,27 @@ def _end_tokens(model: Any, tokenizer: Any) -> list[int]:
             "the model has no end-of-text token: a plan could never end; set one in its tokenizer"
         )
     return [int(token) for token in found]
+
+
+def _first_line(error: Exception) -> str:
+    return next(iter(str(error).strip().splitlines()), type(error).__name__)
+
+
+def _look_up(name: str) -> None:
+    """Raise TrainerError unless the model is a folder, is kept from an earlier download, or is known to the hub.
+
+    The hub is asked once and briefly: the loaders of transformers would try for a minute.
+    """
+    if Path(name).is_dir():
+        return
+    from huggingface_hub import HfApi, try_to_load_from_cache
+
+    try:
+        if isinstance(try_to_load_from_cache(name, "config.json"), str):
+            return
+        HfApi().model_info(name, timeout=LOOK_UP_S)
+    except Exception as error:  # the hub's HTTP library, and with it its errors, differs by version
+        raise TrainerError(
+            f"the model {name!r} is no folder here, and the Hugging Face hub does not give it "
+            f"({_first_line(error)}): {REMEDY}"
+        ) from error
