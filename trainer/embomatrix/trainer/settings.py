@@ -150,8 +150,12 @@ def read_settings(
     if path is not None:
         try:
             _merge(values, tomllib.loads(path.read_text(encoding="utf-8")))
-        except (OSError, tomllib.TOMLDecodeError) as error:
-            raise TrainerError(f"the settings file {path} can't be read: {error}") from error
+        except OSError as error:
+            raise TrainerError(
+                f"the settings file {path} can't be read ({error.strerror}): expected a TOML file"
+            ) from error
+        except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+            raise TrainerError(f"the settings file {path} is no TOML: {error}") from error
     return with_changes(values, changes)
 
 
@@ -163,7 +167,10 @@ def with_changes(values: dict[str, Any], changes: Mapping[str, Any]) -> TrainSet
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
-        raise TrainerError(f"setting {where!r}: {first['msg']} (found {first.get('input')!r})") from error
+        if first["type"] == "extra_forbidden":
+            raise TrainerError(f"there is no setting {where!r}: mend its name or leave it out") from error
+        expected = first["msg"][:1].lower() + first["msg"][1:]
+        raise TrainerError(f"setting {where!r}: {expected} (found {first.get('input')!r})") from error
 
 
 def _set_all(values: dict[str, Any], changes: Mapping[str, Any]) -> None:
