@@ -180,6 +180,8 @@ def _set_all(values: dict[str, Any], changes: Mapping[str, Any]) -> None:
             level = values
             for parent in parents:
                 level = level.setdefault(parent, {})
+                if not isinstance(level, dict):
+                    raise TrainerError(f"setting {parent!r}: expected a table of settings (found {level!r})")
             level[leaf] = value
 
 
