@@ -127,9 +127,7 @@ class Aabb:
         """True when the boxes, ``margin_m`` apart or less, share volume or a face."""
         return all(
             a_lo - margin_m <= b_hi and b_lo - margin_m <= a_hi
-            for a_lo, a_hi, b_lo, b_hi in zip(
-                self.low_m, self.high_m, other.low_m, other.high_m, strict=True
-            )
+            for a_lo, a_hi, b_lo, b_hi in zip(self.low_m, self.high_m, other.low_m, other.high_m, strict=True)
         )
 
     @staticmethod
