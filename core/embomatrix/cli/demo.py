@@ -106,7 +106,7 @@ def _folder(wanted: Path | None) -> Path:
 
 
 def _holds_run(folder: Path) -> bool:
-    return (folder / "checkpoints").exists()
+    return any((folder / "checkpoints").glob("step-*"))
 
 
 def _problem(cluster: LocalCluster) -> str:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from embomatrix.trainer.errors import DAMAGE, TrainerError
+from embomatrix.trainer.errors import DAMAGE, TrainerError, reason_of
 from embomatrix.trainer.settings import TrainSettings
 
 if TYPE_CHECKING:
@@ -24,6 +24,8 @@ SCHEMA = 1
 _STATE = "state.json"
 _TENSORS = "training.pt"
 _PREFIX = "step-"
+FULL_BYTES = 8 * 1024 * 1024
+"""With less than this left, a disk counts as full: torch does not tell why a file can't be written."""
 
 
 @dataclass
@@ -57,8 +59,7 @@ class CheckpointStore:
     ) -> Path:
         """Write beside, sync, then rename: a crash leaves the last checkpoint as it was. Raises TrainerError."""
         final = self._folder / f"{_PREFIX}{progress.step:06d}"
-        partial = self._folder / f".{final.name}.partial"
-        with _whole_or_nothing(partial, final):
+        with whole_folder(final) as partial:
             policy.save(partial / "policy")
             torch.save(
                 {"optimiser": optimiser.state_dict(), "generator": generator.get_state()}, partial / _TENSORS
@@ -86,18 +87,20 @@ class CheckpointStore:
 
 
 @contextlib.contextmanager
-def _whole_or_nothing(partial: Path, final: Path) -> Iterator[None]:
-    """An empty folder ``partial`` to fill, which becomes ``final`` at the end; what can't be filled is removed."""
+def whole_folder(final: Path) -> Iterator[Path]:
+    """An empty folder to fill, which becomes ``final`` at the end. Raises TrainerError, and leaves nothing, if that fails."""
+    partial = final.with_name(f".{final.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
     try:
         partial.mkdir(parents=True)
-        yield
+        yield partial
         shutil.rmtree(final, ignore_errors=True)
         os.replace(partial, final)
     except (OSError, RuntimeError) as error:  # torch's writer raises RuntimeError where a disk is full
+        full = shutil.disk_usage(final.parent if final.parent.is_dir() else ".").free < FULL_BYTES
         raise TrainerError(
-            f"the checkpoint {final} can't be written ({str(error).splitlines()[0]}): make room there; those before it are "
-            "whole, and --resume goes on from the newest"
+            f"{final} can't be written ({'the disk is full' if full else reason_of(error)}): make room there, or give rights; "
+            "checkpoints before it are whole, and --resume goes on from the newest"
         ) from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
@@ -120,9 +123,9 @@ def read_state(folder: Path) -> tuple[Progress, TrainSettings]:
             )
         return Progress(**state["progress"]), TrainSettings.model_validate(state["settings"])
     except (OSError, ValueError, KeyError, TypeError) as error:
-        reason = f"{_STATE}: {error.strerror}" if isinstance(error, OSError) else str(error).splitlines()[0]
         raise TrainerError(
-            f"{folder} is no readable checkpoint ({reason}): pass a folder such as runs/NAME/checkpoints/step-000050"
+            f"{folder} is no readable checkpoint ({_STATE}: {reason_of(error)}): pass a folder such as "
+            "runs/NAME/checkpoints/step-000050"
         ) from error
 
 
@@ -134,6 +137,6 @@ def restore(folder: Path, optimiser: torch.optim.Optimizer, generator: torch.Gen
         generator.set_state(tensors["generator"])
     except DAMAGE as error:
         raise TrainerError(
-            f"{folder / _TENSORS} is damaged ({str(error).splitlines()[0]}): remove {folder}, and --resume goes on from the "
+            f"{folder / _TENSORS} is damaged ({reason_of(error)}): remove {folder}, and --resume goes on from the "
             "checkpoint before it"
         ) from error

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from embomatrix.rpc.channel import DEFAULT_ADDRESS
-from embomatrix.trainer.errors import TrainerError
+from embomatrix.trainer.errors import TrainerError, reason_of
 from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:
@@ -104,7 +104,7 @@ def evaluate(
         tasks = _loaded(dataset, settings)
         chosen = {"heldout": tasks.heldout, "train": tasks.train}.get(split)
         if not chosen:
-            raise TrainerError(f"the data set has no tasks of split {split!r}: expected `heldout` or `train`")
+            raise TrainerError(f"the dataset has no tasks of split {split!r}: expected `heldout` or `train`")
         policy = saved_policy(checkpoint / "policy", settings)
         result = _evaluated(policy, chosen, tasks, manager, token, settings)
         _show_evaluation(result)
@@ -123,8 +123,13 @@ def _problems_shown(command: str, out: Path | None = None) -> Iterator[None]:
     except (TrainerError, ClusterError) as error:
         _leave(command, str(error), 2)
     except KeyboardInterrupt:
-        saved = out is not None and any((out / "checkpoints").glob("step-*"))
+        saved = out is not None and _saved(out)
         _leave(command, f"interrupted: go on with `--resume --out={out}`" if saved else "interrupted", 130)
+
+
+def _saved(out: Path) -> bool:
+    """Whether the folder holds a checkpoint to go on from."""
+    return any((out / "checkpoints").glob("step-*"))
 
 
 def _leave(command: str, sentence: str, status: int) -> NoReturn:
@@ -149,7 +154,7 @@ def _started(
     threads = changes["threads"] or max(1, (os.cpu_count() or 2) // 2)
     defaults = {} if model == TINY else LANGUAGE_MODEL_DEFAULTS
     settings = read_settings(settings_file, {**changes, "model": model, "threads": threads}, defaults)
-    if (out / "checkpoints").exists():
+    if _saved(out):
         raise TrainerError(f"{out} holds another run: pass --resume to go on with it, or another --out")
     tasks = _loaded(dataset, settings)
     policy = new_policy(settings, tasks)
@@ -189,9 +194,8 @@ def _loaded(dataset: Path, settings: TrainSettings) -> TaskSet:
     try:
         torch.empty(0, device=settings.device)
     except (RuntimeError, AssertionError) as error:
-        reason = str(error).splitlines()[0].split(". ")[0]
         raise TrainerError(
-            f"the device {settings.device!r} can't be used ({reason}): expected cpu, or cuda where torch finds a GPU"
+            f"the device {settings.device!r} can't be used ({reason_of(error)}): expected cpu, or cuda where torch finds a GPU"
         ) from error
     return load_tasks(dataset)
 

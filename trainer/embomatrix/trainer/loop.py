@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from embomatrix.trainer.checkpoint import CheckpointStore, Progress, restore
+from embomatrix.trainer.checkpoint import CheckpointStore, Progress, restore, whole_folder
 from embomatrix.trainer.data import Schedule
 from embomatrix.trainer.evaluate import Evaluation, evaluate_policy
 from embomatrix.trainer.imitate import imitate
@@ -84,7 +84,7 @@ class TrainingRun:
             newest = self._store.latest()
             if newest is not None:
                 restore(newest, updater.optimiser, self._generator)
-            self._recorder.forget_after(self._progress.step)
+        self._recorder.forget_after(self._progress.step)
         try:
             self._optimise(updater)
         finally:
@@ -108,7 +108,8 @@ class TrainingRun:
             )
         before = self._evaluate("before GRPO")
         self._progress.before = before.as_json() if before else []
-        parts.policy.save(self._out / REFERENCE)
+        with whole_folder(self._out / REFERENCE) as folder:
+            parts.policy.save(folder)
         return parts.policy.frozen_copy()
 
     def _evaluate(self, label: str) -> Evaluation | None:

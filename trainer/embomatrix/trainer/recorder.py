@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from embomatrix.rpc.values import Cancelled, Completed, InfraFailure
+from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -41,15 +43,26 @@ class Recorder:
             self._append(SAMPLES, {**described, "advantage": round(advantage, 4), **_described(outcome)})
 
     def forget_after(self, step: int) -> None:
-        """Drop the metrics of steps that a resumed run will take again."""
-        path = self._folder / METRICS
-        if path.exists():
-            kept = [line for line in path.read_text().splitlines() if json.loads(line)["step"] <= step]
-            path.write_text("".join(f"{line}\n" for line in kept), encoding="utf-8")
+        """Drop what was written of steps that a run will take again: it is resumed, or had no checkpoint yet."""
+        for name in (METRICS, SAMPLES):
+            path = self._folder / name
+            if path.exists():
+                kept = [
+                    line for line in path.read_text(encoding="utf-8").splitlines() if _step_of(line) <= step
+                ]
+                write_whole(path, "".join(f"{line}\n" for line in kept).encode("utf-8"))
 
     def _append(self, name: str, value: Mapping[str, Any]) -> None:
         with (self._folder / name).open("a", encoding="utf-8") as file:
             file.write(json.dumps(value) + "\n")
+
+
+def _step_of(line: str) -> float:
+    """A line that a crash cut short belongs to no step that is kept."""
+    try:
+        return int(json.loads(line)["step"])
+    except ValueError:
+        return math.inf
 
 
 def read_metrics(folder: Path) -> list[dict[str, Any]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.trainer.errors import DAMAGE, TrainerError
+from embomatrix.trainer.errors import DAMAGE, TrainerError, reason_of
 from embomatrix.trainer.policy.decoder import DecoderShape
 from embomatrix.trainer.policy.hf import HfPolicy
 from embomatrix.trainer.policy.tiny import TinyPolicy
@@ -36,7 +36,9 @@ def saved_policy(folder: Path, settings: TrainSettings) -> Policy:
         if TinyPolicy.is_saved_in(folder):
             return TinyPolicy.load(folder, device=settings.device)
     except DAMAGE as error:
-        raise TrainerError(f"the policy in {folder} is damaged ({error}): use another checkpoint") from error
+        raise TrainerError(
+            f"the policy in {folder} is damaged ({reason_of(error)}): use another checkpoint"
+        ) from error
     if HfPolicy.is_saved_in(folder):
         return HfPolicy.load(folder, settings.codec, device=settings.device, label=settings.model)
     raise TrainerError(

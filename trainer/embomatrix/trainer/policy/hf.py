@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import torch
 
-from embomatrix.trainer.errors import TrainerError
+from embomatrix.trainer.errors import TrainerError, reason_of
 from embomatrix.trainer.policy.drawing import draw
 from embomatrix.trainer.policy.protocol import Samples, Scored
 
@@ -56,7 +56,7 @@ class HfPolicy:
             model.to(device)
         except (OSError, ValueError, KeyError) as error:
             raise TrainerError(
-                f"the model {str(name)!r} can't be loaded ({_first_line(error)}): {REMEDY}"
+                f"the model {str(name)!r} can't be loaded ({reason_of(error)}): {REMEDY}"
             ) from error
         return cls(model, tokenizer, codec, label or str(name))
 
@@ -203,10 +203,6 @@ def _end_tokens(model: Any, tokenizer: Any) -> list[int]:
     return [int(token) for token in found]
 
 
-def _first_line(error: Exception) -> str:
-    return next(iter(str(error).strip().splitlines()), type(error).__name__)
-
-
 def _look_up(name: str) -> None:
     """Raise TrainerError unless the model is a folder, is kept from an earlier download, or is known to the hub.
 
@@ -223,5 +219,5 @@ def _look_up(name: str) -> None:
     except Exception as error:  # the hub's HTTP library, and with it its errors, differs by version
         raise TrainerError(
             f"the model {name!r} is no folder here, and the Hugging Face hub does not give it "
-            f"({_first_line(error)}): {REMEDY}"
+            f"({reason_of(error)}): {REMEDY}"
         ) from error
