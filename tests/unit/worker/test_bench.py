@@ -146,7 +146,7 @@ def test_one_bench_alone_writes_no_file_unless_asked(dataset, tmp_path, monkeypa
 def test_a_folder_without_a_data_set_is_told_how_to_build_one(tmp_path):
     result = _bench("rollout", f"--dataset={tmp_path}")
     assert result.exit_code == 2
-    assert "there is no data set in" in result.stderr
+    assert "there is no dataset in" in result.stderr
     assert "embomatrix factory build" in result.stderr
 
 

@@ -126,12 +126,14 @@ async def test_a_slot_is_used_again_for_the_next_lease_of_its_scene(tmp_path):
 
 
 async def test_idle_processes_are_bounded_over_all_scenes(tmp_path):
-    async with running(tmp_path, slots=1) as harness:
+    limits = SlotLimits(slots=1, memory_mb=128)
+    assert limits.idle_slots == 4
+    async with running(tmp_path, slots=limits.slots, memory_mb=limits.memory_mb) as harness:
         for number in range(8):
             harness.submit(f"l{number}", digest=f"scene-{number}")
             await harness.outcomes(number + 1)
         root_and_scenes = 1 + 8
-        await harness.until(lambda: len(_living()) <= root_and_scenes + 4)
+        await harness.until(lambda: len(_living()) <= root_and_scenes + limits.idle_slots)
         harness.submit("again", digest="scene-0")
         assert isinstance((await harness.outcomes(9))["again"], Completed)
 
