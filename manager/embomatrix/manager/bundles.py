@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import hashlib
+import logging
 import os
 import re
 import tempfile
@@ -16,6 +17,8 @@ from embomatrix.rpc.status import InvalidRequestError, NotFoundError, Overloaded
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
+
+logger = logging.getLogger(__name__)
 
 PREFIX: Final = "sha256:"
 _DIGEST: Final = re.compile(r"sha256:[0-9a-f]{64}")
@@ -37,9 +40,25 @@ class BundleStore:
         """Those that were never put here, in the same order."""
         return [digest for digest in dict.fromkeys(digests) if not self.has(digest)]
 
+    async def lacking(self, digests: list[str]) -> list[str]:
+        """Those that are missing or damaged, to be put again. Damaged files are removed: no worker could use them."""
+
+        def check() -> list[str]:
+            return [digest for digest in dict.fromkeys(digests) if not self._is_sound(digest)]
+
+        return await asyncio.to_thread(check)
+
     async def put(self, digest: str, chunks: AsyncIterator[bytes]) -> None:
         """Take a bundle in. It appears under its name only when all of it is there and its digest is right."""
         path = self._path(digest)
+        try:
+            await self._take(digest, path, chunks)
+        except OSError as error:
+            raise OverloadedError(
+                f"the bundle folder {self._folder} can't be written ({error.strerror}): make room on the manager's disk"
+            ) from error
+
+    async def _take(self, digest: str, path: Path, chunks: AsyncIterator[bytes]) -> None:
         handle, name = tempfile.mkstemp(prefix="incoming-", dir=self._folder)
         sha, size = hashlib.sha256(), 0
         try:
@@ -71,6 +90,18 @@ class BundleStore:
         with path.open("rb") as file:
             while chunk := await asyncio.to_thread(file.read, CHUNK_BYTES):
                 yield chunk
+
+    def _is_sound(self, digest: str) -> bool:
+        path = self._path(digest)
+        try:
+            with path.open("rb") as file:
+                found = PREFIX + hashlib.file_digest(file, "sha256").hexdigest()
+        except FileNotFoundError:
+            return False
+        if found != digest:
+            logger.warning("bundle damaged on disk, removed bundle=%s found=%s", digest, found)
+            path.unlink(missing_ok=True)
+        return found == digest
 
     def _check_space(self, size: int) -> None:
         used = sum(entry.stat().st_size for entry in os.scandir(self._folder) if entry.is_file())

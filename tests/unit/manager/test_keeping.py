@@ -79,6 +79,16 @@ async def test_a_bundle_appears_only_when_its_digest_is_right(tmp_path):
     assert b"".join([part async for part in store.get(digest_of(b"something"))]) == b"something"
 
 
+async def test_a_bundle_damaged_on_disk_is_asked_for_again(tmp_path):
+    store = BundleStore(tmp_path, limit_bytes=100, total_bytes=1000)
+    digest = digest_of(b"content")
+    await store.put(digest, pieces(b"content"))
+    assert await store.lacking([digest, digest]) == []
+    next(tmp_path.iterdir()).write_bytes(b"contemt")
+    assert await store.lacking([digest, digest]) == [digest]
+    assert list(tmp_path.iterdir()) == []
+
+
 async def test_a_bundle_that_is_too_large_is_refused_before_it_is_whole(tmp_path):
     store = BundleStore(tmp_path, limit_bytes=10, total_bytes=1000)
     with pytest.raises(InvalidRequestError, match="larger than 10 bytes"):
@@ -91,6 +101,13 @@ async def test_a_full_folder_takes_no_more(tmp_path):
     await store.put(digest_of(b"a" * 40), pieces(b"a" * 40))
     with pytest.raises(OverloadedError, match="no room"):
         await store.put(digest_of(b"b" * 40), pieces(b"b" * 40))
+
+
+async def test_a_folder_that_is_gone_is_named(tmp_path):
+    store = BundleStore(tmp_path / "bundles", limit_bytes=100, total_bytes=50)
+    (tmp_path / "bundles").rmdir()
+    with pytest.raises(OverloadedError, match=r"bundles can't be written \(No such file or directory\)"):
+        await store.put(digest_of(b"a"), pieces(b"a"))
 
 
 async def test_a_bundle_that_was_never_put_is_not_found(tmp_path):
