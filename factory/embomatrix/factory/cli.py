@@ -26,9 +26,9 @@ from embomatrix.factory.refusal import Refusal
 from embomatrix.factory.scene_build import build_base_scene
 from embomatrix.sim.engine import EngineMissingError
 from embomatrix.sim.pose_cache import PlacementLibrary
-from embomatrix.world.bddl import BddlError
+from embomatrix.world.bddl import BddlError, parse_problem
 from embomatrix.world.catalog import CatalogError
-from embomatrix.world.dataset import Dataset, DatasetError, write_dataset
+from embomatrix.world.dataset import TASKS_FILE, Dataset, DatasetError, write_dataset
 from embomatrix.world.task import TaskCategory
 
 if TYPE_CHECKING:
@@ -94,11 +94,13 @@ def import_(
     """Bind BDDL problems to base scenes and verify them, or say why not."""
     console = Console()
     with _mended(out):
-        sources = list(_sources(bddl, activity, jsonl))
+        if out is not None:
+            _check_free(out, bind_only=bind_only)
+        sources = [_parsed(source) for source in _sources(bddl, activity, jsonl)]
         bases = [build_base_scene(scene_id) for scene_id in scenes or DEFAULT_SCENES]
         outcomes = _judged(console, sources, bases, seed, bind_only=bind_only)
-        if out is not None:
-            verified = [item for item in outcomes if isinstance(item, Verified)]
+        verified = [item for item in outcomes if isinstance(item, Verified)]
+        if out is not None and verified:
             write_dataset(
                 out,
                 [item.record for item in verified],
@@ -108,6 +110,8 @@ def import_(
         _print_one(console, sources[0], outcomes[0])
         return
     _print_outcomes(console, outcomes)
+    if out is not None and not verified:
+        _fail(f"no problem was admitted, so {out} was not written: `--bind-only` shows which could be bound")
 
 
 @app.command("list")
@@ -127,6 +131,24 @@ def list_(folder: Annotated[Path, typer.Argument(help="Folder of a dataset.")]) 
             task.instruction,
         )
     Console().print(table)
+
+
+def _check_free(out: Path, *, bind_only: bool) -> None:
+    """Nothing that is already there is overwritten, and nothing that could not be written is begun."""
+    if bind_only:
+        raise SourceError("--bind-only admits no task that could be written: leave out --bind-only or --out")
+    if (out / TASKS_FILE).exists():
+        raise SourceError(f"{out} holds a dataset already: name another folder with --out")
+    out.mkdir(parents=True, exist_ok=True)
+
+
+def _parsed(source: SourceText) -> SourceText:
+    """The source, whose text is BDDL: what is not shall be told before scenes are built."""
+    try:
+        parse_problem(source.text)
+    except BddlError as error:
+        raise SourceError(f"{source.name}: {error}") from error
+    return source
 
 
 def _sources(bddl: Path | None, activity: str, jsonl: Path | None) -> Iterator[SourceText]:
@@ -152,13 +174,10 @@ def _judged(
     with _progress(console) as bars, contextlib.closing(PlacementLibrary()) as library:
         bar = bars.add_task("problems", total=len(sources))
         for source in sources:
-            try:
-                if bind_only:
-                    outcomes.append(bind_first(source, bases, seed=seed))
-                else:
-                    outcomes.append(verify_first(source, bases, library, seed=seed))
-            except BddlError as error:
-                raise SourceError(f"{source.name}: {error}") from error
+            if bind_only:
+                outcomes.append(bind_first(source, bases, seed=seed))
+            else:
+                outcomes.append(verify_first(source, bases, library, seed=seed))
             bars.advance(bar)
     return outcomes
 

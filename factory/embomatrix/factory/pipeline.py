@@ -23,6 +23,7 @@ from embomatrix.sim.planner import find_plan
 from embomatrix.sim.pose_cache import PlacementLibrary
 from embomatrix.skills.parse import plan_to_json
 from embomatrix.world.bundle import Bundle, bundle_digest, encode_bundle
+from embomatrix.world.catalog import Catalog
 from embomatrix.world.dataset import TaskRecord, write_dataset
 from embomatrix.world.task import TaskCategory
 
@@ -108,9 +109,10 @@ def build_dataset(
 
     Raises CatalogError for an unknown scene, DatasetError when the folder holds a build of other settings.
     """
-    # Scenes first: a wrong name shall leave no folder behind.
-    bases = [build_base_scene(scene_id, seed=settings.seed) for scene_id in settings.scenes]
+    for scene_id in settings.scenes:
+        Catalog.load().inventory(scene_id)  # a wrong name shall leave no folder behind
     store = BuildStore.open(folder, dataclasses.asdict(settings))
+    bases = [build_base_scene(scene_id, seed=settings.seed) for scene_id in settings.scenes]
     rooms = split_rooms(bases, settings.seed)
     library = PlacementLibrary()
     try:

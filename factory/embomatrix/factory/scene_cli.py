@@ -50,8 +50,9 @@ def build(scene_id: SceneId, seed: Seed = 0, out: Out = Path()) -> None:
     """Lay out and furnish a scene, and write it as JSON."""
     import json
 
-    scene = _built(scene_id, seed)
+    _check_name(scene_id)
     path = _folder(out) / f"{scene_id}.json"
+    scene = _built(scene_id, seed)
     _write(path, json.dumps(scene_to_json(scene)).encode("utf-8"))
     Console().print(f"{len(scene.rooms)} rooms, {len(scene.objects)} objects: {path}", highlight=False)
 
@@ -76,8 +77,9 @@ def show(scene_id: SceneId, seed: Seed = 0) -> None:
 @app.command()
 def render(scene_id: SceneId, seed: Seed = 0, out: Out = Path()) -> None:
     """Draw a plan from above and an oblique view, as PNG files."""
-    scene = _built(scene_id, seed)
+    _check_name(scene_id)
     folder = _folder(out)
+    scene = _built(scene_id, seed)
     plan, oblique = folder / f"{scene_id}_plan.png", folder / f"{scene_id}_view.png"
     _write(plan, _png(draw_plan(scene)))
     try:
@@ -101,6 +103,14 @@ def check(scene_id: SceneId, seed: Seed = 0) -> None:
     if problems:
         raise typer.Exit(1)
     Console().print(f"{scene_id}: {len(scene.objects)} objects, nothing wrong", highlight=False)
+
+
+def _check_name(scene_id: str) -> None:
+    """Before anything is made: a wrong name shall leave no folder behind."""
+    try:
+        Catalog.load().inventory(scene_id)
+    except CatalogError as error:
+        raise _refused(str(error)) from None
 
 
 def _built(scene_id: str, seed: int) -> Scene:

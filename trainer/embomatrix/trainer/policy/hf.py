@@ -43,12 +43,12 @@ class HfPolicy:
     def load(cls, name: str | Path, codec: Codec, *, device: str = "cpu", label: str = "") -> HfPolicy:
         """Read a model by name or folder. Raises TrainerError with a remedy where that fails."""
         try:
+            _look_up(str(name))
             from transformers import AutoModelForCausalLM, AutoTokenizer
         except ImportError as error:
             raise TrainerError(
                 f"the model {str(name)!r} needs transformers: `pip install 'embomatrix[hf]'`, or --model tiny"
             ) from error
-        _look_up(str(name))
         dtype = torch.float32 if device == "cpu" else torch.bfloat16
         try:
             tokenizer = AutoTokenizer.from_pretrained(str(name))

@@ -1,0 +1,287 @@
+"""What a person gets wrong: one sentence that names the thing and the remedy, an exit status, and never a traceback."""
+
+import json
+import resource
+import shutil
+
+import pytest
+from tests.fakes.commands import background, run, without
+
+TASK = "apple_to_counter"
+NOWHERE = "127.0.0.1:1"
+BDDL = """(define (problem apple-0)
+  (:domain omnigibson)
+  (:objects
+    apple.n.01_1 - apple.n.01
+    countertop.n.01_1 - countertop.n.01
+    agent.n.01_1 - agent.n.01)
+  (:init
+    (inroom countertop.n.01_1 kitchen)
+    (ontop apple.n.01_1 countertop.n.01_1))
+  (:goal (and (inside apple.n.01_1 countertop.n.01_1))))
+"""
+
+
+def assert_told(told, status, *words):
+    assert "Traceback" not in told.text
+    assert "should not have happened" not in told.text
+    assert told.status == status, told.text
+    for word in words:
+        assert word in told.text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("play", "apple_to_countr", "--oracle", "--dataset=DATASET"), "did you mean apple_to_counter?"),
+        (("scene", "show", "Rs_imt"), "unknown scene 'Rs_imt' (the catalog holds 51): did you mean Rs_int"),
+        (("factory", "build", "--scene=Rs_imt", "--out=OUT"), "unknown scene 'Rs_imt'"),
+        (("factory", "import", "--activity=bringin_water"), "did you mean bringing_water"),
+        (("train", "--model=tinny", "--dataset=DATASET", "--out=OUT"), "the model 'tinny' is no folder here"),
+        (("trian",), "did you mean `train`?"),
+    ],
+)
+def test_unknown_name_is_told_with_what_is_near(kitchen, tmp_path, arguments, words):
+    out = tmp_path / "out"
+    filled = [item.replace("DATASET", str(kitchen)).replace("OUT", str(out)) for item in arguments]
+    assert_told(run(*filled, HF_HUB_OFFLINE="1"), 2, words)
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("plan", "words"),
+    [
+        (
+            "I would rather not.",
+            "no plan was found (the text begins with 'I would rather not.'): expected a JSON array",
+        ),
+        ('[{"action": "move", "object_index": 3}', "its JSON is wrong at line 1, column 39"),
+        (
+            '[{"action": "dance", "object_index": 3}]',
+            "step 1: unknown skill 'dance': expected one of move, turn",
+        ),
+        ("open 1\n" * 9_000, "the plan has 9000 steps: expected at most 64"),
+        (json.dumps([{"action": "open", "object_index": 1}] * 10_000), "a plan has at most 65536"),
+        ('[{"action": "turn", "yaw": NaN}]', "yaw must be a finite number, found nan"),
+        ('[{"action": "move"}]', "step 1: move lacks object_index: it takes object_index"),
+        ("", "the text is empty"),
+        (bytes(range(256)) * 20, "no plan was found"),
+    ],
+    ids=["prose", "cut", "skill", "steps", "bytes", "nan", "argument", "empty", "binary"],
+)
+def test_text_that_is_no_plan_earns_minus_one_and_is_told_why(kitchen, tmp_path, plan, words):
+    file = tmp_path / "plan"
+    file.write_bytes(plan if isinstance(plan, bytes) else plan.encode())
+    told = run("play", TASK, f"--plan={file}", f"--dataset={kitchen}")
+    assert_told(told, 1, words, "the text is no plan: it was not executed", "-1.00")
+
+
+@pytest.mark.parametrize(
+    ("plan", "words"),
+    [
+        ("move 9999", "unknown_index: there is no object with index 9999: the table has indices 0 to 14"),
+        ("go_to_room attic_0", "unknown_room: "),
+        ("pick_up 10", "out_of_reach: "),
+    ],
+)
+def test_step_that_can_not_be_done_is_told_its_reason_and_the_rest_left_out(kitchen, plan, words):
+    told = run("play", TASK, "--plan=-", f"--dataset={kitchen}", text=f"{plan}\nmove 0")
+    assert_told(told, 0, words, "not executed", "the goal is not reached")
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (
+            BDDL.rstrip()[:-1],
+            "problem: line 1, column 1: the parenthesis opened here is never closed: add ')'",
+        ),
+        (
+            BDDL.replace("- apple.n.01", "- unicorn.n.01"),
+            "type 'unicorn.n.01' of 'apple.n.01_1' is in no catalog",
+        ),
+        (
+            BDDL.replace("inside apple", "inside pear"),
+            "object 'pear.n.01_1' is not declared: add it to :objects",
+        ),
+        ("", "problem: line 1, column 1: the text is empty: expected '(define (problem NAME) ...)'"),
+        (b"\xff\xfe\x00", "problem.bddl is no text in UTF-8: expected BDDL problems"),
+        (None, "problem.bddl can't be read (No such file or directory)"),
+    ],
+    ids=["parenthesis", "type", "undeclared", "empty", "binary", "absent"],
+)
+def test_bddl_that_can_not_be_read_is_told_where(tmp_path, content, words):
+    file, out = tmp_path / "problem.bddl", tmp_path / "out"
+    if content is not None:
+        file.write_bytes(content if isinstance(content, bytes) else content.encode())
+    told = run("factory", "import", f"--bddl={file}", "--scene=Rs_int", f"--out={out}")
+    assert_told(told, 2, words)
+    assert not (out / "tasks.jsonl").exists()
+
+
+def test_import_does_not_write_over_a_dataset(kitchen, tmp_path):
+    (tmp_path / "problem.bddl").write_text(BDDL)
+    before = (kitchen / "tasks.jsonl").read_bytes()
+    told = run("factory", "import", f"--bddl={tmp_path / 'problem.bddl'}", f"--out={kitchen}")
+    assert_told(told, 2, f"{kitchen} holds a dataset already: name another folder with --out")
+    assert (kitchen / "tasks.jsonl").read_bytes() == before
+
+
+def _cut(path):
+    path.write_bytes(path.read_bytes()[:200])
+
+
+def _bundle(folder):
+    return next((folder / "bundles").iterdir())
+
+
+DAMAGES = {
+    "no folder": (shutil.rmtree, "build one with `embomatrix factory build --out="),
+    "no records": (lambda folder: (folder / "tasks.jsonl").unlink(), "tasks.jsonl can't be read"),
+    "records cut": (lambda folder: _cut(folder / "tasks.jsonl"), "tasks.jsonl:1 is damaged: expected a JSON"),
+    "records binary": (
+        lambda folder: (folder / "tasks.jsonl").write_bytes(b"\xff"),
+        "expected text in UTF-8",
+    ),
+    "bundle cut": (
+        lambda folder: _cut(_bundle(folder)),
+        "of the dataset is damaged (the bundle's digest is sha256:",
+    ),
+    "no bundle": (lambda folder: _bundle(folder).unlink(), "copy the dataset again, or build one with"),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_dataset_that_is_missing_or_damaged_is_named_with_a_remedy(kitchen, tmp_path, damage):
+    folder = tmp_path / "dataset"
+    shutil.copytree(kitchen, folder)
+    change, words = DAMAGES[damage]
+    change(folder)
+    assert_told(run("play", TASK, "--oracle", f"--dataset={folder}"), 2, str(folder), words)
+
+
+@pytest.mark.parametrize("damage", ["no folder", "bundle cut"])
+def test_trainer_tells_the_same_of_a_dataset(kitchen, tmp_path, damage):
+    folder = tmp_path / "dataset"
+    shutil.copytree(kitchen, folder)
+    DAMAGES[damage][0](folder)
+    told = run("train", f"--dataset={folder}", f"--manager={NOWHERE}", f"--out={tmp_path / 'out'}")
+    assert_told(told, 2, "embomatrix train:", str(folder), "embomatrix factory build")
+
+
+@pytest.mark.parametrize(
+    ("package", "arguments", "words"),
+    [
+        ("torch", ("train",), "the package 'torch' is not installed: install it with `pip install 'embomatrix[trainer]'`"),
+        ("uvicorn", ("manager", "serve"), "pip install 'embomatrix[manager]'"),
+        ("psutil", ("worker", "run"), "pip install 'embomatrix[worker]'"),
+        ("trimesh", ("factory", "build", "--out=no"), "pip install 'embomatrix[factory]'"),
+        ("pybullet", ("worker", "run"), "needs the physics engine pybullet, and this Python"),
+        ("pybullet", ("play", TASK, "--oracle", "--dataset=DATASET"), "the physics engine is missing: expected the package"),
+        ("pybullet", ("demo", "--dataset=DATASET", "--out=OUT"), "the cluster can't work, worker-"),
+    ],
+)  # fmt: skip
+def test_missing_package_is_named_with_what_brings_it(kitchen, tmp_path, package, arguments, words):
+    out = tmp_path / "out"
+    filled = [item.replace("DATASET", str(kitchen)).replace("OUT", str(out)) for item in arguments]
+    assert_told(run(*filled, **without(tmp_path, package)), 2, words)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("play", TASK, "--dataset=x"), "expected either --plan FILE or --oracle"),
+        (("factory", "import"), "found 0 sources: expected exactly one of --bddl FILE"),
+        (("train", "--minutes=-1"), "Invalid value for '--minutes'"),
+        (("demo", "--workers=0"), "Invalid value for '--workers'"),
+        (("manager", "serve", "--port=99999"), "--port 99999: input should be less than or equal to 65535"),
+        (("manager", "serve", "--state=foo:bar"), "expected memory:, sqlite:PATH or redis://HOST:PORT/DB"),
+        (
+            ("manager", "status", "--manager=nowhere"),
+            "'nowhere' is no address of a manager: expected HOST:PORT",
+        ),
+        (("worker", "run", "--manager=host:99999"), "--manager 'host:99999': expected HOST:PORT"),
+        (("worker", "run", "--nice=50"), "--nice 50: input should be less than or equal to 19"),
+    ],
+)
+def test_wrong_value_of_an_option_is_named_with_what_was_expected(tmp_path, arguments, words):
+    assert_told(run(*arguments, HOME=str(tmp_path)), 2, words)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("speed = 3", "there is no setting 'speed'"),
+        ("[grpo]\ngroup = 1", "setting 'grpo.group': input should be greater than or equal to 2 (found 1)"),
+        ("[grpo", "is no TOML"),
+    ],
+)
+def test_wrong_settings_of_a_training_are_named(kitchen, tmp_path, content, words):
+    (tmp_path / "settings.toml").write_text(content)
+    told = run(
+        "train",
+        f"--settings={tmp_path / 'settings.toml'}",
+        f"--dataset={kitchen}",
+        f"--out={tmp_path / 'out'}",
+    )
+    assert_told(told, 2, words)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("factory", "build", "--scene=Rs_int", "--out=OUT"), "can't be written (Not a directory)"),
+        (("scene", "build", "Rs_int", "--out=OUT"), "can't be written (Not a directory)"),
+        (("manager", "serve", "--port=0", "--data-dir=OUT"), "pass another --data-dir"),
+        (("worker", "run", "--cache-dir=OUT"), "name another folder with --cache-dir"),
+        (("train", "--dataset=DATASET", "--out=OUT"), "can't be made (Not a directory): pass another --out"),
+        (("demo", "--dataset=DATASET", "--out=OUT"), "can't be made (Not a directory): pass another --out"),
+    ],
+)
+def test_folder_that_can_not_be_written_is_named(kitchen, tmp_path, arguments, words):
+    (tmp_path / "file").write_text("no folder")
+    out = tmp_path / "file" / "out"
+    filled = [item.replace("DATASET", str(kitchen)).replace("OUT", str(out)) for item in arguments]
+    assert_told(run(*filled), 2, str(out), words)
+
+
+def _small_files():
+    """A disk that takes files of 4 kB at most: writes beyond fail in the middle, as on a full one."""
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
+
+
+def test_full_disk_leaves_no_half_scene(tmp_path):
+    told = run("scene", "build", "Rs_int", f"--out={tmp_path}", before=_small_files)
+    assert_told(told, 2, "Rs_int.json can't be written (File too large): make room")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_there_is_nothing_to_resume_without_a_checkpoint(kitchen, tmp_path):
+    told = run("train", "--resume", f"--dataset={kitchen}", f"--out={tmp_path}")
+    assert_told(told, 2, f"there is no checkpoint in {tmp_path} to resume from: leave out --resume")
+
+
+def test_folder_of_another_run_is_left_alone(kitchen, tmp_path):
+    (tmp_path / "checkpoints" / "step-000001").mkdir(parents=True)
+    told = run("train", f"--dataset={kitchen}", f"--out={tmp_path}")
+    assert_told(told, 2, f"{tmp_path} holds another run: pass --resume to go on with it, or another --out")
+    assert_told(
+        run("demo", f"--dataset={kitchen}", f"--out={tmp_path}"), 2, "holds another run: pass another --out"
+    )
+
+
+def test_what_is_no_checkpoint_can_not_be_evaluated(kitchen, tmp_path):
+    told = run("eval", tmp_path, f"--dataset={kitchen}")
+    assert_told(told, 2, f"{tmp_path} is no readable checkpoint (state.json: No such file or directory)")
+
+
+def test_interrupted_build_leaves_no_dataset_and_can_be_gone_on_with(tmp_path):
+    out = tmp_path / "out"
+    arguments = ("factory", "build", f"--out={out}", "--scene=Rs_int", "--train=8", "--heldout=0")
+    with background(tmp_path / "log", *arguments) as building:
+        building.wait_for((out / "build.jsonl").exists)
+        told = building.interrupt()
+    assert_told(told, 130, "interrupted: what was built is kept in", "the same command goes on from there")
+    assert not (out / "tasks.jsonl").exists()
+    other = run("factory", "build", f"--out={out}", "--scene=Rs_int", "--train=9", "--heldout=0")
+    assert_told(other, 2, "holds a build of other settings (train 8, now 9): give the same again")
