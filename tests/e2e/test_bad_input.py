@@ -208,23 +208,15 @@ def test_wrong_value_of_an_option_is_named_with_what_was_expected(tmp_path, argu
     assert_told(run(*arguments, HOME=str(tmp_path)), 2, words)
 
 
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        ("speed = 3", "there is no setting 'speed'"),
-        ("[grpo]\ngroup = 1", "setting 'grpo.group': input should be greater than or equal to 2 (found 1)"),
-        ("[grpo", "is no TOML"),
-    ],
-)
-def test_wrong_settings_of_a_training_are_named(kitchen, tmp_path, content, words):
-    (tmp_path / "settings.toml").write_text(content)
+def test_unknown_setting_of_a_training_is_named(kitchen, tmp_path):
+    (tmp_path / "settings.toml").write_text("speed = 3")
     told = run(
         "train",
         f"--settings={tmp_path / 'settings.toml'}",
         f"--dataset={kitchen}",
         f"--out={tmp_path / 'out'}",
     )
-    assert_told(told, 2, words)
+    assert_told(told, 2, "there is no setting 'speed': mend its name or leave it out")
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,222 @@
+"""What a person gets wrong between the parts of a cluster: addresses, ports, tokens, state, damaged bundles, interrupts."""
+
+import contextlib
+import re
+import resource
+import socket
+from pathlib import Path
+
+import pytest
+import torch
+from tests.fakes.commands import background, run
+
+from embomatrix.rpc.client import ClusterClient
+from embomatrix.rpc.status import InvalidRequestError
+from embomatrix.rpc.values import Batch, Completed, Rollout
+from embomatrix.skills.parse import plan_from_json
+from embomatrix.trainer.checkpoint import CheckpointStore, Progress
+from embomatrix.trainer.data import load_tasks
+from embomatrix.trainer.policy.choice import new_policy
+from embomatrix.trainer.settings import read_settings
+from embomatrix.world.dataset import Dataset
+
+NOWHERE = "127.0.0.1:1"
+UNREACHABLE = f"no manager answers at {NOWHERE}: start one with `embomatrix manager serve`, or pass --manager"
+REFUSED = "no token, or a wrong one: pass --token, or set EMBOMATRIX_TOKEN to the token of this manager"
+SECRET = "the-secret-of-this-test"
+
+
+def assert_told(told, status, *words):
+    assert "Traceback" not in told.text
+    assert "should not have happened" not in told.text
+    assert told.status == status, told.text
+    for word in words:
+        assert word in told.text
+
+
+@contextlib.contextmanager
+def manager(folder, *options):
+    """A manager on free ports; yields the command, its address and its page."""
+    folder.mkdir(exist_ok=True)
+    arguments = ("manager", "serve", "--port=0", "--http-port=0", f"--data-dir={folder}", *options)
+    with background(folder / "log", *arguments) as command:
+        command.wait_for("status page")
+        found = re.search(r"manager serves at (\S+), status page (\S+),", command.text)
+        yield command, found[1], found[2]
+
+
+@contextlib.contextmanager
+def worker(folder, address, *options):
+    arguments = ("worker", "run", f"--manager={address}", "--slots=1", f"--cache-dir={folder}", *options)
+    with background(folder.with_suffix(".log"), *arguments) as command:
+        command.wait_for("registered with the manager")
+        yield command
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory):
+    with manager(tmp_path_factory.mktemp("manager") / "data", f"--token={SECRET}") as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def checkpoint(kitchen, tmp_path_factory):
+    """A policy that knows nothing yet, saved as training would."""
+    settings = read_settings(None, {"tiny.layers": 1, "tiny.width": 16, "tiny.heads": 1, "tiny.inner": 16})
+    policy = new_policy(settings, load_tasks(kitchen))
+    optimiser = torch.optim.AdamW(policy.parameters())
+    store = CheckpointStore(tmp_path_factory.mktemp("run") / "checkpoints", keep=1)
+    return store.save(policy, optimiser, torch.Generator(), Progress(), settings)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("train", "--dataset=DATASET", "--out=OUT"),
+        ("eval", "CHECKPOINT", "--dataset=DATASET"),
+        ("worker", "run", "--once", "--cache-dir=OUT"),
+        ("worker", "doctor"),
+        ("manager", "status"),
+    ],
+    ids=lambda arguments: " ".join(arguments[:2]),
+)
+def test_manager_that_can_not_be_reached_is_named(kitchen, checkpoint, tmp_path, arguments):
+    places = {"DATASET": kitchen, "OUT": tmp_path / "out", "CHECKPOINT": checkpoint}
+    filled = [_placed(item, places) for item in arguments]
+    assert_told(run(*filled, f"--manager={NOWHERE}"), 2, UNREACHABLE)
+
+
+def _placed(item, places):
+    for name, place in places.items():
+        item = item.replace(name, str(place))
+    return item
+
+
+@pytest.mark.parametrize(
+    ("arguments", "token"),
+    [
+        (("train", "--dataset=DATASET", "--out=OUT"), "wrong"),
+        (("worker", "run", "--cache-dir=OUT"), "wrong"),
+        (("manager", "status"), "wrong"),
+        (("manager", "status"), ""),
+    ],
+    ids=str,
+)
+def test_wrong_token_is_refused_and_never_shown(served, kitchen, tmp_path, arguments, token):
+    _, address, _ = served
+    filled = [_placed(item, {"DATASET": kitchen, "OUT": tmp_path / "out"}) for item in arguments]
+    told = run(*filled, f"--manager={address}", f"--token={token}")
+    assert_told(told, 2, REFUSED)
+    assert SECRET not in told.text
+
+
+@pytest.mark.parametrize("option", ["", "http-"])
+def test_port_in_use_is_named_and_whoever_uses_it_is_left_alone(tmp_path, option):
+    """The second manager shares the data folder of the first: it must not take its state before it knows it can serve."""
+    with manager(tmp_path / "data") as (first, address, page):
+        taken = address if not option else page.removeprefix("http://").rstrip("/")
+        port = taken.rpartition(":")[2]
+        ports = {"port": "0", "http-port": "0", f"{option}port": port}
+        options = [f"--{name}={value}" for name, value in ports.items()]
+        told = run("manager", "serve", f"--data-dir={tmp_path / 'data'}", *options)
+        remedy = f"stop the program that uses it, or pass another --{option}port"
+        assert_told(told, 2, f"{taken} can't be bound (Address already in use): {remedy}")
+        assert "add_port.cc" not in told.text
+        assert_told(run("manager", "status", f"--manager={address}"), 0, "no open runs")
+        assert first.process.poll() is None, first.text
+
+
+def test_redis_that_can_not_be_reached_is_named_without_its_password(tmp_path):
+    state = "--state=redis://:hidden@127.0.0.1:1/0"
+    told = run("manager", "serve", "--port=0", "--http-port=0", f"--data-dir={tmp_path}", state)
+    assert_told(
+        told, 2, "Redis at redis://:***@127.0.0.1:1/0 can't be reached", "start it, or pass another --state"
+    )
+    assert "hidden" not in told.text
+
+
+@pytest.mark.parametrize("option", ["--host=0.0.0.0", "--http-host=0.0.0.0"])
+def test_no_port_is_opened_to_others_without_a_token(tmp_path, option):
+    told = run("manager", "serve", option, f"--data-dir={tmp_path}")
+    assert_told(told, 2, "refusing to serve on 0.0.0.0 without a token", "set --token (or EMBOMATRIX_TOKEN)")
+
+
+async def test_bundle_under_a_wrong_digest_is_refused(served):
+    _, address, _ = served
+    wrong = f"sha256:{'0' * 64}"
+    async with ClusterClient(address, SECRET) as client:
+        with pytest.raises(
+            InvalidRequestError, match=rf"digest sha256:\w+, expected {wrong}: it was damaged"
+        ):
+            await client.put_bundles({wrong: b"another content"})
+        assert await client.list_workers() == ()
+
+
+async def _reward(address, record, data, run_name):
+    """Put the bundle, execute the oracle's plan once, and give the reward; None where the rollout was lost."""
+    rollout = Rollout(
+        "r", "g", record.bundle_digest, record.task.task_id, plan_from_json(list(record.oracle)), 0
+    )
+    async with ClusterClient(address) as client:
+        run_id = await client.open_run(run_name)
+        await client.put_bundles({record.bundle_digest: data})
+        [result] = [item async for item in client.execute(Batch(run_id, "b", 1, (rollout,)), deadline_s=60)]
+    return result.outcome.reward.total if isinstance(result.outcome, Completed) else None
+
+
+async def test_bundle_damaged_in_a_cache_is_fetched_again(kitchen, tmp_path):
+    dataset = Dataset.load(kitchen)
+    record = dataset.train[0]
+    data = dataset.bundle_bytes(record.bundle_digest)
+    with manager(tmp_path / "data", "--state=memory:") as (serving, address, _):
+        with worker(tmp_path / "cache", address, "--name=one"):
+            reward = await _reward(address, record, data, "first")
+            assert reward > 30
+        for folder in (tmp_path / "cache", tmp_path / "data"):
+            [file] = (folder / "bundles").iterdir()
+            file.write_bytes(file.read_bytes()[:-1])
+        with worker(tmp_path / "cache", address, "--name=two") as second:
+            assert await _reward(address, record, data, "second") == reward
+            assert "bundle damaged on disk, fetching it again" in second.text
+        assert "bundle damaged on disk, removed" in serving.text
+
+
+def _small_files():
+    """A disk that takes files of 64 kB at most: a checkpoint fails in the middle, as on a full one."""
+    resource.setrlimit(resource.RLIMIT_FSIZE, (64 * 1024, 64 * 1024))
+
+
+def test_training_tells_how_it_was_interrupted_and_what_could_not_be_written(kitchen, tmp_path):
+    with manager(tmp_path / "data") as (_, address, _), worker(tmp_path / "cache", address):
+        common = ("train", f"--dataset={kitchen}", f"--manager={address}", "--threads=1")
+        short = ("--imitate-seconds=0.5", "--steps=1000000")
+        with background(
+            tmp_path / "early.log", *common, f"--out={tmp_path / 'early'}", "--imitate-seconds=60"
+        ) as run_:
+            run_.wait_for("imitation")
+            assert_told(run_.interrupt(), 130, "embomatrix train: interrupted")
+        with background(tmp_path / "late.log", *common, *short, f"--out={tmp_path / 'late'}") as run_:
+            run_.wait_for((tmp_path / "late" / "metrics.jsonl").exists)
+            assert_told(
+                run_.interrupt(), 130, f"interrupted: go on with `--resume --out={tmp_path / 'late'}`"
+            )
+        [saved] = (tmp_path / "late" / "checkpoints").iterdir()
+        assert saved.name.startswith("step-")
+        full = run(*common, f"--out={tmp_path / 'full'}", "--imitate-seconds=0.5", before=_small_files)
+        assert_told(full, 2, "can't be written", "make room there, or give rights")
+        assert not list((tmp_path / "full").glob("reference*"))
+
+
+def test_interrupted_demo_ends_what_it_started(kitchen, tmp_path):
+    out = tmp_path / "out"
+    arguments = ("demo", f"--dataset={kitchen}", f"--out={out}", "--imitate-seconds=0.5", "--minutes=30")
+    with background(tmp_path / "log", *arguments) as demo:
+        demo.wait_for((out / "metrics.jsonl").exists)
+        address = re.search(r"manager at (\S+),", demo.text)[1]
+        told = demo.interrupt()
+    assert_told(told, 130, "interrupted: go on with `--resume --out=")
+    assert list((out / "checkpoints").glob("step-*"))
+    with socket.socket() as probe:
+        host, _, port = address.rpartition(":")
+        assert probe.connect_ex((host, int(port))) != 0, "the manager outlived the demo"
+    assert "Traceback" not in "".join(Path(log).read_text() for log in (out / "cluster" / "logs").iterdir())

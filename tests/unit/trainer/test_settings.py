@@ -1,0 +1,41 @@
+"""Settings are read once, and what is wrong with them is named."""
+
+import pytest
+
+from embomatrix.trainer.errors import TrainerError
+from embomatrix.trainer.settings import read_settings
+
+
+def test_file_stands_above_defaults_and_below_options(tmp_path):
+    path = tmp_path / "settings.toml"
+    path.write_text("seed = 3\n[grpo]\ngroup = 4\nchunk = 2\n")
+    settings = read_settings(
+        path, {"grpo.chunk": 1, "grpo.steps": None}, {"grpo.group": 6, "grpo.max_new": 9}
+    )
+    assert (settings.seed, settings.grpo.group, settings.grpo.chunk, settings.grpo.max_new) == (3, 4, 1, 9)
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        ("speed = 3", r"there is no setting 'speed': mend its name"),
+        ("[grpo]\nspeed = 3", r"there is no setting 'grpo\.speed'"),
+        (
+            "[grpo]\ngroup = 1",
+            r"setting 'grpo\.group': input should be greater than or equal to 2 \(found 1\)",
+        ),
+        ("grpo = 3", r"setting 'grpo': expected a table of settings \(found 3\)"),
+        ("[grpo", r"settings\.toml is no TOML"),
+    ],
+)
+def test_wrong_settings_are_named(tmp_path, content, sentence):
+    (tmp_path / "settings.toml").write_text(content)
+    with pytest.raises(TrainerError, match=sentence):
+        read_settings(tmp_path / "settings.toml", {"grpo.minutes": 1})
+
+
+def test_settings_file_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(
+        TrainerError, match=r"can't be read \(No such file or directory\): expected a TOML file"
+    ):
+        read_settings(tmp_path / "none.toml", {})
