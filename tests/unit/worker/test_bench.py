@@ -156,7 +156,7 @@ def test_too_few_scenes_for_a_cold_and_a_warm_phase_are_refused_at_once(dataset,
     write_dataset(tmp_path, [first], {first.bundle_digest: whole.bundle_bytes(first.bundle_digest)})
     result = _bench("cluster", f"--dataset={tmp_path}")
     assert result.exit_code == 2
-    assert "the data set has too few scenes, 1: expected at least 3" in " ".join(result.stderr.split())
+    assert "the dataset has too few scenes, 1: expected at least 3" in " ".join(result.stderr.split())
 
 
 def test_an_empty_data_set_is_named(tmp_path):

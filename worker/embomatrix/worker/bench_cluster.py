@@ -105,7 +105,7 @@ def bench_cluster_load(
     """
     if len(scenes) < LEAST_SCENES:
         raise BenchError(
-            f"the data set has too few scenes, {len(scenes)}: expected at least {LEAST_SCENES}, since each is cold only once"
+            f"the dataset has too few scenes, {len(scenes)}: expected at least {LEAST_SCENES}, since each is cold only once"
         )
     deadline_s = time.monotonic() + load.limit_s
     on_phase("starting manager and workers")

@@ -94,7 +94,7 @@ def result_to_json(result: BenchResult) -> dict[str, Any]:
 def quantile(values: Sequence[float], share: float) -> float:
     """The value below which ``share`` of the measurements lie. Raises BenchError when there are none."""
     if not values:
-        raise BenchError("nothing was measured: expected a data set with at least one task")
+        raise BenchError("nothing was measured: expected a dataset with at least one task")
     return float(np.quantile(np.asarray(values), share))
 
 

@@ -23,7 +23,7 @@ _MARK: Final = re.compile(r"<!-- (?:by hand: [a-z-]+|end by hand) -->")
 TITLES: Final[Mapping[str, tuple[str, str]]] = {
     "rollout": (
         "One process",
-        "`embomatrix bench rollout`: oracle plans of the data set, executed and scored in one simulator, without a cluster. "
+        "`embomatrix bench rollout`: oracle plans of the dataset, executed and scored in one simulator, without a cluster. "
         "A worker builds scenes in clients that are connected before. *First* is a scene's first rollout, *cold* is decoding, "
         "loading and the first rollout together.",
     ),

@@ -1,4 +1,4 @@
-"""What benches run on: scenes of a data set with the oracle plans of their tasks."""
+"""What benches run on: scenes of a dataset with the oracle plans of their tasks."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ class BenchScene:
 
 
 def scenes_of(dataset: Dataset, count: int) -> tuple[BenchScene, ...]:
-    """Up to ``count`` scenes, evenly spread over the data set. Raises BenchError or DatasetError."""
+    """Up to ``count`` scenes, evenly spread over the dataset. Raises BenchError or DatasetError."""
     by_digest: dict[str, list[TaskRecord]] = {}
     for record in dataset.records:
         by_digest.setdefault(record.bundle_digest, []).append(record)
     if not by_digest:
         raise BenchError(
-            f"the data set in {dataset.folder} has no tasks: build one with 'embomatrix factory build'"
+            f"the dataset in {dataset.folder} has no tasks: build one with 'embomatrix factory build'"
         )
     digests = list(by_digest)
     chosen = np.linspace(0, len(digests) - 1, min(count, len(digests))).round().astype(int)
@@ -58,5 +58,5 @@ def _demonstration(record: TaskRecord) -> Demonstration:
         return Demonstration(record.task.task_id, plan_from_json([*record.oracle]))
     except PlanError as error:
         raise BenchError(
-            f"the oracle plan of task {record.task.task_id!r} is no plan: {error}; build the data set anew"
+            f"the oracle plan of task {record.task.task_id!r} is no plan: {error}; build the dataset anew"
         ) from error
