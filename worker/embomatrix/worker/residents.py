@@ -30,7 +30,7 @@ RETRY_LOAD_S: Final = 5.0
 SLOT_MB: Final = 8.0
 IDLE_MEMORY_SHARE: Final = 0.25
 """Idle processes may hold this share of the worker's memory, at about 8 MB each. A step's scenes come back step after step,
-and a fork with its page faults costs ten times what a short plan does: 36 ms of system time on a small virtual machine."""
+and a process that is kept is spared a fork and its page faults."""
 
 
 class LoadError(Exception):
