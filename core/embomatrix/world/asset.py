@@ -45,7 +45,8 @@ class SupportSurface:
     """Horizontal rectangle that things can stand on.
 
     ``center_m`` lies on the surface; ``size_m`` is its extent along the asset's x and y; ``clearance_m`` is the free
-    height above it. ``interior`` names the cavity that the surface is the floor of, or is empty in the open.
+    height above it. ``interior`` names the cavity that the surface is the floor of, or is empty in the open. ``link`` names
+    the moving link that the surface rides on, as a drawer's floor does; empty for the base.
     """
 
     name: str
@@ -53,6 +54,7 @@ class SupportSurface:
     size_m: Vec2
     clearance_m: float
     interior: str = ""
+    link: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,19 +62,31 @@ class Interior:
     """Box-shaped cavity that things can be inside of.
 
     ``closed_by`` names the links whose joints bar the way in while they are shut; empty means that it is always open.
+    ``link`` names the moving link that the cavity rides on, as a drawer's does; empty for the base.
     """
 
     name: str
     center_m: Vec3
     size_m: Vec3
     closed_by: tuple[str, ...] = ()
+    link: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Credit:
+    """Whose work an imported model is, and on which terms it may be used."""
+
+    creator: str
+    licence: str
+    source: str
 
 
 @dataclass(frozen=True, slots=True)
 class Asset:
     """One object model: ``asset_id`` is ``category-model``, as in the scene inventories.
 
-    ``abilities`` maps an ability of the catalog ("openable", "heatSource", ...) to its parameters.
+    ``abilities`` maps an ability of the catalog ("openable", "heatSource", ...) to its parameters. ``credit`` is None for
+    what this project generated itself.
     """
 
     asset_id: str
@@ -84,6 +98,7 @@ class Asset:
     supports: tuple[SupportSurface, ...] = ()
     interiors: tuple[Interior, ...] = ()
     abilities: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    credit: Credit | None = None
 
     def can(self, ability: str) -> bool:
         return ability in self.abilities

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from embomatrix.world.bddl import BddlError, parse_formula
-from embomatrix.world.codec import pose_from_field, pose_to_json
+from embomatrix.world.codec_asset import pose_from_field, pose_to_json
 from embomatrix.world.evaluate import GoalError, objects_of
 from embomatrix.world.field import Field
 from embomatrix.world.poses import PlacementKey, PoseCache, StandPose

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
     from embomatrix.world.asset import Asset
     from embomatrix.world.geometry import Part, Pose, Vec2, Vec3
-    from embomatrix.world.state import Relation, State
+    from embomatrix.world.state import Relation, State, SubstanceFact
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +59,8 @@ class SceneObject:
 
     ``joints`` are the positions of the asset's joints in their order, as a share of the travel: 0 closed, 1 open.
     ``host`` is the object that it rests on or in by ``relation``; empty: it stands on the floor or hangs on a wall.
-    ``fixed`` objects never move: furniture, appliances, wall-mounted things.
+    ``fixed`` objects never move: furniture, appliances, wall-mounted things. ``absent`` objects are not in the world at the
+    start: slicing another object, whose ``pieces`` name them, brings them in where that one was.
     """
 
     name: str
@@ -71,6 +72,9 @@ class SceneObject:
     host: str = ""
     relation: Relation | None = None
     states: frozenset[State] = frozenset()
+    substances: frozenset[SubstanceFact] = frozenset()
+    absent: bool = False
+    pieces: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from enum import StrEnum
 
 
@@ -28,6 +29,23 @@ class State(StrEnum):
     DUSTY = "dusty"
     STAINED = "stained"
     SOAKED = "soaked"
+
+
+class SubstanceRelation(StrEnum):
+    """Symbolic relations of an object to a substance. ``covered(a, dust.n.01)`` means that dust lies on a."""
+
+    COVERED = "covered"
+    FILLED = "filled"
+    CONTAINS = "contains"
+    SATURATED = "saturated"
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class SubstanceFact:
+    """What an object has of a substance; ``substance`` is a synset of the catalog, such as ``water.n.06``."""
+
+    relation: SubstanceRelation
+    substance: str
 
 
 AMBIENT_C = 23.0

@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from embomatrix.world.bundle import Bundle
-from embomatrix.world.codec import asset_from_json, asset_to_json, check_scene, scene_from_json, scene_to_json
+from embomatrix.world.codec import check_scene, scene_from_json, scene_to_json
+from embomatrix.world.codec_asset import asset_from_json, asset_to_json
 from embomatrix.world.codec_task import poses_from_json, poses_to_json, task_from_json, task_to_json
 from embomatrix.world.field import SceneInvalidError
 from embomatrix.world.scene import Scene
