@@ -29,9 +29,18 @@ LEAST_OPEN: Final = 0.5
 """A door that something stops before this share of its travel does not open."""
 
 
-def act(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
-    """Carry out a call whose preconditions hold. A refusal leaves the world as it was."""
-    return ACTIONS[call.skill](world, call, rng)
+class CachedActor:
+    """The language-physics interface: outcomes found before are instantiated. Holds nothing of its own."""
+
+    def reset(self, world: LiveWorld) -> None:
+        """Nothing to do: all there is, is in the world."""
+
+    def act(self, world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+        """Carry out a call whose preconditions hold. A refusal leaves the world as it was."""
+        return ACTIONS[call.skill](world, call, rng)
+
+    def close(self) -> None:
+        """Nothing to free."""
 
 
 def _move(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:

@@ -1,13 +1,13 @@
-"""Execute plans in a scene, in cached mode: preconditions, actions, effects of temperature, and the trace of it all."""
+"""Execute plans in a scene: preconditions, actions, effects of temperature, and the trace of it all."""
 
 from __future__ import annotations
 
 import hashlib
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from embomatrix.sim.actions import act
+from embomatrix.sim.actions import CachedActor
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.live_world import LiveWorld
 from embomatrix.skills.check import check
@@ -25,11 +25,28 @@ if TYPE_CHECKING:
     from embomatrix.sim.facts import SceneFacts
     from embomatrix.sim.thermal import Change
     from embomatrix.skills.syntax import Plan, SkillCall
+    from embomatrix.skills.view import Refusal
     from embomatrix.world.bundle import Bundle
     from embomatrix.world.task import Task
 
 CHANGING = frozenset({Skill.PLACE, Skill.OPEN, Skill.CLOSE, Skill.TOGGLE_ON, Skill.TOGGLE_OFF})
 """Skills after which a source may act on something that it did not act on before."""
+
+
+class Actor(Protocol):
+    """Carries out calls: the one thing in which the execution modes differ."""
+
+    def reset(self, world: LiveWorld) -> None:
+        """A rollout begins: ``world`` is at the scene's start."""
+
+    def act(self, world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+        """Carry out a call whose preconditions hold and leave in ``world`` what became of it.
+
+        None for a success, else why it failed. ``rng`` decides between outcomes that are equally good.
+        """
+
+    def close(self) -> None:
+        """Free what the actor holds. It can't be used afterwards."""
 
 
 class Simulator:
@@ -38,9 +55,15 @@ class Simulator:
     ``execute`` runs a whole plan; ``reset`` and ``run_step`` run one call at a time.
     """
 
-    def __init__(self, bundle: Bundle, engine: PhysicsEngine | None = None) -> None:
-        """Load the scene, unless ``engine`` holds it already. Raises EngineError when it can't be loaded."""
+    def __init__(
+        self, bundle: Bundle, engine: PhysicsEngine | None = None, actor: Actor | None = None
+    ) -> None:
+        """Load the scene, unless ``engine`` holds it already. Raises EngineError when it can't be loaded.
+
+        ``actor`` is the execution mode, cached unless told otherwise. Engine and actor are closed with the simulator.
+        """
         self._world = LiveWorld(bundle, engine if engine is not None else BulletEngine(bundle.scene))
+        self._actor: Actor = actor if actor is not None else CachedActor()
         self._seed = 0
         self._count = 0
         self._hash = hashlib.sha256()
@@ -59,6 +82,7 @@ class Simulator:
     def reset(self, task: Task, seed: int) -> None:
         """Back to the scene's start. ``seed`` decides between outcomes that are equally good; it is not negative."""
         self._world.reset(task)
+        self._actor.reset(self._world)
         self._seed = seed
         self._count = 0
         self._touched = set()
@@ -66,7 +90,10 @@ class Simulator:
         self._hash.update(self._world.state_bytes())
 
     def run_step(self, call: SkillCall) -> Step:
-        """Execute one call in the state reached. A failed one changes nothing; the caller decides whether to go on."""
+        """Execute one call in the state reached; the caller decides whether to go on after a failure.
+
+        A call that is refused by its preconditions changes nothing, nor does a cached one that fails.
+        """
         world = self._world
         self._count += 1
         held = world.carried[:1]
@@ -74,9 +101,9 @@ class Simulator:
         if refusal is None:
             # Equal prefixes of plans meet equal numbers: the stream depends on the step, not on what was drawn before.
             rng = np.random.default_rng(np.random.SeedSequence((self._seed, self._count)))
-            refusal = act(world, call, rng)
+            refusal = self._actor.act(world, call, rng)
         if refusal is not None:
-            self._hash.update(refusal.reason.encode())
+            self._hash.update(world.state_bytes() + refusal.reason.encode())
             return Step(call, refusal.reason, refusal.sentence)
         changes = world.thermal.apply() if call.skill in CHANGING else ()
         self._touched.update(filter(None, (target_of(world, call), source_of(world, call))))
@@ -106,7 +133,8 @@ class Simulator:
         return final_lines([self._sight(name) for name in names])
 
     def close(self) -> None:
-        """Free the engine. The simulator can't be used afterwards."""
+        """Free the engine and the actor. The simulator can't be used afterwards."""
+        self._actor.close()
         self._world.engine.close()
 
     def _message(self, call: SkillCall, held: Sequence[str], changes: Sequence[Change]) -> str:
