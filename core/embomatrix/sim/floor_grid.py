@@ -118,6 +118,44 @@ class FloorGrid:
             return None
         return float(self._field(end)[start[0] * self._shape[1] + start[1]])
 
+    def path(self, start: Cell, end: Cell) -> tuple[Vec2, ...] | None:
+        """Corners of a short way over free cells, both ends included, in the world; None when there is none.
+
+        Steepest descent of the distance to the end, of which the corners are kept that no straight drive can cut.
+        """
+        if self.distance(start, end) is None:
+            return None
+        field = self._field(end).reshape(self._shape)
+        cells = [start]
+        while cells[-1] != end:
+            i, j = cells[-1]
+            cells.append(min(self._neighbours(i, j), key=lambda cell: (float(field[cell]), cell)))
+        corners = [self.center(cells[0])]
+        for number in range(2, len(cells)):
+            if not self.drives_straight(corners[-1], self.center(cells[number])):
+                corners.append(self.center(cells[number - 1]))
+        return (*corners, self.center(cells[-1]))
+
+    def drives_straight(self, start: Vec2, end: Vec2) -> bool:
+        """Whether the robot fits everywhere on the straight line between two points."""
+        count = max(1, math.ceil(math.dist(start, end) / (CELL_M / 2)))
+        shares = np.linspace(0.0, 1.0, count + 1)[:, None]
+        points = np.asarray(start) + shares * (np.asarray(end) - np.asarray(start))  # (n, 2)
+        cells = np.floor((points - self._origin) / CELL_M).astype(int)
+        inside = ((cells >= 0) & (cells < self._shape)).all()
+        return bool(inside and self.free[cells[:, 0], cells[:, 1]].all())
+
+    def _neighbours(self, i: int, j: int) -> list[Cell]:
+        """Free cells next to a cell; those across a corner only where both cells beside it are free."""
+        return [
+            (i + di, j + dj)
+            for di in (-1, 0, 1)
+            for dj in (-1, 0, 1)
+            if (di or dj)
+            and self.free[i + di, j + dj]
+            and (not (di and dj) or (self.free[i + di, j] and self.free[i, j + dj]))
+        ]
+
     def _field_from(self, cell: Cell) -> FloatArray:
         source = cell[0] * self._shape[1] + cell[1]
         return np.asarray(csgraph.dijkstra(self._graph, indices=source), dtype=np.float32)

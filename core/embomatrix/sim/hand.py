@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from embomatrix.sim.engine import PhysicsEngine
     from embomatrix.world.geometry import Pose
@@ -22,6 +22,11 @@ class Hand:
     def carried(self) -> tuple[str, ...]:
         """What the hand holds, then what lies in it; empty for an empty hand."""
         return tuple(self._pose_held_item)
+
+    @property
+    def offsets(self) -> Mapping[str, Pose]:
+        """Poses of what the hand holds, and of what lies in it, in the frame of what it holds."""
+        return self._pose_held_item
 
     def forget(self) -> None:
         """Be empty again, without putting anything anywhere: for a world that was reset."""

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from embomatrix.sim.floor_grid import Cell
     from embomatrix.sim.relations import Relations
     from embomatrix.world.asset import Asset
-    from embomatrix.world.geometry import FloatArray
+    from embomatrix.world.geometry import FloatArray, Vec2
     from embomatrix.world.scene import Room
 
 FLAT_M: Final = 0.03
@@ -103,6 +103,13 @@ class Navigator:
         if first is None or last is None:
             return None
         return self._grid.distance(first, last)
+
+    def path(self, origin: StandPose, target: StandPose) -> tuple[Vec2, ...]:
+        """Corners of a short free path from one pose to the other, without both ends; empty where none leads there."""
+        first, last = self._cell(origin), self._cell(target)
+        if first is None or last is None:
+            return ()
+        return (self._grid.path(first, last) or ())[1:-1]
 
     def forward(self, origin: StandPose, yaw: float, distance_m: float) -> float:
         """How far of ``distance_m`` the robot gets from ``origin`` along the heading ``yaw`` before it meets something."""

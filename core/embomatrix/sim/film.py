@@ -1,0 +1,177 @@
+"""Films: what happened to a scene while a plan was executed, moment by moment, as data for whoever draws it.
+
+In cached mode nothing moves between two states: the film leads from one to the next as a person would imagine it, the robot
+along its path, what it holds before its chest. It shows outcomes, not motions; motions are the physical mode's.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.world.geometry import Pose
+from embomatrix.world.poses import StandPose
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+    from embomatrix.sim.executor import Simulator
+    from embomatrix.sim.live_world import LiveWorld
+    from embomatrix.skills.syntax import Plan
+    from embomatrix.skills.trace import Step
+    from embomatrix.world.scene import Scene
+    from embomatrix.world.task import Task
+
+FRAMES_PER_S: Final = 12
+DRIVE_M_S: Final = 1.2
+TURN_RAD_S: Final = 2.5
+REACH_FRAMES: Final = 7
+REST_FRAMES: Final = 4
+"""Frames for a hand's movement, and for the look at what it brought."""
+HAND_AHEAD_M: Final = 0.45
+HAND_HIGH_M: Final = 0.95
+"""Where a carried thing is shown, from the robot's base."""
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One moment of a film.
+
+    ``poses`` and ``joints`` hold every object that is not as the scene has it at the start, ``hidden`` those out of the world.
+    ``robot`` is the base on the floor, ``arm`` the positions of the robot's joints in its model's order, empty where the
+    film knows none. ``step`` counts the plan's calls from 1, 0 before the first.
+    """
+
+    robot: StandPose
+    step: int
+    poses: Mapping[str, Pose] = field(default_factory=dict)
+    joints: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    hidden: frozenset[str] = frozenset()
+    arm: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Film:
+    """The frames of a plan at ``FRAMES_PER_S``, and the steps that they show."""
+
+    scene: Scene
+    task: Task
+    plan: Plan
+    steps: tuple[Step, ...]
+    frames: tuple[Frame, ...]
+
+
+def film_cached(simulator: Simulator, task: Task, plan: Plan, seed: int) -> Film:
+    """Execute a plan in cached mode up to its end or its first failed step, and show it."""
+    simulator.reset(task, seed)
+    world = simulator.world
+    shown = snapshot(world, 0)
+    frames, steps = [shown] * REST_FRAMES, []
+    for number, call in enumerate(plan, start=1):
+        step = simulator.run_step(call)
+        after = snapshot(world, number)
+        frames += _between(world, shown, after)
+        frames += [after] * REST_FRAMES
+        steps.append(step)
+        shown = after
+        if not step.ok:
+            frames += [after] * REST_FRAMES
+            break
+    return Film(world.scene, task, plan, tuple(steps), tuple(frames))
+
+
+def snapshot(world: LiveWorld, step: int) -> Frame:
+    """The state of a world as a frame. What the robot holds is shown before its chest."""
+    engine = world.engine
+    poses: dict[str, Pose] = {}
+    joints: dict[str, tuple[float, ...]] = {}
+    hidden: set[str] = set()
+    for item in world.scene.objects:
+        if engine.is_parked(item.name):
+            hidden.add(item.name)
+            continue
+        pose, fractions = engine.pose(item.name), engine.joints(item.name)
+        if pose != item.pose_world_asset or item.absent:
+            poses[item.name] = pose
+        if fractions != tuple(item.joints):
+            joints[item.name] = fractions
+    for name, offset in world.hand.offsets.items():
+        poses[name] = hand_pose(world.robot) @ offset
+        hidden.discard(name)
+    return Frame(world.robot, step, poses, joints, frozenset(hidden))
+
+
+def hand_pose(robot: StandPose) -> Pose:
+    """Where a film shows what the robot carries."""
+    x = robot.x_m + HAND_AHEAD_M * math.cos(robot.yaw)
+    y = robot.y_m + HAND_AHEAD_M * math.sin(robot.yaw)
+    return Pose.from_xyz_yaw(x, y, HAND_HIGH_M, robot.yaw)
+
+
+def _between(world: LiveWorld, before: Frame, after: Frame) -> Iterator[Frame]:
+    """Frames that lead from one state to the next, without both ends."""
+    if before.robot != after.robot:
+        yield from _driving(world, before, after)
+        return
+    changed = before.poses != after.poses or before.joints != after.joints
+    for number in range(1, REACH_FRAMES if changed else 1):
+        yield _mixed(world.scene, before, after, number / REACH_FRAMES)
+
+
+def _driving(world: LiveWorld, before: Frame, after: Frame) -> Iterator[Frame]:
+    """The robot on its way. What it carries keeps its place before it."""
+    held = {name: hand_pose(before.robot).inverse() @ before.poses[name] for name in world.carried}
+    for robot in along(world.navigator.path(before.robot, after.robot), before.robot, after.robot):
+        poses = dict(after.poses)
+        for name, offset in held.items():
+            poses[name] = hand_pose(robot) @ offset
+        yield Frame(robot, after.step, poses, after.joints, after.hidden)
+
+
+def along(points: Sequence[tuple[float, float]], start: StandPose, end: StandPose) -> Iterator[StandPose]:
+    """Poses at ``FRAMES_PER_S`` along a path: turn to it, follow it, turn to the end's heading. Without both ends."""
+    heading = start.yaw
+    corners = [(start.x_m, start.y_m), *points, (end.x_m, end.y_m)]
+    for (ax, ay), (bx, by) in itertools.pairwise(corners):
+        length = math.hypot(bx - ax, by - ay)
+        if length < 1e-6:
+            continue
+        course = math.atan2(by - ay, bx - ax)
+        yield from _turning(ax, ay, heading, course)
+        heading = course
+        count = max(1, round(length / DRIVE_M_S * FRAMES_PER_S))
+        for number in range(1, count + 1):
+            share = number / count
+            yield StandPose(ax + (bx - ax) * share, ay + (by - ay) * share, heading)
+    yield from _turning(end.x_m, end.y_m, heading, end.yaw)
+
+
+def _turning(x: float, y: float, before: float, after: float) -> Iterator[StandPose]:
+    angle = math.remainder(after - before, math.tau)
+    count = round(abs(angle) / TURN_RAD_S * FRAMES_PER_S)
+    for number in range(1, count):
+        yield StandPose(x, y, before + angle * number / count)
+
+
+def _mixed(scene: Scene, before: Frame, after: Frame, share: float) -> Frame:
+    """A frame between two: joints and positions in proportion, headings of the latter."""
+    poses: dict[str, Pose] = {}
+    for name in {*before.poses, *after.poses} - after.hidden:
+        start, end = (_pose_in(scene, frame, name) for frame in (before, after))
+        x, y, z = (a + (b - a) * share for a, b in zip(start.position_m, end.position_m, strict=True))
+        poses[name] = Pose((x, y, z), end.quat_xyzw)
+    joints: dict[str, tuple[float, ...]] = {}
+    for name in {*before.joints, *after.joints}:
+        pairs = zip(_joints_in(scene, before, name), _joints_in(scene, after, name), strict=True)
+        joints[name] = tuple(a + (b - a) * share for a, b in pairs)
+    return Frame(after.robot, after.step, poses, joints, after.hidden)
+
+
+def _pose_in(scene: Scene, frame: Frame, name: str) -> Pose:
+    return frame.poses.get(name, scene.by_name[name].pose_world_asset)
+
+
+def _joints_in(scene: Scene, frame: Frame, name: str) -> tuple[float, ...]:
+    return frame.joints.get(name, tuple(scene.by_name[name].joints))
