@@ -19,7 +19,7 @@ from embomatrix.world.codec_asset import (
     pose_to_json,
 )
 from embomatrix.world.field import Field, SceneInvalidError
-from embomatrix.world.scene import Doorway, RobotStart, Room, Scene, SceneObject
+from embomatrix.world.scene import Doorway, RobotStart, Room, Scene, SceneObject, Window
 from embomatrix.world.state import Relation, State, SubstanceFact, SubstanceRelation
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ MAX_VERTICES: Final = 512
 
 def scene_to_json(scene: Scene) -> Json:
     """The scene with the assets that its objects use, as JSON values in a fixed order."""
-    return {
+    value: Json = {
         "scene_id": scene.scene_id,
         "base": scene.base,
         "seed": scene.seed,
@@ -55,12 +55,25 @@ def scene_to_json(scene: Scene) -> Json:
         },
         "left_out": [*scene.left_out],
     }
+    if scene.windows:
+        value["windows"] = [_window_to_json(window) for window in scene.windows]
+    return value
 
 
 def scene_from_json(value: object) -> Scene:
     """A valid scene. Raises SceneInvalidError naming the field that is wrong."""
     fields = Field(value, "scene").record(
-        "scene_id", "base", "seed", "rooms", "walls", "doorways", "objects", "assets", "robot", "left_out"
+        "scene_id",
+        "base",
+        "seed",
+        "rooms",
+        "walls",
+        "doorways",
+        "objects",
+        "assets",
+        "robot",
+        "left_out",
+        optional=("windows",),
     )
     assets = {key: asset_from_field(item) for key, item in fields["assets"].entries()}
     for key, asset in assets.items():
@@ -78,6 +91,7 @@ def scene_from_json(value: object) -> Scene:
         assets=assets,
         robot=_robot(fields["robot"]),
         left_out=fields["left_out"].texts(),
+        windows=tuple(_window(item) for item in fields["windows"].items()) if "windows" in fields else (),
     )
     _check_references(scene)
     return scene
@@ -109,18 +123,53 @@ def _doorway_to_json(doorway: Doorway) -> Json:
 
 def _doorway(field: Field) -> Doorway:
     fields = field.record("rooms", "center_m", "width_m", "height_m", "along", "model")
-    rooms = fields["rooms"].texts()
-    along = fields["along"].text()
-    if len(rooms) != 2 or along not in {"x", "y"}:
-        field.fail(f"expected two rooms and a wall along x or y, found {list(rooms)} and {along[:20]!r}")
+    rooms, along = _wall_between(field, fields)
     return Doorway(
-        rooms=(rooms[0], rooms[1]),
+        rooms=rooms,
         center_m=fields["center_m"].vec2(),
         width_m=fields["width_m"].number(),
         height_m=fields["height_m"].number(),
         along=along,
         model=fields["model"].text(),
     )
+
+
+def _window_to_json(window: Window) -> Json:
+    return {
+        "rooms": [*window.rooms],
+        "center_m": [*window.center_m],
+        "width_m": window.width_m,
+        "sill_m": window.sill_m,
+        "head_m": window.head_m,
+        "along": window.along,
+        "model": window.model,
+    }
+
+
+def _window(field: Field) -> Window:
+    fields = field.record("rooms", "center_m", "width_m", "sill_m", "head_m", "along", "model")
+    rooms, along = _wall_between(field, fields)
+    sill, head = fields["sill_m"].number(), fields["head_m"].number()
+    if not 0.0 <= sill < head:
+        field.fail(f"found a sill at {sill} m and a head at {head} m: expected 0 <= sill < head")
+    return Window(
+        rooms=rooms,
+        center_m=fields["center_m"].vec2(),
+        width_m=fields["width_m"].number(),
+        sill_m=sill,
+        head_m=head,
+        along=along,
+        model=fields["model"].text(),
+    )
+
+
+def _wall_between(field: Field, fields: Mapping[str, Field]) -> tuple[tuple[str, str], str]:
+    """The rooms on either side of an opening and the axis that its wall runs along."""
+    rooms = fields["rooms"].texts()
+    along = fields["along"].text()
+    if len(rooms) != 2 or along not in {"x", "y"}:
+        field.fail(f"expected two rooms and a wall along x or y, found {list(rooms)} and {along[:20]!r}")
+    return (rooms[0], rooms[1]), along
 
 
 def _object_to_json(item: SceneObject) -> Json:
@@ -217,8 +266,12 @@ def _check_references(scene: Scene) -> None:
         if unknown:
             where = f"scene.objects[{index}].pieces"
             raise SceneInvalidError(where, f"found {min(unknown)!r}: expected an absent object of the scene")
-    for index, doorway in enumerate(scene.doorways):
-        if not set(doorway.rooms) <= known_rooms:
-            raise SceneInvalidError(f"scene.doorways[{index}].rooms", f"unknown room in {doorway.rooms}")
+    sides = {
+        **{f"scene.doorways[{index}].rooms": item.rooms for index, item in enumerate(scene.doorways)},
+        **{f"scene.windows[{index}].rooms": item.rooms for index, item in enumerate(scene.windows)},
+    }
+    for path, beside in sides.items():
+        if not set(beside) <= known_rooms:
+            raise SceneInvalidError(path, f"unknown room in {beside}")
     if scene.robot.room not in known_rooms:
         raise SceneInvalidError("scene.robot.room", f"unknown room {scene.robot.room!r}")

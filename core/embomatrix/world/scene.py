@@ -54,6 +54,23 @@ class Doorway:
 
 
 @dataclass(frozen=True, slots=True)
+class Window:
+    """Opening in a wall, closed by a pane; ``rooms[1]`` is empty where it looks outside.
+
+    ``center_m`` lies on the floor below it; the opening reaches from ``sill_m`` to ``head_m`` above the floor; ``along`` is "x"
+    or "y": the axis that the wall runs along.
+    """
+
+    rooms: tuple[str, str]
+    center_m: Vec2
+    width_m: float
+    sill_m: float
+    head_m: float
+    along: str
+    model: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class SceneObject:
     """One placed object. ``name`` is unique in the scene: category and number, ``apple_1``.
 
@@ -89,7 +106,10 @@ class RobotStart:
 
 @dataclass(frozen=True)
 class Scene:
-    """Rooms, walls, doorways and objects. Order of ``objects`` is part of the content: it is the solver's order."""
+    """Rooms, walls, doorways, windows and objects. Order of ``objects`` is part of the content: it is the solver's order.
+
+    ``walls`` holds all that bars the way: panels, lintels, sills, panes and the leaves of doors that lead outside.
+    """
 
     scene_id: str
     base: str
@@ -102,6 +122,7 @@ class Scene:
     robot: RobotStart
     left_out: tuple[str, ...] = field(default=())
     """Inventory items without a place, one sentence each: nothing is dropped silently."""
+    windows: tuple[Window, ...] = field(default=())
 
     @cached_property
     def by_name(self) -> Mapping[str, SceneObject]:

@@ -4,6 +4,7 @@ import contextlib
 import copy
 import json
 import math
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -15,7 +16,7 @@ from embomatrix.world.codec import check_scene, scene_from_json, scene_to_json
 from embomatrix.world.codec_asset import asset_from_json, asset_to_json
 from embomatrix.world.codec_task import poses_from_json, poses_to_json, task_from_json, task_to_json
 from embomatrix.world.field import SceneInvalidError
-from embomatrix.world.scene import Scene
+from embomatrix.world.scene import Scene, Window
 from embomatrix.world.task import Task
 
 
@@ -29,6 +30,28 @@ def test_scene_task_assets_and_poses_survive_json(scene: Scene, task: Task, bund
     assert poses_from_json(through_text(poses_to_json(bundle.poses))) == bundle.poses
     for asset in scene.assets.values():
         assert asset_from_json(through_text(asset_to_json(asset))) == asset
+
+
+WINDOW = Window(("kitchen_0", ""), (1.0, 0.0), 0.8, 0.9, 1.8, "x", "ulnafj")
+
+
+def test_windows_survive_json(scene: Scene) -> None:
+    lit = replace(scene, windows=(WINDOW,))
+    assert scene_from_json(through_text(scene_to_json(lit))) == lit
+
+
+@pytest.mark.parametrize(
+    ("window", "found"),
+    [
+        (replace(WINDOW, rooms=("attic_0", "")), "unknown room"),
+        (replace(WINDOW, head_m=0.9), "expected 0 <= sill < head"),
+        (replace(WINDOW, along="z"), "a wall along x or y"),
+    ],
+)
+def test_a_window_that_breaks_a_rule_is_named(scene: Scene, window: Window, found: str) -> None:
+    with pytest.raises(SceneInvalidError, match=found) as caught:
+        scene_from_json(scene_to_json(replace(scene, windows=(window,))))
+    assert caught.value.field.startswith("scene.windows[0]")
 
 
 def test_sound_scene_passes_the_check(scene: Scene) -> None:
