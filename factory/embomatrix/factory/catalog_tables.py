@@ -1,7 +1,7 @@
 """Build the catalog's package data from the ``bddl`` package: ``python -m embomatrix.factory.catalog_tables --out FOLDER``.
 
 BEHAVIOR-1K's knowledge base (``bddl`` 3.6.0, MIT) knows the box of every object model, the mass and the abilities of
-their categories, and the room-by-room inventories of 51 scenes. What the project needs of its 28 MB is written as two
+their categories, and the room-by-room inventories of 51 scenes. What the project needs of its 28 MB is written as three
 small tables, byte for byte the same on every run, beside the notice that the licence asks for.
 """
 
@@ -18,6 +18,8 @@ from collections import defaultdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from embomatrix.factory.substance_tables import build_substances
+
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
@@ -26,6 +28,7 @@ Json = Any
 BDDL_VERSION: Final = "3.6.0"
 CATALOG_FILE: Final = "catalog.json.gz"
 SCENES_FILE: Final = "scenes.json.gz"
+SUBSTANCES_FILE: Final = "substances.json.gz"
 NOTICE_FILE: Final = "NOTICE.md"
 
 DOORS: Final = frozenset({"door", "sliding_door", "garage_door", "elevator_door", "gate"})
@@ -196,7 +199,7 @@ def notice(licence: str) -> str:
     """Text that goes beside the tables: where they come from, and the licence with its copyright line."""
     return (
         "# NOTICE: data in this folder\n\n"
-        f"`{CATALOG_FILE}` and `{SCENES_FILE}` are derived from the Python package `bddl` {BDDL_VERSION}\n"
+        f"`{CATALOG_FILE}`, `{SCENES_FILE}` and `{SUBSTANCES_FILE}` are derived from the Python package `bddl` {BDDL_VERSION}\n"
         "(BEHAVIOR Domain Definition Language, https://github.com/StanfordVL/bddl, `bddl/generated_data/`) by\n"
         "`python -m embomatrix.factory.catalog_tables`: fields were selected and re-keyed, extents rounded to 0.1 mm.\n"
         "The package is distributed under this licence:\n\n"
@@ -218,6 +221,7 @@ def write_tables(out: Path) -> tuple[Path, ...]:
     contents = {
         CATALOG_FILE: encode(build_catalog(folder)),
         SCENES_FILE: encode(build_scenes(folder)),
+        SUBSTANCES_FILE: encode({"source": f"bddl {BDDL_VERSION}", **build_substances(folder)}),
         NOTICE_FILE: notice(_licence_text()).encode(),
     }
     out.mkdir(parents=True, exist_ok=True)

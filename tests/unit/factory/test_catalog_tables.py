@@ -13,6 +13,7 @@ from embomatrix.factory.catalog_tables import (
     CATALOG_FILE,
     NOTICE_FILE,
     SCENES_FILE,
+    SUBSTANCES_FILE,
     SourceError,
     encode,
     main,
@@ -36,7 +37,7 @@ def rebuilt(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-@pytest.mark.parametrize("name", [CATALOG_FILE, SCENES_FILE])
+@pytest.mark.parametrize("name", [CATALOG_FILE, SCENES_FILE, SUBSTANCES_FILE])
 def test_rebuilt_table_equals_the_shipped_one(rebuilt: Path, name: str) -> None:
     # values, not bytes: another zlib may compress the same text differently
     fresh, shipped = (rebuilt / name).read_bytes(), SHIPPED.joinpath(name).read_bytes()
