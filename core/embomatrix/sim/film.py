@@ -24,11 +24,11 @@ if TYPE_CHECKING:
     from embomatrix.world.scene import Scene
     from embomatrix.world.task import Task
 
-FRAMES_PER_S: Final = 12
+FRAMES_PER_S: Final = 8
 DRIVE_M_S: Final = 1.2
 TURN_RAD_S: Final = 2.5
-REACH_FRAMES: Final = 7
-REST_FRAMES: Final = 4
+REACH_FRAMES: Final = 5
+REST_FRAMES: Final = 3
 """Frames for a hand's movement, and for the look at what it brought."""
 HAND_AHEAD_M: Final = 0.45
 HAND_HIGH_M: Final = 0.95

@@ -10,12 +10,15 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 from rich.console import Console
 from rich.markup import escape
+from rich.progress import Progress
 from rich.table import Table
 
+from embomatrix.factory.film_pictures import Caption, FilmError, check_suffix, draw_film, write_film
 from embomatrix.reward.hierarchy import score, unparsable
 from embomatrix.sim.engine import EngineError
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.facts import FactError
+from embomatrix.sim.film import film_cached
 from embomatrix.sim.planner import PlanNotFound, find_plan
 from embomatrix.skills.parse import PlanError, argument, parse_plan
 from embomatrix.skills.syntax import MAX_PLAN_BYTES, SIGNATURES, Arg
@@ -24,6 +27,7 @@ from embomatrix.world.evaluate import GoalError
 
 if TYPE_CHECKING:
     from embomatrix.reward.breakdown import RewardBreakdown
+    from embomatrix.sim.film import Film
     from embomatrix.skills.syntax import Plan, SkillCall
     from embomatrix.skills.trace import Trace
     from embomatrix.world.task import Task
@@ -50,21 +54,26 @@ def play(
         typer.Option(help=f"Folder of the dataset; else $EMBOMATRIX_DATASET, else {DEFAULT_DATASET}."),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Decides between outcomes that are equally good.")] = 0,
+    film: Annotated[
+        Path | None, typer.Option(help="Draw the plan as an animation: a .gif, .webp or .png file.")
+    ] = None,
 ) -> None:
     """Execute a plan in a task: every step with its reason, the final state and the reward.
 
     Exit status: 0 for a plan that was executed, 1 for a text that is no plan, 2 for other bad input.
     """
     try:
-        status = _play(task, plan, oracle, dataset, seed)
-    except (PlayError, DatasetError, EngineError, FactError, GoalError) as error:
+        if film is not None:
+            check_suffix(film)
+        status = _play(task, plan, oracle, dataset, seed, film)
+    except (PlayError, DatasetError, EngineError, FactError, FilmError, GoalError) as error:
         Console(stderr=True, highlight=False).print(f"embomatrix play: {error}", markup=False, soft_wrap=True)
         raise SystemExit(BAD_INPUT) from None
     if status:
         raise SystemExit(status)
 
 
-def _play(task_id: str, plan: str, oracle: bool, folder: Path | None, seed: int) -> int:
+def _play(task_id: str, plan: str, oracle: bool, folder: Path | None, seed: int, film: Path | None) -> int:
     if oracle == bool(plan):
         raise PlayError("expected either --plan FILE or --oracle: give one of them")
     root = folder if folder is not None else Path(os.environ.get("EMBOMATRIX_DATASET", DEFAULT_DATASET))
@@ -77,14 +86,14 @@ def _play(task_id: str, plan: str, oracle: bool, folder: Path | None, seed: int)
         found = find_plan(simulator, record.task)
         if isinstance(found, PlanNotFound):
             raise PlayError(f"the oracle finds no plan for {task_id!r}: {found.reason}")
-        _run(simulator, record.task, found, seed)
+        _run(simulator, record.task, found, seed, film)
         return 0
     try:
         parsed = parse_plan(text)
     except PlanError as error:
         _show_unparsable(error)
         return NO_PLAN
-    _run(Simulator(data.bundle(record.bundle_digest)), record.task, parsed, seed)
+    _run(Simulator(data.bundle(record.bundle_digest)), record.task, parsed, seed, film)
     return 0
 
 
@@ -104,13 +113,40 @@ def _text_of(plan: str) -> str:
     return raw.decode("utf-8", errors="replace")
 
 
-def _run(simulator: Simulator, task: Task, plan: Plan, seed: int) -> None:
+def _run(simulator: Simulator, task: Task, plan: Plan, seed: int, film: Path | None) -> None:
     trace = simulator.execute(task, plan, seed)
     _show_steps(task, trace)
     console.print("\n[bold]Final state[/bold]")
     for line in trace.final:
         console.print(f"  {escape(line)}")
     _show_reward(score(task, trace.touched, simulator.facts))
+    if film is not None:
+        _draw(film_cached(simulator, task, plan, seed), film)
+
+
+def _draw(film: Film, path: Path) -> None:
+    """Draw the film, with a bar that tells how far it is, and write it."""
+    captions = [Caption(film.task.instruction, None, "the task")]
+    captions += [
+        Caption(
+            call_in_words(step.call, film.task) + ("" if step.ok else f": {step.message}"),
+            step.ok,
+            f"step {number} of {len(film.plan)}",
+        )
+        for number, step in enumerate(film.steps, start=1)
+    ]
+    with Progress(console=console, transient=True) as progress:
+        bar = progress.add_task("drawing", total=len(film.frames))
+        pictures = draw_film(
+            film, captions, on_frame=lambda done, count: progress.update(bar, completed=done, total=count)
+        )
+    try:
+        write_film(path, pictures)
+    except OSError as error:
+        raise PlayError(
+            f"{path} can't be written ({error.strerror}): make room, or name another file with --film"
+        ) from None
+    console.print(f"\nfilm of {len(pictures)} frames: {path}", markup=False)
 
 
 def _show_task(task: Task) -> None:

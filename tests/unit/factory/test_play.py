@@ -4,6 +4,7 @@ import json
 
 import pytest
 import typer
+from PIL import Image
 from tests.fakes.scenes import kitchen_scene, kitchen_tasks
 from typer.testing import CliRunner
 
@@ -126,3 +127,22 @@ def test_an_unknown_task_is_answered_with_close_ones(run):
 def test_the_folder_can_be_given_as_an_option(run, folder):
     result = run("cook_chicken", "--oracle", "--dataset", str(folder), env={"EMBOMATRIX_DATASET": "/no/such"})
     assert result.exit_code == 0
+
+
+def test_a_plan_is_drawn_as_an_animation(run, tmp_path):
+    film = tmp_path / "film.gif"
+    plan = tmp_path / "plan.json"
+    plan.write_text(json.dumps(GOOD[:2]))
+    result = run("apple_to_counter", "--plan", str(plan), "--film", str(film))
+    assert result.exit_code == 0, result.output
+    with Image.open(film) as picture:
+        assert picture.n_frames > 10
+        assert picture.size == (640, 542)
+
+
+def test_a_film_of_an_unknown_kind_is_refused_before_anything_runs(run):
+    result = run("apple_to_counter", "--oracle", "--film", "film.mp4")
+    assert result.exit_code == 2
+    assert "film.mp4" in result.output
+    assert ".gif" in result.output
+    assert "✓" not in result.output

@@ -45,7 +45,7 @@ def render_oblique(scene: Scene, *, width_px: int = 1280, height_px: int = 960) 
     """
     with Stage(scene) as stage:
         furnish_cutaway(stage)
-        stage.add_post(_start(scene))
+        stage.add_post().stand(_start(scene))
         return shoot_oblique(stage, scene.rooms, width_px, height_px)
 
 

@@ -113,17 +113,17 @@ class Stage:
         for link in asset.links:
             frame = pose if link.joint is None else pose @ joint_motion(link.joint, next(shares))
             for _, (body, part) in zip(link.parts, solids, strict=False):
-                self._place(body, frame @ part.pose)
+                self.place(body, frame @ part.pose)
 
     def hide(self, name: str) -> None:
         """Take an object out of sight."""
         for body, _ in self._solids.get(name, ()):
-            self._place(body, OUT_OF_SIGHT)
+            self.place(body, OUT_OF_SIGHT)
 
-    def add_post(self, stand: StandPose) -> int:
-        """A red post where the robot stands."""
+    def add_post(self) -> Post:
+        """A red post for the robot, out of sight at first."""
         size = (2 * ROBOT.radius_m, 2 * ROBOT.radius_m, POST_M)
-        return self.add_solid(Shape.CYLINDER, size, Pose((stand.x_m, stand.y_m, POST_M / 2)), _ROBOT)
+        return Post(self, self.add_solid(Shape.CYLINDER, size, OUT_OF_SIGHT, _ROBOT))
 
     def add_solid(
         self, shape: Shape, size_m: Vec3, pose: Pose, color: Rgba, vertices_m: tuple[Vec3, ...] = ()
@@ -171,7 +171,8 @@ class Stage:
     def _add_part(self, part: Part, frame: Pose, color: Rgba) -> int:
         return self.add_solid(part.shape, part.size_m, frame @ part.pose, color, part.vertices_m)
 
-    def _place(self, body: int, pose: Pose) -> None:
+    def place(self, body: int, pose: Pose) -> None:
+        """Move a solid that ``add_solid`` made."""
         self._bullet.resetBasePositionAndOrientation(
             body, pose.position_m, pose.quat_xyzw, physicsClientId=self._client
         )
@@ -195,6 +196,22 @@ class Stage:
             case Shape.HULL:
                 mesh = _faces(np.asarray(vertices_m))
                 return int(bullet.createVisualShape(bullet.GEOM_MESH, **mesh, **look))
+
+
+class Post:
+    """What stands for the robot in a picture."""
+
+    def __init__(self, stage: Stage, body: int) -> None:
+        self._stage = stage
+        self._body = body
+
+    def stand(self, at: StandPose) -> None:
+        """Show it where the robot's base is."""
+        self._stage.place(self._body, Pose.from_xyz_yaw(at.x_m, at.y_m, POST_M / 2, at.yaw))
+
+    def leave(self) -> None:
+        """Take it out of sight: the robot does not see itself."""
+        self._stage.place(self._body, OUT_OF_SIGHT)
 
 
 def _faces(points: FloatArray) -> dict[str, list[Any]]:

@@ -1,0 +1,91 @@
+"""Films: from one state to the next without leaps, and what a stage shows of them."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from tests.fakes.plans import plan_of, task_over
+from tests.fakes.scenes import kitchen_scene
+
+from embomatrix.sim.bullet.camera import furnish_cutaway, render_egocentric, shoot_oblique
+from embomatrix.sim.bullet.stage import Stage
+from embomatrix.sim.executor import Simulator
+from embomatrix.sim.film import DRIVE_M_S, FRAMES_PER_S, film_cached
+from embomatrix.world.bundle import Bundle
+from embomatrix.world.poses import StandPose
+
+PLAN = "move fridge_1; open fridge_1; move apple_1; pick_up apple_1; move fridge_1; place fridge_1 inside"
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return kitchen_scene()
+
+
+@pytest.fixture(scope="module")
+def film(scene):
+    simulator = Simulator(Bundle(scene, {}))
+    task = task_over(scene)
+    film = film_cached(simulator, task, plan_of(task, PLAN), 0)
+    simulator.close()
+    return film
+
+
+def test_the_robot_drives_no_faster_than_it_can(film) -> None:
+    most = 1.5 * DRIVE_M_S / FRAMES_PER_S
+    for before, after in itertools.pairwise(film.frames):
+        moved = math.dist((before.robot.x_m, before.robot.y_m), (after.robot.x_m, after.robot.y_m))
+        assert moved <= most
+
+
+def test_what_is_carried_stays_before_the_robot(film) -> None:
+    driven = [frame for frame in film.frames if frame.step == 5]
+    assert len({frame.robot for frame in driven}) > 3
+    for frame in driven:
+        x, y, _ = frame.poses["apple_1"].position_m
+        assert math.hypot(x - frame.robot.x_m, y - frame.robot.y_m) < 0.6
+
+
+def test_a_door_opens_by_and_by(film) -> None:
+    shares = [frame.joints.get("fridge_1", (0.0,))[0] for frame in film.frames]
+    assert shares == sorted(shares)
+    assert len(set(shares)) > 3
+    assert shares[-1] == 1.0
+
+
+def test_the_film_ends_in_the_state_that_the_plan_reached(film, scene) -> None:
+    simulator = Simulator(Bundle(scene, {}))
+    simulator.execute(film.task, film.plan, 0)
+    assert film.frames[-1].poses["apple_1"] == simulator.world.engine.pose("apple_1")
+    assert film.frames[-1].robot == simulator.world.robot
+    simulator.close()
+
+
+def test_a_plan_that_fails_is_shown_up_to_its_failure(scene) -> None:
+    simulator = Simulator(Bundle(scene, {}))
+    task = task_over(scene)
+    film = film_cached(simulator, task, plan_of(task, "pick_up apple_2; move apple_2"), 0)
+    simulator.close()
+    assert [step.ok for step in film.steps] == [False]
+    assert {frame.step for frame in film.frames} == {0, 1}
+
+
+def test_moving_an_object_on_a_stage_changes_the_picture_and_moving_it_back_restores_it(scene) -> None:
+    with Stage(scene) as stage:
+        furnish_cutaway(stage)
+        before = shoot_oblique(stage, scene.rooms, 160, 120)
+        stage.hide("breakfast_table_1")
+        without = shoot_oblique(stage, scene.rooms, 160, 120)
+        stage.put("breakfast_table_1", scene.by_name["breakfast_table_1"].pose_world_asset)
+        again = shoot_oblique(stage, scene.rooms, 160, 120)
+    assert (before != without).any()
+    np.testing.assert_array_equal(before, again)
+
+
+def test_the_robot_sees_another_picture_when_it_turns(scene) -> None:
+    views = [
+        render_egocentric(scene, StandPose(3.5, 1.5, yaw), width_px=80, height_px=60) for yaw in (0.0, 1.5)
+    ]
+    assert all(len(np.unique(view.reshape(-1, 3), axis=0)) > 4 for view in views)
+    assert (views[0] != views[1]).any()
