@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.factory.floorplan_walls import WALL_M, DoorCut, Rect, build_walls, shared_edge
-from embomatrix.world.scene import Doorway, Room
+from embomatrix.world.scene import Doorway, Room, Window
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -119,6 +119,7 @@ class FloorPlan:
     rooms: tuple[Room, ...]
     walls: tuple[Part, ...]
     doorways: tuple[Doorway, ...]
+    windows: tuple[Window, ...] = ()
 
     @property
     def compactness(self) -> float:

@@ -63,7 +63,7 @@ def furnish(plan: FloorPlan, pieces: dict[str, list[Piece]], rng: np.random.Gene
     loss = 0.0
     for room in plan.rooms:
         wanted, notes = _capped(pieces.get(room.name, []), room.name)
-        best = _best_arrangement(room, plan.doorways, wanted, rng)
+        best = _best_arrangement(room, plan, wanted, rng)
         start = len(placed)
         loss += best.loss
         placed += [replace(p, host=p.host + start) if p.host >= 0 else p for p in best.placed]
@@ -103,13 +103,13 @@ def _capped(pieces: Sequence[Piece], room: str) -> tuple[list[Piece], list[str]]
 
 
 def _best_arrangement(
-    room: Room, doorways: Sequence[Doorway], pieces: Sequence[Piece], rng: np.random.Generator
+    room: Room, plan: FloorPlan, pieces: Sequence[Piece], rng: np.random.Generator
 ) -> _Arrangement:
     best: _Arrangement | None = None
     first: set[int] = set()
     standing = [p for p in pieces if p.role is not Role.SURFACE]
     for attempt in range(ATTEMPTS if len(standing) < CROWD else CROWDED_ATTEMPTS):
-        tried = _arrange(room, doorways, pieces, rng, first, wobble=0.4 + 0.2 * attempt)
+        tried = _arrange(room, plan, pieces, rng, first, wobble=0.4 + 0.2 * attempt)
         # What found no place comes first the next time.
         first |= {p.number for p in tried.dropped if p.role not in (Role.WALL, Role.CEILING, Role.RUG)}
         if best is None or tried.loss < best.loss:
@@ -123,14 +123,14 @@ def _best_arrangement(
 
 def _arrange(
     room: Room,
-    doorways: Sequence[Doorway],
+    plan: FloorPlan,
     pieces: Sequence[Piece],
     rng: np.random.Generator,
     first: set[int],
     *,
     wobble: float,
 ) -> _Arrangement:
-    solver = RoomSolver(RoomSpace(room, doorways), rng)
+    solver = RoomSolver(RoomSpace(room, plan.doorways, plan.windows), rng)
     groups, notes = floor_groups(pieces)
     groups.sort(key=lambda g: all(m.piece.number not in first for m in g.members))
     dropped: list[Piece] = []

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from scipy import ndimage
 
+from embomatrix.factory.floorplan_walls import WALL_M
 from embomatrix.skills.limits import ROBOT
 
 if TYPE_CHECKING:
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from embomatrix.world.scene import Doorway, Room
+    from embomatrix.world.scene import Doorway, Room, Window
 
     FloatArray = NDArray[np.float64]
     BoolArray = NDArray[np.bool_]
@@ -23,6 +24,9 @@ if TYPE_CHECKING:
 CELL_M: Final = 0.05
 DOOR_CLEAR_M: Final = 0.8
 DOOR_HEIGHT_M: Final = 2.1
+WINDOW_CLEAR_M: Final = 0.5
+WINDOW_FROM_M: Final = 0.9
+"""What is no higher than this may stand before a window, however low its sill: a sofa, a desk, a counter."""
 LOW_M: Final = 0.03
 """What is no higher than this is floor to the robot: a rug."""
 _TOUCH_M: Final = 1e-4
@@ -44,11 +48,14 @@ class Target:
 class RoomSpace:
     """Occupancy of one room. Boxes are axis-aligned: everything on the floor stands at quarter turns."""
 
-    def __init__(self, room: Room, doorways: Sequence[Doorway]) -> None:
+    def __init__(self, room: Room, doorways: Sequence[Doorway], windows: Sequence[Window] = ()) -> None:
         self.room = room
         self.doorways = tuple(d for d in doorways if room.name in d.rooms)
         self.solids: list[Box] = []
-        self.zones: list[Box] = [self._door_zone(d) for d in self.doorways]
+        self.zones: list[Box] = [
+            *(self._door_zone(d) for d in self.doorways),
+            *(self._window_zone(w) for w in windows if room.name in w.rooms),
+        ]
         self.targets: list[Target] = []
         self._origin = np.asarray(room.low_m) - _MARGIN_M
         cells = np.ceil((np.asarray(room.size_m) + 2 * _MARGIN_M) / CELL_M).astype(int)
@@ -108,21 +115,31 @@ class RoomSpace:
         j = int(np.searchsorted(self._y, y + 0.5 * ny))
         return int(labels[min(i, len(self._x) - 1), min(j, len(self._y) - 1)])
 
-    def inward(self, doorway: Doorway) -> tuple[float, float]:
-        """Unit vector from the doorway into this room."""
-        if doorway.along == "x":
-            return (0.0, 1.0 if self.room.center_m[1] > doorway.center_m[1] else -1.0)
-        return (1.0 if self.room.center_m[0] > doorway.center_m[0] else -1.0, 0.0)
+    def inward(self, opening: Doorway | Window) -> tuple[float, float]:
+        """Unit vector from the opening into this room."""
+        if opening.along == "x":
+            return (0.0, 1.0 if self.room.center_m[1] > opening.center_m[1] else -1.0)
+        return (1.0 if self.room.center_m[0] > opening.center_m[0] else -1.0, 0.0)
 
     def _door_zone(self, doorway: Doorway) -> Box:
         """Floor that stays free inside the room before a doorway."""
-        x, y = doorway.center_m
-        half = doorway.width_m / 2
-        depth = min(DOOR_CLEAR_M, 0.7 * min(self.room.size_m)) + 0.06
-        nx, ny = self.inward(doorway)
-        if doorway.along == "x":
-            return (x - half, min(y, y + depth * ny), 0.0, x + half, max(y, y + depth * ny), DOOR_HEIGHT_M)
-        return (min(x, x + depth * nx), y - half, 0.0, max(x, x + depth * nx), y + half, DOOR_HEIGHT_M)
+        depth = min(DOOR_CLEAR_M, 0.7 * min(self.room.size_m))
+        x0, y0, x1, y1 = self._before(doorway, depth)
+        return (x0, y0, 0.0, x1, y1, DOOR_HEIGHT_M)
+
+    def _window_zone(self, window: Window) -> Box:
+        """Space that stays free inside the room before a window."""
+        x0, y0, x1, y1 = self._before(window, min(WINDOW_CLEAR_M, 0.7 * min(self.room.size_m)))
+        return (x0, y0, max(window.sill_m, WINDOW_FROM_M), x1, y1, window.head_m)
+
+    def _before(self, opening: Doorway | Window, depth_m: float) -> tuple[float, float, float, float]:
+        """The strip (x0, y0, x1, y1) of this depth before an opening, from the middle of its wall."""
+        x, y = opening.center_m
+        half, far = opening.width_m / 2, depth_m + WALL_M / 2
+        nx, ny = self.inward(opening)
+        if opening.along == "x":
+            return (x - half, min(y, y + far * ny), x + half, max(y, y + far * ny))
+        return (min(x, x + far * nx), y - half, max(x, x + far * nx), y + half)
 
     def _empty_floor(self) -> BoolArray:
         floor = np.zeros((len(self._x), len(self._y)), dtype=bool)
