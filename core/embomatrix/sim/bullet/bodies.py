@@ -6,6 +6,7 @@ hull within a compound that comes from memory, so hulls beside other parts ride 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +26,8 @@ HULL_MARGIN_M = 0.001
 PART_LIMIT = 16
 """Parts of a compound: Bullet drops the rest silently."""
 NO_SHAPE = -1
+LEAST_LEAF_KG = 0.2
+"""No door weighs less: the solver wants masses of one order."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,9 +43,11 @@ class Piece:
 class BodyFactory:
     """Makes bodies in one client. Shapes are shared by the bodies of an asset and live until the client is reset."""
 
-    def __init__(self, client: int) -> None:
+    def __init__(self, client: int, flags: int = 0) -> None:
+        """``flags`` are Bullet's, for every body that is made."""
         self._bullet = pybullet()
         self._client = client
+        self._flags = flags
         self._pieces: dict[str, tuple[Piece, ...]] = {}
 
     def forget_shapes(self) -> None:
@@ -53,7 +58,7 @@ class BodyFactory:
         """Immovable bodies of one asset, with its joints; their ids in the order of the poses."""
         pieces = self._pieces_of(asset)
         if len(pieces) > 1:
-            return tuple(self._create(0.0, pieces, pose) for pose in poses)
+            return tuple(self._create([0.0] * len(pieces), pieces, pose) for pose in poses)
         ids = self._bullet.createMultiBody(
             0.0,
             pieces[0].shape,
@@ -70,22 +75,32 @@ class BodyFactory:
             joint_motion(joint, fraction)
             for (_, joint), fraction in zip(asset.joints, fractions, strict=True)
         ]
-        return self._create(mass_kg, pieces, pose, motions)
+        return self._create([mass_kg / len(pieces)] * len(pieces), pieces, pose, motions)
+
+    def hinged(self, asset: Asset, pose: Pose) -> int:
+        """One body whose base is immovable and whose leaves have mass and free joints: physics moves them.
+
+        A leaf has its share of the asset's mass by the volume of its parts.
+        """
+        pieces = self._pieces_of(asset)
+        volumes = [sum(math.prod(part.size_m) for part in link.parts) for link in asset.links]
+        leaves = [max(LEAST_LEAF_KG, asset.mass_kg * volume / sum(volumes)) for volume in volumes]
+        owners = [sum(other.joint is not None for other in pieces[: i + 1]) for i in range(len(pieces))]
+        masses = [leaves[owner] / owners.count(owner) if owner else 0.0 for owner in owners]
+        return self._create(masses, pieces, pose)
 
     def walls(self, parts: Sequence[Part]) -> tuple[int, ...]:
         """Immovable bodies that hold 16 walls each; wall ``i`` is in body ``i // 16``."""
         chunks = [parts[i : i + PART_LIMIT] for i in range(0, len(parts), PART_LIMIT)]
-        return tuple(
-            self._create(0.0, self._link_pieces(chunk, (0.0, 0.0, 0.0), None, 0), IDENTITY)
-            for chunk in chunks
-        )
+        made = [self._link_pieces(chunk, (0.0, 0.0, 0.0), None, 0) for chunk in chunks]
+        return tuple(self._create([0.0] * len(pieces), pieces, IDENTITY) for pieces in made)
 
     def floor(self, x_m: float, y_m: float, half_m: float) -> int:
         """Immovable square slab with its top at height 0, centred at a point."""
         slab = self._bullet.createCollisionShape(
             self._bullet.GEOM_BOX, halfExtents=(half_m, half_m, 0.25), physicsClientId=self._client
         )
-        return self._create(0.0, (Piece(slab, (0.0, 0.0, 0.0), -1, None),), Pose((x_m, y_m, -0.25)))
+        return self._create([0.0], (Piece(slab, (0.0, 0.0, 0.0), -1, None),), Pose((x_m, y_m, -0.25)))
 
     def joint_indices(self, asset: Asset) -> tuple[int, ...]:
         """Bullet's index of each joint of the asset, in the asset's order."""
@@ -147,24 +162,28 @@ class BodyFactory:
         )
 
     def _create(
-        self, mass_kg: float, pieces: Sequence[Piece], pose: Pose, motions: Sequence[Pose] | None = None
+        self,
+        masses_kg: Sequence[float],
+        pieces: Sequence[Piece],
+        pose: Pose,
+        motions: Sequence[Pose] | None = None,
     ) -> int:
-        """One body of these pieces. With ``motions`` (one per joint) the joints are fixed there, else they are free."""
-        share = mass_kg / len(pieces)
+        """One body of these pieces, each with its mass. With ``motions`` (one per joint) the joints are fixed there, else they are free."""
         return int(
             self._bullet.createMultiBody(
-                share,
+                masses_kg[0],
                 pieces[0].shape,
                 NO_SHAPE,
                 basePosition=pose.position_m,
                 baseOrientation=pose.quat_xyzw,
+                flags=self._flags,
                 physicsClientId=self._client,
-                **self._links(share, pieces[1:], motions),
+                **self._links(masses_kg[1:], pieces[1:], motions),
             )
         )
 
     def _links(
-        self, mass_kg: float, pieces: Sequence[Piece], motions: Sequence[Pose] | None
+        self, masses_kg: Sequence[float], pieces: Sequence[Piece], motions: Sequence[Pose] | None
     ) -> dict[str, Any]:
         if not pieces:
             return {}
@@ -179,7 +198,7 @@ class BodyFactory:
         ]
         free = motions is None
         return {
-            "linkMasses": [mass_kg] * len(pieces),
+            "linkMasses": list(masses_kg),
             "linkCollisionShapeIndices": [piece.shape for piece in pieces],
             "linkVisualShapeIndices": [NO_SHAPE] * len(pieces),
             "linkPositions": [pose.position_m for pose in poses],
