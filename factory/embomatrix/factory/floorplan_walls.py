@@ -1,4 +1,4 @@
-"""Walls of a floor plan: centre lines merged over shared edges, cut at doorways, closed above them by lintels."""
+"""Walls of a floor plan: centre lines merged over shared edges, cut at doorways and windows, with lintels, sills and panes."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.world.geometry import Part, Pose, Shape
-from embomatrix.world.scene import Doorway
+from embomatrix.world.scene import Doorway, Window
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -17,8 +17,9 @@ if TYPE_CHECKING:
 WALL_M: Final = 0.12
 WALL_HEIGHT_M: Final = 2.4
 DOOR_LEAF_M: Final = 0.05
+PANE_M: Final = 0.02
 
-_Interval = tuple[float, float]
+Interval = tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +45,16 @@ class Edge:
         doorway = Doorway(rooms, center, width, height, self.along, model)
         return DoorCut(doorway, self, (start, start + width))
 
+    def glaze(
+        self, rooms: tuple[str, str], start: float, width: float, sill: float, head: float, model: str
+    ) -> WindowCut:
+        """A window in this edge from ``start`` (a coordinate on the axis) over ``width`` metres."""
+        middle = start + width / 2
+        center = (middle, self.at) if self.along == "x" else (self.at, middle)
+        return WindowCut(
+            Window(rooms, center, width, sill, head, self.along, model), self, (start, start + width)
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class DoorCut:
@@ -51,7 +62,16 @@ class DoorCut:
 
     doorway: Doorway
     edge: Edge
-    interval: _Interval
+    interval: Interval
+
+
+@dataclass(frozen=True, slots=True)
+class WindowCut:
+    """A window and the interval that it takes out of its wall's centre line."""
+
+    window: Window
+    edge: Edge
+    interval: Interval
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +120,7 @@ class Rect:
                 near, far = (r.y0, r.y1) if edge.along == "x" else (r.x0, r.x1)
                 if near < edge.at + max(0.0, 0.5 * out) and far > edge.at + min(0.0, 0.5 * out):
                     taken.append((low - half, high + half))
-            pieces = _subtract([(edge.start + half, edge.end - half)], taken)
+            pieces = subtract([(edge.start + half, edge.end - half)], taken)
             found += [Edge(edge.along, edge.at, a, b) for a, b in pieces]
         return found
 
@@ -119,32 +139,39 @@ def shared_edge(a: Rect, b: Rect) -> Edge | None:
     return None
 
 
-def build_walls(rects: Mapping[str, Rect], cuts: Sequence[DoorCut]) -> tuple[Part, ...]:
-    """Wall panels, lintels over the doorways and the closed leaf of every exterior door."""
+def build_walls(
+    rects: Mapping[str, Rect], doors: Sequence[DoorCut], windows: Sequence[WindowCut] = ()
+) -> tuple[Part, ...]:
+    """Wall panels; lintels over the doorways and the closed leaf of every exterior door; sill, lintel and pane of windows."""
     half = WALL_M / 2
-    lines: dict[tuple[str, float], list[_Interval]] = defaultdict(list)
+    lines: dict[tuple[str, float], list[Interval]] = defaultdict(list)
     for rect in rects.values():
         for edge in rect.edges:
             lines[edge.along, round(edge.at, 5)].append((edge.start - half, edge.end + half))
-    holes: dict[tuple[str, float], list[_Interval]] = defaultdict(list)
-    for cut in cuts:
+    holes: dict[tuple[str, float], list[Interval]] = defaultdict(list)
+    for cut in (*doors, *windows):
         holes[cut.edge.along, round(cut.edge.at, 5)].append(cut.interval)
     walls = [
         _panel(along, at, piece, 0.0, WALL_HEIGHT_M)
         for (along, at), spans in sorted(lines.items())
-        for piece in _subtract(_merge(spans), holes[along, at])
+        for piece in subtract(_merge(spans), holes[along, at])
     ]
-    for cut in cuts:
-        height = cut.doorway.height_m
-        walls.append(_panel(cut.edge.along, cut.edge.at, cut.interval, height, WALL_HEIGHT_M))
-        if not cut.doorway.rooms[1]:
-            walls.append(_panel(cut.edge.along, cut.edge.at, cut.interval, 0.0, height, DOOR_LEAF_M))
+    for door in doors:
+        height = door.doorway.height_m
+        walls.append(_panel(door.edge.along, door.edge.at, door.interval, height, WALL_HEIGHT_M))
+        if not door.doorway.rooms[1]:
+            walls.append(_panel(door.edge.along, door.edge.at, door.interval, 0.0, height, DOOR_LEAF_M))
+    for glazed in windows:
+        along, at, span, window = glazed.edge.along, glazed.edge.at, glazed.interval, glazed.window
+        walls += [
+            _panel(along, at, span, 0.0, window.sill_m),
+            _panel(along, at, span, window.head_m, WALL_HEIGHT_M),
+            _panel(along, at, span, window.sill_m, window.head_m, PANE_M),
+        ]
     return tuple(walls)
 
 
-def _panel(
-    along: str, at: float, span: _Interval, low: float, high: float, thickness: float = WALL_M
-) -> Part:
+def _panel(along: str, at: float, span: Interval, low: float, high: float, thickness: float = WALL_M) -> Part:
     middle, length = (span[0] + span[1]) / 2, span[1] - span[0]
     z = (low + high) / 2
     if along == "x":
@@ -152,8 +179,8 @@ def _panel(
     return Part(Shape.BOX, Pose((at, middle, z)), (thickness, length, high - low))
 
 
-def _merge(spans: Iterable[_Interval]) -> list[_Interval]:
-    merged: list[_Interval] = []
+def _merge(spans: Iterable[Interval]) -> list[Interval]:
+    merged: list[Interval] = []
     for start, end in sorted(spans):
         if merged and start <= merged[-1][1] + 1e-6:
             merged[-1] = (merged[-1][0], max(merged[-1][1], end))
@@ -162,7 +189,8 @@ def _merge(spans: Iterable[_Interval]) -> list[_Interval]:
     return merged
 
 
-def _subtract(spans: Iterable[_Interval], holes: Iterable[_Interval]) -> list[_Interval]:
+def subtract(spans: Iterable[Interval], holes: Iterable[Interval]) -> list[Interval]:
+    """What is left of intervals when others are taken out of them."""
     pieces = list(spans)
     for low, high in holes:
         pieces = [

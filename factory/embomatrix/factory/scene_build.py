@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.factory.assets.library import build_asset
-from embomatrix.factory.floorplan import DoorSpec, FloorPlan, RoomSpec, plan_floor
+from embomatrix.factory.floorplan import FloorPlan, plan_floor
+from embomatrix.factory.floorplan_spec import DoorSpec, RoomSpec, WindowSpec
 from embomatrix.factory.furnish import Furnishing, furnish
 from embomatrix.factory.furnish_pieces import Piece
 from embomatrix.factory.furnish_roles import Role, is_portable, role_of
@@ -59,7 +60,8 @@ def build_base_scene(scene_id: str, *, seed: int = 0) -> Scene:
         objects=objects,
         assets=assets,
         robot=_robot_start(plan, result.placed),
-        left_out=(*notes, *result.left_out),
+        left_out=(*notes, *plan.left_out, *result.left_out),
+        windows=plan.windows,
     )
     logger.info(
         "scene built id=%s seed=%d objects=%d left_out=%d", scene_id, seed, len(objects), len(scene.left_out)
@@ -86,21 +88,23 @@ def _best_plan(
 
 
 def room_spec(catalog: Catalog, room: RoomInventory) -> RoomSpec:
-    """Floor and doors of an inventory's room, each door as often as it is listed."""
+    """Floor, doors and windows of an inventory's room, each as often as it is listed."""
     doors = []
     for category, model, count in room.doors:
         _, width, height = catalog.model(category, model).size_m
         doors += [DoorSpec(model, width, height)] * count
-    return RoomSpec(room.name, room.type, room.floor_m, tuple(doors))
+    windows = []
+    for category, model, count in room.windows:
+        depth, width, height = catalog.model(category, model).size_m
+        # A flat model's face is at its top: it is listed as it lies, not as it stands.
+        face = (depth, width) if height < 0.1 else (max(depth, width), height)
+        windows += [WindowSpec(model, *face)] * count
+    return RoomSpec(room.name, room.type, room.floor_m, tuple(doors), tuple(windows))
 
 
 def _pieces(catalog: Catalog, inventory: SceneInventory) -> tuple[dict[str, list[Piece]], list[str]]:
     """The items of every room as pieces, and sentences on what is listed twice or not modelled."""
-    notes = [
-        f"{sum(n for _, _, n in room.windows)} windows in {room.name}: its walls are closed"
-        for room in inventory.rooms
-        if room.windows
-    ]
+    notes = [note for room in inventory.rooms for note in _floor_notes(room)]
     pieces: dict[str, list[Piece]] = {}
     seen: set[str] = set()
     number = 0
@@ -121,6 +125,19 @@ def _pieces(catalog: Catalog, inventory: SceneInventory) -> tuple[dict[str, list
                 mine.append(Piece(number, category, asset, role, upended=flat and role is Role.WALL))
                 number += 1
     return pieces, notes
+
+
+def _floor_notes(room: RoomInventory) -> list[str]:
+    """Where the floor is not the inventory's own, or not all of it."""
+    notes = []
+    if room.floor_estimated:
+        notes.append(f"floor of {room.name}: none is listed; the median of its room type stands for it")
+    if room.more_floors_m:
+        more = ", ".join(f"{x:.1f} x {y:.1f} m" for x, y in room.more_floors_m)
+        notes.append(
+            f"{len(room.more_floors_m)} more floors of {room.name} ({more}): its largest one is the room"
+        )
+    return notes
 
 
 def _objects(placed: Sequence[Placed]) -> tuple[tuple[SceneObject, ...], dict[str, Asset]]:

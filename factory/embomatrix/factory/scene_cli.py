@@ -13,7 +13,7 @@ from PIL import Image
 from rich.console import Console
 from rich.table import Table
 
-from embomatrix.factory.floorplan import FloorPlanError
+from embomatrix.factory.floorplan_spec import FloorPlanError
 from embomatrix.factory.pictures import draw_plan
 from embomatrix.factory.scene_build import build_base_scene
 from embomatrix.factory.scene_check import check_in_engine, check_scene

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from embomatrix.factory.floorplan import RoomSpec, plan_floor
+from embomatrix.factory.floorplan import plan_floor
+from embomatrix.factory.floorplan_spec import RoomSpec
 from embomatrix.factory.furnish import MAX_EQUAL, furnish
 from embomatrix.factory.furnish_groups import floor_groups
 from embomatrix.factory.furnish_pieces import REST_GAP_M, Piece, around_table, front_depth_m
