@@ -17,10 +17,12 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from embomatrix.world.asset import Asset, Joint
-    from embomatrix.world.geometry import FloatArray, Part
+    from embomatrix.world.geometry import FloatArray, Part, Quat, Vec3
 
 RIM_POINTS: Final = 24
 """Points on each rim of a cylinder: a box is then at most 0.9 % of the radius too small."""
+EXTENTS_KEPT: Final = 512
+"""Answers in memory for each asset, about 300 bytes each."""
 IDENTITY: Final = Pose((0.0, 0.0, 0.0), IDENTITY_QUAT)
 
 
@@ -41,9 +43,25 @@ class AssetBounds:
 
     def __init__(self, asset: Asset) -> None:
         self._clouds = [(_cloud(link.parts), link.joint) for link in asset.links if link.parts]
+        self._extents: dict[tuple[Quat, tuple[float, ...]], tuple[Vec3, Vec3]] = {}
 
-    def corners(self, pose: Pose, fractions: Sequence[float]) -> tuple[FloatArray, FloatArray]:
-        """Low and high corner of the box in the frame that ``pose`` leads to, each of shape (3,)."""
+    def box(self, pose: Pose, fractions: Sequence[float] = ()) -> Aabb:
+        """Bounding box in the frame that ``pose`` leads to, with the joints at these shares of their travel."""
+        (a, b, c), (d, e, f) = self._extents_at(pose.quat_xyzw, tuple(fractions))
+        x, y, z = pose.position_m
+        return Aabb((x + a, y + b, z + c), (x + d, y + e, z + f))
+
+    def _extents_at(self, quat_xyzw: Quat, fractions: tuple[float, ...]) -> tuple[Vec3, Vec3]:
+        """Corners relative to the origin. Things stand at few angles: answers are kept."""
+        key = (quat_xyzw, fractions)
+        known = self._extents.get(key)
+        if known is None:
+            if len(self._extents) >= EXTENTS_KEPT:
+                self._extents.clear()
+            known = self._extents[key] = self._reckon(Pose((0.0, 0.0, 0.0), quat_xyzw), fractions)
+        return known
+
+    def _reckon(self, pose: Pose, fractions: tuple[float, ...]) -> tuple[Vec3, Vec3]:
         low, high = np.full(3, np.inf), np.full(3, -np.inf)
         moving = iter(fractions)
         for (points, radii), joint in self._clouds:
@@ -52,17 +70,8 @@ class AssetBounds:
             world = placed.apply_all(points)  # (n, 3)
             np.minimum(low, (world - radii).min(axis=0), out=low)
             np.maximum(high, (world + radii).max(axis=0), out=high)
-        return low, high
-
-    def box(self, pose: Pose, fractions: Sequence[float] = ()) -> Aabb:
-        """Bounding box in the frame that ``pose`` leads to, with the joints at these shares of their travel."""
-        return aabb_of(*self.corners(pose, fractions))
-
-
-def aabb_of(low: FloatArray, high: FloatArray) -> Aabb:
-    """Box between two corners, as plain floats."""
-    (a, b, c), (d, e, f) = low.tolist(), high.tolist()
-    return Aabb((a, b, c), (d, e, f))
+        (a, b, c), (d, e, f) = low.tolist(), high.tolist()
+        return (a, b, c), (d, e, f)
 
 
 def _cloud(parts: Sequence[Part]) -> tuple[FloatArray, FloatArray]:

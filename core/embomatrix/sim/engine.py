@@ -53,14 +53,35 @@ class Settled:
         return self.at_rest and self.moved_m < MAX_MOVED_M and self.tilt_rad < MAX_TILT_RAD
 
 
+class Journal:
+    """What changed in an engine since it was loaded or reset: for those who keep answers that depend on its state."""
+
+    def __init__(self) -> None:
+        self.rounds = 0
+        """How often the engine was reset: with every round the entries begin anew."""
+        self.entries: list[tuple[str, Aabb | None]] = []
+        """Objects that were moved, parked or brought back, and the box that each had before; None: it was parked."""
+
+    def begin_round(self) -> None:
+        self.rounds += 1
+        self.entries.clear()
+
+
 class PhysicsEngine(Protocol):
     """One loaded scene. Unknown names and non-finite numbers raise EngineError before physics sees them."""
 
     @property
     def scene(self) -> Scene: ...
 
+    @property
+    def journal(self) -> Journal:
+        """Every change since the last reset, in order. For reading only."""
+
     def reset(self) -> None:
-        """Undo every change since loading: poses, joints and parking are bit-equal to the scene's."""
+        """Undo every change since loading: poses, joints and parking are bit-equal to the scene's.
+
+        What the scene calls absent is parked.
+        """
 
     def pose(self, name: str) -> Pose:
         """Pose of the object's asset frame in the world; of a parked object the last one that it had."""
@@ -104,7 +125,7 @@ class PhysicsEngine(Protocol):
         """
 
     def state_bytes(self) -> bytes:
-        """Poses, joints and parking of all objects that can change, for the digest of a trace."""
+        """Poses, joints and parking of all objects in which they differ from the scene's, for the digest of a trace."""
 
     def close(self) -> None:
         """Free the physics client. The engine can't be used afterwards."""

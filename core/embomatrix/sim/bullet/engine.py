@@ -6,29 +6,37 @@ bit-exact, whatever Bullet rounds. The main client is never stepped and no body 
 
 from __future__ import annotations
 
+import struct
 from typing import TYPE_CHECKING, Final
 
-import numpy as np
-
-from embomatrix.sim.bounds import AssetBounds, aabb_of
+from embomatrix.sim.bounds import AssetBounds
 from embomatrix.sim.bullet.bodies import PART_LIMIT, BodyFactory
 from embomatrix.sim.bullet.client import ClientPool, pybullet
 from embomatrix.sim.bullet.mini_world import MiniWorld, Still
-from embomatrix.sim.engine import FLOOR, NOTHING, SETTLE_STEPS, TOLERANCE_M, WALL, EngineError, Settled
+from embomatrix.sim.engine import (
+    FLOOR,
+    NOTHING,
+    SETTLE_STEPS,
+    TOLERANCE_M,
+    WALL,
+    EngineError,
+    Journal,
+    Settled,
+)
+from embomatrix.sim.neighbourhood import Neighbourhood
 from embomatrix.sim.validation import check_fractions, check_pose, check_scene
-from embomatrix.world.geometry import Aabb, Pose
+from embomatrix.world.geometry import Pose
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Sequence
 
-    from embomatrix.world.geometry import FloatArray
+    from embomatrix.world.geometry import Aabb
     from embomatrix.world.scene import Scene
 
 BOX_SLACK_M: Final = 0.01
 """Boxes this far apart are still compared part by part: boxes of tilted cylinders may be a little too small."""
 SETTLE_RADIUS_M: Final = 0.05
 """Objects whose boxes come this near take part in a settle: nothing that is stable moves a fifth as far."""
-POSE_NUMBERS: Final = 7
 
 
 class BulletEngine:
@@ -53,31 +61,37 @@ class BulletEngine:
         self._bounds = [bounds[item.asset_id] for item in scene.objects]
         self._poses = [item.pose_world_asset for item in scene.objects]
         self._fractions = [tuple(item.joints) for item in scene.objects]
-        self._present = np.ones(len(self._names), dtype=np.bool_)
-        self._low = np.zeros((len(self._names), 3))
-        self._high = np.zeros((len(self._names), 3))
-        self._walls = [wall.aabb(Pose((0.0, 0.0, 0.0))) for wall in scene.walls]
-        self._wall_low = np.array([box.low_m for box in self._walls]).reshape(-1, 3)
-        self._wall_high = np.array([box.high_m for box in self._walls]).reshape(-1, 3)
-        self._state = np.zeros((len(self._names), POSE_NUMBERS))
+        self._present = [not item.absent for item in scene.objects]
+        self._boxes: list[Aabb] = []
+        self._around = Neighbourhood()
+        self._walls_around = Neighbourhood()
+        for number, wall in enumerate(scene.walls):
+            self._walls_around.put(number, wall.aabb(Pose((0.0, 0.0, 0.0))))
+        self._journal = Journal()
         self._changed: set[int] = set()
-        self._can_change = np.array(
-            [not item.fixed or bool(item.joints) for item in scene.objects], dtype=np.bool_
-        )
         self._load()
 
     @property
     def scene(self) -> Scene:
         return self._scene
 
+    @property
+    def journal(self) -> Journal:
+        """Every change since the last reset, in order. For reading only."""
+        return self._journal
+
     def reset(self) -> None:
-        """Undo every change since loading: poses, joints and parking are bit-equal to the scene's."""
+        """Undo every change since loading: poses, joints and parking are bit-equal to the scene's.
+
+        What the scene calls absent is parked.
+        """
         for number in sorted(self._changed):
             item = self._scene.objects[number]
-            self._present[number] = True
+            self._present[number] = not item.absent
             self._put(number, item.pose_world_asset)
             self._put_joints(number, tuple(item.joints))
         self._changed.clear()
+        self._journal.begin_round()
 
     def pose(self, name: str) -> Pose:
         """Pose of the object's asset frame in the world; of a parked object the last one that it had."""
@@ -86,15 +100,16 @@ class BulletEngine:
     def set_pose(self, name: str, pose: Pose) -> None:
         """Teleport the object. One that was parked is back in the world."""
         number = self._number(name)
+        if pose == self._poses[number] and self._present[number]:
+            return
         check_pose(pose, name)
-        self._changed.add(number)
+        self._note(number)
         self._present[number] = True
         self._put(number, pose)
 
     def aabb(self, name: str) -> Aabb:
         """Bounding box in the world, with the joints as they are now."""
-        number = self._number(name)
-        return aabb_of(self._low[number], self._high[number])
+        return self._boxes[self._number(name)]
 
     def joints(self, name: str) -> tuple[float, ...]:
         """Joint positions as shares of their travel: 0 closed, 1 open, in the order of the asset's joints."""
@@ -104,14 +119,17 @@ class BulletEngine:
         """Set every joint of the object. Raises EngineError for a wrong number of them or one outside 0..1."""
         number = self._number(name)
         check_fractions(self._scene.objects[number], self._assets[number], fractions)
-        self._changed.add(number)
+        self._note(number)
         self._put_joints(number, tuple(map(float, fractions)))
 
     def park(self, name: str) -> None:
         """Take the object out of the world: it collides with nothing and stands in no relation, as in the robot's hand."""
         number = self._number(name)
-        self._changed.add(number)
+        if not self._present[number]:
+            return
+        self._note(number)
         self._present[number] = False
+        self._around.take_out(number)
 
     def is_parked(self, name: str) -> bool:
         return not self._present[self._number(name)]
@@ -123,15 +141,15 @@ class BulletEngine:
         """
         number = self._number(name)
         limit = margin_m - TOLERANCE_M
-        low, high = self._low[number], self._high[number]
-        if FLOOR not in ignore and low[2] < limit:
+        box = self._boxes[number]
+        if FLOOR not in ignore and box.low_m[2] < limit:
             return FLOOR
         reach = max(limit, 0.0) + BOX_SLACK_M
         if WALL not in ignore:
-            for body in sorted({int(wall) // PART_LIMIT for wall in self._walls_near(low, high, reach)}):
+            for body in sorted({wall // PART_LIMIT for wall in self._walls_around.near(box, reach)}):
                 if self._closest(self._bodies[number], self._wall_bodies[body], limit) < limit:
                     return WALL
-        for other in self._objects_near(low, high, reach):
+        for other in self._around.near(box, reach):
             if other == number or self._names[other] in ignore:
                 continue
             if self._closest(self._bodies[number], self._bodies[other], limit) < limit:
@@ -140,8 +158,10 @@ class BulletEngine:
 
     def near(self, box: Aabb, ignore: frozenset[str] = NOTHING) -> tuple[str, ...]:
         """Objects whose bounding boxes overlap the box, in scene order, without the parked ones."""
-        found = self._objects_near(np.array(box.low_m), np.array(box.high_m), 0.0)
-        return tuple(self._names[number] for number in found if self._names[number] not in ignore)
+        names = self._names
+        return tuple(
+            names[number] for number in self._around.near(box) if not ignore or names[number] not in ignore
+        )
 
     def gap(self, a: str, b: str, limit_m: float) -> float | None:
         """Smallest signed distance between two objects (negative: depth), None when it is more than ``limit_m``.
@@ -154,8 +174,7 @@ class BulletEngine:
                 raise EngineError(f"{name!r} is parked: expected an object in the world; place it first")
         if not 0.0 <= limit_m < 1e3:
             raise EngineError(f"a gap up to {limit_m} m was asked for: expected a limit from 0 to 1,000 m")
-        apart = np.maximum(self._low[first] - self._high[second], self._low[second] - self._high[first])
-        if apart.max() > limit_m + BOX_SLACK_M:
+        if not self._boxes[first].overlaps(self._boxes[second], limit_m + BOX_SLACK_M):
             return None
         distance = self._closest(self._bodies[first], self._bodies[second], limit_m)
         return distance if distance <= limit_m else None
@@ -166,27 +185,27 @@ class BulletEngine:
         Changes nothing here. Depends on the present state only, not on what was simulated before.
         """
         number = self._number(name)
-        low, high = self._low[number], self._high[number]
+        box = self._boxes[number]
         stills = [
             Still(self._assets[other], self._poses[other], self._fractions[other])
-            for other in self._objects_near(low, high, SETTLE_RADIUS_M)
+            for other in self._around.near(box, SETTLE_RADIUS_M)
             if other != number and self._names[other] not in ignore
         ]
-        walls = [self._scene.walls[int(wall)] for wall in self._walls_near(low, high, SETTLE_RADIUS_M)]
+        walls = [self._scene.walls[wall] for wall in self._walls_around.near(box, SETTLE_RADIUS_M)]
         pose = self._poses[number]
         self._mini.stage(self._assets[number], pose, self._fractions[number], stills, walls)
         return self._mini.drop(pose, steps)
 
     def state_bytes(self) -> bytes:
-        """Poses, joints and parking of all objects that can change, for the digest of a trace."""
-        joints = [value for fractions in self._fractions for value in fractions]
-        return b"".join(
-            (
-                self._state[self._can_change].tobytes(),
-                np.array(joints, dtype=np.float64).tobytes(),
-                self._present[self._can_change].tobytes(),
-            )
-        )
+        """Poses, joints and parking of all objects in which they differ from the scene's, for the digest of a trace."""
+        chunks: list[bytes] = []
+        for number in sorted(self._changed):
+            item, pose = self._scene.objects[number], self._poses[number]
+            fractions, present = self._fractions[number], self._present[number]
+            if (pose, fractions, present) != (item.pose_world_asset, tuple(item.joints), not item.absent):
+                values = (*pose.position_m, *pose.quat_xyzw, *fractions)
+                chunks.append(struct.pack(f"<i?{len(values)}d", number, present, *values))
+        return b"".join(chunks)
 
     def close(self) -> None:
         """Free the physics clients. The engine can't be used afterwards."""
@@ -209,9 +228,19 @@ class BulletEngine:
             bodies |= zip(members, factory.jointed(asset, [self._poses[i] for i in members]), strict=True)
             self._joint_ids[asset_id] = factory.joint_indices(asset)
         self._bodies = [bodies[number] for number in range(len(self._names))]
+        self._boxes = [
+            bounds.box(pose, fractions)
+            for bounds, pose, fractions in zip(self._bounds, self._poses, self._fractions, strict=True)
+        ]
         for number in range(len(self._names)):
             self._put(number, self._poses[number])
             self._put_joints(number, self._fractions[number])
+
+    def _note(self, number: int) -> None:
+        """Enter a change that is about to be made into the journal and the list of what a reset undoes."""
+        self._changed.add(number)
+        box = self._boxes[number] if self._present[number] else None
+        self._journal.entries.append((self._names[number], box))
 
     def _number(self, name: str) -> int:
         number = self._index.get(name)
@@ -224,11 +253,10 @@ class BulletEngine:
 
     def _put(self, number: int, pose: Pose) -> None:
         self._poses[number] = pose
-        self._state[number] = (*pose.position_m, *pose.quat_xyzw)
-        self._low[number], self._high[number] = self._bounds[number].corners(pose, self._fractions[number])
         self._bullet.resetBasePositionAndOrientation(
             self._bodies[number], pose.position_m, pose.quat_xyzw, physicsClientId=self._client
         )
+        self._bound(number)
 
     def _put_joints(self, number: int, fractions: tuple[float, ...]) -> None:
         if not fractions:
@@ -241,17 +269,18 @@ class BulletEngine:
             self._bullet.resetJointState(
                 self._bodies[number], link, fraction * joint.upper, physicsClientId=self._client
             )
-        self._low[number], self._high[number] = self._bounds[number].corners(self._poses[number], fractions)
+        self._bound(number)
 
-    def _objects_near(self, low: FloatArray, high: FloatArray, reach_m: float) -> Iterator[int]:
-        touching = (self._low <= high + reach_m).all(axis=1) & (self._high >= low - reach_m).all(axis=1)
-        return map(int, np.flatnonzero(touching & self._present))
-
-    def _walls_near(self, low: FloatArray, high: FloatArray, reach_m: float) -> list[int]:
-        touching = (self._wall_low <= high + reach_m) & (self._wall_high >= low - reach_m)
-        return [int(wall) for wall in np.flatnonzero(touching.all(axis=1))]
+    def _bound(self, number: int) -> None:
+        """Bring the object's box up to date, and its place among its neighbours."""
+        box = self._bounds[number].box(self._poses[number], self._fractions[number])
+        self._boxes[number] = box
+        if self._present[number]:
+            self._around.put(number, box)
+        else:
+            self._around.take_out(number)
 
     def _closest(self, body: int, other: int, limit_m: float) -> float:
         """Smallest signed distance between two bodies, infinity when it is more than ``limit_m`` (at least 0)."""
         contacts = self._bullet.getClosestPoints(body, other, max(limit_m, 0.0), physicsClientId=self._client)
-        return min((contact[8] for contact in contacts), default=float("inf"))
+        return min([contact[8] for contact in contacts], default=float("inf"))
