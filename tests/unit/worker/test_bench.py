@@ -4,6 +4,7 @@ import json
 import os
 import re
 import time
+from collections import Counter
 from dataclasses import replace
 
 import psutil
@@ -13,6 +14,7 @@ from tests.fakes.scenes import kitchen_scene, kitchen_tasks
 from typer.testing import CliRunner
 
 from embomatrix.skills.parse import plan_to_json
+from embomatrix.skills.syntax import Skill
 from embomatrix.worker.bench_cli import app
 from embomatrix.worker.bench_figures import (
     BenchError,
@@ -27,6 +29,7 @@ from embomatrix.worker.bench_figures import (
 from embomatrix.worker.bench_page import END, render_page
 from embomatrix.worker.bench_processes import bench_cluster
 from embomatrix.worker.bench_scenes import scenes_of
+from embomatrix.worker.bench_workload import read_workload, workload_to_text, write_workload
 from embomatrix.world.bundle import Bundle, bundle_digest, encode_bundle
 from embomatrix.world.dataset import Dataset, TaskRecord, write_dataset
 
@@ -69,11 +72,25 @@ def dataset(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def everything(dataset, tmp_path_factory):
+def workload(dataset, tmp_path_factory):
+    """Three plans in each of two flats."""
+    path = tmp_path_factory.mktemp("workload") / "workload.json"
+    result = _bench(
+        "workload", f"--dataset={dataset}", f"--out={path}", "--bodies=60", "--scenes=2", "--plans=3"
+    )
+    assert result.exit_code == 0, result.output
+    return path
+
+
+@pytest.fixture(scope="module")
+def everything(dataset, workload, tmp_path_factory):
     """What `bench all` printed, and the folder that it wrote to."""
     out = tmp_path_factory.mktemp("out")
     page = f"{out / 'benchmarks.md'}"
-    result = _bench("all", f"--dataset={dataset}", f"--out={page}", f"--json-dir={out}", "--limit-s=200")
+    engine = (f"--engine-dataset={dataset}", f"--workload={workload}", "--cycles=80")
+    result = _bench(
+        "all", f"--dataset={dataset}", f"--out={page}", f"--json-dir={out}", "--limit-s=200", *engine
+    )
     assert result.exit_code == 0, result.output
     return result.output, out
 
@@ -87,7 +104,7 @@ def _figures(folder, bench):
     return {figure["name"]: figure for figure in written["figures"]}
 
 
-@pytest.mark.parametrize("bench", ["rollout", "cluster"])
+@pytest.mark.parametrize("bench", ["engine", "rollout", "cluster"])
 def test_every_bench_writes_the_one_format_and_prints_the_same(everything, bench):
     printed, folder = everything
     written = json.loads((folder / f"{bench}.json").read_text())
@@ -115,6 +132,77 @@ def test_rollouts_are_measured_skill_by_skill_and_reach_their_goals(everything):
     assert figures["places that needed a settle"]["value"] == 1.0
 
 
+def test_the_engine_is_measured_by_the_names_that_goals_are_set_for_and_by_size(everything):
+    figures = _figures(everything[1], "engine")
+    goals = {name for name, figure in figures.items() if figure["goal"] is not None}
+    assert goals == {
+        *(
+            "cold_load_ms",
+            "slot_respawn_ms",
+            "reset_ms",
+            "rollout_p50_ms",
+            "rollout_p99_ms",
+            "rollouts_per_s",
+        ),
+        *("private_mb_per_slot", "leak_kb_per_cycle", "poses_per_s", "analysis_s"),
+    }
+    assert {name.split(" at ")[1] for name in figures if " at " in name} == {"60 bodies"}
+    assert figures["calls_succeeded"] | {"value": 1.0} == figures["calls_succeeded"]
+    assert figures["rollout_p50_ms"]["n"] == 2 * 3
+    # The bundles have no pose cache: every place is settled.
+    assert figures["places_settled_live"]["value"] == 1.0
+
+
+def test_plans_of_a_workload_differ_and_have_the_shape_that_is_promised(workload):
+    written = read_workload(workload)
+    assert [scene.bodies for scene in written.main] == [15, 15]
+    for scene in written.scenes:
+        plans = [item.plan for item in scene.executions]
+        assert len(set(zip((item.task_id for item in scene.executions), plans, strict=True))) == 3
+        for plan in plans:
+            skills = Counter(call.skill for call in plan)
+            assert skills == {Skill.MOVE: 5, Skill.PICK_UP: 2, Skill.PLACE: 2, Skill.OPEN: 1}
+
+
+def test_equal_seeds_and_datasets_give_equal_workloads(dataset, workload):
+    again = write_workload(Dataset.load(dataset), seed=0, bodies=60, scenes=2, plans=3)
+    assert again == read_workload(workload)
+    assert workload_to_text(again) == workload.read_text()
+
+
+def test_a_workload_for_other_scenes_is_refused_before_anything_is_measured(dataset, workload, tmp_path):
+    whole = Dataset.load(dataset)
+    [known] = {scene.bundle_digest for scene in read_workload(workload).scenes[:1]}
+    records = [record for record in whole.records if record.bundle_digest != known]
+    write_dataset(
+        tmp_path, records, {key: whole.bundle_bytes(key) for key in {r.bundle_digest for r in records}}
+    )
+    result = _bench("engine", f"--dataset={tmp_path}", f"--workload={workload}")
+    assert result.exit_code == 2
+    assert "lacks scene" in result.stderr
+    assert "embomatrix bench workload" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("{", "Expecting property name"),
+        ('{"format": 2, "seed": 0, "bodies": 60, "scenes": []}', "found 2"),
+        ('{"format": 1, "seed": 0, "bodies": 60}', "lacks 'scenes'"),
+        (
+            '{"format": 1, "seed": 0, "bodies": 60, "scenes": '
+            '[{"scene_id": "a", "bundle": "b", "bodies": 3, "executions": ["t 1: fly 3"]}]}',
+            "fly",
+        ),
+    ],
+)
+def test_a_damaged_workload_is_named_with_the_remedy(tmp_path, text, found):
+    path = tmp_path / "workload.json"
+    path.write_text(text)
+    with pytest.raises(BenchError, match=rf"{path}.*{found}.*embomatrix bench workload"):
+        read_workload(path)
+
+
 def test_scenes_are_cold_unless_they_were_announced_or_used(everything):
     figures = _figures(everything[1], "cluster")
     assert figures["cold: scenes warm on arrival"]["value"] == 0.0
@@ -128,9 +216,12 @@ def test_the_page_has_the_machine_a_table_for_each_bench_and_a_part_for_people(e
     page = (everything[1] / "benchmarks.md").read_text()
     assert re.search(rf"\| commit \| `{COMMIT.pattern}` \|", page)
     assert (
-        page.index("## One process") < page.index("## Cluster on loopback") < page.index("## Training runs")
+        page.index("## Engine")
+        < page.index("## One process")
+        < page.index("## Cluster on loopback")
+        < page.index("## Training runs")
     )
-    assert page.count("| figure | value | goal | | n |") == 2
+    assert page.count("| figure | value | goal | | n |") == 3
     assert "<!-- by hand: training -->\n" + END in page
     assert not re.search(r"20\d\d-\d\d", page), "a page without a date changes only when its figures do"
 

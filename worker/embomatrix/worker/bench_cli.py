@@ -14,6 +14,7 @@ from rich.table import Table
 from embomatrix.rpc.status import ClusterError
 from embomatrix.sim.engine import EngineError
 from embomatrix.worker.bench_cluster import ClusterLoad, bench_cluster_load
+from embomatrix.worker.bench_engine import bench_engine, check_scenes
 from embomatrix.worker.bench_figures import (
     BenchError,
     BenchResult,
@@ -26,6 +27,7 @@ from embomatrix.worker.bench_figures import (
 from embomatrix.worker.bench_page import hand_parts, render_page
 from embomatrix.worker.bench_rollout import bench_rollout
 from embomatrix.worker.bench_scenes import scenes_of
+from embomatrix.worker.bench_workload import PINNED, SIZES, read_workload, workload_to_text, write_workload
 from embomatrix.world.bundle import BundleError
 from embomatrix.world.dataset import Dataset, DatasetError
 
@@ -36,7 +38,7 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
-    help="Measure rollouts and the cluster on this machine.",
+    help="Measure the engine, rollouts and the cluster on this machine.",
 )
 console = Console()
 errors = Console(stderr=True, soft_wrap=True)
@@ -50,7 +52,12 @@ Workers = Annotated[int, typer.Option(min=1, max=64, help="Worker daemons.")]
 Slots = Annotated[int, typer.Option(min=1, max=64, help="Slots of each worker.")]
 LimitS = Annotated[float, typer.Option(min=5.0, help="Seconds for the whole bench of the cluster.")]
 
+Work = Annotated[Path, typer.Option("--workload", help="File that `embomatrix bench workload` wrote.")]
+EngineDataSet = Annotated[Path, typer.Option(help="Dataset that the workload was written for.")]
+Cycles = Annotated[int, typer.Option(min=80, help="Cycles of loading and resetting, to see growth.")]
+
 DATASET = Path("build/dataset")
+ENGINE_DATASET = Path("build/engine")
 
 
 @app.command()
@@ -60,6 +67,43 @@ def rollout(
     """Measure loading, skills, rollouts, reset and reward in one process."""
     with _refusals():
         _hand_in(_rollout(dataset, scenes, repeats), json_file)
+
+
+@app.command()
+def engine(
+    dataset: DataSet = ENGINE_DATASET, workload: Work = PINNED, json_file: Json = None, cycles: Cycles = 2000
+) -> None:
+    """Measure the engine on one core with a pinned workload in furnished scenes."""
+    with _refusals():
+        _hand_in(_engine(dataset, workload, cycles), json_file)
+
+
+@app.command()
+def workload(
+    dataset: DataSet = ENGINE_DATASET,
+    out: Annotated[Path, typer.Option(help="File to write.")] = PINNED,
+    seed: Annotated[int, typer.Option(min=0, help="Equal seeds and datasets give equal files.")] = 0,
+    bodies: Annotated[
+        int, typer.Option(help=f"Main size of scenes: one of {', '.join(map(str, SIZES))}.")
+    ] = 300,
+    scenes: Annotated[int, typer.Option(min=1, help="Scenes of the main size.")] = 8,
+    plans: Annotated[int, typer.Option(min=1, help="Plans for each scene, all different.")] = 50,
+) -> None:
+    """Write the plans that `bench engine` executes: after a change of scenes, their digests are no longer the same."""
+    if bodies not in SIZES:
+        raise typer.BadParameter(f"found {bodies}: expected one of {', '.join(map(str, SIZES))}")
+    with _refusals(), errors.status("reading the dataset") as status:
+        written = write_workload(
+            Dataset.load(dataset),
+            seed=seed,
+            bodies=bodies,
+            scenes=scenes,
+            plans=plans,
+            on_scene=lambda scene_id: status.update(f"writing plans for {scene_id}"),
+        )
+        _write(out, workload_to_text(written))
+    count = sum(len(scene.executions) for scene in written.scenes)
+    console.print(f"wrote {count} plans in {len(written.scenes)} scenes to {out}", highlight=False)
 
 
 @app.command()
@@ -85,15 +129,35 @@ def everything(
     ),
     json_dir: Annotated[Path | None, typer.Option(help="Folder for one JSON file for each bench.")] = None,
     limit_s: LimitS = 60.0,
+    engine_dataset: EngineDataSet = ENGINE_DATASET,
+    workload: Work = PINNED,
+    cycles: Cycles = 2000,
 ) -> None:
     """Run every bench and render the page."""
     with _refusals():
-        hand_parts(_present(out))  # a page that can't be replaced is refused before minutes are spent
-        results = [_rollout(dataset, scenes=24, repeats=3), _cluster(dataset, ClusterLoad(limit_s=limit_s))]
+        # What can't be read or replaced is refused before minutes are spent.
+        hand_parts(_present(out))
+        check_scenes(Dataset.load(engine_dataset), read_workload(workload))
+        results = [
+            _engine(engine_dataset, workload, cycles),
+            _rollout(dataset, scenes=24, repeats=3),
+            _cluster(dataset, ClusterLoad(limit_s=limit_s)),
+        ]
         for result in results:
             _hand_in(result, json_dir / f"{result.bench}.json" if json_dir is not None else None)
         _write(out, render_page(results, _present(out)))
         console.print(f"wrote {out}", highlight=False)
+
+
+def _engine(dataset: Path, workload: Path, cycles: int) -> BenchResult:
+    machine = describe_machine()
+    found, work = Dataset.load(dataset), read_workload(workload)
+    with errors.status("engine") as status:
+
+        def on_step(what: str) -> None:
+            status.update(f"engine: {what}")
+
+        return BenchResult("engine", commit_here(), machine, bench_engine(found, work, cycles, on_step))
 
 
 def _rollout(dataset: Path, scenes: int, repeats: int) -> BenchResult:

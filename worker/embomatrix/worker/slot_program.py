@@ -76,7 +76,7 @@ def _hold_scene(simulation: Simulation, connection: socket.socket) -> None:
     request = receive(connection)
     if request is None:
         return
-    started_s = time.perf_counter()
+    started_s, core_s = time.perf_counter(), time.thread_time()
     try:
         scene = simulation.load(Path(request.header["path"]), request.header["digest"])
     except BundleCorruptError as error:
@@ -85,8 +85,8 @@ def _hold_scene(simulation: Simulation, connection: socket.socket) -> None:
     except Exception as error:  # noqa: BLE001  # a scene that can't be loaded is a result
         send(connection, Frame(_failure(InfraCode.SCENE_LOAD_FAILED, error)))
         return
-    load_s = time.perf_counter() - started_s
-    send(connection, Frame({"load_s": load_s, "memory_mb": private_mb()}))
+    load_s, cpu_s = time.perf_counter() - started_s, time.thread_time() - core_s
+    send(connection, Frame({"load_s": load_s, "cpu_s": cpu_s, "memory_mb": private_mb()}))
     memory_mb = int(request.header["slot_memory_mb"])
     serve_forks(connection, lambda slot: _run_slot(scene, slot, memory_mb))
 
@@ -99,13 +99,18 @@ def _run_slot(scene: LoadedScene, connection: socket.socket, memory_mb: int) -> 
 
 
 def _answer(scene: LoadedScene, body: bytes) -> Frame:
-    started_s = time.perf_counter()
+    started_s, core_s = time.perf_counter(), time.thread_time()
     try:
         completed = scene.execute(rollout_from_proto(types_pb2.Rollout.FromString(body)))
         result = completed_to_proto(completed).SerializeToString()
     except Exception as error:  # noqa: BLE001  # a defect is a failure of the infrastructure, never a reward
         return Frame(_failure(InfraCode.SLOT_CRASHED, error))
-    return Frame({"execute_s": time.perf_counter() - started_s, "resident_mb": resident_mb()}, result)
+    header = {
+        "execute_s": time.perf_counter() - started_s,
+        "cpu_s": time.thread_time() - core_s,
+        "resident_mb": resident_mb(),
+    }
+    return Frame(header, result)
 
 
 def _failure(code: InfraCode, error: Exception) -> Mapping[str, Any]:
