@@ -7,7 +7,7 @@ import math
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.sim.bounds import IDENTITY, AssetBounds
-from embomatrix.sim.relations import interior_around, is_under, surface_under
+from embomatrix.sim.spots import interior_around, is_under, surface_under
 from embomatrix.world.asset import SupportSurface
 from embomatrix.world.geometry import Aabb, Pose
 from embomatrix.world.state import Relation

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.sim.candidates import candidates
 from embomatrix.sim.engine import FLOOR, TOLERANCE_M
-from embomatrix.sim.relations import is_upright
+from embomatrix.sim.spots import is_upright
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.poses import PlacementKey

@@ -10,7 +10,9 @@ from tests.fakes.scenes import kitchen_scene
 
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
-from embomatrix.sim.relations import Enclosure, Host, Relations, is_shut, surface_under
+from embomatrix.sim.footing import Enclosure, Host
+from embomatrix.sim.relations import Relations
+from embomatrix.sim.spots import is_shut, surface_under
 from embomatrix.world.asset import Interior
 from embomatrix.world.geometry import Aabb, Pose
 from embomatrix.world.state import Relation

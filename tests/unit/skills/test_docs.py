@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from embomatrix.sim import relations, thermal
+from embomatrix.sim import relations, spots, thermal
 from embomatrix.skills.failure import SENTENCES
 from embomatrix.skills.library import LIBRARY, REASONS
 from embomatrix.skills.limits import ROBOT
@@ -88,7 +88,7 @@ def test_every_relation_and_state_stands_there():
 def test_every_tolerance_of_a_relation_stands_there_with_its_value():
     tolerances = {
         name: value
-        for name, value in vars(relations).items()
+        for name, value in {**vars(spots), **vars(relations)}.items()
         if name.isupper() and isinstance(value, float) and name not in vars(state)
     }
     written = {name: float(value) for name, (value, _) in rows("tolerance").items()}

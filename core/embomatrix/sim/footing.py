@@ -1,0 +1,168 @@
+"""How objects stand among their neighbours, kept for as long as nothing near them changes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.sim.bounds import AssetBounds
+from embomatrix.sim.spots import REST_M, interior_around, is_shut, is_upright, link_frame, surface_under
+from embomatrix.world.geometry import Aabb
+from embomatrix.world.state import Relation
+
+if TYPE_CHECKING:
+    from embomatrix.sim.engine import PhysicsEngine
+    from embomatrix.world.asset import Asset, Interior
+    from embomatrix.world.geometry import Pose
+
+
+@dataclass(frozen=True, slots=True)
+class Host:
+    """What an object rests on or in. ``spot`` names the support surface or the interior."""
+
+    name: str
+    relation: Relation
+    spot: str
+
+
+@dataclass(frozen=True, slots=True)
+class Enclosure:
+    """A container around an object: ``closed`` when every joint that bars the way in is shut, and there is one."""
+
+    name: str
+    interior: str
+    closed: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Footing:
+    """How an object stands among its neighbours: its host, the containers around it, and what it is on top of."""
+
+    host: Host | None = None
+    enclosures: tuple[Enclosure, ...] = ()
+    on: frozenset[str] = frozenset()
+
+
+NOWHERE: Final = Footing()
+"""Of what is in the hand, or not in the world."""
+
+
+class Footings:
+    """Footings in an engine's present state.
+
+    A footing follows from the object and its neighbours alone. Those of neighbourhoods in which nothing has changed since
+    the scene was loaded are good for ever; the others until the next change near them.
+    """
+
+    def __init__(self, engine: PhysicsEngine) -> None:
+        self._engine = engine
+        self._scene = engine.scene
+        self._bounds: dict[str, AssetBounds] = {}
+        self._at_start: dict[str, Footing] = {}
+        self._now: dict[str, Footing] = {}
+        self._disturbed: set[str] = set()
+        self._round = engine.journal.rounds
+        self._read = 0
+
+    def of(self, name: str) -> Footing:
+        """How the object stands: its host, the containers around it, what it is on top of."""
+        self._read_journal()
+        known = self._now if name in self._disturbed else self._at_start
+        footing = known.get(name)
+        if footing is None:
+            footing = known[name] = self._find(name)
+        return footing
+
+    def bounds_of(self, name: str) -> AssetBounds:
+        """Bounds of the object's asset."""
+        asset_id = self._scene.by_name[name].asset_id
+        if asset_id not in self._bounds:
+            self._bounds[asset_id] = AssetBounds(self._scene.assets[asset_id])
+        return self._bounds[asset_id]
+
+    def _read_journal(self) -> None:
+        """Forget what is kept of the objects that were near to a change."""
+        journal = self._engine.journal
+        if journal.rounds != self._round:
+            self._round, self._read = journal.rounds, 0
+            self._now.clear()
+            self._disturbed.clear()
+        if len(journal.entries) == self._read:
+            return
+        before: dict[str, Aabb | None] = {}
+        for name, box in journal.entries[self._read :]:
+            before.setdefault(name, box)
+        self._read = len(journal.entries)
+        for name, box in before.items():
+            near = {name}
+            for place in (box, None if self._engine.is_parked(name) else self._engine.aabb(name)):
+                if place is not None:
+                    near.update(self._engine.near(grown(place, REST_M)))
+            self._disturbed |= near
+            for other in near:
+                self._now.pop(other, None)
+
+    def _find(self, name: str) -> Footing:
+        engine, scene = self._engine, self._scene
+        if engine.is_parked(name):
+            return NOWHERE
+        box = engine.aabb(name)
+        hosts: list[tuple[float, str, Host]] = []
+        around: list[tuple[float, str, Enclosure]] = []
+        on: list[str] = []
+        for other in engine.near(grown(box, REST_M), frozenset((name,))):
+            asset, pose, fractions = scene.asset_of(other), engine.pose(other), engine.joints(other)
+            volume = math.prod(asset.size_m)
+            interior = self._interior(name, asset, pose, fractions)
+            if interior is not None:
+                hosts.append((volume, other, Host(other, Relation.INSIDE, interior.name)))
+                closed = is_shut(asset, interior, fractions)
+                enclosure = Enclosure(other, interior.name, closed)
+                around.append((math.prod(interior.size_m), other, enclosure))
+            if surface_under(box, asset, pose, fractions, doored=False):
+                on.append(other)
+            if interior is None and (surface := surface_under(box, asset, pose, fractions, doored=True)):
+                hosts.append((volume, other, Host(other, Relation.ONTOP, surface)))
+        return Footing(
+            min(hosts, key=_first_two)[2] if hosts else None,
+            tuple(item for _, _, item in sorted(around, key=_first_two)),
+            frozenset(on),
+        )
+
+    def _interior(self, name: str, asset: Asset, pose: Pose, fractions: tuple[float, ...]) -> Interior | None:
+        """The smallest cavity of an asset at a pose that the object is in."""
+        found: list[Interior] = []
+        for link in dict.fromkeys(item.link for item in asset.interiors):
+            frame = link_frame(asset, pose, fractions, link)
+            if is_upright(frame) and self._may_be_in(name, asset, frame, link):
+                box = self.bounds_of(name).box(
+                    frame.inverse() @ self._engine.pose(name), self._engine.joints(name)
+                )
+                interior = interior_around(box, asset, link)
+                found += [interior] if interior is not None else []
+        return min(found, key=lambda interior: math.prod(interior.size_m), default=None)
+
+    def _may_be_in(self, name: str, asset: Asset, frame: Pose, link: str) -> bool:
+        """Whether the object's centre is near enough to a cavity to look closer: however it turns, it moves less."""
+        box = self._engine.aabb(name)
+        center = frame.inverse().apply(box.center_m)
+        slack = math.dist(box.low_m, box.high_m) / 2
+        return any(
+            all(
+                abs(value - middle) <= extent / 2 + slack
+                for value, middle, extent in zip(center, item.center_m, item.size_m, strict=True)
+            )
+            for item in asset.interiors
+            if item.link == link
+        )
+
+
+def grown(box: Aabb, margin_m: float) -> Aabb:
+    """The box with ``margin_m`` added on every side."""
+    (a, b, c), (d, e, f) = box.low_m, box.high_m
+    return Aabb((a - margin_m, b - margin_m, c - margin_m), (d + margin_m, e + margin_m, f + margin_m))
+
+
+def _first_two(item: tuple[float, str, object]) -> tuple[float, str]:
+    return item[0], item[1]
