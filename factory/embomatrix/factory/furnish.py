@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.furnish_groups import ceiling_groups, floor_groups, hung_groups, rug_groups
 from embomatrix.factory.furnish_roles import Role, importance_of
-from embomatrix.factory.furnish_solver import Placed, RoomSolver
+from embomatrix.factory.furnish_solver import RoomSolver
 from embomatrix.factory.furnish_space import RoomSpace
 from embomatrix.factory.furnish_surfaces import SurfacePlacer
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from embomatrix.factory.floorplan import FloorPlan
-    from embomatrix.factory.furnish_pieces import Piece
+    from embomatrix.factory.furnish_pieces import Piece, Placed
     from embomatrix.world.scene import Doorway, Room
 
 ATTEMPTS: Final = 24

@@ -5,6 +5,7 @@ A group's own frame has x towards the room and y to its left; the wall, if it st
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
@@ -19,8 +20,9 @@ from embomatrix.world.state import Relation
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from embomatrix.world.asset import Asset, Joint
-    from embomatrix.world.geometry import Vec3
+    from embomatrix.factory.furnish_boxes import Box
+    from embomatrix.world.asset import Asset, Joint, Link
+    from embomatrix.world.geometry import Part, Vec3
 
 REST_GAP_M: Final = 0.0005
 """Things rest half a millimetre above what carries them: close enough to be on it, far enough not to be in it."""
@@ -56,10 +58,60 @@ class Piece:
         x, y, z = self.asset.size_m
         return (z, y, x) if self.upended else (x, y, z)
 
+    @property
+    def blocks(self) -> tuple[Box, ...]:
+        """What it takes up, about its middle and above its underside: one box, or what an open shape is made of."""
+        if self.category in _OPEN_SHAPES and not self.upended:
+            return _blocks_of(self.asset.links[0].parts, self.asset.size_m[2] / 2)
+        x, y, z = (extent / 2 for extent in self.size_m)
+        return ((-x, -y, 0.0, x, y, 2 * z),)
+
     def pose(self, x: float, y: float, bottom: float, yaw: float) -> Pose:
         """Pose of the asset with its lowest point at height ``bottom``."""
         upright = Pose.from_xyz_yaw(x, y, bottom + self.size_m[2] / 2, yaw)
         return upright @ _UPENDED if self.upended else upright
+
+
+@dataclass(frozen=True, slots=True)
+class Placed:
+    """A piece with its place: centre of the footprint, underside, heading, and its host's number (-1: none)."""
+
+    piece: Piece
+    room: str
+    x: float
+    y: float
+    bottom: float
+    yaw: float
+    host: int = -1
+    relation: Relation | None = None
+    interior: str = ""
+
+    @property
+    def pose(self) -> Pose:
+        return self.piece.pose(self.x, self.y, self.bottom, self.yaw)
+
+    @property
+    def box(self) -> Box:
+        """Bounding box in the world."""
+        sx, sy, sz = self.piece.size_m
+        c, s = abs(math.cos(self.yaw)), abs(math.sin(self.yaw))
+        hx, hy = (sx * c + sy * s) / 2, (sx * s + sy * c) / 2
+        return (self.x - hx, self.y - hy, self.bottom, self.x + hx, self.y + hy, self.bottom + sz)
+
+    @property
+    def boxes(self) -> tuple[Box, ...]:
+        """The boxes in the world that the piece takes up, at quarter turns; its bounding box at any other heading."""
+        blocks = self.piece.blocks
+        c, s = math.cos(self.yaw), math.sin(self.yaw)
+        if len(blocks) == 1 or abs(c * s) > 1e-6:
+            return (self.box,)
+        found = []
+        for x0, y0, z0, x1, y1, z1 in blocks:
+            xs = sorted((c * x0 - s * y0, c * x1 - s * y1))
+            ys = sorted((s * x0 + c * y0, s * x1 + c * y1))
+            low, high = self.bottom + z0, self.bottom + z1
+            found.append((self.x + xs[0], self.y + ys[0], low, self.x + xs[1], self.y + ys[1], high))
+        return tuple(found)
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,12 +139,16 @@ class Style(StrEnum):
     ALONG = "along"  # anywhere along a wall
     CORNER = "corner"
     FREE = "free"  # in the middle of the room
+    AISLE = "aisle"  # lines across the room, an aisle apart
     OVERHEAD = "overhead"
 
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """Pieces that are placed as one. ``near`` and ``faces`` name categories whose closeness or sight is worth something."""
+    """Pieces that are placed as one. ``near`` and ``faces`` name categories whose closeness or sight is worth something.
+
+    ``spread`` names categories that it keeps away from; ``clear_m`` is free floor on all sides to anything else.
+    """
 
     members: tuple[Member, ...]
     style: Style
@@ -100,6 +156,7 @@ class Group:
     near: tuple[str, ...] = ()
     faces: tuple[str, ...] = ()
     spread: tuple[str, ...] = field(default=())
+    clear_m: float = 0.0
 
     @property
     def bounds(self) -> Rect4:
@@ -139,16 +196,33 @@ def access_of(piece: Piece) -> Access:
     return Access.NONE
 
 
+_OPEN_SHAPES: Final = frozenset(("tree", "low_resolution_tree"))
+"""What one can walk under: a tree takes up its trunk and its crown, not the box around both."""
+
+
+@functools.lru_cache(maxsize=1024)
+def _blocks_of(parts: tuple[Part, ...], half_m: float) -> tuple[Box, ...]:
+    """Boxes around the parts of an asset, with heights above its underside."""
+    boxes = [part.aabb(Pose((0.0, 0.0, half_m))) for part in parts]
+    return tuple((*box.low_m, *box.high_m) for box in boxes)
+
+
 def front_depth_m(asset: Asset) -> float:
     """Free depth that the front needs: 0.6 m, or as far as its doors and drawers come out."""
+    return max(FRONT_M, min(_furthest_out(asset.links) - asset.size_m[0] / 2 + 0.02, 1.0))
+
+
+@functools.lru_cache(maxsize=4096)
+def _furthest_out(links: tuple[Link, ...]) -> float:
+    """How far moving links come before the asset's middle on their way, along x."""
     out = 0.0
-    for link in asset.links:
+    for link in links:
         if link.joint is None:
             continue
         for fraction in (0.5, 1.0):
             moved = _joint_pose(link.joint, fraction)
             out = max([out, *(part.aabb(moved).high_m[0] for part in link.parts)])
-    return max(FRONT_M, min(out - asset.size_m[0] / 2 + 0.02, 1.0))
+    return out
 
 
 def _joint_pose(joint: Joint, fraction: float) -> Pose:

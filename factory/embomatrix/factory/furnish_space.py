@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -9,6 +11,7 @@ import numpy as np
 from scipy import ndimage
 
 from embomatrix.factory.floorplan_walls import WALL_M
+from embomatrix.factory.furnish_boxes import BoxStack, Planes
 from embomatrix.skills.limits import ROBOT
 
 if TYPE_CHECKING:
@@ -16,10 +19,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from embomatrix.factory.furnish_boxes import BoolArray, Box, FloatArray
     from embomatrix.world.scene import Doorway, Room, Window
-
-    FloatArray = NDArray[np.float64]
-    BoolArray = NDArray[np.bool_]
 
 CELL_M: Final = 0.05
 DOOR_CLEAR_M: Final = 0.8
@@ -29,13 +30,16 @@ WINDOW_FROM_M: Final = 0.9
 """What is no higher than this may stand before a window, however low its sill: a sofa, a desk, a counter."""
 LOW_M: Final = 0.03
 """What is no higher than this is floor to the robot: a rug."""
-_TOUCH_M: Final = 1e-4
 _MARGIN_M: Final = 0.3
 _BASE_CLEAR_M: Final = ROBOT.radius_m + 0.01
 _HALF: Final = CELL_M / 2
+_KEEP_CELLS: Final = (_BASE_CLEAR_M + _HALF) / CELL_M
+"""The base stands nowhere closer than this many cells to a cell that something touches."""
+_RING: Final = math.ceil(_KEEP_CELLS)
+_AROUND: Final = 2
 
-Box = tuple[float, float, float, float, float, float]
-"""(x0, y0, z0, x1, y1, z1) in the world."""
+_Cells = tuple[int, int, int, int]
+"""(i0, i1, j0, j1): a window of cells."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,80 +50,149 @@ class Target:
 
 
 class RoomSpace:
-    """Occupancy of one room. Boxes are axis-aligned: everything on the floor stands at quarter turns."""
+    """Occupancy of one room. Boxes are axis-aligned: everything on the floor stands at quarter turns.
+
+    The floor that the robot can reach is kept up to date box by box: a new one changes only the cells around it.
+    """
 
     def __init__(self, room: Room, doorways: Sequence[Doorway], windows: Sequence[Window] = ()) -> None:
         self.room = room
         self.doorways = tuple(d for d in doorways if room.name in d.rooms)
-        self.solids: list[Box] = []
-        self.zones: list[Box] = [
-            *(self._door_zone(d) for d in self.doorways),
-            *(self._window_zone(w) for w in windows if room.name in w.rooms),
-        ]
-        self.targets: list[Target] = []
-        self._origin = np.asarray(room.low_m) - _MARGIN_M
-        cells = np.ceil((np.asarray(room.size_m) + 2 * _MARGIN_M) / CELL_M).astype(int)
-        self._x = self._origin[0] + (np.arange(cells[0]) + 0.5) * CELL_M
-        self._y = self._origin[1] + (np.arange(cells[1]) + 0.5) * CELL_M
-        self._floor = self._empty_floor()
+        self.solids = BoxStack()
+        self.zones = BoxStack([self._door_zone(d) for d in self.doorways])
+        self.zones.extend([self._window_zone(w) for w in windows if room.name in w.rooms])
+        self._origin, self._shape = _grid_of(room)
+        self._doors = [Target(_flat(self._door_zone(d))) for d in self.doorways]
+        self._targets: list[_Cells] = []
+        stand, reach = _bare_floor(room, self.doorways)
+        self._stand, self._reach = stand.copy(), reach.copy()
+        self._joined = bool(self.doorways) and all(self._touches(self._reach, d) for d in self._doors)
+        self._planes = Planes(room.low_m, room.high_m, (self.solids, self.zones))
+        self._solid_planes = Planes(room.low_m, room.high_m, (self.solids,))
+
+    def occupy(self, boxes: Sequence[Box], zones: Sequence[Box] = (), targets: Sequence[Target] = ()) -> None:
+        """Stand something in the room: its boxes, floor that stays free for it, spots that stay reachable."""
+        self._stand, self._reach = self._after(boxes)
+        self.solids.extend(boxes)
+        self.zones.extend(zones)
+        self._targets += [self._cells_of(t) for t in targets]
 
     def collides(self, boxes: FloatArray) -> BoolArray:
         """Which candidates meet a solid. boxes: (n, 6); result: (n,)."""
-        return _meet(boxes, self.solids)
+        return self.solids.meets(boxes)
 
     def blocks_zone(self, boxes: FloatArray) -> BoolArray:
         """Which candidates stand in a zone that must stay free. boxes: (n, 6); result: (n,)."""
-        return _meet(boxes, self.zones)
+        return self.zones.meets(boxes)
+
+    def surely_barred(self, boxes: FloatArray) -> BoolArray:
+        """A quick look: candidates that certainly meet a solid or a zone. boxes: (n, 6), all of one height; result: (n,)."""
+        return self._planes.meets(boxes)
+
+    def surely_collides(self, boxes: FloatArray) -> BoolArray:
+        """A quick look: candidates that certainly meet a solid. boxes: (n, 6), all of one height; result: (n,)."""
+        return self._solid_planes.meets(boxes)
 
     def reachable(self, extra: Sequence[Box] = (), targets: Sequence[Target] = ()) -> bool:
         """True when, with the extra solids in place, all doorways and all targets share one stretch of free floor."""
-        labels = self._labels(extra)
-        doors = [self._label_at(labels, d) for d in self.doorways]
-        if not doors or 0 in doors or len(set(doors)) > 1:
+        if not self._joined:
             return False
-        main = doors[0]
-        return all(self._touches(labels, t, main) for t in (*self.targets, *targets))
+        _, reach = self._after(extra)
+        if not all(self._touches(reach, d) for d in self._doors):
+            return False
+        if not all(self._touches(reach, t) for t in targets):
+            return False
+        lost = self._window_of(extra)
+        if lost is None or reach is self._reach:
+            return True
+        # Cells outside the window change only where an island was cut off, which the count shows.
+        i0, i1, j0, j1 = lost
+        inside = self._reach[i0:i1, j0:j1].sum() - reach[i0:i1, j0:j1].sum()
+        everywhere = int(self._reach.sum()) != int(reach.sum()) + int(inside)
+        near = (t for t in self._targets if everywhere or _overlap(t, lost))
+        return all(reach[a:b, c:d].any() for a, b, c, d in near)
 
     def free_cells(self) -> FloatArray:
         """Centres of the cells where the robot's base can stand, connected to the doorways; shape (n, 2)."""
-        labels = self._labels(())
-        if not self.doorways:
-            return np.empty((0, 2))
-        main = self._label_at(labels, self.doorways[0])
-        ix, iy = np.nonzero((labels == main) & (main > 0))
-        cells = np.stack([self._x[ix], self._y[iy]], axis=1)
+        cells = self._origin + (np.argwhere(self._reach) + 0.5) * CELL_M
         inside = np.all((cells > self.room.low_m) & (cells < self.room.high_m), axis=1)
         return np.asarray(cells[inside])
 
-    def _labels(self, extra: Sequence[Box]) -> NDArray[np.int32]:
-        free = self._floor.copy()
-        for x0, y0, z0, x1, y1, z1 in (*self.solids, *extra):
-            if z0 < ROBOT.height_m and z1 > LOW_M:
-                # Every cell that the box touches, so that no other grid over the same room finds less floor.
-                free[
-                    self._span(self._x, x0 - _HALF, x1 + _HALF), self._span(self._y, y0 - _HALF, y1 + _HALF)
-                ] = False
-        distance = ndimage.distance_transform_edt(free) * CELL_M
-        labels: NDArray[np.int32] = ndimage.label(distance - _HALF >= _BASE_CLEAR_M)[0]
-        return labels
-
-    def _touches(self, labels: NDArray[np.int32], target: Target, main: int) -> bool:
-        x0, y0, x1, y1 = target.strip
-        return bool(np.any(labels[self._span(self._x, x0, x1), self._span(self._y, y0, y1)] == main))
-
-    def _label_at(self, labels: NDArray[np.int32], doorway: Doorway) -> int:
-        """The label of the floor half a metre inside the doorway."""
-        x, y = doorway.center_m
-        nx, ny = self.inward(doorway)
-        i = int(np.searchsorted(self._x, x + 0.5 * nx))
-        j = int(np.searchsorted(self._y, y + 0.5 * ny))
-        return int(labels[min(i, len(self._x) - 1), min(j, len(self._y) - 1)])
-
     def inward(self, opening: Doorway | Window) -> tuple[float, float]:
-        """Unit vector from the opening into this room."""
+        """Unit vector from a doorway or window into this room."""
         if opening.along == "x":
             return (0.0, 1.0 if self.room.center_m[1] > opening.center_m[1] else -1.0)
         return (1.0 if self.room.center_m[0] > opening.center_m[0] else -1.0, 0.0)
+
+    # Floor
+
+    def _after(self, extra: Sequence[Box]) -> tuple[BoolArray, BoolArray]:
+        """Where the base can stand, and where of that it can get, with the extra boxes in the room."""
+        window = self._window_of(extra)
+        if window is None:
+            return self._stand, self._reach
+        i0, i1, j0, j1 = window
+        lost = np.zeros((i1 - i0, j1 - j0), dtype=bool)
+        for box in extra:
+            if _bars(box):
+                a, b, c, d = self._touched(box)
+                di = _away(np.arange(i0, i1), a, b)
+                dj = _away(np.arange(j0, j1), c, d)
+                lost |= di[:, None] ** 2 + dj[None, :] ** 2 < _KEEP_CELLS**2
+        stand = self._stand.copy()
+        stand[i0:i1, j0:j1] &= ~lost
+        if not np.any(self._reach[i0:i1, j0:j1] & lost):
+            return stand, self._reach
+        reach = self._reach.copy()
+        reach[i0:i1, j0:j1] &= ~lost
+        if not self._still_joined(reach, window):
+            reach = _component(reach, self._doors_seed(reach))
+        return stand, reach
+
+    def _still_joined(self, reach: BoolArray, window: _Cells) -> bool:
+        """Whether what is left around the window hangs together there: then it does so everywhere."""
+        i0, i1, j0, j1 = window
+        near = reach[max(0, i0 - _AROUND) : i1 + _AROUND, max(0, j0 - _AROUND) : j1 + _AROUND]
+        return bool(ndimage.label(near)[1] == 1)
+
+    def _doors_seed(self, reach: BoolArray) -> tuple[int, int] | None:
+        """A reachable cell before the first doorway."""
+        if not self._doors:
+            return None
+        i0, i1, j0, j1 = self._cells_of(self._doors[0])
+        found = np.argwhere(reach[i0:i1, j0:j1])
+        return (int(found[0, 0]) + i0, int(found[0, 1]) + j0) if len(found) else None
+
+    def _touches(self, reach: BoolArray, target: Target) -> bool:
+        i0, i1, j0, j1 = self._cells_of(target)
+        return bool(reach[i0:i1, j0:j1].any())
+
+    def _cells_of(self, target: Target) -> _Cells:
+        """Cells whose centres lie in the strip."""
+        x0, y0, x1, y1 = target.strip
+        return self._cells((x0, x1), (y0, y1))
+
+    def _touched(self, box: Box) -> _Cells:
+        """Every cell that the box touches, so that no other grid over the same room finds less floor."""
+        return self._cells((box[0] - _HALF, box[3] + _HALF), (box[1] - _HALF, box[4] + _HALF))
+
+    def _cells(self, x: tuple[float, float], y: tuple[float, float]) -> _Cells:
+        i0, i1 = (math.ceil((v - self._origin[0]) / CELL_M - 0.5) for v in (x[0] + 1e-9, x[1] - 1e-9))
+        j0, j1 = (math.ceil((v - self._origin[1]) / CELL_M - 0.5) for v in (y[0] + 1e-9, y[1] - 1e-9))
+        nx, ny = self._shape
+        return (min(max(i0, 0), nx), min(max(i1, 0), nx), min(max(j0, 0), ny), min(max(j1, 0), ny))
+
+    def _window_of(self, boxes: Sequence[Box]) -> _Cells | None:
+        """Cells that the boxes take from the robot; None when they bar nothing."""
+        spans = [self._touched(box) for box in boxes if _bars(box)]
+        if not spans:
+            return None
+        i0, i1 = min(s[0] for s in spans) - _RING, max(s[1] for s in spans) + _RING
+        j0, j1 = min(s[2] for s in spans) - _RING, max(s[3] for s in spans) + _RING
+        nx, ny = self._shape
+        return (max(i0, 0), min(i1, nx), max(j0, 0), min(j1, ny))
+
+    # Zones
 
     def _door_zone(self, doorway: Doorway) -> Box:
         """Floor that stays free inside the room before a doorway."""
@@ -141,31 +214,71 @@ class RoomSpace:
             return (x - half, min(y, y + far * ny), x + half, max(y, y + far * ny))
         return (min(x, x + far * nx), y - half, max(x, x + far * nx), y + half)
 
-    def _empty_floor(self) -> BoolArray:
-        floor = np.zeros((len(self._x), len(self._y)), dtype=bool)
-        (x0, y0), (x1, y1) = self.room.low_m, self.room.high_m
-        floor[self._span(self._x, x0, x1), self._span(self._y, y0, y1)] = True
-        for door in self.doorways:
-            if door.rooms[1]:
-                x, y = door.center_m
-                half, deep = door.width_m / 2, _MARGIN_M + 0.2
-                a, b = (half, deep) if door.along == "x" else (deep, half)
-                floor[self._span(self._x, x - a, x + a), self._span(self._y, y - b, y + b)] = True
-        return floor
 
-    @staticmethod
-    def _span(centers: FloatArray, low: float, high: float) -> slice:
-        return slice(int(np.searchsorted(centers, low + 1e-9)), int(np.searchsorted(centers, high - 1e-9)))
+def _grid_of(room: Room) -> tuple[FloatArray, tuple[int, int]]:
+    """Corner of the room's grid and its cells along x and y."""
+    origin = np.asarray(room.low_m) - _MARGIN_M
+    cells = np.ceil((np.asarray(room.size_m) + 2 * _MARGIN_M) / CELL_M).astype(int)
+    return origin, (int(cells[0]), int(cells[1]))
 
 
-def _meet(boxes: FloatArray, others: Sequence[Box]) -> BoolArray:
-    if not others or not len(boxes):
-        return np.zeros(len(boxes), dtype=bool)
-    rest = np.asarray(others)  # (m, 6)
-    low, high = boxes[:, :3].min(axis=0), boxes[:, 3:].max(axis=0)
-    rest = rest[~np.any((rest[:, 3:] <= low) | (rest[:, :3] >= high), axis=1)]
-    meets = np.ones((len(boxes), len(rest)), dtype=bool)
-    for axis in range(3):
-        meets &= boxes[:, None, axis] < rest[None, :, axis + 3] - _TOUCH_M
-        meets &= rest[None, :, axis] < boxes[:, None, axis + 3] - _TOUCH_M
-    return np.asarray(meets.any(axis=1))
+@functools.lru_cache(maxsize=64)
+def _bare_floor(room: Room, doorways: tuple[Doorway, ...]) -> tuple[BoolArray, BoolArray]:
+    """Where the base can stand in the empty room, and where of that it gets from the first doorway."""
+    origin, shape = _grid_of(room)
+    x, y = (origin[axis] + (np.arange(shape[axis]) + 0.5) * CELL_M for axis in (0, 1))
+
+    def within(low: tuple[float, float], high: tuple[float, float]) -> BoolArray:
+        return np.asarray(((x >= low[0]) & (x < high[0]))[:, None] & ((y >= low[1]) & (y < high[1]))[None, :])
+
+    floor = within(room.low_m, room.high_m)
+    for door in doorways:
+        if door.rooms[1]:
+            (cx, cy), half, deep = door.center_m, door.width_m / 2, _MARGIN_M + 0.2
+            a, b = (half, deep) if door.along == "x" else (deep, half)
+            floor |= within((cx - a, cy - b), (cx + a, cy + b))
+    distance = np.asarray(ndimage.distance_transform_edt(floor))
+    stand = np.asarray(distance >= _KEEP_CELLS)
+    return stand, _component(stand, _nearest(stand, origin, room, doorways))
+
+
+def _nearest(
+    stand: BoolArray, origin: FloatArray, room: Room, doorways: Sequence[Doorway]
+) -> tuple[int, int] | None:
+    """The standable cell nearest to half a metre inside the first doorway, no further off than another half."""
+    cells = np.argwhere(stand)
+    if not doorways or not len(cells):
+        return None
+    (x, y), door = doorways[0].center_m, doorways[0]
+    side = 1 if door.along == "x" else 0
+    step = 0.5 if room.center_m[side] > door.center_m[side] else -0.5
+    spot = np.array([x, y + step] if side else [x + step, y])
+    away = np.hypot(*(origin + (cells + 0.5) * CELL_M - spot).T)
+    best = int(np.argmin(away))
+    return (int(cells[best, 0]), int(cells[best, 1])) if away[best] < 0.5 else None
+
+
+def _component(free: BoolArray, seed: tuple[int, int] | None) -> BoolArray:
+    """The connected part of the free cells that holds the seed; empty without one."""
+    if seed is None:
+        return np.zeros_like(free)
+    labels: NDArray[np.int32] = ndimage.label(free)[0]
+    return np.asarray((labels == labels[seed]) & free)
+
+
+def _bars(box: Box) -> bool:
+    """Whether the robot has to go around the box."""
+    return box[2] < ROBOT.height_m and box[5] > LOW_M
+
+
+def _away(cells: NDArray[np.int64], first: int, end: int) -> NDArray[np.int64]:
+    """How many cells each one lies before the first or after the last cell of a span."""
+    return np.asarray(np.maximum(np.maximum(first - cells, cells - (end - 1)), 0))
+
+
+def _overlap(a: _Cells, b: _Cells) -> bool:
+    return a[0] < b[1] and b[0] < a[1] and a[2] < b[3] and b[2] < a[3]
+
+
+def _flat(box: Box) -> tuple[float, float, float, float]:
+    return (box[0], box[1], box[3], box[4])

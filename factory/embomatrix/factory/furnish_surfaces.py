@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.factory.furnish_pieces import REST_GAP_M
+from embomatrix.factory.furnish_pieces import REST_GAP_M, Placed
 from embomatrix.factory.furnish_roles import CUPBOARD, SURFACE_HOSTS, Role
-from embomatrix.factory.furnish_solver import Placed
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:

@@ -22,7 +22,7 @@ from embomatrix.world.scene import RobotStart, Scene, SceneObject
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from embomatrix.factory.furnish_solver import Placed
+    from embomatrix.factory.furnish_pieces import Placed
     from embomatrix.world.asset import Asset
     from embomatrix.world.catalog import RoomInventory, SceneInventory
 
@@ -168,7 +168,7 @@ def _robot_start(plan: FloorPlan, placed: Sequence[Placed]) -> RobotStart:
     rooms = sorted(plan.rooms, key=lambda r: (r.type not in public, -r.size_m[0] * r.size_m[1]))
     for room in rooms:
         space = RoomSpace(room, plan.doorways)
-        space.solids += [p.box for p in placed if p.room == room.name]
+        space.occupy([box for p in placed if p.room == room.name for box in p.boxes])
         cells = space.free_cells()
         if len(cells):
             x, y = cells[np.argmin(np.hypot(*(cells - np.asarray(room.center_m)).T))]
