@@ -15,6 +15,7 @@ from rich.table import Table
 
 from embomatrix.factory.floorplan_spec import FloorPlanError
 from embomatrix.factory.pictures import draw_plan
+from embomatrix.factory.relation_pictures import draw_relations
 from embomatrix.factory.scene_build import build_base_scene
 from embomatrix.factory.scene_check import check_in_engine, check_scene
 from embomatrix.sim.bullet.camera import render_oblique
@@ -103,6 +104,18 @@ def check(scene_id: SceneId, seed: Seed = 0) -> None:
     if problems:
         raise typer.Exit(1)
     Console().print(f"{scene_id}: {len(scene.objects)} objects, nothing wrong", highlight=False)
+
+
+@app.command()
+def relations(out: Out = Path()) -> None:
+    """Draw what every relation means: cases in which it holds, and in which it does not, as a PNG file."""
+    path = _folder(out) / "relations.png"
+    try:
+        picture = draw_relations()
+    except EngineError as error:
+        raise _refused(str(error)) from None
+    _write(path, _png(picture.quantize(64)))
+    Console().print(str(path), highlight=False)
 
 
 def _check_name(scene_id: str) -> None:

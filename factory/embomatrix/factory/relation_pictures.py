@@ -1,0 +1,190 @@
+"""A picture of every relation: small scenes, photographed, each with what the simulator says of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from embomatrix.factory.assets.library import build_asset
+from embomatrix.sim.bounds import AssetBounds
+from embomatrix.sim.bullet.engine import BulletEngine
+from embomatrix.sim.bullet.stage import Stage
+from embomatrix.sim.relations import Relations
+from embomatrix.world.catalog import Catalog
+from embomatrix.world.geometry import Aabb, Pose
+from embomatrix.world.scene import RobotStart, Room, Scene, SceneObject
+from embomatrix.world.state import Relation, State
+
+if TYPE_CHECKING:
+    from embomatrix.world.asset import Asset
+    from embomatrix.world.geometry import Vec3
+
+MODELS: Final = {
+    "table": ("breakfast_table", "pdpkuw"),
+    "fridge": ("fridge", "juwaoh"),
+    "bookcase": ("bookcase", "opryhp"),
+    "cabinet": ("bottom_cabinet_no_top", "pluwfl"),
+    "microwave": ("microwave", "ihxrvr"),
+    "apple": ("apple", "omzprq"),
+    "bowl": ("bowl", "kasebx"),
+    "mug": ("mug", "ntgftr"),
+    "carton": ("carton", "libote"),
+}
+COLUMNS: Final = 4
+PANEL_PX: Final = (300, 240)
+LABEL_PX: Final = 40
+LEAST_SPAN_M: Final = 0.42
+"""The camera comes no nearer than for things of this size."""
+
+
+@dataclass(frozen=True, slots=True)
+class Panel:
+    """One case. ``at_m`` is the middle of the first object's underside, from the second's middle and from ``on``.
+
+    ``on`` names a surface of the second, "top" its top; empty: the floor. The second stands upright with its front at +x, its
+    joints at ``open``. A relation of one object has no first.
+    """
+
+    predicate: str
+    a: str
+    b: str
+    at_m: Vec3
+    note: str
+    on: str = ""
+    open: float = 0.0
+    side: float = -1.3
+    """How far to the right of the second's front the camera stands, in spans: positive looks past its open door."""
+
+
+PANELS: Final = (
+    Panel("ontop", "apple", "table", (0.1, 0.2, 0.0), "rests on its top", "top"),
+    Panel("ontop", "bowl", "bookcase", (0.05, 0.0, 0.0), "an open board is a surface", "shelf2_floor"),
+    Panel(
+        "ontop",
+        "apple",
+        "fridge",
+        (0.1, 0.0, 0.0),
+        "behind a door: inside, not ontop",
+        "shelf2_floor",
+        1.0,
+        0.9,
+    ),
+    Panel("ontop", "apple", "table", (0.1, 0.2, 0.05), "5 cm above its top", "top"),
+    Panel("inside", "apple", "fridge", (0.1, 0.0, 0.0), "its box is in a cavity", "shelf2_floor", 1.0, 0.9),
+    Panel("inside", "apple", "bowl", (0.0, 0.0, 0.0), "it may stick out of an open cavity", "inside_floor"),
+    Panel(
+        "inside", "apple", "microwave", (0.0, 0.0, 0.0), "a closed microwave has an inside", "inside_floor"
+    ),
+    Panel("inside", "apple", "fridge", (0.0, 0.0, 0.0), "on top of it", "top"),
+    Panel("under", "carton", "table", (0.1, 0.2, 0.0), "the table is over its middle"),
+    Panel("under", "carton", "table", (0.0, 1.0, 0.0), "beside it"),
+    Panel("nextto", "apple", "mug", (0.0, 0.15, 0.0), "5 cm apart or less"),
+    Panel("nextto", "apple", "mug", (0.0, 0.35, 0.0), "too far for their sizes"),
+    Panel("touching", "apple", "carton", (0.0, -0.147, 0.0), "5 mm apart or less"),
+    Panel("touching", "apple", "carton", (0.0, -0.19, 0.0), "nextto, and not touching"),
+    Panel("open", "", "cabinet", (0.0, 0.0, 0.0), "a joint past 5 % of its travel", open=0.5),
+    Panel("open", "", "cabinet", (0.0, 0.0, 0.0), "ajar by 4 %", open=0.04),
+)
+
+
+def draw_relations() -> Image.Image:
+    """All panels in rows of four. Raises EngineError where pybullet is missing."""
+    width, height = PANEL_PX[0], PANEL_PX[1] + LABEL_PX
+    sheet = Image.new("RGB", (COLUMNS * width, -(-len(PANELS) // COLUMNS) * height), "white")
+    for number, panel in enumerate(PANELS):
+        row, column = divmod(number, COLUMNS)
+        sheet.paste(_drawn(panel), (column * width, row * height))
+    return sheet
+
+
+def verdict(panel: Panel) -> bool:
+    """What the simulator says of a panel's scene."""
+    scene = panel_scene(panel)
+    engine = BulletEngine(scene)
+    try:
+        relations = Relations(engine)
+        if panel.predicate == State.OPEN:
+            return relations.open(panel.b)
+        return relations.holds(Relation(panel.predicate), panel.a, panel.b)
+    finally:
+        engine.close()
+
+
+def panel_scene(panel: Panel) -> Scene:
+    """The objects of a panel on an empty floor."""
+    catalog = Catalog.load()
+    assets = {name: build_asset(catalog, *MODELS[name]) for name in (panel.b, panel.a) if name}
+    stands = {panel.b: (0.0, 0.0, 0.0), **({panel.a: _at(panel, assets[panel.b])} if panel.a else {})}
+    objects = tuple(
+        SceneObject(
+            name,
+            asset.asset_id,
+            "floor_0",
+            _standing(asset, stands[name]),
+            fixed=name == panel.b,
+            joints=(panel.open if name == panel.b else 0.0,) * len(asset.joints),
+        )
+        for name, asset in assets.items()
+    )
+    room = Room("floor_0", "living_room", (-2.0, -2.0), (2.0, 2.0))
+    start = RobotStart(-1.5, -1.5, 0.0, room.name)
+    by_id = {asset.asset_id: asset for asset in assets.values()}
+    return Scene("relations", "relations", 0, (room,), (), (), objects, by_id, start)
+
+
+def _at(panel: Panel, support: Asset) -> Vec3:
+    """Where the first object's underside is in the world; the second one's lies on the floor."""
+    x, y, z = panel.at_m
+    if not panel.on:
+        return panel.at_m
+    surface = {item.name: item for item in support.supports}.get(panel.on)
+    cx, cy, cz = surface.center_m if surface else (0.0, 0.0, support.size_m[2] / 2)
+    return (cx + x, cy + y, cz + z + support.size_m[2] / 2)
+
+
+def _standing(asset: Asset, at_m: Vec3) -> Pose:
+    x, y, z = at_m
+    return Pose((x, y, z - AssetBounds(asset).box(Pose((0.0, 0.0, 0.0))).low_m[2]))
+
+
+def _drawn(panel: Panel) -> Image.Image:
+    scene = panel_scene(panel)
+    with Stage(replace(scene, rooms=())) as stage:
+        stage.add_objects()
+        picture = Image.fromarray(np.asarray(_photographed(stage, _framed(scene, panel), panel.side)))
+    whole = Image.new("RGB", (PANEL_PX[0], PANEL_PX[1] + LABEL_PX), "white")
+    whole.paste(picture, (0, 0))
+    holds = verdict(panel)
+    pen = ImageDraw.Draw(whole)
+    words = f"{panel.predicate}({', '.join(filter(None, (panel.a, panel.b)))})"
+    color = "#1a7f37" if holds else "#b42318"
+    pen.text(
+        (8, PANEL_PX[1]), f"{words}: {'yes' if holds else 'no'}", fill=color, font=ImageFont.load_default(15)
+    )
+    pen.text((8, PANEL_PX[1] + 19), panel.note, fill="#666666", font=ImageFont.load_default(13))
+    return whole
+
+
+def _framed(scene: Scene, panel: Panel) -> Aabb:
+    """What the camera looks at: all of the second object where it counts, else the first, else both."""
+    boxes = {
+        item.name: AssetBounds(scene.asset_of(item.name)).box(item.pose_world_asset) for item in scene.objects
+    }
+    match panel.predicate:
+        case "nextto" | "touching":
+            return Aabb.around(boxes.values())
+        case "under" | "open":
+            return boxes[panel.b]
+        case _:
+            return boxes[panel.a]
+
+
+def _photographed(stage: Stage, box: Aabb, side: float) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
+    span = max(LEAST_SPAN_M, *box.size_m)
+    x, y, z = box.center_m
+    eye = (x + 2.6 * span, y + side * span, z + 1.1 * span)
+    lens = stage.lens(32.0, PANEL_PX[0] / PANEL_PX[1], 0.05, 50.0)
+    return stage.shoot(stage.look_at(eye, (x, y, z)), lens, *PANEL_PX)

@@ -1,0 +1,40 @@
+"""The picture of the relations says of each case what the simulator does, and what a person expects."""
+
+import numpy as np
+import pytest
+
+from embomatrix.factory.relation_pictures import PANELS, draw_relations, verdict
+
+HOLDING = {
+    "rests on its top",
+    "an open board is a surface",
+    "its box is in a cavity",
+    "it may stick out of an open cavity",
+    "a closed microwave has an inside",
+    "the table is over its middle",
+    "5 cm apart or less",
+    "5 mm apart or less",
+    "a joint past 5 % of its travel",
+}
+
+
+@pytest.mark.parametrize("panel", PANELS, ids=lambda panel: f"{panel.predicate}: {panel.note}")
+def test_each_case_is_judged_as_a_person_reads_it(panel) -> None:
+    assert verdict(panel) == (panel.note in HOLDING)
+
+
+def test_every_relation_is_shown_holding_and_not_holding() -> None:
+    shown = {(panel.predicate, panel.note in HOLDING) for panel in PANELS}
+    assert shown == {
+        (name, holds)
+        for name in ("ontop", "inside", "under", "nextto", "touching", "open")
+        for holds in (True, False)
+    }
+
+
+def test_the_sheet_has_a_photograph_in_every_panel() -> None:
+    sheet = np.asarray(draw_relations())
+    panels = (
+        sheet.reshape(4, sheet.shape[0] // 4, 4, sheet.shape[1] // 4, 3).swapaxes(1, 2).reshape(16, -1, 3)
+    )
+    assert all(len(np.unique(panel, axis=0)) > 12 for panel in panels)
