@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from embomatrix.factory.assets.cabinets import MAX_PARTS
-from embomatrix.factory.assets.families import GENERATORS, Family, family_of
+from embomatrix.factory.assets.families import GENERATORS, Family, family_of, family_of_model
 from embomatrix.factory.assets.library import build_asset
 from embomatrix.factory.assets.shapes import mesh_of
 from embomatrix.world.asset import JointKind
@@ -99,12 +99,21 @@ def moved(points: FloatArray, joint: Joint, fraction: float) -> FloatArray:
     return turn.apply_all(points - np.asarray(joint.origin_m)) + np.asarray(joint.origin_m)
 
 
-def panel_at(link: Link, fraction: float) -> tuple[FloatArray, FloatArray]:
-    """Corners and face axes of a one-box door at a share of its travel."""
+def parts_at(link: Link, fraction: float) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """Corners and face axes of the boxes of a door or drawer at a share of its travel."""
     assert link.joint is not None
-    (panel,) = link.parts
     axes = moved(np.eye(3), link.joint, fraction) - moved(np.zeros((1, 3)), link.joint, fraction)
-    return moved(corners_of(panel), link.joint, fraction), axes
+    for part in link.parts:
+        yield moved(corners_of(part), link.joint, fraction), axes
+
+
+def corners_at(link: Link, fraction: float) -> FloatArray:
+    return np.vstack([corners for corners, _ in parts_at(link, fraction)])
+
+
+def parts_of(asset: Asset, link: str) -> tuple[Part, ...]:
+    """Parts of a link by its name, of the base for ""."""
+    return next(item.parts for item in asset.links if item.name == (link or "base"))
 
 
 def interior_box(center_m: Vec3, size_m: Vec3) -> Aabb:
@@ -115,7 +124,12 @@ def interior_box(center_m: Vec3, size_m: Vec3) -> Aabb:
 
 def test_every_family_has_a_generator_and_a_category() -> None:
     assert set(GENERATORS) == set(Family)
-    assert {family_of(CATALOG, name) for name in CATALOG.category_names} == set(Family)
+    used = {
+        family_of_model(CATALOG, name, model.model_id)
+        for name in CATALOG.category_names
+        for model in CATALOG.models_of(name)
+    }
+    assert used == set(Family)
 
 
 def test_box_of_an_asset_is_the_size_of_its_model() -> None:
@@ -165,8 +179,8 @@ def test_names_of_supports_and_interiors_are_unique_and_refer_to_each_other() ->
 
 def test_supports_lie_on_top_of_parts() -> None:
     for asset in ASSETS:
-        boxes = [part.aabb(HERE) for part in asset.links[0].parts]
         for support in asset.supports:
+            boxes = [part.aabb(HERE) for part in parts_of(asset, support.link)]
             x, y, z = support.center_m
             under = [
                 b for b in boxes if b.contains((x, y, b.center_m[2]), 1e-6) and abs(b.high_m[2] - z) < 1e-4
@@ -183,18 +197,19 @@ def test_nothing_stands_in_the_space_above_a_support() -> None:
             free = Aabb(
                 (x - dx / 2, y - dy / 2, z), (x + dx / 2, y + dy / 2, z + min(support.clearance_m, 5.0))
             )
-            assert_free(asset, free, 2e-4)
+            assert_free(asset, free, 2e-4, parts_of(asset, support.link))
 
 
 def test_interiors_are_empty() -> None:
     for asset in ASSETS:
         for interior in asset.interiors:
-            assert_free(asset, interior_box(interior.center_m, interior.size_m), 2e-4)
+            space = interior_box(interior.center_m, interior.size_m)
+            assert_free(asset, space, 2e-4, parts_of(asset, interior.link))
 
 
-def assert_free(asset: Asset, free: Aabb, tolerance_m: float) -> None:
+def assert_free(asset: Asset, free: Aabb, tolerance_m: float, riding: tuple[Part, ...] = ()) -> None:
     corners = box_corners(free)
-    for part in asset.links[0].parts:
+    for part in (*asset.links[0].parts, *riding):
         if part.aabb(HERE).overlaps(free, -tolerance_m):
             assert overlap_m(part, corners, np.eye(3)) <= tolerance_m, (asset.asset_id, free, part)
 
@@ -227,10 +242,10 @@ def test_doors_swing_without_touching_the_frame() -> None:
 def assert_clear(asset: Asset, fractions: tuple[float, ...]) -> None:
     for link in asset.links[1:]:
         for fraction in fractions:
-            corners, axes = panel_at(link, fraction)
-            for part in asset.links[0].parts:
-                depth = overlap_m(part, corners, axes)
-                assert depth <= 1e-5, (asset.asset_id, link.name, fraction, depth)
+            for corners, axes in parts_at(link, fraction):
+                for part in asset.links[0].parts:
+                    depth = overlap_m(part, corners, axes)
+                    assert depth <= 1e-5, (asset.asset_id, link.name, fraction, depth)
 
 
 def test_an_open_door_leaves_the_mouth_of_its_cavity_free() -> None:
@@ -242,14 +257,14 @@ def test_an_open_door_leaves_the_mouth_of_its_cavity_free() -> None:
                 Aabb(mouth.low_m, (mouth.high_m[0] + 0.3, *mouth.high_m[1:])),
                 Aabb(mouth.low_m, (*mouth.high_m[:2], mouth.high_m[2] + 0.3)),
             ]
-            doors = [link for link in asset.links if link.name in interior.closed_by]
-            assert doors, (asset.asset_id, interior)
+            doors = [link for link in asset.links if link.name in interior.closed_by and not interior.link]
+            assert bool(doors) == (not interior.link and bool(interior.closed_by)), (asset.asset_id, interior)
             assert any(is_free_of(doors, way) for way in ways), (asset.asset_id, interior.name)
 
 
 def is_free_of(doors: list[Link], way: Aabb) -> bool:
     for door in doors:
-        corners, _ = panel_at(door, 1.0)
+        corners = corners_at(door, 1.0)
         low, high = corners.min(axis=0), corners.max(axis=0)
         if all(
             lo < w_hi - 1e-6 and w_lo + 1e-6 < hi
@@ -264,7 +279,7 @@ def test_open_doors_stay_within_the_width_of_their_cabinet() -> None:
         half = asset.size_m[1] / 2
         for link in asset.links[1:]:
             for fraction in (0.25, 0.5, 0.75, 1.0):
-                corners, _ = panel_at(link, fraction)
+                corners = corners_at(link, fraction)
                 assert np.abs(corners[:, 1]).max() <= half + 1e-5, (asset.asset_id, link.name)
 
 
@@ -308,13 +323,50 @@ def test_doors_of_the_same_bay_close_the_same_cavity() -> None:
     }  # fmt: skip
 
 
+def test_a_drawer_carries_its_floor_and_its_cavity_four_fifths_of_its_depth_out() -> None:
+    drawers = [(asset, link) for asset in WITH_JOINTS for link in asset.links[1:] if "drawer" in link.name]
+    assert len({asset.category for asset, _ in drawers}) >= 5
+    for asset, link in drawers:
+        (interior,) = [item for item in asset.interiors if item.link == link.name]
+        (floor,) = [item for item in asset.supports if item.link == link.name]
+        assert interior.closed_by == (link.name,)
+        assert floor.interior == interior.name
+        assert link.joint is not None
+        assert link.joint.axis == (1.0, 0.0, 0.0)
+        depth = np.ptp(corners_at(link, 0.0)[:, 0])
+        assert link.joint.upper == pytest.approx(0.8 * depth, abs=1e-4)
+        # four walls hold the floor's edges: a panel and three boards, a finger high
+        walls = [part for part in link.parts if part.size_m[2] > 0.02 and min(part.size_m[:2]) < 0.03]
+        assert len(walls) == 4, asset.asset_id
+
+
+def test_drawers_are_where_the_records_tell_of_a_joint() -> None:
+    for category in ("desk", "nightstand", "coffee_table", "console_table"):
+        for model in CATALOG.models_of(category):
+            asset = build_asset(CATALOG, category, model.model_id)
+            assert asset.can("openable") == bool(asset.joints)
+            assert not asset.joints or "joint" in model.meta_links
+    kinds = {
+        tuple(
+            sorted(
+                {
+                    name.rstrip("0123456789")
+                    for name, _ in build_asset(CATALOG, "bottom_cabinet", m.model_id).joints
+                }
+            )
+        )
+        for m in CATALOG.models_of("bottom_cabinet")
+    }
+    assert {("door",), ("drawer",), ("door", "drawer")} <= kinds
+
+
 def test_ovens_drop_their_door_and_chests_lift_their_lid() -> None:
     oven = build_asset(CATALOG, "oven", "wuinhm")
     ((name, joint),) = oven.joints
     assert (name, joint.axis) == ("door", (0.0, 1.0, 0.0))
     assert joint.origin_m[0] == pytest.approx(oven.size_m[0] / 2)
     chest = build_asset(CATALOG, "cedar_chest", CATALOG.models_of("cedar_chest")[0].model_id)
-    corners, _ = panel_at(chest.links[1], 1.0)
+    corners = corners_at(chest.links[1], 1.0)
     assert corners[:, 2].min() > chest.size_m[2] / 2 - 0.05
 
 

@@ -6,13 +6,13 @@ Everything is in the asset's frame: origin at the centre of the box, front at +x
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.assets.shapes import box, box_of, rounded
 from embomatrix.world.asset import Interior, Joint, JointKind, Link, SupportSurface
-from embomatrix.world.geometry import Aabb
+from embomatrix.world.geometry import Aabb, Pose
 
 if TYPE_CHECKING:
     from embomatrix.world.geometry import Part, Vec2, Vec3
@@ -36,24 +36,33 @@ class Body:
         self, name: str, low: Vec2, high: Vec2, z: float, clearance_m: float = OPEN_ABOVE_M
     ) -> None:
         """A surface in the open between two corners at height ``z``."""
-        self.supports.append(_surface(name, low, high, z, clearance_m, ""))
+        self.supports.append(_surface(name, low, high, z, clearance_m))
 
     def add_interior(
-        self, name: str, cavity: Aabb, closed_by: tuple[str, ...] = (), clearance_m: float = 0.0
+        self,
+        name: str,
+        cavity: Aabb,
+        closed_by: tuple[str, ...] = (),
+        clearance_m: float = 0.0,
+        link: str = "",
     ) -> None:
-        """A cavity and its floor; ``clearance_m`` exceeds its height where things may stick out at the top."""
+        """A cavity and its floor, which ride on ``link`` where it has a name.
+
+        ``clearance_m`` exceeds the cavity's height where things may stick out at the top.
+        """
         (x0, y0, z0), (x1, y1, z1) = cavity.low_m, cavity.high_m
         x0, y0, x1, y1 = x0 + FIT_M, y0 + FIT_M, x1 - FIT_M, y1 - FIT_M
         centre, size = ((x0 + x1) / 2, (y0 + y1) / 2, (z0 + z1) / 2), (x1 - x0, y1 - y0, z1 - z0)
-        self.interiors.append(Interior(name, rounded(*centre), rounded(*size), closed_by))
+        self.interiors.append(Interior(name, rounded(*centre), rounded(*size), closed_by, link))
         clearance = max(clearance_m, z1 - z0)
-        self.supports.append(_surface(f"{name}_floor", (x0, y0), (x1, y1), z0, clearance, name))
+        surface = _surface(f"{name}_floor", (x0, y0), (x1, y1), z0, clearance)
+        self.supports.append(replace(surface, interior=name, link=link))
 
 
-def _surface(name: str, low: Vec2, high: Vec2, z: float, clearance_m: float, interior: str) -> SupportSurface:
+def _surface(name: str, low: Vec2, high: Vec2, z: float, clearance_m: float) -> SupportSurface:
     (x0, y0), (x1, y1) = low, high
     size = rounded(x1 - x0, y1 - y0, clearance_m)
-    return SupportSurface(name, rounded((x0 + x1) / 2, (y0 + y1) / 2, z), size[:2], size[2], interior)
+    return SupportSurface(name, rounded((x0 + x1) / 2, (y0 + y1) / 2, z), size[:2], size[2])
 
 
 def centred(size_m: Vec3) -> Aabb:
@@ -144,3 +153,40 @@ def sliding(name: str, panel: Aabb, axis: Vec3, travel_m: float) -> Link:
     """A panel that moves along a straight rail."""
     centre = rounded(*panel.center_m)
     return Link(name, (box_of(panel),), Joint(JointKind.PRISMATIC, centre, axis, round(travel_m, 6)))
+
+
+def raised(body: Body, lift_m: float) -> Body:
+    """The same body ``lift_m`` higher in its frame."""
+    links = [
+        Link(
+            link.name,
+            tuple(_raised_part(part, lift_m) for part in link.parts),
+            link.joint and replace(link.joint, origin_m=_raised(link.joint.origin_m, lift_m)),
+        )
+        for link in body.moving
+    ]
+    return Body(
+        [_raised_part(part, lift_m) for part in body.parts],
+        links,
+        [replace(item, center_m=_raised(item.center_m, lift_m)) for item in body.supports],
+        [replace(item, center_m=_raised(item.center_m, lift_m)) for item in body.interiors],
+    )
+
+
+def stacked(lower: Body, upper: Body, lift_m: float) -> Body:
+    """Both bodies as one, the upper one raised. Their links, surfaces and cavities have different names."""
+    above = raised(upper, lift_m)
+    return Body(
+        lower.parts + above.parts,
+        lower.moving + above.moving,
+        lower.supports + above.supports,
+        lower.interiors + above.interiors,
+    )
+
+
+def _raised(point: Vec3, lift_m: float) -> Vec3:
+    return rounded(point[0], point[1], point[2] + lift_m)
+
+
+def _raised_part(part: Part, lift_m: float) -> Part:
+    return replace(part, pose=Pose(_raised(part.pose.position_m, lift_m), part.pose.quat_xyzw))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
@@ -19,8 +19,9 @@ from embomatrix.factory.assets.body import (
     region,
     shell,
 )
+from embomatrix.factory.assets.drawers import add_drawers
 from embomatrix.factory.assets.furniture import slab
-from embomatrix.factory.assets.shapes import box
+from embomatrix.factory.assets.shapes import box, box_of
 from embomatrix.world.geometry import Aabb
 
 if TYPE_CHECKING:
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
 
 MAX_PARTS: Final = 16
 """Bullet drops further parts of one link without a word."""
+_BOARD_M: Final = 0.012
+"""Thickness of the board between drawers and what is below them."""
 
 
 class Front(StrEnum):
@@ -44,7 +47,7 @@ class CabinetStyle:
 
     ``tier_m`` is the height that one shelf compartment should have; ``bay_m`` the greatest width of a door pair;
     ``plinth_m`` lifts the door off the floor; ``head_m`` is a strip above it and ``panel_share`` the share of the width
-    that a control panel takes at the left.
+    that a control panel takes at the left. ``drawer_share`` is the share of the height, from the top, that drawers take.
     """
 
     front: Front
@@ -55,9 +58,12 @@ class CabinetStyle:
     panel_share: float = 0.0
     bay_m: float = 1.1
     single_door_m: float = 0.62
+    drawer_share: float = 0.0
 
 
 CUPBOARD: Final = CabinetStyle(Front.SIDE_HINGED, wall_m=0.018, tier_m=0.34, plinth_m=0.06)
+DRAWER_CUPBOARD: Final = replace(CUPBOARD, drawer_share=0.26)
+CHEST_OF_DRAWERS: Final = replace(CUPBOARD, drawer_share=1.0)
 WALL_CUPBOARD: Final = CabinetStyle(Front.SIDE_HINGED, wall_m=0.018, tier_m=0.36)
 LOCKER: Final = CabinetStyle(Front.SIDE_HINGED, wall_m=0.018, tier_m=0.9, plinth_m=0.04, bay_m=0.5)
 FRIDGE: Final = CabinetStyle(Front.SIDE_HINGED, wall_m=0.045, tier_m=0.38, plinth_m=0.08, single_door_m=0.85)
@@ -73,15 +79,17 @@ OVEN: Final = CabinetStyle(Front.DROP_DOWN, wall_m=0.03, tier_m=0.3, plinth_m=0.
 DISHWASHER: Final = CabinetStyle(Front.DROP_DOWN, wall_m=0.03, tier_m=0.28, plinth_m=0.08, head_m=0.05)
 SHELVING: Final = CabinetStyle(Front.OPEN, wall_m=0.02, tier_m=0.32, plinth_m=0.05, bay_m=1.3)
 CUBBY: Final = CabinetStyle(Front.OPEN, wall_m=0.018, tier_m=0.35, plinth_m=0.06, bay_m=1.3)
+DRAWER_CUBBY: Final = replace(CUBBY, drawer_share=0.34)
 WARDROBE: Final = CabinetStyle(Front.OPEN, wall_m=0.022, tier_m=1.1, plinth_m=0.06, bay_m=1.3)
 
 
 def cabinet(size_m: Vec3, style: CabinetStyle) -> Body:
-    """Box with shelves, in bays of one or two doors; its top carries things too."""
+    """Box with shelves, in bays of one or two doors or with drawers above them; its top carries things too."""
     body = Body()
     outer = centred(size_m)
     wall = min(style.wall_m, 0.08 * min(size_m))
-    door_m = 0.0 if style.front is Front.OPEN else clamp(0.06 * size_m[0], min(0.006, wall), min(0.02, wall))
+    plain = style.front is Front.OPEN and not style.drawer_share
+    door_m = 0.0 if plain else clamp(0.06 * size_m[0], min(0.006, wall), min(0.02, wall))
     frame = Aabb(outer.low_m, (outer.high_m[0] - door_m, *outer.high_m[1:]))
     walls = _walls(size_m, style, wall)
     body.parts, cavity = shell(frame, walls)
@@ -100,11 +108,31 @@ def cabinet(size_m: Vec3, style: CabinetStyle) -> Body:
     boards = (MAX_PARTS - len(body.parts)) // len(spans)
     for number, (span, reach) in enumerate(zip(spans, itertools.pairwise(edges), strict=True), start=1):
         prefix = f"bay{number}_" if len(spans) > 1 else ""
-        doors = _doors(body, style, opening, reach, prefix)
         bay = region((cavity.low_m[0], cavity.high_m[0]), span, (cavity.low_m[2], cavity.high_m[2]))
-        _add_tiers(body, bay, style.tier_m, boards, prefix, doors)
+        front = region((opening.low_m[0], opening.high_m[0]), reach, (opening.low_m[2], opening.high_m[2]))
+        _fill(body, style, bay, front, boards, prefix)
     body.add_support("top", frame.low_m[:2], frame.high_m[:2], frame.high_m[2])
     return body
+
+
+def _fill(body: Body, style: CabinetStyle, bay: Aabb, front: Aabb, boards: int, prefix: str) -> None:
+    """Drawers at the top of a bay, shelves behind doors below them, with at most ``boards`` boards."""
+    if style.drawer_share:
+        gap = min(FIT_M, 0.2 * front.size_m[0])
+        panels = Aabb((front.low_m[0] + gap, *front.low_m[1:]), front.high_m)
+        if style.drawer_share == 1.0:
+            add_drawers(body, bay, panels, prefix, most=2 if prefix else 4)
+            return
+        z = bay.high_m[2] - style.drawer_share * bay.size_m[2]
+        board = region((bay.low_m[0], bay.high_m[0]), (bay.low_m[1], bay.high_m[1]), (z - _BOARD_M, z))
+        body.parts.append(box_of(board))
+        upper = Aabb((*panels.low_m[:2], z), panels.high_m)
+        add_drawers(body, Aabb((*bay.low_m[:2], z), bay.high_m), upper, prefix)
+        bay = Aabb(bay.low_m, (*bay.high_m[:2], z - _BOARD_M))
+        front = Aabb(front.low_m, (*front.high_m[:2], z))
+        boards -= 1
+    doors = _doors(body, style, front, prefix)
+    _add_tiers(body, bay, style.tier_m, boards, prefix, doors)
 
 
 def shelving(size_m: Vec3) -> Body:
@@ -145,18 +173,17 @@ def _upright(cavity: Aabb, before: float, after: float) -> Part:
     return box((cavity.low_m[0], before, cavity.low_m[2]), (cavity.high_m[0], after, cavity.high_m[2]))
 
 
-def _doors(body: Body, style: CabinetStyle, opening: Aabb, reach: Vec2, prefix: str) -> tuple[str, ...]:
+def _doors(body: Body, style: CabinetStyle, front: Aabb, prefix: str) -> tuple[str, ...]:
     """Add the doors of one bay and return their names."""
     if style.front is Front.OPEN:
         return ()
-    (x0, _, z0), (x1, _, z1) = opening.low_m, opening.high_m
-    y0, y1 = reach
+    (x0, y0, z0), (x1, y1, z1) = front.low_m, front.high_m
     gap = min(FIT_M, 0.2 * (x1 - x0))
     x = (x0 + gap, x1)
     if style.front is Front.DROP_DOWN:
-        doors = [hinged(f"{prefix}door", region(x, reach, (z0, z1)), Hinge.BOTTOM)]
+        doors = [hinged(f"{prefix}door", region(x, (y0, y1), (z0, z1)), Hinge.BOTTOM)]
     elif y1 - y0 <= style.single_door_m:
-        doors = [hinged(f"{prefix}door", region(x, reach, (z0, z1)), Hinge.RIGHT)]
+        doors = [hinged(f"{prefix}door", region(x, (y0, y1), (z0, z1)), Hinge.RIGHT)]
     else:
         middle = (y0 + y1) / 2
         doors = [

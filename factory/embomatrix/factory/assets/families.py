@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import functools
 import re
+import zlib
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.assets import cabinets, fixtures, furniture, goods, vessels
+from embomatrix.factory.assets import cabinets, desks, fixtures, furniture, goods, vessels
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -26,6 +27,8 @@ class Family(StrEnum):
     """Kinds of geometry."""
 
     CUPBOARD = "cupboard"
+    DRAWER_CUPBOARD = "drawer_cupboard"
+    CHEST_OF_DRAWERS = "chest_of_drawers"
     WALL_CUPBOARD = "wall_cupboard"
     LOCKER = "locker"
     FRIDGE = "fridge"
@@ -36,10 +39,14 @@ class Family(StrEnum):
     WASHER = "washer"
     SHELVING = "shelving"
     CUBBY = "cubby"
+    DRAWER_CUBBY = "drawer_cubby"
     WARDROBE = "wardrobe"
     CHEST = "chest"
     OPEN_BOX = "open_box"
     TABLE = "table"
+    DRAWER_TABLE = "drawer_table"
+    DESK = "desk"
+    DRAWER_DESK = "drawer_desk"
     SHELF_TABLE = "shelf_table"
     PEDESTAL_TABLE = "pedestal_table"
     COUNTER = "counter"
@@ -96,6 +103,8 @@ def _vessel(style: vessels.VesselStyle) -> Generator:
 
 GENERATORS: Final[Mapping[Family, Generator]] = {
     Family.CUPBOARD: _cabinet(cabinets.CUPBOARD),
+    Family.DRAWER_CUPBOARD: _cabinet(cabinets.DRAWER_CUPBOARD),
+    Family.CHEST_OF_DRAWERS: _cabinet(cabinets.CHEST_OF_DRAWERS),
     Family.WALL_CUPBOARD: _cabinet(cabinets.WALL_CUPBOARD),
     Family.LOCKER: _cabinet(cabinets.LOCKER),
     Family.FRIDGE: _cabinet(cabinets.FRIDGE),
@@ -106,10 +115,14 @@ GENERATORS: Final[Mapping[Family, Generator]] = {
     Family.WASHER: _cabinet(cabinets.WASHER),
     Family.SHELVING: cabinets.shelving,
     Family.CUBBY: _cabinet(cabinets.CUBBY),
+    Family.DRAWER_CUBBY: _cabinet(cabinets.DRAWER_CUBBY),
     Family.WARDROBE: _cabinet(cabinets.WARDROBE),
     Family.CHEST: cabinets.chest,
     Family.OPEN_BOX: cabinets.open_box,
     Family.TABLE: furniture.table,
+    Family.DRAWER_TABLE: desks.drawer_table,
+    Family.DESK: desks.desk,
+    Family.DRAWER_DESK: desks.drawer_desk,
     Family.SHELF_TABLE: furniture.table_with_shelf,
     Family.PEDESTAL_TABLE: furniture.pedestal_table,
     Family.COUNTER: furniture.counter,
@@ -179,9 +192,10 @@ _NAMES: Final[Mapping[Family, str]] = {
     "shoulder_bag briefcase outline_tray drying_rack roasting_pan ice_bucket mop_bucket burlap_bag "
     "cash_register sandbox soap_dish dustpan waffle_maker toaster french_fry_holder knife_block "
     "umbrella_rack first_aid_kit deep_fryer shoe_box pet_bed",
-    Family.TABLE: "breakfast_table coffee_table desk conference_table console_table "
-    "garden_coffee_table lab_table pool_table booth gaming_table ironing_board farm_stand massage_bed "
+    Family.TABLE: "breakfast_table coffee_table conference_table console_table "
+    "garden_coffee_table pool_table booth gaming_table ironing_board farm_stand massage_bed "
     "trampoline",
+    Family.DESK: "desk lab_table",
     Family.SHELF_TABLE: "commercial_kitchen_table serving_cart",
     Family.PEDESTAL_TABLE: "pedestal_table cake_stand garden_umbrella",
     Family.COUNTER: "bar reception_desk checkout_counter display_case chopping_block pedestal",
@@ -278,6 +292,34 @@ _KINDS: Final[tuple[tuple[str, Family], ...]] = (
     ("plant.n.02", Family.PLANT),
 )
 """Ancestors in the taxonomy, nearest kinds first."""
+
+
+_MOVABLE_FAMILY: Final[Mapping[Family, Family]] = {
+    Family.CUBBY: Family.DRAWER_CUBBY,
+    Family.DESK: Family.DRAWER_DESK,
+    Family.TABLE: Family.DRAWER_TABLE,
+}
+"""What builds a model whose record tells of a joint, in families that have none else: drawers."""
+_CABINETS: Final = (
+    Family.CUPBOARD, Family.DRAWER_CUPBOARD, Family.CUPBOARD, Family.CHEST_OF_DRAWERS,
+)  # fmt: skip
+"""Fronts of low cabinets, in turn: the records don't tell doors from drawers, so their models share them out."""
+_LOW_CABINETS: Final = frozenset({"bottom_cabinet", "bottom_cabinet_no_top", "metal_bottom_cabinet"})
+_LOW_M: Final = 1.1
+
+
+def family_of_model(catalog: Catalog, category: str, model_id: str) -> Family:
+    """The family that builds one model: that of its category, or the like with drawers.
+
+    Raises CatalogError for an unknown category or model.
+    """
+    family = family_of(catalog, category)
+    model = catalog.model(category, model_id)
+    if "joint" not in model.meta_links:
+        return family
+    if category in _LOW_CABINETS and model.size_m[2] <= _LOW_M:
+        return _CABINETS[zlib.crc32(model_id.encode()) % len(_CABINETS)]
+    return _MOVABLE_FAMILY.get(family, family)
 
 
 def family_of(catalog: Catalog, category: str) -> Family:

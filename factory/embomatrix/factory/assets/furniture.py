@@ -17,12 +17,21 @@ def _legs(low: Vec2, high: Vec2, z: Vec2, thickness_m: float) -> list[Part]:
     return [box((x, y, z[0]), (x + t, y + t, z[1])) for x in (x0, x1 - t) for y in (y0, y1 - t)]
 
 
+def top_thickness(size_m: Vec3) -> float:
+    """Thickness of a table's top, in metres."""
+    return clamp(0.05 * size_m[2], 0.006, 0.04)
+
+
+def leg_thickness(size_m: Vec3) -> float:
+    """Width of a table's square legs, in metres."""
+    return clamp(0.07 * min(size_m[:2]), 0.008, 0.07)
+
+
 def table(size_m: Vec3) -> Body:
     """A top on four legs."""
     (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
     body = Body()
-    top = clamp(0.05 * size_m[2], 0.006, 0.04)
-    leg = clamp(0.07 * min(size_m[:2]), 0.008, 0.07)
+    top, leg = top_thickness(size_m), leg_thickness(size_m)
     body.parts = [box((x0, y0, z1 - top), (x1, y1, z1)), *_legs((x0, y0), (x1, y1), (z0, z1 - top), leg)]
     body.add_support("top", (x0, y0), (x1, y1), z1)
     return body
@@ -35,8 +44,7 @@ def table_with_shelf(size_m: Vec3) -> Body:
     board = clamp(0.03 * size_m[2], 0.006, 0.025)
     z = z0 + 0.25 * size_m[2]
     body.parts.append(box((x0, y0, z - board), (x1, y1, z)))
-    inset = clamp(0.07 * min(size_m[:2]), 0.008, 0.07)
-    under_top = z1 - clamp(0.05 * size_m[2], 0.006, 0.04)
+    inset, under_top = leg_thickness(size_m), z1 - top_thickness(size_m)
     body.add_support("shelf", (x0 + inset, y0 + inset), (x1 - inset, y1 - inset), z, under_top - z)
     return body
 

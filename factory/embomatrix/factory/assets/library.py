@@ -6,7 +6,7 @@ import functools
 from typing import TYPE_CHECKING
 
 from embomatrix.factory.assets.cabinets import MAX_PARTS
-from embomatrix.factory.assets.families import GENERATORS, family_of
+from embomatrix.factory.assets.families import GENERATORS, family_of_model
 from embomatrix.world.asset import Asset, Link
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ def build_asset(catalog: Catalog, category: str, model: str) -> Asset:
     """
     kind = catalog.category(category)
     entry = catalog.model(category, model)
-    family = family_of(catalog, category)
+    family = family_of_model(catalog, category, model)
     body = GENERATORS[family](entry.size_m)
     links = (Link("base", tuple(body.parts)), *body.moving)
     for link in links:
@@ -39,5 +39,5 @@ def build_asset(catalog: Catalog, category: str, model: str) -> Asset:
         links=links,
         supports=tuple(body.supports),
         interiors=tuple(body.interiors),
-        abilities=kind.abilities,
+        abilities=kind.abilities if not body.moving else {"openable": {}, **kind.abilities},
     )

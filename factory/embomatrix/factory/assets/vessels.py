@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.assets.body import FIT_M, OPEN_ABOVE_M, Body, Hinge, centred, clamp, hinged, region
+from embomatrix.factory.assets.body import (
+    FIT_M,
+    OPEN_ABOVE_M,
+    Body,
+    Hinge,
+    centred,
+    clamp,
+    hinged,
+    region,
+    stacked,
+)
 from embomatrix.factory.assets.cabinets import SHALLOW_M
-from embomatrix.factory.assets.shapes import box, inscribed, octagon, prism, ring, rounded, shouldered
-from embomatrix.world.asset import Link
-from embomatrix.world.geometry import Aabb, Pose
+from embomatrix.factory.assets.shapes import box, inscribed, octagon, prism, ring, shouldered
+from embomatrix.world.geometry import Aabb
 
 if TYPE_CHECKING:
     from embomatrix.world.geometry import Part, Vec2, Vec3
@@ -144,26 +153,6 @@ def blender(size_m: Vec3) -> Body:
     jar = lidded_vessel((size_m[0], size_m[1], size_m[2] - motor))
     body = Body(parts=[box(outer.low_m, (*outer.high_m[:2], outer.low_m[2] + motor))])
     return stacked(body, jar, motor / 2)
-
-
-def stacked(lower: Body, upper: Body, lift_m: float) -> Body:
-    """Both bodies as one, the upper one raised."""
-    lower.parts += [_raised_part(part, lift_m) for part in upper.parts]
-    for link in upper.moving:
-        joint = link.joint and replace(link.joint, origin_m=_raised(link.joint.origin_m, lift_m))
-        parts = tuple(_raised_part(part, lift_m) for part in link.parts)
-        lower.moving.append(Link(link.name, parts, joint))
-    lower.supports += [replace(item, center_m=_raised(item.center_m, lift_m)) for item in upper.supports]
-    lower.interiors += [replace(item, center_m=_raised(item.center_m, lift_m)) for item in upper.interiors]
-    return lower
-
-
-def _raised(point: Vec3, lift_m: float) -> Vec3:
-    return rounded(point[0], point[1], point[2] + lift_m)
-
-
-def _raised_part(part: Part, lift_m: float) -> Part:
-    return replace(part, pose=Pose(_raised(part.pose.position_m, lift_m), part.pose.quat_xyzw))
 
 
 def plate(size_m: Vec3) -> Body:

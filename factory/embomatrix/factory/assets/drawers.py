@@ -1,0 +1,71 @@
+"""Drawers: boxes open above that slide out of the front of a carcass, with what lies in them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.factory.assets.body import Body, Walls, clamp, region, shell
+from embomatrix.factory.assets.shapes import box_of, rounded
+from embomatrix.world.asset import Joint, JointKind, Link
+from embomatrix.world.geometry import Aabb
+
+if TYPE_CHECKING:
+    from embomatrix.world.geometry import Vec2
+
+TRAVEL_SHARE: Final = 0.8
+"""How much of its depth a drawer comes out: the rest stays on the rails."""
+PLAY_M: Final = 0.004
+"""Gap between a drawer and what it slides past."""
+DRAWER_M: Final = 0.21
+"""Height that a drawer should have."""
+_RIM_SHARE: Final = 0.7
+"""Height of a drawer's walls against the room that it has: what lies in it may stick out a little."""
+
+
+def add_drawers(body: Body, bay: Aabb, front: Aabb, prefix: str = "", most: int = 4) -> None:
+    """Fill a bay with drawers of equal height, named from the top down.
+
+    ``bay`` is the room within the carcass, open at its +x side; ``front`` what their panels cover, before it.
+    """
+    height = front.size_m[2]
+    count = int(clamp(round(height / DRAWER_M), 1, most))
+    # Panels divide the front, boxes the bay: a panel also covers the edges of the carcass.
+    fronts = _divided((front.low_m[2], front.high_m[2]), count)
+    for number, (low, high) in enumerate(fronts, start=1):
+        room = (max(low, bay.low_m[2]), min(high, bay.high_m[2]))
+        panel = region(_x(front), _y(front), (low + PLAY_M / 4, high - PLAY_M / 4))
+        name = f"{prefix}drawer{number}" if count > 1 else f"{prefix}drawer"
+        _add_drawer(body, name, panel, region((bay.low_m[0], panel.low_m[0]), _y(bay), room))
+
+
+def _add_drawer(body: Body, name: str, panel: Aabb, room: Aabb) -> None:
+    """One drawer: a panel and behind it a box with four walls, the panel being the fifth board's cover."""
+    (x0, y0, z0), (x1, y1, z1) = room.low_m, room.high_m
+    low, top = z0 + PLAY_M, z1 - PLAY_M
+    wall = clamp(0.02 * (y1 - y0), 0.004, 0.012)
+    outer = region((x0 + PLAY_M, x1), (y0 + PLAY_M, y1 - PLAY_M), (low, low + _RIM_SHARE * (top - low)))
+    boards, cavity = shell(outer, Walls(wall, 0.0, wall, wall, wall, 0.0))
+    joint = Joint(
+        JointKind.PRISMATIC,
+        rounded(*panel.center_m),
+        (1.0, 0.0, 0.0),
+        round(TRAVEL_SHARE * (panel.high_m[0] - outer.low_m[0]), 6),
+    )
+    body.moving.append(Link(name, (box_of(panel), *boards), joint))
+    free = Aabb(cavity.low_m, (*cavity.high_m[:2], top))
+    body.add_interior(name, free, (name,), link=name)
+
+
+def _divided(span: Vec2, count: int) -> list[Vec2]:
+    """Equal intervals from the top down."""
+    low, high = span
+    pitch = (high - low) / count
+    return [(high - (k + 1) * pitch, high - k * pitch) for k in range(count)]
+
+
+def _x(box: Aabb) -> Vec2:
+    return (box.low_m[0], box.high_m[0])
+
+
+def _y(box: Aabb) -> Vec2:
+    return (box.low_m[1], box.high_m[1])
