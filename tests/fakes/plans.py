@@ -13,7 +13,7 @@ from embomatrix.skills.parse import parse_plan
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.evaluate import render
 from embomatrix.world.goal import And, Formula
-from embomatrix.world.task import Task, TaskCategory
+from embomatrix.world.task import Profile, Task, TaskCategory
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -42,7 +42,7 @@ def plan_of(task: Task, text: str) -> Plan:
     calls = [
         " ".join(str(task.index_of.get(word, word)) for word in call.split()) for call in text.split(";")
     ]
-    return parse_plan("\n".join(calls))
+    return parse_plan("\n".join(calls), Profile.HOUSEHOLD)
 
 
 def words_of(plan: Plan, task: Task) -> str:

@@ -47,6 +47,9 @@ SKILL_KINDS: Final[Mapping[Skill, types_pb2.SkillKind.ValueType]] = {
     Skill.COOK: types_pb2.SKILL_KIND_COOK,
     Skill.FREEZE: types_pb2.SKILL_KIND_FREEZE,
     Skill.GO_TO_ROOM: types_pb2.SKILL_KIND_GO_TO_ROOM,
+    Skill.SLICE: types_pb2.SKILL_KIND_SLICE,
+    Skill.CLEAN: types_pb2.SKILL_KIND_CLEAN,
+    Skill.SOAK: types_pb2.SKILL_KIND_SOAK,
 }
 _SKILLS: Final = {kind: skill for skill, kind in SKILL_KINDS.items()}
 _INFRA_CODES: Final[Mapping[InfraCode, types_pb2.InfraCode.ValueType]] = {

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.sim.household import clean, cut, soak
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.syntax import Skill
 from embomatrix.skills.view import metres, preposition, refuse, target_of
@@ -171,5 +172,8 @@ ACTIONS: Final[Mapping[Skill, Action]] = {
     Skill.COOK: _wait,
     Skill.FREEZE: _wait,
     Skill.GO_TO_ROOM: _go_to_room,
+    Skill.SLICE: cut,
+    Skill.CLEAN: clean,
+    Skill.SOAK: soak,
 }
 """One action for each skill."""

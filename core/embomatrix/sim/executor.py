@@ -1,4 +1,4 @@
-"""Execute plans in a scene: preconditions, actions, effects of temperature, and the trace of it all."""
+"""Execute plans in a scene: preconditions, actions, effects of heat and water, and the trace of it all."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from embomatrix.skills.trace import Step, Trace
 from embomatrix.skills.view import source_of, target_of
 from embomatrix.world.evaluate import objects_of
 from embomatrix.world.state import State
+from embomatrix.world.substances import in_words
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -29,7 +30,9 @@ if TYPE_CHECKING:
     from embomatrix.world.bundle import Bundle
     from embomatrix.world.task import Task
 
-CHANGING = frozenset({Skill.PLACE, Skill.OPEN, Skill.CLOSE, Skill.TOGGLE_ON, Skill.TOGGLE_OFF})
+CHANGING = frozenset(
+    {Skill.PLACE, Skill.OPEN, Skill.CLOSE, Skill.TOGGLE_ON, Skill.TOGGLE_OFF, Skill.SLICE}
+)
 """Skills after which a source may act on something that it did not act on before."""
 
 
@@ -105,7 +108,7 @@ class Simulator:
         if refusal is not None:
             self._hash.update(world.state_bytes() + refusal.reason.encode())
             return Step(call, refusal.reason, refusal.sentence)
-        changes = world.thermal.apply() if call.skill in CHANGING else ()
+        changes = world.let_sources_act() if call.skill in CHANGING else ()
         self._touched.update(filter(None, (target_of(world, call), source_of(world, call))))
         self._hash.update(world.state_bytes())
         return Step(call, None, self._message(call, held, changes))
@@ -140,7 +143,7 @@ class Simulator:
     def _message(self, call: SkillCall, held: Sequence[str], changes: Sequence[Change]) -> str:
         by_object: dict[str, list[str]] = {}
         for change in changes:
-            by_object.setdefault(change.name, []).append(change.state.value)
+            by_object.setdefault(change.name, []).append(change.words)
         cargo = self._world.carried[1:] if call.skill is Skill.PICK_UP else ()
         sentence = done(call, target=target_of(self._world, call), held=held[0] if held else "", cargo=cargo)
         return "; ".join(filter(None, (sentence, gained(by_object))))
@@ -155,11 +158,13 @@ class Simulator:
         if asset.can("toggleable"):
             states.append("on" if world.is_on(name) else "off")
         states += sorted(state.value for state in world.states[name] - {State.TOGGLED_ON})
+        states += [in_words(fact) for fact in sorted(world.substances[name])]
         return Sight(
             name=name,
             room=world.room_of(name),
             host=host.name if host is not None else "",
             relation=host.relation if host is not None else None,
             held=name in world.carried,
+            gone=not world.is_real(name),
             states=tuple(states),
         )

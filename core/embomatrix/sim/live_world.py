@@ -11,17 +11,23 @@ from embomatrix.sim.navigation import Navigator
 from embomatrix.sim.placement import Placer
 from embomatrix.sim.relations import Relations
 from embomatrix.sim.thermal import Thermal
+from embomatrix.sim.water import Water
 from embomatrix.skills.appliance import cold_source, heat_source
 from embomatrix.skills.view import Reach
 from embomatrix.world.state import State
+from embomatrix.world.substances import MEANINGS, facts_of
 
 if TYPE_CHECKING:
+    from collections.abc import Set
+
     from embomatrix.sim.engine import PhysicsEngine
+    from embomatrix.sim.thermal import Change
     from embomatrix.world.asset import Asset
     from embomatrix.world.bundle import Bundle
+    from embomatrix.world.state import SubstanceFact
     from embomatrix.world.task import Task
 
-SYMBOLIC = frozenset(State) - {State.OPEN}
+SYMBOLIC = frozenset(State) - {State.OPEN} - MEANINGS.keys()
 
 
 class LiveWorld:
@@ -35,25 +41,39 @@ class LiveWorld:
         self.navigator = Navigator(engine, self.relations)
         self.placer = Placer(engine, self.relations, bundle.poses)
         self.states: dict[str, set[State]] = {}
+        self.substances: dict[str, set[SubstanceFact]] = {}
+        self._future = frozenset(item.name for item in self.scene.objects if item.absent)
+        self.absent: set[str] = set()
         self.thermal = Thermal(engine, self.relations, self.states)
-        self.facts = SceneFacts(self.relations, self.states)
+        self.water = Water(engine, self.relations, self.states, self.substances)
+        self.facts = SceneFacts(self.relations, self.states, self.substances, self.absent, self._future)
         self.table: tuple[str, ...] = ()
         self.rooms = tuple(room.name for room in self.scene.rooms)
         self.robot = self.navigator.start
         self.hand = Hand(engine)
         self._take_states_from_scene()
-        self.thermal.apply()
+        self.absent |= self._future
+        self.let_sources_act()
         self._initial = {name: frozenset(states) for name, states in self.states.items()}
+        self._initial_substances = {name: frozenset(facts) for name, facts in self.substances.items()}
 
     def reset(self, task: Task) -> None:
         """Back to the scene's beginning, where the sources have long acted on what lies at them."""
         self.engine.reset()
         for name, states in self._initial.items():
             self.states[name] = set(states)
+        for name, facts in self._initial_substances.items():
+            self.substances[name] = set(facts)
+        self.absent.clear()
+        self.absent |= self._future
         self.hand.forget()
         self.robot = self.navigator.start
         self.navigator.refresh()
         self.table = task.table
+
+    def let_sources_act(self) -> tuple[Change, ...]:
+        """Let heat, cold and water act on what lies at their sources. Returns what changed."""
+        return (*self.thermal.apply(), *self.water.apply())
 
     @property
     def carried(self) -> tuple[str, ...]:
@@ -104,6 +124,18 @@ class LiveWorld:
         found = heat_source(asset) or cold_source(asset)
         return found is not None and self.thermal.is_at(name, source, found)
 
+    def is_real(self, name: str) -> bool:
+        return name not in self.absent
+
+    def is_sliced(self, name: str) -> bool:
+        return State.SLICED in self.states[name]
+
+    def is_inside(self, name: str, container: str) -> bool:
+        return self.relations.inside(name, container)
+
+    def facts_about(self, name: str) -> Set[SubstanceFact]:
+        return self.substances[name]
+
     def room_of(self, name: str) -> str:
         """Room that the object is in; of a carried one, the robot's."""
         return self.robot_room if name in self.carried else self.relations.room_of(name)
@@ -119,9 +151,16 @@ class LiveWorld:
         symbolic = [
             f"{name}:{','.join(sorted(states))}" for name, states in sorted(self.states.items()) if states
         ]
+        symbolic += [
+            f"{name}:{','.join(f'{fact.relation} {fact.substance}' for fact in sorted(facts))}"
+            for name, facts in sorted(self.substances.items())
+            if facts
+        ]
+        symbolic += sorted(self.absent)
         text = "\n".join([robot, " ".join(self.carried), *symbolic])
         return self.engine.state_bytes() + text.encode()
 
     def _take_states_from_scene(self) -> None:
         for item in self.scene.objects:
             self.states[item.name] = set(item.states & SYMBOLIC)
+            self.substances[item.name] = set(facts_of(item.states, item.substances))

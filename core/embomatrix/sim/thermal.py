@@ -24,10 +24,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """A state that an object got."""
+    """What became of an object, as words that follow "is now": ``hot``, ``soaked``."""
 
     name: str
-    state: State
+    words: str
 
 
 class Thermal:
@@ -100,7 +100,7 @@ class Thermal:
         if State.FROZEN in gained:
             states.discard(State.HOT)
         states.update(gained)
-        return [Change(item, state) for state in gained]
+        return [Change(item, state.value) for state in gained]
 
 
 VESSEL_M = 0.3

@@ -17,9 +17,11 @@ from embomatrix.skills.appliance import (
     heats,
     starts_closed,
 )
+from embomatrix.skills.check_household import HOUSEHOLD_CHECKS
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.library import LIBRARY, Precondition
 from embomatrix.skills.limits import ROBOT
+from embomatrix.skills.reach import hidden, out_of_reach, shut_in
 from embomatrix.skills.syntax import PlaceRelation, Skill
 from embomatrix.skills.view import metres, preposition, refuse, source_of, target_of
 from embomatrix.world.state import FREEZE_C, HOT_C
@@ -36,7 +38,7 @@ if TYPE_CHECKING:
 
 def within_reach(world: WorldView, name: str) -> Refusal | None:
     """Why the arm does not get at an object from where the robot stands, None when it does."""
-    return _reachable(world, name) or _clear(world, name)
+    return out_of_reach(world, name) or hidden(world, name)
 
 
 def check(world: WorldView, call: SkillCall) -> Refusal | None:
@@ -49,15 +51,17 @@ def check(world: WorldView, call: SkillCall) -> Refusal | None:
 
 
 def _object_listed(world: WorldView, call: SkillCall) -> Refusal | None:
-    return None if target_of(world, call) else _unknown(world, call.object_index)
+    return _listed(world, target_of(world, call), call.object_index)
 
 
 def _source_listed(world: WorldView, call: SkillCall) -> Refusal | None:
-    return None if source_of(world, call) else _unknown(world, call.source_index)
+    return _listed(world, source_of(world, call), call.source_index)
 
 
-def _unknown(world: WorldView, index: int | None) -> Refusal:
-    return refuse(FailureReason.UNKNOWN_INDEX, index=str(index), last=str(len(world.table) - 1))
+def _listed(world: WorldView, name: str, index: int | None) -> Refusal | None:
+    if not name:
+        return refuse(FailureReason.UNKNOWN_INDEX, index=str(index), last=str(len(world.table) - 1))
+    return None if world.is_real(name) else refuse(FailureReason.NOT_THERE, target=name)
 
 
 def _room_known(world: WorldView, call: SkillCall) -> Refusal | None:
@@ -129,47 +133,23 @@ def _bears_nothing(world: WorldView, call: SkillCall) -> Refusal | None:
 
 
 def _in_reach(world: WorldView, call: SkillCall) -> Refusal | None:
-    return _reachable(world, target_of(world, call))
+    return out_of_reach(world, target_of(world, call))
 
 
 def _source_in_reach(world: WorldView, call: SkillCall) -> Refusal | None:
-    return _reachable(world, source_of(world, call))
-
-
-def _reachable(world: WorldView, name: str) -> Refusal | None:
-    reach = world.reach(name)
-    if reach.height_m > ROBOT.reach_high_m:
-        return refuse(
-            FailureReason.TOO_HIGH,
-            target=name,
-            height=metres(reach.height_m),
-            limit=metres(ROBOT.reach_high_m),
-        )
-    if reach.distance_m > ROBOT.reach_m:
-        return refuse(
-            FailureReason.OUT_OF_REACH,
-            target=name,
-            distance=metres(reach.distance_m),
-            limit=metres(ROBOT.reach_m),
-        )
-    return None
+    return out_of_reach(world, source_of(world, call))
 
 
 def _approachable(world: WorldView, call: SkillCall) -> Refusal | None:
-    return _clear(world, target_of(world, call))
+    return hidden(world, target_of(world, call))
 
 
 def _source_approachable(world: WorldView, call: SkillCall) -> Refusal | None:
-    return _clear(world, source_of(world, call))
-
-
-def _clear(world: WorldView, name: str) -> Refusal | None:
-    return None if world.is_approachable(name) else refuse(FailureReason.NO_LINE_OF_APPROACH, target=name)
+    return hidden(world, source_of(world, call))
 
 
 def _accessible(world: WorldView, call: SkillCall) -> Refusal | None:
-    container = world.closed_around(target_of(world, call))
-    return refuse(FailureReason.CONTAINER_CLOSED, container=container) if container else None
+    return shut_in(world, target_of(world, call))
 
 
 def _openable(world: WorldView, call: SkillCall) -> Refusal | None:
@@ -366,5 +346,6 @@ CHECKS: Final[Mapping[Precondition, Check]] = {
     Precondition.HOT_ENOUGH: _hot_enough,
     Precondition.COOKS: _cooks,
     Precondition.COLD_ENOUGH: _cold_enough,
+    **HOUSEHOLD_CHECKS,
 }
 """How each precondition is decided."""

@@ -31,6 +31,9 @@ DONE: Final[Mapping[Skill, str]] = {
     Skill.COOK: "{target} is cooked",
     Skill.FREEZE: "{target} is frozen",
     Skill.GO_TO_ROOM: "stands in {room}",
+    Skill.SLICE: "sliced {target}",
+    Skill.CLEAN: "cleaned {target}",
+    Skill.SOAK: "soaked {target}",
 }
 """What a call that succeeded says. One sentence for each skill."""
 
@@ -47,13 +50,17 @@ WORDS: Final[Mapping[Relation, str]] = {
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """One object as it is described: where it is, and ``states`` in words in the order in which they are told."""
+    """One object as it is described: where it is, and ``states`` in words in the order in which they are told.
+
+    ``gone`` is True for what is not in the world: a piece that is still to come, or a thing that was cut up.
+    """
 
     name: str
     room: str
     host: str = ""
     relation: Relation | None = None
     held: bool = False
+    gone: bool = False
     states: tuple[str, ...] = ()
 
 
@@ -71,12 +78,14 @@ def done(call: SkillCall, *, target: str = "", held: str = "", cargo: Sequence[s
 
 
 def gained(changes: Mapping[str, Sequence[str]]) -> str:
-    """What temperature did: objects and the states that they got; "" when it did nothing."""
+    """What heat, cold and water did: objects and the states that they got; "" when they did nothing."""
     return "; ".join(f"{name} is now {listed(states)}" for name, states in changes.items())
 
 
 def line(sight: Sight) -> str:
     """One object on one line: ``apple_1: on table_1 in kitchen_0, hot``."""
+    if sight.gone:
+        return f"{sight.name}: not there"
     if sight.held:
         place = "in the robot's hand"
     elif sight.host and sight.relation is not None:

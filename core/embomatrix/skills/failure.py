@@ -11,6 +11,7 @@ if TYPE_CHECKING:
 
 class FailureReason(StrEnum):
     UNKNOWN_INDEX = "unknown_index"
+    NOT_THERE = "not_there"
     UNKNOWN_ROOM = "unknown_room"
     NO_PATH = "no_path"
     NO_STANDING_POSE = "no_standing_pose"
@@ -49,10 +50,20 @@ class FailureReason(StrEnum):
     NOT_AT_SOURCE = "not_at_source"
     NOT_HOT_ENOUGH = "not_hot_enough"
     NOT_COLD_ENOUGH = "not_cold_enough"
+    TOOL_NOT_HELD = "tool_not_held"
+    NOT_A_SLICER = "not_a_slicer"
+    NOT_SLICEABLE = "not_sliceable"
+    ALREADY_SLICED = "already_sliced"
+    NOT_A_CLEANER = "not_a_cleaner"
+    NEEDS_SOAKING = "needs_soaking"
+    STAYS_ON = "stays_on"
+    GIVES_NO_LIQUID = "gives_no_liquid"
+    NOT_SOAKABLE = "not_soakable"
 
 
 SENTENCES: Final[Mapping[FailureReason, str]] = {
     FailureReason.UNKNOWN_INDEX: "there is no object with index {index}: the table has indices 0 to {last}",
+    FailureReason.NOT_THERE: "{target} is not there: it was cut up, or comes only when something else is",
     FailureReason.UNKNOWN_ROOM: "there is no room {room}: the rooms are {rooms}",
     FailureReason.NO_PATH: "the robot can't get to {target}: no free path leads there",
     FailureReason.NO_STANDING_POSE: "there is no free place to stand from which {target} can be reached",
@@ -91,4 +102,13 @@ SENTENCES: Final[Mapping[FailureReason, str]] = {
     FailureReason.NOT_AT_SOURCE: "{target} is not {relation} {source}",
     FailureReason.NOT_HOT_ENOUGH: "{source} reaches {found} C and {target} needs {needed} C",
     FailureReason.NOT_COLD_ENOUGH: "{source} reaches {found} C and {target} needs {needed} C",
+    FailureReason.TOOL_NOT_HELD: "{source} is not in the hand: pick it up first",
+    FailureReason.NOT_A_SLICER: "{source} does not cut: expected a knife or the like",
+    FailureReason.NOT_SLICEABLE: "{target} can't be sliced",
+    FailureReason.ALREADY_SLICED: "{target} is sliced already",
+    FailureReason.NOT_A_CLEANER: "{source} takes nothing off other things: expected a cloth, a brush, a sink or the like",
+    FailureReason.NEEDS_SOAKING: "{source} takes {substance} off only when it is soaked with {needed}",
+    FailureReason.STAYS_ON: "{source} does not take {substance} off {target}",
+    FailureReason.GIVES_NO_LIQUID: "{source} gives no liquid to soak things with",
+    FailureReason.NOT_SOAKABLE: "{target} does not take up a liquid",
 }

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 class Precondition(StrEnum):
     """What a skill asks of the world before it starts. *Target* is the call's object, *source* its source."""
 
-    OBJECT_LISTED = "the target is a row of the object table"
-    SOURCE_LISTED = "the source is a row of the object table"
+    OBJECT_LISTED = "the target is a row of the object table, and in the world"
+    SOURCE_LISTED = "the source is a row of the object table, and in the world"
     ROOM_KNOWN = "the scene has the room"
     STEP_SHORT = "the distance is one that can be driven in one step"
     NOT_CARRIED = "the target is not in the hand, nor in what the hand holds"
@@ -58,11 +58,24 @@ class Precondition(StrEnum):
     HOT_ENOUGH = "the source is hot enough to make things hot"
     COOKS = "the source is hot enough to cook the target"
     COLD_ENOUGH = "the source is cold enough to freeze"
+    SOURCE_CUTS = "the source is something to cut with"
+    SLICEABLE = "the target can be sliced"
+    NOT_SLICED = "the target is not sliced"
+    SOURCE_HELD = "the source is what the hand holds, unless it washes what lies in it"
+    SOURCE_CLEANS = "the source takes substances off other things"
+    WORKED_ON = "the arm reaches the target, and no closed container is around it, unless it is washed"
+    WASHED = "the target lies in the source, which runs and is closed if it must be, if the source washes"
+    COMES_OFF = "the source takes off something of what is on the target, soaked or on if it must be"
+    SOURCE_WETS = "the source holds a liquid, or one flows out of it"
+    SOAKABLE = "the target takes up liquids, or holds them"
+    SOURCE_ACCESSIBLE = "no closed container is around the source"
+    UNDER_SOURCE = "the target is in the hand, or in the source"
+    SOURCE_FLOWS = "the source is on, if it holds no liquid"
 
 
 REASONS: Final[Mapping[Precondition, tuple[FailureReason, ...]]] = {
-    Precondition.OBJECT_LISTED: (FailureReason.UNKNOWN_INDEX,),
-    Precondition.SOURCE_LISTED: (FailureReason.UNKNOWN_INDEX,),
+    Precondition.OBJECT_LISTED: (FailureReason.UNKNOWN_INDEX, FailureReason.NOT_THERE),
+    Precondition.SOURCE_LISTED: (FailureReason.UNKNOWN_INDEX, FailureReason.NOT_THERE),
     Precondition.ROOM_KNOWN: (FailureReason.UNKNOWN_ROOM,),
     Precondition.STEP_SHORT: (FailureReason.STEP_TOO_LONG,),
     Precondition.NOT_CARRIED: (FailureReason.HAND_FULL,),
@@ -99,6 +112,24 @@ REASONS: Final[Mapping[Precondition, tuple[FailureReason, ...]]] = {
     Precondition.HOT_ENOUGH: (FailureReason.NOT_HOT_ENOUGH,),
     Precondition.COOKS: (FailureReason.NOT_HOT_ENOUGH,),
     Precondition.COLD_ENOUGH: (FailureReason.NOT_COLD_ENOUGH,),
+    Precondition.SOURCE_CUTS: (FailureReason.NOT_A_SLICER,),
+    Precondition.SLICEABLE: (FailureReason.NOT_SLICEABLE,),
+    Precondition.NOT_SLICED: (FailureReason.ALREADY_SLICED,),
+    Precondition.SOURCE_HELD: (FailureReason.TOOL_NOT_HELD,),
+    Precondition.SOURCE_CLEANS: (FailureReason.NOT_A_CLEANER,),
+    Precondition.WORKED_ON: (
+        FailureReason.OUT_OF_REACH,
+        FailureReason.TOO_HIGH,
+        FailureReason.NO_LINE_OF_APPROACH,
+        FailureReason.CONTAINER_CLOSED,
+    ),
+    Precondition.WASHED: (FailureReason.NOT_AT_SOURCE, FailureReason.SOURCE_OFF, FailureReason.SOURCE_OPEN),
+    Precondition.COMES_OFF: (FailureReason.NEEDS_SOAKING, FailureReason.SOURCE_OFF, FailureReason.STAYS_ON),
+    Precondition.SOURCE_WETS: (FailureReason.GIVES_NO_LIQUID,),
+    Precondition.SOAKABLE: (FailureReason.NOT_SOAKABLE,),
+    Precondition.SOURCE_ACCESSIBLE: (FailureReason.CONTAINER_CLOSED,),
+    Precondition.UNDER_SOURCE: (FailureReason.NOT_AT_SOURCE,),
+    Precondition.SOURCE_FLOWS: (FailureReason.SOURCE_OFF,),
 }
 """Reasons with which a call fails when the precondition does not hold."""
 
@@ -259,6 +290,53 @@ LIBRARY: Final[Mapping[Skill, Entry]] = {
         "the robot stands in the room",
         (Precondition.ROOM_KNOWN,),
         (FailureReason.NO_PATH,),
+    ),
+    Skill.SLICE: Entry(
+        "Cut the object with the knife in the hand.",
+        "the object is sliced; if it has pieces, these lie where it was and it is gone",
+        (
+            Precondition.OBJECT_LISTED,
+            Precondition.SOURCE_LISTED,
+            Precondition.SOURCE_CUTS,
+            Precondition.SLICEABLE,
+            Precondition.SOURCE_HELD,
+            Precondition.NOT_CARRIED,
+            *_AT_HAND,
+            Precondition.NOT_SLICED,
+            Precondition.BEARS_NOTHING,
+        ),
+        (FailureReason.NO_FREE_POSE,),
+    ),
+    Skill.CLEAN: Entry(
+        "Wipe or brush the object with the tool in the hand, or wait while it is washed in a sink or a machine.",
+        "what the tool takes off is no longer on the object",
+        (
+            Precondition.OBJECT_LISTED,
+            Precondition.SOURCE_LISTED,
+            Precondition.SOURCE_CLEANS,
+            Precondition.SOURCE_HELD,
+            Precondition.NOT_CARRIED,
+            Precondition.SOURCE_IN_REACH,
+            Precondition.SOURCE_APPROACHABLE,
+            Precondition.WORKED_ON,
+            Precondition.WASHED,
+            Precondition.COMES_OFF,
+        ),
+    ),
+    Skill.SOAK: Entry(
+        "Let the liquid of the source run over the object, which is in the hand or in the source.",
+        "the object is soaked with what the source gives; a vessel is filled with it too",
+        (
+            Precondition.OBJECT_LISTED,
+            Precondition.SOURCE_LISTED,
+            Precondition.SOURCE_WETS,
+            Precondition.SOAKABLE,
+            Precondition.SOURCE_IN_REACH,
+            Precondition.SOURCE_APPROACHABLE,
+            Precondition.SOURCE_ACCESSIBLE,
+            Precondition.UNDER_SOURCE,
+            Precondition.SOURCE_FLOWS,
+        ),
     ),
 }
 

@@ -3,7 +3,7 @@
 Two forms are read. JSON: an array of calls, or an object that holds one under "action_sequence" or "plan", in a code fence
 or among prose and reasoning; arguments stand beside the action or under "parameters". The last plan of the text counts:
 a model reasons first and answers last. Compact: one call on a line, or between semicolons, ``move 3; place 3 inside``,
-arguments in the order of ``SIGNATURES``.
+arguments in the order of ``SIGNATURES``. A skill outside the task's profile is as unknown as one that does not exist.
 """
 
 from __future__ import annotations
@@ -15,8 +15,10 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, Any, Final, cast
 
 from embomatrix.skills.syntax import (
+    ALIASES,
     MAX_PLAN_BYTES,
     MAX_STEPS,
+    PROFILES,
     SIGNATURES,
     Arg,
     PlaceRelation,
@@ -24,6 +26,7 @@ from embomatrix.skills.syntax import (
     Skill,
     SkillCall,
 )
+from embomatrix.world.task import Profile
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -48,7 +51,6 @@ class PlanError(ValueError):
         self.reason = reason
 
 
-SKILLS: Final[Mapping[str, Skill]] = {skill.value: skill for skill in Skill}
 PLAN_KEYS: Final = ("action_sequence", "plan")
 MAX_INDEX: Final = 2**63 - 1
 """Indices beyond the wire's 64 bits name nothing."""
@@ -63,7 +65,7 @@ _ARGUMENT: Final = re.compile(
 )
 
 
-def parse_plan(text: str) -> Plan:
+def parse_plan(text: str, profile: Profile = Profile.PAPER) -> Plan:
     """The plan that the text ends with. Raises PlanError, and nothing else, for any text."""
     size = len(text.encode("utf-8", errors="replace"))
     if size > MAX_PLAN_BYTES:
@@ -73,11 +75,11 @@ def parse_plan(text: str) -> Plan:
     answer = _without_reasoning(text)
     value = _last_json_plan(answer)
     if value is not None:
-        return plan_from_json(value)
-    return _parse_lines(answer)
+        return plan_from_json(value, profile)
+    return _parse_lines(answer, profile)
 
 
-def plan_from_json(value: object) -> Plan:
+def plan_from_json(value: object, profile: Profile = Profile.PAPER) -> Plan:
     """A plan from decoded JSON: an array of calls, or an object that holds one. Raises PlanError."""
     steps = _steps_in(value)
     if steps is None:
@@ -86,7 +88,7 @@ def plan_from_json(value: object) -> Plan:
             'expected a JSON array of calls such as [{"action": "move", "object_index": 0}]',
         )
     _check_length(len(steps))
-    return tuple(_call_from_json(step, number) for number, step in enumerate(steps, start=1))
+    return tuple(_call_from_json(step, number, profile) for number, step in enumerate(steps, start=1))
 
 
 def plan_to_json(plan: Plan) -> list[dict[str, object]]:
@@ -160,7 +162,7 @@ def _last_json_plan(text: str) -> object | None:
     return found
 
 
-def _call_from_json(value: object, number: int) -> SkillCall:
+def _call_from_json(value: object, number: int, profile: Profile) -> SkillCall:
     """One call. Keys that no skill knows, such as a comment, change nothing and are passed over."""
     if not isinstance(value, dict) or "action" not in value:
         raise PlanError(PlanReason.MISSING_ARGUMENT, f'step {number} has no "action": name the skill')
@@ -170,12 +172,14 @@ def _call_from_json(value: object, number: int) -> SkillCall:
             PlanReason.WRONG_ARGUMENT,
             f'step {number}: "parameters" must be an object, found {_shown(nested)}',
         )
-    return _build_call(_skill(value["action"], number), {**nested, **value}, number)
+    given = {**nested, **value}
+    aliased = {arg.value: given[alias] for alias, arg in ALIASES.items() if alias in given}
+    return _build_call(_skill(value["action"], number, profile), {**aliased, **given}, number)
 
 
-def _parse_lines(text: str) -> Plan:
+def _parse_lines(text: str, profile: Profile) -> Plan:
     """The calls among the lines, in their order; other lines are prose."""
-    calls = [words for words in _segments(text) if _is_call(words)]
+    calls = [words for words in _segments(text) if _is_call(words, profile)]
     if not calls:
         raise PlanError(
             PlanReason.NO_PLAN,
@@ -183,7 +187,7 @@ def _parse_lines(text: str) -> Plan:
             '[{"action": "move", "object_index": 0}], or lines such as "move 0"',
         )
     _check_length(len(calls))
-    return tuple(_call_from_words(words, number) for number, words in enumerate(calls, start=1))
+    return tuple(_call_from_words(words, number, profile) for number, words in enumerate(calls, start=1))
 
 
 def _found_instead(text: str) -> str:
@@ -209,16 +213,16 @@ def _segments(text: str) -> Iterator[list[str]]:
             yield words
 
 
-def _is_call(words: list[str]) -> bool:
+def _is_call(words: list[str], profile: Profile) -> bool:
     """A known skill with few words after it, or any word with nothing but numbers and relations after it."""
     skill, *arguments = words
-    if skill.lower() in SKILLS and len(arguments) <= 2:
+    if skill.lower() in PROFILES[profile] and len(arguments) <= 2:
         return True
     return bool(_WORD.fullmatch(skill) and arguments and all(_ARGUMENT.fullmatch(item) for item in arguments))
 
 
-def _call_from_words(words: list[str], number: int) -> SkillCall:
-    skill = _skill(words[0], number)
+def _call_from_words(words: list[str], number: int, profile: Profile) -> SkillCall:
+    skill = _skill(words[0], number, profile)
     expected = SIGNATURES[skill]
     if len(words) - 1 > len(expected):
         raise PlanError(
@@ -238,12 +242,13 @@ def _number_or_word(word: str) -> int | float | str:
     return word
 
 
-def _skill(value: object, number: int) -> Skill:
-    skill = SKILLS.get(value.strip().lower()) if isinstance(value, str) else None
+def _skill(value: object, number: int, profile: Profile) -> Skill:
+    known = {skill.value: skill for skill in PROFILES[profile]}
+    skill = known.get(value.strip().lower()) if isinstance(value, str) else None
     if skill is None:
         raise PlanError(
             PlanReason.UNKNOWN_SKILL,
-            f"step {number}: unknown skill {_shown(value)}: expected one of {', '.join(SKILLS)}",
+            f"step {number}: unknown skill {_shown(value)}: expected one of {', '.join(known)}",
         )
     return skill
 

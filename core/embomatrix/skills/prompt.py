@@ -17,8 +17,10 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.skills.syntax import SIGNATURES, Arg, PlaceRelation, Skill
+from embomatrix.skills.syntax import PROFILES, SIGNATURES, Arg, PlaceRelation, Skill
 from embomatrix.world.state import OPEN_FRACTION, Relation, State
+from embomatrix.world.substances import MEANINGS, facts_of, in_words
+from embomatrix.world.task import Profile
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
@@ -44,6 +46,8 @@ PREPOSITIONS: Final[Mapping[Relation, str]] = {
     Relation.UNDER: "under",
 }
 """How a row's contents are introduced. Other relations host nothing."""
+ABSENT: Final = "absent"
+"""How a row is told that is not in the world yet: a piece of a thing that can be cut."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +68,8 @@ class Row:
 class Situation:
     """What a policy may know of a task. ``rows`` are in the order in which a prompt tells them.
 
-    ``table_size`` is the number of rows of the whole table: the first index that names nothing.
+    ``table_size`` is the number of rows of the whole table: the first index that names nothing. ``profile`` says which
+    skills the prompt offers.
     """
 
     rooms: tuple[str, ...]
@@ -72,6 +77,7 @@ class Situation:
     rows: tuple[Row, ...]
     instruction: str
     table_size: int
+    profile: Profile = Profile.PAPER
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +93,7 @@ def situation_of(scene: Scene, task: Task) -> Situation:
     listed = set(task.table)
     rows = tuple(_row(index, scene.by_name[name], scene, listed) for index, name in enumerate(task.table))
     rooms = tuple(dict.fromkeys([*(row.room for row in rows if row.room), scene.robot.room]))
-    return Situation(rooms, scene.robot.room, rows, task.instruction, len(task.table))
+    return Situation(rooms, scene.robot.room, rows, task.instruction, len(task.table), task.profile)
 
 
 def _row(index: int, item: SceneObject, scene: Scene, listed: set[str]) -> Row:
@@ -113,7 +119,14 @@ def _visible(item: SceneObject, *, openable: bool, toggleable: bool) -> tuple[st
         words.append("open" if is_open else "closed")
     if toggleable:
         words.append("on" if State.TOGGLED_ON in item.states else "off")
-    return (*words, *sorted(s.value for s in item.states - {State.OPEN, State.TOGGLED_ON}))
+    if item.absent:
+        words.append(ABSENT)
+    plain = item.states - {State.OPEN, State.TOGGLED_ON} - MEANINGS.keys()
+    told = (in_words(fact) for fact in sorted(facts_of(item.states, item.substances)))
+    return (
+        *words,
+        *sorted([*(state.value for state in plain), *(words.replace(" ", "_") for words in told)]),
+    )
 
 
 def limited(situation: Situation, rows: int) -> Situation:
@@ -159,7 +172,7 @@ def prompt_for(situation: Situation, codec: Codec) -> Prompt:
     """The text that a policy completes with a plan."""
     if codec is Codec.NAMES:
         return Prompt("", _names_text(situation))
-    return Prompt(_SYSTEM[codec], _indexed_text(situation))
+    return Prompt(_SYSTEM[codec, situation.profile], _indexed_text(situation))
 
 
 def _tree(situation: Situation) -> dict[str, list[tuple[Row, list[Row]]]]:
@@ -235,21 +248,21 @@ EXAMPLES: Final[Mapping[Codec, str]] = {
 """A plan in each codec: put the apple (row 4) into the fridge (row 2)."""
 
 
-def _skill_lines() -> str:
+def _skill_lines(profile: Profile) -> str:
     return " | ".join(
         " ".join([skill.value, *(_PLACEHOLDERS[argument] for argument in SIGNATURES[skill])])
-        for skill in Skill
+        for skill in PROFILES[profile]
     )
 
 
-def _skill_objects() -> str:
+def _skill_objects(profile: Profile) -> str:
     return "\n".join(
         "{"
         + ", ".join(
             [f'"action": "{skill.value}"', *(f'"{a.value}": <{_PLACEHOLDERS[a]}>' for a in SIGNATURES[skill])]
         )
         + "}"
-        for skill in Skill
+        for skill in PROFILES[profile]
     )
 
 
@@ -258,11 +271,28 @@ _RULES: Final = (
     "use it, open closed containers before you pick up what goes inside. "
     "Objects are called by the number that follows their name. The plan stops at the first step that fails."
 )
-_SYSTEM: Final[Mapping[Codec, str]] = {
-    Codec.LINES: "You control a home robot. Answer only with the plan, one action a line.\n"
-    f"Actions: {_skill_lines()}\n{_RULES}\nExample, put apple 4 into fridge 2:\n{EXAMPLES[Codec.LINES]}",
-    Codec.JSON: "You control a home robot. Answer only with the plan, a JSON list of actions.\n"
-    f"Actions:\n{_skill_objects()}\n{_RULES}\nExample, put apple 4 into fridge 2:\n{EXAMPLES[Codec.JSON]}",
+_HOUSEHOLD_RULES: Final = (
+    " Slice, wipe and brush with the tool in the hand, which is the source; a sink or a machine that runs washes what lies "
+    "in it. A cloth takes dust off dry, and stains when it is soaked. What is absent comes when another object is sliced."
+)
+_ADDED_RULES: Final[Mapping[Profile, str]] = {Profile.PAPER: "", Profile.HOUSEHOLD: _HOUSEHOLD_RULES}
+
+
+def _system(codec: Codec, profile: Profile) -> str:
+    rules = f"{_RULES}{_ADDED_RULES[profile]}\nExample, put apple 4 into fridge 2:\n{EXAMPLES[codec]}"
+    if codec is Codec.LINES:
+        return (
+            "You control a home robot. Answer only with the plan, one action a line.\n"
+            f"Actions: {_skill_lines(profile)}\n{rules}"
+        )
+    return (
+        "You control a home robot. Answer only with the plan, a JSON list of actions.\n"
+        f"Actions:\n{_skill_objects(profile)}\n{rules}"
+    )
+
+
+_SYSTEM: Final[Mapping[tuple[Codec, Profile], str]] = {
+    (codec, profile): _system(codec, profile) for codec in (Codec.LINES, Codec.JSON) for profile in Profile
 }
 
 
@@ -289,7 +319,7 @@ def _arguments(call: SkillCall, called: _Caller) -> list[str]:
     return words
 
 
-_SKILLS: Final = frozenset(skill.value for skill in Skill)
+_SKILLS: Final = frozenset(Skill)
 
 
 def with_indices(text: str, situation: Situation) -> str:

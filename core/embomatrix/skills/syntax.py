@@ -1,10 +1,12 @@
-"""The plan language: thirteen skills, their arguments, and the calls that make up a plan."""
+"""The plan language: the skills of each profile, their arguments, and the calls that make up a plan."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final
+
+from embomatrix.world.task import Profile
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -15,7 +17,7 @@ MAX_PLAN_BYTES: Final = 64 * 1024
 
 
 class Skill(StrEnum):
-    """The paper's skill library, by the paper's names."""
+    """The paper's skill library, by the paper's names, and three skills for goals that it can't reach."""
 
     MOVE = "move"
     TURN = "turn"
@@ -30,10 +32,16 @@ class Skill(StrEnum):
     COOK = "cook_object_with_tool"
     FREEZE = "froze_object_with_source"
     GO_TO_ROOM = "go_to_room"
+    SLICE = "slice_object_with_tool"
+    CLEAN = "clean_object_with_tool"
+    SOAK = "soak_object_in_source"
 
 
 class Arg(StrEnum):
-    """Argument names of a call, as they stand in JSON."""
+    """Argument names of a call, as they stand in JSON.
+
+    A tool is called by ``source_index`` too, as in the paper's ``cook_object_with_tool``: it is the second object of a call.
+    """
 
     OBJECT = "object_index"
     SOURCE = "source_index"
@@ -65,7 +73,19 @@ SIGNATURES: Final[Mapping[Skill, tuple[Arg, ...]]] = {
     Skill.COOK: (Arg.OBJECT, Arg.SOURCE),
     Skill.FREEZE: (Arg.OBJECT, Arg.SOURCE),
     Skill.GO_TO_ROOM: (Arg.ROOM,),
+    Skill.SLICE: (Arg.OBJECT, Arg.SOURCE),
+    Skill.CLEAN: (Arg.OBJECT, Arg.SOURCE),
+    Skill.SOAK: (Arg.OBJECT, Arg.SOURCE),
 }
+
+_ADDED: Final = (Skill.SLICE, Skill.CLEAN, Skill.SOAK)
+PROFILES: Final[Mapping[Profile, tuple[Skill, ...]]] = {
+    Profile.PAPER: tuple(skill for skill in Skill if skill not in _ADDED),
+    Profile.HOUSEHOLD: tuple(Skill),
+}
+"""The skills that plans of a profile may use, in the order in which a prompt tells them."""
+ALIASES: Final[Mapping[str, Arg]] = {"tool_index": Arg.SOURCE}
+"""Other names under which JSON may give an argument."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,8 +9,11 @@ from embomatrix.skills.failure import SENTENCES, FailureReason
 from embomatrix.skills.syntax import PlaceRelation
 
 if TYPE_CHECKING:
+    from collections.abc import Set
+
     from embomatrix.skills.syntax import SkillCall
     from embomatrix.world.asset import Asset
+    from embomatrix.world.state import SubstanceFact
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +74,16 @@ class WorldView(Protocol):
 
     def is_at(self, name: str, source: str) -> bool:
         """Whether a heat or cold source acts on the object where it lies, were the source running."""
+
+    def is_real(self, name: str) -> bool:
+        """Whether the object is in the world, be it in the hand: not a piece that is still to come, nor cut up."""
+
+    def is_sliced(self, name: str) -> bool: ...
+
+    def is_inside(self, name: str, container: str) -> bool: ...
+
+    def facts_about(self, name: str) -> Set[SubstanceFact]:
+        """What the object is covered, filled and soaked with."""
 
 
 def refuse(reason: FailureReason, **values: str) -> Refusal:

@@ -10,7 +10,7 @@ from embomatrix.world.evaluate import GoalError, objects_of
 from embomatrix.world.field import Field
 from embomatrix.world.poses import PlacementKey, PoseCache, StandPose
 from embomatrix.world.state import Relation
-from embomatrix.world.task import MAX_TABLE, Task, TaskCategory
+from embomatrix.world.task import MAX_TABLE, Profile, Task, TaskCategory
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 
 
 def task_to_json(task: Task) -> Json:
-    return {
+    """The profile is written where it is not the paper's: data sets from before there were two read the same."""
+    value = {
         "task_id": task.task_id,
         "scene_id": task.scene_id,
         "instruction": task.instruction,
@@ -31,12 +32,23 @@ def task_to_json(task: Task) -> Json:
         "types": {key: [*names] for key, names in task.types.items()},
         "source": task.source,
     }
+    if task.profile is not Profile.PAPER:
+        value["profile"] = task.profile.value
+    return value
 
 
 def task_from_json(value: object) -> Task:
     """A task whose goal speaks of objects in its table only. Raises SceneInvalidError."""
     fields = Field(value, "task").record(
-        "task_id", "scene_id", "instruction", "category", "goal", "table", "types", "source"
+        "task_id",
+        "scene_id",
+        "instruction",
+        "category",
+        "goal",
+        "table",
+        "types",
+        "source",
+        optional=("profile",),
     )
     table = tuple(item.name() for item in fields["table"].items(at_most=MAX_TABLE))
     if len(set(table)) != len(table):
@@ -52,6 +64,7 @@ def task_from_json(value: object) -> Task:
         table=table,
         types=types,
         source=fields["source"].text(),
+        profile=fields["profile"].member(Profile) if "profile" in fields else Profile.PAPER,
     )
 
 

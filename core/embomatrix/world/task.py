@@ -25,13 +25,21 @@ class TaskCategory(StrEnum):
     COMPOUND = "compound"
 
 
+class Profile(StrEnum):
+    """Which skills the plans of a task may use: the paper's thirteen, or three more for cutting, cleaning and wetting."""
+
+    PAPER = "paper"
+    HOUSEHOLD = "household"
+
+
 @dataclass(frozen=True)
 class Task:
     """What the robot must do in a scene. All names are names of scene objects or rooms.
 
     ``goal`` is ground but for its quantifiers, which range over ``types``: synset to object names. ``table`` is the object
     table: a plan's ``object_index`` is a row of it; the order betrays nothing of the goal. ``goal_bddl`` is the same goal
-    as text. ``source`` says where the task came from ("writer", "behavior-1k", "embomatrix", "file").
+    as text. ``source`` says where the task came from ("writer", "behavior-1k", "embomatrix", "file"). ``profile`` says
+    which skills a plan may use.
     """
 
     task_id: str
@@ -43,6 +51,7 @@ class Task:
     table: tuple[str, ...]
     types: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     source: str = "writer"
+    profile: Profile = Profile.PAPER
 
     @cached_property
     def index_of(self) -> Mapping[str, int]:

@@ -89,7 +89,7 @@ def _play(task_id: str, plan: str, oracle: bool, folder: Path | None, seed: int,
         _run(simulator, record.task, found, seed, film)
         return 0
     try:
-        parsed = parse_plan(text)
+        parsed = parse_plan(text, record.task.profile)
     except PlanError as error:
         _show_unparsable(error)
         return NO_PLAN

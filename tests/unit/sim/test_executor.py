@@ -9,13 +9,13 @@ from tests.fakes.scenes import kitchen_scene
 from embomatrix.reward.hierarchy import score
 from embomatrix.sim.executor import Simulator
 from embomatrix.skills.failure import FailureReason
-from embomatrix.skills.library import LIBRARY
 from embomatrix.skills.parse import parse_plan
 from embomatrix.skills.prompt import EXAMPLES, Codec
-from embomatrix.skills.syntax import Skill
+from embomatrix.skills.syntax import PROFILES
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.goal import And, Atom
 from embomatrix.world.state import Relation
+from embomatrix.world.task import Profile
 
 HEATED = And((Atom("hot", ("chicken_leg_1",)), Atom("inside", ("chicken_leg_1", "microwave_1"))))
 FETCH = "move microwave_1; open microwave_1; move fridge_1; open fridge_1; pick_up chicken_leg_1; move microwave_1"
@@ -171,7 +171,7 @@ def test_every_skill_can_succeed(flat):
     ]
     traces = [executed(flat, text) for text in plans]
     assert [trace.failure for trace in traces] == [None, None]
-    assert {step.call.skill for trace in traces for step in trace.steps} == set(Skill) == set(LIBRARY)
+    assert {step.call.skill for trace in traces for step in trace.steps} == set(PROFILES[Profile.PAPER])
 
 
 # Traces.

@@ -9,7 +9,7 @@ from tests.fakes.scenes import kitchen_scene
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.facts import FactError
 from embomatrix.world.bundle import Bundle
-from embomatrix.world.state import Relation, State
+from embomatrix.world.state import Relation, State, SubstanceRelation
 
 
 def stained_scene():
@@ -69,7 +69,8 @@ def test_every_state_is_known(flat, predicate):
 
 
 @pytest.mark.parametrize(
-    ("predicate", "args"), [("covered", ("a", "b")), ("ontop", ("apple_1",)), ("hot", ())]
+    ("predicate", "args"),
+    [("grasped", ("apple_1", "bowl_1")), ("covered", ("apple_1",)), ("ontop", ("apple_1",)), ("hot", ())],
 )
 def test_an_unknown_predicate_is_refused_with_the_known_ones(flat, predicate, args):
     with pytest.raises(FactError, match="expected one of ontop"):
@@ -79,3 +80,19 @@ def test_an_unknown_predicate_is_refused_with_the_known_ones(flat, predicate, ar
 def test_an_unknown_object_is_refused_by_name(flat):
     with pytest.raises(FactError, match="no object 'ghost_1'"):
         flat.facts.holds("hot", ("ghost_1",))
+
+
+@pytest.mark.parametrize("predicate", [*SubstanceRelation])
+def test_every_relation_to_a_substance_is_known(flat, predicate):
+    assert flat.facts.holds(predicate.value, ("apple_1", "salt.n.02")) is False
+
+
+def test_dusty_and_stained_are_coverings_whichever_the_scene_speaks_of(flat):
+    assert flat.facts.holds("covered", ("bowl_1", "dust.n.01"))
+    assert flat.facts.holds("covered", ("bowl_1", "stain.n.01"))
+    assert not flat.facts.holds("covered", ("bowl_1", "water.n.06"))
+
+
+def test_what_is_in_the_world_is_real_and_no_future(flat):
+    assert flat.facts.holds("real", ("apple_1",))
+    assert not flat.facts.holds("future", ("apple_1",))

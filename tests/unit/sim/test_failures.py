@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 from tests.fakes import furniture as make
+from tests.fakes.household import household_scene
 from tests.fakes.plans import awkward_scene, executed, executed_alone
 from tests.fakes.scenes import kitchen_scene, placed, scene_of, upright
 
@@ -17,6 +18,13 @@ from embomatrix.world.scene import RobotStart
 @pytest.fixture(scope="module")
 def flat():
     simulator = Simulator(Bundle(kitchen_scene(), {}))
+    yield simulator
+    simulator.close()
+
+
+@pytest.fixture(scope="module")
+def home():
+    simulator = Simulator(Bundle(household_scene(), {}))
     yield simulator
     simulator.close()
 
@@ -66,6 +74,20 @@ REACHED = {
     FailureReason.NOT_COLD_ENOUGH: "move apple_1; pick_up apple_1; move cooler_1; place cooler_1 inside; "
     "froze_object_with_source apple_1 cooler_1",
 }
+AT_HOME = {
+    FailureReason.NOT_THERE: "move half_melon_1",
+    FailureReason.TOOL_NOT_HELD: "move melon_1; slice_object_with_tool melon_1 table_knife_1",
+    FailureReason.NOT_A_SLICER: "move rag_1; pick_up rag_1; slice_object_with_tool melon_1 rag_1",
+    FailureReason.NOT_SLICEABLE: "slice_object_with_tool apple_1 table_knife_1",
+    FailureReason.ALREADY_SLICED: "move table_knife_1; pick_up table_knife_1; move loaf_1; "
+    "slice_object_with_tool loaf_1 table_knife_1; slice_object_with_tool loaf_1 table_knife_1",
+    FailureReason.NOT_A_CLEANER: "clean_object_with_tool plate_1 table_knife_1",
+    FailureReason.NEEDS_SOAKING: "move rag_1; pick_up rag_1; move plate_2; clean_object_with_tool plate_2 rag_1",
+    FailureReason.STAYS_ON: "move rag_1; pick_up rag_1; move vacuum_1; clean_object_with_tool vacuum_1 rag_1",
+    FailureReason.GIVES_NO_LIQUID: "soak_object_in_source rag_1 plate_1",
+    FailureReason.NOT_SOAKABLE: "soak_object_in_source plate_1 sink_1",
+}
+"""Those of cutting, cleaning and soaking."""
 ELSEWHERE = {
     FailureReason.NO_PATH,
     FailureReason.NO_STANDING_POSE,
@@ -84,9 +106,37 @@ def test_a_plan_meets_the_reason(awkward, reason):
     assert trace.steps[-1].failure in reasons_of(trace.steps[-1].call.skill)
 
 
+@pytest.mark.parametrize("reason", list(AT_HOME))
+def test_a_household_plan_meets_the_reason(home, reason):
+    trace = executed(home, AT_HOME[reason])
+    assert trace.failure is reason, trace.steps[-1].message
+    assert trace.steps[-1].failure in reasons_of(trace.steps[-1].call.skill)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        (
+            "move rag_1; pick_up rag_1; move sink_1; soak_object_in_source rag_1 sink_1",
+            FailureReason.SOURCE_OFF,
+        ),
+        ("move sink_1; soak_object_in_source rag_1 sink_1", FailureReason.NOT_AT_SOURCE),
+        ("move sink_1; clean_object_with_tool plate_1 sink_1", FailureReason.NOT_AT_SOURCE),
+        ("move rag_1; pick_up rag_1; clean_object_with_tool mug_1 rag_1", FailureReason.OUT_OF_REACH),
+        (
+            "move vacuum_1; pick_up vacuum_1; move plate_1; clean_object_with_tool plate_1 vacuum_1",
+            FailureReason.SOURCE_OFF,
+        ),
+    ],
+)
+def test_a_tool_or_a_tap_that_is_not_ready_is_told(home, text, reason):
+    trace = executed(home, text)
+    assert trace.failure is reason, trace.steps[-1].message
+
+
 def test_every_reason_is_met_by_some_test():
-    assert set(REACHED) | ELSEWHERE == set(FailureReason)
-    assert not set(REACHED) & ELSEWHERE
+    assert {*REACHED, *AT_HOME} | ELSEWHERE == set(FailureReason)
+    assert not {*REACHED, *AT_HOME} & ELSEWHERE
 
 
 def test_no_path_leads_into_a_room_without_a_door():

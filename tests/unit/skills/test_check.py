@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from tests.fakes import furniture as make
+from tests.fakes import household
 
 from embomatrix.skills.check import check
 from embomatrix.skills.failure import FailureReason
@@ -14,6 +15,7 @@ from embomatrix.skills.limits import ROBOT
 from embomatrix.skills.syntax import PlaceRelation, Skill, SkillCall
 from embomatrix.skills.view import Reach
 from embomatrix.world.asset import Asset
+from embomatrix.world.state import SubstanceFact, SubstanceRelation
 
 ASSETS = {
     "apple": make.apple(),
@@ -42,6 +44,9 @@ class WordWorld:
     reaches: dict[str, Reach] = field(default_factory=dict)
     hidden: set[str] = field(default_factory=set)
     at: set[tuple[str, str]] = field(default_factory=set)
+    absent: set[str] = field(default_factory=set)
+    sliced: set[str] = field(default_factory=set)
+    facts: dict[str, frozenset[SubstanceFact]] = field(default_factory=dict)
 
     def asset(self, name):
         return self.assets[name]
@@ -73,6 +78,18 @@ class WordWorld:
 
     def is_at(self, name, source):
         return (name, source) in self.at
+
+    def is_real(self, name):
+        return name not in self.absent
+
+    def is_sliced(self, name):
+        return name in self.sliced
+
+    def is_inside(self, name, container):
+        return self.inside.get(name) == container
+
+    def facts_about(self, name):
+        return self.facts.get(name, frozenset())
 
 
 def call(skill, target="", source="", relation=None):
@@ -246,3 +263,118 @@ def test_every_refusal_is_one_that_the_library_lists_and_a_whole_sentence(
     if refusal is not None:
         assert refusal.reason in reasons_of(skill)
         assert "{" not in refusal.sentence
+
+
+# Cutting, cleaning and soaking.
+
+HOME = {
+    "plate": household.plate(),
+    "rag": household.rag(),
+    "vacuum": household.vacuum(),
+    "knife": household.knife(),
+    "loaf": household.loaf(),
+    "sink": make.sink(),
+    "dishwasher": household.dishwasher(),
+    "bottle": household.soap_bottle(),
+}
+COVERED, SATURATED = SubstanceRelation.COVERED, SubstanceRelation.SATURATED
+
+
+def at_home(**changes):
+    return WordWorld(table=tuple(HOME), assets=HOME, **changes)
+
+
+def home_reason(world, skill, target, source):
+    rows = list(HOME)
+    refusal = check(world, SkillCall(skill, object_index=rows.index(target), source_index=rows.index(source)))
+    return refusal.reason if refusal else None
+
+
+def covered(substance):
+    return {"plate": frozenset({SubstanceFact(COVERED, substance)})}
+
+
+def soaked(substance):
+    return {"rag": frozenset({SubstanceFact(SATURATED, substance)})}
+
+
+@pytest.mark.parametrize(
+    ("substance", "soak", "expected"),
+    [
+        ("dust.n.01", "", None),
+        ("mud.n.03", "", FailureReason.NEEDS_SOAKING),
+        ("mud.n.03", "water.n.06", None),
+        ("stain.n.01", "water.n.06", None),
+        ("stain.n.01", "liquid_soap.n.01", None),
+        ("ink.n.01", "water.n.06", FailureReason.NEEDS_SOAKING),
+        ("ink.n.01", "vinegar.n.01", None),
+        ("house_paint.n.01", "acetone.n.01", None),
+        ("rust.n.01", "water.n.06", FailureReason.STAYS_ON),
+        ("breadcrumb.n.01", "", None),
+        ("red_wine.n.01", "", None),
+    ],
+)
+def test_what_a_rag_takes_off_depends_on_what_it_is_soaked_with(substance, soak, expected):
+    facts = {**covered(substance), **(soaked(soak) if soak else {})}
+    world = at_home(carried=("rag",), facts=facts)
+    assert home_reason(world, Skill.CLEAN, "plate", "rag") is expected
+
+
+def test_a_rag_that_takes_one_of_two_substances_off_is_of_use():
+    facts = {"plate": frozenset(SubstanceFact(COVERED, name) for name in ("dust.n.01", "rust.n.01"))}
+    assert home_reason(at_home(carried=("rag",), facts=facts), Skill.CLEAN, "plate", "rag") is None
+
+
+def test_a_clean_plate_may_be_wiped():
+    assert home_reason(at_home(carried=("rag",)), Skill.CLEAN, "plate", "rag") is None
+
+
+def test_a_vacuum_sucks_when_it_is_on():
+    world = at_home(carried=("vacuum",), facts=covered("dust.n.01"))
+    assert home_reason(world, Skill.CLEAN, "plate", "vacuum") is FailureReason.SOURCE_OFF
+    world.on.add("vacuum")
+    assert home_reason(world, Skill.CLEAN, "plate", "vacuum") is None
+
+
+def test_a_dishwasher_needs_the_plate_the_door_and_the_switch():
+    world = at_home(facts=covered("ink.n.01"))
+    assert home_reason(world, Skill.CLEAN, "plate", "dishwasher") is FailureReason.NOT_AT_SOURCE
+    world.inside["plate"] = "dishwasher"
+    assert home_reason(world, Skill.CLEAN, "plate", "dishwasher") is FailureReason.SOURCE_OFF
+    world.on.add("dishwasher")
+    assert home_reason(world, Skill.CLEAN, "plate", "dishwasher") is None
+    world.open.add("dishwasher")
+    assert home_reason(world, Skill.CLEAN, "plate", "dishwasher") is FailureReason.SOURCE_OPEN
+
+
+def test_running_water_alone_does_not_take_ink_off():
+    world = at_home(facts=covered("ink.n.01"), inside={"plate": "sink"}, on={"sink"})
+    assert home_reason(world, Skill.CLEAN, "plate", "sink") is FailureReason.STAYS_ON
+    world.facts = covered("stain.n.01")
+    assert home_reason(world, Skill.CLEAN, "plate", "sink") is None
+
+
+def test_a_rag_is_soaked_in_the_hand_or_in_the_sink_and_nowhere_else():
+    world = at_home(on={"sink"})
+    assert home_reason(world, Skill.SOAK, "rag", "sink") is FailureReason.NOT_AT_SOURCE
+    assert home_reason(at_home(on={"sink"}, carried=("rag",)), Skill.SOAK, "rag", "sink") is None
+    assert home_reason(at_home(on={"sink"}, inside={"rag": "sink"}), Skill.SOAK, "rag", "sink") is None
+
+
+def test_a_full_bottle_needs_no_switch_and_an_empty_one_gives_nothing():
+    full = {"bottle": frozenset({SubstanceFact(SubstanceRelation.FILLED, "liquid_soap.n.01")})}
+    assert home_reason(at_home(carried=("rag",), facts=full), Skill.SOAK, "rag", "bottle") is None
+    empty = at_home(carried=("rag",))
+    assert home_reason(empty, Skill.SOAK, "rag", "bottle") is FailureReason.GIVES_NO_LIQUID
+
+
+def test_bread_is_cut_once_with_a_knife_that_is_held():
+    assert home_reason(at_home(), Skill.SLICE, "loaf", "knife") is FailureReason.TOOL_NOT_HELD
+    assert home_reason(at_home(carried=("knife",)), Skill.SLICE, "loaf", "knife") is None
+    again = at_home(carried=("knife",), sliced={"loaf"})
+    assert home_reason(again, Skill.SLICE, "loaf", "knife") is FailureReason.ALREADY_SLICED
+
+
+def test_what_was_cut_up_is_no_longer_there():
+    world = at_home(carried=("knife",), absent={"loaf"})
+    assert home_reason(world, Skill.SLICE, "loaf", "knife") is FailureReason.NOT_THERE

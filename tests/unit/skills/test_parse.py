@@ -16,14 +16,19 @@ from embomatrix.skills.parse import (
     plan_to_lines,
 )
 from embomatrix.skills.syntax import (
+    ALIASES,
     MAX_PLAN_BYTES,
     MAX_STEPS,
+    PROFILES,
     SIGNATURES,
     Arg,
     PlaceRelation,
     Skill,
     SkillCall,
 )
+from embomatrix.world.task import Profile
+
+HOUSEHOLD = Profile.HOUSEHOLD
 
 TWO = (
     SkillCall(Skill.MOVE, object_index=3),
@@ -182,16 +187,42 @@ plans = st.lists(calls(), min_size=1, max_size=12).map(tuple)
 
 @given(plans)
 def test_plan_survives_both_forms(plan: tuple[SkillCall, ...]) -> None:
-    assert parse_plan(plan_to_lines(plan)) == plan
-    assert parse_plan(json.dumps(plan_to_json(plan), indent=1)) == plan
-    assert plan_from_json(plan_to_json(plan)) == plan
+    assert parse_plan(plan_to_lines(plan), HOUSEHOLD) == plan
+    assert parse_plan(json.dumps(plan_to_json(plan), indent=1), HOUSEHOLD) == plan
+    assert plan_from_json(plan_to_json(plan), HOUSEHOLD) == plan
+
+
+@given(plans)
+def test_the_paper_s_profile_reads_a_plan_exactly_when_all_its_skills_are_the_paper_s(
+    plan: tuple[SkillCall, ...],
+) -> None:
+    if {call.skill for call in plan} <= set(PROFILES[Profile.PAPER]):
+        assert parse_plan(plan_to_lines(plan)) == plan
+        return
+    for text in (plan_to_lines(plan), json.dumps(plan_to_json(plan))):
+        with pytest.raises(PlanError) as caught:
+            parse_plan(text)
+        assert caught.value.reason is PlanReason.UNKNOWN_SKILL
+
+
+def test_the_paper_has_thirteen_skills_and_the_household_three_more() -> None:
+    assert set(PROFILES) == set(Profile)
+    assert len(PROFILES[Profile.PAPER]) == 13
+    assert PROFILES[Profile.HOUSEHOLD] == tuple(Skill)
+    assert PROFILES[Profile.HOUSEHOLD][:13] == PROFILES[Profile.PAPER]
+
+
+def test_a_tool_may_be_called_by_its_own_index() -> None:
+    text = '[{"action": "slice_object_with_tool", "object_index": 3, "tool_index": 5}]'
+    assert parse_plan(text, HOUSEHOLD) == (SkillCall(Skill.SLICE, object_index=3, source_index=5),)
+    assert set(ALIASES.values()) <= set(Arg)
 
 
 @given(
     plans, st.text(max_size=60).filter(lambda text: "<" not in text and "[" not in text and "{" not in text)
 )
 def test_plan_is_found_whatever_prose_precedes_it(plan: tuple[SkillCall, ...], prose: str) -> None:
-    assert parse_plan(f"{prose}\n```json\n{json.dumps(plan_to_json(plan))}\n```") == plan
+    assert parse_plan(f"{prose}\n```json\n{json.dumps(plan_to_json(plan))}\n```", HOUSEHOLD) == plan
 
 
 @given(st.text(max_size=300))

@@ -1,6 +1,10 @@
 """Prompts: the scene as a tree, names that are unique, and examples that parse."""
 
+from dataclasses import replace
+
 import pytest
+from tests.fakes.household import household_scene
+from tests.fakes.plans import task_over
 
 from embomatrix.skills.parse import parse_plan
 from embomatrix.skills.prompt import (
@@ -12,11 +16,13 @@ from embomatrix.skills.prompt import (
     limited,
     plan_in_names,
     prompt_for,
+    situation_of,
     subset,
     with_indices,
 )
-from embomatrix.skills.syntax import PlaceRelation, Skill, SkillCall
+from embomatrix.skills.syntax import PROFILES, PlaceRelation, Skill, SkillCall
 from embomatrix.world.state import Relation
+from embomatrix.world.task import Profile
 
 FRIDGE = Row(2, "fridge_1", "fridge", "kitchen_0", states=("closed",), fixed=True)
 COUNTER = Row(0, "countertop_1", "countertop", "kitchen_0", fixed=True)
@@ -56,9 +62,10 @@ def test_indexed_prompt_puts_the_name_before_the_index():
 
 @pytest.mark.parametrize("codec", [Codec.LINES, Codec.JSON])
 def test_system_text_lists_every_skill_and_its_own_example(codec):
-    system = prompt_for(SITUATION, codec).system
-    assert all(skill.value in system for skill in Skill)
-    assert EXAMPLES[codec] in system
+    for profile in Profile:
+        system = prompt_for(replace(SITUATION, profile=profile), codec).system
+        assert [skill for skill in Skill if skill.value in system] == [*PROFILES[profile]]
+        assert EXAMPLES[codec] in system
 
 
 @pytest.mark.parametrize("codec", Codec)
@@ -133,3 +140,14 @@ def test_a_prompt_never_holds_the_goal():
     for codec in Codec:
         prompt = prompt_for(SITUATION, codec)
         assert "inside(" not in prompt.system + prompt.user
+
+
+def test_what_can_be_seen_of_substances_and_of_what_is_to_come_is_told():
+    scene = household_scene()
+    situation = situation_of(scene, replace(task_over(scene), profile=Profile.HOUSEHOLD))
+    states = {row.name: row.states for row in situation.rows}
+    assert states["plate_1"] == ("dusty",)
+    assert states["plate_2"] == ("stained",), "a covering that has a word of its own is told by it"
+    assert states["liquid_soap__bottle_1"] == ("filled_with_liquid_soap",)
+    assert states["half_melon_1"] == ("absent",)
+    assert situation.profile is Profile.HOUSEHOLD

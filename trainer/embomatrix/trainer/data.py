@@ -112,7 +112,7 @@ def _training_task(bundle: Bundle, record: TaskRecord) -> TrainingTask:
             "build the dataset again"
         )
     try:
-        oracle = plan_from_json(list(record.oracle)) if record.oracle else ()
+        oracle = plan_from_json(list(record.oracle), task.profile) if record.oracle else ()
     except PlanError as error:
         raise TrainerError(
             f"the oracle plan of the dataset's task {task.task_id!r} is damaged ({error}): build the dataset again"

@@ -78,7 +78,7 @@ class PlanOutcome:
 
 def parsed(text: str, situation: Situation, codec: Codec) -> Plan:
     """The plan that a policy's text means. Raises PlanError when it means none."""
-    return parse_plan(with_indices(text, situation) if codec is Codec.NAMES else text)
+    return parse_plan(with_indices(text, situation) if codec is Codec.NAMES else text, situation.profile)
 
 
 class Gateway:

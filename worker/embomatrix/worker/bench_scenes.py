@@ -55,7 +55,7 @@ def scenes_of(dataset: Dataset, count: int) -> tuple[BenchScene, ...]:
 
 def _demonstration(record: TaskRecord) -> Demonstration:
     try:
-        return Demonstration(record.task.task_id, plan_from_json([*record.oracle]))
+        return Demonstration(record.task.task_id, plan_from_json([*record.oracle], record.task.profile))
     except PlanError as error:
         raise BenchError(
             f"the oracle plan of task {record.task.task_id!r} is no plan: {error}; build the dataset anew"

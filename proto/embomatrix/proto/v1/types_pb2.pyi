@@ -39,6 +39,9 @@ class _SkillKindEnumTypeWrapper(google.protobuf.internal.enum_type_wrapper._Enum
     SKILL_KIND_COOK: _SkillKind.ValueType  # 11
     SKILL_KIND_FREEZE: _SkillKind.ValueType  # 12
     SKILL_KIND_GO_TO_ROOM: _SkillKind.ValueType  # 13
+    SKILL_KIND_SLICE: _SkillKind.ValueType  # 14
+    SKILL_KIND_CLEAN: _SkillKind.ValueType  # 15
+    SKILL_KIND_SOAK: _SkillKind.ValueType  # 16
 
 class SkillKind(_SkillKind, metaclass=_SkillKindEnumTypeWrapper): ...
 
@@ -56,6 +59,9 @@ SKILL_KIND_HEAT: SkillKind.ValueType  # 10
 SKILL_KIND_COOK: SkillKind.ValueType  # 11
 SKILL_KIND_FREEZE: SkillKind.ValueType  # 12
 SKILL_KIND_GO_TO_ROOM: SkillKind.ValueType  # 13
+SKILL_KIND_SLICE: SkillKind.ValueType  # 14
+SKILL_KIND_CLEAN: SkillKind.ValueType  # 15
+SKILL_KIND_SOAK: SkillKind.ValueType  # 16
 Global___SkillKind: typing_extensions.TypeAlias = SkillKind
 
 class _InfraCode:

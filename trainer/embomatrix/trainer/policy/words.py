@@ -11,8 +11,9 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.skills.syntax import PlaceRelation, Skill
+from embomatrix.skills.syntax import PROFILES, PlaceRelation
 from embomatrix.world.state import State
+from embomatrix.world.task import Profile
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -30,7 +31,7 @@ _WORD: Final = re.compile(r"\n|-?\d+\.\d+|[a-z0-9_]+(?:-[a-z][a-z0-9_]*)*|-\d+")
 _LONGEST_PHRASE: Final = 4
 _FIXED_WORDS: Final = (
     _BREAK,
-    *(skill.value for skill in Skill),
+    *(skill.value for skill in PROFILES[Profile.PAPER]),
     *(relation.value for relation in PlaceRelation),
     *(state.value for state in State),
     *("room", "robot", "task", "in", "on", "under", "off", "open", "closed", "and", "then", "the", "it"),
@@ -47,6 +48,8 @@ def build_vocabulary(
     for situation in situations:
         names = [*situation.rooms, *(row.name for row in situation.rows)]
         words |= dict.fromkeys(row.category for row in situation.rows)
+        words |= dict.fromkeys(skill.value for skill in PROFILES[situation.profile])
+        words |= dict.fromkeys(state for row in situation.rows for state in row.states)
         for name in names:
             stem, number = _split_number(name)
             words.setdefault(stem)

@@ -1,0 +1,73 @@
+"""Effects of water: what lies in a sink or a machine that runs is soaked, filled and washed.
+
+As with heat, the effects follow from the state alone, whichever call brought it about, and are there at once. Nothing dries,
+and nothing is emptied.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from embomatrix.sim.thermal import Change
+from embomatrix.skills.household import coverings, liquids_given, soaked_with, washed_away, washing
+from embomatrix.world.state import State, SubstanceFact, SubstanceRelation
+from embomatrix.world.substances import flows_from, in_words, word_of
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, MutableMapping, Set
+
+    from embomatrix.sim.engine import PhysicsEngine
+    from embomatrix.sim.relations import Relations
+
+
+class Water:
+    """The sinks and washing machines of a scene. ``substances`` maps each object to facts, and is changed."""
+
+    def __init__(
+        self,
+        engine: PhysicsEngine,
+        relations: Relations,
+        states: Mapping[str, Set[State]],
+        substances: MutableMapping[str, set[SubstanceFact]],
+    ) -> None:
+        self._engine = engine
+        self._relations = relations
+        self._scene = engine.scene
+        self._states = states
+        self._substances = substances
+        self._sources = [
+            item.name
+            for item in self._scene.objects
+            if washing(asset := self._scene.assets[item.asset_id]) is not None or flows_from(asset.synset)
+        ]
+
+    def apply(self) -> tuple[Change, ...]:
+        """Let every source that runs act on what lies in it. Returns what changed, in scene order of the sources."""
+        changes: list[Change] = []
+        for name in self._sources:
+            if State.TOGGLED_ON not in self._states[name] or self._engine.is_parked(name):
+                continue
+            asset = self._scene.asset_of(name)
+            machine = washing(asset)
+            if machine is not None and machine.requires_closed and self._relations.open(name):
+                continue
+            liquids = liquids_given(asset, (), on=True)
+            for item in self._engine.near(self._engine.aabb(name), frozenset((name,))):
+                if self._scene.by_name[item].fixed or not self._relations.inside(item, name):
+                    continue
+                if machine is not None:
+                    changes += self.take_off(item, washed_away(machine, coverings(self._substances[item])))
+                changes += self.wet(item, liquids)
+        return tuple(changes)
+
+    def wet(self, name: str, liquids: tuple[str, ...]) -> list[Change]:
+        """Let liquids run over an object. Returns what changed."""
+        gained = soaked_with(self._scene.asset_of(name), liquids) - self._substances[name]
+        self._substances[name] |= gained
+        return [Change(name, in_words(fact)) for fact in sorted(gained)]
+
+    def take_off(self, name: str, covering: tuple[str, ...]) -> list[Change]:
+        """Take substances off an object that is covered with them. Returns what changed."""
+        lost = {SubstanceFact(SubstanceRelation.COVERED, substance) for substance in covering}
+        self._substances[name] -= lost
+        return [Change(name, f"free of {word_of(fact.substance)}") for fact in sorted(lost)]
