@@ -55,11 +55,25 @@ class Placer:
         The order of the poses follows from ``rng``; without one it is the cache's. The world is left as it was. Raises
         EngineError for names that the engine does not know.
         """
+        found = self.choices(held, target, relation, robot, rng, most=1)
+        return found if isinstance(found, FailureReason) else found[0]
+
+    def choices(
+        self,
+        held: str,
+        target: str,
+        relation: Relation,
+        robot: StandPose,
+        rng: np.random.Generator | None = None,
+        *,
+        most: int,
+    ) -> tuple[Pose, ...] | FailureReason:
+        """The first poses, at least one and at most ``most``, that ``find`` would choose from, in its order."""
         if held == target or self._engine.is_parked(target):
             return FailureReason.PLACE_ON_ITSELF
         before = self._engine.pose(held)
         try:
-            return self._search(held, target, relation, robot, rng)
+            return self._search(held, target, relation, robot, rng, most)
         finally:
             self._engine.set_pose(held, before)
             self._engine.park(held)
@@ -71,16 +85,19 @@ class Placer:
         relation: Relation,
         robot: StandPose,
         rng: np.random.Generator | None,
-    ) -> Pose | FailureReason:
+        most: int,
+    ) -> tuple[Pose, ...] | FailureReason:
         fails = FailureReason.NO_CAVITY if relation is Relation.INSIDE else FailureReason.NO_SURFACE
         base = self._engine.pose(target)
         if not is_upright(base):
             return fails
+        good: list[Pose] = []
         cached = self._cached(held, target, relation, rng)
         for local in cached:
             found = self._accept_verified(held, target, relation, base @ local, robot)
-            if found is not None:
-                return found
+            good += [found] if found is not None else []
+            if len(good) == most:
+                return tuple(good)
         settles = 0
         fresh = self._fresh(held, target, relation, rng)
         for local in fresh:
@@ -90,8 +107,11 @@ class Placer:
                 continue
             settles += 1
             found = self._accept_settled(held, target, relation, robot)
-            if found is not None:
-                return found
+            good += [found] if found is not None else []
+            if len(good) == most:
+                break
+        if good:
+            return tuple(good)
         return FailureReason.NO_FREE_POSE if cached or fresh else fails
 
     def _cached(
