@@ -21,11 +21,16 @@ from embomatrix.world.scene import Room
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from embomatrix.factory.floorplan_packing import Packing
     from embomatrix.factory.floorplan_spec import RoomSpec
     from embomatrix.world.geometry import Part
     from embomatrix.world.scene import Doorway, Window
 
 TRIALS: Final = 80
+FINALISTS: Final = 6
+"""Packings that get doors and windows before one is chosen."""
+WINDOW_COST_M2: Final = 3.0
+"""What a window without a wall costs a plan, in square metres of extent."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,15 +67,24 @@ def plan_floor(rooms: Sequence[RoomSpec], rng: np.random.Generator, *, trials: i
         raise FloorPlanError(
             f"{len(rooms)} rooms found no joint plan in {trials} trials: every room needs a side of at least {MIN_DOOR_M} m"
         )
-    best = min(packings, key=lambda p: p.score)
-    low = np.min([r.low for r in best.rects.values()], axis=0)
-    rects = {name: rect.moved(-float(low[0]), -float(low[1])) for name, rect in best.rects.items()}
-    doors, unused = place_doorways(rooms, rects, best.parents, rng)
+    finished = [
+        _finish(rooms, packing, rng) for packing in sorted(packings, key=lambda p: p.score)[:FINALISTS]
+    ]
+    return min(finished, key=lambda pair: pair[0])[1]
+
+
+def _finish(rooms: Sequence[RoomSpec], packing: Packing, rng: np.random.Generator) -> tuple[float, FloorPlan]:
+    """Doorways, windows and walls for a packing, and its score with what every window without a wall costs."""
+    low = np.min([r.low for r in packing.rects.values()], axis=0)
+    rects = {name: rect.moved(-float(low[0]), -float(low[1])) for name, rect in packing.rects.items()}
+    doors, unused = place_doorways(rooms, rects, packing.parents, rng)
     panes, walled_up = place_windows(rooms, rects, doors)
-    return FloorPlan(
+    plan = FloorPlan(
         rooms=tuple(Room(s.name, s.type, *rects[s.name].floor) for s in rooms),
         walls=build_walls(rects, doors, panes),
         doorways=tuple(cut.doorway for cut in doors),
         windows=tuple(cut.window for cut in panes),
         left_out=(*unused, *walled_up),
     )
+    listed = sum(len(room.windows) for room in rooms)
+    return packing.score + WINDOW_COST_M2 * (listed - len(panes)), plan

@@ -51,7 +51,7 @@ def place_doorways(
             cuts.append(_join(a, b, rects, left, types, rng))
     unused = Counter((room, door.model) for room, doors in left.items() for door in doors)
     notes = [
-        f"{n} doors {model} in {room}: no neighbour is left to join" for (room, model), n in unused.items()
+        f"{n} door-{model} in {room}: no neighbour is left to join" for (room, model), n in unused.items()
     ]
     return [*cuts, front], notes
 

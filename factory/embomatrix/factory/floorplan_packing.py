@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -17,6 +17,13 @@ if TYPE_CHECKING:
 
     from embomatrix.factory.floorplan_spec import RoomSpec
 
+    FloatArray = NDArray[np.float64]
+
+CONTACT_WORTH: Final = 1.5
+"""What a metre of shared wall is worth, in square metres."""
+CHUNK: Final = 128
+"""Candidates whose overlaps are computed at a time, the cheapest first."""
+
 
 @dataclass(frozen=True, slots=True)
 class Packing:
@@ -28,6 +35,7 @@ class Packing:
 
 
 def pack(rooms: Sequence[RoomSpec], rng: np.random.Generator) -> Packing | None:
+    """One seeded trial; None when a room finds no side that it can share a doorway with."""
     order = _order(rooms, rng)
     root = order[0]
     w, h = root.floor_m[0] + WALL_M, root.floor_m[1] + WALL_M
@@ -36,18 +44,14 @@ def pack(rooms: Sequence[RoomSpec], rng: np.random.Generator) -> Packing | None:
     penalty = 0.0
     by_name = {r.name: r for r in rooms}
     for spec in order[1:]:
-        best: tuple[float, Rect, str] | None = None
-        for name in rects:
-            oddness = 4.0 * _rank(spec.type, by_name[name].type) - 8.0 * _share_a_door(
-                spec, by_name[name], rooms
-            )
-            for score, rect in _slots(spec, name, rects, rng):
-                if best is None or score + oddness < best[0]:
-                    best = (score + oddness, rect, name)
-        if best is None:
+        ranks = {name: 4.0 * _rank(spec.type, by_name[name].type) for name in rects}
+        bonus = {name: 8.0 * _share_a_door(spec, by_name[name], rooms) for name in rects}
+        slot = _best_slot(spec, rects, [ranks[name] - bonus[name] for name in rects], rng)
+        if slot is None:
             return None
-        rects[spec.name], parents[spec.name] = best[1], best[2]
-        penalty += 4.0 * _rank(spec.type, by_name[best[2]].type)
+        host = tuple(rects)[slot[0]]
+        rects[spec.name], parents[spec.name] = slot[1], host
+        penalty += ranks[host]
     boxes = np.array([r.as_tuple() for r in rects.values()])
     span = boxes[:, 2:].max(axis=0) - boxes[:, :2].min(axis=0)
     return Packing(rects, parents, float(np.mean(span) ** 2) + penalty)
@@ -87,45 +91,79 @@ def _share_a_door(a: RoomSpec, b: RoomSpec, rooms: Sequence[RoomSpec]) -> bool:
     return any(sum(any(d.model == m for d in r.doors) for r in rooms) == 2 for m in shared)
 
 
-def _slots(
-    spec: RoomSpec, parent: str, rects: Mapping[str, Rect], rng: np.random.Generator
-) -> list[tuple[float, Rect]]:
-    """Free rectangles for the room along the parent's four sides, each with its cost in square metres."""
-    host = rects[parent]
+def _best_slot(
+    spec: RoomSpec, rects: Mapping[str, Rect], oddness: Sequence[float], rng: np.random.Generator
+) -> tuple[int, Rect] | None:
+    """The number of the room to attach to and the cheapest free rectangle beside it; None when no side has room.
+
+    The cost, in square metres, is the extent of the house with the room, less what it shares of walls, plus the host's oddness.
+    """
     placed = np.array([r.as_tuple() for r in rects.values()])  # (m, 4)
     door = max([MIN_DOOR_M, *(min(d.width_m, OPEN_PASSAGE_M) for d in spec.doors)]) + 0.05
-    found: list[Rect] = []
-    for w, h in {(spec.floor_m[0], spec.floor_m[1]), (spec.floor_m[1], spec.floor_m[0])}:
-        found += _along(host, placed, w + WALL_M, h + WALL_M, door + WALL_M)
-    if not found:
-        return []
-    boxes = np.array([r.as_tuple() for r in found])  # (n, 4)
-    gap = np.maximum(boxes[:, None, :2], placed[None, :, :2]) - np.minimum(
-        boxes[:, None, 2:], placed[None, :, 2:]
-    )
-    free = ~np.any(np.all(gap < -1e-6, axis=2), axis=1)  # (n,)
-    contact = np.where(
-        np.abs(gap).min(axis=2) < 1e-6, np.maximum(0.0, -gap.min(axis=2)), 0.0
-    )  # shared length (n, m)
+    sizes = [(w + WALL_M, h + WALL_M) for w, h in (spec.floor_m, spec.floor_m[::-1])]
+    found = [_beside(placed, w, h, door + WALL_M) for w, h in sizes]
+    hosts = np.concatenate([host for host, _ in found])  # (n,)
+    boxes = np.concatenate([box for _, box in found])  # (n, 4)
     low = np.minimum(boxes[:, :2], placed[:, :2].min(axis=0))
     high = np.maximum(boxes[:, 2:], placed[:, 2:].max(axis=0))
     # The square of the mean side, not the area: it keeps the house from growing into a long row of rooms.
-    cost = np.mean(high - low, axis=1) ** 2 - 1.5 * contact.sum(axis=1) + rng.uniform(0.0, 4.0, len(found))
-    return [(float(cost[i]), found[i]) for i in np.flatnonzero(free)]
+    extent = np.mean(high - low, axis=1) ** 2
+    cost = extent + np.asarray(oddness)[hosts] + rng.uniform(0.0, 4.0, len(boxes))
+    order = np.argsort(cost)
+    most_contact = CONTACT_WORTH * 2 * sum(sizes[0])
+    best: tuple[float, int] | None = None
+    for first in range(0, len(order), CHUNK):
+        if best is not None and cost[order[first]] - most_contact >= best[0]:
+            break
+        picks = order[first : first + CHUNK]
+        free, contact = _fit(boxes[picks], placed)
+        total = np.where(free, cost[picks] - CONTACT_WORTH * contact, np.inf)
+        pick = int(np.argmin(total))
+        if free[pick] and (best is None or total[pick] < best[0]):
+            best = (float(total[pick]), int(picks[pick]))
+    if best is None:
+        return None
+    x0, y0, x1, y1 = (float(value) for value in boxes[best[1]])
+    return int(hosts[best[1]]), Rect(x0, y0, x1, y1)
 
 
-def _along(host: Rect, placed: NDArray[np.float64], w: float, h: float, need: float) -> list[Rect]:
-    """Rectangles of size (w, h) that touch the host from outside and share at least ``need`` of an edge with it."""
-    found = []
-    least = MIN_DOOR_M + WALL_M
-    need_y = max(least, min(need, h, host.y1 - host.y0))
-    need_x = max(least, min(need, w, host.x1 - host.x0))
-    starts_y = {host.y0, host.y1 - h, (host.y0 + host.y1 - h) / 2, *placed[:, 3], *(placed[:, 1] - h)}
-    for y in map(float, sorted(starts_y)):
-        if min(y + h, host.y1) - max(y, host.y0) >= need_y - 1e-9:
-            found += [Rect(host.x1, y, host.x1 + w, y + h), Rect(host.x0 - w, y, host.x0, y + h)]
-    starts_x = {host.x0, host.x1 - w, (host.x0 + host.x1 - w) / 2, *placed[:, 2], *(placed[:, 0] - w)}
-    for x in map(float, sorted(starts_x)):
-        if min(x + w, host.x1) - max(x, host.x0) >= need_x - 1e-9:
-            found += [Rect(x, host.y1, x + w, host.y1 + h), Rect(x, host.y0 - h, x + w, host.y0)]
-    return found
+def _fit(boxes: FloatArray, placed: FloatArray) -> tuple[NDArray[np.bool_], FloatArray]:
+    """Which of the boxes (n, 4) overlap no placed one (m, 4), and the length of walls that each shares with them."""
+    gap = np.maximum(boxes[:, None, :2], placed[None, :, :2]) - np.minimum(
+        boxes[:, None, 2:], placed[None, :, 2:]
+    )  # (n, m, 2), negative where the two overlap along an axis
+    free = ~np.any(np.all(gap < -1e-6, axis=2), axis=1)
+    touching = np.abs(gap).min(axis=2) < 1e-6
+    contact = np.where(touching, np.maximum(0.0, -gap.min(axis=2)), 0.0).sum(axis=1)
+    return np.asarray(free), np.asarray(contact)
+
+
+def _beside(placed: FloatArray, w: float, h: float, need: float) -> tuple[NDArray[np.int64], FloatArray]:
+    """Rectangles of size (w, h) that touch a placed one from outside and share at least ``need`` of an edge with it.
+
+    Returns the number of that host (n,) and the rectangles (n, 4).
+    """
+    x0, y0, x1, y1 = placed.T
+    by_y, y = _starts(y0, y1, h, need)
+    by_x, x = _starts(x0, x1, w, need)
+    hosts = np.concatenate([by_y, by_y, by_x, by_x])
+    low_x = np.concatenate([x1[by_y], x0[by_y] - w, x, x])
+    low_y = np.concatenate([y, y, y1[by_x], y0[by_x] - h])
+    return hosts, np.stack([low_x, low_y, low_x + w, low_y + h], axis=1)
+
+
+def _starts(
+    low: FloatArray, high: FloatArray, size: float, need: float
+) -> tuple[NDArray[np.int64], FloatArray]:
+    """Where a side of this size may begin along each host's edge, from ``low`` to ``high`` (m,): hosts (n,) and starts (n,).
+
+    It begins flush with an end of the edge, in its middle, or flush with any other room.
+    """
+    m = len(low)
+    own = np.stack([low, high - size, (low + high - size) / 2], axis=1)  # (m, 3)
+    others = np.broadcast_to(np.concatenate([high, low - size]), (m, 2 * m))
+    starts = np.concatenate([own, others], axis=1)
+    shared = np.minimum(starts + size, high[:, None]) - np.maximum(starts, low[:, None])
+    least = np.maximum(MIN_DOOR_M + WALL_M, np.minimum(min(need, size), high - low))
+    host, column = np.nonzero(shared >= least[:, None] - 1e-9)
+    return host, starts[host, column]

@@ -67,7 +67,7 @@ def place_windows(
                 dropped[window.model] += 1
         cuts += [cut for stretch in stretches for cut in _spread(stretch, room.name)]
         left_out += [
-            f"{n} windows {model} in {room.name}: no outer wall has room for them"
+            f"{n} window-{model} in {room.name}: no outer wall has room for them"
             for model, n in dropped.items()
         ]
     return cuts, left_out
