@@ -59,6 +59,10 @@ class FailureReason(StrEnum):
     STAYS_ON = "stays_on"
     GIVES_NO_LIQUID = "gives_no_liquid"
     NOT_SOAKABLE = "not_soakable"
+    COLLIDED = "collided"
+    ARM_BLOCKED = "arm_blocked"
+    SLIPPED = "slipped"
+    FELL = "fell"
 
 
 SENTENCES: Final[Mapping[FailureReason, str]] = {
@@ -111,4 +115,8 @@ SENTENCES: Final[Mapping[FailureReason, str]] = {
     FailureReason.STAYS_ON: "{source} does not take {substance} off {target}",
     FailureReason.GIVES_NO_LIQUID: "{source} gives no liquid to soak things with",
     FailureReason.NOT_SOAKABLE: "{target} does not take up a liquid",
+    FailureReason.COLLIDED: "the robot ran into {other} and stopped",
+    FailureReason.ARM_BLOCKED: "the arm finds no free way to {target}: {other} bars it",
+    FailureReason.SLIPPED: "{target} slipped out of the hand",
+    FailureReason.FELL: "{held} did not stay {relation} {target}",
 }

@@ -341,9 +341,31 @@ LIBRARY: Final[Mapping[Skill, Entry]] = {
 }
 
 
+_AT_WORK: Final = (FailureReason.COLLIDED, FailureReason.ARM_BLOCKED)
+
+MISHAPS: Final[Mapping[Skill, tuple[FailureReason, ...]]] = {
+    Skill.MOVE: (FailureReason.COLLIDED, FailureReason.SLIPPED),
+    Skill.TURN: (FailureReason.COLLIDED, FailureReason.SLIPPED),
+    Skill.PICK_UP: (*_AT_WORK, FailureReason.SLIPPED),
+    Skill.PLACE: (*_AT_WORK, FailureReason.SLIPPED, FailureReason.FELL),
+    Skill.MOVE_FORWARD: (FailureReason.COLLIDED, FailureReason.SLIPPED),
+    Skill.OPEN: _AT_WORK,
+    Skill.CLOSE: _AT_WORK,
+    Skill.TOGGLE_ON: _AT_WORK,
+    Skill.TOGGLE_OFF: _AT_WORK,
+    Skill.HEAT: (),
+    Skill.COOK: (),
+    Skill.FREEZE: (),
+    Skill.GO_TO_ROOM: (FailureReason.COLLIDED, FailureReason.SLIPPED),
+    Skill.SLICE: _AT_WORK,
+    Skill.CLEAN: _AT_WORK,
+    Skill.SOAK: _AT_WORK,
+}
+"""What else stops a skill when a robot really carries it out: reasons of the physical mode alone."""
+
+
 def reasons_of(skill: Skill) -> frozenset[FailureReason]:
     """Every reason with which a call of the skill can fail."""
     entry = LIBRARY[skill]
-    return frozenset(reason for item in entry.preconditions for reason in REASONS[item]) | frozenset(
-        entry.outcomes
-    )
+    foreseen = frozenset(reason for item in entry.preconditions for reason in REASONS[item])
+    return foreseen | frozenset(entry.outcomes) | frozenset(MISHAPS[skill])

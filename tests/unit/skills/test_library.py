@@ -6,12 +6,12 @@ from embomatrix.sim.actions import ACTIONS
 from embomatrix.skills.check import CHECKS
 from embomatrix.skills.describe import DONE
 from embomatrix.skills.failure import SENTENCES, FailureReason
-from embomatrix.skills.library import LIBRARY, REASONS, Precondition, reasons_of
+from embomatrix.skills.library import LIBRARY, MISHAPS, REASONS, Precondition, reasons_of
 from embomatrix.skills.syntax import SIGNATURES, Arg, Skill
 
 
 def test_every_skill_has_an_entry_a_signature_an_action_and_a_sentence():
-    assert set(LIBRARY) == set(SIGNATURES) == set(ACTIONS) == set(DONE) == set(Skill)
+    assert set(LIBRARY) == set(SIGNATURES) == set(ACTIONS) == set(DONE) == set(MISHAPS) == set(Skill)
 
 
 def test_every_precondition_is_decided_has_reasons_and_is_asked_by_a_skill():
