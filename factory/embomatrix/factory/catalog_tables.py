@@ -35,6 +35,8 @@ DOORS: Final = frozenset({"door", "sliding_door", "garage_door", "elevator_door"
 WINDOWS: Final = frozenset({"openable_window", "fixed_window"})
 STRUCTURE: Final = frozenset({"walls", "floors", "ceilings", "lawn", "driveway"})
 """Categories of the building itself: its panels and its ground, which a scene lays out anew."""
+LEAST_FLOOR_M: Final = 0.4
+"""A narrower floor model is a threshold or a strip between two others, where nobody can stand."""
 
 UNIVERSAL: Final = frozenset(
     {
@@ -159,13 +161,14 @@ def _pick(models: Mapping[str, int], categories: frozenset[str]) -> dict[str, in
 
 
 def _floors(models: Iterable[str], boxes: Json) -> list[list[float]]:
-    """Depth and width of a room's floor models, the largest first."""
+    """Depth and width of a room's floor models, the largest first, without thresholds."""
     sizes = [boxes[key.rsplit("-", 1)[1]] for key in models if _category(key) == "floors"]
-    return sorted(([round(size[0], 3), round(size[1], 3)] for size in sizes), key=lambda s: (-s[0] * s[1], s))
+    floors = [[round(size[0], 3), round(size[1], 3)] for size in sizes if min(size[:2]) >= LEAST_FLOOR_M]
+    return sorted(floors, key=lambda s: (-s[0] * s[1], s))
 
 
 def _typical_floors(scenes: Json, boxes: Json) -> dict[str, list[float]]:
-    """Median floor of each room type: the size of the eleven rooms whose inventory lists no floor."""
+    """Median floor of each room type: the size of the twelve rooms whose inventory lists none to stand on."""
     seen: dict[str, list[list[float]]] = defaultdict(list)
     for rooms in scenes.values():
         for name, models in rooms.items():
