@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from embomatrix.sim.facts import SceneFacts
 from embomatrix.sim.hand import Hand
@@ -18,7 +18,7 @@ from embomatrix.world.state import State
 from embomatrix.world.substances import MEANINGS, facts_of
 
 if TYPE_CHECKING:
-    from collections.abc import Set
+    from collections.abc import Mapping, Set
 
     from embomatrix.sim.engine import PhysicsEngine
     from embomatrix.sim.thermal import Change
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from embomatrix.world.state import SubstanceFact
     from embomatrix.world.task import Task
 
+T = TypeVar("T")
 SYMBOLIC = frozenset(State) - {State.OPEN} - MEANINGS.keys()
 
 
@@ -60,10 +61,8 @@ class LiveWorld:
     def reset(self, task: Task) -> None:
         """Back to the scene's beginning, where the sources have long acted on what lies at them."""
         self.engine.reset()
-        for name, states in self._initial.items():
-            self.states[name] = set(states)
-        for name, facts in self._initial_substances.items():
-            self.substances[name] = set(facts)
+        _restore(self.states, self._initial)
+        _restore(self.substances, self._initial_substances)
         self.absent.clear()
         self.absent |= self._future
         self.hand.forget()
@@ -148,12 +147,10 @@ class LiveWorld:
     def state_bytes(self) -> bytes:
         """All that a trace's digest depends on: the engine's state, the robot, the hand and the symbolic states."""
         robot = f"{self.robot.x_m.hex()} {self.robot.y_m.hex()} {self.robot.yaw.hex()}"
-        symbolic = [
-            f"{name}:{','.join(sorted(states))}" for name, states in sorted(self.states.items()) if states
-        ]
+        symbolic = [f"{name}:{','.join(sorted(states))}" for name, states in self.states.items() if states]
         symbolic += [
             f"{name}:{','.join(f'{fact.relation} {fact.substance}' for fact in sorted(facts))}"
-            for name, facts in sorted(self.substances.items())
+            for name, facts in self.substances.items()
             if facts
         ]
         symbolic += sorted(self.absent)
@@ -164,3 +161,10 @@ class LiveWorld:
         for item in self.scene.objects:
             self.states[item.name] = set(item.states & SYMBOLIC)
             self.substances[item.name] = set(facts_of(item.states, item.substances))
+
+
+def _restore(current: dict[str, set[T]], initial: Mapping[str, frozenset[T]]) -> None:
+    """Make the sets equal to the initial ones; those that are so already are left alone, as nearly all are."""
+    for name, members in initial.items():
+        if current[name] != members:
+            current[name] = set(members)

@@ -1,6 +1,8 @@
 """Parser of BDDL problems, in the dialects of BEHAVIOR-1K and of the paper's factory.
 
 ``?`` before an object of the problem is optional, text is lower-cased but for the problem's name, ``;`` starts a comment.
+A *wildcard* (``sink.n.01_*``) stands for the further objects of its type in the room that ``:init`` names; it is spelt out
+when the rooms are known. A substance may be called by its synset, without being declared: goals over scenes do.
 Three habits of published problems are accepted: a stray backslash at a line's end, an object declared again with the same
 type, and a room instance (``closet_0``) where an object should stand. Every error names the line and the column, from 1.
 """
@@ -8,10 +10,10 @@ type, and a room instance (``closet_0``) where an object should stand. Every err
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, NoReturn
 
-from embomatrix.world.evaluate import render
+from embomatrix.world.evaluate import atoms_of, render
 from embomatrix.world.goal import (
     And,
     Atom,
@@ -25,6 +27,8 @@ from embomatrix.world.goal import (
     Not,
     Or,
 )
+from embomatrix.world.state import SubstanceRelation
+from embomatrix.world.substances import is_substance
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -54,6 +58,8 @@ ROOM_TYPES: Final = frozenset(
     )
 )  # fmt: skip
 """Room types of the 51 base scenes; a room instance is a type and a number: ``kitchen_0``."""
+WILDCARD: Final = "_*"
+"""How the name of a wildcard ends."""
 MAX_DEPTH: Final = 64
 """Deeper nesting is no goal that anyone wrote."""
 
@@ -86,11 +92,33 @@ class Problem:
 
     @property
     def types(self) -> Mapping[str, tuple[str, ...]]:
-        """Type to object names: what quantifiers range over."""
-        members: dict[str, tuple[str, ...]] = {}
+        """Type to object names, without wildcards: what quantifiers range over."""
+        members: dict[str, tuple[str, ...]] = {type_name: () for type_name in self.objects.values()}
         for name, type_name in self.objects.items():
-            members[type_name] = (*members.get(type_name, ()), name)
+            if not name.endswith(WILDCARD):
+                members[type_name] = (*members[type_name], name)
         return members
+
+    @property
+    def wildcards(self) -> Mapping[str, str]:
+        """Wildcards of the problem, and the words for the rooms that they are about."""
+        return {
+            item.atom.args[0]: item.atom.args[1]
+            for item in self.init
+            if item.atom.args[0].endswith(WILDCARD)
+        }
+
+    def spelt_out(self, members: Mapping[str, tuple[str, ...]]) -> Problem:
+        """The problem with each wildcard replaced by objects of these names, which may be none."""
+        objects: dict[str, str] = {}
+        for name, type_name in self.objects.items():
+            objects |= dict.fromkeys(members.get(name, (name,)), type_name)
+        init = [
+            replace(item, atom=replace(item.atom, args=(name, *item.atom.args[1:])))
+            for item in self.init
+            for name in members.get(item.atom.args[0], item.atom.args[:1])
+        ]
+        return replace(self, objects=objects, init=tuple(init))
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,9 +178,10 @@ def parse_formula(text: str, objects: Mapping[str, str]) -> Formula:
 
 def render_problem(problem: Problem) -> str:
     """BDDL text that ``parse_problem`` reads back to an equal problem."""
-    objects = "\n".join(
-        f"        {' '.join(names)} - {type_name}" for type_name, names in problem.types.items()
-    )
+    grouped: dict[str, list[str]] = {}
+    for name, type_name in problem.objects.items():
+        grouped.setdefault(type_name, []).append(name)
+    objects = "\n".join(f"        {' '.join(names)} - {type_name}" for type_name, names in grouped.items())
     init = "\n".join(
         f"        {render(item.atom if item.positive else Not(item.atom))}" for item in problem.init
     )
@@ -253,6 +282,9 @@ class _Reader:
 
     def goal(self, section: _Node) -> Formula:
         parts = tuple(self.formula(node, {}) for node in section.items[1:])
+        for atom in (atom for part in parts for atom in atoms_of(part)):
+            if any(arg.endswith(WILDCARD) for arg in atom.args):
+                section.fail(f"the goal names a wildcard in {render(atom)}: range over its type instead")
         if not parts:
             section.fail("the goal is empty: expected one formula")
         return parts[0] if len(parts) == 1 else And(parts)
@@ -314,13 +346,11 @@ class _Reader:
         if len(args) not in ARITIES[predicate]:
             expected = " or ".join(map(str, ARITIES[predicate]))
             node.fail(f"{predicate!r} takes {expected} arguments, found {len(args)}")
-        is_room = [predicate == "inroom" and index == 1 for index in range(len(args))]
         return Atom(
-            predicate,
-            tuple(self._name(arg, scope, room=room) for arg, room in zip(args, is_room, strict=True)),
+            predicate, tuple(self._name(arg, scope, predicate, index) for index, arg in enumerate(args))
         )
 
-    def _name(self, node: _Node, scope: Mapping[str, str], *, room: bool) -> str:
+    def _name(self, node: _Node, scope: Mapping[str, str], predicate: str, index: int) -> str:
         if not node.word:
             node.fail("expected a name, found a list")
         word = node.word.lower()
@@ -328,7 +358,11 @@ class _Reader:
         for name in (word, f"?{bare}"):  # both dialects leave the mark out now and then
             if name in scope:
                 return name
-        if not room and bare not in self.objects and not is_room_instance(bare):
+        if bare.endswith(WILDCARD) and predicate != "inroom":
+            node.fail(f"the wildcard {bare!r} can only be said to be in a room: range over its type instead")
+        free = predicate == "inroom" and index == 1
+        of_substance = index == 1 and predicate in set(SubstanceRelation) and is_substance(bare)
+        if not (free or of_substance or bare in self.objects or is_room_instance(bare)):
             node.fail(f"object {bare!r} is not declared: add it to :objects, or mend its name")
         return bare
 

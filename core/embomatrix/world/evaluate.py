@@ -21,6 +21,7 @@ from embomatrix.world.goal import (
     Not,
     Or,
 )
+from embomatrix.world.substances import is_substance
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -187,16 +188,16 @@ def types_of(formula: Formula) -> frozenset[str]:
 def objects_of(formula: Formula, types: Types) -> frozenset[str]:
     """Objects that the goal is about: those it names, and the members of the types it quantifies over.
 
-    The room in ``inroom(object, room)`` is no object.
+    The room in ``inroom(object, room)`` is no object, nor is a substance that is called by its synset.
     """
     named = {
         arg
         for atom in atoms_of(formula)
         for arg in (atom.args[:1] if atom.predicate == "inroom" else atom.args)
-        if not arg.startswith("?")
+        if not arg.startswith("?") and not is_substance(arg)
     }
     ranged = {name for type_name in types_of(formula) for name in _members(type_name, types)}
-    return frozenset(named | ranged)
+    return frozenset(named | {name for name in ranged if not is_substance(name)})
 
 
 def render(formula: Formula) -> str:
