@@ -11,18 +11,19 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.world.asset import JointKind
-from embomatrix.world.geometry import IDENTITY_QUAT, Aabb, Pose, Shape
+from embomatrix.world.geometry import IDENTITY_QUAT, Aabb, Part, Pose, Shape
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from embomatrix.world.asset import Asset, Joint
-    from embomatrix.world.geometry import FloatArray, Part, Quat, Vec3
+    from embomatrix.world.geometry import FloatArray, Quat, Vec3
 
 RIM_POINTS: Final = 24
 """Points on each rim of a cylinder: a box is then at most 0.9 % of the radius too small."""
 EXTENTS_KEPT: Final = 512
-"""Answers in memory for each asset, about 300 bytes each."""
+"""Answers in memory for each asset, about 300 bytes each; for its parts as much for each of them."""
+CORNERS: Final = 8
 IDENTITY: Final = Pose((0.0, 0.0, 0.0), IDENTITY_QUAT)
 
 
@@ -74,6 +75,73 @@ class AssetBounds:
         return (a, b, c), (d, e, f)
 
 
+class AssetParts:
+    """The parts of an asset one by one, made once and shared by all objects of the asset."""
+
+    def __init__(self, asset: Asset) -> None:
+        self._links = [(link.joint, link.parts) for link in asset.links if link.parts]
+        corners = [part.pose.apply_all(_enclosing_points(part)) for _, parts in self._links for part in parts]
+        self._points = np.concatenate(corners)  # (n, 3)
+        self._starts = np.cumsum([0, *map(len, corners)])[:-1]
+        self._extents: dict[tuple[Quat, tuple[float, ...]], list[tuple[Vec3, Vec3]]] = {}
+
+    def boxes(self, pose: Pose, fractions: Sequence[float]) -> list[Aabb]:
+        """Box of every part in the world, in the order of the links, as ``Part.aabb`` has it."""
+        x, y, z = pose.position_m
+        return [
+            Aabb((x + a, y + b, z + c), (x + d, y + e, z + f))
+            for (a, b, c), (d, e, f) in self._extents_at(pose.quat_xyzw, tuple(fractions))
+        ]
+
+    def within(self, pose: Pose, fractions: Sequence[float], box: Aabb) -> list[Part]:
+        """Parts whose boxes overlap a box of the world, each at its pose in the world."""
+        x, y, z = pose.position_m
+        (low_x, low_y, low_z), (high_x, high_y, high_z) = box.low_m, box.high_m
+        extents = iter(self._extents_at(pose.quat_xyzw, tuple(fractions)))
+        found: list[Part] = []
+        for frame, parts in self._frames(pose, fractions):
+            for part, ((a, b, c), (d, e, f)) in zip(parts, extents, strict=False):
+                if (
+                    x + a <= high_x
+                    and y + b <= high_y
+                    and z + c <= high_z
+                    and x + d >= low_x
+                    and y + e >= low_y
+                    and z + f >= low_z
+                ):
+                    found.append(Part(part.shape, frame @ part.pose, part.size_m, part.vertices_m))
+        return found
+
+    def _extents_at(self, quat_xyzw: Quat, fractions: tuple[float, ...]) -> list[tuple[Vec3, Vec3]]:
+        """Corners of each part's box relative to the asset's origin. Things stand at few angles: answers are kept."""
+        key = (quat_xyzw, fractions)
+        known = self._extents.get(key)
+        if known is None:
+            if len(self._extents) >= EXTENTS_KEPT:
+                self._extents.clear()
+            known = self._extents[key] = self._reckon(Pose((0.0, 0.0, 0.0), quat_xyzw), fractions)
+        return known
+
+    def _reckon(self, pose: Pose, fractions: tuple[float, ...]) -> list[tuple[Vec3, Vec3]]:
+        chunks, first = [], 0
+        for frame, parts in self._frames(pose, fractions):
+            count = sum(len(part.vertices_m) or CORNERS for part in parts)
+            chunks.append(frame.apply_all(self._points[first : first + count]))
+            first += count
+        world = np.concatenate(chunks)  # (n, 3)
+        lows = np.minimum.reduceat(world, self._starts).tolist()
+        highs = np.maximum.reduceat(world, self._starts).tolist()
+        return [((a, b, c), (d, e, f)) for (a, b, c), (d, e, f) in zip(lows, highs, strict=True)]
+
+    def _frames(self, pose: Pose, fractions: Sequence[float]) -> Iterator[tuple[Pose, tuple[Part, ...]]]:
+        """Frame of each link that has parts, and those."""
+        moving = iter(fractions)
+        for joint, parts in self._links:
+            fraction = next(moving, 0.0) if joint is not None else 0.0
+            placed = pose @ joint_motion(joint, fraction) if joint is not None and fraction else pose
+            yield placed, parts
+
+
 def _cloud(parts: Sequence[Part]) -> tuple[FloatArray, FloatArray]:
     """Points, shape (n, 3), and the radius of the ball around each, shape (n, 1), in the asset's frame."""
     points = [part.pose.apply_all(_points(part)) for part in parts]
@@ -82,6 +150,18 @@ def _cloud(parts: Sequence[Part]) -> tuple[FloatArray, FloatArray]:
         for part, chunk in zip(parts, points, strict=True)
     ]
     return np.concatenate(points), np.concatenate(radii)
+
+
+def _enclosing_points(part: Part) -> FloatArray:
+    """Vertices of a hull, corners of the box around the other shapes; in the part's frame."""
+    if part.vertices_m:
+        return np.asarray(part.vertices_m, dtype=np.float64)
+    return np.asarray(_signs(part.size_m), dtype=np.float64)
+
+
+def _signs(size_m: Vec3) -> list[Vec3]:
+    x, y, z = (extent / 2 for extent in size_m)
+    return [(sx * x, sy * y, sz * z) for sx in (-1.0, 1.0) for sy in (-1.0, 1.0) for sz in (-1.0, 1.0)]
 
 
 def _points(part: Part) -> FloatArray:
@@ -96,5 +176,4 @@ def _points(part: Part) -> FloatArray:
             rim = np.stack([x * np.cos(angles), y * np.sin(angles), np.full(RIM_POINTS, z)], axis=1)
             return np.concatenate([rim, rim * (1.0, 1.0, -1.0)])
         case Shape.BOX:
-            signs = (-1.0, 1.0)
-            return np.array([(sx * x, sy * y, sz * z) for sx in signs for sy in signs for sz in signs])
+            return np.array(_signs(part.size_m))

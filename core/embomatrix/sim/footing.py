@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.sim.bounds import AssetBounds
 from embomatrix.sim.spots import REST_M, interior_around, is_shut, is_upright, link_frame, surface_under
-from embomatrix.world.geometry import Aabb
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
     from embomatrix.sim.engine import PhysicsEngine
     from embomatrix.world.asset import Asset, Interior
-    from embomatrix.world.geometry import Pose
+    from embomatrix.world.geometry import Aabb, Pose
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +97,7 @@ class Footings:
             near = {name}
             for place in (box, None if self._engine.is_parked(name) else self._engine.aabb(name)):
                 if place is not None:
-                    near.update(self._engine.near(grown(place, REST_M)))
+                    near.update(self._engine.near(place.grown(REST_M)))
             self._disturbed |= near
             for other in near:
                 self._now.pop(other, None)
@@ -111,7 +110,7 @@ class Footings:
         hosts: list[tuple[float, str, Host]] = []
         around: list[tuple[float, str, Enclosure]] = []
         on: list[str] = []
-        for other in engine.near(grown(box, REST_M), frozenset((name,))):
+        for other in engine.near(box.grown(REST_M), frozenset((name,))):
             asset, pose, fractions = scene.asset_of(other), engine.pose(other), engine.joints(other)
             volume = math.prod(asset.size_m)
             interior = self._interior(name, asset, pose, fractions)
@@ -156,12 +155,6 @@ class Footings:
             for item in asset.interiors
             if item.link == link
         )
-
-
-def grown(box: Aabb, margin_m: float) -> Aabb:
-    """The box with ``margin_m`` added on every side."""
-    (a, b, c), (d, e, f) = box.low_m, box.high_m
-    return Aabb((a - margin_m, b - margin_m, c - margin_m), (d + margin_m, e + margin_m, f + margin_m))
 
 
 def _first_two(item: tuple[float, str, object]) -> tuple[float, str]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.sim.footing import Footings, grown
+from embomatrix.sim.footing import Footings
 from embomatrix.sim.spots import REST_M, is_under
 from embomatrix.world.state import OPEN_FRACTION, Relation
 
@@ -129,7 +129,7 @@ class Relations:
         """Objects whose host is this one, in scene order: on its surfaces and in its cavities."""
         if self._engine.is_parked(name):
             return ()
-        around = self._engine.near(grown(self._engine.aabb(name), REST_M), frozenset((name,)))
+        around = self._engine.near(self._engine.aabb(name).grown(REST_M), frozenset((name,)))
         return tuple(other for other in around if self._is_host(name, other))
 
     def group_of(self, name: str) -> tuple[str, ...]:

@@ -123,6 +123,11 @@ class Aabb:
             for lo, p, hi in zip(self.low_m, point, self.high_m, strict=True)
         )
 
+    def grown(self, margin_m: float) -> Aabb:
+        """The box with ``margin_m`` added on every side."""
+        (a, b, c), (d, e, f) = self.low_m, self.high_m
+        return Aabb((a - margin_m, b - margin_m, c - margin_m), (d + margin_m, e + margin_m, f + margin_m))
+
     def overlaps(self, other: Aabb, margin_m: float = 0.0) -> bool:
         """True when the boxes, ``margin_m`` apart or less, share volume or a face."""
         return all(

@@ -15,6 +15,7 @@ from tests.fakes.scenes import kitchen_scene, placed, scene_of, upright
 from embomatrix.sim.bounds import AssetBounds
 from embomatrix.sim.bullet.client import ClientPool, connect, pybullet
 from embomatrix.sim.bullet.engine import BulletEngine
+from embomatrix.sim.bullet.mini_world import STAGES_KEPT
 from embomatrix.sim.engine import FLOOR, WALL, EngineError
 from embomatrix.world.asset import Joint, JointKind, Link
 from embomatrix.world.geometry import Aabb, Part, Pose, Shape
@@ -79,6 +80,29 @@ def test_two_engines_agree_to_the_bit_whatever_one_simulated_before(pool) -> Non
     assert first.state_bytes() == second.state_bytes()
     first.close()
     second.close()
+
+
+def test_settling_has_no_memory(engine, pool) -> None:
+    poses = {name: engine.pose(name) for name in MOVABLE}
+    lifted = {
+        name: Pose((x, y, z + 0.004), pose.quat_xyzw)
+        for name, pose in poses.items()
+        for x, y, z in [pose.position_m]
+    }
+    fresh = {}
+    for name in MOVABLE:
+        engine.set_pose(name, lifted[name])
+        other = BulletEngine(engine.scene, pool)
+        other.set_pose(name, lifted[name])
+        fresh[name] = other.settle(name)
+        other.close()
+        engine.set_pose(name, poses[name])
+    rng = np.random.default_rng(5)
+    for _ in range(STAGES_KEPT + 60):  # the client is emptied in between
+        name = MOVABLE[int(rng.integers(len(MOVABLE)))]
+        engine.set_pose(name, lifted[name])
+        assert engine.settle(name) == fresh[name]
+        engine.set_pose(name, poses[name])
 
 
 def test_settling_changes_nothing(engine) -> None:

@@ -43,12 +43,17 @@ class Piece:
 class BodyFactory:
     """Makes bodies in one client. Shapes are shared by the bodies of an asset and live until the client is reset."""
 
-    def __init__(self, client: int, flags: int = 0) -> None:
-        """``flags`` are Bullet's, for every body that is made."""
+    def __init__(self, client: int, flags: int = 0, *, plain: bool = False) -> None:
+        """``flags`` are Bullet's, for every body that is made.
+
+        With ``plain``, bodies of one piece are rigid bodies instead of multi-bodies: they step three times as fast, but
+        Bullet restores no saved state of them exactly.
+        """
         self._bullet = pybullet()
         self._client = client
         self._flags = flags
-        self._pieces: dict[str, tuple[Piece, ...]] = {}
+        self._plain = plain
+        self._pieces: dict[int, tuple[Asset, tuple[Piece, ...]]] = {}
 
     def forget_shapes(self) -> None:
         """Drop the shapes' ids: resetting a client frees the shapes themselves."""
@@ -108,13 +113,14 @@ class BodyFactory:
         return tuple(i - 1 for i, piece in enumerate(pieces) if piece.joint is not None)
 
     def _pieces_of(self, asset: Asset) -> tuple[Piece, ...]:
-        if asset.asset_id not in self._pieces:
+        """Shapes of an asset. It is kept beside them, so that its id can't pass to another one."""
+        if id(asset) not in self._pieces:
             pieces: list[Piece] = []
             for link in asset.links:
                 origin = link.joint.origin_m if link.joint is not None else (0.0, 0.0, 0.0)
                 pieces += self._link_pieces(link.parts, origin, link.joint, len(pieces))
-            self._pieces[asset.asset_id] = tuple(pieces)
-        return self._pieces[asset.asset_id]
+            self._pieces[id(asset)] = (asset, tuple(pieces))
+        return self._pieces[id(asset)][1]
 
     def _link_pieces(
         self, parts: Sequence[Part], origin: Vec3, joint: Joint | None, first: int
@@ -168,7 +174,7 @@ class BodyFactory:
         pose: Pose,
         motions: Sequence[Pose] | None = None,
     ) -> int:
-        """One body of these pieces, each with its mass. With ``motions`` (one per joint) the joints are fixed there, else they are free."""
+        """One body of these pieces, each with its mass. With ``motions``, one per joint, the joints are fixed there."""
         return int(
             self._bullet.createMultiBody(
                 masses_kg[0],
@@ -177,6 +183,7 @@ class BodyFactory:
                 basePosition=pose.position_m,
                 baseOrientation=pose.quat_xyzw,
                 flags=self._flags,
+                useMaximalCoordinates=self._plain and len(pieces) == 1,
                 physicsClientId=self._client,
                 **self._links(masses_kg[1:], pieces[1:], motions),
             )

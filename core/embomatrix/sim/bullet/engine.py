@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 BOX_SLACK_M: Final = 0.01
 """Boxes this far apart are still compared part by part: boxes of tilted cylinders may be a little too small."""
 SETTLE_RADIUS_M: Final = 0.05
-"""Objects whose boxes come this near take part in a settle: nothing that is stable moves a fifth as far."""
+"""Parts whose boxes come this near take part in a settle: nothing that is stable moves a fifth as far."""
 
 
 class BulletEngine:
@@ -193,7 +193,8 @@ class BulletEngine:
         ]
         walls = [self._scene.walls[wall] for wall in self._walls_around.near(box, SETTLE_RADIUS_M)]
         pose = self._poses[number]
-        self._mini.stage(self._assets[number], pose, self._fractions[number], stills, walls)
+        region = box.grown(SETTLE_RADIUS_M)
+        self._mini.stage(self._assets[number], pose, self._fractions[number], stills, walls, region)
         return self._mini.drop(pose, steps)
 
     def state_bytes(self) -> bytes:

@@ -6,16 +6,16 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.sim.bounds import AssetParts
 from embomatrix.sim.bullet.bodies import BodyFactory
 from embomatrix.sim.bullet.client import ClientPool, pybullet
 from embomatrix.sim.engine import SETTLE_STEPS, Settled
-from embomatrix.world.geometry import Pose
+from embomatrix.world.geometry import Aabb, Part, Pose, Shape
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from embomatrix.world.asset import Asset
-    from embomatrix.world.geometry import Part
 
 GRAVITY_M_S2: Final = -9.81
 CHUNK_STEPS: Final = 12
@@ -29,7 +29,13 @@ REST_RAD_S: Final = 0.2
 """Above either speed the object is not at rest when time is up."""
 ROLLING_FRICTION: Final = 2e-3
 """Round food is not a ball bearing: a little resistance to rolling lets an apple come to rest."""
-FLOOR_HALF_M: Final = 3.0
+ROUND: Final = frozenset((Shape.CYLINDER, Shape.SPHERE, Shape.HULL))
+"""Shapes that may roll. Boxes go without: with it the solver uses all its iterations, and a step costs five times as much."""
+FLOOR_M: Final = 6.0
+FLOOR_THICKNESS_M: Final = 0.5
+STAGES_KEPT: Final = 256
+"""Stages between two resets: a stage leaves about 5 kB behind, and a reset costs as much as ten."""
+EVERYWHERE: Final = Aabb((-math.inf,) * 3, (math.inf,) * 3)
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,15 +48,22 @@ class Still:
 
 
 class MiniWorld:
-    """One client, rebuilt for every stage: what it simulates does not depend on what it simulated before."""
+    """One client in which one object moves and nothing else does. What it simulates does not depend on what it did before.
+
+    All that stands still is one body of boxes, or a few: a step costs what the object touches, not what furniture consists
+    of. Each stage makes its bodies anew and removes those of the last; the shapes that this leaves behind are freed, by a
+    reset of the client, once in many stages.
+    """
 
     def __init__(self, pool: ClientPool) -> None:
         self._bullet = pybullet()
         self._pool = pool
         self._client = pool.take()
-        self._factory = BodyFactory(self._client)
+        self._factory = BodyFactory(self._client, plain=True)
+        self._parts: dict[int, tuple[Asset, AssetParts]] = {}
         self._body = -1
-        self._still: list[int] = []
+        self._still: tuple[int, ...] = ()
+        self._stages = 0
 
     def stage(
         self,
@@ -59,25 +72,48 @@ class MiniWorld:
         fractions: Sequence[float],
         stills: Sequence[Still],
         walls: Sequence[Part] = (),
+        region: Aabb | None = None,
     ) -> None:
-        """Build a world of one object that moves, others that do not, some walls and the floor."""
-        bullet, client = self._bullet, self._client
-        bullet.resetSimulation(physicsClientId=client)
-        self._factory.forget_shapes()
-        bullet.setGravity(0, 0, GRAVITY_M_S2, physicsClientId=client)
-        self._still = [
-            self._factory.floor(pose.position_m[0], pose.position_m[1], FLOOR_HALF_M),
-            *self._factory.walls(walls),
-            *(self._factory.rigid(item.asset, item.pose, item.fractions, 0.0) for item in stills),
-        ]
+        """Build a world of one object that moves, others that do not, some walls and the floor.
+
+        Of what does not move only those parts are there that reach into ``region``, when one is given.
+        """
+        self._clear()
+        x, y, _ = pose.position_m
+        slab = Part(Shape.BOX, Pose((x, y, -FLOOR_THICKNESS_M / 2)), (FLOOR_M, FLOOR_M, FLOOR_THICKNESS_M))
+        parts = [slab, *walls]
+        for item in stills:
+            box = region if region is not None else EVERYWHERE
+            parts += self._parts_of(item.asset).within(item.pose, item.fractions, box)
+        self._still = self._factory.walls(parts)
         self._body = self._factory.rigid(asset, pose, fractions, asset.mass_kg)
-        bullet.changeDynamics(
-            self._body,
-            -1,
-            rollingFriction=ROLLING_FRICTION,
-            spinningFriction=ROLLING_FRICTION,
-            physicsClientId=client,
-        )
+        if any(part.shape in ROUND for link in asset.links for part in link.parts):
+            self._bullet.changeDynamics(
+                self._body,
+                -1,
+                rollingFriction=ROLLING_FRICTION,
+                spinningFriction=ROLLING_FRICTION,
+                physicsClientId=self._client,
+            )
+
+    def _clear(self) -> None:
+        bullet, client = self._bullet, self._client
+        if self._stages % STAGES_KEPT == 0:
+            bullet.resetSimulation(physicsClientId=client)
+            self._factory.forget_shapes()
+            bullet.setGravity(0, 0, GRAVITY_M_S2, physicsClientId=client)
+            # Contacts are solved in the order in which bodies were made, whatever the tree of boxes went through before.
+            bullet.setPhysicsEngineParameter(deterministicOverlappingPairs=1, physicsClientId=client)
+        else:
+            for body in (self._body, *self._still):
+                bullet.removeBody(body, physicsClientId=client)
+        self._stages += 1
+
+    def _parts_of(self, asset: Asset) -> AssetParts:
+        """Parts of an asset. It is kept beside them, so that its id can't pass to another one."""
+        if id(asset) not in self._parts:
+            self._parts[id(asset)] = (asset, AssetParts(asset))
+        return self._parts[id(asset)][1]
 
     def depth_m(self, pose: Pose) -> float:
         """How deep the object, put at a pose, reaches into the bodies that stand still; 0 when it is free."""
