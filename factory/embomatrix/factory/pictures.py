@@ -18,6 +18,8 @@ _ORIGIN: Final = Pose((0.0, 0.0, 0.0))
 _MARGIN_PX: Final = 30
 _LONG_SIDE_PX: Final = 1500
 _LINE_PX: Final = 15
+_PANE_M: Final = 0.03
+"""Half the thickness at which windows are drawn."""
 _SMALL_M: Final = 0.3
 _HUNG_M: Final = 1.2
 _CEILING_M: Final = 2.3
@@ -98,6 +100,11 @@ class _Plan:
             x, y = door.center_m
             ends = [self._px(x - a, y - b), self._px(x + a, y + b)]
             self._draw.line(ends, fill="#b5522b", width=2)
+        for window in self._scene.windows:
+            a, b = (window.width_m / 2, _PANE_M) if window.along == "x" else (_PANE_M, window.width_m / 2)
+            x, y = window.center_m
+            corners = [self._px(x - a, y - b), self._px(x + a, y + b)]
+            self._draw.rectangle(_ordered(corners), fill="#6fc3e8")
 
     def furniture(self) -> None:
         shown = [o for o in self._scene.objects if not self._is_small(o)]
@@ -125,7 +132,7 @@ class _Plan:
             self._draw.rectangle((x, y + 2, x + 14, y + 12), fill=_FILL[kind], outline="#555555")
             self._text((x + 22, y), words, 11, "black")
             self._row += 1
-        self._say("     triangle: front · red line: doorway · ring: light or fan")
+        self._say("     triangle: front · red: doorway · blue: window · ring: light or fan")
         self._say("")
         for number, item in enumerate(self._small, start=1):
             x, y = self._px(*item.pose_world_asset.position_m[:2])

@@ -1,17 +1,23 @@
-"""What a scene must keep: nothing interpenetrates, everything rests or hangs, the robot gets to all that it may use."""
+"""What a scene must keep: nothing interpenetrates, everything rests or hangs, the robot gets to all that it may use.
+
+Geometry tells most of it; the engine finds penetrations once more, and lets everything that can move fall for a second.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.factory.floorplan_spec import MIN_DOOR_M
 from embomatrix.factory.furnish_pieces import Access, Piece, access_of
 from embomatrix.factory.furnish_roles import role_of
+from embomatrix.factory.scene_clearance import Clearance
 from embomatrix.factory.scene_floor import ReachableFloor, box_of
 from embomatrix.factory.scene_solids import Solids, placed_parts
 from embomatrix.sim.bullet.engine import BulletEngine
+from embomatrix.sim.bullet.settling import settle_scene
 from embomatrix.sim.engine import FLOOR
 from embomatrix.world.state import Relation
 
@@ -24,6 +30,8 @@ if TYPE_CHECKING:
 REST_M: Final = 0.002
 HANG_M: Final = 0.03
 CEILING_M: Final = 2.4
+STABLE_SHARE: Final = 0.96
+"""Share of the movable objects that must stay within 1 cm and 10 degrees when all are let go at once."""
 _EDGE_M: Final = 0.005
 
 
@@ -34,6 +42,10 @@ class ProblemKind(StrEnum):
     ROOM = "room"
     ACCESS = "access"
     UNREACHABLE_ROOM = "unreachable_room"
+    DOORWAY = "doorway"
+    WINDOW = "window"
+    UNSTABLE = "unstable"
+    SUNKEN = "sunken"
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +65,7 @@ def check_scene(scene: Scene) -> tuple[Problem, ...]:
         *_supports(scene),
         *_rooms(scene),
         *reach_problems(scene),
+        *_openings(scene),
     )
 
 
@@ -68,6 +81,38 @@ def check_in_engine(scene: Scene) -> tuple[Problem, ...]:
         return tuple(found)
     finally:
         engine.close()
+
+
+@dataclass(frozen=True, slots=True)
+class Settlement:
+    """What became of a scene that was let go: how many objects can move, which did, and who sank into whom."""
+
+    movable: int
+    unstable: tuple[str, ...]
+    problems: tuple[Problem, ...]
+
+    @property
+    def stable_share(self) -> float:
+        """Share of the movable objects that stayed; 1 where nothing can move."""
+        return 1.0 - len(self.unstable) / self.movable if self.movable else 1.0
+
+
+def check_settled(scene: Scene) -> Settlement:
+    """Let everything fall for a second of simulated time. Raises EngineError where the engine is missing."""
+    settled = settle_scene(scene)
+    problems = [
+        Problem(ProblemKind.SUNKEN, pair, f"{depth * 1000:.1f} mm into one another after settling")
+        for pair, depth in settled.overlaps.items()
+    ]
+    found = Settlement(len(settled.objects), settled.unstable, ())
+    if found.stable_share < STABLE_SHARE:
+        moved = max(settled.objects[name].moved_m for name in found.unstable)
+        detail = (
+            f"{found.stable_share:.1%} of {found.movable} movable objects stay, one moves {moved:.2f} m: "
+            f"expected {STABLE_SHARE:.0%}"
+        )
+        problems.append(Problem(ProblemKind.UNSTABLE, found.unstable, detail))
+    return replace(found, problems=tuple(problems))
 
 
 def _names(scene: Scene) -> Iterator[Problem]:
@@ -164,3 +209,18 @@ def reach_problems(scene: Scene) -> Iterator[Problem]:
         if not len(floor.spots(box_of(scene, item), front_of=front)):
             where = "beside it" if front is None else "before its front"
             yield Problem(ProblemKind.ACCESS, (item.name,), f"no reachable spot {where}")
+
+
+def _openings(scene: Scene) -> Iterator[Problem]:
+    for doorway in scene.doorways:
+        if doorway.width_m < MIN_DOOR_M - _EDGE_M:
+            detail = f"{doorway.width_m:.2f} m wide: expected {MIN_DOOR_M} m"
+            yield Problem(ProblemKind.DOORWAY, doorway.rooms, detail)
+    clearance = Clearance(scene)
+    for doorway, room, names in clearance.before_doorways():
+        if names:
+            beyond = next((other for other in doorway.rooms if other != room), "") or "outside"
+            yield Problem(ProblemKind.DOORWAY, names, f"before the doorway from {room} to {beyond}")
+    for _, room, names in clearance.before_windows():
+        if names:
+            yield Problem(ProblemKind.WINDOW, names, f"before a window of {room}")

@@ -50,9 +50,11 @@ _RESTS: Final[Rgba] = (0.60, 0.47, 0.38, 1.0)
 _SOFT: Final[Rgba] = (0.45, 0.50, 0.62, 1.0)
 _ROBOT: Final[Rgba] = (0.85, 0.15, 0.15, 1.0)
 _DOOR: Final[Rgba] = (0.55, 0.30, 0.18, 1.0)
+_GLASS: Final[Rgba] = (0.66, 0.84, 0.93, 1.0)
 _CLOTH: Final = frozenset({"bed", "sofa", "armchair", "ottoman", "carpet", "booth", "bench", "pillow"})
 _LEAF_M: Final = 0.1
-"""Walls thinner than this are leaves of doors."""
+_PANE_M: Final = 0.03
+"""Walls thinner than the first are leaves of doors, thinner than the second panes of windows."""
 
 
 class Stage:
@@ -87,7 +89,7 @@ class Stage:
         for wall in self.scene.walls:
             seen = seen_as(wall)
             if seen is not None:
-                self._add_part(seen, IDENTITY, _DOOR if min(wall.size_m[:2]) < _LEAF_M else _WALL)
+                self._add_part(seen, IDENTITY, _material(wall))
 
     def add_objects(self, visible: Callable[[SceneObject], bool] = lambda item: True) -> None:
         """The objects at their places at the start; absent ones are out of sight."""
@@ -234,6 +236,14 @@ def _faces(points: FloatArray) -> dict[str, list[Any]]:
         "indices": list(range(count)),
         "normals": np.repeat(normals, 3, axis=0).tolist(),
     }
+
+
+def _material(wall: Part) -> Rgba:
+    """Colour of a wall's part by what its thickness makes it."""
+    thickness = min(wall.size_m[:2])
+    if thickness < _PANE_M:
+        return _GLASS
+    return _DOOR if thickness < _LEAF_M else _WALL
 
 
 def color_of(asset: Asset) -> Rgba:

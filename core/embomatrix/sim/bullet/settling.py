@@ -1,0 +1,118 @@
+"""A whole scene let go at once: everything that can move falls for a while, in a client that is thrown away."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from embomatrix.sim.bullet.bodies import BodyFactory
+from embomatrix.sim.bullet.client import ClientPool, pybullet
+from embomatrix.sim.bullet.mini_world import (
+    GRAVITY_M_S2,
+    REST_M_S,
+    REST_RAD_S,
+    ROLLING_FRICTION,
+    tilt_between,
+)
+from embomatrix.sim.engine import FLOOR, TOLERANCE_M, WALL, Settled
+from embomatrix.sim.validation import check_scene
+from embomatrix.world.geometry import Pose
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from embomatrix.world.scene import Scene
+
+SECONDS: Final = 1.0
+STEPS_PER_S: Final = 240
+MARGIN_M: Final = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class SettledScene:
+    """Where the movable objects end up, and who then overlaps whom by more than a millimetre, with the depth in metres."""
+
+    objects: Mapping[str, Settled]
+    overlaps: Mapping[tuple[str, str], float]
+
+    @property
+    def unstable(self) -> tuple[str, ...]:
+        return tuple(name for name, settled in self.objects.items() if not settled.stable)
+
+
+def settle_scene(scene: Scene, seconds: float = SECONDS) -> SettledScene:
+    """Let go of all movable objects at once; furniture stands still and shut.
+
+    Raises EngineError where the engine is missing or can't take the scene.
+    """
+    check_scene(scene)
+    pool = ClientPool()
+    client = pool.take()
+    try:
+        return _Fall(scene, client).run(round(seconds * STEPS_PER_S))
+    finally:
+        pool.give_back(client)
+
+
+class _Fall:
+    """One scene in one client, with mass on what can move."""
+
+    def __init__(self, scene: Scene, client: int) -> None:
+        self._bullet = pybullet()
+        self._client = client
+        factory = BodyFactory(client)
+        self._bullet.resetSimulation(physicsClientId=client)
+        self._bullet.setGravity(0, 0, GRAVITY_M_S2, physicsClientId=client)
+        low = np.min([room.low_m for room in scene.rooms], axis=0)
+        high = np.max([room.high_m for room in scene.rooms], axis=0)
+        x, y = (low + high) / 2
+        floor = factory.floor(float(x), float(y), float(max(high - low)) / 2 + MARGIN_M)
+        self._names = {floor: FLOOR, **dict.fromkeys(factory.walls(scene.walls), WALL)}
+        self._starts: dict[int, Pose] = {}
+        for item in scene.objects:
+            if item.absent:
+                continue
+            asset = scene.assets[item.asset_id]
+            fractions = item.joints or (0.0,) * len(asset.joints)
+            mass_kg = 0.0 if item.fixed else asset.mass_kg
+            body = factory.rigid(asset, item.pose_world_asset, fractions, mass_kg)
+            self._names[body] = item.name
+            if not item.fixed:
+                self._starts[body] = item.pose_world_asset
+                self._brake(body)
+
+    def run(self, steps: int) -> SettledScene:
+        for _ in range(steps):
+            self._bullet.stepSimulation(physicsClientId=self._client)
+        objects = {self._names[body]: self._settled(body, start) for body, start in self._starts.items()}
+        return SettledScene(objects, self._overlaps())
+
+    def _brake(self, body: int) -> None:
+        self._bullet.changeDynamics(
+            body,
+            -1,
+            rollingFriction=ROLLING_FRICTION,
+            spinningFriction=ROLLING_FRICTION,
+            physicsClientId=self._client,
+        )
+
+    def _settled(self, body: int, start: Pose) -> Settled:
+        position, quat = self._bullet.getBasePositionAndOrientation(body, physicsClientId=self._client)
+        linear, angular = self._bullet.getBaseVelocity(body, physicsClientId=self._client)
+        if not all(map(math.isfinite, (*position, *quat, *linear, *angular))):
+            return Settled(start, math.inf, math.pi, False)
+        pose = Pose(tuple(position), tuple(quat))
+        at_rest = math.hypot(*linear) < REST_M_S and math.hypot(*angular) < REST_RAD_S
+        return Settled(pose, math.dist(position, start.position_m), tilt_between(start, pose), at_rest)
+
+    def _overlaps(self) -> dict[tuple[str, str], float]:
+        """Pairs in contact deeper than the tolerance. Bodies that can't move are not compared with one another."""
+        deepest: dict[tuple[str, str], float] = {}
+        for contact in self._bullet.getContactPoints(physicsClientId=self._client):
+            pair = (self._names[contact[1]], self._names[contact[2]])
+            if -contact[8] > max(TOLERANCE_M, deepest.get(pair, 0.0)):
+                deepest[pair] = -contact[8]
+        return deepest
