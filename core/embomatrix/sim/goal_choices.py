@@ -44,21 +44,33 @@ Choice = tuple[Literal, ...]
 
 
 def choices(
-    goal: Formula, types: Types, facts: Facts, liking: Callable[[str], int] = lambda name: 0
+    goal: Formula,
+    types: Types,
+    facts: Facts,
+    liking: Callable[[str], int] = lambda name: 0,
+    hopeless: Callable[[Literal], bool] = lambda literal: False,
 ) -> tuple[Choice, ...]:
     """Up to ``WIDTH`` ways to make the goal true, by how many of their literals do not hold yet.
 
-    Of equal ones those come first whose objects are liked most. Each is enough for the goal; together they need not be
-    all there are. A way that contradicts itself is left out.
+    Of equal ones those come first whose objects are liked most, and ways with a hopeless literal come last. Each is enough for the goal; together they need not be all there are. A way that contradicts itself is
+    left out.
     """
-    return tuple(_Choices(types, facts, liking).of(goal, positive=True))
+    return tuple(_Choices(types, facts, liking, hopeless).of(goal, positive=True))
 
 
 class _Choices:
-    def __init__(self, types: Types, facts: Facts, liking: Callable[[str], int]) -> None:
+    def __init__(
+        self,
+        types: Types,
+        facts: Facts,
+        liking: Callable[[str], int],
+        hopeless: Callable[[Literal], bool],
+    ) -> None:
         self._types = types
         self._facts = facts
         self._liking = liking
+        self._hopeless = hopeless
+        self._known: dict[Literal, tuple[bool, bool]] = {}
 
     def of(self, formula: Formula, *, positive: bool) -> list[Choice]:
         match formula:
@@ -81,7 +93,7 @@ class _Choices:
             case ForN(count, variable, type_name, body):
                 return self._exactly(count, self._ground(body, variable, type_name), positive=positive)
             case ForPairs() | ForNPairs():
-                return self._paired(formula) if positive else []
+                return self._paired(formula) if positive else self._unpaired(formula)
 
     def _ground(self, body: Formula, variable: str, type_name: str) -> list[Formula]:
         return [substitute(body, {variable: name}) for name in self._types.get(type_name, ())]
@@ -124,16 +136,40 @@ class _Choices:
                 found += self._joined(bodies, positive=True, every=True)
         return self._best(found)
 
+    def _unpaired(self, formula: ForPairs | ForNPairs) -> list[Choice]:
+        """So many rows, or so many columns, without a true cell that too few are left."""
+        rows, columns = (self._types.get(name, ()) for name in (formula.type_a, formula.type_b))
+        needed = formula.count if isinstance(formula, ForNPairs) else min(len(rows), len(columns))
+        found: list[Choice] = []
+        for cleared, others, turned in ((rows, columns, False), (columns, rows, True)):
+            for picked in itertools.islice(itertools.combinations(cleared, len(cleared) - needed + 1), WIDTH):
+                pairs = [(b, a) if turned else (a, b) for a in picked for b in others if a != b]
+                cells = [
+                    substitute(formula.body, {formula.variable_a: a, formula.variable_b: b}) for a, b in pairs
+                ]
+                found += self._joined(cells, positive=False, every=True)
+        return self._best(found)
+
     def _cost_of(self, formula: Formula) -> int:
         options = self.of(formula, positive=True)
         return min((self._cost(choice) for choice in options), default=len(self._types))
 
     def _cost(self, choice: Choice) -> int:
-        return sum(self._facts.holds(item.atom.predicate, item.atom.args) != item.positive for item in choice)
+        return sum(self._judge(item)[0] for item in choice)
+
+    def _judge(self, item: Literal) -> tuple[bool, bool]:
+        """Whether the literal is still to be made true, and whether that is hopeless."""
+        if item not in self._known:
+            missing = self._facts.holds(item.atom.predicate, item.atom.args) != item.positive
+            self._known[item] = (missing, self._hopeless(item))
+        return self._known[item]
 
     def _best(self, found: Iterable[Choice | None]) -> list[Choice]:
         kept = [choice for choice in found if choice is not None]
-        return sorted(kept, key=lambda choice: (self._cost(choice), -self._liked(choice)))[:WIDTH]
+        return sorted(kept, key=self._rank)[:WIDTH]
+
+    def _rank(self, choice: Choice) -> tuple[bool, int, int]:
+        return (any(self._judge(item)[1] for item in choice), self._cost(choice), -self._liked(choice))
 
     def _liked(self, choice: Choice) -> int:
         return sum(self._liking(name) for item in choice for name in item.atom.args if item.positive)

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from embomatrix.sim.plan_script import StuckError
+from embomatrix.sim.plan_ways import ways
 from embomatrix.skills.appliance import cold_source, heat_source
 from embomatrix.skills.syntax import PlaceRelation
 from embomatrix.world.state import Relation
@@ -20,16 +21,8 @@ if TYPE_CHECKING:
     from embomatrix.sim.executor import Simulator
     from embomatrix.sim.live_world import LiveWorld
     from embomatrix.sim.plan_script import PlanScript
+    from embomatrix.sim.plan_ways import Placement
     from embomatrix.skills.appliance import Source
-
-
-@dataclass(frozen=True, slots=True)
-class Placement:
-    """``relation(name, target)`` must hold. The target of INROOM is a room."""
-
-    name: str
-    relation: Relation
-    target: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,34 +36,39 @@ class Warming:
 
 @dataclass(frozen=True)
 class Errands:
-    """``open`` and ``on`` say how doors and switches must end; ``leave`` are pairs that must not stay together."""
+    """``open`` and ``on`` say how doors and switches must end; ``leave`` are relations that must end.
+
+    ``way`` is the rank of the way in which relations are brought about; ``singly`` has sources work on one thing at a time.
+    """
 
     placements: tuple[Placement, ...]
     warmings: tuple[Warming, ...]
     open: Mapping[str, bool]
     on: Mapping[str, bool]
-    leave: tuple[tuple[str, str], ...]
+    leave: tuple[Placement, ...]
+    way: int = 0
+    singly: bool = False
 
     def run(self, script: PlanScript, simulator: Simulator) -> None:
         """Do it all. Raises StuckError."""
         world = simulator.world
         self._warm(script, world)
-        settled: set[str] = set()
         for number, item in enumerate(self.placements):
             self._place(item, script, world)
             rest = {other.target for other in self.placements[number + 1 :]}
             if item.target not in rest and not self._still_holds_something(item.target, number, world):
                 self._finish(item.target, script)
-                settled.add(item.target)
-        for name, other in self.leave:
-            if world.relations.inside(name, other) or world.relations.ontop(name, other):
-                script.put_away(name, frozenset((name, other)))
+        for item in self.leave:
+            if script.holds(item.relation, item.name, item.target):
+                self._part(item, script, world)
         for name in dict.fromkeys((*self.open, *self.on)):
             self._finish(name, script)
 
     def _still_holds_something(self, target: str, number: int, world: LiveWorld) -> bool:
         """Whether something that is yet to be carried lies in the target."""
-        waiting = {other.name for other in self.placements[number + 1 :]} | {name for name, _ in self.leave}
+        if target in world.rooms:
+            return False
+        waiting = {other.name for other in self.placements[number + 1 :]} | {item.name for item in self.leave}
         return any(world.relations.inside(name, target) for name in waiting)
 
     def _warm(self, script: PlanScript, world: LiveWorld) -> None:
@@ -78,7 +76,10 @@ class Errands:
             batch = [item for item in self.warmings if item.hot is hot]
             for source in dict.fromkeys(item.source for item in batch):
                 names = [item.name for item in batch if item.source == source]
-                self._expose(names, source, hot, script, world)
+                for group in [[name] for name in names] if self.singly else [names]:
+                    self._expose(group, source, hot, script, world)
+                    if self.singly:
+                        script.put_away(group[0], frozenset((group[0], source)))
 
     def _expose(self, names: list[str], source: str, hot: bool, script: PlanScript, world: LiveWorld) -> None:
         """Take the objects to the source, then let it run."""
@@ -97,25 +98,25 @@ class Errands:
     def _place(self, item: Placement, script: PlanScript, world: LiveWorld) -> None:
         if script.holds(item.relation, item.name, item.target):
             return
-        match item.relation:
-            case Relation.ONTOP | Relation.INSIDE | Relation.UNDER:
-                script.transfer(item.name, item.target, PlaceRelation(item.relation.value))
-            case Relation.TOUCHING:
-                script.transfer(item.name, item.target, PlaceRelation.ONTOP)
-            case Relation.NEXTTO:
-                self._place_beside(item, script, world)
-            case Relation.INROOM:
-                elsewhere = frozenset(
-                    name for name in world.scene.by_name if world.room_of(name) != item.target
-                )
-                script.put_away(item.name, elsewhere)
+        if item.relation is Relation.INROOM:
+            elsewhere = frozenset(name for name in world.scene.by_name if world.room_of(name) != item.target)
+            script.put_away(item.name, elsewhere)
+            return
+        found = ways(item, world, script.rows)
+        if not found:
+            raise StuckError(f"{item.name} fits nowhere so that it is {item.relation.value} {item.target}")
+        for carry in found[self.way % len(found)]:
+            script.transfer(carry.name, carry.target, carry.relation)
 
-    def _place_beside(self, item: Placement, script: PlanScript, world: LiveWorld) -> None:
-        """On or in what the other thing stands on or in: next to it, if there is not much room."""
-        host = world.relations.host_of(item.target)
-        if host is None or host.name == item.name:
-            raise StuckError(f"nothing can be put beside {item.target}: it stands on the floor")
-        script.transfer(item.name, host.name, PlaceRelation(host.relation.value))
+    def _part(self, item: Placement, script: PlanScript, world: LiveWorld) -> None:
+        """End a relation: carry the first object elsewhere, or the second where the first can't be carried."""
+        if item.relation is Relation.INROOM:
+            here = frozenset(name for name in world.scene.by_name if world.room_of(name) == item.target)
+            script.put_away(item.name, here)
+        elif world.is_fixed(item.name):
+            script.put_away(item.target, frozenset((item.name, item.target)))
+        else:
+            script.put_away(item.name, frozenset((item.name, item.target)))
 
     def _finish(self, name: str, script: PlanScript) -> None:
         """Bring the doors and the switch of an object into the position in which they must end."""

@@ -2,24 +2,45 @@
 
 A routine goes to a thing before it uses it, unless the robot was just sent to that thing or to the container that it
 lies in. So whether a plan has a move follows from what the plan says, not from distances that no planner is told.
+A call that fails changes nothing and is left out of the plan: where there is a remedy, the routine takes it and tries again.
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.skills.appliance import starts_closed
+from embomatrix.skills.appliance import cold_source, heat_source, starts_closed
 from embomatrix.skills.check import within_reach
+from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.syntax import MAX_STEPS, PlaceRelation, Skill, SkillCall
+from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from embomatrix.sim.executor import Simulator
+    from embomatrix.sim.plan_wishes import Wishes
     from embomatrix.skills.syntax import Plan
-    from embomatrix.world.state import Relation
+    from embomatrix.skills.trace import Step
     from embomatrix.world.task import Task
 
 DEPTH: Final = 4
-"""Things stacked on one another that are taken off at most before the lowest is moved."""
+"""Things that are taken off, out of or from before one another at most before the last of them is moved."""
+SURFACES_TRIED: Final = 8
+"""Surfaces that are tried for a thing that is in the way."""
+BLOCKERS: Final = 3
+"""Things that are taken from before a door at most."""
+NEIGHBOURS: Final = 6
+"""Things beside another from which that is tried to be reached, when no place to stand serves it itself."""
+OUT_OF_ARM: Final = frozenset(
+    {
+        FailureReason.NO_STANDING_POSE,
+        FailureReason.NO_PATH,
+        FailureReason.OUT_OF_REACH,
+        FailureReason.NO_LINE_OF_APPROACH,
+    }
+)
+"""Failures that standing elsewhere may mend."""
 
 
 class StuckError(Exception):
@@ -27,47 +48,63 @@ class StuckError(Exception):
 
 
 class PlanScript:
-    """One attempt at a task, from its start. Every routine raises StuckError when a call of it fails."""
+    """One attempt at a task, from its start. Every routine raises StuckError when a call of it fails for good."""
 
-    def __init__(self, simulator: Simulator, task: Task, seed: int) -> None:
+    def __init__(self, simulator: Simulator, task: Task, seed: int, wishes: Wishes) -> None:
         simulator.reset(task, seed)
         self._simulator = simulator
         self._world = simulator.world
         self._task = task
+        self._wishes = wishes
         self._at = ""
         self._calls: list[SkillCall] = []
 
     @property
     def plan(self) -> Plan:
-        """The calls so far. Of several moves in a row the last is kept."""
+        """The calls so far. Of several moves in a row the last is kept, and none at the end."""
         pairs = zip(self._calls, [*self._calls[1:], None], strict=True)
         return tuple(
             call
             for call, following in pairs
-            if not (call.skill is Skill.MOVE and following is not None and following.skill is Skill.MOVE)
+            if call.skill is not Skill.MOVE or (following is not None and following.skill is not Skill.MOVE)
         )
 
-    def transfer(self, name: str, target: str, relation: PlaceRelation, depth: int = 0) -> None:
-        """Carry an object to its place. What must be open is opened while the hand is empty, the target first."""
-        self._clear_way_to(target)
-        if relation is PlaceRelation.INSIDE and self._world.asset(target).joints:
-            self.open(target)
-        self._take(name, depth)
-        self._use(Skill.PLACE, target, relation)
+    @property
+    def rows(self) -> tuple[str, ...]:
+        """The task's object table."""
+        return self._task.table
 
-    def open(self, name: str) -> None:
+    def transfer(self, name: str, target: str, relation: PlaceRelation, depth: int = 0) -> None:
+        """Carry an object to its place. What must be open is opened while the hand is empty, the target first.
+
+        When there is no room, other things are taken from the place first, as long as there are any.
+        """
+        while True:
+            self._prepare(target, relation)
+            self._take(name, depth)
+            step = self._try_place(target, relation)
+            if step.ok:
+                return
+            burden = self._in_the_way_at(target, relation, name)
+            if step.failure is not FailureReason.NO_FREE_POSE or not burden or depth == DEPTH:
+                raise StuckError(_sentence(step))
+            self._set_down(name, frozenset((name, target)))
+            self.put_away(burden, frozenset((burden, name, target)), depth + 1)
+
+    def open(self, name: str, depth: int = 0) -> None:
         """Open it, unless it is open. An appliance that must be closed while it runs is switched off first."""
         if self._world.is_open(name):
             return
         self._clear_way_to(name)
         if self._world.is_on(name) and starts_closed(self._world.asset(name)):
             self.switch_off(name)
-        self._use(Skill.OPEN, name)
+        self._swing(Skill.OPEN, name, depth)
 
-    def close(self, name: str) -> None:
+    def close(self, name: str, depth: int = 0) -> None:
         """Close it, unless it is closed."""
         if self._world.is_open(name):
-            self._use(Skill.CLOSE, name)
+            self._clear_way_to(name)
+            self._swing(Skill.CLOSE, name, depth)
 
     def switch_on(self, name: str) -> None:
         """Switch it on, unless it is on, closed if it must be."""
@@ -85,28 +122,103 @@ class PlanScript:
             self._use(Skill.TOGGLE_OFF, name)
 
     def put_away(self, name: str, avoid: frozenset[str], depth: int = 0) -> None:
-        """Carry an object to the first free surface that is none of ``avoid``; those of its own room come first."""
-        room = self._world.room_of(name)
-        surfaces = sorted(
-            (item for item in self._task.table if self._is_open_surface(item) and item not in avoid),
-            key=lambda item: self._world.room_of(item) != room,
-        )
-        if not surfaces:
+        """Carry an object to the first surface with room that is none of ``avoid``; those of its own room come first."""
+        if not any(self._surfaces(name, avoid)):
             raise StuckError(f"there is no free surface in the object table to put {name} on")
-        self.transfer(name, surfaces[0], PlaceRelation.ONTOP, depth)
+        self._take(name, depth)
+        self._set_down(name, avoid)
 
-    def _is_open_surface(self, name: str) -> bool:
-        asset = self._world.asset(name)
-        return self._world.is_fixed(name) and bool(asset.supports) and not asset.joints
+    def holds(self, relation: Relation, a: str, b: str) -> bool:
+        """Whether the relation holds in the state reached."""
+        return self._world.relations.holds(relation, a, b)
+
+    def _set_down(self, name: str, avoid: frozenset[str]) -> None:
+        """Place what the hand holds on the first surface with room."""
+        reason = ""
+        for _, surface in zip(range(SURFACES_TRIED), self._surfaces(name, avoid), strict=False):
+            step = self._try(Skill.PLACE, surface, PlaceRelation.ONTOP)
+            if step.ok:
+                return
+            reason = reason or _sentence(step)
+        raise StuckError(reason or f"there is no free surface in the object table to put {name} on")
+
+    def _surfaces(self, name: str, avoid: frozenset[str]) -> Iterator[str]:
+        """Where a thing may be left: plain furniture before what has doors, works or can be carried itself."""
+        room = self._world.room_of(name)
+
+        def rank(surface: str) -> tuple[bool, ...]:
+            asset = self._world.asset(surface)
+            source = heat_source(asset) is not None or cold_source(asset) is not None
+            fixed = self._world.is_fixed(surface)
+            return (source, not fixed, self._world.room_of(surface) != room, bool(asset.joints))
+
+        return iter(
+            sorted(
+                (
+                    item
+                    for item in self._task.table
+                    if item not in avoid
+                    and item not in self._world.carried
+                    and self._world.asset(item).supports
+                    and self._wishes.may_lie_on(name, item, self._world.room_of(item))
+                ),
+                key=rank,
+            )
+        )
+
+    def _prepare(self, target: str, relation: PlaceRelation) -> None:
+        self._clear_way_to(target)
+        if relation is PlaceRelation.INSIDE and self._world.asset(target).joints:
+            self.open(target)
+
+    def _in_the_way_at(self, target: str, relation: PlaceRelation, name: str) -> str:
+        """A thing that can be carried and takes room on or in the target, "" when there is none."""
+        wanted = Relation(relation.value)
+        return next(
+            (
+                other
+                for other in self._task.table
+                if other != name
+                and not self._world.is_fixed(other)
+                and self._world.relations.holds(wanted, other, target)
+                and not self._wishes.belongs_at(other, target)
+            ),
+            "",
+        )
 
     def _take(self, name: str, depth: int) -> None:
         self._clear_way_to(name)
         while burden := self._world.burden(name):
-            if depth == DEPTH:
-                raise StuckError(f"too many things are stacked on {name}")
-            self.put_away(burden, frozenset((name,)), depth + 1)
-            self._clear_way_to(name)
-        self._use(Skill.PICK_UP, name)
+            self._unload(burden, name, depth)
+        step = self._try(Skill.PICK_UP, name)
+        while step.failure is FailureReason.TOO_HEAVY and len(cargo := self._world.cargo(name)) > 1:
+            self._unload(cargo[1], name, depth)
+            step = self._try(Skill.PICK_UP, name)
+        if not step.ok:
+            raise StuckError(_sentence(step))
+
+    def _unload(self, burden: str, name: str, depth: int) -> None:
+        if depth == DEPTH:
+            raise StuckError(f"too many things are stacked on {name}")
+        self.put_away(burden, frozenset((name, burden)), depth + 1)
+        self._clear_way_to(name)
+
+    def _swing(self, skill: Skill, name: str, depth: int) -> None:
+        """Move a door; what can be carried away from before it is."""
+        for _ in range(BLOCKERS):
+            step = self._try(skill, name)
+            if step.ok:
+                return
+            blocker = self._named_in(step, name) if step.failure is FailureReason.DOOR_BLOCKED else ""
+            if not blocker or self._world.is_fixed(blocker) or depth == DEPTH:
+                raise StuckError(_sentence(step))
+            self.put_away(blocker, frozenset((blocker, name)), depth + 1)
+        self._use(skill, name)
+
+    def _named_in(self, step: Step, name: str) -> str:
+        """The other object that a refusal's sentence names: refusals carry no fields."""
+        known = self._world.scene.by_name
+        return next((word for word in step.message.split() if word in known and word != name), "")
 
     def _clear_way_to(self, name: str) -> None:
         """Open the closed containers around an object, the outermost first."""
@@ -114,31 +226,73 @@ class PlanScript:
         for container in reversed(around):
             self.open(container)
 
-    def _use(self, skill: Skill, name: str, relation: PlaceRelation | None = None) -> None:
-        if not self._stands_at(name):
-            self._do(SkillCall(Skill.MOVE, object_index=self._row(name)))
+    def _use(self, skill: Skill, name: str) -> None:
+        step = self._try(skill, name)
+        if not step.ok:
+            raise StuckError(_sentence(step))
+
+    def _try_place(self, target: str, relation: PlaceRelation) -> Step:
+        """Place what the hand holds; when nothing is free within reach, from beside other things on the target too."""
+        step = self._try(Skill.PLACE, target, relation)
+        if step.failure is FailureReason.NO_FREE_POSE:
+            for other in self._around(target):
+                if self._go_to(other).ok and within_reach(self._world, target) is None:
+                    again = self._run(self._call(Skill.PLACE, target, relation))
+                    if again.ok:
+                        return again
+        return step
+
+    def _try(self, skill: Skill, name: str, relation: PlaceRelation | None = None) -> Step:
+        """Go to the object unless the robot is there, then do it, from beside a neighbour if need be."""
+        call = self._call(skill, name, relation)
+        if self._stands_at(name):
+            return self._run(call)
+        step = self._go_to(name)
+        step = self._run(call) if step.ok else step
+        if step.failure in OUT_OF_ARM:
+            for other in self._around(name):
+                if self._go_to(other).ok and within_reach(self._world, name) is None:
+                    return self._run(call)
+        return step
+
+    def _around(self, name: str) -> list[str]:
+        """Rows near an object, the nearest first: who stands at one of them may reach it."""
+        box = self._world.relations.body(name)
+        x, y, _ = box.center_m
+
+        def away(other: str) -> float:
+            ox, oy, _ = self._world.relations.body(other).center_m
+            return (ox - x) ** 2 + (oy - y) ** 2
+
+        others = [item for item in self._task.table if item != name and item not in self._world.carried]
+        return sorted(others, key=away)[:NEIGHBOURS]
+
+    def _go_to(self, name: str) -> Step:
+        step = self._run(self._call(Skill.MOVE, name))
+        if step.ok:
             self._at = name
-        self._do(SkillCall(skill, object_index=self._row(name), relation=relation))
+        return step
 
     def _stands_at(self, name: str) -> bool:
         inside = self._world.relations.inside
         sent = name == self._at or (self._at and (inside(name, self._at) or inside(self._at, name)))
         return bool(sent) and within_reach(self._world, name) is None
 
-    def _row(self, name: str) -> int:
+    def _call(self, skill: Skill, name: str, relation: PlaceRelation | None = None) -> SkillCall:
         row = self._task.index_of.get(name)
         if row is None:
             raise StuckError(f"{name} is not in the object table: no plan can name it")
-        return row
+        return SkillCall(skill, object_index=row, relation=relation)
 
-    def _do(self, call: SkillCall) -> None:
-        if len(self._calls) == MAX_STEPS:
-            raise StuckError(f"the plan needs more than {MAX_STEPS} steps")
+    def _run(self, call: SkillCall) -> Step:
+        """Execute a call; one that succeeds is part of the plan."""
         step = self._simulator.run_step(call)
-        if not step.ok:
-            raise StuckError(f"{call.skill.value} fails: {step.message}")
-        self._calls.append(call)
+        if step.ok:
+            self._calls.append(call)
+            if len(self.plan) > MAX_STEPS:
+                raise StuckError(f"the plan needs more than {MAX_STEPS} steps")
+        return step
 
-    def holds(self, relation: Relation, a: str, b: str) -> bool:
-        """Whether the relation holds in the state reached."""
-        return self._world.relations.holds(relation, a, b)
+
+def _sentence(step: Step) -> str:
+    return f"{step.call.skill.value} fails: {step.message}"

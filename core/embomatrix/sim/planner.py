@@ -1,38 +1,49 @@
 """The oracle: a plan for a task, found by working back from its goal and proven by executing it.
 
 It sees what no policy sees, the goal and the whole state, so it tells which tasks can be done and teaches imitation.
+A goal is first turned into conjunctions of literals; an attempt makes one of them true, errand by errand, in the simulator,
+and looks again: what an errand undid is done in the next round.
 """
 
 from __future__ import annotations
 
+import functools
+import itertools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.sim.goal_choices import choices
-from embomatrix.sim.plan_errands import Errands, Placement, Warming
+from embomatrix.sim.plan_errands import Errands, Warming
+from embomatrix.sim.plan_limits import is_hot_work, sources_for, why_impossible
 from embomatrix.sim.plan_script import PlanScript, StuckError
+from embomatrix.sim.plan_ways import Placement
+from embomatrix.sim.plan_wishes import Wishes
 from embomatrix.sim.plan_wording import Wording
-from embomatrix.skills.appliance import cold_source, cooks, freezes, heat_source, heats
-from embomatrix.world.evaluate import evaluate
+from embomatrix.world.evaluate import evaluate, render
+from embomatrix.world.goal import Not
 from embomatrix.world.state import Relation, State
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Sequence
 
     from embomatrix.sim.executor import Simulator
     from embomatrix.sim.goal_choices import Choice, Literal
     from embomatrix.skills.syntax import Plan
-    from embomatrix.world.asset import Asset
     from embomatrix.world.task import Task
 
 PROOF_SEEDS: Final = (0, 1, 2)
 """A plan must succeed with each of these: one that needs luck is none."""
 SOURCES_TRIED: Final = 3
 """Heat or cold sources that are tried for an object."""
-ATTEMPTS: Final = 24
+WAYS_TRIED: Final = 4
+UNAIMED_WAYS_TRIED: Final = 8
+"""Ways in which a relation is brought about, and one that no skill aims at."""
+ATTEMPTS: Final = 36
 """Plans that are written at most for a task."""
-INEXPRESSIBLE: Final = frozenset({State.SLICED, State.DUSTY, State.STAINED, State.SOAKED})
-"""States that none of the thirteen skills changes."""
+ROUNDS: Final = 4
+"""Times that an attempt looks for what is missing, and does it."""
+UNAIMED: Final = Relation.NEXTTO
+"""The relation that comes about by luck alone, unless two things share a small surface."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,15 +55,18 @@ class PlanNotFound:
 
 @dataclass(frozen=True, slots=True)
 class Strategy:
-    """How an attempt differs from the others: the rank of its heat sources, and the order of its errands."""
+    """How an attempt differs from the others.
 
-    source_rank: int
-    reverse: bool
+    ``source_rank`` and ``way`` choose among sources and ways to bring relations about; ``reverse`` turns the order of the
+    placements; ``singly`` lets a source work on one thing at a time; ``seed`` decides where things come to
+    stand while the plan is written.
+    """
 
-
-STRATEGIES: Final = tuple(
-    Strategy(rank, reverse) for rank in range(SOURCES_TRIED) for reverse in (False, True)
-)
+    source_rank: int = 0
+    reverse: bool = False
+    way: int = 0
+    singly: bool = False
+    seed: int = PROOF_SEEDS[0]
 
 
 def find_plan(simulator: Simulator, task: Task) -> Plan | PlanNotFound:
@@ -60,15 +74,27 @@ def find_plan(simulator: Simulator, task: Task) -> Plan | PlanNotFound:
     simulator.reset(task, PROOF_SEEDS[0])
     if evaluate(task.goal, simulator.facts, task.types):
         return PlanNotFound("the goal holds at the start: there is nothing to do")
-    wording = Wording(task, simulator.world.scene)
-    options = choices(task.goal, task.types, simulator.facts, wording.names)
+    limit = functools.cache(functools.partial(_limit, simulator, task))
+    names = Wording(task, simulator.world.scene).names
+    options = choices(task.goal, task.types, simulator.facts, names, lambda item: bool(limit(item)))
     if not options:
         return PlanNotFound("the goal contradicts itself")
+    hopeful = [choice for choice in options if not any(map(limit, choice))]
+    if not hopeful:
+        return PlanNotFound(next(filter(None, map(limit, options[0]))))
+    return _first_proven(simulator, task, hopeful)
+
+
+def _limit(simulator: Simulator, task: Task, item: Literal) -> str:
+    """Why the literal, which does not hold yet, never will; "" otherwise."""
+    missing = simulator.facts.holds(item.atom.predicate, item.atom.args) != item.positive
+    return why_impossible(simulator.world, task, item) if missing else ""
+
+
+def _first_proven(simulator: Simulator, task: Task, options: Sequence[Choice]) -> Plan | PlanNotFound:
     reason = ""
     tried: set[Plan] = set()
-    for attempt, (choice, strategy) in enumerate(_attempts(options)):
-        if attempt == ATTEMPTS:
-            break
+    for choice, strategy in _attempts(options):
         try:
             plan = _write(simulator, task, choice, strategy)
         except StuckError as error:
@@ -77,60 +103,100 @@ def find_plan(simulator: Simulator, task: Task) -> Plan | PlanNotFound:
         if plan in tried:
             continue
         tried.add(plan)
-        flaw = _flaw(simulator, task, plan)
+        flaw = _flaw(simulator, task, plan, choice)
         if not flaw:
             return plan
         reason = reason or flaw
     return PlanNotFound(reason)
 
 
-def _attempts(options: tuple[Choice, ...]) -> Iterator[tuple[Choice, Strategy]]:
-    for choice in options:
-        for strategy in STRATEGIES:
-            yield choice, strategy
+def _attempts(options: Sequence[Choice]) -> list[tuple[Choice, Strategy]]:
+    """Choices with strategies that make a difference to them, the first of both first: in diagonals."""
+    ranked = [
+        (rank + place, place, choice, strategy)
+        for place, choice in enumerate(options)
+        for rank, strategy in enumerate(_strategies(choice))
+    ]
+    ranked.sort(key=lambda item: item[:2])
+    return [(choice, strategy) for _, _, choice, strategy in ranked[:ATTEMPTS]]
 
 
-def _flaw(simulator: Simulator, task: Task, plan: Plan) -> str:
+def _strategies(choice: Choice) -> list[Strategy]:
+    predicates = [item.atom.predicate for item in choice]
+    warm = bool({State.HOT, State.COOKED, State.FROZEN} & set(predicates))
+    carried = sum(predicate in set(Relation) for predicate in predicates)
+    found = itertools.product(
+        PROOF_SEEDS,
+        (False, True) if warm else (False,),
+        range(UNAIMED_WAYS_TRIED if UNAIMED in predicates else WAYS_TRIED if carried else 1),
+        range(SOURCES_TRIED) if warm else (0,),
+        (False, True) if carried > 1 else (False,),
+    )
+    return [Strategy(rank, reverse, way, singly, seed) for seed, singly, way, rank, reverse in found]
+
+
+def _flaw(simulator: Simulator, task: Task, plan: Plan, choice: Choice) -> str:
     """Why the plan is no proof that the task can be done, "" when it is one."""
     for seed in PROOF_SEEDS:
         trace = simulator.execute(task, plan, seed)
         if trace.failure is not None:
             return f"with seed {seed}, step {len(trace.steps)} of the plan fails: {trace.steps[-1].message}"
         if not evaluate(task.goal, simulator.facts, task.types):
-            return f"with seed {seed} the plan runs to its end and the goal does not hold"
+            missing = _missing(simulator, choice)
+            lucky = next((item for item in missing if item.atom.predicate == UNAIMED), None)
+            if lucky is not None:
+                return f"{_in_words(lucky)} is a matter of luck: no skill aims at it"
+            unmet = " ".join(map(_in_words, missing))
+            return f"with seed {seed} the plan runs to its end and the goal does not hold: {unmet} is missing"
     return ""
 
 
 def _write(simulator: Simulator, task: Task, choice: Choice, strategy: Strategy) -> Plan:
     """Execute what the literals ask for, and return the calls that it took. Raises StuckError."""
-    script = PlanScript(simulator, task, PROOF_SEEDS[0])
-    missing = [item for item in choice if simulator.facts.holds(*_question(item)) != item.positive]
-    errands = Errands(
+    script = PlanScript(simulator, task, strategy.seed, Wishes(choice))
+    for _ in range(ROUNDS):
+        missing = _missing(simulator, choice)
+        if not missing:
+            break
+        _errands(simulator, task, choice, missing, strategy).run(script, simulator)
+    return script.plan
+
+
+def _missing(simulator: Simulator, choice: Choice) -> list[Literal]:
+    return [
+        item for item in choice if simulator.facts.holds(item.atom.predicate, item.atom.args) != item.positive
+    ]
+
+
+def _errands(
+    simulator: Simulator, task: Task, choice: Choice, missing: list[Literal], strategy: Strategy
+) -> Errands:
+    return Errands(
         placements=_placements(choice, strategy),
         warmings=_warmings(simulator, task, choice, missing, strategy),
         open={item.atom.args[0]: item.positive for item in choice if item.atom.predicate == State.OPEN},
         on={item.atom.args[0]: item.positive for item in choice if item.atom.predicate == State.TOGGLED_ON},
-        leave=tuple(
-            (item.atom.args[0], item.atom.args[1])
-            for item in choice
-            if not item.positive and item.atom.predicate in set(Relation)
-        ),
+        leave=tuple(_relation_of(item) for item in choice if not item.positive and _is_relation(item)),
+        way=strategy.way,
+        singly=strategy.singly,
     )
-    errands.run(script, simulator)
-    return script.plan
 
 
-def _question(item: Literal) -> tuple[str, tuple[str, ...]]:
-    return item.atom.predicate, item.atom.args
+def _is_relation(item: Literal) -> bool:
+    return item.atom.predicate in set(Relation)
+
+
+def _relation_of(item: Literal) -> Placement:
+    return Placement(item.atom.args[0], Relation(item.atom.predicate), item.atom.args[1])
+
+
+def _in_words(item: Literal) -> str:
+    return render(item.atom if item.positive else Not(item.atom))
 
 
 def _placements(choice: Choice, strategy: Strategy) -> tuple[Placement, ...]:
     """Where things must be, what others go on or in before those; what is there and stays there is not carried."""
-    wanted = [
-        Placement(item.atom.args[0], Relation(item.atom.predicate), item.atom.args[1])
-        for item in choice
-        if item.positive and item.atom.predicate in set(Relation)
-    ]
+    wanted = [_relation_of(item) for item in choice if item.positive and _is_relation(item)]
     if strategy.reverse:
         wanted.reverse()
     ordered: list[Placement] = []
@@ -153,19 +219,17 @@ def _warmings(
     }
     needs: dict[tuple[str, bool], set[State]] = {}
     for item in missing:
-        if item.atom.predicate not in set(State) - {State.OPEN, State.TOGGLED_ON}:
-            continue
-        name, state = item.atom.args[0], State(item.atom.predicate)
-        if state in INEXPRESSIBLE or (state is State.COOKED and not item.positive):
-            change = "made" if item.positive else "undone"
-            raise StuckError(f"none of the skills can do this: {name} must be {change} {state.value}")
-        hot = state is State.COOKED or (state is State.HOT) == item.positive
-        needs.setdefault((name, hot), set()).add(state)
-    found: list[Warming] = []
-    for (name, hot), states in sorted(needs.items(), key=lambda need: not need[0][1]):
-        source = _source_for(simulator, task, name, hot, states, homes.get(name, ""), strategy)
-        found.append(Warming(name, source, hot))
-    return tuple(found)
+        if not _is_relation(item) and item.atom.predicate not in (State.OPEN, State.TOGGLED_ON):
+            key = (item.atom.args[0], is_hot_work(item))
+            needs.setdefault(key, set()).add(State(item.atom.predicate))
+    return tuple(
+        Warming(
+            name,
+            _source_for(simulator, task, name, hot, frozenset(states), homes.get(name, ""), strategy),
+            hot,
+        )
+        for (name, hot), states in sorted(needs.items(), key=lambda need: not need[0][1])
+    )
 
 
 def _source_for(
@@ -173,7 +237,7 @@ def _source_for(
     task: Task,
     name: str,
     hot: bool,
-    states: set[State],
+    states: frozenset[State],
     home: str,
     strategy: Strategy,
 ) -> str:
@@ -182,8 +246,7 @@ def _source_for(
     The one that the instruction names goes first, then where the object must end, then those in its room.
     """
     world = simulator.world
-    item = world.asset(name)
-    able = [other for other in task.table if other != name and _does(world.asset(other), item, hot, states)]
+    able = list(sources_for(world, task, name, states, hot=hot))
     if not able:
         raise StuckError(
             f"no object in the table makes {name} {' and '.join(sorted(states))}: expected a heat or cold source"
@@ -199,13 +262,3 @@ def _source_for(
         )
     )
     return able[strategy.source_rank % len(able)]
-
-
-def _does(source: Asset, item: Asset, hot: bool, states: set[State]) -> bool:
-    found = heat_source(source) if hot else cold_source(source)
-    if found is None:
-        return False
-    if hot:
-        able = heats(found) and item.can("heatable")
-        return cooks(found, item) and (able or states == {State.COOKED}) if State.COOKED in states else able
-    return freezes(found) and item.can("freezable")

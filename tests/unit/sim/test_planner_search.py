@@ -1,0 +1,27 @@
+"""The oracle against exhaustive search: where breadth-first search over executed calls finds a plan, so does the oracle."""
+
+import pytest
+from tests.fakes.search import compare
+
+GOALS = 10
+SCENES = 10
+
+
+def test_the_oracle_solves_what_search_solves_in_a_small_scene():
+    comparison = compare(0, GOALS, limit=120)
+    assert comparison.found >= GOALS // 2
+    assert not comparison.missed
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_the_oracle_solves_98_of_100_small_tasks_that_search_solves(capsys):
+    found, missed = 0, []
+    for number in range(SCENES):
+        comparison = compare(number, GOALS, limit=700)
+        found += comparison.found
+        missed += comparison.missed
+    with capsys.disabled():
+        print(f"\n{SCENES * GOALS} tasks: search solves {found}, the oracle {found - len(missed)} of those")
+    assert found >= 0.7 * SCENES * GOALS
+    assert len(missed) <= 0.02 * found, "\n".join(missed)
