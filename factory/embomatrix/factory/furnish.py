@@ -6,29 +6,45 @@ from collections import Counter
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.furnish_groups import ceiling_groups, floor_groups, hung_groups, rug_groups
+from embomatrix.factory.furnish_groups import alone, hung_and_laid, room_groups
+from embomatrix.factory.furnish_pieces import Rows
 from embomatrix.factory.furnish_roles import Role, importance_of
+from embomatrix.factory.furnish_rows import lay_rows
 from embomatrix.factory.furnish_solver import RoomSolver
 from embomatrix.factory.furnish_space import RoomSpace
 from embomatrix.factory.furnish_surfaces import SurfacePlacer
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     import numpy as np
 
     from embomatrix.factory.floorplan import FloorPlan
-    from embomatrix.factory.furnish_pieces import Piece, Placed
+    from embomatrix.factory.furnish_pieces import Group, Member, Piece, Placed
     from embomatrix.world.scene import Doorway, Room
 
 ATTEMPTS: Final = 24
 CROWDED_ATTEMPTS: Final = 6
 """Arrangements of a room that are tried before one that leaves something out is taken; fewer where there is much to place."""
 CROWD: Final = 30
+HALL: Final = 90
+"""A room with more to place than this is arranged at most twice."""
 GOOD_ENOUGH: Final = 2.0
 """After CROWDED_ATTEMPTS an arrangement that loses no more than this is taken: a trash can, a picture."""
 MAX_EQUAL: Final = 6
-"""Small things of one model in one room at most: the diner's kitchen lists 137 trays."""
+"""Small things and lights of one model in one room at most: the diner's kitchen lists 137 trays."""
+MAX_FURNITURE: Final = 60
+MAX_SEATS: Final = 120
+MAX_PLANTS: Final = 24
+"""Warehouses and woods: so many of a model stand for all of them."""
+_CAPS: Final[Mapping[Role, int]] = {
+    Role.SURFACE: MAX_EQUAL,
+    Role.CEILING: MAX_EQUAL,
+    Role.SEAT: MAX_SEATS,
+    Role.PLANTING: MAX_PLANTS,
+}
+_LIGHT_LOSSES: Final = frozenset((Role.WALL, Role.CEILING, Role.RUG, Role.PLANTING))
+"""What finds no place of these is no reason to start again with it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,34 +86,35 @@ def furnish(plan: FloorPlan, pieces: dict[str, list[Piece]], rng: np.random.Gene
         left_out += [
             *notes,
             *(f"{note} in {room.name}" for note in best.notes),
-            *_sentences(best.dropped, room.name, "no free place keeps the room passable"),
+            *_unplaced(best.dropped, room),
         ]
-        done = {id(p.piece) for p in best.placed} | {id(p) for p in best.dropped}
-        small += [(room.name, p) for p in wanted if p.role is Role.SURFACE and id(p) not in done]
+        done = {p.piece.number for p in best.placed} | {p.number for p in best.dropped}
+        small += [(room.name, p) for p in wanted if p.role is Role.SURFACE and p.number not in done]
     left_out += _set_small_things(plan, placed, small, rng)
     return Furnishing(tuple(placed), tuple(left_out), loss)
 
 
 def _capped(pieces: Sequence[Piece], room: str) -> tuple[list[Piece], list[str]]:
-    """At most MAX_EQUAL small things of one model, nothing that belongs to the building; with sentences on the rest."""
+    """As many of each model as `_CAPS` allows, nothing that belongs to the building; with sentences on the rest."""
     kept: list[Piece] = []
     totals = Counter(p.asset.asset_id for p in pieces)
     seen: Counter[str] = Counter()
     for piece in pieces:
         seen[piece.asset.asset_id] += 1
-        small = piece.role in (Role.SURFACE, Role.CEILING)
-        if piece.role is not Role.STRUCTURE and not (small and seen[piece.asset.asset_id] > MAX_EQUAL):
+        most = _CAPS.get(piece.role, MAX_FURNITURE)
+        if piece.role is not Role.STRUCTURE and seen[piece.asset.asset_id] <= most:
             kept.append(piece)
     notes = []
     for piece in {p.asset.asset_id: p for p in pieces}.values():
         asset_id, total = piece.asset.asset_id, totals[piece.asset.asset_id]
+        most = _CAPS.get(piece.role, MAX_FURNITURE)
         if piece.role is Role.STRUCTURE:
             notes.append(
                 f"{total} {asset_id} in {room}: part of the building, which floor and walls stand for"
             )
-        elif total > MAX_EQUAL and piece.role in (Role.SURFACE, Role.CEILING):
+        elif total > most:
             notes.append(
-                f"{total - MAX_EQUAL} of {total} {asset_id} in {room}: at most {MAX_EQUAL} of a model in a room"
+                f"{total - most} of {total} {asset_id} in {room}: at most {most} of a model in a room"
             )
     return kept, notes
 
@@ -107,14 +124,16 @@ def _best_arrangement(
 ) -> _Arrangement:
     best: _Arrangement | None = None
     first: set[int] = set()
-    standing = [p for p in pieces if p.role is not Role.SURFACE]
-    for attempt in range(ATTEMPTS if len(standing) < CROWD else CROWDED_ATTEMPTS):
+    standing = sum(p.role not in (Role.SURFACE, Role.PLANTING) for p in pieces)
+    attempts = ATTEMPTS if standing < CROWD else CROWDED_ATTEMPTS if standing < HALL else 2
+    for attempt in range(attempts):
         tried = _arrange(room, plan, pieces, rng, first, wobble=0.4 + 0.2 * attempt)
         # What found no place comes first the next time.
-        first |= {p.number for p in tried.dropped if p.role not in (Role.WALL, Role.CEILING, Role.RUG)}
+        lost = [p for p in tried.dropped if p.role not in _LIGHT_LOSSES]
+        first |= {p.number for p in lost}
         if best is None or tried.loss < best.loss:
             best = tried
-        if best.loss == 0 or (attempt >= CROWDED_ATTEMPTS and best.loss <= GOOD_ENOUGH):
+        if not lost or (attempt >= CROWDED_ATTEMPTS and best.loss <= GOOD_ENOUGH):
             break
     if best is None:
         raise ValueError(f"room {room.name!r} was never arranged: expected at least one attempt")
@@ -131,18 +150,42 @@ def _arrange(
     wobble: float,
 ) -> _Arrangement:
     solver = RoomSolver(RoomSpace(room, plan.doorways, plan.windows), rng)
-    groups, notes = floor_groups(pieces)
-    groups.sort(key=lambda g: all(m.piece.number not in first for m in g.members))
-    dropped: list[Piece] = []
-    for group in (*groups, *hung_groups(pieces), *ceiling_groups(pieces), *rug_groups(pieces)):
-        remaining = group
-        while not solver.place(remaining, wobble=wobble):
-            dropped.append(remaining.members[-1].piece)
-            if len(remaining.members) == 1:
-                break
-            # The last member is the least important one: a chair, a stool, the coffee table.
-            remaining = replace(remaining, members=remaining.members[:-1])
+    groups, notes = room_groups(pieces, room.type, room.size_m)
+    groups.sort(key=lambda g: all(m.piece.number not in first for m in _members(g)))
+    dropped = _place_all(solver, groups, wobble, rng)
+    # What its group had no room for may still stand alone: a chair at the wall, an armchair in the corner.
+    dropped = _place_all(solver, [alone(p) for p in dropped], wobble, rng)
+    taken = {p.piece.number for p in solver.placed} | {p.number for p in dropped}
+    dropped += _place_all(solver, hung_and_laid(pieces, taken), wobble, rng)
     return _Arrangement(tuple(solver.placed), tuple(dropped), tuple(notes))
+
+
+def _place_all(
+    solver: RoomSolver, groups: Iterable[Group | Rows], wobble: float, rng: np.random.Generator
+) -> list[Piece]:
+    """Place group after group; returns the pieces that found no place."""
+    dropped: list[Piece] = []
+    hopeless: set[tuple[str, ...]] = set()
+    for item in groups:
+        for group in lay_rows(solver, item, wobble, rng) if isinstance(item, Rows) else (item,):
+            remaining = group
+            while _signature(remaining) in hopeless or not solver.place(remaining, wobble=wobble):
+                # An equal group finds no place either: a room only fills up.
+                hopeless.add(_signature(remaining))
+                dropped.append(remaining.members[-1].piece)
+                if len(remaining.members) == 1:
+                    break
+                # The last member is the least important one: a chair, a stool, the coffee table.
+                remaining = replace(remaining, members=remaining.members[:-1])
+    return dropped
+
+
+def _signature(group: Group) -> tuple[str, ...]:
+    return (group.style, *(m.piece.asset.asset_id for m in group.members))
+
+
+def _members(item: Group | Rows) -> tuple[Member, ...]:
+    return tuple(m for g in item.groups for m in g.members) if isinstance(item, Rows) else item.members
 
 
 def _set_small_things(
@@ -165,6 +208,21 @@ def _set_small_things(
 
 def _other(doorway: Doorway, room: str) -> str:
     return doorway.rooms[1] if doorway.rooms[0] == room else doorway.rooms[0]
+
+
+def _unplaced(pieces: Sequence[Piece], room: Room) -> list[str]:
+    """Sentences on what found no place on floor or walls: larger than the room, or in the way."""
+    large = [
+        p for p in pieces if max(p.size_m[:2]) > max(room.size_m) or min(p.size_m[:2]) > min(room.size_m)
+    ]
+    numbers = {p.number for p in large}
+    rest = [p for p in pieces if p.number not in numbers]
+    return [
+        *_sentences(
+            large, room.name, f"larger than the room of {room.size_m[0]:.1f} x {room.size_m[1]:.1f} m"
+        ),
+        *_sentences(rest, room.name, "no free place keeps the room passable"),
+    ]
 
 
 def _sentences(pieces: Sequence[Piece], room: str, reason: str) -> list[str]:

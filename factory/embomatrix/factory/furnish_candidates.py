@@ -52,8 +52,10 @@ class Candidates:
 class Surroundings:
     """What stands in a room, looked up by category: middles and headings, and the edges of runs."""
 
-    def __init__(self) -> None:
+    def __init__(self, space: RoomSpace) -> None:
         self._spots: dict[str, list[tuple[float, float, float]]] = defaultdict(list)
+        self._spots["doorway"] = [(*d.center_m, 0.0) for d in space.doorways]
+        self._spots["window"] = [(*w.center_m, 0.0) for w in space.windows]
         self._runs: list[tuple[float, ...]] = []
 
     def add(self, items: Iterable[Placed]) -> None:
@@ -79,6 +81,10 @@ def candidates_of(group: Group, space: RoomSpace, around: Surroundings) -> Candi
         x, y, turns = _open_floor(group, space)
     else:
         x, y, turns = _along_walls(group, space)
+    if group.style is Style.EDGE:
+        x, y, turns = (
+            np.concatenate(both) for both in zip((x, y, turns), _open_floor(group, space), strict=True)
+        )
     if not len(x):
         return Candidates(x, y, turns, np.empty(0))
     cost = _style_cost(group, space, around, x, y, turns)
@@ -121,7 +127,7 @@ def _open_floor(group: Group, space: RoomSpace) -> tuple[FloatArray, FloatArray,
     # About 60 x 60 places at most, so that a hall takes no longer than a parlour.
     step = max(0.1, math.sqrt((x1 - x0) * (y1 - y0)) / 60)
     gx, gy = np.meshgrid(np.arange(x0 + 0.1, x1, step), np.arange(y0 + 0.1, y1, step), indexing="ij")
-    ways = 2 if group.style in (Style.OVERHEAD, Style.AISLE) else 4
+    ways = {Style.OVERHEAD: 2, Style.AISLE: 2, Style.EDGE: 1}.get(group.style, 4)
     turns = np.repeat(np.arange(ways), gx.size)
     return np.tile(gx.ravel(), ways), np.tile(gy.ravel(), ways), turns
 
@@ -155,6 +161,9 @@ def _style_cost(
             across = np.where(turns % 2 == 0, x - room.low_m[0], y - room.low_m[1])
             shorter = np.where(turns % 2 == 0, room.size_m[0], room.size_m[1])
             cost = 0.4 * across + 0.8 * off - 0.3 * shorter
+        case Style.EDGE:
+            (x0, y0), (x1, y1) = room.low_m, room.high_m
+            cost = 0.6 * np.minimum(np.minimum(x - x0, x1 - x), np.minimum(y - y0, y1 - y))
         case Style.OVERHEAD:
             cost = 0.1 * np.hypot(x - cx, y - cy)
         case Style.ALONG:

@@ -139,6 +139,7 @@ class Style(StrEnum):
     ALONG = "along"  # anywhere along a wall
     CORNER = "corner"
     FREE = "free"  # in the middle of the room
+    EDGE = "edge"  # along the walls and, where those are taken, next to what stands there
     AISLE = "aisle"  # lines across the room, an aisle apart
     OVERHEAD = "overhead"
 
@@ -166,13 +167,22 @@ class Group:
         return (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
 
 
+@dataclass(frozen=True, slots=True)
+class Rows:
+    """Equal groups that stand in rows and columns, all looking one way; ``gap_m`` is free floor behind and beside each."""
+
+    groups: tuple[Group, ...]
+    importance: float
+    gap_m: tuple[float, float]
+
+
 _FRONTED_NAMES: Final = (
     "fridge freezer oven stove dishwasher washer clothes_dryer furniture_sink commercial_kitchen_sink toilet pedestal_sink "
     "multi_station_furniture_sink flat_top_grill deep_fryer bookcase bathtub jukebox wardrobe urinal electric_cauldron "
     "vending_machine grocery_shelf photocopier locker wall_mounted_sink"
 )
 _FRONTED: Final = frozenset(_FRONTED_NAMES.split())
-_BESIDE: Final = frozenset((Role.TABLE, Role.LOW_TABLE))
+_BESIDE: Final = frozenset((Role.TABLE, Role.LOW_TABLE, Role.FITTED))
 
 
 def access_of(piece: Piece) -> Access:
@@ -255,23 +265,47 @@ def relation_of(member: Member) -> Relation | None:
 
 def around_table(table: Piece, chairs: Sequence[Piece], gap_m: float = 0.04) -> tuple[Member, ...]:
     """A table with chairs facing it: along the long sides first, then at the ends."""
-    members = [Member(table)]
-    depth, width, _ = table.size_m
-    seat = max((c.size_m[1] for c in chairs), default=0.5) + 0.08
-    side = max(1, int(width / seat))
-    ends = max(1, int(depth / seat)) if len(chairs) > 2 * side else 0
+    side, end = _places(table, max((c.size_m[1] for c in chairs), default=0.5))
+    ends = end if len(chairs) > 2 * side else 0
     counts = _seats(len(chairs), (side, side, ends, ends))
+    members = [Member(table)]
     rest = list(chairs)
     for direction, count in zip((0, 2, 1, 3), counts, strict=True):
-        for place in range(count):
-            chair = rest.pop(0)
-            across = depth if direction % 2 == 0 else width
-            run = width if direction % 2 == 0 else depth
-            offset = across / 2 + gap_m + chair.size_m[0] / 2
-            shift = ((place + 0.5) / count - 0.5) * max(run, count * seat)
-            x, y = ((offset, shift), (shift, offset), (-offset, shift), (shift, -offset))[direction]
-            members.append(Member(chair, x, y, turns=(direction + 2) % 4))
+        members += _line(table, rest[:count], direction, gap_m)
+        rest = rest[count:]
     return tuple(members)
+
+
+def before_table(table: Piece, chairs: Sequence[Piece], gap_m: float = 0.04) -> tuple[Member, ...]:
+    """A table with chairs on its front side only, facing it: a workplace, a row of a class."""
+    return (Member(table), *_line(table, list(chairs), 0, gap_m))
+
+
+def seats_around(table: Piece, seat_m: float) -> int:
+    """How many chairs of this width find a place around the table."""
+    side, end = _places(table, seat_m)
+    return 2 * (side + end)
+
+
+def _places(table: Piece, seat_m: float) -> tuple[int, int]:
+    """Chairs along a long side and at an end of the table."""
+    depth, width, _ = table.size_m
+    seat = seat_m + 0.08
+    return max(1, int(width / seat)), max(0, int(depth / seat))
+
+
+def _line(table: Piece, chairs: Sequence[Piece], direction: int, gap_m: float) -> list[Member]:
+    """Chairs side by side along the table's side that looks this many quarter turns away from its front."""
+    depth, width, _ = table.size_m
+    across, run = (depth, width) if direction % 2 == 0 else (width, depth)
+    seat = max((c.size_m[1] for c in chairs), default=0.5) + 0.08
+    members = []
+    for place, chair in enumerate(chairs):
+        offset = across / 2 + gap_m + chair.size_m[0] / 2
+        shift = ((place + 0.5) / len(chairs) - 0.5) * max(run, len(chairs) * seat)
+        x, y = ((offset, shift), (shift, offset), (-offset, shift), (shift, -offset))[direction]
+        members.append(Member(chair, x, y, turns=(direction + 2) % 4))
+    return members
 
 
 def _seats(chairs: int, places: tuple[int, int, int, int]) -> tuple[int, ...]:

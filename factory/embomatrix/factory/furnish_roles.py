@@ -31,6 +31,9 @@ class Role(StrEnum):
     CEILING = "ceiling"
     RUG = "rug"
     SURFACE = "surface"  # on or in furniture
+    FITTED = "fitted"  # on a counter, for good: basins and cooktops
+    OPEN = "open"  # in the open, away from walls: cars, machines, a pool table
+    PLANTING = "planting"  # along the edges of a garden
     STRUCTURE = "structure"  # part of the building or its surroundings: walls and floors stand for it
 
 
@@ -42,13 +45,12 @@ _BY_ROLE: Final[Mapping[Role, str]] = {
     Role.BACKED: "bed sofa bookcase armchair wardrobe cedar_chest console_table nightstand standing_mirror piano toilet "
     "pedestal_sink bathtub shower_stall grandfather_clock jukebox bar commercial_kitchen_table locker vending_machine "
     "photocopier reception_desk checkout_counter display_case grocery_shelf hall_tree wood_fireplace gas_fireplace "
-    "treadmill crib hospital_bed magazine_stand snack_rack urinal eames_chair commercial_kitchen_shelf serving_cart",
-    Role.TABLE: "breakfast_table dining_table pedestal_table conference_table desk booth garden_coffee_table lab_table "
-    "pool_table",
+    "crib hospital_bed magazine_stand snack_rack urinal eames_chair commercial_kitchen_shelf serving_cart",
+    Role.TABLE: "breakfast_table dining_table pedestal_table conference_table desk booth lab_table cubicle",
     Role.SEAT: "straight_chair swivel_chair taboret bench garden_chair music_stool rocking_chair",
-    Role.LOW_TABLE: "coffee_table",
+    Role.LOW_TABLE: "coffee_table garden_coffee_table",
     Role.CORNER: "floor_lamp public_trash_can trash_can coatrack ottoman hamper standing_loudspeaker umbrella_rack "
-    "water_cooler pillar radiator electric_fan desktop_computer shredder suitcase",
+    "water_cooler radiator electric_fan desktop_computer shredder suitcase shopping_cart",
     Role.HUNG_CABINET: "top_cabinet range_hood",
     Role.WALL: "picture painting portrait mirror electric_switch towel_rack wall_mounted_tv wall_clock whiteboard "
     "blackboard paper_towel_dispenser toilet_paper_dispenser toilet_paper_holder hand_dryer wall_socket wall_nail hook "
@@ -62,17 +64,25 @@ _BY_ROLE: Final[Mapping[Role, str]] = {
     Role.RUG: "carpet gym_mat",
     Role.SURFACE: "microwave laptop coffee_maker table_lamp loudspeaker monitor keyboard printer espresso_machine standing_tv "
     "popcorn_machine electric_mixer food_slicer crock_pot beer_tap jug stockpot saucepot frying_pan tray pillow vase",
+    Role.FITTED: "burner drop_in_sink tabletop_sink multi_station_tabletop_sink",
+    Role.OPEN: "car pool_table playground swing_set sandbox wading_pool garden_statue hot_tub massage_bed motorcycle "
+    "recreational_vehicle bench_press_machine elliptical_machine exercise_bike flat_bench parallel_bars pommel_horse "
+    "treadmill turnstile",
+    Role.PLANTING: "tree low_resolution_tree bush garden_plant boulder garden_light",
     Role.STRUCTURE: "structural_element baseboard background greenery paver skeletal_frame stone_wall rail_fence stairs "
     "railing pergola arbor swimming_pool room_divider pedestal wall_panel l_shaped_handle handle classroom_mock_up "
-    "burner drop_in_sink tabletop_sink multi_station_tabletop_sink vine shower fairy_light window_blind",
+    "vine shower fairy_light window_blind pillar roof volleyball_net ceiling_mounted_basketball_hoop",
 }
 _ROLE_OF: Final[Mapping[str, Role]] = {c: role for role, names in _BY_ROLE.items() for c in names.split()}
 
 _IMPORTANCE: Final[Mapping[str, float]] = {
-    "fridge": 20, "oven": 14, "stove": 14, "furniture_sink": 20, "pedestal_sink": 20, "commercial_kitchen_sink": 20,
-    "bed": 25, "toilet": 25, "sofa": 9, "dishwasher": 6, "bar": 9, "breakfast_table": 8, "dining_table": 8, "desk": 8,
-    "booth": 8, "commercial_kitchen_table": 9, "bathtub": 8, "shower_stall": 8, "washer": 8, "microwave": 8, "countertop": 6,
-    "bottom_cabinet": 6, "bookcase": 6, "top_cabinet": 5, "wardrobe": 6,
+    "fridge": 20, "oven": 14, "stove": 14, "furniture_sink": 20, "pedestal_sink": 20,
+    "commercial_kitchen_sink": 20, "bed": 25, "toilet": 25, "sofa": 9, "dishwasher": 6, "bar": 9,
+    "breakfast_table": 8, "dining_table": 8, "desk": 8, "booth": 8, "cubicle": 8, "conference_table": 8,
+    "car": 7, "drop_in_sink": 10, "tabletop_sink": 10, "burner": 8, "multi_station_furniture_sink": 20,
+    "urinal": 9, "grocery_shelf": 9, "checkout_counter": 10, "reception_desk": 10, "lab_table": 8,
+    "hospital_bed": 12, "commercial_kitchen_table": 9, "bathtub": 8, "shower_stall": 8, "washer": 8,
+    "microwave": 8, "countertop": 6, "bottom_cabinet": 6, "bookcase": 6, "top_cabinet": 5, "wardrobe": 6,
 }  # fmt: skip
 
 _WALL_HEIGHT: Final[Mapping[str, float]] = {
@@ -116,6 +126,8 @@ def importance_of(category: str, role: Role) -> float:
         Role.LOW_TABLE: 4.0,
         Role.SEAT: 2.0,
         Role.CORNER: 2.0,
+        Role.OPEN: 4.0,
+        Role.PLANTING: 0.1,
     }.get(role, 1.0)
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.factory.furnish_candidates import AHEAD, WALL_GAP_M, Surroundings, candidates_of
+from embomatrix.factory.furnish_candidates import AHEAD, WALL_GAP_M, Candidates, Surroundings, candidates_of
 from embomatrix.factory.furnish_pieces import Access, Placed, access_of, front_depth_m
 from embomatrix.factory.furnish_space import LOW_M, Target
 from embomatrix.skills.limits import ROBOT
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from embomatrix.factory.furnish_boxes import BoolArray, Box, FloatArray
-    from embomatrix.factory.furnish_candidates import Candidates
     from embomatrix.factory.furnish_pieces import Group, Member
     from embomatrix.factory.furnish_space import RoomSpace
 
@@ -37,7 +36,7 @@ class RoomSolver:
     def __init__(self, space: RoomSpace, rng: np.random.Generator) -> None:
         self.space = space
         self.placed: list[Placed] = []
-        self._around = Surroundings()
+        self._around = Surroundings(space)
         self._rng = rng
 
     def place(self, group: Group, *, wobble: float = 1.0) -> bool:
@@ -76,6 +75,11 @@ class RoomSolver:
         self.space.occupy(boxes, zones, targets)
         return True
 
+    def is_free_at(self, group: Group, x: float, y: float, turns: int) -> bool:
+        """Whether the group stands free in this frame, its fronts included."""
+        spot = Candidates(np.array([x]), np.array([y]), np.array([turns]), np.zeros(1))
+        return bool(self.free(group, spot)[0])
+
     def free(self, group: Group, options: Candidates) -> BoolArray:
         """Which candidates stand free of everything, with their fronts free too; shape (n,)."""
         free = self._looks_free(group, options)
@@ -93,7 +97,7 @@ class RoomSolver:
     def _looks_free(self, group: Group, options: Candidates) -> BoolArray:
         """Candidates inside the room that the quick look does not rule out."""
         (x0, y0), (x1, y1) = self.space.room.low_m, self.space.room.high_m
-        gap = WALL_GAP_M - 1e-6
+        gap = WALL_GAP_M - 1e-6 + group.clear_m
         free = np.ones(len(options), dtype=bool)
         for member in group.members:
             for boxes in _boxes(member, options):

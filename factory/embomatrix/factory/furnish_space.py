@@ -60,7 +60,8 @@ class RoomSpace:
         self.doorways = tuple(d for d in doorways if room.name in d.rooms)
         self.solids = BoxStack()
         self.zones = BoxStack([self._door_zone(d) for d in self.doorways])
-        self.zones.extend([self._window_zone(w) for w in windows if room.name in w.rooms])
+        self.windows = tuple(w for w in windows if room.name in w.rooms)
+        self.zones.extend([self._window_zone(w) for w in self.windows])
         self._origin, self._shape = _grid_of(room)
         self._doors = [Target(_flat(self._door_zone(d))) for d in self.doorways]
         self._targets: list[_Cells] = []

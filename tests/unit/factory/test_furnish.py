@@ -9,7 +9,7 @@ import pytest
 from embomatrix.factory.floorplan import plan_floor
 from embomatrix.factory.floorplan_spec import RoomSpec
 from embomatrix.factory.furnish import MAX_EQUAL, furnish
-from embomatrix.factory.furnish_groups import floor_groups
+from embomatrix.factory.furnish_groups import room_groups
 from embomatrix.factory.furnish_pieces import REST_GAP_M, Piece, around_table, front_depth_m
 from embomatrix.factory.furnish_roles import HUNG_BOTTOM_M, Role, role_of
 from embomatrix.factory.furnish_space import RoomSpace, Target
@@ -67,7 +67,7 @@ def test_a_counter_slab_lies_on_its_tallest_cabinet() -> None:
         block("bottom_cabinet", (0.5, 0.5, 0.55), door=True),
         block("bottom_cabinet", (0.5, 0.45, 0.53), door=True),
     )
-    groups, left_out = floor_groups(pieces(block("countertop", (0.6, 1.0, 0.03)), cabinet, lower))
+    groups, left_out = room_groups(pieces(block("countertop", (0.6, 1.0, 0.03)), cabinet, lower))
     (counter,) = groups
     slab = counter.members[-1]
     assert slab.piece.category == "countertop"
@@ -77,7 +77,7 @@ def test_a_counter_slab_lies_on_its_tallest_cabinet() -> None:
 
 
 def test_a_slab_without_cabinets_is_left_out_with_a_sentence() -> None:
-    groups, left_out = floor_groups(pieces(block("countertop", (0.6, 1.0, 0.03))))
+    groups, left_out = room_groups(pieces(block("countertop", (0.6, 1.0, 0.03))))
     assert groups == []
     assert left_out == ["1 of the countertop-box slabs: no base cabinets are left to carry them"]
 

@@ -1,0 +1,179 @@
+"""Tables with their seats: dining sets, workplaces, rows that look at a board, booths and bars."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.factory.furnish_pieces import (
+    Group,
+    Member,
+    Rows,
+    Style,
+    around_table,
+    before_table,
+    seats_around,
+    top_of,
+)
+from embomatrix.factory.furnish_pool import worth
+from embomatrix.factory.furnish_roles import Role
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from embomatrix.factory.furnish_pieces import Piece
+    from embomatrix.factory.furnish_pool import Pool
+
+_KNEE_M: Final = 0.05
+_STOOL_GAP_M: Final = 0.12
+_HIGH_TABLE_M: Final = 0.85
+_EATING: Final = frozenset(
+    ("dining_room", "conference_hall", "break_room", "bar", "lobby", "garden", "meeting_room")
+)
+"""Rooms where an armchair, too, is a seat at a table when there are tables without chairs."""
+_FACING: Final = frozenset(("classroom", "computer_lab", "biology_lab", "chemistry_lab", "conference_hall"))
+"""Rooms whose seats all look the same way."""
+_WORK: Final = ("desk", "cubicle")
+ROW_OF: Final = 4
+"""This many equal sets stand in rows."""
+_WALK_M: Final = 0.7
+_BESIDE_DESK_M: Final = 0.65
+
+
+def table_groups(pool: Pool) -> list[Group | Rows]:
+    """Everything people sit at, with what they sit on; seats that are left over stay in the pool."""
+    groups: list[Group] = [*_booths(pool), *_bars(pool)]
+    tables = _tables(pool)
+    work = [t for t in tables if t.category in _WORK]
+    eat = sorted((t for t in tables if t.category not in _WORK), key=lambda t: -t.size_m[0] * t.size_m[1])
+    groups += _workplaces(pool, work, swivels=not eat or len(pool.of("swivel_chair")) <= 2 * len(work))
+    groups += _sets(pool, eat)
+    found = _in_rows(groups, pool)
+    if len(pool.of("armchair")) >= 3 * ROW_OF and pool.room_type in _FACING:
+        audience = [Group((Member(p),), Style.FREE, 6.0) for p in pool.take(pool.of("armchair"))]
+        found.append(Rows(tuple(audience), 6.0, (0.55, 0.06)))
+    return found
+
+
+def _tables(pool: Pool) -> list[Piece]:
+    tables = pool.take(p for p in pool.rest if p.role is Role.TABLE)
+    chairs = len(pool.of("straight_chair", "swivel_chair", "garden_chair"))
+    if not tables and chairs >= 2:
+        tables = pool.take(sorted(pool.of("coffee_table"), key=lambda p: -p.size_m[1])[:1])
+    return tables
+
+
+def _workplaces(pool: Pool, desks: Sequence[Piece], *, swivels: bool) -> list[Group]:
+    """A desk at the wall with its chair at the room's side; deep double desks with a chair on either side."""
+    kinds = ("swivel_chair",) if swivels else ()
+    kinds = (*kinds, "eames_chair", "straight_chair", "armchair" if pool.room_type in _EATING else "taboret")
+    count = sum(len(pool.of(kind)) for kind in kinds)
+    each = 2 if len(desks) and count >= 2 * len(desks) and min(desks[0].size_m[:2]) > 1.2 else 1
+    drawers = [p for p in pool.of("bottom_cabinet") if p.size_m[2] <= _BESIDE_DESK_M]
+    spare = len(drawers) // max(1, len(desks)) if len(desks) >= ROW_OF else 0
+    groups = []
+    for desk in desks:
+        seats = pool.take([p for kind in kinds for p in pool.of(kind)][:each])
+        members = before_table(desk, seats[:1]) + tuple(
+            m for m in around_table(desk, seats)[2:] if len(seats) > 1
+        )
+        members = (*members, *_drawers_beside(desk, pool.take(drawers[: min(spare, each)])))
+        drawers = drawers[min(spare, each) :]
+        style = Style.FREE if pool.room_type in _FACING else Style.ALONG
+        groups.append(Group(members, style, worth(members), spread=(desk.category,)))
+    return groups
+
+
+def _drawers_beside(desk: Piece, drawers: Sequence[Piece]) -> list[Member]:
+    """Low cabinets at the sides of the desk: the first opens to the chair's side, the second to the other."""
+    found = []
+    for drawer, side in zip(drawers, (1, -1), strict=False):
+        x = side * (desk.size_m[0] - drawer.size_m[0]) / 2
+        y = side * ((desk.size_m[1] + drawer.size_m[1]) / 2 + 0.01)
+        found.append(Member(drawer, x, y, turns=0 if side > 0 else 2))
+    return found
+
+
+def _sets(pool: Pool, tables: Sequence[Piece]) -> list[Group]:
+    """Tables with seats shared out among them, in the middle of the room; those without seats go to a wall."""
+    high = [t for t in tables if top_of(t) > _HIGH_TABLE_M]
+    stools = pool.of("taboret", "music_stool")
+    seats = pool.of("straight_chair", "garden_chair", "eames_chair", "swivel_chair", "rocking_chair")
+    if pool.room_type in _EATING and len(seats) < 2 * len(tables):
+        seats += pool.of("armchair")
+    if not high:
+        seats += stools
+    one_side = pool.room_type in _FACING and len(tables) >= ROW_OF
+    return [
+        *_shared(pool, high, stools, one_side),
+        *_shared(pool, [t for t in tables if t not in high], seats, one_side),
+    ]
+
+
+def _shared(pool: Pool, tables: Sequence[Piece], seats: list[Piece], one_side: bool) -> list[Group]:
+    """Seats of one kind to each table, as evenly as they go."""
+    pool.take(seats)
+    groups = []
+    for number, table in enumerate(tables):
+        share = -(-len(seats) // (len(tables) - number))
+        share = min(share, seats_around(table, seats[0].size_m[1]) if seats else 0)
+        mine, seats = seats[:share], seats[share:]
+        members = before_table(table, mine) if one_side else around_table(table, mine)
+        seated = {m.piece.number for m in members}
+        seats = [s for s in mine if s.number not in seated] + seats
+        style = Style.FREE if len(members) > 2 or (one_side and mine) else Style.ALONG
+        groups.append(Group(members, style, worth(members), spread=(table.category,)))
+    pool.rest += seats
+    return groups
+
+
+def _in_rows(groups: Sequence[Group], pool: Pool) -> list[Group | Rows]:
+    """Equal sets, four or more, as rows."""
+    kinds: dict[tuple[str, ...], list[Group]] = defaultdict(list)
+    for group in groups:
+        kinds[tuple(m.piece.category for m in group.members)].append(group)
+    found: list[Group | Rows] = []
+    for equal in kinds.values():
+        if len(equal) < ROW_OF or len(equal[0].members) < 2:
+            found += equal
+            continue
+        beside = 0.05 if equal[0].members[0].piece.category in _WORK else 0.45
+        if pool.room_type in _FACING:
+            beside = 0.6
+        found.append(Rows(tuple(equal), max(g.importance for g in equal), (_WALK_M, beside)))
+    return found
+
+
+def _booths(pool: Pool) -> list[Group]:
+    """A table end-on to the wall, with a bench on either side facing it."""
+    groups = []
+    benches = pool.of("bench")
+    tables = pool.of("booth")
+    if not tables and len(benches) >= 2 and pool.room_type == "dining_room":
+        tables = [t for t in pool.of("breakfast_table") if 0.5 <= benches[0].size_m[1] / t.size_m[1] <= 1.5]
+        tables = tables[: len(benches) // 2]
+    for table in tables:
+        mine = [b for b in pool.of("bench") if 0.5 <= b.size_m[1] / table.size_m[1] <= 1.5][:2]
+        pool.take([table, *mine])
+        members = [Member(table, turns=1)]
+        for bench, side in zip(mine, (1, -1), strict=False):
+            offset = table.size_m[0] / 2 + _KNEE_M + bench.size_m[0] / 2
+            members.append(Member(bench, 0.0, side * offset, turns=3 if side > 0 else 1))
+        groups.append(Group(tuple(members), Style.ALONG, worth(members), near=("booth", "bench")))
+    return groups
+
+
+def _bars(pool: Pool) -> list[Group]:
+    """Bars along a wall with stools before the longest."""
+    groups = []
+    bars = pool.take(sorted(pool.of("bar"), key=lambda p: -p.size_m[1]))
+    for bar in bars:
+        room = int(bar.size_m[1] / 0.55)
+        stools = pool.take(pool.of("music_stool", "taboret")[:room])
+        pitch = bar.size_m[1] / (len(stools) + 1)
+        members = [Member(bar)]
+        for place, stool in enumerate(stools):
+            x = bar.size_m[0] / 2 + _STOOL_GAP_M + stool.size_m[0] / 2
+            members.append(Member(stool, x, (place + 1) * pitch - bar.size_m[1] / 2, turns=2))
+        groups.append(Group(tuple(members), Style.ALONG, worth(members)))
+    return groups
