@@ -12,13 +12,15 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.sim.floor_grid import CELL_M, FloorGrid, Obstacles
+from embomatrix.sim.bounds import AssetParts
+from embomatrix.sim.floor_grid import CELL_M, FloorGrid
+from embomatrix.sim.obstacles import WALLS, Obstacles, crosses
 from embomatrix.skills.limits import ROBOT
-from embomatrix.world.geometry import Aabb, Pose
+from embomatrix.world.geometry import Pose
 from embomatrix.world.poses import StandPose
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Mapping
 
     from embomatrix.sim.engine import PhysicsEngine
     from embomatrix.sim.floor_grid import Cell
@@ -27,14 +29,10 @@ if TYPE_CHECKING:
     from embomatrix.world.geometry import FloatArray, Vec2
     from embomatrix.world.scene import Room
 
-FLAT_M: Final = 0.03
-"""The robot drives over what is lower than this: rugs."""
 ON_FLOOR_M: Final = 0.05
 """A movable object whose underside is lower than this stands on the floor."""
 REACH_SLACK_M: Final = 0.05
 """Standing poses are this much nearer than the arm reaches, so that a thing may be a little off its box's edge."""
-OVER_M: Final = 0.1
-"""The arm passes over what is no more than this much higher than the thing it reaches for."""
 FRONT_COSINE: Final = math.cos(math.radians(65.0))
 """What has a front is served from within 65 degrees of it."""
 STANDS: Final = 8
@@ -45,46 +43,80 @@ SIDE_WEIGHT_M: Final = 0.4
 """Standing abeam of the front is as bad as standing this much farther away."""
 ROOFED_M: Final = 1.5
 """A cavity whose floor has less free height than this can't be reached from above."""
-SLACK_M: Final = 0.005
 GRIDS_KEPT: Final = 8
-STANDS_KEPT: Final = 4096
-"""Answers in memory, about 1 KB each."""
+ANSWERS_KEPT: Final = 4096
+"""Standing poses and rectangles in memory, a few KB each."""
 ENTRY_M: Final = 0.4
 STEP_M: Final = CELL_M / 2
+
+
+Floor = tuple[tuple[int, Pose | None], ...]
+"""Movable objects that stand on the floor otherwise than at the start: number and pose, None for what stands there no more."""
 
 
 class Navigator:
     """Paths and standing poses in an engine's present state. Call ``refresh`` after objects on the floor have moved."""
 
-    def __init__(self, engine: PhysicsEngine, relations: Relations) -> None:
+    def __init__(
+        self,
+        engine: PhysicsEngine,
+        relations: Relations,
+        stands: Mapping[str, tuple[StandPose, ...]] | None = None,
+    ) -> None:
+        """``stands`` are standing poses that were found before, in this scene as it was loaded."""
         self._engine = engine
         self._relations = relations
         self._scene = engine.scene
         self._numbers = {item.name: number for number, item in enumerate(self._scene.objects)}
-        self._base = self._walls()
-        for item in self._scene.objects:
-            if item.fixed:
-                self._base = self._base.joined(self._parts_of(item.name))
-        self._grids: OrderedDict[tuple[object, ...], tuple[FloorGrid, Obstacles]] = OrderedDict()
+        self._parts: dict[str, AssetParts] = {}
+        bars = [item for item in self._scene.objects if item.fixed or self._on_floor(item.name)]
+        self._on_floor_at_start = {self._numbers[item.name] for item in bars if not item.fixed}
+        self._all_at_start = Obstacles.joined([self._walls(), *(self._parts_of(item.name) for item in bars)])
+        self._grid_at_start = FloorGrid(self._scene, self._all_at_start.barring)
+        self._grids: OrderedDict[Floor, tuple[FloorGrid, Obstacles]] = OrderedDict()
         self._stands: dict[tuple[object, ...], tuple[StandPose, ...]] = {}
+        self._blockers: dict[tuple[object, ...], FloatArray] = {}
+        self._found_before = dict(stands or {})
+        self._moved: set[int] = set()
+        self._round, self._read = -1, 0
         self.refresh()
 
     def refresh(self) -> None:
         """Bring the grid up to date with the movable objects on the floor. States seen before cost a look-up."""
-        standing = [item.name for item in self._scene.objects if not item.fixed and self._on_floor(item.name)]
-        key = tuple((name, self._engine.pose(name)) for name in standing)
-        if key not in self._grids:
-            obstacles = self._base
-            for name in standing:
-                obstacles = obstacles.joined(self._parts_of(name))
-            boxes = obstacles.boxes
-            barring = (boxes[:, 4] < ROBOT.height_m) & (boxes[:, 5] > FLAT_M)
-            self._grids[key] = (FloorGrid(self._scene, boxes[barring]), obstacles)
-        self._grids.move_to_end(key)
-        self._floor = key
-        if len(self._grids) > GRIDS_KEPT:
-            self._grids.popitem(last=False)
-        self._grid, self._obstacles = self._grids[key]
+        journal = self._engine.journal
+        if journal.rounds != self._round:
+            self._moved.clear()
+            self._round, self._read = journal.rounds, 0
+        for name, _ in journal.entries[self._read :]:
+            if not self._scene.by_name[name].fixed:
+                self._moved.add(self._numbers[name])
+        self._read = len(journal.entries)
+        floor = tuple(self._difference())
+        if floor not in self._grids:
+            self._grids[floor] = self._grid_of(floor)
+            if len(self._grids) > GRIDS_KEPT:
+                self._grids.popitem(last=False)
+        self._grids.move_to_end(floor)
+        self._floor = floor
+        self._grid, self._obstacles = self._grids[floor]
+
+    def _difference(self) -> Iterator[tuple[int, Pose | None]]:
+        """Movable objects that stand on the floor otherwise than at the start, in scene order; None: no more."""
+        for number in sorted(self._moved):
+            item = self._scene.objects[number]
+            pose = self._engine.pose(item.name) if self._on_floor(item.name) else None
+            if pose != (item.pose_world_asset if number in self._on_floor_at_start else None):
+                yield number, pose
+
+    def _grid_of(self, floor: Floor) -> tuple[FloorGrid, Obstacles]:
+        if not floor:
+            return self._grid_at_start, self._all_at_start
+        moved = [number for number, _ in floor]
+        names = [self._scene.objects[number].name for number, pose in floor if pose is not None]
+        come = Obstacles.joined([Obstacles.of([], WALLS, []), *map(self._parts_of, names)])
+        gone = self._all_at_start.only(moved)
+        now = Obstacles.joined([self._all_at_start.without(moved), come])
+        return self._grid_at_start.changed(gone.barring, come.barring), now
 
     @property
     def start(self) -> StandPose:
@@ -110,6 +142,11 @@ class Navigator:
         if first is None or last is None:
             return ()
         return (self._grid.path(first, last) or ())[1:-1]
+
+    def spots(self, low_m: Vec2, high_m: Vec2, origin: StandPose) -> FloatArray:
+        """Middles of the free cells in a rectangle that a path leads to, shape (n, 2)."""
+        start = self._cell(origin)
+        return self._grid.free_centers(low_m, high_m, self._grid.label(start) if start is not None else 0)
 
     def forward(self, origin: StandPose, yaw: float, distance_m: float) -> float:
         """How far of ``distance_m`` the robot gets from ``origin`` along the heading ``yaw`` before it meets something."""
@@ -155,14 +192,17 @@ class Navigator:
         start = self._cell(origin)
         if start is None or self._engine.is_parked(name):
             return ()
-        # All that the answer depends on: plans of a group ask the same again and again.
-        hosts = tuple(self._hosts_of(name))
-        key = (self._floor, self._grid.label(start), name, self._engine.pose(name), hosts)
-        if key not in self._stands:
-            if len(self._stands) == STANDS_KEPT:
+        key = self._key(name)
+        if self._floor == () and self._is_as_loaded(name) and self._serves_start(start):
+            found = self._found_before.get(name)
+            if found is not None:
+                return found
+        label = self._grid.label(start)
+        if (key, label) not in self._stands:
+            if len(self._stands) == ANSWERS_KEPT:
                 self._stands.clear()
-            self._stands[key] = self._find_stands(name, start)
-        return self._stands[key]
+            self._stands[key, label] = self._find_stands(name, start)
+        return self._stands[key, label]
 
     def _find_stands(self, name: str, start: Cell) -> tuple[StandPose, ...]:
         box = self._relations.body(name)
@@ -179,20 +219,20 @@ class Navigator:
         if required:
             fits &= cosines >= FRONT_COSINE
         cost = np.where(fits, away + SIDE_WEIGHT_M * (1 - cosines) / 2, np.inf)
-        return self._choose(name, box, centers, nearest, cost)
+        return self._choose(name, centers, nearest, cost)
 
     def line_is_clear(self, origin: StandPose, name: str) -> bool:
         """Whether no wall nor anything much taller than the object stands between the robot and the object's box."""
         box = self._relations.body(name)
-        point = np.array((origin.x_m, origin.y_m))
-        nearest = np.clip(point, box.low_m[:2], box.high_m[:2])
-        return not _crosses(point, nearest, self._blockers(name, box))
+        (low_x, low_y, _), (high_x, high_y, _) = box.low_m, box.high_m
+        nearest = (min(max(origin.x_m, low_x), high_x), min(max(origin.y_m, low_y), high_y))
+        return not crosses((origin.x_m, origin.y_m), nearest, self._blockers_of(name))
 
     def _choose(
-        self, name: str, box: Aabb, centers: FloatArray, nearest: FloatArray, cost: FloatArray
+        self, name: str, centers: FloatArray, nearest: FloatArray, cost: FloatArray
     ) -> tuple[StandPose, ...]:
         """Walk through the cells by cost; keep those with a clear line that are apart from the ones kept before."""
-        blockers = self._blockers(name, box)
+        blockers = self._blockers_of(name)
         chosen: list[StandPose] = []
         tried = 0
         for index in np.argsort(cost, kind="stable").tolist():
@@ -202,9 +242,9 @@ class Navigator:
             if any(math.hypot(x - other.x_m, y - other.y_m) < APART_M for other in chosen):
                 continue
             tried += 1
-            if _crosses(centers[index], nearest[index], blockers):
-                continue
             tx, ty = nearest[index].tolist()
+            if crosses((x, y), (tx, ty), blockers):
+                continue
             chosen.append(StandPose(x, y, math.atan2(ty - y, tx - x)))
         return tuple(chosen)
 
@@ -213,44 +253,39 @@ class Navigator:
 
         The front is that of the fixed furniture which the object stands in or on, or its own.
         """
-        fixed = [host for host in self._hosts_of(name) if self._scene.by_name[host].fixed]
+        fixed = [host for host in self._relations.hosts_of(name) if self._scene.by_name[host].fixed]
         yaw = self._engine.pose(fixed[0] if fixed else name).yaw
         to_robot = centers - np.array(self._relations.body(name).center_m[:2])
         to_robot /= np.maximum(np.linalg.norm(to_robot, axis=1, keepdims=True), 1e-9)
         cosines = to_robot @ np.array((math.cos(yaw), math.sin(yaw)))
         return cosines, has_front(self._scene.asset_of(name))
 
-    def _blockers(self, name: str, box: Aabb) -> FloatArray:
-        """Rectangles, shape (n, 4), that the arm can't pass on its way to a box.
+    def _blockers_of(self, name: str) -> FloatArray:
+        """Rectangles that the arm can't pass on its way to the object, shape (4, n)."""
+        key = self._key(name)
+        if key not in self._blockers:
+            if len(self._blockers) == ANSWERS_KEPT:
+                self._blockers.clear()
+            own = [self._numbers[item] for item in (name, *self._relations.hosts_of(name))]
+            self._blockers[key] = self._obstacles.blockers(self._relations.body(name), own)
+        return self._blockers[key]
 
-        Walls and what is much taller than the object; and where a host roofs the object over, the host's own sides.
-        """
-        rows, owners = self._obstacles.boxes, self._obstacles.owners
-        low, top = box.low_m[2], box.high_m[2]
-        x, y, _ = box.center_m
-        own = [self._numbers[item] for item in (name, *self._hosts_of(name))]
-        barring = (rows[:, 5] > top + OVER_M) & (rows[:, 4] < max(top, ROBOT.shoulder_m))
-        barring &= ~np.isin(owners, own)
-        over = (
-            (rows[:, 0] <= x)
-            & (x <= rows[:, 2])
-            & (rows[:, 1] <= y)
-            & (y <= rows[:, 3])
-            & (rows[:, 4] >= top)
+    def _key(self, name: str) -> tuple[object, ...]:
+        """All that standing poses and lines of approach depend on, but for where the robot is."""
+        hosts = tuple(self._relations.hosts_of(name))
+        return self._floor, name, self._engine.pose(name), hosts
+
+    def _is_as_loaded(self, name: str) -> bool:
+        """Whether the object and what it stands on or in are where the scene has them."""
+        return all(
+            self._engine.pose(item) == self._scene.by_name[item].pose_world_asset
+            for item in (name, *self._relations.hosts_of(name))
         )
-        beside = (rows[:, 4] < top - SLACK_M) & (rows[:, 5] > low + SLACK_M) & ~self._obstacles.leaves
-        for number in own[1:]:
-            mine = owners == number
-            if (mine & over).any():
-                barring |= mine & beside
-        return rows[barring, :4]
 
-    def _hosts_of(self, name: str) -> list[str]:
-        """What the object stands on or in, what that stands on or in, and so on."""
-        chain = [name]
-        while (host := self._relations.host_of(chain[-1])) is not None and host.name not in chain:
-            chain.append(host.name)
-        return chain[1:]
+    def _serves_start(self, cell: Cell) -> bool:
+        """Whether a path leads from a cell to where the scene has the robot start."""
+        start = self._cell(self.start)
+        return start is not None and self._grid.label(start) == self._grid.label(cell)
 
     def _cell(self, pose: StandPose) -> Cell | None:
         return self._grid.cell(pose.x_m, pose.y_m)
@@ -266,42 +301,21 @@ class Navigator:
 
     def _walls(self) -> Obstacles:
         world = Pose((0.0, 0.0, 0.0))
-        rows = [_row(wall.aabb(world)) for wall in self._scene.walls]
-        return _obstacles(rows, -1, [False] * len(rows))
+        boxes = [wall.aabb(world) for wall in self._scene.walls]
+        return Obstacles.of(boxes, WALLS, [False] * len(boxes))
 
     def _parts_of(self, name: str) -> Obstacles:
         """Boxes of the object's parts with its joints shut."""
-        pose = self._engine.pose(name)
-        links = self._scene.asset_of(name).links
-        rows = [_row(part.aabb(pose)) for link in links for part in link.parts]
-        leaves = [link.joint is not None for link in links for _ in link.parts]
-        return _obstacles(rows, self._numbers[name], leaves)
+        asset = self._scene.asset_of(name)
+        if asset.asset_id not in self._parts:
+            self._parts[asset.asset_id] = AssetParts(asset)
+        shut = (0.0,) * len(asset.joints)
+        boxes = self._parts[asset.asset_id].boxes(self._engine.pose(name), shut)
+        leaves = [link.joint is not None for link in asset.links for _ in link.parts]
+        return Obstacles.of(boxes, self._numbers[name], leaves)
 
 
 def has_front(asset: Asset) -> bool:
     """Whether a thing is served from its front only: it has doors, or cavities with a roof."""
     roofed = any(surface.interior and surface.clearance_m < ROOFED_M for surface in asset.supports)
     return bool(asset.joints) or roofed
-
-
-def _obstacles(rows: Sequence[tuple[float, ...]], owner: int, leaves: Sequence[bool]) -> Obstacles:
-    return Obstacles(
-        np.array(rows, dtype=np.float64).reshape(-1, 6),
-        np.full(len(rows), owner, dtype=np.int32),
-        np.array(leaves, dtype=np.bool_),
-    )
-
-
-def _row(box: Aabb) -> tuple[float, ...]:
-    return (*box.low_m[:2], *box.high_m[:2], box.low_m[2], box.high_m[2])
-
-
-def _crosses(start: FloatArray, end: FloatArray, boxes: FloatArray) -> bool:
-    """Whether the segment between two points of the plane passes through any rectangle, shape (n, 4): slab test."""
-    step = end - start
-    step = np.where(np.abs(step) < 1e-12, 1e-12, step)
-    first = (boxes[:, :2] - start) / step  # (n, 2)
-    last = (boxes[:, 2:] - start) / step  # (n, 2)
-    enter = np.minimum(first, last).max(axis=1)
-    leave = np.maximum(first, last).min(axis=1)
-    return bool(((enter < leave) & (leave > 0.0) & (enter < 1.0)).any())

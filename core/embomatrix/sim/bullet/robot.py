@@ -1,0 +1,174 @@
+"""The robot in a Bullet client: motors with limits, what its links touch, and what its hand holds."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.sim.bullet.client import pybullet
+from embomatrix.sim.bullet.robot_model import (
+    ARM_JOINTS,
+    BASE_JOINTS,
+    FINGER_JOINTS,
+    HAND,
+    LIFT_JOINTS,
+    robot_urdf,
+)
+from embomatrix.world.geometry import Pose
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+BASE_N: Final = 600.0
+BASE_NM: Final = 200.0
+LIFT_N: Final = 1500.0
+SHOULDER_NM: Final = 87.0
+WRIST_NM: Final = 40.0
+FINGER_N: Final = 30.0
+GRIP_N: Final = 400.0
+"""What the hand's hold on a thing can bear."""
+GAIN: Final = 0.3
+"""Share of the way to its target that a motor takes in a step, as far as its force lets it."""
+FINGERS_OPEN_M: Final = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class Posture:
+    """Where the robot's joints are: base in the world, height of the lift, the arm's seven angles."""
+
+    x_m: float
+    y_m: float
+    yaw: float
+    lift_m: float
+    arm: tuple[float, ...]
+
+    @property
+    def numbers(self) -> tuple[float, ...]:
+        return (self.x_m, self.y_m, self.yaw, self.lift_m, *self.arm)
+
+    @staticmethod
+    def of(numbers: Sequence[float]) -> Posture:
+        x, y, yaw, lift, *arm = (float(value) for value in numbers)
+        return Posture(x, y, yaw, lift, tuple(arm))
+
+
+class RobotBody:
+    """A robot that was loaded into a client. It lives until the client is reset."""
+
+    def __init__(self, client: int, posture: Posture) -> None:
+        """Load the robot with its joints at a posture."""
+        self._bullet = bullet = pybullet()
+        self._client = client
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "robot.urdf"
+            path.write_text(robot_urdf())
+            self.body = int(bullet.loadURDF(str(path), useFixedBase=True, physicsClientId=client))
+        infos = [
+            bullet.getJointInfo(self.body, joint, physicsClientId=client)
+            for joint in range(bullet.getNumJoints(self.body, physicsClientId=client))
+        ]
+        joints = {info[1].decode(): int(info[0]) for info in infos}
+        links = {info[12].decode(): int(info[0]) for info in infos}
+        self.hand = links[HAND]
+        self.tips = frozenset((self.hand, *(joints[name] for name in FINGER_JOINTS)))
+        self.base = links["base"]
+        self._driven = [joints[name] for name in (*BASE_JOINTS, *LIFT_JOINTS, *ARM_JOINTS, *FINGER_JOINTS)]
+        self._forces = [BASE_N] * 2 + [BASE_NM] + [LIFT_N] * 2
+        self._forces += [SHOULDER_NM] * 4 + [WRIST_NM] * 3 + [FINGER_N] * 2
+        self._inertial = Pose(tuple(bullet.getDynamicsInfo(self.body, self.hand, physicsClientId=client)[3]))
+        self._hold = -1
+        for joint, value in zip(self._driven, _spread(posture), strict=True):
+            bullet.resetJointState(self.body, joint, value, physicsClientId=client)
+        self.steer(posture)
+
+    @property
+    def posture(self) -> Posture:
+        """Where the joints are now."""
+        states = self._bullet.getJointStates(self.body, self._driven, physicsClientId=self._client)
+        values = [state[0] for state in states]
+        return Posture.of((*values[:3], values[3] + values[4], *values[5:12]))
+
+    def steer(self, posture: Posture) -> None:
+        """Give the motors their targets. They pursue them within their forces as time passes."""
+        bullet = self._bullet
+        bullet.setJointMotorControlArray(
+            self.body,
+            self._driven,
+            bullet.POSITION_CONTROL,
+            targetPositions=_spread(posture),
+            forces=self._forces,
+            positionGains=[GAIN] * len(self._driven),
+            physicsClientId=self._client,
+        )
+
+    def hold(self, body: int, link: int, pose_hand_body: Pose, force_n: float = GRIP_N) -> None:
+        """Hold a body's link as it is in the hand now, up to a force."""
+        centre = self._inertial.inverse() @ pose_hand_body
+        self._hold = self._bullet.createConstraint(
+            self.body,
+            self.hand,
+            body,
+            link,
+            self._bullet.JOINT_FIXED,
+            (0, 0, 0),
+            centre.position_m,
+            (0, 0, 0),
+            centre.quat_xyzw,
+            (0, 0, 0, 1),
+            physicsClientId=self._client,
+        )
+        self._bullet.changeConstraint(self._hold, maxForce=force_n, physicsClientId=self._client)
+
+    def hook(self, body: int, link: int, in_hand: Sequence[float], in_link: Sequence[float]) -> None:
+        """Hold one point of a body's link by a point of the hand: it may turn about it."""
+        point = self._inertial.inverse().apply((in_hand[0], in_hand[1], in_hand[2]))
+        self._hold = self._bullet.createConstraint(
+            self.body,
+            self.hand,
+            body,
+            link,
+            self._bullet.JOINT_POINT2POINT,
+            (0, 0, 0),
+            point,
+            tuple(in_link),
+            physicsClientId=self._client,
+        )
+        self._bullet.changeConstraint(self._hold, maxForce=GRIP_N, physicsClientId=self._client)
+
+    def let_go(self) -> None:
+        """End the hold, if there is one."""
+        if self._hold >= 0:
+            self._bullet.removeConstraint(self._hold, physicsClientId=self._client)
+            self._hold = -1
+
+    def hand_pose(self) -> Pose:
+        """Frame of the hand in the world: z points out of it, y along the fingers' travel."""
+        state = self._bullet.getLinkState(
+            self.body, self.hand, computeForwardKinematics=1, physicsClientId=self._client
+        )
+        return Pose(tuple(state[4]), tuple(state[5]))
+
+    def collide(self, body: int, links: Sequence[int], *, on: bool) -> None:
+        """Let the robot collide with a body's links, or not: what the hand holds does not push against it."""
+        for link in range(-1, self._bullet.getNumJoints(self.body, physicsClientId=self._client)):
+            for other in links:
+                self._bullet.setCollisionFilterPair(
+                    self.body, body, link, other, int(on), physicsClientId=self._client
+                )
+
+
+def _spread(posture: Posture) -> list[float]:
+    """Values of the driven joints: both stages of the lift share its height."""
+    half = posture.lift_m / 2
+    return [
+        posture.x_m,
+        posture.y_m,
+        posture.yaw,
+        half,
+        half,
+        *posture.arm,
+        FINGERS_OPEN_M,
+        FINGERS_OPEN_M,
+    ]

@@ -1,0 +1,257 @@
+"""Doors, drawers and lids: the hand takes the free edge and leads it along its arc, or pushes it from within."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from embomatrix.sim import physical_body as body
+from embomatrix.sim.bounds import joint_motion
+from embomatrix.sim.physical_grasp import facing
+from embomatrix.sim.physical_hands import GENTLE, TOUCH_M, fold, unfold
+from embomatrix.sim.physical_motion import standing
+from embomatrix.sim.physical_reach import TOUCH_M as PRESS_M
+from embomatrix.sim.physical_reach import Reach, Track
+from embomatrix.sim.physical_space import boxes_of, part_boxes, strikes
+from embomatrix.sim.physical_travel import SOMETHING
+from embomatrix.skills.failure import FailureReason
+from embomatrix.skills.view import refuse
+from embomatrix.world.asset import JointKind
+from embomatrix.world.geometry import Aabb, Pose
+from embomatrix.world.state import OPEN_FRACTION
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from embomatrix.sim.physical_reach import Way
+    from embomatrix.sim.physical_stage import Stage
+    from embomatrix.skills.view import Refusal
+    from embomatrix.world.asset import Asset, Joint, Link
+    from embomatrix.world.geometry import FloatArray
+
+EDGE: Final = 0.88
+"""The hand takes a leaf at this share of the way from its hinge to its free edge."""
+ALONG: Final = (0.0, 0.5, -0.5, 0.8, -0.8)
+"""Where along the edge, as shares of its half length."""
+FOLLOWED: Final = (1.0, 0.5, 0.0)
+"""Shares of the leaf's turn that the hand turns along."""
+OFF_M: Final = 0.08
+WAYPOINTS: Final = 7
+ENOUGH: Final = 0.5
+"""A door that something stops before this share of its travel is not open: the same as in cached mode."""
+SHUT: Final = OPEN_FRACTION
+STRETCHES: Final = ((1.0,), (0.5, 1.0))
+"""How the way is divided: in one pull, else in two with a step between them."""
+
+
+@dataclass(frozen=True, slots=True)
+class Leaf:
+    """One door, drawer or lid of an object: which joint moves it, and where the hand takes it."""
+
+    name: str
+    number: int
+    link: Link
+    joint: Joint
+    asset: Asset
+    pose: Pose
+
+    def grips(
+        self, fraction: float, along: float, *, within: bool
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Point on the leaf in the world at a share of its travel, the way out of its surface there, and the edge's line."""
+        box = Aabb.around(part.aabb(Pose((0.0, 0.0, 0.0))) for part in self.link.parts)
+        centre, half = np.array(box.center_m), np.array(box.size_m) / 2
+        axis = np.array(self.joint.axis)
+        if self.joint.kind is JointKind.PRISMATIC:
+            out = axis * math.copysign(1.0, self.joint.upper)
+            edge = np.cross(out, [0.0, 0.0, 1.0])
+            point = centre + out * (np.abs(out) @ half) + along * 0.5 * edge * (np.abs(edge) @ half)
+        else:
+            arm = centre - np.array(self.joint.origin_m)
+            arm = arm - axis * (axis @ arm)
+            free = _main_axis(arm)
+            out = np.cross(axis, free) * math.copysign(1.0, self.joint.upper)
+            edge = axis
+            hinge = np.array(self.joint.origin_m) @ free
+            tip = centre @ free + np.abs(free) @ half
+            point = centre + free * (hinge + EDGE * (tip - hinge) - centre @ free)
+            point = (
+                point
+                + along * axis * (np.abs(axis) @ half)
+                + out * (np.abs(out) @ half) * (-1.0 if within else 1.0)
+            )
+        out = -out if within else out
+        frame = self.pose @ joint_motion(self.joint, fraction)
+        turn = frame.rotation
+        return np.array(frame.apply(tuple(point.tolist()))), turn @ out, turn @ edge
+
+
+def leaves_of(stage: Stage, name: str) -> list[Leaf]:
+    """The moving leaves of an object, in the order of its joints."""
+    asset, pose = stage.world.asset(name), stage.world.engine.pose(name)
+    moving = [link for link in asset.links if link.joint is not None]
+    return [
+        Leaf(name, number, link, link.joint, asset, pose)
+        for number, link in enumerate(moving)
+        if link.joint is not None
+    ]
+
+
+def open_all(stage: Stage, name: str, rng: np.random.Generator) -> Refusal | None:
+    """Open every leaf. It fails, and leaves what it did, when one does not get half open."""
+    return _lead_all(stage, name, 1.0, rng)
+
+
+def close_all(stage: Stage, name: str, rng: np.random.Generator) -> Refusal | None:
+    """Shut every leaf."""
+    return _lead_all(stage, name, 0.0, rng)
+
+
+def _lead_all(stage: Stage, name: str, goal: float, rng: np.random.Generator) -> Refusal | None:
+    home = stage.world.robot
+    refusal = None
+    for leaf in leaves_of(stage, name):
+        now = stage.dynamic.joints(name)[leaf.number]
+        if abs(now - goal) <= SHUT:
+            continue
+        refusal = _lead(stage, leaf, goal, rng)
+        reached = stage.dynamic.joints(name)[leaf.number]
+        if reached >= ENOUGH if goal else reached <= SHUT:
+            refusal = None
+        elif refusal is None:
+            refusal = refuse(FailureReason.DOOR_BLOCKED, target=name, other=SOMETHING)
+        if refusal is not None:
+            break
+    back = fold(stage, home, rng)
+    return refusal or back
+
+
+def _lead(stage: Stage, leaf: Leaf, goal: float, rng: np.random.Generator) -> Refusal | None:
+    """Move one leaf to a share of its travel, in one stretch or in two."""
+    refusal: Refusal | None = None
+    for stretch in STRETCHES:
+        for share in stretch:
+            now = stage.dynamic.joints(leaf.name)[leaf.number]
+            start = now if len(stretch) > 1 and share == 1.0 else now
+            aim = goal if share == 1.0 else now + share * (goal - now)
+            refusal = _stretch(stage, leaf, start, aim, rng)
+            if refusal is not None:
+                break
+        if refusal is None:
+            return None
+    return refusal
+
+
+def _stretch(stage: Stage, leaf: Leaf, start: float, goal: float, rng: np.random.Generator) -> Refusal | None:
+    """Take the leaf where it is and lead it to a share of its travel."""
+    boxes = stage.boxes()
+    fractions = np.linspace(start, goal, WAYPOINTS)
+    moving = [_leaf_boxes(leaf, float(fraction)) for fraction in fractions]
+    fixed = boxes.without((leaf.name,)).joined(_body_boxes(stage, leaf))
+    course = np.concatenate([[0, 0], np.arange(WAYPOINTS), [WAYPOINTS - 1]]).astype(int)
+
+    def clear(postures: FloatArray) -> bool:
+        """Whether arm and trunk, but not the hand, keep clear of the leaf as it moves."""
+        arms = body.balls(postures)[:, ~body.HAND_BALLS]
+        trunk, sizes = body.trunk_balls(postures)
+        points = np.concatenate([arms, trunk], axis=1)
+        radii = np.concatenate([body.RADII[~body.HAND_BALLS], sizes])
+        return all(
+            strikes(moving[number], points[row : row + 1], radii, PRESS_M)[0] < 0
+            for row, number in enumerate(course.tolist())
+        )
+
+    reach = Reach(boxes, fixed, None, clear)
+    tracks = list(_tracks(leaf, fractions))
+    point = np.array(tracks[0].position[2])
+    for bases in stage.bases(point, wide=True):
+        for way in reach.ways(tracks, bases):
+            at = standing(stage.mover.posture, *way.postures[0, :3].tolist())
+            if reach.transit(at, way.postures[0], rng, loaded=False) is None:
+                continue
+            return unfold(stage, way, reach, rng, loaded=False) or _pull(stage, way, leaf, goal)
+    return refuse(FailureReason.ARM_BLOCKED, target=leaf.name, other=reach.hindrance or SOMETHING)
+
+
+def _pull(stage: Stage, way: Way, leaf: Leaf, goal: float) -> Refusal | None:
+    """Touch the leaf, lead it along the way, let go and step back."""
+    stage.wake_around(leaf.name)
+    touch = way.postures[1:3]
+    stage.mover.follow(touch, GENTLE, lambda: stage.dynamic.gap(leaf.name) < TOUCH_M)
+    if stage.dynamic.gap(leaf.name) > 3 * TOUCH_M:
+        return refuse(FailureReason.ARM_BLOCKED, target=leaf.name, other=SOMETHING)
+    stage.dynamic.hook(leaf.name, leaf.number)
+    hit = stage.mover.follow(way.postures[3:-1], 0.6)
+    stage.mover.wait(24)
+    stage.dynamic.unhook()
+    stage.mover.follow(way.postures[-1:], 0.6)
+    reached = stage.dynamic.joints(leaf.name)[leaf.number]
+    stage.settle()
+    if abs(reached - goal) > 0.12 and hit is not None:
+        return refuse(FailureReason.DOOR_BLOCKED, target=leaf.name, other=hit or SOMETHING)
+    return None
+
+
+def _tracks(leaf: Leaf, fractions: FloatArray) -> Iterator[Track]:
+    """Ways of the tool: to the leaf, along its arc, and off it."""
+    opened = min(float(fractions[0]), float(fractions[-1])) > 0.3
+    sides = (False, True) if opened or float(fractions[0]) > 0.3 else (False,)
+    for within in sides:
+        for along in ALONG:
+            for followed in FOLLOWED:
+                yield _track(leaf, fractions, along, followed, within=within)
+            if leaf.joint.kind is JointKind.PRISMATIC and along < 0:
+                break
+
+
+def _track(leaf: Leaf, fractions: FloatArray, along: float, followed: float, *, within: bool) -> Track:
+    start = float(fractions[0])
+    rotations, positions = [], []
+    for fraction in fractions.tolist():
+        point, _, _ = leaf.grips(fraction, along, within=within)
+        _, out, edge = leaf.grips(start + followed * (fraction - start), along, within=within)
+        rotations.append(facing(-out, 0.0 if abs(edge[2]) < 0.5 else math.pi / 2, edge))
+        positions.append(point)
+    first, last = leaf.grips(start, along, within=within)[1], -rotations[-1][:, 2]
+    positions = [
+        positions[0] + OFF_M * first,
+        positions[0] + 0.01 * first,
+        positions[0] - 0.004 * first,
+        *positions[1:],
+        positions[-1] + OFF_M * last,
+    ]
+    rotations = [rotations[0], rotations[0], *rotations, rotations[-1]]
+    count = len(positions)
+    return Track(
+        np.array(rotations), np.array(positions), np.zeros(count, dtype=bool), 2 + len(fractions) // 2
+    )
+
+
+def _leaf_boxes(leaf: Leaf, fraction: float):
+    frame = leaf.pose @ joint_motion(leaf.joint, fraction)
+    return boxes_of([(frame @ part.pose, part.size_m, leaf.name) for part in leaf.link.parts])
+
+
+def _body_boxes(stage: Stage, leaf: Leaf):
+    """The object's parts but those of the leaf."""
+    fractions = stage.world.engine.joints(leaf.name)
+    parts = part_boxes(leaf.asset, leaf.pose, fractions)
+    owners = [link for link in leaf.asset.links for _ in link.parts]
+    return boxes_of(
+        [
+            (pose, size, leaf.name)
+            for (pose, size), link in zip(parts, owners, strict=True)
+            if link.name != leaf.link.name
+        ]
+    )
+
+
+def _main_axis(vector: FloatArray) -> FloatArray:
+    """The coordinate axis that a vector points along most."""
+    found = np.zeros(3)
+    number = int(np.abs(vector).argmax())
+    found[number] = math.copysign(1.0, vector[number])
+    return found

@@ -1,0 +1,114 @@
+"""Where the hand may touch a thing to take it, and on which way it comes there."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from embomatrix.sim.physical_reach import Track
+from embomatrix.sim.physical_space import part_boxes
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from embomatrix.world.asset import Asset
+    from embomatrix.world.geometry import FloatArray, Pose
+
+OPEN_ELEVATIONS: Final = (50.0, 90.0, 25.0, 70.0, 8.0)
+ROOFED_ELEVATIONS: Final = (15.0, 0.0, 30.0, 45.0)
+"""Degrees by which the hand comes from above, in the order of preference."""
+OPEN_AZIMUTHS: Final = (0.0, 40.0, -40.0, 80.0, -80.0)
+ROOFED_AZIMUTHS: Final = (0.0, 25.0, -25.0)
+"""Degrees by which it comes from aside."""
+ROLLS: Final = (0.0, 90.0)
+OPEN_BACK_M: Final = 0.10
+BEYOND_M: Final = 0.015
+"""The way ends this far behind the surface: the hand stops when it touches."""
+
+
+def facing(direction: FloatArray, roll: float, aside: FloatArray) -> FloatArray:
+    """Rotation, (3, 3), of a tool whose z axis points along a direction and whose y axis is level, turned by ``roll``."""
+    level = np.cross([0.0, 0.0, 1.0], direction)
+    if np.linalg.norm(level) < 0.05:
+        level = aside
+    level = level / np.linalg.norm(level)
+    across = np.cross(level, direction)
+    y = math.cos(roll) * level + math.sin(roll) * across
+    return np.stack([np.cross(y, direction), y, direction], axis=1)
+
+
+def surface_point(
+    boxes: Sequence[tuple[Pose, tuple[float, float, float]]], aim: FloatArray, direction: FloatArray
+) -> FloatArray | None:
+    """Where a ray through a point first meets any of the boxes, None when it misses them all: slab test."""
+    start = aim - 3.0 * direction
+    nearest = math.inf
+    for pose, size in boxes:
+        back = pose.rotation.T
+        origin, course = back @ (start - np.array(pose.position_m)), back @ direction
+        course = np.where(np.abs(course) < 1e-9, 1e-9, course)
+        half = np.array(size) / 2
+        first, second = (-half - origin) / course, (half - origin) / course
+        enter, leave = np.minimum(first, second).max(), np.maximum(first, second).min()
+        if enter <= leave and enter < nearest:
+            nearest = float(enter)
+    return start + nearest * direction if math.isfinite(nearest) else None
+
+
+def grasp_tracks(
+    asset: Asset, pose: Pose, fractions: Sequence[float], course: float, out_m: float | None
+) -> list[Track]:
+    """Ways of the tool to the thing's surface, the preferred ones first: far, half way, at it, a little beyond.
+
+    ``course`` is the heading, in the world, in which the hand goes; ``out_m`` the length of the way in when the thing stands
+    under a roof, None in the open.
+    """
+    boxes = part_boxes(asset, pose, fractions)
+    elevations = OPEN_ELEVATIONS if out_m is None else ROOFED_ELEVATIONS
+    azimuths = OPEN_AZIMUTHS if out_m is None else ROOFED_AZIMUTHS
+    back_m = OPEN_BACK_M if out_m is None else out_m
+    aside = np.array([-math.sin(course), math.cos(course), 0.0])
+    tracks = []
+    for azimuth in azimuths:
+        for elevation in elevations:
+            if elevation == 90.0 and azimuth != 0.0:
+                continue
+            direction = _direction(course + math.radians(azimuth), math.radians(elevation))
+            retreat = direction if out_m is None else _direction(course, 0.0)
+            for aim in _aims(asset, pose, boxes):
+                point = surface_point(boxes, aim, direction)
+                if point is None:
+                    continue
+                for roll in ROLLS:
+                    rotation = facing(direction, math.radians(roll), aside)
+                    tracks.append(_approach(rotation, point, direction, retreat, back_m))
+    return tracks
+
+
+def _approach(
+    rotation: FloatArray, point: FloatArray, direction: FloatArray, retreat: FloatArray, back_m: float
+) -> Track:
+    near = point - 0.03 * direction
+    count = max(2, math.ceil(back_m / 0.12) + 1)
+    steps = np.linspace(back_m, 0.0, count)[:, None]
+    positions = np.concatenate([near - steps * retreat, [point, point + BEYOND_M * direction]])
+    total = len(positions)
+    return Track(np.tile(rotation, (total, 1, 1)), positions, np.zeros(total, dtype=bool), total - 2)
+
+
+def _aims(
+    asset: Asset, pose: Pose, boxes: Sequence[tuple[Pose, tuple[float, float, float]]]
+) -> Iterator[FloatArray]:
+    """Points of the thing that the hand goes for: its middle, then the middles of its largest parts."""
+    middle = np.array(pose.position_m)
+    yield middle
+    yield middle + np.array([0.0, 0.0, 0.25 * asset.size_m[2]])
+    sizes = [size[0] * size[1] * size[2] for _, size in boxes]
+    for number in np.argsort(sizes)[::-1][: 3 if len(boxes) > 1 else 0].tolist():
+        yield np.array(boxes[number][0].position_m)
+
+
+def _direction(course: float, down: float) -> FloatArray:
+    return np.array([math.cos(course) * math.cos(down), math.sin(course) * math.cos(down), -math.sin(down)])

@@ -1,0 +1,330 @@
+"""Taking and putting: the hand comes on a free way, touches, holds, carries, sets down and leaves."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from embomatrix.sim import physical_arm as arm
+from embomatrix.sim import physical_body as body
+from embomatrix.sim.physical_grasp import grasp_tracks
+from embomatrix.sim.physical_motion import raised, standing, with_arm
+from embomatrix.sim.physical_reach import Reach, Track
+from embomatrix.sim.physical_stage import TOOL, TUCKED, TUCKED_LIFT_M
+from embomatrix.sim.physical_travel import SOMETHING, travel
+from embomatrix.skills.failure import FailureReason
+from embomatrix.skills.view import preposition, refuse
+from embomatrix.world.poses import StandPose
+from embomatrix.world.state import Relation
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from embomatrix.sim.physical_reach import Way
+    from embomatrix.sim.physical_space import Boxes
+    from embomatrix.sim.physical_stage import Stage
+    from embomatrix.skills.syntax import PlaceRelation
+    from embomatrix.skills.view import Refusal
+    from embomatrix.world.geometry import Aabb, FloatArray, Pose
+
+GENTLE: Final = 0.25
+"""Share of full speed on the last centimetres."""
+TOUCH_M: Final = 0.004
+RAISE_M: Final = 0.06
+ROOFED_RAISE_M: Final = 0.015
+ROOF_M: Final = 0.35
+"""Things with a roof lower than this over them are reached from the side."""
+WAY_OUT_M: Final = 0.04
+ATTEMPTS: Final = 3
+PLACES: Final = 10
+DROP_M: Final = 0.004
+"""The hand lets go when what it holds touches, or this far below where it should."""
+STRAY_M: Final = 0.06
+
+
+def unfold(stage: Stage, way: Way, reach: Reach, rng: np.random.Generator, *, loaded: bool) -> Refusal | None:
+    """Bring base and arm to the start of a way."""
+    start = way.postures[0]
+    now = stage.mover.posture
+    if math.dist(now[:2], start[:2]) > 0.01:
+        refusal = travel(stage, StandPose(*start[:3].tolist()))
+        if refusal is not None:
+            return refusal
+    now = stage.mover.posture
+    swing = reach.transit(standing(now, *start[:3].tolist()), start, rng, loaded=loaded)
+    if swing is None:
+        return refuse(FailureReason.ARM_BLOCKED, target=SOMETHING, other=reach.hindrance or SOMETHING)
+    hit = stage.mover.follow(swing[1:])
+    if hit is not None:
+        return refuse(FailureReason.ARM_BLOCKED, target=SOMETHING, other=hit or SOMETHING)
+    return None
+
+
+def fold(stage: Stage, home: StandPose, rng: np.random.Generator) -> Refusal | None:
+    """Bring the arm, with what it holds, over the base, and the base back to where it stood."""
+    reach = stage.reach(stage.boxes())
+    now = stage.mover.posture
+    folded = carrying(stage, now)
+    swing = reach.transit(now, folded, rng, loaded=stage.grip is not None)
+    if swing is not None:
+        stage.mover.follow(swing[1:])
+    if (
+        math.dist(now[:2], (home.x_m, home.y_m)) > 0.01
+        or abs(math.remainder(now[2] - home.yaw, math.tau)) > 0.01
+    ):
+        return travel(stage, home)
+    return None
+
+
+def carrying(stage: Stage, now: FloatArray) -> FloatArray:
+    """The posture in which the robot drives: folded when the hand is empty, else with the load upright and near."""
+    if stage.grip is None:
+        folded = with_arm(now, TUCKED)
+        folded[body.LIFT] = TUCKED_LIFT_M
+        return folded
+    rotation, _ = body.tools(now[None])
+    turns, xs, ys, heights = (
+        grid.ravel()
+        for grid in np.meshgrid(
+            np.arange(8) * math.pi / 4,
+            (0.1, 0.2, 0.3, 0.4, 0.5),
+            (-0.25, 0.0, 0.25),
+            (0.35, 0.6, 0.85),
+            indexing="ij",
+        )
+    )
+    count = len(turns)
+    turn = arm.about_z(turns)
+    yaw = arm.about_z(now[None, body.YAW])[0]
+    wanted = turn @ rotation[0]
+    local = np.stack([xs, ys, np.zeros(count)], axis=1)
+    lift = np.full(count, 0.3)
+    where = local @ yaw.T + np.array([now[0], now[1], 0.0])
+    where[:, 2] = body.MOUNT_LOW_M + 0.3 + heights
+    best, found = math.inf, now
+    for last in (0.785, -0.785, 2.3, -2.3, 1.57):
+        postures = body.solve(wanted, where, np.tile(now[:3], (count, 1)), lift, np.full(count, last))
+        rows = postures.reshape(-1, body.NUMBERS)
+        rows = rows[~np.isnan(rows[:, -1])]
+        if not len(rows):
+            continue
+        load = stage.grip.held.placed(rows)
+        wide = np.linalg.norm(load[:, :, :2] - now[:2], axis=2) + stage.grip.held.radii
+        limbs = np.linalg.norm(body.balls(rows)[:, :, :2] - now[:2], axis=2) + body.RADII
+        cost = np.maximum(wide.max(axis=1), limbs.max(axis=1)) + 0.02 * np.abs(rows[:, 4:] - now[4:]).max(
+            axis=1
+        )
+        cost = np.where(body.strikes_itself(rows, load, stage.grip.held.radii), math.inf, cost)
+        if cost.min() < best:
+            best, found = float(cost.min()), rows[int(cost.argmin())]
+    return found
+
+
+def pick_up(stage: Stage, target: str, rng: np.random.Generator) -> Refusal | None:
+    """Take an object that lies where the robot can reach it."""
+    home = stage.world.robot
+    refusal = _take(stage, target, rng)
+    back = fold(stage, home, rng)
+    if refusal is None and stage.has_slipped():
+        refusal = refuse(FailureReason.SLIPPED, target=target)
+    if refusal is not None and stage.grip is not None:
+        stage.release()
+        stage.settle()
+    return refusal or back
+
+
+def _take(stage: Stage, target: str, rng: np.random.Generator) -> Refusal | None:
+    world = stage.world
+    pose = world.engine.pose(target)
+    boxes = stage.boxes()
+    course, out_m = way_in(stage, target, world.engine.aabb(target), boxes)
+    tracks = grasp_tracks(world.asset(target), pose, world.engine.joints(target), course, out_m)
+    reach = stage.reach(boxes, target)
+    refusal = None
+    attempts = 0
+    for bases in stage.bases(np.array(pose.position_m)):
+        for way in reach.ways(tracks, bases):
+            if attempts == ATTEMPTS:
+                return refusal
+            if (
+                reach.transit(
+                    standing(stage.mover.posture, *way.postures[0, :3].tolist()),
+                    way.postures[0],
+                    rng,
+                    loaded=False,
+                )
+                is None
+            ):
+                continue
+            attempts += 1
+            refusal = unfold(stage, way, reach, rng, loaded=False) or _touch(stage, way, target)
+            if refusal is None:
+                return _lift(stage, way, target, RAISE_M if out_m is None else ROOFED_RAISE_M)
+            fold(stage, StandPose(*stage.mover.posture[:3].tolist()), rng)
+    return refusal or refuse(FailureReason.ARM_BLOCKED, target=target, other=reach.hindrance or SOMETHING)
+
+
+def _touch(stage: Stage, way: Way, target: str) -> Refusal | None:
+    """Go along a way until the hand touches the target, and hold it."""
+    stage.wake_around(target)
+    hit = stage.mover.follow(way.postures[1:-2]) if len(way.postures) > 3 else None
+    if hit is None:
+        hit = stage.mover.follow(way.postures[-2:], GENTLE, lambda: stage.dynamic.gap(target) < TOUCH_M)
+    if stage.dynamic.gap(target) > TOUCH_M * 2:
+        return refuse(FailureReason.ARM_BLOCKED, target=target, other=hit or SOMETHING)
+    stage.take(target)
+    return None
+
+
+def _lift(stage: Stage, way: Way, target: str, by_m: float) -> Refusal | None:
+    """Raise what is held, with what lies in it, and go back along the way."""
+    world = stage.world
+    world.hand.take(world.cargo(target))
+    world.navigator.refresh()
+    hit = stage.mover.follow(raised(stage.mover.posture[None], by_m), 0.5)
+    if hit is None:
+        stage.mover.follow(raised(way.postures[-3::-1], by_m))
+    if stage.has_slipped():
+        stage.release()
+        world.hand.let_go(stage.dynamic.pose(target))
+        return refuse(FailureReason.SLIPPED, target=target)
+    return None
+
+
+def way_in(stage: Stage, name: str, box: Aabb, boxes: Boxes) -> tuple[float, float | None]:
+    """Heading in which the hand goes to a place, and how long its way under a roof is; None in the open.
+
+    Under a roof the way follows the front of what roofs the place over.
+    """
+    robot, engine = stage.world.robot, stage.world.engine
+    x, y, _ = box.center_m
+    course = math.atan2(y - robot.y_m, x - robot.x_m)
+    low = np.array([x - 0.01, y - 0.01, box.high_m[2] + 0.002])
+    over = boxes.without((name,)).near(low, low + np.array([0.02, 0.02, ROOF_M]))
+    hosts = [
+        owner for owner in over.owners if owner in stage.world.scene.by_name and stage.world.is_fixed(owner)
+    ]
+    if not hosts:
+        return course, None
+    host = engine.pose(hosts[0])
+    front = math.remainder(host.yaw + math.pi, math.tau)
+    bounds = stage.world.relations.body(hosts[0])
+    ahead = np.array([math.cos(host.yaw), math.sin(host.yaw)])
+    half = np.abs(ahead) @ (np.array(bounds.size_m[:2]) / 2)
+    depth = float(ahead @ (np.array(bounds.center_m[:2]) - (x, y)) + half)
+    return front, max(0.05, depth) + WAY_OUT_M
+
+
+def place(stage: Stage, target: str, asked: PlaceRelation, rng: np.random.Generator) -> Refusal | None:
+    """Put what the hand holds where the planning scene has room for it, and see whether it stays."""
+    world, grip = stage.world, stage.grip
+    assert grip is not None
+    home, held = world.robot, grip.name
+    relation = Relation(asked.value)
+    words = {"held": held, "target": target, "relation": preposition(asked)}
+    found = world.placer.choices(held, target, relation, world.robot, rng, most=PLACES)
+    if isinstance(found, FailureReason):
+        return refuse(found, **words)
+    refusal = _put(stage, target, relation, found, rng)
+    if stage.grip is not None:
+        back = fold(stage, home, rng)
+        return refusal or back
+    back = fold(stage, home, rng)
+    stage.settle()
+    if refusal is None and not world.relations.holds(relation, held, target):
+        return refuse(FailureReason.FELL, **words)
+    return refusal or back
+
+
+def _put(
+    stage: Stage, target: str, relation: Relation, poses: Sequence[Pose], rng: np.random.Generator
+) -> Refusal | None:
+    """Bring what is held to the first of several poses that the arm gets at, let go, and draw the hand back."""
+    grip = stage.grip
+    assert grip is not None
+    boxes = stage.boxes()
+    reach = stage.reach(boxes)
+    tracks = list(_put_tracks(stage, poses, boxes))
+    attempts, refusal = 0, None
+    for bases in stage.bases(np.array(poses[0].position_m)):
+        for way in reach.ways(tracks, bases):
+            if attempts == ATTEMPTS:
+                return refusal
+            start = standing(stage.mover.posture, *way.postures[0, :3].tolist())
+            if reach.transit(start, way.postures[0], rng, loaded=True) is None:
+                continue
+            attempts += 1
+            refusal = unfold(stage, way, reach, rng, loaded=True)
+            if refusal is None:
+                return _set_down(stage, way, tracks[way.track])
+    name = grip.name
+    return refusal or refuse(
+        FailureReason.ARM_BLOCKED, target=f"a place for {name}", other=reach.hindrance or target
+    )
+
+
+def _put_tracks(stage: Stage, poses: Sequence[Pose], boxes: Boxes) -> Iterator[Track]:
+    """Ways that bring what is held to a pose and the empty hand back from there: in, down, and out."""
+    grip = stage.grip
+    assert grip is not None
+    back = grip.pose_tool_object.inverse()
+    world = stage.world
+    for pose in poses:
+        world.engine.set_pose(grip.name, pose)
+        box = world.engine.aabb(grip.name)
+        world.engine.park(grip.name)
+        course, out_m = way_in(stage, grip.name, box, boxes)
+        tool = pose @ back
+        rotation, point = tool.rotation, np.array(tool.position_m)
+        inward = np.array([math.cos(course), math.sin(course), 0.0])
+        up = np.array([0.0, 0.0, 1.0])
+        if out_m is None:
+            before = [point + 0.12 * up, point + 0.05 * up]
+            after = [point - 0.05 * rotation[:, 2] + 0.01 * up, point - 0.1 * rotation[:, 2] + 0.03 * up]
+        else:
+            count = max(2, math.ceil(out_m / 0.12) + 1)
+            steps = np.linspace(out_m, 0.0, count)[:, None]
+            before = list(point + ROOFED_RAISE_M * up - steps * inward)
+            after = list(point - steps[::-1][1:] * inward)
+        positions = np.array([*before, point, *after])
+        loaded = np.arange(len(positions)) < len(before)
+        yield Track(np.tile(rotation, (len(positions), 1, 1)), positions, loaded, len(before))
+
+
+def _set_down(stage: Stage, way: Way, track: Track) -> Refusal | None:
+    """Follow a way down to where the thing touches, let go, and follow it out."""
+    grip, world = stage.grip, stage.world
+    assert grip is not None
+    name = grip.name
+    key = track.key
+    hit = stage.mover.follow(way.postures[1:key])
+    if hit is not None or stage.has_slipped():
+        reason = FailureReason.SLIPPED if stage.has_slipped() else FailureReason.ARM_BLOCKED
+        return refuse(reason, target=name, other=hit or SOMETHING)
+    lower = raised(way.postures[key], -DROP_M)
+    ignore = frozenset(world.carried)
+    stage.mover.follow(
+        np.stack([way.postures[key], lower]), GENTLE, lambda: bool(stage.dynamic.touched_by(name, ignore))
+    )
+    stage.release()
+    stage.mover.wait(16)
+    let_go(stage)
+    stage.mover.follow(way.postures[key + 1 :], 0.5)
+    return None
+
+
+def let_go(stage: Stage) -> None:
+    """Put what the hand held, and what lay in it, into the planning scene where it now is."""
+    world = stage.world
+    group = world.carried
+    world.hand.forget()
+    for name in group:
+        world.engine.set_pose(name, stage.dynamic.pose(name))
+    world.navigator.refresh()
+
+
+def tool_pose(stage: Stage) -> Pose:
+    """The tool's frame in the world."""
+    return stage.dynamic.robot.hand_pose() @ TOOL

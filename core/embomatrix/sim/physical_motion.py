@@ -1,0 +1,113 @@
+"""Motions in the dynamic world: the motors follow postures at bounded speeds, and stop when something holds them up."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from embomatrix.sim.bullet.robot import Posture
+from embomatrix.sim.physical_body import ARM, LIFT, YAW
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from embomatrix.sim.bullet.dynamic import DynamicWorld
+    from embomatrix.world.geometry import FloatArray
+
+SPEED: Final = np.array([1.0, 1.0, 2.5, 0.5, 2.1, 2.1, 2.1, 2.1, 2.6, 2.6, 2.6])
+"""Metres, and radians, a second: the arm's are the Panda's own limits."""
+STEERED: Final = 4
+"""Steps of 1/240 s between two commands to the motors."""
+STEPS_A_SECOND: Final = 240
+LAG: Final = np.array([0.08, 0.08, 0.15, 0.06, 0.3, 0.3, 0.3, 0.3, 0.4, 0.4, 0.4])
+"""A joint that falls this far behind is held up by something."""
+ARRIVAL_STEPS: Final = 12
+LEAST_COMMANDS: Final = 3
+RAMP_S: Final = 0.3
+"""Time in which full speed is reached."""
+
+
+class Mover:
+    """Moves the robot of one dynamic world."""
+
+    def __init__(self, world: DynamicWorld, watch: Callable[[], None]) -> None:
+        """``watch`` is called after every few steps: for whoever makes a film."""
+        self._world = world
+        self._watch = watch
+
+    @property
+    def posture(self) -> FloatArray:
+        """The present posture, shape (11,)."""
+        return np.array(self._world.robot.posture.numbers)
+
+    def follow(
+        self, postures: FloatArray, pace: float = 1.0, until: Callable[[], bool] | None = None
+    ) -> str | None:
+        """Move through postures, (w, 11), from the present one. ``pace`` is a share of full speed.
+
+        None when the end is reached or ``until`` says so, else the name of what holds the robot up, "" when unknown.
+        """
+        commands = _commands(np.concatenate([self.posture[None], postures]), pace)
+        for command in commands:
+            self._world.robot.steer(Posture.of(command))
+            self.wait(STEERED)
+            if until is not None and until():
+                self._world.robot.steer(Posture.of(self.posture))
+                return None
+            if (np.abs(self.posture - command) > LAG).any():
+                hindrance = self._world.hindrance()
+                self._world.robot.steer(Posture.of(self.posture))
+                return hindrance
+        self.wait(ARRIVAL_STEPS)
+        return None
+
+    def wait(self, steps: int) -> None:
+        """Let time pass with the motors at their targets."""
+        for _ in range(0, steps, STEERED):
+            self._world.step(STEERED)
+            self._watch()
+
+
+def _commands(postures: FloatArray, pace: float) -> FloatArray:
+    """Targets for every few steps along postures: full speed in the middle, gentle at both ends."""
+    postures = postures.copy()
+    postures[:, YAW] = np.unwrap(postures[:, YAW])
+    seconds = (np.abs(np.diff(postures, axis=0)) / (SPEED * pace)).max(axis=1)  # (w - 1,)
+    marks = np.concatenate([[0.0], np.cumsum(seconds)])
+    total = float(marks[-1])
+    if total <= 0.0:
+        return postures[-1:]
+    # Speed grows evenly, stays, and shrinks evenly: the ramps cost as much time as one of them lasts.
+    ramp = min(RAMP_S, total)
+    count = max(LEAST_COMMANDS, int(np.ceil((total + ramp) * STEPS_A_SECOND / STEERED)))
+    clock = np.linspace(0.0, total + ramp, count + 1)[1:]
+    left = total + ramp - clock
+    times = np.where(
+        clock < ramp,
+        clock**2 / (2 * ramp),
+        np.where(left < ramp, total - left**2 / (2 * ramp), clock - ramp / 2),
+    )
+    columns = [np.interp(times, marks, postures[:, column]) for column in range(postures.shape[1])]
+    return np.stack(columns, axis=1)
+
+
+def raised(posture: FloatArray, by_m: float) -> FloatArray:
+    """The posture with the lift higher by some metres."""
+    higher = posture.copy()
+    higher[..., LIFT] += by_m
+    return higher
+
+
+def standing(posture: FloatArray, x_m: float, y_m: float, yaw: float) -> FloatArray:
+    """The posture with the base elsewhere."""
+    moved = posture.copy()
+    moved[..., :3] = (x_m, y_m, yaw)
+    return moved
+
+
+def with_arm(posture: FloatArray, arm: FloatArray) -> FloatArray:
+    """The posture with the arm's joints elsewhere."""
+    changed = posture.copy()
+    changed[..., ARM] = arm
+    return changed

@@ -1,0 +1,218 @@
+"""How the arm gets the tool along a short way: postures in closed form, judged by joint limits and by what is around.
+
+Nothing is searched at random where geometry answers: bases, heights of the lift and angles of the last joint are tried
+together, and of what is left the most comfortable way that is free is taken.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from embomatrix.sim import physical_arm as arm
+from embomatrix.sim import physical_body as body
+from embomatrix.sim.physical_space import Boxes, strikes
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+    from embomatrix.world.geometry import FloatArray
+
+OVER_WRIST_M: Final = (0.0, 0.2, 0.4, -0.2)
+"""Heights of the shoulder over the wrist that are tried."""
+LIFT_SPARE_M: Final = 0.08
+"""The lift keeps this much travel to raise what the hand takes."""
+LAST_RAD: Final = np.array([0.785, -0.785, 2.3, -2.3, 0.0, 1.57, -1.57])
+JUMP_RAD: Final = 1.3
+"""Between two waypoints of a way no joint turns further."""
+KEPT: Final = 32
+BATCH: Final = 12
+"""Ways that are looked at together."""
+AIR_M: Final = 0.012
+"""Distance that the arm keeps from things."""
+TOUCH_M: Final = -0.012
+"""How deep balls of the hand, or of what it holds, may seem to be in things: they are a little larger than the truth."""
+SWING_SAMPLES: Final = 10
+VIAS: Final = 24
+
+
+@dataclass(frozen=True, slots=True)
+class Held:
+    """Balls of what the hand holds, in the tool's frame: centres (k, 3), radii (k,)."""
+
+    centres: FloatArray
+    radii: FloatArray
+
+    def placed(self, postures: FloatArray) -> FloatArray:
+        """Centres in the world, (n, k, 3)."""
+        rotation, position = body.tools(postures)
+        return position[:, None] + np.einsum("nij,kj->nki", rotation, self.centres)
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """A way of the tool: rotations (w, 3, 3) and positions (w, 3) in the world.
+
+    ``loaded`` marks the waypoints, (w,), at which the hand holds what it holds. ``key`` is the waypoint that matters most.
+    """
+
+    rotation: FloatArray
+    position: FloatArray
+    loaded: FloatArray
+    key: int
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """Postures (w, 11) that follow a track, and the track's number."""
+
+    postures: FloatArray
+    track: int
+
+
+class Reach:
+    """Ways of one hand, empty or not, among boxes."""
+
+    def __init__(
+        self,
+        boxes: Boxes,
+        at_work: Boxes,
+        held: Held | None = None,
+        also: Callable[[FloatArray], bool] | None = None,
+    ) -> None:
+        """``at_work`` are the boxes without those that the hand may touch at the end of its way.
+
+        ``also`` has a say in which ways, (w, 11), are free.
+        """
+        self._also = also
+        self._boxes = boxes
+        self._at_work = at_work
+        self._held = held
+        self.hindrance = ""
+        """Owner of the box that barred the last way that was not free."""
+
+    def ways(self, tracks: Sequence[Track], bases: FloatArray) -> Iterator[Way]:
+        """Free ways along any of the tracks from any of the bases, (b, 3), the preferred tracks first."""
+        for start in range(0, len(tracks), BATCH):
+            yield from self._some(tracks, range(start, min(start + BATCH, len(tracks))), bases)
+
+    def transit(
+        self, start: FloatArray, end: FloatArray, rng: np.random.Generator, *, loaded: bool
+    ) -> FloatArray | None:
+        """Postures (w, 11) that lead from one to another without touching anything, None when none are found.
+
+        The base stays where it is. First straight on, then by way of one posture more.
+        """
+        held = self._held if loaded else None
+        if self._is_free(_between(start, end), held):
+            return np.stack([start, end])
+        low = np.concatenate([start[:3], [0.0], arm.LOW_RAD * 0.9])
+        high = np.concatenate([start[:3], [body.LIFT_M], arm.HIGH_RAD * 0.9])
+        middle = (start + end) / 2
+        vias = [np.concatenate([start[:4], end[4:]]), np.concatenate([end[:4], start[4:]])]
+        for number in range(VIAS):
+            spread = 0.25 + 0.75 * number / VIAS
+            vias.append(middle + spread * (rng.uniform(low, high) - middle))
+        for via in vias:
+            via[:3] = start[:3]
+            if self._is_free(_between(start, via), held) and self._is_free(_between(via, end), held):
+                return np.stack([start, via, end])
+        return None
+
+    def _is_free(self, postures: FloatArray, held: Held | None) -> bool:
+        return bool(self._free(postures, self._boxes, held, AIR_M)[1:].all())
+
+    def _some(self, tracks: Sequence[Track], numbers: range, bases: FloatArray) -> list[Way]:
+        """Free ways along a batch of tracks, best first."""
+        track, base, lift, last = _combinations(tracks, numbers, bases)
+        key_rotation = np.stack([tracks[number].rotation[tracks[number].key] for number in numbers])
+        key_position = np.stack([tracks[number].position[tracks[number].key] for number in numbers])
+        found = body.solve(key_rotation[track], key_position[track], bases[base], lift, last)
+        rows, branches = np.nonzero(~np.isnan(found[:, :, -1]))
+        if not len(rows):
+            return []
+        comfort = _strain(found[rows, branches]) + 0.02 * track[rows]
+        best = np.argsort(comfort, kind="stable")[:KEPT]
+        ways = []
+        for row, branch in zip(rows[best].tolist(), branches[best].tolist(), strict=True):
+            number = numbers[int(track[row])]
+            postures = _followed(tracks[number], bases[base[row]], lift[row], last[row], branch)
+            if postures is not None and self._passes(tracks[number], postures):
+                ways.append(Way(postures, number))
+                if len(ways) == 3:
+                    break
+        return ways
+
+    def _passes(self, track: Track, postures: FloatArray) -> bool:
+        trunk, radii = body.trunk_balls(postures[:1])
+        hit = strikes(self._boxes.without(("floor",)), trunk, radii, TOUCH_M)
+        if hit[0] >= 0:
+            return False
+        loaded = track.loaded.astype(bool)
+        for mask, held in ((~loaded, None), (loaded, self._held)):
+            if mask.any() and not self._free(postures[mask], self._at_work, held, TOUCH_M).all():
+                return False
+        return self._also is None or self._also(postures)
+
+    def _free(self, postures: FloatArray, boxes: Boxes, held: Held | None, margin_m: float) -> FloatArray:
+        """Whether arm and load keep a margin from the boxes and from the robot's own trunk, shape (n,)."""
+        load = held.placed(postures) if held is not None else None
+        sizes = held.radii if held is not None else None
+        own = body.strikes_itself(postures, load, sizes)
+        centres = body.balls(postures)
+        radii = body.RADII
+        if load is not None and sizes is not None:
+            centres = np.concatenate([centres, load], axis=1)
+            radii = np.concatenate([radii, sizes])
+        low = (centres - radii[None, :, None]).min(axis=(0, 1)) - 0.05
+        high = (centres + radii[None, :, None]).max(axis=(0, 1)) + 0.05
+        close = boxes.near(low, high)
+        hit = strikes(close, centres, radii, margin_m)
+        if (hit >= 0).any():
+            self.hindrance = close.owners[int(hit[hit >= 0][0])]
+        return ~own & (hit < 0)
+
+
+def _combinations(
+    tracks: Sequence[Track], numbers: range, bases: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Every track with every base, lift and last angle: numbers within the batch, numbers of bases, lifts, angles."""
+    heights = np.array(
+        [
+            track.position[track.key][2] - track.rotation[track.key][2, 2] * (arm.FLANGE_M + arm.TOOL_M)
+            for track in (tracks[number] for number in numbers)
+        ]
+    )
+    offsets = np.array(OVER_WRIST_M)
+    track, base, offset, last = (
+        grid.ravel()
+        for grid in np.meshgrid(
+            np.arange(len(numbers)), np.arange(len(bases)), offsets, LAST_RAD, indexing="ij"
+        )
+    )
+    lift = heights[track] + offset - arm.SHOULDER_M - body.MOUNT_LOW_M
+    return track, base, np.clip(lift, 0.0, body.LIFT_M - LIFT_SPARE_M), last
+
+
+def _followed(track: Track, base: FloatArray, lift: float, last: float, branch: int) -> FloatArray | None:
+    """Postures along a track with base, lift and last joint at rest, None where it leaves the arm's reach or jumps."""
+    count = len(track.position)
+    found = body.solve(
+        track.rotation, track.position, np.tile(base, (count, 1)), np.full(count, lift), np.full(count, last)
+    )[:, branch]
+    if np.isnan(found).any() or np.abs(np.diff(found[:, 4:], axis=0)).max(initial=0.0) > JUMP_RAD:
+        return None
+    return found
+
+
+def _strain(postures: FloatArray) -> FloatArray:
+    """How far the arm is from the middle of its travel, (n,)."""
+    middle, half = (arm.HIGH_RAD + arm.LOW_RAD) / 2, (arm.HIGH_RAD - arm.LOW_RAD) / 2
+    return np.asarray((((postures[:, 4:] - middle) / half) ** 4).sum(axis=1))
+
+
+def _between(start: FloatArray, end: FloatArray) -> FloatArray:
+    shares = np.linspace(0.0, 1.0, SWING_SAMPLES)[:, None]
+    return start + shares * (end - start)

@@ -1,0 +1,156 @@
+"""Free space around the robot: the scene's parts as boxes, and how near balls are to them.
+
+Read from the planning scene, so that a motion can be judged before it is made. What really happens, physics decides.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from embomatrix.sim.bounds import IDENTITY, joint_motion
+from embomatrix.sim.engine import FLOOR, WALL
+from embomatrix.world.geometry import Aabb, Pose, Shape
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from embomatrix.sim.engine import PhysicsEngine
+    from embomatrix.world.asset import Asset
+    from embomatrix.world.geometry import FloatArray
+
+CHUNK: Final = 400_000
+"""Pairs of balls and boxes that are compared at once: what fits into a processor's cache."""
+
+
+@dataclass(frozen=True, slots=True)
+class Boxes:
+    """Oriented boxes: rotations (m, 3, 3), centres (m, 3), half extents (m, 3), and the object that each belongs to."""
+
+    rotation: FloatArray
+    centre: FloatArray
+    half: FloatArray
+    owners: tuple[str, ...]
+
+    def without(self, names: Iterable[str]) -> Boxes:
+        """All but those of some objects."""
+        left_out = frozenset(names)
+        keep = np.array([owner not in left_out for owner in self.owners], dtype=np.bool_)
+        return self.where(keep)
+
+    def where(self, keep: FloatArray) -> Boxes:
+        """Those that a mask, shape (m,), keeps."""
+        owners = tuple(owner for owner, kept in zip(self.owners, keep, strict=True) if kept)
+        return Boxes(self.rotation[keep], self.centre[keep], self.half[keep], owners)
+
+    def joined(self, other: Boxes) -> Boxes:
+        """These and others."""
+        return Boxes(
+            np.concatenate([self.rotation, other.rotation]),
+            np.concatenate([self.centre, other.centre]),
+            np.concatenate([self.half, other.half]),
+            (*self.owners, *other.owners),
+        )
+
+    def near(self, low: FloatArray, high: FloatArray) -> Boxes:
+        """Those whose enclosing boxes overlap a box between two corners."""
+        reach = np.einsum("mij,mj->mi", np.abs(self.rotation), self.half)
+        keep = ((self.centre - reach <= high) & (self.centre + reach >= low)).all(axis=1)
+        return self.where(keep)
+
+    def gaps(self, points: FloatArray) -> FloatArray:
+        """Signed distances of points, (k, 3), to every box, (k, m): negative inside."""
+        away = points[:, None] - self.centre  # (k, m, 3)
+        local = np.abs(np.einsum("kmj,mji->kmi", away, self.rotation)) - self.half
+        outside = np.sqrt((np.maximum(local, 0.0) ** 2).sum(axis=2))
+        return np.asarray(outside + np.minimum(local.max(axis=2), 0.0))
+
+
+def boxes_around(engine: PhysicsEngine, low: tuple[float, float], high: tuple[float, float]) -> Boxes:
+    """Parts of all objects, and the walls, over a rectangle of the floor, with doors and drawers as they are."""
+    scene = engine.scene
+    window = Aabb((low[0], low[1], -1.0), (high[0], high[1], 3.0))
+    rows: list[tuple[Pose, tuple[float, float, float], str]] = []
+    for name in engine.near(window):
+        rows += [
+            (pose, size, name)
+            for pose, size in part_boxes(scene.asset_of(name), engine.pose(name), engine.joints(name))
+        ]
+    for wall in scene.walls:
+        if wall.aabb(IDENTITY).overlaps(window):
+            rows.append((wall.pose, wall.size_m, WALL))
+    rows.append((Pose((0.0, 0.0, -0.5)), (1e3, 1e3, 1.0), FLOOR))
+    return boxes_of(rows).near(np.array(window.low_m), np.array(window.high_m))
+
+
+def part_boxes(
+    asset: Asset, pose: Pose, fractions: Sequence[float]
+) -> list[tuple[Pose, tuple[float, float, float]]]:
+    """World pose and size of the box around each part of an asset, its joints at shares of their travel."""
+    shares = iter(fractions)
+    found = []
+    for link in asset.links:
+        frame = pose if link.joint is None else pose @ joint_motion(link.joint, next(shares, 0.0))
+        for part in link.parts:
+            found.append((frame @ part.pose, _size(part.shape, part.size_m)))
+    return found
+
+
+def object_balls(
+    asset: Asset, fractions: Sequence[float], *, least_m: float = 0.012
+) -> tuple[FloatArray, FloatArray]:
+    """Balls that fill an asset's parts, in its frame: centres (k, 3) and radii (k,). Large flat parts get many."""
+    centres, radii = [], []
+    for pose, size in part_boxes(asset, IDENTITY, fractions):
+        half = np.array(size) / 2
+        radius = max(least_m, float(half.min()))
+        spans = [np.linspace(-1, 1, _count(extent, radius)) * max(extent - radius, 0.0) for extent in half]
+        grid = np.stack(np.meshgrid(*spans, indexing="ij"), axis=-1).reshape(-1, 3)
+        centres.append(pose.apply_all(grid))
+        radii.append(np.full(len(grid), radius))
+    return np.concatenate(centres), np.concatenate(radii)
+
+
+def strikes(boxes: Boxes, balls: FloatArray, radii: FloatArray, margin_m: float) -> FloatArray:
+    """For each of n sets of balls, (n, b, 3), the number of the box that it comes nearer than a margin to, -1 for none.
+
+    radii: (b,). Shape of the answer: (n,).
+    """
+    count, each, _ = balls.shape
+    found = np.full(count, -1)
+    if not boxes.owners or not count:
+        return found
+    rows = max(1, CHUNK // (each * len(boxes.owners)))
+    for start in range(0, count, rows):
+        part = balls[start : start + rows]
+        gaps = boxes.gaps(part.reshape(-1, 3)).reshape(len(part), each, -1) - radii[None, :, None]
+        nearest = gaps.min(axis=1)  # (rows, m)
+        deepest = nearest.argmin(axis=1)
+        hit = nearest[np.arange(len(part)), deepest] < margin_m
+        found[start : start + rows][hit] = deepest[hit]
+    return found
+
+
+def _count(half_m: float, radius: float) -> int:
+    return 1 if half_m <= radius * 1.2 else min(9, int(np.ceil((half_m - radius) / (radius * 1.5))) + 1)
+
+
+def _size(shape: Shape, size: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Boxes of round things are drawn in: a box around a ball is twice as large as the ball."""
+    if shape is Shape.CYLINDER:
+        return (size[0] * 0.9, size[1] * 0.9, size[2])
+    if shape is Shape.SPHERE:
+        return (size[0] * 0.85, size[1] * 0.85, size[2] * 0.85)
+    return size
+
+
+def boxes_of(rows: Sequence[tuple[Pose, tuple[float, float, float], str]]) -> Boxes:
+    """Boxes from (pose, size, owner)."""
+    return Boxes(
+        np.array([pose.rotation for pose, _, _ in rows]).reshape(-1, 3, 3),
+        np.array([pose.position_m for pose, _, _ in rows]).reshape(-1, 3),
+        np.array([size for _, size, _ in rows]).reshape(-1, 3) / 2,
+        tuple(owner for _, _, owner in rows),
+    )
