@@ -126,6 +126,7 @@ class Catalog:
         self._synsets: Mapping[str, Json] = tables["synsets"]
         self._categories: Mapping[str, Json] = tables["categories"]
         self._scenes: Mapping[str, Json] = scenes["scenes"]
+        self._activity_synsets: tuple[str, ...] = tuple(tables.get("activity_synsets", ()))
 
     @staticmethod
     @functools.cache
@@ -140,6 +141,16 @@ class Catalog:
     @property
     def category_names(self) -> tuple[str, ...]:
         return tuple(sorted(self._categories))
+
+    @functools.cached_property
+    def used_categories(self) -> tuple[str, ...]:
+        """Categories that an inventory lists, or that an object of one of BEHAVIOR-1K's activities may be; sorted."""
+        found = {name for synset in self._activity_synsets for name in self.categories_of(synset)}
+        for scene in self._scenes.values():
+            for room in scene["rooms"].values():
+                keys = (key for part in ("objects", "doors", "windows") for key in room[part])
+                found.update(_split(key)[0] for key in keys)
+        return tuple(sorted(found))
 
     def inventory(self, scene_id: str) -> SceneInventory:
         """Rooms and models of a scene. Raises CatalogError when there is none of this name."""

@@ -13,6 +13,7 @@ import gzip
 import importlib.metadata
 import importlib.util
 import json
+import re
 import statistics
 from collections import defaultdict
 from pathlib import Path
@@ -37,6 +38,9 @@ STRUCTURE: Final = frozenset({"walls", "floors", "ceilings", "lawn", "driveway"}
 """Categories of the building itself: its panels and its ground, which a scene lays out anew."""
 LEAST_FLOOR_M: Final = 0.4
 """A narrower floor model is a threshold or a strip between two others, where nobody can stand."""
+
+_SYNSET: Final = re.compile(r"[a-z][\w'\-]*\.n\.\d\d")
+"""A name of the taxonomy in a problem file, ``apple.n.01``, without the number of an instance."""
 
 UNIVERSAL: Final = frozenset(
     {
@@ -83,7 +87,20 @@ def build_catalog(folder: Path) -> Json:
             size = [round(extent, 4) for extent in inventory["bounding_box_sizes"][model]]
             links = sorted(set(inventory["meta_links"].get(asset_id, [])) - {"collision"})
             categories[category]["models"][model] = [*size, links] if links else size
-    return {"source": f"bddl {BDDL_VERSION}", "synsets": synsets, "categories": categories}
+    return {
+        "source": f"bddl {BDDL_VERSION}",
+        "synsets": synsets,
+        "categories": categories,
+        "activity_synsets": _activity_synsets(folder.parent / "activity_definitions", synsets),
+    }
+
+
+def _activity_synsets(folder: Path, known: Mapping[str, Json]) -> list[str]:
+    """Synsets that the activities' definitions name, of those in the taxonomy."""
+    found: set[str] = set()
+    for path in folder.glob("*/problem*.bddl"):
+        found.update(_SYNSET.findall(path.read_text(encoding="utf-8").lower()))
+    return sorted(found & known.keys())
 
 
 def _taxonomy(root: Json) -> dict[str, Json]:

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from embomatrix.factory.assets.cabinets import MAX_PARTS
-from embomatrix.factory.assets.families import GENERATORS, Family, family_of, family_of_model
+from embomatrix.factory.assets.families import GENERATORS, Family
 from embomatrix.factory.assets.library import build_asset
+from embomatrix.factory.assets.naming import HUNG, family_of, family_of_model
 from embomatrix.factory.assets.shapes import mesh_of
 from embomatrix.world.asset import JointKind
 from embomatrix.world.catalog import Catalog, CatalogError
@@ -285,7 +286,7 @@ def test_open_doors_stay_within_the_width_of_their_cabinet() -> None:
 
 def test_loose_things_have_a_flat_base_under_their_middle() -> None:
     for asset in ASSETS:
-        if asset.mass_kg > 5.0:
+        if asset.mass_kg > 5.0 or family_of(CATALOG, asset.category) in HUNG:
             continue
         floor = -asset.size_m[2] / 2
         feet = np.vstack([corners_of(part) for part in asset.links[0].parts])

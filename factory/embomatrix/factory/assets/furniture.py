@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.assets.body import Body, centred, clamp
 from embomatrix.factory.assets.shapes import box, octagon
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from embomatrix.world.geometry import Part, Vec2, Vec3
 
 
-def _legs(low: Vec2, high: Vec2, z: Vec2, thickness_m: float) -> list[Part]:
+def legs(low: Vec2, high: Vec2, z: Vec2, thickness_m: float) -> list[Part]:
     """Four square legs at the corners of a rectangle."""
     (x0, y0), (x1, y1), t = low, high, thickness_m
     return [box((x, y, z[0]), (x + t, y + t, z[1])) for x in (x0, x1 - t) for y in (y0, y1 - t)]
@@ -32,7 +32,7 @@ def table(size_m: Vec3) -> Body:
     (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
     body = Body()
     top, leg = top_thickness(size_m), leg_thickness(size_m)
-    body.parts = [box((x0, y0, z1 - top), (x1, y1, z1)), *_legs((x0, y0), (x1, y1), (z0, z1 - top), leg)]
+    body.parts = [box((x0, y0, z1 - top), (x1, y1, z1)), *legs((x0, y0), (x1, y1), (z0, z1 - top), leg)]
     body.add_support("top", (x0, y0), (x1, y1), z1)
     return body
 
@@ -104,7 +104,7 @@ def chair(size_m: Vec3) -> Body:
     body.parts = [
         box((x0, y0, z - seat), (x1, y1, z)),
         box((x0, y0, z), (x0 + back, y1, z1)),
-        *_legs((x0, y0), (x1, y1), (z0, z - seat), leg),
+        *legs((x0, y0), (x1, y1), (z0, z - seat), leg),
     ]
     body.add_support("seat", (x0 + back, y0), (x1, y1), z)
     return body
@@ -136,8 +136,14 @@ def stool(size_m: Vec3) -> Body:
     return body
 
 
+CORNER_FROM_M: Final = 1.4
+"""A sofa that exceeds this along both sides is one for a corner: nobody's seat is as deep."""
+
+
 def sofa(size_m: Vec3) -> Body:
-    """Upholstered base on short feet, with back and arms: armchairs to corner sofas."""
+    """Upholstered base on short feet, with back and arms; a deep and wide one goes round a corner."""
+    if size_m[0] > CORNER_FROM_M and size_m[1] > CORNER_FROM_M:
+        return _corner_sofa(size_m)
     (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
     body = Body()
     z, feet = z0 + _seat_height(size_m[2]), 0.1 * size_m[2]
@@ -149,9 +155,29 @@ def sofa(size_m: Vec3) -> Body:
         box((x0, y0, z), (x0 + back, y1, z1)),
         box((x0 + back, y0, z), (x1, y0 + arm, rest)),
         box((x0 + back, y1 - arm, z), (x1, y1, rest)),
-        *_legs((x0, y0), (x1, y1), (z0, z0 + feet), clamp(0.08 * min(size_m[:2]), 0.02, 0.08)),
+        *legs((x0, y0), (x1, y1), (z0, z0 + feet), clamp(0.08 * min(size_m[:2]), 0.02, 0.08)),
     ]
     body.add_support("seat", (x0 + back, y0 + arm), (x1, y1 - arm), z)
+    return body
+
+
+def _corner_sofa(size_m: Vec3) -> Body:
+    """Seats along the back and along the right side, with a back behind each; the corner between them is open floor."""
+    (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
+    z, feet = z0 + _seat_height(size_m[2]), 0.1 * size_m[2]
+    deep, back = 0.95, 0.22
+    body = Body()
+    body.parts = [
+        box((x0, y0, z0 + feet), (x0 + deep, y1, z)),
+        box((x0 + deep, y0, z0 + feet), (x1, y0 + deep, z)),
+        box((x0, y0, z), (x0 + back, y1, z1)),
+        box((x0 + back, y0, z), (x1, y0 + back, z1)),
+        *legs((x0, y0), (x0 + deep, y1), (z0, z0 + feet), 0.08),
+        box((x1 - 0.08, y0, z0), (x1, y0 + 0.08, z0 + feet)),
+        box((x1 - 0.08, y0 + deep - 0.08, z0), (x1, y0 + deep, z0 + feet)),
+    ]
+    body.add_support("seat", (x0 + back, y0 + back), (x0 + deep, y1), z)
+    body.add_support("long_seat", (x0 + deep, y0 + back), (x1, y0 + deep), z)
     return body
 
 
@@ -165,7 +191,7 @@ def bed(size_m: Vec3) -> Body:
     body.parts = [
         box((x0 + head, y0, z0 + feet), (x1, y1, z)),
         box((x0, y0, z0), (x0 + head, y1, z1)),
-        *_legs((x0 + head, y0), (x1, y1), (z0, z0 + feet), clamp(0.06 * min(size_m[:2]), 0.03, 0.1)),
+        *legs((x0 + head, y0), (x1, y1), (z0, z0 + feet), clamp(0.06 * min(size_m[:2]), 0.03, 0.1)),
     ]
     body.add_support("mattress", (x0 + head, y0), (x1, y1), z)
     return body
@@ -177,7 +203,7 @@ def bunk_bed(size_m: Vec3) -> Body:
     body = Body()
     post, thickness = 0.06, 0.18
     lower, upper = z0 + 0.28 * size_m[2], z0 + 0.8 * size_m[2]
-    body.parts = _legs((x0, y0), (x1, y1), (z0, z1), post)
+    body.parts = legs((x0, y0), (x1, y1), (z0, z1), post)
     for name, z, clearance in (("lower", lower, upper - thickness - lower), ("upper", upper, 2.0)):
         body.parts.append(box((x0 + post, y0, z - thickness), (x1 - post, y1, z)))
         body.add_support(name, (x0 + post, y0), (x1 - post, y1), z, clearance)

@@ -6,7 +6,8 @@ import functools
 from typing import TYPE_CHECKING
 
 from embomatrix.factory.assets.cabinets import MAX_PARTS
-from embomatrix.factory.assets.families import GENERATORS, family_of_model
+from embomatrix.factory.assets.families import GENERATORS
+from embomatrix.factory.assets.naming import family_of_model
 from embomatrix.world.asset import Asset, Link
 
 if TYPE_CHECKING:

@@ -128,6 +128,72 @@ def cushion(region: Aabb) -> Part:
     return _stretched(_unit_cushion(), region)
 
 
+def loaf(region: Aabb) -> Part:
+    """Bread: a bar along the longer side with an arched back."""
+    return _extruded(region, _LOAF, ((0.0, 1.0), (1.0, 1.0)))
+
+
+def log(region: Aabb) -> Part:
+    """Round bar lying along the longer side; its eighth side is flat on the ground, so it does not roll."""
+    return _extruded(region, _ROUND, ((0.0, 1.0), (1.0, 1.0)))
+
+
+def capsule(region: Aabb) -> Part:
+    """Lying bar with rounded ends: sausages, carrots, bananas."""
+    return _extruded(
+        region, _ROUND, ((0.0, 0.45), (0.15, 0.9), (0.3, 1.0), (0.7, 1.0), (0.85, 0.9), (1.0, 0.45))
+    )
+
+
+def ridge(region: Aabb) -> Part:
+    """Prism with a ridge along the longer side: tents and roofs."""
+    return _extruded(region, ((0.0, 0.0), (1.0, 0.0), (0.5, 1.0)), ((0.0, 1.0), (1.0, 1.0)))
+
+
+def frustum(region: Aabb, top_share: float) -> Part:
+    """Block that narrows to a share of its base towards the top: folded cloth, heaps, boulders."""
+    (x0, y0, z0), (x1, y1, z1) = region.low_m, region.high_m
+    (cx, cy, _), share = region.center_m, top_share
+    top = [(cx + share * (x - cx), cy + share * (y - cy), z1) for x in (x0, x1) for y in (y0, y1)]
+    return hull(np.array([*((x, y, z0) for x in (x0, x1) for y in (y0, y1)), *top]))
+
+
+def wedge(region: Aabb) -> Part:
+    """Slice of a cake: a triangle seen from above, its tip at the end of the longer side."""
+    (x0, y0, z0), (x1, y1, z1) = region.low_m, region.high_m
+    cx, cy, _ = region.center_m
+    tip = ((x0, y0), (x0, y1), (x1, cy)) if x1 - x0 >= y1 - y0 else ((x0, y0), (x1, y0), (cx, y1))
+    return hull(np.array([(x, y, z) for z in (z0, z1) for x, y in tip]))
+
+
+def half_disc(region: Aabb) -> Part:
+    """Half a flat round: its straight edge is the longer side."""
+    turn = np.linspace(0.0, math.pi, 9)
+    along, out = (1 - np.cos(turn)) / 2, np.sin(turn)
+    out[-1] = 0.0
+    (x0, y0, z0), size = region.low_m, region.size_m
+    rim = np.column_stack((out, along) if size[1] >= size[0] else (along, out)) * size[:2] + (x0, y0)
+    return hull(np.vstack([np.column_stack((rim, np.full(9, z))) for z in (z0, region.high_m[2])]))
+
+
+_LOAF: Final = ((0.0, 0.0), (1.0, 0.0), (1.0, 0.55), (0.78, 0.92), (0.5, 1.0), (0.22, 0.92), (0.0, 0.55))
+_ROUND: Final = tuple((0.5 + x / 2, 0.5 + y / 2) for x, y in _OCTAGON)
+
+
+def _extruded(region: Aabb, section: Sequence[Vec2], stations: Sequence[Vec2]) -> Part:
+    """A section in the unit square (across, up), drawn along the longer horizontal side.
+
+    ``stations`` lists (share of the length, scale of the section about its centre).
+    """
+    size = np.asarray(region.size_m)
+    flat = np.asarray(section) - 0.5  # (n, 2)
+    rings = [np.column_stack((np.full(len(flat), share - 0.5), flat * scale)) for share, scale in stations]
+    points = np.vstack(rings)  # along, across, up
+    if size[1] > size[0]:
+        points = points[:, (1, 0, 2)]
+    return hull(points * size + np.asarray(region.center_m))
+
+
 def _stretched(unit: FloatArray, region: Aabb) -> Part:
     return hull(unit * np.asarray(region.size_m) + np.asarray(region.center_m))
 

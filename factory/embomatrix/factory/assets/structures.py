@@ -1,0 +1,252 @@
+"""Open structures and machines: posts, stands, racks, fences, canopies, stairs, gym machines, vehicles, wall fittings."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from embomatrix.factory.assets.body import OPEN_ABOVE_M, Body, Walls, centred, clamp, shell
+from embomatrix.factory.assets.furniture import legs
+from embomatrix.factory.assets.shapes import box, octagon
+from embomatrix.world.geometry import Aabb
+
+if TYPE_CHECKING:
+    from embomatrix.world.geometry import Part, Vec3
+
+
+def post(size_m: Vec3) -> Body:
+    """A flat foot with a pole: flag poles, tripods, clamps on their stands, signposts."""
+    (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
+    foot = z0 + clamp(0.06 * size_m[2], 0.004, 0.05)
+    thick = clamp(0.08 * min(size_m[:2]), 0.002, 0.04)
+    return Body(parts=[box((x0, y0, z0), (x1, y1, foot)), box((-thick, -thick, foot), (thick, thick, z1))])
+
+
+def pendant(size_m: Vec3) -> Body:
+    """What hangs from a ceiling: a rod with a round shade or blades at its lower end."""
+    (_, _, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
+    shade = z0 + clamp(0.35 * size_m[2], 0.02, 0.4)
+    thick = clamp(0.06 * min(size_m[:2]), 0.003, 0.03)
+    return Body(
+        parts=[*octagon((0.0, 0.0), (x1, y1), (z0, shade)), box((-thick, -thick, shade), (thick, thick, z1))]
+    )
+
+
+def fence(size_m: Vec3) -> Body:
+    """Posts with three rails between them, along the longer side."""
+    (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
+    along = 0 if size_m[0] > size_m[1] else 1
+    low, high = (x0, y0)[along], (x1, y1)[along]
+    count = int(clamp(round((high - low) / 2.0), 1, 6)) + 1
+    thick = min(0.12, 0.2 * (high - low))
+    rail = 0.08 * size_m[2]
+    body = Body()
+    for number in range(count):
+        start = low + (high - low - thick) * number / (count - 1)
+        body.parts.append(_across(along, (start, start + thick), (x0, y0), (x1, y1), (z0, z1)))
+    inner = (0.4 * x0, 0.4 * y0), (0.4 * x1, 0.4 * y1)  # rails are thinner than posts
+    for share in (0.15, 0.5, 0.86):
+        foot = z0 + share * size_m[2]
+        body.parts.append(_across(along, (low, high), *inner, (foot, foot + rail)))
+    return body
+
+
+def _across(
+    along: int,
+    span: tuple[float, float],
+    low: tuple[float, float],
+    high: tuple[float, float],
+    z: tuple[float, float],
+) -> Part:
+    """Box over an interval of one horizontal axis, and over what two corners span on the other."""
+    if along == 0:
+        return box((span[0], low[1], z[0]), (span[1], high[1], z[1]))
+    return box((low[0], span[0], z[0]), (high[0], span[1], z[1]))
+
+
+def canopy(size_m: Vec3) -> Body:
+    """Four posts under a roof: arbours, pergolas, swings, climbing frames."""
+    (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
+    roof = clamp(0.05 * size_m[2], 0.02, 0.2)
+    thick = clamp(0.05 * min(size_m[:2]), 0.02, 0.15)
+    return Body(
+        parts=[box((x0, y0, z1 - roof), (x1, y1, z1)), *legs((x0, y0), (x1, y1), (z0, z1 - roof), thick)]
+    )
+
+
+def bars(size_m: Vec3) -> Body:
+    """Two bars on four posts: parallel bars, towel stands, luggage racks."""
+    (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
+    thick = clamp(0.06 * min(size_m[:2]), 0.01, 0.08)
+    rails = [box((x0, y, z1 - thick), (x1, y + thick, z1)) for y in (y0, y1 - thick)]
+    return Body(parts=[*rails, *legs((x0, y0), (x1, y1), (z0, z1 - thick), thick)])
+
+
+def staircase(size_m: Vec3) -> Body:
+    """Solid steps that rise towards the back."""
+    (x0, y0, z0), (x1, y1, _) = centred(size_m).low_m, centred(size_m).high_m
+    steps = int(clamp(round(size_m[2] / 0.18), 2, 16))
+    tread, rise = size_m[0] / steps, size_m[2] / steps
+    body = Body()
+    for number in range(steps):
+        body.parts.append(
+            box((x0, y0, z0 + number * rise), (x1 - number * tread, y1, z0 + (number + 1) * rise))
+        )
+    body.add_support("step1", (x1 - tread, y0), (x1, y1), z0 + rise)
+    return body
+
+
+def ladder(size_m: Vec3) -> Body:
+    """Two stiles with rungs between them, along the longest side."""
+    (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
+    stile = 0.12 * size_m[1]
+    body = Body(parts=[box((x0, y0, z0), (x1, y0 + stile, z1)), box((x0, y1 - stile, z0), (x1, y1, z1))])
+    axis = 2 if size_m[2] > size_m[0] else 0
+    length = size_m[axis]
+    for number in range(6):
+        middle = -length / 2 + length * (number + 0.5) / 6
+        low, high = [0.4 * x0, y0 + stile, 0.4 * z0], [0.4 * x1, y1 - stile, 0.4 * z1]
+        low[axis], high[axis] = middle - 0.02 * length, middle + 0.02 * length
+        body.parts.append(box(low, high))
+    return body
+
+
+def treadmill(size_m: Vec3) -> Body:
+    """A deck with two uprights and a console at its front; exercise bikes and steppers too."""
+    (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
+    deck, console = z0 + 0.16 * size_m[2], z1 - 0.15 * size_m[2]
+    rear, arm = x1 - 0.12 * size_m[0], 0.1 * size_m[1]
+    body = Body(
+        parts=[
+            box((x0, y0, z0), (x1, y1, deck)),
+            box((rear, y0, deck), (x1, y0 + arm, console)),
+            box((rear, y1 - arm, deck), (x1, y1, console)),
+            box((x1 - 0.22 * size_m[0], y0, console), (x1, y1, z1)),
+        ]
+    )
+    body.add_support("deck", (x0, y0), (x1 - 0.22 * size_m[0], y1), deck)
+    return body
+
+
+def lorry(size_m: Vec3) -> Body:
+    """A loading bed and a cab on wheels; toy cars and trains too. The front of the vehicle is at +x, or at +y."""
+    (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
+    deck, axle = z0 + 0.45 * size_m[2], z0 + 0.22 * size_m[2]
+    cab = x1 - 0.32 * size_m[0]
+    wheel, tyre = 0.16 * size_m[0], 0.2 * size_m[1]
+    wheels = [
+        box((x, y, z0), (x + wheel, y + tyre, axle))
+        for x in (x0 + 0.06 * size_m[0], x1 - 0.06 * size_m[0] - wheel)
+        for y in (y0, y1 - tyre)
+    ]
+    body = Body(parts=[box((x0, y0, axle), (x1, y1, deck)), box((cab, y0, deck), (x1, y1, z1)), *wheels])
+    body.add_support("bed", (x0, y0), (cab, y1), deck)
+    return body
+
+
+def cycle(size_m: Vec3) -> Body:
+    """Two wheels, a frame and handlebars, on a stand."""
+    (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
+    hub = z0 + 0.6 * size_m[2]
+    wheel, slim = 0.36 * size_m[0], 0.12
+    return Body(
+        parts=[
+            box((x0, slim * y0, z0), (x0 + wheel, slim * y1, hub)),
+            box((x1 - wheel, slim * y0, z0), (x1, slim * y1, hub)),
+            box(
+                (x0 + wheel, slim * y0, z0 + 0.3 * size_m[2]), (x1 - wheel, slim * y1, hub + 0.1 * size_m[2])
+            ),
+            box((x1 - 0.35 * size_m[0], y0, z1 - 0.1 * size_m[2]), (x1 - 0.25 * size_m[0], y1, z1)),
+            box(
+                (x1 - 0.33 * size_m[0], slim * y0, hub),
+                (x1 - 0.27 * size_m[0], slim * y1, z1 - 0.1 * size_m[2]),
+            ),
+            box((-0.04 * size_m[0], 0.7 * y0, z0), (0.04 * size_m[0], 0.7 * y1, z0 + 0.06 * size_m[2])),
+            box(
+                (-0.02 * size_m[0], slim * y0, z0 + 0.06 * size_m[2]),
+                (0.02 * size_m[0], slim * y1, z0 + 0.3 * size_m[2]),
+            ),
+        ]
+    )
+
+
+def range_hood(size_m: Vec3) -> Body:
+    """A broad hood with a duct above."""
+    (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
+    hood = z0 + 0.4 * size_m[2]
+    return Body(
+        parts=[
+            box((x0, y0, z0), (x1, y1, hood)),
+            box((x0, 0.4 * y0, hood), (x0 + 0.6 * size_m[0], 0.4 * y1, z1)),
+        ]
+    )
+
+
+def urinal(size_m: Vec3) -> Body:
+    """A back plate with a bowl before its lower half."""
+    (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
+    back, rim = x0 + 0.25 * size_m[0], z0 + 0.5 * size_m[2]
+    wall = clamp(0.08 * min(size_m), 0.005, 0.03)
+    parts, cavity = shell(Aabb((back, y0, z0), (x1, y1, rim)), Walls(0.0, wall, wall, wall, wall, 0.0))
+    body = Body(parts=[box((x0, y0, z0), (back, y1, z1)), *parts])
+    body.add_interior("bowl", cavity, clearance_m=OPEN_ABOVE_M)
+    return body
+
+
+def shower_rail(size_m: Vec3) -> Body:
+    """A rail on the wall with an arm and a rose at its upper end."""
+    (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
+    rail, rose = 0.12, z1 - 0.08 * size_m[2]
+    edge = x0 + rail * size_m[0]
+    return Body(
+        parts=[
+            box((x0, rail * y0, z0), (edge, rail * y1, z1)),
+            box((edge, y0, rose), (x1, y1, z1)),
+        ]
+    )
+
+
+def workstation(size_m: Vec3) -> Body:
+    """Walls on three sides of an open front: cubicles, booths, stalls."""
+    outer = centred(size_m)
+    wall = clamp(0.04 * min(size_m[:2]), 0.01, 0.06)
+    parts, _ = shell(outer, Walls(wall, 0.0, wall, wall, 0.0, 0.0))
+    return Body(parts=parts)
+
+
+def telephone(size_m: Vec3) -> Body:
+    """A low case with a handset across its left."""
+    (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
+    case = z0 + 0.6 * size_m[2]
+    return Body(
+        parts=[box((x0, y0, z0), (x1, y1, case)), box((x0, y0 + 0.65 * size_m[1], case), (x1, y1, z1))]
+    )
+
+
+def microscope(size_m: Vec3) -> Body:
+    """A foot, an arm behind and a head that reaches forward."""
+    (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
+    foot, head, arm = z0 + 0.15 * size_m[2], z1 - 0.3 * size_m[2], x0 + 0.35 * size_m[0]
+    body = Body(
+        parts=[
+            box((x0, y0, z0), (x1, y1, foot)),
+            box((x0, 0.4 * y0, foot), (arm, 0.4 * y1, z1)),
+            box((arm, 0.4 * y0, head), (x1 - 0.2 * size_m[0], 0.4 * y1, z1)),
+        ]
+    )
+    body.add_support("stage", (arm, y0), (x1, y1), foot, head - foot)
+    return body
+
+
+def wheeled_board(size_m: Vec3) -> Body:
+    """A board on two axles: skateboards, scooters."""
+    (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
+    axle = z0 + 0.6 * size_m[2]
+    body = Body(
+        parts=[
+            box((x0, y0, axle), (x1, y1, z1)),
+            box((x0, 0.7 * y0, z0), (x1, 0.5 * y0, axle)),
+            box((x0, 0.5 * y1, z0), (x1, 0.7 * y1, axle)),
+        ]
+    )
+    body.add_support("deck", (x0, y0), (x1, y1), z1)
+    return body
