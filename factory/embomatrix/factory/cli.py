@@ -27,7 +27,7 @@ from embomatrix.factory.scene_build import build_base_scene
 from embomatrix.sim.engine import EngineMissingError
 from embomatrix.sim.pose_cache import PlacementLibrary
 from embomatrix.world.bddl import BddlError, parse_problem
-from embomatrix.world.catalog import CatalogError
+from embomatrix.world.catalog import Catalog, CatalogError
 from embomatrix.world.dataset import TASKS_FILE, Dataset, DatasetError, write_dataset
 from embomatrix.world.task import TaskCategory
 
@@ -41,11 +41,13 @@ app = typer.Typer(
     help="Make verified tasks.", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False
 )
 EVERY_ACTIVITY = "all"
+EVERY_SCENE = "all"
 
 Out = Annotated[Path, typer.Option(help="Folder for the dataset.")]
 Seed = Annotated[int, typer.Option(min=0, help="Equal seeds give equal datasets.")]
 Scenes = Annotated[
-    list[str] | None, typer.Option("--scenes", "--scene", help="Base scene; give it again for more.")
+    list[str] | None,
+    typer.Option("--scenes", "--scene", help="Base scene, or 'all'; give it again for more."),
 ]
 
 
@@ -58,7 +60,7 @@ def build(
     scenes: Scenes = None,
 ) -> None:
     """Write tasks over base scenes, keep those that the oracle solves, and save them with their scenes."""
-    settings = BuildSettings(train, heldout, seed, tuple(scenes or DEFAULT_SCENES))
+    settings = BuildSettings(train, heldout, seed, _scene_ids(scenes))
     console = Console()
     kept = f": what was built is kept in {out}, and the same command goes on from there"
     with _mended(out, kept), _progress(console) as bars:
@@ -97,7 +99,7 @@ def import_(
         if out is not None:
             _check_free(out, bind_only=bind_only)
         sources = [_parsed(source) for source in _sources(bddl, activity, jsonl)]
-        bases = [build_base_scene(scene_id) for scene_id in scenes or DEFAULT_SCENES]
+        bases = [build_base_scene(scene_id) for scene_id in _scene_ids(scenes)]
         outcomes = _judged(console, sources, bases, seed, bind_only=bind_only)
         verified = [item for item in outcomes if isinstance(item, Verified)]
         if out is not None and verified:
@@ -131,6 +133,13 @@ def list_(folder: Annotated[Path, typer.Argument(help="Folder of a dataset.")]) 
             task.instruction,
         )
     Console().print(table)
+
+
+def _scene_ids(scenes: list[str] | None) -> tuple[str, ...]:
+    """The scenes asked for, without repetition; "all" stands for every base scene of the catalog."""
+    if scenes and EVERY_SCENE in scenes:
+        return Catalog.load().scene_ids
+    return tuple(dict.fromkeys(scenes or DEFAULT_SCENES))
 
 
 def _check_free(out: Path, *, bind_only: bool) -> None:
