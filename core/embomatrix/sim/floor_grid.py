@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -25,67 +25,82 @@ if TYPE_CHECKING:
 Cell = tuple[int, int]
 
 CELL_M: Final = 0.05
-SNAP_M: Final = 0.3
-"""A robot that stands this close to a free cell counts as standing on it."""
+SNAP_CELLS: Final = 6
+"""A robot that stands within 30 cm of a free cell counts as standing on it."""
 DOORWAY_DEPTH_M: Final = 0.4
 """How far the floor of a doorway reaches, centred on the wall: more than any wall's thickness."""
 FIELDS_KEPT: Final = 64
 """Distance fields in memory, 0.2 MB each in a flat of 120 m2."""
 
 
-@dataclass(frozen=True, slots=True)
-class Obstacles:
-    """Rectangles in the world's xy plane with the heights between which they stand, shape (n, 6), and whose they are.
+class FloorGrid:
+    """Cells of 5 cm over the bounding rectangle of the rooms. What is not room or doorway is no floor.
 
-    Columns: x low, y low, x high, y high, z low, z high. ``owners`` holds the number of the scene object, -1 for walls;
-    ``leaves`` marks doors and drawers.
+    Made once for a scene; when something on the floor moves, ``changed`` makes the next one from it, at the cost of the
+    place where it moved.
     """
 
-    boxes: FloatArray
-    owners: IntArray
-    leaves: BoolArray
-
-    def joined(self, other: Obstacles) -> Obstacles:
-        return Obstacles(
-            np.concatenate([self.boxes, other.boxes]),
-            np.concatenate([self.owners, other.owners]),
-            np.concatenate([self.leaves, other.leaves]),
-        )
-
-
-class FloorGrid:
-    """Cells of 5 cm over the bounding rectangle of the rooms. What is not room or doorway is no floor."""
-
     def __init__(self, scene: Scene, boxes: FloatArray) -> None:
-        """Rasterise obstacles, shape (n, 6), inflate them by the robot's radius and label what is left."""
+        """Rasterise obstacles, shape (n, 6), and inflate them by the robot's radius."""
         lows = np.array([room.low_m for room in scene.rooms])
         highs = np.array([room.high_m for room in scene.rooms])
         self._origin = lows.min(axis=0) - 2 * CELL_M
+        self._origin_m = (float(self._origin[0]), float(self._origin[1]))
         span = highs.max(axis=0) + 2 * CELL_M - self._origin
         self._shape = (math.ceil(span[0] / CELL_M), math.ceil(span[1] / CELL_M))
-        blocked = ~self._floor_of(scene)
+        self._covered = (~self._floor_of(scene)).astype(np.int16)
+        """How many obstacles cover each cell, and one more where there is no floor."""
         for box in boxes:
-            blocked[self._window(box[:2], box[2:4])] = True
-        blocked[0, :] = blocked[-1, :] = True
-        blocked[:, 0] = blocked[:, -1] = True
-        clearance = np.asarray(ndimage.distance_transform_edt(~blocked)) * CELL_M
-        self.free: BoolArray = clearance >= ROBOT.radius_m
-        self.labels: IntArray = np.asarray(ndimage.label(self.free)[0], dtype=np.int32)
-        off, nearest = ndimage.distance_transform_edt(~self.free, return_indices=True)
-        self._off_m = np.asarray(off) * CELL_M
-        self._nearest = np.asarray(nearest)
+            self._covered[self._window(box[:2], box[2:4])] += 1
+        for edge in (np.s_[0, :], np.s_[-1, :], np.s_[:, 0], np.s_[:, -1]):
+            self._covered[edge] += 1
+        self.free: BoolArray = self._clear_of_obstacles(np.s_[:, :])
         self._field = functools.lru_cache(maxsize=FIELDS_KEPT)(self._field_from)
+
+    def changed(self, gone: FloatArray, come: FloatArray) -> FloorGrid:
+        """This grid without some of its obstacles and with others, each of shape (n, 6)."""
+        grid = copy.copy(self)
+        vars(grid).pop("labels", None)
+        vars(grid).pop("_graph", None)
+        grid._covered, grid.free = self._covered.copy(), self.free.copy()
+        for boxes, step in ((gone, -1), (come, 1)):
+            for box in boxes:
+                grid._covered[self._window(box[:2], box[2:4])] += step
+        for box in (*gone, *come):
+            reach = ROBOT.radius_m + CELL_M
+            here = self._window(box[:2] - reach, box[2:4] + reach)
+            around = self._window(box[:2] - 2 * reach, box[2:4] + 2 * reach)
+            inner = tuple(
+                slice(small.start - large.start, small.stop - large.start)
+                for small, large in zip(here, around, strict=True)
+            )
+            grid.free[here] = grid._clear_of_obstacles(around)[inner]
+        grid._field = functools.lru_cache(maxsize=FIELDS_KEPT)(grid._field_from)
+        return grid
+
+    @functools.cached_property
+    def labels(self) -> IntArray:
+        """Number of the component of each free cell, 0 for the others."""
+        return np.asarray(ndimage.label(self.free)[0], dtype=np.int32)
 
     def cell(self, x_m: float, y_m: float) -> Cell | None:
         """The free cell at a point, or the nearest one within 30 cm; None when there is none."""
         if not (math.isfinite(x_m) and math.isfinite(y_m)):
             return None
-        i, j = (
-            math.floor((value - low) / CELL_M) for value, low in zip((x_m, y_m), self._origin, strict=True)
-        )
-        if not (0 <= i < self._shape[0] and 0 <= j < self._shape[1]) or self._off_m[i, j] > SNAP_M:
+        i, j = self._cell_at(x_m, y_m)
+        if not (0 <= i < self._shape[0] and 0 <= j < self._shape[1]):
             return None
-        return (int(self._nearest[0, i, j]), int(self._nearest[1, i, j]))
+        if self.free[i, j]:
+            return (i, j)
+        first_i, first_j = max(0, i - SNAP_CELLS), max(0, j - SNAP_CELLS)
+        near = np.argwhere(self.free[first_i : i + SNAP_CELLS + 1, first_j : j + SNAP_CELLS + 1])
+        if not len(near):
+            return None
+        away = (near[:, 0] + first_i - i) ** 2 + (near[:, 1] + first_j - j) ** 2  # (n,) in cells
+        best = int(np.argmin(away))
+        if away[best] > SNAP_CELLS**2:
+            return None
+        return (int(near[best, 0]) + first_i, int(near[best, 1]) + first_j)
 
     def center(self, cell: Cell) -> Vec2:
         """World coordinates of the middle of a cell."""
@@ -96,9 +111,7 @@ class FloorGrid:
 
     def is_free(self, x_m: float, y_m: float) -> bool:
         """Whether the robot fits at a point."""
-        i, j = (
-            math.floor((value - low) / CELL_M) for value, low in zip((x_m, y_m), self._origin, strict=True)
-        )
+        i, j = self._cell_at(x_m, y_m)
         return bool(0 <= i < self._shape[0] and 0 <= j < self._shape[1] and self.free[i, j])
 
     def label(self, cell: Cell) -> int:
@@ -180,6 +193,17 @@ class FloorGrid:
         one_way = sparse.coo_matrix((weight, (source, target)), shape=(size, size))
         return (one_way + one_way.T).tocsr()
 
+    def _cell_at(self, x_m: float, y_m: float) -> Cell:
+        low_x, low_y = self._origin_m
+        return math.floor((x_m - low_x) / CELL_M), math.floor((y_m - low_y) / CELL_M)
+
+    def _clear_of_obstacles(self, window: tuple[slice, slice]) -> BoolArray:
+        """Which cells of a window are a robot's radius or more from every covered cell of it."""
+        clear = self._covered[window] == 0
+        if clear.all():  # there is nothing to measure the distance from
+            return np.asarray(clear)
+        return np.asarray(np.asarray(ndimage.distance_transform_edt(clear)) * CELL_M >= ROBOT.radius_m)
+
     def _floor_of(self, scene: Scene) -> BoolArray:
         floor = np.zeros(self._shape, dtype=np.bool_)
         for room in scene.rooms:
@@ -197,5 +221,5 @@ class FloorGrid:
         first = np.floor((low - self._origin) / CELL_M + 1e-9).astype(int)
         last = np.ceil((high - self._origin) / CELL_M - 1e-9).astype(int)
         first = np.clip(first, 0, self._shape)
-        last = np.clip(last, 0, self._shape)
+        last = np.clip(last, first, self._shape)
         return slice(int(first[0]), int(last[0])), slice(int(first[1]), int(last[1]))

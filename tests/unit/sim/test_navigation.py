@@ -6,16 +6,33 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from tests.fakes.furniture import box
 from tests.fakes.scenes import kitchen_scene
 
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
+from embomatrix.sim.floor_grid import CELL_M, FloorGrid
 from embomatrix.sim.navigation import Navigator
 from embomatrix.sim.relations import Relations
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.geometry import Pose
 from embomatrix.world.poses import StandPose
+
+COORDINATE = st.floats(-0.5, 9.5)
+RECTANGLE = st.builds(
+    lambda x, y, width, depth: (x, y, x + width, y + depth),
+    COORDINATE,
+    st.floats(-0.5, 4.5),
+    st.floats(0.02, 1.5),
+    st.floats(0.02, 1.5),
+)
+
+
+def rows_of(rectangles) -> np.ndarray:
+    """Obstacles from the floor to 1 m, shape (n, 6)."""
+    return np.array([(*rectangle, 0.0, 1.0) for rectangle in rectangles]).reshape(-1, 6)
 
 
 @pytest.fixture(scope="module")
@@ -167,3 +184,31 @@ def test_place_off_the_map_is_not_reachable(navigator) -> None:
     for x, y in ((-50.0, 0.0), (math.nan, 1.0), (2.0, 1.3)):
         assert not navigator.reachable(navigator.start, StandPose(x, y, 0.0))
         assert navigator.path_length(navigator.start, StandPose(x, y, 0.0)) is None
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(RECTANGLE, max_size=6), st.lists(RECTANGLE, max_size=4), st.data())
+def test_changed_grid_is_the_one_that_would_be_made_anew(start, come, data) -> None:
+    scene = kitchen_scene()
+    gone = data.draw(st.lists(st.sampled_from(start), unique=True)) if start else []
+    left = [row for row in start if row not in gone]
+    start = left + gone
+    changed = FloorGrid(scene, rows_of(start)).changed(rows_of(gone), rows_of(come))
+    fresh = FloorGrid(scene, rows_of(left + come))
+    assert (changed.free == fresh.free).all()
+    assert (changed.labels == fresh.labels).all()
+
+
+@settings(max_examples=60, deadline=None)
+@given(COORDINATE, COORDINATE)
+def test_robot_beside_a_free_cell_counts_as_on_the_nearest_one(x, y) -> None:
+    grid = FloorGrid(kitchen_scene(), rows_of([(2.0, 1.0, 3.0, 2.0)]))
+    cell = grid.cell(x, y)
+    free = np.argwhere(grid.free)
+    centers = np.array([grid.center((int(i), int(j))) for i, j in free])
+    nearest = float(np.linalg.norm(centers - (x, y), axis=1).min())
+    if cell is None:
+        assert nearest > 6 * CELL_M - CELL_M
+    else:
+        assert grid.free[cell]
+        assert float(np.linalg.norm(np.array(grid.center(cell)) - (x, y))) <= nearest + CELL_M

@@ -1,0 +1,130 @@
+"""What stands in the robot's way and in its arm's: rectangles of the plane with the heights between which they stand."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from embomatrix.skills.limits import ROBOT
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from embomatrix.world.geometry import Aabb, FloatArray, Vec2
+
+    BoolArray = NDArray[np.bool_]
+    IntArray = NDArray[np.int32]
+
+FLAT_M: Final = 0.03
+"""The robot drives over what is lower than this: rugs."""
+OVER_M: Final = 0.1
+"""The arm passes over what is no more than this much higher than the thing it reaches for."""
+SLACK_M: Final = 0.005
+WALLS: Final = -1
+"""Owner of the walls."""
+
+
+class Obstacles:
+    """Boxes of parts, shape (n, 6), and whose they are.
+
+    Columns: x low, y low, x high, y high, z low, z high. ``owners`` holds the number of the scene object, -1 for walls;
+    ``leaves`` marks doors and drawers.
+    """
+
+    def __init__(self, boxes: FloatArray, owners: IntArray, leaves: BoolArray) -> None:
+        self.boxes = boxes
+        self.owners = owners
+        self.leaves = leaves
+
+    @staticmethod
+    def of(boxes: Sequence[Aabb], owner: int, leaves: Sequence[bool]) -> Obstacles:
+        """Boxes of one owner."""
+        rows = [(*box.low_m[:2], *box.high_m[:2], box.low_m[2], box.high_m[2]) for box in boxes]
+        return Obstacles(
+            np.array(rows, dtype=np.float64).reshape(-1, 6),
+            np.full(len(rows), owner, dtype=np.int32),
+            np.array(leaves, dtype=np.bool_),
+        )
+
+    @staticmethod
+    def joined(parts: Sequence[Obstacles]) -> Obstacles:
+        """All of them, in this order."""
+        return Obstacles(
+            np.concatenate([item.boxes for item in parts]),
+            np.concatenate([item.owners for item in parts]),
+            np.concatenate([item.leaves for item in parts]),
+        )
+
+    def only(self, owners: Sequence[int]) -> Obstacles:
+        """Those that belong to one of these."""
+        return self._chosen(np.isin(self.owners, owners))
+
+    def without(self, owners: Sequence[int]) -> Obstacles:
+        """Those that belong to none of these."""
+        return self._chosen(~np.isin(self.owners, owners))
+
+    @property
+    def barring(self) -> FloatArray:
+        """Those that the robot's base can't drive through, shape (m, 6)."""
+        return self.boxes[self._bars_base()]
+
+    def owners_near(self, points: FloatArray) -> dict[int, int]:
+        """For how many of some points of the plane, shape (n, 2), each owner keeps the robot from standing there."""
+        bars = self._bars_base()
+        boxes, owners = self.boxes[bars], self.owners[bars]
+        counts: dict[int, int] = {}
+        for owner in dict.fromkeys(owners.tolist()):
+            mine = boxes[owners == owner]
+            off = np.maximum(mine[:, None, :2] - points, points - mine[:, None, 2:4])  # (m, n, 2)
+            away = np.linalg.norm(np.maximum(off, 0.0), axis=2).min(axis=0)  # (n,)
+            counts[owner] = int((away < ROBOT.radius_m).sum())
+        return counts
+
+    def blockers(self, box: Aabb, own: Sequence[int]) -> FloatArray:
+        """Rectangles, shape (4, m), that the arm can't pass on its way to a box: x low, y low, x high, y high.
+
+        Walls and what is much taller than the box. ``own`` are the numbers of the object in the box and of its hosts: they
+        don't bar the way, unless a host roofs the object over; then the host's own sides do.
+        """
+        rows, owners = self.boxes, self.owners
+        low, top = box.low_m[2], box.high_m[2]
+        x, y, _ = box.center_m
+        barring = (rows[:, 5] > top + OVER_M) & (rows[:, 4] < max(top, ROBOT.shoulder_m))
+        for place, number in enumerate(own):
+            mine = np.flatnonzero(owners == number)
+            barring[mine] = False
+            if place == 0:
+                continue
+            parts = rows[mine]
+            over = (parts[:, 0] <= x) & (x <= parts[:, 2]) & (parts[:, 1] <= y) & (y <= parts[:, 3])
+            if (over & (parts[:, 4] >= top)).any():
+                beside = (parts[:, 4] < top - SLACK_M) & (parts[:, 5] > low + SLACK_M)
+                barring[mine] = beside & ~self.leaves[mine]
+        return np.ascontiguousarray(rows[barring, :4].T)
+
+    def _chosen(self, rows: BoolArray) -> Obstacles:
+        return Obstacles(self.boxes[rows], self.owners[rows], self.leaves[rows])
+
+    def _bars_base(self) -> BoolArray:
+        return np.asarray((self.boxes[:, 4] < ROBOT.height_m) & (self.boxes[:, 5] > FLAT_M))
+
+
+def crosses(start: Vec2, end: Vec2, rectangles: FloatArray) -> bool:
+    """Whether the segment between two points of the plane passes through any rectangle, shape (4, n): slab test."""
+    (x, y), (to_x, to_y) = start, end
+    near = (rectangles[0] <= max(x, to_x)) & (rectangles[2] >= min(x, to_x))
+    near &= (rectangles[1] <= max(y, to_y)) & (rectangles[3] >= min(y, to_y))
+    return any(_passes(x, y, to_x - x, to_y - y, rectangle) for rectangle in rectangles[:, near].T.tolist())
+
+
+def _passes(x: float, y: float, dx: float, dy: float, rectangle: Sequence[float]) -> bool:
+    low_x, low_y, high_x, high_y = rectangle
+    dx, dy = (dx if abs(dx) > 1e-12 else 1e-12), (dy if abs(dy) > 1e-12 else 1e-12)
+    first_x, last_x = (low_x - x) / dx, (high_x - x) / dx
+    first_y, last_y = (low_y - y) / dy, (high_y - y) / dy
+    enter = max(min(first_x, last_x), min(first_y, last_y))
+    leave = min(max(first_x, last_x), max(first_y, last_y))
+    return enter < leave and leave > 0.0 and enter < 1.0
