@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.floorplan_spec import (
     ENTRANCES,
@@ -23,6 +23,9 @@ if TYPE_CHECKING:
     import numpy as np
 
     from embomatrix.factory.floorplan_spec import RoomSpec
+
+FRONT_YARD_M: Final = 3.0
+"""Open ground before the front door, if any wall has it: nobody enters a house through a crack between two rooms."""
 
 
 def place_doorways(
@@ -112,14 +115,15 @@ def _front_door(rooms: Sequence[RoomSpec], rects: Mapping[str, Rect]) -> DoorCut
         )
         return (not own_doors(room), rank)
 
-    for room in sorted(rooms, key=order):
-        door = max(own_doors(room), key=lambda d: d.width_m, default=DoorSpec("", 0.9, 2.05))
-        outer = rects[room.name].outer_edges([r for n, r in rects.items() if n != room.name])
-        fitting = [e for e in outer if e.length >= MIN_DOOR_M + 0.1]
-        if fitting:
-            edge = max(fitting, key=lambda e: e.length)
-            width = min(max(door.width_m, MIN_DOOR_M), edge.length - 0.1)
-            start = edge.start + (edge.length - width) / 2
-            height = min(door.height_m, MAX_DOOR_HEIGHT_M)
-            return edge.cut((room.name, ""), start, width, height, door.model)
+    for yard_m in (FRONT_YARD_M, 0.5):
+        for room in sorted(rooms, key=order):
+            door = max(own_doors(room), key=lambda d: d.width_m, default=DoorSpec("", 0.9, 2.05))
+            others = [r for n, r in rects.items() if n != room.name]
+            outer = rects[room.name].outer_edges(others, yard_m)
+            edge = max(outer, key=lambda e: e.length, default=None)
+            if edge is not None and edge.length >= MIN_DOOR_M + 0.1:
+                width = min(max(door.width_m, MIN_DOOR_M), edge.length - 0.1)
+                start = edge.start + (edge.length - width) / 2
+                height = min(door.height_m, MAX_DOOR_HEIGHT_M)
+                return edge.cut((room.name, ""), start, width, height, door.model)
     raise FloorPlanError("no room has an outer wall wide enough for a front door")

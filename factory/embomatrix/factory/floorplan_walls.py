@@ -107,8 +107,8 @@ class Rect:
             Edge("y", self.x1, self.y0, self.y1),
         )
 
-    def outer_edges(self, others: Iterable[Rect]) -> list[Edge]:
-        """Stretches of this room's walls with no other room within half a metre behind them."""
+    def outer_edges(self, others: Iterable[Rect], clear_m: float) -> list[Edge]:
+        """Stretches of this room's walls with no other room within ``clear_m`` behind them."""
         half = WALL_M / 2
         rects = list(others)
         found = []
@@ -118,7 +118,7 @@ class Rect:
             for r in rects:
                 low, high = (r.x0, r.x1) if edge.along == "x" else (r.y0, r.y1)
                 near, far = (r.y0, r.y1) if edge.along == "x" else (r.x0, r.x1)
-                if near < edge.at + max(0.0, 0.5 * out) and far > edge.at + min(0.0, 0.5 * out):
+                if near < edge.at + max(0.0, clear_m * out) and far > edge.at + min(0.0, clear_m * out):
                     taken.append((low - half, high + half))
             pieces = subtract([(edge.start + half, edge.end - half)], taken)
             found += [Edge(edge.along, edge.at, a, b) for a, b in pieces]

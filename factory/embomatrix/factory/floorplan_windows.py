@@ -24,6 +24,8 @@ TRANSOM_M: Final = 0.6
 LEAST_WIDTH_M: Final = 0.35
 GAP_M: Final = 0.25
 """Wall between two windows, and between a window and a doorway or a corner."""
+VIEW_M: Final = 0.8
+"""Open air behind a window."""
 SKYLIGHT_M: Final = 6.0
 """What is listed as higher than this, in a house with walls of 2.4 m, is part of a roof or a facade."""
 
@@ -78,7 +80,8 @@ def _stretches(
 ) -> list[_Stretch]:
     """Outer walls of the room without the doorways in them."""
     mine = rects[room.name]
-    found = [_Stretch(edge, "") for edge in mine.outer_edges([r for n, r in rects.items() if n != room.name])]
+    others = [r for n, r in rects.items() if n != room.name]
+    found = [_Stretch(edge, "") for edge in mine.outer_edges(others, VIEW_M)]
     for name in sorted(outdoors):
         edge = shared_edge(mine, rects[name])
         if edge is not None:

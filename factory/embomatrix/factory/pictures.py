@@ -23,8 +23,8 @@ _PANE_M: Final = 0.03
 _SMALL_M: Final = 0.3
 _HUNG_M: Final = 1.2
 _CEILING_M: Final = 2.3
-_PALE: Final = ("#f6f1e7", "#eaf1f6", "#f1eaf4", "#e9f4ea", "#f7ecec", "#f3f3e4", "#e8f3f3")
-_FILL: Final = {
+PALE: Final = ("#f6f1e7", "#eaf1f6", "#f1eaf4", "#e9f4ea", "#f7ecec", "#f3f3e4", "#e8f3f3")
+FILL: Final = {
     "opens": "#f0c48a",
     "works": "#9fc5e8",
     "rests": "#d9d2c5",
@@ -64,6 +64,23 @@ def footprint(scene: Scene, item: SceneObject) -> Aabb:
     )
 
 
+def is_overhead(box: Aabb) -> bool:
+    """Whether an object with this box hangs under the ceiling, out of the plan's way."""
+    return box.high_m[2] > _CEILING_M and box.low_m[2] > 0.85
+
+
+def kind_of(scene: Scene, item: SceneObject, box: Aabb) -> str:
+    """Key of ``FILL``: what an object is to the robot."""
+    asset = scene.assets[item.asset_id]
+    if box.low_m[2] >= _HUNG_M:
+        return "hung"
+    if box.high_m[2] < 0.04:
+        return "rug"
+    if asset.can("openable"):
+        return "opens"
+    return "works" if any(asset.can(a) for a in _WORKS) else "rests"
+
+
 class _Plan:
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
@@ -84,7 +101,7 @@ class _Plan:
     def rooms(self) -> None:
         for number, room in enumerate(self._scene.rooms):
             corners = [self._px(*room.low_m), self._px(*room.high_m)]
-            self._draw.rectangle(_ordered(corners), fill=_PALE[number % len(_PALE)])
+            self._draw.rectangle(_ordered(corners), fill=PALE[number % len(PALE)])
         # Names last, at the top left of each room, where furniture seldom hides them.
 
     def walls(self) -> None:
@@ -110,14 +127,14 @@ class _Plan:
         shown = [o for o in self._scene.objects if not self._is_small(o)]
         for item in sorted(shown, key=lambda o: footprint(self._scene, o).low_m[2]):
             box = footprint(self._scene, item)
-            if self._overhead(box):
+            if is_overhead(box):
                 self._ceiling(box)
                 continue
-            kind = self._kind(item, box)
+            kind = kind_of(self._scene, item, box)
             outline = "#7a5fa8" if kind == "hung" else "#555555"
             corners = _ordered([self._px(*box.low_m[:2]), self._px(*box.high_m[:2])])
             self._draw.rectangle(
-                corners, fill=None if kind == "hung" else _FILL[kind], outline=outline, width=2
+                corners, fill=None if kind == "hung" else FILL[kind], outline=outline, width=2
             )
             self._front(item, outline)
             self._label(item.name, corners, "#5a3f88" if kind == "hung" else "black")
@@ -129,7 +146,7 @@ class _Plan:
         self._say("Legend", 15)
         for kind, words in _LEGEND:
             x, y = self._place()
-            self._draw.rectangle((x, y + 2, x + 14, y + 12), fill=_FILL[kind], outline="#555555")
+            self._draw.rectangle((x, y + 2, x + 14, y + 12), fill=FILL[kind], outline="#555555")
             self._text((x + 22, y), words, 11, "black")
             self._row += 1
         self._say("     triangle: front · red: doorway · blue: window · ring: light or fan")
@@ -161,21 +178,7 @@ class _Plan:
     def _is_small(self, item: SceneObject) -> bool:
         box = footprint(self._scene, item)
         x, y, _ = box.size_m
-        return (max(x, y) < _SMALL_M or bool(item.host and not item.fixed)) and not self._overhead(box)
-
-    @staticmethod
-    def _overhead(box: Aabb) -> bool:
-        return box.high_m[2] > _CEILING_M and box.low_m[2] > 0.85
-
-    def _kind(self, item: SceneObject, box: Aabb) -> str:
-        asset = self._scene.assets[item.asset_id]
-        if box.low_m[2] >= _HUNG_M:
-            return "hung"
-        if box.high_m[2] < 0.04:
-            return "rug"
-        if asset.can("openable"):
-            return "opens"
-        return "works" if any(asset.can(a) for a in _WORKS) else "rests"
+        return (max(x, y) < _SMALL_M or bool(item.host and not item.fixed)) and not is_overhead(box)
 
     def _ceiling(self, box: Aabb) -> None:
         x, y = self._px(*box.center_m[:2])
