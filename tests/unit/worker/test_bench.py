@@ -41,7 +41,7 @@ SCENES = 5
 MACHINE = {"cpu": "a core", "cores": 2, "load_before": 0.1, "gpu": ""}
 FIGURE_KEYS = {"name", "value", "unit", "goal", "better", "n"}
 COMMIT = re.compile(r"[0-9a-f]{12}(?:-dirty)?|version \S+")
-MAY_BE_ZERO = {"share", "count"}
+MAY_BE_ZERO = {"share", "count", "kB"}
 
 pytestmark = pytest.mark.timeout(240)
 

@@ -219,7 +219,8 @@ def _main_figures(samples: EngineSamples, slots: SlotSample) -> Iterator[Figure]
 
 
 def _leak_figure(leak_kb: float, cycles: int) -> Figure:
-    return Figure("leak_kb_per_cycle", leak_kb, "kB", Better.LOWER, cycles, LEAK_GOAL_KB)
+    # A fitted slope of a level line is a little above or below nothing.
+    return Figure("leak_kb_per_cycle", max(0.0, leak_kb), "kB", Better.LOWER, cycles, LEAK_GOAL_KB)
 
 
 def _size_figures(size: int, samples: EngineSamples, slots: SlotSample) -> Iterator[Figure]:
