@@ -24,6 +24,7 @@ LAG: Final = np.array([0.08, 0.08, 0.15, 0.06, 0.3, 0.3, 0.3, 0.3, 0.4, 0.4, 0.4
 """A joint that falls this far behind is held up by something."""
 ARRIVAL_STEPS: Final = 12
 LEAST_COMMANDS: Final = 3
+SHARP_RAD: Final = 1.2
 RAMP_S: Final = 0.3
 """Time in which full speed is reached."""
 
@@ -74,7 +75,7 @@ def _commands(postures: FloatArray, pace: float) -> FloatArray:
     postures = postures.copy()
     postures[:, YAW] = np.unwrap(postures[:, YAW])
     seconds = (np.abs(np.diff(postures, axis=0)) / (SPEED * pace)).max(axis=1)  # (w - 1,)
-    marks = np.concatenate([[0.0], np.cumsum(seconds)])
+    marks = np.concatenate([[0.0], np.cumsum(seconds * _caution(postures))])
     total = float(marks[-1])
     if total <= 0.0:
         return postures[-1:]
@@ -90,6 +91,20 @@ def _commands(postures: FloatArray, pace: float) -> FloatArray:
     )
     columns = [np.interp(times, marks, postures[:, column]) for column in range(postures.shape[1])]
     return np.stack(columns, axis=1)
+
+
+def _caution(postures: FloatArray) -> FloatArray:
+    """How many times longer than at full speed each piece takes, (w - 1,): the base slows down before and after corners."""
+    steps = np.diff(postures[:, :2], axis=0)
+    length = np.linalg.norm(steps, axis=1)
+    course = np.arctan2(steps[:, 1], steps[:, 0])
+    turn = np.abs(np.remainder(np.diff(course) + np.pi, 2 * np.pi) - np.pi)
+    turn[(length[:-1] < 1e-3) | (length[1:] < 1e-3)] = 0.0
+    sharp = np.minimum(turn / SHARP_RAD, 1.0)
+    slower = np.ones(len(length))
+    slower[:-1] = np.maximum(slower[:-1], 1 + 2 * sharp)
+    slower[1:] = np.maximum(slower[1:], 1 + 2 * sharp)
+    return slower
 
 
 def raised(posture: FloatArray, by_m: float) -> FloatArray:

@@ -14,6 +14,7 @@ import numpy as np
 from embomatrix.sim import physical_arm as arm
 from embomatrix.sim import physical_body as body
 from embomatrix.sim.bullet.robot import Posture
+from embomatrix.sim.physical_floor import Floor
 from embomatrix.sim.physical_motion import Mover
 from embomatrix.sim.physical_reach import Held, Reach
 from embomatrix.sim.physical_space import boxes_around, object_balls
@@ -60,6 +61,7 @@ class Stage:
         self.world = world
         self.dynamic = dynamic
         self.mover = Mover(dynamic, watch)
+        self.floor = Floor(world.engine)
         self.grip: Grip | None = None
 
     def begin(self) -> None:
@@ -96,7 +98,9 @@ class Stage:
         here = self.mover.posture[:3]
         yaw = math.atan2(point[1] - here[1], point[0] - here[0])
         low, high = (point[0] - 1.0, point[1] - 1.0), (point[0] + 1.0, point[1] + 1.0)
-        spots = self.world.navigator.spots(low, high, StandPose(*here.tolist()))
+        grid = self.floor.grid
+        cell = grid.cell(float(here[0]), float(here[1]))
+        spots = grid.free_centers(low, high, grid.label(cell) if cell is not None else 0)
         options = [np.array([[here[0], here[1], yaw]])]
         if len(spots):
             away = np.linalg.norm(spots - point[:2], axis=1)

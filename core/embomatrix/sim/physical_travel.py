@@ -28,11 +28,14 @@ SOMETHING: Final = "something"
 
 
 def travel(stage: Stage, goal: StandPose) -> Refusal | None:
-    """Drive to a pose on the floor by a free path."""
-    here = StandPose(*stage.mover.posture[:3].tolist())
-    corners = stage.world.navigator.path(here, goal)
-    points = np.array([(here.x_m, here.y_m), *corners, (goal.x_m, goal.y_m)])
-    return drive(stage, points, goal.yaw)
+    """Drive to a pose on the floor, or where an open door takes that place beside it."""
+    here = stage.mover.posture[:3]
+    way = stage.floor.way((float(here[0]), float(here[1])), goal)
+    if way is not None:
+        return drive(stage, way[0], way[1].yaw)
+    # Only a door stands in the way, as the planner knows of a path: drive against it, and physics says what gives.
+    corners = stage.world.navigator.path(StandPose(*here.tolist()), goal)
+    return drive(stage, np.array([here[:2], *corners, (goal.x_m, goal.y_m)]), goal.yaw)
 
 
 def drive(stage: Stage, points: FloatArray, yaw: float) -> Refusal | None:

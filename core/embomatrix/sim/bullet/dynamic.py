@@ -58,6 +58,7 @@ class DynamicWorld:
         self._movable = tuple(item.name for item in scene.objects if not item.fixed)
         self._jointed = tuple(item.name for item in scene.objects if item.fixed and item.joints)
         self._held = ""
+        self._hooked = ("", -1)
         self.steps = 0
         """Steps of 1/240 s since the world was built."""
 
@@ -227,10 +228,14 @@ class DynamicWorld:
         self.wake((name,))
         in_link = Pose(tuple(state[4]), tuple(state[5])).inverse().apply(point)
         self.robot.hook(self._bodies[name], link, (0.0, 0.0, TIP_M), in_link)
+        self.robot.brush(self._bodies[name], link, on=False)
+        self._hooked = (name, link)
 
     def unhook(self) -> None:
         """Let go of a leaf."""
         self.robot.let_go()
+        name, link = self._hooked
+        self.robot.brush(self._bodies[name], link, on=True)
 
     def close(self) -> None:
         """Give the client back. The world can't be used afterwards."""

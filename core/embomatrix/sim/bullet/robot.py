@@ -19,9 +19,9 @@ from embomatrix.sim.bullet.robot_model import (
 from embomatrix.world.geometry import Pose
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
-BASE_N: Final = 600.0
+BASE_N: Final = 1000.0
 BASE_NM: Final = 200.0
 LIFT_N: Final = 1500.0
 SHOULDER_NM: Final = 87.0
@@ -152,7 +152,15 @@ class RobotBody:
 
     def collide(self, body: int, links: Sequence[int], *, on: bool) -> None:
         """Let the robot collide with a body's links, or not: what the hand holds does not push against it."""
-        for link in range(-1, self._bullet.getNumJoints(self.body, physicsClientId=self._client)):
+        every = range(-1, self._bullet.getNumJoints(self.body, physicsClientId=self._client))
+        self._filter(body, links, every, on=on)
+
+    def brush(self, body: int, link: int, *, on: bool) -> None:
+        """Let the hand alone collide with one link of a body, or not."""
+        self._filter(body, (link,), sorted(self.tips), on=on)
+
+    def _filter(self, body: int, links: Sequence[int], own: Iterable[int], *, on: bool) -> None:
+        for link in own:
             for other in links:
                 self._bullet.setCollisionFilterPair(
                     self.body, body, link, other, int(on), physicsClientId=self._client

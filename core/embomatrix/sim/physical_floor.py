@@ -1,0 +1,71 @@
+"""Where the base really fits: the floor with doors and drawers as they stand, which cached mode leaves out."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from embomatrix.sim.floor_grid import FloorGrid
+from embomatrix.sim.navigation import FLAT_M
+from embomatrix.sim.physical_space import boxes_around
+from embomatrix.skills.limits import ROBOT
+from embomatrix.world.poses import StandPose
+
+if TYPE_CHECKING:
+    from embomatrix.sim.engine import PhysicsEngine
+    from embomatrix.world.geometry import FloatArray, Vec2
+
+SPREAD_M: Final = 500.0
+ASIDE_M: Final = 0.9
+"""When a place to stand is taken, one this near does."""
+
+
+class Floor:
+    """The free floor in the planning scene's present state."""
+
+    def __init__(self, engine: PhysicsEngine) -> None:
+        self._engine = engine
+        self._seen: bytes = b""
+        self._grid: FloorGrid | None = None
+
+    @property
+    def grid(self) -> FloorGrid:
+        """Made anew when anything has moved."""
+        state = self._engine.state_bytes()
+        if self._grid is None or state != self._seen:
+            everything = boxes_around(self._engine, (-SPREAD_M, -SPREAD_M), (SPREAD_M, SPREAD_M))
+            boxes = everything.without(("floor",))
+            half = np.einsum("mij,mj->mi", np.abs(boxes.rotation), boxes.half)
+            low, high = boxes.centre - half, boxes.centre + half
+            rows = np.column_stack([low[:, :2], high[:, :2], low[:, 2], high[:, 2]])
+            barring = (rows[:, 4] < ROBOT.height_m) & (rows[:, 5] > FLAT_M)
+            self._grid, self._seen = FloorGrid(self._engine.scene, rows[barring]), state
+        return self._grid
+
+    def way(self, start: Vec2, goal: StandPose) -> tuple[FloatArray, StandPose] | None:
+        """Points, (n, 2), from here to a pose or to the free place nearest to it, and that pose; None when there is none."""
+        grid = self.grid
+        first = grid.cell(*start)
+        if first is None:
+            return None
+        end = self._free_near(goal, grid.label(first))
+        last = grid.cell(end.x_m, end.y_m) if end is not None else None
+        corners = grid.path(first, last) if last is not None else None
+        if end is None or corners is None:
+            return None
+        return np.array([start, *corners[1:-1], (end.x_m, end.y_m)]), end
+
+    def _free_near(self, goal: StandPose, label: int) -> StandPose | None:
+        cell = self.grid.cell(goal.x_m, goal.y_m)
+        if cell is not None and self.grid.is_free(goal.x_m, goal.y_m) and self.grid.label(cell) == label:
+            return goal
+        low, high = (goal.x_m - ASIDE_M, goal.y_m - ASIDE_M), (goal.x_m + ASIDE_M, goal.y_m + ASIDE_M)
+        spots = self.grid.free_centers(low, high, label)
+        if not len(spots):
+            return None
+        away = np.hypot(spots[:, 0] - goal.x_m, spots[:, 1] - goal.y_m)
+        number = int(away.argmin())
+        x, y = spots[number].tolist()
+        return StandPose(x, y, goal.yaw) if math.isfinite(away[number]) and away[number] <= ASIDE_M else None
