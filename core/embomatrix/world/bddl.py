@@ -93,7 +93,7 @@ class Problem:
     @property
     def types(self) -> Mapping[str, tuple[str, ...]]:
         """Type to object names, without wildcards: what quantifiers range over."""
-        members: dict[str, tuple[str, ...]] = {type_name: () for type_name in self.objects.values()}
+        members: dict[str, tuple[str, ...]] = dict.fromkeys(self.objects.values(), ())
         for name, type_name in self.objects.items():
             if not name.endswith(WILDCARD):
                 members[type_name] = (*members[type_name], name)
@@ -103,9 +103,7 @@ class Problem:
     def wildcards(self) -> Mapping[str, str]:
         """Wildcards of the problem, and the words for the rooms that they are about."""
         return {
-            item.atom.args[0]: item.atom.args[1]
-            for item in self.init
-            if item.atom.args[0].endswith(WILDCARD)
+            item.atom.args[0]: item.atom.args[1] for item in self.init if item.atom.args[0].endswith(WILDCARD)
         }
 
     def spelt_out(self, members: Mapping[str, tuple[str, ...]]) -> Problem:

@@ -118,6 +118,14 @@ def washed_off(substance: str, *, with_detergent: bool) -> bool:
     return need is not None and (with_detergent or not need or WATER in need)
 
 
+def comes_off(substance: str) -> bool:
+    """Whether any tool, sink or machine takes the substance off."""
+    tools = _table()["removers"]
+    return washed_off(substance, with_detergent=True) or any(
+        removal_need(tool, substance) is not None for tool in tools
+    )
+
+
 def half_of(synset: str) -> str:
     """Kind of the two things that slicing makes of one of this kind, "" where the catalog knows none."""
     return str(_table()["halves"].get(synset, ""))

@@ -100,6 +100,27 @@ class SceneEditor:
             return self._insert(asset, pose, room or where, relation, host)
         raise errors[-1]
 
+    def add_pieces(self, whole: str, category: str, model: str, count: int) -> tuple[str, ...]:
+        """Add absent objects that come in when ``whole`` is sliced, and return their names. Raises PlacementError."""
+        (asset,) = self._choices(category, model)
+        origin = self._known(whole)
+        names: list[str] = []
+        for _ in range(count):
+            self._counts[asset.category] += 1
+            names.append(f"{asset.category}_{self._counts[asset.category]}")
+            self._objects[names[-1]] = SceneObject(
+                name=names[-1],
+                asset_id=asset.asset_id,
+                room=origin.room,
+                pose_world_asset=origin.pose_world_asset,
+                fixed=False,
+                joints=(0.0,) * len(asset.joints),
+                absent=True,
+            )
+        self._assets[asset.asset_id] = asset
+        self._objects[whole] = replace(origin, pieces=(*origin.pieces, *names))
+        return tuple(names)
+
     def set_states(self, name: str, states: frozenset[State]) -> None:
         """Give an object these symbolic states. Raises PlacementError for an unknown name."""
         self._objects[name] = replace(self._known(name), states=frozenset(states))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import math
 import re
@@ -13,6 +12,7 @@ import numpy as np
 
 from embomatrix.factory.editor import PlacementError, SceneEditor
 from embomatrix.factory.importer_binding import AGENT, FLOORS, bind
+from embomatrix.factory.importer_reach import FUTURE, INSOURCE, REAL, pieces_of, profile_for
 from embomatrix.factory.importer_scene import with_robot_in, with_states
 from embomatrix.factory.refusal import Refusal, RefusalReason, RefusedError
 from embomatrix.factory.writer import object_table
@@ -20,7 +20,9 @@ from embomatrix.factory.writer_view import SceneView, is_liftable
 from embomatrix.world.bddl import ROOM_TYPES, Literal, is_room_instance, parse_problem
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.evaluate import atoms_of, objects_of, render, substitute, types_of
-from embomatrix.world.state import Relation, State
+from embomatrix.world.goal import Atom
+from embomatrix.world.state import Relation, State, SubstanceRelation
+from embomatrix.world.substances import MEANINGS, flows_from, is_substance
 from embomatrix.world.task import MAX_TABLE, Task, TaskCategory
 
 if TYPE_CHECKING:
@@ -28,7 +30,8 @@ if TYPE_CHECKING:
     from embomatrix.factory.importer_sources import SourceText
     from embomatrix.world.bddl import Problem
     from embomatrix.world.catalog import Model
-    from embomatrix.world.goal import Atom, Formula
+    from embomatrix.world.geometry import Vec3
+    from embomatrix.world.goal import Formula
     from embomatrix.world.scene import Scene
 
 _ROOM_OR_TEXT: Final = re.compile(
@@ -37,8 +40,9 @@ _ROOM_OR_TEXT: Final = re.compile(
 )
 MODEL_TRIES: Final = 5
 """Models of a type that are tried before it counts as not fitting its place."""
-THERMAL: Final = frozenset({State.COOKED, State.FROZEN, State.HOT})
+KITCHEN: Final = frozenset({State.COOKED, State.FROZEN, State.HOT, State.SLICED, REAL})
 SWITCHED: Final = frozenset({State.OPEN, State.TOGGLED_ON})
+CLEANED: Final = frozenset((*MEANINGS, *SubstanceRelation))
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +77,7 @@ class _Binder:
     ) -> None:
         self._source = source
         self._problem = problem
+        self._substances = {name: synset for name, synset in problem.objects.items() if is_substance(synset)}
         self._base = base
         self._rng = rng
         self._scene_id = f"{base.base}-{_slug(source.name)}-{key}"
@@ -85,10 +90,13 @@ class _Binder:
 
     def imported(self) -> Imported:
         binding = bind(self._problem, self._base, self._rng)
+        self._problem = binding.problem
         editor = SceneEditor(self._base, self._rng)
         names = dict(binding.found)
         for addition in binding.additions:
             names[addition.name] = self._add(editor, addition, names)
+        for whole, halves in pieces_of(self._problem).items():
+            names |= zip(halves, self._add_pieces(editor, names[whole], halves), strict=True)
         start = self._start(names, binding)
         scene = with_states(with_robot_in(editor.freeze(self._scene_id), binding.robot_room), start)
         return self._task(scene, names, binding, start)
@@ -105,6 +113,22 @@ class _Binder:
             RefusalReason.DOES_NOT_FIT,
             f"{addition.name!r} has no place {addition.relation or 'on the floor of'} {host}: {reason}",
         )
+
+    def _add_pieces(self, editor: SceneEditor, whole: str, halves: tuple[str, ...]) -> tuple[str, ...]:
+        """The halves of a thing, of the model whose volume is nearest to half of the whole's."""
+        catalog = Catalog.load()
+        half_m3 = math.prod(self._size_of(editor, whole)) / 2
+        models = [
+            model
+            for category in catalog.categories_of(self._problem.objects[halves[0]])
+            for model in catalog.models_of(category)
+        ]
+        model = min(models, key=lambda model: abs(math.prod(model.size_m) - half_m3))
+        return editor.add_pieces(whole, model.category, model.model_id, len(halves))
+
+    def _size_of(self, editor: SceneEditor, name: str) -> Vec3:
+        category, _, model = editor.objects[name].asset_id.rpartition("-")
+        return Catalog.load().model(category, model).size_m
 
     def _models(self, addition: Addition) -> list[Model]:
         """Models of the type: liftable ones first; large ones for what must hold others, else small ones."""
@@ -123,10 +147,10 @@ class _Binder:
     ) -> Imported:
         view = SceneView(scene)
         types = {
-            type_name: tuple(names[name] for name in self._problem.types[type_name])
+            type_name: tuple({**names, **self._substances}[name] for name in self._problem.types[type_name])
             for type_name in sorted(types_of(self._problem.goal))
         }
-        goal = substitute(self._problem.goal, {**names, **binding.rooms})
+        goal = substitute(self._problem.goal, {**names, **self._substances, **binding.rooms})
         about = objects_of(goal, types)
         table = object_table(view, tuple(dict.fromkeys(names.values())), self._rng)
         missing = about - set(table)
@@ -145,27 +169,44 @@ class _Binder:
             table=table,
             types=types,
             source=self._source.source,
+            profile=profile_for(goal),
         )
         rooms = tuple(sorted({view.room(name) for name in about}))
         return Imported(scene, task, start, tuple(names.values()), rooms, signature_of(goal, view))
 
     def _start(self, names: dict[str, str], binding: Binding) -> tuple[Literal, ...]:
-        """``:init`` in the scene's names, without floors, the robot and the absence of relations and heat."""
+        """``:init`` in the scene's names, without floors, the robot and the absence of relations, heat and substances.
+
+        What a thing is the source of, a shaker of its salt, it contains; water flows out of a sink by itself.
+        """
         skipped = {
             name
             for name, type_name in self._problem.objects.items()
             if type_name == AGENT or type_name in FLOORS
         }
+        scene_names = {**names, **self._substances, **binding.rooms}
         return tuple(
-            Literal(_renamed(literal, {**names, **binding.rooms}), literal.positive)
+            Literal(_renamed(literal, scene_names), literal.positive)
             for literal in self._problem.init
             if not skipped & set(literal.atom.args)
             and (literal.positive or literal.atom.predicate in SWITCHED)
+            and not self._is_understood(literal.atom)
         )
+
+    def _is_understood(self, atom: Atom) -> bool:
+        """Whether the scene need not be told: a substance is to come, or flows out of what it is said to come from."""
+        type_name = self._problem.objects.get(atom.args[0], "")
+        if atom.predicate == INSOURCE:
+            return self._substances.get(atom.args[1], "") in flows_from(type_name)
+        return atom.predicate in (REAL, FUTURE) and is_substance(type_name)
 
 
 def _renamed(literal: Literal, names: dict[str, str]) -> Atom:
-    return dataclasses.replace(literal.atom, args=tuple(names.get(arg, arg) for arg in literal.atom.args))
+    predicate = literal.atom.predicate
+    return Atom(
+        SubstanceRelation.CONTAINS.value if predicate == INSOURCE else predicate,
+        tuple(names.get(arg, arg) for arg in literal.atom.args),
+    )
 
 
 def instruction_of(source: SourceText, problem: Problem) -> str:
@@ -185,8 +226,8 @@ def category_of(goal: Formula) -> TaskCategory:
     """Which of the paper's four kinds a goal is."""
     predicates = {atom.predicate for atom in atoms_of(goal)}
     moves = bool(predicates & set(Relation))
-    switches = bool(predicates & SWITCHED)
-    if predicates & THERMAL:
+    switches = bool(predicates & (SWITCHED | CLEANED))
+    if predicates & KITCHEN:
         outside = {Relation.ONTOP, Relation.UNDER, Relation.NEXTTO, State.OPEN} & predicates
         return TaskCategory.COMPOUND if outside else TaskCategory.KITCHEN_OPERATION
     if moves and switches:

@@ -1,7 +1,8 @@
 """Binding: the objects of a BDDL problem are found in a base scene, or refused for a reason.
 
 ``inroom`` names the scene's own objects; they are found by backtracking over room instances and categories. What the
-problem puts on, in, under or beside something is added later by the editor.
+problem puts on, in, under or beside something is added later by the editor. Substances have no place: they are what things
+are covered, filled or soaked with. Objects that are still to come are the halves of things that can be sliced.
 """
 
 from __future__ import annotations
@@ -11,12 +12,14 @@ from collections import defaultdict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.factory.importer_reach import FUTURE, HELD, INSOURCE, Horizon, pieces_of
 from embomatrix.factory.refusal import RefusalReason, RefusedError
 from embomatrix.factory.writer_view import SceneView, is_liftable
 from embomatrix.world.bddl import is_room_instance
 from embomatrix.world.catalog import Catalog, CatalogError
-from embomatrix.world.evaluate import atoms_of, types_of
+from embomatrix.world.evaluate import atoms_of, render, types_of
 from embomatrix.world.state import Relation, State
+from embomatrix.world.substances import is_substance
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -31,15 +34,6 @@ FLOORS: Final = frozenset({"floor.n.01"})
 AGENT: Final = "agent.n.01"
 PLACING: Final = (Relation.INSIDE, Relation.ONTOP, Relation.UNDER, Relation.NEXTTO)
 """Relations by which ``:init`` places an object, the most telling first."""
-GOAL_PREDICATES: Final = frozenset(
-    {relation.value for relation in Relation}
-    | {state.value for state in (State.OPEN, State.TOGGLED_ON, State.COOKED, State.FROZEN, State.HOT)}
-)
-"""What the thirteen skills can bring about."""
-INIT_PREDICATES: Final = frozenset(
-    {relation.value for relation in Relation} | {state.value for state in State}
-)
-"""What a scene can hold at the start."""
 MAX_STEPS: Final = 20_000
 """Assignments that are looked at before a scene counts as lacking the objects."""
 
@@ -57,8 +51,12 @@ class Addition:
 
 @dataclass(frozen=True, slots=True)
 class Binding:
-    """``found`` maps objects of the problem to scene objects, ``floors`` to rooms; ``additions`` are in order of need."""
+    """``found`` maps objects of the problem to scene objects, ``floors`` to rooms; ``additions`` are in order of need.
 
+    ``problem`` is the one that was bound, with its wildcards spelt out.
+    """
+
+    problem: Problem
     found: Mapping[str, str]
     floors: Mapping[str, str]
     additions: tuple[Addition, ...]
@@ -69,8 +67,7 @@ class Binding:
 
 def bind(problem: Problem, scene: Scene, rng: np.random.Generator) -> Binding:
     """Find the problem's objects in the scene. Raises RefusedError with the first thing that can't be bound."""
-    _check_types(problem)
-    _check_predicates(problem)
+    check_expressible(problem)
     inroom = {
         item.atom.args[0]: item.atom.args[1]
         for item in problem.init
@@ -81,13 +78,43 @@ def bind(problem: Problem, scene: Scene, rng: np.random.Generator) -> Binding:
     fixtures = [
         name
         for name in inroom
-        if problem.objects[name] not in FLOORS and problem.objects[name] != AGENT and name not in placed
+        if problem.objects[name] not in FLOORS
+        and problem.objects[name] != AGENT
+        and name not in placed
+        and name not in problem.wildcards
     ]
     rooms, found = _search(problem, view, inroom, fixtures, rng)
-    floors = {name: rooms[room] for name, room in inroom.items() if problem.objects[name] in FLOORS}
+    problem = _spelt_out(problem, view, rooms, found)
+    floors = {name: rooms[room] for name, room in inroom.items() if problem.objects.get(name) in FLOORS}
     loose = {name: rooms[inroom[name]] for name in fixtures if name not in found}
     additions = _in_order(problem, placed, found, floors, loose)
-    return Binding(found, floors, additions, rooms, _robot_room(problem, placed, floors, scene))
+    return Binding(problem, found, floors, additions, rooms, _robot_room(problem, placed, floors, scene))
+
+
+def check_expressible(problem: Problem) -> None:
+    """Raise RefusedError for what no scene could hold and no skill could reach, whatever the scene."""
+    _check_types(problem)
+    _check_goal(problem)
+    _check_start(problem)
+
+
+def _spelt_out(problem: Problem, view: SceneView, rooms: Mapping[str, str], found: dict[str, str]) -> Problem:
+    """The problem with wildcards replaced by all further objects of the type in the room, which are added to ``found``."""
+    catalog = Catalog.load()
+    members: dict[str, tuple[str, ...]] = {}
+    for wildcard, word in problem.wildcards.items():
+        type_name = problem.objects[wildcard]
+        taken = set(found.values())
+        categories = () if type_name in FLOORS else catalog.categories_of(type_name)
+        others = [
+            name
+            for name in view.in_room.get(rooms.get(word, ""), ())
+            if view.category(name) in categories and name not in taken
+        ]
+        declared = len(problem.types[type_name])
+        members[wildcard] = tuple(f"{type_name}_{declared + 1 + n}" for n in range(len(others)))
+        found |= zip(members[wildcard], others, strict=True)
+    return problem.spelt_out(members)
 
 
 def _check_types(problem: Problem) -> None:
@@ -100,11 +127,7 @@ def _check_types(problem: Problem) -> None:
                 RefusalReason.UNKNOWN_TYPE,
                 f"type {type_name!r} of {name!r} is in no catalog{_close_synsets(type_name)}",
             )
-        if "substance" in catalog.abilities_of(type_name):
-            raise RefusedError(
-                RefusalReason.SUBSTANCE, f"{name!r} is a substance: the world holds solid objects only"
-            )
-        if not catalog.categories_of(type_name):
+        if not is_substance(type_name) and not catalog.categories_of(type_name):
             raise RefusedError(RefusalReason.UNKNOWN_TYPE, f"no category has a model of type {type_name!r}")
 
 
@@ -115,27 +138,50 @@ def _close_synsets(type_name: str) -> str:
     return f": did you mean {', '.join(close)}?" if close else ""
 
 
-def _check_predicates(problem: Problem) -> None:
+def _check_goal(problem: Problem) -> None:
+    obstacle = Horizon(problem).obstacle(problem.goal)
+    if obstacle is not None:
+        solid = not any(
+            is_substance(_type(problem, arg)) for atom in atoms_of(obstacle) for arg in atom.args[:1]
+        )
+        raise RefusedError(
+            RefusalReason.INEXPRESSIBLE if solid else RefusalReason.SUBSTANCE,
+            f"the goal asks for {render(obstacle)}, which no skill brings about",
+        )
     for atom in atoms_of(problem.goal):
-        if atom.predicate not in GOAL_PREDICATES:
-            raise RefusedError(
-                RefusalReason.INEXPRESSIBLE,
-                f"the goal asks for {atom.predicate!r}, which no skill brings about",
-            )
         _check_goal_args(problem, atom)
     for type_name in types_of(problem.goal):
         if type_name in FLOORS:
             raise RefusedError(
                 RefusalReason.FLOOR_IN_GOAL, "the goal ranges over floors, which are no objects"
             )
+
+
+def _check_start(problem: Problem) -> None:
+    pieces = {half for halves in pieces_of(problem).values() for half in halves}
     for item in problem.init:
-        if item.positive and item.atom.predicate not in INIT_PREDICATES:
+        predicate, args = item.atom.predicate, item.atom.args
+        if item.positive and predicate not in HELD | {INSOURCE}:
             raise RefusedError(
                 RefusalReason.INEXPRESSIBLE,
-                f"the start asks for {item.atom.predicate!r}, which the world does not hold",
+                f"the start asks for {predicate!r}, which the world does not hold",
             )
-        for arg in item.atom.args[: 1 if item.atom.predicate == Relation.INROOM else 2]:
+        if predicate in set(Relation) and any(is_substance(_type(problem, arg)) for arg in args):
+            raise RefusedError(
+                RefusalReason.SUBSTANCE, f"the start asks for {render(item.atom)}: a substance has no place"
+            )
+        if predicate == FUTURE and args[0] not in pieces and not is_substance(_type(problem, args[0])):
+            raise RefusedError(
+                RefusalReason.INEXPRESSIBLE,
+                f"{args[0]!r} is to come, and no skill makes it: only halves are made",
+            )
+        for arg in args[: 1 if predicate == Relation.INROOM else 2]:
             _check_no_room(problem, arg)
+
+
+def _type(problem: Problem, arg: str) -> str:
+    """Type of an object, or of a bound variable that is called by it, ``?water.n.06``."""
+    return problem.objects.get(arg, arg.lstrip("?"))
 
 
 def _check_goal_args(problem: Problem, atom: Atom) -> None:
@@ -303,10 +349,15 @@ def _in_order(
     """Additions such that each host is there before its guest."""
     additions: list[Addition] = []
     ready = {*found, *floors}
+    absent = {half for halves in pieces_of(problem).values() for half in halves}
     waiting = [
         name
         for name, type_name in problem.objects.items()
-        if name not in ready and type_name != AGENT and type_name not in FLOORS
+        if name not in ready
+        and name not in absent
+        and type_name != AGENT
+        and type_name not in FLOORS
+        and not is_substance(type_name)
     ]
     while waiting:
         name = next(

@@ -1,4 +1,4 @@
-"""How a scene starts: where the robot stands, what is open, on, hot or frozen."""
+"""How a scene starts: where the robot stands, what is open, on, hot or frozen, and what is covered or filled with what."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from embomatrix.factory.refusal import RefusalReason, RefusedError
 from embomatrix.factory.scene_floor import ReachableFloor
 from embomatrix.world.scene import RobotStart
-from embomatrix.world.state import State
+from embomatrix.world.state import State, SubstanceFact, SubstanceRelation
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -34,11 +34,17 @@ def with_robot_in(scene: Scene, room_name: str) -> Scene:
 
 
 def with_states(scene: Scene, literals: Iterable[Literal]) -> Scene:
-    """The scene with doors and symbolic states as the literals say. Relations are passed over."""
+    """The scene with doors, symbolic states and substances as the literals say. Relations are passed over."""
     shares: dict[str, float] = {}
+    facts: dict[str, set[SubstanceFact]] = {}
+    denied: dict[str, set[SubstanceFact]] = {}
     gained: dict[str, set[State]] = {}
     lost: dict[str, set[State]] = {}
     for literal in literals:
+        if literal.atom.predicate in set(SubstanceRelation):
+            name, substance = literal.atom.args
+            fact = SubstanceFact(SubstanceRelation(literal.atom.predicate), substance)
+            (facts if literal.positive else denied).setdefault(name, set()).add(fact)
         if literal.atom.predicate not in set(State):
             continue
         name, state = literal.atom.args[0], State(literal.atom.predicate)
@@ -52,8 +58,7 @@ def with_states(scene: Scene, literals: Iterable[Literal]) -> Scene:
         if item.name in shares:
             joints = (shares[item.name],) * len(scene.assets[item.asset_id].joints)
         states = (item.states | gained.get(item.name, set())) - lost.get(item.name, set())
-        if joints == item.joints and states == item.states:
-            return item
-        return dataclasses.replace(item, joints=joints, states=states)
+        substances = (item.substances | facts.get(item.name, set())) - denied.get(item.name, set())
+        return dataclasses.replace(item, joints=joints, states=states, substances=substances)
 
     return dataclasses.replace(scene, objects=tuple(changed(item) for item in scene.objects))

@@ -72,6 +72,46 @@ def test_problem_is_read_into_values() -> None:
     )
 
 
+WILD = TIDY.replace("basket.n.01_1 - basket", "basket.n.01_1 basket.n.01_* - basket").replace(
+    "(inroom basket.n.01_1 living_room)",
+    "(inroom basket.n.01_1 living_room) (inroom basket.n.01_* living_room)",
+)
+
+
+def test_wildcard_stands_for_objects_that_are_named_once_the_room_is_known() -> None:
+    problem = parse_problem(WILD)
+    assert problem.wildcards == {"basket.n.01_*": "living_room"}
+    assert problem.types["basket.n.01"] == ("basket.n.01_1",)
+    spelt = problem.spelt_out({"basket.n.01_*": ("basket.n.01_2", "basket.n.01_3")})
+    assert spelt.types["basket.n.01"] == ("basket.n.01_1", "basket.n.01_2", "basket.n.01_3")
+    assert [item.atom.args for item in spelt.init[-3:]] == [
+        (f"basket.n.01_{number}", "living_room") for number in (1, 2, 3)
+    ]
+    assert not spelt.wildcards
+    assert problem.spelt_out({"basket.n.01_*": ()}) == parse_problem(TIDY)
+    assert parse_problem(render_problem(problem)) == problem
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("(not (OnTop apple.n.01_1", "(not (OnTop basket.n.01_*"),
+        ("(inroom basket.n.01_*", "(ontop basket.n.01_*"),
+    ],
+)
+def test_wildcard_is_only_ever_in_a_room(old: str, new: str) -> None:
+    with pytest.raises(BddlError, match="wildcard"):
+        parse_problem(WILD.replace(old, new).replace("_* living_room", "_* floor.n.01_1"))
+
+
+def test_substance_is_called_by_its_synset_where_one_can_stand() -> None:
+    formula = parse_formula("(not (covered x dust.n.01))", {"x": "plate"})
+    assert formula == Not(Atom("covered", ("x", "dust.n.01")))
+    for text in ("(covered x dusk.n.01)", "(ontop x dust.n.01)", "(covered dust.n.01 dust.n.01)"):
+        with pytest.raises(BddlError, match="not declared"):
+            parse_formula(text, {"x": "plate"})
+
+
 def test_goal_of_several_expressions_is_their_conjunction() -> None:
     text = TIDY.replace("(:goal\n        (and", "(:goal (open basket.n.01_1) (and")
     goal = parse_problem(text).goal
