@@ -1,29 +1,46 @@
 """Bundles: a scene, its tasks and its pose cache as one compressed, content-addressed file.
 
 The digest is taken of the compressed bytes, so a receiver checks it before it decompresses anything; the size and the
-ratio of decompression are bounded, so a hostile bundle costs nothing but its transfer.
+ratio of decompression are bounded, so a hostile bundle costs nothing but its transfer. Compressed is a head, JSON that says
+how everything hangs together, and arrays that hold the numbers: see ``tables``.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import math
+import struct
 import zlib
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
 
 from embomatrix.world.codec import scene_from_json, scene_to_json
 from embomatrix.world.codec_task import poses_from_json, poses_to_json, task_from_json, task_to_json
 from embomatrix.world.field import Field, SceneInvalidError
 from embomatrix.world.poses import PoseCache
+from embomatrix.world.tables import Tables, TableWriter
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+    from pathlib import Path
+
+    from numpy.typing import NDArray
 
     from embomatrix.world.scene import Scene
     from embomatrix.world.task import Task
 
-FORMAT: Final = 1
+    Arrays = Mapping[str, NDArray[np.generic]]
+
+FORMAT: Final = 2
+MAGIC: Final = b"EMBX"
+_HEAD: Final = struct.Struct("<4sII")
+"""Magic, format, bytes of JSON."""
+_ALIGNMENT: Final = 8
+_DTYPES: Final[Mapping[str, np.dtype[Any]]] = {name: np.dtype(name) for name in ("<f8", "<i4", "|u1")}
+_PREPARED: Final = "prepared."
 _CHUNK: Final = 1 << 20
 
 
@@ -37,16 +54,21 @@ class BundleLimits:
 
     compressed_bytes: int = 8 * 1024 * 1024
     ratio: float = 100.0
-    """Decompressed bytes for each compressed byte; JSON of scenes needs about ten."""
+    """Decompressed bytes for each compressed byte; scenes need about ten."""
 
 
 @dataclass(frozen=True, slots=True)
 class Bundle:
-    """What a worker needs to execute plans in a scene. ``tasks`` maps a task's id to the task."""
+    """What a worker needs to execute plans in a scene. ``tasks`` maps a task's id to the task.
+
+    ``prepared`` are arrays that the simulator derived from the scene beforehand, by name. They are its own affair: what it
+    does not know it leaves alone, and what is missing it derives again.
+    """
 
     scene: Scene
     tasks: Mapping[str, Task]
     poses: PoseCache = field(default_factory=PoseCache)
+    prepared: Arrays = field(default_factory=dict, compare=False)
 
 
 DEFAULT_LIMITS: Final = BundleLimits()
@@ -55,14 +77,22 @@ DEFAULT_LIMITS: Final = BundleLimits()
 def encode_bundle(bundle: Bundle) -> bytes:
     """Compressed bytes: equal bundles give equal bytes. Raises BundleError for a task of another scene."""
     _check_tasks(bundle)
-    value = {
-        "format": FORMAT,
-        "scene": scene_to_json(bundle.scene),
+    tables = TableWriter()
+    value: dict[str, Any] = {
+        "scene": scene_to_json(bundle.scene, tables),
         "tasks": [task_to_json(bundle.tasks[task_id]) for task_id in sorted(bundle.tasks)],
-        "poses": poses_to_json(bundle.poses),
+        "poses": poses_to_json(bundle.poses, tables),
     }
-    text = json.dumps(value, separators=(",", ":"), allow_nan=False, ensure_ascii=True)
-    return zlib.compress(text.encode("ascii"), level=6)
+    prepared = {f"{_PREPARED}{name}": array for name, array in sorted(bundle.prepared.items())}
+    arrays = {name: _plain(name, array) for name, array in (tables.arrays() | prepared).items()}
+    value["arrays"] = {name: [array.dtype.str, *array.shape] for name, array in arrays.items()}
+    text = json.dumps(value, separators=(",", ":"), allow_nan=False, ensure_ascii=True).encode("ascii")
+    text += b" " * (-(_HEAD.size + len(text)) % _ALIGNMENT)
+    parts = [_HEAD.pack(MAGIC, FORMAT, len(text)), text]
+    for array in arrays.values():
+        data = array.tobytes()
+        parts += [data, bytes(-len(data) % _ALIGNMENT)]
+    return zlib.compress(b"".join(parts), level=6)
 
 
 def bundle_digest(data: bytes) -> str:
@@ -70,30 +100,92 @@ def bundle_digest(data: bytes) -> str:
     return f"sha256:{hashlib.sha256(data).hexdigest()}"
 
 
+def read_bundle(path: Path, *, digest: str = "", limits: BundleLimits = DEFAULT_LIMITS) -> Bundle:
+    """The bundle in a file, whose size is looked at before it is read. Raises BundleError, or OSError."""
+    with path.open("rb") as file:
+        data = file.read(limits.compressed_bytes + 1)
+    return decode_bundle(data, digest=digest, limits=limits)
+
+
 def decode_bundle(data: bytes, *, digest: str = "", limits: BundleLimits = DEFAULT_LIMITS) -> Bundle:
     """The bundle, checked in every part. ``digest`` is compared first unless it is empty. Raises BundleError."""
     if len(data) > limits.compressed_bytes:
-        raise BundleError(f"the bundle has {len(data)} bytes: expected at most {limits.compressed_bytes}")
+        raise BundleError(
+            f"the bundle has over {limits.compressed_bytes:,} bytes: expected at most {limits.compressed_bytes:,}"
+        )
     found = bundle_digest(data)
     if digest and found != digest:
         raise BundleError(f"the bundle's digest is {found}, expected {digest}")
     try:
-        value = json.loads(_decompress(data, limits), parse_constant=_refuse_constant)
-        fields = Field(value, "bundle").record("format", "scene", "tasks", "poses")
-        if fields["format"].integer() != FORMAT:
-            fields["format"].fail(f"found {fields['format'].value}: this version reads {FORMAT}")
-        tasks = [task_from_json(item.value) for item in fields["tasks"].items()]
-        bundle = Bundle(
-            scene=scene_from_json(fields["scene"].value),
-            tasks={task.task_id: task for task in tasks},
-            poses=poses_from_json(fields["poses"].value),
-        )
+        bundle = _from_content(_decompress(data, limits))
     except SceneInvalidError as error:
         raise BundleError(f"bundle {found}: {error}") from error
     except (ValueError, RecursionError) as error:
-        raise BundleError(f"bundle {found} is no JSON text: {error}") from error
+        raise BundleError(f"bundle {found} can't be read: {error}") from error
     _check_tasks(bundle)
     return bundle
+
+
+def _from_content(content: bytes) -> Bundle:
+    """Raises ValueError for what is no bundle, SceneInvalidError for one that breaks a rule."""
+    if len(content) < _HEAD.size or content[:4] != MAGIC:
+        raise ValueError(
+            f"it begins with {content[:4]!r}, expected {MAGIC!r}: build the dataset anew with this version"
+        )
+    _, version, text_bytes = _HEAD.unpack_from(content)
+    if version != FORMAT:
+        raise ValueError(
+            f"it has format {version}, this version reads {FORMAT}: build the dataset anew with it"
+        )
+    end = _HEAD.size + text_bytes
+    if end > len(content) or end % _ALIGNMENT:
+        raise ValueError(f"its JSON has {text_bytes} bytes, {len(content)} are there in all")
+    value = json.loads(content[_HEAD.size : end], parse_constant=_refuse_constant)
+    fields = Field(value, "bundle").record("scene", "tasks", "poses", "arrays")
+    arrays = _arrays(fields["arrays"], memoryview(content)[end:])
+    prepared = {
+        name.removeprefix(_PREPARED): arrays.pop(name) for name in list(arrays) if name.startswith(_PREPARED)
+    }
+    tables = Tables(arrays)
+    tasks = [task_from_json(item.value) for item in fields["tasks"].items()]
+    return Bundle(
+        scene=scene_from_json(fields["scene"].value, tables),
+        tasks={task.task_id: task for task in tasks},
+        poses=poses_from_json(fields["poses"].value, tables),
+        prepared=prepared,
+    )
+
+
+def _arrays(field: Field, data: memoryview) -> dict[str, NDArray[np.generic]]:
+    """Read-only arrays by name, as the field describes them, one after another."""
+    arrays: dict[str, NDArray[np.generic]] = {}
+    first = 0
+    for name, described in field.entries():
+        kind, *extents = described.items(at_most=5)
+        dtype = _DTYPES.get(kind.text())
+        if dtype is None:
+            kind.fail(f"found {kind.text()[:20]!r}: expected one of {', '.join(_DTYPES)}")
+        shape = tuple(item.integer() for item in extents)
+        if not shape or min(shape) < 0:
+            described.fail(f"found the shape {shape}: expected numbers from 0")
+        count = math.prod(shape)
+        size = count * dtype.itemsize
+        if size > len(data) - first:
+            described.fail(f"asks for {size} bytes: there are {len(data) - first} more")
+        arrays[name] = np.frombuffer(data, dtype, count, first).reshape(shape)
+        first += size + -size % _ALIGNMENT
+    if first != len(data):
+        field.fail(f"describes {first} bytes: there are {len(data)}")
+    return arrays
+
+
+def _plain(name: str, array: NDArray[np.generic]) -> NDArray[np.generic]:
+    """The array in a layout that every machine reads. Raises BundleError for one of another type."""
+    kinds = {"f": "<f8", "i": "<i4", "u": "|u1", "b": "|u1"}
+    kind = kinds.get(array.dtype.kind, "")
+    if not kind or array.dtype.itemsize > _DTYPES[kind].itemsize or not array.ndim:
+        raise BundleError(f"array {name!r} holds {array.dtype}: expected float64, int32, uint8 or bool")
+    return np.ascontiguousarray(array, dtype=_DTYPES[kind])
 
 
 def _check_tasks(bundle: Bundle) -> None:

@@ -26,15 +26,18 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from embomatrix.world.asset import Asset
+    from embomatrix.world.tables import Tables, TableWriter
 
     Json = dict[str, Any]
 
 MAX_OBJECTS: Final = 5_000
-MAX_VERTICES: Final = 512
 
 
-def scene_to_json(scene: Scene) -> Json:
-    """The scene with the assets that its objects use, as JSON values in a fixed order."""
+def scene_to_json(scene: Scene, tables: TableWriter | None = None) -> Json:
+    """The scene with the assets that its objects use, as JSON values in a fixed order.
+
+    Poses and parts are rows of ``tables`` where they are given.
+    """
     value: Json = {
         "scene_id": scene.scene_id,
         "base": scene.base,
@@ -43,10 +46,10 @@ def scene_to_json(scene: Scene) -> Json:
             {"name": room.name, "type": room.type, "low_m": [*room.low_m], "high_m": [*room.high_m]}
             for room in scene.rooms
         ],
-        "walls": [part_to_json(part) for part in scene.walls],
+        "walls": [part_to_json(part, tables) for part in scene.walls],
         "doorways": [_doorway_to_json(doorway) for doorway in scene.doorways],
-        "objects": [_object_to_json(item) for item in scene.objects],
-        "assets": {key: asset_to_json(asset) for key, asset in sorted(scene.assets.items())},
+        "objects": [_object_to_json(item, tables) for item in scene.objects],
+        "assets": {key: asset_to_json(asset, tables) for key, asset in sorted(scene.assets.items())},
         "robot": {
             "x_m": scene.robot.x_m,
             "y_m": scene.robot.y_m,
@@ -60,9 +63,9 @@ def scene_to_json(scene: Scene) -> Json:
     return value
 
 
-def scene_from_json(value: object) -> Scene:
-    """A valid scene. Raises SceneInvalidError naming the field that is wrong."""
-    fields = Field(value, "scene").record(
+def scene_from_json(value: object, tables: Tables | None = None) -> Scene:
+    """A valid scene; ``tables`` hold the rows that it was written with. Raises SceneInvalidError naming the wrong field."""
+    fields = Field(value, "scene", tables=tables).record(
         "scene_id",
         "base",
         "seed",
@@ -172,12 +175,12 @@ def _wall_between(field: Field, fields: Mapping[str, Field]) -> tuple[tuple[str,
     return (rooms[0], rooms[1]), along
 
 
-def _object_to_json(item: SceneObject) -> Json:
+def _object_to_json(item: SceneObject, tables: TableWriter | None) -> Json:
     value: Json = {
         "name": item.name,
         "asset_id": item.asset_id,
         "room": item.room,
-        "pose": pose_to_json(item.pose_world_asset),
+        "pose": pose_to_json(item.pose_world_asset, tables),
         "fixed": item.fixed,
         "joints": [*item.joints],
         "host": item.host,
@@ -252,7 +255,7 @@ def _check_references(scene: Scene) -> None:
     check_unique(Field(None, "scene.objects"), names, "object")
     check_unique(
         Field(None, "scene.objects"),
-        [str(item.pose_world_asset.position_m) for item in scene.objects],
+        [str(item.pose_world_asset.position_m) for item in scene.objects if not item.absent],
         "position",
     )
     absent = {item.name for item in scene.objects if item.absent}

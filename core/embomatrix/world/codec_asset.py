@@ -8,29 +8,28 @@ from typing import TYPE_CHECKING, Any, Final
 from embomatrix.world.asset import Asset, Credit, Interior, Joint, JointKind, Link, SupportSurface
 from embomatrix.world.field import Field
 from embomatrix.world.geometry import Part, Pose, Shape
+from embomatrix.world.tables import MAX_COORDINATE_M, MAX_VERTICES, MIN_EXTENT_M, QUAT_TOLERANCE
 
 if TYPE_CHECKING:
     from embomatrix.world.geometry import Vec3
+    from embomatrix.world.tables import TableWriter
 
     Json = dict[str, Any]
 
 MAX_PARTS: Final = 16
 """Parts of a link: Bullet drops the rest of a compound in silence."""
 MAX_LINKS: Final = 100
-MAX_VERTICES: Final = 512
-MIN_EXTENT_M: Final = 1e-3
-MAX_COORDINATE_M: Final = 1e4
-QUAT_TOLERANCE: Final = 1e-4
 
 
-def asset_to_json(asset: Asset) -> Json:
+def asset_to_json(asset: Asset, tables: TableWriter | None = None) -> Json:
+    """JSON values. Parts are rows of ``tables`` where they are given."""
     value: Json = {
         "asset_id": asset.asset_id,
         "category": asset.category,
         "synset": asset.synset,
         "size_m": [*asset.size_m],
         "mass_kg": asset.mass_kg,
-        "links": [_link_to_json(link) for link in asset.links],
+        "links": [_link_to_json(link, tables) for link in asset.links],
         "supports": [
             {
                 "name": surface.name,
@@ -65,13 +64,17 @@ def asset_from_json(value: object) -> Asset:
     return asset_from_field(Field(value, "asset"))
 
 
-def pose_to_json(pose: Pose) -> list[float]:
-    """x, y, z in metres and the quaternion x, y, z, w."""
+def pose_to_json(pose: Pose, tables: TableWriter | None = None) -> list[float] | int:
+    """x, y, z in metres and the quaternion x, y, z, w; or the row of ``tables`` that holds them."""
+    if tables is not None:
+        return tables.pose(pose)
     return [*map(float, pose.position_m), *map(float, pose.quat_xyzw)]
 
 
 def pose_from_field(field: Field) -> Pose:
     """A pose with a unit quaternion and a position within reason."""
+    if field.tables is not None:
+        return field.tables.pose(field)
     x, y, z, qx, qy, qz, qw = field.numbers(7)
     norm = math.sqrt(qx * qx + qy * qy + qz * qz + qw * qw)
     if abs(norm - 1.0) > QUAT_TOLERANCE:
@@ -83,7 +86,10 @@ def pose_from_field(field: Field) -> Pose:
     return Pose((x, y, z), (qx, qy, qz, qw))
 
 
-def part_to_json(part: Part) -> Json:
+def part_to_json(part: Part, tables: TableWriter | None = None) -> Json | int:
+    """JSON values, or the row of ``tables`` that holds the part."""
+    if tables is not None:
+        return tables.part(part)
     value: Json = {"shape": part.shape.value, "pose": pose_to_json(part.pose), "size_m": [*part.size_m]}
     if part.vertices_m:
         value["vertices_m"] = [[*vertex] for vertex in part.vertices_m]
@@ -91,6 +97,9 @@ def part_to_json(part: Part) -> Json:
 
 
 def part_from_field(field: Field) -> Part:
+    """A part with extents above 1 mm, and vertices where it is a hull."""
+    if field.tables is not None:
+        return field.tables.part(field)
     fields = field.record("shape", "pose", "size_m", optional=("vertices_m",))
     shape = fields["shape"].member(Shape)
     vertices: tuple[Vec3, ...] = ()
@@ -110,8 +119,8 @@ def _extent(field: Field) -> Vec3:
     return size
 
 
-def _link_to_json(link: Link) -> Json:
-    value: Json = {"name": link.name, "parts": [part_to_json(part) for part in link.parts]}
+def _link_to_json(link: Link, tables: TableWriter | None) -> Json:
+    value: Json = {"name": link.name, "parts": [part_to_json(part, tables) for part in link.parts]}
     if link.joint is not None:
         value["joint"] = {
             "kind": link.joint.kind.value,

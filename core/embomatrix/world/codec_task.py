@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from embomatrix.world.goal import Formula
+    from embomatrix.world.tables import Tables, TableWriter
 
     Json = dict[str, Any]
 
@@ -80,27 +81,25 @@ def _goal(field: Field, table: tuple[str, ...], types: Mapping[str, tuple[str, .
     return goal
 
 
-def poses_to_json(poses: PoseCache) -> Json:
+def poses_to_json(poses: PoseCache, tables: TableWriter | None = None) -> Json:
+    """JSON values. Poses are rows of ``tables`` where they are given."""
     return {
         "placements": [
             {
                 "asset_id": key.asset_id,
                 "support_asset_id": key.support_asset_id,
                 "relation": key.relation.value,
-                "poses": [pose_to_json(pose) for pose in found],
+                "poses": [pose_to_json(pose, tables) for pose in found],
             }
             for key, found in poses.placements.items()
         ],
-        "stands": {
-            name: [[float(stand.x_m), float(stand.y_m), float(stand.yaw)] for stand in stands]
-            for name, stands in poses.stands.items()
-        },
+        "stands": {name: _stands_to_json(stands, tables) for name, stands in poses.stands.items()},
     }
 
 
-def poses_from_json(value: object) -> PoseCache:
-    """A pose cache. Raises SceneInvalidError."""
-    fields = Field(value, "poses").record("placements", "stands")
+def poses_from_json(value: object, tables: Tables | None = None) -> PoseCache:
+    """A pose cache; ``tables`` hold the rows that it was written with. Raises SceneInvalidError."""
+    fields = Field(value, "poses", tables=tables).record("placements", "stands")
     placements = {}
     for item in fields["placements"].items():
         entry = item.record("asset_id", "support_asset_id", "relation", "poses")
@@ -110,8 +109,17 @@ def poses_from_json(value: object) -> PoseCache:
         if key in placements:
             item.fail("the same placement stands in the cache twice")
         placements[key] = tuple(pose_from_field(pose) for pose in entry["poses"].items())
-    stands = {
-        name: tuple(StandPose(*stand.vec3()) for stand in found.items())
-        for name, found in fields["stands"].entries()
-    }
+    stands = {name: _stands_from_field(found) for name, found in fields["stands"].entries()}
     return PoseCache(placements, stands)
+
+
+def _stands_to_json(stands: tuple[StandPose, ...], tables: TableWriter | None) -> Any:
+    """Triples, or the first row of ``tables`` that holds them and their number."""
+    rows = [(float(stand.x_m), float(stand.y_m), float(stand.yaw)) for stand in stands]
+    return [tables.stands(rows), len(rows)] if tables is not None else [[*row] for row in rows]
+
+
+def _stands_from_field(field: Field) -> tuple[StandPose, ...]:
+    if field.tables is not None:
+        return tuple(StandPose(x, y, yaw) for x, y, yaw in field.tables.stands(field))
+    return tuple(StandPose(*stand.vec3()) for stand in field.items())

@@ -1,18 +1,25 @@
-"""Strict reading of decoded JSON: every value knows its path, so that an error can name the field."""
+"""Strict reading of decoded JSON: every value knows its path, so that an error can name the field.
+
+A scene is ten thousand values. So a field is little more than the value and where it hangs: its path is put into words
+when something is wrong, and lists of numbers are checked at once.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Final, NoReturn, TypeVar
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from enum import StrEnum
 
     from embomatrix.world.geometry import Vec2, Vec3
+    from embomatrix.world.tables import Tables
 
     E = TypeVar("E", bound=StrEnum)
+
+MAX_NAME: Final = 200
+_FORBIDDEN: Final = frozenset("/\\")
 
 
 class SceneInvalidError(ValueError):
@@ -23,56 +30,91 @@ class SceneInvalidError(ValueError):
         self.field = field
 
 
-@dataclass(frozen=True, slots=True)
 class Field:
-    """One JSON value and where it stands."""
+    """One JSON value and where it stands. ``tables`` are those that rows in the value refer to, if there are any."""
 
-    value: object
-    path: str
+    __slots__ = ("_parent", "_step", "tables", "value")
+
+    def __init__(
+        self,
+        value: object,
+        path: str | int | tuple[str],
+        parent: Field | None = None,
+        tables: Tables | None = None,
+    ) -> None:
+        """``path`` is the whole path without a parent; below one it is a key, an index or, as a tuple, a free key."""
+        self.value = value
+        self.tables = tables
+        self._parent = parent
+        self._step = path
+
+    @property
+    def path(self) -> str:
+        if self._parent is None:
+            return str(self._step)
+        match self._step:
+            case str():
+                return f"{self._parent.path}.{self._step}"
+            case int():
+                return f"{self._parent.path}[{self._step}]"
+            case (key,):
+                return f"{self._parent.path}[{key!r}]"
 
     def fail(self, message: str) -> NoReturn:
         raise SceneInvalidError(self.path, message)
 
     def record(self, *keys: str, optional: tuple[str, ...] = ()) -> dict[str, Field]:
         """An object with exactly these keys; those in ``optional`` may be missing."""
-        if not isinstance(self.value, dict):
-            self.fail(f"expected an object with {', '.join(keys)}, found {_kind(self.value)}")
-        found = set(self.value)
-        missing = [key for key in keys if key not in found]
-        if missing:
-            self.fail(f"lacks {missing[0]!r}: expected {', '.join(keys)}")
-        unknown = sorted(found - {*keys, *optional})
-        if unknown:
-            self.fail(f"unknown key {unknown[0][:60]!r}: expected {', '.join((*keys, *optional))}")
-        return {key: Field(item, f"{self.path}.{key}") for key, item in self.value.items()}
+        value = self.value
+        if not isinstance(value, dict):
+            self.fail(f"expected an object with {', '.join(keys)}, found {_kind(value)}")
+        for key in keys:
+            if key not in value:
+                self.fail(f"lacks {key!r}: expected {', '.join(keys)}")
+        if len(value) > len(keys):
+            unknown = sorted(value.keys() - {*keys, *optional})
+            if unknown:
+                self.fail(f"unknown key {unknown[0][:60]!r}: expected {', '.join((*keys, *optional))}")
+        tables = self.tables
+        return {key: Field(item, key, self, tables) for key, item in value.items()}
 
     def entries(self) -> Iterator[tuple[str, Field]]:
         """Keys and values of an object with free keys, in their order."""
         if not isinstance(self.value, dict):
             self.fail(f"expected an object, found {_kind(self.value)}")
         for key, item in self.value.items():
-            yield key, Field(item, f"{self.path}[{key!r}]")
+            yield key, Field(item, (key,), self, self.tables)
 
     def items(self, *, at_most: int = 100_000) -> list[Field]:
-        if not isinstance(self.value, list):
-            self.fail(f"expected a list, found {_kind(self.value)}")
-        if len(self.value) > at_most:
-            self.fail(f"has {len(self.value)} items: expected at most {at_most}")
-        return [Field(item, f"{self.path}[{index}]") for index, item in enumerate(self.value)]
+        value = self.value
+        if not isinstance(value, list):
+            self.fail(f"expected a list, found {_kind(value)}")
+        if len(value) > at_most:
+            self.fail(f"has {len(value)} items: expected at most {at_most}")
+        tables = self.tables
+        return [Field(item, index, self, tables) for index, item in enumerate(value)]
 
     def text(self) -> str:
-        if not isinstance(self.value, str):
-            self.fail(f"expected text, found {_kind(self.value)}")
-        return self.value
+        value = self.value
+        if not isinstance(value, str):
+            self.fail(f"expected text, found {_kind(value)}")
+        return value
 
     def name(self) -> str:
-        """Text that is not empty."""
+        """Text that is not empty, not long, and no path: a name never leads to a file."""
         text = self.text()
         if not text:
             self.fail("is empty: expected a name")
+        if len(text) > MAX_NAME or not text.isprintable() or not _FORBIDDEN.isdisjoint(text):
+            self.fail(
+                f"found {text[:60]!r}: expected a name of at most {MAX_NAME} printable characters without a slash"
+            )
         return text
 
     def texts(self) -> tuple[str, ...]:
+        value = self.value
+        if isinstance(value, list) and set(map(type, value)) <= _TEXTS:
+            return tuple(value)  # the usual case, without a Field for each text
         return tuple(item.text() for item in self.items())
 
     def flag(self) -> bool:
@@ -92,14 +134,18 @@ class Field:
             self.fail(f"expected a number, found {_kind(value)}")
         if not abs(value) < math.inf:
             self.fail(f"expected a finite number, found {value}")
-        return float(value)
+        try:
+            return float(value)
+        except OverflowError:
+            self.fail("expected a finite number, found a whole one of more than 300 digits")
 
     def numbers(self, count: int) -> tuple[float, ...]:
-        if not isinstance(self.value, list) or len(self.value) != count:
-            found = f"{len(self.value)} items" if isinstance(self.value, list) else _kind(self.value)
+        value = self.value
+        if not isinstance(value, list) or len(value) != count:
+            found = f"{len(value)} items" if isinstance(value, list) else _kind(value)
             self.fail(f"expected a list of {count} numbers, found {found}")
-        if all(type(item) is float and abs(item) < math.inf for item in self.value):
-            return tuple(self.value)  # the usual case, without a Field for each number
+        if set(map(type, value)) == _FLOATS and math.isfinite(sum(value)):
+            return tuple(value)  # the usual case, without a Field for each number
         return tuple(item.number() for item in self.items())
 
     def vec2(self) -> Vec2:
@@ -116,6 +162,10 @@ class Field:
             return kind(self.text())
         except ValueError:
             self.fail(f"found {self.text()[:60]!r}: expected one of {', '.join(kind)}")
+
+
+_FLOATS: Final = {float}
+_TEXTS: Final = {str}
 
 
 def _kind(value: object) -> str:

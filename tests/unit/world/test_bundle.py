@@ -74,10 +74,15 @@ def test_compressed_nonsense_is_refused_in_a_sentence(text: str) -> None:
 
 
 def test_bundle_of_another_format_names_both(bundle: Bundle) -> None:
-    value = json.loads(zlib.decompress(encode_bundle(bundle)))
-    value["format"] = 9
-    with pytest.raises(BundleError, match="found 9: this version reads 1"):
-        decode_bundle(zlib.compress(json.dumps(value).encode()))
+    content = bytearray(zlib.decompress(encode_bundle(bundle)))
+    content[4:8] = (9).to_bytes(4, "little")
+    with pytest.raises(BundleError, match="has format 9, this version reads 2: build the dataset anew"):
+        decode_bundle(zlib.compress(content))
+
+
+def test_bundle_of_the_first_format_is_told_to_be_built_anew() -> None:
+    with pytest.raises(BundleError, match="build the dataset anew"):
+        decode_bundle(zlib.compress(b'{"format":1,"scene":{}}'))
 
 
 def test_task_of_another_scene_is_not_bundled(bundle: Bundle, task: Task) -> None:

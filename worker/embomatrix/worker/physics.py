@@ -13,7 +13,7 @@ from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.executor import Simulator
 from embomatrix.worker.slot_program import BundleCorruptError, run_program
-from embomatrix.world.bundle import BundleError, decode_bundle
+from embomatrix.world.bundle import BundleError, read_bundle
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -38,7 +38,7 @@ class Physics:
 
     def load(self, path: Path, digest: str) -> PhysicsScene:
         try:
-            bundle = decode_bundle(path.read_bytes(), digest=digest)
+            bundle = read_bundle(path, digest=digest)
         except BundleError as error:
             raise BundleCorruptError(str(error)) from error
         return PhysicsScene(bundle, self._clients)

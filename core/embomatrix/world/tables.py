@@ -1,0 +1,182 @@
+"""Tables of numbers beside JSON: poses and convex parts as flat arrays, checked all at once.
+
+A bundle's scene is JSON in which each pose and each part is a row's number. Reading arrays costs a tenth of reading the
+same numbers as text, and a rule about a column is one comparison.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from embomatrix.world.field import Field, SceneInvalidError
+from embomatrix.world.geometry import Part, Pose, Shape
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from embomatrix.world.geometry import FloatArray, Vec3
+
+    Arrays = Mapping[str, NDArray[np.generic]]
+
+MIN_EXTENT_M: Final = 1e-3
+MAX_COORDINATE_M: Final = 1e4
+QUAT_TOLERANCE: Final = 1e-4
+MAX_VERTICES: Final = 512
+SHAPES: Final = tuple(Shape)
+POSE_NUMBERS: Final = 7
+COLUMNS: Final = ("poses", "parts", "kinds", "vertices", "stands")
+"""``poses``: rows of x, y, z, qx, qy, qz, qw. ``parts``: rows of a pose and three extents. ``kinds``: for each part the index
+of its shape in ``SHAPES`` and the number of its vertices, which follow one another in ``vertices``. ``stands``: rows of x, y
+and yaw."""
+
+
+@dataclass(frozen=True, slots=True)
+class TableWriter:
+    """Collects rows while a scene is put into JSON. Equal poses and equal parts share a row."""
+
+    _poses: dict[bytes, int] = field(default_factory=dict)
+    _parts: dict[bytes, tuple[int, Part]] = field(default_factory=dict)
+    _stands: list[Vec3] = field(default_factory=list)
+
+    def pose(self, pose: Pose) -> int:
+        # By their bits: zero and minus zero are equal, but not the same.
+        row = struct.pack("<7d", *pose.position_m, *pose.quat_xyzw)
+        return self._poses.setdefault(row, len(self._poses))
+
+    def part(self, part: Part) -> int:
+        numbers = [*part.pose.position_m, *part.pose.quat_xyzw, *part.size_m]
+        numbers += [value for vertex in part.vertices_m for value in vertex]
+        key = struct.pack(f"<{len(numbers)}d", *numbers) + part.shape.encode()
+        return self._parts.setdefault(key, (len(self._parts), part))[0]
+
+    def stands(self, rows: Sequence[Vec3]) -> int:
+        """Append rows of x, y and yaw; the number of the first."""
+        self._stands.extend(rows)
+        return len(self._stands) - len(rows)
+
+    def arrays(self) -> dict[str, NDArray[np.generic]]:
+        """The arrays of ``COLUMNS``, float64 but for ``kinds``, which is int32."""
+        parts = [part for _, part in self._parts.values()]
+        rows = [(*part.pose.position_m, *part.pose.quat_xyzw, *part.size_m) for part in parts]
+        vertices = [vertex for part in parts for vertex in part.vertices_m]
+        kinds = [(SHAPES.index(part.shape), len(part.vertices_m)) for part in parts]
+        return {
+            "poses": np.frombuffer(b"".join(self._poses), dtype="<f8").reshape(-1, POSE_NUMBERS),
+            "parts": np.array(rows, dtype=np.float64).reshape(-1, POSE_NUMBERS + 3),
+            "kinds": np.array(kinds, dtype=np.int32).reshape(-1, 2),
+            "vertices": np.array(vertices, dtype=np.float64).reshape(-1, 3),
+            "stands": np.array(self._stands, dtype=np.float64).reshape(-1, 3),
+        }
+
+
+class Tables:
+    """Rows that were checked, as values. Raises SceneInvalidError for arrays that break a rule."""
+
+    def __init__(self, arrays: Arrays) -> None:
+        poses = _floats(arrays, "poses", POSE_NUMBERS)
+        parts = _floats(arrays, "parts", POSE_NUMBERS + 3)
+        vertices = _floats(arrays, "vertices", 3)
+        _check_poses("poses", poses)
+        _check_poses("parts", parts[:, :POSE_NUMBERS])
+        sizes = parts[:, POSE_NUMBERS:]
+        _check_rows(
+            "parts", sizes, (sizes.min(axis=1, initial=1) > MIN_EXTENT_M), "an extent of 1 mm or less"
+        )
+        _check_rows(
+            "parts", sizes, (sizes.max(axis=1, initial=1) <= MAX_COORDINATE_M), "an extent above 10 km"
+        )
+        self._poses = [Pose((x, y, z), (a, b, c, d)) for x, y, z, a, b, c, d in poses.tolist()]
+        self._stands = [(x, y, yaw) for x, y, yaw in _floats(arrays, "stands", 3).tolist()]
+        self._parts = _parts(parts, _kinds(arrays, len(parts), len(vertices)), vertices)
+
+    def pose(self, field: Field) -> Pose:
+        """The pose whose row the field names."""
+        return self._poses[_row(field, len(self._poses))]
+
+    def part(self, field: Field) -> Part:
+        """The part whose row the field names."""
+        return self._parts[_row(field, len(self._parts))]
+
+    def stands(self, field: Field) -> list[Vec3]:
+        """The rows of x, y and yaw whose first row and number the field holds."""
+        span = field.value
+        if not isinstance(span, list) or len(span) != 2 or set(map(type, span)) != {int}:
+            field.fail(f"found {str(span)[:40]}: expected the first row and the number of rows")
+        first, count = span
+        if min(first, count) < 0 or first + count > len(self._stands):
+            field.fail(f"found rows {first} to {first + count}: there are {len(self._stands)}")
+        return self._stands[first : first + count]
+
+
+def _row(field: Field, count: int) -> int:
+    row = field.value
+    if type(row) is not int or not 0 <= row < count:
+        field.fail(f"found {str(row)[:40]}: expected a row from 0 to {count - 1}")
+    return row
+
+
+def _floats(arrays: Arrays, name: str, columns: int) -> FloatArray:
+    """A float array of that many columns, all finite."""
+    array = arrays.get(name)
+    if array is None or array.dtype != np.float64 or array.ndim != 2 or array.shape[1] != columns:
+        found = "nothing" if array is None else f"{array.dtype} of shape {array.shape}"
+        raise SceneInvalidError(f"tables.{name}", f"found {found}: expected float64 with {columns} columns")
+    rows = np.asarray(array, dtype=np.float64)
+    finite = np.asarray(np.isfinite(rows).all(axis=1), dtype=np.bool_)  # (n,)
+    _check_rows(name, rows, finite, "a number that is not finite")
+    return rows
+
+
+def _check_poses(name: str, rows: FloatArray) -> None:
+    quats = rows[:, 3:]
+    off: FloatArray = np.abs(np.sqrt((quats * quats).sum(axis=1)) - 1.0)  # (n,)
+    _check_rows(name, rows, off <= QUAT_TOLERANCE, "a quaternion whose length is not 1")
+    near = np.abs(rows[:, :3]).max(axis=1, initial=0) <= MAX_COORDINATE_M
+    _check_rows(name, rows, near, f"a position further than {MAX_COORDINATE_M:g} m from the origin")
+
+
+def _check_rows(name: str, rows: FloatArray, sound: NDArray[np.bool_], what: str) -> None:
+    if not sound.all():
+        row = int(np.argmin(sound))
+        raise SceneInvalidError(f"tables.{name}[{row}]", f"has {what}: {rows[row].tolist()}")
+
+
+def _kinds(arrays: Arrays, parts: int, vertices: int) -> list[tuple[int, int]]:
+    """Shape and number of vertices of each part."""
+    kinds = arrays.get("kinds")
+    if kinds is None or kinds.dtype != np.int32 or kinds.shape != (parts, 2):
+        raise SceneInvalidError("tables.kinds", f"expected int32 of shape ({parts}, 2)")
+    rows = [(int(shape), int(count)) for shape, count in kinds.tolist()]
+    for row, (shape, count) in enumerate(rows):
+        if not 0 <= shape < len(SHAPES):
+            raise SceneInvalidError(
+                f"tables.kinds[{row}]", f"found shape {shape}: expected 0 to {len(SHAPES) - 1}"
+            )
+        hull = SHAPES[shape] is Shape.HULL
+        if not (4 <= count <= MAX_VERTICES if hull else count == 0):
+            raise SceneInvalidError(
+                f"tables.kinds[{row}]",
+                f"a {SHAPES[shape].value} has {count} vertices: expected {f'4 to {MAX_VERTICES}' if hull else 0}",
+            )
+    if sum(count for _, count in rows) != vertices:
+        raise SceneInvalidError(
+            "tables.vertices", f"has {vertices} rows: expected as many as the parts have vertices"
+        )
+    return rows
+
+
+def _parts(rows: FloatArray, kinds: list[tuple[int, int]], vertices: FloatArray) -> list[Part]:
+    points = [(x, y, z) for x, y, z in vertices.tolist()]
+    parts: list[Part] = []
+    first = 0
+    for (x, y, z, a, b, c, d, width, depth, height), (shape, count) in zip(rows.tolist(), kinds, strict=True):
+        own = tuple(points[first : first + count])
+        first += count
+        parts.append(Part(SHAPES[shape], Pose((x, y, z), (a, b, c, d)), (width, depth, height), own))
+    return parts
