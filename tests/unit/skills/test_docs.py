@@ -14,7 +14,9 @@ from embomatrix.skills.limits import ROBOT
 from embomatrix.skills.parse import MAX_ROOM_NAME, PlanReason, parse_plan, plan_from_json
 from embomatrix.skills.syntax import MAX_PLAN_BYTES, MAX_STEPS, SIGNATURES, Arg, Skill
 from embomatrix.world import state
-from embomatrix.world.state import Relation, State
+from embomatrix.world.state import Relation, State, SubstanceRelation
+from embomatrix.world.substances import MEANINGS
+from embomatrix.world.task import Profile
 
 PAGE = (Path(__file__).parents[3] / "docs" / "skills.md").read_text(encoding="utf-8")
 
@@ -83,6 +85,13 @@ def test_every_limit_of_the_robot_stands_there_with_its_value():
 def test_every_relation_and_state_stands_there():
     assert set(rows("relation")) == set(Relation)
     assert set(rows("state")) == set(State)
+
+
+def test_every_profile_and_every_relation_to_a_substance_stands_there():
+    assert set(rows("profile")) == set(Profile)
+    assert set(rows("fact")) == set(SubstanceRelation)
+    for state, fact in MEANINGS.items():
+        assert rows("state")[state] == [f"another word for {fact.relation} with {fact.substance}"]
 
 
 def test_every_tolerance_of_a_relation_stands_there_with_its_value():
