@@ -90,8 +90,8 @@ def test_every_relation_and_state_stands_there():
 def test_every_profile_and_every_relation_to_a_substance_stands_there():
     assert set(rows("profile")) == set(Profile)
     assert set(rows("fact")) == set(SubstanceRelation)
-    for state, fact in MEANINGS.items():
-        assert rows("state")[state] == [f"another word for {fact.relation} with {fact.substance}"]
+    for word, fact in MEANINGS.items():
+        assert rows("state")[word] == [f"another word for {fact.relation} with {fact.substance}"]
 
 
 def test_every_tolerance_of_a_relation_stands_there_with_its_value():
