@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.sim.floor_grid import FloorGrid
-from embomatrix.sim.navigation import FLAT_M
+from embomatrix.sim.obstacles import FLAT_M
 from embomatrix.sim.physical_space import boxes_around
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.poses import StandPose
