@@ -17,6 +17,7 @@ from embomatrix.world.poses import StandPose
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
+    from embomatrix.sim.bullet.robot import Posture
     from embomatrix.sim.executor import Simulator
     from embomatrix.sim.live_world import LiveWorld
     from embomatrix.skills.syntax import Plan
@@ -40,8 +41,8 @@ class Frame:
     """One moment of a film.
 
     ``poses`` and ``joints`` hold every object that is not as the scene has it at the start, ``hidden`` those out of the world.
-    ``robot`` is the base on the floor, ``arm`` the positions of the robot's joints in its model's order, empty where the
-    film knows none. ``step`` counts the plan's calls from 1, 0 before the first.
+    ``robot`` is the base on the floor, ``posture`` all of the robot's joints, None where the film knows none of its
+    arm. ``step`` counts the plan's calls from 1, 0 before the first.
     """
 
     robot: StandPose
@@ -49,7 +50,7 @@ class Frame:
     poses: Mapping[str, Pose] = field(default_factory=dict)
     joints: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     hidden: frozenset[str] = frozenset()
-    arm: tuple[float, ...] = ()
+    posture: Posture | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -54,6 +54,11 @@ class Grip:
     held: Held
 
 
+def tucked(at: StandPose) -> Posture:
+    """The robot with its empty arm as it is while driving."""
+    return Posture(at.x_m, at.y_m, at.yaw, TUCKED_LIFT_M, tuple(TUCKED.tolist()))
+
+
 class Stage:
     """One rollout's two worlds and the robot. ``begin`` starts the next."""
 
@@ -70,9 +75,7 @@ class Stage:
         names = [item.name for item in self.world.scene.objects]
         poses = {name: engine.pose(name) for name in names if not engine.is_parked(name)}
         joints = {name: engine.joints(name) for name in names}
-        self.dynamic.build(
-            poses, joints, Posture(robot.x_m, robot.y_m, robot.yaw, TUCKED_LIFT_M, tuple(TUCKED.tolist()))
-        )
+        self.dynamic.build(poses, joints, tucked(robot))
         self.grip = None
 
     def boxes(self) -> Boxes:

@@ -14,6 +14,7 @@ from PIL import Image, ImageDraw, ImageFont
 from embomatrix.sim.bullet.camera import furnish_cutaway, shoot_egocentric, shoot_oblique
 from embomatrix.sim.bullet.stage import Stage
 from embomatrix.sim.film import FRAMES_PER_S
+from embomatrix.sim.physical_stage import tucked
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -95,7 +96,7 @@ class _Cutter:
         self._stage = Stage(scene)
         furnish_cutaway(self._stage)
         self._rooms = rooms
-        self._post = self._stage.add_post()
+        self._robot = self._stage.add_robot()
         self._changed: set[str] = set()
 
     def shoot(self, frame: Frame) -> Image.Image:
@@ -104,9 +105,9 @@ class _Cutter:
         for name in sorted(changed | self._changed):
             self._show(frame, name)
         self._changed = changed
-        self._post.stand(frame.robot)
+        self._robot.stand(frame.posture or tucked(frame.robot))
         wide = Image.fromarray(np.asarray(shoot_oblique(self._stage, self._rooms, WIDTH_PX, HEIGHT_PX)))
-        self._post.leave()
+        self._robot.leave()
         inset = Image.fromarray(np.asarray(shoot_egocentric(self._stage, frame.robot, *INSET_PX)))
         wide.paste(inset, (WIDTH_PX - INSET_PX[0] - 6, 6))
         return wide

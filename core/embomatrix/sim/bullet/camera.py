@@ -10,6 +10,7 @@ import numpy as np
 
 from embomatrix.sim.bounds import IDENTITY
 from embomatrix.sim.bullet.stage import Stage
+from embomatrix.sim.physical_stage import tucked
 from embomatrix.world.geometry import Pose
 from embomatrix.world.poses import StandPose
 
@@ -45,7 +46,7 @@ def render_oblique(scene: Scene, *, width_px: int = 1280, height_px: int = 960) 
     """
     with Stage(scene) as stage:
         furnish_cutaway(stage)
-        stage.add_post().stand(_start(scene))
+        stage.add_robot().stand(tucked(_start(scene)))
         return shoot_oblique(stage, scene.rooms, width_px, height_px)
 
 

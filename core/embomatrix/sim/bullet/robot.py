@@ -79,7 +79,7 @@ class RobotBody:
         self._forces += [SHOULDER_NM] * 4 + [WRIST_NM] * 3 + [FINGER_N] * 2
         self._inertial = Pose(tuple(bullet.getDynamicsInfo(self.body, self.hand, physicsClientId=client)[3]))
         self._hold = -1
-        for joint, value in zip(self._driven, _spread(posture), strict=True):
+        for joint, value in zip(self._driven, spread(posture), strict=True):
             bullet.resetJointState(self.body, joint, value, physicsClientId=client)
         self.steer(posture)
 
@@ -97,7 +97,7 @@ class RobotBody:
             self.body,
             self._driven,
             bullet.POSITION_CONTROL,
-            targetPositions=_spread(posture),
+            targetPositions=spread(posture),
             forces=self._forces,
             positionGains=[GAIN] * len(self._driven),
             physicsClientId=self._client,
@@ -167,8 +167,8 @@ class RobotBody:
                 )
 
 
-def _spread(posture: Posture) -> list[float]:
-    """Values of the driven joints: both stages of the lift share its height."""
+def spread(posture: Posture) -> list[float]:
+    """Values of the driven joints, base first, fingers last: both stages of the lift share its height."""
     half = posture.lift_m / 2
     return [
         posture.x_m,

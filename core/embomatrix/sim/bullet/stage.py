@@ -14,6 +14,7 @@ from scipy.spatial import ConvexHull
 
 from embomatrix.sim.bounds import IDENTITY, joint_motion
 from embomatrix.sim.bullet.client import pybullet
+from embomatrix.sim.bullet.robot_figure import RobotFigure
 from embomatrix.sim.engine import EngineError
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.geometry import Pose, Shape
@@ -26,15 +27,12 @@ if TYPE_CHECKING:
 
     from embomatrix.world.asset import Asset
     from embomatrix.world.geometry import Part, Vec3
-    from embomatrix.world.poses import StandPose
     from embomatrix.world.scene import Scene, SceneObject
 
     FloatArray = NDArray[np.float64]
     Rgba = tuple[float, float, float, float]
 
 OUT_OF_SIGHT: Final = Pose((0.0, 0.0, -100.0))
-POST_M: Final = 0.7
-"""Height of the post that stands for the robot."""
 
 _WALL: Final[Rgba] = (0.86, 0.86, 0.84, 1.0)
 _FLOORS: Final[tuple[Rgba, ...]] = (
@@ -48,7 +46,6 @@ _OPENS: Final[Rgba] = (0.80, 0.58, 0.34, 1.0)
 _WORKS: Final[Rgba] = (0.45, 0.60, 0.74, 1.0)
 _RESTS: Final[Rgba] = (0.60, 0.47, 0.38, 1.0)
 _SOFT: Final[Rgba] = (0.45, 0.50, 0.62, 1.0)
-_ROBOT: Final[Rgba] = (0.85, 0.15, 0.15, 1.0)
 _DOOR: Final[Rgba] = (0.55, 0.30, 0.18, 1.0)
 _GLASS: Final[Rgba] = (0.66, 0.84, 0.93, 1.0)
 _CLOTH: Final = frozenset({"bed", "sofa", "armchair", "ottoman", "carpet", "booth", "bench", "pillow"})
@@ -115,17 +112,16 @@ class Stage:
         for link in asset.links:
             frame = pose if link.joint is None else pose @ joint_motion(link.joint, next(shares))
             for _, (body, part) in zip(link.parts, solids, strict=False):
-                self.place(body, frame @ part.pose)
+                self._place(body, frame @ part.pose)
 
     def hide(self, name: str) -> None:
         """Take an object out of sight."""
         for body, _ in self._solids.get(name, ()):
-            self.place(body, OUT_OF_SIGHT)
+            self._place(body, OUT_OF_SIGHT)
 
-    def add_post(self) -> Post:
-        """A red post for the robot, out of sight at first."""
-        size = (2 * ROBOT.radius_m, 2 * ROBOT.radius_m, POST_M)
-        return Post(self, self.add_solid(Shape.CYLINDER, size, OUT_OF_SIGHT, _ROBOT))
+    def add_robot(self) -> RobotFigure:
+        """The robot, out of sight at first."""
+        return RobotFigure(self._client)
 
     def add_solid(
         self, shape: Shape, size_m: Vec3, pose: Pose, color: Rgba, vertices_m: tuple[Vec3, ...] = ()
@@ -173,8 +169,7 @@ class Stage:
     def _add_part(self, part: Part, frame: Pose, color: Rgba) -> int:
         return self.add_solid(part.shape, part.size_m, frame @ part.pose, color, part.vertices_m)
 
-    def place(self, body: int, pose: Pose) -> None:
-        """Move a solid that ``add_solid`` made."""
+    def _place(self, body: int, pose: Pose) -> None:
         self._bullet.resetBasePositionAndOrientation(
             body, pose.position_m, pose.quat_xyzw, physicsClientId=self._client
         )
@@ -198,22 +193,6 @@ class Stage:
             case Shape.HULL:
                 mesh = _faces(np.asarray(vertices_m))
                 return int(bullet.createVisualShape(bullet.GEOM_MESH, **mesh, **look))
-
-
-class Post:
-    """What stands for the robot in a picture."""
-
-    def __init__(self, stage: Stage, body: int) -> None:
-        self._stage = stage
-        self._body = body
-
-    def stand(self, at: StandPose) -> None:
-        """Show it where the robot's base is."""
-        self._stage.place(self._body, Pose.from_xyz_yaw(at.x_m, at.y_m, POST_M / 2, at.yaw))
-
-    def leave(self) -> None:
-        """Take it out of sight: the robot does not see itself."""
-        self._stage.place(self._body, OUT_OF_SIGHT)
 
 
 def _faces(points: FloatArray) -> dict[str, list[Any]]:
