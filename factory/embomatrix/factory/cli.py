@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from embomatrix.factory.assets_cli import app as assets_app
 from embomatrix.factory.importer_batch import Verified, bind_first, verify_first
 from embomatrix.factory.importer_sources import (
     SourceError,
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
 app = typer.Typer(
     help="Make verified tasks.", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False
 )
+app.add_typer(assets_app, name="assets")
 EVERY_ACTIVITY = "all"
 EVERY_SCENE = "all"
 

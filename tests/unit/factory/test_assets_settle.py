@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
 
+from embomatrix.factory.assets.check import Finding, Rule
 from embomatrix.factory.assets.library import build_asset
+from embomatrix.factory.assets.standing import GLANCE_STEPS, check_standing
+from embomatrix.factory.assets.standing import STEPS as STEPS_OF_TWO_SECONDS
+from embomatrix.world.asset import Link
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.geometry import Pose
 
@@ -15,7 +20,7 @@ bullet_bodies = pytest.importorskip("embomatrix.sim.bullet.bodies", reason="need
 pybullet = pytest.importorskip("pybullet", reason="PyBullet has wheels up to Python 3.11 on x86-64")
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
 THINGS = (
     "apple banana bell_pepper bottle_of_wine bowl can_of_soda carrot chicken chopping_board cupcake egg frying_pan "
@@ -23,6 +28,8 @@ THINGS = (
     "water_glass watermelon wineglass wok"
 )
 STEPS = 360
+CATALOG = Catalog.load()
+LEANING = Pose((0.0, 0.0, 0.0), (math.sin(0.3), 0.0, 0.0, math.cos(0.3)))
 
 
 @pytest.fixture(scope="module")
@@ -48,3 +55,26 @@ def test_thing_stays_upright_where_it_is_put(client: int, category: str) -> None
     assert math.hypot(x, y) < 0.005
     assert z == pytest.approx(half, abs=0.002)
     assert math.degrees(math.acos(1 - 2 * (qx * qx + qy * qy))) < 1.5
+
+
+def test_nearly_every_category_in_use_stands_at_a_glance() -> None:
+    assert not fallen(CATALOG.used_categories[::6], GLANCE_STEPS)
+
+
+@pytest.mark.slow
+def test_every_category_in_use_stands_for_two_seconds() -> None:
+    assert not fallen(CATALOG.used_categories, STEPS_OF_TWO_SECONDS)
+
+
+def test_a_thing_on_its_edge_is_found() -> None:
+    book = build_asset(CATALOG, "hardback", CATALOG.models_of("hardback")[0].model_id)
+    lean = Link("base", tuple(replace(part, pose=LEANING @ part.pose) for part in book.links[0].parts))
+    (finding,) = check_standing(CATALOG, [replace(book, links=(lean,), size_m=(0.2, 0.2, 0.2))])
+    assert finding.rule is Rule.STANDS
+    assert not finding.excused
+
+
+def fallen(categories: Sequence[str], least_steps: int) -> list[Finding]:
+    """What does not stand, of the first model of each category, and is not excused."""
+    assets = [build_asset(CATALOG, name, CATALOG.models_of(name)[0].model_id) for name in categories]
+    return [f for f in check_standing(CATALOG, assets, least_steps) if not f.excused]

@@ -32,7 +32,12 @@ ROLLING_FRICTION: Final = 2e-3
 ROUND: Final = frozenset((Shape.CYLINDER, Shape.SPHERE, Shape.HULL))
 """Shapes that may roll. Boxes go without: with it the solver uses all its iterations, and a step costs five times as much."""
 FLOOR_M: Final = 6.0
+AWAY_M: Final = 100.0
 FLOOR_THICKNESS_M: Final = 0.5
+LEVEL_M: Final = 0.002
+PROBE_M: Final = 0.01
+PROBED: Final = (0.04, 0.5, 0.96)
+"""Where a box's underside is probed, as shares of its sides."""
 STAGES_KEPT: Final = 256
 """Stages between two resets: a stage leaves about 5 kB behind, and a reset costs as much as ten."""
 EVERYWHERE: Final = Aabb((-math.inf,) * 3, (math.inf,) * 3)
@@ -115,6 +120,10 @@ class MiniWorld:
             self._parts[id(asset)] = (asset, AssetParts(asset))
         return self._parts[id(asset)][1]
 
+    def lift(self) -> None:
+        """Take the object out of the way, for questions about what stands still."""
+        self._put(Pose((0.0, 0.0, AWAY_M)))
+
     def depth_m(self, pose: Pose) -> float:
         """How deep the object, put at a pose, reaches into the bodies that stand still; 0 when it is free."""
         self._put(pose)
@@ -126,8 +135,23 @@ class MiniWorld:
                 deepest = max(deepest, -contact[8])
         return deepest
 
-    def drop(self, pose: Pose, steps: int = SETTLE_STEPS) -> Settled:
-        """Put the object at a pose, let go, and tell where it is when it rests or ``steps`` of 1/240 s have passed."""
+    def is_level_under(self, box: Aabb) -> bool:
+        """Whether something that stands still is level, to 2 mm, under nine points of a box's underside."""
+        (low_x, low_y, z), (high_x, high_y, _) = box.low_m, box.high_m
+        starts = [
+            (low_x + u * (high_x - low_x), low_y + v * (high_y - low_y), z + PROBE_M)
+            for u in PROBED
+            for v in PROBED
+        ]
+        ends = [(x, y, z - LEVEL_M) for x, y, _ in starts]
+        hits = self._bullet.rayTestBatch(starts, ends, physicsClientId=self._client)
+        return all(hit[0] in self._still and abs(hit[3][2] - z) <= LEVEL_M for hit in hits)
+
+    def drop(self, pose: Pose, steps: int = SETTLE_STEPS, least: int = EARLIEST_STEPS) -> Settled:
+        """Put the object at a pose, let go, and tell where it is when it rests or ``steps`` of 1/240 s have passed.
+
+        It is not taken to rest before ``least`` steps.
+        """
         bullet, client = self._bullet, self._client
         self._put(pose)
         done = 0
@@ -137,7 +161,7 @@ class MiniWorld:
                 bullet.stepSimulation(physicsClientId=client)
             done += CHUNK_STEPS
             linear, angular = self._speeds()
-            if done >= EARLIEST_STEPS and linear < SLOW_M_S and angular < SLOW_RAD_S:
+            if done >= least and linear < SLOW_M_S and angular < SLOW_RAD_S:
                 break
         position, quat = bullet.getBasePositionAndOrientation(self._body, physicsClientId=client)
         if not all(map(math.isfinite, (*position, *quat, linear, angular))):

@@ -95,7 +95,7 @@ def pedestal_sink(size_m: Vec3) -> Body:
     bowl = Aabb((x0, y0, deck - depth), (x1, y1, deck))
     body.parts, cavity = shell(bowl, Walls(0.22 * size_m[0], wall, wall, wall, 0.03, 0.0))
     body.parts.append(
-        box((x0, -0.12 * size_m[1], z0), (x0 + 0.5 * size_m[0], 0.12 * size_m[1], deck - depth))
+        box((x0, -0.12 * size_m[1], z0), (x0 + 0.65 * size_m[0], 0.12 * size_m[1], deck - depth))
     )
     body.parts.extend(_tap((x0 + 0.1 * size_m[0], 0.0), cavity.center_m[0], (deck, z1)))
     body.add_interior("basin", cavity, clearance_m=_under_tap((deck, z1)) - cavity.low_m[2])

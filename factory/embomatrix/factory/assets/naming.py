@@ -24,12 +24,12 @@ _NAMES: Final[Mapping[Family, str]] = {
     Family.DISHWASHER: "dishwasher",
     Family.WASHER: "washer clothes_dryer",
     Family.SHELVING: "shelf bookcase grocery_shelf commercial_kitchen_shelf snack_rack magazine_rack magazine_stand "
-    "shoe_rack dish_rack_cart storage_organizer desk_organizer hall_tree test_tube_rack "
+    "shoe_rack dish_rack_cart storage_organizer  hall_tree test_tube_rack "
     "free_weight_rack dry_food_dispenser_shelf candy_dispenser_shelf",
     Family.CUBBY: "nightstand stand wood_fireplace dessert_stand chicken_coop",
     Family.WARDROBE: "wardrobe lab_exhaust_hood",
     Family.CHEST: "carton cedar_chest cooler toolbox violin_case recycling_bin backpack tank tackle_box",
-    Family.OPEN_BOX: "packing_box storage_box toy_box crib hamper trash_can public_trash_can tray baking_sheet "
+    Family.OPEN_BOX: "desk_organizer packing_box storage_box toy_box crib hamper trash_can public_trash_can tray baking_sheet "
     "ice_tray litter_box compost_bin shopping_basket shopping_cart tote paper_bag lunch_box "
     "pencil_case pizza_box suitcase kayak skiff wheelbarrow dish_rack tupperware birdcage stroller "
     "shoulder_bag briefcase outline_tray drying_rack roasting_pan ice_bucket mop_bucket burlap_bag "
@@ -162,6 +162,29 @@ HUNG: Final = frozenset(
     {Family.PENDANT, Family.SHOWER_RAIL, Family.RANGE_HOOD, Family.URINAL, Family.WINDOW, Family.GARAGE_DOOR}
 )
 """Families whose things hang from a ceiling or on a wall, or stand in one: they need not stand by themselves."""
+FLAT_ON_WALL: Final = frozenset(
+    {
+        "poster",
+        "picture",
+        "painting",
+        "portrait",
+        "mirror",
+        "wall_mounted_tv",
+        "window_blind",
+        "curtain",
+        "hanging",
+        "hanging_banners",
+        "canvas",
+        "fixed_window",
+        "electric_switch",
+        "wall_socket",
+        "periodic_table",
+        "decorative_sign",
+        "information_bulletin",
+        "map",
+    }
+)
+"""Sheets that hang on a wall."""
 _FAMILY_OF: Final = {name: family for family, names in _NAMES.items() for name in names.split()}
 
 _PATTERNS: Final[tuple[tuple[re.Pattern[str], Family], ...]] = tuple(

@@ -17,7 +17,8 @@ def post(size_m: Vec3) -> Body:
     """A flat foot with a pole: flag poles, tripods, clamps on their stands, signposts."""
     (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
     foot = z0 + clamp(0.06 * size_m[2], 0.004, 0.05)
-    thick = clamp(0.08 * min(size_m[:2]), 0.002, 0.04)
+    thin = min(size_m[:2])
+    thick = clamp(0.08 * thin, min(0.002, 0.4 * thin), 0.04)
     return Body(parts=[box((x0, y0, z0), (x1, y1, foot)), box((-thick, -thick, foot), (thick, thick, z1))])
 
 

@@ -1,0 +1,161 @@
+"""The sanity test of assets: are they of the catalog's size, do their cavities hold something, do their doors move freely?
+
+`check_asset` looks at geometry alone and takes a millisecond or two; `settles` in ``standing`` asks the engine whether the
+thing stands.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from embomatrix.factory.assets.families import Family
+from embomatrix.factory.assets.naming import family_of_model
+from embomatrix.factory.assets.shapes import mesh_of
+from embomatrix.sim.bounds import IDENTITY, joint_motion
+from embomatrix.world.geometry import Aabb, Pose, Shape
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+    from embomatrix.world.asset import Asset, Link
+    from embomatrix.world.catalog import Catalog
+    from embomatrix.world.geometry import FloatArray, Part
+
+SIZE_TOLERANCE: Final = 0.05
+PROBE_M: Final = 0.03
+"""A thing that can be filled holds a cube of this edge."""
+DEPTH_M: Final = 1e-4
+"""Deeper than this is a collision; two parts may touch."""
+TRAVEL: Final = (0.0, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 1.0)
+"""Shares of the travel at which moving parts are tested."""
+
+
+class Rule(StrEnum):
+    """What is asked of an asset."""
+
+    SIZE = "size"
+    FILLABLE = "fillable"
+    OPENABLE = "openable"
+    STANDS = "stands"
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """A rule that an asset does not keep. ``excused`` tells that it need not, for the reason in ``detail``."""
+
+    asset_id: str
+    rule: Rule
+    detail: str
+    excused: bool = False
+
+
+EXCUSED_FROM_PROBE: Final[Mapping[Family, str]] = {
+    Family.BOTTLE: "a closed bottle: what it is filled with is a substance, and its neck is narrower than the probe",
+    Family.CAN: "a closed can or jar: what it is filled with is a substance",
+    Family.SLAB: "a closed carton or package: what it is filled with is a substance",
+    Family.SOFT: "a closed bag: what it is filled with is a substance",
+    Family.PLATE: "flat: things lie on it, and what it is filled with is a substance",
+}
+"""Families of fillable categories that have no cavity, and why."""
+
+
+def check_asset(catalog: Catalog, asset: Asset) -> tuple[Finding, ...]:
+    """What is wrong with the geometry of an asset, and what is excused. Empty for most."""
+    return (*_size(asset), *_fillable(catalog, asset), *_openable(asset))
+
+
+def _size(asset: Asset) -> Iterator[Finding]:
+    box = Aabb.around(part.aabb(IDENTITY) for link in asset.links for part in link.parts)
+    for axis, found, wanted in zip("xyz", box.size_m, asset.size_m, strict=True):
+        if abs(found - wanted) > SIZE_TOLERANCE * wanted:
+            yield Finding(
+                asset.asset_id,
+                Rule.SIZE,
+                f"{found:.4f} m along {axis}, the table has {wanted:.4f} m: expected within {SIZE_TOLERANCE:.0%}",
+            )
+
+
+def _fillable(catalog: Catalog, asset: Asset) -> Iterator[Finding]:
+    if not asset.can("fillable"):
+        return
+    widest = max((min(interior.size_m) for interior in asset.interiors), default=0.0)
+    if widest >= PROBE_M:
+        return
+    model = asset.asset_id.removeprefix(f"{asset.category}-")
+    family = family_of_model(catalog, asset.category, model)
+    if not asset.interiors and family in EXCUSED_FROM_PROBE:
+        yield Finding(asset.asset_id, Rule.FILLABLE, EXCUSED_FROM_PROBE[family], excused=True)
+        return
+    # A cavity is as large as its box but for the walls: what is under two probes wide may be too small for one.
+    small = min(asset.size_m) < 2 * PROBE_M
+    detail = f"its largest cavity is {widest:.3f} m wide, the probe {PROBE_M} m; the table's box is {asset.size_m} m"
+    yield Finding(asset.asset_id, Rule.FILLABLE, detail, excused=small)
+
+
+def _openable(asset: Asset) -> Iterator[Finding]:
+    if asset.can("openable") != bool(asset.joints):
+        yield Finding(
+            asset.asset_id, Rule.OPENABLE, "openable without a joint, or a joint without being openable"
+        )
+    base, moving = asset.links[0], asset.links[1:]
+    still = [_Solid.of(part) for part in base.parts]
+    for share in TRAVEL:
+        placed = [_moved(link, share) for link in moving]
+        shut = [_moved(link, 0.0) for link in moving]
+        for number, (link, parts) in enumerate(zip(moving, placed, strict=True)):
+            others = [*still, *itertools.chain.from_iterable(placed[number + 1 :])]
+            others += [part for k, parts_of in enumerate(shut) if k != number for part in parts_of]
+            depth = max((_depth(a, b) for a, b in itertools.product(parts, others)), default=0.0)
+            if depth > DEPTH_M:
+                yield Finding(
+                    asset.asset_id,
+                    Rule.OPENABLE,
+                    f"{link.name} at {share:.0%} of its travel is {depth * 1000:.1f} mm deep in another part",
+                )
+                return
+
+
+@dataclass(frozen=True, slots=True)
+class _Solid:
+    """A convex part in the asset's frame: corners (n, 3), face normals (m, 3), and the box around it."""
+
+    corners: FloatArray
+    normals: FloatArray
+    low: FloatArray
+    high: FloatArray
+
+    @staticmethod
+    def of(part: Part, motion: Pose = IDENTITY) -> _Solid:
+        pose = motion @ part.pose
+        if part.shape is Shape.BOX:
+            normals = pose.rotation.T
+            corners = pose.apply_all(_CUBE * np.asarray(part.size_m))
+        else:
+            mesh = mesh_of(part)
+            normals = mesh.face_normals @ motion.rotation.T
+            corners = motion.apply_all(np.asarray(mesh.vertices))
+        return _Solid(corners, normals, corners.min(axis=0), corners.max(axis=0))
+
+
+_CUBE: Final = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))
+
+
+def _moved(link: Link, share: float) -> Sequence[_Solid]:
+    assert link.joint is not None
+    motion = joint_motion(link.joint, share)
+    return [_Solid.of(part, motion) for part in link.parts]
+
+
+def _depth(a: _Solid, b: _Solid) -> float:
+    """Least overlap along the face normals of both: never less than the true depth of penetration."""
+    if (a.low > b.high).any() or (b.low > a.high).any():
+        return 0.0
+    axes = np.vstack((a.normals, b.normals))
+    of_a, of_b = a.corners @ axes.T, b.corners @ axes.T
+    overlap = np.minimum(of_a.max(axis=0) - of_b.min(axis=0), of_b.max(axis=0) - of_a.min(axis=0))
+    return max(0.0, float(overlap.min()))

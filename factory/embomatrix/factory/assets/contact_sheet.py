@@ -1,0 +1,87 @@
+"""Pictures of assets side by side, closed and open, each in its own frame: for looking at what the families build."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from embomatrix.factory.assets.shapes import mesh_of
+from embomatrix.sim.bounds import IDENTITY, joint_motion
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from embomatrix.world.asset import Asset
+    from embomatrix.world.geometry import FloatArray
+
+TILE_PX: Final = 190
+_COLUMNS: Final = 8
+_TEXT_PX: Final = 24
+_AZIMUTH: Final = math.radians(35.0)
+_ELEVATION: Final = math.radians(28.0)
+_BASE: Final = np.array((205.0, 190.0, 165.0))
+_MOVING: Final = np.array((120.0, 165.0, 215.0))
+_LIGHT: Final = np.array((0.62, 0.30, 0.72))
+OPEN_SHARE: Final = 0.6
+"""How far doors and drawers stand open in the second picture."""
+
+
+def draw_sheet(assets: Sequence[Asset], columns: int = _COLUMNS) -> Image.Image:
+    """One tile for each asset, and a second one, doors and drawers open, for each that has any. Returns an RGB image."""
+    tiles = [(asset, 0.0) for asset in assets]
+    tiles += [(asset, OPEN_SHARE) for asset in assets if asset.joints]
+    tiles.sort(key=lambda tile: tile[0].asset_id)
+    rows = math.ceil(len(tiles) / columns)
+    sheet = Image.new("RGB", (columns * TILE_PX, rows * (TILE_PX + _TEXT_PX)), "white")
+    draw = ImageDraw.Draw(sheet)
+    font = ImageFont.load_default(size=10)
+    for number, (asset, share) in enumerate(tiles):
+        x, y = number % columns * TILE_PX, number // columns * (TILE_PX + _TEXT_PX)
+        _draw_asset(draw, asset, share, (x, y))
+        size = " x ".join(f"{extent:.2f}" for extent in asset.size_m)
+        draw.text((x + 4, y + TILE_PX), f"{asset.category[:30]}\n{size}", fill="black", font=font, spacing=1)
+    return sheet
+
+
+def _draw_asset(draw: ImageDraw.ImageDraw, asset: Asset, share: float, corner: tuple[int, int]) -> None:
+    """Faces from the back to the front: parts are convex and don't interlock, so that order is nearly right."""
+    faces, colors = _faces(asset, share)
+    right, up, toward = _camera()
+    flat = np.stack((faces @ right, faces @ up), axis=-1)  # (n, 3, 2)
+    low, high = flat.reshape(-1, 2).min(axis=0), flat.reshape(-1, 2).max(axis=0)
+    scale = (TILE_PX - 16) / max(float((high - low).max()), 1e-6)
+    middle = (low + high) / 2
+    for k in np.argsort((faces @ toward).mean(axis=1)):
+        points = (flat[k] - middle) * scale
+        polygon = [(corner[0] + TILE_PX / 2 + x, corner[1] + TILE_PX / 2 - y) for x, y in points.tolist()]
+        draw.polygon(polygon, fill=tuple(colors[k]))
+
+
+def _camera() -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Axes of the picture to the right and up, and the direction towards the eye, which sees front and left."""
+    cos_a, sin_a = math.cos(_AZIMUTH), math.sin(_AZIMUTH)
+    cos_e, sin_e = math.cos(_ELEVATION), math.sin(_ELEVATION)
+    toward = np.array((cos_e * cos_a, cos_e * sin_a, sin_e))
+    right = np.array((-sin_a, cos_a, 0.0))
+    return right, np.cross(toward, right), toward
+
+
+def _faces(asset: Asset, share: float) -> tuple[FloatArray, list[list[int]]]:
+    """Triangles that face the eye, shape (n, 3, 3), and their colours."""
+    _, _, toward = _camera()
+    faces, colors = [], []
+    for link in asset.links:
+        motion = joint_motion(link.joint, share) if link.joint is not None else IDENTITY
+        for part in link.parts:
+            # Finely divided faces sort better by depth.
+            mesh = mesh_of(part).subdivide().subdivide()
+            normals = mesh.face_normals @ motion.rotation.T
+            seen = normals @ toward > 0
+            shade = 0.55 + 0.45 * np.clip(normals[seen] @ _LIGHT, 0.0, 1.0)
+            corners = motion.apply_all(mesh.triangles[seen].reshape(-1, 3)).reshape(-1, 3, 3)
+            faces.append(corners)
+            colors.append(np.outer(shade, _MOVING if link.joint is not None else _BASE))
+    return np.concatenate(faces), np.concatenate(colors).astype(int).tolist()

@@ -1,0 +1,117 @@
+"""``embomatrix factory assets``: test the generated assets, look at them, and import models from files."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NoReturn
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from embomatrix.factory.assets.check import Rule, check_asset
+from embomatrix.factory.assets.contact_sheet import draw_sheet
+from embomatrix.factory.assets.library import build_asset
+from embomatrix.factory.assets.naming import family_of
+from embomatrix.factory.assets.standing import GLANCE_STEPS, STEPS, check_standing
+from embomatrix.sim.engine import EngineError
+from embomatrix.world.catalog import Catalog, CatalogError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from embomatrix.world.asset import Asset
+
+app = typer.Typer(
+    help="Test, draw and import the models that scenes are built from.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+Categories = Annotated[
+    list[str] | None, typer.Option("--category", help="Only this category; give it again for more.")
+]
+
+
+@app.command()
+def check(
+    category: Categories = None,
+    every_model: Annotated[
+        bool, typer.Option("--every-model", help="All models of a category, not its first alone.")
+    ] = False,
+    glance: Annotated[
+        bool, typer.Option("--glance", help="Watch things only until they are slow, not for two seconds.")
+    ] = False,
+) -> None:
+    """Test size, cavities, doors and standing of all that scenes or activities use; exit status 1 when something is wrong."""
+    catalog = Catalog.load()
+    assets = _assets(catalog, category, every_model=every_model)
+    try:
+        findings = [finding for asset in assets for finding in check_asset(catalog, asset)]
+        findings += check_standing(catalog, assets, GLANCE_STEPS if glance else STEPS)
+    except EngineError as error:
+        _fail(str(error))
+    console = Console()
+    for finding in findings:
+        if not finding.excused:
+            console.print(f"{finding.asset_id}: {finding.rule}: {finding.detail}", highlight=False)
+    table = Table("rule", "wrong", "excused", title=f"{len(assets)} models")
+    counts = Counter((finding.rule, finding.excused) for finding in findings)
+    for rule in Rule:
+        table.add_row(rule, str(counts[rule, False]), str(counts[rule, True]))
+    console.print(table)
+    reasons = Counter(f"{finding.rule}: {finding.detail}" for finding in findings if finding.excused)
+    for reason, number in sorted(reasons.items()):
+        console.print(f"excused {number} x {reason}", highlight=False)
+    if any(not finding.excused for finding in findings):
+        raise typer.Exit(1)
+
+
+@app.command()
+def families() -> None:
+    """Count the categories of each family, of those that scenes or activities use."""
+    catalog = Catalog.load()
+    counts = Counter(family_of(catalog, name) for name in catalog.used_categories)
+    table = Table("family", "categories", title=f"{len(catalog.used_categories)} categories")
+    for family, number in counts.most_common():
+        table.add_row(family, str(number))
+    Console().print(table)
+
+
+@app.command()
+def draw(
+    out: Annotated[Path, typer.Option(help="PNG file to write.")] = Path("assets.png"),
+    category: Categories = None,
+    every_model: Annotated[bool, typer.Option("--every-model", help="All models of a category.")] = False,
+) -> None:
+    """Draw assets side by side, those with doors or drawers also open. Without a category: all that open, heat or cool."""
+    catalog = Catalog.load()
+    chosen = category or [name for name in catalog.used_categories if _is_worth_a_look(catalog, name)]
+    picture = draw_sheet(_assets(catalog, chosen, every_model=every_model))
+    try:
+        picture.save(out)
+    except (OSError, ValueError) as error:
+        _fail(f"can't write {out}: {error}")
+    Console().print(str(out), highlight=False)
+
+
+def _is_worth_a_look(catalog: Catalog, name: str) -> bool:
+    return not {"openable", "heatSource", "coldSource"}.isdisjoint(catalog.category(name).abilities)
+
+
+def _assets(catalog: Catalog, categories: Sequence[str] | None, *, every_model: bool) -> list[Asset]:
+    try:
+        return [
+            build_asset(catalog, name, model.model_id)
+            for name in categories or catalog.used_categories
+            for model in catalog.models_of(name)[: None if every_model else 1]
+        ]
+    except CatalogError as error:
+        _fail(str(error))
+
+
+def _fail(sentence: str) -> NoReturn:
+    console = Console(stderr=True)
+    console.print(f"embomatrix factory assets: {sentence}", highlight=False, markup=False, soft_wrap=True)
+    raise typer.Exit(2) from None

@@ -1,0 +1,126 @@
+"""The sanity test of all assets that scenes or activities use, and that it finds what is wrong."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from typer.testing import CliRunner
+
+from embomatrix.factory.assets.check import EXCUSED_FROM_PROBE, PROBE_M, Finding, Rule, check_asset
+from embomatrix.factory.assets.contact_sheet import TILE_PX, draw_sheet
+from embomatrix.factory.assets.families import Family
+from embomatrix.factory.assets.library import build_asset
+from embomatrix.factory.assets.naming import family_of
+from embomatrix.factory.assets_cli import app
+from embomatrix.world.asset import Asset, Interior, Joint, JointKind, Link
+from embomatrix.world.catalog import Catalog
+from embomatrix.world.geometry import Part, Pose, Shape
+
+CATALOG = Catalog.load()
+PLAIN_BOXES = 160
+"""Of the categories in use, at most so many are a plain box: sheets, thin rods, flat fittings, dice."""
+
+
+def first_of(category: str) -> Asset:
+    return build_asset(CATALOG, category, CATALOG.models_of(category)[0].model_id)
+
+
+def box_at(center: tuple[float, float, float], size: tuple[float, float, float]) -> Part:
+    return Part(Shape.BOX, Pose(center), size)
+
+
+def wrong(findings: tuple[Finding, ...]) -> list[Rule]:
+    return [finding.rule for finding in findings if not finding.excused]
+
+
+def test_what_scenes_and_activities_use_is_known() -> None:
+    used = CATALOG.used_categories
+    assert len(used) == 1428
+    assert {"fridge", "apple", "door", "bath_towel"} <= set(used)
+
+
+def test_every_category_in_use_passes() -> None:
+    for category in CATALOG.used_categories:
+        assert not wrong(check_asset(CATALOG, first_of(category))), category
+
+
+def test_every_model_of_what_opens_heats_or_cools_passes() -> None:
+    for category in CATALOG.used_categories:
+        if {"openable", "heatSource", "coldSource"} & set(CATALOG.category(category).abilities):
+            for model in CATALOG.models_of(category):
+                assert not wrong(check_asset(CATALOG, build_asset(CATALOG, category, model.model_id)))
+
+
+def test_few_categories_are_plain_boxes() -> None:
+    plain = [name for name in CATALOG.used_categories if family_of(CATALOG, name) is Family.BLOCK]
+    assert len(plain) <= PLAIN_BOXES
+
+
+def test_every_excuse_from_the_probe_is_needed_and_has_a_reason() -> None:
+    excused = {
+        family_of(CATALOG, name)
+        for name in CATALOG.used_categories
+        if any(f.rule is Rule.FILLABLE and f.excused for f in check_asset(CATALOG, first_of(name)))
+    }
+    assert all(EXCUSED_FROM_PROBE.values())
+    assert set(EXCUSED_FROM_PROBE) <= excused
+
+
+def test_a_model_of_another_size_is_found() -> None:
+    apple = first_of("apple")
+    taller = replace(apple, size_m=(*apple.size_m[:2], apple.size_m[2] * 1.06))
+    assert wrong(check_asset(CATALOG, taller)) == [Rule.SIZE]
+    assert not check_asset(CATALOG, replace(apple, size_m=(*apple.size_m[:2], apple.size_m[2] * 1.04)))
+
+
+def test_a_cavity_that_is_too_narrow_is_found() -> None:
+    bucket = first_of("bucket")
+    slit = Interior("inside", (0.0, 0.0, 0.0), (0.1, PROBE_M - 1e-3, 0.1))
+    (finding,) = check_asset(CATALOG, replace(bucket, interiors=(slit,)))
+    assert (finding.rule, finding.excused) == (Rule.FILLABLE, False)
+    assert "0.029 m wide" in finding.detail
+
+
+def test_a_door_that_cuts_its_frame_is_found() -> None:
+    fridge = first_of("fridge")
+    base, door = fridge.links
+    assert door.joint is not None
+    inward = replace(door, joint=replace(door.joint, axis=(0.0, 0.0, 1.0)))
+    (finding,) = check_asset(CATALOG, replace(fridge, links=(base, inward)))
+    assert finding.rule is Rule.OPENABLE
+    assert finding.detail.startswith("door at 5% of its travel")
+
+
+def test_two_drawers_that_cut_each_other_are_found() -> None:
+    fridge = first_of("fridge")
+    out, side = Joint(JointKind.PRISMATIC, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 0.4), (0.0, 1.0, 0.0)
+    one = Link("one", (box_at((0.0, 0.0, 0.0), (0.1, 0.1, 0.1)),), out)
+    other = Link("other", (box_at((0.3, -0.2, 0.0), (0.1, 0.1, 0.1)),), replace(out, axis=side))
+    base = Link("base", (box_at((0.0, 0.0, -0.3), (0.2, 0.2, 0.1)),))
+    findings = check_asset(CATALOG, replace(fridge, links=(base, one, other)))
+    assert Rule.OPENABLE in wrong(findings)
+
+
+def test_an_openable_thing_without_a_joint_is_found() -> None:
+    fridge = first_of("fridge")
+    assert Rule.OPENABLE in wrong(check_asset(CATALOG, replace(fridge, links=fridge.links[:1])))
+
+
+def test_a_sheet_has_a_tile_for_the_closed_and_one_for_the_open_thing() -> None:
+    picture = draw_sheet([first_of("apple"), first_of("fridge")], columns=3)
+    assert picture.width == 3 * TILE_PX
+    grey = picture.convert("L")
+    for tile in range(3):
+        dark = grey.crop((tile * TILE_PX, 0, (tile + 1) * TILE_PX, TILE_PX)).point(lambda v: v < 230 and 255)
+        assert dark.getbbox() is not None
+
+
+def test_check_tells_the_rules_and_an_unknown_category_by_name() -> None:
+    pytest.importorskip("pybullet", reason="PyBullet has wheels up to Python 3.11 on x86-64")
+    told = CliRunner().invoke(app, ["check", "--category", "bowl", "--category", "fridge", "--glance"])
+    assert told.exit_code == 0, told.output
+    assert "2 models" in told.output
+    unknown = CliRunner().invoke(app, ["check", "--category", "frigde"])
+    assert unknown.exit_code == 2
+    assert "did you mean fridge" in unknown.output
