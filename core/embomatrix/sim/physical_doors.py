@@ -11,8 +11,7 @@ import numpy as np
 from embomatrix.sim import physical_body as body
 from embomatrix.sim.bounds import joint_motion
 from embomatrix.sim.physical_grasp import facing
-from embomatrix.sim.physical_hands import GENTLE, TOUCH_M, fold, unfold
-from embomatrix.sim.physical_motion import standing
+from embomatrix.sim.physical_hands import GENTLE, TOUCH_M, approach, fold, unfold
 from embomatrix.sim.physical_reach import TOUCH_M as PRESS_M
 from embomatrix.sim.physical_reach import Reach, Track
 from embomatrix.sim.physical_space import boxes_of, part_boxes, strikes
@@ -169,10 +168,10 @@ def _stretch(stage: Stage, leaf: Leaf, start: float, goal: float, rng: np.random
     point = np.array(tracks[0].position[2])
     for bases in stage.bases(point, wide=True):
         for way in reach.ways(tracks, bases):
-            at = standing(stage.mover.posture, *way.postures[0, :3].tolist())
-            if reach.transit(at, way.postures[0], rng, loaded=False) is None:
+            swing = approach(stage, way, reach, rng, loaded=False)
+            if swing is None:
                 continue
-            return unfold(stage, way, reach, rng, loaded=False) or _pull(stage, way, leaf, goal)
+            return unfold(stage, swing) or _pull(stage, way, leaf, goal)
     return refuse(FailureReason.ARM_BLOCKED, target=leaf.name, other=reach.hindrance or SOMETHING)
 
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from embomatrix.world.asset import Asset
     from embomatrix.world.geometry import FloatArray, Pose
 
-OPEN_ELEVATIONS: Final = (50.0, 90.0, 25.0, 70.0, 8.0)
+OPEN_ELEVATIONS: Final = (30.0, 50.0, 10.0, 70.0, 90.0)
 ROOFED_ELEVATIONS: Final = (15.0, 0.0, 30.0, 45.0)
 """Degrees by which the hand comes from above, in the order of preference."""
 OPEN_AZIMUTHS: Final = (0.0, 40.0, -40.0, 80.0, -80.0)

@@ -16,6 +16,7 @@ from embomatrix.sim.physical_stage import TOOL, TUCKED, TUCKED_LIFT_M
 from embomatrix.sim.physical_travel import SOMETHING, travel
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.view import preposition, refuse
+from embomatrix.world.geometry import Pose
 from embomatrix.world.poses import StandPose
 from embomatrix.world.state import Relation
 
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from embomatrix.sim.physical_stage import Stage
     from embomatrix.skills.syntax import PlaceRelation
     from embomatrix.skills.view import Refusal
-    from embomatrix.world.geometry import Aabb, FloatArray, Pose
+    from embomatrix.world.geometry import Aabb, FloatArray
 
 GENTLE: Final = 0.25
 """Share of full speed on the last centimetres."""
@@ -37,29 +38,55 @@ ROOFED_RAISE_M: Final = 0.015
 ROOF_M: Final = 0.35
 """Things with a roof lower than this over them are reached from the side."""
 WAY_OUT_M: Final = 0.04
+BACK_OFF_M: Final = (0.0, 0.3, 0.55)
+"""How far before the place of work the arm is unfolded."""
 ATTEMPTS: Final = 3
 PLACES: Final = 10
 DROP_M: Final = 0.004
 """The hand lets go when what it holds touches, or this far below where it should."""
-STRAY_M: Final = 0.06
+LEVEL: Final = 0.3
+"""A hand that points down more steeply than this has no heading."""
+ASIDES: Final = (0.0, 35.0, -35.0)
+"""Degrees by which the hand may come from aside when it puts something."""
 
 
-def unfold(stage: Stage, way: Way, reach: Reach, rng: np.random.Generator, *, loaded: bool) -> Refusal | None:
-    """Bring base and arm to the start of a way."""
+def approach(
+    stage: Stage, way: Way, reach: Reach, rng: np.random.Generator, *, loaded: bool
+) -> FloatArray | None:
+    """Postures that lead to the start of a way, (w, 11), None when none are found.
+
+    The arm unfolds where it will work, or some way back from there, whence the base then drives on with the arm ready.
+    """
     start = way.postures[0]
     now = stage.mover.posture
-    if math.dist(now[:2], start[:2]) > 0.01:
-        refusal = travel(stage, StandPose(*start[:3].tolist()))
+    back = -np.array([math.cos(start[body.YAW]), math.sin(start[body.YAW])])
+    for away in BACK_OFF_M:
+        spot = start[:2] + away * back
+        if away and not stage.floor.grid.drives_straight(_pair(spot), _pair(start)):
+            continue
+        swing = reach.transit(
+            standing(now, *spot.tolist(), float(start[body.YAW])), start, rng, loaded=loaded
+        )
+        if swing is not None:
+            return swing
+    return None
+
+
+def unfold(stage: Stage, swing: FloatArray) -> Refusal | None:
+    """Drive to where a swing begins, and make it."""
+    now = stage.mover.posture
+    if math.dist(now[:2], swing[0, :2]) > 0.01:
+        refusal = travel(stage, StandPose(*swing[0, :3].tolist()))
         if refusal is not None:
             return refusal
-    now = stage.mover.posture
-    swing = reach.transit(standing(now, *start[:3].tolist()), start, rng, loaded=loaded)
-    if swing is None:
-        return refuse(FailureReason.ARM_BLOCKED, target=SOMETHING, other=reach.hindrance or SOMETHING)
-    hit = stage.mover.follow(swing[1:])
+    hit = stage.mover.follow(swing)
     if hit is not None:
         return refuse(FailureReason.ARM_BLOCKED, target=SOMETHING, other=hit or SOMETHING)
     return None
+
+
+def _pair(point: FloatArray) -> tuple[float, float]:
+    return float(point[0]), float(point[1])
 
 
 def fold(stage: Stage, home: StandPose, rng: np.random.Generator) -> Refusal | None:
@@ -148,18 +175,11 @@ def _take(stage: Stage, target: str, rng: np.random.Generator) -> Refusal | None
         for way in reach.ways(tracks, bases):
             if attempts == ATTEMPTS:
                 return refusal
-            if (
-                reach.transit(
-                    standing(stage.mover.posture, *way.postures[0, :3].tolist()),
-                    way.postures[0],
-                    rng,
-                    loaded=False,
-                )
-                is None
-            ):
+            swing = approach(stage, way, reach, rng, loaded=False)
+            if swing is None:
                 continue
             attempts += 1
-            refusal = unfold(stage, way, reach, rng, loaded=False) or _touch(stage, way, target)
+            refusal = unfold(stage, swing) or _touch(stage, way, target)
             if refusal is None:
                 return _lift(stage, way, target, RAISE_M if out_m is None else ROOFED_RAISE_M)
             fold(stage, StandPose(*stage.mover.posture[:3].tolist()), rng)
@@ -214,7 +234,8 @@ def way_in(stage: Stage, name: str, box: Aabb, boxes: Boxes) -> tuple[float, flo
     ahead = np.array([math.cos(host.yaw), math.sin(host.yaw)])
     half = np.abs(ahead) @ (np.array(bounds.size_m[:2]) / 2)
     depth = float(ahead @ (np.array(bounds.center_m[:2]) - (x, y)) + half)
-    return front, max(0.05, depth) + WAY_OUT_M
+    extent = np.array(box.size_m[:2])
+    return front, max(0.05, depth) + float(np.abs(ahead) @ extent) / 2 + WAY_OUT_M
 
 
 def place(stage: Stage, target: str, asked: PlaceRelation, rng: np.random.Generator) -> Refusal | None:
@@ -246,17 +267,17 @@ def _put(
     assert grip is not None
     boxes = stage.boxes()
     reach = stage.reach(boxes)
-    tracks = list(_put_tracks(stage, poses, boxes))
+    tracks = list(_put_tracks(stage, target, relation, poses, boxes))
     attempts, refusal = 0, None
     for bases in stage.bases(np.array(poses[0].position_m)):
         for way in reach.ways(tracks, bases):
             if attempts == ATTEMPTS:
                 return refusal
-            start = standing(stage.mover.posture, *way.postures[0, :3].tolist())
-            if reach.transit(start, way.postures[0], rng, loaded=True) is None:
+            swing = approach(stage, way, reach, rng, loaded=True)
+            if swing is None:
                 continue
             attempts += 1
-            refusal = unfold(stage, way, reach, rng, loaded=True)
+            refusal = unfold(stage, swing)
             if refusal is None:
                 return _set_down(stage, way, tracks[way.track])
     name = grip.name
@@ -265,17 +286,45 @@ def _put(
     )
 
 
-def _put_tracks(stage: Stage, poses: Sequence[Pose], boxes: Boxes) -> Iterator[Track]:
+def _turned(
+    stage: Stage, target: str, relation: Relation, poses: Sequence[Pose], boxes: Boxes
+) -> Iterator[tuple[Pose, float, float | None]]:
+    """Each pose turned about the vertical so that the hand can come the way in, as far as there is room; then as it is.
+
+    With the pose, the heading of the way in and its length under a roof.
+    """
+    grip = stage.grip
+    assert grip is not None
+    world = stage.world
+    fits: list[tuple[Pose, float, float | None]] = []
+    for pose in poses:
+        world.engine.set_pose(grip.name, pose)
+        course, out_m = way_in(stage, grip.name, world.engine.aabb(grip.name), boxes)
+        pointing = (pose @ grip.pose_tool_object.inverse()).rotation[:, 2]
+        if math.hypot(pointing[0], pointing[1]) > LEVEL:
+            present = math.atan2(pointing[1], pointing[0])
+            turns = [math.remainder(course + math.radians(aside) - present, math.tau) for aside in ASIDES]
+        else:
+            turns = [0.0, math.pi / 2]
+        for turn in turns:
+            about = Pose.from_xyz_yaw(0.0, 0.0, 0.0, turn) @ Pose((0.0, 0.0, 0.0), pose.quat_xyzw)
+            turned = Pose(pose.position_m, about.quat_xyzw)
+            world.engine.set_pose(grip.name, turned)
+            if not world.engine.penetrates(grip.name) and world.relations.holds(relation, grip.name, target):
+                fits.append((turned, course, out_m))
+        fits.append((pose, course, out_m))
+    world.engine.park(grip.name)
+    yield from fits
+
+
+def _put_tracks(
+    stage: Stage, target: str, relation: Relation, poses: Sequence[Pose], boxes: Boxes
+) -> Iterator[Track]:
     """Ways that bring what is held to a pose and the empty hand back from there: in, down, and out."""
     grip = stage.grip
     assert grip is not None
     back = grip.pose_tool_object.inverse()
-    world = stage.world
-    for pose in poses:
-        world.engine.set_pose(grip.name, pose)
-        box = world.engine.aabb(grip.name)
-        world.engine.park(grip.name)
-        course, out_m = way_in(stage, grip.name, box, boxes)
+    for pose, course, out_m in _turned(stage, target, relation, poses, boxes):
         tool = pose @ back
         rotation, point = tool.rotation, np.array(tool.position_m)
         inward = np.array([math.cos(course), math.sin(course), 0.0])

@@ -9,8 +9,7 @@ import numpy as np
 
 from embomatrix.sim import physical_arm as arm
 from embomatrix.sim.physical_grasp import facing, surface_point
-from embomatrix.sim.physical_hands import GENTLE, TOUCH_M, fold, unfold
-from embomatrix.sim.physical_motion import standing
+from embomatrix.sim.physical_hands import GENTLE, TOUCH_M, approach, fold, unfold
 from embomatrix.sim.physical_reach import Track
 from embomatrix.sim.physical_space import part_boxes
 from embomatrix.sim.physical_travel import SOMETHING
@@ -48,11 +47,11 @@ def _press(stage: Stage, target: str, rng: np.random.Generator) -> Refusal | Non
         for way in reach.ways(tracks, bases):
             if attempts == ATTEMPTS:
                 return refusal
-            at = standing(stage.mover.posture, *way.postures[0, :3].tolist())
-            if reach.transit(at, way.postures[0], rng, loaded=False) is None:
+            swing = approach(stage, way, reach, rng, loaded=False)
+            if swing is None:
                 continue
             attempts += 1
-            refusal = unfold(stage, way, reach, rng, loaded=False)
+            refusal = unfold(stage, swing)
             if refusal is not None:
                 continue
             stage.wake_around(target)

@@ -27,7 +27,12 @@ LIFT_SPARE_M: Final = 0.08
 LAST_RAD: Final = np.array([0.785, -0.785, 2.3, -2.3, 0.0, 1.57, -1.57])
 JUMP_RAD: Final = 1.3
 """Between two waypoints of a way no joint turns further."""
-KEPT: Final = 32
+LOOKED_AT: Final = 160
+"""Of all solutions, this many of the most comfortable ones are compared with what is around."""
+RANK: Final = 0.1
+"""What a place further down the list of tracks weighs against the strain of joints."""
+OFFERED: Final = 3
+"""Ways of one batch that are offered."""
 BATCH: Final = 12
 """Ways that are looked at together."""
 AIR_M: Final = 0.012
@@ -103,22 +108,24 @@ class Reach:
     ) -> FloatArray | None:
         """Postures (w, 11) that lead from one to another without touching anything, None when none are found.
 
-        The base stays where it is. First straight on, then by way of one posture more.
+        The arm moves where the base is at the start; then the base drives to where it is at the end. First straight on, then
+        by way of one posture more.
         """
         held = self._held if loaded else None
-        if self._is_free(_between(start, end), held):
-            return np.stack([start, end])
+        ready = np.concatenate([start[:3], end[3:]])
+        if not self._is_free(_between(ready, end), held):
+            return None
         low = np.concatenate([start[:3], [0.0], arm.LOW_RAD * 0.9])
         high = np.concatenate([start[:3], [body.LIFT_M], arm.HIGH_RAD * 0.9])
-        middle = (start + end) / 2
-        vias = [np.concatenate([start[:4], end[4:]]), np.concatenate([end[:4], start[4:]])]
+        middle = (start + ready) / 2
+        vias = [middle, np.concatenate([start[:4], end[4:]]), np.concatenate([end[:4], start[4:]])]
         for number in range(VIAS):
             spread = 0.25 + 0.75 * number / VIAS
             vias.append(middle + spread * (rng.uniform(low, high) - middle))
         for via in vias:
             via[:3] = start[:3]
-            if self._is_free(_between(start, via), held) and self._is_free(_between(via, end), held):
-                return np.stack([start, via, end])
+            if self._is_free(np.concatenate([_between(start, via), _between(via, ready)[1:]]), held):
+                return np.stack([start, via, ready, end])
         return None
 
     def _is_free(self, postures: FloatArray, held: Held | None) -> bool:
@@ -133,15 +140,17 @@ class Reach:
         rows, branches = np.nonzero(~np.isnan(found[:, :, -1]))
         if not len(rows):
             return []
-        comfort = _strain(found[rows, branches]) + 0.02 * track[rows]
-        best = np.argsort(comfort, kind="stable")[:KEPT]
+        comfort = _strain(found[rows, branches]) + RANK * track[rows]
+        best = np.argsort(comfort, kind="stable")[:LOOKED_AT]
+        rows, branches = rows[best], branches[best]
+        clear = self._free(found[rows, branches], self._at_work, None, TOUCH_M)
         ways = []
-        for row, branch in zip(rows[best].tolist(), branches[best].tolist(), strict=True):
+        for row, branch in zip(rows[clear].tolist(), branches[clear].tolist(), strict=True):
             number = numbers[int(track[row])]
             postures = _followed(tracks[number], bases[base[row]], lift[row], last[row], branch)
             if postures is not None and self._passes(tracks[number], postures):
                 ways.append(Way(postures, number))
-                if len(ways) == 3:
+                if len(ways) == OFFERED:
                     break
         return ways
 

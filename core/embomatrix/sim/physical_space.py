@@ -62,8 +62,9 @@ class Boxes:
 
     def gaps(self, points: FloatArray) -> FloatArray:
         """Signed distances of points, (k, 3), to every box, (k, m): negative inside."""
-        away = points[:, None] - self.centre  # (k, m, 3)
-        local = np.abs(np.einsum("kmj,mji->kmi", away, self.rotation)) - self.half
+        turns = self.rotation.transpose(1, 0, 2).reshape(3, -1)  # (3, m * 3)
+        offset = np.einsum("mj,mji->mi", self.centre, self.rotation)
+        local = np.abs((points @ turns).reshape(len(points), -1, 3) - offset) - self.half  # (k, m, 3)
         outside = np.sqrt((np.maximum(local, 0.0) ** 2).sum(axis=2))
         return np.asarray(outside + np.minimum(local.max(axis=2), 0.0))
 
