@@ -1,7 +1,8 @@
 """What is to be done in a house so that a goal holds, and the order in which one arm does it.
 
-Sources first: what must get hot, cooked or frozen is taken there, all of it before the source is shut and started. Then
-everything goes to its place. Doors and switches come as soon as nothing more goes through them.
+What must be cut, cleaned and wetted comes first. Then the sources: what must get hot, cooked or frozen is taken there, all of
+it before the source is shut and started. Then everything goes to its place. Doors and switches come as soon as nothing
+more goes through them.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from embomatrix.sim.plan_chores import do_chores
 from embomatrix.sim.plan_script import StuckError
 from embomatrix.sim.plan_ways import ways
 from embomatrix.skills.appliance import cold_source, heat_source
@@ -20,6 +22,7 @@ if TYPE_CHECKING:
 
     from embomatrix.sim.executor import Simulator
     from embomatrix.sim.live_world import LiveWorld
+    from embomatrix.sim.plan_chores import Chore, Means
     from embomatrix.sim.plan_script import PlanScript
     from embomatrix.sim.plan_ways import Placement
     from embomatrix.skills.appliance import Source
@@ -46,12 +49,14 @@ class Errands:
     open: Mapping[str, bool]
     on: Mapping[str, bool]
     leave: tuple[Placement, ...]
+    chores: tuple[tuple[Chore, Means], ...] = ()
     way: int = 0
     singly: bool = False
 
     def run(self, script: PlanScript, simulator: Simulator) -> None:
         """Do it all. Raises StuckError."""
         world = simulator.world
+        do_chores(script, world, self.chores)
         self._warm(script, world)
         for number, item in enumerate(self.placements):
             self._place(item, script, world)

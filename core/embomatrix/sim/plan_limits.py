@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.sim.plan_chores import chore_for, is_about_chores, means_for, nothing_for
 from embomatrix.skills.appliance import cold_source, cooks, freezes, heat_source, heats
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.state import Relation, State
+from embomatrix.world.substances import word_of
+from embomatrix.world.task import Profile
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -30,6 +33,8 @@ def why_impossible(world: LiveWorld, task: Task, literal: Literal) -> str:
     predicate = literal.atom.predicate
     if predicate in set(Relation):
         return _relation_limit(world, task, literal)
+    if is_about_chores(predicate):
+        return _chore_limit(world, task, literal)
     return STATE_LIMITS[State(predicate)](world, task, literal)
 
 
@@ -87,9 +92,25 @@ def _switch_limit(world: LiveWorld, task: Task, literal: Literal) -> str:
 
 
 def _no_skill(world: LiveWorld, task: Task, literal: Literal) -> str:
-    (name,) = literal.atom.args
+    name, *substance = literal.atom.args
     change = "made" if literal.positive else "undone"
-    return f"none of the skills can do this: {name} must be {change} {literal.atom.predicate}"
+    what = " ".join((literal.atom.predicate, *map(word_of, substance)))
+    return f"none of the skills can do this: {name} must be {change} {what}"
+
+
+def _chore_limit(world: LiveWorld, task: Task, literal: Literal) -> str:
+    """Chores need their own skills, and something in the table to do them with."""
+    chore = chore_for(world, literal)
+    if chore is None or task.profile is Profile.PAPER:
+        return _no_skill(world, task, literal)
+    if means_for(world, task.table, chore, portables(world, task)):
+        return _unlisted(task, chore.name)
+    return nothing_for(chore)
+
+
+def portables(world: LiveWorld, task: Task) -> frozenset[str]:
+    """Rows of the table that the robot can carry."""
+    return frozenset(name for name in task.table if not carries(world, name))
 
 
 def _temperature_limit(world: LiveWorld, task: Task, literal: Literal) -> str:
@@ -134,9 +155,9 @@ STATE_LIMITS: Final[Mapping[State, Limit]] = {
     State.HOT: _temperature_limit,
     State.COOKED: _temperature_limit,
     State.FROZEN: _temperature_limit,
-    State.SLICED: _no_skill,
-    State.DUSTY: _no_skill,
-    State.STAINED: _no_skill,
-    State.SOAKED: _no_skill,
+    State.SLICED: _chore_limit,
+    State.DUSTY: _chore_limit,
+    State.STAINED: _chore_limit,
+    State.SOAKED: _chore_limit,
 }
 """What speaks against a change of each state."""

@@ -95,7 +95,7 @@ class PlanScript:
         """Open it, unless it is open. An appliance that must be closed while it runs is switched off first."""
         if self._world.is_open(name):
             return
-        self._clear_way_to(name)
+        self.clear_way_to(name)
         if self._world.is_on(name) and starts_closed(self._world.asset(name)):
             self.switch_off(name)
         self._swing(Skill.OPEN, name, depth)
@@ -103,14 +103,14 @@ class PlanScript:
     def close(self, name: str, depth: int = 0) -> None:
         """Close it, unless it is closed."""
         if self._world.is_open(name):
-            self._clear_way_to(name)
+            self.clear_way_to(name)
             self._swing(Skill.CLOSE, name, depth)
 
     def switch_on(self, name: str) -> None:
         """Switch it on, unless it is on, closed if it must be."""
         if self._world.is_on(name):
             return
-        self._clear_way_to(name)
+        self.clear_way_to(name)
         if starts_closed(self._world.asset(name)):
             self.close(name)
         self._use(Skill.TOGGLE_ON, name)
@@ -118,7 +118,7 @@ class PlanScript:
     def switch_off(self, name: str) -> None:
         """Switch it off, unless it is off."""
         if self._world.is_on(name):
-            self._clear_way_to(name)
+            self.clear_way_to(name)
             self._use(Skill.TOGGLE_OFF, name)
 
     def put_away(self, name: str, avoid: frozenset[str], depth: int = 0) -> None:
@@ -131,6 +131,33 @@ class PlanScript:
     def holds(self, relation: Relation, a: str, b: str) -> bool:
         """Whether the relation holds in the state reached."""
         return self._world.relations.holds(relation, a, b)
+
+    def take(self, name: str) -> None:
+        """Take an object into the hand, unless it is there."""
+        if name not in self._world.carried[:1]:
+            self._take(name, 0)
+
+    def lay_down(self, avoid: frozenset[str]) -> None:
+        """Leave what the hand holds on the first surface with room that is none of ``avoid``."""
+        held = self._world.carried[0]
+        self._set_down(held, avoid | {held})
+
+    def use_on(self, skill: Skill, name: str, source: str, at: str) -> None:
+        """Use a source or a tool on an object, from beside ``at``."""
+        step = self._attempt(self._call(skill, name, source=source), at)
+        if not step.ok:
+            raise StuckError(_sentence(step))
+
+    def unload(self, name: str) -> None:
+        """Take off what rests on an object."""
+        while burden := self._world.burden(name):
+            self._unload(burden, name, 0)
+
+    def clear_way_to(self, name: str) -> None:
+        """Open the closed containers around an object, the outermost first."""
+        around = [item.name for item in self._world.relations.enclosing(name) if item.closed]
+        for container in reversed(around):
+            self.open(container)
 
     def _set_down(self, name: str, avoid: frozenset[str]) -> None:
         """Place what the hand holds on the first surface with room."""
@@ -167,7 +194,7 @@ class PlanScript:
         )
 
     def _prepare(self, target: str, relation: PlaceRelation) -> None:
-        self._clear_way_to(target)
+        self.clear_way_to(target)
         if relation is PlaceRelation.INSIDE and self._world.asset(target).joints:
             self.open(target)
 
@@ -187,7 +214,7 @@ class PlanScript:
         )
 
     def _take(self, name: str, depth: int) -> None:
-        self._clear_way_to(name)
+        self.clear_way_to(name)
         while burden := self._world.burden(name):
             self._unload(burden, name, depth)
         step = self._try(Skill.PICK_UP, name)
@@ -201,7 +228,7 @@ class PlanScript:
         if depth == DEPTH:
             raise StuckError(f"too many things are stacked on {name}")
         self.put_away(burden, frozenset((name, burden)), depth + 1)
-        self._clear_way_to(name)
+        self.clear_way_to(name)
 
     def _swing(self, skill: Skill, name: str, depth: int) -> None:
         """Move a door; what can be carried away from before it is."""
@@ -219,12 +246,6 @@ class PlanScript:
         """The other object that a refusal's sentence names: refusals carry no fields."""
         known = self._world.scene.by_name
         return next((word for word in step.message.split() if word in known and word != name), "")
-
-    def _clear_way_to(self, name: str) -> None:
-        """Open the closed containers around an object, the outermost first."""
-        around = [item.name for item in self._world.relations.enclosing(name) if item.closed]
-        for container in reversed(around):
-            self.open(container)
 
     def _use(self, skill: Skill, name: str) -> None:
         step = self._try(skill, name)
@@ -244,7 +265,9 @@ class PlanScript:
 
     def _try(self, skill: Skill, name: str, relation: PlaceRelation | None = None) -> Step:
         """Go to the object unless the robot is there, then do it, from beside a neighbour if need be."""
-        call = self._call(skill, name, relation)
+        return self._attempt(self._call(skill, name, relation), name)
+
+    def _attempt(self, call: SkillCall, name: str) -> Step:
         if self._stands_at(name):
             return self._run(call)
         step = self._go_to(name)
@@ -278,11 +301,21 @@ class PlanScript:
         sent = name == self._at or (self._at and (inside(name, self._at) or inside(self._at, name)))
         return bool(sent) and within_reach(self._world, name) is None
 
-    def _call(self, skill: Skill, name: str, relation: PlaceRelation | None = None) -> SkillCall:
+    def _call(
+        self, skill: Skill, name: str, relation: PlaceRelation | None = None, source: str = ""
+    ) -> SkillCall:
+        return SkillCall(
+            skill,
+            object_index=self._row(name),
+            source_index=self._row(source) if source else None,
+            relation=relation,
+        )
+
+    def _row(self, name: str) -> int:
         row = self._task.index_of.get(name)
         if row is None:
             raise StuckError(f"{name} is not in the object table: no plan can name it")
-        return SkillCall(skill, object_index=row, relation=relation)
+        return row
 
     def _run(self, call: SkillCall) -> Step:
         """Execute a call; one that succeeds is part of the plan."""

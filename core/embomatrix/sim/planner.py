@@ -13,8 +13,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.sim.goal_choices import choices
+from embomatrix.sim.plan_chores import chores_for, chosen, is_about_chores
 from embomatrix.sim.plan_errands import Errands, Warming
-from embomatrix.sim.plan_limits import is_hot_work, sources_for, why_impossible
+from embomatrix.sim.plan_limits import is_hot_work, portables, sources_for, why_impossible
 from embomatrix.sim.plan_script import PlanScript, StuckError
 from embomatrix.sim.plan_ways import Placement
 from embomatrix.sim.plan_wishes import Wishes
@@ -57,8 +58,8 @@ class PlanNotFound:
 class Strategy:
     """How an attempt differs from the others.
 
-    ``source_rank`` and ``way`` choose among sources and ways to bring relations about; ``reverse`` turns the order of the
-    placements; ``singly`` lets a source work on one thing at a time; ``seed`` decides where things come to
+    ``source_rank`` and ``way`` choose among sources and tools, and among ways to bring relations about; ``reverse`` turns
+    the order of the placements; ``singly`` lets a source work on one thing at a time; ``seed`` decides where things come to
     stand while the plan is written.
     """
 
@@ -124,12 +125,13 @@ def _attempts(options: Sequence[Choice]) -> list[tuple[Choice, Strategy]]:
 def _strategies(choice: Choice) -> list[Strategy]:
     predicates = [item.atom.predicate for item in choice]
     warm = bool({State.HOT, State.COOKED, State.FROZEN} & set(predicates))
+    choosy = warm or any(map(is_about_chores, predicates))
     carried = sum(predicate in set(Relation) for predicate in predicates)
     found = itertools.product(
         PROOF_SEEDS,
         (False, True) if warm else (False,),
         range(UNAIMED_WAYS_TRIED if UNAIMED in predicates else WAYS_TRIED if carried else 1),
-        range(SOURCES_TRIED) if warm else (0,),
+        range(SOURCES_TRIED) if choosy else (0,),
         (False, True) if carried > 1 else (False,),
     )
     return [Strategy(rank, reverse, way, singly, seed) for seed, singly, way, rank, reverse in found]
@@ -173,6 +175,15 @@ def _errands(
 ) -> Errands:
     return Errands(
         placements=_placements(choice, strategy),
+        chores=tuple(
+            chosen(
+                simulator.world,
+                task.table,
+                chores_for(simulator.world, missing),
+                portables(simulator.world, task),
+                strategy.source_rank,
+            )
+        ),
         warmings=_warmings(simulator, task, choice, missing, strategy),
         open={item.atom.args[0]: item.positive for item in choice if item.atom.predicate == State.OPEN},
         on={item.atom.args[0]: item.positive for item in choice if item.atom.predicate == State.TOGGLED_ON},
@@ -219,7 +230,7 @@ def _warmings(
     }
     needs: dict[tuple[str, bool], set[State]] = {}
     for item in missing:
-        if not _is_relation(item) and item.atom.predicate not in (State.OPEN, State.TOGGLED_ON):
+        if item.atom.predicate in (State.HOT, State.COOKED, State.FROZEN):
             key = (item.atom.args[0], is_hot_work(item))
             needs.setdefault(key, set()).add(State(item.atom.predicate))
     return tuple(
