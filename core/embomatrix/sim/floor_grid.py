@@ -42,19 +42,27 @@ class FloorGrid:
 
     def __init__(self, scene: Scene, boxes: FloatArray) -> None:
         """Rasterise obstacles, shape (n, 6), and inflate them by the robot's radius."""
-        lows = np.array([room.low_m for room in scene.rooms])
-        highs = np.array([room.high_m for room in scene.rooms])
-        self._origin = lows.min(axis=0) - 2 * CELL_M
-        self._origin_m = (float(self._origin[0]), float(self._origin[1]))
-        span = highs.max(axis=0) + 2 * CELL_M - self._origin
-        self._shape = (math.ceil(span[0] / CELL_M), math.ceil(span[1] / CELL_M))
-        self._covered = (~self._floor_of(scene)).astype(np.int16)
+        self._lay_out(scene)
+        self.covered = (~self._floor_of(scene)).astype(np.int16)
         """How many obstacles cover each cell, and one more where there is no floor."""
         for box in boxes:
-            self._covered[self._window(box[:2], box[2:4])] += 1
+            self.covered[self._window(box[:2], box[2:4])] += 1
         for edge in (np.s_[0, :], np.s_[-1, :], np.s_[:, 0], np.s_[:, -1]):
-            self._covered[edge] += 1
+            self.covered[edge] += 1
         self.free: BoolArray = self._clear_of_obstacles(np.s_[:, :])
+
+    @classmethod
+    def restored(cls, scene: Scene, covered: NDArray[np.int16], free: BoolArray) -> FloorGrid:
+        """The grid of the scene that once had these arrays, of shape ``grid_shape``."""
+        grid = cls.__new__(cls)
+        grid._lay_out(scene)
+        grid.covered, grid.free = covered, free
+        return grid
+
+    def _lay_out(self, scene: Scene) -> None:
+        self._origin = _origin_of(scene)
+        self._origin_m = (float(self._origin[0]), float(self._origin[1]))
+        self._shape = grid_shape(scene)
         self._field = functools.lru_cache(maxsize=FIELDS_KEPT)(self._field_from)
 
     def changed(self, gone: FloatArray, come: FloatArray) -> FloorGrid:
@@ -62,10 +70,10 @@ class FloorGrid:
         grid = copy.copy(self)
         vars(grid).pop("labels", None)
         vars(grid).pop("_graph", None)
-        grid._covered, grid.free = self._covered.copy(), self.free.copy()
+        grid.covered, grid.free = self.covered.copy(), self.free.copy()
         for boxes, step in ((gone, -1), (come, 1)):
             for box in boxes:
-                grid._covered[self._window(box[:2], box[2:4])] += step
+                grid.covered[self._window(box[:2], box[2:4])] += step
         for box in (*gone, *come):
             reach = ROBOT.radius_m + CELL_M
             here = self._window(box[:2] - reach, box[2:4] + reach)
@@ -199,7 +207,7 @@ class FloorGrid:
 
     def _clear_of_obstacles(self, window: tuple[slice, slice]) -> BoolArray:
         """Which cells of a window are a robot's radius or more from every covered cell of it."""
-        clear = self._covered[window] == 0
+        clear = self.covered[window] == 0
         if clear.all():  # there is nothing to measure the distance from
             return np.asarray(clear)
         return np.asarray(np.asarray(ndimage.distance_transform_edt(clear)) * CELL_M >= ROBOT.radius_m)
@@ -223,3 +231,15 @@ class FloorGrid:
         first = np.clip(first, 0, self._shape)
         last = np.clip(last, first, self._shape)
         return slice(int(first[0]), int(last[0])), slice(int(first[1]), int(last[1]))
+
+
+def grid_shape(scene: Scene) -> tuple[int, int]:
+    """Cells along x and y: over the bounding rectangle of the scene's rooms, and two more on each side."""
+    highs = np.array([room.high_m for room in scene.rooms])
+    span = highs.max(axis=0) + 2 * CELL_M - _origin_of(scene)
+    return math.ceil(span[0] / CELL_M), math.ceil(span[1] / CELL_M)
+
+
+def _origin_of(scene: Scene) -> FloatArray:
+    """Lower corner of the first cell, shape (2,)."""
+    return np.asarray(np.array([room.low_m for room in scene.rooms]).min(axis=0) - 2 * CELL_M)

@@ -9,6 +9,7 @@ from embomatrix.sim.facts import SceneFacts
 from embomatrix.sim.hand import Hand
 from embomatrix.sim.navigation import Navigator
 from embomatrix.sim.placement import Placer
+from embomatrix.sim.prepared import Prepared
 from embomatrix.sim.relations import Relations
 from embomatrix.sim.thermal import Thermal
 from embomatrix.sim.water import Water
@@ -39,7 +40,7 @@ class LiveWorld:
         self.scene = bundle.scene
         self.engine = engine
         self.relations = Relations(engine)
-        self.navigator = Navigator(engine, self.relations)
+        self.navigator = Navigator(engine, self.relations, prepared=Prepared.of(bundle))
         self.placer = Placer(engine, self.relations, bundle.poses)
         self.states: dict[str, set[State]] = {}
         self.substances: dict[str, set[SubstanceFact]] = {}

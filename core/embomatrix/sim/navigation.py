@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from embomatrix.sim.engine import PhysicsEngine
     from embomatrix.sim.floor_grid import Cell
+    from embomatrix.sim.prepared import Prepared
     from embomatrix.sim.relations import Relations
     from embomatrix.world.asset import Asset
     from embomatrix.world.geometry import FloatArray, Vec2
@@ -62,8 +63,9 @@ class Navigator:
         engine: PhysicsEngine,
         relations: Relations,
         stands: Mapping[str, tuple[StandPose, ...]] | None = None,
+        prepared: Prepared | None = None,
     ) -> None:
-        """``stands`` are standing poses that were found before, in this scene as it was loaded."""
+        """``stands`` and ``prepared`` were found before, in this scene as it was loaded."""
         self._engine = engine
         self._relations = relations
         self._scene = engine.scene
@@ -71,8 +73,13 @@ class Navigator:
         self._parts: dict[str, AssetParts] = {}
         bars = [item for item in self._scene.objects if item.fixed or self._on_floor(item.name)]
         self._on_floor_at_start = {self._numbers[item.name] for item in bars if not item.fixed}
-        self._all_at_start = Obstacles.joined([self._walls(), *(self._parts_of(item.name) for item in bars)])
-        self._grid_at_start = FloorGrid(self._scene, self._all_at_start.barring)
+        if prepared is not None:
+            self._all_at_start = prepared.obstacles
+            self._grid_at_start = FloorGrid.restored(self._scene, prepared.covered, prepared.free)
+        else:
+            parts = (self._parts_of(item.name) for item in bars)
+            self._all_at_start = Obstacles.joined([self._walls(), *parts])
+            self._grid_at_start = FloorGrid(self._scene, self._all_at_start.barring)
         self._grids: OrderedDict[Floor, tuple[FloorGrid, Obstacles]] = OrderedDict()
         self._stands: dict[tuple[object, ...], tuple[StandPose, ...]] = {}
         self._blockers: dict[tuple[object, ...], FloatArray] = {}
@@ -117,6 +124,11 @@ class Navigator:
         gone = self._all_at_start.only(moved)
         now = Obstacles.joined([self._all_at_start.without(moved), come])
         return self._grid_at_start.changed(gone.barring, come.barring), now
+
+    @property
+    def at_start(self) -> tuple[Obstacles, FloorGrid]:
+        """What stands in the way in the scene as it was loaded, and where the robot may be. For reading only."""
+        return self._all_at_start, self._grid_at_start
 
     @property
     def start(self) -> StandPose:

@@ -13,6 +13,7 @@ from embomatrix.factory.refusal import Refusal, RefusalReason
 from embomatrix.factory.writer_view import SceneView
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.planner import find_plan
+from embomatrix.sim.prepared import prepare
 from embomatrix.skills.parse import plan_to_json
 from embomatrix.world.bundle import Bundle, bundle_digest, encode_bundle
 from embomatrix.world.dataset import TaskRecord
@@ -71,9 +72,10 @@ def verify(imported: Imported, library: PlacementLibrary, *, seed: int = 0) -> V
     poses = cache_poses(SceneView(imported.scene), [needs], library, seed)
     with contextlib.closing(Simulator(Bundle(imported.scene, {}, poses))) as stage:
         verdict = admit(stage, imported.task, find_plan, imported.init)
-    if not isinstance(verdict, Admitted):
-        return verdict
-    data = encode_bundle(Bundle(imported.scene, {imported.task.task_id: imported.task}, poses))
+        if not isinstance(verdict, Admitted):
+            return verdict
+        bundle = Bundle(imported.scene, {imported.task.task_id: imported.task}, poses)
+        data = encode_bundle(prepare(bundle, stage.world))
     record = TaskRecord(
         task=imported.task,
         bundle_digest=bundle_digest(data),

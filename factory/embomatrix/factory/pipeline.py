@@ -21,6 +21,7 @@ from embomatrix.factory.writer_view import SceneView
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.planner import find_plan
 from embomatrix.sim.pose_cache import PlacementLibrary
+from embomatrix.sim.prepared import prepare
 from embomatrix.skills.parse import plan_to_json
 from embomatrix.world.bundle import Bundle, bundle_digest, encode_bundle
 from embomatrix.world.catalog import Catalog
@@ -222,8 +223,8 @@ class _VariantJob:
                     break
                 if left[draft.task.category] > 0 and self._judge(stage, draft):
                     left[draft.task.category] -= 1
-        tasks = {draft.task.task_id: draft.task for draft, _ in self._admitted}
-        data = encode_bundle(Bundle(self._variant.scene, tasks, poses))
+            tasks = {draft.task.task_id: draft.task for draft, _ in self._admitted}
+            data = encode_bundle(prepare(Bundle(self._variant.scene, tasks, poses), stage.world))
         return self._result(bundle_digest(data)), data
 
     def _write(self, missing: Mapping[TaskCategory, int], rng: np.random.Generator) -> list[Draft]:

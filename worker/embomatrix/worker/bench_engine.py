@@ -20,6 +20,7 @@ from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.engine import NOTHING, SETTLE_STEPS
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.pose_cache import PlacementLibrary, build_pose_cache
+from embomatrix.sim.prepared import Prepared
 from embomatrix.sim.zygote import resident_mb
 from embomatrix.skills.syntax import Skill
 from embomatrix.worker.bench_figures import BenchError, Better, Figure, quantile
@@ -119,7 +120,7 @@ def _bundle_bytes(dataset: Dataset, scene: SceneWork) -> bytes:
 def _measure_rollouts(scene: SceneWork, data: bytes, samples: EngineSamples) -> None:
     bundle = decode_bundle(data, digest=scene.bundle_digest)
     clients = ClientPool(spare=CLIENTS_PER_SCENE)
-    engine = CountingEngine(bundle.scene, clients)
+    engine = CountingEngine(bundle.scene, clients, Prepared.of(bundle))
     simulator = Simulator(bundle, engine)
     try:
         with _frozen_heap():
@@ -168,7 +169,9 @@ def _leak_kb(data: bytes, scene: SceneWork, cycles: int) -> float:
     for cycle in range(cycles):
         bundle = decode_bundle(data)
         execution = scene.executions[cycle % len(scene.executions)]
-        with contextlib.closing(Simulator(bundle, BulletEngine(bundle.scene, clients))) as simulator:
+        with contextlib.closing(
+            Simulator(bundle, BulletEngine(bundle.scene, clients, Prepared.of(bundle)))
+        ) as simulator:
             simulator.execute(bundle.tasks[execution.task_id], execution.plan, execution.seed)
             simulator.reset(bundle.tasks[execution.task_id], execution.seed)
         if cycle % SAMPLE_EVERY == SAMPLE_EVERY - 1:

@@ -13,6 +13,7 @@ from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.engine import NOTHING, SETTLE_STEPS
 from embomatrix.sim.executor import Simulator
+from embomatrix.sim.prepared import Prepared
 from embomatrix.skills.syntax import Skill
 from embomatrix.worker.bench_figures import Better, Figure, quantile, quantile_figure
 from embomatrix.worker.physics import CLIENTS_PER_SCENE
@@ -97,7 +98,7 @@ def _measure_scene(scene: BenchScene, repeats: int, samples: Samples) -> None:
     engine.close()
     clients = ClientPool(spare=CLIENTS_PER_SCENE)
     started_s = time.perf_counter()
-    counting = CountingEngine(bundle.scene, clients)
+    counting = CountingEngine(bundle.scene, clients, Prepared.of(bundle))
     samples.build_connected_s.append(time.perf_counter() - started_s)
     simulator = Simulator(bundle, counting)
     ready_s = decode_s + time.perf_counter() - started_s

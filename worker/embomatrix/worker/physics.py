@@ -12,6 +12,7 @@ from embomatrix.rpc.values import Completed, Timings
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.executor import Simulator
+from embomatrix.sim.prepared import Prepared
 from embomatrix.worker.slot_program import BundleCorruptError, run_program
 from embomatrix.world.bundle import BundleError, read_bundle
 
@@ -49,7 +50,7 @@ class PhysicsScene:
 
     def __init__(self, bundle: Bundle, clients: ClientPool) -> None:
         self._tasks = bundle.tasks
-        self._simulator = Simulator(bundle, BulletEngine(bundle.scene, clients))
+        self._simulator = Simulator(bundle, BulletEngine(bundle.scene, clients, Prepared.of(bundle)))
         for task in list(bundle.tasks.values())[:1]:
             # An empty plan: what the simulator makes when it is first needed is made before the slots are forked.
             self._simulator.execute(task, (), 0)

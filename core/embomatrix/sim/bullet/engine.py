@@ -9,10 +9,11 @@ from __future__ import annotations
 import struct
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.sim.bounds import AssetBounds
-from embomatrix.sim.bullet.bodies import PART_LIMIT, BodyFactory
+from embomatrix.sim.bounds import IDENTITY, AssetBounds
+from embomatrix.sim.bullet.bodies import PART_LIMIT
 from embomatrix.sim.bullet.client import ClientPool, pybullet
 from embomatrix.sim.bullet.mini_world import MiniWorld, Still
+from embomatrix.sim.bullet.scene_bodies import SceneBodies
 from embomatrix.sim.engine import (
     FLOOR,
     NOTHING,
@@ -25,12 +26,12 @@ from embomatrix.sim.engine import (
 )
 from embomatrix.sim.neighbourhood import Neighbourhood
 from embomatrix.sim.validation import check_fractions, check_pose, check_scene
-from embomatrix.world.geometry import Pose
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from embomatrix.world.geometry import Aabb
+    from embomatrix.sim.prepared import Prepared
+    from embomatrix.world.geometry import Aabb, Pose
     from embomatrix.world.scene import Scene
 
 BOX_SLACK_M: Final = 0.01
@@ -42,12 +43,16 @@ SETTLE_RADIUS_M: Final = 0.05
 class BulletEngine:
     """One scene in one Bullet client, with a second one to settle objects in. Not for use by several threads."""
 
-    def __init__(self, scene: Scene, pool: ClientPool | None = None) -> None:
+    def __init__(
+        self, scene: Scene, pool: ClientPool | None = None, prepared: Prepared | None = None
+    ) -> None:
         """Load the scene into clients of the pool, or into new ones that are closed with the engine.
 
-        Raises EngineError when the scene is not valid or pybullet is missing.
+        A scene with ``prepared`` boxes was decoded from a bundle: it was checked there. Raises EngineError when the scene is
+        not valid or pybullet is missing.
         """
-        check_scene(scene)
+        if prepared is None:
+            check_scene(scene)
         self._scene = scene
         self._bullet = pybullet()
         self._owns_pool = pool is None
@@ -57,19 +62,24 @@ class BulletEngine:
         self._index = {item.name: number for number, item in enumerate(scene.objects)}
         self._names = tuple(self._index)
         self._assets = [scene.assets[item.asset_id] for item in scene.objects]
-        bounds = {asset_id: AssetBounds(asset) for asset_id, asset in scene.assets.items()}
-        self._bounds = [bounds[item.asset_id] for item in scene.objects]
+        self._bounds: dict[str, AssetBounds] = {}
         self._poses = [item.pose_world_asset for item in scene.objects]
         self._fractions = [tuple(item.joints) for item in scene.objects]
         self._present = [not item.absent for item in scene.objects]
-        self._boxes: list[Aabb] = []
+        self._boxes = (
+            list(prepared.object_boxes) if prepared else list(map(self._box, range(len(self._names))))
+        )
         self._around = Neighbourhood()
+        for number, box in enumerate(self._boxes):
+            if self._present[number]:
+                self._around.put(number, box)
         self._walls_around = Neighbourhood()
-        for number, wall in enumerate(scene.walls):
-            self._walls_around.put(number, wall.aabb(Pose((0.0, 0.0, 0.0))))
+        walls = prepared.wall_boxes if prepared else [wall.aabb(IDENTITY) for wall in scene.walls]
+        for number, box in enumerate(walls):
+            self._walls_around.put(number, box)
         self._journal = Journal()
         self._changed: set[int] = set()
-        self._load()
+        self._bodies = SceneBodies(self._client, scene)
 
     @property
     def scene(self) -> Scene:
@@ -147,12 +157,12 @@ class BulletEngine:
         reach = max(limit, 0.0) + BOX_SLACK_M
         if WALL not in ignore:
             for body in sorted({wall // PART_LIMIT for wall in self._walls_around.near(box, reach)}):
-                if self._closest(self._bodies[number], self._wall_bodies[body], limit) < limit:
+                if self._closest(self._body(number), self._bodies.wall(body), limit) < limit:
                     return WALL
         for other in self._around.near(box, reach):
             if other == number or self._names[other] in ignore:
                 continue
-            if self._closest(self._bodies[number], self._bodies[other], limit) < limit:
+            if self._closest(self._body(number), self._body(other), limit) < limit:
                 return self._names[other]
         return ""
 
@@ -176,7 +186,7 @@ class BulletEngine:
             raise EngineError(f"a gap up to {limit_m} m was asked for: expected a limit from 0 to 1,000 m")
         if not self._boxes[first].overlaps(self._boxes[second], limit_m + BOX_SLACK_M):
             return None
-        distance = self._closest(self._bodies[first], self._bodies[second], limit_m)
+        distance = self._closest(self._body(first), self._body(second), limit_m)
         return distance if distance <= limit_m else None
 
     def settle(self, name: str, steps: int = SETTLE_STEPS, ignore: frozenset[str] = NOTHING) -> Settled:
@@ -215,28 +225,6 @@ class BulletEngine:
         if self._owns_pool:
             self._pool.close()
 
-    def _load(self) -> None:
-        """Create the bodies: walls, then assets in the order in which the scene's objects name them first."""
-        factory = BodyFactory(self._client)
-        self._wall_bodies = factory.walls(self._scene.walls)
-        groups: dict[str, list[int]] = {}
-        for number, item in enumerate(self._scene.objects):
-            groups.setdefault(item.asset_id, []).append(number)
-        bodies: dict[int, int] = {}
-        self._joint_ids: dict[str, tuple[int, ...]] = {}
-        for asset_id, members in groups.items():
-            asset = self._scene.assets[asset_id]
-            bodies |= zip(members, factory.jointed(asset, [self._poses[i] for i in members]), strict=True)
-            self._joint_ids[asset_id] = factory.joint_indices(asset)
-        self._bodies = [bodies[number] for number in range(len(self._names))]
-        self._boxes = [
-            bounds.box(pose, fractions)
-            for bounds, pose, fractions in zip(self._bounds, self._poses, self._fractions, strict=True)
-        ]
-        for number in range(len(self._names)):
-            self._put(number, self._poses[number])
-            self._put_joints(number, self._fractions[number])
-
     def _note(self, number: int) -> None:
         """Enter a change that is about to be made into the journal and the list of what a reset undoes."""
         self._changed.add(number)
@@ -254,32 +242,34 @@ class BulletEngine:
 
     def _put(self, number: int, pose: Pose) -> None:
         self._poses[number] = pose
-        self._bullet.resetBasePositionAndOrientation(
-            self._bodies[number], pose.position_m, pose.quat_xyzw, physicsClientId=self._client
-        )
+        self._bodies.move(number, pose)
         self._bound(number)
 
     def _put_joints(self, number: int, fractions: tuple[float, ...]) -> None:
         if not fractions:
             return
-        asset = self._assets[number]
         self._fractions[number] = fractions
-        for link, (_, joint), fraction in zip(
-            self._joint_ids[asset.asset_id], asset.joints, fractions, strict=True
-        ):
-            self._bullet.resetJointState(
-                self._bodies[number], link, fraction * joint.upper, physicsClientId=self._client
-            )
+        self._bodies.turn(number, fractions)
         self._bound(number)
 
     def _bound(self, number: int) -> None:
         """Bring the object's box up to date, and its place among its neighbours."""
-        box = self._bounds[number].box(self._poses[number], self._fractions[number])
+        box = self._box(number)
         self._boxes[number] = box
         if self._present[number]:
             self._around.put(number, box)
         else:
             self._around.take_out(number)
+
+    def _box(self, number: int) -> Aabb:
+        asset = self._assets[number]
+        bounds = self._bounds.get(asset.asset_id)
+        if bounds is None:
+            bounds = self._bounds[asset.asset_id] = AssetBounds(asset)
+        return bounds.box(self._poses[number], self._fractions[number])
+
+    def _body(self, number: int) -> int:
+        return self._bodies.object(number, self._poses[number], self._fractions[number])
 
     def _closest(self, body: int, other: int, limit_m: float) -> float:
         """Smallest signed distance between two bodies, infinity when it is more than ``limit_m`` (at least 0)."""

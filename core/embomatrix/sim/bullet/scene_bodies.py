@@ -1,0 +1,66 @@
+"""Bodies of a scene's objects and walls in one client, each made when it is first asked for.
+
+To make a body costs fifteen times as much as to ask how far two of them are apart, and a rollout asks after a tenth of its
+scene. Nothing depends on which bodies there are: they are never stepped, only compared in pairs.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from embomatrix.sim.bullet.bodies import PART_LIMIT, BodyFactory
+from embomatrix.sim.bullet.client import pybullet
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from embomatrix.world.geometry import Pose
+    from embomatrix.world.scene import Scene
+
+
+class SceneBodies:
+    """Immovable bodies by the numbers of a scene's objects and walls. The client must be empty."""
+
+    def __init__(self, client: int, scene: Scene) -> None:
+        self._bullet = pybullet()
+        self._client = client
+        self._scene = scene
+        self._factory = BodyFactory(client)
+        self._objects: dict[int, int] = {}
+        self._walls: dict[int, int] = {}
+
+    def object(self, number: int, pose: Pose, fractions: Sequence[float]) -> int:
+        """Body of an object. One that is not there yet is put at the pose, with its joints at these shares of their travel."""
+        body = self._objects.get(number)
+        if body is None:
+            asset = self._scene.assets[self._scene.objects[number].asset_id]
+            [body] = self._factory.jointed(asset, [pose])
+            self._objects[number] = body
+            self.move(number, pose)
+            self.turn(number, fractions)
+        return body
+
+    def wall(self, chunk: int) -> int:
+        """Body of the walls whose numbers are from ``16 * chunk`` to below ``16 * (chunk + 1)``."""
+        if chunk not in self._walls:
+            parts = self._scene.walls[chunk * PART_LIMIT : (chunk + 1) * PART_LIMIT]
+            [self._walls[chunk]] = self._factory.walls(parts)
+        return self._walls[chunk]
+
+    def move(self, number: int, pose: Pose) -> None:
+        """Put the object's body at a pose, if there is one."""
+        body = self._objects.get(number)
+        if body is not None:
+            self._bullet.resetBasePositionAndOrientation(
+                body, pose.position_m, pose.quat_xyzw, physicsClientId=self._client
+            )
+
+    def turn(self, number: int, fractions: Sequence[float]) -> None:
+        """Put the joints of the object's body, if there is one, at these shares of their travel."""
+        body = self._objects.get(number)
+        if body is None or not fractions:
+            return
+        asset = self._scene.assets[self._scene.objects[number].asset_id]
+        links = self._factory.joint_indices(asset)
+        for link, (_, joint), fraction in zip(links, asset.joints, fractions, strict=True):
+            self._bullet.resetJointState(body, link, fraction * joint.upper, physicsClientId=self._client)
