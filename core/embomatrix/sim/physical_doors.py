@@ -166,12 +166,11 @@ def _stretch(stage: Stage, leaf: Leaf, start: float, goal: float, rng: np.random
     reach = Reach(boxes, fixed, None, clear)
     tracks = list(_tracks(leaf, fractions))
     point = np.array(tracks[0].position[2])
-    for bases in stage.bases(point, wide=True):
-        for way in reach.ways(tracks, bases):
-            swing = approach(stage, way, reach, rng, loaded=False)
-            if swing is None:
-                continue
-            return unfold(stage, swing) or _pull(stage, way, leaf, goal)
+    for way in reach.ways(tracks, stage.bases(point, wide=True)):
+        swing = approach(stage, way, reach, rng, loaded=False)
+        if swing is None:
+            continue
+        return unfold(stage, swing) or _pull(stage, way, leaf, goal)
     return refuse(FailureReason.ARM_BLOCKED, target=leaf.name, other=reach.hindrance or SOMETHING)
 
 

@@ -171,18 +171,17 @@ def _take(stage: Stage, target: str, rng: np.random.Generator) -> Refusal | None
     reach = stage.reach(boxes, target)
     refusal = None
     attempts = 0
-    for bases in stage.bases(np.array(pose.position_m)):
-        for way in reach.ways(tracks, bases):
-            if attempts == ATTEMPTS:
-                return refusal
-            swing = approach(stage, way, reach, rng, loaded=False)
-            if swing is None:
-                continue
-            attempts += 1
-            refusal = unfold(stage, swing) or _touch(stage, way, target)
-            if refusal is None:
-                return _lift(stage, way, target, RAISE_M if out_m is None else ROOFED_RAISE_M)
-            fold(stage, StandPose(*stage.mover.posture[:3].tolist()), rng)
+    for way in reach.ways(tracks, stage.bases(np.array(pose.position_m))):
+        if attempts == ATTEMPTS:
+            return refusal
+        swing = approach(stage, way, reach, rng, loaded=False)
+        if swing is None:
+            continue
+        attempts += 1
+        refusal = unfold(stage, swing) or _touch(stage, way, target)
+        if refusal is None:
+            return _lift(stage, way, target, RAISE_M if out_m is None else ROOFED_RAISE_M)
+        fold(stage, StandPose(*stage.mover.posture[:3].tolist()), rng)
     return refusal or refuse(FailureReason.ARM_BLOCKED, target=target, other=reach.hindrance or SOMETHING)
 
 
@@ -269,17 +268,16 @@ def _put(
     reach = stage.reach(boxes)
     tracks = list(_put_tracks(stage, target, relation, poses, boxes))
     attempts, refusal = 0, None
-    for bases in stage.bases(np.array(poses[0].position_m)):
-        for way in reach.ways(tracks, bases):
-            if attempts == ATTEMPTS:
-                return refusal
-            swing = approach(stage, way, reach, rng, loaded=True)
-            if swing is None:
-                continue
-            attempts += 1
-            refusal = unfold(stage, swing)
-            if refusal is None:
-                return _set_down(stage, way, tracks[way.track])
+    for way in reach.ways(tracks, stage.bases(np.array(poses[0].position_m))):
+        if attempts == ATTEMPTS:
+            return refusal
+        swing = approach(stage, way, reach, rng, loaded=True)
+        if swing is None:
+            continue
+        attempts += 1
+        refusal = unfold(stage, swing)
+        if refusal is None:
+            return _set_down(stage, way, tracks[way.track])
     name = grip.name
     return refusal or refuse(
         FailureReason.ARM_BLOCKED, target=f"a place for {name}", other=reach.hindrance or target

@@ -43,24 +43,23 @@ def _press(stage: Stage, target: str, rng: np.random.Generator) -> Refusal | Non
     reach = stage.reach(stage.boxes(), target)
     refusal, attempts = None, 0
     point = np.array(stage.world.relations.body(target).center_m)
-    for bases in stage.bases(point):
-        for way in reach.ways(tracks, bases):
-            if attempts == ATTEMPTS:
-                return refusal
-            swing = approach(stage, way, reach, rng, loaded=False)
-            if swing is None:
-                continue
-            attempts += 1
-            refusal = unfold(stage, swing)
-            if refusal is not None:
-                continue
-            stage.wake_around(target)
-            hit = stage.mover.follow(way.postures[1:3], GENTLE, lambda: stage.dynamic.gap(target) < TOUCH_M)
-            touched = stage.dynamic.gap(target) < 2 * TOUCH_M
-            stage.mover.follow(way.postures[:1])
-            if touched:
-                return None
-            refusal = refuse(FailureReason.ARM_BLOCKED, target=target, other=hit or SOMETHING)
+    for way in reach.ways(tracks, stage.bases(point)):
+        if attempts == ATTEMPTS:
+            return refusal
+        swing = approach(stage, way, reach, rng, loaded=False)
+        if swing is None:
+            continue
+        attempts += 1
+        refusal = unfold(stage, swing)
+        if refusal is not None:
+            continue
+        stage.wake_around(target)
+        hit = stage.mover.follow(way.postures[1:3], GENTLE, lambda: stage.dynamic.gap(target) < TOUCH_M)
+        touched = stage.dynamic.gap(target) < 2 * TOUCH_M
+        stage.mover.follow(way.postures[:1])
+        if touched:
+            return None
+        refusal = refuse(FailureReason.ARM_BLOCKED, target=target, other=hit or SOMETHING)
     return refusal or refuse(FailureReason.ARM_BLOCKED, target=target, other=reach.hindrance or SOMETHING)
 
 

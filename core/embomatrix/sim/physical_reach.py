@@ -98,10 +98,18 @@ class Reach:
         self.hindrance = ""
         """Owner of the box that barred the last way that was not free."""
 
-    def ways(self, tracks: Sequence[Track], bases: FloatArray) -> Iterator[Way]:
-        """Free ways along any of the tracks from any of the bases, (b, 3), the preferred tracks first."""
+    def ways(self, tracks: Sequence[Track], places: Sequence[FloatArray]) -> Iterator[Way]:
+        """Free ways along any of the tracks, the preferred tracks first, from any base of groups of them, (b, 3) each.
+
+        A later group is looked at for what the ones before it do not reach.
+        """
         for start in range(0, len(tracks), BATCH):
-            yield from self._some(tracks, range(start, min(start + BATCH, len(tracks))), bases)
+            numbers = range(start, min(start + BATCH, len(tracks)))
+            for bases in places:
+                found = self._some(tracks, numbers, bases)
+                yield from found
+                if found:
+                    break
 
     def transit(
         self, start: FloatArray, end: FloatArray, rng: np.random.Generator, *, loaded: bool
@@ -129,7 +137,8 @@ class Reach:
         return None
 
     def _is_free(self, postures: FloatArray, held: Held | None) -> bool:
-        return bool(self._free(postures, self._boxes, held, AIR_M)[1:].all())
+        """Whether all but the first and the last posture keep clear: these are where the robot is, and where it must be."""
+        return bool(self._free(postures[1:-1], self._boxes, held, AIR_M).all())
 
     def _some(self, tracks: Sequence[Track], numbers: range, bases: FloatArray) -> list[Way]:
         """Free ways along a batch of tracks, best first."""
