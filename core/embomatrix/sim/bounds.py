@@ -5,6 +5,7 @@ Read from the parts, not from the physics engine: its boxes carry collision marg
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import TYPE_CHECKING, Final
 
@@ -16,14 +17,19 @@ from embomatrix.world.geometry import IDENTITY_QUAT, Aabb, Part, Pose, Shape
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+    from numpy.typing import NDArray
+
     from embomatrix.world.asset import Asset, Joint
     from embomatrix.world.geometry import FloatArray, Quat, Vec3
+
+    IntArray = NDArray[np.int64]
 
 RIM_POINTS: Final = 24
 """Points on each rim of a cylinder: a box is then at most 0.9 % of the radius too small."""
 EXTENTS_KEPT: Final = 512
 """Answers in memory for each asset, about 300 bytes each; for its parts as much for each of them."""
 CORNERS: Final = 8
+ASSETS_KEPT: Final = 2048
 IDENTITY: Final = Pose((0.0, 0.0, 0.0), IDENTITY_QUAT)
 
 
@@ -43,7 +49,7 @@ class AssetBounds:
     """Points whose hull encloses each link of an asset, made once and shared by all objects of the asset."""
 
     def __init__(self, asset: Asset) -> None:
-        self._clouds = [(_cloud(link.parts), link.joint) for link in asset.links if link.parts]
+        self._links = [(link.parts, link.joint) for link in asset.links if link.parts]
         self._extents: dict[tuple[Quat, tuple[float, ...]], tuple[Vec3, Vec3]] = {}
 
     def box(self, pose: Pose, fractions: Sequence[float] = ()) -> Aabb:
@@ -51,6 +57,10 @@ class AssetBounds:
         (a, b, c), (d, e, f) = self._extents_at(pose.quat_xyzw, tuple(fractions))
         x, y, z = pose.position_m
         return Aabb((x + a, y + b, z + c), (x + d, y + e, z + f))
+
+    @functools.cached_property
+    def _clouds(self) -> list[tuple[tuple[FloatArray, FloatArray], Joint | None]]:
+        return [(_cloud(parts), joint) for parts, joint in self._links]
 
     def _extents_at(self, quat_xyzw: Quat, fractions: tuple[float, ...]) -> tuple[Vec3, Vec3]:
         """Corners relative to the origin. Things stand at few angles: answers are kept."""
@@ -80,9 +90,7 @@ class AssetParts:
 
     def __init__(self, asset: Asset) -> None:
         self._links = [(link.joint, link.parts) for link in asset.links if link.parts]
-        corners = [part.pose.apply_all(_enclosing_points(part)) for _, parts in self._links for part in parts]
-        self._points = np.concatenate(corners)  # (n, 3)
-        self._starts = np.cumsum([0, *map(len, corners)])[:-1]
+        self._of_base = len(asset.links[0].parts)
         self._extents: dict[tuple[Quat, tuple[float, ...]], list[tuple[Vec3, Vec3]]] = {}
 
     def boxes(self, pose: Pose, fractions: Sequence[float]) -> list[Aabb]:
@@ -92,6 +100,10 @@ class AssetParts:
             Aabb((x + a, y + b, z + c), (x + d, y + e, z + f))
             for (a, b, c), (d, e, f) in self._extents_at(pose.quat_xyzw, tuple(fractions))
         ]
+
+    def base_boxes(self, pose: Pose) -> list[Aabb]:
+        """Box of every part of the base in the world."""
+        return self.boxes(pose, ())[: self._of_base]
 
     def within(self, pose: Pose, fractions: Sequence[float], box: Aabb) -> list[Part]:
         """Parts whose boxes overlap a box of the world, each at its pose in the world."""
@@ -122,15 +134,22 @@ class AssetParts:
             known = self._extents[key] = self._reckon(Pose((0.0, 0.0, 0.0), quat_xyzw), fractions)
         return known
 
+    @functools.cached_property
+    def _points(self) -> tuple[FloatArray, IntArray]:
+        """Points whose hull encloses each part, shape (n, 3), and where each part's begin."""
+        corners = [part.pose.apply_all(_enclosing_points(part)) for _, parts in self._links for part in parts]
+        return np.concatenate(corners), np.cumsum([0, *map(len, corners)])[:-1]
+
     def _reckon(self, pose: Pose, fractions: tuple[float, ...]) -> list[tuple[Vec3, Vec3]]:
+        points, starts = self._points
         chunks, first = [], 0
         for frame, parts in self._frames(pose, fractions):
             count = sum(len(part.vertices_m) or CORNERS for part in parts)
-            chunks.append(frame.apply_all(self._points[first : first + count]))
+            chunks.append(frame.apply_all(points[first : first + count]))
             first += count
         world = np.concatenate(chunks)  # (n, 3)
-        lows = np.minimum.reduceat(world, self._starts).tolist()
-        highs = np.maximum.reduceat(world, self._starts).tolist()
+        lows = np.minimum.reduceat(world, starts).tolist()
+        highs = np.maximum.reduceat(world, starts).tolist()
         return [((a, b, c), (d, e, f)) for (a, b, c), (d, e, f) in zip(lows, highs, strict=True)]
 
     def _frames(self, pose: Pose, fractions: Sequence[float]) -> Iterator[tuple[Pose, tuple[Part, ...]]]:
@@ -140,6 +159,29 @@ class AssetParts:
             fraction = next(moving, 0.0) if joint is not None else 0.0
             placed = pose @ joint_motion(joint, fraction) if joint is not None and fraction else pose
             yield placed, parts
+
+
+def bounds_of(asset: Asset) -> AssetBounds:
+    """Bounds of an asset, made at the first call for it."""
+    return _known(asset)[0]
+
+
+def parts_of(asset: Asset) -> AssetParts:
+    """Parts of an asset, made at the first call for it."""
+    return _known(asset)[1]
+
+
+_KNOWN: dict[int, tuple[Asset, AssetBounds, AssetParts]] = {}
+"""By the asset's id. The asset is kept beside them, so that its id can't pass to another one."""
+
+
+def _known(asset: Asset) -> tuple[AssetBounds, AssetParts]:
+    known = _KNOWN.get(id(asset))
+    if known is None:
+        if len(_KNOWN) >= ASSETS_KEPT:
+            _KNOWN.clear()
+        known = _KNOWN[id(asset)] = (asset, AssetBounds(asset), AssetParts(asset))
+    return known[1], known[2]
 
 
 def _cloud(parts: Sequence[Part]) -> tuple[FloatArray, FloatArray]:

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.sim.bounds import IDENTITY, AssetBounds
+from embomatrix.sim.bounds import IDENTITY, bounds_of
 from embomatrix.sim.spots import interior_around, is_under, surface_under
 from embomatrix.world.asset import SupportSurface
 from embomatrix.world.geometry import Aabb, Pose
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
+    from embomatrix.sim.bounds import AssetBounds
     from embomatrix.world.asset import Asset
     from embomatrix.world.geometry import Vec2, Vec3
 
@@ -54,6 +56,7 @@ def surfaces_for(asset: Asset, relation: Relation) -> tuple[SupportSurface, ...]
                     (item.size_m[0], item.size_m[1]),
                     item.size_m[2] if item.closed_by else math.inf,
                     item.name,
+                    item.link,
                 )
                 for item in bare
             )
@@ -63,48 +66,68 @@ def surfaces_for(asset: Asset, relation: Relation) -> tuple[SupportSurface, ...]
             return ()
 
 
-def candidates(held: Asset, support: Asset, relation: Relation, shift: Vec2, tries: int) -> Iterator[Pose]:
-    """Poses of ``held`` in the frame of ``support`` at which the relation holds, its surfaces taken in turn.
+@dataclass(frozen=True, slots=True)
+class Patch:
+    """Where an asset may stand on one surface, turned by one yaw.
 
-    At most ``tries`` poses are looked at. ``shift`` in the unit square moves the whole pattern: equal shifts give equal
-    poses.
+    ``center_m`` is that of the poses, in the support's frame; they lie up to ``room_m`` from it along x and y.
     """
-    bounds = AssetBounds(held)
-    boxes = [bounds.box(Pose.from_xyz_yaw(0.0, 0.0, 0.0, yaw)) for yaw in YAWS]
-    # Yaws turn slowest: the first round visits every surface once.
-    rooms = [
-        (surface, yaw, box, room)
-        for yaw, box in zip(YAWS, boxes, strict=True)
-        for surface in surfaces_for(support, relation)
-        if (room := _room_for(box, surface)) is not None
-    ]
-    for number, (surface, yaw, box, room) in zip(range(1, tries + 1), itertools.cycle(rooms), strict=False):
-        u, v = ((start + number * step) % 1.0 for start, step in zip(shift, GOLDEN, strict=True))
-        x = surface.center_m[0] - box.center_m[0] + (2 * u - 1) * room[0]
-        y = surface.center_m[1] - box.center_m[1] + (2 * v - 1) * room[1]
-        z = surface.center_m[2] - box.low_m[2] + LIFT_M
-        if _stands(box, (x, y, z), support, relation):
-            yield Pose.from_xyz_yaw(x, y, z, yaw)
+
+    center_m: Vec3
+    room_m: Vec2
+    yaw: float
+
+
+def patches(bounds: AssetBounds, support: Asset, relation: Relation) -> tuple[Patch, ...]:
+    """Where something with these bounds fits in the relation to a support. Yaws turn slowest: each visits every surface."""
+    found: list[Patch] = []
+    for yaw in YAWS:
+        box = bounds.box(Pose.from_xyz_yaw(0.0, 0.0, 0.0, yaw))
+        x, y, _ = box.center_m
+        for surface in surfaces_for(support, relation):
+            room = _room_for(box, surface)
+            if room is not None:
+                cx, cy, cz = surface.center_m
+                found.append(Patch((cx - x, cy - y, cz - box.low_m[2] + LIFT_M), room, yaw))
+    return tuple(found)
+
+
+def proposals(found: Sequence[Patch], shift: Vec2, tries: int) -> Iterator[Pose]:
+    """At most ``tries`` poses in the frame of the support, its joints shut, the patches taken in turn.
+
+    ``shift`` in the unit square moves the whole pattern: equal shifts give equal poses. Whether the relation holds there is
+    not looked at.
+    """
+    (start_u, start_v), (step_u, step_v) = shift, GOLDEN
+    for number, patch in zip(range(1, tries + 1), itertools.cycle(found), strict=False):
+        u, v = (start_u + number * step_u) % 1.0, (start_v + number * step_v) % 1.0
+        x, y, z = patch.center_m
+        yield Pose.from_xyz_yaw(
+            x + (2 * u - 1) * patch.room_m[0], y + (2 * v - 1) * patch.room_m[1], z, patch.yaw
+        )
+
+
+def candidates(held: Asset, support: Asset, relation: Relation, shift: Vec2, tries: int) -> Iterator[Pose]:
+    """Those of ``proposals`` at which the relation holds."""
+    bounds = bounds_of(held)
+    for pose in proposals(patches(bounds, support, relation), shift, tries):
+        if _stands(bounds.box(pose), support, relation):
+            yield pose
 
 
 def stands_in(held: Asset, pose_support_held: Pose, support: Asset, relation: Relation) -> bool:
     """Whether the relation holds between two assets, joints shut, by the definitions of ``relations``."""
-    return _stands(AssetBounds(held).box(pose_support_held), (0.0, 0.0, 0.0), support, relation)
+    return _stands(bounds_of(held).box(pose_support_held), support, relation)
 
 
-def _stands(box: Aabb, offset: Vec3, support: Asset, relation: Relation) -> bool:
-    low, high = (
-        tuple(value + more for value, more in zip(corner, offset, strict=True))
-        for corner in (box.low_m, box.high_m)
-    )
-    moved = Aabb((low[0], low[1], low[2]), (high[0], high[1], high[2]))
+def _stands(box: Aabb, support: Asset, relation: Relation) -> bool:
     match relation:
         case Relation.ONTOP:
-            return bool(surface_under(moved, support, IDENTITY, doored=False))
+            return bool(surface_under(box, support, IDENTITY, doored=False))
         case Relation.INSIDE:
-            return interior_around(moved, support) is not None
+            return interior_around(box, support) is not None
         case Relation.UNDER:
-            return is_under(moved, support, IDENTITY)
+            return is_under(box, support, IDENTITY)
         case _:
             return False
 

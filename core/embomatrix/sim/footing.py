@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.sim.bounds import AssetBounds
+from embomatrix.sim.bounds import bounds_of
 from embomatrix.sim.spots import REST_M, interior_around, is_shut, is_upright, link_frame, surface_under
 from embomatrix.world.state import Relation
 
@@ -57,7 +57,6 @@ class Footings:
     def __init__(self, engine: PhysicsEngine) -> None:
         self._engine = engine
         self._scene = engine.scene
-        self._bounds: dict[str, AssetBounds] = {}
         self._at_start: dict[str, Footing] = {}
         self._now: dict[str, Footing] = {}
         self._disturbed: set[str] = set()
@@ -72,13 +71,6 @@ class Footings:
         if footing is None:
             footing = known[name] = self._find(name)
         return footing
-
-    def bounds_of(self, name: str) -> AssetBounds:
-        """Bounds of the object's asset."""
-        asset_id = self._scene.by_name[name].asset_id
-        if asset_id not in self._bounds:
-            self._bounds[asset_id] = AssetBounds(self._scene.assets[asset_id])
-        return self._bounds[asset_id]
 
     def _read_journal(self) -> None:
         """Forget what is kept of the objects that were near to a change."""
@@ -135,7 +127,7 @@ class Footings:
         for link in dict.fromkeys(item.link for item in asset.interiors):
             frame = link_frame(asset, pose, fractions, link)
             if is_upright(frame) and self._may_be_in(name, asset, frame, link):
-                box = self.bounds_of(name).box(
+                box = bounds_of(self._scene.asset_of(name)).box(
                     frame.inverse() @ self._engine.pose(name), self._engine.joints(name)
                 )
                 interior = interior_around(box, asset, link)

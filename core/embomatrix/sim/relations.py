@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.sim.bounds import bounds_of
 from embomatrix.sim.footing import Footings
 from embomatrix.sim.spots import REST_M, is_under
 from embomatrix.world.state import OPEN_FRACTION, Relation
@@ -104,7 +105,7 @@ class Relations:
         fractions = self._engine.joints(name)
         if not any(fractions):
             return self._engine.aabb(name)
-        return self._footings.bounds_of(name).box(self._engine.pose(name), (0.0,) * len(fractions))
+        return bounds_of(self._scene.asset_of(name)).box(self._engine.pose(name), (0.0,) * len(fractions))
 
     def room_of(self, name: str) -> str:
         """Room that the object's centre is over, "" when it is in none."""

@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.sim.bounds import joint_motion
-from embomatrix.world.state import OPEN_FRACTION
+from embomatrix.sim.bounds import IDENTITY, joint_motion, parts_of
+from embomatrix.world.state import OPEN_FRACTION, Relation
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -96,13 +96,13 @@ def _on_top(box: Aabb, asset: Asset, pose: Pose) -> bool:
     return abs(x) <= half_x + EDGE_M and abs(y) <= half_y + EDGE_M
 
 
-def interior_around(box_in_asset: Aabb, asset: Asset, link: str = "") -> Interior | None:
-    """The smallest interior of an asset that a box is in, of those that ride on a link; "" asks for those of the base.
+def interior_around(box_in_asset: Aabb, asset: Asset, link: str | None = None) -> Interior | None:
+    """The smallest interior of an asset that a box is in: of those that ride on a link, or of all with the joints shut.
 
-    The box is given in the link's frame. Its centre lies in the cavity, and the box within it, 1 cm outside allowed; out of a
-    cavity that is always open it may stick out at the top.
+    The box is given in the link's frame: "" names the base. Its centre lies in the cavity, and the box within it, 1 cm
+    outside allowed; out of a cavity that is always open it may stick out at the top.
     """
-    found = [item for item in asset.interiors if item.link == link and _within(box_in_asset, item)]
+    found = [item for item in asset.interiors if link in (None, item.link) and _within(box_in_asset, item)]
     return min(found, key=lambda interior: math.prod(interior.size_m), default=None)
 
 
@@ -117,6 +117,17 @@ def _within(box: Aabb, interior: Interior) -> bool:
     return True
 
 
+def link_under(box_in_asset: Aabb, asset: Asset, relation: Relation) -> str:
+    """Link on which a box rides that is in the relation to an asset with its joints shut; "" for the base."""
+    if relation is Relation.INSIDE:
+        interior = interior_around(box_in_asset, asset)
+        return interior.link if interior is not None else ""
+    if relation is Relation.ONTOP:
+        surface = surface_under(box_in_asset, asset, IDENTITY, doored=False)
+        return next((item.link for item in asset.supports if item.name == surface), "")
+    return ""
+
+
 def is_under(box: Aabb, asset: Asset, pose: Pose) -> bool:
     """Whether a box is under an asset at ``pose``.
 
@@ -128,7 +139,7 @@ def is_under(box: Aabb, asset: Asset, pose: Pose) -> bool:
     cx, cy, _ = box.center_m
     over = [
         part_box.low_m[2]
-        for part_box in (part.aabb(pose) for part in asset.links[0].parts)
+        for part_box in parts_of(asset).base_boxes(pose)
         if part_box.low_m[0] <= cx <= part_box.high_m[0] and part_box.low_m[1] <= cy <= part_box.high_m[1]
     ]
     return bool(over) and all(bottom >= box.high_m[2] - REST_M for bottom in over)

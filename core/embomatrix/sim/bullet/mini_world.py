@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.sim.bounds import AssetParts
+from embomatrix.sim.bounds import parts_of
 from embomatrix.sim.bullet.bodies import BodyFactory
 from embomatrix.sim.bullet.client import ClientPool, pybullet
 from embomatrix.sim.engine import SETTLE_STEPS, Settled
@@ -65,7 +65,6 @@ class MiniWorld:
         self._pool = pool
         self._client = pool.take()
         self._factory = BodyFactory(self._client, plain=True)
-        self._parts: dict[int, tuple[Asset, AssetParts]] = {}
         self._body = -1
         self._still: tuple[int, ...] = ()
         self._stages = 0
@@ -89,7 +88,7 @@ class MiniWorld:
         parts = [slab, *walls]
         for item in stills:
             box = region if region is not None else EVERYWHERE
-            parts += self._parts_of(item.asset).within(item.pose, item.fractions, box)
+            parts += parts_of(item.asset).within(item.pose, item.fractions, box)
         self._still = self._factory.walls(parts)
         self._body = self._factory.rigid(asset, pose, fractions, asset.mass_kg)
         if any(part.shape in ROUND for link in asset.links for part in link.parts):
@@ -113,12 +112,6 @@ class MiniWorld:
             for body in (self._body, *self._still):
                 bullet.removeBody(body, physicsClientId=client)
         self._stages += 1
-
-    def _parts_of(self, asset: Asset) -> AssetParts:
-        """Parts of an asset. It is kept beside them, so that its id can't pass to another one."""
-        if id(asset) not in self._parts:
-            self._parts[id(asset)] = (asset, AssetParts(asset))
-        return self._parts[id(asset)][1]
 
     def lift(self) -> None:
         """Take the object out of the way, for questions about what stands still."""
