@@ -145,6 +145,8 @@ class Horizon:
         at_start = known in self._true
         if atom.predicate == REAL:
             at_start = Atom(FUTURE, atom.args) not in self._true
+        elif atom.predicate == SubstanceRelation.CONTAINS:
+            at_start = at_start or Atom(SubstanceRelation.FILLED.value, known.args) in self._true
         gain, loss = self._changes(known)
         return at_start or gain, not at_start or loss
 
