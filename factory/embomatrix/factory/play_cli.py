@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import sys
+from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -19,6 +21,8 @@ from embomatrix.sim.engine import EngineError
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.facts import FactError
 from embomatrix.sim.film import film_cached
+from embomatrix.sim.physical import PhysicalActor
+from embomatrix.sim.physical_film import film_physical
 from embomatrix.sim.planner import PlanNotFound, find_plan
 from embomatrix.skills.parse import PlanError, argument, parse_plan
 from embomatrix.skills.syntax import MAX_PLAN_BYTES, SIGNATURES, Arg
@@ -30,6 +34,7 @@ if TYPE_CHECKING:
     from embomatrix.sim.film import Film
     from embomatrix.skills.syntax import Plan, SkillCall
     from embomatrix.skills.trace import Trace
+    from embomatrix.world.bundle import Bundle
     from embomatrix.world.task import Task
 
 DEFAULT_DATASET: Final = "build/dataset"
@@ -37,6 +42,22 @@ BAD_INPUT: Final = 2
 NO_PLAN: Final = 1
 
 console = Console(highlight=False)
+
+
+class Mode(StrEnum):
+    """How a plan is carried out."""
+
+    CACHED = "cached"
+    PHYSICAL = "physical"
+
+
+@dataclass(frozen=True, slots=True)
+class Take:
+    """How a plan is to be executed, and where a film of it goes."""
+
+    mode: Mode
+    seed: int
+    film: Path | None
 
 
 class PlayError(Exception):
@@ -54,6 +75,9 @@ def play(
         typer.Option(help=f"Folder of the dataset; else $EMBOMATRIX_DATASET, else {DEFAULT_DATASET}."),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Decides between outcomes that are equally good.")] = 0,
+    mode: Annotated[
+        Mode, typer.Option(help="cached: verified outcomes; physical: a robot does it in stepped physics.")
+    ] = Mode.CACHED,
     film: Annotated[
         Path | None, typer.Option(help="Draw the plan as an animation: a .gif, .webp or .png file.")
     ] = None,
@@ -65,7 +89,7 @@ def play(
     try:
         if film is not None:
             check_suffix(film)
-        status = _play(task, plan, oracle, dataset, seed, film)
+        status = _play(task, plan, oracle, dataset, Take(mode, seed, film))
     except (PlayError, DatasetError, EngineError, FactError, FilmError, GoalError) as error:
         Console(stderr=True, highlight=False).print(f"embomatrix play: {error}", markup=False, soft_wrap=True)
         raise SystemExit(BAD_INPUT) from None
@@ -73,27 +97,27 @@ def play(
         raise SystemExit(status)
 
 
-def _play(task_id: str, plan: str, oracle: bool, folder: Path | None, seed: int, film: Path | None) -> int:
+def _play(task_id: str, plan: str, oracle: bool, folder: Path | None, take: Take) -> int:
     if oracle == bool(plan):
         raise PlayError("expected either --plan FILE or --oracle: give one of them")
     root = folder if folder is not None else Path(os.environ.get("EMBOMATRIX_DATASET", DEFAULT_DATASET))
     data = Dataset.load(root)
     record = data.find(task_id)
+    bundle = data.bundle(record.bundle_digest)
     text = "" if oracle else _text_of(plan)
     _show_task(record.task)
     if oracle:
-        simulator = Simulator(data.bundle(record.bundle_digest))
-        found = find_plan(simulator, record.task)
+        found = find_plan(Simulator(bundle), record.task)
         if isinstance(found, PlanNotFound):
             raise PlayError(f"the oracle finds no plan for {task_id!r}: {found.reason}")
-        _run(simulator, record.task, found, seed, film)
+        _run(bundle, record.task, found, take)
         return 0
     try:
         parsed = parse_plan(text, record.task.profile)
     except PlanError as error:
         _show_unparsable(error)
         return NO_PLAN
-    _run(Simulator(data.bundle(record.bundle_digest)), record.task, parsed, seed, film)
+    _run(bundle, record.task, parsed, take)
     return 0
 
 
@@ -113,15 +137,21 @@ def _text_of(plan: str) -> str:
     return raw.decode("utf-8", errors="replace")
 
 
-def _run(simulator: Simulator, task: Task, plan: Plan, seed: int, film: Path | None) -> None:
-    trace = simulator.execute(task, plan, seed)
+def _run(bundle: Bundle, task: Task, plan: Plan, take: Take) -> None:
+    actor = PhysicalActor(bundle) if take.mode is Mode.PHYSICAL else None
+    simulator = Simulator(bundle, actor=actor)
+    trace = simulator.execute(task, plan, take.seed)
     _show_steps(task, trace)
     console.print("\n[bold]Final state[/bold]")
     for line in trace.final:
         console.print(f"  {escape(line)}")
     _show_reward(score(task, trace.touched, simulator.facts))
-    if film is not None:
-        _draw(film_cached(simulator, task, plan, seed), film)
+    if take.film is None:
+        return
+    if actor is None:
+        _draw(film_cached(simulator, task, plan, take.seed), take.film)
+    else:
+        _draw(film_physical(simulator, actor, task, plan, take.seed), take.film)
 
 
 def _draw(film: Film, path: Path) -> None:

@@ -1,0 +1,44 @@
+"""Films of the physical mode: the arm moves, and things move only while something moves them."""
+
+import itertools
+import math
+
+import pytest
+from tests.fakes.plans import plan_of, task_over
+from tests.fakes.scenes import kitchen_scene
+
+from embomatrix.sim.executor import Simulator
+from embomatrix.sim.physical import PhysicalActor
+from embomatrix.sim.physical_film import film_physical
+from embomatrix.world.bundle import Bundle
+
+
+@pytest.fixture(scope="module")
+def film():
+    bundle = Bundle(kitchen_scene(), {})
+    actor = PhysicalActor(bundle)
+    simulator = Simulator(bundle, actor=actor)
+    task = task_over(bundle.scene)
+    film = film_physical(simulator, actor, task, plan_of(task, "move apple_1; pick_up apple_1"), 0)
+    simulator.close()
+    return film
+
+
+def test_the_arm_reaches_and_the_object_is_lifted(film) -> None:
+    assert [step.ok for step in film.steps] == [True, True]
+    start = film.scene.by_name["apple_1"].pose_world_asset.position_m[2]
+    assert film.frames[-1].poses["apple_1"].position_m[2] > start + 0.05
+    assert len({frame.posture.arm for frame in film.frames if frame.step == 2}) > 5
+
+
+def test_nothing_leaps_between_two_frames(film) -> None:
+    heights = [
+        frame.poses.get("apple_1", film.scene.by_name["apple_1"].pose_world_asset).position_m
+        for frame in film.frames
+    ]
+    assert max(math.dist(a, b) for a, b in itertools.pairwise(heights)) < 0.5
+
+
+def test_what_nobody_touches_stays_where_it_is(film) -> None:
+    moved = {name for frame in film.frames for name in frame.poses}
+    assert moved == {"apple_1"}
