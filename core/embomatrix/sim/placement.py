@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.sim.candidates import candidates
+from embomatrix.sim.bounds import bounds_of
+from embomatrix.sim.candidates import Patch, candidates, patches, proposals
 from embomatrix.sim.engine import FLOOR, TOLERANCE_M
-from embomatrix.sim.spots import is_upright
+from embomatrix.sim.footprints import LEVEL_FLOOR, footprint_of, pose_box_asset
+from embomatrix.sim.spots import is_shut, is_upright, link_frame, link_under, links_with_spots
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.poses import PlacementKey
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
     import numpy as np
 
     from embomatrix.sim.engine import PhysicsEngine
     from embomatrix.sim.relations import Relations
+    from embomatrix.world.asset import Asset
     from embomatrix.world.geometry import Aabb, Pose
     from embomatrix.world.poses import PoseCache, StandPose
 
@@ -27,6 +34,25 @@ LIVE_TRIES: Final = 64
 """Candidates looked at beyond the cached ones."""
 LIVE_SETTLES: Final = 8
 """How many of them are simulated at most."""
+
+
+@dataclass(frozen=True, slots=True)
+class Spot:
+    """A pose in the frame of a support's link, which is the support's own for the base."""
+
+    pose: Pose
+    link: str
+
+
+@dataclass(frozen=True, slots=True)
+class Errand:
+    """What is to be placed where, and from which standing pose it must be in reach."""
+
+    held: str
+    target: str
+    relation: Relation
+    robot: StandPose
+    passed_over: tuple[StandPose, ...] = ()
 
 
 class Placer:
@@ -41,6 +67,8 @@ class Placer:
         self._relations = relations
         self._scene = engine.scene
         self._cache = cache
+        self._verified: dict[tuple[str, str, Relation], tuple[tuple[Spot, ...], tuple[Spot, ...]]] = {}
+        self._patches: dict[tuple[str, str, Relation], tuple[Patch, ...]] = {}
 
     def find(
         self,
@@ -49,13 +77,15 @@ class Placer:
         relation: Relation,
         robot: StandPose,
         rng: np.random.Generator | None = None,
+        passed_over: tuple[StandPose, ...] = (),
     ) -> Pose | FailureReason:
         """Pose for a parked object on, in or under another, or why there is none.
 
-        The order of the poses follows from ``rng``; without one it is the cache's. The world is left as it was. Raises
-        EngineError for names that the engine does not know.
+        The order of the poses follows from ``rng``; without one it is the cache's. Poses within reach of the standing poses
+        ``passed_over`` are not looked at. The world is left as it was. Raises EngineError for names that the engine does not
+        know.
         """
-        found = self.choices(held, target, relation, robot, rng, most=1)
+        found = self.choices(held, target, relation, robot, rng, most=1, passed_over=passed_over)
         return found if isinstance(found, FailureReason) else found[0]
 
     def choices(
@@ -67,90 +97,144 @@ class Placer:
         rng: np.random.Generator | None = None,
         *,
         most: int,
+        passed_over: tuple[StandPose, ...] = (),
     ) -> tuple[Pose, ...] | FailureReason:
         """The first poses, at least one and at most ``most``, that ``find`` would choose from, in its order."""
         if held == target or self._engine.is_parked(target):
             return FailureReason.PLACE_ON_ITSELF
+        fails = FailureReason.NO_CAVITY if relation is Relation.INSIDE else FailureReason.NO_SURFACE
+        if not is_upright(self._engine.pose(target)):
+            return fails
         before = self._engine.pose(held)
+        errand = Errand(held, target, relation, robot, passed_over)
         try:
-            return self._search(held, target, relation, robot, rng, most)
+            found = tuple(itertools.islice(self._search(errand, rng), most))
         finally:
             self._engine.set_pose(held, before)
             self._engine.park(held)
+        if found:
+            return found
+        return FailureReason.NO_FREE_POSE if self._fits(held, target, relation) else fails
 
-    def _search(
-        self,
-        held: str,
-        target: str,
-        relation: Relation,
-        robot: StandPose,
-        rng: np.random.Generator | None,
-        most: int,
-    ) -> tuple[Pose, ...] | FailureReason:
-        fails = FailureReason.NO_CAVITY if relation is Relation.INSIDE else FailureReason.NO_SURFACE
-        base = self._engine.pose(target)
-        if not is_upright(base):
-            return fails
-        good: list[Pose] = []
-        cached = self._cached(held, target, relation, rng)
-        for local in cached:
-            found = self._accept_verified(held, target, relation, base @ local, robot)
-            good += [found] if found is not None else []
-            if len(good) == most:
-                return tuple(good)
-        settles = 0
-        fresh = self._fresh(held, target, relation, rng)
-        for local in fresh:
-            if settles == LIVE_SETTLES:
-                break
-            if not self._is_free(held, base @ local, robot):
-                continue
-            settles += 1
-            found = self._accept_settled(held, target, relation, robot)
-            good += [found] if found is not None else []
-            if len(good) == most:
-                break
-        if good:
-            return tuple(good)
-        return FailureReason.NO_FREE_POSE if cached or fresh else fails
+    def _fits(self, held: str, target: str, relation: Relation) -> bool:
+        """Whether there is any pose for the one on, in or under the other when nothing else is there."""
+        if any(self._cached(held, target, relation)):
+            return True
+        one, other = self._scene.asset_of(held), self._scene.asset_of(target)
+        return any(True for _ in candidates(one, other, relation, (0.5, 0.5), LIVE_TRIES))
 
-    def _cached(
-        self, held: str, target: str, relation: Relation, rng: np.random.Generator | None
-    ) -> list[Pose]:
-        key = PlacementKey(self._scene.by_name[held].asset_id, self._scene.by_name[target].asset_id, relation)
-        poses = self._cache.placements.get(key, ())
-        order = range(len(poses)) if rng is None else rng.permutation(len(poses)).tolist()
-        return [poses[number] for number in order]
+    def _search(self, errand: Errand, rng: np.random.Generator | None) -> Iterator[Pose]:
+        """Good poses: of those verified for the pair, then for the footprint's class, then of fresh ones."""
+        frames = self._frames(errand)
+        for spots in self._cached(errand.held, errand.target, errand.relation):
+            order = range(len(spots)) if rng is None else rng.permutation(len(spots)).tolist()
+            for number in order:
+                frame = frames.get(spots[number].link)
+                if frame is None:
+                    continue
+                found = self._accept_verified(errand, frame @ spots[number].pose)
+                if found is not None:
+                    yield found
+        yield from self._fresh(errand, frames, rng)
 
     def _fresh(
-        self, held: str, target: str, relation: Relation, rng: np.random.Generator | None
-    ) -> list[Pose]:
-        """Unverified candidates, for pairs that the analysis did not foresee and surfaces that have filled up."""
+        self, errand: Errand, frames: dict[str, Pose], rng: np.random.Generator | None
+    ) -> Iterator[Pose]:
+        """Poses for pairs that the analysis did not foresee, and on surfaces that have filled up."""
         shift = (0.5, 0.5) if rng is None else (float(rng.random()), float(rng.random()))
+        settles = 0
+        found = self._patches_for(errand.held, errand.target, errand.relation)
+        for local in proposals(found, shift, LIVE_TRIES):
+            frame = frames.get(self._link_of(errand.held, errand.target, errand.relation, local))
+            if settles == LIVE_SETTLES:
+                return
+            if frame is None or not self._is_free(errand, frame @ local) or not self._holds(errand):
+                continue
+            settles += 1
+            pose = self._accept_settled(errand)
+            if pose is not None:
+                yield pose
+
+    def _frames(self, errand: Errand) -> dict[str, Pose]:
+        """Frame of each link of the target on which something can be placed; not of a drawer that is shut."""
+        asset = self._scene.asset_of(errand.target)
+        pose, fractions = self._engine.pose(errand.target), self._engine.joints(errand.target)
+        shut = {
+            item.link
+            for item in asset.interiors
+            if item.link and errand.relation is Relation.INSIDE and is_shut(asset, item, fractions)
+        }
+        links = ({""} | links_with_spots(asset)) - shut
+        return {link: link_frame(asset, pose, fractions, link) for link in sorted(links)}
+
+    def _cached(
+        self, held: str, target: str, relation: Relation
+    ) -> tuple[tuple[Spot, ...], tuple[Spot, ...]]:
+        """Spots verified for this pair of assets, and those verified for the footprint of what is held."""
+        one, other = self._scene.by_name[held].asset_id, self._scene.by_name[target].asset_id
+        key = (one, other, relation)
+        if key not in self._verified:
+            exact = self._cache.placements.get(PlacementKey(one, other, relation), ())
+            by_class = self._by_class(self._scene.assets[one], other, relation)
+            self._verified[key] = (
+                tuple(self._spot(held, target, relation, pose) for pose in exact),
+                tuple(self._spot(held, target, relation, pose) for pose in by_class),
+            )
+        return self._verified[key]
+
+    def _by_class(self, asset: Asset, support_id: str, relation: Relation) -> Sequence[Pose]:
+        standing = self._cache.placements.get(
+            PlacementKey(asset.asset_id, LEVEL_FLOOR.asset_id, Relation.ONTOP)
+        )
+        footprint = footprint_of(asset, standing[0]) if standing else None
+        if not standing or footprint is None:
+            return ()
+        poses = self._cache.placements.get(PlacementKey(footprint.name, support_id, relation), ())
+        pose_box_held = pose_box_asset(footprint, asset, standing[0])
+        return [pose_support_box @ pose_box_held for pose_support_box in poses]
+
+    def _spot(self, held: str, target: str, relation: Relation, pose: Pose) -> Spot:
+        return Spot(pose, self._link_of(held, target, relation, pose))
+
+    def _link_of(self, held: str, target: str, relation: Relation, pose: Pose) -> str:
+        asset = self._scene.asset_of(target)
+        if links_with_spots(asset) <= {""}:
+            return ""
+        return link_under(bounds_of(self._scene.asset_of(held)).box(pose), asset, relation)
+
+    def _patches_for(self, held: str, target: str, relation: Relation) -> tuple[Patch, ...]:
         one, other = self._scene.asset_of(held), self._scene.asset_of(target)
-        return list(candidates(one, other, relation, shift, LIVE_TRIES))
+        key = (one.asset_id, other.asset_id, relation)
+        if key not in self._patches:
+            self._patches[key] = patches(bounds_of(one), other, relation)
+        return self._patches[key]
 
-    def _accept_verified(
-        self, held: str, target: str, relation: Relation, pose: Pose, robot: StandPose
-    ) -> Pose | None:
-        if not self._is_free(held, pose, robot):
+    def _accept_verified(self, errand: Errand, pose: Pose) -> Pose | None:
+        if not self._is_free(errand, pose):
             return None
-        alone = not self._engine.penetrates(held, UNDISTURBED_M + TOLERANCE_M, frozenset((target, FLOOR)))
-        if alone and self._relations.holds(relation, held, target):
+        near = frozenset((errand.target, FLOOR))
+        alone = not self._engine.penetrates(errand.held, UNDISTURBED_M + TOLERANCE_M, near)
+        if alone and self._holds(errand):
             return pose
-        return self._accept_settled(held, target, relation, robot)
+        return self._accept_settled(errand)
 
-    def _accept_settled(self, held: str, target: str, relation: Relation, robot: StandPose) -> Pose | None:
+    def _accept_settled(self, errand: Errand) -> Pose | None:
         """Let the object go where it is and take the pose where it comes to rest, if all still holds there."""
-        settled = self._engine.settle(held)
-        if not settled.stable or not self._is_free(held, settled.pose, robot):
+        settled = self._engine.settle(errand.held)
+        if not settled.stable or not self._is_free(errand, settled.pose):
             return None
-        return settled.pose if self._relations.holds(relation, held, target) else None
+        return settled.pose if self._holds(errand) else None
 
-    def _is_free(self, held: str, pose: Pose, robot: StandPose) -> bool:
+    def _holds(self, errand: Errand) -> bool:
+        return self._relations.holds(errand.relation, errand.held, errand.target)
+
+    def _is_free(self, errand: Errand, pose: Pose) -> bool:
         """Put the object at the pose and tell whether it is in reach there and penetrates nothing."""
-        self._engine.set_pose(held, pose)
-        return in_reach(self._engine.aabb(held), robot) and not self._engine.penetrates(held)
+        box = bounds_of(self._scene.asset_of(errand.held)).box(pose, self._engine.joints(errand.held))
+        if not in_reach(box, errand.robot) or any(in_reach(box, stand) for stand in errand.passed_over):
+            return False
+        self._engine.set_pose(errand.held, pose)
+        return not self._engine.penetrates(errand.held)
 
 
 def in_reach(box: Aabb, robot: StandPose) -> bool:

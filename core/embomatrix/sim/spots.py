@@ -117,6 +117,11 @@ def _within(box: Aabb, interior: Interior) -> bool:
     return True
 
 
+def links_with_spots(asset: Asset) -> set[str]:
+    """Links on which surfaces or cavities ride; "" for the base."""
+    return {surface.link for surface in asset.supports} | {interior.link for interior in asset.interiors}
+
+
 def link_under(box_in_asset: Aabb, asset: Asset, relation: Relation) -> str:
     """Link on which a box rides that is in the relation to an asset with its joints shut; "" for the base."""
     if relation is Relation.INSIDE:
