@@ -30,11 +30,15 @@ EXTRA: Final = 3
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """What is asked of one scene: plans of each kind, and successful calls of each skill. Fewer valid ones are not made up."""
+    """What is asked of one scene: plans of each kind, and successful calls of each skill.
+
+    Trials are numbered from ``first``.
+    """
 
     plans: Mapping[PlanKind, int]
     calls: Mapping[Skill, int]
     seed: int
+    first: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +82,7 @@ class _Writer:
         self._digest = digest
         self._examples = examples
         self._request = request
-        self._number = 0
+        self._number = request.first
         words = np.frombuffer(bytes.fromhex(digest.partition(":")[2][:16]), dtype=np.uint32).tolist()
         self._rng = np.random.default_rng(np.random.SeedSequence((request.seed, *words)))
         self._missing: Counter[Skill] = Counter(request.calls)
@@ -111,7 +115,7 @@ class _Writer:
 
     def _trial(self, kind: PlanKind, task: Task, plan: Plan, seed: int) -> Trial:
         scene = self._simulator.world.scene
-        trial_id = f"{scene.scene_id}-{self._digest.partition(':')[2][:8]}-{self._number:03d}"
+        trial_id = f"{scene.scene_id}-{self._digest.partition(':')[2][:8]}-{self._number:04d}"
         self._number += 1
         return Trial(trial_id, self._digest, scene.base, task.task_id, kind, seed, plan)
 

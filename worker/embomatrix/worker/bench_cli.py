@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,8 +14,21 @@ from rich.table import Table
 
 from embomatrix.rpc.status import ClusterError
 from embomatrix.sim.engine import EngineError
+from embomatrix.sim.executor import Simulator
+from embomatrix.sim.fidelity_report import report_on
+from embomatrix.sim.physical import physical_simulator
 from embomatrix.worker.bench_cluster import ClusterLoad, bench_cluster_load
 from embomatrix.worker.bench_engine import bench_engine, check_scenes
+from embomatrix.worker.bench_fidelity import (
+    DISAGREEMENTS_FILE,
+    RESULTS_FILE,
+    FidelitySettings,
+    Progress,
+    run_fidelity,
+)
+from embomatrix.worker.bench_fidelity_page import figures_of, read_disagreement, skill_table
+from embomatrix.worker.bench_fidelity_page import replay as replayed
+from embomatrix.worker.bench_fidelity_pool import Modes
 from embomatrix.worker.bench_figures import (
     BenchError,
     BenchResult,
@@ -58,6 +72,9 @@ Cycles = Annotated[int, typer.Option(min=80, help="Cycles of loading and resetti
 
 DATASET = Path("build/dataset")
 ENGINE_DATASET = Path("build/engine")
+FIDELITY_DATASET = Path("build/scenes")
+FIDELITY_OUT = Path("build/fidelity")
+MODES = Modes(cached=Simulator, physical=physical_simulator)
 
 
 @app.command()
@@ -76,6 +93,29 @@ def engine(
     """Measure the engine on one core with a pinned workload in furnished scenes."""
     with _refusals():
         _hand_in(_engine(dataset, workload, cycles), json_file)
+
+
+@app.command()
+def fidelity(
+    dataset: DataSet = FIDELITY_DATASET,
+    json_file: Json = None,
+    out: Annotated[Path, typer.Option(help="Folder for plans, results and disagreements.")] = FIDELITY_OUT,
+    jobs: Annotated[int, typer.Option(min=1, max=64, help="Processes.")] = 2,
+    plans: Annotated[int, typer.Option(min=1, help="Plans at least.")] = 1_000,
+    calls: Annotated[int, typer.Option(min=0, help="Calls of every skill at least.")] = 200,
+    seed: Annotated[int, typer.Option(min=0, help="Equal seeds and datasets give equal plans.")] = 0,
+    replay: Annotated[
+        str, typer.Option(help="FILE:N, a line of the disagreements, to see step by step.")
+    ] = "",
+) -> None:
+    """Run the same plans in both execution modes and tell how far they agree; goes on where it was cut short."""
+    with _refusals():
+        if replay:
+            for line in replayed(Dataset.load(dataset), read_disagreement(replay), MODES):
+                console.print(line, highlight=False, markup=False, soft_wrap=True)
+            return
+        settings = FidelitySettings(plans, calls, seed)
+        _hand_in(_fidelity(Dataset.load(dataset), settings, out, jobs), json_file)
 
 
 @app.command()
@@ -169,6 +209,27 @@ def _rollout(dataset: Path, scenes: int, repeats: int) -> BenchResult:
             status.update(f"one process: {number} of {len(chosen)} scenes")
 
         return BenchResult("rollout", commit_here(), machine, bench_rollout(chosen, repeats, on_scene))
+
+
+def _fidelity(dataset: Dataset, settings: FidelitySettings, out: Path, jobs: int) -> BenchResult:
+    machine = describe_machine() | {"jobs": jobs, "plans_asked": settings.plans, "seed": settings.seed}
+    started_s = time.monotonic()
+    fresh = not (out / RESULTS_FILE).exists()
+    with errors.status("fidelity") as status:
+        progress = Progress(
+            written=lambda done, of: status.update(f"fidelity: plans for {done} of {of} scenes"),
+            executed=lambda done, of: status.update(f"fidelity: {done} of {of} plans in both modes"),
+        )
+        outcome = run_fidelity(dataset, settings, out, jobs, MODES, progress)
+    minutes = (time.monotonic() - started_s) / 60 if fresh else None
+    console.print(skill_table(report_on(outcome.comparisons)))
+    for sentence in outcome.lost:
+        errors.print(f"lost: {sentence}", highlight=False, markup=False)
+    console.print(
+        f"disagreements: {out / DISAGREEMENTS_FILE}; see one with --replay {out / DISAGREEMENTS_FILE}:1",
+        highlight=False,
+    )
+    return BenchResult("fidelity", commit_here(), machine, figures_of(outcome, minutes))
 
 
 def _cluster(dataset: Path, load: ClusterLoad) -> BenchResult:

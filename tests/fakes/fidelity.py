@@ -1,0 +1,91 @@
+"""Stand-ins for the physical mode that differ from the cached one in ways known beforehand. Functions of a module: processes
+that are spawned find them by name."""
+
+from __future__ import annotations
+
+import os
+import time
+from typing import TYPE_CHECKING
+
+from embomatrix.sim.actions import CachedActor
+from embomatrix.sim.executor import Simulator
+from embomatrix.skills.failure import FailureReason
+from embomatrix.skills.syntax import Skill
+from embomatrix.skills.view import refuse, target_of
+from embomatrix.world.geometry import Pose
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from embomatrix.sim.live_world import LiveWorld
+    from embomatrix.skills.syntax import SkillCall
+    from embomatrix.skills.view import Refusal
+    from embomatrix.world.bundle import Bundle
+
+
+class ClumsyActor(CachedActor):
+    """Never gets a switch pressed."""
+
+    def act(self, world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+        if call.skill is Skill.TOGGLE_ON:
+            target = target_of(world, call)
+            return refuse(FailureReason.ARM_BLOCKED, target=target, other=target)
+        return super().act(world, call, rng)
+
+
+class SloppyActor(CachedActor):
+    """Places things as it should, after which they lie in the far corner of the kitchen."""
+
+    def act(self, world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+        held = world.carried[:1]
+        refusal = super().act(world, call, rng)
+        if call.skill is Skill.PLACE and refusal is None:
+            world.engine.set_pose(held[0], Pose((4.8, 0.2, 0.5)))
+        return refusal
+
+
+class DyingActor(CachedActor):
+    """Takes the process with it when it opens something."""
+
+    def act(self, world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+        if call.skill is Skill.OPEN:
+            os._exit(7)
+        return super().act(world, call, rng)
+
+
+class HangingActor(CachedActor):
+    """Never comes back from opening something."""
+
+    def act(self, world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+        if call.skill is Skill.OPEN:
+            time.sleep(600.0)
+        return super().act(world, call, rng)
+
+
+class RaisingActor(CachedActor):
+    """Breaks down with an error when it opens something."""
+
+    def act(self, world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+        if call.skill is Skill.OPEN:
+            raise ArithmeticError("the door is not a number")
+        return super().act(world, call, rng)
+
+
+def clumsy(bundle: Bundle) -> Simulator:
+    return Simulator(bundle, actor=ClumsyActor())
+
+
+def sloppy(bundle: Bundle) -> Simulator:
+    return Simulator(bundle, actor=SloppyActor())
+
+
+def dying(bundle: Bundle) -> Simulator:
+    return Simulator(bundle, actor=DyingActor())
+
+
+def hanging(bundle: Bundle) -> Simulator:
+    return Simulator(bundle, actor=HangingActor())
+
+
+def raising(bundle: Bundle) -> Simulator:
+    return Simulator(bundle, actor=RaisingActor())

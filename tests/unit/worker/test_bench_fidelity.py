@@ -1,0 +1,150 @@
+"""`bench fidelity`: processes that die cost one trial, a suite goes on where it was cut short, disagreements can be seen again."""
+
+import json
+
+import pytest
+from tests.fakes.datasets import write_kitchen_dataset
+from tests.fakes.fidelity import clumsy, dying, hanging, raising
+
+from embomatrix.sim.executor import Simulator
+from embomatrix.sim.fidelity import PlanKind, Trial
+from embomatrix.sim.fidelity_sampler import SKILLS
+from embomatrix.skills.parse import parse_plan
+from embomatrix.worker.bench_fidelity import (
+    DISAGREEMENTS_FILE,
+    PLANS_FILE,
+    RESULTS_FILE,
+    FidelitySettings,
+    Progress,
+    run_fidelity,
+    write_all_trials,
+)
+from embomatrix.worker.bench_fidelity_page import figures_of, read_disagreement, replay
+from embomatrix.worker.bench_fidelity_pool import LOST, FidelityPool, Modes, SceneJob
+from embomatrix.worker.bench_figures import BenchError
+from embomatrix.world.dataset import Dataset
+
+QUIET = Progress(written=lambda done, of: None, executed=lambda done, of: None)
+SMALL = FidelitySettings(plans=20, calls=0, seed=0)
+LIMIT_S = 60.0
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    return Dataset.load(write_kitchen_dataset(tmp_path_factory.mktemp("dataset")))
+
+
+@pytest.fixture(scope="module")
+def suite(dataset, tmp_path_factory):
+    """A suite against a mode that can't press switches: its folder and its outcome."""
+    folder = tmp_path_factory.mktemp("suite")
+    return folder, run_fidelity(dataset, SMALL, folder, 2, Modes(Simulator, clumsy), QUIET)
+
+
+def test_a_suite_compares_every_plan_and_writes_the_disagreements(suite):
+    folder, outcome = suite
+    plans = (folder / PLANS_FILE).read_text().splitlines()
+    assert len(plans) == len(outcome.comparisons) >= SMALL.plans
+    assert not outcome.lost
+    differing = [item for item in outcome.comparisons if item.first_difference is not None]
+    assert differing
+    assert {item.pairs[item.first_difference][0].skill.value for item in differing} == {"toggle_on"}
+    told = [json.loads(line) for line in (folder / DISAGREEMENTS_FILE).read_text().splitlines()]
+    assert {value["trial"] for value in told} >= {item.trial.trial_id for item in differing}
+
+
+def test_figures_bear_the_names_that_others_read(suite):
+    figures = {figure.name: figure for figure in figures_of(suite[1], minutes=None)}
+    assert {"final_atoms_equal", "step_outcomes_equal", "plans", "scenes", "skill_speedup_min"} <= set(
+        figures
+    )
+    assert figures["step_outcomes_equal"].value < 1.0
+    assert figures["scenes"].value == 1.0
+
+
+def test_a_suite_that_was_cut_short_goes_on_where_it_was(suite, dataset, tmp_path):
+    folder, outcome = suite
+    for name in (PLANS_FILE, "settings.json"):
+        (tmp_path / name).write_text((folder / name).read_text())
+    lines = (folder / RESULTS_FILE).read_text().splitlines()
+    (tmp_path / RESULTS_FILE).write_text("\n".join(lines[:-2]) + "\n" + lines[-2][:40])
+    executed = []
+    progress = Progress(written=QUIET.written, executed=lambda done, of: executed.append(done))
+    again = run_fidelity(dataset, SMALL, tmp_path, 1, Modes(Simulator, clumsy), progress)
+    assert executed == [len(lines) - 1, len(lines)]
+    assert [item.cached.atoms for item in again.comparisons] == [
+        item.cached.atoms for item in outcome.comparisons
+    ]
+
+
+def test_a_folder_of_other_settings_is_refused(suite, dataset):
+    with pytest.raises(BenchError, match="other settings"):
+        run_fidelity(dataset, FidelitySettings(21, 0, 0), suite[0], 1, Modes(Simulator, clumsy), QUIET)
+
+
+def test_plans_reach_the_quota_of_every_skill(dataset):
+    settings = FidelitySettings(plans=20, calls=8, seed=1)
+    trials = write_all_trials(dataset, settings, Modes(Simulator, clumsy), QUIET)
+    calls = [
+        call.skill
+        for trial in trials
+        if trial.kind in (PlanKind.ORACLE, PlanKind.VALID)
+        for call in trial.plan
+    ]
+    assert all(calls.count(skill) >= settings.calls for skill in SKILLS)
+    assert trials == write_all_trials(dataset, settings, Modes(Simulator, clumsy), QUIET)
+
+
+def trials_of(dataset, *texts):
+    record = dataset.records[0]
+    fridge = record.task.index_of["fridge_1"]
+    return tuple(
+        Trial(
+            f"t-{number}",
+            record.bundle_digest,
+            "flat",
+            record.task.task_id,
+            PlanKind.VALID,
+            0,
+            parse_plan(text.replace("fridge", str(fridge))),
+        )
+        for number, text in enumerate(texts)
+    )
+
+
+@pytest.mark.parametrize(
+    ("physical", "reason", "limit_s"),
+    [
+        (dying, "the process died", LIMIT_S),
+        (raising, "the door is not a number", LIMIT_S),
+        pytest.param(hanging, "no answer in 10 s", 10.0, marks=pytest.mark.slow),
+    ],
+)
+def test_a_process_that_fails_costs_only_the_trial_that_it_was_at(dataset, physical, reason, limit_s):
+    trials = trials_of(dataset, "move fridge", "move fridge\nopen fridge", "turn 1.0")
+    values = []
+    pool = FidelityPool(dataset.folder, Modes(Simulator, physical), 1, limit_s)
+    pool.run([SceneJob(trials[0].bundle_digest, trials)], values.append)
+    assert [value["trial"] for value in values] == ["t-0", "t-1", "t-2"]
+    assert [LOST in value for value in values] == [False, True, False]
+    assert reason in values[1][LOST]
+
+
+def test_a_disagreement_is_shown_again_step_by_step(suite, dataset):
+    folder, _ = suite
+    path = folder / DISAGREEMENTS_FILE
+    number = next(
+        n
+        for n, line in enumerate(path.read_text().splitlines(), 1)
+        if "toggle_on" in line and '"step"' in line
+    )
+    lines = list(replay(dataset, read_disagreement(f"{path}:{number}"), Modes(Simulator, clumsy)))
+    assert any(line.startswith("≠") and "toggle_on" in line for line in lines)
+    assert any("bars it" in line for line in lines)
+    assert any(line.strip().startswith("cached only:") for line in lines)
+
+
+@pytest.mark.parametrize("spot", ["nowhere", "file:0", "file:x"])
+def test_a_line_that_is_not_named_right_is_refused(spot):
+    with pytest.raises(BenchError, match="FILE:N"):
+        read_disagreement(spot)

@@ -1,0 +1,180 @@
+"""What `bench fidelity` shows: its figures, a table of skills, and one disagreement step by step."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from typing import TYPE_CHECKING, Final
+
+from rich.table import Table
+
+from embomatrix.sim.fidelity import objects_in, true_atoms
+from embomatrix.sim.fidelity_records import trial_from_json
+from embomatrix.sim.fidelity_report import MANIPULATION, calls_of, report_on
+from embomatrix.sim.fidelity_sampler import SKILLS
+from embomatrix.worker.bench_figures import BenchError, Better, Figure
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from embomatrix.sim.executor import Simulator
+    from embomatrix.sim.fidelity import Trial
+    from embomatrix.sim.fidelity_report import FidelityReport
+    from embomatrix.skills.trace import Step
+    from embomatrix.worker.bench_fidelity import Outcome
+    from embomatrix.worker.bench_fidelity_pool import Modes
+    from embomatrix.world.dataset import Dataset
+    from embomatrix.world.task import Task
+
+ATOMS_GOAL: Final = 0.99
+STEPS_GOAL: Final = 0.98
+PLANS_GOAL: Final = 1_000.0
+SCENES_GOAL: Final = 20.0
+SUCCEEDED_GOAL: Final = 0.6
+CALLS_GOAL: Final = 200.0
+PLAN_S_GOAL: Final = 2.5
+SPEEDUP_GOAL: Final = 100.0
+MINUTES_GOAL: Final = 25.0
+
+
+def figures_of(outcome: Outcome, minutes: float | None) -> tuple[Figure, ...]:
+    """All figures. ``minutes`` is the wall time of the whole suite, None when part of it was done before."""
+    report = report_on(outcome.comparisons)
+    calls = calls_of(outcome.comparisons)
+    higher, lower = Better.HIGHER, Better.LOWER
+    plans, steps = report.plans, report.steps
+    found = [
+        Figure("final_atoms_equal", report.atoms_equal, "share", higher, report.atoms, ATOMS_GOAL),
+        Figure("step_outcomes_equal", report.steps_equal, "share", higher, steps, STEPS_GOAL),
+        Figure(
+            "step_outcomes_equal_of_either",
+            report.steps_equal_of_either,
+            "share",
+            higher,
+            report.steps_of_either,
+        ),
+        Figure("step_reasons_equal", report.reasons_equal, "share", higher, steps),
+        Figure("plans_equal", report.plans_equal, "share", higher, plans),
+        Figure("plans", float(plans), "", higher, plans, PLANS_GOAL),
+        Figure("plans_lost", float(len(outcome.lost)), "", lower, plans + len(outcome.lost), 0.0),
+        Figure("scenes", float(report.scenes), "", higher, report.scenes, SCENES_GOAL),
+        Figure("succeeded_in_cached_mode", report.succeeded, "share", higher, plans, SUCCEEDED_GOAL),
+        Figure(
+            "calls_of_the_rarest_skill",
+            float(min(calls[skill] for skill in SKILLS)),
+            "",
+            higher,
+            len(SKILLS),
+            CALLS_GOAL,
+        ),
+        Figure("physical_plan_s", report.plan_s, "s", lower, plans),
+    ]
+    if report.full_scene_plans:
+        found.append(
+            Figure(
+                "physical_plan_300_s",
+                report.full_scene_plan_s,
+                "s",
+                lower,
+                report.full_scene_plans,
+                PLAN_S_GOAL,
+            )
+        )
+    found += _skill_figures(report)
+    if minutes is not None:
+        found.append(Figure("suite_minutes", minutes, "min", lower, 1, MINUTES_GOAL))
+    return tuple(found)
+
+
+def _skill_figures(report: FidelityReport) -> Iterator[Figure]:
+    yield Figure("skill_speedup_min", report.speedup_min, "×", Better.HIGHER, len(MANIPULATION), SPEEDUP_GOAL)
+    for item in report.skills:
+        if item.compared:
+            equal = 1.0 - item.unequal / item.compared
+            yield Figure(f"equal {item.skill.value}", equal, "share", Better.HIGHER, item.compared)
+        if item.speedup:
+            yield Figure(f"speed-up {item.skill.value}", item.speedup, "×", Better.HIGHER, item.compared)
+
+
+def skill_table(report: FidelityReport) -> Table:
+    """One row a skill: calls, disagreements and times."""
+    table = Table(title="skills", title_justify="left")
+    table.add_column("skill")
+    for heading in (
+        "calls",
+        "succeeded",
+        "compared",
+        "unequal",
+        "other reason",
+        "cached ms",
+        "physical ms",
+        "×",
+    ):
+        table.add_column(heading, justify="right")
+    for item in report.skills:
+        if item.calls:
+            table.add_row(
+                item.skill.value,
+                *(
+                    f"{n:,}"
+                    for n in (item.calls, item.succeeded, item.compared, item.unequal, item.other_reason)
+                ),
+                f"{item.cached_s * 1e3:.2f}",
+                f"{item.physical_s * 1e3:.1f}",
+                f"{item.speedup:,.0f}",
+            )
+    return table
+
+
+def read_disagreement(spot: str) -> Trial:
+    """The trial of a line, given as FILE:N with N from 1. Raises BenchError."""
+    name, _, number = spot.rpartition(":")
+    if not name or not number.isdecimal() or int(number) < 1:
+        raise BenchError(f"found {spot!r}: expected FILE:N, a line of a file of disagreements, N from 1")
+    with open(name, encoding="utf-8") as file:
+        for count, line in enumerate(file, start=1):
+            if count == int(number):
+                try:
+                    return trial_from_json(json.loads(line))
+                except (KeyError, TypeError, ValueError) as error:
+                    raise BenchError(
+                        f"{spot} is no trial ({error}): expected a line that the suite wrote"
+                    ) from error
+    raise BenchError(f"{name} has fewer than {number} lines: name one that is there")
+
+
+def replay(dataset: Dataset, trial: Trial, modes: Modes) -> Iterator[str]:
+    """Lines about the trial, executed again in both modes. Raises DatasetError, BenchError and EngineError."""
+    bundle = dataset.bundle(trial.bundle_digest)
+    task = bundle.tasks.get(trial.task_id)
+    if task is None:
+        raise BenchError(f"the bundle has no task {trial.task_id!r}: name the dataset that the suite ran on")
+    yield f"{trial.trial_id} ({trial.kind.value} plan) in {trial.base}, task {trial.task_id}, seed {trial.seed}"
+    yield f"goal: {task.goal_bddl}"
+    with (
+        contextlib.closing(modes.cached(bundle)) as cached,
+        contextlib.closing(modes.physical(bundle)) as physical,
+    ):
+        cached.reset(task, trial.seed)
+        physical.reset(task, trial.seed)
+        for number, call in enumerate(trial.plan, start=1):
+            one, other = cached.run_step(call), physical.run_step(call)
+            mark = " " if one.ok is other.ok else "≠"
+            yield f"{mark} {number}. {one.call.skill.value}"
+            yield f"      cached:   {_told(one)}"
+            yield f"      physical: {_told(other)}"
+            if not (one.ok and other.ok):
+                break
+        yield from _atom_lines(cached, physical, task, trial)
+
+
+def _told(step: Step) -> str:
+    return step.message if step.failure is None else f"{step.failure.value}: {step.message}"
+
+
+def _atom_lines(cached: Simulator, physical: Simulator, task: Task, trial: Trial) -> Iterator[str]:
+    names = objects_in(task, trial.plan)
+    one, other = true_atoms(cached, names), true_atoms(physical, names)
+    yield f"atoms that hold in both: {len(one & other)}"
+    yield from (f"  cached only:   {atom}" for atom in sorted(one - other))
+    yield from (f"  physical only: {atom}" for atom in sorted(other - one))
