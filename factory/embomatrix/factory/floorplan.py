@@ -49,10 +49,15 @@ class FloorPlan:
     @property
     def compactness(self) -> float:
         """Share of the plan's bounding box that is room floor or wall, in (0, 1]."""
-        low = np.min([r.low_m for r in self.rooms], axis=0) - WALL_M / 2
-        high = np.max([r.high_m for r in self.rooms], axis=0) + WALL_M / 2
-        used = sum((r.size_m[0] + WALL_M) * (r.size_m[1] + WALL_M) for r in self.rooms)
-        return float(used / np.prod(high - low))
+        return compactness(self.rooms)
+
+
+def compactness(rooms: Sequence[Room]) -> float:
+    """Share of the rooms' bounding box that is floor or wall, in (0, 1]."""
+    low = np.min([r.low_m for r in rooms], axis=0) - WALL_M / 2
+    high = np.max([r.high_m for r in rooms], axis=0) + WALL_M / 2
+    used = sum((r.size_m[0] + WALL_M) * (r.size_m[1] + WALL_M) for r in rooms)
+    return float(used / np.prod(high - low))
 
 
 def plan_floor(rooms: Sequence[RoomSpec], rng: np.random.Generator, *, trials: int = TRIALS) -> FloorPlan:

@@ -32,9 +32,11 @@ PLANS: Final = 4
 SMALL_HOUSE: Final = 250
 LOSS_TAKEN: Final = 4.0
 """Plans are drawn again while more than this is left out: a cabinet, a bed; not for a trash can."""
-_FLAT_ON_WALL: Final = frozenset(
-    {"picture", "painting", "portrait", "information_bulletin", "periodic_table", "map"}
+_FLAT_NAMES: Final = (
+    "picture painting portrait information_bulletin periodic_table map projection_screen hanging_banners hanging "
+    "architectural_plan"
 )
+_FLAT_ON_WALL: Final = frozenset(_FLAT_NAMES.split())
 
 
 def build_base_scene(scene_id: str, *, seed: int = 0) -> Scene:
@@ -115,7 +117,7 @@ def _pieces(catalog: Catalog, inventory: SceneInventory) -> tuple[dict[str, list
             asset = build_asset(catalog, category, model)
             if asset.asset_id in seen and max(asset.size_m[:2]) > max(room.floor_m) - 0.02:
                 notes.append(
-                    f"{asset.asset_id} in {room.name}: it is listed in two rooms and stands in the larger one"
+                    f"{count} {asset.asset_id} in {room.name}: listed in two rooms, it stands in the larger one"
                 )
                 continue
             seen.add(asset.asset_id)

@@ -46,6 +46,7 @@ class ProblemKind(StrEnum):
     WINDOW = "window"
     UNSTABLE = "unstable"
     SUNKEN = "sunken"
+    UNACCOUNTED = "unaccounted"
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import json
+import os
 from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,20 +13,24 @@ import numpy as np
 import typer
 from PIL import Image
 from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from embomatrix.factory.floorplan_spec import FloorPlanError
 from embomatrix.factory.pictures import draw_plan
-from embomatrix.factory.relation_pictures import draw_relations
+from embomatrix.factory.pictures_sheet import draw_sheet
+from embomatrix.factory.scene_batch import SceneJob, run_batch
 from embomatrix.factory.scene_build import build_base_scene
-from embomatrix.factory.scene_check import check_in_engine, check_scene
+from embomatrix.factory.scene_tables import problem_lines, report_table
 from embomatrix.sim.bullet.camera import render_oblique
 from embomatrix.sim.engine import EngineError
 from embomatrix.world.catalog import Catalog, CatalogError
-from embomatrix.world.codec import scene_to_json
 from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from embomatrix.factory.scene_report import SceneReport
     from embomatrix.world.scene import Scene
 
 app = typer.Typer(
@@ -34,8 +40,21 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 SceneId = Annotated[str, typer.Argument(help="Name of a scene, as `embomatrix scene list` shows it.")]
-Seed = Annotated[int, typer.Option(help="Another seed gives another arrangement of the same inventory.")]
+SceneIds = Annotated[list[str] | None, typer.Argument(help="Names of scenes, or none with --all.")]
+All = Annotated[bool, typer.Option("--all", help="All 51 scenes.")]
+Seed = Annotated[
+    int, typer.Option(min=0, help="Another seed gives another arrangement of the same inventory.")
+]
+Seeds = Annotated[
+    list[int] | None,
+    typer.Option("--seed", min=0, help="Arrangement of the inventory; give it again for more. Default: 0."),
+]
 Out = Annotated[Path, typer.Option(help="Folder for the files.")]
+Jobs = Annotated[int, typer.Option(min=1, help="Processes at a time.")]
+Report = Annotated[
+    Path | None, typer.Option(help="JSON file for all figures, problems and what was left out.")
+]
+CORES = os.cpu_count() or 1
 
 
 @app.command("list")
@@ -47,15 +66,41 @@ def list_scenes() -> None:
 
 
 @app.command()
-def build(scene_id: SceneId, seed: Seed = 0, out: Out = Path()) -> None:
-    """Lay out and furnish a scene, and write it as JSON."""
-    import json
+def build(
+    scene_ids: SceneIds = None,
+    every: All = False,
+    seeds: Seeds = None,
+    out: Out = Path(),
+    report: Report = None,
+    jobs: Jobs = CORES,
+) -> None:
+    """Lay out and furnish scenes, check them, and write them as JSON; exit status 1 when one has a problem."""
+    chosen = _chosen(scene_ids, every)
+    folder = _folder(out)
+    several = len(set(seeds or ())) > 1
+    orders = [
+        SceneJob(name, seed, folder / (f"{name}-{seed}.json" if several else f"{name}.json"))
+        for name in chosen
+        for seed in dict.fromkeys(seeds or (0,))
+    ]
+    reports = _run(orders, jobs)
+    Console().print(str(orders[0].path if len(orders) == 1 else folder), highlight=False)
+    _tell(reports, report)
 
-    _check_name(scene_id)
-    path = _folder(out) / f"{scene_id}.json"
-    scene = _built(scene_id, seed)
-    _write(path, json.dumps(scene_to_json(scene)).encode("utf-8"))
-    Console().print(f"{len(scene.rooms)} rooms, {len(scene.objects)} objects: {path}", highlight=False)
+
+@app.command()
+def check(
+    scene_ids: SceneIds = None,
+    every: All = False,
+    seeds: Seeds = None,
+    report: Report = None,
+    jobs: Jobs = CORES,
+) -> None:
+    """Test scenes for penetration, unstable and floating things and blocked ways; exit status 1 when something is wrong."""
+    chosen = _chosen(scene_ids, every)
+    _tell(
+        _run([SceneJob(name, seed) for name in chosen for seed in dict.fromkeys(seeds or (0,))], jobs), report
+    )
 
 
 @app.command()
@@ -63,13 +108,15 @@ def show(scene_id: SceneId, seed: Seed = 0) -> None:
     """Print rooms, doorways, objects and what was left out."""
     scene = _built(scene_id, seed)
     console = Console()
-    table = Table("room", "size (m)", "doors to", "objects")
+    table = Table("room", "size (m)", "doors to", "windows", "objects")
     for room in scene.rooms:
         doors = [d for d in scene.doorways if room.name in d.rooms]
         beyond = [next((r or "outside" for r in d.rooms if r != room.name), "outside") for d in doors]
+        windows = sum(room.name in window.rooms for window in scene.windows)
         counts = Counter(scene.assets[o.asset_id].category for o in scene.objects if o.room == room.name)
         listed = ", ".join(f"{n} {c}" if n > 1 else c for c, n in sorted(counts.items()))
-        table.add_row(room.name, f"{room.size_m[0]:.2f} x {room.size_m[1]:.2f}", ", ".join(beyond), listed)
+        size = f"{room.size_m[0]:.2f} x {room.size_m[1]:.2f}"
+        table.add_row(room.name, size, ", ".join(beyond), str(windows), listed)
     console.print(table)
     for sentence in scene.left_out:
         console.print(f"left out: {sentence}", highlight=False, markup=False)
@@ -78,7 +125,7 @@ def show(scene_id: SceneId, seed: Seed = 0) -> None:
 @app.command()
 def render(scene_id: SceneId, seed: Seed = 0, out: Out = Path()) -> None:
     """Draw a plan from above and an oblique view, as PNG files."""
-    _check_name(scene_id)
+    _known([scene_id])
     folder = _folder(out)
     scene = _built(scene_id, seed)
     plan, oblique = folder / f"{scene_id}_plan.png", folder / f"{scene_id}_view.png"
@@ -92,36 +139,67 @@ def render(scene_id: SceneId, seed: Seed = 0, out: Out = Path()) -> None:
 
 
 @app.command()
-def check(scene_id: SceneId, seed: Seed = 0) -> None:
-    """Test a scene for penetration, floating things and blocked ways; exit status 1 when something is wrong."""
-    scene = _built(scene_id, seed)
-    try:
-        problems = (*check_scene(scene), *check_in_engine(scene))
-    except EngineError as error:
-        raise _refused(str(error)) from None
-    for problem in problems:
-        Console().print(f"{problem.kind}: {', '.join(problem.names)}: {problem.detail}", highlight=False)
-    if problems:
+def sheet(
+    scene_ids: SceneIds = None,
+    every: All = False,
+    seed: Seed = 0,
+    out: Annotated[Path, typer.Option(help="PNG file to write.")] = Path("scenes.png"),
+) -> None:
+    """Draw the plans of many scenes on one sheet, as a PNG file."""
+    chosen = _chosen(scene_ids, every)
+    scenes = []
+    with _progress(len(chosen)) as bar:
+        for name in chosen:
+            bar.update(bar.task_ids[0], description=name)
+            scenes.append(_built(name, seed))
+            bar.advance(bar.task_ids[0])
+    _write(out, _png(draw_sheet(scenes).quantize(64)))
+    Console().print(str(out), highlight=False)
+
+
+def _run(orders: Sequence[SceneJob], jobs: int) -> list[SceneReport]:
+    reports = []
+    with _progress(len(orders)) as bar:
+        try:
+            for report in run_batch(orders, processes=jobs):
+                reports.append(report)
+                bar.update(bar.task_ids[0], advance=1, description=report.scene_id)
+        except OSError as error:
+            raise _unwritable(Path(error.filename or "."), error) from None
+    return sorted(reports, key=lambda r: (r.scene_id, r.seed))
+
+
+def _tell(reports: Sequence[SceneReport], path: Path | None) -> None:
+    console = Console()
+    console.print(report_table(reports))
+    for line in problem_lines(reports):
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+    if path is not None:
+        _write(path, (json.dumps([r.to_json() for r in reports], indent=1) + "\n").encode("utf-8"))
+        console.print(str(path), highlight=False)
+    wrong = sum(not report.sound for report in reports)
+    if wrong:
+        console.print(f"{wrong} of {len(reports)} scenes have problems", highlight=False)
         raise typer.Exit(1)
-    Console().print(f"{scene_id}: {len(scene.objects)} objects, nothing wrong", highlight=False)
+    console.print(
+        f"{len(reports)} scenes, nothing wrong" if len(reports) > 1 else "nothing wrong", highlight=False
+    )
 
 
-@app.command()
-def relations(out: Out = Path()) -> None:
-    """Draw what every relation means: cases in which it holds, and in which it does not, as a PNG file."""
-    path = _folder(out) / "relations.png"
-    try:
-        picture = draw_relations()
-    except EngineError as error:
-        raise _refused(str(error)) from None
-    _write(path, _png(picture.quantize(64)))
-    Console().print(str(path), highlight=False)
-
-
-def _check_name(scene_id: str) -> None:
+def _chosen(scene_ids: Sequence[str] | None, every: bool) -> tuple[str, ...]:
     """Before anything is made: a wrong name shall leave no folder behind."""
+    if every and scene_ids:
+        raise _refused(f"--all and {scene_ids[0]!r} exclude one another: give names, or --all")
+    if not every and not scene_ids:
+        raise _refused("no scene is named: give a name that `embomatrix scene list` shows, or --all")
+    _known(scene_ids or ())
+    return Catalog.load().scene_ids if every else tuple(dict.fromkeys(scene_ids or ()))
+
+
+def _known(names: Sequence[str]) -> None:
     try:
-        Catalog.load().inventory(scene_id)
+        for name in names:
+            Catalog.load().inventory(name)
     except CatalogError as error:
         raise _refused(str(error)) from None
 
@@ -131,6 +209,13 @@ def _built(scene_id: str, seed: int) -> Scene:
         return build_base_scene(scene_id, seed=seed)
     except (CatalogError, FloorPlanError) as error:
         raise _refused(str(error)) from None
+
+
+def _progress(total: int) -> Progress:
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    progress = Progress(*columns, console=Console(stderr=True), transient=True)
+    progress.add_task("scenes", total=total)
+    return progress
 
 
 def _folder(out: Path) -> Path:
@@ -150,7 +235,7 @@ def _write(path: Path, data: bytes) -> None:
 
 def _png(image: Image.Image) -> bytes:
     buffer = io.BytesIO()
-    image.save(buffer, format="PNG")
+    image.save(buffer, format="PNG", optimize=True)
     return buffer.getvalue()
 
 

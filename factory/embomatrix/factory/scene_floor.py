@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.sim.floor_grid import FloorGrid
+from embomatrix.sim.floor_grid import CELL_M, FloorGrid
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.geometry import Aabb, Pose
 
@@ -34,7 +34,9 @@ class ReachableFloor:
             rows += [_row(part.aabb(item.pose_world_asset)) for part in parts]
         boxes = np.array(rows).reshape(-1, 6)
         barring = (boxes[:, 4] < ROBOT.height_m) & (boxes[:, 5] > _FLAT_M)
-        self._grid = FloorGrid(scene, boxes[barring])
+        self._rooms = scene.rooms
+        self._barring = boxes[barring]
+        self._grid = FloorGrid(scene, self._barring)
         cell = self._grid.cell(scene.robot.x_m, scene.robot.y_m)
         self._label = self._grid.label(cell) if cell is not None else 0
 
@@ -42,6 +44,24 @@ class ReachableFloor:
     def has_start(self) -> bool:
         """Whether the robot's start is free floor."""
         return self._label > 0
+
+    @property
+    def reachable_share(self) -> float:
+        """Share of the places where the robot fits that it can drive to from its start; 0 when there are none."""
+        free = int(self._grid.free.sum())
+        return float((self._grid.labels == self._label).sum() / free) if free and self.has_start else 0.0
+
+    @property
+    def free_share(self) -> float:
+        """Share of the rooms' floor over which nothing stands up to the robot's height."""
+        free = total = 0
+        for room in self._rooms:
+            floor = np.ones(np.ceil(np.array(room.size_m) / CELL_M).astype(int), dtype=bool)
+            low = np.array([*room.low_m, *room.low_m])
+            for x0, y0, x1, y1 in np.rint((self._barring[:, :4] - low) / CELL_M).astype(int).clip(0):
+                floor[x0:x1, y0:y1] = False
+            free, total = free + int(floor.sum()), total + floor.size
+        return free / total
 
     def cells(self, low: tuple[float, float], high: tuple[float, float]) -> FloatArray:
         """Centres of the reachable cells in a rectangle, shape (n, 2)."""
