@@ -166,6 +166,8 @@ class LiveWorld:
 
 def _restore(current: dict[str, set[T]], initial: Mapping[str, frozenset[T]]) -> None:
     """Make the sets equal to the initial ones; those that are so already are left alone, as nearly all are."""
+    if current == initial:
+        return
     for name, members in initial.items():
         if current[name] != members:
             current[name] = set(members)

@@ -85,27 +85,26 @@ def _comes_off(world: WorldView, call: SkillCall) -> Refusal | None:
     asset, covering = world.asset(source), coverings(world.facts_about(target))
     machine = washing(asset)
     if machine is not None:
-        stays = not washed_away(machine, covering)
-        missing = dict.fromkeys(covering) if stays else {}
+        lacking = dict.fromkeys(covering) if not washed_away(machine, covering) else {}
     else:
         facts, on = world.facts_about(source), world.is_on(source)
-        missing = {name: missing_for(asset, facts, name, on=on) for name in covering}
-        if () in missing.values():
-            return None
-    for substance, lacking in missing.items():
-        if lacking is None:
-            continue
-        if RUNNING in lacking:
-            return refuse(FailureReason.SOURCE_OFF, source=source)
-        return refuse(
-            FailureReason.NEEDS_SOAKING,
-            source=source,
-            substance=word_of(substance),
-            needed=" or ".join(map(word_of, lacking)),
-        )
-    for substance in missing:
+        lacking = {name: missing_for(asset, facts, name, on=on) for name in covering}
+    if not lacking or () in lacking.values():
+        return None
+    # What a change of the tool would help against is told before what it never takes off.
+    substance, needed = next(
+        ((name, needed) for name, needed in lacking.items() if needed), (covering[0], None)
+    )
+    if needed is None:
         return refuse(FailureReason.STAYS_ON, source=source, target=target, substance=word_of(substance))
-    return None
+    if RUNNING in needed:
+        return refuse(FailureReason.SOURCE_OFF, source=source)
+    return refuse(
+        FailureReason.NEEDS_SOAKING,
+        source=source,
+        substance=word_of(substance),
+        needed=" or ".join(map(word_of, needed)),
+    )
 
 
 def _source_wets(world: WorldView, call: SkillCall) -> Refusal | None:

@@ -1,6 +1,8 @@
 """Cutting, cleaning and soaking: what changes, what does not, and that a reset undoes it."""
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from tests.fakes.household import household_scene
 from tests.fakes.plans import executed, plan_of, task_over
 
@@ -175,3 +177,48 @@ def test_every_skill_of_the_household_profile_is_tried_here(home):
         Skill.MOVE,
         Skill.PICK_UP,
     }
+
+
+CALLS = st.sampled_from(
+    [
+        "move table_knife_1",
+        "pick_up table_knife_1",
+        "move melon_1",
+        "slice_object_with_tool melon_1 table_knife_1",
+        "slice_object_with_tool loaf_1 table_knife_1",
+        "move breakfast_table_1",
+        "place breakfast_table_1 ontop",
+        "move rag_1",
+        "pick_up rag_1",
+        "move sink_1",
+        "toggle_on sink_1",
+        "soak_object_in_source rag_1 sink_1",
+        "place sink_1 inside",
+        "move plate_2",
+        "clean_object_with_tool plate_2 rag_1",
+        "pick_up half_melon_1",
+    ]
+)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(CALLS, min_size=1, max_size=14))
+def test_whatever_was_cut_and_cleaned_a_reset_undoes_it_to_the_bit(home, calls):
+    task = task_over(home.world.scene)
+    home.reset(task, 0)
+    before = home.world.state_bytes()
+    for call in plan_of(task, "; ".join(calls)):
+        home.run_step(call)  # those that fail change nothing, and the next one is tried
+    home.reset(task, 0)
+    assert home.world.state_bytes() == before
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(CALLS, min_size=1, max_size=14))
+def test_a_call_that_fails_changes_nothing(home, calls):
+    task = task_over(home.world.scene)
+    home.reset(task, 0)
+    for call in plan_of(task, "; ".join(calls)):
+        before = home.world.state_bytes()
+        if not home.run_step(call).ok:
+            assert home.world.state_bytes() == before

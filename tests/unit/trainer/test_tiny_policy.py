@@ -1,5 +1,7 @@
 """The word-level policy: shared prompts change nothing, names survive the round trip, files bring it back."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from hypothesis import given
@@ -7,10 +9,12 @@ from hypothesis import strategies as st
 from tests.fakes.symbolic_household import make_tasks
 
 from embomatrix.skills.prompt import Codec, plan_in_names, prompt_for
+from embomatrix.skills.syntax import PROFILES
 from embomatrix.trainer.policy.decoder import DecoderShape
 from embomatrix.trainer.policy.tiny import TinyPolicy
 from embomatrix.trainer.policy.words import END, UNKNOWN, build_vocabulary
 from embomatrix.trainer.rollout import parsed
+from embomatrix.world.task import Profile
 
 TASKS = make_tasks(12, 3)
 WORDS = build_vocabulary(
@@ -141,3 +145,16 @@ def test_a_prompt_too_long_keeps_its_end():
     long = made.encode(prompt_for(type(situation)((), "", rows, situation.instruction, 16), Codec.NAMES))
     assert len(long) <= SHAPE.longest
     assert long[-4:] == told[-4:]
+
+
+def test_household_tasks_add_their_words_and_the_paper_s_none():
+    situations = [task.situation for task in TASKS.train]
+    added = {skill.value for skill in PROFILES[Profile.HOUSEHOLD]} - {
+        skill.value for skill in PROFILES[Profile.PAPER]
+    }
+    assert not added & set(build_vocabulary(situations, []).words)
+    dirty = replace(situations[0].rows[0], states=("covered_with_mud",))
+    household = replace(situations[0], rows=(dirty, *situations[0].rows[1:]), profile=Profile.HOUSEHOLD)
+    words = build_vocabulary([*situations, household], []).words
+    assert added | {"covered_with_mud"} <= set(words)
+    assert set(words) - set(build_vocabulary(situations, []).words) == added | {"covered_with_mud"}
