@@ -101,7 +101,6 @@ def serve_forks(control: socket.socket, child: Callable[[socket.socket], None]) 
     ``{"op": "reap", "pid": …}`` waits for a child that has ended and is answered by its wait status. A child stays a
     zombie until then, so its id is never another process's when the asker kills it.
     """
-    gc.collect()
     # Objects that exist now are never collected: a collection in a child would copy the pages they lie in.
     gc.freeze()
     while (request := receive(control)) is not None:
