@@ -210,13 +210,20 @@ class Placer:
         return self._patches[key]
 
     def _accept_verified(self, errand: Errand, pose: Pose) -> Pose | None:
-        if not self._is_free(errand, pose):
+        """A pose that was verified with nothing but its support around; it is settled where anything else is near."""
+        if not self._reaches(errand, pose):
             return None
-        near = frozenset((errand.target, FLOOR))
-        alone = not self._engine.penetrates(errand.held, UNDISTURBED_M + TOLERANCE_M, near)
-        if alone and self._holds(errand):
-            return pose
-        return self._accept_settled(errand)
+        engine, held, target = self._engine, errand.held, errand.target
+        engine.set_pose(held, pose)
+        if engine.penetrates(held, UNDISTURBED_M + TOLERANCE_M, frozenset((target, FLOOR))):
+            if engine.penetrates(held):
+                return None
+            return self._accept_settled(errand)
+        # The support's own doors may have moved since.
+        depth = engine.gap(held, target, 0.0)
+        if depth is not None and depth < -TOLERANCE_M:
+            return None
+        return pose if self._holds(errand) else self._accept_settled(errand)
 
     def _accept_settled(self, errand: Errand) -> Pose | None:
         """Let the object go where it is and take the pose where it comes to rest, if all still holds there."""
@@ -229,12 +236,15 @@ class Placer:
         return self._relations.holds(errand.relation, errand.held, errand.target)
 
     def _is_free(self, errand: Errand, pose: Pose) -> bool:
-        """Put the object at the pose and tell whether it is in reach there and penetrates nothing."""
-        box = bounds_of(self._scene.asset_of(errand.held)).box(pose, self._engine.joints(errand.held))
-        if not in_reach(box, errand.robot) or any(in_reach(box, stand) for stand in errand.passed_over):
+        """Put the object at the pose, if it is in reach there, and tell whether it penetrates nothing."""
+        if not self._reaches(errand, pose):
             return False
         self._engine.set_pose(errand.held, pose)
         return not self._engine.penetrates(errand.held)
+
+    def _reaches(self, errand: Errand, pose: Pose) -> bool:
+        box = bounds_of(self._scene.asset_of(errand.held)).box(pose, self._engine.joints(errand.held))
+        return in_reach(box, errand.robot) and not any(in_reach(box, stand) for stand in errand.passed_over)
 
 
 def in_reach(box: Aabb, robot: StandPose) -> bool:
