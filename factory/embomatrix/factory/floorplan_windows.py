@@ -21,7 +21,9 @@ HEAD_M: Final = 2.15
 LEAST_SILL_M: Final = 0.1
 TRANSOM_M: Final = 0.6
 """Lower windows sit under the lintel, above people's heads."""
-LEAST_WIDTH_M: Final = 0.35
+LEAST_SHARE: Final = 0.5
+LEAST_WIDTH_M: Final = 2.0
+"""Windows are cut to the wall that they go into, but not below half their width or these metres, whichever is less."""
 GAP_M: Final = 0.25
 """Wall between two windows, and between a window and a doorway or a corner."""
 VIEW_M: Final = 0.8
@@ -69,7 +71,7 @@ def place_windows(
                 dropped[window.model] += 1
         cuts += [cut for stretch in stretches for cut in _spread(stretch, room.name)]
         left_out += [
-            f"{n} window-{model} in {room.name}: no outer wall has room for them"
+            f"{n} window-{model} in {room.name}: no outer wall has room for it"
             for model, n in dropped.items()
         ]
     return cuts, left_out
@@ -102,7 +104,7 @@ def _stretches(
 def _assign(window: WindowSpec, stretches: Sequence[_Stretch]) -> bool:
     """Give the window to the stretch with most room, narrower than listed where need be; False when none has any."""
     best = max(stretches, key=lambda s: s.free_m, default=None)
-    if best is None or best.free_m < min(window.width_m, LEAST_WIDTH_M):
+    if best is None or best.free_m < min(LEAST_SHARE * window.width_m, LEAST_WIDTH_M):
         return False
     best.windows.append(replace(window, width_m=min(window.width_m, best.free_m)))
     return True
