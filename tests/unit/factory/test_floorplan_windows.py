@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -10,7 +12,9 @@ from embomatrix.factory.floorplan_spec import DoorSpec, RoomSpec, WindowSpec
 from embomatrix.factory.floorplan_walls import PANE_M, WALL_HEIGHT_M
 from embomatrix.factory.floorplan_windows import GAP_M, HEAD_M, LEAST_SILL_M, sill_and_head
 from embomatrix.world.geometry import Aabb, Pose
-from embomatrix.world.scene import Window
+
+if TYPE_CHECKING:
+    from embomatrix.world.scene import Window
 
 ORIGIN = Pose((0.0, 0.0, 0.0))
 CASEMENT = WindowSpec("casement", 0.8, 0.92)
