@@ -30,7 +30,8 @@ AHEAD: Final = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])
 _RUN_ROLES: Final = (Role.RUN, Role.COUNTERTOP, Role.HUNG_CABINET)
 _SIGHT_M: Final = 0.8
 _MANY: Final = 4
-_AISLE_M: Final = 0.7
+_BED_SHARE: Final = 0.28
+"""Planting keeps this close to a garden's edges, as a share of its shorter side."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +86,9 @@ def candidates_of(group: Group, space: RoomSpace, around: Surroundings) -> Candi
         x, y, turns = (
             np.concatenate(both) for both in zip((x, y, turns), _open_floor(group, space), strict=True)
         )
+        # The middle of a garden stays open.
+        near = _to_edge(space, x, y) <= _BED_SHARE * min(space.room.size_m)
+        x, y, turns = x[near], y[near], turns[near]
     if not len(x):
         return Candidates(x, y, turns, np.empty(0))
     cost = _style_cost(group, space, around, x, y, turns)
@@ -152,6 +156,9 @@ def _style_cost(
             cost = 0.8 * off - 0.3 * half
         case Style.CORNER:
             cost = 1.5 * (half - off)
+        case Style.NOOK:
+            right = np.where((turns == 0) | (turns == 3), middle - along, along - middle)
+            cost = 1.5 * (half - right)
         case Style.RUN:
             cost = 0.3 * (half - off) + 3.0 * _gap_to_run(group, around, x, y, turns)
         case Style.FREE:
@@ -160,15 +167,20 @@ def _style_cost(
             # Lines of shelves fill the hall from one side, each an aisle away from the last.
             across = np.where(turns % 2 == 0, x - room.low_m[0], y - room.low_m[1])
             shorter = np.where(turns % 2 == 0, room.size_m[0], room.size_m[1])
-            cost = 0.4 * across + 0.8 * off - 0.3 * shorter
+            cost = 0.4 * across + 0.8 * off - 0.6 * shorter
         case Style.EDGE:
-            (x0, y0), (x1, y1) = room.low_m, room.high_m
-            cost = 0.6 * np.minimum(np.minimum(x - x0, x1 - x), np.minimum(y - y0, y1 - y))
+            cost = 0.6 * _to_edge(space, x, y)
         case Style.OVERHEAD:
             cost = 0.1 * np.hypot(x - cx, y - cy)
         case Style.ALONG:
             cost = np.zeros(len(x))
     return np.asarray(cost)
+
+
+def _to_edge(space: RoomSpace, x: FloatArray, y: FloatArray) -> FloatArray:
+    """Distance from each place to the nearest edge of the room."""
+    (x0, y0), (x1, y1) = space.room.low_m, space.room.high_m
+    return np.asarray(np.minimum(np.minimum(x - x0, x1 - x), np.minimum(y - y0, y1 - y)))
 
 
 def _gap_to_run(

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.factory.furnish_halls import hall_groups, mat_rows, planting_groups
 from embomatrix.factory.furnish_hung import ceiling_groups, hung_groups, on_wall, rug_groups
 from embomatrix.factory.furnish_kitchen import COOKERS, SINKS, run_groups
-from embomatrix.factory.furnish_pieces import Group, Member, Rows, Style, stacked, top_of
+from embomatrix.factory.furnish_pieces import CORNER_SOFA_M, Group, Member, Rows, Style, stacked, top_of
 from embomatrix.factory.furnish_pool import Pool, worth
 from embomatrix.factory.furnish_roles import Role
-from embomatrix.factory.furnish_tables import table_groups
+from embomatrix.factory.furnish_tables import table_groups, work_groups
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from embomatrix.factory.furnish_pieces import Piece
 
 _COFFEE_GAP_M: Final = 0.38
-_CORNER_SOFA_M: Final = 1.4
-"""Deeper sofas are corner sofas: their table stands in the nook."""
+_CORNER_SEAT_M: Final = 0.95
+"""Depth of a corner sofa's two seats; its table stands in the nook between them."""
 _TV_STANDS: Final = ("console_table", "bottom_cabinet", "bookcase", "coffee_table", "breakfast_table")
 _ISLAND_M: Final = 2.0
 """Longer kitchen tables stand in the middle of the kitchen."""
@@ -64,8 +64,9 @@ def room_groups(
     found: list[Group | Rows] = [
         *_television(pool, [p for p in pieces if p.category == "standing_tv"]),
         *(_first(on_wall(p)) for p in screens[:1] if pool.of("sofa")),
-        *run_groups(pool, left_out),
         *hall_groups(pool),
+        *work_groups(pool),
+        *run_groups(pool, left_out),
         *table_groups(pool),
         *_beds(pool),
         *_sofas(pool),
@@ -137,9 +138,13 @@ def _sofas(pool: Pool) -> list[Group]:
     each = len(armchairs) // max(1, len(sofas))
     for sofa in sofas:
         members = [Member(sofa)]
+        nook = min(sofa.size_m[:2]) > CORNER_SOFA_M
         tables = [p for p in pool.of("coffee_table", "garden_coffee_table") if p.size_m[1] <= sofa.size_m[1]]
         for table in pool.take(tables[:1]):
             at = sofa.size_m[0] / 2 + _COFFEE_GAP_M + table.size_m[0] / 2
+            if nook and max(table.size_m[:2]) + 0.3 <= min(sofa.size_m[:2]) - _CORNER_SEAT_M:
+                members.append(Member(table, _CORNER_SEAT_M / 2 + 0.1, _CORNER_SEAT_M / 2 + 0.1))
+                continue
             members.append(Member(table, at))
             mine = pool.take(armchairs[: min(each, 2)])
             armchairs = armchairs[len(mine) :]
@@ -148,7 +153,7 @@ def _sofas(pool: Pool) -> list[Group]:
                 members.append(
                     Member(chair, max(at, (sofa.size_m[0] + chair.size_m[1]) / 2 + 0.1), y, turns=2 + side)
                 )
-        style = Style.CENTERED if sofa.size_m[0] <= _CORNER_SOFA_M else Style.CORNER
+        style = Style.NOOK if nook else Style.CENTERED
         screens = ("standing_tv", "wall_mounted_tv")
         groups.append(Group(tuple(members), style, worth(members), faces=screens, spread=("sofa",)))
     return groups

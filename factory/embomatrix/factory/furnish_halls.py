@@ -19,8 +19,8 @@ _SHELVES: Final = ("grocery_shelf", "snack_rack", "dry_food_dispenser_shelf", "c
 _TALL_M: Final = 1.9
 """Taller shelves stand at the walls, as far as those reach."""
 _AISLE_M: Final = 1.0
-_WALKS_M: Final = 2.6
-"""Free floor left over at both ends of a line of shelves."""
+_WALKS_M: Final = 3.2
+"""Free floor left over at both ends of a line of shelves, shelves at the walls included."""
 _LONGEST_LINE_M: Final = 9.0
 _STEP_M: Final = 0.005
 _PLANTS_WORTH: Final = 0.5
@@ -31,7 +31,9 @@ def hall_groups(pool: Pool) -> list[Group | Rows]:
     """What fills large rooms: shelves in aisles, machines in the open."""
     found: list[Group | Rows] = [*_aisles(pool)]
     for piece in pool.take(pool.with_role(Role.OPEN)):
-        found.append(Group((Member(piece),), Style.FREE, worth([Member(piece)]), spread=(piece.category,)))
+        near = ("doorway",) if piece.category == "turnstile" else ()
+        members = (Member(piece),)
+        found.append(Group(members, Style.FREE, worth(members), near, spread=(piece.category,)))
     return found
 
 
@@ -71,7 +73,7 @@ def _aisles(pool: Pool) -> list[Group]:
     groups = [
         Group((Member(p),), Style.RUN, 9.0 + 0.1 * p.size_m[1], near=("grocery_shelf",)) for p in at_wall
     ]
-    longest = min(max(pool.floor_m) - _WALKS_M, _LONGEST_LINE_M)
+    longest = min(min(pool.floor_m) - _WALKS_M, _LONGEST_LINE_M)
     lines = _lines(sorted(free, key=lambda p: (-p.size_m[0].__round__(1), -p.size_m[1])), longest)
     for front, back in zip(lines[::2], [*lines[1::2], []], strict=False):
         members = (*_line(front, 0), *_line(back, 2))

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.floorplan_walls import WALL_HEIGHT_M
 from embomatrix.factory.furnish_kitchen import COOKERS, SINKS, UNDER_COUNTER
-from embomatrix.factory.furnish_pieces import REST_GAP_M, Group, Member, Style
+from embomatrix.factory.furnish_pieces import REST_GAP_M, Group, Member, Rows, Style
 from embomatrix.factory.furnish_roles import HUNG_BOTTOM_M, Role, wall_height_m
 
 if TYPE_CHECKING:
@@ -42,6 +43,8 @@ _TABLES_UNDER_LIGHTS: Final = (
 )
 _HEAD_ROOM_M: Final = 1.45
 _SMALL_M: Final = 0.3
+_EVENLY: Final = 3
+_ANY_PITCH: Final = 100.0
 _RUGS_NEAR: Final = (
     "coffee_table",
     "sofa",
@@ -80,17 +83,26 @@ def on_wall(piece: Piece) -> Group:
     return Group((Member(piece, bottom=bottom),), style, 1.0 + piece.size_m[1], near, faces, spread)
 
 
-def ceiling_groups(pieces: Sequence[Piece]) -> list[Group]:
-    """Lights, fans and racks under the ceiling; those that hang low go over a table."""
-    groups = []
+def ceiling_groups(pieces: Sequence[Piece]) -> list[Group | Rows]:
+    """Lights, fans and racks under the ceiling: equal ones evenly over the room, those that hang low over a table."""
+    groups: list[Group | Rows] = []
+    kinds: dict[str, list[Group]] = defaultdict(list)
     for piece in pieces:
         if piece.role is Role.CEILING:
             bottom = WALL_HEIGHT_M - piece.size_m[2]
-            tables = _TABLES_UNDER_LIGHTS if bottom < _HEAD_ROOM_M else ()
+            low = bottom < _HEAD_ROOM_M
             member = Member(piece, bottom=max(bottom, 0.9))
-            groups.append(
-                Group((member,), Style.OVERHEAD, 1.0 + piece.size_m[1], tables, spread=(piece.category,))
-            )
+            tables = _TABLES_UNDER_LIGHTS if low else ()
+            group = Group((member,), Style.OVERHEAD, 1.0 + piece.size_m[1], tables, spread=(piece.category,))
+            if low:
+                groups.append(group)
+            else:
+                kinds[piece.category].append(group)
+    for equal in kinds.values():
+        if len(equal) >= _EVENLY:
+            groups.append(Rows(tuple(equal), equal[0].importance, (0.5, 0.5), stretch=_ANY_PITCH))
+        else:
+            groups += equal
     return sorted(groups, key=lambda g: -g.importance)
 
 

@@ -48,6 +48,7 @@ _CARRIED: Final = 0.3
 _STEP_M: Final = 0.003
 _LEVEL_M: Final = 0.035
 _HIGHEST_M: Final = 0.95
+_WORKTOP_M: Final = 0.72
 _BASIN_RIM_M: Final = 0.86
 
 
@@ -104,6 +105,10 @@ def _counters(pool: Pool, left_out: list[str]) -> list[Group]:
             groups.append(Group(_counter_members(slab, row), Style.RUN, 0.0))
         else:
             left.append(slab)
+    if left and not groups and pool.room_type != "kitchen":
+        # A worktop on brackets: the basins of a washroom, the table of a copy room.
+        bracketed = left.pop(0)
+        groups.append(Group((Member(bracketed, bottom=_WORKTOP_M),), Style.RUN, 0.0))
     for asset_id in dict.fromkeys(s.asset.asset_id for s in left):
         count = sum(s.asset.asset_id == asset_id for s in left)
         left_out.append(f"{count} of the {asset_id} slabs: no base cabinets are left to carry them")

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from embomatrix.world.asset import Asset, Joint, Link
     from embomatrix.world.geometry import Part, Vec3
 
+CORNER_SOFA_M: Final = 1.4
+"""A sofa that exceeds this along both sides goes round a corner, its second arm on its right: the nook is open floor."""
 REST_GAP_M: Final = 0.0005
 """Things rest half a millimetre above what carries them: close enough to be on it, far enough not to be in it."""
 FRONT_M: Final = 0.6
@@ -61,7 +63,8 @@ class Piece:
     @property
     def blocks(self) -> tuple[Box, ...]:
         """What it takes up, about its middle and above its underside: one box, or what an open shape is made of."""
-        if self.category in _OPEN_SHAPES and not self.upended:
+        corner = self.category == "sofa" and min(self.size_m[:2]) > CORNER_SOFA_M
+        if (corner or self.category in _OPEN_SHAPES) and not self.upended:
             return _blocks_of(self.asset.links[0].parts, self.asset.size_m[2] / 2)
         x, y, z = (extent / 2 for extent in self.size_m)
         return ((-x, -y, 0.0, x, y, 2 * z),)
@@ -138,6 +141,7 @@ class Style(StrEnum):
     CENTERED = "centered"  # at the middle of a wall
     ALONG = "along"  # anywhere along a wall
     CORNER = "corner"
+    NOOK = "nook"  # in a corner with the right side at the other wall
     FREE = "free"  # in the middle of the room
     EDGE = "edge"  # along the walls and, where those are taken, next to what stands there
     AISLE = "aisle"  # lines across the room, an aisle apart
@@ -169,11 +173,15 @@ class Group:
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """Equal groups that stand in rows and columns, all looking one way; ``gap_m`` is free floor behind and beside each."""
+    """Equal groups that stand in rows and columns, all looking one way; ``gap_m`` is free floor behind and beside each.
+
+    They spread over the room up to ``stretch`` times their closest pitch.
+    """
 
     groups: tuple[Group, ...]
     importance: float
     gap_m: tuple[float, float]
+    stretch: float = 1.35
 
 
 _FRONTED_NAMES: Final = (

@@ -45,7 +45,8 @@ _BY_ROLE: Final[Mapping[Role, str]] = {
     Role.BACKED: "bed sofa bookcase armchair wardrobe cedar_chest console_table nightstand standing_mirror piano toilet "
     "pedestal_sink bathtub shower_stall grandfather_clock jukebox bar commercial_kitchen_table locker vending_machine "
     "photocopier reception_desk checkout_counter display_case grocery_shelf hall_tree wood_fireplace gas_fireplace "
-    "crib hospital_bed magazine_stand snack_rack urinal eames_chair commercial_kitchen_shelf serving_cart",
+    "crib hospital_bed magazine_stand snack_rack urinal eames_chair commercial_kitchen_shelf serving_cart "
+    "charcoal_grill stadium_stand sauna_bench hammam_bench car recreational_vehicle motorcycle stand dish_rack_cart",
     Role.TABLE: "breakfast_table dining_table pedestal_table conference_table desk booth lab_table cubicle",
     Role.SEAT: "straight_chair swivel_chair taboret bench garden_chair music_stool rocking_chair",
     Role.LOW_TABLE: "coffee_table garden_coffee_table",
@@ -62,11 +63,13 @@ _BY_ROLE: Final[Mapping[Role, str]] = {
     "fire_alarm fire_sprinkler track_light spotlight chandelier paper_lantern ceiling_air_conditioner hanging_plant "
     "ceiling_mounted_projector motion_sensor",
     Role.RUG: "carpet gym_mat",
-    Role.SURFACE: "microwave laptop coffee_maker table_lamp loudspeaker monitor keyboard printer espresso_machine standing_tv "
-    "popcorn_machine electric_mixer food_slicer crock_pot beer_tap jug stockpot saucepot frying_pan tray pillow vase",
+    Role.SURFACE: "cash_register microwave laptop coffee_maker table_lamp loudspeaker monitor keyboard printer "
+    "espresso_machine standing_tv popcorn_machine electric_mixer food_slicer crock_pot beer_tap jug stockpot saucepot "
+    "frying_pan tray pillow vase desk_phone buret box_of_fruit lid chess_set mousepad place_mat table_runner oden_cooker "
+    "dessert_stand terrarium chopping_board carton toy_box blanket quilt guitar",
     Role.FITTED: "burner drop_in_sink tabletop_sink multi_station_tabletop_sink",
-    Role.OPEN: "car pool_table playground swing_set sandbox wading_pool garden_statue hot_tub massage_bed motorcycle "
-    "recreational_vehicle bench_press_machine elliptical_machine exercise_bike flat_bench parallel_bars pommel_horse "
+    Role.OPEN: "pool_table playground swing_set sandbox wading_pool garden_statue hot_tub massage_bed "
+    "bench_press_machine elliptical_machine exercise_bike flat_bench parallel_bars pommel_horse "
     "treadmill turnstile",
     Role.PLANTING: "tree low_resolution_tree bush garden_plant boulder garden_light",
     Role.STRUCTURE: "structural_element baseboard background greenery paver skeletal_frame stone_wall rail_fence stairs "
@@ -144,70 +147,3 @@ def is_portable(asset: Asset) -> bool:
         and max(asset.size_m) <= ROBOT.extent_m
         and not (asset.interiors and asset.can("heatSource"))
     )
-
-
-SURFACE_HOSTS: Final[Mapping[str, tuple[str, ...]]] = {
-    "microwave": ("countertop", "commercial_kitchen_table", "bottom_cabinet", "breakfast_table", "bar"),
-    "coffee_maker": ("countertop", "commercial_kitchen_table", "bar", "bottom_cabinet", "breakfast_table"),
-    "espresso_machine": ("bar", "countertop", "commercial_kitchen_table"),
-    "popcorn_machine": ("bar", "countertop", "bottom_cabinet"),
-    "beer_tap": ("bar", "countertop"),
-    "laptop": ("desk", "breakfast_table", "coffee_table", "console_table"),
-    "table_lamp": (
-        "nightstand",
-        "console_table",
-        "desk",
-        "bottom_cabinet",
-        "bookcase",
-        "breakfast_table",
-        "coffee_table",
-    ),
-    "monitor": ("desk",),
-    "keyboard": ("desk",),
-    "mouse": ("desk",),
-    "pillow": ("bed", "sofa", "armchair"),
-    "pot_plant": (
-        "console_table",
-        "bookcase",
-        "bottom_cabinet",
-        "coffee_table",
-        "breakfast_table",
-        "cedar_chest",
-    ),
-    "standing_tv": ("bottom_cabinet", "console_table", "bookcase", "coffee_table", "breakfast_table"),
-    "loudspeaker": ("bookcase", "console_table", "bottom_cabinet"),
-    "menu": ("booth", "pedestal_table", "bar"),
-    "bottle_of_mustard": ("booth", "pedestal_table", "bar"),
-    "bottle_of_catsup": ("booth", "pedestal_table", "bar"),
-    "jar_of_sugar": ("booth", "pedestal_table", "bar"),
-    "pepper_shaker": ("booth", "pedestal_table", "bar"),
-    "salt_shaker": ("booth", "pedestal_table", "bar"),
-    "phonograph_record": ("jukebox", "bar", "booth"),
-    "cloche": ("bar", "countertop"),
-    "cake_stand": ("bar", "countertop"),
-    "wrapped_hamburger": ("bar", "booth", "pedestal_table"),
-    "soda_cup": ("bar", "bookcase", "shelf", "commercial_kitchen_table"),
-    "cap": ("bar", "console_table", "bottom_cabinet"),
-    "chopping_board": ("commercial_kitchen_table", "countertop"),
-    "saucepot": ("stove", "commercial_kitchen_table", "shelf", "bookcase", "bottom_cabinet"),
-    "frying_pan": ("flat_top_grill", "stove", "commercial_kitchen_table", "bookcase"),
-    "stockpot": ("stove", "bookcase", "commercial_kitchen_table"),
-    "plate": ("bookcase", "shelf", "bottom_cabinet", "top_cabinet", "countertop", "commercial_kitchen_table"),
-    "bowl": ("bookcase", "shelf", "bottom_cabinet", "top_cabinet", "countertop", "commercial_kitchen_table"),
-    "mug": ("shelf", "bookcase", "bottom_cabinet", "top_cabinet", "countertop", "commercial_kitchen_table"),
-    "tray": ("bookcase", "commercial_kitchen_table", "bar", "freezer", "bottom_cabinet"),
-    "teapot": ("bookcase", "shelf", "commercial_kitchen_table"),
-    "jug": ("bookcase", "commercial_kitchen_table"),
-    "lid": ("shelf", "bookcase", "commercial_kitchen_table"),
-    "hardback": ("bookcase", "desk", "coffee_table"),
-    "paperback_book": ("bookcase", "desk", "coffee_table"),
-    "printer": ("desk", "bottom_cabinet", "console_table"),
-}
-"""Hosts that a small thing likes, best first; without an entry, or when those are full, any surface of the room serves."""
-
-_CUPBOARD_NAMES: Final = (
-    "plate bowl mug tray saucepot stockpot frying_pan lid jug teapot teacup saucer wineglass water_glass casserole gravy_boat "
-    "box_of_cereal canned_food bag_of_rice bag_of_flour box_of_cookies towel hand_towel toilet_paper"
-)
-CUPBOARD: Final = frozenset(_CUPBOARD_NAMES.split())
-"""What people keep behind doors; a lamp or a plant doesn't belong there."""

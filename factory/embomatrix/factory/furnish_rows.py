@@ -16,10 +16,10 @@ if TYPE_CHECKING:
     from embomatrix.factory.furnish_pieces import Group, Rect4, Rows
     from embomatrix.factory.furnish_solver import RoomSolver
 
-_MARGINS_M: Final = (0.75, 0.05)
-"""Free floor along the walls: a way around, or none."""
-_STRETCH: Final = 1.35
-"""Rows spread over the room up to this share of their closest pitch."""
+_MARGINS_M: Final = ((0.75, 0.75), (0.75, 0.05), (0.05, 0.75), (0.05, 0.05))
+"""Free floor along the walls in x and y: a way around, or none."""
+_SPARE: Final = 0.04
+"""A node too many costs as much as this share of a group without a place."""
 _LATTICES: Final = 4
 """Numbers of columns that are tried for each heading and margin, the closest to the room's own shape."""
 
@@ -34,7 +34,9 @@ def lay_rows(solver: RoomSolver, rows: Rows, wobble: float, rng: np.random.Gener
                 lattice[:, 0], lattice[:, 1], np.full(len(lattice), turns), np.zeros(len(lattice))
             )
             free = nodes.take(np.flatnonzero(_all_free(solver, rows, nodes)))
-            score = min(len(free), len(rows.groups)) + wobble * float(rng.uniform(0.0, 0.5))
+            score = (
+                min(len(free), len(rows.groups)) - _SPARE * len(nodes) + wobble * float(rng.uniform(0.0, 0.5))
+            )
             if best is None or score > best[0]:
                 best = (score, free)
     if best is None:
@@ -79,7 +81,7 @@ def _lattices(solver: RoomSolver, unit: Rect4, rows: Rows, turns: int) -> Iterat
     c, s = ((1, 0), (0, 1), (-1, 0), (0, -1))[turns]
     offset = np.array([c * middle[0] - s * middle[1], s * middle[0] + c * middle[1]])
     for margin in _MARGINS_M:
-        space = np.asarray(room.size_m) - 2 * margin
+        space = np.asarray(room.size_m) - 2 * np.array(margin)
         most = np.floor((space + gap + 1e-9) / (size + gap)).astype(int)
         if min(most) < 1:
             continue
@@ -87,7 +89,7 @@ def _lattices(solver: RoomSolver, unit: Rect4, rows: Rows, turns: int) -> Iterat
             number = np.array([nx, ny])
             pitch = size + gap
             free = np.where(number > 1, (space - size) / np.maximum(1, number - 1), pitch)
-            pitch = np.clip(free, pitch, _STRETCH * pitch)
+            pitch = np.clip(free, pitch, rows.stretch * pitch)
             start = np.asarray(room.center_m) - pitch * (number - 1) / 2
             gx, gy = np.meshgrid(
                 start[0] + pitch[0] * np.arange(nx), start[1] + pitch[1] * np.arange(ny), indexing="ij"

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from embomatrix.factory.furnish_boxes import BoxStack
+from embomatrix.factory.furnish_hosts import NO_HOSTS, hosts_of, kept_behind_doors
 from embomatrix.factory.furnish_pieces import REST_GAP_M, Placed
-from embomatrix.factory.furnish_roles import CUPBOARD, SURFACE_HOSTS, Role
+from embomatrix.factory.furnish_roles import Role
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
@@ -28,14 +30,11 @@ _EDGE_M: Final = 0.01
 _SAMPLES: Final = 60
 _SPACING_M: Final = np.array([0.01, 0.01, 0.0])
 """Free space to other things along each axis."""
-_NO_HOST_NAMES: Final = (
-    "toilet taboret straight_chair swivel_chair eames_chair bench ottoman bathtub urinal fridge furniture_sink pedestal_sink "
-    "commercial_kitchen_sink public_trash_can trash_can floor_lamp bed sofa armchair stove flat_top_grill deep_fryer jukebox "
-    "shower_stall oven crib treadmill"
-)
-_NO_HOSTS: Final = frozenset(_NO_HOST_NAMES.split())
-"""Nothing is put down on these unless SURFACE_HOSTS names them."""
-_HIGHEST_M: Final = 1.7
+_HIGHEST_M: Final = 1.75
+_TALL_M: Final = 1.3
+"""The top of a higher cabinet is no place to put things down, its boards are."""
+_SAME_KIND: Final = 2.0
+"""Equal things stand together: a surface that holds one already goes this many ranks before others."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,9 +74,12 @@ class SurfacePlacer:
     def __init__(self, placed: list[Placed], rng: np.random.Generator) -> None:
         self.placed = placed
         self._rng = rng
-        self._surfaces = [s for i, p in enumerate(placed) for s in self._usable(p, i)]
-        self._boxes = [p.box for p in placed]
+        self._surfaces: dict[str, list[Surface]] = defaultdict(list)
+        for number, item in enumerate(placed):
+            self._surfaces[item.room] += self._usable(item, number)
+        self._boxes = BoxStack(p.box for p in placed)
         self._used = Counter(p.host for p in placed)
+        self._holds: set[tuple[str, int, str]] = set()
 
     def place(self, piece: Piece, rooms: Sequence[str]) -> bool:
         """Set the piece on the best surface with room, in the first of the rooms that has one. False when none has."""
@@ -93,26 +95,31 @@ class SurfacePlacer:
             return []
         if placed.piece.role is Role.WALL and placed.piece.category != "shelf":
             return []
-        return [s for s in surfaces_of(placed, number) if 0.05 < s.z < _HIGHEST_M]
+        tall = placed.bottom + placed.piece.size_m[2] > _TALL_M and placed.piece.role is not Role.WALL
+        return [
+            s
+            for s in surfaces_of(placed, number)
+            if 0.05 < s.z < _HIGHEST_M and not (tall and s.z > _TALL_M and not s.interior)
+        ]
 
     def _ranked(self, piece: Piece, room: str) -> list[Surface]:
         """Surfaces of the room in the order of preference: the listed hosts, then any other in the open."""
-        wanted = SURFACE_HOSTS.get(piece.category, ())
+        wanted = {host: rank for rank, host in enumerate(hosts_of(piece.category))}
+        surfaces = self._surfaces[room]
+        noise = self._rng.uniform(0.0, 0.8, len(surfaces))
         ranked = []
-        for surface in self._surfaces:
-            host = self.placed[surface.host]
-            if host.room != room:
+        for surface, extra in zip(surfaces, noise, strict=True):
+            category = self.placed[surface.host].piece.category
+            if surface.shut and not kept_behind_doors(piece.category, category):
                 continue
-            category = host.piece.category
-            if surface.shut and piece.category not in CUPBOARD:
-                continue
-            if category in wanted:
-                rank = wanted.index(category)
-            elif category in _NO_HOSTS or surface.interior:
-                continue
-            else:
+            rank = wanted.get(category)
+            if rank is None:
+                if category in NO_HOSTS or surface.interior:
+                    continue
                 rank = len(wanted) + 3
-            ranked.append((rank + 0.35 * self._used[surface.host] + self._rng.uniform(0.0, 0.8), surface))
+            together = (piece.category, surface.host, surface.name) in self._holds
+            cost = rank + min(0.35 * self._used[surface.host], 4.0) + float(extra) - _SAME_KIND * together
+            ranked.append((cost, surface))
         return [s for _, s in sorted(ranked, key=lambda item: item[0])]
 
     def _set_on(self, piece: Piece, surface: Surface) -> bool:
@@ -121,7 +128,7 @@ class SurfacePlacer:
             return False
         host = self.placed[surface.host]
         # Screens and machines look where their host looks; loose things lie as they were put down.
-        square = max(piece.size_m[:2]) > 0.3 or (piece.category in SURFACE_HOSTS and piece.asset.joints)
+        square = max(piece.size_m[:2]) > 0.3 or bool(hosts_of(piece.category) and piece.asset.joints)
         turn = np.zeros(_SAMPLES) if square else self._rng.uniform(-0.6, 0.6, _SAMPLES)
         x, y, half, fits = self._spots(piece, surface, host.yaw + turn)
         bottom = surface.z + REST_GAP_M
@@ -146,6 +153,7 @@ class SurfacePlacer:
                 surface.interior,
             )
         )
+        self._holds.add((piece.category, surface.host, surface.name))
         return True
 
     def _spots(
@@ -164,7 +172,7 @@ class SurfacePlacer:
 
     def _hits(self, low: FloatArray, high: FloatArray, host: int) -> NDArray[np.bool_]:
         """Which of the boxes, given by corners of shape (n, 3), meet anything but their host and what carries it."""
-        boxes = np.asarray(self._boxes)
+        boxes = self._boxes.rows
         near = ~np.any(
             (boxes[:, 3:] <= low.min(axis=0) - _SPACING_M) | (boxes[:, :3] >= high.max(axis=0) + _SPACING_M),
             axis=1,
@@ -180,5 +188,5 @@ class SurfacePlacer:
 
     def _add(self, item: Placed) -> None:
         self.placed.append(item)
-        self._boxes.append(item.box)
+        self._boxes.extend([item.box])
         self._used[item.host] += 1

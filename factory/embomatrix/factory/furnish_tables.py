@@ -36,22 +36,28 @@ _FACING: Final = frozenset(("classroom", "computer_lab", "biology_lab", "chemist
 _WORK: Final = ("desk", "cubicle")
 ROW_OF: Final = 4
 """This many equal sets stand in rows."""
-_WALK_M: Final = 0.7
+_WALK_M: Final = 0.8
+_ROW_M: Final = 0.3
+"""Floor behind the chairs of a class: one gets there by the aisle beside them."""
 _BESIDE_DESK_M: Final = 0.65
 
 
+def work_groups(pool: Pool) -> list[Group | Rows]:
+    """Desks and cubicles with their chairs and drawers."""
+    desks = pool.take(pool.of(*_WORK))
+    others = [p for p in pool.rest if p.role is Role.TABLE]
+    swivels = not others or len(pool.of("swivel_chair")) <= 2 * len(desks)
+    return _in_rows(_workplaces(pool, desks, swivels=swivels), pool)
+
+
 def table_groups(pool: Pool) -> list[Group | Rows]:
-    """Everything people sit at, with what they sit on; seats that are left over stay in the pool."""
+    """Everything else that people sit at, with what they sit on; seats that are left over stay in the pool."""
     groups: list[Group] = [*_booths(pool), *_bars(pool)]
-    tables = _tables(pool)
-    work = [t for t in tables if t.category in _WORK]
-    eat = sorted((t for t in tables if t.category not in _WORK), key=lambda t: -t.size_m[0] * t.size_m[1])
-    groups += _workplaces(pool, work, swivels=not eat or len(pool.of("swivel_chair")) <= 2 * len(work))
-    groups += _sets(pool, eat)
-    found = _in_rows(groups, pool)
+    tables = sorted(_tables(pool), key=lambda t: -t.size_m[0] * t.size_m[1])
+    found = _in_rows([*groups, *_sets(pool, tables)], pool)
     if len(pool.of("armchair")) >= 3 * ROW_OF and pool.room_type in _FACING:
         audience = [Group((Member(p),), Style.FREE, 6.0) for p in pool.take(pool.of("armchair"))]
-        found.append(Rows(tuple(audience), 6.0, (0.55, 0.06)))
+        found.append(Rows(tuple(audience), 6.0, (_ROW_M + 0.3, 0.06)))
     return found
 
 
@@ -79,7 +85,7 @@ def _workplaces(pool: Pool, desks: Sequence[Piece], *, swivels: bool) -> list[Gr
         )
         members = (*members, *_drawers_beside(desk, pool.take(drawers[: min(spare, each)])))
         drawers = drawers[min(spare, each) :]
-        style = Style.FREE if pool.room_type in _FACING else Style.ALONG
+        style = Style.FREE if pool.room_type in _FACING and len(desks) >= ROW_OF else Style.ALONG
         groups.append(Group(members, style, worth(members), spread=(desk.category,)))
     return groups
 
@@ -138,9 +144,8 @@ def _in_rows(groups: Sequence[Group], pool: Pool) -> list[Group | Rows]:
             found += equal
             continue
         beside = 0.05 if equal[0].members[0].piece.category in _WORK else 0.45
-        if pool.room_type in _FACING:
-            beside = 0.6
-        found.append(Rows(tuple(equal), max(g.importance for g in equal), (_WALK_M, beside)))
+        gap = (_ROW_M, _WALK_M) if pool.room_type in _FACING else (_WALK_M, beside)
+        found.append(Rows(tuple(equal), max(g.importance for g in equal), gap))
     return found
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import zlib
 from collections import Counter
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -20,7 +21,7 @@ from embomatrix.world.catalog import Catalog
 from embomatrix.world.scene import RobotStart, Scene, SceneObject
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from embomatrix.factory.furnish_pieces import Placed
     from embomatrix.world.asset import Asset
@@ -39,16 +40,18 @@ _FLAT_NAMES: Final = (
 _FLAT_ON_WALL: Final = frozenset(_FLAT_NAMES.split())
 
 
-def build_base_scene(scene_id: str, *, seed: int = 0) -> Scene:
+def build_base_scene(
+    scene_id: str, *, seed: int = 0, imported: Mapping[str, Asset] = MappingProxyType({})
+) -> Scene:
     """Lay out and furnish one of the catalog's inventories.
 
-    The same id and seed give the same scene. Raises CatalogError for an unknown id, FloorPlanError when its rooms can't
-    be joined.
+    ``imported`` assets, by their id, stand in place of the generated ones. Equal arguments give equal scenes.
+    Raises CatalogError for an unknown id, FloorPlanError when its rooms can't be joined.
     """
     catalog = Catalog.load()
     inventory = catalog.inventory(scene_id)
     rng = np.random.default_rng(np.random.SeedSequence((seed, zlib.crc32(scene_id.encode()))))
-    pieces, notes = _pieces(catalog, inventory)
+    pieces, notes = _pieces(catalog, inventory, imported)
     specs = [room_spec(catalog, room) for room in inventory.rooms]
     plan, result = _best_plan(specs, pieces, rng)
     objects, assets = _objects(result.placed)
@@ -104,7 +107,9 @@ def room_spec(catalog: Catalog, room: RoomInventory) -> RoomSpec:
     return RoomSpec(room.name, room.type, room.floor_m, tuple(doors), tuple(windows))
 
 
-def _pieces(catalog: Catalog, inventory: SceneInventory) -> tuple[dict[str, list[Piece]], list[str]]:
+def _pieces(
+    catalog: Catalog, inventory: SceneInventory, imported: Mapping[str, Asset]
+) -> tuple[dict[str, list[Piece]], list[str]]:
     """The items of every room as pieces, and sentences on what is listed twice or not modelled."""
     notes = [note for room in inventory.rooms for note in _floor_notes(room)]
     pieces: dict[str, list[Piece]] = {}
@@ -114,7 +119,7 @@ def _pieces(catalog: Catalog, inventory: SceneInventory) -> tuple[dict[str, list
     for room in sorted(inventory.rooms, key=lambda r: -r.floor_m[0] * r.floor_m[1]):
         mine = pieces.setdefault(room.name, [])
         for category, model, count in room.items:
-            asset = build_asset(catalog, category, model)
+            asset = imported.get(f"{category}-{model}") or build_asset(catalog, category, model)
             if asset.asset_id in seen and max(asset.size_m[:2]) > max(room.floor_m) - 0.02:
                 notes.append(
                     f"{count} {asset.asset_id} in {room.name}: listed in two rooms, it stands in the larger one"

@@ -77,7 +77,7 @@ def test_a_counter_slab_lies_on_its_tallest_cabinet() -> None:
 
 
 def test_a_slab_without_cabinets_is_left_out_with_a_sentence() -> None:
-    groups, left_out = room_groups(pieces(block("countertop", (0.6, 1.0, 0.03))))
+    groups, left_out = room_groups(pieces(block("countertop", (0.6, 1.0, 0.03))), "kitchen")
     assert groups == []
     assert left_out == ["1 of the countertop-box slabs: no base cabinets are left to carry them"]
 
