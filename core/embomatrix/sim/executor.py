@@ -5,10 +5,9 @@ from __future__ import annotations
 import hashlib
 from typing import TYPE_CHECKING, Protocol
 
-import numpy as np
-
 from embomatrix.sim.actions import CachedActor
 from embomatrix.sim.bullet.engine import BulletEngine
+from embomatrix.sim.draws import Draws
 from embomatrix.sim.live_world import LiveWorld
 from embomatrix.skills.check import check
 from embomatrix.skills.describe import Sight, done, final_lines, gained
@@ -22,6 +21,8 @@ from embomatrix.world.substances import in_words
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    import numpy as np
+
     from embomatrix.sim.engine import PhysicsEngine
     from embomatrix.sim.facts import SceneFacts
     from embomatrix.sim.thermal import Change
@@ -30,9 +31,7 @@ if TYPE_CHECKING:
     from embomatrix.world.bundle import Bundle
     from embomatrix.world.task import Task
 
-CHANGING = frozenset(
-    {Skill.PLACE, Skill.OPEN, Skill.CLOSE, Skill.TOGGLE_ON, Skill.TOGGLE_OFF, Skill.SLICE}
-)
+CHANGING = frozenset({Skill.PLACE, Skill.OPEN, Skill.CLOSE, Skill.TOGGLE_ON, Skill.TOGGLE_OFF, Skill.SLICE})
 """Skills after which a source may act on something that it did not act on before."""
 
 
@@ -67,6 +66,7 @@ class Simulator:
         """
         self._world = LiveWorld(bundle, engine if engine is not None else BulletEngine(bundle.scene))
         self._actor: Actor = actor if actor is not None else CachedActor()
+        self._draws = Draws()
         self._seed = 0
         self._count = 0
         self._hash = hashlib.sha256()
@@ -89,7 +89,7 @@ class Simulator:
         self._seed = seed
         self._count = 0
         self._touched = set()
-        self._hash = hashlib.sha256()
+        self._hash = hashlib.sha256(self._world.scene.scene_id.encode())
         self._hash.update(self._world.state_bytes())
 
     def run_step(self, call: SkillCall) -> Step:
@@ -103,8 +103,7 @@ class Simulator:
         refusal = check(world, call)
         if refusal is None:
             # Equal prefixes of plans meet equal numbers: the stream depends on the step, not on what was drawn before.
-            rng = np.random.default_rng(np.random.SeedSequence((self._seed, self._count)))
-            refusal = self._actor.act(world, call, rng)
+            refusal = self._actor.act(world, call, self._draws.at(self._seed, self._count))
         if refusal is not None:
             self._hash.update(world.state_bytes() + refusal.reason.encode())
             return Step(call, refusal.reason, refusal.sentence)

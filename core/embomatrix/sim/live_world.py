@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 from embomatrix.sim.facts import SceneFacts
 from embomatrix.sim.hand import Hand
@@ -11,6 +11,7 @@ from embomatrix.sim.navigation import Navigator
 from embomatrix.sim.placement import Placer
 from embomatrix.sim.prepared import Prepared
 from embomatrix.sim.relations import Relations
+from embomatrix.sim.symbols import Symbols
 from embomatrix.sim.thermal import Thermal
 from embomatrix.sim.water import Water
 from embomatrix.skills.appliance import cold_source, heat_source
@@ -19,7 +20,7 @@ from embomatrix.world.state import State
 from embomatrix.world.substances import MEANINGS, facts_of
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Set
+    from collections.abc import Set
 
     from embomatrix.sim.engine import PhysicsEngine
     from embomatrix.sim.thermal import Change
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
     from embomatrix.world.state import SubstanceFact
     from embomatrix.world.task import Task
 
-T = TypeVar("T")
 SYMBOLIC = frozenset(State) - {State.OPEN} - MEANINGS.keys()
 
 
@@ -42,8 +42,8 @@ class LiveWorld:
         self.relations = Relations(engine)
         self.navigator = Navigator(engine, self.relations, prepared=Prepared.of(bundle))
         self.placer = Placer(engine, self.relations, bundle.poses)
-        self.states: dict[str, set[State]] = {}
-        self.substances: dict[str, set[SubstanceFact]] = {}
+        self.states: Symbols[State] = Symbols()
+        self.substances: Symbols[SubstanceFact] = Symbols()
         self._future = frozenset(item.name for item in self.scene.objects if item.absent)
         self.absent: set[str] = set()
         self.thermal = Thermal(engine, self.relations, self.states)
@@ -56,14 +56,14 @@ class LiveWorld:
         self._take_states_from_scene()
         self.absent |= self._future
         self.let_sources_act()
-        self._initial = {name: frozenset(states) for name, states in self.states.items()}
-        self._initial_substances = {name: frozenset(facts) for name, facts in self.substances.items()}
+        self.states.keep()
+        self.substances.keep()
 
     def reset(self, task: Task) -> None:
         """Back to the scene's beginning, where the sources have long acted on what lies at them."""
         self.engine.reset()
-        _restore(self.states, self._initial)
-        _restore(self.substances, self._initial_substances)
+        self.states.restore()
+        self.substances.restore()
         self.absent.clear()
         self.absent |= self._future
         self.hand.forget()
@@ -146,13 +146,12 @@ class LiveWorld:
         return self.scene.room_at((self.robot.x_m, self.robot.y_m))
 
     def state_bytes(self) -> bytes:
-        """All that a trace's digest depends on: the engine's state, the robot, the hand and the symbolic states."""
+        """All in which the engine's state and the symbolic states differ from the scene's start, the robot and the hand."""
         robot = f"{self.robot.x_m.hex()} {self.robot.y_m.hex()} {self.robot.yaw.hex()}"
-        symbolic = [f"{name}:{','.join(sorted(states))}" for name, states in self.states.items() if states]
+        symbolic = [f"{name}:{','.join(sorted(states))}" for name, states in self.states.changed()]
         symbolic += [
             f"{name}:{','.join(f'{fact.relation} {fact.substance}' for fact in sorted(facts))}"
-            for name, facts in self.substances.items()
-            if facts
+            for name, facts in self.substances.changed()
         ]
         symbolic += sorted(self.absent)
         text = "\n".join([robot, " ".join(self.carried), *symbolic])
@@ -162,12 +161,3 @@ class LiveWorld:
         for item in self.scene.objects:
             self.states[item.name] = set(item.states & SYMBOLIC)
             self.substances[item.name] = set(facts_of(item.states, item.substances))
-
-
-def _restore(current: dict[str, set[T]], initial: Mapping[str, frozenset[T]]) -> None:
-    """Make the sets equal to the initial ones; those that are so already are left alone, as nearly all are."""
-    if current == initial:
-        return
-    for name, members in initial.items():
-        if current[name] != members:
-            current[name] = set(members)
