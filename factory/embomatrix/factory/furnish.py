@@ -6,13 +6,14 @@ from collections import Counter
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.furnish_groups import alone, hung_and_laid, room_groups
+from embomatrix.factory.furnish_groups import alone, hung_and_laid, in_the_open, room_groups
 from embomatrix.factory.furnish_pieces import Rows
 from embomatrix.factory.furnish_roles import Role, importance_of
 from embomatrix.factory.furnish_rows import lay_rows
 from embomatrix.factory.furnish_solver import RoomSolver
 from embomatrix.factory.furnish_space import RoomSpace
 from embomatrix.factory.furnish_surfaces import SurfacePlacer
+from embomatrix.skills.limits import ROBOT
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -31,6 +32,7 @@ HALL: Final = 90
 """A room with more to place than this is arranged at most twice."""
 GOOD_ENOUGH: Final = 2.0
 """After CROWDED_ATTEMPTS an arrangement that loses no more than this is taken: a trash can, a picture."""
+_IN_THE_WAY: Final = "no free place keeps the room passable"
 MAX_EQUAL: Final = 6
 """Small things and lights of one model in one room at most: the diner's kitchen lists 137 trays."""
 MAX_FURNITURE: Final = 60
@@ -43,6 +45,8 @@ _CAPS: Final[Mapping[Role, int]] = {
     Role.SEAT: MAX_SEATS,
     Role.PLANTING: MAX_PLANTS,
 }
+_STANDING: Final = frozenset((Role.BACKED, Role.RUN, Role.TABLE, Role.OPEN))
+_PAST_M: Final = 2 * ROBOT.radius_m + 0.1
 _LIGHT_LOSSES: Final = frozenset((Role.WALL, Role.CEILING, Role.RUG, Role.PLANTING))
 """What finds no place of these is no reason to start again with it."""
 
@@ -77,6 +81,7 @@ def furnish(plan: FloorPlan, pieces: dict[str, list[Piece]], rng: np.random.Gene
     left_out: list[str] = []
     small: list[tuple[str, Piece]] = []
     loss = 0.0
+    pieces = _moved(plan, pieces)
     for room in plan.rooms:
         wanted, notes = _capped(pieces.get(room.name, []), room.name)
         best = _best_arrangement(room, plan, wanted, rng)
@@ -92,6 +97,26 @@ def furnish(plan: FloorPlan, pieces: dict[str, list[Piece]], rng: np.random.Gene
         small += [(room.name, p) for p in wanted if p.role is Role.SURFACE and p.number not in done]
     left_out += _set_small_things(plan, placed, small, rng)
     return Furnishing(tuple(placed), tuple(left_out), loss)
+
+
+def _moved(plan: FloorPlan, pieces: Mapping[str, Sequence[Piece]]) -> dict[str, list[Piece]]:
+    """The inventories with what no wall of its own room can take in the room next door: a bar between two rooms."""
+    rooms = {room.name: room for room in plan.rooms}
+    moved: dict[str, list[Piece]] = {name: [] for name in rooms}
+    for name, mine in pieces.items():
+        beside = [_other(d, name) for d in plan.doorways if name in d.rooms and d.rooms[1]]
+        for piece in mine:
+            home = name
+            if piece.role in _STANDING and not _has_room(piece, rooms[name]):
+                home = next((other for other in beside if _has_room(piece, rooms[other])), name)
+            moved[home].append(piece)
+    return moved
+
+
+def _has_room(piece: Piece, room: Room) -> bool:
+    """Whether the robot gets past the piece when it stands at a wall."""
+    short, long = sorted(piece.size_m[:2])
+    return short + _PAST_M <= min(room.size_m) and long <= max(room.size_m)
 
 
 def _capped(pieces: Sequence[Piece], room: str) -> tuple[list[Piece], list[str]]:
@@ -155,6 +180,8 @@ def _arrange(
     dropped = _place_all(solver, groups, wobble, rng)
     # What its group had no room for may still stand alone: a chair at the wall, an armchair in the corner.
     dropped = _place_all(solver, [alone(p) for p in dropped], wobble, rng)
+    walls = [p for p in dropped if in_the_open(p) is None]
+    dropped = walls + _place_all(solver, [g for p in dropped if (g := in_the_open(p))], wobble, rng)
     taken = {p.piece.number for p in solver.placed} | {p.number for p in dropped}
     dropped += _place_all(solver, hung_and_laid(pieces, taken), wobble, rng)
     return _Arrangement(tuple(solver.placed), tuple(dropped), tuple(notes))
@@ -221,7 +248,10 @@ def _unplaced(pieces: Sequence[Piece], room: Room) -> list[str]:
         *_sentences(
             large, room.name, f"larger than the room of {room.size_m[0]:.1f} x {room.size_m[1]:.1f} m"
         ),
-        *_sentences(rest, room.name, "no free place keeps the room passable"),
+        *_sentences(
+            [p for p in rest if p.role is Role.PLANTING], room.name, "the edges of the garden are full"
+        ),
+        *_sentences([p for p in rest if p.role is not Role.PLANTING], room.name, _IN_THE_WAY),
     ]
 
 

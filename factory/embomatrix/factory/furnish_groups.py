@@ -23,6 +23,8 @@ _COFFEE_GAP_M: Final = 0.38
 _CORNER_SEAT_M: Final = 0.95
 """Depth of a corner sofa's two seats; its table stands in the nook between them."""
 _TV_STANDS: Final = ("console_table", "bottom_cabinet", "bookcase", "coffee_table", "breakfast_table")
+_ISLANDS: Final = ("commercial_kitchen_table", "display_case", "bar")
+_LONG_SIDE: Final = ("bathtub", "bicycle")
 _ISLAND_M: Final = 2.0
 """Longer kitchen tables stand in the middle of the kitchen."""
 _IN_LINE: Final = 3
@@ -86,8 +88,20 @@ def hung_and_laid(pieces: Sequence[Piece], taken: set[int]) -> list[Group | Rows
 
 
 def alone(piece: Piece) -> Group:
-    """A piece that its group found no place for, by itself."""
-    return Group((Member(piece),), Style.ALONG, worth([Member(piece)]), _NEAR.get(piece.category, ()))
+    """A piece that its group found no place for, by itself at a wall."""
+    return Group((_sideways(piece),), Style.ALONG, worth([Member(piece)]), _NEAR.get(piece.category, ()))
+
+
+def in_the_open(piece: Piece) -> Group | None:
+    """A piece that found no wall, in the middle of the room; None for what belongs to a wall."""
+    if piece.role in (Role.TABLE, Role.LOW_TABLE, Role.OPEN) or piece.category in _ISLANDS:
+        return Group((Member(piece),), Style.FREE, worth([Member(piece)]))
+    return None
+
+
+def _sideways(piece: Piece) -> Member:
+    """The piece in its group: a bathtub and a bench that is modelled end on have their long side at the wall."""
+    return Member(piece, turns=1 if piece.category in _LONG_SIDE and piece.size_m[0] > piece.size_m[1] else 0)
 
 
 def _first(group: Group) -> Group:
@@ -171,5 +185,7 @@ def _singles(pool: Pool) -> list[Group]:
             style = Style.ALONG
         if not near and counts[piece.category] >= _IN_LINE and piece.role in (Role.BACKED, Role.RUN):
             near = (piece.category,)
-        groups.append(Group((Member(piece),), style, worth([Member(piece)]), near))
+        if pool.room_type == "locker_room" and piece.category == "bench":
+            style = Style.FREE
+        groups.append(Group((_sideways(piece),), style, worth([Member(piece)]), near))
     return groups

@@ -43,6 +43,7 @@ _TABLES_UNDER_LIGHTS: Final = (
 )
 _HEAD_ROOM_M: Final = 1.45
 _SMALL_M: Final = 0.3
+_HOOD_M: Final = 1.5
 _EVENLY: Final = 3
 _ANY_PITCH: Final = 100.0
 _RUGS_NEAR: Final = (
@@ -63,10 +64,11 @@ def hung_groups(pieces: Sequence[Piece]) -> list[Group]:
         if piece.role is Role.HUNG_CABINET:
             hood = piece.category == "range_hood"
             near: tuple[str, ...] = COOKERS if hood else ("countertop", *SINKS, *UNDER_COUNTER)
-            bottom = min(HUNG_BOTTOM_M + 0.1 * hood, WALL_HEIGHT_M - piece.size_m[2] - 0.01)
-            groups.append(
-                Group((Member(piece, bottom=max(bottom, 0.9)),), Style.RUN, 8.0 if hood else 5.0, near)
-            )
+            highest = WALL_HEIGHT_M - piece.size_m[2] - 0.01
+            # A hood too high for the room reaches into the ceiling rather than into the cook's way.
+            bottom = _HOOD_M if hood else max(min(HUNG_BOTTOM_M, highest), 0.9)
+            member = Member(piece, bottom=bottom)
+            groups.append(Group((member,), Style.RUN, 8.0 if hood else 5.0, near))
         elif piece.role is Role.WALL:
             groups.append(on_wall(piece))
     return sorted(groups, key=lambda g: -g.importance)

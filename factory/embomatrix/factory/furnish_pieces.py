@@ -186,7 +186,7 @@ class Rows:
 
 _FRONTED_NAMES: Final = (
     "fridge freezer oven stove dishwasher washer clothes_dryer furniture_sink commercial_kitchen_sink toilet pedestal_sink "
-    "multi_station_furniture_sink flat_top_grill deep_fryer bookcase bathtub jukebox wardrobe urinal electric_cauldron "
+    "multi_station_furniture_sink flat_top_grill deep_fryer bookcase jukebox wardrobe urinal electric_cauldron "
     "vending_machine grocery_shelf photocopier locker wall_mounted_sink"
 )
 _FRONTED: Final = frozenset(_FRONTED_NAMES.split())
@@ -209,6 +209,7 @@ def access_of(piece: Piece) -> Access:
         "bar",
         "commercial_kitchen_table",
         "shower_stall",
+        "bathtub",
     ):
         return Access.BESIDE
     return Access.NONE

@@ -45,14 +45,14 @@ _BY_ROLE: Final[Mapping[Role, str]] = {
     Role.BACKED: "bed sofa bookcase armchair wardrobe cedar_chest console_table nightstand standing_mirror piano toilet "
     "pedestal_sink bathtub shower_stall grandfather_clock jukebox bar commercial_kitchen_table locker vending_machine "
     "photocopier reception_desk checkout_counter display_case grocery_shelf hall_tree wood_fireplace gas_fireplace "
-    "crib hospital_bed magazine_stand snack_rack urinal eames_chair commercial_kitchen_shelf serving_cart "
+    "crib hospital_bed magazine_stand snack_rack urinal eames_chair serving_cart "
     "charcoal_grill stadium_stand sauna_bench hammam_bench car recreational_vehicle motorcycle stand dish_rack_cart",
     Role.TABLE: "breakfast_table dining_table pedestal_table conference_table desk booth lab_table cubicle",
     Role.SEAT: "straight_chair swivel_chair taboret bench garden_chair music_stool rocking_chair",
     Role.LOW_TABLE: "coffee_table garden_coffee_table",
     Role.CORNER: "floor_lamp public_trash_can trash_can coatrack ottoman hamper standing_loudspeaker umbrella_rack "
     "water_cooler radiator electric_fan desktop_computer shredder suitcase shopping_cart",
-    Role.HUNG_CABINET: "top_cabinet range_hood",
+    Role.HUNG_CABINET: "top_cabinet range_hood commercial_kitchen_shelf",
     Role.WALL: "picture painting portrait mirror electric_switch towel_rack wall_mounted_tv wall_clock whiteboard "
     "blackboard paper_towel_dispenser toilet_paper_dispenser toilet_paper_holder hand_dryer wall_socket wall_nail hook "
     "wall_mounted_light wall_mounted_sink wall_mounted_soap_dispenser shelf pay_phone wall_mounted_loudspeaker "

@@ -9,6 +9,7 @@ import numpy as np
 
 from embomatrix.factory.furnish_candidates import AHEAD, WALL_GAP_M, Candidates, Surroundings, candidates_of
 from embomatrix.factory.furnish_pieces import Access, Placed, access_of, front_depth_m
+from embomatrix.factory.furnish_roles import Role
 from embomatrix.factory.furnish_space import LOW_M, Target
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.state import Relation
@@ -26,6 +27,7 @@ TRIES: Final = 12
 """Candidates of a group whose access is checked before the group is given up."""
 _ACCESS_TOP_M: Final = 1.35
 _CHUNK: Final = 256
+_FLAT_M: Final = 0.25
 _APART_M: Final = 0.12
 """A candidate this close to one that failed fails for the same reason; the distance grows with every failure."""
 
@@ -66,13 +68,13 @@ class RoomSolver:
         """Place the group in a frame known to be free, unless that takes something out of the robot's reach."""
         items = self._items(group, x, y, turns)
         boxes = [box for item in items for box in item.boxes]
-        targets, zones = _access(items)
+        targets, zones, fronts = _access(items)
         bars_no_way = not targets and all(box[2] >= ROBOT.height_m or box[5] <= LOW_M for box in boxes)
         if not bars_no_way and not self.space.reachable(boxes, targets):
             return False
         self.placed += items
         self._around.add(items)
-        self.space.occupy(boxes, zones, targets)
+        self.space.occupy(boxes, zones, fronts, targets)
         return True
 
     def is_free_at(self, group: Group, x: float, y: float, turns: int) -> bool:
@@ -103,7 +105,7 @@ class RoomSolver:
             for boxes in _boxes(member, options):
                 free &= (boxes[:, 0] >= x0 + gap) & (boxes[:, 1] >= y0 + gap)
                 free &= (boxes[:, 3] <= x1 - gap) & (boxes[:, 4] <= y1 - gap)
-                free &= ~self.space.surely_barred(boxes)
+                free &= ~self.space.surely_barred(boxes, hung=_hangs(member))
             front = _front(member, options)
             if front is not None:
                 free &= (front[:, 0] >= x0) & (front[:, 1] >= y0) & (front[:, 3] <= x1) & (front[:, 4] <= y1)
@@ -115,7 +117,9 @@ class RoomSolver:
         for member in group.members:
             for boxes in _boxes(member, options):
                 free &= ~self.space.collides(_grown(boxes, group.clear_m))
-                if len(boxes) and boxes[0, 5] > LOW_M:
+                if _hangs(member):
+                    free &= ~self.space.hangs_in_zone(boxes)
+                elif len(boxes) and boxes[0, 5] > LOW_M:
                     free &= ~self.space.blocks_zone(boxes)
             front = _front(member, options)
             if front is not None:
@@ -140,10 +144,16 @@ class RoomSolver:
         ]
 
 
-def _access(items: Sequence[Placed]) -> tuple[list[Target], list[Box]]:
-    """Where the robot must be able to stand for these pieces, and the floor before them that stays free."""
+def _hangs(member: Member) -> bool:
+    """Whether it is a flat thing on a wall, which takes no floor before what stands opposite."""
+    return member.piece.role is Role.WALL and member.piece.size_m[0] <= _FLAT_M
+
+
+def _access(items: Sequence[Placed]) -> tuple[list[Target], list[Box], list[Box]]:
+    """Where the robot must be able to stand for these pieces, what their doors need to open, floor that stays free."""
     targets: list[Target] = []
     zones: list[Box] = []
+    fronts: list[Box] = []
     for item in items:
         kind = access_of(item.piece)
         if kind is Access.NONE:
@@ -162,8 +172,9 @@ def _access(items: Sequence[Placed]) -> tuple[list[Target], list[Box]]:
             zones.append((fx0, fy0, item.box[2], fx1, fy1, item.box[5]))
             continue
         targets.append(Target(_before(item.box, ax, ay, 0.2, depth + 0.45)))
-        zones.append((fx0, fy0, 0.0, fx1, fy1, _ACCESS_TOP_M))
-    return targets, zones
+        opens = zones if item.piece.asset.joints else fronts
+        opens.append((fx0, fy0, 0.0, fx1, fy1, _ACCESS_TOP_M))
+    return targets, zones, fronts
 
 
 def _before(box: Box, ax: int, ay: int, near: float, far: float) -> tuple[float, float, float, float]:

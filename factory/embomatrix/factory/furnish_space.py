@@ -68,14 +68,26 @@ class RoomSpace:
         stand, reach = _bare_floor(room, self.doorways)
         self._stand, self._reach = stand.copy(), reach.copy()
         self._joined = bool(self.doorways) and all(self._touches(self._reach, d) for d in self._doors)
-        self._planes = Planes(room.low_m, room.high_m, (self.solids, self.zones))
+        self.fronts = BoxStack()
+        self._planes = Planes(room.low_m, room.high_m, (self.solids, self.zones, self.fronts))
+        self._hung_planes = Planes(room.low_m, room.high_m, (self.solids, self.zones))
         self._solid_planes = Planes(room.low_m, room.high_m, (self.solids,))
 
-    def occupy(self, boxes: Sequence[Box], zones: Sequence[Box] = (), targets: Sequence[Target] = ()) -> None:
-        """Stand something in the room: its boxes, floor that stays free for it, spots that stay reachable."""
+    def occupy(
+        self,
+        boxes: Sequence[Box],
+        zones: Sequence[Box] = (),
+        fronts: Sequence[Box] = (),
+        targets: Sequence[Target] = (),
+    ) -> None:
+        """Stand something in the room: its boxes, space that stays free for it, floor before it, spots to be reached.
+
+        In ``zones`` nothing may be, for doors open there; in ``fronts`` nothing may stand.
+        """
         self._stand, self._reach = self._after(boxes)
         self.solids.extend(boxes)
         self.zones.extend(zones)
+        self.fronts.extend(fronts)
         self._targets += [self._cells_of(t) for t in targets]
 
     def collides(self, boxes: FloatArray) -> BoolArray:
@@ -83,12 +95,16 @@ class RoomSpace:
         return self.solids.meets(boxes)
 
     def blocks_zone(self, boxes: FloatArray) -> BoolArray:
-        """Which candidates stand in a zone that must stay free. boxes: (n, 6); result: (n,)."""
+        """Which candidates would stand in a zone or front that must stay free. boxes: (n, 6); result: (n,)."""
+        return self.zones.meets(boxes) | self.fronts.meets(boxes)
+
+    def hangs_in_zone(self, boxes: FloatArray) -> BoolArray:
+        """Which candidates would hang in a zone that must stay free. boxes: (n, 6); result: (n,)."""
         return self.zones.meets(boxes)
 
-    def surely_barred(self, boxes: FloatArray) -> BoolArray:
+    def surely_barred(self, boxes: FloatArray, *, hung: bool) -> BoolArray:
         """A quick look: candidates that certainly meet a solid or a zone. boxes: (n, 6), all of one height; result: (n,)."""
-        return self._planes.meets(boxes)
+        return (self._hung_planes if hung else self._planes).meets(boxes)
 
     def surely_collides(self, boxes: FloatArray) -> BoolArray:
         """A quick look: candidates that certainly meet a solid. boxes: (n, 6), all of one height; result: (n,)."""
