@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from embomatrix.world.scene import Scene
 
     BoolArray = NDArray[np.bool_]
-    IntArray = NDArray[np.int32]
+    IntArray = NDArray[np.int16]
 
 Cell = tuple[int, int]
 
@@ -88,8 +88,8 @@ class FloorGrid:
 
     @functools.cached_property
     def labels(self) -> IntArray:
-        """Number of the component of each free cell, 0 for the others."""
-        return np.asarray(ndimage.label(self.free)[0], dtype=np.int32)
+        """Number of the component of each free cell, 0 for the others: fewer than there may be objects in a scene."""
+        return np.asarray(ndimage.label(self.free, output=np.int16)[0])
 
     def cell(self, x_m: float, y_m: float) -> Cell | None:
         """The free cell at a point, or the nearest one within 30 cm; None when there is none."""

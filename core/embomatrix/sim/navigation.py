@@ -44,7 +44,8 @@ SIDE_WEIGHT_M: Final = 0.4
 """Standing abeam of the front is as bad as standing this much farther away."""
 ROOFED_M: Final = 1.5
 """A cavity whose floor has less free height than this can't be reached from above."""
-GRIDS_KEPT: Final = 8
+GRIDS_KEPT: Final = 3
+"""Floors in memory: a plan comes back to few of them, and each takes a megabyte in a house with a garden."""
 ANSWERS_KEPT: Final = 4096
 """Standing poses and rectangles in memory, a few KB each."""
 ENTRY_M: Final = 0.4

@@ -68,6 +68,9 @@ class MiniWorld:
         self._body = -1
         self._still: tuple[int, ...] = ()
         self._stages = 0
+        self._renew()
+        # What Bullet allocates at its first step is allocated here: processes that are forked later share it.
+        self._bullet.stepSimulation(physicsClientId=self._client)
 
     def stage(
         self,
@@ -101,17 +104,21 @@ class MiniWorld:
             )
 
     def _clear(self) -> None:
-        bullet, client = self._bullet, self._client
-        if self._stages % STAGES_KEPT == 0:
-            bullet.resetSimulation(physicsClientId=client)
-            self._factory.forget_shapes()
-            bullet.setGravity(0, 0, GRAVITY_M_S2, physicsClientId=client)
-            # Contacts are solved in the order in which bodies were made, whatever the tree of boxes went through before.
-            bullet.setPhysicsEngineParameter(deterministicOverlappingPairs=1, physicsClientId=client)
-        else:
-            for body in (self._body, *self._still):
-                bullet.removeBody(body, physicsClientId=client)
         self._stages += 1
+        if self._stages % STAGES_KEPT == 0:
+            self._renew()
+        elif self._still:
+            for body in (self._body, *self._still):
+                self._bullet.removeBody(body, physicsClientId=self._client)
+
+    def _renew(self) -> None:
+        """Free what the stages left behind."""
+        bullet, client = self._bullet, self._client
+        bullet.resetSimulation(physicsClientId=client)
+        self._factory.forget_shapes()
+        bullet.setGravity(0, 0, GRAVITY_M_S2, physicsClientId=client)
+        # Contacts are solved in the order in which bodies were made, whatever the tree of boxes went through before.
+        bullet.setPhysicsEngineParameter(deterministicOverlappingPairs=1, physicsClientId=client)
 
     def lift(self) -> None:
         """Take the object out of the way, for questions about what stands still."""
