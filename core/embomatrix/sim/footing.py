@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from embomatrix.world.geometry import Aabb, Pose
 
 
+SLACK_M: Final = 0.05
+
+
 @dataclass(frozen=True, slots=True)
 class Host:
     """What an object rests on or in. ``spot`` names the support surface or the interior."""
@@ -63,6 +66,11 @@ class Footings:
         self._round = engine.journal.rounds
         self._read = 0
 
+    def is_disturbed(self, name: str) -> bool:
+        """Whether anything within 1 cm of the object's box has changed since the scene was loaded or reset."""
+        self._read_journal()
+        return name in self._disturbed
+
     def of(self, name: str) -> Footing:
         """How the object stands: its host, the containers around it, what it is on top of."""
         self._read_journal()
@@ -103,17 +111,22 @@ class Footings:
         around: list[tuple[float, str, Enclosure]] = []
         on: list[str] = []
         for other in engine.near(box.grown(REST_M), frozenset((name,))):
-            asset, pose, fractions = scene.asset_of(other), engine.pose(other), engine.joints(other)
+            asset = scene.asset_of(other)
+            may_rest = _is_over(box, engine.aabb(other))
+            if not (may_rest or asset.interiors):
+                continue
+            pose, fractions = engine.pose(other), engine.joints(other)
+            interior = self._interior(name, asset, pose, fractions) if asset.interiors else None
+            surface = surface_under(box, asset, pose, fractions, doored=True) if may_rest else ""
+            if surface and surface_under(box, asset, pose, fractions, doored=False):
+                on.append(other)
             volume = math.prod(asset.size_m)
-            interior = self._interior(name, asset, pose, fractions)
             if interior is not None:
                 hosts.append((volume, other, Host(other, Relation.INSIDE, interior.name)))
                 closed = is_shut(asset, interior, fractions)
                 enclosure = Enclosure(other, interior.name, closed)
                 around.append((math.prod(interior.size_m), other, enclosure))
-            if surface_under(box, asset, pose, fractions, doored=False):
-                on.append(other)
-            if interior is None and (surface := surface_under(box, asset, pose, fractions, doored=True)):
+            elif surface:
                 hosts.append((volume, other, Host(other, Relation.ONTOP, surface)))
         return Footing(
             min(hosts, key=_first_two)[2] if hosts else None,
@@ -147,6 +160,13 @@ class Footings:
             for item in asset.interiors
             if item.link == link
         )
+
+
+def _is_over(box: Aabb, other: Aabb) -> bool:
+    """Whether a box may rest on something in another: its centre is over it, give or take 5 cm for what a model lacks."""
+    x, y, _ = box.center_m
+    (low_x, low_y, _), (high_x, high_y, _) = other.low_m, other.high_m
+    return low_x - SLACK_M <= x <= high_x + SLACK_M and low_y - SLACK_M <= y <= high_y + SLACK_M
 
 
 def _first_two(item: tuple[float, str, object]) -> tuple[float, str]:

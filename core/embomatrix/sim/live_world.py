@@ -40,7 +40,7 @@ class LiveWorld:
         self.scene = bundle.scene
         self.engine = engine
         self.relations = Relations(engine)
-        self.navigator = Navigator(engine, self.relations, prepared=Prepared.of(bundle))
+        self.navigator = Navigator(engine, self.relations, bundle.poses.stands, Prepared.of(bundle))
         self.placer = Placer(engine, self.relations, bundle.poses)
         self.states: Symbols[State] = Symbols()
         self.substances: Symbols[SubstanceFact] = Symbols()

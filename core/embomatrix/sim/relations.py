@@ -34,7 +34,7 @@ class Relations:
     def __init__(self, engine: PhysicsEngine) -> None:
         self._engine = engine
         self._scene = engine.scene
-        self._footings = Footings(engine)
+        self.footings = Footings(engine)
 
     def holds(self, relation: Relation, a: str, b: str) -> bool:
         """Whether ``relation(a, b)`` holds; ``b`` is a room for INROOM and an object otherwise."""
@@ -57,14 +57,14 @@ class Relations:
 
         Open shelf boards and the bottoms of bowls count, boards behind a door do not: what lies there is inside.
         """
-        return self._apart(a, b) and b in self._footings.of(a).on
+        return self._apart(a, b) and b in self.footings.of(a).on
 
     def inside(self, a: str, b: str) -> bool:
         """The centre of ``a`` lies in a cavity of ``b``, and its box within the cavity, 1 cm outside allowed.
 
         What stands in an open cavity may stick out at the top. Holds through nested containers.
         """
-        return self._apart(a, b) and any(item.name == b for item in self._footings.of(a).enclosures)
+        return self._apart(a, b) and any(item.name == b for item in self.footings.of(a).enclosures)
 
     def under(self, a: str, b: str) -> bool:
         """Some part of ``b`` lies over the centre of ``a``, and all that do begin above its top, 1 cm deeper allowed."""
@@ -117,7 +117,7 @@ class Relations:
         Of several, the smallest: food on a plate on a table is on the plate. Lying in a cavity goes before resting on a
         surface.
         """
-        return self._footings.of(name).host
+        return self.footings.of(name).host
 
     def hosts_of(self, name: str) -> list[str]:
         """What the object rests on or in, what that rests on or in, and so on."""
@@ -146,7 +146,7 @@ class Relations:
 
     def enclosing(self, name: str) -> tuple[Enclosure, ...]:
         """Containers around the object, the innermost first."""
-        return self._footings.of(name).enclosures
+        return self.footings.of(name).enclosures
 
     def _lies_in(self, name: str, container: str) -> bool:
         host = self.host_of(name)

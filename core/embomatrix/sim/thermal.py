@@ -41,6 +41,7 @@ class Thermal:
         self._scene = engine.scene
         self._states = states
         self._sources: list[tuple[str, Source]] = []
+        self._acted = False
         for item in self._scene.objects:
             asset = self._scene.assets[item.asset_id]
             found = (heat_source(asset), cold_source(asset))
@@ -50,10 +51,18 @@ class Thermal:
         """Let every working source act. Returns what changed, in scene order of the sources."""
         changes: list[Change] = []
         for name, source in self._sources:
+            if self._acted and self._has_nothing_new(name, source):
+                continue
             if self.works(name, source):
                 for item in self._acted_on(name, source):
                     changes += self._expose(item, source)
+        self._acted = True
         return tuple(changes)
+
+    def _has_nothing_new(self, name: str, source: Source) -> bool:
+        """Whether a source that acts by itself on what is in it has done so before on all that is there now."""
+        by_itself = source.requires_inside and not source.requires_on
+        return by_itself and not self._relations.footings.is_disturbed(name)
 
     def works(self, name: str, source: Source) -> bool:
         """Whether the source is on and closed, as far as it must be."""
