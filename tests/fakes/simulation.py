@@ -38,6 +38,9 @@ class FakeScene:
         self._ballast = ballast
         self._executed = 0
 
+    def complete(self):
+        yield from (None,) * 3
+
     def execute(self, rollout):
         self._executed += 1
         match rollout.task_id:

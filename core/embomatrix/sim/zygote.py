@@ -12,6 +12,7 @@ import gc
 import json
 import os
 import resource
+import select
 import signal
 import socket
 import struct
@@ -21,7 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
 _PREFIX: Final = struct.Struct("!II")
 PREFIX_BYTES: Final = _PREFIX.size
@@ -94,16 +95,16 @@ def _receive_exactly(connection: socket.socket, count: int) -> bytes:
     return bytes(parts)
 
 
-def serve_forks(control: socket.socket, child: Callable[[socket.socket], None]) -> None:
-    """Fork children on request until the control stream ends.
+def serve_forks(
+    control: socket.socket, child: Callable[[socket.socket], None], spare: Iterator[None] | None = None
+) -> None:
+    """Fork children on request until the control stream ends. Steps of ``spare`` are taken while no request waits.
 
     ``{"op": "fork"}`` with one descriptor forks a child that runs ``child`` on it and is answered by its process id;
     ``{"op": "reap", "pid": …}`` waits for a child that has ended and is answered by its wait status. A child stays a
     zombie until then, so its id is never another process's when the asker kills it.
     """
-    # Objects that exist now are never collected: a collection in a child would copy the pages they lie in.
-    gc.freeze()
-    while (request := receive(control)) is not None:
+    while (request := _next_request(control, spare)) is not None:
         match request.header.get("op"):
             case "fork" if len(request.fds) == 1:
                 send(control, Frame({"pid": _fork(control, request.fds[0], child)}))
@@ -114,7 +115,19 @@ def serve_forks(control: socket.socket, child: Callable[[socket.socket], None]) 
                 raise FrameError(f"a zygote can't {unknown!r}: it takes fork (with a descriptor) and reap")
 
 
+def _next_request(control: socket.socket, spare: Iterator[None] | None) -> Frame | None:
+    if spare is not None:
+        while not select.select([control], [], [], 0)[0]:
+            try:
+                next(spare)
+            except StopIteration:
+                break
+    return receive(control)
+
+
 def _fork(control: socket.socket, fd: int, child: Callable[[socket.socket], None]) -> int:
+    # Objects that exist now are never collected: a collection in a child would copy the pages they lie in.
+    gc.freeze()
     parent = os.getpid()
     pid = os.fork()
     if pid:
@@ -146,6 +159,13 @@ def limit_memory(more_mb: int) -> None:
     mapped_pages = int(Path("/proc/self/statm").read_text().split()[0])
     limit = mapped_pages * resource.getpagesize() + more_mb * MIB
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+
+
+def give_back_memory() -> None:
+    """Hand the heap's free pages back to the system: what a slot needed once shall not count as its own for good."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # the GNU C library has it
+    if trim is not None:
+        trim(0)
 
 
 def resident_mb() -> float:

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 LOADS: Final = 3
 """Loads of each scene, in a new process each."""
 RESPAWNS: Final = 8
+WAIT_S: Final = 0.3
+"""A scene that is announced waits for its first rollout, and makes meanwhile what that will need."""
 ANSWER_S: Final = 60.0
 
 
@@ -79,6 +81,7 @@ async def _load(root: Root, scene: SceneWork, path: Path, sample: SlotSample) ->
 
 
 async def _execute(child: Child, scene: SceneWork, sample: SlotSample) -> None:
+    await asyncio.sleep(WAIT_S)
     slot = await child.fork()
     rollouts = [
         Rollout(str(number), "bench", scene.bundle_digest, item.task_id, item.plan, item.seed)

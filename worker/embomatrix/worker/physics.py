@@ -17,6 +17,7 @@ from embomatrix.worker.slot_program import BundleCorruptError, run_program
 from embomatrix.world.bundle import BundleError, read_bundle
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from embomatrix.rpc.values import Rollout
@@ -50,11 +51,16 @@ class PhysicsScene:
 
     def __init__(self, bundle: Bundle, clients: ClientPool) -> None:
         self._tasks = bundle.tasks
-        self._simulator = Simulator(bundle, BulletEngine(bundle.scene, clients, Prepared.of(bundle)))
+        self._engine = BulletEngine(bundle.scene, clients, Prepared.of(bundle))
+        self._simulator = Simulator(bundle, self._engine)
         for task in list(bundle.tasks.values())[:1]:
             # An empty plan: what the simulator makes when it is first needed is made before the slots are forked.
             self._simulator.execute(task, (), 0)
             score(task, frozenset(), self._simulator.facts)
+
+    def complete(self) -> Iterator[None]:
+        """Make what executions would make when they first need it."""
+        return self._engine.complete()
 
     def execute(self, rollout: Rollout) -> Completed:
         task = self._tasks.get(rollout.task_id)

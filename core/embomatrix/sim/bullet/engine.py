@@ -28,7 +28,7 @@ from embomatrix.sim.neighbourhood import Neighbourhood
 from embomatrix.sim.validation import check_fractions, check_pose, check_scene
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from embomatrix.sim.prepared import Prepared
     from embomatrix.world.geometry import Aabb, Pose
@@ -217,6 +217,12 @@ class BulletEngine:
                 values = (*pose.position_m, *pose.quat_xyzw, *fractions)
                 chunks.append(struct.pack(f"<i?{len(values)}d", number, present, *values))
         return b"".join(chunks)
+
+    def complete(self) -> Iterator[None]:
+        """Make the bodies that nobody asked for yet, one at a step: work for a process that waits. Changes no answer."""
+        for number in self._bodies.missing():
+            self._body(number)
+            yield
 
     def close(self) -> None:
         """Free the physics clients. The engine can't be used afterwards."""

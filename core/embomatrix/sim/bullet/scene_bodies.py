@@ -12,7 +12,7 @@ from embomatrix.sim.bullet.bodies import PART_LIMIT, BodyFactory
 from embomatrix.sim.bullet.client import pybullet
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from embomatrix.world.geometry import Pose
     from embomatrix.world.scene import Scene
@@ -39,6 +39,10 @@ class SceneBodies:
             self.move(number, pose)
             self.turn(number, fractions)
         return body
+
+    def missing(self) -> Iterator[int]:
+        """Numbers of the objects that have no body yet."""
+        return (number for number in range(len(self._scene.objects)) if number not in self._objects)
 
     def wall(self, chunk: int) -> int:
         """Body of the walls whose numbers are from ``16 * chunk`` to below ``16 * (chunk + 1)``."""
