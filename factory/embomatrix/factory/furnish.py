@@ -13,6 +13,7 @@ from embomatrix.factory.furnish_rows import lay_rows
 from embomatrix.factory.furnish_solver import RoomSolver
 from embomatrix.factory.furnish_space import RoomSpace
 from embomatrix.factory.furnish_surfaces import SurfacePlacer
+from embomatrix.factory.furnish_tables import STOOLS
 from embomatrix.skills.limits import ROBOT
 
 if TYPE_CHECKING:
@@ -45,7 +46,6 @@ _CAPS: Final[Mapping[Role, int]] = {
     Role.SEAT: MAX_SEATS,
     Role.PLANTING: MAX_PLANTS,
 }
-_STANDING: Final = frozenset((Role.BACKED, Role.RUN, Role.TABLE, Role.OPEN))
 _PAST_M: Final = 2 * ROBOT.radius_m + 0.1
 _LIGHT_LOSSES: Final = frozenset((Role.WALL, Role.CEILING, Role.RUG, Role.PLANTING))
 """What finds no place of these is no reason to start again with it."""
@@ -100,16 +100,16 @@ def furnish(plan: FloorPlan, pieces: dict[str, list[Piece]], rng: np.random.Gene
 
 
 def _moved(plan: FloorPlan, pieces: Mapping[str, Sequence[Piece]]) -> dict[str, list[Piece]]:
-    """The inventories with what no wall of its own room can take in the room next door: a bar between two rooms."""
+    """The inventories; a bar that its own room can't take stands in the room next door, and its stools with it."""
     rooms = {room.name: room for room in plan.rooms}
     moved: dict[str, list[Piece]] = {name: [] for name in rooms}
     for name, mine in pieces.items():
         beside = [_other(d, name) for d in plan.doorways if name in d.rooms and d.rooms[1]]
+        large = [p for p in mine if p.category == "bar" and not _has_room(p, rooms[name])]
+        home = next((other for other in beside if large and _has_room(large[0], rooms[other])), name)
         for piece in mine:
-            home = name
-            if piece.role in _STANDING and not _has_room(piece, rooms[name]):
-                home = next((other for other in beside if _has_room(piece, rooms[other])), name)
-            moved[home].append(piece)
+            goes = any(piece is bar for bar in large) or (bool(large) and piece.category in STOOLS)
+            moved[home if goes else name].append(piece)
     return moved
 
 

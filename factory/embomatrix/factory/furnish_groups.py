@@ -23,6 +23,8 @@ _COFFEE_GAP_M: Final = 0.38
 _CORNER_SEAT_M: Final = 0.95
 """Depth of a corner sofa's two seats; its table stands in the nook between them."""
 _TV_STANDS: Final = ("console_table", "bottom_cabinet", "bookcase", "coffee_table", "breakfast_table")
+_CLEAR_M: Final = 0.8
+"""Free floor on all sides of what stands in the open."""
 _ISLANDS: Final = ("commercial_kitchen_table", "display_case", "bar")
 _LONG_SIDE: Final = ("bathtub", "bicycle")
 _ISLAND_M: Final = 2.0
@@ -95,7 +97,7 @@ def alone(piece: Piece) -> Group:
 def in_the_open(piece: Piece) -> Group | None:
     """A piece that found no wall, in the middle of the room; None for what belongs to a wall."""
     if piece.role in (Role.TABLE, Role.LOW_TABLE, Role.OPEN) or piece.category in _ISLANDS:
-        return Group((Member(piece),), Style.FREE, worth([Member(piece)]))
+        return Group((Member(piece),), Style.FREE, worth([Member(piece)]), clear_m=_CLEAR_M)
     return None
 
 
@@ -187,5 +189,6 @@ def _singles(pool: Pool) -> list[Group]:
             near = (piece.category,)
         if pool.room_type == "locker_room" and piece.category == "bench":
             style = Style.FREE
-        groups.append(Group((_sideways(piece),), style, worth([Member(piece)]), near))
+        clear = _CLEAR_M if style is Style.FREE else 0.0
+        groups.append(Group((_sideways(piece),), style, worth([Member(piece)]), near, clear_m=clear))
     return groups

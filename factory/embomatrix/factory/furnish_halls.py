@@ -30,10 +30,17 @@ _MATS: Final = 4
 def hall_groups(pool: Pool) -> list[Group | Rows]:
     """What fills large rooms: shelves in aisles, machines in the open."""
     found: list[Group | Rows] = [*_aisles(pool)]
-    for piece in pool.take(pool.with_role(Role.OPEN)):
+    standing = pool.take(pool.with_role(Role.OPEN))
+    if pool.room_type == "gym" and len(standing) >= _MATS:
+        machines = tuple(Group((Member(p),), Style.FREE, worth([Member(p)])) for p in standing)
+        found.append(Rows(machines, 6.0, (_AISLE_M, _AISLE_M)))
+        standing = []
+    for piece in standing:
         near = ("doorway",) if piece.category == "turnstile" else ()
         members = (Member(piece),)
-        found.append(Group(members, Style.FREE, worth(members), near, spread=(piece.category,)))
+        found.append(
+            Group(members, Style.FREE, worth(members), near, spread=(piece.category,), clear_m=_AISLE_M)
+        )
     return found
 
 

@@ -100,11 +100,11 @@ def _lattices(solver: RoomSolver, unit: Rect4, rows: Rows, turns: int) -> Iterat
 
 
 def _counts(wanted: int, most_x: int, most_y: int) -> list[tuple[int, int]]:
-    """Columns and rows that hold as many as are wanted, the squarest first; and the whole floor."""
+    """Columns and rows that hold as many as are wanted, those like the room and without waste first; and the whole floor."""
     found = []
     for nx in range(1, most_x + 1):
         ny = min(most_y, -(-wanted // nx))
         if nx * ny >= wanted:
             found.append((nx, ny))
-    found.sort(key=lambda n: (n[0] * n[1] - wanted, abs(n[0] / most_x - n[1] / most_y)))
+    found.sort(key=lambda n: (n[0] * n[1] - wanted) / wanted + abs(n[0] / most_x - n[1] / most_y))
     return [*found[:_LATTICES], (most_x, most_y)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -44,8 +45,14 @@ class RoomSolver:
     def place(self, group: Group, *, wobble: float = 1.0) -> bool:
         """Place the group at its best free candidate; False when none leaves the room passable.
 
-        ``wobble`` scales the noise on the costs: more of it makes attempts differ more.
+        ``wobble`` scales the noise on the costs: more of it makes attempts differ more. Where no place has the clearance that
+        the group asks for, it does with less.
         """
+        if self._place(group, wobble):
+            return True
+        return group.clear_m > 0 and self._place(replace(group, clear_m=0.0), wobble)
+
+    def _place(self, group: Group, wobble: float) -> bool:
         options = candidates_of(group, self.space, self._around)
         if not len(options):
             return False

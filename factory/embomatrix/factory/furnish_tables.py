@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.furnish_pieces import (
@@ -24,8 +23,11 @@ if TYPE_CHECKING:
     from embomatrix.factory.furnish_pieces import Piece
     from embomatrix.factory.furnish_pool import Pool
 
+STOOLS: Final = ("music_stool", "taboret")
 _KNEE_M: Final = 0.05
 _STOOL_GAP_M: Final = 0.12
+_DINING_TOP_M: Final = 0.62
+"""A higher coffee table is one to eat at."""
 _HIGH_TABLE_M: Final = 0.85
 _EATING: Final = frozenset(
     ("dining_room", "conference_hall", "break_room", "bar", "lobby", "garden", "meeting_room")
@@ -36,6 +38,8 @@ _FACING: Final = frozenset(("classroom", "computer_lab", "biology_lab", "chemist
 _WORK: Final = ("desk", "cubicle")
 ROW_OF: Final = 4
 """This many equal sets stand in rows."""
+ALIKE: Final = 1.4
+_SET_CLEAR_M: Final = 0.5
 _WALK_M: Final = 0.8
 _ROW_M: Final = 0.3
 """Floor behind the chairs of a class: one gets there by the aisle beside them."""
@@ -63,6 +67,7 @@ def table_groups(pool: Pool) -> list[Group | Rows]:
 
 def _tables(pool: Pool) -> list[Piece]:
     tables = pool.take(p for p in pool.rest if p.role is Role.TABLE)
+    tables += pool.take(p for p in pool.of("coffee_table") if top_of(p) > _DINING_TOP_M)
     chairs = len(pool.of("straight_chair", "swivel_chair", "garden_chair"))
     if not tables and chairs >= 2:
         tables = pool.take(sorted(pool.of("coffee_table"), key=lambda p: -p.size_m[1])[:1])
@@ -103,7 +108,7 @@ def _drawers_beside(desk: Piece, drawers: Sequence[Piece]) -> list[Member]:
 def _sets(pool: Pool, tables: Sequence[Piece]) -> list[Group]:
     """Tables with seats shared out among them, in the middle of the room; those without seats go to a wall."""
     high = [t for t in tables if top_of(t) > _HIGH_TABLE_M]
-    stools = pool.of("taboret", "music_stool")
+    stools = pool.of(*STOOLS)
     seats = pool.of("straight_chair", "garden_chair", "eames_chair", "swivel_chair", "rocking_chair")
     if pool.room_type in _EATING and len(seats) < 2 * len(tables):
         seats += pool.of("armchair")
@@ -128,18 +133,16 @@ def _shared(pool: Pool, tables: Sequence[Piece], seats: list[Piece], one_side: b
         seated = {m.piece.number for m in members}
         seats = [s for s in mine if s.number not in seated] + seats
         style = Style.FREE if len(members) > 2 or (one_side and mine) else Style.ALONG
-        groups.append(Group(members, style, worth(members), spread=(table.category,)))
+        clear = _SET_CLEAR_M if style is Style.FREE else 0.0
+        groups.append(Group(members, style, worth(members), spread=(table.category,), clear_m=clear))
     pool.rest += seats
     return groups
 
 
 def _in_rows(groups: Sequence[Group], pool: Pool) -> list[Group | Rows]:
-    """Equal sets, four or more, as rows."""
-    kinds: dict[tuple[str, ...], list[Group]] = defaultdict(list)
-    for group in groups:
-        kinds[tuple(m.piece.category for m in group.members)].append(group)
+    """Sets of about one size, four or more, as rows."""
     found: list[Group | Rows] = []
-    for equal in kinds.values():
+    for equal in _alike(groups):
         if len(equal) < ROW_OF or len(equal[0].members) < 2:
             found += equal
             continue
@@ -147,6 +150,26 @@ def _in_rows(groups: Sequence[Group], pool: Pool) -> list[Group | Rows]:
         gap = (_ROW_M, _WALK_M) if pool.room_type in _FACING else (_WALK_M, beside)
         found.append(Rows(tuple(equal), max(g.importance for g in equal), gap))
     return found
+
+
+def _alike(groups: Sequence[Group]) -> list[list[Group]]:
+    """Groups of one style whose sides differ by less than ALIKE, the larger ones first."""
+    kinds: list[list[Group]] = []
+    for group in sorted(groups, key=lambda g: -_side(g)):
+        for kind in kinds:
+            work = group.members[0].piece.category in _WORK
+            same = kind[0].style is group.style and work == (kind[0].members[0].piece.category in _WORK)
+            if same and _side(kind[0]) <= ALIKE * _side(group) and len(group.members) > 1:
+                kind.append(group)
+                break
+        else:
+            kinds.append([group])
+    return kinds
+
+
+def _side(group: Group) -> float:
+    x0, y0, x1, y1 = group.bounds
+    return max(x1 - x0, y1 - y0)
 
 
 def _booths(pool: Pool) -> list[Group]:
@@ -174,7 +197,7 @@ def _bars(pool: Pool) -> list[Group]:
     bars = pool.take(sorted(pool.of("bar"), key=lambda p: -p.size_m[1]))
     for bar in bars:
         room = int(bar.size_m[1] / 0.55)
-        stools = pool.take(pool.of("music_stool", "taboret")[:room])
+        stools = pool.take(pool.of(*STOOLS)[:room])
         pitch = bar.size_m[1] / (len(stools) + 1)
         members = [Member(bar)]
         for place, stool in enumerate(stools):
