@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
+from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated, Final, NoReturn
 
 import typer
 from rich.console import Console
@@ -15,8 +16,14 @@ from embomatrix.factory.assets.contact_sheet import draw_sheet
 from embomatrix.factory.assets.library import build_asset
 from embomatrix.factory.assets.naming import family_of
 from embomatrix.factory.assets.standing import GLANCE_STEPS, STEPS, check_standing
+from embomatrix.factory.importers.assemble import import_model, read_model
+from embomatrix.factory.importers.convex import Coacd, by_components
+from embomatrix.factory.importers.model import Frame, ModelFileError
+from embomatrix.factory.importers.shelf import save_asset
 from embomatrix.sim.engine import EngineError
+from embomatrix.world.asset import Credit
 from embomatrix.world.catalog import Catalog, CatalogError
+from embomatrix.world.field import SceneInvalidError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -29,6 +36,17 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
+WORTH_TELLING: Final = 1.25
+"""A model that is stretched more than this along one side against another no longer looks like itself."""
+
+
+class Cut(StrEnum):
+    """Ways to cut a mesh into convex parts."""
+
+    COACD = "coacd"
+    COMPONENTS = "components"
+
+
 Categories = Annotated[
     list[str] | None, typer.Option("--category", help="Only this category; give it again for more.")
 ]
@@ -94,6 +112,52 @@ def draw(
     except (OSError, ValueError) as error:
         _fail(f"can't write {out}: {error}")
     Console().print(str(out), highlight=False)
+
+
+@app.command("import")
+def import_(
+    file: Annotated[Path, typer.Argument(help="OBJ, STL, GLB or URDF.")],
+    category: Annotated[str, typer.Option(help="Category of the catalog that the model is one of.")],
+    creator: Annotated[str, typer.Option(help="Whose work it is.")],
+    licence: Annotated[str, typer.Option(help="On which terms it may be used, e.g. CC0-1.0.")],
+    out: Annotated[Path, typer.Option(help="Folder of imported assets.")],
+    model: Annotated[
+        str,
+        typer.Option(help="The catalog's model to replace; by default the one of the likest proportions."),
+    ] = "",
+    source: Annotated[str, typer.Option(help="Where it comes from; by default the file's name.")] = "",
+    up: Annotated[
+        Frame | None, typer.Option(help="Axis that points up: y (OBJ, GLB) or z (STL, URDF).")
+    ] = None,
+    cut: Annotated[Cut, typer.Option(help="How meshes are cut into convex parts.")] = Cut.COACD,
+) -> None:
+    """Make an asset of a model file, in the place of one of the catalog's models: `scene build --assets` then uses it."""
+    credit = Credit(creator, licence, source or file.name)
+    try:
+        raw = read_model(file, up)
+        decompose = Coacd() if cut is Cut.COACD else by_components
+        imported = import_model(Catalog.load(), raw, category, model, credit, decompose)
+        path = save_asset(out, imported.asset)
+    except (ModelFileError, CatalogError, SceneInvalidError) as error:
+        _fail(str(error))
+    except OSError as error:
+        _fail(f"{error.filename or out} can't be written ({error.strerror}): name another folder with --out")
+    asset = imported.asset
+    parts = sum(len(link.parts) for link in asset.links)
+    console = Console(soft_wrap=True)
+    console.print(
+        f"{asset.asset_id}: {parts} convex parts in {len(asset.links)} links, {len(asset.supports)} surfaces, "
+        f"{len(asset.interiors)} cavities: {path}",
+        highlight=False,
+    )
+    for lack in imported.lacks:
+        console.print(lack, highlight=False)
+    if imported.stretch > WORTH_TELLING:
+        console.print(
+            f"its proportions are changed by a factor of {imported.stretch:.2f} to fit {asset.size_m} m: "
+            "another --model may be more like it",
+            highlight=False,
+        )
 
 
 def _is_worth_a_look(catalog: Catalog, name: str) -> bool:

@@ -8,6 +8,7 @@ from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from embomatrix.factory.importers.shelf import read_assets
 from embomatrix.factory.scene_report import SceneReport, report_on
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.codec import scene_to_json
@@ -20,17 +21,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class SceneJob:
-    """One scene to build and check; ``path`` is the file to write it to, None for none."""
+    """One scene to build and check; ``path`` is the file to write it to, ``assets`` a folder of imported ones."""
 
     scene_id: str
     seed: int
     path: Path | None = None
+    assets: Path | None = None
 
 
 def run_batch(jobs: Sequence[SceneJob], *, processes: int) -> Iterator[SceneReport]:
     """Reports in the order in which they are finished; a single scene is built here.
 
-    Raises CatalogError for an unknown scene before anything is built, OSError when a file can't be written. A process that dies
+    Raises CatalogError for an unknown scene before anything is built, ModelFileError for a damaged asset, OSError when a file
+    can't be written. A process that dies
     is told in the reports of all that it leaves undone.
     """
     catalog = Catalog.load()
@@ -55,7 +58,8 @@ def run_batch(jobs: Sequence[SceneJob], *, processes: int) -> Iterator[SceneRepo
 
 
 def _run(job: SceneJob) -> SceneReport:
-    report, scene = report_on(job.scene_id, job.seed)
+    imported = read_assets(job.assets) if job.assets is not None else {}
+    report, scene = report_on(job.scene_id, job.seed, imported)
     if scene is not None and job.path is not None:
         try:
             write_whole(job.path, json.dumps(scene_to_json(scene)).encode("utf-8"))

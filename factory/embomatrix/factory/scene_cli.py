@@ -17,6 +17,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from embomatrix.factory.floorplan_spec import FloorPlanError
+from embomatrix.factory.importers.model import ModelFileError
+from embomatrix.factory.importers.shelf import read_assets
 from embomatrix.factory.pictures import draw_plan
 from embomatrix.factory.pictures_sheet import draw_sheet
 from embomatrix.factory.scene_batch import SceneJob, run_batch
@@ -54,6 +56,10 @@ Jobs = Annotated[int, typer.Option(min=1, help="Processes at a time.")]
 Report = Annotated[
     Path | None, typer.Option(help="JSON file for all figures, problems and what was left out.")
 ]
+Assets = Annotated[
+    Path | None,
+    typer.Option(help="Folder of imported assets, which take the place of the generated ones."),
+]
 CORES = os.cpu_count() or 1
 
 
@@ -73,13 +79,15 @@ def build(
     out: Out = Path(),
     report: Report = None,
     jobs: Jobs = CORES,
+    assets: Assets = None,
 ) -> None:
     """Lay out and furnish scenes, check them, and write them as JSON; exit status 1 when one has a problem."""
     chosen = _chosen(scene_ids, every)
+    _check_assets(assets)
     folder = _folder(out)
     several = len(set(seeds or ())) > 1
     orders = [
-        SceneJob(name, seed, folder / (f"{name}-{seed}.json" if several else f"{name}.json"))
+        SceneJob(name, seed, folder / (f"{name}-{seed}.json" if several else f"{name}.json"), assets)
         for name in chosen
         for seed in dict.fromkeys(seeds or (0,))
     ]
@@ -155,6 +163,15 @@ def sheet(
             bar.advance(bar.task_ids[0])
     _write(out, _png(draw_sheet(scenes).quantize(64)))
     Console().print(str(out), highlight=False)
+
+
+def _check_assets(folder: Path | None) -> None:
+    """Before anything is made: a damaged asset shall leave no folder behind."""
+    try:
+        if folder is not None:
+            read_assets(folder)
+    except ModelFileError as error:
+        raise _refused(str(error)) from None
 
 
 def _run(orders: Sequence[SceneJob], jobs: int) -> list[SceneReport]:

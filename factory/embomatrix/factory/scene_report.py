@@ -6,6 +6,7 @@ import re
 import time
 from collections import Counter
 from dataclasses import asdict, dataclass
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
 from embomatrix.factory.floorplan import compactness
@@ -19,6 +20,7 @@ from embomatrix.world.catalog import Catalog, CatalogError
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from embomatrix.world.asset import Asset
     from embomatrix.world.scene import Scene
 
 Json = dict[str, Any]
@@ -69,11 +71,13 @@ class SceneReport:
         return value
 
 
-def report_on(scene_id: str, seed: int) -> tuple[SceneReport, Scene | None]:
-    """Build one scene and check it; what fails is told in the report."""
+def report_on(
+    scene_id: str, seed: int, imported: Mapping[str, Asset] = MappingProxyType({})
+) -> tuple[SceneReport, Scene | None]:
+    """Build one scene, perhaps with imported assets, and check it; what fails is told in the report."""
     started = time.process_time()
     try:
-        scene = build_base_scene(scene_id, seed=seed)
+        scene = build_base_scene(scene_id, seed=seed, imported=imported)
     except (CatalogError, FloorPlanError) as error:
         return SceneReport(scene_id, seed, error=str(error)), None
     built = time.process_time()

@@ -1,0 +1,274 @@
+"""From a model file to an asset: turned, scaled to the catalog's size, cut into convex parts, with the catalog's mass.
+
+A model takes the place of one of the catalog's: it bears that one's id, size, mass and abilities, so that a scene in which the
+catalog's model stands can be built with the imported one.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError
+
+from embomatrix.factory.assets.body import OPEN_ABOVE_M, Body
+from embomatrix.factory.assets.shapes import box, hull, mesh_of, rounded
+from embomatrix.factory.importers.cavities import cavity, solid_cells, top_surface
+from embomatrix.factory.importers.convex import MAX_HULLS, MAX_VERTICES, merged
+from embomatrix.factory.importers.hinges import linked
+from embomatrix.factory.importers.meshes import read_groups
+from embomatrix.factory.importers.model import Frame, Mesh, ModelFileError, RawModel
+from embomatrix.factory.importers.urdf import read_urdf
+from embomatrix.world.asset import Asset, Joint, JointKind, Link
+from embomatrix.world.codec_asset import asset_from_json, asset_to_json
+from embomatrix.world.geometry import Aabb, Shape
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+    from pathlib import Path
+
+    from embomatrix.factory.importers.convex import Decomposer
+    from embomatrix.world.asset import Credit
+    from embomatrix.world.catalog import Catalog, Model
+    from embomatrix.world.geometry import FloatArray, Part, Vec3
+
+THIN_M: Final = 0.002
+"""Parts are grown to this thickness: a sheet without any is no body for an engine."""
+BOX_SHARE: Final = 0.97
+"""A hull that fills this much of its box becomes that box: the engine is quickest with those."""
+BARRING_SHARE: Final = 0.25
+"""A link that covers this share of a cavity's mouth bars the way in."""
+TURN: Final = {
+    # asset x, y, z in terms of the file's axes: its front is +z there, its width x, its height y
+    Frame.Y_UP: np.array(((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))),
+    Frame.Z_UP: np.eye(3),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Imported:
+    """An imported asset; ``stretch`` is the ratio of its largest to its smallest scale: 1 keeps the proportions.
+
+    ``lacks`` says what the category's things can do and this model can't.
+    """
+
+    asset: Asset
+    stretch: float
+    lacks: tuple[str, ...]
+
+
+def read_model(path: Path, frame: Frame | None = None) -> RawModel:
+    """The model of an OBJ, STL, GLB or URDF file. ``frame`` overrules what its kind says of its axes.
+
+    Raises ModelFileError for a file that is of another kind, damaged or too large.
+    """
+    if path.suffix.lower() == ".urdf":
+        model = read_urdf(path)
+    else:
+        groups = read_groups(path)
+        model = linked(groups, frame or (Frame.Z_UP if path.suffix.lower() == ".stl" else Frame.Y_UP))
+    return RawModel(model.links, frame or model.frame)
+
+
+def import_model(
+    catalog: Catalog, raw: RawModel, category: str, model_id: str, credit: Credit, decompose: Decomposer
+) -> Imported:
+    """The asset of a model file in the place of one of the catalog's models; without a ``model_id``, of the one most like it.
+
+    Raises CatalogError for an unknown category or model, ModelFileError when the model can't be made an asset.
+    """
+    turn = TURN[raw.frame]
+    clouds = [mesh.vertices @ turn.T for link in raw.links for mesh in link.meshes]
+    low = np.min([cloud.min(axis=0) for cloud in clouds], axis=0)
+    high = np.max([cloud.max(axis=0) for cloud in clouds], axis=0)
+    if (high - low).min() <= 0:
+        raise ModelFileError(f"the model is {tuple(high - low)} large: expected a solid, not a sheet")
+    entry = catalog.model(category, model_id) if model_id else _likest(catalog, category, high - low)
+    scale = np.asarray(entry.size_m) / (high - low)
+    transform = _Transform(turn, (low + high) / 2, scale)
+    links = tuple(_link(number, raw, transform, decompose) for number in range(len(raw.links)))
+    links = _exactly(links, entry)
+    body = _places(links, entry.size_m)
+    kind = catalog.category(category)
+    asset = Asset(
+        asset_id=entry.asset_id,
+        category=category,
+        synset=kind.synset,
+        size_m=entry.size_m,
+        mass_kg=kind.mass_kg,
+        links=links,
+        supports=tuple(body.supports),
+        interiors=tuple(body.interiors),
+        abilities=_abilities(kind.abilities, moves=len(links) > 1),
+        credit=credit,
+    )
+    sound = asset_from_json(asset_to_json(asset))
+    return Imported(sound, float(scale.max() / scale.min()), tuple(_lacks(sound, kind.abilities)))
+
+
+def _lacks(asset: Asset, wanted: Mapping[str, Mapping[str, float]]) -> Iterator[str]:
+    if "openable" in wanted and not asset.joints:
+        yield f"things of the category {asset.category} can be opened: this model has no group that moves"
+    if not {"openable", "fillable"}.isdisjoint(wanted) and not asset.interiors:
+        yield f"things are put inside a {asset.category}: this model has no cavity that is large enough"
+
+
+def _abilities(known: Mapping[str, Mapping[str, float]], *, moves: bool) -> Mapping[str, Mapping[str, float]]:
+    """The category's abilities, but openable is what this model has a joint for."""
+    others = {name: values for name, values in known.items() if name != "openable"}
+    return {"openable": known.get("openable", {}), **others} if moves else others
+
+
+def _likest(catalog: Catalog, category: str, extents: FloatArray) -> Model:
+    """The category's model whose proportions are nearest."""
+
+    def unlike(model: Model) -> float:
+        ratios = np.log(np.asarray(model.size_m) / extents)
+        return float(np.ptp(ratios))
+
+    return min(catalog.models_of(category), key=unlike)
+
+
+@dataclass(frozen=True, slots=True)
+class _Transform:
+    """From the file's frame to the asset's: turn, centre, scale along each axis."""
+
+    turn: FloatArray
+    middle: FloatArray
+    scale: FloatArray
+
+    def points(self, points: FloatArray) -> FloatArray:
+        return np.asarray((points @ self.turn.T - self.middle) * self.scale)
+
+    def joint(self, raw: RawModel, number: int) -> Joint | None:
+        motion = raw.links[number].motion
+        if motion is None:
+            return None
+        (origin,) = self.points(np.array([motion.origin]))
+        axis = self.turn @ np.asarray(motion.axis)
+        upper = motion.upper
+        if motion.kind is JointKind.PRISMATIC:
+            along = axis * self.scale
+            upper *= float(np.linalg.norm(along) / np.linalg.norm(axis))
+            axis = along
+        return Joint(motion.kind, rounded(*origin), rounded(*(axis / np.linalg.norm(axis))), round(upper, 6))
+
+
+def _link(number: int, raw: RawModel, transform: _Transform, decompose: Decomposer) -> Link:
+    link = raw.links[number]
+    pieces = [mesh.vertices for mesh in link.meshes if mesh.convex]
+    meshes = [mesh for mesh in link.meshes if not mesh.convex]
+    if meshes:
+        pieces += decompose(_together(meshes), max(1, MAX_HULLS - len(pieces)))
+    parts = tuple(convex_part(transform.points(piece)) for piece in merged(pieces, MAX_HULLS))
+    name = "base" if number == 0 else link.name
+    return Link(name, parts, transform.joint(raw, number))
+
+
+def _together(meshes: Sequence[Mesh]) -> Mesh:
+    """One mesh of several: cut together, they share the hulls that a link may have."""
+    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]
+    return Mesh(np.vstack([mesh.vertices for mesh in meshes]), np.vstack(faces))
+
+
+def convex_part(points: FloatArray) -> Part:
+    """The convex hull of points as a box, where it nearly is one, or as a hull of at most 64 corners."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    thin = np.maximum(0.0, THIN_M - (high - low)) / 2
+    if thin.any():
+        return box(low - thin, high + thin)
+    try:
+        shape = ConvexHull(points)
+    except QhullError:  # flat or a needle, though not along an axis
+        return box(low, high)
+    if shape.volume >= BOX_SHARE * float(np.prod(high - low)):
+        return box(low, high)
+    return hull(_extremes(points[shape.vertices]))
+
+
+def _extremes(corners: FloatArray) -> FloatArray:
+    """At most 64 of a hull's corners: those furthest out along directions that are spread evenly."""
+    if len(corners) <= MAX_VERTICES:
+        return corners
+    far = corners[np.unique((corners @ _directions().T).argmax(axis=0))]
+    return np.asarray(far[ConvexHull(far).vertices])
+
+
+@functools.cache
+def _directions() -> FloatArray:
+    """Directions over the sphere (Fibonacci's spiral), the six axes first, shape (64, 3)."""
+    axes = np.vstack((np.eye(3), -np.eye(3)))
+    k = np.arange(MAX_VERTICES - len(axes)) + 0.5
+    z = 1 - 2 * k / len(k)
+    turn = math.pi * (1 + math.sqrt(5)) * k
+    flat = np.sqrt(1 - z * z)
+    return np.vstack((axes, np.column_stack((flat * np.cos(turn), flat * np.sin(turn), z))))
+
+
+def _exactly(links: Sequence[Link], entry: Model) -> tuple[Link, ...]:
+    """The links with their common box drawn to the catalog's: cutting and thickening may have moved it a little."""
+    boxes = [_box_of(part) for link in links for part in link.parts]
+    whole = Aabb.around(boxes)
+    scale = np.asarray(entry.size_m) / np.asarray(whole.size_m)
+    middle = np.asarray(whole.center_m)
+
+    def drawn(part: Part) -> Part:
+        points = (
+            part.pose.apply_all(np.asarray(part.vertices_m)) if part.vertices_m else _corners(part)
+        ) - middle
+        points = points * scale
+        return hull(points) if part.shape is Shape.HULL else box(points.min(axis=0), points.max(axis=0))
+
+    return tuple(Link(link.name, tuple(drawn(part) for part in link.parts), link.joint) for link in links)
+
+
+def _corners(part: Part) -> FloatArray:
+    found = _box_of(part)
+    return np.array([found.low_m, found.high_m])
+
+
+def _box_of(part: Part) -> Aabb:
+    points = part.pose.apply_all(np.asarray(part.vertices_m)) if part.vertices_m else None
+    if points is None:
+        half = np.asarray(part.size_m) / 2
+        points = np.array([np.asarray(part.pose.position_m) - half, np.asarray(part.pose.position_m) + half])
+    (a, b, c), (d, e, f) = points.min(axis=0).tolist(), points.max(axis=0).tolist()
+    return Aabb((a, b, c), (d, e, f))
+
+
+def _places(links: Sequence[Link], size_m: Vec3) -> Body:
+    """Where things can be put on and in: the largest open surface of the base, and its largest cavity."""
+    solid = solid_cells([_planes(part) for part in links[0].parts], size_m)
+    body = Body()
+    surface = top_surface(solid, size_m)
+    inside = cavity(solid, size_m)
+    if inside is not None:
+        doors = tuple(link.name for link in links[1:] if _bars(link, inside))
+        body.add_interior("inside", inside, doors, 0.0 if doors else OPEN_ABOVE_M)
+    if surface is not None and (inside is None or surface.low_m[2] > inside.center_m[2]):
+        body.add_support("top", surface.low_m[:2], surface.high_m[:2], surface.high_m[2])
+    return body
+
+
+def _bars(link: Link, inside: Aabb) -> bool:
+    """Whether a moving link covers a good part of the front or of the top of a cavity."""
+    box = Aabb.around(_box_of(part) for part in link.parts)
+    shared = [
+        max(0.0, min(b, d) - max(a, c))
+        for a, b, c, d in zip(box.low_m, box.high_m, inside.low_m, inside.high_m, strict=True)
+    ]
+    width, depth, height = inside.size_m[1], inside.size_m[0], inside.size_m[2]
+    front, top = shared[1] * shared[2] / (width * height), shared[0] * shared[1] / (depth * width)
+    return (front if box.center_m[0] > inside.center_m[0] else 0.0) >= BARRING_SHARE or (
+        top if box.center_m[2] > inside.high_m[2] else 0.0
+    ) >= BARRING_SHARE
+
+
+def _planes(part: Part) -> tuple[FloatArray, FloatArray]:
+    """Outer half spaces of a part: normals (n, 3) and offsets (n,)."""
+    mesh = mesh_of(part)
+    return mesh.face_normals, np.einsum("ij,ij->i", mesh.face_normals, mesh.triangles[:, 0])

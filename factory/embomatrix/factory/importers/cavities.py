@@ -1,0 +1,125 @@
+"""Surfaces and cavities of imported models, found in a grid of cells about their convex parts."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from scipy import ndimage
+
+from embomatrix.world.geometry import Aabb
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from embomatrix.world.geometry import FloatArray, Vec3
+
+    Grid = NDArray[np.bool_]
+
+CELLS: Final = 40
+"""Cells along each side of the box: what is thinner than a fortieth of it may be missed."""
+LEAST_SHARE: Final = 0.12
+"""A surface or a cavity that takes less than this share of the box along x or y is none to put things on or in."""
+
+
+def solid_cells(planes: Sequence[tuple[FloatArray, FloatArray]], size_m: Vec3) -> Grid:
+    """Cells whose middle is in a part, shape (40, 40, 40). ``planes`` are (normals (n, 3), offsets (n,)) of each part."""
+    ticks = [(np.arange(CELLS) + 0.5) / CELLS * extent - extent / 2 for extent in size_m]
+    points = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
+    inside = np.zeros(len(points), dtype=np.bool_)
+    # Half a cell of margin: a board thinner than a cell must not fall between two middles.
+    margin = min(size_m) / CELLS / 2
+    for normals, offsets in planes:
+        inside |= (points @ normals.T <= offsets + margin).all(axis=1)
+    return inside.reshape(CELLS, CELLS, CELLS)
+
+
+def top_surface(solid: Grid, size_m: Vec3) -> Aabb | None:
+    """The largest level rectangle that lies open to above, as a box without height; None when all are small."""
+    heights = np.where(solid.any(axis=2), CELLS - np.argmax(solid[:, :, ::-1], axis=2), 0)  # (x, y)
+    best: tuple[int, tuple[int, int, int, int], int] = (0, (0, 0, 0, 0), 0)
+    for level in np.unique(heights[heights > 0]):
+        area, rectangle = largest_rectangle(heights == level)
+        best = max(best, (area, rectangle, int(level)))
+    area, (x0, y0, x1, y1), level = best
+    if area == 0 or min(x1 - x0, y1 - y0) < LEAST_SHARE * CELLS:
+        return None
+    return _box((x0, y0, level), (x1, y1, level), size_m)
+
+
+def cavity(solid: Grid, size_m: Vec3) -> Aabb | None:
+    """The largest box of free cells with a floor and three walls about it; None when there is none worth having.
+
+    Free means that something solid lies below, behind, and to both sides: in front or above the way is open, or barred by a
+    door, whose cells are not in ``solid``.
+    """
+    free = ~solid
+    for axis, ahead in ((0, False), (1, False), (1, True), (2, False)):
+        free &= _behind(solid, axis, ahead=ahead)
+    room = ndimage.distance_transform_cdt(np.pad(free, 1), metric="chessboard")[1:-1, 1:-1, 1:-1]
+    if room.max() < 2:
+        return None
+    low = np.array(np.unravel_index(int(room.argmax()), room.shape))
+    high = low + 1
+    grown = True
+    while grown:
+        grown = False
+        for axis in range(3):
+            for end in (0, 1):
+                grown |= _grow(free, low, high, axis, end)
+    if min(high[:2] - low[:2]) < LEAST_SHARE * CELLS:
+        return None
+    return _box(tuple(low), tuple(high), size_m)
+
+
+def _grow(free: Grid, low: NDArray[np.int64], high: NDArray[np.int64], axis: int, end: int) -> bool:
+    """Move one face of the box out by a cell, when all cells of that layer are free."""
+    at = low[axis] - 1 if end == 0 else high[axis]
+    if not 0 <= at < CELLS:
+        return False
+    spans = [slice(a, b) for a, b in zip(low, high, strict=True)]
+    spans[axis] = slice(at, at + 1)
+    if not free[tuple(spans)].all():
+        return False
+    if end == 0:
+        low[axis] -= 1
+    else:
+        high[axis] += 1
+    return True
+
+
+def _behind(solid: Grid, axis: int, *, ahead: bool) -> Grid:
+    """Cells that have something solid further along an axis, ahead of them or behind."""
+    flipped = np.flip(solid, axis) if ahead else solid
+    seen = np.maximum.accumulate(flipped, axis=axis)
+    return np.flip(seen, axis) if ahead else seen
+
+
+def largest_rectangle(mask: NDArray[np.bool_]) -> tuple[int, tuple[int, int, int, int]]:
+    """Area and corners (x0, y0, x1, y1) of the largest rectangle of True cells, by histograms row by row."""
+    best, corners = 0, (0, 0, 0, 0)
+    runs = np.zeros(mask.shape[1], dtype=np.int64)
+    for row, cells in enumerate(mask):
+        runs = np.where(cells, runs + 1, 0)
+        stack: list[int] = []
+        for column in range(len(runs) + 1):
+            height = int(runs[column]) if column < len(runs) else 0
+            while stack and runs[stack[-1]] >= height:
+                top = int(runs[stack.pop()])
+                left = stack[-1] + 1 if stack else 0
+                if top * (column - left) > best:
+                    best = top * (column - left)
+                    corners = (row - top + 1, left, row + 1, column)
+            stack.append(column)
+    return best, corners
+
+
+def _box(low: tuple[int, ...], high: tuple[int, ...], size_m: Vec3) -> Aabb:
+    """Box in metres between two corners in cells."""
+    (a, b, c), (d, e, f) = (
+        tuple(float(v) / CELLS * extent - extent / 2 for v, extent in zip(corner, size_m, strict=True))
+        for corner in (low, high)
+    )
+    return Aabb((a, b, c), (d, e, f))

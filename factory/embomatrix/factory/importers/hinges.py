@@ -1,0 +1,98 @@
+"""Moving parts of Sweet Home 3D's models, told by the names of their groups.
+
+``sweethome3d_hinge_N`` is a rod along the axis about which ``sweethome3d_opening_on_hinge_N`` turns,
+``sweethome3d_unique_rail`` (or ``sweethome3d_rail_N``) one along which ``sweethome3d_opening_on_rail_N`` slides. Groups may
+have anything appended to their names. The rods are no part of the asset: an opening goes through its own.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from embomatrix.factory.importers.model import Frame, Mesh, ModelFileError, Motion, RawLink, RawModel
+from embomatrix.world.asset import JointKind
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    from embomatrix.world.geometry import FloatArray
+
+_OPENING: Final = re.compile(r"sweethome3d_opening_on_(hinge|rail)_(\d+)")
+_HINGE: Final = re.compile(r"sweethome3d_hinge_(\d+)")
+_RAIL: Final = re.compile(r"sweethome3d_(?:unique_rail|rail_(\d+))")
+TRAVEL_SHARE: Final = 0.8
+FORWARD: Final = {Frame.Y_UP: 2, Frame.Z_UP: 0}
+"""The axis along which a model's front lies, at its positive end."""
+
+
+def linked(groups: Mapping[str, Mesh], frame: Frame) -> RawModel:
+    """A model whose named openings move, and all else is its base. Raises ModelFileError when nothing else is left."""
+    openings: dict[tuple[str, str], list[Mesh]] = {}
+    hinges: dict[str, Mesh] = {}
+    rails: dict[str, Mesh] = {}
+    base: list[Mesh] = []
+    for name, mesh in groups.items():
+        if found := _OPENING.match(name):
+            openings.setdefault((found[1], found[2]), []).append(mesh)
+            continue
+        if found := _HINGE.match(name):
+            hinges[found[1]] = mesh
+        elif found := _RAIL.match(name):
+            rails[found[1] or ""] = mesh
+        else:
+            base.append(mesh)
+    if not base:
+        raise ModelFileError("all groups are openings: expected a group that stands still")
+    links = [RawLink("base", tuple(base))]
+    for (kind, number), meshes in sorted(openings.items()):
+        name = f"{'door' if kind == 'hinge' else 'drawer'}{number}"
+        rod = hinges.get(number) if kind == "hinge" else rails.get(number, rails.get(""))
+        if rod is None:
+            raise ModelFileError(
+                f"the opening on {kind} {number} has no sweethome3d_{kind}_{number} to move on"
+            )
+        motion = _turn(rod, meshes, frame) if kind == "hinge" else _slide(rod, meshes, frame)
+        links.append(RawLink(name, tuple(meshes), motion))
+    return RawModel(tuple(links), frame)
+
+
+def _turn(rod: Mesh, meshes: Iterable[Mesh], frame: Frame) -> Motion:
+    """A quarter turn about the rod's middle line, towards the front."""
+    origin, axis = _line(rod)
+    low, high = _box(meshes)
+    arm = (low + high) / 2 - origin
+    swung = np.cross(axis, arm)  # where a positive turn takes the opening first
+    sign = 1.0 if swung[FORWARD[frame]] >= 0 else -1.0
+    return Motion(JointKind.REVOLUTE, _triple(origin), _triple(sign * axis), math.pi / 2)
+
+
+def _slide(rod: Mesh, meshes: Iterable[Mesh], frame: Frame) -> Motion:
+    """Along the rod: towards the front, or to the side on which there is more of it."""
+    origin, axis = _line(rod)
+    low, high = _box(meshes)
+    along = int(np.argmax(np.abs(axis)))
+    sign = 1.0 if along == FORWARD[frame] or origin[along] >= (low + high)[along] / 2 else -1.0
+    travel = TRAVEL_SHARE * float(high[along] - low[along])
+    return Motion(JointKind.PRISMATIC, _triple((low + high) / 2), _triple(sign * axis), travel)
+
+
+def _line(rod: Mesh) -> tuple[FloatArray, FloatArray]:
+    """Middle and direction of a rod: the longest side of its box."""
+    low, high = _box((rod,))
+    axis = np.zeros(3)
+    axis[int(np.argmax(high - low))] = 1.0
+    return (low + high) / 2, axis
+
+
+def _box(meshes: Iterable[Mesh]) -> tuple[FloatArray, FloatArray]:
+    points = np.vstack([mesh.vertices for mesh in meshes])
+    return points.min(axis=0), points.max(axis=0)
+
+
+def _triple(values: FloatArray) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in values)
+    return (x, y, z)

@@ -1,0 +1,94 @@
+"""What a model file holds, before it becomes an asset: links of triangle meshes in the file's own frame and units."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from embomatrix.world.asset import JointKind
+    from embomatrix.world.geometry import FloatArray
+
+    IntArray = NDArray[np.int64]
+
+MAX_BYTES: Final = 64 * 1024 * 1024
+MAX_FACES: Final = 400_000
+
+
+class ModelFileError(Exception):
+    """A model file that can't be imported: the message names the file, what was found, and what was expected."""
+
+
+class Frame(StrEnum):
+    """Which way a file's axes point."""
+
+    Y_UP = "y"  # x width, y up, z towards the viewer of its front: OBJ of Sweet Home 3D, glTF
+    Z_UP = "z"  # x forward, y to the left, z up: URDF
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mesh:
+    """Triangles: vertices (n, 3), faces (m, 3). ``convex`` tells that its hull is the whole of it."""
+
+    vertices: FloatArray
+    faces: IntArray
+    convex: bool = False
+
+    def __post_init__(self) -> None:
+        if len(self.vertices) < 3 or len(self.faces) < 1:
+            raise ModelFileError(
+                f"a mesh has {len(self.vertices)} vertices and {len(self.faces)} faces: it is empty"
+            )
+        if not np.isfinite(self.vertices).all():
+            raise ModelFileError("a vertex is not a finite number")
+        if self.faces.min() < 0 or self.faces.max() >= len(self.vertices):
+            raise ModelFileError(f"a face names a vertex outside 0 .. {len(self.vertices) - 1}")
+        if len(self.faces) > MAX_FACES:
+            raise ModelFileError(
+                f"a mesh has {len(self.faces)} faces: expected at most {MAX_FACES}; thin it out first"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """How a link moves, in the file's frame: ``upper`` in radians or in the file's units."""
+
+    kind: JointKind
+    origin: tuple[float, float, float]
+    axis: tuple[float, float, float]
+    upper: float
+
+
+@dataclass(frozen=True, slots=True)
+class RawLink:
+    """Meshes that move together. The first link of a model is its base and has no motion."""
+
+    name: str
+    meshes: tuple[Mesh, ...]
+    motion: Motion | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class RawModel:
+    """A model as its file has it."""
+
+    links: tuple[RawLink, ...]
+    frame: Frame
+
+
+def read_bytes(path: Path) -> bytes:
+    """The file's content. Raises ModelFileError when it is missing, unreadable, empty or larger than 64 MiB."""
+    try:
+        size = path.stat().st_size
+        if not 0 < size <= MAX_BYTES:
+            raise ModelFileError(f"{path} has {size} bytes: expected 1 to {MAX_BYTES}")
+        return path.read_bytes()
+    except OSError as error:
+        raise ModelFileError(f"{path} can't be read: {error.strerror}") from None

@@ -1,0 +1,43 @@
+"""A folder of imported assets: one JSON file each, read back when a scene is built."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.factory.importers.model import ModelFileError
+from embomatrix.world.codec_asset import asset_from_json, asset_to_json
+from embomatrix.world.field import SceneInvalidError
+from embomatrix.world.whole_file import write_whole
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from embomatrix.world.asset import Asset
+
+SUFFIX: Final = ".asset.json"
+
+
+def save_asset(folder: Path, asset: Asset) -> Path:
+    """Write an asset into a folder, which is made when it is missing, and return its file. Raises OSError."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{asset.asset_id}{SUFFIX}"
+    write_whole(path, json.dumps(asset_to_json(asset), indent=1).encode())
+    return path
+
+
+def read_assets(folder: Path) -> Mapping[str, Asset]:
+    """Assets of a folder by their id. Raises ModelFileError naming the file that is missing or damaged."""
+    if not folder.is_dir():
+        raise ModelFileError(f"{folder} is no folder: expected one with files that end in {SUFFIX}")
+    found: dict[str, Asset] = {}
+    for path in sorted(folder.glob(f"*{SUFFIX}")):
+        try:
+            asset = asset_from_json(json.loads(path.read_bytes()))
+        except (OSError, ValueError, SceneInvalidError) as error:
+            raise ModelFileError(f"{path} is no asset that can be read: {error}") from None
+        found[asset.asset_id] = asset
+    if not found:
+        raise ModelFileError(f"{folder} holds no file that ends in {SUFFIX}: import a model into it first")
+    return found

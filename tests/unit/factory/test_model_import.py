@@ -1,0 +1,358 @@
+"""Models from OBJ, GLB and URDF files become assets of the catalog's size and mass, or a clear error."""
+
+from __future__ import annotations
+
+import json
+import math
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from embomatrix.factory.assets.check import check_asset
+from embomatrix.factory.assets_cli import app
+from embomatrix.factory.importers.assemble import Imported, convex_part, import_model, read_model
+from embomatrix.factory.importers.convex import MAX_HULLS, MAX_VERTICES, Coacd, by_components
+from embomatrix.factory.importers.model import Mesh, ModelFileError
+from embomatrix.factory.importers.shelf import read_assets, save_asset
+from embomatrix.factory.importers.urdf import read_urdf
+from embomatrix.factory.scene_build import build_base_scene
+from embomatrix.factory.scene_cli import app as scene_app
+from embomatrix.world.asset import Credit, JointKind
+from embomatrix.world.catalog import Catalog
+from embomatrix.world.geometry import Aabb, Pose, Shape
+
+CATALOG = Catalog.load()
+CREDIT = Credit("A. Maker", "CC0-1.0", "a drawing")
+HERE = Pose((0.0, 0.0, 0.0))
+SAMPLES = Path(__file__).parents[4] / "shared" / "data" / "sweethome3d_cc0_sample.zip"
+CUPBOARD = (
+    # name, low and high corner; x width, y height, z depth with the front at +z, in centimetres
+    ("back", (0, 0, 0), (60, 80, 2)),
+    ("floor", (0, 0, 2), (60, 2, 48)),
+    ("roof", (0, 78, 2), (60, 80, 48)),
+    ("left", (0, 2, 2), (2, 78, 48)),
+    ("right", (58, 2, 2), (60, 78, 48)),
+    ("sweethome3d_hinge_1", (0, 10, 49), (1, 70, 50)),
+    ("sweethome3d_opening_on_hinge_1", (1, 2, 48.5), (60, 78, 50)),
+)
+
+
+def obj_text(boxes: tuple[tuple[str, tuple[float, ...], tuple[float, ...]], ...]) -> str:
+    lines, count = [], 0
+    for name, low, high in boxes:
+        mesh = trimesh.creation.box(bounds=(low, high))
+        lines.append(f"g {name}")
+        lines += [f"v {x} {y} {z}" for x, y, z in mesh.vertices]
+        lines += [f"f {a + 1 + count}/1/1 {b + 1 + count} {c + 1 + count}" for a, b, c in mesh.faces]
+        count += len(mesh.vertices)
+    return "\n".join(lines)
+
+
+def imported(path: Path, category: str, model: str = "") -> Imported:
+    return import_model(CATALOG, read_model(path), category, model, CREDIT, by_components)
+
+
+def urdf(tmp_path: Path, body: str) -> Path:
+    path = tmp_path / "thing.urdf"
+    path.write_text(f'<robot name="thing">{body}</robot>')
+    return path
+
+
+def link(name: str, extra: str = "", size: str = "1 1 1") -> str:
+    shape = f'<collision><geometry><box size="{size}"/></geometry></collision>'
+    return f'<link name="{name}">{shape}{extra}</link>'
+
+
+def joint(name: str, parent: str, child: str, kind: str = "fixed", extra: str = "") -> str:
+    ends = f'<parent link="{parent}"/><child link="{child}"/>'
+    return f'<joint name="{name}" type="{kind}">{ends}{extra}</joint>'
+
+
+def test_an_obj_takes_the_place_and_the_size_and_the_mass_of_a_catalog_model(tmp_path: Path) -> None:
+    path = tmp_path / "cupboard.obj"
+    path.write_text(obj_text(CUPBOARD))
+    result = imported(path, "bottom_cabinet", "songes")
+    asset, entry = result.asset, CATALOG.model("bottom_cabinet", "songes")
+    assert asset.asset_id == entry.asset_id
+    assert asset.mass_kg == CATALOG.category("bottom_cabinet").mass_kg
+    assert asset.credit == CREDIT
+    box = Aabb.around(part.aabb(HERE) for item in asset.links for part in item.parts)
+    assert box.size_m == pytest.approx(entry.size_m, abs=1e-5)
+    scales = np.asarray(entry.size_m) / (0.50, 0.60, 0.80)
+    assert result.stretch == pytest.approx(scales.max() / scales.min())
+    assert not check_asset(CATALOG, asset)
+
+
+def test_a_hinge_of_sweet_home_3d_opens_towards_the_front(tmp_path: Path) -> None:
+    path = tmp_path / "cupboard.obj"
+    path.write_text(obj_text(CUPBOARD))
+    asset = imported(path, "bottom_cabinet", "songes").asset
+    ((name, hinge),) = asset.joints
+    assert (name, hinge.kind, hinge.upper) == ("door1", JointKind.REVOLUTE, round(math.pi / 2, 6))
+    assert hinge.origin_m[1] < 0
+    assert hinge.axis == (0.0, 0.0, -1.0)  # hinged at -y: the free edge at +y comes forward
+    (inside,) = asset.interiors
+    assert inside.closed_by == ("door1",)
+    assert min(inside.size_m) > 0.3
+    (floor,) = [surface for surface in asset.supports if surface.interior]
+    assert floor.center_m[2] == pytest.approx(-asset.size_m[2] / 2, abs=0.06)
+    assert [surface.name for surface in asset.supports if not surface.interior] == ["top"]
+
+
+def test_a_rail_of_sweet_home_3d_is_a_drawer(tmp_path: Path) -> None:
+    path = tmp_path / "drawer.obj"
+    rail = ("sweethome3d_unique_rail", (29, 1, 2), (31, 2, 48))
+    drawer = ("sweethome3d_opening_on_rail_1", (3, 10, 4), (57, 30, 50))
+    path.write_text(obj_text((*CUPBOARD[:5], rail, drawer)))
+    ((name, slide),) = imported(path, "bottom_cabinet", "songes").asset.joints
+    assert (name, slide.kind, slide.axis) == ("drawer1", JointKind.PRISMATIC, (1.0, 0.0, 0.0))
+    depth = 0.46 * CATALOG.model("bottom_cabinet", "songes").size_m[0] / 0.50
+    assert slide.upper == pytest.approx(0.8 * depth, rel=0.01)
+
+
+def test_an_opening_without_its_hinge_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "cupboard.obj"
+    path.write_text(obj_text((*CUPBOARD[:5], CUPBOARD[6])))
+    with pytest.raises(ModelFileError, match="has no sweethome3d_hinge_1"):
+        read_model(path)
+
+
+def test_a_model_that_lacks_what_its_category_does_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "block.obj"
+    path.write_text(obj_text((("base", (0, 0, 0), (70, 170, 70)),)))
+    result = imported(path, "fridge")
+    assert not result.asset.can("openable")
+    assert [lack.split(":")[1].strip() for lack in result.lacks] == [
+        "this model has no group that moves", "this model has no cavity that is large enough",
+    ]  # fmt: skip
+
+
+def test_a_glb_is_read_with_the_poses_of_its_nodes(tmp_path: Path) -> None:
+    scene: Any = trimesh.Scene()
+    for size, height in (((1.0, 0.1, 0.6), 1.0), ((0.1, 1.0, 0.1), 0.45)):
+        lifted = np.eye(4)
+        lifted[1, 3] = height
+        scene.add_geometry(trimesh.creation.box(size), transform=lifted)
+    path = tmp_path / "table.glb"
+    path.write_bytes(scene.export(file_type="glb"))
+    asset = imported(path, "breakfast_table").asset
+    assert {part.shape for part in asset.links[0].parts} == {Shape.BOX}
+    (top,) = asset.supports
+    assert top.size_m == pytest.approx(asset.size_m[:2], rel=0.06)
+    assert top.center_m[2] == pytest.approx(asset.size_m[2] / 2, abs=0.03)
+
+
+def test_a_urdf_keeps_its_joint_and_merges_what_is_fixed(tmp_path: Path) -> None:
+    limits = '<limit lower="0" upper="1.2"/><axis xyz="0 0 1"/><origin xyz="0.5 -0.5 0" rpy="0 0 0"/>'
+    path = urdf(
+        tmp_path,
+        link("body") + link("plinth", size="1 1 0.2") + link("door", size="0.05 1 1")
+        + joint("foot", "body", "plinth", extra='<origin xyz="0 0 -0.6"/>')
+        + joint("swing", "body", "door", "revolute", limits),
+    )  # fmt: skip
+    asset = imported(path, "bottom_cabinet", "songes").asset
+    assert [item.name for item in asset.links] == ["base", "door"]
+    assert len(asset.links[0].parts) == 2
+    assert asset.joints[0][1].upper == pytest.approx(1.2)
+    assert asset.joints[0][1].axis == (0.0, 0.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("body", "message"),
+    [
+        (link("a") + link("b"), "expected one link without a parent, found 'a', 'b'"),
+        (link("a") + link("b") + joint("j", "a", "b") + joint("k", "b", "a"), "form a cycle"),
+        (link("a") + link("b") + link("c") + joint("j", "b", "c") + joint("k", "c", "b"), "form a cycle that hangs on"),
+        (link("a") + joint("j", "a", "ghost"), "the child of the joint 'j' is 'ghost': there is no such link"),
+        (link("a") + link("b") + link("c") + joint("j", "a", "c") + joint("k", "b", "c"), "has two parents"),
+        (link("a") + link("a"), "two links are named 'a'"),
+        (link("a", '<inertial><mass value="-2"/></inertial>'), "the mass of the link 'a' is negative"),
+        (link("a", size="1 nan 1"), "expected 3 finite numbers"),
+        (link("a", size="1 1"), "expected 3 finite numbers"),
+        (link("a") + link("b") + joint("j", "a", "b", "planar"), "of type 'planar'"),
+        (link("a") + link("b") + joint("j", "a", "b", "revolute"), "has no travel"),
+        ('<link name="a"/>', "the link 'a' has no shape"),
+        ("", "it has 0 links"),
+        ('<link name="a"><visual><geometry><cone/></geometry></visual></link>', "is a 'cone'"),
+        ('<link name="a"><visual><geometry><mesh filename="../x.obj"/></geometry></visual></link>', "outside the URDF's"),
+        ('<link name="a"><visual><geometry><mesh filename="/etc/x.obj"/></geometry></visual></link>', "outside the URDF's"),
+        ('<link name="a"><visual><geometry><mesh filename="x.obj"/></geometry></visual></link>', "can't be read"),
+    ],
+)  # fmt: skip
+def test_a_urdf_that_is_no_tree_or_leaves_its_folder_is_refused(
+    tmp_path: Path, body: str, message: str
+) -> None:
+    with pytest.raises(ModelFileError, match=message):
+        read_urdf(urdf(tmp_path, body))
+
+
+def test_a_moving_link_on_a_moving_link_is_refused(tmp_path: Path) -> None:
+    limit = '<limit lower="0" upper="1"/>'
+    joints = joint("j", "a", "b", "revolute", limit) + joint("k", "b", "c", "prismatic", limit)
+    with pytest.raises(ModelFileError, match="the joint 'k' moves on the moving link 'b'"):
+        read_urdf(urdf(tmp_path, link("a") + link("b") + link("c") + joints))
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
+def test_entities_are_refused_in_any_encoding(tmp_path: Path, encoding: str) -> None:
+    path = tmp_path / "bomb.urdf"
+    bomb = '<!DOCTYPE r [<!ENTITY a "aaaa">]><robot name="&a;"/>'
+    path.write_bytes(f'<?xml version="1.0" encoding="{encoding}"?>{bomb}'.encode(encoding))
+    with pytest.raises(ModelFileError, match=r"declares entities|is not UTF-8"):
+        read_urdf(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "message"),
+    [
+        ("a.obj", b"", "has 0 bytes"),
+        ("a.obj", b"v 0 0 0\nv 1 0 zero", "line 2"),
+        ("a.obj", b"v 0 0 0\nf 1 2 3", "line 2"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0", "holds no face"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 inf 0\nf 1 2 3", "not a finite number"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3", "expected a solid, not a sheet"),
+        ("a.glb", b"glTF but not really", "no glb that can be read"),
+        ("a.blend", b"BLENDER", "ends in '.blend'"),
+    ],
+)
+def test_a_damaged_mesh_file_is_named(tmp_path: Path, name: str, data: bytes, message: str) -> None:
+    path = tmp_path / name
+    path.write_bytes(data)
+    with pytest.raises(ModelFileError, match=message):
+        imported(path, "carton")
+
+
+@given(st.lists(st.tuples(*[st.floats(-2, 2)] * 3), min_size=1, max_size=120))
+def test_a_convex_part_holds_its_points_within_a_millimetre_or_few(points: list[tuple[float, ...]]) -> None:
+    cloud = np.array(points)
+    part = convex_part(cloud)
+    box = part.aabb(HERE)
+    assert len(part.vertices_m) <= MAX_VERTICES
+    assert min(part.size_m) >= 0.001
+    low, high = cloud.min(axis=0), cloud.max(axis=0)
+    assert (np.asarray(box.low_m) <= low + 1e-5).all()
+    assert (np.asarray(box.high_m) >= high - 1e-5).all()
+    assert (np.asarray(box.size_m) <= np.maximum(high - low, 0.0021) + 1e-5).all()
+
+
+def test_too_many_components_are_joined_to_sixteen() -> None:
+    rng = np.random.default_rng(0)
+    cube = trimesh.creation.box((0.1, 0.1, 0.1))
+    middles = rng.uniform(0, 3, (40, 3))
+    vertices = np.vstack([cube.vertices + middle for middle in middles])
+    faces = np.vstack([cube.faces + number * len(cube.vertices) for number in range(40)])
+    pieces = by_components(Mesh(vertices, faces), MAX_HULLS)
+    assert len(pieces) == MAX_HULLS
+    assert np.vstack(pieces).min(axis=0) == pytest.approx(vertices.min(axis=0))
+
+
+def test_a_cut_mesh_is_kept_by_its_content_and_a_damaged_copy_is_not_used(tmp_path: Path) -> None:
+    cube = trimesh.creation.box((1.0, 1.0, 1.0))
+    mesh = Mesh(np.asarray(cube.vertices), np.asarray(cube.faces))
+    moved = Mesh(mesh.vertices + 1e-9, mesh.faces)
+    cutter = Coacd(tmp_path)
+    assert cutter.key(mesh, 16) == Coacd(tmp_path).key(mesh, 16)
+    assert len({cutter.key(mesh, 16), cutter.key(moved, 16), cutter.key(mesh, 8)}) == 3
+    kept = [mesh.vertices[:4].tolist()]
+    (tmp_path / f"{cutter.key(mesh, 16)}.json").write_text(json.dumps(kept))
+    assert np.asarray(cutter(mesh, 16)).tolist() == kept
+
+
+def test_a_folder_of_assets_reads_back_equal_and_names_what_is_damaged(tmp_path: Path) -> None:
+    path = tmp_path / "box.obj"
+    path.write_text(obj_text((("base", (0, 0, 0), (7, 7, 7)),)))
+    asset = imported(path, "apple").asset
+    shelf = tmp_path / "shelf"
+    written = save_asset(shelf, asset)
+    assert read_assets(shelf) == {asset.asset_id: asset}
+    written.write_text(written.read_text().replace('"mass_kg"', '"mass"'))
+    with pytest.raises(ModelFileError, match=str(written)):
+        read_assets(shelf)
+    with pytest.raises(ModelFileError, match="holds no file"):
+        read_assets(tmp_path)
+    with pytest.raises(ModelFileError, match="is no folder"):
+        read_assets(tmp_path / "nowhere")
+
+
+def test_the_command_writes_an_asset_or_one_line_that_says_why_not(tmp_path: Path) -> None:
+    path = tmp_path / "cupboard.obj"
+    path.write_text(obj_text(CUPBOARD))
+    said = [
+        "--creator",
+        "A. Maker",
+        "--licence",
+        "CC0-1.0",
+        "--out",
+        str(tmp_path / "shelf"),
+        "--cut",
+        "components",
+    ]
+    done = CliRunner().invoke(app, ["import", str(path), "--category", "bottom_cabinet", *said])
+    assert done.exit_code == 0, done.output
+    assert "2 links" in done.output
+    (asset,) = read_assets(tmp_path / "shelf").values()
+    assert asset.credit == Credit("A. Maker", "CC0-1.0", "cupboard.obj")
+    for wrong in (["--category", "bottom_cabinets"], ["--category", "bottom_cabinet", "--model", "nope"]):
+        refused = CliRunner().invoke(app, ["import", str(path), *said, *wrong])
+        assert refused.exit_code == 2
+        assert "unknown" in refused.output
+        assert "Traceback" not in refused.output
+
+
+def sample(tmp_path: Path, name: str) -> Path:
+    if not SAMPLES.is_file():
+        pytest.skip("the sample of Sweet Home 3D's models is not here")
+    with zipfile.ZipFile(SAMPLES) as archive:
+        return Path(archive.extract(f"Blend Swap CC-0_{name}.obj", tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("name", "category"),
+    [("table", "breakfast_table"), ("sinkCabinet", "bottom_cabinet")],
+)
+def test_models_of_sweet_home_3d_become_assets(tmp_path: Path, name: str, category: str) -> None:
+    result = imported(sample(tmp_path, name), category)
+    assert result.stretch < 1.25
+    assert all(len(item.parts) <= MAX_HULLS for item in result.asset.links)
+    box = Aabb.around(part.aabb(HERE) for item in result.asset.links[:1] for part in item.parts)
+    assert box.size_m[:2] == pytest.approx(result.asset.size_m[:2], rel=0.05)
+    assert any(surface.name == "top" for surface in result.asset.supports)
+
+
+@pytest.mark.slow
+def test_coacd_hollows_out_what_one_hull_would_fill(tmp_path: Path) -> None:
+    pytest.importorskip("coacd", reason="needs embomatrix[importers]")
+    raw = read_model(sample(tmp_path, "dustbin"))
+    cutter = Coacd(tmp_path / "cache")
+    asset = import_model(CATALOG, raw, "trash_can", "", CREDIT, cutter).asset
+    assert 4 <= len(asset.links[0].parts) <= MAX_HULLS
+    (inside,) = asset.interiors
+    assert min(inside.size_m) > 0.1
+    assert import_model(CATALOG, raw, "trash_can", "", CREDIT, cutter).asset == asset
+    assert len(list((tmp_path / "cache").glob("*.json"))) == 1
+
+
+def test_a_scene_is_built_with_the_imported_asset_in_place_of_the_generated_one(tmp_path: Path) -> None:
+    path = tmp_path / "cupboard.obj"
+    path.write_text(obj_text(CUPBOARD))
+    room = next(item for item in CATALOG.inventory("Rs_int").rooms if item.type == "kitchen")
+    model = next(m for category, m, _ in room.items if category == "bottom_cabinet")
+    save_asset(tmp_path / "shelf", imported(path, "bottom_cabinet", model).asset)
+    scene = build_base_scene("Rs_int", imported=read_assets(tmp_path / "shelf"))
+    assert scene.assets[f"bottom_cabinet-{model}"].credit == CREDIT
+    assert {asset.credit for asset in scene.assets.values()} == {CREDIT, None}
+
+
+def test_a_folder_without_assets_is_refused_before_anything_is_built(tmp_path: Path) -> None:
+    said = ["build", "Rs_int", "--out", str(tmp_path / "out"), "--assets", str(tmp_path / "nowhere")]
+    refused = CliRunner().invoke(scene_app, said)
+    assert refused.exit_code == 2
+    assert "is no folder" in refused.output
+    assert not (tmp_path / "out").exists()
