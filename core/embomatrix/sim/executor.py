@@ -31,8 +31,19 @@ if TYPE_CHECKING:
     from embomatrix.world.bundle import Bundle
     from embomatrix.world.task import Task
 
-CHANGING = frozenset({Skill.PLACE, Skill.OPEN, Skill.CLOSE, Skill.TOGGLE_ON, Skill.TOGGLE_OFF, Skill.SLICE})
-"""Skills after which a source may act on something that it did not act on before."""
+CHANGING = frozenset(
+    {
+        Skill.PLACE,
+        Skill.OPEN,
+        Skill.CLOSE,
+        Skill.TOGGLE_ON,
+        Skill.TOGGLE_OFF,
+        Skill.SLICE,
+        Skill.CLEAN,
+        Skill.SOAK,
+    }
+)
+"""Skills after which a source may act on something that it did not act on before, or by which substances come and go."""
 
 
 class Actor(Protocol):

@@ -178,12 +178,16 @@ def do_chores(script: PlanScript, world: LiveWorld, chores: Sequence[tuple[Chore
     waiting = list(chores)
     while waiting:
         means = waiting[0][1]
-        same = [chore for chore, other in waiting if other == means and means.tool] or [waiting[0][0]]
-        waiting = [pair for pair in waiting if pair[0] not in same]
+        if means.inside:
+            _wash(script, world, means.source, waiting.pop(0)[0].name)
+            continue
+        name = waiting[0][0].name
+        same = [pair for pair in waiting if (pair[1] == means if means.tool else _is_held(pair, name))]
+        waiting = [pair for pair in waiting if pair not in same]
         if means.tool:
-            _with_tool(script, world, means, same)
+            _with_tool(script, world, means, [chore for chore, _ in same])
         else:
-            _at_source(script, world, means, same[0])
+            _hold_under(script, world, name, [other.source for _, other in same])
 
 
 def _with_tool(script: PlanScript, world: LiveWorld, means: Means, chores: Sequence[Chore]) -> None:
@@ -211,19 +215,29 @@ def _must_run(world: LiveWorld, tool: str, chores: Sequence[Chore]) -> bool:
     return any(missing is not None and RUNNING in missing for missing in lacking)
 
 
-def _at_source(script: PlanScript, world: LiveWorld, means: Means, chore: Chore) -> None:
-    if means.inside:
-        if not world.is_inside(chore.name, means.source):
-            script.transfer(chore.name, means.source, PlaceRelation.INSIDE)
-        machine = washing(world.asset(means.source))
-        if machine is not None and machine.requires_closed:
-            script.close(means.source)
-        script.switch_on(means.source)
-        return
-    script.clear_way_to(means.source)
-    _run_tap(script, world, means.source)
-    script.take(chore.name)
-    script.use_on(Skill.SOAK, chore.name, means.source, at=means.source)
+def _is_held(pair: tuple[Chore, Means], name: str) -> bool:
+    """Whether the chore is done with the object itself in the hand."""
+    chore, means = pair
+    return chore.name == name and not means.tool and not means.inside
+
+
+def _wash(script: PlanScript, world: LiveWorld, source: str, name: str) -> None:
+    if not world.is_inside(name, source):
+        script.transfer(name, source, PlaceRelation.INSIDE)
+    machine = washing(world.asset(source))
+    if machine is not None and machine.requires_closed:
+        script.close(source)
+    script.switch_on(source)
+
+
+def _hold_under(script: PlanScript, world: LiveWorld, name: str, sources: Sequence[str]) -> None:
+    """Take the object to one source after the other."""
+    for source in sources:
+        script.clear_way_to(source)
+        _run_tap(script, world, source)
+    script.take(name)
+    for source in sources:
+        script.use_on(Skill.SOAK, name, source, at=source)
     script.lay_down(frozenset())
 
 

@@ -35,6 +35,7 @@ class Water:
         self._scene = engine.scene
         self._states = states
         self._substances = substances
+        self._changes: list[Change] = []
         self._sources = [
             item.name
             for item in self._scene.objects
@@ -42,8 +43,7 @@ class Water:
         ]
 
     def apply(self) -> tuple[Change, ...]:
-        """Let every source that runs act on what lies in it. Returns what changed, in scene order of the sources."""
-        changes: list[Change] = []
+        """Let every source that runs act on what lies in it. Returns what changed since the last time, by hand or by itself."""
         for name in self._sources:
             if State.TOGGLED_ON not in self._states[name] or self._engine.is_parked(name):
                 continue
@@ -56,18 +56,20 @@ class Water:
                 if self._scene.by_name[item].fixed or not self._relations.inside(item, name):
                     continue
                 if machine is not None:
-                    changes += self.take_off(item, washed_away(machine, coverings(self._substances[item])))
-                changes += self.wet(item, liquids)
-        return tuple(changes)
+                    self.take_off(item, washed_away(machine, coverings(self._substances[item])))
+                self.wet(item, liquids)
+        changes = tuple(self._changes)
+        self._changes.clear()
+        return changes
 
-    def wet(self, name: str, liquids: tuple[str, ...]) -> list[Change]:
-        """Let liquids run over an object. Returns what changed."""
+    def wet(self, name: str, liquids: tuple[str, ...]) -> None:
+        """Let liquids run over an object."""
         gained = soaked_with(self._scene.asset_of(name), liquids) - self._substances[name]
         self._substances[name] |= gained
-        return [Change(name, in_words(fact)) for fact in sorted(gained)]
+        self._changes += [Change(name, in_words(fact)) for fact in sorted(gained)]
 
-    def take_off(self, name: str, covering: tuple[str, ...]) -> list[Change]:
-        """Take substances off an object that is covered with them. Returns what changed."""
+    def take_off(self, name: str, covering: tuple[str, ...]) -> None:
+        """Take substances off an object that is covered with them."""
         lost = {SubstanceFact(SubstanceRelation.COVERED, substance) for substance in covering}
         self._substances[name] -= lost
-        return [Change(name, f"free of {word_of(fact.substance)}") for fact in sorted(lost)]
+        self._changes += [Change(name, f"free of {word_of(fact.substance)}") for fact in sorted(lost)]

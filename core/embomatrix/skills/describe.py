@@ -33,7 +33,7 @@ DONE: Final[Mapping[Skill, str]] = {
     Skill.GO_TO_ROOM: "stands in {room}",
     Skill.SLICE: "sliced {target}",
     Skill.CLEAN: "cleaned {target}",
-    Skill.SOAK: "soaked {target}",
+    Skill.SOAK: "held {target} under what flows",
 }
 """What a call that succeeded says. One sentence for each skill."""
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.world.state import SubstanceFact, SubstanceRelation
 from embomatrix.world.substances import (
     RUNNING,
+    WATER,
     flows_from,
     is_remover,
     liquids_in,
@@ -76,13 +77,14 @@ def liquids_given(asset: Asset, facts: Iterable[SubstanceFact], *, on: bool) -> 
 
 
 def soaked_with(asset: Asset, liquids: Iterable[str]) -> frozenset[SubstanceFact]:
-    """What becomes of a thing that liquids run over."""
-    if not soaks_up(asset):
-        return frozenset()
-    relations = [SubstanceRelation.SATURATED]
-    if asset.can("fillable"):
-        relations.append(SubstanceRelation.FILLED)
-    return frozenset(SubstanceFact(relation, liquid) for liquid in liquids for relation in relations)
+    """What becomes of a thing that liquids run over: a cloth is soaked, a vessel filled. With water, a vessel is wet too."""
+    found: set[SubstanceFact] = set()
+    for liquid in liquids:
+        if asset.can("fillable"):
+            found.add(SubstanceFact(SubstanceRelation.FILLED, liquid))
+        if is_remover(asset.synset) or (liquid == WATER and asset.can("fillable")):
+            found.add(SubstanceFact(SubstanceRelation.SATURATED, liquid))
+    return frozenset(found)
 
 
 def coverings(facts: Iterable[SubstanceFact]) -> tuple[str, ...]:

@@ -93,7 +93,8 @@ def test_what_is_still_to_come_can_not_be_used(home):
 
 
 def test_a_dry_cloth_takes_dust_off_and_leaves_stains(home):
-    succeeded(home, f"{RAG}; move plate_1; clean_object_with_tool plate_1 rag_1")
+    wiped = succeeded(home, f"{RAG}; move plate_1; clean_object_with_tool plate_1 rag_1")
+    assert wiped.steps[-1].message == "cleaned plate_1; plate_1 is now free of dust"
     assert not home.facts.holds("dusty", ("plate_1",))
     assert not home.facts.holds("covered", ("plate_1", "dust.n.01"))
     trace = executed(home, f"{RAG}; move plate_2; clean_object_with_tool plate_2 rag_1")
@@ -117,6 +118,17 @@ def test_soap_from_a_bottle_does_as_well(home):
     assert not home.facts.holds("soaked", ("rag_1",))
     assert home.facts.holds("saturated", ("rag_1", "liquid_soap.n.01"))
     assert not home.facts.holds("stained", ("plate_2",))
+
+
+def test_a_cup_is_filled_from_a_bottle_or_a_tap_and_wet_by_water_only(home):
+    text = "move cup_1; pick_up cup_1; move liquid_soap__bottle_1; soak_object_in_source cup_1 liquid_soap__bottle_1"
+    poured = succeeded(home, text)
+    assert poured.steps[-1].message == "held cup_1 under what flows; cup_1 is now filled with liquid soap"
+    assert home.facts.holds("filled", ("cup_1", "liquid_soap.n.01"))
+    assert not home.facts.holds("saturated", ("cup_1", "liquid_soap.n.01"))
+    succeeded(home, f"{TAP}; move cup_1; pick_up cup_1; move sink_1; soak_object_in_source cup_1 sink_1")
+    assert home.facts.holds("soaked", ("cup_1",))
+    assert home.facts.holds("filled", ("cup_1", "water.n.06"))
 
 
 def test_what_is_put_into_a_running_sink_is_soaked_filled_and_washed_at_once(home):

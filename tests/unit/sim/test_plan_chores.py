@@ -60,6 +60,13 @@ def test_one_cloth_is_soaked_once_and_wipes_all_that_it_can(home):
     assert sum(call.skill is Skill.CLEAN for call in plan) == 2
 
 
+def test_a_cup_is_taken_from_source_to_source_without_being_put_down(home):
+    task = task_of(home, "(and (filled cup_1 liquid_soap.n.01) (filled cup_1 water.n.06))")
+    plan = find_plan(home, task)
+    assert not isinstance(plan, PlanNotFound), plan.reason
+    assert sum(call.skill is Skill.PICK_UP for call in plan) == 1
+
+
 @pytest.mark.parametrize(
     ("goal", "profile", "reason"),
     [
