@@ -10,7 +10,7 @@ import numpy as np
 
 from embomatrix.sim.fidelity import PlanKind, Trial
 from embomatrix.sim.fidelity_sampler import ABILITY, SKILLS, PlanSampler, work_pairs
-from embomatrix.skills.syntax import MAX_STEPS, Skill
+from embomatrix.skills.syntax import Skill
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -20,8 +20,9 @@ if TYPE_CHECKING:
     from embomatrix.skills.syntax import Plan, SkillCall
     from embomatrix.world.task import Task
 
-LENGTHS: Final = (6, 13)
-"""Calls of a random plan: at least, and less than."""
+LENGTHS: Final = (4, 9)
+MOST: Final = 12
+"""Calls of a random plan: at least, less than, and at most with what they need before them."""
 PREFIXES: Final = (0, 5)
 """Calls before the one that fails, likewise."""
 EXTRA: Final = 3
@@ -146,7 +147,7 @@ class _Writer:
             if len(sampler.plan) >= length:
                 break
             sampler.add(able[int(self._rng.choice(len(able), p=weights / weights.sum()))])
-        return sampler.plan[:MAX_STEPS]
+        return sampler.plan[:MOST]
 
     def _perturbed(self) -> tuple[Task, Plan, int]:
         """A plan that was written before, with a step dropped, two swapped or an index changed."""

@@ -1,4 +1,4 @@
-"""`bench fidelity`: processes that die cost one trial, a suite goes on where it was cut short, disagreements can be seen again."""
+"""`bench fidelity`: a process that dies costs one trial, a suite goes on where it was cut short, disagreements are replayed."""
 
 import json
 
