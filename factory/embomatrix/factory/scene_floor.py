@@ -12,7 +12,7 @@ from embomatrix.skills.limits import ROBOT
 from embomatrix.world.geometry import Aabb, Pose
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable
 
     from embomatrix.world.geometry import FloatArray
     from embomatrix.world.scene import Room, Scene, SceneObject
@@ -27,16 +27,15 @@ class ReachableFloor:
     """Free floor connected to the robot's start, with all joints shut."""
 
     def __init__(self, scene: Scene) -> None:
-        rows = [_row(wall.aabb(_ORIGIN)) for wall in scene.walls]
-        for item in scene.objects:
-            asset = scene.assets[item.asset_id]
-            parts = (part for link in asset.links for part in link.parts)
-            rows += [_row(part.aabb(item.pose_world_asset)) for part in parts]
-        boxes = np.array(rows).reshape(-1, 6)
-        barring = (boxes[:, 4] < ROBOT.height_m) & (boxes[:, 5] > _FLAT_M)
         self._rooms = scene.rooms
-        self._barring = boxes[barring]
-        self._grid = FloorGrid(scene, self._barring)
+        walls = [wall.aabb(_ORIGIN) for wall in scene.walls]
+        self._standing = _barring(
+            part.aabb(item.pose_world_asset)
+            for item in scene.objects
+            for link in scene.assets[item.asset_id].links
+            for part in link.parts
+        )
+        self._grid = FloorGrid(scene, np.concatenate([_barring(walls), self._standing]))
         cell = self._grid.cell(scene.robot.x_m, scene.robot.y_m)
         self._label = self._grid.label(cell) if cell is not None else 0
 
@@ -58,7 +57,7 @@ class ReachableFloor:
         for room in self._rooms:
             floor = np.ones(np.ceil(np.array(room.size_m) / CELL_M).astype(int), dtype=bool)
             low = np.array([*room.low_m, *room.low_m])
-            for x0, y0, x1, y1 in np.rint((self._barring[:, :4] - low) / CELL_M).astype(int).clip(0):
+            for x0, y0, x1, y1 in np.rint((self._standing[:, :4] - low) / CELL_M).astype(int).clip(0):
                 floor[x0:x1, y0:y1] = False
             free, total = free + int(floor.sum()), total + floor.size
         return free / total
@@ -93,8 +92,11 @@ def box_of(scene: Scene, item: SceneObject) -> Aabb:
     return Aabb.around(part.aabb(item.pose_world_asset) for link in asset.links for part in link.parts)
 
 
-def _row(box: Aabb) -> Sequence[float]:
-    return (*box.low_m[:2], *box.high_m[:2], box.low_m[2], box.high_m[2])
+def _barring(boxes: Iterable[Aabb]) -> FloatArray:
+    """Rows (x0, y0, x1, y1, z0, z1) of the boxes that stand in the robot's way: no rugs, nothing above its head."""
+    rows = [(*box.low_m[:2], *box.high_m[:2], box.low_m[2], box.high_m[2]) for box in boxes]
+    table = np.array(rows, dtype=np.float64).reshape(-1, 6)
+    return np.asarray(table[(table[:, 4] < ROBOT.height_m) & (table[:, 5] > _FLAT_M)])
 
 
 def _pair(values: FloatArray) -> tuple[float, float]:

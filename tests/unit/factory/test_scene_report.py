@@ -1,0 +1,181 @@
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from embomatrix.factory.scene_batch import SceneJob, run_batch
+from embomatrix.factory.scene_check import STABLE_SHARE, ProblemKind, check_scene, check_settled
+from embomatrix.factory.scene_cli import app
+from embomatrix.factory.scene_floor import ReachableFloor
+from embomatrix.factory.scene_report import report_of, report_on, unaccounted
+from embomatrix.world.catalog import Catalog, CatalogError
+from embomatrix.world.codec import scene_from_json
+from embomatrix.world.geometry import Pose
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from embomatrix.world.scene import Scene
+
+SMALL = "hotel_suite_small"
+
+
+def put(scene: Scene, name: str, x: float, y: float, z: float | None = None) -> Scene:
+    """The scene with one object at another place, as it is turned."""
+    item = scene.by_name[name]
+    pose = item.pose_world_asset
+    there = Pose((x, y, pose.position_m[2] if z is None else z), pose.quat_xyzw)
+    return replace(
+        scene, objects=tuple(replace(o, pose_world_asset=there) if o is item else o for o in scene.objects)
+    )
+
+
+def problems(scene: Scene, kind: ProblemKind) -> list[tuple[str, ...]]:
+    return [problem.names for problem in check_scene(scene) if problem.kind is kind]
+
+
+def standing(scene: Scene) -> str:
+    """Something higher than a window's sill that stands on the floor."""
+    return next(
+        o.name
+        for o in scene.objects
+        if not o.host
+        and scene.assets[o.asset_id].size_m[2] > 1.2
+        and o.pose_world_asset.position_m[2] < scene.assets[o.asset_id].size_m[2] / 2 + 0.01
+    )
+
+
+def test_what_stands_in_a_doorway_is_reported(flat: Scene) -> None:
+    door = next(d for d in flat.doorways if d.rooms[1])
+    name = standing(flat)
+    assert not problems(flat, ProblemKind.DOORWAY)
+    assert (name,) in problems(put(flat, name, *door.center_m), ProblemKind.DOORWAY)
+
+
+def test_what_stands_before_a_window_is_reported_unless_it_is_low(flat: Scene) -> None:
+    window = next(w for w in flat.windows if not w.rooms[1])
+    room = next(r for r in flat.rooms if r.name == window.rooms[0])
+    inward = np.sign(np.subtract(room.center_m, window.center_m)) * (
+        (0.0, 0.4) if window.along == "x" else (0.4, 0.0)
+    )
+    x, y = np.add(window.center_m, inward)
+    name = standing(flat)
+    assert not problems(flat, ProblemKind.WINDOW)
+    assert any(name in names for names in problems(put(flat, name, x, y), ProblemKind.WINDOW))
+    height = flat.asset_of(name).size_m[2]
+    sunk = put(flat, name, x, y, 0.8 - height / 2)
+    assert not any(name in names for names in problems(sunk, ProblemKind.WINDOW))
+
+
+def test_a_narrow_doorway_is_reported(flat: Scene) -> None:
+    narrow = replace(flat, doorways=tuple(replace(d, width_m=0.6) for d in flat.doorways))
+    assert problems(narrow, ProblemKind.DOORWAY)
+
+
+def test_a_base_scene_stays_where_it_is_when_all_is_let_go(flat: Scene) -> None:
+    settlement = check_settled(flat)
+    assert settlement.movable == sum(not item.fixed for item in flat.objects) > 0
+    assert settlement.stable_share >= STABLE_SHARE
+    assert settlement.problems == ()
+
+
+def test_things_hung_in_the_air_fall_and_are_reported(flat: Scene) -> None:
+    scene = flat
+    for item in flat.objects:
+        if not item.fixed:
+            x, y, z = item.pose_world_asset.position_m
+            scene = put(scene, item.name, x, y, z + 0.3)
+    settlement = check_settled(scene)
+    assert settlement.stable_share < STABLE_SHARE
+    assert [problem.kind for problem in settlement.problems] == [ProblemKind.UNSTABLE]
+
+
+def test_an_item_that_vanishes_is_unaccounted_for(flat: Scene) -> None:
+    assert unaccounted(flat) == ()
+    gone = flat.objects[-1]
+    (problem,) = unaccounted(replace(flat, objects=flat.objects[:-1]))
+    assert problem.names == (gone.asset_id,)
+
+
+def test_a_report_counts_what_is_in_the_scene(flat: Scene) -> None:
+    report = report_of(flat)
+    listed = sum(n for room in Catalog.load().inventory("Rs_int").rooms for *_, n in room.items)
+    assert report.sound
+    assert (report.rooms, report.listed, report.placed) == (5, listed, len(flat.objects))
+    assert sum(count for _, count in report.placed_by_room) == report.placed
+    assert json.loads(json.dumps(report.to_json()))["left_out"] == list(flat.left_out)
+    assert 0.8 < report.compactness <= 1.0
+
+
+def test_an_empty_house_is_all_free_floor(flat: Scene) -> None:
+    bare = ReachableFloor(replace(flat, objects=()))
+    full = ReachableFloor(flat)
+    assert bare.free_share == 1.0
+    assert bare.reachable_share > 0.99
+    assert 0.3 < full.free_share < 0.95
+
+
+def test_an_unknown_scene_is_a_report_not_a_crash() -> None:
+    report, scene = report_on("Rs_itn", 0)
+    assert scene is None
+    assert "Rs_int" in report.error
+    assert not report.sound
+
+
+def test_scenes_are_built_side_by_side_and_written(tmp_path: Path) -> None:
+    jobs = [SceneJob(SMALL, seed, tmp_path / f"{seed}.json") for seed in (0, 1)]
+    reports = sorted(run_batch(jobs, processes=2), key=lambda report: report.seed)
+    assert [report.seed for report in reports] == [0, 1]
+    assert all(report.sound for report in reports), [report.problems for report in reports]
+    first, second = (scene_from_json(json.loads(job.path.read_text())) for job in jobs if job.path)
+    assert first.seed == 0
+    assert first.objects != second.objects
+    assert {room.name for room in first.rooms} == {room.name for room in second.rooms}
+
+
+def test_a_wrong_name_stops_a_batch_before_anything_is_built() -> None:
+    with pytest.raises(CatalogError, match="Rs_int"):
+        list(run_batch([SceneJob("Rs_itn", 0), SceneJob(SMALL, 0)], processes=1))
+
+
+def test_check_writes_a_report_and_names_what_is_missing(tmp_path: Path) -> None:
+    path = tmp_path / "report.json"
+    result = CliRunner().invoke(app, ["check", SMALL, "--report", str(path)])
+    assert result.exit_code == 0, result.output
+    (entry,) = json.loads(path.read_text())
+    assert entry["scene_id"] == SMALL
+    assert entry["problems"] == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["check"], "no scene is named"),
+        (["check", SMALL, "--all"], "exclude one another"),
+        (["build", "--all", "Rs_itn"], "exclude one another"),
+        (["sheet", "Rs_itn"], "Rs_int"),
+    ],
+)
+def test_what_to_build_must_be_said_once(arguments: list[str], words: str) -> None:
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 2
+    assert words in result.output
+    assert "Traceback" not in result.output
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_all_51_scenes_are_built_and_keep_every_rule(seed: int) -> None:
+    jobs = [SceneJob(scene_id, seed) for scene_id in Catalog.load().scene_ids]
+    reports = list(run_batch(jobs, processes=os.cpu_count() or 1))
+    assert len(reports) == 51
+    assert sum(report.rooms for report in reports) == 374
+    wrong = {report.scene_id: report.error or report.problems for report in reports if not report.sound}
+    assert not wrong
