@@ -38,6 +38,8 @@ ALONG: Final = (0.0, 0.5, -0.5, 0.8, -0.8)
 FOLLOWED: Final = (1.0, 0.5, 0.0)
 """Shares of the leaf's turn that the hand turns along."""
 OFF_M: Final = 0.08
+PULL: Final = 0.4
+"""Share of full speed at which a leaf is led."""
 WAYPOINTS: Final = 7
 ENOUGH: Final = 0.5
 """A door that something stops before this share of its travel is not open: the same as in cached mode."""
@@ -166,7 +168,7 @@ def _stretch(stage: Stage, leaf: Leaf, start: float, goal: float, rng: np.random
     reach = Reach(boxes, fixed, None, clear)
     tracks = list(_tracks(leaf, fractions))
     point = np.array(tracks[0].position[2])
-    for way in reach.ways(tracks, stage.bases(point, wide=True)):
+    for way in reach.ways(tracks, stage.bases(point, 0.8)):
         swing = approach(stage, way, reach, rng, loaded=False)
         if swing is None:
             continue
@@ -182,7 +184,7 @@ def _pull(stage: Stage, way: Way, leaf: Leaf, goal: float) -> Refusal | None:
     if stage.dynamic.gap(leaf.name) > 3 * TOUCH_M:
         return refuse(FailureReason.ARM_BLOCKED, target=leaf.name, other=SOMETHING)
     stage.dynamic.hook(leaf.name, leaf.number)
-    hit = stage.mover.follow(way.postures[3:-1], 0.6)
+    hit = stage.mover.follow(way.postures[3:-1], PULL)
     stage.mover.wait(24)
     stage.dynamic.unhook()
     stage.mover.follow(way.postures[-1:], 0.6)

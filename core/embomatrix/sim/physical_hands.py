@@ -15,6 +15,7 @@ from embomatrix.sim.physical_reach import Reach, Track
 from embomatrix.sim.physical_stage import TOOL, TUCKED, TUCKED_LIFT_M
 from embomatrix.sim.physical_travel import SOMETHING, travel
 from embomatrix.skills.failure import FailureReason
+from embomatrix.skills.limits import ROBOT
 from embomatrix.skills.view import preposition, refuse
 from embomatrix.world.geometry import Pose
 from embomatrix.world.poses import StandPose
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
     from embomatrix.sim.physical_reach import Way
     from embomatrix.sim.physical_space import Boxes
-    from embomatrix.sim.physical_stage import Stage
+    from embomatrix.sim.physical_stage import Grip, Stage
     from embomatrix.skills.syntax import PlaceRelation
     from embomatrix.skills.view import Refusal
     from embomatrix.world.geometry import Aabb, FloatArray
@@ -35,11 +36,17 @@ GENTLE: Final = 0.25
 TOUCH_M: Final = 0.004
 RAISE_M: Final = 0.06
 ROOFED_RAISE_M: Final = 0.015
-ROOF_M: Final = 0.35
+CARRY_LIFT_M: Final = 0.35
+"""Height of the lift while the robot drives with a load."""
+OVER_M: Final = 1.0
+"""Loads are carried higher than this where that is possible: over counters."""
+ROOF_M: Final = 1.0
 """Things with a roof lower than this over them are reached from the side."""
 WAY_OUT_M: Final = 0.04
 BACK_OFF_M: Final = (0.0, 0.3, 0.55)
 """How far before the place of work the arm is unfolded."""
+ROOM_M: Final = 0.45
+"""From the base's centre to where the hand is before its way in."""
 ATTEMPTS: Final = 3
 PLACES: Final = 10
 DROP_M: Final = 0.004
@@ -85,24 +92,48 @@ def unfold(stage: Stage, swing: FloatArray) -> Refusal | None:
     return None
 
 
+def _bases(stage: Stage, pose: Pose, course: float, out_m: float | None) -> list[FloatArray]:
+    """Where to stand to work at a pose: before the way in, far enough to hold the thing outside."""
+    point = np.array(pose.position_m)
+    return stage.bases(point) if out_m is None else stage.bases(point, out_m + ROOM_M, course)
+
+
 def _pair(point: FloatArray) -> tuple[float, float]:
     return float(point[0]), float(point[1])
 
 
 def fold(stage: Stage, home: StandPose, rng: np.random.Generator) -> Refusal | None:
-    """Bring the arm, with what it holds, over the base, and the base back to where it stood."""
+    """Bring the arm, with what it holds, over the base, and the base back to where it stood.
+
+    Where the arm has no room to fold, the base first draws it back.
+    """
     reach = stage.reach(stage.boxes())
     now = stage.mover.posture
+    loaded = stage.grip is not None
     folded = carrying(stage, now)
-    swing = reach.transit(now, folded, rng, loaded=stage.grip is not None)
-    if swing is not None:
-        stage.mover.follow(swing[1:])
+    for spot in _retreats(stage, now, home):
+        there = standing(now, *spot.tolist())
+        swing = reach.transit(there, standing(folded, *spot.tolist()), rng, loaded=loaded)
+        if swing is not None and reach.drives(now, there, loaded=loaded):
+            stage.mover.follow(swing)
+            break
+    now = stage.mover.posture
     if (
         math.dist(now[:2], (home.x_m, home.y_m)) > 0.01
         or abs(math.remainder(now[2] - home.yaw, math.tau)) > 0.01
     ):
         return travel(stage, home)
     return None
+
+
+def _retreats(stage: Stage, now: FloatArray, home: StandPose) -> Iterator[FloatArray]:
+    """Bases, (3,), at which the arm may fold: here, then straight back, then where the robot stood."""
+    yield now[:3]
+    back = -np.array([math.cos(now[body.YAW]), math.sin(now[body.YAW]), 0.0])
+    spots = [now[:3] + away * back for away in (0.2, 0.4, 0.6)]
+    for spot in (*spots, np.array([home.x_m, home.y_m, now[body.YAW]])):
+        if stage.floor.grid.drives_straight(_pair(now), _pair(spot)):
+            yield spot
 
 
 def carrying(stage: Stage, now: FloatArray) -> FloatArray:
@@ -127,9 +158,9 @@ def carrying(stage: Stage, now: FloatArray) -> FloatArray:
     yaw = arm.about_z(now[None, body.YAW])[0]
     wanted = turn @ rotation[0]
     local = np.stack([xs, ys, np.zeros(count)], axis=1)
-    lift = np.full(count, 0.3)
+    lift = np.full(count, CARRY_LIFT_M)
     where = local @ yaw.T + np.array([now[0], now[1], 0.0])
-    where[:, 2] = body.MOUNT_LOW_M + 0.3 + heights
+    where[:, 2] = body.MOUNT_LOW_M + CARRY_LIFT_M + heights
     best, found = math.inf, now
     for last in (0.785, -0.785, 2.3, -2.3, 1.57):
         postures = body.solve(wanted, where, np.tile(now[:3], (count, 1)), lift, np.full(count, last))
@@ -139,8 +170,15 @@ def carrying(stage: Stage, now: FloatArray) -> FloatArray:
             continue
         load = stage.grip.held.placed(rows)
         wide = np.linalg.norm(load[:, :, :2] - now[:2], axis=2) + stage.grip.held.radii
-        limbs = np.linalg.norm(body.balls(rows)[:, :, :2] - now[:2], axis=2) + body.RADII
-        cost = np.maximum(wide.max(axis=1), limbs.max(axis=1)) + 0.02 * np.abs(rows[:, 4:] - now[4:]).max(
+        arms = body.balls(rows)
+        limbs = np.linalg.norm(arms[:, :, :2] - now[:2], axis=2) + body.RADII
+        top = np.maximum(
+            (load[:, :, 2] + stage.grip.held.radii).max(axis=1), (arms[:, :, 2] + body.RADII).max(axis=1)
+        )
+        bottom = (load[:, :, 2] - stage.grip.held.radii).min(axis=1)
+        cost = np.maximum(top - ROBOT.height_m, 0.0) + 0.3 * np.maximum(OVER_M - bottom, 0.0)
+        cost += 0.02 * np.abs(rows[:, 4:] - now[4:]).max(axis=1)
+        cost += np.maximum(wide.max(axis=1), limbs.max(axis=1)) + 0.02 * np.abs(rows[:, 4:] - now[4:]).max(
             axis=1
         )
         cost = np.where(body.strikes_itself(rows, load, stage.grip.held.radii), math.inf, cost)
@@ -171,7 +209,7 @@ def _take(stage: Stage, target: str, rng: np.random.Generator) -> Refusal | None
     reach = stage.reach(boxes, target)
     refusal = None
     attempts = 0
-    for way in reach.ways(tracks, stage.bases(np.array(pose.position_m))):
+    for way in reach.ways(tracks, _bases(stage, pose, course, out_m)):
         if attempts == ATTEMPTS:
             return refusal
         swing = approach(stage, way, reach, rng, loaded=False)
@@ -266,9 +304,11 @@ def _put(
     assert grip is not None
     boxes = stage.boxes()
     reach = stage.reach(boxes)
-    tracks = list(_put_tracks(stage, target, relation, poses, boxes))
+    fits = _turned(stage, target, relation, poses, boxes)
+    tracks = list(_put_tracks(grip, fits))
     attempts, refusal = 0, None
-    for way in reach.ways(tracks, stage.bases(np.array(poses[0].position_m))):
+    pose, course, out_m = fits[0]
+    for way in reach.ways(tracks, _bases(stage, pose, course, out_m)):
         if attempts == ATTEMPTS:
             return refusal
         swing = approach(stage, way, reach, rng, loaded=True)
@@ -286,7 +326,7 @@ def _put(
 
 def _turned(
     stage: Stage, target: str, relation: Relation, poses: Sequence[Pose], boxes: Boxes
-) -> Iterator[tuple[Pose, float, float | None]]:
+) -> list[tuple[Pose, float, float | None]]:
     """Each pose turned about the vertical so that the hand can come the way in, as far as there is room; then as it is.
 
     With the pose, the heading of the way in and its length under a roof.
@@ -312,17 +352,13 @@ def _turned(
                 fits.append((turned, course, out_m))
         fits.append((pose, course, out_m))
     world.engine.park(grip.name)
-    yield from fits
+    return fits
 
 
-def _put_tracks(
-    stage: Stage, target: str, relation: Relation, poses: Sequence[Pose], boxes: Boxes
-) -> Iterator[Track]:
+def _put_tracks(grip: Grip, fits: Sequence[tuple[Pose, float, float | None]]) -> Iterator[Track]:
     """Ways that bring what is held to a pose and the empty hand back from there: in, down, and out."""
-    grip = stage.grip
-    assert grip is not None
     back = grip.pose_tool_object.inverse()
-    for pose, course, out_m in _turned(stage, target, relation, poses, boxes):
+    for pose, course, out_m in fits:
         tool = pose @ back
         rotation, point = tool.rotation, np.array(tool.position_m)
         inward = np.array([math.cos(course), math.sin(course), 0.0])

@@ -25,6 +25,8 @@ LAG: Final = np.array([0.08, 0.08, 0.15, 0.06, 0.3, 0.3, 0.3, 0.3, 0.4, 0.4, 0.4
 ARRIVAL_STEPS: Final = 12
 LEAST_COMMANDS: Final = 3
 SHARP_RAD: Final = 1.2
+WINDOW: Final = 8
+"""Commands over which motions are smoothed, 0.13 s."""
 RAMP_S: Final = 0.3
 """Time in which full speed is reached."""
 
@@ -90,7 +92,15 @@ def _commands(postures: FloatArray, pace: float) -> FloatArray:
         np.where(left < ramp, total - left**2 / (2 * ramp), clock - ramp / 2),
     )
     columns = [np.interp(times, marks, postures[:, column]) for column in range(postures.shape[1])]
-    return np.stack(columns, axis=1)
+    return _smoothed(np.stack(columns, axis=1), postures[0])
+
+
+def _smoothed(commands: FloatArray, start: FloatArray) -> FloatArray:
+    """Running means over a short window: no joint changes its speed at once. The end stays where it is."""
+    window = min(WINDOW, len(commands))
+    padded = np.concatenate([np.tile(start, (window // 2, 1)), commands, np.tile(commands[-1], (window, 1))])
+    sums = np.cumsum(np.concatenate([np.zeros((1, padded.shape[1])), padded]), axis=0)
+    return np.asarray((sums[window:] - sums[:-window]) / window)[1:]
 
 
 def _caution(postures: FloatArray) -> FloatArray:

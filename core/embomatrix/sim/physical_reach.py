@@ -37,10 +37,12 @@ BATCH: Final = 12
 """Ways that are looked at together."""
 AIR_M: Final = 0.012
 """Distance that the arm keeps from things."""
-TOUCH_M: Final = -0.012
+TOUCH_M: Final = -0.003
 """How deep balls of the hand, or of what it holds, may seem to be in things: they are a little larger than the truth."""
 SWING_SAMPLES: Final = 10
-VIAS: Final = 24
+VIAS: Final = 60
+TRIED: Final = 16
+"""Postures by way of which a swing may lead, and how many of the free ones are tried."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,18 +125,30 @@ class Reach:
         ready = np.concatenate([start[:3], end[3:]])
         if not self._is_free(_between(ready, end), held):
             return None
-        low = np.concatenate([start[:3], [0.0], arm.LOW_RAD * 0.9])
-        high = np.concatenate([start[:3], [body.LIFT_M], arm.HIGH_RAD * 0.9])
-        middle = (start + ready) / 2
-        vias = [middle, np.concatenate([start[:4], end[4:]]), np.concatenate([end[:4], start[4:]])]
-        for number in range(VIAS):
-            spread = 0.25 + 0.75 * number / VIAS
-            vias.append(middle + spread * (rng.uniform(low, high) - middle))
-        for via in vias:
-            via[:3] = start[:3]
+        for via in self._vias(start, ready, rng, held):
             if self._is_free(np.concatenate([_between(start, via), _between(via, ready)[1:]]), held):
                 return np.stack([start, via, ready, end])
         return None
+
+    def drives(self, start: FloatArray, end: FloatArray, *, loaded: bool) -> bool:
+        """Whether the base can drive straight from one posture to another with the arm as it is."""
+        return self._is_free(_between(start, end), self._held if loaded else None)
+
+    def _vias(
+        self, start: FloatArray, end: FloatArray, rng: np.random.Generator, held: Held | None
+    ) -> FloatArray:
+        """Free postures between two, (n, 11): half way, one after the other, then at random and ever farther off."""
+        low = np.concatenate([[0.0], arm.LOW_RAD * 0.9])
+        high = np.concatenate([[body.LIFT_M], arm.HIGH_RAD * 0.9])
+        middle = (start + end) / 2
+        vias = np.tile(middle, (VIAS + 3, 1))
+        vias[1] = np.concatenate([start[:4], end[4:]])
+        vias[2] = np.concatenate([end[:4], start[4:]])
+        spread = np.linspace(0.15, 1.0, VIAS)[:, None]
+        vias[3:, 3:] += spread * (rng.uniform(low, high, (VIAS, len(low))) - middle[3:])
+        free = self._free(vias, self._boxes, held, AIR_M)
+        free[0] = True
+        return np.asarray(vias[free][:TRIED])
 
     def _is_free(self, postures: FloatArray, held: Held | None) -> bool:
         """Whether all but the first and the last posture keep clear: these are where the robot is, and where it must be."""

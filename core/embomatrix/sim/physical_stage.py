@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from embomatrix.sim.physical_space import Boxes
     from embomatrix.world.geometry import FloatArray
 
-TUCKED: Final = np.array([0.0, -0.75, 0.0, -1.1, 0.0, 2.2, 0.785])
-"""The empty arm while driving: upright over the base, within its disc."""
+TUCKED: Final = np.array([0.0, -1.57, 0.0, -2.97, 0.0, 0.05, 0.785])
+"""The empty arm while driving: folded over the base, within its disc, lower than a counter is wide."""
 TUCKED_LIFT_M: Final = 0.0
 SETTLE_STEPS: Final = 240
 """After a second the world is taken as it is, at rest or not."""
@@ -41,7 +41,8 @@ SLIP_M: Final = 0.04
 WAKE_M: Final = 0.03
 TOOL: Final = Pose((0.0, 0.0, arm.TOOL_M))
 """The tool's frame in the hand's."""
-NEARER: Final = 14
+NEARER: Final = 24
+SPAN_M: Final = 0.5
 """Places that are tried when the arm does not reach from where the robot stands."""
 
 
@@ -93,14 +94,15 @@ class Stage:
         held = self.grip.held if self.grip is not None else None
         return Reach(boxes, boxes.without((target,)) if target else boxes, held)
 
-    def bases(self, point: FloatArray, *, wide: bool = False) -> list[FloatArray]:
+    def bases(self, point: FloatArray, away_m: float = 0.6, course: float | None = None) -> list[FloatArray]:
         """Where the base may stand to work at a point: here, shape (1, 3); then other places, (b, 3), the likeliest first.
 
-        ``wide`` looks farther off, for work that needs room.
+        ``away_m`` is the distance that suits the work, ``course`` the heading in which the hand must go.
         """
         here = self.mover.posture[:3]
         yaw = math.atan2(point[1] - here[1], point[0] - here[0])
-        low, high = (point[0] - 1.0, point[1] - 1.0), (point[0] + 1.0, point[1] + 1.0)
+        wide = away_m + SPAN_M
+        low, high = (point[0] - wide, point[1] - wide), (point[0] + wide, point[1] + wide)
         grid = self.floor.grid
         cell = grid.cell(float(here[0]), float(here[1]))
         spots = grid.free_centers(low, high, grid.label(cell) if cell is not None else 0)
@@ -108,7 +110,10 @@ class Stage:
         if len(spots):
             away = np.linalg.norm(spots - point[:2], axis=1)
             walk = np.linalg.norm(spots - here[:2], axis=1)
-            cost = np.abs(away - (0.8 if wide else 0.6)) + 0.3 * walk
+            cost = np.abs(away - away_m) + 0.3 * walk
+            if course is not None:
+                ahead = (point[:2] - spots) @ np.array([math.cos(course), math.sin(course)])
+                cost += 1.0 - ahead / np.maximum(away, 1e-6)
             chosen: list[tuple[float, float, float]] = []
             for number in np.argsort(cost, kind="stable").tolist():
                 x, y = spots[number].tolist()
@@ -116,7 +121,7 @@ class Stage:
                     continue
                 if all(math.hypot(x - other[0], y - other[1]) > 0.14 for other in chosen):
                     chosen.append((x, y, math.atan2(point[1] - y, point[0] - x)))
-                if len(chosen) == (2 * NEARER if wide else NEARER):
+                if len(chosen) == NEARER:
                     break
             half = len(chosen) // 2
             options += [np.array(part) for part in (chosen[:half], chosen[half:]) if part]

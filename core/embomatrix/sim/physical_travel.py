@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.sim import physical_body as body
-from embomatrix.sim.physical_space import strikes
+from embomatrix.sim.physical_space import clearance
 from embomatrix.sim.physical_stage import compact
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.view import refuse
@@ -20,10 +20,17 @@ if TYPE_CHECKING:
     from embomatrix.skills.view import Refusal
     from embomatrix.world.geometry import FloatArray
 
-HEADINGS: Final = 16
+HEADINGS: Final = 24
 SPACING_M: Final = 0.12
 """Along the way the load's room is looked at this often."""
+TURNS: Final = 8
+"""Marks at either end at which the robot may turn on the spot."""
+MOST_STEPS: Final = 2
+"""Headings that it may turn by from one mark to the next."""
 BLOCKED_COST: Final = 20.0
+BESIDE_COST: Final = 1.0
+STRUCK_M: Final = 0.005
+BESIDE_M: Final = 0.05
 SOMETHING: Final = "something"
 
 
@@ -42,7 +49,7 @@ def drive(stage: Stage, points: FloatArray, yaw: float) -> Refusal | None:
     """Drive along straight lines between points, (n, 2), the first of which is here, and end with a heading."""
     start = stage.mover.posture
     marks = _resampled(points)
-    headings = _headings(stage, start, marks, yaw)
+    marks, headings = _headings(stage, start, marks, yaw)
     postures = np.tile(start, (len(marks), 1))
     postures[:, : body.LIFT] = np.column_stack([marks, headings])
     hit = stage.mover.follow(postures[1:] if len(postures) > 1 else postures)
@@ -62,37 +69,45 @@ def _resampled(points: FloatArray) -> FloatArray:
     return np.concatenate(rows)
 
 
-def _headings(stage: Stage, start: FloatArray, marks: FloatArray, yaw: float) -> FloatArray:
-    """A heading at each mark, (n,): any where the arm is folded, else one that lets arm and load pass."""
-    count = len(marks)
+def _headings(
+    stage: Stage, start: FloatArray, marks: FloatArray, yaw: float
+) -> tuple[FloatArray, FloatArray]:
+    """Marks, (n, 2), and a heading at each, (n,): any where the arm is folded, else one that lets arm and load pass.
+
+    With a load there is time to turn at both ends.
+    """
     begin = start[body.YAW]
     end = begin + math.remainder(yaw - begin, math.tau)
-    even = begin + (end - begin) * np.linspace(0.0, 1.0, count)
     if compact(stage, start):
-        return even
+        return marks, begin + (end - begin) * np.linspace(0.0, 1.0, len(marks))
+    marks = np.concatenate([np.tile(marks[0], (TURNS, 1)), marks, np.tile(marks[-1], (TURNS, 1))])
     options = begin + np.arange(HEADINGS) * math.tau / HEADINGS
-    blocked = _blocked(stage, start, marks, options)
+    danger = _danger(stage, start, marks[TURNS - 1 : 1 - TURNS], options)
+    danger = np.concatenate([np.tile(danger[0], (TURNS - 1, 1)), danger, np.tile(danger[-1], (TURNS - 1, 1))])
     step = np.abs(np.arange(HEADINGS)[:, None] - np.arange(HEADINGS)[None])
-    turn = np.minimum(step, HEADINGS - step) * (math.tau / HEADINGS)
+    step = np.minimum(step, HEADINGS - step)
+    turn = np.where(step <= MOST_STEPS, step * math.tau / HEADINGS, np.inf)
     # Cheapest chain of headings: little turning, nothing struck, and the wanted heading in the end.
     wanted = np.abs([math.remainder(option - end, math.tau) for option in options])
-    cost = np.where(np.arange(HEADINGS) == 0, 0.0, 1e6)
-    back = np.zeros((count, HEADINGS), dtype=int)
-    for number in range(1, count):
+    cost = np.where(np.arange(HEADINGS) == 0, 0.0, np.inf)
+    back = np.zeros((len(marks), HEADINGS), dtype=int)
+    for number in range(1, len(marks)):
         total = cost[:, None] + turn
         back[number] = total.argmin(axis=0)
-        cost = total.min(axis=0) + BLOCKED_COST * blocked[number]
+        cost = total.min(axis=0) + danger[number]
     chosen = [int((cost + 2.0 * wanted).argmin())]
-    for number in range(count - 1, 0, -1):
+    for number in range(len(marks) - 1, 0, -1):
         chosen.append(int(back[number][chosen[-1]]))
     found = np.unwrap(options[chosen[::-1]])
     nearest = found[-1] + math.remainder(end - found[-1], math.tau)
-    last = np.append(found[:-1], nearest)
-    return last if not _blocked(stage, start, marks[-1:], np.array([nearest]))[0, 0] else found
+    close = abs(nearest - found[-1]) <= math.tau / HEADINGS
+    if close and _danger(stage, start, marks[-1:], np.array([nearest]))[0, 0] < BLOCKED_COST:
+        found[-1] = nearest
+    return marks, found
 
 
-def _blocked(stage: Stage, start: FloatArray, marks: FloatArray, options: FloatArray) -> FloatArray:
-    """Whether arm or load would strike something at marks with headings, shape (marks, headings)."""
+def _danger(stage: Stage, start: FloatArray, marks: FloatArray, options: FloatArray) -> FloatArray:
+    """What it costs to have arm and load at marks with headings, (marks, headings): much in things, little beside them."""
     rows = np.tile(start, (len(marks) * len(options), 1))
     rows[:, :2] = np.repeat(marks, len(options), axis=0)
     rows[:, body.YAW] = np.tile(options, len(marks))
@@ -103,5 +118,6 @@ def _blocked(stage: Stage, start: FloatArray, marks: FloatArray, options: FloatA
     far = np.linalg.norm(centres[0, :, :2] - rows[0, :2], axis=1) + radii > 0.2
     centres, radii = centres[:, far], radii[far]
     low, high = centres.min(axis=(0, 1)) - 0.1, centres.max(axis=(0, 1)) + 0.1
-    boxes = stage.boxes_within(low, high)
-    return (strikes(boxes, centres, radii, 0.01) >= 0).reshape(len(marks), len(options))
+    gaps = clearance(stage.boxes_within(low, high), centres, radii)
+    cost = np.where(gaps < STRUCK_M, BLOCKED_COST, np.where(gaps < BESIDE_M, BESIDE_COST, 0.0))
+    return np.asarray(cost).reshape(len(marks), len(options))
