@@ -18,7 +18,7 @@ from embomatrix.world.poses import PlacementKey
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     import numpy as np
 
@@ -128,11 +128,13 @@ class Placer:
         frames = self._frames(errand)
         for spots in self._cached(errand.held, errand.target, errand.relation):
             order = range(len(spots)) if rng is None else rng.permutation(len(spots)).tolist()
-            for number in order:
-                frame = frames.get(spots[number].link)
-                if frame is None:
-                    continue
-                found = self._accept_verified(errand, frame @ spots[number].pose)
+            poses = (
+                frames[spots[number].link] @ spots[number].pose
+                for number in order
+                if spots[number].link in frames
+            )
+            for pose in self._roomy_first(errand, poses):
+                found = self._accept_verified(errand, pose)
                 if found is not None:
                     yield found
         yield from self._fresh(errand, frames, rng)
@@ -142,18 +144,41 @@ class Placer:
     ) -> Iterator[Pose]:
         """Poses for pairs that the analysis did not foresee, and on surfaces that have filled up."""
         shift = (0.5, 0.5) if rng is None else (float(rng.random()), float(rng.random()))
+        names = (errand.held, errand.target, errand.relation)
+        poses = (
+            frames[link] @ local
+            for local in proposals(self._patches_for(*names), shift, LIVE_TRIES)
+            if (link := self._link_of(*names, local)) in frames
+        )
         settles = 0
-        found = self._patches_for(errand.held, errand.target, errand.relation)
-        for local in proposals(found, shift, LIVE_TRIES):
-            frame = frames.get(self._link_of(errand.held, errand.target, errand.relation, local))
+        for pose in self._roomy_first(errand, poses):
             if settles == LIVE_SETTLES:
                 return
-            if frame is None or not self._is_free(errand, frame @ local) or not self._holds(errand):
+            if not self._is_free(errand, pose) or not self._holds(errand):
                 continue
             settles += 1
-            pose = self._accept_settled(errand)
-            if pose is not None:
+            found = self._accept_settled(errand)
+            if found is not None:
+                yield found
+
+    def _roomy_first(self, errand: Errand, poses: Iterable[Pose]) -> Iterator[Pose]:
+        """Those in reach, in their order: first those around which there is nothing but the target, then the others.
+
+        Boxes decide that, so it is cheap; what is really free is looked at later.
+        """
+        bounds = bounds_of(self._scene.asset_of(errand.held))
+        fractions = self._engine.joints(errand.held)
+        known = frozenset((errand.held, errand.target))
+        close: list[Pose] = []
+        for pose in poses:
+            box = bounds.box(pose, fractions)
+            if not in_reach(box, errand.robot) or any(in_reach(box, stand) for stand in errand.passed_over):
+                continue
+            if self._engine.near(box.grown(UNDISTURBED_M + TOLERANCE_M), known):
+                close.append(pose)
+            else:
                 yield pose
+        yield from close
 
     def _frames(self, errand: Errand) -> dict[str, Pose]:
         """Frame of each link of the target on which something can be placed; not of a drawer that is shut."""
@@ -211,24 +236,26 @@ class Placer:
 
     def _accept_verified(self, errand: Errand, pose: Pose) -> Pose | None:
         """A pose that was verified with nothing but its support around; it is settled where anything else is near."""
-        if not self._reaches(errand, pose):
-            return None
         engine, held, target = self._engine, errand.held, errand.target
         engine.set_pose(held, pose)
-        if engine.penetrates(held, UNDISTURBED_M + TOLERANCE_M, frozenset((target, FLOOR))):
-            if engine.penetrates(held):
-                return None
-            return self._accept_settled(errand)
+        other = engine.penetrates(held, UNDISTURBED_M + TOLERANCE_M, frozenset((target, FLOOR)))
+        if other in self._scene.by_name and self._is_deep(held, other):
+            return None
+        if other:
+            return None if engine.penetrates(held) else self._accept_settled(errand)
         # The support's own doors may have moved since.
-        depth = engine.gap(held, target, 0.0)
-        if depth is not None and depth < -TOLERANCE_M:
+        if self._is_deep(held, target):
             return None
         return pose if self._holds(errand) else self._accept_settled(errand)
+
+    def _is_deep(self, held: str, other: str) -> bool:
+        gap_m = self._engine.gap(held, other, 0.0)
+        return gap_m is not None and gap_m < -TOLERANCE_M
 
     def _accept_settled(self, errand: Errand) -> Pose | None:
         """Let the object go where it is and take the pose where it comes to rest, if all still holds there."""
         settled = self._engine.settle(errand.held)
-        if not settled.stable or not self._is_free(errand, settled.pose):
+        if not settled.stable or not self._is_free(errand, settled.pose) or not self._reaches(errand):
             return None
         return settled.pose if self._holds(errand) else None
 
@@ -236,15 +263,12 @@ class Placer:
         return self._relations.holds(errand.relation, errand.held, errand.target)
 
     def _is_free(self, errand: Errand, pose: Pose) -> bool:
-        """Put the object at the pose, if it is in reach there, and tell whether it penetrates nothing."""
-        if not self._reaches(errand, pose):
-            return False
+        """Put the object at the pose and tell whether it penetrates nothing there."""
         self._engine.set_pose(errand.held, pose)
         return not self._engine.penetrates(errand.held)
 
-    def _reaches(self, errand: Errand, pose: Pose) -> bool:
-        box = bounds_of(self._scene.asset_of(errand.held)).box(pose, self._engine.joints(errand.held))
-        return in_reach(box, errand.robot) and not any(in_reach(box, stand) for stand in errand.passed_over)
+    def _reaches(self, errand: Errand) -> bool:
+        return in_reach(self._engine.aabb(errand.held), errand.robot)
 
 
 def in_reach(box: Aabb, robot: StandPose) -> bool:
