@@ -39,7 +39,7 @@ class SlotSample:
     respawn_s: list[float] = field(default_factory=list)
     """From the order to kill a slot to the first answer of the next one, which executed an empty plan."""
     private_mb: list[float] = field(default_factory=list)
-    """What a slot holds for itself after it has executed every plan of its scene."""
+    """What a slot holds for itself when it waits, after it has executed every plan of its scene."""
 
 
 def measure_slots(scenes: Sequence[tuple[SceneWork, bytes]]) -> SlotSample:
@@ -90,6 +90,7 @@ async def _execute(child: Child, scene: SceneWork, sample: SlotSample) -> None:
     for rollout in rollouts:
         answer = await _ask(slot, _frame(rollout))
         sample.execute_s.append(float(answer.header["cpu_s"]))
+    await asyncio.sleep(WAIT_S)
     sample.private_mb.append(private_mb(slot.pid))
     nothing = _frame(Rollout("empty", "bench", scene.bundle_digest, rollouts[0].task_id, (), 0))
     for _ in range(RESPAWNS):

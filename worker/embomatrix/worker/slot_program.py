@@ -8,7 +8,7 @@ threads: a thread does not survive a fork, but the locks that it held do.
 from __future__ import annotations
 
 import gc
-import itertools
+import select
 import signal
 import socket
 import sys
@@ -37,8 +37,8 @@ if TYPE_CHECKING:
     from embomatrix.rpc.values import Completed, Rollout
 
 MAX_ERROR_CHARS: Final = 500
-TRIM_EVERY: Final = 16
-"""Rollouts of a slot between two times that it gives free memory back, which takes a millisecond."""
+IDLE_S: Final = 0.1
+"""A slot that waits this long for its next rollout gives free memory back, which takes some milliseconds."""
 
 
 class LoadedScene(Protocol):
@@ -106,13 +106,13 @@ def _hold_scene(simulation: Simulation, connection: socket.socket) -> None:
 def _run_slot(scene: LoadedScene, connection: socket.socket, memory_mb: int) -> None:
     """Execute rollouts, one after another, until the daemon closes the stream."""
     limit_memory(memory_mb)
-    for number in itertools.count(1):
+    while True:
+        if not select.select([connection], [], [], IDLE_S)[0]:
+            give_back_memory()
         request = receive(connection)
         if request is None:
             return
         send(connection, _answer(scene, request.body))
-        if number % TRIM_EVERY == 0:
-            give_back_memory()
 
 
 def _answer(scene: LoadedScene, body: bytes) -> Frame:
