@@ -5,11 +5,13 @@ import json
 import pytest
 from tests.fakes.datasets import write_kitchen_dataset
 from tests.fakes.fidelity import clumsy, dying, hanging, raising
+from typer.testing import CliRunner
 
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.fidelity import PlanKind, Trial
 from embomatrix.sim.fidelity_sampler import SKILLS
 from embomatrix.skills.parse import parse_plan
+from embomatrix.worker.bench_cli import app
 from embomatrix.worker.bench_fidelity import (
     DISAGREEMENTS_FILE,
     PLANS_FILE,
@@ -148,3 +150,27 @@ def test_a_disagreement_is_shown_again_step_by_step(suite, dataset):
 def test_a_line_that_is_not_named_right_is_refused(spot):
     with pytest.raises(BenchError, match="FILE:N"):
         read_disagreement(spot)
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (["--dataset", "nowhere"], "there is no dataset in nowhere"),
+        (["--replay", "nowhere"], "expected FILE:N"),
+        (["--replay", "nowhere:3"], "nowhere"),
+    ],
+)
+def test_what_a_person_gets_wrong_is_one_sentence(dataset, options, sentence):
+    given = options if "--dataset" in options else ["--dataset", str(dataset.folder), *options]
+    answer = CliRunner().invoke(app, ["fidelity", *given])
+    assert answer.exit_code == 2
+    assert sentence in answer.output
+    assert "Traceback" not in answer.output
+
+
+def test_a_damaged_suite_is_refused_with_its_folder(dataset, suite, tmp_path):
+    for name in (PLANS_FILE, "settings.json"):
+        (tmp_path / name).write_text((suite[0] / name).read_text())
+    (tmp_path / RESULTS_FILE).write_text("not JSON\n{}\n")
+    with pytest.raises(BenchError, match="damaged"):
+        run_fidelity(dataset, SMALL, tmp_path, 1, Modes(Simulator, clumsy), QUIET)
