@@ -48,6 +48,8 @@ _RESTS: Final[Rgba] = (0.60, 0.47, 0.38, 1.0)
 _SOFT: Final[Rgba] = (0.45, 0.50, 0.62, 1.0)
 _DOOR: Final[Rgba] = (0.55, 0.30, 0.18, 1.0)
 _GLASS: Final[Rgba] = (0.66, 0.84, 0.93, 1.0)
+_LEAVES: Final[Rgba] = (0.42, 0.58, 0.36, 1.0)
+_PLANTS: Final = frozenset({"tree", "bush", "pot_plant", "hanging_plant", "greenery", "vine"})
 _CLOTH: Final = frozenset({"bed", "sofa", "armchair", "ottoman", "carpet", "booth", "bench", "pillow"})
 _LEAF_M: Final = 0.1
 _PANE_M: Final = 0.03
@@ -231,6 +233,8 @@ def color_of(asset: Asset) -> Rgba:
         return _hue(zlib.crc32(asset.category.encode()) / 2**32)
     if asset.category in _CLOTH:
         return _SOFT
+    if asset.category in _PLANTS:
+        return _LEAVES
     if asset.can("openable"):
         return _OPENS
     return _WORKS if asset.can("toggleable") or asset.can("heatSource") else _RESTS
