@@ -1,6 +1,6 @@
 """What a scene must keep: nothing interpenetrates, everything rests or hangs, the robot gets to all that it may use.
 
-Geometry tells most of it; the engine finds penetrations once more, and lets everything that can move fall for a second.
+Geometry tells most of it; the engine finds penetrations once more, and lets go of everything that can move.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ class Settlement:
 
 
 def check_settled(scene: Scene) -> Settlement:
-    """Let everything fall for a second of simulated time. Raises EngineError where the engine is missing."""
+    """Let go of everything that can move, at once. Raises EngineError where the engine is missing."""
     settled = settle_scene(scene)
     problems = [
         Problem(ProblemKind.SUNKEN, pair, f"{depth * 1000:.1f} mm into one another after settling")

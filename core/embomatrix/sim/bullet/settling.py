@@ -11,10 +11,13 @@ import numpy as np
 from embomatrix.sim.bullet.bodies import BodyFactory
 from embomatrix.sim.bullet.client import ClientPool, pybullet
 from embomatrix.sim.bullet.mini_world import (
+    CHUNK_STEPS,
     GRAVITY_M_S2,
     REST_M_S,
     REST_RAD_S,
     ROLLING_FRICTION,
+    SLOW_M_S,
+    SLOW_RAD_S,
     tilt_between,
 )
 from embomatrix.sim.engine import FLOOR, TOLERANCE_M, WALL, Settled
@@ -26,8 +29,9 @@ if TYPE_CHECKING:
 
     from embomatrix.world.scene import Scene
 
-SECONDS: Final = 1.0
-STEPS_PER_S: Final = 240
+LEAST_STEPS: Final = 120
+MOST_STEPS: Final = 480
+"""Steps of 1/240 s: half a second at least, two where something still moves."""
 MARGIN_M: Final = 5.0
 
 
@@ -43,8 +47,8 @@ class SettledScene:
         return tuple(name for name, settled in self.objects.items() if not settled.stable)
 
 
-def settle_scene(scene: Scene, seconds: float = SECONDS) -> SettledScene:
-    """Let go of all movable objects at once; furniture stands still and shut.
+def settle_scene(scene: Scene) -> SettledScene:
+    """Let go of all movable objects at once until they rest or two seconds have passed; furniture stands still and shut.
 
     Raises EngineError where the engine is missing or can't take the scene.
     """
@@ -52,7 +56,7 @@ def settle_scene(scene: Scene, seconds: float = SECONDS) -> SettledScene:
     pool = ClientPool()
     client = pool.take()
     try:
-        return _Fall(scene, client).run(round(seconds * STEPS_PER_S))
+        return _Fall(scene, client).run()
     finally:
         pool.give_back(client)
 
@@ -84,9 +88,12 @@ class _Fall:
                 self._starts[body] = item.pose_world_asset
                 self._brake(body)
 
-    def run(self, steps: int) -> SettledScene:
-        for _ in range(steps):
-            self._bullet.stepSimulation(physicsClientId=self._client)
+    def run(self) -> SettledScene:
+        done = 0
+        while done < LEAST_STEPS or (done < MOST_STEPS and self._moves()):
+            for _ in range(CHUNK_STEPS):
+                self._bullet.stepSimulation(physicsClientId=self._client)
+            done += CHUNK_STEPS
         objects = {self._names[body]: self._settled(body, start) for body, start in self._starts.items()}
         return SettledScene(objects, self._overlaps())
 
@@ -98,6 +105,13 @@ class _Fall:
             spinningFriction=ROLLING_FRICTION,
             physicsClientId=self._client,
         )
+
+    def _moves(self) -> bool:
+        for body in self._starts:
+            linear, angular = self._bullet.getBaseVelocity(body, physicsClientId=self._client)
+            if not (math.hypot(*linear) < SLOW_M_S and math.hypot(*angular) < SLOW_RAD_S):
+                return True
+        return False
 
     def _settled(self, body: int, start: Pose) -> Settled:
         position, quat = self._bullet.getBasePositionAndOrientation(body, physicsClientId=self._client)
