@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
@@ -11,7 +12,7 @@ import numpy as np
 from embomatrix.sim import physical_body as body
 from embomatrix.sim.bounds import joint_motion
 from embomatrix.sim.physical_grasp import facing
-from embomatrix.sim.physical_hands import GENTLE, TOUCH_M, approach, fold, unfold
+from embomatrix.sim.physical_hands import GENTLE, TOUCH_M, WAYS, approach, fold, unfold
 from embomatrix.sim.physical_reach import TOUCH_M as PRESS_M
 from embomatrix.sim.physical_reach import Reach, Track
 from embomatrix.sim.physical_space import boxes_of, part_boxes, strikes
@@ -168,7 +169,7 @@ def _stretch(stage: Stage, leaf: Leaf, start: float, goal: float, rng: np.random
     reach = Reach(boxes, fixed, None, clear)
     tracks = list(_tracks(leaf, fractions))
     point = np.array(tracks[0].position[2])
-    for way in reach.ways(tracks, stage.bases(point, 0.8)):
+    for way in itertools.islice(reach.ways(tracks, stage.bases(point, 0.8)), WAYS):
         swing = approach(stage, way, reach, rng, loaded=False)
         if swing is None:
             continue

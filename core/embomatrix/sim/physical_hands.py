@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import TYPE_CHECKING, Final
 
@@ -48,6 +49,8 @@ BACK_OFF_M: Final = (0.0, 0.3, 0.55)
 ROOM_M: Final = 0.45
 """From the base's centre to where the hand is before its way in."""
 ATTEMPTS: Final = 3
+WAYS: Final = 16
+"""Ways that are looked at, and that are tried, before a skill gives up."""
 PLACES: Final = 10
 DROP_M: Final = 0.004
 """The hand lets go when what it holds touches, or this far below where it should."""
@@ -209,7 +212,7 @@ def _take(stage: Stage, target: str, rng: np.random.Generator) -> Refusal | None
     reach = stage.reach(boxes, target)
     refusal = None
     attempts = 0
-    for way in reach.ways(tracks, _bases(stage, pose, course, out_m)):
+    for way in itertools.islice(reach.ways(tracks, _bases(stage, pose, course, out_m)), WAYS):
         if attempts == ATTEMPTS:
             return refusal
         swing = approach(stage, way, reach, rng, loaded=False)
@@ -308,7 +311,7 @@ def _put(
     tracks = list(_put_tracks(grip, fits))
     attempts, refusal = 0, None
     pose, course, out_m = fits[0]
-    for way in reach.ways(tracks, _bases(stage, pose, course, out_m)):
+    for way in itertools.islice(reach.ways(tracks, _bases(stage, pose, course, out_m)), WAYS):
         if attempts == ATTEMPTS:
             return refusal
         swing = approach(stage, way, reach, rng, loaded=True)
@@ -370,7 +373,8 @@ def _put_tracks(grip: Grip, fits: Sequence[tuple[Pose, float, float | None]]) ->
             count = max(2, math.ceil(out_m / 0.12) + 1)
             steps = np.linspace(out_m, 0.0, count)[:, None]
             before = list(point + ROOFED_RAISE_M * up - steps * inward)
-            after = list(point - steps[::-1][1:] * inward)
+            off = point - 0.04 * rotation[:, 2] + 0.012 * up
+            after = [off, *(off - steps[::-1][1:] * inward)]
         positions = np.array([*before, point, *after])
         loaded = np.arange(len(positions)) < len(before)
         yield Track(np.tile(rotation, (len(positions), 1, 1)), positions, loaded, len(before))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import TYPE_CHECKING, Final
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from embomatrix.sim import physical_arm as arm
 from embomatrix.sim.physical_grasp import facing, surface_point
-from embomatrix.sim.physical_hands import GENTLE, TOUCH_M, approach, fold, unfold
+from embomatrix.sim.physical_hands import GENTLE, TOUCH_M, WAYS, approach, fold, unfold
 from embomatrix.sim.physical_reach import Track
 from embomatrix.sim.physical_space import part_boxes
 from embomatrix.sim.physical_travel import SOMETHING
@@ -43,7 +44,7 @@ def _press(stage: Stage, target: str, rng: np.random.Generator) -> Refusal | Non
     reach = stage.reach(stage.boxes(), target)
     refusal, attempts = None, 0
     point = np.array(stage.world.relations.body(target).center_m)
-    for way in reach.ways(tracks, stage.bases(point)):
+    for way in itertools.islice(reach.ways(tracks, stage.bases(point)), WAYS):
         if attempts == ATTEMPTS:
             return refusal
         swing = approach(stage, way, reach, rng, loaded=False)

@@ -25,11 +25,12 @@ OVER_WRIST_M: Final = (0.0, 0.2, 0.4, -0.2)
 LIFT_SPARE_M: Final = 0.08
 """The lift keeps this much travel to raise what the hand takes."""
 LAST_RAD: Final = np.array([0.785, -0.785, 2.3, -2.3, 0.0, 1.57, -1.57])
+ALIKE_RAD: Final = 0.5
 JUMP_RAD: Final = 1.3
 """Between two waypoints of a way no joint turns further."""
 LOOKED_AT: Final = 160
 """Of all solutions, this many of the most comfortable ones are compared with what is around."""
-RANK: Final = 0.1
+RANK: Final = 0.2
 """What a place further down the list of tracks weighs against the strain of joints."""
 OFFERED: Final = 3
 """Ways of one batch that are offered."""
@@ -39,7 +40,9 @@ AIR_M: Final = 0.012
 """Distance that the arm keeps from things."""
 TOUCH_M: Final = -0.003
 """How deep balls of the hand, or of what it holds, may seem to be in things: they are a little larger than the truth."""
-SWING_SAMPLES: Final = 10
+SAMPLED: Final = np.array([0.06, 0.06, 0.1, 0.06, 0.1, 0.1, 0.12, 0.12, 0.25, 0.25, 0.4])
+"""Metres, and radians, of each number of a posture between two that are looked at."""
+MOST_SAMPLES: Final = 36
 VIAS: Final = 60
 TRIED: Final = 16
 """Postures by way of which a swing may lead, and how many of the free ones are tried."""
@@ -108,10 +111,7 @@ class Reach:
         for start in range(0, len(tracks), BATCH):
             numbers = range(start, min(start + BATCH, len(tracks)))
             for bases in places:
-                found = self._some(tracks, numbers, bases)
-                yield from found
-                if found:
-                    break
+                yield from self._some(tracks, numbers, bases)
 
     def transit(
         self, start: FloatArray, end: FloatArray, rng: np.random.Generator, *, loaded: bool
@@ -167,11 +167,13 @@ class Reach:
         best = np.argsort(comfort, kind="stable")[:LOOKED_AT]
         rows, branches = rows[best], branches[best]
         clear = self._free(found[rows, branches], self._at_work, None, TOUCH_M)
-        ways = []
+        ways: list[Way] = []
         for row, branch in zip(rows[clear].tolist(), branches[clear].tolist(), strict=True):
             number = numbers[int(track[row])]
             postures = _followed(tracks[number], bases[base[row]], lift[row], last[row], branch)
-            if postures is not None and self._passes(tracks[number], postures):
+            if postures is None or any(_alike(postures[0], way.postures[0]) for way in ways):
+                continue
+            if self._passes(tracks[number], postures):
                 ways.append(Way(postures, number))
                 if len(ways) == OFFERED:
                     break
@@ -190,6 +192,8 @@ class Reach:
 
     def _free(self, postures: FloatArray, boxes: Boxes, held: Held | None, margin_m: float) -> FloatArray:
         """Whether arm and load keep a margin from the boxes and from the robot's own trunk, shape (n,)."""
+        if not len(postures):
+            return np.zeros(0, dtype=np.bool_)
         load = held.placed(postures) if held is not None else None
         sizes = held.radii if held is not None else None
         own = body.strikes_itself(postures, load, sizes)
@@ -205,6 +209,11 @@ class Reach:
         if (hit >= 0).any():
             self.hindrance = close.owners[int(hit[hit >= 0][0])]
         return ~own & (hit < 0)
+
+
+def _alike(one: FloatArray, other: FloatArray) -> bool:
+    """Whether two postures differ so little that what bars the one bars the other."""
+    return bool(np.abs(one[:2] - other[:2]).max() < 0.1 and np.abs(one[4:] - other[4:]).max() < ALIKE_RAD)
 
 
 def _combinations(
@@ -246,5 +255,7 @@ def _strain(postures: FloatArray) -> FloatArray:
 
 
 def _between(start: FloatArray, end: FloatArray) -> FloatArray:
-    shares = np.linspace(0.0, 1.0, SWING_SAMPLES)[:, None]
-    return start + shares * (end - start)
+    """Postures from one to another, (n, 11), so close that nothing thin is passed unseen."""
+    count = int(np.ceil((np.abs(end - start) / SAMPLED).max())) + 2
+    shares = np.linspace(0.0, 1.0, min(count, MOST_SAMPLES))[:, None]
+    return np.asarray(start + shares * (end - start))
