@@ -267,6 +267,45 @@ def bowl() -> Asset:
     return tub("bowl", "bowl.n.01", (0.2, 0.2, 0.07), 0.01, 0.01, mass_kg=0.4, abilities={"heatable": {}})
 
 
+def drawer_cabinet() -> Asset:
+    """A carcass 0.5 m deep, 0.6 m wide and 0.5 m high, open in front, with two drawers that come out by 0.36 m."""
+    size = (0.5, 0.6, 0.5)
+    x, y, z = size
+    t, w = PANEL_M, 0.01
+    panels = [
+        box((0, 0, z / 2 - t / 2), (x, y, t)),
+        box((0, 0, -z / 2 + t / 2), (x, y, t)),
+        box((0, y / 2 - t / 2, 0), (x, t, z - 2 * t)),
+        box((0, -y / 2 + t / 2, 0), (x, t, z - 2 * t)),
+        box((-x / 2 + t / 2, 0, 0), (t, y - 2 * t, z - 2 * t)),
+    ]
+    links, supports, interiors = [], [top_of(size)], []
+    inner = (0.44, 0.54)
+    for name, floor in (("upper", 0.01), ("lower", -0.22)):
+        center = (0.02, 0.0, floor + 0.08)
+        parts = (
+            box((0.02, 0, floor - w / 2), (inner[0] + 2 * w, inner[1] + 2 * w, w)),
+            box((0.02 + inner[0] / 2 + w / 2, 0, floor + 0.08), (w, inner[1], 0.16)),
+            box((0.02 - inner[0] / 2 - w / 2, 0, floor + 0.05), (w, inner[1], 0.1)),
+            box((0.02, inner[1] / 2 + w / 2, floor + 0.05), (inner[0], w, 0.1)),
+            box((0.02, -inner[1] / 2 - w / 2, floor + 0.05), (inner[0], w, 0.1)),
+        )
+        joint = Joint(JointKind.PRISMATIC, (x / 2, 0.0, floor + 0.05), (1.0, 0.0, 0.0), 0.36)
+        links.append(Link(name, parts, joint))
+        supports.append(SupportSurface(f"{name}_floor", (0.02, 0.0, floor), inner, 0.17, name, name))
+        interiors.append(Interior(name, center, (*inner, 0.16), (name,), name))
+    return asset(
+        "bottom_cabinet",
+        "cabinet.n.01",
+        size,
+        panels,
+        links=links,
+        supports=supports,
+        interiors=interiors,
+        abilities={"openable": {}},
+    )
+
+
 def counter() -> Asset:
     return block("countertop", "countertop.n.01", (0.6, 1.6, 0.9), {})
 

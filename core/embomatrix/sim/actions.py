@@ -6,6 +6,7 @@ import math
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.sim.household import clean, cut, soak
+from embomatrix.sim.leaves import Leaves
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.syntax import Skill
 from embomatrix.skills.view import metres, preposition, refuse, target_of
@@ -14,7 +15,7 @@ from embomatrix.world.poses import StandPose
 from embomatrix.world.state import Relation, State
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     import numpy as np
 
@@ -26,6 +27,9 @@ if TYPE_CHECKING:
 
 SWING: Final = (0.25, 0.5, 0.75, 1.0)
 """Shares of its travel at which a door is checked for things in its way."""
+OTHER_STANDS: Final = 2
+APART_M: Final = 0.4
+"""A crowded support is served from up to two other standing poses, this far or further from the first."""
 LEAST_OPEN: Final = 0.5
 """A door that something stops before this share of its travel does not open."""
 
@@ -95,52 +99,50 @@ def _pick_up(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Ref
 def _place(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
     assert call.relation is not None
     target, held = target_of(world, call), world.carried[0]
-    found = world.placer.find(held, target, Relation(call.relation.value), world.robot, rng)
-    if isinstance(found, Pose):
-        if world.hand.let_go(found):
+    fails = FailureReason.NO_FREE_POSE
+    tried: tuple[StandPose, ...] = ()
+    for stand in (world.robot, *_other_stands(world, target)):
+        found = world.placer.find(held, target, Relation(call.relation.value), stand, rng, tried)
+        if isinstance(found, Pose) and world.hand.let_go(found):
+            world.robot = stand
             world.navigator.refresh()
             return None
-        found = FailureReason.NO_FREE_POSE
-    return refuse(found, held=held, target=target, relation=preposition(call.relation))
+        if isinstance(found, FailureReason) and found is not FailureReason.NO_FREE_POSE:
+            fails = found
+            break
+        tried = (*tried, stand)
+    return refuse(fails, held=held, target=target, relation=preposition(call.relation))
+
+
+def _other_stands(world: LiveWorld, target: str) -> Iterator[StandPose]:
+    """Where else the robot may stand to place something, apart from where it stands: from there it reaches other spots."""
+    here = world.robot
+    stands = world.navigator.stands(target, here)
+    away = [stand for stand in stands if math.hypot(stand.x_m - here.x_m, stand.y_m - here.y_m) >= APART_M]
+    yield from away[:OTHER_STANDS]
 
 
 def _open(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
     target = target_of(world, call)
     before = world.engine.joints(target)
-    in_contact = _in_contact(world, target)
-    reached, other = 0.0, ""
-    for share in SWING:
-        world.engine.set_joints(target, [max(share, fraction) for fraction in before])
-        other = world.engine.penetrates(target, ignore=in_contact)
-        if other:
-            break
-        reached = share
-    if reached < LEAST_OPEN:
-        world.engine.set_joints(target, before)
-        return refuse(FailureReason.DOOR_BLOCKED, target=target, other=other)
-    world.engine.set_joints(target, [max(reached, fraction) for fraction in before])
-    return None
+    leaves = Leaves(world.engine, world.relations, target)
+    reached, other = leaves.swing([max(share, fraction) for fraction in before] for share in SWING)
+    if reached and SWING[reached - 1] >= LEAST_OPEN:
+        return None
+    leaves.put_back()
+    return refuse(FailureReason.DOOR_BLOCKED, target=target, other=other)
 
 
 def _close(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
     target = target_of(world, call)
     before = world.engine.joints(target)
-    in_contact = _in_contact(world, target)
-    for share in (*reversed(SWING), 0.0):
-        world.engine.set_joints(target, [min(share, fraction) for fraction in before])
-        other = world.engine.penetrates(target, ignore=in_contact)
-        if other:
-            world.engine.set_joints(target, before)
-            return refuse(FailureReason.DOOR_BLOCKED, target=target, other=other)
-    return None
-
-
-def _in_contact(world: LiveWorld, target: str) -> frozenset[str]:
-    """Bodies that the target penetrates before its doors move: built-in neighbours, not in the way of a door."""
-    found: set[str] = set()
-    while other := world.engine.penetrates(target, ignore=frozenset(found)):
-        found.add(other)
-    return frozenset(found)
+    leaves = Leaves(world.engine, world.relations, target)
+    shares = (*reversed(SWING), 0.0)
+    _, other = leaves.swing([min(share, fraction) for fraction in before] for share in shares)
+    if not other:
+        return None
+    leaves.put_back()
+    return refuse(FailureReason.DOOR_BLOCKED, target=target, other=other)
 
 
 def _toggle_on(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:

@@ -1,0 +1,139 @@
+"""Doors, drawers and lids: where they swing, what rides on them, and what stops them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.sim.bounds import parts_of
+from embomatrix.sim.spots import link_frame
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from embomatrix.sim.engine import PhysicsEngine
+    from embomatrix.sim.relations import Relations
+    from embomatrix.world.geometry import Aabb, Pose
+
+LEAF_SLACK_M: Final = 0.02
+"""What is further than this from the boxes of all leaves is not looked at."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rider:
+    """An object that moves along with a link; its pose before, and in the frame of the link."""
+
+    name: str
+    link: str
+    before: Pose
+    pose_link_object: Pose
+
+
+class Leaves:
+    """The moving links of one object, with all that rests on or lies in them."""
+
+    def __init__(self, engine: PhysicsEngine, relations: Relations, name: str) -> None:
+        self._engine = engine
+        self._name = name
+        self._asset = engine.scene.asset_of(name)
+        self._base = engine.pose(name)
+        self._before = engine.joints(name)
+        self._riders = tuple(self._riders_of(relations))
+        self._contacts: dict[str, frozenset[str]] = {}
+
+    @property
+    def riders(self) -> tuple[str, ...]:
+        """Names of the objects that move along."""
+        return tuple(rider.name for rider in self._riders)
+
+    def swing(self, course: Iterable[Sequence[float]]) -> tuple[int, str]:
+        """Go through joint positions until something is in the way.
+
+        Returns how many of them were reached, and what stopped the next: the name of a body, or of the rider that bumped
+        into something; "" at the end of the course. The leaves stay at the last that was reached.
+        """
+        reached, last = 0, self._before
+        for fractions in course:
+            self._put(fractions)
+            other = self._stopped_by()
+            if other:
+                self._put(last)
+                return reached, other
+            reached, last = reached + 1, tuple(fractions)
+        return reached, ""
+
+    def put_back(self) -> None:
+        """Undo the swing, to the bit."""
+        self._put(self._before)
+        for rider in self._riders:
+            self._engine.set_pose(rider.name, rider.before)
+
+    def _put(self, fractions: Sequence[float]) -> None:
+        self._engine.set_joints(self._name, fractions)
+        for rider in self._riders:
+            frame = link_frame(self._asset, self._base, fractions, rider.link)
+            self._engine.set_pose(rider.name, frame @ rider.pose_link_object)
+
+    def _stopped_by(self) -> str:
+        """A body that the leaves or their riders run into where they are; "" when there is none."""
+        riders = frozenset(self.riders)
+        hit = self._hits(self._name, riders | self._out_of_the_way())
+        if hit:
+            return hit
+        # For a rider the furniture itself counts: what sticks out of a drawer keeps it from closing.
+        return next((name for name in self.riders if self._hits(name, riders - {name})), "")
+
+    def _hits(self, name: str, ignore: frozenset[str]) -> str:
+        """A body that the object penetrates and did not before; "" when there is none."""
+        if not self._engine.penetrates(name, ignore=ignore):
+            return ""
+        return self._engine.penetrates(name, ignore=ignore | self._contacts_of(name))
+
+    def _out_of_the_way(self) -> frozenset[str]:
+        """Objects near the furniture that no leaf comes near to: most of what stands in and on it."""
+        leaves = self._leaf_boxes()
+        around = self._engine.near(
+            self._engine.aabb(self._name).grown(LEAF_SLACK_M), frozenset((self._name,))
+        )
+        boxes = {other: self._engine.aabb(other).grown(LEAF_SLACK_M) for other in around}
+        return frozenset(
+            other for other, box in boxes.items() if not any(box.overlaps(leaf) for leaf in leaves)
+        )
+
+    def _leaf_boxes(self) -> list[Aabb]:
+        boxes = parts_of(self._asset).boxes(self._base, self._engine.joints(self._name))
+        moves = [link.joint is not None for link in self._asset.links for _ in link.parts]
+        return [box for box, moving in zip(boxes, moves, strict=True) if moving]
+
+    def _contacts_of(self, name: str) -> frozenset[str]:
+        """Bodies that the object penetrated before anything moved: built-in neighbours, not in the way of a door."""
+        if name not in self._contacts:
+            now = self._engine.joints(self._name)
+            self.put_back()
+            found: set[str] = set()
+            while other := self._engine.penetrates(name, ignore=frozenset(found)):
+                found.add(other)
+            self._contacts[name] = frozenset(found)
+            self._put(now)
+        return self._contacts[name]
+
+    def _riders_of(self, relations: Relations) -> Iterable[Rider]:
+        """What rests on or lies in a moving link, and what rests on or in that."""
+        links = {surface.name: surface.link for surface in self._asset.supports if surface.link}
+        links |= {interior.name: interior.link for interior in self._asset.interiors if interior.link}
+        if not links:
+            return
+        seen = {self._name}
+        waiting = [(other, "") for other in relations.resting_on(self._name)]
+        while waiting:
+            other, link = waiting.pop(0)
+            host = relations.host_of(other)
+            if not link and host is not None:
+                link = links.get(host.spot, "")
+            if not link or other in seen or self._engine.scene.by_name[other].fixed:
+                continue
+            seen.add(other)
+            frame = link_frame(self._asset, self._base, self._before, link)
+            pose = self._engine.pose(other)
+            yield Rider(other, link, pose, frame.inverse() @ pose)
+            waiting += [(item, link) for item in relations.resting_on(other)]
