@@ -1,6 +1,7 @@
 """docs/tasks.md names every refusal, field and option, and its problem can be bound."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import typer
@@ -8,14 +9,14 @@ from tests.fakes.scenes import kitchen_scene
 
 from embomatrix.factory import cli, play_cli, scene_cli
 from embomatrix.factory.importer import Imported, import_problem
-from embomatrix.factory.importer_binding import GOAL_PREDICATES
+from embomatrix.factory.importer_reach import HELD
 from embomatrix.factory.importer_sources import SourceText
 from embomatrix.factory.refusal import RefusalReason
 from embomatrix.skills.parse import plan_to_json
 from embomatrix.skills.syntax import Skill, SkillCall
 from embomatrix.world.codec_task import task_to_json
 from embomatrix.world.dataset import SPLITS, TaskRecord, record_to_json
-from embomatrix.world.task import MAX_TABLE, TaskCategory
+from embomatrix.world.task import MAX_TABLE, Profile, TaskCategory
 
 PAGE = (Path(__file__).parents[3] / "docs" / "tasks.md").read_text(encoding="utf-8")
 
@@ -42,7 +43,7 @@ def test_every_refusal_stands_there_in_the_order_in_which_it_is_looked_for():
 
 
 def test_fields_of_records_and_tasks_stand_there():
-    task = imported().task
+    task = replace(imported().task, profile=Profile.HOUSEHOLD)
     oracle = tuple(plan_to_json((SkillCall(Skill.MOVE, object_index=0),)))
     record = TaskRecord(task, "sha256:", "train", oracle, ("kitchen_0",), "")
     assert list(rows("field of a record")) == list(record_to_json(record))
@@ -54,7 +55,7 @@ def test_categories_splits_and_predicates_stand_there():
     for name in (*TaskCategory, *SPLITS):
         assert f"`{name}`" in PAGE
     (predicates,) = re.findall(r"A goal may use `([\w\s]+)`", PAGE)
-    assert set(predicates.split()) == GOAL_PREDICATES
+    assert set(predicates.split()) == HELD
 
 
 def test_problem_on_the_page_can_be_bound():
