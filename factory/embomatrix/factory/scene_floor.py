@@ -72,6 +72,12 @@ class ReachableFloor:
         """Whether any floor of the room is reachable."""
         return len(self.cells(room.low_m, room.high_m)) > 0
 
+    def cut_off_m2(self, room: Room) -> float:
+        """Area of the places in the room where the robot fits but can't drive to."""
+        islands = set(np.unique(self._grid.labels).tolist()) - {0, self._label}
+        cells = sum(len(self._grid.free_centers(room.low_m, room.high_m, label)) for label in islands)
+        return cells * CELL_M**2
+
     def spots(self, box: Aabb, *, front_of: Pose | None = None) -> FloatArray:
         """Cells from which the arm reaches a box, shape (n, 2); with ``front_of`` only those before that pose's front."""
         low, high = np.asarray(box.low_m[:2]), np.asarray(box.high_m[:2])

@@ -16,7 +16,7 @@ from embomatrix.factory.scene_floor import ReachableFloor
 from embomatrix.factory.scene_report import report_of, report_on, unaccounted
 from embomatrix.world.catalog import Catalog, CatalogError
 from embomatrix.world.codec import scene_from_json
-from embomatrix.world.geometry import Pose
+from embomatrix.world.geometry import Part, Pose, Shape
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -71,6 +71,16 @@ def test_what_stands_before_a_window_is_reported_unless_it_is_low(flat: Scene) -
     height = flat.asset_of(name).size_m[2]
     sunk = put(flat, name, x, y, 0.8 - height / 2)
     assert not any(name in names for names in problems(sunk, ProblemKind.WINDOW))
+
+
+def test_a_barred_aisle_is_reported(flat: Scene) -> None:
+    room = max(flat.rooms, key=lambda r: min(r.size_m))
+    middle = room.center_m[1]
+    x0, x1 = room.low_m[0] - 0.1, room.high_m[0] + 0.1
+    bar = Part(Shape.BOX, Pose(((x0 + x1) / 2, middle, 0.5)), (x1 - x0, 0.1, 1.0))
+    barred = replace(flat, walls=(*flat.walls, bar), objects=(), doorways=flat.doorways[-1:])
+    start = replace(flat.robot, x_m=room.center_m[0], y_m=middle + 0.6, room=room.name)
+    assert (room.name,) in problems(replace(barred, robot=start), ProblemKind.AISLE)
 
 
 def test_a_narrow_doorway_is_reported(flat: Scene) -> None:
