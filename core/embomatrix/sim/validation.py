@@ -5,8 +5,11 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
+import numpy as np
+
 from embomatrix.sim.engine import FLOOR, WALL, EngineError
 from embomatrix.world.geometry import Shape
+from embomatrix.world.tables import MAX_VERTICES, has_volume
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -121,6 +124,11 @@ def _check_part(part: Part, what: str) -> None:
     if len(part.vertices_m) < 4 or not all(_finite(vertex) for vertex in part.vertices_m):
         raise EngineError(
             f"{what} is a hull of {len(part.vertices_m)} vertices: expected 4 or more finite points"
+        )
+    if len(part.vertices_m) > MAX_VERTICES or not has_volume(np.asarray(part.vertices_m)):
+        raise EngineError(
+            f"{what} is a hull of {len(part.vertices_m)} vertices, flat or too many: expected at most {MAX_VERTICES} that "
+            "span a body"
         )
 
 

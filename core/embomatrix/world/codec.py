@@ -31,6 +31,11 @@ if TYPE_CHECKING:
     Json = dict[str, Any]
 
 MAX_OBJECTS: Final = 5_000
+MAX_WALLS: Final = 10_000
+MAX_FLOOR_M2: Final = 40_000.0
+"""Area of the rectangle around all rooms: the floor is covered with cells of 5 cm."""
+RESERVED_NAMES: Final = frozenset(("wall", "floor"))
+"""What the engine calls bodies that are no objects."""
 
 
 def scene_to_json(scene: Scene, tables: TableWriter | None = None) -> Json:
@@ -88,7 +93,7 @@ def scene_from_json(value: object, tables: Tables | None = None) -> Scene:
         base=fields["base"].text(),
         seed=fields["seed"].integer(),
         rooms=rooms,
-        walls=tuple(part_from_field(item) for item in fields["walls"].items()),
+        walls=tuple(part_from_field(item) for item in fields["walls"].items(at_most=MAX_WALLS)),
         doorways=tuple(_doorway(item) for item in fields["doorways"].items()),
         objects=tuple(_object(item, assets) for item in fields["objects"].items(at_most=MAX_OBJECTS)),
         assets=assets,
@@ -214,7 +219,7 @@ def _object(field: Field, assets: Mapping[str, Asset]) -> SceneObject:
         fields["asset_id"].fail(f"unknown asset {asset_id[:80]!r}: the scene carries {len(assets)} others")
     joints = tuple(item.number() for item in fields["joints"].items(at_most=MAX_LINKS))
     count = len(assets[asset_id].joints)
-    if len(joints) not in {0, count} or not all(0.0 <= share <= 1.0 for share in joints):
+    if len(joints) != count or not all(0.0 <= share <= 1.0 for share in joints):
         fields["joints"].fail(f"found {list(joints)}: expected {count} shares of travel between 0 and 1")
     return SceneObject(
         name=fields["name"].name(),
@@ -253,14 +258,22 @@ def _check_references(scene: Scene) -> None:
     names = [item.name for item in scene.objects]
     check_unique(Field(None, "scene.rooms"), rooms, "room")
     check_unique(Field(None, "scene.objects"), names, "object")
-    check_unique(
-        Field(None, "scene.objects"),
-        [str(item.pose_world_asset.position_m) for item in scene.objects if not item.absent],
-        "position",
-    )
+    # To a tenth of a millimetre: things that lie in one another make physics slow without end.
+    places = [
+        str([round(value, 4) for value in item.pose_world_asset.position_m])
+        for item in scene.objects
+        if not item.absent
+    ]
+    check_unique(Field(None, "scene.objects"), places, "position")
+    _check_floor(scene)
     absent = {item.name for item in scene.objects if item.absent}
     known_rooms, known_names = {"", *rooms}, {"", *names}
     for index, item in enumerate(scene.objects):
+        if item.name in RESERVED_NAMES:
+            where = f"scene.objects[{index}].name"
+            raise SceneInvalidError(
+                where, f"found {item.name!r}: the engine calls something else so; rename it"
+            )
         if item.room not in known_rooms:
             raise SceneInvalidError(f"scene.objects[{index}].room", f"unknown room {item.room!r}")
         if item.host not in known_names or item.host == item.name:
@@ -278,3 +291,33 @@ def _check_references(scene: Scene) -> None:
             raise SceneInvalidError(path, f"unknown room in {beside}")
     if scene.robot.room not in known_rooms:
         raise SceneInvalidError("scene.robot.room", f"unknown room {scene.robot.room!r}")
+    _check_hosts(scene)
+
+
+def _check_floor(scene: Scene) -> None:
+    """Raise SceneInvalidError unless there is a floor, and one that a machine can hold in memory."""
+    if not scene.rooms:
+        raise SceneInvalidError("scene.rooms", "is empty: expected at least one room")
+    width, depth = (
+        max(room.high_m[axis] for room in scene.rooms) - min(room.low_m[axis] for room in scene.rooms)
+        for axis in (0, 1)
+    )
+    if not width * depth <= MAX_FLOOR_M2:
+        raise SceneInvalidError(
+            "scene.rooms", f"lie within {width:g} x {depth:g} m: expected at most {MAX_FLOOR_M2:,.0f} m2"
+        )
+
+
+def _check_hosts(scene: Scene) -> None:
+    """Raise SceneInvalidError where things rest on one another in a circle."""
+    sound = {""}
+    for index, item in enumerate(scene.objects):
+        chain: list[str] = []
+        name = item.name
+        while name not in sound:
+            if name in chain:
+                where = f"scene.objects[{index}].host"
+                raise SceneInvalidError(where, f"rests on itself: {' on '.join([*chain[:8], name])}")
+            chain.append(name)
+            name = scene.by_name[name].host
+        sound.update(chain)

@@ -5,10 +5,19 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any, Final
 
+import numpy as np
+
 from embomatrix.world.asset import Asset, Credit, Interior, Joint, JointKind, Link, SupportSurface
 from embomatrix.world.field import Field
 from embomatrix.world.geometry import Part, Pose, Shape
-from embomatrix.world.tables import MAX_COORDINATE_M, MAX_VERTICES, MIN_EXTENT_M, QUAT_TOLERANCE
+from embomatrix.world.tables import (
+    FLAT_HULL,
+    MAX_COORDINATE_M,
+    MAX_VERTICES,
+    MIN_EXTENT_M,
+    QUAT_TOLERANCE,
+    has_volume,
+)
 
 if TYPE_CHECKING:
     from embomatrix.world.geometry import Vec3
@@ -19,6 +28,7 @@ if TYPE_CHECKING:
 MAX_PARTS: Final = 16
 """Parts of a link: Bullet drops the rest of a compound in silence."""
 MAX_LINKS: Final = 100
+MAX_MASS_KG: Final = 1e6
 
 
 def asset_to_json(asset: Asset, tables: TableWriter | None = None) -> Json:
@@ -109,6 +119,8 @@ def part_from_field(field: Field) -> Part:
         field.fail(
             f"a {shape.value} has {len(vertices)} vertices: expected {'4 or more' if shape is Shape.HULL else 0}"
         )
+    if shape is Shape.HULL and not has_volume(np.asarray(vertices)):
+        fields["vertices_m"].fail(FLAT_HULL)
     return Part(shape, pose_from_field(fields["pose"]), _extent(fields["size_m"]), vertices)
 
 
@@ -142,12 +154,16 @@ def _link(field: Field) -> Link:
 def _joint(field: Field) -> Joint:
     fields = field.record("kind", "origin_m", "axis", "upper")
     axis = fields["axis"].vec3()
-    if math.hypot(*axis) < 1e-6:
-        fields["axis"].fail("the axis is zero: expected a direction")
+    length = math.hypot(*axis)
+    if not abs(length - 1.0) <= QUAT_TOLERANCE:
+        fields["axis"].fail(f"the axis has length {length:.6g}: expected 1")
+    origin = fields["origin_m"].vec3()
     upper = fields["upper"].number()
+    if max(map(abs, (*origin, upper))) > MAX_COORDINATE_M:
+        field.fail(f"found the origin {origin} and the travel {upper}: expected at most {MAX_COORDINATE_M:g}")
     if upper == 0:
         fields["upper"].fail("the joint has no travel: expected a number other than 0")
-    return Joint(fields["kind"].member(JointKind), fields["origin_m"].vec3(), axis, upper)
+    return Joint(fields["kind"].member(JointKind), origin, axis, upper)
 
 
 def asset_from_field(field: Field) -> Asset:
@@ -167,9 +183,12 @@ def asset_from_field(field: Field) -> Asset:
     if not links or links[0].joint is not None or any(link.joint is None for link in links[1:]):
         fields["links"].fail("expected a base without a joint first, and a joint for every other link")
     check_unique(fields["links"], [link.name for link in links], "link")
+    bodies = sum(1 + sum(part.shape is Shape.HULL for part in link.parts) for link in links)
+    if bodies > MAX_LINKS:
+        fields["links"].fail(f"make {bodies} bodies: expected at most {MAX_LINKS}; use fewer hulls or links")
     mass = fields["mass_kg"].number()
-    if mass <= 0:
-        fields["mass_kg"].fail(f"found {mass}: expected more than 0 kg")
+    if not 0.0 < mass <= MAX_MASS_KG:
+        fields["mass_kg"].fail(f"found {mass}: expected more than 0 kg and at most {MAX_MASS_KG:g} kg")
     interiors = tuple(_interior(item, links) for item in fields["interiors"].items())
     return Asset(
         asset_id=fields["asset_id"].name(),

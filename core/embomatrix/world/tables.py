@@ -28,6 +28,10 @@ MIN_EXTENT_M: Final = 1e-3
 MAX_COORDINATE_M: Final = 1e4
 QUAT_TOLERANCE: Final = 1e-4
 MAX_VERTICES: Final = 512
+MIN_SPREAD_M: Final = 5e-5
+FLAT_HULL: Final = (
+    "the hull's vertices lie in one point, on a line or in a plane: expected a body; give it thickness"
+)
 SHAPES: Final = tuple(Shape)
 POSE_NUMBERS: Final = 7
 COLUMNS: Final = ("poses", "parts", "kinds", "vertices", "stands")
@@ -114,6 +118,17 @@ class Tables:
         return self._stands[first : first + count]
 
 
+def has_volume(vertices: FloatArray) -> bool:
+    """Whether points, shape (n, 3), span a body that is thicker than a twentieth of a millimetre and within the world."""
+    if not np.abs(vertices).max(initial=0.0) <= MAX_COORDINATE_M:
+        return False
+    offsets = vertices - vertices.mean(axis=0)
+    spread = np.linalg.eigvalsh(
+        offsets.T @ offsets / len(offsets)
+    )  # variances along the principal axes, rising
+    return bool(spread[0] >= MIN_SPREAD_M**2)
+
+
 def _row(field: Field, count: int) -> int:
     row = field.value
     if type(row) is not int or not 0 <= row < count:
@@ -135,7 +150,8 @@ def _floats(arrays: Arrays, name: str, columns: int) -> FloatArray:
 
 def _check_poses(name: str, rows: FloatArray) -> None:
     quats = rows[:, 3:]
-    off: FloatArray = np.abs(np.sqrt((quats * quats).sum(axis=1)) - 1.0)  # (n,)
+    with np.errstate(over="ignore"):  # too long is too long
+        off: FloatArray = np.abs(np.sqrt((quats * quats).sum(axis=1)) - 1.0)  # (n,)
     _check_rows(name, rows, off <= QUAT_TOLERANCE, "a quaternion whose length is not 1")
     near = np.abs(rows[:, :3]).max(axis=1, initial=0) <= MAX_COORDINATE_M
     _check_rows(name, rows, near, f"a position further than {MAX_COORDINATE_M:g} m from the origin")
@@ -177,6 +193,8 @@ def _parts(rows: FloatArray, kinds: list[tuple[int, int]], vertices: FloatArray)
     first = 0
     for (x, y, z, a, b, c, d, width, depth, height), (shape, count) in zip(rows.tolist(), kinds, strict=True):
         own = tuple(points[first : first + count])
+        if own and not has_volume(vertices[first : first + count]):
+            raise SceneInvalidError(f"tables.parts[{len(parts)}]", FLAT_HULL)
         first += count
         parts.append(Part(SHAPES[shape], Pose((x, y, z), (a, b, c, d)), (width, depth, height), own))
     return parts
