@@ -14,7 +14,7 @@ import numpy as np
 
 from embomatrix.sim.bounds import AssetParts
 from embomatrix.sim.floor_grid import CELL_M, FloorGrid
-from embomatrix.sim.obstacles import WALLS, Obstacles, crosses
+from embomatrix.sim.obstacles import FLAT_M, WALLS, Obstacles, crosses
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.geometry import Pose
 from embomatrix.world.poses import StandPose
@@ -228,7 +228,13 @@ class Navigator:
         nearest = np.clip(centers, low, high)  # (n, 2)
         away = np.linalg.norm(centers - nearest, axis=1)  # (n,)
         cosines, required = self._frontality(name, centers)
-        fits = (away >= ROBOT.shoulder_m) & (away <= reach)
+        if (
+            box.high_m[2] <= FLAT_M
+        ):  # the robot stands on rugs and floors, in their middle rather than at their edge
+            fits = away <= reach
+            away = away + np.linalg.norm(centers - np.array(box.center_m[:2]), axis=1)
+        else:
+            fits = (away >= ROBOT.shoulder_m) & (away <= reach)
         if required:
             fits &= cosines >= FRONT_COSINE
         cost = np.where(fits, away + SIDE_WEIGHT_M * (1 - cosines) / 2, np.inf)

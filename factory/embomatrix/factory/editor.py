@@ -14,8 +14,9 @@ from embomatrix.factory.scene_floor import ReachableFloor, box_of
 from embomatrix.factory.scene_solids import Solids, placed_parts
 from embomatrix.sim.candidates import candidates
 from embomatrix.skills.limits import ROBOT
+from embomatrix.world.asset import Asset, Link, SupportSurface
 from embomatrix.world.catalog import Catalog, CatalogError
-from embomatrix.world.geometry import Aabb, Pose
+from embomatrix.world.geometry import Aabb, Part, Pose, Shape
 from embomatrix.world.scene import SceneObject
 from embomatrix.world.state import Relation
 
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-    from embomatrix.world.asset import Asset
     from embomatrix.world.scene import Room, Scene
     from embomatrix.world.state import State
 
@@ -33,6 +33,11 @@ _FLOOR_TRIES: Final = 200
 _REST_GAP_M: Final = 0.0005
 _ON_FLOOR_M: Final = 0.05
 _FLAT_M: Final = 0.03
+
+
+_SUNK_M: Final = 0.008
+"""How deep the plate of a floor lies: near enough for things to be on it, too deep for them to touch it (5 mm)."""
+_PLATE_M: Final = 0.01
 
 
 class PlacementReason(StrEnum):
@@ -120,6 +125,15 @@ class SceneEditor:
         self._assets[asset.asset_id] = asset
         self._objects[whole] = replace(origin, pieces=(*origin.pieces, *names))
         return tuple(names)
+
+    def add_floor(self, room: str) -> str:
+        """Make the floor of a room an object that plans and goals can name, and return its name."""
+        area = self._rooms[room]
+        asset = floor_asset(area)
+        x, y = area.center_m
+        name = self._insert(asset, Pose((x, y, -_SUNK_M - _PLATE_M / 2)), room, None, "")
+        self._objects[name] = replace(self._objects[name], fixed=True)
+        return name
 
     def set_states(self, name: str, states: frozenset[State]) -> None:
         """Give an object these symbolic states. Raises PlacementError for an unknown name."""
@@ -295,3 +309,17 @@ class SceneEditor:
 
 def _metres(asset: Asset) -> str:
     return " x ".join(f"{extent:.2f}" for extent in asset.size_m) + " m"
+
+
+def floor_asset(room: Room) -> Asset:
+    """The floor of a room as a fixed thing: a plate just below the ground, and a surface that is the ground itself."""
+    size = (*room.size_m, _PLATE_M)
+    return Asset(
+        asset_id=f"floors-{room.name}",
+        category="floors",
+        synset="floor.n.01",
+        size_m=size,
+        mass_kg=100.0,
+        links=(Link("base", (Part(Shape.BOX, Pose((0.0, 0.0, 0.0)), size),)),),
+        supports=(SupportSurface("floor", (0.0, 0.0, _PLATE_M / 2 + _SUNK_M), room.size_m, 2.0),),
+    )

@@ -97,9 +97,29 @@ class _Binder:
             names[addition.name] = self._add(editor, addition, names)
         for whole, halves in pieces_of(self._problem).items():
             names |= zip(halves, self._add_pieces(editor, names[whole], halves), strict=True)
+        for floor in self._floors_asked_for():
+            names[floor] = self._add_floor(editor, floor, binding)
         start = self._start(names, binding)
         scene = with_states(with_robot_in(editor.freeze(self._scene_id), binding.robot_room), start)
         return self._task(scene, names, binding, start)
+
+    def _add_floor(self, editor: SceneEditor, floor: str, binding: Binding) -> str:
+        if floor not in binding.floors:
+            raise RefusedError(
+                RefusalReason.NO_PLACE_GIVEN, f"the start does not say of which room {floor!r} is the floor"
+            )
+        return editor.add_floor(binding.floors[floor])
+
+    def _floors_asked_for(self) -> tuple[str, ...]:
+        """Floors that the goal is about: these become objects. Others are just where things stand."""
+        about = {arg for atom in atoms_of(self._problem.goal) for arg in atom.args} | types_of(
+            self._problem.goal
+        )
+        return tuple(
+            name
+            for name, type_name in self._problem.objects.items()
+            if type_name in FLOORS and {name, type_name} & about
+        )
 
     def _add(self, editor: SceneEditor, addition: Addition, names: dict[str, str]) -> str:
         host = names[addition.host] if addition.host else addition.room
@@ -175,14 +195,14 @@ class _Binder:
         return Imported(scene, task, start, tuple(names.values()), rooms, signature_of(goal, view))
 
     def _start(self, names: dict[str, str], binding: Binding) -> tuple[Literal, ...]:
-        """``:init`` in the scene's names, without floors, the robot and the absence of relations, heat and substances.
+        """``:init`` in the scene's names, without the floors that are no objects, the robot, and what is not the case.
 
         What a thing is the source of, a shaker of its salt, it contains; water flows out of a sink by itself.
         """
         skipped = {
             name
             for name, type_name in self._problem.objects.items()
-            if type_name == AGENT or type_name in FLOORS
+            if type_name == AGENT or (type_name in FLOORS and name not in names)
         }
         scene_names = {**names, **self._substances, **binding.rooms}
         return tuple(

@@ -17,7 +17,7 @@ from embomatrix.factory.refusal import RefusalReason, RefusedError
 from embomatrix.factory.writer_view import SceneView, is_liftable
 from embomatrix.world.bddl import is_room_instance
 from embomatrix.world.catalog import Catalog, CatalogError
-from embomatrix.world.evaluate import atoms_of, render, types_of
+from embomatrix.world.evaluate import atoms_of, render
 from embomatrix.world.state import Relation, State
 from embomatrix.world.substances import is_substance
 
@@ -150,11 +150,6 @@ def _check_goal(problem: Problem) -> None:
         )
     for atom in atoms_of(problem.goal):
         _check_goal_args(problem, atom)
-    for type_name in types_of(problem.goal):
-        if type_name in FLOORS:
-            raise RefusedError(
-                RefusalReason.FLOOR_IN_GOAL, "the goal ranges over floors, which are no objects"
-            )
 
 
 def _check_start(problem: Problem) -> None:
@@ -190,11 +185,6 @@ def _check_goal_args(problem: Problem, atom: Atom) -> None:
         if arg.startswith("?"):
             continue
         _check_no_room(problem, arg)
-        if problem.objects[arg] in FLOORS:
-            raise RefusedError(
-                RefusalReason.FLOOR_IN_GOAL,
-                f"the goal has {arg!r}: a floor is a room here, no object to place on",
-            )
         if problem.objects[arg] == AGENT:
             raise RefusedError(RefusalReason.AGENT_IN_GOAL, "the goal is about where the robot stands")
 

@@ -7,14 +7,13 @@ from enum import StrEnum
 
 
 class RefusalReason(StrEnum):
-    """In the order in which they are looked for: the first eleven stop a binding, the others an admission."""
+    """In the order in which they are looked for: the first ten stop a binding, the others an admission."""
 
     UNKNOWN_TYPE = "unknown_type"
     SUBSTANCE = "substance"
     INEXPRESSIBLE = "inexpressible"
     ROOM_MISSING = "room_missing"
     ROOM_AS_OBJECT = "room_as_object"
-    FLOOR_IN_GOAL = "floor_in_goal"
     AGENT_IN_GOAL = "agent_in_goal"
     NO_SCENE_OBJECT = "no_scene_object"
     DOES_NOT_FIT = "does_not_fit"

@@ -26,6 +26,7 @@ from embomatrix.factory.importer_sources import (
 )
 from embomatrix.factory.refusal import Refusal, RefusalReason, RefusedError
 from embomatrix.factory.scene_build import build_base_scene
+from embomatrix.sim.engine import FLOOR
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.pose_cache import PlacementLibrary
 from embomatrix.world.bddl import BddlError, Literal, parse_formula, parse_problem
@@ -119,7 +120,6 @@ REFUSALS: dict[RefusalReason, tuple[str, str]] = {
     RefusalReason.INEXPRESSIBLE: ("(not (open ?", "(not (folded ?"),
     RefusalReason.ROOM_MISSING: ("_1 kitchen)", "_1 sauna)"),
     RefusalReason.ROOM_AS_OBJECT: ("(not (open ?electric_refrigerator.n.01_1))", "(not (open closet_0))"),
-    RefusalReason.FLOOR_IN_GOAL: ("?apple.n.01 ?electric_refrigerator.n.01_1", "?apple.n.01 floor.n.01_1"),
     RefusalReason.AGENT_IN_GOAL: ("(not (open ?electric", "(nextto agent.n.01_1 electric"),
     RefusalReason.NO_SCENE_OBJECT: ("breakfast_table.n.01", "bed.n.01"),
     RefusalReason.NO_PLACE_GIVEN: ("(ontop apple.n.01_2 breakfast_table.n.01_1)\n", "\n"),
@@ -330,6 +330,42 @@ def test_a_wildcard_is_every_further_object_of_the_type_in_the_room(home: Scene)
     fruit = fruit.replace("mug.n.04_* kitchen", "mug.n.04_* living_room")
     binding = bind(parse_problem(fruit), home, np.random.default_rng(0))
     assert binding.found["mug.n.04_1"] == "mug_1"
+
+
+def test_a_floor_that_the_goal_is_about_becomes_an_object_that_can_be_wiped_and_stood_on(home: Scene) -> None:
+    text = HOUSEHOLD.replace("(covered plate.n.04_1 dust.n.01_1)", "(covered floor.n.01_1 dust.n.01_1)", 1)
+    text = text.replace(
+        "(not (covered ?plate.n.04_1 ?dust.n.01_1))",
+        "(not (covered ?floor.n.01_1 ?dust.n.01_1)) (ontop ?plate.n.04_1 ?floor.n.01_1)",
+    )
+    imported = import_problem(source(text), home)
+    assert isinstance(imported, Imported), imported
+    task = imported.task
+    assert "(not (covered floors_1 dust.n.01)) (ontop plate_1 floors_1)" in task.goal_bddl
+    assert imported.scene.by_name["floors_1"].fixed
+    outcome = verify(imported, PlacementLibrary())
+    assert isinstance(outcome, Verified), outcome
+    assert {"clean_object_with_tool", "slice_object_with_tool"} <= {
+        step["action"] for step in outcome.record.oracle
+    }
+
+
+def test_a_floor_is_no_obstacle_and_what_stands_in_its_room_is_on_it(home: Scene) -> None:
+    text = PROBLEM.replace(
+        "(not (open ?electric_refrigerator.n.01_1))", "(not (ontop ?apple.n.01_1 ?floor.n.01_1))"
+    )
+    imported = import_problem(source(text), home)
+    assert isinstance(imported, Imported)
+    with contextlib.closing(Simulator(Bundle(imported.scene, {}))) as simulator:
+        engine = simulator.world.engine
+        simulator.reset(imported.task, 0)
+        assert not engine.penetrates("floors_1", ignore=frozenset({FLOOR}))
+        standing = simulator.world.relations.resting_on("floors_1")
+        assert {"fridge_1", "stove_1", "breakfast_table_1"} <= set(standing)
+        assert not {"apple_3", "microwave_1", "shelf_1"} & set(standing)
+        assert simulator.execute(imported.task, plan_of(imported.task, "move floors_1"), 0).failure is None
+        assert simulator.facts.holds("ontop", ("fridge_1", "floors_1"))
+        assert simulator.facts.holds("inroom", ("floors_1", "kitchen_0"))
 
 
 REACHABLE: dict[str, bool] = {
