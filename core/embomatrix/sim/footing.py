@@ -136,30 +136,32 @@ class Footings:
 
     def _interior(self, name: str, asset: Asset, pose: Pose, fractions: tuple[float, ...]) -> Interior | None:
         """The smallest cavity of an asset at a pose that the object is in."""
+        engine = self._engine
+        box = engine.aabb(name)
+        # However the object turns, the centre of its box moves less than this.
+        slack = math.dist(box.low_m, box.high_m) / 2
         found: list[Interior] = []
         for link in dict.fromkeys(item.link for item in asset.interiors):
             frame = link_frame(asset, pose, fractions, link)
-            if is_upright(frame) and self._may_be_in(name, asset, frame, link):
-                box = bounds_of(self._scene.asset_of(name)).box(
-                    frame.inverse() @ self._engine.pose(name), self._engine.joints(name)
-                )
-                interior = interior_around(box, asset, link)
-                found += [interior] if interior is not None else []
-        return min(found, key=lambda interior: math.prod(interior.size_m), default=None)
-
-    def _may_be_in(self, name: str, asset: Asset, frame: Pose, link: str) -> bool:
-        """Whether the object's centre is near enough to a cavity to look closer: however it turns, it moves less."""
-        box = self._engine.aabb(name)
-        center = frame.inverse().apply(box.center_m)
-        slack = math.dist(box.low_m, box.high_m) / 2
-        return any(
-            all(
-                abs(value - middle) <= extent / 2 + slack
-                for value, middle, extent in zip(center, item.center_m, item.size_m, strict=True)
+            if not is_upright(frame):
+                continue
+            inverse = frame.inverse()
+            x, y, z = inverse.apply(box.center_m)
+            if not any(
+                abs(z - item.center_m[2]) <= item.size_m[2] / 2 + slack
+                and abs(x - item.center_m[0]) <= item.size_m[0] / 2 + slack
+                and abs(y - item.center_m[1]) <= item.size_m[1] / 2 + slack
+                for item in asset.interiors
+                if item.link == link
+            ):
+                continue
+            placed = bounds_of(self._scene.asset_of(name)).box(
+                inverse @ engine.pose(name), engine.joints(name)
             )
-            for item in asset.interiors
-            if item.link == link
-        )
+            interior = interior_around(placed, asset, link)
+            if interior is not None:
+                found.append(interior)
+        return min(found, key=lambda interior: math.prod(interior.size_m), default=None)
 
 
 def _is_over(box: Aabb, other: Aabb) -> bool:

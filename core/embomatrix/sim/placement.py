@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
 UNDISTURBED_M: Final = 0.005
 """A pose that was verified offline is settled again when anything but its support is this near."""
+TAKEN_SHARE: Final = 0.16
+"""Boxes of two upright cylinders that overlap by this share of their extents along both axes are of cylinders that do."""
 LIVE_TRIES: Final = 64
 """Candidates looked at beyond the cached ones."""
 LIVE_SETTLES: Final = 8
@@ -164,7 +166,8 @@ class Placer:
     def _roomy_first(self, errand: Errand, poses: Iterable[Pose]) -> Iterator[Pose]:
         """Those in reach, in their order: first those around which there is nothing but the target, then the others.
 
-        Boxes decide that, so it is cheap; what is really free is looked at later.
+        Boxes decide that, so it is cheap; what is really free is looked at later. Where something stands for sure is left
+        out.
         """
         bounds = bounds_of(self._scene.asset_of(errand.held))
         fractions = self._engine.joints(errand.held)
@@ -174,11 +177,25 @@ class Placer:
             box = bounds.box(pose, fractions)
             if not in_reach(box, errand.robot) or any(in_reach(box, stand) for stand in errand.passed_over):
                 continue
-            if self._engine.near(box.grown(UNDISTURBED_M + TOLERANCE_M), known):
-                close.append(pose)
-            else:
+            near = self._engine.near(box.grown(UNDISTURBED_M + TOLERANCE_M), known)
+            if not near:
                 yield pose
+            elif not any(self._is_taken(box, other) for other in near):
+                close.append(pose)
         yield from close
+
+    def _is_taken(self, box: Aabb, other: str) -> bool:
+        """Whether a thing in the box would surely meet another: one convex body, and the boxes overlap by much."""
+        asset = self._scene.asset_of(other)
+        if len(asset.links) > 1 or len(asset.links[0].parts) > 1:
+            return False
+        there = self._engine.aabb(other)
+        return all(
+            min(high, other_high) - max(low, other_low) > TAKEN_SHARE * (high - low + other_high - other_low)
+            for low, high, other_low, other_high in zip(
+                box.low_m, box.high_m, there.low_m, there.high_m, strict=True
+            )
+        )
 
     def _frames(self, errand: Errand) -> dict[str, Pose]:
         """Frame of each link of the target on which something can be placed; not of a drawer that is shut."""
