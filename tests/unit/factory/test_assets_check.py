@@ -52,6 +52,28 @@ def test_every_model_of_what_opens_heats_or_cools_passes() -> None:
                 assert not wrong(check_asset(CATALOG, build_asset(CATALOG, category, model.model_id)))
 
 
+def test_what_slicing_makes_has_the_shape_of_a_part_of_the_whole() -> None:
+    kinds = {
+        name: family_of(CATALOG, name)
+        for name in (
+            "half_apple",
+            "half_pizza",
+            "half_butter",
+            "half_baguette",
+            "sliced_cucumber",
+            "half_log",
+        )
+    }
+    assert kinds == {
+        "half_apple": Family.HALF_FOOD,
+        "half_pizza": Family.HALF_FOOD,
+        "half_butter": Family.SLAB,
+        "half_baguette": Family.BREAD,
+        "sliced_cucumber": Family.DISC,
+        "half_log": Family.BAR,
+    }
+
+
 def test_few_categories_are_plain_boxes() -> None:
     plain = [name for name in CATALOG.used_categories if family_of(CATALOG, name) is Family.BLOCK]
     assert len(plain) <= PLAIN_BOXES

@@ -187,6 +187,8 @@ FLAT_ON_WALL: Final = frozenset(
 """Sheets that hang on a wall."""
 _FAMILY_OF: Final = {name: family for family, names in _NAMES.items() for name in names.split()}
 
+_ALIKE_IN_HALF: Final = frozenset({Family.SLAB, Family.BREAD, Family.BAR})
+"""Families whose halves are of the same kind: half a block is a shorter block."""
 _PATTERNS: Final[tuple[tuple[re.Pattern[str], Family], ...]] = tuple(
     (re.compile(pattern), family)
     for pattern, family in (
@@ -251,6 +253,9 @@ def family_of(catalog: Catalog, category: str) -> Family:
     """The family that builds a category: every category has one, at the least the plain block."""
     if category in _FAMILY_OF:
         return _FAMILY_OF[category]
+    whole = category.removeprefix("half_")
+    if _FAMILY_OF.get(whole) in _ALIKE_IN_HALF:
+        return _FAMILY_OF[whole]
     for pattern, family in _PATTERNS:
         if pattern.fullmatch(category):
             return family
