@@ -112,6 +112,7 @@ def household_scene() -> Scene:
     changed = {
         "plate_1": {"states": frozenset({State.DUSTY})},
         "plate_2": {"substances": frozenset({SubstanceFact(COVERED, "stain.n.01")})},
+        "mug_1": {"substances": frozenset({SubstanceFact(COVERED, "mud.n.03")})},
         "vacuum_1": {"substances": frozenset({SubstanceFact(COVERED, "rust.n.01")})},
         "liquid_soap__bottle_1": {"substances": frozenset({SubstanceFact(FILLED, "liquid_soap.n.01")})},
         "melon_1": {"pieces": ("half_melon_1", "half_melon_2"), "states": frozenset({State.FROZEN})},

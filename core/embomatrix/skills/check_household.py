@@ -55,7 +55,9 @@ def _source_held(world: WorldView, call: SkillCall) -> Refusal | None:
 
 def _source_cleans(world: WorldView, call: SkillCall) -> Refusal | None:
     source = source_of(world, call)
-    return None if is_cleaner(world.asset(source)) else refuse(FailureReason.NOT_A_CLEANER, source=source)
+    if is_cleaner(world.asset(source), world.facts_about(source)):
+        return None
+    return refuse(FailureReason.NOT_A_CLEANER, source=source)
 
 
 def _worked_on(world: WorldView, call: SkillCall) -> Refusal | None:

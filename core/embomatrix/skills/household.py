@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
     from embomatrix.world.asset import Asset
 
+CLOTH: Final = "rag.n.01"
+"""The tool whose rules say what a cleaning agent takes off that is poured on by itself."""
 _MACHINES: Final = frozenset({"dishwasher.n.01", "washer.n.03"})
 """Washing machines: they bring their own detergent."""
 
@@ -60,9 +62,9 @@ def washing(asset: Asset) -> Washing | None:
     return Washing(requires_closed=False, with_detergent=False) if flows_from(asset.synset) else None
 
 
-def is_cleaner(asset: Asset) -> bool:
-    """Whether it takes substances off other things, in the hand or by washing them."""
-    return is_remover(asset.synset) or washing(asset) is not None
+def is_cleaner(asset: Asset, facts: Iterable[SubstanceFact]) -> bool:
+    """Whether it takes substances off other things: by wiping, by washing them, or with the liquid that it holds."""
+    return is_remover(asset.synset) or washing(asset) is not None or bool(liquids_in(facts))
 
 
 def gives_liquid(asset: Asset, facts: Iterable[SubstanceFact]) -> bool:
@@ -99,6 +101,8 @@ def missing_for(
 
     Empty: it takes the substance off as it is. None: it never does. ``facts`` are the tool's own.
     """
+    if not is_remover(tool.synset):
+        return _missing_of_bottle(facts, substance)
     need = removal_need(tool.synset, substance)
     if need is None:
         return None
@@ -106,6 +110,12 @@ def missing_for(
         SubstanceFact(SubstanceRelation.SATURATED, liquid) in facts for liquid in need - {RUNNING}
     )
     return () if met or not need else tuple(sorted(need))
+
+
+def _missing_of_bottle(facts: Set[SubstanceFact], substance: str) -> tuple[str, ...] | None:
+    """The paper's rule: detergent in the hand does what a cloth does that is soaked with it. Water needs the cloth."""
+    agents = (removal_need(CLOTH, substance) or frozenset()) - {WATER}
+    return () if agents & set(liquids_in(facts)) else None
 
 
 def taken_off(

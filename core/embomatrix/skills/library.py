@@ -62,7 +62,7 @@ class Precondition(StrEnum):
     SLICEABLE = "the target can be sliced"
     NOT_SLICED = "the target is not sliced"
     SOURCE_HELD = "the source is what the hand holds, unless it washes what lies in it"
-    SOURCE_CLEANS = "the source takes substances off other things"
+    SOURCE_CLEANS = "the source takes substances off other things, or holds a liquid that may"
     WORKED_ON = "the arm reaches the target, and no closed container is around it, unless it is washed"
     WASHED = "the target lies in the source, which runs and is closed if it must be, if the source washes"
     COMES_OFF = "the source takes off something of what is on the target, soaked or on if it must be"

@@ -2,7 +2,7 @@
 
 A substance is called by its synset, ``water.n.06``, wherever an object could be called by its name; it has no place and no
 amount. What takes a substance off is BEHAVIOR-1K's knowledge (``data/substances.json.gz``), with one rule of the paper's
-added: plain water takes stains off.
+added here: plain water takes stains off.
 """
 
 from __future__ import annotations

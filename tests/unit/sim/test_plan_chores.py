@@ -31,7 +31,8 @@ def task_of(home, goal, profile=Profile.HOUSEHOLD):
 GOALS = {
     "(sliced loaf_1)": "slice_object_with_tool loaf_1 table_knife_1",
     "(not (dusty plate_1))": "clean_object_with_tool plate_1 rag_1",
-    "(not (covered plate_2 stain.n.01))": "soak_object_in_source rag_1",
+    "(not (covered plate_2 stain.n.01))": "clean_object_with_tool plate_2 liquid_soap__bottle_1",
+    "(not (covered mug_1 mud.n.03))": "soak_object_in_source rag_1 sink_1",
     "(soaked rag_1)": "soak_object_in_source rag_1 sink_1",
     "(saturated rag_1 liquid_soap.n.01)": "soak_object_in_source rag_1 liquid_soap__bottle_1",
     "(filled cup_1 water.n.06)": "cup_1",

@@ -368,6 +368,22 @@ def test_a_full_bottle_needs_no_switch_and_an_empty_one_gives_nothing():
     assert home_reason(empty, Skill.SOAK, "rag", "bottle") is FailureReason.GIVES_NO_LIQUID
 
 
+@pytest.mark.parametrize(
+    ("liquid", "substance", "expected"),
+    [
+        ("liquid_soap.n.01", "stain.n.01", None),
+        ("liquid_soap.n.01", "dust.n.01", FailureReason.STAYS_ON),
+        ("water.n.06", "stain.n.01", FailureReason.STAYS_ON),
+        ("red_wine.n.01", "stain.n.01", FailureReason.STAYS_ON),
+        ("", "stain.n.01", FailureReason.NOT_A_CLEANER),
+    ],
+)
+def test_soap_in_the_hand_takes_stains_off_without_a_cloth(liquid, substance, expected):
+    held = {SubstanceFact(SubstanceRelation.FILLED, liquid)} if liquid else set()
+    world = at_home(carried=("bottle",), facts={**covered(substance), "bottle": frozenset(held)})
+    assert home_reason(world, Skill.CLEAN, "plate", "bottle") is expected
+
+
 def test_bread_is_cut_once_with_a_knife_that_is_held():
     assert home_reason(at_home(), Skill.SLICE, "loaf", "knife") is FailureReason.TOOL_NOT_HELD
     assert home_reason(at_home(carried=("knife",)), Skill.SLICE, "loaf", "knife") is None
