@@ -12,6 +12,7 @@ from embomatrix.factory.floorplan_spec import (
     OPEN_PASSAGE_M,
     OPEN_PLAN,
     PRIVATE,
+    SLEEPING,
     DoorSpec,
     FloorPlanError,
 )
@@ -102,17 +103,17 @@ def _take_door(a: list[DoorSpec], b: list[DoorSpec]) -> DoorSpec | None:
 def _front_door(rooms: Sequence[RoomSpec], rects: Mapping[str, Rect]) -> DoorCut:
     """The exterior door, in the most public room that has enough of an outer wall.
 
-    A door that a single room lists is an exterior one, so a public room with such a door goes first.
+    A door that a single room lists is an exterior one, so a public room with such a door goes first. In a house without public
+    rooms, a hotel's suite, people enter the bedroom, not the bathroom.
     """
     listed = Counter(model for r in rooms for model in {d.model for d in r.doors})
+    public = [kind for kind in ENTRANCES if any(r.type == kind for r in rooms)] or list(SLEEPING)
 
     def own_doors(room: RoomSpec) -> list[DoorSpec]:
-        return [d for d in room.doors if listed[d.model] == 1 and room.type in ENTRANCES]
+        return [d for d in room.doors if listed[d.model] == 1 and room.type in public]
 
     def order(room: RoomSpec) -> tuple[bool, int]:
-        rank = (
-            ENTRANCES.index(room.type) if room.type in ENTRANCES else len(ENTRANCES) + (room.type in PRIVATE)
-        )
+        rank = public.index(room.type) if room.type in public else len(public) + (room.type in PRIVATE)
         return (not own_doors(room), rank)
 
     for yard_m in (FRONT_YARD_M, 0.5):

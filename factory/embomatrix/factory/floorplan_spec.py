@@ -73,6 +73,7 @@ PRIVATE: Final = frozenset(
         "sauna",
     }
 )
+SLEEPING: Final = ("bedroom", "childs_room")
 OPEN_PLAN: Final = frozenset(
     {"kitchen", "living_room", "dining_room", "entryway", "corridor", "bar", "lobby"}
 )

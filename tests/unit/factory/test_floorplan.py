@@ -135,6 +135,16 @@ def test_an_inner_door_is_taken_from_both_rooms_that_list_it() -> None:
     assert [(door.model, door.width_m) for door in inner] == [("wide", pytest.approx(1.5))]
 
 
+def test_a_suite_is_entered_by_its_bedroom() -> None:
+    front, cabin = DoorSpec("front", 0.9, 2.0), DoorSpec("cabin", 0.9, 2.0)
+    rooms = [
+        RoomSpec("bathroom_0", "bathroom", (3, 3), (cabin,)),
+        RoomSpec("bedroom_0", "bedroom", (4, 4), (front,)),
+    ]
+    plan = plan_floor(rooms, np.random.default_rng(0), trials=4)
+    assert (plan.doorways[-1].rooms, plan.doorways[-1].model) == (("bedroom_0", ""), "front")
+
+
 def test_no_rooms_are_refused() -> None:
     with pytest.raises(FloorPlanError, match="at least one"):
         plan_floor([], np.random.default_rng(0))
