@@ -32,6 +32,7 @@ UNDISTURBED_M: Final = 0.005
 """A pose that was verified offline is settled again when anything but its support is this near."""
 TAKEN_SHARE: Final = 0.16
 """Boxes of two upright cylinders that overlap by this share of their extents along both axes are of cylinders that do."""
+SAME_LEVEL_M: Final = 0.02
 LIVE_TRIES: Final = 64
 """Candidates looked at beyond the cached ones."""
 LIVE_SETTLES: Final = 8
@@ -185,17 +186,23 @@ class Placer:
         yield from close
 
     def _is_taken(self, box: Aabb, other: str) -> bool:
-        """Whether a thing in the box would surely meet another: one convex body, and the boxes overlap by much."""
-        asset = self._scene.asset_of(other)
-        if len(asset.links) > 1 or len(asset.links[0].parts) > 1:
-            return False
+        """Whether a thing in the box would surely meet another.
+
+        The boxes overlap by much, and the other is one convex body, or a vessel or the like that stands on the same level.
+        """
         there = self._engine.aabb(other)
-        return all(
-            min(high, other_high) - max(low, other_low) > TAKEN_SHARE * (high - low + other_high - other_low)
-            for low, high, other_low, other_high in zip(
-                box.low_m, box.high_m, there.low_m, there.high_m, strict=True
-            )
-        )
+        (low_x, low_y, low_z), (high_x, high_y, high_z) = box.low_m, box.high_m
+        (x, y, z), (to_x, to_y, to_z) = there.low_m, there.high_m
+        if (
+            min(high_x, to_x) - max(low_x, x) <= TAKEN_SHARE * (high_x - low_x + to_x - x)
+            or min(high_y, to_y) - max(low_y, y) <= TAKEN_SHARE * (high_y - low_y + to_y - y)
+            or min(high_z, to_z) - max(low_z, z) <= SAME_LEVEL_M
+        ):
+            return False
+        links = self._scene.asset_of(other).links
+        if len(links) == 1 and len(links[0].parts) == 1:
+            return True
+        return not self._scene.by_name[other].fixed and abs(low_z - z) <= SAME_LEVEL_M
 
     def _frames(self, errand: Errand) -> dict[str, Pose]:
         """Frame of each link of the target on which something can be placed; not of a drawer that is shut."""
