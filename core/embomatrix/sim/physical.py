@@ -84,7 +84,7 @@ def _move(stage: Stage, call: SkillCall, rng: np.random.Generator) -> Refusal | 
     target = target_of(world, call)
     stands = world.navigator.stands(target, world.robot)
     if stands:
-        return travel(stage, stands[0])
+        return travel(stage, stands[0], target)
     room = world.room_of(target)
     cut_off = room in world.rooms and world.navigator.room_entry(room, world.robot) is None
     return refuse(FailureReason.NO_PATH if cut_off else FailureReason.NO_STANDING_POSE, target=target)

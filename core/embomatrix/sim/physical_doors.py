@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
+from enum import Enum
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from embomatrix.sim.physical_reach import Way
+    from embomatrix.sim.physical_space import Boxes
     from embomatrix.sim.physical_stage import Stage
     from embomatrix.skills.view import Refusal
     from embomatrix.world.asset import Asset, Joint, Link
@@ -42,11 +44,21 @@ OFF_M: Final = 0.08
 PULL: Final = 0.4
 """Share of full speed at which a leaf is led."""
 WAYPOINTS: Final = 7
+AJAR: Final = 0.3
+"""A leaf that is open by more can be taken from within."""
 ENOUGH: Final = 0.5
 """A door that something stops before this share of its travel is not open: the same as in cached mode."""
 SHUT: Final = OPEN_FRACTION
 STRETCHES: Final = ((1.0,), (0.5, 1.0))
 """How the way is divided: in one pull, else in two with a step between them."""
+
+
+class Spot(Enum):
+    """Where the hand takes a hinged leaf: on the face that looks out when it is shut, on the other, or at its free edge."""
+
+    OUTSIDE = "outside"
+    WITHIN = "within"
+    EDGE = "edge"
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,9 +72,7 @@ class Leaf:
     asset: Asset
     pose: Pose
 
-    def grips(
-        self, fraction: float, along: float, *, within: bool
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def grips(self, fraction: float, along: float, spot: Spot) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Point on the leaf in the world at a share of its travel, the way out of its surface there, and the edge's line."""
         box = Aabb.around(part.aabb(Pose((0.0, 0.0, 0.0))) for part in self.link.parts)
         centre, half = np.array(box.center_m), np.array(box.size_m) / 2
@@ -73,22 +83,20 @@ class Leaf:
             point = centre + out * (np.abs(out) @ half) + along * 0.5 * edge * (np.abs(edge) @ half)
         else:
             arm = centre - np.array(self.joint.origin_m)
-            arm = arm - axis * (axis @ arm)
-            free = _main_axis(arm)
-            out = np.cross(axis, free) * math.copysign(1.0, self.joint.upper)
+            free = _main_axis(arm - axis * (axis @ arm))
+            face = np.cross(axis, free) * math.copysign(1.0, self.joint.upper)
             edge = axis
             hinge = np.array(self.joint.origin_m) @ free
-            tip = centre @ free + np.abs(free) @ half
-            point = centre + free * (hinge + EDGE * (tip - hinge) - centre @ free)
+            width = centre @ free + np.abs(free) @ half - hinge
+            share = 1.0 if spot is Spot.EDGE else EDGE
             point = (
-                point
-                + along * axis * (np.abs(axis) @ half)
-                + out * (np.abs(out) @ half) * (-1.0 if within else 1.0)
+                centre + free * (hinge + share * width - centre @ free) + along * axis * (np.abs(axis) @ half)
             )
-        out = -out if within else out
+            out = {Spot.OUTSIDE: face, Spot.WITHIN: -face, Spot.EDGE: free}[spot]
+            point = point + out * (np.abs(face) @ half) * (0.0 if spot is Spot.EDGE else 1.0)
         frame = self.pose @ joint_motion(self.joint, fraction)
         turn = frame.rotation
-        return np.array(frame.apply(tuple(point.tolist()))), turn @ out, turn @ edge
+        return np.array(frame.apply((point[0], point[1], point[2]))), turn @ out, turn @ edge
 
 
 def leaves_of(stage: Stage, name: str) -> list[Leaf]:
@@ -127,7 +135,7 @@ def _lead_all(stage: Stage, name: str, goal: float, rng: np.random.Generator) ->
             refusal = refuse(FailureReason.DOOR_BLOCKED, target=name, other=SOMETHING)
         if refusal is not None:
             break
-    back = fold(stage, home, rng)
+    back = fold(stage, home, rng, name)
     return refusal or back
 
 
@@ -137,9 +145,8 @@ def _lead(stage: Stage, leaf: Leaf, goal: float, rng: np.random.Generator) -> Re
     for stretch in STRETCHES:
         for share in stretch:
             now = stage.dynamic.joints(leaf.name)[leaf.number]
-            start = now if len(stretch) > 1 and share == 1.0 else now
             aim = goal if share == 1.0 else now + share * (goal - now)
-            refusal = _stretch(stage, leaf, start, aim, rng)
+            refusal = _stretch(stage, leaf, now, aim, rng)
             if refusal is not None:
                 break
         if refusal is None:
@@ -198,25 +205,31 @@ def _pull(stage: Stage, way: Way, leaf: Leaf, goal: float) -> Refusal | None:
 
 def _tracks(leaf: Leaf, fractions: FloatArray) -> Iterator[Track]:
     """Ways of the tool: to the leaf, along its arc, and off it."""
-    opened = min(float(fractions[0]), float(fractions[-1])) > 0.3
-    sides = (False, True) if opened or float(fractions[0]) > 0.3 else (False,)
-    for within in sides:
+    if leaf.joint.kind is JointKind.PRISMATIC:
+        spots: tuple[Spot, ...] = (Spot.OUTSIDE,)
+    elif fractions[0] > AJAR:
+        spots = (
+            (Spot.EDGE, Spot.OUTSIDE, Spot.WITHIN)
+            if fractions[-1] < AJAR
+            else (Spot.WITHIN, Spot.EDGE, Spot.OUTSIDE)
+        )
+    else:
+        spots = (Spot.OUTSIDE, Spot.EDGE)
+    for spot in spots:
         for along in ALONG:
             for followed in FOLLOWED:
-                yield _track(leaf, fractions, along, followed, within=within)
-            if leaf.joint.kind is JointKind.PRISMATIC and along < 0:
-                break
+                yield _track(leaf, fractions, along, followed, spot)
 
 
-def _track(leaf: Leaf, fractions: FloatArray, along: float, followed: float, *, within: bool) -> Track:
+def _track(leaf: Leaf, fractions: FloatArray, along: float, followed: float, spot: Spot) -> Track:
     start = float(fractions[0])
     rotations, positions = [], []
     for fraction in fractions.tolist():
-        point, _, _ = leaf.grips(fraction, along, within=within)
-        _, out, edge = leaf.grips(start + followed * (fraction - start), along, within=within)
+        point, _, _ = leaf.grips(fraction, along, spot)
+        _, out, edge = leaf.grips(start + followed * (fraction - start), along, spot)
         rotations.append(facing(-out, 0.0 if abs(edge[2]) < 0.5 else math.pi / 2, edge))
         positions.append(point)
-    first, last = leaf.grips(start, along, within=within)[1], -rotations[-1][:, 2]
+    first, last = leaf.grips(start, along, spot)[1], -rotations[-1][:, 2]
     positions = [
         positions[0] + OFF_M * first,
         positions[0] + 0.01 * first,
@@ -231,12 +244,12 @@ def _track(leaf: Leaf, fractions: FloatArray, along: float, followed: float, *, 
     )
 
 
-def _leaf_boxes(leaf: Leaf, fraction: float):
+def _leaf_boxes(leaf: Leaf, fraction: float) -> Boxes:
     frame = leaf.pose @ joint_motion(leaf.joint, fraction)
     return boxes_of([(frame @ part.pose, part.size_m, leaf.name) for part in leaf.link.parts])
 
 
-def _body_boxes(stage: Stage, leaf: Leaf):
+def _body_boxes(stage: Stage, leaf: Leaf) -> Boxes:
     """The object's parts but those of the leaf."""
     fractions = stage.world.engine.joints(leaf.name)
     parts = part_boxes(leaf.asset, leaf.pose, fractions)

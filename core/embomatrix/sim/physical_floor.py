@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -14,6 +13,8 @@ from embomatrix.skills.limits import ROBOT
 from embomatrix.world.poses import StandPose
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from embomatrix.sim.engine import PhysicsEngine
     from embomatrix.world.geometry import FloatArray, Vec2
 
@@ -44,28 +45,35 @@ class Floor:
             self._grid, self._seen = FloorGrid(self._engine.scene, rows[barring]), state
         return self._grid
 
-    def way(self, start: Vec2, goal: StandPose) -> tuple[FloatArray, StandPose] | None:
-        """Points, (n, 2), from here to a pose or to the free place nearest to it, and that pose; None when there is none."""
+    def way(
+        self, start: Vec2, goal: StandPose, serves: Callable[[StandPose], bool]
+    ) -> tuple[FloatArray, StandPose] | None:
+        """Points, (n, 2), from here to a pose, and that pose; None when there are none.
+
+        Where the pose is taken, the nearest free one that ``serves`` as well is meant, or else the nearest.
+        """
         grid = self.grid
         first = grid.cell(*start)
         if first is None:
             return None
-        end = self._free_near(goal, grid.label(first))
+        end = self._free_near(goal, grid.label(first), serves)
         last = grid.cell(end.x_m, end.y_m) if end is not None else None
         corners = grid.path(first, last) if last is not None else None
         if end is None or corners is None:
             return None
-        return np.array([start, *corners[1:-1], (end.x_m, end.y_m)]), end
+        # From beside a door the robot first goes where it fits.
+        out = () if grid.is_free(*start) else (corners[0],)
+        return np.array([start, *out, *corners[1:-1], (end.x_m, end.y_m)]), end
 
-    def _free_near(self, goal: StandPose, label: int) -> StandPose | None:
+    def _free_near(
+        self, goal: StandPose, label: int, serves: Callable[[StandPose], bool]
+    ) -> StandPose | None:
         cell = self.grid.cell(goal.x_m, goal.y_m)
         if cell is not None and self.grid.is_free(goal.x_m, goal.y_m) and self.grid.label(cell) == label:
             return goal
         low, high = (goal.x_m - ASIDE_M, goal.y_m - ASIDE_M), (goal.x_m + ASIDE_M, goal.y_m + ASIDE_M)
         spots = self.grid.free_centers(low, high, label)
-        if not len(spots):
-            return None
         away = np.hypot(spots[:, 0] - goal.x_m, spots[:, 1] - goal.y_m)
-        number = int(away.argmin())
-        x, y = spots[number].tolist()
-        return StandPose(x, y, goal.yaw) if math.isfinite(away[number]) and away[number] <= ASIDE_M else None
+        order = [number for number in np.argsort(away, kind="stable").tolist() if away[number] <= ASIDE_M]
+        near = [StandPose(*spots[number].tolist(), goal.yaw) for number in order]
+        return next((spot for spot in near[::4] if serves(spot)), near[0] if near else None)

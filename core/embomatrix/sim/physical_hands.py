@@ -12,7 +12,8 @@ from embomatrix.sim import physical_arm as arm
 from embomatrix.sim import physical_body as body
 from embomatrix.sim.physical_grasp import grasp_tracks
 from embomatrix.sim.physical_motion import raised, standing, with_arm
-from embomatrix.sim.physical_reach import Reach, Track
+from embomatrix.sim.physical_reach import AIR_M, Reach, Track
+from embomatrix.sim.physical_space import clearance
 from embomatrix.sim.physical_stage import TOOL, TUCKED, TUCKED_LIFT_M
 from embomatrix.sim.physical_travel import SOMETHING, travel
 from embomatrix.skills.failure import FailureReason
@@ -39,6 +40,7 @@ RAISE_M: Final = 0.06
 ROOFED_RAISE_M: Final = 0.015
 CARRY_LIFT_M: Final = 0.35
 """Height of the lift while the robot drives with a load."""
+SURROUNDINGS_M: Final = np.array([0.8, 0.8, 9.0])
 OVER_M: Final = 1.0
 """Loads are carried higher than this where that is possible: over counters."""
 ROOF_M: Final = 1.0
@@ -105,8 +107,8 @@ def _pair(point: FloatArray) -> tuple[float, float]:
     return float(point[0]), float(point[1])
 
 
-def fold(stage: Stage, home: StandPose, rng: np.random.Generator) -> Refusal | None:
-    """Bring the arm, with what it holds, over the base, and the base back to where it stood.
+def fold(stage: Stage, home: StandPose, rng: np.random.Generator, target: str = "") -> Refusal | None:
+    """Bring the arm, with what it holds, over the base, and the base back to where it stood to serve a target.
 
     Where the arm has no room to fold, the base first draws it back.
     """
@@ -125,7 +127,7 @@ def fold(stage: Stage, home: StandPose, rng: np.random.Generator) -> Refusal | N
         math.dist(now[:2], (home.x_m, home.y_m)) > 0.01
         or abs(math.remainder(now[2] - home.yaw, math.tau)) > 0.01
     ):
-        return travel(stage, home)
+        return travel(stage, home, target)
     return None
 
 
@@ -164,6 +166,8 @@ def carrying(stage: Stage, now: FloatArray) -> FloatArray:
     lift = np.full(count, CARRY_LIFT_M)
     where = local @ yaw.T + np.array([now[0], now[1], 0.0])
     where[:, 2] = body.MOUNT_LOW_M + CARRY_LIFT_M + heights
+    boxes = stage.boxes_within(now[:3] - SURROUNDINGS_M, now[:3] + SURROUNDINGS_M)
+    radii = np.concatenate([body.RADII, stage.grip.held.radii])
     best, found = math.inf, now
     for last in (0.785, -0.785, 2.3, -2.3, 1.57):
         postures = body.solve(wanted, where, np.tile(now[:3], (count, 1)), lift, np.full(count, last))
@@ -184,6 +188,7 @@ def carrying(stage: Stage, now: FloatArray) -> FloatArray:
         cost += np.maximum(wide.max(axis=1), limbs.max(axis=1)) + 0.02 * np.abs(rows[:, 4:] - now[4:]).max(
             axis=1
         )
+        cost += np.where(clearance(boxes, np.concatenate([arms, load], axis=1), radii) < AIR_M, 2.0, 0.0)
         cost = np.where(body.strikes_itself(rows, load, stage.grip.held.radii), math.inf, cost)
         if cost.min() < best:
             best, found = float(cost.min()), rows[int(cost.argmin())]
@@ -194,7 +199,7 @@ def pick_up(stage: Stage, target: str, rng: np.random.Generator) -> Refusal | No
     """Take an object that lies where the robot can reach it."""
     home = stage.world.robot
     refusal = _take(stage, target, rng)
-    back = fold(stage, home, rng)
+    back = fold(stage, home, rng, target)
     if refusal is None and stage.has_slipped():
         refusal = refuse(FailureReason.SLIPPED, target=target)
     if refusal is not None and stage.grip is not None:
@@ -290,9 +295,9 @@ def place(stage: Stage, target: str, asked: PlaceRelation, rng: np.random.Genera
         return refuse(found, **words)
     refusal = _put(stage, target, relation, found, rng)
     if stage.grip is not None:
-        back = fold(stage, home, rng)
+        back = fold(stage, home, rng, target)
         return refusal or back
-    back = fold(stage, home, rng)
+    back = fold(stage, home, rng, target)
     stage.settle()
     if refusal is None and not world.relations.holds(relation, held, target):
         return refuse(FailureReason.FELL, **words)

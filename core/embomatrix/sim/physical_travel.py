@@ -11,6 +11,7 @@ import numpy as np
 from embomatrix.sim import physical_body as body
 from embomatrix.sim.physical_space import clearance
 from embomatrix.sim.physical_stage import compact
+from embomatrix.sim.placement import in_reach
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.view import refuse
 from embomatrix.world.poses import StandPose
@@ -34,15 +35,23 @@ BESIDE_M: Final = 0.05
 SOMETHING: Final = "something"
 
 
-def travel(stage: Stage, goal: StandPose) -> Refusal | None:
-    """Drive to a pose on the floor, or where an open door takes that place beside it."""
+def travel(stage: Stage, goal: StandPose, target: str = "") -> Refusal | None:
+    """Drive to a pose on the floor, or where an open door takes that place beside it, where the target is in reach too."""
     here = stage.mover.posture[:3]
-    way = stage.floor.way((float(here[0]), float(here[1])), goal)
+    way = stage.floor.way((float(here[0]), float(here[1])), goal, lambda spot: _serves(stage, spot, target))
     if way is not None:
         return drive(stage, way[0], way[1].yaw)
     # Only a door stands in the way, as the planner knows of a path: drive against it, and physics says what gives.
     corners = stage.world.navigator.path(StandPose(*here.tolist()), goal)
     return drive(stage, np.array([here[:2], *corners, (goal.x_m, goal.y_m)]), goal.yaw)
+
+
+def _serves(stage: Stage, spot: StandPose, target: str) -> bool:
+    """Whether a target is in reach from a spot, with nothing between; without a target any spot will do."""
+    if not target or target in stage.world.carried:
+        return True
+    box = stage.world.relations.body(target)
+    return in_reach(box, spot) and stage.world.navigator.line_is_clear(spot, target)
 
 
 def drive(stage: Stage, points: FloatArray, yaw: float) -> Refusal | None:
