@@ -325,7 +325,7 @@ LIBRARY: Final[Mapping[Skill, Entry]] = {
     ),
     Skill.SOAK: Entry(
         "Let the liquid of the source run over the object, which is in the hand or in the source.",
-        "the object is soaked with what the source gives; a vessel is filled with it too",
+        "a cloth is soaked with what the source gives, a vessel filled with it",
         (
             Precondition.OBJECT_LISTED,
             Precondition.SOURCE_LISTED,
