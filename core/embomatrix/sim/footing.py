@@ -63,6 +63,9 @@ class Footings:
         self._at_start: dict[str, Footing] = {}
         self._now: dict[str, Footing] = {}
         self._disturbed: set[str] = set()
+        """Objects near to which anything has changed."""
+        self._stale: set[str] = set()
+        """Those of them that may stand otherwise since."""
         self._round = engine.journal.rounds
         self._read = 0
 
@@ -74,7 +77,7 @@ class Footings:
     def of(self, name: str) -> Footing:
         """How the object stands: its host, the containers around it, what it is on top of."""
         self._read_journal()
-        known = self._now if name in self._disturbed else self._at_start
+        known = self._now if name in self._stale else self._at_start
         footing = known.get(name)
         if footing is None:
             footing = known[name] = self._find(name)
@@ -87,6 +90,7 @@ class Footings:
             self._round, self._read = journal.rounds, 0
             self._now.clear()
             self._disturbed.clear()
+            self._stale.clear()
         if len(journal.entries) == self._read:
             return
         before: dict[str, Aabb | None] = {}
@@ -94,13 +98,31 @@ class Footings:
             before.setdefault(name, box)
         self._read = len(journal.entries)
         for name, box in before.items():
-            near = {name}
-            for place in (box, None if self._engine.is_parked(name) else self._engine.aabb(name)):
-                if place is not None:
-                    near.update(self._engine.near(place.grown(REST_M)))
-            self._disturbed |= near
-            for other in near:
-                self._now.pop(other, None)
+            places = [box] if box is not None else []
+            if not self._engine.is_parked(name):
+                places.append(self._engine.aabb(name))
+            self._disturbed.add(name)
+            self._forget(name)
+            for place in places:
+                for other in self._engine.near(place.grown(REST_M)):
+                    self._disturbed.add(other)
+                    if self._concerns(other, name, place):
+                        self._forget(other)
+
+    def _forget(self, name: str) -> None:
+        self._stale.add(name)
+        self._now.pop(name, None)
+
+    def _concerns(self, other: str, name: str, place: Aabb) -> bool:
+        """Whether an object may rest on or lie in a thing at a place: a table does neither in a mug that stands on it."""
+        if _is_over(self._engine.aabb(other), place):
+            return True
+        if not self._scene.asset_of(name).interiors:
+            return False
+        # However it lies, a thing is nowhere narrower than its middle extent along both axes of the plane.
+        _, middle, _ = sorted(self._scene.asset_of(other).size_m)
+        width, depth, _ = place.size_m
+        return middle <= math.hypot(width, depth) + SLACK_M
 
     def _find(self, name: str) -> Footing:
         engine, scene = self._engine, self._scene

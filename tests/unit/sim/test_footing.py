@@ -58,7 +58,7 @@ def change(engine, kind, name, seed) -> None:
             engine.reset()
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(st.lists(CHANGE, max_size=12))
 def test_kept_footings_are_those_of_a_fresh_look(engine, changes) -> None:
     engine.reset()
