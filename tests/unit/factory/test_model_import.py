@@ -106,6 +106,31 @@ def test_a_hinge_of_sweet_home_3d_opens_towards_the_front(tmp_path: Path) -> Non
     assert [surface.name for surface in asset.supports if not surface.interior] == ["top"]
 
 
+def test_every_compartment_of_a_shelf_is_a_cavity_with_its_own_floor(tmp_path: Path) -> None:
+    path = tmp_path / "shelf.obj"
+    boards = (("board1", (2, 26, 2), (58, 28, 48)), ("board2", (2, 52, 2), (58, 54, 48)))
+    path.write_text(obj_text((*CUPBOARD[:5], *boards)))
+    asset = imported(path, "bookcase").asset
+    assert [interior.name for interior in asset.interiors] == ["shelf1", "shelf2", "shelf3"]
+    assert all(interior.closed_by == () for interior in asset.interiors)
+    floors = [surface for surface in asset.supports if surface.interior]
+    assert all(surface.clearance_m < 0.4 * asset.size_m[2] for surface in floors)
+    bottom, height = -asset.size_m[2] / 2, asset.size_m[2]
+    assert [(f.center_m[2] - bottom) / height for f in floors] == pytest.approx(
+        [2 / 80, 28 / 80, 54 / 80], abs=0.03
+    )
+
+
+def test_a_box_without_a_lid_holds_what_sticks_out_of_it(tmp_path: Path) -> None:
+    path = tmp_path / "crate.obj"
+    front = ("front", (0, 0, 48), (60, 80, 50))
+    path.write_text(obj_text((*(board for board in CUPBOARD[:5] if board[0] != "roof"), front)))
+    asset = imported(path, "packing_box").asset
+    assert [interior.name for interior in asset.interiors] == ["inside"]
+    (floor,) = [surface for surface in asset.supports if surface.interior]
+    assert floor.clearance_m > 1.0
+
+
 def test_a_rail_of_sweet_home_3d_is_a_drawer(tmp_path: Path) -> None:
     path = tmp_path / "drawer.obj"
     rail = ("sweethome3d_unique_rail", (29, 1, 2), (31, 2, 48))

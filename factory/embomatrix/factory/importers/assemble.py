@@ -16,7 +16,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from embomatrix.factory.assets.body import OPEN_ABOVE_M, Body
 from embomatrix.factory.assets.shapes import box, hull, mesh_of, rounded
-from embomatrix.factory.importers.cavities import cavity, solid_cells, top_surface
+from embomatrix.factory.importers.cavities import cavities, solid_cells, top_surface
 from embomatrix.factory.importers.convex import MAX_HULLS, MAX_VERTICES, merged
 from embomatrix.factory.importers.hinges import linked
 from embomatrix.factory.importers.meshes import read_groups
@@ -241,15 +241,16 @@ def _box_of(part: Part) -> Aabb:
 
 
 def _places(links: Sequence[Link], size_m: Vec3) -> Body:
-    """Where things can be put on and in: the largest open surface of the base, and its largest cavity."""
+    """Where things can be put on and in: the largest open surface of the base, and its cavities."""
     solid = solid_cells([_planes(part) for part in links[0].parts], size_m)
     body = Body()
     surface = top_surface(solid, size_m)
-    inside = cavity(solid, size_m)
-    if inside is not None:
-        doors = tuple(link.name for link in links[1:] if _bars(link, inside))
-        body.add_interior("inside", inside, doors, 0.0 if doors else OPEN_ABOVE_M)
-    if surface is not None and (inside is None or surface.low_m[2] > inside.center_m[2]):
+    found = cavities(solid, size_m)
+    for number, space in enumerate(found, start=1):
+        doors = tuple(link.name for link in links[1:] if _bars(link, space.box))
+        name = f"shelf{number}" if len(found) > 1 else "inside"
+        body.add_interior(name, space.box, doors, 0.0 if doors or space.roofed else OPEN_ABOVE_M)
+    if surface is not None and all(surface.low_m[2] > space.box.center_m[2] for space in found):
         body.add_support("top", surface.low_m[:2], surface.high_m[:2], surface.high_m[2])
     return body
 

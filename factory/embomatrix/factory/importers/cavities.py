@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -22,6 +23,17 @@ CELLS: Final = 40
 """Cells along each side of the box: what is thinner than a fortieth of it may be missed."""
 LEAST_SHARE: Final = 0.12
 """A surface or a cavity that takes less than this share of the box along x or y is none to put things on or in."""
+MAX_CAVITIES: Final = 12
+FLOOR_SHARE: Final = 0.6
+"""The share of a cavity's floor that is solid, at least: boards may have slots."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cavity:
+    """A box of free space; ``roofed`` when something solid is above it, so that nothing sticks out at its top."""
+
+    box: Aabb
+    roofed: bool
 
 
 def solid_cells(planes: Sequence[tuple[FloatArray, FloatArray]], size_m: Vec3) -> Grid:
@@ -49,8 +61,8 @@ def top_surface(solid: Grid, size_m: Vec3) -> Aabb | None:
     return _box((x0, y0, level), (x1, y1, level), size_m)
 
 
-def cavity(solid: Grid, size_m: Vec3) -> Aabb | None:
-    """The largest box of free cells with a floor and three walls about it; None when there is none worth having.
+def cavities(solid: Grid, size_m: Vec3) -> tuple[Cavity, ...]:
+    """The largest boxes of free cells with a floor and three walls about them, from the bottom up: shelves, drawers' bays.
 
     Free means that something solid lies below, behind, and to both sides: in front or above the way is open, or barred by a
     door, whose cells are not in ``solid``.
@@ -58,6 +70,21 @@ def cavity(solid: Grid, size_m: Vec3) -> Aabb | None:
     free = ~solid
     for axis, ahead in ((0, False), (1, False), (1, True), (2, False)):
         free &= _behind(solid, axis, ahead=ahead)
+    found: list[Cavity] = []
+    for _ in range(MAX_CAVITIES):
+        box = _largest_box(free)
+        if box is None:
+            break
+        low, high = box
+        if _is_roomy(low, high) and _has_floor(solid, low, high):
+            above = solid[low[0] : high[0], low[1] : high[1], high[2] :]
+            found.append(Cavity(_box(tuple(low), tuple(high), size_m), bool(above.any())))
+        free[tuple(slice(a, b) for a, b in zip(low, high, strict=True))] = False
+    return tuple(sorted(found, key=lambda item: (item.box.low_m[2], item.box.low_m[1])))
+
+
+def _largest_box(free: Grid) -> tuple[NDArray[np.int64], NDArray[np.int64]] | None:
+    """A box of free cells about the one that is furthest from any other cell, grown on all sides in turn."""
     room = ndimage.distance_transform_cdt(np.pad(free, 1), metric="chessboard")[1:-1, 1:-1, 1:-1]
     if room.max() < 2:
         return None
@@ -69,9 +96,17 @@ def cavity(solid: Grid, size_m: Vec3) -> Aabb | None:
         for axis in range(3):
             for end in (0, 1):
                 grown |= _grow(free, low, high, axis, end)
-    if min(high[:2] - low[:2]) < LEAST_SHARE * CELLS:
-        return None
-    return _box(tuple(low), tuple(high), size_m)
+    return low, high
+
+
+def _is_roomy(low: NDArray[np.int64], high: NDArray[np.int64]) -> bool:
+    return bool(min(high - low) >= LEAST_SHARE * CELLS)
+
+
+def _has_floor(solid: Grid, low: NDArray[np.int64], high: NDArray[np.int64]) -> bool:
+    """Whether most of what lies right below a box is solid: a cavity above another's mouth has no floor of its own."""
+    below = solid[low[0] : high[0], low[1] : high[1], low[2] - 1] if low[2] > 0 else np.zeros(1)
+    return bool(below.mean() >= FLOOR_SHARE)
 
 
 def _grow(free: Grid, low: NDArray[np.int64], high: NDArray[np.int64], axis: int, end: int) -> bool:
