@@ -13,7 +13,11 @@ import numpy as np
 from embomatrix.sim import physical_arm as arm
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from embomatrix.world.geometry import FloatArray
+
+    BoolArray = NDArray[np.bool_]
 
 MOUNT_LOW_M: Final = 0.43
 MOUNT_AHEAD_M: Final = 0.12
@@ -83,7 +87,7 @@ def balls(postures: FloatArray) -> FloatArray:
     turn, place = mounts(postures)
     rotation, position = arm.frames(postures[:, ARM])
     local = position[:, _LINK] + np.einsum("nbij,bj->nbi", rotation[:, _LINK], _CENTRE)
-    return place[:, None] + np.einsum("nij,nbj->nbi", turn, local)
+    return np.asarray(place[:, None] + np.einsum("nij,nbj->nbi", turn, local))
 
 
 def trunk_balls(postures: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -104,7 +108,7 @@ def trunk_balls(postures: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def strikes_itself(
     postures: FloatArray, extra: FloatArray | None = None, radii: FloatArray | None = None
-) -> FloatArray:
+) -> BoolArray:
     """Whether forearm, hand or what it holds touch the robot's own foot, column or base, shape (n,).
 
     ``extra``: (n, k, 3) centres of balls that the hand holds, with their ``radii`` (k,).

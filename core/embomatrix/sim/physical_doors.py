@@ -12,8 +12,9 @@ import numpy as np
 
 from embomatrix.sim import physical_body as body
 from embomatrix.sim.bounds import joint_motion
+from embomatrix.sim.physical_fold import approach, fold, unfold
 from embomatrix.sim.physical_grasp import facing
-from embomatrix.sim.physical_hands import GENTLE, TOUCH_M, WAYS, approach, fold, unfold
+from embomatrix.sim.physical_hands import GENTLE, TOUCH_M, WAYS
 from embomatrix.sim.physical_reach import TOUCH_M as PRESS_M
 from embomatrix.sim.physical_reach import Reach, Track
 from embomatrix.sim.physical_space import boxes_of, part_boxes, strikes

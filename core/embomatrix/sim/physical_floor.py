@@ -75,5 +75,5 @@ class Floor:
         spots = self.grid.free_centers(low, high, label)
         away = np.hypot(spots[:, 0] - goal.x_m, spots[:, 1] - goal.y_m)
         order = [number for number in np.argsort(away, kind="stable").tolist() if away[number] <= ASIDE_M]
-        near = [StandPose(*spots[number].tolist(), goal.yaw) for number in order]
+        near = [StandPose(float(spots[number, 0]), float(spots[number, 1]), goal.yaw) for number in order]
         return next((spot for spot in near[::4] if serves(spot)), near[0] if near else None)

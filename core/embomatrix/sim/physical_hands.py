@@ -8,16 +8,13 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.sim import physical_arm as arm
-from embomatrix.sim import physical_body as body
+from embomatrix.sim.physical_fold import approach, fold, unfold
 from embomatrix.sim.physical_grasp import grasp_tracks
-from embomatrix.sim.physical_motion import raised, standing, with_arm
-from embomatrix.sim.physical_reach import AIR_M, Reach, Track
-from embomatrix.sim.physical_space import clearance
-from embomatrix.sim.physical_stage import TOOL, TUCKED, TUCKED_LIFT_M
-from embomatrix.sim.physical_travel import SOMETHING, travel
+from embomatrix.sim.physical_motion import raised
+from embomatrix.sim.physical_reach import Track
+from embomatrix.sim.physical_stage import TOOL
+from embomatrix.sim.physical_travel import SOMETHING
 from embomatrix.skills.failure import FailureReason
-from embomatrix.skills.limits import ROBOT
 from embomatrix.skills.view import preposition, refuse
 from embomatrix.world.geometry import Pose
 from embomatrix.world.poses import StandPose
@@ -38,16 +35,9 @@ GENTLE: Final = 0.25
 TOUCH_M: Final = 0.004
 RAISE_M: Final = 0.06
 ROOFED_RAISE_M: Final = 0.015
-CARRY_LIFT_M: Final = 0.35
-"""Height of the lift while the robot drives with a load."""
-SURROUNDINGS_M: Final = np.array([0.8, 0.8, 9.0])
-OVER_M: Final = 1.0
-"""Loads are carried higher than this where that is possible: over counters."""
 ROOF_M: Final = 1.0
 """Things with a roof lower than this over them are reached from the side."""
 WAY_OUT_M: Final = 0.04
-BACK_OFF_M: Final = (0.0, 0.3, 0.55)
-"""How far before the place of work the arm is unfolded."""
 ROOM_M: Final = 0.45
 """From the base's centre to where the hand is before its way in."""
 ATTEMPTS: Final = 3
@@ -62,137 +52,10 @@ ASIDES: Final = (0.0, 35.0, -35.0)
 """Degrees by which the hand may come from aside when it puts something."""
 
 
-def approach(
-    stage: Stage, way: Way, reach: Reach, rng: np.random.Generator, *, loaded: bool
-) -> FloatArray | None:
-    """Postures that lead to the start of a way, (w, 11), None when none are found.
-
-    The arm unfolds where it will work, or some way back from there, whence the base then drives on with the arm ready.
-    """
-    start = way.postures[0]
-    now = stage.mover.posture
-    back = -np.array([math.cos(start[body.YAW]), math.sin(start[body.YAW])])
-    for away in BACK_OFF_M:
-        spot = start[:2] + away * back
-        if away and not stage.floor.grid.drives_straight(_pair(spot), _pair(start)):
-            continue
-        swing = reach.transit(
-            standing(now, *spot.tolist(), float(start[body.YAW])), start, rng, loaded=loaded
-        )
-        if swing is not None:
-            return swing
-    return None
-
-
-def unfold(stage: Stage, swing: FloatArray) -> Refusal | None:
-    """Drive to where a swing begins, and make it."""
-    now = stage.mover.posture
-    if math.dist(now[:2], swing[0, :2]) > 0.01:
-        refusal = travel(stage, StandPose(*swing[0, :3].tolist()))
-        if refusal is not None:
-            return refusal
-    hit = stage.mover.follow(swing)
-    if hit is not None:
-        return refuse(FailureReason.ARM_BLOCKED, target=SOMETHING, other=hit or SOMETHING)
-    return None
-
-
 def _bases(stage: Stage, pose: Pose, course: float, out_m: float | None) -> list[FloatArray]:
     """Where to stand to work at a pose: before the way in, far enough to hold the thing outside."""
     point = np.array(pose.position_m)
     return stage.bases(point) if out_m is None else stage.bases(point, out_m + ROOM_M, course)
-
-
-def _pair(point: FloatArray) -> tuple[float, float]:
-    return float(point[0]), float(point[1])
-
-
-def fold(stage: Stage, home: StandPose, rng: np.random.Generator, target: str = "") -> Refusal | None:
-    """Bring the arm, with what it holds, over the base, and the base back to where it stood to serve a target.
-
-    Where the arm has no room to fold, the base first draws it back.
-    """
-    reach = stage.reach(stage.boxes())
-    now = stage.mover.posture
-    loaded = stage.grip is not None
-    folded = carrying(stage, now)
-    for spot in _retreats(stage, now, home):
-        there = standing(now, *spot.tolist())
-        swing = reach.transit(there, standing(folded, *spot.tolist()), rng, loaded=loaded)
-        if swing is not None and reach.drives(now, there, loaded=loaded):
-            stage.mover.follow(swing)
-            break
-    now = stage.mover.posture
-    if (
-        math.dist(now[:2], (home.x_m, home.y_m)) > 0.01
-        or abs(math.remainder(now[2] - home.yaw, math.tau)) > 0.01
-    ):
-        return travel(stage, home, target)
-    return None
-
-
-def _retreats(stage: Stage, now: FloatArray, home: StandPose) -> Iterator[FloatArray]:
-    """Bases, (3,), at which the arm may fold: here, then straight back, then where the robot stood."""
-    yield now[:3]
-    back = -np.array([math.cos(now[body.YAW]), math.sin(now[body.YAW]), 0.0])
-    spots = [now[:3] + away * back for away in (0.2, 0.4, 0.6)]
-    for spot in (*spots, np.array([home.x_m, home.y_m, now[body.YAW]])):
-        if stage.floor.grid.drives_straight(_pair(now), _pair(spot)):
-            yield spot
-
-
-def carrying(stage: Stage, now: FloatArray) -> FloatArray:
-    """The posture in which the robot drives: folded when the hand is empty, else with the load upright and near."""
-    if stage.grip is None:
-        folded = with_arm(now, TUCKED)
-        folded[body.LIFT] = TUCKED_LIFT_M
-        return folded
-    rotation, _ = body.tools(now[None])
-    turns, xs, ys, heights = (
-        grid.ravel()
-        for grid in np.meshgrid(
-            np.arange(8) * math.pi / 4,
-            (0.1, 0.2, 0.3, 0.4, 0.5),
-            (-0.25, 0.0, 0.25),
-            (0.35, 0.6, 0.85),
-            indexing="ij",
-        )
-    )
-    count = len(turns)
-    turn = arm.about_z(turns)
-    yaw = arm.about_z(now[None, body.YAW])[0]
-    wanted = turn @ rotation[0]
-    local = np.stack([xs, ys, np.zeros(count)], axis=1)
-    lift = np.full(count, CARRY_LIFT_M)
-    where = local @ yaw.T + np.array([now[0], now[1], 0.0])
-    where[:, 2] = body.MOUNT_LOW_M + CARRY_LIFT_M + heights
-    boxes = stage.boxes_within(now[:3] - SURROUNDINGS_M, now[:3] + SURROUNDINGS_M)
-    radii = np.concatenate([body.RADII, stage.grip.held.radii])
-    best, found = math.inf, now
-    for last in (0.785, -0.785, 2.3, -2.3, 1.57):
-        postures = body.solve(wanted, where, np.tile(now[:3], (count, 1)), lift, np.full(count, last))
-        rows = postures.reshape(-1, body.NUMBERS)
-        rows = rows[~np.isnan(rows[:, -1])]
-        if not len(rows):
-            continue
-        load = stage.grip.held.placed(rows)
-        wide = np.linalg.norm(load[:, :, :2] - now[:2], axis=2) + stage.grip.held.radii
-        arms = body.balls(rows)
-        limbs = np.linalg.norm(arms[:, :, :2] - now[:2], axis=2) + body.RADII
-        top = np.maximum(
-            (load[:, :, 2] + stage.grip.held.radii).max(axis=1), (arms[:, :, 2] + body.RADII).max(axis=1)
-        )
-        bottom = (load[:, :, 2] - stage.grip.held.radii).min(axis=1)
-        cost = np.maximum(top - ROBOT.height_m, 0.0) + 0.3 * np.maximum(OVER_M - bottom, 0.0)
-        cost += 0.02 * np.abs(rows[:, 4:] - now[4:]).max(axis=1)
-        cost += np.maximum(wide.max(axis=1), limbs.max(axis=1)) + 0.02 * np.abs(rows[:, 4:] - now[4:]).max(
-            axis=1
-        )
-        cost += np.where(clearance(boxes, np.concatenate([arms, load], axis=1), radii) < AIR_M, 2.0, 0.0)
-        cost = np.where(body.strikes_itself(rows, load, stage.grip.held.radii), math.inf, cost)
-        if cost.min() < best:
-            best, found = float(cost.min()), rows[int(cost.argmin())]
-    return found
 
 
 def pick_up(stage: Stage, target: str, rng: np.random.Generator) -> Refusal | None:

@@ -53,14 +53,14 @@ class Mover:
         """
         commands = _commands(np.concatenate([self.posture[None], postures]), pace)
         for command in commands:
-            self._world.robot.steer(Posture.of(command))
+            self._world.robot.steer(Posture.of(command.tolist()))
             self.wait(STEERED)
             if until is not None and until():
-                self._world.robot.steer(Posture.of(self.posture))
+                self._world.robot.steer(self._world.robot.posture)
                 return None
             if (np.abs(self.posture - command) > LAG).any():
                 hindrance = self._world.hindrance()
-                self._world.robot.steer(Posture.of(self.posture))
+                self._world.robot.steer(self._world.robot.posture)
                 return hindrance
         self.wait(ARRIVAL_STEPS)
         return None
@@ -124,10 +124,10 @@ def raised(posture: FloatArray, by_m: float) -> FloatArray:
     return higher
 
 
-def standing(posture: FloatArray, x_m: float, y_m: float, yaw: float) -> FloatArray:
-    """The posture with the base elsewhere."""
+def standing(posture: FloatArray, base: FloatArray) -> FloatArray:
+    """The posture with the base elsewhere: x, y and heading, shape (3,)."""
     moved = posture.copy()
-    moved[..., :3] = (x_m, y_m, yaw)
+    moved[..., :3] = base
     return moved
 
 

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.sim import physical_arm as arm
+from embomatrix.sim.physical_fold import approach, fold, unfold
 from embomatrix.sim.physical_grasp import facing, surface_point
-from embomatrix.sim.physical_hands import GENTLE, TOUCH_M, WAYS, approach, fold, unfold
+from embomatrix.sim.physical_hands import GENTLE, TOUCH_M, WAYS
 from embomatrix.sim.physical_reach import Track
 from embomatrix.sim.physical_space import part_boxes
 from embomatrix.sim.physical_travel import SOMETHING

@@ -18,7 +18,11 @@ from embomatrix.sim.physical_space import Boxes, strikes
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
+    from numpy.typing import NDArray
+
     from embomatrix.world.geometry import FloatArray
+
+    BoolArray = NDArray[np.bool_]
 
 OVER_WRIST_M: Final = (0.0, 0.2, 0.4, -0.2)
 """Heights of the shoulder over the wrist that are tried."""
@@ -58,7 +62,7 @@ class Held:
     def placed(self, postures: FloatArray) -> FloatArray:
         """Centres in the world, (n, k, 3)."""
         rotation, position = body.tools(postures)
-        return position[:, None] + np.einsum("nij,kj->nki", rotation, self.centres)
+        return np.asarray(position[:, None] + np.einsum("nij,kj->nki", rotation, self.centres))
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +74,7 @@ class Track:
 
     rotation: FloatArray
     position: FloatArray
-    loaded: FloatArray
+    loaded: BoolArray
     key: int
 
 
@@ -184,13 +188,12 @@ class Reach:
         hit = strikes(self._boxes.without(("floor",)), trunk, radii, TOUCH_M)
         if hit[0] >= 0:
             return False
-        loaded = track.loaded.astype(bool)
-        for mask, held in ((~loaded, None), (loaded, self._held)):
+        for mask, held in ((~track.loaded, None), (track.loaded, self._held)):
             if mask.any() and not self._free(postures[mask], self._at_work, held, TOUCH_M).all():
                 return False
         return self._also is None or self._also(postures)
 
-    def _free(self, postures: FloatArray, boxes: Boxes, held: Held | None, margin_m: float) -> FloatArray:
+    def _free(self, postures: FloatArray, boxes: Boxes, held: Held | None, margin_m: float) -> BoolArray:
         """Whether arm and load keep a margin from the boxes and from the robot's own trunk, shape (n,)."""
         if not len(postures):
             return np.zeros(0, dtype=np.bool_)
@@ -208,7 +211,7 @@ class Reach:
         hit = strikes(close, centres, radii, margin_m)
         if (hit >= 0).any():
             self.hindrance = close.owners[int(hit[hit >= 0][0])]
-        return ~own & (hit < 0)
+        return np.asarray(~own & (hit < 0))
 
 
 def _alike(one: FloatArray, other: FloatArray) -> bool:

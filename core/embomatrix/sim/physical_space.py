@@ -17,9 +17,14 @@ from embomatrix.world.geometry import Aabb, Pose, Shape
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
+    from numpy.typing import NDArray
+
     from embomatrix.sim.engine import PhysicsEngine
     from embomatrix.world.asset import Asset
     from embomatrix.world.geometry import FloatArray
+
+    BoolArray = NDArray[np.bool_]
+    IntArray = NDArray[np.int_]
 
 CHUNK: Final = 400_000
 """Pairs of balls and boxes that are compared at once: what fits into a processor's cache."""
@@ -40,7 +45,7 @@ class Boxes:
         keep = np.array([owner not in left_out for owner in self.owners], dtype=np.bool_)
         return self.where(keep)
 
-    def where(self, keep: FloatArray) -> Boxes:
+    def where(self, keep: BoolArray) -> Boxes:
         """Those that a mask, shape (m,), keeps."""
         owners = tuple(owner for owner, kept in zip(self.owners, keep, strict=True) if kept)
         return Boxes(self.rotation[keep], self.centre[keep], self.half[keep], owners)
@@ -114,7 +119,7 @@ def object_balls(
     return np.concatenate(centres), np.concatenate(radii)
 
 
-def strikes(boxes: Boxes, balls: FloatArray, radii: FloatArray, margin_m: float) -> FloatArray:
+def strikes(boxes: Boxes, balls: FloatArray, radii: FloatArray, margin_m: float) -> IntArray:
     """For each of n sets of balls, (n, b, 3), the number of the box that it comes nearer than a margin to, -1 for none.
 
     radii: (b,). Shape of the answer: (n,).
