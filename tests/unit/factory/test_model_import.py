@@ -367,11 +367,9 @@ def test_coacd_hollows_out_what_one_hull_would_fill(tmp_path: Path) -> None:
 def test_a_scene_is_built_with_the_imported_asset_in_place_of_the_generated_one(tmp_path: Path) -> None:
     path = tmp_path / "cupboard.obj"
     path.write_text(obj_text(CUPBOARD))
-    room = next(item for item in CATALOG.inventory("Rs_int").rooms if item.type == "kitchen")
-    model = next(m for category, m, _ in room.items if category == "bottom_cabinet")
-    save_asset(tmp_path / "shelf", imported(path, "bottom_cabinet", model).asset)
-    scene = build_base_scene("Rs_int", imported=read_assets(tmp_path / "shelf"))
-    assert scene.assets[f"bottom_cabinet-{model}"].credit == CREDIT
+    save_asset(tmp_path / "shelf", imported(path, "stand", "oyenza").asset)
+    scene = build_base_scene("hotel_suite_small", imported=read_assets(tmp_path / "shelf"))
+    assert scene.assets["stand-oyenza"].credit == CREDIT
     assert {asset.credit for asset in scene.assets.values()} == {CREDIT, None}
 
 
