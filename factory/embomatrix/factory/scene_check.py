@@ -31,7 +31,8 @@ REST_M: Final = 0.002
 HANG_M: Final = 0.03
 CEILING_M: Final = 2.4
 CUT_OFF_M2: Final = 1.0
-"""Floor that the robot fits on but can't get to: more of it in a room is an aisle that is barred."""
+CUT_OFF_SHARE: Final = 0.01
+"""Floor that the robot fits on but can't get to: more of it in a room, by both counts, is an aisle that is barred."""
 STABLE_SHARE: Final = 0.96
 """Share of the movable objects that must stay within 1 cm and 10 degrees when all are let go at once."""
 _EDGE_M: Final = 0.005
@@ -203,7 +204,7 @@ def reach_problems(scene: Scene) -> Iterator[Problem]:
     for room in scene.rooms:
         if not floor.enters(room):
             yield Problem(ProblemKind.UNREACHABLE_ROOM, (room.name,), "no free floor leads into it")
-        elif floor.cut_off_m2(room) > CUT_OFF_M2:
+        elif floor.cut_off_m2(room) > max(CUT_OFF_M2, CUT_OFF_SHARE * room.size_m[0] * room.size_m[1]):
             detail = f"furniture cuts off {floor.cut_off_m2(room):.1f} m2 of floor where the robot fits"
             yield Problem(ProblemKind.AISLE, (room.name,), detail)
     for item in scene.objects:

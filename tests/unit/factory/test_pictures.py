@@ -1,11 +1,13 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from typer.testing import CliRunner
 
 from embomatrix.factory.pictures import draw_plan
+from embomatrix.factory.pictures_sheet import draw_sheet
 from embomatrix.factory.scene_cli import app
 from embomatrix.sim.bullet.camera import render_oblique
 
@@ -29,6 +31,23 @@ def test_the_oblique_view_holds_the_whole_scene(flat: Scene) -> None:
     assert 0.15 < background.mean() < 0.85
     edge = np.concatenate([background[0], background[-1], background[:, 0], background[:, -1]])
     assert edge.mean() > 0.95, "nothing is cut off at the edge of the picture"
+
+
+def test_a_plan_shows_its_windows(flat: Scene) -> None:
+    lit, walled = (np.asarray(draw_plan(scene)) for scene in (flat, replace(flat, windows=())))
+    blue = (0x6F, 0xC3, 0xE8)
+    assert (lit == blue).all(axis=2).any()
+    assert not (walled == blue).all(axis=2).any()
+
+
+def test_a_sheet_holds_a_plan_in_every_cell(flat: Scene) -> None:
+    pixels = np.asarray(draw_sheet([flat] * 5, columns=3, cell_px=120))
+    assert pixels.shape == (2 * (120 + 16), 3 * 120, 3)
+    for row, column in ((0, 0), (0, 2), (1, 1)):
+        cell = pixels[row * 136 : row * 136 + 120, column * 120 : column * 120 + 120]
+        assert len(np.unique(cell.reshape(-1, 3), axis=0)) > 6
+    empty = pixels[136:, 240:]
+    assert (empty == 255).all()
 
 
 def test_an_unknown_scene_gets_one_sentence_with_close_names() -> None:
