@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
     Arrays = Mapping[str, NDArray[np.generic]]
 
-FORMAT: Final = 2
+FORMAT: Final = 3
 MAGIC: Final = b"EMBX"
 _HEAD: Final = struct.Struct("<4sII")
 """Magic, format, bytes of JSON."""

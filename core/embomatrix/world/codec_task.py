@@ -8,6 +8,7 @@ from embomatrix.world.bddl import BddlError, parse_formula
 from embomatrix.world.codec_asset import pose_from_field, pose_to_json
 from embomatrix.world.evaluate import GoalError, objects_of
 from embomatrix.world.field import Field
+from embomatrix.world.placements import flattened
 from embomatrix.world.poses import PlacementKey, PoseCache, StandPose
 from embomatrix.world.state import Relation
 from embomatrix.world.task import MAX_TABLE, Profile, Task, TaskCategory
@@ -82,24 +83,30 @@ def _goal(field: Field, table: tuple[str, ...], types: Mapping[str, tuple[str, .
 
 
 def poses_to_json(poses: PoseCache, tables: TableWriter | None = None) -> Json:
-    """JSON values. Poses are rows of ``tables`` where they are given."""
-    return {
-        "placements": [
-            {
-                "asset_id": key.asset_id,
-                "support_asset_id": key.support_asset_id,
-                "relation": key.relation.value,
-                "poses": [pose_to_json(pose, tables) for pose in found],
-            }
-            for key, found in poses.placements.items()
-        ],
-        "stands": {name: _stands_to_json(stands, tables) for name, stands in poses.stands.items()},
-    }
+    """JSON values. Poses are arrays of ``tables`` where they are given, and the assets of the placements their names."""
+    stands = {name: _stands_to_json(found, tables) for name, found in poses.stands.items()}
+    if tables is not None:
+        names, sets, spots = flattened(poses.placements)
+        tables.placements(sets, spots)
+        return {"placements": names, "stands": stands}
+    placements = [
+        {
+            "asset_id": key.asset_id,
+            "support_asset_id": key.support_asset_id,
+            "relation": key.relation.value,
+            "poses": [pose_to_json(pose) for pose in found],
+        }
+        for key, found in poses.placements.items()
+    ]
+    return {"placements": placements, "stands": stands}
 
 
 def poses_from_json(value: object, tables: Tables | None = None) -> PoseCache:
     """A pose cache; ``tables`` hold the rows that it was written with. Raises SceneInvalidError."""
     fields = Field(value, "poses", tables=tables).record("placements", "stands")
+    stands = {name: _stands_from_field(found) for name, found in fields["stands"].entries()}
+    if tables is not None:
+        return PoseCache(tables.placements([item.name() for item in fields["placements"].items()]), stands)
     placements = {}
     for item in fields["placements"].items():
         entry = item.record("asset_id", "support_asset_id", "relation", "poses")
@@ -109,7 +116,6 @@ def poses_from_json(value: object, tables: Tables | None = None) -> PoseCache:
         if key in placements:
             item.fail("the same placement stands in the cache twice")
         placements[key] = tuple(pose_from_field(pose) for pose in entry["poses"].items())
-    stands = {name: _stands_from_field(found) for name, found in fields["stands"].entries()}
     return PoseCache(placements, stands)
 
 

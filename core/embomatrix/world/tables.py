@@ -14,6 +14,7 @@ import numpy as np
 
 from embomatrix.world.field import Field, SceneInvalidError
 from embomatrix.world.geometry import Part, Pose, Shape
+from embomatrix.world.placements import SET_NUMBERS, Placements
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -34,10 +35,10 @@ FLAT_HULL: Final = (
 )
 SHAPES: Final = tuple(Shape)
 POSE_NUMBERS: Final = 7
-COLUMNS: Final = ("poses", "parts", "kinds", "vertices", "stands")
+COLUMNS: Final = ("poses", "parts", "kinds", "vertices", "stands", "sets", "spots")
 """``poses``: rows of x, y, z, qx, qy, qz, qw. ``parts``: rows of a pose and three extents. ``kinds``: for each part the index
 of its shape in ``SHAPES`` and the number of its vertices, which follow one another in ``vertices``. ``stands``: rows of x, y
-and yaw."""
+and yaw. ``sets`` and ``spots``: those of ``Placements``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +48,7 @@ class TableWriter:
     _poses: dict[bytes, int] = field(default_factory=dict)
     _parts: dict[bytes, tuple[int, Part]] = field(default_factory=dict)
     _stands: list[Vec3] = field(default_factory=list)
+    _placements: dict[str, NDArray[np.generic]] = field(default_factory=dict)
 
     def pose(self, pose: Pose) -> int:
         # By their bits: zero and minus zero are equal, but not the same.
@@ -64,8 +66,12 @@ class TableWriter:
         self._stands.extend(rows)
         return len(self._stands) - len(rows)
 
+    def placements(self, sets: NDArray[np.int32], spots: FloatArray) -> None:
+        """Take the arrays of ``Placements``."""
+        self._placements.update(sets=sets, spots=spots)
+
     def arrays(self) -> dict[str, NDArray[np.generic]]:
-        """The arrays of ``COLUMNS``, float64 but for ``kinds``, which is int32."""
+        """The arrays of ``COLUMNS``, float64 but for ``kinds`` and ``sets``, which are int32."""
         parts = [part for _, part in self._parts.values()]
         rows = [(*part.pose.position_m, *part.pose.quat_xyzw, *part.size_m) for part in parts]
         vertices = [vertex for part in parts for vertex in part.vertices_m]
@@ -76,6 +82,9 @@ class TableWriter:
             "kinds": np.array(kinds, dtype=np.int32).reshape(-1, 2),
             "vertices": np.array(vertices, dtype=np.float64).reshape(-1, 3),
             "stands": np.array(self._stands, dtype=np.float64).reshape(-1, 3),
+            "sets": np.zeros((0, SET_NUMBERS), dtype=np.int32),
+            "spots": np.zeros((0, POSE_NUMBERS)),
+            **self._placements,
         }
 
 
@@ -97,7 +106,14 @@ class Tables:
         )
         self._poses = [Pose((x, y, z), (a, b, c, d)) for x, y, z, a, b, c, d in poses.tolist()]
         self._stands = [(x, y, yaw) for x, y, yaw in _floats(arrays, "stands", 3).tolist()]
+        self._spots = _floats(arrays, "spots", POSE_NUMBERS)
+        _check_poses("spots", self._spots)
+        self._sets = _sets(arrays)
         self._parts = _parts(parts, _kinds(arrays, len(parts), len(vertices)), vertices)
+
+    def placements(self, names: Sequence[str]) -> Placements:
+        """The sets of verified poses, of these assets."""
+        return Placements(names, self._sets, self._spots)
 
     def pose(self, field: Field) -> Pose:
         """The pose whose row the field names."""
@@ -185,6 +201,13 @@ def _kinds(arrays: Arrays, parts: int, vertices: int) -> list[tuple[int, int]]:
             "tables.vertices", f"has {vertices} rows: expected as many as the parts have vertices"
         )
     return rows
+
+
+def _sets(arrays: Arrays) -> NDArray[np.int32]:
+    sets = arrays.get("sets")
+    if sets is None or sets.dtype != np.int32 or sets.ndim != 2 or sets.shape[1] != SET_NUMBERS:
+        raise SceneInvalidError("tables.sets", f"expected int32 with {SET_NUMBERS} columns")
+    return np.asarray(sets, dtype=np.int32)
 
 
 def _parts(rows: FloatArray, kinds: list[tuple[int, int]], vertices: FloatArray) -> list[Part]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from embomatrix.sim.pose_cache import build_pose_cache
+from embomatrix.sim.pose_cache import build_pose_cache, footprint_placements
 from embomatrix.world.poses import PlacementKey, PoseCache
 from embomatrix.world.state import Relation
 
@@ -29,7 +29,11 @@ class Needs:
 
 
 def cache_poses(view: SceneView, tasks: Iterable[Needs], library: PlacementLibrary, seed: int) -> PoseCache:
-    """Poses for every thing of a task on, or in, whatever of the same task can hold it."""
+    """Poses for every thing of a task on, or in, whatever of the same task can hold it.
+
+    What a goal brings together has poses of its own; for all other rows of a task's table there are those of their
+    footprints.
+    """
     scene = view.scene
     placements: dict[PlacementKey, tuple[Pose, ...]] = {}
     rows: dict[str, None] = {}
@@ -39,6 +43,13 @@ def cache_poses(view: SceneView, tasks: Iterable[Needs], library: PlacementLibra
             key = PlacementKey(view.item(thing).asset_id, view.item(host).asset_id, relation)
             if key not in placements:
                 placements[key] = library.poses(view.asset(thing), view.asset(host), relation, seed)
+        portable = [name for name in task.table if view.is_portable(name)]
+        holders = [
+            name
+            for name in task.table
+            if view.is_surface(name) or view.is_container(name) or view.is_basket(name)
+        ]
+        placements.update(footprint_placements(scene, portable, holders, library, seed))
     stands = build_pose_cache(scene, list(rows), [], seed=seed, library=library).stands
     return PoseCache({key: poses for key, poses in placements.items() if poses}, stands)
 

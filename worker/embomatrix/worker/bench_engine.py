@@ -19,7 +19,7 @@ from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.engine import NOTHING, SETTLE_STEPS
 from embomatrix.sim.executor import Simulator
-from embomatrix.sim.pose_cache import PlacementLibrary, build_pose_cache
+from embomatrix.sim.pose_cache import PlacementLibrary, analyse_scene
 from embomatrix.sim.prepared import Prepared
 from embomatrix.sim.zygote import resident_mb
 from embomatrix.skills.syntax import Skill
@@ -186,18 +186,14 @@ def _leak_kb(data: bytes, scene: SceneWork, cycles: int) -> float:
 
 
 def _analysis(bundle: Bundle) -> Iterator[Figure]:
-    """Placements of all that tasks of the scene name, on, in and under all that can hold it, and standing poses."""
-    scene = bundle.scene
-    names = list(dict.fromkeys(name for task in bundle.tasks.values() for name in task.table))
-    movable = [name for name in names if not scene.by_name[name].fixed]
-    hosts = [name for name in names if scene.asset_of(name).supports or scene.asset_of(name).interiors]
+    """Poses of every footprint on, in and under all that can hold something, and standing poses for all objects."""
     seconds: list[float] = []
     with (
         contextlib.closing(PlacementLibrary()) as library,
-        contextlib.closing(BulletEngine(scene)) as engine,
+        contextlib.closing(BulletEngine(bundle.scene)) as engine,
         _cpu_timed(seconds),
     ):
-        poses = build_pose_cache(scene, movable, hosts, seed=0, engine=engine, library=library)
+        poses = analyse_scene(bundle.scene, seed=0, engine=engine, library=library)
     count = sum(len(found) for found in poses.placements.values())
     rate = count / seconds[0]
     yield Figure("poses_per_s", rate, "1/s", Better.HIGHER, count, POSES_GOAL)

@@ -1,0 +1,102 @@
+"""Verified placements of a bundle as flat arrays, made into poses when one asks for them.
+
+An analysis knows thousands of poses and a rollout uses a few: a worker that loads a bundle makes none of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from embomatrix.world.field import SceneInvalidError
+from embomatrix.world.geometry import Pose
+from embomatrix.world.poses import PlacementKey
+from embomatrix.world.state import Relation
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from numpy.typing import NDArray
+
+    from embomatrix.world.geometry import FloatArray
+
+RELATIONS: Final = tuple(Relation)
+SET_NUMBERS: Final = 5
+MAX_POSES: Final = 1024
+"""Poses of one set."""
+
+
+class Placements(Mapping[PlacementKey, tuple[Pose, ...]]):
+    """Sets of poses by key.
+
+    ``names`` are the assets; ``sets``, shape (m, 5), holds for each set the index of its asset, of its support and of its
+    relation in ``RELATIONS``, its first row in ``spots`` and the number of its rows; ``spots``, shape (n, 7), are poses.
+    """
+
+    def __init__(self, names: Sequence[str], sets: NDArray[np.int32], spots: FloatArray) -> None:
+        """Raises SceneInvalidError for rows and indices that are not there, and for a set that stands there twice."""
+        self._names = tuple(names)
+        self._numbers = {name: number for number, name in enumerate(self._names)}
+        self._spots = spots
+        if len(self._numbers) != len(self._names):
+            raise SceneInvalidError("poses.assets", "an asset stands there twice: expected each once")
+        bounds = np.array([len(names), len(names), len(RELATIONS), len(spots) + 1, MAX_POSES + 1])
+        wrong = np.flatnonzero(((sets < 0) | (sets >= bounds)).any(axis=1))
+        wrong = wrong if len(wrong) else np.flatnonzero(sets[:, 3].astype(np.int64) + sets[:, 4] > len(spots))
+        if len(wrong):
+            row = int(wrong[0])
+            raise SceneInvalidError(
+                f"tables.sets[{row}]",
+                f"found {sets[row].tolist()}: expected two of {len(names)} assets, one of {len(RELATIONS)} relations and "
+                f"rows of {len(spots)}, at most {MAX_POSES} of them",
+            )
+        self._spans = {(a, b, c): (first, count) for a, b, c, first, count in sets.tolist()}
+        if len(self._spans) != len(sets):
+            raise SceneInvalidError("tables.sets", "a set stands there twice: expected each once")
+        self._made: dict[PlacementKey, tuple[Pose, ...]] = {}
+
+    def __getitem__(self, key: PlacementKey) -> tuple[Pose, ...]:
+        if key not in self._made:
+            first, count = self._spans[self._index(key)]
+            rows = self._spots[first : first + count].tolist()
+            self._made[key] = tuple(Pose((x, y, z), (a, b, c, d)) for x, y, z, a, b, c, d in rows)
+        return self._made[key]
+
+    def __contains__(self, key: object) -> bool:
+        return isinstance(key, PlacementKey) and self._index(key) in self._spans
+
+    def __iter__(self) -> Iterator[PlacementKey]:
+        for a, b, c in self._spans:
+            yield PlacementKey(self._names[a], self._names[b], RELATIONS[c])
+
+    def __len__(self) -> int:
+        return len(self._spans)
+
+    def _index(self, key: PlacementKey) -> tuple[int, int, int]:
+        """The set's numbers; -1 stands for what is not there."""
+        numbers = self._numbers
+        return (
+            numbers.get(key.asset_id, -1),
+            numbers.get(key.support_asset_id, -1),
+            RELATIONS.index(key.relation),
+        )
+
+
+def flattened(
+    placements: Mapping[PlacementKey, tuple[Pose, ...]],
+) -> tuple[list[str], NDArray[np.int32], FloatArray]:
+    """Names, sets and spots of ``Placements``, in the order of the mapping."""
+    names: dict[str, int] = {}
+    sets: list[tuple[int, ...]] = []
+    spots: list[tuple[float, ...]] = []
+    for key, poses in placements.items():
+        held, support = (names.setdefault(name, len(names)) for name in (key.asset_id, key.support_asset_id))
+        sets.append((held, support, RELATIONS.index(key.relation), len(spots), len(poses)))
+        spots += [(*pose.position_m, *pose.quat_xyzw) for pose in poses]
+    return (
+        list(names),
+        np.array(sets, dtype=np.int32).reshape(-1, SET_NUMBERS),
+        np.array(spots, dtype=np.float64).reshape(-1, 7),
+    )
