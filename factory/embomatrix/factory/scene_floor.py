@@ -35,6 +35,8 @@ class ReachableFloor:
             for link in scene.assets[item.asset_id].links
             for part in link.parts
         )
+        boxes = [box_of(scene, item) for item in scene.objects]
+        self._footprints = _barring(boxes)[:, :4]
         self._grid = FloorGrid(scene, np.concatenate([_barring(walls), self._standing]))
         cell = self._grid.cell(scene.robot.x_m, scene.robot.y_m)
         self._label = self._grid.label(cell) if cell is not None else 0
@@ -73,10 +75,13 @@ class ReachableFloor:
         return len(self.cells(room.low_m, room.high_m)) > 0
 
     def cut_off_m2(self, room: Room) -> float:
-        """Area of the places in the room where the robot fits but can't drive to."""
+        """Area of the places in the room where the robot fits but can't drive to; none of it lies within an object's box."""
         islands = set(np.unique(self._grid.labels).tolist()) - {0, self._label}
-        cells = sum(len(self._grid.free_centers(room.low_m, room.high_m, label)) for label in islands)
-        return cells * CELL_M**2
+        centers = [self._grid.free_centers(room.low_m, room.high_m, label) for label in sorted(islands)]
+        spots = np.concatenate([np.empty((0, 2)), *centers])
+        for box in self._footprints:
+            spots = spots[~((spots > box[:2]) & (spots < box[2:])).all(axis=1)]
+        return len(spots) * CELL_M**2
 
     def spots(self, box: Aabb, *, front_of: Pose | None = None) -> FloatArray:
         """Cells from which the arm reaches a box, shape (n, 2); with ``front_of`` only those before that pose's front."""
