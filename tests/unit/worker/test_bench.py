@@ -21,6 +21,7 @@ from embomatrix.worker.bench_figures import (
     BenchResult,
     Better,
     Figure,
+    figure_in,
     is_shared,
     quantile_figure,
     result_to_json,
@@ -151,6 +152,17 @@ def test_the_engine_is_measured_by_the_names_that_goals_are_set_for_and_by_size(
     assert figures["rollout_p50_ms"]["n"] == 2 * 3
     # The bundles have no pose cache: every place is settled.
     assert figures["places_settled_live"]["value"] == 1.0
+
+
+def test_the_least_speed_up_is_taken_from_the_figures_of_the_two_modes(tmp_path):
+    speedup = Figure("skill_speedup_min", 134.0, "×", Better.HIGHER, 5, 100.0)
+    path = tmp_path / "fidelity.json"
+    path.write_text(json.dumps(result_to_json(BenchResult("fidelity", "abc", MACHINE, (speedup,)))))
+    assert figure_in(path, "skill_speedup_min") == speedup
+    for text in ("", "[]", '{"figures": []}', '{"figures": [{"name": "skill_speedup_min"}]}'):
+        path.write_text(text)
+        with pytest.raises(BenchError, match="has no figure 'skill_speedup_min'.*bench fidelity --json"):
+            figure_in(path, "skill_speedup_min")
 
 
 def test_plans_of_a_workload_differ_and_have_the_shape_that_is_promised(workload):

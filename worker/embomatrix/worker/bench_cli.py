@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -34,6 +35,7 @@ from embomatrix.worker.bench_figures import (
     BenchResult,
     commit_here,
     describe_machine,
+    figure_in,
     is_shared,
     result_to_json,
     shown,
@@ -74,6 +76,7 @@ DATASET = Path("build/dataset")
 ENGINE_DATASET = Path("build/engine")
 FIDELITY_DATASET = Path("build/scenes")
 FIDELITY_OUT = Path("build/fidelity")
+SPEEDUP = "skill_speedup_min"
 MODES = Modes(cached=Simulator, physical=physical_simulator)
 
 
@@ -88,11 +91,20 @@ def rollout(
 
 @app.command()
 def engine(
-    dataset: DataSet = ENGINE_DATASET, workload: Work = PINNED, json_file: Json = None, cycles: Cycles = 2000
+    dataset: DataSet = ENGINE_DATASET,
+    workload: Work = PINNED,
+    json_file: Json = None,
+    cycles: Cycles = 2000,
+    fidelity: Annotated[
+        Path | None,
+        typer.Option(help="Figures that `bench fidelity` wrote: skill_speedup_min is taken from there."),
+    ] = None,
 ) -> None:
     """Measure the engine on one core with a pinned workload in furnished scenes."""
     with _refusals():
-        _hand_in(_engine(dataset, workload, cycles), json_file)
+        speedup = (figure_in(fidelity, SPEEDUP),) if fidelity is not None else ()
+        result = _engine(dataset, workload, cycles)
+        _hand_in(replace(result, figures=(*result.figures, *speedup)), json_file)
 
 
 @app.command()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import platform
 import subprocess
@@ -89,6 +90,22 @@ def result_to_json(result: BenchResult) -> dict[str, Any]:
             for figure in result.figures
         ],
     }
+
+
+def figure_in(path: Path, name: str) -> Figure:
+    """A figure of a file that another bench wrote. Raises BenchError when it has none of that name."""
+    try:
+        found = {str(item["name"]): item for item in json.loads(path.read_text(encoding="utf-8"))["figures"]}
+        item = found[name]
+        better, goal = Better(item["better"]), item["goal"]
+        value = float(item["value"])
+        return Figure(
+            name, value, str(item["unit"]), better, int(item["n"]), None if goal is None else float(goal)
+        )
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise BenchError(
+            f"{path} has no figure {name!r} ({error}): expected a file that 'embomatrix bench fidelity --json' wrote"
+        ) from error
 
 
 def quantile(values: Sequence[float], share: float) -> float:
