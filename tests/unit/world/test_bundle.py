@@ -1,7 +1,6 @@
 """Bundles come back equal, have one digest each, and refuse what is damaged, hostile or foreign."""
 
 import dataclasses
-import json
 import zlib
 
 import pytest
@@ -76,7 +75,7 @@ def test_compressed_nonsense_is_refused_in_a_sentence(text: str) -> None:
 def test_bundle_of_another_format_names_both(bundle: Bundle) -> None:
     content = bytearray(zlib.decompress(encode_bundle(bundle)))
     content[4:8] = (9).to_bytes(4, "little")
-    with pytest.raises(BundleError, match="has format 9, this version reads 2: build the dataset anew"):
+    with pytest.raises(BundleError, match="has format 9, this version reads 3: build the dataset anew"):
         decode_bundle(zlib.compress(content))
 
 
