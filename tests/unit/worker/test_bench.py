@@ -161,7 +161,7 @@ def test_the_least_speed_up_is_taken_from_the_figures_of_the_two_modes(tmp_path)
     assert figure_in(path, "skill_speedup_min") == speedup
     for text in ("", "[]", '{"figures": []}', '{"figures": [{"name": "skill_speedup_min"}]}'):
         path.write_text(text)
-        with pytest.raises(BenchError, match="has no figure 'skill_speedup_min'.*bench fidelity --json"):
+        with pytest.raises(BenchError, match=r"has no figure 'skill_speedup_min'.*bench fidelity --json"):
             figure_in(path, "skill_speedup_min")
 
 
