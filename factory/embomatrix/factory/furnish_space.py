@@ -37,7 +37,10 @@ _KEEP_CELLS: Final = (_BASE_CLEAR_M + _HALF) / CELL_M
 """The base stands nowhere closer than this many cells to a cell that something touches."""
 _RING: Final = math.ceil(_KEEP_CELLS)
 _AROUND: Final = 2
+_ISLAND_CELLS: Final = round(0.5 / CELL_M**2)
+"""Half a square metre: more floor that the base fits on is not cut off from the doorways."""
 
+_Cell = tuple[int, int]
 _Cells = tuple[int, int, int, int]
 """(i0, i1, j0, j1): a window of cells."""
 
@@ -63,11 +66,10 @@ class RoomSpace:
         self.windows = tuple(w for w in windows if room.name in w.rooms)
         self.zones.extend([self._window_zone(w) for w in self.windows])
         self._origin, self._shape = _grid_of(room)
-        self._doors = [Target(_flat(self._door_zone(d))) for d in self.doorways]
         self._targets: list[_Cells] = []
-        stand, reach = _bare_floor(room, self.doorways)
+        stand, reach, self._doors = _bare_floor(room, self.doorways)
         self._stand, self._reach = stand.copy(), reach.copy()
-        self._joined = bool(self.doorways) and all(self._touches(self._reach, d) for d in self._doors)
+        self._joined = bool(self._doors) and all(reach[cell] for cell in self._doors)
         self.fronts = BoxStack()
         self._planes = Planes(room.low_m, room.high_m, (self.solids, self.zones, self.fronts))
         self._hung_planes = Planes(room.low_m, room.high_m, (self.solids, self.zones))
@@ -111,11 +113,13 @@ class RoomSpace:
         return self._solid_planes.meets(boxes)
 
     def reachable(self, extra: Sequence[Box] = (), targets: Sequence[Target] = ()) -> bool:
-        """True when, with the extra solids in place, all doorways and all targets share one stretch of free floor."""
+        """True when, with the extra solids in place, doorways, targets and nearly all floor share one stretch of free floor."""
         if not self._joined:
             return False
-        _, reach = self._after(extra)
-        if not all(self._touches(reach, d) for d in self._doors):
+        stand, reach = self._after(extra)
+        if not all(reach[cell] for cell in self._doors):
+            return False
+        if reach is not self._reach and int(stand.sum()) - int(reach.sum()) > _ISLAND_CELLS:
             return False
         if not all(self._touches(reach, t) for t in targets):
             return False
@@ -163,7 +167,7 @@ class RoomSpace:
         reach = self._reach.copy()
         reach[i0:i1, j0:j1] &= ~lost
         if not self._still_joined(reach, window):
-            reach = _component(reach, self._doors_seed(reach))
+            reach = _component(reach, self._doors[:1])
         return stand, reach
 
     def _still_joined(self, reach: BoolArray, window: _Cells) -> bool:
@@ -171,14 +175,6 @@ class RoomSpace:
         i0, i1, j0, j1 = window
         near = reach[max(0, i0 - _AROUND) : i1 + _AROUND, max(0, j0 - _AROUND) : j1 + _AROUND]
         return bool(ndimage.label(near)[1] == 1)
-
-    def _doors_seed(self, reach: BoolArray) -> tuple[int, int] | None:
-        """A reachable cell before the first doorway."""
-        if not self._doors:
-            return None
-        i0, i1, j0, j1 = self._cells_of(self._doors[0])
-        found = np.argwhere(reach[i0:i1, j0:j1])
-        return (int(found[0, 0]) + i0, int(found[0, 1]) + j0) if len(found) else None
 
     def _touches(self, reach: BoolArray, target: Target) -> bool:
         i0, i1, j0, j1 = self._cells_of(target)
@@ -240,8 +236,11 @@ def _grid_of(room: Room) -> tuple[FloatArray, tuple[int, int]]:
 
 
 @functools.lru_cache(maxsize=64)
-def _bare_floor(room: Room, doorways: tuple[Doorway, ...]) -> tuple[BoolArray, BoolArray]:
-    """Where the base can stand in the empty room, and where of that it gets from the first doorway."""
+def _bare_floor(room: Room, doorways: tuple[Doorway, ...]) -> tuple[BoolArray, BoolArray, tuple[_Cell, ...]]:
+    """Where the base can stand in the empty room, where of that it gets from the doorways, and a cell before each of them.
+
+    A doorway with no floor before it that the base fits on has no cell: then there are no cells at all.
+    """
     origin, shape = _grid_of(room)
     x, y = (origin[axis] + (np.arange(shape[axis]) + 0.5) * CELL_M for axis in (0, 1))
 
@@ -254,19 +253,18 @@ def _bare_floor(room: Room, doorways: tuple[Doorway, ...]) -> tuple[BoolArray, B
             (cx, cy), half, deep = door.center_m, door.width_m / 2, _MARGIN_M + 0.2
             a, b = (half, deep) if door.along == "x" else (deep, half)
             floor |= within((cx - a, cy - b), (cx + a, cy + b))
-    distance = np.asarray(ndimage.distance_transform_edt(floor))
-    stand = np.asarray(distance >= _KEEP_CELLS)
-    return stand, _component(stand, _nearest(stand, origin, room, doorways))
+    stand = np.asarray(ndimage.distance_transform_edt(floor) >= _KEEP_CELLS)
+    found = [_before_door(stand, origin, room, door) for door in doorways]
+    cells = tuple(cell for cell in found if cell is not None) if None not in found else ()
+    return stand, _component(stand, cells[:1]), cells
 
 
-def _nearest(
-    stand: BoolArray, origin: FloatArray, room: Room, doorways: Sequence[Doorway]
-) -> tuple[int, int] | None:
-    """The standable cell nearest to half a metre inside the first doorway, no further off than another half."""
+def _before_door(stand: BoolArray, origin: FloatArray, room: Room, door: Doorway) -> _Cell | None:
+    """The standable cell nearest to half a metre inside the doorway, no further off than another half."""
     cells = np.argwhere(stand)
-    if not doorways or not len(cells):
+    if not len(cells):
         return None
-    (x, y), door = doorways[0].center_m, doorways[0]
+    x, y = door.center_m
     side = 1 if door.along == "x" else 0
     step = 0.5 if room.center_m[side] > door.center_m[side] else -0.5
     spot = np.array([x, y + step] if side else [x + step, y])
@@ -275,12 +273,12 @@ def _nearest(
     return (int(cells[best, 0]), int(cells[best, 1])) if away[best] < 0.5 else None
 
 
-def _component(free: BoolArray, seed: tuple[int, int] | None) -> BoolArray:
-    """The connected part of the free cells that holds the seed; empty without one."""
-    if seed is None:
+def _component(free: BoolArray, seeds: Sequence[_Cell]) -> BoolArray:
+    """The connected part of the free cells that holds the first seed; empty without one."""
+    if not seeds or not free[seeds[0]]:
         return np.zeros_like(free)
     labels: NDArray[np.int32] = ndimage.label(free)[0]
-    return np.asarray((labels == labels[seed]) & free)
+    return np.asarray(labels == labels[seeds[0]])
 
 
 def _bars(box: Box) -> bool:
@@ -295,7 +293,3 @@ def _away(cells: NDArray[np.int64], first: int, end: int) -> NDArray[np.int64]:
 
 def _overlap(a: _Cells, b: _Cells) -> bool:
     return a[0] < b[1] and b[0] < a[1] and a[2] < b[3] and b[2] < a[3]
-
-
-def _flat(box: Box) -> tuple[float, float, float, float]:
-    return (box[0], box[1], box[3], box[4])
