@@ -6,6 +6,7 @@ from collections import Counter
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.factory.floorplan_walls import WALL_HEIGHT_M
 from embomatrix.factory.furnish_groups import alone, hung_and_laid, in_the_open, room_groups
 from embomatrix.factory.furnish_pieces import Rows
 from embomatrix.factory.furnish_roles import Role, importance_of
@@ -46,6 +47,7 @@ _CAPS: Final[Mapping[Role, int]] = {
     Role.SEAT: MAX_SEATS,
     Role.PLANTING: MAX_PLANTS,
 }
+_ABOVE_FLOOR_M: Final = 0.1
 _PAST_M: Final = 2 * ROBOT.radius_m + 0.1
 _LIGHT_LOSSES: Final = frozenset((Role.WALL, Role.CEILING, Role.RUG, Role.PLANTING))
 """What finds no place of these is no reason to start again with it."""
@@ -65,7 +67,8 @@ class Furnishing:
 class _Arrangement:
     placed: tuple[Placed, ...]
     dropped: tuple[Piece, ...]
-    notes: tuple[str, ...]
+    unfit: tuple[tuple[Piece, str], ...]
+    """What no group takes, with the reason."""
 
     @property
     def loss(self) -> float:
@@ -90,7 +93,11 @@ def furnish(plan: FloorPlan, pieces: dict[str, list[Piece]], rng: np.random.Gene
         placed += [replace(p, host=p.host + start) if p.host >= 0 else p for p in best.placed]
         left_out += [
             *notes,
-            *(f"{note} in {room.name}" for note in best.notes),
+            *(
+                sentence
+                for reason in dict.fromkeys(reason for _, reason in best.unfit)
+                for sentence in _sentences([p for p, why in best.unfit if why == reason], room.name, reason)
+            ),
             *_unplaced(best.dropped, room),
         ]
         done = {p.piece.number for p in best.placed} | {p.number for p in best.dropped}
@@ -127,7 +134,8 @@ def _capped(pieces: Sequence[Piece], room: str) -> tuple[list[Piece], list[str]]
     for piece in pieces:
         seen[piece.asset.asset_id] += 1
         most = _CAPS.get(piece.role, MAX_FURNITURE)
-        if piece.role is not Role.STRUCTURE and seen[piece.asset.asset_id] <= most:
+        belongs = piece.role is not Role.STRUCTURE and not _too_high(piece)
+        if belongs and seen[piece.asset.asset_id] <= most:
             kept.append(piece)
     notes = []
     for piece in {p.asset.asset_id: p for p in pieces}.values():
@@ -137,11 +145,18 @@ def _capped(pieces: Sequence[Piece], room: str) -> tuple[list[Piece], list[str]]
             notes.append(
                 f"{total} {asset_id} in {room}: part of the building, which floor and walls stand for"
             )
+        elif _too_high(piece):
+            notes.append(f"{total} {asset_id} in {room}: it hangs, and is higher than the room")
         elif total > most:
             notes.append(
                 f"{total - most} of {total} {asset_id} in {room}: at most {most} of a model in a room"
             )
     return kept, notes
+
+
+def _too_high(piece: Piece) -> bool:
+    """Whether a thing for wall or ceiling has no room above the floor: lamps of a hall, screens of a theatre."""
+    return piece.role in (Role.WALL, Role.CEILING) and piece.size_m[2] > WALL_HEIGHT_M - _ABOVE_FLOOR_M
 
 
 def _best_arrangement(
@@ -175,7 +190,7 @@ def _arrange(
     wobble: float,
 ) -> _Arrangement:
     solver = RoomSolver(RoomSpace(room, plan.doorways, plan.windows), rng)
-    groups, notes = room_groups(pieces, room.type, room.size_m)
+    groups, unfit = room_groups(pieces, room.type, room.size_m)
     groups.sort(key=lambda g: all(m.piece.number not in first for m in _members(g)))
     dropped = _place_all(solver, groups, wobble, rng)
     # What its group had no room for may still stand alone: a chair at the wall, an armchair in the corner.
@@ -184,7 +199,7 @@ def _arrange(
     dropped = walls + _place_all(solver, [g for p in dropped if (g := in_the_open(p))], wobble, rng)
     taken = {p.piece.number for p in solver.placed} | {p.number for p in dropped}
     dropped += _place_all(solver, hung_and_laid(pieces, taken), wobble, rng)
-    return _Arrangement(tuple(solver.placed), tuple(dropped), tuple(notes))
+    return _Arrangement(tuple(solver.placed), tuple(dropped), tuple(unfit))
 
 
 def _place_all(

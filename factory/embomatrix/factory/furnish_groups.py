@@ -60,10 +60,10 @@ _OFF_FLOOR: Final = frozenset(
 
 def room_groups(
     pieces: Sequence[Piece], room_type: str = "", floor_m: tuple[float, float] = (5.0, 5.0)
-) -> tuple[list[Group | Rows], list[str]]:
-    """Everything that stands on the floor, as groups, the important ones first; and a sentence for what is left out."""
+) -> tuple[list[Group | Rows], list[tuple[Piece, str]]]:
+    """Everything that stands on the floor, as groups, the important ones first; and what no group takes, with the reason."""
     pool = Pool((p for p in pieces if p.role not in _OFF_FLOOR), room_type, floor_m)
-    left_out: list[str] = []
+    left_out: list[tuple[Piece, str]] = []
     screens = [p for p in pieces if p.category == "wall_mounted_tv"]
     found: list[Group | Rows] = [
         *_television(pool, [p for p in pieces if p.category == "standing_tv"]),

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from embomatrix.factory.furnish_pieces import Piece
     from embomatrix.factory.furnish_pool import Pool
 
+    Unplaced = tuple[Piece, str]
+
 UNDER_COUNTER: Final = (
     "bottom_cabinet",
     "bottom_cabinet_no_top",
@@ -52,13 +54,13 @@ _WORKTOP_M: Final = 0.72
 _BASIN_RIM_M: Final = 0.86
 
 
-def run_groups(pool: Pool, left_out: list[str]) -> list[Group]:
+def run_groups(pool: Pool, left_out: list[Unplaced]) -> list[Group]:
     """Everything that stands in lines along the walls, in the order of a kitchen: cold, wet, work, hot, and the rest."""
     counters = _counters(pool, left_out)
     _fit(pool, counters)
     basins = [_basin(p) for p in pool.take(p for p in pool.of(*FITTED) if p.category != "burner")]
     for burner in pool.take(pool.of("burner")):
-        left_out.append(f"1 {burner.asset.asset_id}: no counter is left to carry it")
+        left_out.append((burner, "no counter is left to carry it"))
     units = [Group((Member(p),), Style.RUN, 0.0) for p in pool.take(pool.with_role(Role.RUN))]
     ordered = _in_order([*counters, *units])
     near = ("countertop", *SINKS, "stove", "fridge", *UNDER_COUNTER)
@@ -94,7 +96,7 @@ def _is_counter(piece: Piece) -> bool:
     return piece.category in ("countertop", "bar")
 
 
-def _counters(pool: Pool, left_out: list[str]) -> list[Group]:
+def _counters(pool: Pool, left_out: list[Unplaced]) -> list[Group]:
     """Slabs over base cabinets and low appliances: widest first, close in height."""
     groups: list[Group] = []
     left: list[Piece] = []
@@ -109,9 +111,7 @@ def _counters(pool: Pool, left_out: list[str]) -> list[Group]:
         # A worktop on brackets: the basins of a washroom, the table of a copy room.
         bracketed = left.pop(0)
         groups.append(Group((Member(bracketed, bottom=_WORKTOP_M),), Style.RUN, 0.0))
-    for asset_id in dict.fromkeys(s.asset.asset_id for s in left):
-        count = sum(s.asset.asset_id == asset_id for s in left)
-        left_out.append(f"{count} of the {asset_id} slabs: no base cabinets are left to carry them")
+    left_out += [(slab, "no base cabinets are left to carry it") for slab in left]
     groups += [
         Group((Member(bar),), Style.RUN, 0.0)
         for bar in pool.take(p for p in pool.of("bar") if pool.room_type == "kitchen" and p.size_m[0] <= 0.75)
