@@ -94,11 +94,13 @@ async def _execute(child: Child, scene: SceneWork, sample: SlotSample) -> None:
     sample.private_mb.append(private_mb(slot.pid))
     nothing = _frame(Rollout("empty", "bench", scene.bundle_digest, rollouts[0].task_id, (), 0))
     for _ in range(RESPAWNS):
+        killed = slot
         started_s = time.perf_counter()
-        await slot.end()
+        killed.kill()
         slot = await child.fork()
         await _ask(slot, nothing)
         sample.respawn_s.append(time.perf_counter() - started_s)
+        await killed.end()
     await slot.end()
 
 

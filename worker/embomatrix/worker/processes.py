@@ -122,11 +122,15 @@ class Child(Zygote):
         self.pid = pid
         self._parent = parent
 
-    async def end(self) -> str:
-        """Kill the process, whatever it does, and say how it ended; one that had died before keeps its own reason."""
+    def kill(self) -> None:
+        """Have the process die, whatever it does. It must be ended later, or its id is never free again."""
         self.peer.close()
         with contextlib.suppress(ProcessLookupError):
             os.kill(self.pid, signal.SIGKILL)
+
+    async def end(self) -> str:
+        """Kill the process and say how it ended; one that had died before keeps its own reason."""
+        self.kill()
         try:
             return await self._parent.reap(self.pid)
         except ProcessGoneError:

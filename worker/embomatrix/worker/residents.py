@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+COLLECT_S: Final = 0.05
+"""How long the system may take to tear a killed process down before its parent is asked to collect it."""
 LOAD_S: Final = 60.0
 """Limit for fetching and loading one scene."""
 RETRY_LOAD_S: Final = 5.0
@@ -201,8 +203,12 @@ class Residents:
             self.end_later(oldest.idle.pop(0).child)
 
     def end_later(self, child: Child) -> None:
-        """Kill a process without waiting for its end."""
-        task = asyncio.create_task(child.end())
+        """Kill a process without waiting for its end.
+
+        It is collected a little later: whom its parent waits for, it can't fork another one meanwhile.
+        """
+        child.kill()
+        task = asyncio.create_task(_collect(child))
         self._ending.add(task)
         task.add_done_callback(self._ending.discard)
 
@@ -291,3 +297,8 @@ class Residents:
             self.end_later(scene.child)
             scene.child = None
         self._on_change(scene)
+
+
+async def _collect(child: Child) -> str:
+    await asyncio.sleep(COLLECT_S)
+    return await child.end()
