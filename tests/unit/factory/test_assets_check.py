@@ -40,16 +40,23 @@ def test_what_scenes_and_activities_use_is_known() -> None:
     assert {"fridge", "apple", "door", "bath_towel"} <= set(used)
 
 
-def test_every_category_in_use_passes() -> None:
-    for category in CATALOG.used_categories:
-        assert not wrong(check_asset(CATALOG, first_of(category))), category
+def test_three_models_of_every_category_in_use_pass() -> None:
+    assert not wrong_ones(most=3)
 
 
-def test_every_model_of_what_opens_heats_or_cools_passes() -> None:
-    for category in CATALOG.used_categories:
-        if {"openable", "heatSource", "coldSource"} & set(CATALOG.category(category).abilities):
-            for model in CATALOG.models_of(category):
-                assert not wrong(check_asset(CATALOG, build_asset(CATALOG, category, model.model_id)))
+@pytest.mark.slow
+def test_every_model_of_every_category_in_use_passes() -> None:
+    assert not wrong_ones(most=None)
+
+
+def wrong_ones(most: int | None) -> list[str]:
+    """Models in use that break a rule of geometry, of so many of each category."""
+    return [
+        f"{category}-{model.model_id}"
+        for category in CATALOG.used_categories
+        for model in CATALOG.models_of(category)[:most]
+        if wrong(check_asset(CATALOG, build_asset(CATALOG, category, model.model_id)))
+    ]
 
 
 def test_what_slicing_makes_has_the_shape_of_a_part_of_the_whole() -> None:

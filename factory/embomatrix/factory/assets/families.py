@@ -75,6 +75,7 @@ class Family(StrEnum):
     TOILET = "toilet"
     SHOWER_STALL = "shower_stall"
     COOKTOP = "cooktop"
+    GRILL = "grill"
     COFFEE_MACHINE = "coffee_machine"
     DOOR = "door"
     SLIDING_DOOR = "sliding_door"
@@ -177,6 +178,7 @@ GENERATORS: Final[Mapping[Family, Generator]] = {
     Family.TOILET: fixtures.toilet,
     Family.SHOWER_STALL: fixtures.shower_stall,
     Family.COOKTOP: fixtures.cooktop,
+    Family.GRILL: fixtures.grill,
     Family.COFFEE_MACHINE: fixtures.coffee_machine,
     Family.DOOR: fixtures.door,
     Family.SLIDING_DOOR: fixtures.sliding_door,

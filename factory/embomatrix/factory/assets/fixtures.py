@@ -17,12 +17,15 @@ from embomatrix.factory.assets.body import (
     shell,
     sliding,
 )
+from embomatrix.factory.assets.furniture import legs
 from embomatrix.factory.assets.shapes import box, lump, octagon
 from embomatrix.world.geometry import Aabb
 
 if TYPE_CHECKING:
     from embomatrix.world.geometry import Part, Vec2, Vec3
 
+_ON_LEGS_M: Final = 0.6
+"""A grill as high as this is one to stand at."""
 _TAP_M: Final = 0.2
 _BASIN_DEPTH_M: Final = 0.18
 
@@ -143,6 +146,19 @@ def cooktop(size_m: Vec3) -> Body:
     outer = centred(size_m)
     body = Body(parts=[box(outer.low_m, outer.high_m)])
     body.add_support("cooktop", outer.low_m[:2], outer.high_m[:2], outer.high_m[2])
+    return body
+
+
+def grill(size_m: Vec3) -> Body:
+    """A fire box on four legs, whose whole top is the hot surface; a low one stands on the ground."""
+    if size_m[2] < _ON_LEGS_M:
+        return cooktop(size_m)
+    outer = centred(size_m)
+    (x0, y0, z0), (x1, y1, z1) = outer.low_m, outer.high_m
+    fire = z1 - 0.4 * size_m[2]
+    thick = clamp(0.08 * min(size_m[:2]), 0.02, 0.06)
+    body = Body(parts=[box((x0, y0, fire), (x1, y1, z1)), *legs((x0, y0), (x1, y1), (z0, fire), thick)])
+    body.add_support("cooktop", (x0, y0), (x1, y1), z1)
     return body
 
 
