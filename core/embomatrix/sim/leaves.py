@@ -5,15 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.sim.bounds import parts_of
+from embomatrix.sim.bounds import bounds_of, parts_of
 from embomatrix.sim.spots import link_frame
+from embomatrix.world.geometry import Aabb
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from embomatrix.sim.engine import PhysicsEngine
     from embomatrix.sim.relations import Relations
-    from embomatrix.world.geometry import Aabb, Pose
+    from embomatrix.world.geometry import Pose
 
 LEAF_SLACK_M: Final = 0.02
 """What is further than this from the boxes of all leaves is not looked at."""
@@ -40,6 +41,7 @@ class Leaves:
         self._before = engine.joints(name)
         self._riders = tuple(self._riders_of(relations))
         self._contacts: dict[str, frozenset[str]] = {}
+        self._around: dict[str, Aabb] = {}
 
     @property
     def riders(self) -> tuple[str, ...]:
@@ -53,13 +55,15 @@ class Leaves:
         into something; "" at the end of the course. The leaves stay at the last that was reached.
         """
         reached, last = 0, self._before
-        for fractions in course:
+        stops = [self._before, *map(tuple, course)]
+        self._around = self._boxes_around(stops)
+        for fractions in stops[1:]:
             self._put(fractions)
             other = self._stopped_by()
             if other:
                 self._put(last)
                 return reached, other
-            reached, last = reached + 1, tuple(fractions)
+            reached, last = reached + 1, fractions
         return reached, ""
 
     def put_back(self) -> None:
@@ -89,15 +93,18 @@ class Leaves:
             return ""
         return self._engine.penetrates(name, ignore=ignore | self._contacts_of(name))
 
+    def _boxes_around(self, stops: Sequence[Sequence[float]]) -> dict[str, Aabb]:
+        """Boxes of the objects near the furniture as it swings from stop to stop, grown by a slack."""
+        bounds = bounds_of(self._asset)
+        swept = Aabb.around(bounds.box(self._base, fractions) for fractions in stops).grown(LEAF_SLACK_M)
+        near = self._engine.near(swept, frozenset((self._name,)))
+        return {other: self._engine.aabb(other).grown(LEAF_SLACK_M) for other in near}
+
     def _out_of_the_way(self) -> frozenset[str]:
         """Objects near the furniture that no leaf comes near to: most of what stands in and on it."""
         leaves = self._leaf_boxes()
-        around = self._engine.near(
-            self._engine.aabb(self._name).grown(LEAF_SLACK_M), frozenset((self._name,))
-        )
-        boxes = {other: self._engine.aabb(other).grown(LEAF_SLACK_M) for other in around}
         return frozenset(
-            other for other, box in boxes.items() if not any(box.overlaps(leaf) for leaf in leaves)
+            other for other, box in self._around.items() if not any(box.overlaps(leaf) for leaf in leaves)
         )
 
     def _leaf_boxes(self) -> list[Aabb]:

@@ -130,9 +130,15 @@ class Aabb:
 
     def overlaps(self, other: Aabb, margin_m: float = 0.0) -> bool:
         """True when the boxes, ``margin_m`` apart or less, share volume or a face."""
-        return all(
-            a_lo - margin_m <= b_hi and b_lo - margin_m <= a_hi
-            for a_lo, a_hi, b_lo, b_hi in zip(self.low_m, self.high_m, other.low_m, other.high_m, strict=True)
+        (a, b, c), (d, e, f) = self.low_m, self.high_m
+        (x, y, z), (u, v, w) = other.low_m, other.high_m
+        return (
+            a - margin_m <= u
+            and x - margin_m <= d
+            and b - margin_m <= v
+            and y - margin_m <= e
+            and c - margin_m <= w
+            and z - margin_m <= f
         )
 
     @staticmethod
@@ -141,9 +147,12 @@ class Aabb:
         items = list(boxes)
         if not items:
             raise ValueError("no boxes to enclose: expected at least one")
-        low = np.min([b.low_m for b in items], axis=0)
-        high = np.max([b.high_m for b in items], axis=0)
-        return Aabb(_vec3(low), _vec3(high))
+        lows, highs = zip(*((box.low_m, box.high_m) for box in items), strict=True)
+        (a, b, c), (d, e, f) = (
+            (min(axis) for axis in zip(*lows, strict=True)),
+            (max(axis) for axis in zip(*highs, strict=True)),
+        )
+        return Aabb((a, b, c), (d, e, f))
 
 
 def _vec3(values: FloatArray) -> Vec3:
