@@ -103,11 +103,14 @@ def _openable(asset: Asset) -> Iterator[Finding]:
             asset.asset_id, Rule.OPENABLE, "openable without a joint, or a joint without being openable"
         )
     base, moving = asset.links[0], asset.links[1:]
+    if not moving:
+        return
     still = [_Solid.of(part) for part in base.parts]
+    shut = [_moved(link, 0.0) for link in moving]
     for share in TRAVEL:
         placed = [_moved(link, share) for link in moving]
-        shut = [_moved(link, 0.0) for link in moving]
         for number, (link, parts) in enumerate(zip(moving, placed, strict=True)):
+            # the frame, the doors that open with it, and those that stay shut
             others = [*still, *itertools.chain.from_iterable(placed[number + 1 :])]
             others += [part for k, parts_of in enumerate(shut) if k != number for part in parts_of]
             depth = max((_depth(a, b) for a, b in itertools.product(parts, others)), default=0.0)
