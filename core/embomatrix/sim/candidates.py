@@ -70,12 +70,14 @@ def surfaces_for(asset: Asset, relation: Relation) -> tuple[SupportSurface, ...]
 class Patch:
     """Where an asset may stand on one surface, turned by one yaw.
 
-    ``center_m`` is that of the poses, in the support's frame; they lie up to ``room_m`` from it along x and y.
+    ``center_m`` is that of the poses, in the frame of the support's ``link``; they lie up to ``room_m`` from it along x
+    and y.
     """
 
     center_m: Vec3
     room_m: Vec2
     yaw: float
+    link: str
 
 
 def patches(bounds: AssetBounds, support: Asset, relation: Relation) -> tuple[Patch, ...]:
@@ -88,12 +90,13 @@ def patches(bounds: AssetBounds, support: Asset, relation: Relation) -> tuple[Pa
             room = _room_for(box, surface)
             if room is not None:
                 cx, cy, cz = surface.center_m
-                found.append(Patch((cx - x, cy - y, cz - box.low_m[2] + LIFT_M), room, yaw))
+                center = (cx - x, cy - y, cz - box.low_m[2] + LIFT_M)
+                found.append(Patch(center, room, yaw, surface.link))
     return tuple(found)
 
 
-def proposals(found: Sequence[Patch], shift: Vec2, tries: int) -> Iterator[Pose]:
-    """At most ``tries`` poses in the frame of the support, its joints shut, the patches taken in turn.
+def proposals(found: Sequence[Patch], shift: Vec2, tries: int) -> Iterator[tuple[Patch, Pose]]:
+    """At most ``tries`` poses in the frame of a support's link, the patches taken in turn.
 
     ``shift`` in the unit square moves the whole pattern: equal shifts give equal poses. Whether the relation holds there is
     not looked at.
@@ -102,15 +105,15 @@ def proposals(found: Sequence[Patch], shift: Vec2, tries: int) -> Iterator[Pose]
     for number, patch in zip(range(1, tries + 1), itertools.cycle(found), strict=False):
         u, v = (start_u + number * step_u) % 1.0, (start_v + number * step_v) % 1.0
         x, y, z = patch.center_m
-        yield Pose.from_xyz_yaw(
-            x + (2 * u - 1) * patch.room_m[0], y + (2 * v - 1) * patch.room_m[1], z, patch.yaw
-        )
+        x += (2 * u - 1) * patch.room_m[0]
+        y += (2 * v - 1) * patch.room_m[1]
+        yield patch, Pose.from_xyz_yaw(x, y, z, patch.yaw)
 
 
 def candidates(held: Asset, support: Asset, relation: Relation, shift: Vec2, tries: int) -> Iterator[Pose]:
     """Those of ``proposals`` at which the relation holds."""
     bounds = bounds_of(held)
-    for pose in proposals(patches(bounds, support, relation), shift, tries):
+    for _, pose in proposals(patches(bounds, support, relation), shift, tries):
         if _stands(bounds.box(pose), support, relation):
             yield pose
 

@@ -147,11 +147,11 @@ class Placer:
     ) -> Iterator[Pose]:
         """Poses for pairs that the analysis did not foresee, and on surfaces that have filled up."""
         shift = (0.5, 0.5) if rng is None else (float(rng.random()), float(rng.random()))
-        names = (errand.held, errand.target, errand.relation)
+        found = self._patches_for(errand.held, errand.target, errand.relation)
         poses = (
-            frames[link] @ local
-            for local in proposals(self._patches_for(*names), shift, LIVE_TRIES)
-            if (link := self._link_of(*names, local)) in frames
+            frames[patch.link] @ local
+            for patch, local in proposals(found, shift, LIVE_TRIES)
+            if patch.link in frames
         )
         settles = 0
         for pose in self._roomy_first(errand, poses):
@@ -160,9 +160,9 @@ class Placer:
             if not self._is_free(errand, pose) or not self._holds(errand):
                 continue
             settles += 1
-            found = self._accept_settled(errand)
-            if found is not None:
-                yield found
+            settled = self._accept_settled(errand)
+            if settled is not None:
+                yield settled
 
     def _roomy_first(self, errand: Errand, poses: Iterable[Pose]) -> Iterator[Pose]:
         """Those in reach, in their order: first those around which there is nothing but the target, then the others.
