@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 EDGE: Final = 0.88
 """The hand takes a leaf at this share of the way from its hinge to its free edge."""
-ALONG: Final = (0.0, 0.5, -0.5, 0.8, -0.8)
+ALONG: Final = (0.0, 0.5, -0.5, 0.85)
 """Where along the edge, as shares of its half length."""
 FOLLOWED: Final = (1.0, 0.5, 0.0)
 """Shares of the leaf's turn that the hand turns along."""
@@ -50,8 +50,10 @@ AJAR: Final = 0.3
 ENOUGH: Final = 0.5
 """A door that something stops before this share of its travel is not open: the same as in cached mode."""
 SHUT: Final = OPEN_FRACTION
-STRETCHES: Final = ((1.0,), (0.5, 1.0))
-"""How the way is divided: in one pull, else in two with a step between them."""
+STRETCHES: Final = (1, 2, 4)
+"""Into how many pulls the way is divided, with steps between them."""
+FAR_M: Final = 1.7
+"""So far the base may go to lead a leaf."""
 
 
 class Spot(Enum):
@@ -141,13 +143,14 @@ def _lead_all(stage: Stage, name: str, goal: float, rng: np.random.Generator) ->
 
 
 def _lead(stage: Stage, leaf: Leaf, goal: float, rng: np.random.Generator) -> Refusal | None:
-    """Move one leaf to a share of its travel, in one stretch or in two."""
+    """Move one leaf to a share of its travel: in one stretch, else in ever more of them with steps between."""
     refusal: Refusal | None = None
-    for stretch in STRETCHES:
-        for share in stretch:
+    for stretches in STRETCHES:
+        start = stage.dynamic.joints(leaf.name)[leaf.number]
+        for number in range(stretches):
             now = stage.dynamic.joints(leaf.name)[leaf.number]
-            aim = goal if share == 1.0 else now + share * (goal - now)
-            refusal = _stretch(stage, leaf, now, aim, rng)
+            aim = start + (number + 1) / stretches * (goal - start)
+            refusal = _stretch(stage, leaf, now, aim, rng) if abs(aim - now) > SHUT else None
             if refusal is not None:
                 break
         if refusal is None:
@@ -177,7 +180,7 @@ def _stretch(stage: Stage, leaf: Leaf, start: float, goal: float, rng: np.random
     reach = Reach(boxes, fixed, None, clear)
     tracks = list(_tracks(leaf, fractions))
     point = np.array(tracks[0].position[2])
-    for way in itertools.islice(reach.ways(tracks, stage.bases(point, 0.8)), WAYS):
+    for way in itertools.islice(reach.ways(tracks, stage.bases(point, 0.75, walk_m=FAR_M)), WAYS):
         swing = approach(stage, way, reach, rng, loaded=False)
         if swing is None:
             continue

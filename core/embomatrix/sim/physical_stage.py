@@ -43,6 +43,7 @@ TOOL: Final = Pose((0.0, 0.0, arm.TOOL_M))
 """The tool's frame in the hand's."""
 NEARER: Final = 24
 SPAN_M: Final = 0.5
+APART: Final = 0.13
 """Places that are tried when the arm does not reach from where the robot stands."""
 
 
@@ -94,10 +95,17 @@ class Stage:
         held = self.grip.held if self.grip is not None else None
         return Reach(boxes, boxes.without((target,)) if target else boxes, held)
 
-    def bases(self, point: FloatArray, away_m: float = 0.6, course: float | None = None) -> list[FloatArray]:
+    def bases(
+        self,
+        point: FloatArray,
+        away_m: float = 0.6,
+        course: float | None = None,
+        walk_m: float = ROBOT.reach_m,
+    ) -> list[FloatArray]:
         """Where the base may stand to work at a point: here, shape (1, 3); then other places, (b, 3), the likeliest first.
 
-        ``away_m`` is the distance that suits the work, ``course`` the heading in which the hand must go.
+        ``away_m`` is the distance that suits the work, ``course`` the heading in which the hand must go, ``walk_m`` how far the
+        base may go. Places are the farther apart the farther it may.
         """
         here = self.mover.posture[:3]
         yaw = math.atan2(point[1] - here[1], point[0] - here[0])
@@ -117,9 +125,9 @@ class Stage:
             chosen: list[tuple[float, float, float]] = []
             for number in np.argsort(cost, kind="stable").tolist():
                 x, y = spots[number].tolist()
-                if walk[number] > ROBOT.reach_m or away[number] < 0.35:
+                if walk[number] > walk_m or away[number] < 0.35:
                     continue
-                if all(math.hypot(x - other[0], y - other[1]) > 0.14 for other in chosen):
+                if all(math.hypot(x - other[0], y - other[1]) > APART * walk_m for other in chosen):
                     chosen.append((x, y, math.atan2(point[1] - y, point[0] - x)))
                 if len(chosen) == NEARER:
                     break
