@@ -447,16 +447,16 @@ def test_unreadable_sources_are_one_sentence(tmp_path: Path) -> None:
 )
 def test_tasks_of_the_paper_s_factory_are_bound_or_refused() -> None:
     bases = [build_base_scene("Rs_int"), build_base_scene("Wainscott_0_int")]
-    outcomes = [bind_first(item, bases) for item in list(read_jsonl(SAMPLE))[::4]]
+    outcomes = [bind_first(item, bases) for item in list(read_jsonl(SAMPLE))[::8]]
     counts = Counter(item.reason if isinstance(item, Refusal) else "bound" for item in outcomes)
-    assert counts["bound"] >= 5
-    assert sum(counts.values()) == 100
+    assert counts["bound"] >= 3
+    assert sum(counts.values()) == 50
 
 
 def test_activities_of_behavior_1k_are_bound_or_refused() -> None:
     pytest.importorskip("bddl", reason="the bddl package is not installed")
     base = build_base_scene("Wainscott_0_int")
-    names = activity_names()[::16]
+    names = activity_names()[::32]
     outcomes = [import_problem(read_activity(name), base) for name in names]
     bound = [item for item in outcomes if isinstance(item, Imported)]
     assert len(bound) >= 2
