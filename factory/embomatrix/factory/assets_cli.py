@@ -28,6 +28,7 @@ from embomatrix.world.field import SceneInvalidError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from embomatrix.factory.importers.assemble import Imported
     from embomatrix.world.asset import Asset
 
 app = typer.Typer(
@@ -142,9 +143,13 @@ def import_(
         _fail(str(error))
     except OSError as error:
         _fail(f"{error.filename or out} can't be written ({error.strerror}): name another folder with --out")
-    asset = imported.asset
+    _tell(imported, path)
+
+
+def _tell(imported: Imported, path: Path) -> None:
+    """What the asset has, and what it lacks of what its category's things do."""
+    asset, console = imported.asset, Console(soft_wrap=True)
     parts = sum(len(link.parts) for link in asset.links)
-    console = Console(soft_wrap=True)
     console.print(
         f"{asset.asset_id}: {parts} convex parts in {len(asset.links)} links, {len(asset.supports)} surfaces, "
         f"{len(asset.interiors)} cavities: {path}",
