@@ -133,28 +133,63 @@ class Footings:
         around: list[tuple[float, str, Enclosure]] = []
         on: list[str] = []
         for other in engine.near(box.grown(REST_M), frozenset((name,))):
-            asset = scene.asset_of(other)
-            may_rest = _is_over(box, engine.aabb(other))
-            if not (may_rest or asset.interiors):
-                continue
-            pose, fractions = engine.pose(other), engine.joints(other)
-            interior = self._interior(name, asset, pose, fractions) if asset.interiors else None
-            surface = surface_under(box, asset, pose, fractions, doored=True) if may_rest else ""
-            if surface and surface_under(box, asset, pose, fractions, doored=False):
+            interior, surface = self._spots_of(name, other)
+            if surface and self._is_open_to(name, other):
                 on.append(other)
+            if interior is None and not surface:
+                continue
+            asset = scene.asset_of(other)
             volume = math.prod(asset.size_m)
             if interior is not None:
                 hosts.append((volume, other, Host(other, Relation.INSIDE, interior.name)))
-                closed = is_shut(asset, interior, fractions)
-                enclosure = Enclosure(other, interior.name, closed)
+                enclosure = Enclosure(other, interior.name, is_shut(asset, interior, engine.joints(other)))
                 around.append((math.prod(interior.size_m), other, enclosure))
-            elif surface:
+            else:
                 hosts.append((volume, other, Host(other, Relation.ONTOP, surface)))
         return Footing(
             min(hosts, key=_first_two)[2] if hosts else None,
             tuple(item for _, _, item in sorted(around, key=_first_two)),
             frozenset(on),
         )
+
+    def is_on(self, name: str, other: str) -> bool:
+        """Whether the object rests on a surface of another that no door shuts off."""
+        known = self._known(name)
+        if known is not None:
+            return other in known.on
+        near = self._engine.aabb(name).overlaps(self._engine.aabb(other), REST_M)
+        return near and bool(self._spots_of(name, other)[1]) and self._is_open_to(name, other)
+
+    def is_in(self, name: str, other: str) -> bool:
+        """Whether the object lies in a cavity of another."""
+        known = self._known(name)
+        if known is not None:
+            return any(item.name == other for item in known.enclosures)
+        near = self._engine.aabb(name).overlaps(self._engine.aabb(other), REST_M)
+        return near and self._spots_of(name, other)[0] is not None
+
+    def _known(self, name: str) -> Footing | None:
+        self._read_journal()
+        return (self._now if name in self._stale else self._at_start).get(name)
+
+    def _spots_of(self, name: str, other: str) -> tuple[Interior | None, str]:
+        """The cavity of another object that this one is in, and the surface of it that it rests on, doored or not."""
+        engine, asset = self._engine, self._scene.asset_of(other)
+        box = engine.aabb(name)
+        over = _is_over(box, engine.aabb(other))
+        if not (over or asset.interiors):
+            return None, ""
+        pose, fractions = engine.pose(other), engine.joints(other)
+        interior = self._interior(name, asset, pose, fractions) if asset.interiors else None
+        return interior, surface_under(box, asset, pose, fractions, doored=True) if over else ""
+
+    def _is_open_to(self, name: str, other: str) -> bool:
+        """Whether the surface that the object rests on is one that no door shuts off, of an asset that may have such."""
+        asset = self._scene.asset_of(other)
+        if not any(interior.closed_by for interior in asset.interiors):
+            return True
+        pose, fractions = self._engine.pose(other), self._engine.joints(other)
+        return bool(surface_under(self._engine.aabb(name), asset, pose, fractions, doored=False))
 
     def _interior(self, name: str, asset: Asset, pose: Pose, fractions: tuple[float, ...]) -> Interior | None:
         """The smallest cavity of an asset at a pose that the object is in."""

@@ -57,14 +57,14 @@ class Relations:
 
         Open shelf boards and the bottoms of bowls count, boards behind a door do not: what lies there is inside.
         """
-        return self._apart(a, b) and b in self.footings.of(a).on
+        return self._apart(a, b) and self.footings.is_on(a, b)
 
     def inside(self, a: str, b: str) -> bool:
         """The centre of ``a`` lies in a cavity of ``b``, and its box within the cavity, 1 cm outside allowed.
 
         What stands in an open cavity may stick out at the top. Holds through nested containers.
         """
-        return self._apart(a, b) and any(item.name == b for item in self.footings.of(a).enclosures)
+        return self._apart(a, b) and self.footings.is_in(a, b)
 
     def under(self, a: str, b: str) -> bool:
         """Some part of ``b`` lies over the centre of ``a``, and all that do begin above its top, 1 cm deeper allowed."""

@@ -67,8 +67,13 @@ def test_kept_footings_are_those_of_a_fresh_look(engine, changes) -> None:
         change(engine, kind, name, seed)
         if kind == "ask":
             kept.of(name)
-    fresh = Footings(engine)
+    fresh, pairs = Footings(engine), Footings(engine)
     for name in engine.scene.by_name:
+        for other in ("bowl_1", "fridge_1", "breakfast_table_1", "countertop_1"):
+            if name != other and not engine.is_parked(name) and not engine.is_parked(other):
+                assert pairs.is_on(name, other) == (other in fresh.of(name).on), (name, other)
+                around = {item.name for item in fresh.of(name).enclosures}
+                assert pairs.is_in(name, other) == (other in around), (name, other)
         assert kept.of(name) == fresh.of(name), name
 
 
