@@ -30,6 +30,7 @@ FILL: Final = {
     "rests": "#d9d2c5",
     "hung": "#c9b8e0",
     "rug": "#e4d3d3",
+    "plant": "#bcd9a9",
 }
 _LEGEND: Final = (
     ("opens", "opens (cabinet, fridge, oven ...)"),
@@ -37,7 +38,9 @@ _LEGEND: Final = (
     ("rests", "other furniture"),
     ("hung", "on the wall above the robot's way"),
     ("rug", "rug"),
+    ("plant", "plant"),
 )
+_PLANTS: Final = frozenset({"tree", "low_resolution_tree", "bush", "pot_plant"})
 _WORKS: Final = ("toggleable", "heatSource", "coldSource", "particleSource")
 
 
@@ -76,6 +79,8 @@ def kind_of(scene: Scene, item: SceneObject, box: Aabb) -> str:
         return "hung"
     if box.high_m[2] < 0.04:
         return "rug"
+    if asset.category in _PLANTS:
+        return "plant"
     if asset.can("openable"):
         return "opens"
     return "works" if any(asset.can(a) for a in _WORKS) else "rests"

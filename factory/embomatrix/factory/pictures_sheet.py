@@ -60,10 +60,13 @@ def draw_thumbnail(scene: Scene, side_px: int) -> Image.Image:
         a, b = (window.width_m / 2, _PANE_M) if window.along == "x" else (_PANE_M, window.width_m / 2)
         x, y = window.center_m
         draw.rectangle(box(x - a, y - b, x + a, y + b), fill="#6fc3e8")
-    for item in scene.objects:
-        around = footprint(scene, item)
-        kind = kind_of(scene, item, around)
-        if not is_overhead(around) and kind != "hung":
+    boxes = {item.name: footprint(scene, item) for item in scene.objects}
+    kinds = {item.name: kind_of(scene, item, boxes[item.name]) for item in scene.objects}
+    # Plants first: a tree's crown would hide what stands under it.
+    for item in sorted(scene.objects, key=lambda o: kinds[o.name] != "plant"):
+        around = boxes[item.name]
+        if not is_overhead(around) and kinds[item.name] != "hung":
             outline = None if item.host else "#8a8a8a"
-            draw.rectangle(box(*around.low_m[:2], *around.high_m[:2]), fill=FILL[kind], outline=outline)
+            fill = FILL[kinds[item.name]]
+            draw.rectangle(box(*around.low_m[:2], *around.high_m[:2]), fill=fill, outline=outline)
     return image

@@ -49,7 +49,9 @@ _SOFT: Final[Rgba] = (0.45, 0.50, 0.62, 1.0)
 _DOOR: Final[Rgba] = (0.55, 0.30, 0.18, 1.0)
 _GLASS: Final[Rgba] = (0.66, 0.84, 0.93, 1.0)
 _LEAVES: Final[Rgba] = (0.42, 0.58, 0.36, 1.0)
-_PLANTS: Final = frozenset({"tree", "bush", "pot_plant", "hanging_plant", "greenery", "vine"})
+_PLANTS: Final = frozenset(
+    {"tree", "low_resolution_tree", "bush", "pot_plant", "hanging_plant", "greenery", "vine"}
+)
 _CLOTH: Final = frozenset({"bed", "sofa", "armchair", "ottoman", "carpet", "booth", "bench", "pillow"})
 _LEAF_M: Final = 0.1
 _PANE_M: Final = 0.03
