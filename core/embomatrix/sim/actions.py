@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.sim.barriers import no_way_into, no_way_to
 from embomatrix.sim.household import clean, cut, soak
 from embomatrix.sim.leaves import Leaves
 from embomatrix.skills.failure import FailureReason
@@ -54,9 +55,7 @@ def _move(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusa
     if stands:
         world.robot = stands[0]
         return None
-    room = world.room_of(target)
-    cut_off = room in world.rooms and world.navigator.room_entry(room, world.robot) is None
-    return refuse(FailureReason.NO_PATH if cut_off else FailureReason.NO_STANDING_POSE, target=target)
+    return no_way_to(world, target)
 
 
 def _turn(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
@@ -85,7 +84,7 @@ def _go_to_room(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> 
     room = call.room_name or ""
     entry = world.navigator.room_entry(room, world.robot)
     if entry is None:
-        return refuse(FailureReason.NO_PATH, target=room)
+        return no_way_into(world, room)
     world.robot = entry
     return None
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import functools
+import heapq
 import math
 from typing import TYPE_CHECKING, Final
 
@@ -29,6 +30,8 @@ SNAP_CELLS: Final = 6
 """A robot that stands within 30 cm of a free cell counts as standing on it."""
 DOORWAY_DEPTH_M: Final = 0.4
 """How far the floor of a doorway reaches, centred on the wall: more than any wall's thickness."""
+CROSSING_COST: Final = 100.0
+"""To drive through a thing is as bad as a detour of this many cells for each of its own."""
 FIELDS_KEPT: Final = 64
 """Distance fields in memory, 0.2 MB each in a flat of 120 m2."""
 
@@ -156,6 +159,35 @@ class FloorGrid:
             if not self.drives_straight(corners[-1], self.center(cells[number])):
                 corners.append(self.center(cells[number - 1]))
         return (*corners, self.center(cells[-1]))
+
+    def crossing(self, start: Cell, low_m: Vec2, high_m: Vec2, floor: BoolArray) -> FloatArray:
+        """Cells that are not free on the way from a cell into a rectangle that has the fewest of them, shape (n, 2).
+
+        The way leads over ``floor`` only, of the grid's shape. Empty when there is none.
+        """
+        cost = np.where(self.free, 1.0, CROSSING_COST)
+        seen = np.full(self._shape, np.inf)
+        seen[start] = 0.0
+        came: dict[Cell, Cell] = {}
+        queue = [(0.0, start)]
+        goal = self._window(np.asarray(low_m), np.asarray(high_m))
+        while queue:
+            spent, (i, j) = heapq.heappop(queue)
+            if spent > seen[i, j]:
+                continue
+            if goal[0].start <= i < goal[0].stop and goal[1].start <= j < goal[1].stop and self.free[i, j]:
+                break
+            for cell in ((i + 1, j), (i - 1, j), (i, j + 1), (i, j - 1)):
+                if floor[cell] and spent + cost[cell] < seen[cell]:
+                    seen[cell] = spent + cost[cell]
+                    came[cell] = (i, j)
+                    heapq.heappush(queue, (float(seen[cell]), cell))
+        else:
+            return np.zeros((0, 2))
+        way = [(i, j)]
+        while way[-1] in came:
+            way.append(came[way[-1]])
+        return np.array([self.center(cell) for cell in way if not self.free[cell]]).reshape(-1, 2)
 
     def drives_straight(self, start: Vec2, end: Vec2) -> bool:
         """Whether the robot fits everywhere on the straight line between two points."""

@@ -14,8 +14,8 @@ import numpy as np
 
 from embomatrix.sim.bounds import AssetParts
 from embomatrix.sim.floor_grid import CELL_M, FloorGrid
-from embomatrix.sim.obstacles import FLAT_M, WALLS, Obstacles, crosses
-from embomatrix.skills.limits import ROBOT
+from embomatrix.sim.obstacles import WALLS, Obstacles, crosses
+from embomatrix.sim.standing import Service
 from embomatrix.world.geometry import Pose
 from embomatrix.world.poses import StandPose
 
@@ -32,16 +32,6 @@ if TYPE_CHECKING:
 
 ON_FLOOR_M: Final = 0.05
 """A movable object whose underside is lower than this stands on the floor."""
-REACH_SLACK_M: Final = 0.05
-"""Standing poses are this much nearer than the arm reaches, so that a thing may be a little off its box's edge."""
-FRONT_COSINE: Final = math.cos(math.radians(65.0))
-"""What has a front is served from within 65 degrees of it."""
-STANDS: Final = 8
-APART_M: Final = 0.25
-"""Standing poses of one thing are at least this far from one another."""
-TRIED: Final = 96
-SIDE_WEIGHT_M: Final = 0.4
-"""Standing abeam of the front is as bad as standing this much farther away."""
 ROOFED_M: Final = 1.5
 """A cavity whose floor has less free height than this can't be reached from above."""
 GRIDS_KEPT: Final = 3
@@ -132,6 +122,19 @@ class Navigator:
         return self._all_at_start, self._grid_at_start
 
     @property
+    def present(self) -> tuple[Obstacles, FloorGrid]:
+        """What stands in the way now, and where the robot may be. For reading only."""
+        return self._obstacles, self._grid
+
+    def crossing(self, origin: StandPose, low_m: Vec2, high_m: Vec2) -> FloatArray:
+        """Where the way into a rectangle that crosses the least of what stands on the floor crosses it, shape (n, 2)."""
+        start = self._cell(origin)
+        if start is None:
+            return np.zeros((0, 2))
+        floor = FloorGrid(self._scene, self._obstacles.only([WALLS]).barring).free
+        return self._grid.crossing(start, low_m, high_m, floor)
+
+    @property
     def start(self) -> StandPose:
         """Where the scene says that the robot starts."""
         robot = self._scene.robot
@@ -218,27 +221,17 @@ class Navigator:
         return self._stands[key, label]
 
     def _find_stands(self, name: str, start: Cell) -> tuple[StandPose, ...]:
-        box = self._relations.body(name)
-        low, high = np.array(box.low_m[:2]), np.array(box.high_m[:2])
-        reach = ROBOT.reach_m - REACH_SLACK_M
-        window_low, window_high = (low - reach).tolist(), (high + reach).tolist()
-        centers = self._grid.free_centers(
-            (window_low[0], window_low[1]), (window_high[0], window_high[1]), self._grid.label(start)
-        )
-        nearest = np.clip(centers, low, high)  # (n, 2)
-        away = np.linalg.norm(centers - nearest, axis=1)  # (n,)
-        cosines, required = self._frontality(name, centers)
-        if (
-            box.high_m[2] <= FLAT_M
-        ):  # the robot stands on rugs and floors, in their middle rather than at their edge
-            fits = away <= reach
-            away = away + np.linalg.norm(centers - np.array(box.center_m[:2]), axis=1)
-        else:
-            fits = (away >= ROBOT.shoulder_m) & (away <= reach)
-        if required:
-            fits &= cosines >= FRONT_COSINE
-        cost = np.where(fits, away + SIDE_WEIGHT_M * (1 - cosines) / 2, np.inf)
-        return self._choose(name, centers, nearest, cost)
+        service = self.service(name)
+        low, high = service.window
+        return service.stands(self._grid.free_centers(low, high, self._grid.label(start)))
+
+    def service(self, name: str) -> Service:
+        """What a place must offer from which the robot works on the object."""
+        # The front is that of the fixed furniture which the object stands in or on, or its own.
+        fixed = [host for host in self._relations.hosts_of(name) if self._scene.by_name[host].fixed]
+        yaw = self._engine.pose(fixed[0] if fixed else name).yaw
+        from_front = has_front(self._scene.asset_of(name))
+        return Service(self._relations.body(name), yaw, from_front, self._blockers_of(name))
 
     def line_is_clear(self, origin: StandPose, name: str) -> bool:
         """Whether no wall nor anything much taller than the object stands between the robot and the object's box."""
@@ -246,38 +239,6 @@ class Navigator:
         (low_x, low_y, _), (high_x, high_y, _) = box.low_m, box.high_m
         nearest = (min(max(origin.x_m, low_x), high_x), min(max(origin.y_m, low_y), high_y))
         return not crosses((origin.x_m, origin.y_m), nearest, self._blockers_of(name))
-
-    def _choose(
-        self, name: str, centers: FloatArray, nearest: FloatArray, cost: FloatArray
-    ) -> tuple[StandPose, ...]:
-        """Walk through the cells by cost; keep those with a clear line that are apart from the ones kept before."""
-        blockers = self._blockers_of(name)
-        chosen: list[StandPose] = []
-        tried = 0
-        for index in np.argsort(cost, kind="stable").tolist():
-            if not math.isfinite(cost[index]) or len(chosen) == STANDS or tried == TRIED:
-                break
-            x, y = centers[index].tolist()
-            if any(math.hypot(x - other.x_m, y - other.y_m) < APART_M for other in chosen):
-                continue
-            tried += 1
-            tx, ty = nearest[index].tolist()
-            if crosses((x, y), (tx, ty), blockers):
-                continue
-            chosen.append(StandPose(x, y, math.atan2(ty - y, tx - x)))
-        return tuple(chosen)
-
-    def _frontality(self, name: str, centers: FloatArray) -> tuple[FloatArray, bool]:
-        """Cosines between the front and the direction to each centre, shape (n,), and whether the front is required.
-
-        The front is that of the fixed furniture which the object stands in or on, or its own.
-        """
-        fixed = [host for host in self._relations.hosts_of(name) if self._scene.by_name[host].fixed]
-        yaw = self._engine.pose(fixed[0] if fixed else name).yaw
-        to_robot = centers - np.array(self._relations.body(name).center_m[:2])
-        to_robot /= np.maximum(np.linalg.norm(to_robot, axis=1, keepdims=True), 1e-9)
-        cosines = to_robot @ np.array((math.cos(yaw), math.sin(yaw)))
-        return cosines, has_front(self._scene.asset_of(name))
 
     def _blockers_of(self, name: str) -> FloatArray:
         """Rectangles that the arm can't pass on its way to the object, shape (4, n)."""

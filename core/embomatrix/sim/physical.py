@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.sim.actions import ACTIONS
+from embomatrix.sim.barriers import no_way_into, no_way_to
 from embomatrix.sim.bullet.dynamic import DynamicWorld
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.physical_doors import close_all, open_all
@@ -85,9 +86,7 @@ def _move(stage: Stage, call: SkillCall, rng: np.random.Generator) -> Refusal | 
     stands = world.navigator.stands(target, world.robot)
     if stands:
         return travel(stage, stands[0], target)
-    room = world.room_of(target)
-    cut_off = room in world.rooms and world.navigator.room_entry(room, world.robot) is None
-    return refuse(FailureReason.NO_PATH if cut_off else FailureReason.NO_STANDING_POSE, target=target)
+    return no_way_to(world, target)
 
 
 def _turn(stage: Stage, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
@@ -114,7 +113,7 @@ def _go_to_room(stage: Stage, call: SkillCall, rng: np.random.Generator) -> Refu
     room = call.room_name or ""
     entry = stage.world.navigator.room_entry(room, stage.world.robot)
     if entry is None:
-        return refuse(FailureReason.NO_PATH, target=room)
+        return no_way_into(stage.world, room)
     return travel(stage, entry)
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 from tests.fakes import furniture as make
 from tests.fakes.household import household_scene
-from tests.fakes.plans import awkward_scene, executed, executed_alone
+from tests.fakes.plans import awkward_scene, executed, executed_alone, with_objects
 from tests.fakes.scenes import kitchen_scene, placed, scene_of, upright
 
 from embomatrix.sim.executor import Simulator
@@ -144,7 +144,7 @@ def test_every_reason_is_met_by_some_test():
 def test_no_path_leads_into_a_room_without_a_door():
     trace = executed_alone(replace(kitchen_scene(), doorways=()), "move apple_2")
     assert trace.failure is FailureReason.NO_PATH
-    assert trace.steps[0].message == "the robot can't get to apple_2: no free path leads there"
+    assert trace.steps[0].message == "the robot can't get to apple_2: a wall bars the way"
 
 
 def test_a_room_without_a_door_can_not_be_entered():
@@ -163,6 +163,19 @@ def test_what_lies_in_the_middle_of_a_huge_table_can_not_be_reached():
     )
     trace = executed_alone(replace(scene, robot=RobotStart(0.5, 0.5, 0.0, "kitchen_0")), "move apple_1")
     assert trace.failure is FailureReason.NO_STANDING_POSE
+    assert trace.steps[0].message.endswith("can be reached: island_1 is in the way")
+
+
+@pytest.mark.parametrize("text", ["move apple_2", "go_to_room living_room_0"])
+def test_who_stands_in_the_doorway_is_told(text):
+    chest = make.block("chest", "chest.n.02", (0.5, 0.9, 0.6), {})
+    scene = with_objects(
+        kitchen_scene(),
+        [(placed("chest_1", chest, "kitchen_0", upright(4.7, 2.0, 0, chest), fixed=True), chest)],
+    )
+    trace = executed_alone(scene, text)
+    assert trace.failure is FailureReason.NO_PATH
+    assert trace.steps[0].message.endswith(": chest_1 bars the way")
 
 
 def test_the_arm_does_not_reach_through_a_wall():

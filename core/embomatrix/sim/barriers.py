@@ -1,0 +1,67 @@
+"""Who bars the robot's way, by name: what a person would move to let it pass."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from embomatrix.sim.obstacles import WALLS
+from embomatrix.skills.failure import FailureReason
+from embomatrix.skills.view import refuse
+
+if TYPE_CHECKING:
+    from embomatrix.sim.live_world import LiveWorld
+    from embomatrix.skills.view import Refusal
+    from embomatrix.world.geometry import FloatArray, Vec2
+
+RASTER_M: Final = 0.1
+"""Distance of the points at which the robot might stand."""
+WALL: Final = "a wall"
+
+
+def no_way_to(world: LiveWorld, target: str) -> Refusal:
+    """Why the robot does not get to an object that it has no standing pose for, and who is in the way."""
+    room = world.room_of(target)
+    if room in world.rooms and world.navigator.room_entry(room, world.robot) is None:
+        return refuse(FailureReason.NO_PATH, target=target, other=_between(world, room))
+    low, high = world.navigator.service(target).window
+    points = world.navigator.service(target).serving(_on_floor(world, _raster(low, high)))
+    other = _most_in_the_way(world, points)
+    return refuse(FailureReason.NO_STANDING_POSE, target=target, other=other)
+
+
+def no_way_into(world: LiveWorld, room: str) -> Refusal:
+    """Why the robot does not get into a room that no path leads to, and who is in the way."""
+    return refuse(FailureReason.NO_PATH, target=room, other=_between(world, room))
+
+
+def _between(world: LiveWorld, room: str) -> str:
+    """What the robot would have to drive through on the way to a room that costs the least."""
+    area = next(item for item in world.scene.rooms if item.name == room)
+    crossed = world.navigator.crossing(world.robot, area.low_m, area.high_m)
+    return _most_in_the_way(world, crossed)
+
+
+def _most_in_the_way(world: LiveWorld, points: FloatArray) -> str:
+    """The object that keeps the robot from the most of some points; a wall when none does."""
+    obstacles, _ = world.navigator.present
+    counts = obstacles.owners_near(points) if len(points) else {}
+    counts.pop(WALLS, None)
+    # Of equals the first in scene order: the answer is part of the trace.
+    number = max(sorted(counts), key=lambda owner: counts[owner], default=WALLS)
+    return world.scene.objects[number].name if counts.get(number) else WALL
+
+
+def _raster(low: Vec2, high: Vec2) -> FloatArray:
+    """Points of a rectangle, shape (n, 2)."""
+    x, y = (np.arange(a, b, RASTER_M) for a, b in zip(low, high, strict=True))
+    return np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+
+
+def _on_floor(world: LiveWorld, points: FloatArray) -> FloatArray:
+    """Those of some points that lie in a room."""
+    inside = np.zeros(len(points), dtype=np.bool_)
+    for room in world.scene.rooms:
+        inside |= ((points >= room.low_m) & (points <= room.high_m)).all(axis=1)
+    return np.asarray(points[inside], dtype=np.float64)
