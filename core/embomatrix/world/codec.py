@@ -259,11 +259,8 @@ def _check_references(scene: Scene) -> None:
     check_unique(Field(None, "scene.rooms"), rooms, "room")
     check_unique(Field(None, "scene.objects"), names, "object")
     # To a tenth of a millimetre: things that lie in one another make physics slow without end.
-    places = [
-        str([round(value, 4) for value in item.pose_world_asset.position_m])
-        for item in scene.objects
-        if not item.absent
-    ]
+    present = [item.pose_world_asset.position_m for item in scene.objects if not item.absent]
+    places = [f"({x:.4f}, {y:.4f}, {z:.4f})" for x, y, z in present]
     check_unique(Field(None, "scene.objects"), places, "position")
     _check_floor(scene)
     absent = {item.name for item in scene.objects if item.absent}

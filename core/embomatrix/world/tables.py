@@ -135,14 +135,29 @@ class Tables:
 
 
 def has_volume(vertices: FloatArray) -> bool:
-    """Whether points, shape (n, 3), span a body that is thicker than a twentieth of a millimetre and within the world."""
-    if not np.abs(vertices).max(initial=0.0) <= MAX_COORDINATE_M:
-        return False
-    offsets = vertices - vertices.mean(axis=0)
-    spread = np.linalg.eigvalsh(
-        offsets.T @ offsets / len(offsets)
-    )  # variances along the principal axes, rising
-    return bool(spread[0] >= MIN_SPREAD_M**2)
+    """Whether points, shape (n, 3), span a body that is thicker than a tenth of a millimetre and within the world."""
+    return bool(_have_volume(vertices, np.array([len(vertices)]))[0])
+
+
+def _have_volume(vertices: FloatArray, counts: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """The same for several bodies whose points, ``counts`` of them each, follow one another. At least one point each."""
+    starts = np.concatenate(([0], np.cumsum(counts)[:-1]))
+    within = np.maximum.reduceat(np.abs(vertices).max(axis=1), starts) <= MAX_COORDINATE_M
+    means = np.add.reduceat(vertices, starts) / counts[:, None]  # (k, 3)
+    with np.errstate(over="ignore", invalid="ignore"):  # what lies outside is told apart by ``within``
+        offsets = vertices - np.repeat(means, counts, axis=0)
+        squares = np.add.reduceat(offsets[:, :, None] * offsets[:, None, :], starts)  # (k, 3, 3)
+    covariances = np.where(within[:, None, None], squares, 0.0) / counts[:, None, None]
+    spreads = np.linalg.eigvalsh(covariances)  # (k, 3): variances along the principal axes, rising
+    return np.asarray(within & (spreads[:, 0] >= MIN_SPREAD_M**2))
+
+
+def _check_hulls(kinds: list[tuple[int, int]], vertices: FloatArray) -> None:
+    hulls = [row for row, (_, count) in enumerate(kinds) if count]
+    if hulls:
+        sound = _have_volume(vertices, np.array([kinds[row][1] for row in hulls]))
+        if not sound.all():
+            raise SceneInvalidError(f"tables.parts[{hulls[int(np.argmin(sound))]}]", FLAT_HULL)
 
 
 def _row(field: Field, count: int) -> int:
@@ -212,12 +227,11 @@ def _sets(arrays: Arrays) -> NDArray[np.int32]:
 
 def _parts(rows: FloatArray, kinds: list[tuple[int, int]], vertices: FloatArray) -> list[Part]:
     points = [(x, y, z) for x, y, z in vertices.tolist()]
+    _check_hulls(kinds, vertices)
     parts: list[Part] = []
     first = 0
     for (x, y, z, a, b, c, d, width, depth, height), (shape, count) in zip(rows.tolist(), kinds, strict=True):
         own = tuple(points[first : first + count])
-        if own and not has_volume(vertices[first : first + count]):
-            raise SceneInvalidError(f"tables.parts[{len(parts)}]", FLAT_HULL)
         first += count
         parts.append(Part(SHAPES[shape], Pose((x, y, z), (a, b, c, d)), (width, depth, height), own))
     return parts
