@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 import os
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,8 +20,6 @@ from embomatrix.world.codec import scene_from_json
 from embomatrix.world.geometry import Part, Pose, Shape
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from embomatrix.world.scene import Scene
 
 SMALL = "hotel_suite_small"
@@ -177,6 +176,11 @@ def test_what_to_build_must_be_said_once(arguments: list[str], words: str) -> No
     assert result.exit_code == 2
     assert words in result.output
     assert "Traceback" not in result.output
+
+
+def test_the_page_names_every_rule() -> None:
+    page = (Path(__file__).parents[3] / "docs" / "scenes.md").read_text(encoding="utf-8")
+    assert [kind.value for kind in ProblemKind if f"`{kind.value}`" not in page] == []
 
 
 @pytest.mark.slow
