@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.factory.assets.library import build_asset
 from embomatrix.factory.furnish_roles import is_portable
 from embomatrix.factory.scene_check import reach_problems
+from embomatrix.factory.scene_clearance import Clearance
 from embomatrix.factory.scene_floor import ReachableFloor, box_of
 from embomatrix.factory.scene_solids import Solids, placed_parts
 from embomatrix.sim.candidates import candidates
@@ -78,6 +79,7 @@ class SceneEditor:
         self._rooms = {room.name: room for room in scene.rooms}
         self._solids = Solids.of_scene(scene)
         self._floor = ReachableFloor(scene)
+        self._clearance = Clearance(scene)
         self._unreached = {problem.names for problem in reach_problems(scene)}
         self._counts = Counter(self._assets[item.asset_id].category for item in scene.objects)
 
@@ -230,9 +232,11 @@ class SceneEditor:
         return len(self._floor.spots(box, front_of=front)) > 0
 
     def _leaves_ways(self, asset: Asset, pose: Pose, box: Aabb, room: str) -> bool:
-        """Whether, with the object on the floor, the robot still gets to all that it got to before."""
+        """Whether, with the object on the floor, doorways stay clear and the robot gets to all that it got to before."""
         if box.low_m[2] > _ON_FLOOR_M or box.high_m[2] < _FLAT_M:
             return True
+        if self._clearance.bars_a_doorway(box):
+            return False
         item = SceneObject("candidate", asset.asset_id, room, pose, fixed=False)
         assets = {**self._assets, asset.asset_id: asset}
         trial = replace(self._scene, objects=(*self._objects.values(), item), assets=assets)

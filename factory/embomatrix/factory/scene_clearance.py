@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -17,8 +18,12 @@ from embomatrix.factory.furnish_space import (
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from embomatrix.world.geometry import FloatArray
+    from numpy.typing import NDArray
+
+    from embomatrix.world.geometry import Aabb, FloatArray
     from embomatrix.world.scene import Doorway, Room, Scene, Window
+
+    BoolArray = NDArray[np.bool_]
 
 SHALLOW: Final = 0.7
 """Share of a room's shorter side that is kept free before a door or window where the full clearance is deeper than that."""
@@ -45,10 +50,13 @@ class Clearance:
 
     def before_doorways(self) -> Iterator[tuple[Doorway, str, tuple[str, ...]]]:
         """Every side of every doorway: the doorway, the room on this side, and what stands in its clear floor."""
-        for doorway in self._scene.doorways:
-            for room in self._sides(doorway):
-                zone = self._zone(doorway, self._rooms[room], DOOR_CLEAR_M, LOW_M, DOOR_HEIGHT_M)
-                yield doorway, room, self._within(zone)
+        for doorway, room, zone in self._door_zones:
+            yield doorway, room, self._within(zone)
+
+    def bars_a_doorway(self, box: Aabb) -> bool:
+        """Whether a box reaches into the clear floor before any doorway."""
+        corners = np.array((*box.low_m, *box.high_m))
+        return any(_overlap(corners[None], zone)[0] for _, _, zone in self._door_zones)
 
     def before_windows(self) -> Iterator[tuple[Window, str, tuple[str, ...]]]:
         """Every side of every window, and what takes its light."""
@@ -57,6 +65,14 @@ class Clearance:
             for room in self._sides(window):
                 zone = self._zone(window, self._rooms[room], WINDOW_CLEAR_M, low, window.head_m)
                 yield window, room, self._within(zone)
+
+    @functools.cached_property
+    def _door_zones(self) -> list[tuple[Doorway, str, FloatArray]]:
+        return [
+            (doorway, room, self._zone(doorway, self._rooms[room], DOOR_CLEAR_M, LOW_M, DOOR_HEIGHT_M))
+            for doorway in self._scene.doorways
+            for room in self._sides(doorway)
+        ]
 
     def _sides(self, opening: Doorway | Window) -> list[str]:
         return [room for room in opening.rooms if room in self._rooms]
@@ -77,6 +93,11 @@ class Clearance:
         return np.array([*low, low_m, *high, high_m])
 
     def _within(self, zone: FloatArray) -> tuple[str, ...]:
-        over = np.minimum(self._boxes[:, 3:], zone[3:]) - np.maximum(self._boxes[:, :3], zone[:3])
-        hits = np.flatnonzero((over > _TOUCH_M).all(axis=1))
+        hits = np.flatnonzero(_overlap(self._boxes, zone))
         return tuple(dict.fromkeys(self._names[hit] for hit in hits))
+
+
+def _overlap(boxes: FloatArray, zone: FloatArray) -> BoolArray:
+    """Which of the boxes, shape (n, 6), share more than a millimetre with a zone (6,)."""
+    over = np.minimum(boxes[:, 3:], zone[3:]) - np.maximum(boxes[:, :3], zone[:3])
+    return np.asarray((over > _TOUCH_M).all(axis=1))
