@@ -149,8 +149,9 @@ def build_walls(
         for edge in rect.edges:
             lines[edge.along, round(edge.at, 5)].append((edge.start - half, edge.end + half))
     holes: dict[tuple[str, float], list[Interval]] = defaultdict(list)
-    for cut in (*doors, *windows):
-        holes[cut.edge.along, round(cut.edge.at, 5)].append(cut.interval)
+    cuts = [(door.edge, door.interval) for door in doors] + [(pane.edge, pane.interval) for pane in windows]
+    for edge, interval in cuts:
+        holes[edge.along, round(edge.at, 5)].append(interval)
     walls = [
         _panel(along, at, piece, 0.0, WALL_HEIGHT_M)
         for (along, at), spans in sorted(lines.items())
