@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.furnish_halls import hall_groups, mat_rows, planting_groups
 from embomatrix.factory.furnish_hung import ceiling_groups, hung_groups, on_wall, rug_groups
-from embomatrix.factory.furnish_kitchen import COOKERS, SINKS, run_groups
+from embomatrix.factory.furnish_kitchen import COOKERS, SINKS, basin, run_groups, worktop
 from embomatrix.factory.furnish_pieces import CORNER_SOFA_M, Group, Member, Rows, Style, stacked, top_of
 from embomatrix.factory.furnish_pool import Pool, worth
 from embomatrix.factory.furnish_roles import Role
@@ -90,7 +90,11 @@ def hung_and_laid(pieces: Sequence[Piece], taken: set[int]) -> list[Group | Rows
 
 
 def alone(piece: Piece) -> Group:
-    """A piece that its group found no place for, by itself at a wall."""
+    """A piece that its group found no place for, by itself at a wall; a worktop on brackets, a basin at its height."""
+    if piece.role is Role.COUNTERTOP:
+        return worktop(piece)
+    if piece.role is Role.FITTED:
+        return basin(piece)
     return Group((_sideways(piece),), Style.ALONG, worth([Member(piece)]), _NEAR.get(piece.category, ()))
 
 

@@ -58,7 +58,7 @@ def run_groups(pool: Pool, left_out: list[Unplaced]) -> list[Group]:
     """Everything that stands in lines along the walls, in the order of a kitchen: cold, wet, work, hot, and the rest."""
     counters = _counters(pool, left_out)
     _fit(pool, counters)
-    basins = [_basin(p) for p in pool.take(p for p in pool.of(*FITTED) if p.category != "burner")]
+    basins = [basin(p) for p in pool.take(p for p in pool.of(*FITTED) if p.category != "burner")]
     for burner in pool.take(pool.of("burner")):
         left_out.append((burner, "no counter is left to carry it"))
     units = [Group((Member(p),), Style.RUN, 0.0) for p in pool.take(pool.with_role(Role.RUN))]
@@ -109,8 +109,7 @@ def _counters(pool: Pool, left_out: list[Unplaced]) -> list[Group]:
             left.append(slab)
     if left and not groups and pool.room_type != "kitchen":
         # A worktop on brackets: the basins of a washroom, the table of a copy room.
-        bracketed = left.pop(0)
-        groups.append(Group((Member(bracketed, bottom=_WORKTOP_M),), Style.RUN, 0.0))
+        groups.append(worktop(left.pop(0)))
     left_out += [(slab, "no base cabinets are left to carry it") for slab in left]
     groups += [
         Group((Member(bar),), Style.RUN, 0.0)
@@ -225,7 +224,12 @@ def _evened(group: Group) -> Group:
     return replace(group, members=(*carcass, *members))
 
 
-def _basin(piece: Piece) -> Group:
-    """A basin without a counter hangs on the wall."""
+def worktop(slab: Piece) -> Group:
+    """A slab without cabinets under it, on brackets at the wall."""
+    return Group((Member(slab, bottom=_WORKTOP_M),), Style.RUN, 0.0, near=SINKS)
+
+
+def basin(piece: Piece) -> Group:
+    """A basin or cooktop without a counter hangs on the wall."""
     bottom = max(0.4, _BASIN_RIM_M - piece.size_m[2])
     return Group((Member(piece, bottom=bottom),), Style.ALONG, 12.0, near=SINKS)

@@ -70,7 +70,7 @@ def panel_of(scene: Scene, inventory: SceneInventory) -> Panel:
         placed=len(scene.objects),
         at_wall=_share([_backed(o, boxes[o.name], rooms[o.room]) for o in walled]),
         at_table=_share([_seated(scene, o, tables) for o in seats]),
-        in_doorways=sum(1 for _ in _in_doorways(scene, standing, boxes)),
+        in_doorways=sum(1 for _ in _in_doorways(scene, standing)),
         free_floor=_free_floor(scene),
     )
 
@@ -107,15 +107,13 @@ def _seated(scene: Scene, item: SceneObject, tables: Sequence[Aabb]) -> bool:
     return False
 
 
-def _in_doorways(
-    scene: Scene, standing: Sequence[SceneObject], boxes: dict[str, Aabb]
-) -> Iterator[SceneObject]:
+def _in_doorways(scene: Scene, standing: Sequence[SceneObject]) -> Iterator[SceneObject]:
     for room in scene.rooms:
         space = RoomSpace(room, scene.doorways)
         for item in standing:
-            box = boxes[item.name]
-            inside = item.room == room.name and box.high_m[2] > LOW_M
-            if inside and space.blocks_zone(np.array([[*box.low_m, *box.high_m]]))[0]:
+            parts = [p.aabb(item.pose_world_asset) for p in scene.assets[item.asset_id].links[0].parts]
+            rows = np.array([(*box.low_m, *box.high_m) for box in parts if box.high_m[2] > LOW_M])
+            if item.room == room.name and len(rows) and space.blocks_zone(rows).any():
                 yield item
 
 

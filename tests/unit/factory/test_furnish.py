@@ -5,19 +5,24 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from embomatrix.factory.floorplan import plan_floor
 from embomatrix.factory.floorplan_spec import RoomSpec
 from embomatrix.factory.furnish import MAX_EQUAL, furnish
 from embomatrix.factory.furnish_groups import room_groups
-from embomatrix.factory.furnish_pieces import REST_GAP_M, Piece, around_table, front_depth_m
+from embomatrix.factory.furnish_hosts import hosts_of, kept_behind_doors
+from embomatrix.factory.furnish_panel import panel_of
+from embomatrix.factory.furnish_pieces import REST_GAP_M, Group, Piece, around_table, front_depth_m
 from embomatrix.factory.furnish_roles import HUNG_BOTTOM_M, Role, role_of
 from embomatrix.factory.furnish_space import RoomSpace, Target
 from embomatrix.factory.scene_build import build_base_scene
 from embomatrix.factory.scene_floor import box_of
 from embomatrix.world.asset import Asset, Joint, JointKind, Link, SupportSurface
+from embomatrix.world.catalog import Catalog
 from embomatrix.world.geometry import Part, Pose, Shape, Vec3
-from embomatrix.world.scene import Doorway, Room, Scene
+from embomatrix.world.scene import Doorway, Room, Scene, Window
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
@@ -69,6 +74,7 @@ def test_a_counter_slab_lies_on_its_tallest_cabinet() -> None:
     )
     groups, left_out = room_groups(pieces(block("countertop", (0.6, 1.0, 0.03)), cabinet, lower))
     (counter,) = groups
+    assert isinstance(counter, Group)
     slab = counter.members[-1]
     assert slab.piece.category == "countertop"
     assert slab.bottom == pytest.approx(0.55 + REST_GAP_M)
@@ -161,10 +167,136 @@ def test_wall_cabinets_hang_above_the_robots_way_and_everything_is_shut(flat: Sc
 
 
 def test_every_inventory_item_is_placed_or_accounted_for(flat: Scene) -> None:
-    from embomatrix.world.catalog import Catalog
-
     placed = {item.asset_id for item in flat.objects}
     for room in Catalog.load().inventory("Rs_int").rooms:
         for category, model, _ in room.items:
             asset_id = f"{category}-{model}"
             assert asset_id in placed or any(asset_id in sentence for sentence in flat.left_out), asset_id
+
+
+def test_a_dishwasher_stays_in_the_run() -> None:
+    result = furnished(
+        block("fridge", (0.7, 0.65, 1.7), door=True),
+        block("furniture_sink", (0.64, 1.3, 1.0)),
+        block("oven", (0.5, 0.5, 0.7), door=True),
+        block("dishwasher", (0.55, 0.56, 0.65), door=True),
+        block("countertop", (0.56, 1.02, 0.03)),
+        *[block("bottom_cabinet", (0.45, 0.43, 0.62), door=True)] * 2,
+        floor=(3.4, 2.8),
+    )
+    assert not result.left_out
+    slab, washer = (
+        next(p for p in result.placed if p.piece.category == c) for c in ("countertop", "dishwasher")
+    )
+    (x0, y0, _, x1, y1, _), (a0, b0, _, a1, b1, _) = slab.box, washer.box
+    assert x0 - 0.05 <= a0 < a1 <= x1 + 0.05
+    assert y0 - 0.05 <= b0 < b1 <= y1 + 0.05
+
+
+def test_units_of_a_kitchen_stand_in_one_line_or_round_a_corner() -> None:
+    units = [block(c, (0.6, 0.6, 0.9)) for c in ("fridge", "stove", "oven", "dishwasher", "washer")]
+    placed = furnished(*units).placed
+    assert len(placed) == len(units)
+    boxes = [p.box for p in placed]
+    for box in boxes:
+        gaps = [
+            max(box[0] - o[3], o[0] - box[3], box[1] - o[4], o[1] - box[4]) for o in boxes if o is not box
+        ]
+        assert min(gaps) < 1.0
+
+
+def test_a_basin_is_let_into_the_counter() -> None:
+    result = furnished(
+        block("countertop", (0.56, 1.02, 0.03)),
+        *[block("bottom_cabinet", (0.45, 0.48, 0.62), door=True)] * 2,
+        block("drop_in_sink", (0.5, 0.7, 0.3)),
+    )
+    basin = next(p for p in result.placed if p.piece.category == "drop_in_sink")
+    slab = result.placed[basin.host]
+    assert slab.piece.category == "countertop"
+    assert basin.bottom == pytest.approx(slab.box[5] + REST_GAP_M)
+
+
+def test_a_basin_without_a_counter_hangs_on_the_wall() -> None:
+    (basin,) = furnished(block("drop_in_sink", (0.5, 0.7, 0.3))).placed
+    assert basin.host == -1
+    assert basin.bottom > 0.4
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_nothing_stands_in_a_doorways_clearance_and_every_chair_is_at_the_table(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    specs = [RoomSpec("hall_0", "corridor", (3.0, 3.0)), RoomSpec("dining_room_0", "dining_room", (4.0, 3.6))]
+    plan = plan_floor(specs, rng)
+    table, chair = block("breakfast_table", (0.8, 1.3, 0.75)), block("straight_chair", (0.45, 0.45, 0.8))
+    assets = (table, *[chair] * 4, block("bookcase", (0.35, 0.9, 1.9)), block("sofa", (0.9, 1.8, 0.8)))
+    result = furnish(plan, {"dining_room_0": pieces(*assets)}, rng)
+    for room in plan.rooms:
+        zones = RoomSpace(room, plan.doorways).zones
+        boxes = np.array([p.box for p in result.placed if p.room == room.name]).reshape(-1, 6)
+        assert not zones.meets(boxes).any()
+    seats = [p for p in result.placed if p.piece.category == "straight_chair"]
+    (board,) = (p for p in result.placed if p.piece.category == "breakfast_table")
+    for seat in seats:
+        x, y, _ = seat.pose.apply((0.225 + 0.1, 0.0, 0.0))
+        assert board.box[0] <= x <= board.box[3]
+        assert board.box[1] <= y <= board.box[4]
+
+
+def test_a_class_looks_one_way() -> None:
+    desk, chair = block("desk", (0.6, 0.75, 0.76)), block("straight_chair", (0.5, 0.5, 0.85))
+    rng = np.random.default_rng(0)
+    plan = plan_floor([RoomSpec("classroom_0", "classroom", (8.0, 7.0))], rng)
+    result = furnish(plan, {"classroom_0": pieces(*[desk] * 9, *[chair] * 9)}, rng)
+    assert len(result.placed) == 18
+    assert len({round(p.yaw, 3) for p in result.placed if p.piece.category == "straight_chair"}) == 1
+
+
+def test_a_piece_before_a_window_is_no_higher_than_its_sill() -> None:
+    window = Window(("kitchen_0", ""), (2.0, 3.06), 1.2, 0.9, 2.0, "x")
+    space = RoomSpace(ROOM, [DOOR], [window])
+    low, tall = (1.8, 2.6, 0.0, 2.2, 2.9, 0.8), (1.8, 2.6, 0.0, 2.2, 2.9, 1.8)
+    assert space.blocks_zone(np.array([low, tall])).tolist() == [False, True]
+
+
+@given(
+    st.lists(
+        st.tuples(st.floats(0.1, 3.4), st.floats(0.1, 2.4), st.floats(0.1, 0.8), st.floats(0.1, 0.8)),
+        max_size=5,
+    )
+)
+def test_floor_kept_up_to_date_box_by_box_is_the_floor_of_all_boxes_at_once(
+    corners: list[tuple[float, float, float, float]],
+) -> None:
+    boxes = [(x, y, 0.0, x + w, y + d, 0.9) for x, y, w, d in corners]
+    one_by_one, at_once = RoomSpace(ROOM, [DOOR]), RoomSpace(ROOM, [DOOR])
+    for box in boxes:
+        one_by_one.occupy([box])
+    at_once.occupy(boxes)
+    assert np.array_equal(one_by_one.free_cells(), at_once.free_cells())
+
+
+def test_the_quick_look_rules_out_only_what_meets_something() -> None:
+    rng = np.random.default_rng(0)
+    space = RoomSpace(ROOM, [DOOR])
+    space.occupy([(1.0, 1.0, 0.0, 2.0, 2.0, 0.9), (3.0, 0.5, 1.2, 3.6, 1.5, 2.0)])
+    low = np.column_stack([rng.uniform(0, 3, (200, 2)), np.zeros(200)])
+    boxes = np.column_stack([low, low + np.array([0.4, 0.3, 1.8])])
+    ruled_out = space.surely_collides(boxes)
+    assert ruled_out.any()
+    assert not (ruled_out & ~space.collides(boxes)).any()
+
+
+def test_crockery_goes_behind_doors_and_milk_into_the_fridge() -> None:
+    assert kept_behind_doors("plate", "bottom_cabinet")
+    assert kept_behind_doors("carton_of_milk", "fridge")
+    assert not kept_behind_doors("table_lamp", "bottom_cabinet")
+    assert hosts_of("pillow")[0] == "bed"
+
+
+def test_the_panel_of_a_flat_shows_backs_at_walls_and_free_doorways(flat: Scene) -> None:
+    panel = panel_of(flat, Catalog.load().inventory("Rs_int"))
+    assert panel.placed_share > 0.9
+    assert panel.at_wall > 0.9
+    assert panel.in_doorways == 0
+    assert 0.1 < panel.free_floor < 1.0
