@@ -136,6 +136,13 @@ class FloorGrid:
         corner = np.array([window[0].start, window[1].start])
         return np.asarray(self._origin + (inside + corner + 0.5) * CELL_M, dtype=np.float64)
 
+    def all_free_centers(self, low_m: Vec2, high_m: Vec2) -> FloatArray:
+        """Middles of the free cells in a rectangle, whatever their component, shape (n, 2), in the world."""
+        window = self._window(np.asarray(low_m), np.asarray(high_m))
+        corner = np.array([window[0].start, window[1].start])
+        inside = np.argwhere(self.free[window])
+        return np.asarray(self._origin + (inside + corner + 0.5) * CELL_M, dtype=np.float64)
+
     def distance(self, start: Cell, end: Cell) -> float | None:
         """Length in metres of the shortest path over free cells, None when there is none."""
         if not self.free[start] or self.labels[start] != self.labels[end]:

@@ -107,9 +107,12 @@ def _rest(
     q5 = np.arctan2(turned[:, 1, 0], turned[:, 0, 0])
     x3 = c[:, None] * across - s[:, None] * forearm
     z3 = s[:, None] * across + c[:, None] * forearm
-    q2 = shoulder_sign * np.arccos(np.clip(z3[:, 2], -1.0, 1.0))
+    q2 = shoulder_sign * np.arctan2(np.hypot(z3[:, 0], z3[:, 1]), z3[:, 2])
     q1 = np.arctan2(shoulder_sign * z3[:, 1], shoulder_sign * z3[:, 0])
-    q3 = np.arctan2(shoulder_sign * normal[:, 2], -shoulder_sign * x3[:, 2])
+    # The third angle is what the first two leave: exact with the upper arm upright too, where they are arbitrary.
+    ahead = np.cos(q1) * x3[:, 0] + np.sin(q1) * x3[:, 1]
+    aside = np.cos(q1) * x3[:, 1] - np.sin(q1) * x3[:, 0]
+    q3 = np.arctan2(aside, np.cos(q2) * ahead - np.sin(q2) * x3[:, 2])
     return np.stack([q1, q2, q3, bend, q5, q6, last], axis=1)
 
 

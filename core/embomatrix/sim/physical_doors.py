@@ -45,6 +45,8 @@ OFF_M: Final = 0.08
 PULL: Final = 0.4
 """Share of full speed at which a leaf is led."""
 WAYPOINTS: Final = 7
+OVER: Final = 0.08
+"""The hand goes on for this share of the travel, as leaf and arm give way a little."""
 AJAR: Final = 0.3
 """A leaf that is open by more can be taken from within."""
 ENOUGH: Final = 0.5
@@ -138,8 +140,9 @@ def _lead_all(stage: Stage, name: str, goal: float, rng: np.random.Generator) ->
             refusal = refuse(FailureReason.DOOR_BLOCKED, target=name, other=SOMETHING)
         if refusal is not None:
             break
-    back = fold(stage, home, rng, name)
-    return refusal or back
+    # Where the robot ends up does not undo what became of the door.
+    fold(stage, home, rng, name)
+    return refusal
 
 
 def _lead(stage: Stage, leaf: Leaf, goal: float, rng: np.random.Generator) -> Refusal | None:
@@ -161,7 +164,8 @@ def _lead(stage: Stage, leaf: Leaf, goal: float, rng: np.random.Generator) -> Re
 def _stretch(stage: Stage, leaf: Leaf, start: float, goal: float, rng: np.random.Generator) -> Refusal | None:
     """Take the leaf where it is and lead it to a share of its travel."""
     boxes = stage.boxes()
-    fractions = np.linspace(start, goal, WAYPOINTS)
+    further = math.copysign(OVER, goal - start) if goal in (0.0, 1.0) else 0.0
+    fractions = np.linspace(start, goal + further, WAYPOINTS)
     moving = [_leaf_boxes(leaf, float(fraction)) for fraction in fractions]
     fixed = boxes.without((leaf.name,)).joined(_body_boxes(stage, leaf))
     course = np.concatenate([[0, 0], np.arange(WAYPOINTS), [WAYPOINTS - 1]]).astype(int)

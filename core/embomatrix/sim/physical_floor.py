@@ -16,9 +16,12 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from embomatrix.sim.engine import PhysicsEngine
+    from embomatrix.sim.floor_grid import Cell
     from embomatrix.world.geometry import FloatArray, Vec2
 
 SPREAD_M: Final = 500.0
+OUT_M: Final = 0.45
+OUT_TRIED: Final = 60
 ASIDE_M: Final = 0.9
 """When a place to stand is taken, one this near does."""
 
@@ -30,6 +33,7 @@ class Floor:
         self._engine = engine
         self._seen: bytes = b""
         self._grid: FloorGrid | None = None
+        self._rows: FloatArray = np.zeros((0, 6))
 
     @property
     def grid(self) -> FloorGrid:
@@ -42,7 +46,8 @@ class Floor:
             low, high = boxes.centre - half, boxes.centre + half
             rows = np.column_stack([low[:, :2], high[:, :2], low[:, 2], high[:, 2]])
             barring = (rows[:, 4] < ROBOT.height_m) & (rows[:, 5] > FLAT_M)
-            self._grid, self._seen = FloorGrid(self._engine.scene, rows[barring]), state
+            self._rows = rows[barring]
+            self._grid, self._seen = FloorGrid(self._engine.scene, self._rows), state
         return self._grid
 
     def way(
@@ -53,7 +58,7 @@ class Floor:
         Where the pose is taken, the nearest free one that ``serves`` as well is meant, or else the nearest.
         """
         grid = self.grid
-        first = grid.cell(*start)
+        first = self._way_out(start)
         if first is None:
             return None
         end = self._free_near(goal, grid.label(first), serves)
@@ -61,9 +66,28 @@ class Floor:
         corners = grid.path(first, last) if last is not None else None
         if end is None or corners is None:
             return None
-        # From beside a door the robot first goes where it fits.
-        out = () if grid.is_free(*start) else (corners[0],)
+        out = () if grid.is_free(*start) else (grid.center(first),)
         return np.array([start, *out, *corners[1:-1], (end.x_m, end.y_m)]), end
+
+    def _way_out(self, start: Vec2) -> Cell | None:
+        """The free cell to begin at: from beside a door the robot first goes where it fits, not through the door."""
+        grid = self.grid
+        if grid.is_free(*start):
+            return grid.cell(*start)
+        low, high = (start[0] - OUT_M, start[1] - OUT_M), (start[0] + OUT_M, start[1] + OUT_M)
+        spots = grid.all_free_centers(low, high)
+        here = np.array(start)
+        air = self._air(here[None])[0]
+        for number in np.argsort(np.linalg.norm(spots - here, axis=1), kind="stable")[:OUT_TRIED].tolist():
+            line = here + np.linspace(0.2, 1.0, 5)[:, None] * (spots[number] - here)
+            if self._air(line).min() >= min(air, ROBOT.radius_m) - 0.01:
+                return grid.cell(float(spots[number, 0]), float(spots[number, 1]))
+        return grid.cell(*start)
+
+    def _air(self, points: FloatArray) -> FloatArray:
+        """Distance from points, (n, 2), to the nearest obstacle, (n,)."""
+        nearest = np.clip(points[:, None], self._rows[:, :2], self._rows[:, 2:4])
+        return np.asarray(np.linalg.norm(points[:, None] - nearest, axis=2).min(axis=1, initial=np.inf))
 
     def _free_near(
         self, goal: StandPose, label: int, serves: Callable[[StandPose], bool]

@@ -62,13 +62,13 @@ def pick_up(stage: Stage, target: str, rng: np.random.Generator) -> Refusal | No
     """Take an object that lies where the robot can reach it."""
     home = stage.world.robot
     refusal = _take(stage, target, rng)
-    back = fold(stage, home, rng, target)
+    fold(stage, home, rng, target)
     if refusal is None and stage.has_slipped():
         refusal = refuse(FailureReason.SLIPPED, target=target)
     if refusal is not None and stage.grip is not None:
         stage.release()
         stage.settle()
-    return refusal or back
+    return refusal
 
 
 def _take(stage: Stage, target: str, rng: np.random.Generator) -> Refusal | None:
@@ -158,13 +158,13 @@ def place(stage: Stage, target: str, asked: PlaceRelation, rng: np.random.Genera
         return refuse(found, **words)
     refusal = _put(stage, target, relation, found, rng)
     if stage.grip is not None:
-        back = fold(stage, home, rng, target)
-        return refusal or back
-    back = fold(stage, home, rng, target)
+        fold(stage, home, rng, target)
+        return refusal
+    fold(stage, home, rng, target)
     stage.settle()
     if refusal is None and not world.relations.holds(relation, held, target):
         return refuse(FailureReason.FELL, **words)
-    return refusal or back
+    return refusal
 
 
 def _put(

@@ -37,7 +37,8 @@ def press(stage: Stage, target: str, rng: np.random.Generator) -> Refusal | None
     """Touch a thing with the empty hand."""
     home = stage.world.robot
     refusal = _press(stage, target, rng)
-    return refusal or fold(stage, home, rng, target)
+    fold(stage, home, rng, target)
+    return refusal
 
 
 def _press(stage: Stage, target: str, rng: np.random.Generator) -> Refusal | None:
