@@ -20,11 +20,18 @@ END: Final = "<!-- end by hand -->"
 _PART: Final = re.compile(r"<!-- by hand: ([a-z-]+) -->\n(.*?)<!-- end by hand -->", re.DOTALL)
 _MARK: Final = re.compile(r"<!-- (?:by hand: [a-z-]+|end by hand) -->")
 
+ENGINE_SCENES: Final = (
+    "restaurant_diner, office_bike, Wainscott_0_garden, house_double_floor_upper, restaurant_cafeteria, "
+    "office_cubicles_right, restaurant_hotel, restaurant_asian, school_geography, Benevolence_1_int, Wainscott_0_int, "
+    "restaurant_brunch, house_single_floor, Rs_int, hotel_gym_spa"
+)
+"""Base scenes of the pinned workload: nine that come to about 300 bodies, and some of the other sizes."""
 TITLES: Final[Mapping[str, tuple[str, str]]] = {
     "engine": (
         "Engine",
-        "`embomatrix bench engine`: 10 calls a plan with two places, a door and five moves, all plans different, each executed "
-        "once, in furnished scenes; the plans are pinned in `worker/embomatrix/worker/data/engine_workload.json`. Durations "
+        "`embomatrix bench engine` on the dataset of `embomatrix factory build --out=build/engine --seed=7 --train=120 "
+        f"--heldout=0` with `--scene` for each of {ENGINE_SCENES}: "
+        "10 calls a plan with two places, a door and five moves, all plans different, each executed once, in furnished scenes; the plans are pinned in `worker/embomatrix/worker/data/engine_workload.json`. Durations "
         "are CPU time of one thread, but for *slot_respawn_ms*, which is on the clock: from the order to kill a slot to the "
         "next one's first answer. *cold_load_ms* is from the bundle's bytes to a scene that executed an empty plan, in a fresh "
         "fork of the worker's root. *rollouts_per_s* is executed and scored in a slot, with all that goes over its stream. A "
