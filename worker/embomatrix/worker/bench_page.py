@@ -31,12 +31,14 @@ TITLES: Final[Mapping[str, tuple[str, str]]] = {
         "Engine",
         "`embomatrix bench engine` on the dataset of `embomatrix factory build --out=build/engine --seed=7 --train=120 "
         f"--heldout=0` with `--scene` for each of {ENGINE_SCENES}: "
-        "10 calls a plan with two places, a door and five moves, all plans different, each executed once, in furnished scenes; the plans are pinned in `worker/embomatrix/worker/data/engine_workload.json`. Durations "
-        "are CPU time of one thread, but for *slot_respawn_ms*, which is on the clock: from the order to kill a slot to the "
-        "next one's first answer. *cold_load_ms* is from the bundle's bytes to a scene that executed an empty plan, in a fresh "
-        "fork of the worker's root. *rollouts_per_s* is executed and scored in a slot, with all that goes over its stream. A "
-        "rollout checks every precondition, every placed thing for penetration, relations and the reward. Names without a size "
-        "are for scenes of about 300 bodies.",
+        "10 calls a plan with two places, a door and five moves, all plans different, each executed once, in furnished "
+        "scenes; the plans are pinned in `worker/embomatrix/worker/data/engine_workload.json`. Durations are CPU time of "
+        "one thread, but for *slot_respawn_ms*, which is on the clock: from the order to kill a slot to the next one's "
+        "first answer. *cold_load_ms* is from the bundle's bytes to a scene that executed an empty plan, in a fresh fork "
+        "of the worker's root. *rollouts_per_s* is executed and scored in a slot, with all that goes over its stream. "
+        "*private_mb_per_slot* is what a slot that waits holds for itself after fifty rollouts. A rollout checks every "
+        "precondition, every placed thing for penetration, relations and the reward. Names without a size are for scenes "
+        "of about 300 bodies.",
     ),
     "rollout": (
         "One process",
