@@ -33,9 +33,9 @@ POSES: Final = 16
 """Verified poses that are kept for a pair."""
 TRIES: Final = 40
 """Candidates that are looked at for a pair."""
-CLASS_POSES: Final = 10
-CLASS_POSES_PER_M2: Final = 8
-CLASS_POSES_MOST: Final = 32
+CLASS_POSES: Final = 12
+CLASS_POSES_PER_M2: Final = 16
+CLASS_POSES_MOST: Final = 40
 """Verified poses that are kept for a footprint class: more on larger surfaces."""
 HOPELESS: Final = 12
 """A pair none of whose first candidates is stable is given up."""
