@@ -166,7 +166,7 @@ class RoomSpace:
             return stand, self._reach
         reach = self._reach.copy()
         reach[i0:i1, j0:j1] &= ~lost
-        if not self._still_joined(reach, window):
+        if not reach[self._doors[0]] or not self._still_joined(reach, window):
             reach = _component(reach, self._doors[:1])
         return stand, reach
 
