@@ -45,8 +45,8 @@ OFF_M: Final = 0.08
 PULL: Final = 0.4
 """Share of full speed at which a leaf is led."""
 WAYPOINTS: Final = 7
-OVER: Final = 0.08
-"""The hand goes on for this share of the travel, as leaf and arm give way a little."""
+OVER: Final = 0.5
+"""The hand goes on for this share of a waypoint's step, as leaf and arm give way a little."""
 AJAR: Final = 0.3
 """A leaf that is open by more can be taken from within."""
 ENOUGH: Final = 0.5
@@ -164,8 +164,7 @@ def _lead(stage: Stage, leaf: Leaf, goal: float, rng: np.random.Generator) -> Re
 def _stretch(stage: Stage, leaf: Leaf, start: float, goal: float, rng: np.random.Generator) -> Refusal | None:
     """Take the leaf where it is and lead it to a share of its travel."""
     boxes = stage.boxes()
-    further = math.copysign(OVER, goal - start) if goal in (0.0, 1.0) else 0.0
-    fractions = np.linspace(start, goal + further, WAYPOINTS)
+    fractions = np.linspace(start, goal, WAYPOINTS)
     moving = [_leaf_boxes(leaf, float(fraction)) for fraction in fractions]
     fixed = boxes.without((leaf.name,)).joined(_body_boxes(stage, leaf))
     course = np.concatenate([[0, 0], np.arange(WAYPOINTS), [WAYPOINTS - 1]]).astype(int)
@@ -201,6 +200,9 @@ def _pull(stage: Stage, way: Way, leaf: Leaf, goal: float) -> Refusal | None:
         return refuse(FailureReason.ARM_BLOCKED, target=leaf.name, other=SOMETHING)
     stage.dynamic.hook(leaf.name, leaf.number)
     hit = stage.mover.follow(way.postures[3:-1], PULL)
+    if hit is None and goal in (0.0, 1.0):
+        last = way.postures[-2]
+        stage.mover.follow((last + OVER * (last - way.postures[-3]))[None], PULL)
     stage.mover.wait(24)
     stage.dynamic.unhook()
     stage.mover.follow(way.postures[-1:], 0.6)

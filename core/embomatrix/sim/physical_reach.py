@@ -168,7 +168,7 @@ class Reach:
         if not len(rows):
             return []
         comfort = _strain(found[rows, branches]) + RANK * track[rows]
-        best = np.argsort(comfort, kind="stable")[:LOOKED_AT]
+        best = _best_of_each(base[rows], comfort, max(4, LOOKED_AT // len(bases)))
         rows, branches = rows[best], branches[best]
         clear = self._free(found[rows, branches], self._at_work, None, TOUCH_M)
         ways: list[Way] = []
@@ -212,6 +212,14 @@ class Reach:
         if (hit >= 0).any():
             self.hindrance = close.owners[int(hit[hit >= 0][0])]
         return np.asarray(~own & (hit < 0))
+
+
+def _best_of_each(base: FloatArray, cost: FloatArray, most: int) -> FloatArray:
+    """Numbers of the cheapest solutions, at most so many for each base, the cheapest first."""
+    order = np.argsort(cost, kind="stable")
+    kept = [order[base[order] == number][:most] for number in np.unique(base)]
+    chosen = np.concatenate(kept)
+    return np.asarray(chosen[np.argsort(cost[chosen], kind="stable")])
 
 
 def _alike(one: FloatArray, other: FloatArray) -> bool:

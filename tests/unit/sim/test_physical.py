@@ -1,0 +1,149 @@
+"""The physical mode, each skill carried out once by the robot in the flat, and what must fail there."""
+
+from dataclasses import replace
+
+import pytest
+from tests.fakes import furniture as make
+from tests.fakes.plans import executed, with_objects
+from tests.fakes.scenes import kitchen_scene, placed, upright
+
+from embomatrix.sim.executor import Simulator
+from embomatrix.sim.physical import MOTIONS, PhysicalActor, physical_simulator
+from embomatrix.skills.failure import FailureReason
+from embomatrix.skills.library import MISHAPS, reasons_of
+from embomatrix.skills.syntax import Skill
+from embomatrix.world.bundle import Bundle
+from embomatrix.world.geometry import Pose
+
+
+@pytest.fixture(scope="module")
+def flat():
+    simulator = physical_simulator(Bundle(kitchen_scene(), {}))
+    yield simulator
+    simulator.close()
+
+
+def executed_physically(scene, text):
+    simulator = physical_simulator(Bundle(scene, {}))
+    try:
+        return executed(simulator, text)
+    finally:
+        simulator.close()
+
+
+def test_every_skill_has_a_motion_and_says_what_may_go_wrong():
+    assert set(MOTIONS) == set(MISHAPS) == set(Skill)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "move apple_1; pick_up apple_1; move countertop_1; place countertop_1 ontop",
+        "move mug_1; pick_up mug_1; move coffee_table_1; place coffee_table_1 ontop",
+        "move apple_1; pick_up apple_1; move breakfast_table_1; place breakfast_table_1 under",
+        "move stove_1; toggle_on stove_1; toggle_off stove_1",
+        "go_to_room living_room_0; turn 1; move_forward 0.5 0",
+    ],
+)
+def test_the_robot_does_what_cached_mode_says_it_does(flat, text):
+    trace = executed(flat, text)
+    assert trace.failure is None, trace.steps[-1].message
+
+
+def test_food_comes_out_of_the_fridge_and_its_door_is_shut_again(flat):
+    text = "move fridge_1; open fridge_1; move chicken_leg_1; pick_up chicken_leg_1; move fridge_1"
+    trace = executed(flat, text)
+    assert trace.failure is None, trace.steps[-1].message
+    assert flat.world.engine.joints("fridge_1")[0] > 0.5
+    assert flat.world.carried == ("chicken_leg_1",)
+
+
+def test_a_door_is_led_open_and_shut_by_the_hand(flat):
+    trace = executed(flat, "move fridge_1; open fridge_1; close fridge_1")
+    assert trace.failure is None, trace.steps[-1].message
+    assert flat.world.engine.joints("fridge_1")[0] < 0.05
+
+
+def test_a_bowl_carries_what_lies_in_it_to_the_stove_where_both_get_hot(flat):
+    text = (
+        "move apple_1; pick_up apple_1; move bowl_1; place bowl_1 inside; pick_up bowl_1; move stove_1; "
+        "place stove_1 ontop; toggle_on stove_1"
+    )
+    trace = executed(flat, text)
+    assert trace.failure is None, trace.steps[-1].message
+    assert flat.facts.holds("inside", ("apple_1", "bowl_1"))
+    assert flat.facts.holds("cooked", ("apple_1",))
+
+
+def test_what_is_held_is_lifted_and_what_is_placed_rests_where_physics_left_it(flat):
+    executed(flat, "move apple_1; pick_up apple_1; move countertop_1; place countertop_1 ontop")
+    pose = flat.world.engine.pose("apple_1")
+    assert abs(pose.position_m[2] - 0.94) < 0.005
+    assert flat.world.carried == ()
+
+
+def test_equal_plans_end_bit_equal_whatever_was_executed_before():
+    text = "move apple_1; pick_up apple_1; move countertop_1; place countertop_1 ontop"
+    bundle = Bundle(kitchen_scene(), {})
+    first, second = physical_simulator(bundle), physical_simulator(bundle)
+    try:
+        executed(first, "move mug_1; pick_up mug_1")
+        assert executed(first, text).digest == executed(second, text).digest
+    finally:
+        first.close()
+        second.close()
+
+
+def test_a_refused_call_moves_nothing(flat):
+    trace = executed(flat, "pick_up mug_1")
+    assert trace.failure is FailureReason.OUT_OF_REACH
+    assert flat.world.engine.pose("apple_1") == flat.world.scene.by_name["apple_1"].pose_world_asset
+
+
+def test_a_heavy_thing_before_a_door_bars_it_really():
+    anvil = replace(make.block("anvil", "anvil.n.01", (0.12, 0.3, 0.28), {}), mass_kg=60.0)
+    anvil_pose = upright(2.6, 3.47, 0.9, anvil, 1.5707963)
+    scene = with_objects(
+        kitchen_scene(), [(placed("anvil_1", anvil, "kitchen_0", anvil_pose, fixed=True), anvil)]
+    )
+    trace = executed_physically(scene, "move microwave_1; open microwave_1")
+    assert trace.failure in {
+        FailureReason.DOOR_BLOCKED,
+        FailureReason.ARM_BLOCKED,
+        FailureReason.NO_LINE_OF_APPROACH,
+    }
+
+
+def test_what_stands_walled_in_by_heavy_things_can_not_be_taken():
+    wall = replace(make.block("slab", "slab.n.01", (0.04, 0.6, 0.5), {}), mass_kg=50.0)
+    lid = replace(make.block("lid", "lid.n.01", (0.6, 0.6, 0.04), {}), mass_kg=50.0)
+    x, y, top = 1.9, 1.6, 0.75
+    sides = [
+        placed(f"slab_{number}", wall, "kitchen_0", upright(x + dx, y + dy, top, wall, yaw), fixed=True)
+        for number, (dx, dy, yaw) in enumerate(
+            [(0.12, 0.0, 0.0), (-0.12, 0.0, 0.0), (0.0, 0.34, 1.5707963), (0.0, -0.34, 1.5707963)]
+        )
+    ]
+    cover = placed("lid_1", lid, "kitchen_0", Pose((x, y, top + 0.55)), fixed=True)
+    scene = with_objects(kitchen_scene(), [*((side, wall) for side in sides), (cover, lid)])
+    simulator = physical_simulator(Bundle(scene, {}))
+    try:
+        trace = executed(simulator, "move apple_1; pick_up apple_1")
+        assert trace.failure is not None
+        assert trace.failure in reasons_of(trace.steps[-1].call.skill)
+    finally:
+        simulator.close()
+
+
+def test_watching_sees_time_pass():
+    scene = kitchen_scene()
+    actor = PhysicalActor(Bundle(scene, {}))
+    simulator = Simulator(Bundle(scene, {}), actor=actor)
+    seen = []
+    actor.watch(lambda: seen.append(actor.dynamic.steps))
+    try:
+        executed(simulator, "move apple_1")
+        assert seen == sorted(seen)
+        assert len(seen) > 20
+    finally:
+        simulator.close()

@@ -1,0 +1,66 @@
+"""The arm's kinematics: what is solved in closed form is where the chain of joints leads."""
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+
+from embomatrix.sim import physical_arm as arm
+from embomatrix.sim import physical_body as body
+from embomatrix.sim.physical_space import boxes_of, clearance, strikes
+from embomatrix.world.geometry import Pose
+
+SHARES = arrays.arrays(np.float64, (5, arm.JOINTS), elements=st.floats(0.02, 0.98))
+
+
+@given(SHARES)
+def test_every_solution_brings_the_tool_where_it_was_asked_to_be(shares):
+    joints = arm.LOW_RAD + shares * (arm.HIGH_RAD - arm.LOW_RAD)
+    rotation, position = arm.frames(joints)
+    found = arm.solve(rotation[:, 7], position[:, 7], joints[:, 6])
+    for branch in range(arm.BRANCHES):
+        solved = ~np.isnan(found[:, branch, 0])
+        again, there = arm.frames(found[solved, branch])
+        np.testing.assert_allclose(there[:, 7], position[solved, 7], atol=1e-6)
+        np.testing.assert_allclose(again[:, 7], rotation[solved, 7], atol=1e-6)
+
+
+def test_nearly_all_postures_are_found_again():
+    rng = np.random.default_rng(0)
+    joints = rng.uniform(arm.LOW_RAD, arm.HIGH_RAD, (500, arm.JOINTS))
+    rotation, position = arm.frames(joints)
+    found = arm.solve(rotation[:, 7], position[:, 7], joints[:, 6])
+    assert (~np.isnan(found[:, :, 0])).any(axis=1).mean() > 0.97
+
+
+def test_what_is_out_of_the_arms_reach_has_no_solution():
+    found = arm.solve(np.eye(3)[None], np.array([[1.5, 0.0, 0.5]]), np.array([0.785]))
+    assert np.isnan(found).all()
+
+
+def test_the_base_the_lift_and_the_heading_carry_the_tool_along():
+    rest = np.array([[0.0, 0.0, 0.0, 0.2, 0.0, -0.6, 0.0, -2.2, 0.0, 1.7, 0.785]])
+    moved = rest.copy()
+    moved[0, :4] = (1.0, 2.0, np.pi / 2, 0.5)
+    (turn, place), (turned, there) = body.tools(rest), body.tools(moved)
+    x, y, z = place[0]
+    np.testing.assert_allclose(there[0], (1.0 - y, 2.0 + x, z + 0.3), atol=1e-9)
+    np.testing.assert_allclose(turned[0], arm.about_z(np.array([np.pi / 2]))[0] @ turn[0], atol=1e-9)
+
+
+def test_the_folded_arm_keeps_within_the_robots_disc_and_off_its_own_trunk():
+    from embomatrix.sim.physical_stage import TUCKED
+    from embomatrix.skills.limits import ROBOT
+
+    posture = np.concatenate([[0.0, 0.0, 0.0, 0.0], TUCKED])[None]
+    wide = np.linalg.norm(body.balls(posture)[0, :, :2], axis=1) + body.RADII
+    assert wide.max() <= ROBOT.radius_m + 0.005
+    assert not body.strikes_itself(posture)[0]
+
+
+def test_balls_strike_a_turned_box_where_they_are_in_it():
+    quarter = Pose.from_xyz_yaw(1.0, 0.0, 0.0, np.pi / 4)
+    boxes = boxes_of([(quarter, (0.2, 2.0, 0.2), "beam")])
+    balls = np.array([[[0.5, 0.5, 0.0]], [[1.5, 0.5, 0.0]]])  # the beam runs along (-1, 1)
+    assert strikes(boxes, balls, np.array([0.05]), 0.0).tolist() == [0, -1]
+    np.testing.assert_allclose(clearance(boxes, balls, np.array([0.05])), (-0.15, 0.5571), atol=1e-3)
