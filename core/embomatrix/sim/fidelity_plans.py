@@ -25,8 +25,12 @@ MOST: Final = 12
 """Calls of a random plan: at least, less than, and at most with what they need before them."""
 PREFIXES: Final = (0, 5)
 """Calls before the one that fails, likewise."""
-EXTRA: Final = 3
+EXTRA: Final = 2
 """Times as many valid plans as asked for, at most, to reach the skills' quotas."""
+WAITS: Final = 3
+"""Times in a plan that the robot waits at a source for the same effect."""
+IDLE: Final = 3
+"""Plans in a row without a call that was lacking, after which a scene is taken to allow no more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,18 +98,23 @@ class _Writer:
         for number in range(wanted.get(PlanKind.ORACLE, 0)):
             example = self._examples[number % len(self._examples)]
             yield self._counted(PlanKind.ORACLE, example.task, example.plan, self._seed())
-        made = 0
-        while made < EXTRA * wanted.get(PlanKind.VALID, 0):
-            if made >= wanted.get(PlanKind.VALID, 0) and not self._lacking():
-                break
+        yield from self._valid_trials(wanted.get(PlanKind.VALID, 0))
+        for kind, change in ((PlanKind.PERTURBED, self._perturbed), (PlanKind.FAILING, self._failing)):
+            for _ in range(wanted.get(kind, 0)):
+                yield self._trial(kind, *change())
+
+    def _valid_trials(self, count: int) -> Iterator[Trial]:
+        """As many as asked for, and more while they bring calls of skills that lack some."""
+        made = idle = 0
+        while made < count or (made < EXTRA * count and idle < IDLE and self._lacking()):
             made += 1
+            before = sum(self._missing[skill] for skill in self._lacking())
             task, seed = self._task(), self._seed()
             plan = self._valid(task, seed)
             if plan:
                 yield self._counted(PlanKind.VALID, task, plan, seed)
-        for kind, change in ((PlanKind.PERTURBED, self._perturbed), (PlanKind.FAILING, self._failing)):
-            for _ in range(wanted.get(kind, 0)):
-                yield self._trial(kind, *change())
+            after = sum(self._missing[skill] for skill in self._lacking())
+            idle = 0 if after < before else idle + 1
 
     def _counted(self, kind: PlanKind, task: Task, plan: Plan, seed: int) -> Trial:
         self._base.append((task, plan))
@@ -146,7 +155,10 @@ class _Writer:
         for _ in range(3 * length):
             if len(sampler.plan) >= length:
                 break
-            sampler.add(able[int(self._rng.choice(len(able), p=weights / weights.sum()))])
+            skill = able[int(self._rng.choice(len(able), p=weights / weights.sum()))]
+            # What lies at a working source is dear to bring about: there the robot waits more than once.
+            while sampler.add(skill) and skill in ABILITY and sampler.count(skill) < WAITS:
+                pass
         return sampler.plan[:MOST]
 
     def _perturbed(self) -> tuple[Task, Plan, int]:

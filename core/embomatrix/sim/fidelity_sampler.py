@@ -58,6 +58,10 @@ class PlanSampler:
         """The calls so far: all of them succeed."""
         return tuple(self._calls)
 
+    def count(self, skill: Skill) -> int:
+        """Calls of the skill so far."""
+        return sum(call.skill is skill for call in self._calls)
+
     def add(self, skill: Skill) -> bool:
         """Add a call of the skill with what it needs before; False when none was found. What was needed may be added still."""
         return ROUTINES[skill](self, skill)
