@@ -29,7 +29,8 @@ RIM_POINTS: Final = 24
 EXTENTS_KEPT: Final = 512
 """Answers in memory for each asset, about 300 bytes each; for its parts as much for each of them."""
 CORNERS: Final = 8
-ASSETS_KEPT: Final = 2048
+ASSETS_KEPT: Final = 512
+"""Of this many assets the points are kept: more than a scene has, few enough for a process that loads many scenes."""
 IDENTITY: Final = Pose((0.0, 0.0, 0.0), IDENTITY_QUAT)
 
 
