@@ -68,7 +68,7 @@ class MiniWorld:
         self._body = -1
         self._still: tuple[int, ...] = ()
         self._stages = 0
-        self._renew()
+        self._set_rules()
         # What Bullet allocates at its first step is allocated here: processes that are forked later share it.
         self._bullet.stepSimulation(physicsClientId=self._client)
 
@@ -113,9 +113,13 @@ class MiniWorld:
 
     def _renew(self) -> None:
         """Free what the stages left behind."""
-        bullet, client = self._bullet, self._client
-        bullet.resetSimulation(physicsClientId=client)
+        self._bullet.resetSimulation(physicsClientId=self._client)
         self._factory.forget_shapes()
+        self._set_rules()
+
+    def _set_rules(self) -> None:
+        """What a client that was emptied has to be told again."""
+        bullet, client = self._bullet, self._client
         bullet.setGravity(0, 0, GRAVITY_M_S2, physicsClientId=client)
         # Contacts are solved in the order in which bodies were made, whatever the tree of boxes went through before.
         bullet.setPhysicsEngineParameter(deterministicOverlappingPairs=1, physicsClientId=client)
