@@ -25,11 +25,9 @@ MOST: Final = 12
 """Calls of a random plan: at least, less than, and at most with what they need before them."""
 PREFIXES: Final = (0, 5)
 """Calls before the one that fails, likewise."""
-EXTRA: Final = 2
-"""Times as many valid plans as asked for, at most, to reach the skills' quotas."""
 WAITS: Final = 3
 """Times in a plan that the robot waits at a source for the same effect."""
-IDLE: Final = 3
+IDLE: Final = 6
 """Plans in a row without a call that was lacking, after which a scene is taken to allow no more."""
 
 
@@ -37,12 +35,13 @@ IDLE: Final = 3
 class Request:
     """What is asked of one scene: plans of each kind, and successful calls of each skill.
 
-    Trials are numbered from ``first``.
+    ``extra`` valid plans more are written at most, while they bring calls that are lacking. Trials are numbered from ``first``.
     """
 
     plans: Mapping[PlanKind, int]
     calls: Mapping[Skill, int]
     seed: int
+    extra: int = 0
     first: int = 0
 
 
@@ -59,8 +58,7 @@ def write_trials(
 ) -> tuple[Trial, ...]:
     """Trials for a scene that is loaded in cached mode; equal arguments give equal trials.
 
-    Valid plans go on until every skill that the scene allows has its calls, or there are ``EXTRA`` times as many as
-    asked for.
+    Skills that lack calls come more often in valid plans.
     """
     return tuple(_Writer(simulator, digest, examples, request).write())
 
@@ -106,7 +104,8 @@ class _Writer:
     def _valid_trials(self, count: int) -> Iterator[Trial]:
         """As many as asked for, and more while they bring calls of skills that lack some."""
         made = idle = 0
-        while made < count or (made < EXTRA * count and idle < IDLE and self._lacking()):
+        most = count + self._request.extra
+        while made < count or (made < most and idle < IDLE and self._lacking()):
             made += 1
             before = sum(self._missing[skill] for skill in self._lacking())
             task, seed = self._task(), self._seed()

@@ -43,7 +43,7 @@ SHARES: Final[Mapping[PlanKind, float]] = {
     PlanKind.FAILING: 0.11,
 }
 """Plans of each kind."""
-ROUNDS: Final = 3
+ROUNDS: Final = 6
 """Times that plans are written for the skills that still lack calls."""
 LIMIT_S: Final = 180.0
 """Time that a process may take to load a scene and run a trial, on a busy machine."""
@@ -126,10 +126,11 @@ def write_all_trials(
     examples = examples_of(dataset)
     plans = {kind: math.ceil(settings.plans * share / len(examples)) for kind, share in SHARES.items()}
     trials: list[Trial] = []
+    extra = 0
     wanted = dict.fromkeys(SKILLS, math.ceil(settings.calls / len(examples)))
     for turn in range(ROUNDS):
         for number, (digest, items) in enumerate(examples.items(), start=1):
-            request = Request(plans, wanted, settings.seed + turn, first=len(trials))
+            request = Request(plans, wanted, settings.seed + turn, extra, first=len(trials))
             with contextlib.closing(modes.cached(dataset.read_bundle(digest))) as simulator:
                 trials += write_trials(simulator, digest, items, request)
             progress.written(number, len(examples))
@@ -138,7 +139,7 @@ def write_all_trials(
             break
         # Scenes without what a skill needs make no plan for it, so the others are asked for more than their share.
         wanted = {skill: math.ceil(2 * max(0, lacking[skill]) / len(examples)) for skill in SKILLS}
-        plans = {PlanKind.VALID: max(1, *wanted.values())}
+        plans, extra = {}, max(wanted.values())
     return tuple(trials)
 
 
