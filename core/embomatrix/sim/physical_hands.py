@@ -77,6 +77,10 @@ def _take(stage: Stage, target: str, rng: np.random.Generator) -> Refusal | None
     boxes = stage.boxes()
     course, out_m = way_in(stage, target, world.engine.aabb(target), boxes)
     tracks = grasp_tracks(world.asset(target), pose, world.engine.joints(target), course, out_m)
+    roofed = len(tracks) if out_m is not None else 0
+    if roofed:
+        # A roof may be high enough to come from above all the same: what is around decides.
+        tracks += grasp_tracks(world.asset(target), pose, world.engine.joints(target), course, None)
     reach = stage.reach(boxes, target)
     refusal = None
     attempts = 0
@@ -89,7 +93,7 @@ def _take(stage: Stage, target: str, rng: np.random.Generator) -> Refusal | None
         attempts += 1
         refusal = unfold(stage, swing) or _touch(stage, way, target)
         if refusal is None:
-            return _lift(stage, way, target, RAISE_M if out_m is None else ROOFED_RAISE_M)
+            return _lift(stage, way, target, ROOFED_RAISE_M if way.track < roofed else RAISE_M)
         fold(stage, StandPose(*stage.mover.posture[:3].tolist()), rng)
     return refusal or refuse(FailureReason.ARM_BLOCKED, target=target, other=reach.hindrance or SOMETHING)
 
@@ -223,7 +227,7 @@ def _turned(
                 fits.append((turned, course, out_m))
         fits.append((pose, course, out_m))
     world.engine.park(grip.name)
-    return fits
+    return fits + [(pose, course, None) for pose, course, out_m in fits if out_m is not None]
 
 
 def _put_tracks(grip: Grip, fits: Sequence[tuple[Pose, float, float | None]]) -> Iterator[Track]:
