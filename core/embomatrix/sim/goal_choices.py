@@ -52,8 +52,8 @@ def choices(
 ) -> tuple[Choice, ...]:
     """Up to ``WIDTH`` ways to make the goal true, by how many of their literals do not hold yet.
 
-    Of equal ones those come first whose objects are liked most, and ways with a hopeless literal come last. Each is enough for the goal; together they need not be all there are. A way that contradicts itself is
-    left out.
+    Of equal ones those come first whose objects are liked most, and ways with a hopeless literal come last. Each is enough
+    for the goal; together they need not be all there are. A way that contradicts itself is left out.
     """
     return tuple(_Choices(types, facts, liking, hopeless).of(goal, positive=True))
 
