@@ -37,6 +37,11 @@ check: lint types contracts
 compose-check: $(VENV)/.dev
 	$(BIN)/python -m pytest -m docker $(ARGS)
 
+pictures: $(VENV)/.dev
+	for scene in Rs_int Wainscott_0_int restaurant_diner; do $(BIN)/embomatrix scene render $$scene --out docs/pictures || exit 1; done
+	$(BIN)/embomatrix scene sheet --all --out docs/pictures/base_scenes.png
+	$(BIN)/embomatrix scene relations --out docs/pictures
+
 clean:
 	rm -rf build runs
 
