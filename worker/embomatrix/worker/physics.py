@@ -8,19 +8,20 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.reward.hierarchy import score
-from embomatrix.rpc.values import Completed, Timings
+from embomatrix.rpc.convert import completed_to_proto, rollout_from_proto, rollout_to_proto
+from embomatrix.rpc.values import Completed, Rollout, Timings
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.prepared import Prepared
+from embomatrix.worker.rehearsal import PLANS, REHEARSAL, TIMES, rehearsal_bundle
 from embomatrix.worker.slot_program import BundleCorruptError, run_program
-from embomatrix.world.bundle import BundleError, read_bundle
+from embomatrix.world.bundle import BundleError, bundle_digest, decode_bundle, encode_bundle, read_bundle
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from embomatrix.rpc.values import Rollout
     from embomatrix.world.bundle import Bundle
 
 CLIENTS_PER_SCENE: Final = 2
@@ -37,6 +38,7 @@ class Physics:
     def prepare(self) -> None:
         """Import the engine and connect the clients that every scene needs; raises EngineError where it is missing."""
         self._clients = ClientPool(spare=CLIENTS_PER_SCENE)
+        self._rehearse()
 
     def load(self, path: Path, digest: str) -> PhysicsScene:
         try:
@@ -44,6 +46,17 @@ class Physics:
         except BundleError as error:
             raise BundleCorruptError(str(error)) from error
         return PhysicsScene(bundle, self._clients)
+
+    def _rehearse(self) -> None:
+        """Load and execute something small, and forget it: see ``rehearsal``."""
+        data = encode_bundle(rehearsal_bundle())
+        for _ in range(TIMES):
+            scene = PhysicsScene(decode_bundle(data), self._clients)
+            for plan in PLANS:
+                rollout = Rollout(REHEARSAL, REHEARSAL, bundle_digest(data), REHEARSAL, plan, 0)
+                completed = scene.execute(rollout_from_proto(rollout_to_proto(rollout)))
+                completed_to_proto(completed).SerializeToString()
+            scene.close()
 
 
 class PhysicsScene:
@@ -63,6 +76,10 @@ class PhysicsScene:
     def complete(self) -> Iterator[None]:
         """Make what executions would make when they first need it."""
         return self._engine.complete()
+
+    def close(self) -> None:
+        """Give the clients back. The scene can't be used afterwards."""
+        self._simulator.close()
 
     def execute(self, rollout: Rollout) -> Completed:
         task = self._tasks.get(rollout.task_id)

@@ -1,0 +1,134 @@
+"""A room that the simulator's root loads and acts in once, before it forks.
+
+Much is made when it is first needed: patterns are compiled, libraries set themselves up, the interpreter adapts its
+bytecode to what it meets. What the root did, its forks find done, and share.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.skills.parse import parse_plan
+from embomatrix.world.asset import Asset, Interior, Joint, JointKind, Link, SupportSurface
+from embomatrix.world.bundle import Bundle
+from embomatrix.world.evaluate import render
+from embomatrix.world.geometry import Part, Pose, Shape
+from embomatrix.world.goal import And, Atom, Not
+from embomatrix.world.poses import PlacementKey, PoseCache, StandPose
+from embomatrix.world.scene import Doorway, RobotStart, Room, Scene, SceneObject, Window
+from embomatrix.world.state import Relation, State, SubstanceFact, SubstanceRelation
+from embomatrix.world.task import Task, TaskCategory
+
+if TYPE_CHECKING:
+    from embomatrix.skills.syntax import Plan
+    from embomatrix.world.geometry import Vec3
+
+REHEARSAL: Final = "rehearsal"
+"""Name of the scene and of its task."""
+TIMES: Final = 10
+"""Executions of each plan: the interpreter adapts bytecode that it has met eight times."""
+PLANS: Final[tuple[Plan, ...]] = tuple(
+    map(
+        parse_plan,
+        (
+            "move 2\npick_up 2\nmove 0\nplace 0 ontop",
+            "move 1\nopen 1\nclose 1\nmove 3\npick_up 3\nmove 0\nplace 0 ontop",
+        ),
+    )
+)
+
+
+def rehearsal_bundle() -> Bundle:
+    """A table, a cupboard with a door, a ball and a wedge in one room, and a task over all of them."""
+    table, cupboard, ball, wedge = _table(), _cupboard(), _ball(), _wedge()
+    dust = SubstanceFact(SubstanceRelation.COVERED, "dust")
+    objects = (
+        SceneObject("table_1", "table-a", "room_0", Pose((2.0, 2.0, 0.35)), True),
+        SceneObject("cupboard_1", "cupboard-a", "room_0", Pose((0.3, 1.0, 0.4)), True, (0.0,)),
+        SceneObject(
+            "ball_1", "ball-a", "room_0", Pose((1.8, 2.0, 0.74)), False, (), "table_1", Relation.ONTOP
+        ),
+        SceneObject(
+            "wedge_1",
+            "wedge-a",
+            "room_0",
+            Pose((2.2, 2.0, 0.75)),
+            False,
+            host="table_1",
+            relation=Relation.ONTOP,
+            states=frozenset({State.COOKED}),
+            substances=frozenset({dust}),
+        ),
+    )
+    scene = Scene(
+        scene_id=REHEARSAL,
+        base=REHEARSAL,
+        seed=0,
+        rooms=(Room("room_0", "room", (0.0, 0.0), (4.0, 4.0)),),
+        walls=(_box((2.0, -0.05, 1.2), (4.0, 0.1, 2.4)), _box((-0.05, 2.0, 1.2), (0.1, 4.0, 2.4))),
+        doorways=(Doorway(("room_0", ""), (2.0, 4.05), 0.9, 2.0, "x"),),
+        objects=objects,
+        assets={asset.asset_id: asset for asset in (table, cupboard, ball, wedge)},
+        robot=RobotStart(1.0, 3.0, 0.0, "room_0"),
+        windows=(Window(("room_0", ""), (4.05, 2.0), 1.0, 0.9, 2.0, "y"),),
+    )
+    on_table = PlacementKey("ball-a", "table-a", Relation.ONTOP)
+    poses = PoseCache({on_table: (Pose((0.1, 0.2, 0.39)),)}, {"table_1": (StandPose(1.0, 2.0, 0.0),)})
+    return Bundle(scene, {REHEARSAL: _task(scene)}, poses)
+
+
+def _task(scene: Scene) -> Task:
+    names = tuple(item.name for item in scene.objects)
+    goal = And((Atom("ontop", ("ball_1", "table_1")), Not(Atom("open", ("cupboard_1",)))))
+    types = {"ball.n.01": ("ball_1",), "table.n.02": ("table_1",)}
+    category = TaskCategory.PICK_AND_PLACE
+    return Task(
+        REHEARSAL, scene.scene_id, "Tidy up.", category, goal, render(goal), names, types, "embomatrix"
+    )
+
+
+def _table() -> Asset:
+    size = (0.8, 1.0, 0.7)
+    top = SupportSurface("top", (0.0, 0.0, 0.35), (0.8, 1.0), 1.0)
+    parts = (_box((0.0, 0.0, 0.325), (0.8, 1.0, 0.05)), _box((0.0, 0.0, -0.025), (0.1, 0.1, 0.65)))
+    return Asset("table-a", "table", "table.n.02", size, 20.0, (Link("base", parts),), (top,))
+
+
+def _cupboard() -> Asset:
+    """Open at the front but for a door that turns about its left edge."""
+    back = _box((-0.23, 0.0, 0.0), (0.04, 0.6, 0.8))
+    floor, top = _box((0.0, 0.0, -0.38), (0.42, 0.6, 0.04)), _box((0.0, 0.0, 0.38), (0.42, 0.6, 0.04))
+    door = Link(
+        "door",
+        (_box((0.23, 0.0, 0.0), (0.04, 0.6, 0.72)),),
+        Joint(JointKind.REVOLUTE, (0.25, 0.3, 0.0), (0.0, 0.0, 1.0), 1.5),
+    )
+    inside = Interior("inside", (0.0, 0.0, 0.0), (0.4, 0.56, 0.7), ("door",))
+    board = SupportSurface("floor", (0.0, 0.0, -0.36), (0.4, 0.56), 0.7, "inside")
+    return Asset(
+        "cupboard-a",
+        "cupboard",
+        "cabinet.n.01",
+        (0.5, 0.6, 0.8),
+        30.0,
+        (Link("base", (back, floor, top)), door),
+        (board,),
+        (inside,),
+        {"openable": {}},
+    )
+
+
+def _ball() -> Asset:
+    part = Part(Shape.SPHERE, Pose((0.0, 0.0, 0.0)), (0.08, 0.08, 0.08))
+    return Asset("ball-a", "ball", "ball.n.01", (0.08, 0.08, 0.08), 0.1, (Link("base", (part,)),))
+
+
+def _wedge() -> Asset:
+    corners = ((-0.1, -0.1, -0.05), (0.1, -0.1, -0.05), (0.1, 0.1, -0.05), (-0.1, 0.1, -0.05))
+    ridge = ((-0.1, 0.0, 0.05), (0.1, 0.0, 0.05))
+    part = Part(Shape.HULL, Pose((0.0, 0.0, 0.0)), (0.2, 0.2, 0.1), (*corners, *ridge))
+    return Asset("wedge-a", "wedge", "cake.n.03", (0.2, 0.2, 0.1), 0.3, (Link("base", (part,)),))
+
+
+def _box(center: Vec3, size: Vec3) -> Part:
+    return Part(Shape.BOX, Pose(center), size)
