@@ -47,7 +47,7 @@ PULL: Final = 0.4
 WAYPOINTS: Final = 7
 OVER: Final = 0.5
 """The hand goes on for this share of a waypoint's step, as leaf and arm give way a little."""
-AJAR: Final = 0.3
+AJAR: Final = 0.2
 """A leaf that is open by more can be taken from within."""
 ENOUGH: Final = 0.5
 """A door that something stops before this share of its travel is not open: the same as in cached mode."""
@@ -76,6 +76,12 @@ class Leaf:
     joint: Joint
     asset: Asset
     pose: Pose
+
+    @property
+    def height_m(self) -> float:
+        """Height of its middle above the floor with the joint at zero, to the centimetre: leaves of one row are equal."""
+        box = Aabb.around(part.aabb(self.pose) for part in self.link.parts)
+        return round(box.center_m[2], 2)
 
     def grips(self, fraction: float, along: float, spot: Spot) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Point on the leaf in the world at a share of its travel, the way out of its surface there, and the edge's line."""
@@ -116,19 +122,19 @@ def leaves_of(stage: Stage, name: str) -> list[Leaf]:
 
 
 def open_all(stage: Stage, name: str, rng: np.random.Generator) -> Refusal | None:
-    """Open every leaf. It fails, and leaves what it did, when one does not get half open."""
+    """Open every leaf, the low ones first. It fails, and leaves what it did, when one does not get half open."""
     return _lead_all(stage, name, 1.0, rng)
 
 
 def close_all(stage: Stage, name: str, rng: np.random.Generator) -> Refusal | None:
-    """Shut every leaf."""
+    """Shut every leaf, the high ones first."""
     return _lead_all(stage, name, 0.0, rng)
 
 
 def _lead_all(stage: Stage, name: str, goal: float, rng: np.random.Generator) -> Refusal | None:
     home = stage.world.robot
     refusal = None
-    for leaf in leaves_of(stage, name):
+    for leaf in sorted(leaves_of(stage, name), key=lambda leaf: leaf.height_m, reverse=not goal):
         now = stage.dynamic.joints(name)[leaf.number]
         if abs(now - goal) <= SHUT:
             continue
@@ -206,6 +212,11 @@ def _pull(stage: Stage, way: Way, leaf: Leaf, goal: float) -> Refusal | None:
     stage.mover.wait(24)
     stage.dynamic.unhook()
     stage.mover.follow(way.postures[-1:], 0.6)
+    stage.dynamic.part()
+    stage.mover.wait(4)
+    if stage.dynamic.hindrance() == leaf.name:
+        # The arm leans on the leaf: back as it came it leaves it.
+        stage.mover.follow(way.postures[-3:0:-1], 0.6)
     reached = stage.dynamic.joints(leaf.name)[leaf.number]
     stage.settle()
     if abs(reached - goal) > 0.12 and hit is not None:

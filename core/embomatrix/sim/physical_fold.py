@@ -76,10 +76,10 @@ def _pair(point: FloatArray) -> tuple[float, float]:
 def fold(stage: Stage, home: StandPose, rng: np.random.Generator, target: str = "") -> Refusal | None:
     """Bring the arm, with what it holds, over the base, and the base back to where it stood to serve a target.
 
-    Where the arm has no room to fold, the base first draws it back.
+    Where the arm has no room to fold, the base first draws it back. What the hand still touches does not keep it there.
     """
-    reach = stage.reach(stage.boxes())
     now = stage.mover.posture
+    reach = stage.reach(stage.boxes().drawn_in(*_limbs(stage, now), AIR_M))
     loaded = stage.grip is not None
     folded = carrying(stage, now)
     for spot in _retreats(stage, now, home):
@@ -95,6 +95,15 @@ def fold(stage: Stage, home: StandPose, rng: np.random.Generator, target: str = 
     ):
         return travel(stage, home, target)
     return None
+
+
+def _limbs(stage: Stage, now: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Balls of the arm and of what it holds: centres (k, 3) and radii (k,)."""
+    points, radii = body.balls(now[None])[0], body.RADII
+    if stage.grip is not None:
+        points = np.concatenate([points, stage.grip.held.placed(now[None])[0]])
+        radii = np.concatenate([radii, stage.grip.held.radii])
+    return points, radii
 
 
 def _retreats(stage: Stage, now: FloatArray, home: StandPose) -> Iterator[FloatArray]:

@@ -59,6 +59,11 @@ class Boxes:
             (*self.owners, *other.owners),
         )
 
+    def drawn_in(self, points: FloatArray, radii: FloatArray, margin_m: float) -> Boxes:
+        """The same, those smaller that balls, (k, 3) and (k,), come nearer to than a margin: by as much as lacks."""
+        lack = np.maximum(margin_m - (self.gaps(points) - radii[:, None]).min(axis=0), 0.0)  # (m,)
+        return Boxes(self.rotation, self.centre, self.half - lack[:, None], self.owners)
+
     def near(self, low: FloatArray, high: FloatArray) -> Boxes:
         """Those whose enclosing boxes overlap a box between two corners."""
         reach = np.einsum("mij,mj->mi", np.abs(self.rotation), self.half)

@@ -232,8 +232,11 @@ class DynamicWorld:
         self._hooked = (name, link)
 
     def unhook(self) -> None:
-        """Let go of a leaf."""
+        """Let go of a leaf. The hand passes through it until ``part``: fingers in it do not drag it along."""
         self.robot.let_go()
+
+    def part(self) -> None:
+        """The hand has left the leaf, and meets it again."""
         name, link = self._hooked
         self.robot.brush(self._bodies[name], link, on=True)
 
