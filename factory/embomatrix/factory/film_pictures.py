@@ -1,4 +1,4 @@
-"""Draw films: frames as pictures, in processes of their own, with the plan's steps below, as an animated file."""
+"""Draw films: the room that the robot is in, what it sees, and its plan beside that, in processes of their own."""
 
 from __future__ import annotations
 
@@ -17,17 +17,18 @@ from embomatrix.sim.film import FRAMES_PER_S
 from embomatrix.sim.physical_stage import tucked
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
     from embomatrix.sim.film import Film, Frame
     from embomatrix.world.scene import Room, Scene
 
-WIDTH_PX: Final = 640
-HEIGHT_PX: Final = 480
-INSET_PX: Final = (200, 150)
-CAPTION_PX: Final = 62
-LINE_CHARACTERS: Final = 82
+ROOM_PX: Final = (640, 480)
+EYE_PX: Final = (256, 192)
+LINE_PX: Final = 17
+LINES: Final = 15
+"""Lines of the plan that fit beside the picture."""
+LINE_CHARACTERS: Final = 38
 COLORS: Final = 128
 """Of a frame's palette: flat shading needs no more."""
 CHUNK: Final = 6
@@ -43,11 +44,10 @@ class FilmError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Caption:
-    """What stands below a frame: the call, whether it succeeded (None before it ends), and how far the plan is."""
+    """One line of the plan: the call in words, and whether it succeeded; None for a call that was not executed."""
 
     text: str
     ok: bool | None
-    progress: str
 
 
 def draw_film(
@@ -57,9 +57,10 @@ def draw_film(
     processes: int = 2,
     on_frame: Callable[[int, int], None] = lambda done, count: None,
 ) -> list[Image.Image]:
-    """Pictures of all frames with their captions, ``captions[frame.step]`` below each. RGB, 640 x 524 pixels.
+    """Pictures of all frames, RGB, 896 x 480 pixels: the room on the left, the robot's view and ``captions`` on the right.
 
-    Drawn by processes that share nothing with this one. ``on_frame`` hears how many of how many are done.
+    There is a caption for each call of the plan. Frames are drawn by processes that share nothing with this one;
+    ``on_frame`` hears how many of how many are done.
     """
     rooms = _rooms_seen(film)
     chunks = [film.frames[start : start + CHUNK] for start in range(0, len(film.frames), CHUNK)]
@@ -67,8 +68,8 @@ def draw_film(
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(processes, context, _open_stage, (film.scene, rooms)) as pool:
         for chunk, drawn in zip(chunks, pool.map(_draw, chunks), strict=True):
-            for frame, pixels in zip(chunk, drawn, strict=True):
-                pictures.append(_captioned(pixels, captions[frame.step]))
+            for frame, (room, eye) in zip(chunk, drawn, strict=True):
+                pictures.append(_page(room, eye, captions, frame.step))
             on_frame(len(pictures), len(film.frames))
     return pictures
 
@@ -92,25 +93,24 @@ def check_suffix(path: Path) -> None:
 class _Cutter:
     """One process's stage, brought from frame to frame."""
 
-    def __init__(self, scene: Scene, rooms: tuple[Room, ...]) -> None:
+    def __init__(self, scene: Scene, rooms: Mapping[int, tuple[Room, ...]]) -> None:
         self._stage = Stage(scene)
         furnish_cutaway(self._stage)
         self._rooms = rooms
         self._robot = self._stage.add_robot()
         self._changed: set[str] = set()
 
-    def shoot(self, frame: Frame) -> Image.Image:
-        """The rooms from above and aside, with the robot's own view in the corner."""
+    def shoot(self, frame: Frame) -> tuple[Image.Image, Image.Image]:
+        """The rooms of the frame's step from above and aside, and what the robot sees."""
         changed = {*frame.poses, *frame.joints, *frame.hidden}
         for name in sorted(changed | self._changed):
             self._show(frame, name)
         self._changed = changed
         self._robot.stand(frame.posture or tucked(frame.robot))
-        wide = Image.fromarray(np.asarray(shoot_oblique(self._stage, self._rooms, WIDTH_PX, HEIGHT_PX)))
+        room = shoot_oblique(self._stage, self._rooms[frame.step], *ROOM_PX)
         self._robot.leave()
-        inset = Image.fromarray(np.asarray(shoot_egocentric(self._stage, frame.robot, *INSET_PX)))
-        wide.paste(inset, (WIDTH_PX - INSET_PX[0] - 6, 6))
-        return wide
+        eye = shoot_egocentric(self._stage, frame.robot, *EYE_PX)
+        return Image.fromarray(np.asarray(room)), Image.fromarray(np.asarray(eye))
 
     def _show(self, frame: Frame, name: str) -> None:
         item = self._stage.scene.by_name[name]
@@ -124,29 +124,46 @@ class _Cutter:
 _cutter: _Cutter | None = None
 
 
-def _open_stage(scene: Scene, rooms: tuple[Room, ...]) -> None:
+def _open_stage(scene: Scene, rooms: Mapping[int, tuple[Room, ...]]) -> None:
     global _cutter  # a pool's initializer has no other way to leave something for its tasks
     _cutter = _Cutter(scene, rooms)
 
 
-def _draw(frames: Sequence[Frame]) -> list[Image.Image]:
+def _draw(frames: Sequence[Frame]) -> list[tuple[Image.Image, Image.Image]]:
     assert _cutter is not None
     return [_cutter.shoot(frame) for frame in frames]
 
 
-def _rooms_seen(film: Film) -> tuple[Room, ...]:
-    """The rooms that the robot is in at any moment; all of them where it is in none."""
-    names = {film.scene.room_at((frame.robot.x_m, frame.robot.y_m)) for frame in film.frames}
-    return tuple(room for room in film.scene.rooms if room.name in names) or film.scene.rooms
+def _rooms_seen(film: Film) -> dict[int, tuple[Room, ...]]:
+    """Of each step the rooms that the robot is in while it lasts; all of them where it is in none."""
+    names: dict[int, set[str]] = {}
+    for frame in film.frames:
+        names.setdefault(frame.step, set()).add(film.scene.room_at((frame.robot.x_m, frame.robot.y_m)))
+    rooms = film.scene.rooms
+    return {step: tuple(room for room in rooms if room.name in seen) or rooms for step, seen in names.items()}
 
 
-def _captioned(picture: Image.Image, caption: Caption) -> Image.Image:
-    width, height = picture.size
-    whole = Image.new("RGB", (width, height + CAPTION_PX), "white")
-    whole.paste(picture, (0, 0))
-    pen = ImageDraw.Draw(whole)
-    color = {None: "#444444", True: "#1a7f37", False: "#b42318"}[caption.ok]
-    pen.text((8, height + 3), caption.progress, fill="#888888", font=ImageFont.load_default(12))
-    lines = textwrap.wrap(caption.text, LINE_CHARACTERS, max_lines=2, placeholder=" …")
-    pen.multiline_text((8, height + 19), "\n".join(lines), fill=color, font=ImageFont.load_default(15))
+def _page(room: Image.Image, eye: Image.Image, captions: Sequence[Caption], step: int) -> Image.Image:
+    """One frame: the room, the robot's view, and the plan with the step that is under way."""
+    whole = Image.new("RGB", (ROOM_PX[0] + EYE_PX[0], ROOM_PX[1]), "white")
+    whole.paste(room, (0, 0))
+    whole.paste(eye, (ROOM_PX[0], 0))
+    pen, font = ImageDraw.Draw(whole), ImageFont.load_default(13)
+    first = max(0, min(step - LINES // 2, len(captions) - LINES))
+    for line, caption in enumerate(captions[first : first + LINES]):
+        number = first + line + 1
+        words = textwrap.shorten(f"{number}  {caption.text}", LINE_CHARACTERS, placeholder=" …")
+        at = (ROOM_PX[0] + 10, EYE_PX[1] + 10 + line * LINE_PX)
+        if number == step:
+            pen.rectangle((ROOM_PX[0] + 4, at[1] - 1, whole.width - 4, at[1] + LINE_PX - 2), fill="#eef2f6")
+        pen.text(at, words, fill=_color(caption, number, step), font=font)
     return whole
+
+
+def _color(caption: Caption, number: int, step: int) -> str:
+    """Calls to come are grey, the present one is dark, those behind it green, and what failed red."""
+    if number > step or caption.ok is None:
+        return "#a0a7b0"
+    if not caption.ok:
+        return "#b42318"
+    return "#1f2933" if number == step else "#1a7f37"

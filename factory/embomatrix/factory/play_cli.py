@@ -156,14 +156,10 @@ def _run(bundle: Bundle, task: Task, plan: Plan, take: Take) -> None:
 
 def _draw(film: Film, path: Path) -> None:
     """Draw the film, with a bar that tells how far it is, and write it."""
-    captions = [Caption(film.task.instruction, None, "the task")]
-    captions += [
-        Caption(
-            call_in_words(step.call, film.task) + ("" if step.ok else f": {step.message}"),
-            step.ok,
-            f"step {number} of {len(film.plan)}",
-        )
-        for number, step in enumerate(film.steps, start=1)
+    done = [step.ok for step in film.steps]
+    captions = [
+        Caption(call_in_words(call, film.task), done[number] if number < len(done) else None)
+        for number, call in enumerate(film.plan)
     ]
     with Progress(console=console, transient=True) as progress:
         bar = progress.add_task("drawing", total=len(film.frames))

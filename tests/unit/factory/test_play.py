@@ -137,7 +137,7 @@ def test_a_plan_is_drawn_as_an_animation(run, tmp_path):
     assert result.exit_code == 0, result.output
     with Image.open(film) as picture:
         assert picture.n_frames > 10
-        assert picture.size == (640, 542)
+        assert picture.size == (896, 480)
 
 
 def test_a_film_of_an_unknown_kind_is_refused_before_anything_runs(run):
