@@ -18,6 +18,7 @@ from embomatrix.world.codec_asset import (
     pose_from_field,
     pose_to_json,
 )
+from embomatrix.world.codec_plain import plain_assets, plain_objects
 from embomatrix.world.field import Field, SceneInvalidError
 from embomatrix.world.scene import Doorway, RobotStart, Room, Scene, SceneObject, Window
 from embomatrix.world.state import Relation, State, SubstanceFact, SubstanceRelation
@@ -83,10 +84,7 @@ def scene_from_json(value: object, tables: Tables | None = None) -> Scene:
         "left_out",
         optional=("windows",),
     )
-    assets = {key: asset_from_field(item) for key, item in fields["assets"].entries()}
-    for key, asset in assets.items():
-        if key != asset.asset_id:
-            fields["assets"].fail(f"asset {asset.asset_id!r} stands under the key {key!r}")
+    assets = _assets(fields["assets"])
     rooms = tuple(_room(item) for item in fields["rooms"].items(at_most=1_000))
     scene = Scene(
         scene_id=fields["scene_id"].name(),
@@ -95,7 +93,7 @@ def scene_from_json(value: object, tables: Tables | None = None) -> Scene:
         rooms=rooms,
         walls=tuple(part_from_field(item) for item in fields["walls"].items(at_most=MAX_WALLS)),
         doorways=tuple(_doorway(item) for item in fields["doorways"].items()),
-        objects=tuple(_object(item, assets) for item in fields["objects"].items(at_most=MAX_OBJECTS)),
+        objects=_objects(fields["objects"], assets),
         assets=assets,
         robot=_robot(fields["robot"]),
         left_out=fields["left_out"].texts(),
@@ -201,7 +199,29 @@ def _object_to_json(item: SceneObject, tables: TableWriter | None) -> Json:
     return value
 
 
-def _object(field: Field, assets: Mapping[str, Asset]) -> SceneObject:
+def _assets(field: Field) -> dict[str, Asset]:
+    plain = plain_assets(field.value, field.tables) if field.tables is not None else None
+    if plain is not None:
+        return plain
+    assets = {key: asset_from_field(item) for key, item in field.entries()}
+    for key, asset in assets.items():
+        if key != asset.asset_id:
+            field.fail(f"asset {asset.asset_id!r} stands under the key {key!r}")
+    return assets
+
+
+def _objects(field: Field, assets: Mapping[str, Asset]) -> tuple[SceneObject, ...]:
+    items = field.items(at_most=MAX_OBJECTS)
+    plain = None
+    if field.tables is not None:
+        plain = plain_objects(
+            field.value, assets, field.tables, lambda index: object_from_field(items[index], assets)
+        )
+    return plain if plain is not None else tuple(object_from_field(item, assets) for item in items)
+
+
+def object_from_field(field: Field, assets: Mapping[str, Asset]) -> SceneObject:
+    """An object of one of the assets, with a joint position for each of its joints."""
     fields = field.record(
         "name",
         "asset_id",

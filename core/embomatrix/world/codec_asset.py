@@ -148,10 +148,13 @@ def _link(field: Field) -> Link:
     parts = tuple(part_from_field(item) for item in fields["parts"].items(at_most=MAX_PARTS))
     if not parts:
         fields["parts"].fail("is empty: expected at least one part")
-    return Link(fields["name"].name(), parts, _joint(fields["joint"]) if "joint" in fields else None)
+    return Link(
+        fields["name"].name(), parts, joint_from_field(fields["joint"]) if "joint" in fields else None
+    )
 
 
-def _joint(field: Field) -> Joint:
+def joint_from_field(field: Field) -> Joint:
+    """A joint with a travel, about or along an axis of length 1. Raises SceneInvalidError."""
     fields = field.record("kind", "origin_m", "axis", "upper")
     axis = fields["axis"].vec3()
     length = math.hypot(*axis)

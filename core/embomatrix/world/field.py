@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     E = TypeVar("E", bound=StrEnum)
 
 MAX_NAME: Final = 200
-_FORBIDDEN: Final = frozenset("/\\")
+FORBIDDEN: Final = frozenset("/\\")
 
 
 class SceneInvalidError(ValueError):
@@ -105,7 +105,7 @@ class Field:
         text = self.text()
         if not text:
             self.fail("is empty: expected a name")
-        if len(text) > MAX_NAME or not text.isprintable() or not _FORBIDDEN.isdisjoint(text):
+        if len(text) > MAX_NAME or not text.isprintable() or not FORBIDDEN.isdisjoint(text):
             self.fail(
                 f"found {text[:60]!r}: expected a name of at most {MAX_NAME} printable characters without a slash"
             )

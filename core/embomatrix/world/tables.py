@@ -123,6 +123,16 @@ class Tables:
         """The part whose row the field names."""
         return self._parts[_row(field, len(self._parts))]
 
+    def poses_at(self, rows: Sequence[int]) -> list[Pose]:
+        """The poses of these rows. Raises ValueError where one is no row."""
+        _check_are_rows(rows, len(self._poses))
+        return [self._poses[row] for row in rows]
+
+    def parts_at(self, rows: Sequence[int]) -> tuple[Part, ...]:
+        """The parts of these rows. Raises ValueError where one is no row."""
+        _check_are_rows(rows, len(self._parts))
+        return tuple([self._parts[row] for row in rows])
+
     def stands(self, field: Field) -> list[Vec3]:
         """The rows of x, y and yaw whose first row and number the field holds."""
         span = field.value
@@ -167,6 +177,12 @@ def _row(field: Field, count: int) -> int:
     return row
 
 
+def _check_are_rows(rows: Sequence[int], count: int) -> None:
+    """For rows of which no one asks where they stand."""
+    if set(map(type, rows)) - {int} or min(rows, default=0) < 0 or max(rows, default=0) >= max(count, 1):
+        raise ValueError(f"expected rows from 0 to {count - 1}")
+
+
 def _floats(arrays: Arrays, name: str, columns: int) -> FloatArray:
     """A float array of that many columns, all finite."""
     array = arrays.get(name)
@@ -180,11 +196,12 @@ def _floats(arrays: Arrays, name: str, columns: int) -> FloatArray:
 
 
 def _check_poses(name: str, rows: FloatArray) -> None:
-    quats = rows[:, 3:]
+    x, y, z, w = rows[:, 3:].T
     with np.errstate(over="ignore"):  # too long is too long
-        off: FloatArray = np.abs(np.sqrt((quats * quats).sum(axis=1)) - 1.0)  # (n,)
+        off: FloatArray = np.abs(np.sqrt(x * x + y * y + z * z + w * w) - 1.0)  # (n,)
     _check_rows(name, rows, off <= QUAT_TOLERANCE, "a quaternion whose length is not 1")
-    near = np.abs(rows[:, :3]).max(axis=1, initial=0) <= MAX_COORDINATE_M
+    x, y, z = np.abs(rows[:, :3]).T
+    near = np.maximum(np.maximum(x, y), z) <= MAX_COORDINATE_M
     _check_rows(name, rows, near, f"a position further than {MAX_COORDINATE_M:g} m from the origin")
 
 
