@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-    from embomatrix.sim.live_world import LiveWorld
     from embomatrix.sim.footing import Host
+    from embomatrix.sim.live_world import LiveWorld
     from embomatrix.skills.syntax import SkillCall
     from embomatrix.skills.view import Refusal
     from embomatrix.world.geometry import Aabb
