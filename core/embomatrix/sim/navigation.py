@@ -74,7 +74,7 @@ class Navigator:
         self._grids: OrderedDict[Floor, tuple[FloorGrid, Obstacles]] = OrderedDict()
         self._stands: dict[tuple[object, ...], tuple[StandPose, ...]] = {}
         self._blockers: dict[tuple[object, ...], FloatArray] = {}
-        self._found_before = dict(stands or {})
+        self._found_before = stands if stands is not None else {}
         self._moved: set[int] = set()
         self._round, self._read = -1, 0
         self.refresh()

@@ -104,9 +104,13 @@ def poses_to_json(poses: PoseCache, tables: TableWriter | None = None) -> Json:
 def poses_from_json(value: object, tables: Tables | None = None) -> PoseCache:
     """A pose cache; ``tables`` hold the rows that it was written with. Raises SceneInvalidError."""
     fields = Field(value, "poses", tables=tables).record("placements", "stands")
-    stands = {name: _stands_from_field(found) for name, found in fields["stands"].entries()}
     if tables is not None:
-        return PoseCache(tables.placements([item.name() for item in fields["placements"].items()]), stands)
+        names = [item.name() for item in fields["placements"].items()]
+        return PoseCache(tables.placements(names), tables.stands(fields["stands"]))
+    stands = {
+        name: tuple(StandPose(*stand.vec3()) for stand in found.items())
+        for name, found in fields["stands"].entries()
+    }
     placements = {}
     for item in fields["placements"].items():
         entry = item.record("asset_id", "support_asset_id", "relation", "poses")
@@ -123,9 +127,3 @@ def _stands_to_json(stands: tuple[StandPose, ...], tables: TableWriter | None) -
     """Triples, or the first row of ``tables`` that holds them and their number."""
     rows = [(float(stand.x_m), float(stand.y_m), float(stand.yaw)) for stand in stands]
     return [tables.stands(rows), len(rows)] if tables is not None else [[*row] for row in rows]
-
-
-def _stands_from_field(field: Field) -> tuple[StandPose, ...]:
-    if field.tables is not None:
-        return tuple(StandPose(x, y, yaw) for x, y, yaw in field.tables.stands(field))
-    return tuple(StandPose(*stand.vec3()) for stand in field.items())

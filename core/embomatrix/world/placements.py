@@ -1,4 +1,4 @@
-"""Verified placements of a bundle as flat arrays, made into poses when one asks for them.
+"""Verified placements and standing poses of a bundle as flat arrays, made into poses when one asks for them.
 
 An analysis knows thousands of poses and a rollout uses a few: a worker that loads a bundle makes none of them.
 """
@@ -12,7 +12,7 @@ import numpy as np
 
 from embomatrix.world.field import SceneInvalidError
 from embomatrix.world.geometry import Pose
-from embomatrix.world.poses import PlacementKey
+from embomatrix.world.poses import PlacementKey, StandPose
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
@@ -82,6 +82,32 @@ class Placements(Mapping[PlacementKey, tuple[Pose, ...]]):
             numbers.get(key.support_asset_id, -1),
             RELATIONS.index(key.relation),
         )
+
+
+class Stands(Mapping[str, tuple[StandPose, ...]]):
+    """Standing poses by object name.
+
+    ``spans`` hold for each name its first row in ``rows`` and the number of its rows, which must be there; ``rows``, shape
+    (n, 3), are x, y and yaw.
+    """
+
+    def __init__(self, spans: Mapping[str, tuple[int, int]], rows: FloatArray) -> None:
+        self._spans = spans
+        self._rows = rows
+        self._made: dict[str, tuple[StandPose, ...]] = {}
+
+    def __getitem__(self, name: str) -> tuple[StandPose, ...]:
+        if name not in self._made:
+            first, count = self._spans[name]
+            rows = self._rows[first : first + count].tolist()
+            self._made[name] = tuple(StandPose(x, y, yaw) for x, y, yaw in rows)
+        return self._made[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._spans)
+
+    def __len__(self) -> int:
+        return len(self._spans)
 
 
 def flattened(

@@ -14,7 +14,7 @@ import numpy as np
 
 from embomatrix.world.field import Field, SceneInvalidError
 from embomatrix.world.geometry import Part, Pose, Shape
-from embomatrix.world.placements import SET_NUMBERS, Placements
+from embomatrix.world.placements import SET_NUMBERS, Placements, Stands
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -105,7 +105,7 @@ class Tables:
             "parts", sizes, (sizes.max(axis=1, initial=1) <= MAX_COORDINATE_M), "an extent above 10 km"
         )
         self._poses = [Pose((x, y, z), (a, b, c, d)) for x, y, z, a, b, c, d in poses.tolist()]
-        self._stands = [(x, y, yaw) for x, y, yaw in _floats(arrays, "stands", 3).tolist()]
+        self._stands = _floats(arrays, "stands", 3)
         self._spots = _floats(arrays, "spots", POSE_NUMBERS)
         _check_poses("spots", self._spots)
         self._sets = _sets(arrays)
@@ -133,15 +133,18 @@ class Tables:
         _check_are_rows(rows, len(self._parts))
         return tuple([self._parts[row] for row in rows])
 
-    def stands(self, field: Field) -> list[Vec3]:
-        """The rows of x, y and yaw whose first row and number the field holds."""
+    def stands(self, field: Field) -> Stands:
+        """The standing poses of the objects whose first row and number of rows the field holds by name."""
+        return Stands({name: self._span(item) for name, item in field.entries()}, self._stands)
+
+    def _span(self, field: Field) -> tuple[int, int]:
         span = field.value
         if not isinstance(span, list) or len(span) != 2 or set(map(type, span)) != {int}:
             field.fail(f"found {str(span)[:40]}: expected the first row and the number of rows")
         first, count = span
         if min(first, count) < 0 or first + count > len(self._stands):
             field.fail(f"found rows {first} to {first + count}: there are {len(self._stands)}")
-        return self._stands[first : first + count]
+        return first, count
 
 
 def has_volume(vertices: FloatArray) -> bool:

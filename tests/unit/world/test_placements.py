@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from embomatrix.world.field import SceneInvalidError
 from embomatrix.world.geometry import Pose
-from embomatrix.world.placements import Placements, flattened
-from embomatrix.world.poses import PlacementKey
+from embomatrix.world.placements import Placements, Stands, flattened
+from embomatrix.world.poses import PlacementKey, StandPose
 from embomatrix.world.state import Relation
 
 NAME = st.sampled_from(("apple-aa", "table-bb", "footprint-9x9x12cm", "level-floor"))
@@ -59,3 +59,14 @@ def test_what_stands_there_twice_is_refused() -> None:
         Placements(["a", "b"], np.array([GOOD, GOOD], dtype=np.int32), spots)
     with pytest.raises(SceneInvalidError, match="twice"):
         Placements(["a", "a"], np.array([GOOD], dtype=np.int32), spots)
+
+
+def test_standing_poses_are_made_of_the_rows_that_belong_to_a_name() -> None:
+    rows = np.array([[1.0, 2.0, 0.5], [3.0, 4.0, -0.5], [5.0, 6.0, 0.0]])
+    stands = Stands({"apple_1": (0, 2), "table_1": (2, 1), "sky_1": (3, 0)}, rows)
+    assert stands == {
+        "apple_1": (StandPose(1.0, 2.0, 0.5), StandPose(3.0, 4.0, -0.5)),
+        "table_1": (StandPose(5.0, 6.0, 0.0),),
+        "sky_1": (),
+    }
+    assert stands.get("pear_1") is None
