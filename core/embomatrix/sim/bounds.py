@@ -52,12 +52,39 @@ class AssetBounds:
     def __init__(self, asset: Asset) -> None:
         self._links = [(link.parts, link.joint) for link in asset.links if link.parts]
         self._extents: dict[tuple[Quat, tuple[float, ...]], tuple[Vec3, Vec3]] = {}
+        self._clouds_at: dict[tuple[float, ...], tuple[FloatArray, FloatArray | None]] = {}
 
     def box(self, pose: Pose, fractions: Sequence[float] = ()) -> Aabb:
         """Bounding box in the frame that ``pose`` leads to, with the joints at these shares of their travel."""
         (a, b, c), (d, e, f) = self._extents_at(pose.quat_xyzw, tuple(fractions))
         x, y, z = pose.position_m
         return Aabb((x + a, y + b, z + c), (x + d, y + e, z + f))
+
+    def extents(
+        self, rotations: FloatArray, fractions: Sequence[float] = ()
+    ) -> tuple[FloatArray, FloatArray]:
+        """Corners of the boxes relative to the origin at many rotations, shape (n, 3, 3); each of shape (n, 3)."""
+        points, radii = self._placed(tuple(fractions))
+        turned = rotations @ points  # (n, 3, m)
+        if radii is None:
+            return turned.min(axis=2), turned.max(axis=2)
+        return (turned - radii).min(axis=2), (turned + radii).max(axis=2)
+
+    def _placed(self, fractions: tuple[float, ...]) -> tuple[FloatArray, FloatArray | None]:
+        """Points of all links in the asset's frame, shape (3, m), and radii of the balls around them; None: no balls."""
+        known = self._clouds_at.get(fractions)
+        if known is None:
+            if len(self._clouds_at) >= EXTENTS_KEPT:
+                self._clouds_at.clear()
+            moving = iter(fractions)
+            points: list[FloatArray] = []
+            for (cloud, _), joint in self._clouds:
+                fraction = next(moving, 0.0) if joint is not None else 0.0
+                points.append(joint_motion(joint, fraction).apply_all(cloud) if joint and fraction else cloud)
+            radii = np.concatenate([balls[:, 0] for (_, balls), _ in self._clouds])
+            known = np.ascontiguousarray(np.concatenate(points).T), radii if radii.any() else None
+            self._clouds_at[fractions] = known
+        return known
 
     @functools.cached_property
     def _clouds(self) -> list[tuple[tuple[FloatArray, FloatArray], Joint | None]]:

@@ -101,13 +101,17 @@ def proposals(found: Sequence[Patch], shift: Vec2, tries: int) -> Iterator[tuple
     ``shift`` in the unit square moves the whole pattern: equal shifts give equal poses. Whether the relation holds there is
     not looked at.
     """
+    for patch, (x, y, z) in proposed_places(found, shift, tries):
+        yield patch, Pose.from_xyz_yaw(x, y, z, patch.yaw)
+
+
+def proposed_places(found: Sequence[Patch], shift: Vec2, tries: int) -> Iterator[tuple[Patch, Vec3]]:
+    """Positions of ``proposals``."""
     (start_u, start_v), (step_u, step_v) = shift, GOLDEN
     for number, patch in zip(range(1, tries + 1), itertools.cycle(found), strict=False):
         u, v = (start_u + number * step_u) % 1.0, (start_v + number * step_v) % 1.0
         x, y, z = patch.center_m
-        x += (2 * u - 1) * patch.room_m[0]
-        y += (2 * v - 1) * patch.room_m[1]
-        yield patch, Pose.from_xyz_yaw(x, y, z, patch.yaw)
+        yield patch, (x + (2 * u - 1) * patch.room_m[0], y + (2 * v - 1) * patch.room_m[1], z)
 
 
 def candidates(held: Asset, support: Asset, relation: Relation, shift: Vec2, tries: int) -> Iterator[Pose]:

@@ -167,8 +167,8 @@ class Simulator:
             states.append("open" if world.is_open(name) else "closed")
         if asset.can("toggleable"):
             states.append("on" if world.is_on(name) else "off")
-        states += sorted(state.value for state in world.states[name] - {State.TOGGLED_ON})
-        states += [in_words(fact) for fact in sorted(world.substances[name])]
+        states += sorted(state.value for state in world.states.get(name, set()) - {State.TOGGLED_ON})
+        states += [in_words(fact) for fact in sorted(world.substances.get(name, ()))]
         return Sight(
             name=name,
             room=world.room_of(name),

@@ -62,17 +62,10 @@ class Footings:
         self._scene = engine.scene
         self._at_start: dict[str, Footing] = {}
         self._now: dict[str, Footing] = {}
-        self._disturbed: set[str] = set()
-        """Objects near to which anything has changed."""
         self._stale: set[str] = set()
-        """Those of them that may stand otherwise since."""
+        """Objects near to which something has changed, so that they may stand otherwise since."""
         self._round = engine.journal.rounds
         self._read = 0
-
-    def is_disturbed(self, name: str) -> bool:
-        """Whether anything within 1 cm of the object's box has changed since the scene was loaded or reset."""
-        self._read_journal()
-        return name in self._disturbed
 
     def of(self, name: str) -> Footing:
         """How the object stands: its host, the containers around it, what it is on top of."""
@@ -89,7 +82,6 @@ class Footings:
         if journal.rounds != self._round:
             self._round, self._read = journal.rounds, 0
             self._now.clear()
-            self._disturbed.clear()
             self._stale.clear()
         if len(journal.entries) == self._read:
             return
@@ -101,11 +93,9 @@ class Footings:
             places = [box] if box is not None else []
             if not self._engine.is_parked(name):
                 places.append(self._engine.aabb(name))
-            self._disturbed.add(name)
             self._forget(name)
             for place in places:
                 for other in self._engine.near(place.grown(REST_M)):
-                    self._disturbed.add(other)
                     if self._concerns(other, name, place):
                         self._forget(other)
 
@@ -155,18 +145,30 @@ class Footings:
     def is_on(self, name: str, other: str) -> bool:
         """Whether the object rests on a surface of another that no door shuts off."""
         known = self._known(name)
-        if known is not None:
-            return other in known.on
-        near = self._engine.aabb(name).overlaps(self._engine.aabb(other), REST_M)
-        return near and bool(self._spots_of(name, other)[1]) and self._is_open_to(name, other)
+        return other in known.on if known is not None else self.would_be_on(name, other)
 
     def is_in(self, name: str, other: str) -> bool:
         """Whether the object lies in a cavity of another."""
         known = self._known(name)
         if known is not None:
             return any(item.name == other for item in known.enclosures)
-        near = self._engine.aabb(name).overlaps(self._engine.aabb(other), REST_M)
-        return near and self._spots_of(name, other)[0] is not None
+        return self.would_be_in(name, other)
+
+    def would_be_on(self, name: str, other: str) -> bool:
+        """As ``is_on``, without a look at what is kept: for an object that is being tried in many places."""
+        engine = self._engine
+        box, there = engine.aabb(name), engine.aabb(other)
+        if not box.overlaps(there, REST_M) or not _is_over(box, there):
+            return False
+        asset, pose, fractions = self._scene.asset_of(other), engine.pose(other), engine.joints(other)
+        return bool(surface_under(box, asset, pose, fractions, doored=False))
+
+    def would_be_in(self, name: str, other: str) -> bool:
+        """As ``is_in``, without a look at what is kept."""
+        engine, asset = self._engine, self._scene.asset_of(other)
+        if not asset.interiors or not engine.aabb(name).overlaps(engine.aabb(other), REST_M):
+            return False
+        return self._interior(name, asset, engine.pose(other), engine.joints(other)) is not None
 
     def _known(self, name: str) -> Footing | None:
         self._read_journal()

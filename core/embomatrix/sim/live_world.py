@@ -90,7 +90,7 @@ class LiveWorld:
         return self.relations.open(name)
 
     def is_on(self, name: str) -> bool:
-        return State.TOGGLED_ON in self.states[name]
+        return State.TOGGLED_ON in self.states.get(name, ())
 
     def cargo(self, name: str) -> tuple[str, ...]:
         """The object and what lies in it, and what rests on that: all that is lifted with it."""
@@ -128,7 +128,7 @@ class LiveWorld:
         return name not in self.absent
 
     def is_sliced(self, name: str) -> bool:
-        return State.SLICED in self.states[name]
+        return State.SLICED in self.states.get(name, ())
 
     def is_inside(self, name: str, container: str) -> bool:
         return self.relations.inside(name, container)

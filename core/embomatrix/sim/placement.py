@@ -8,43 +8,32 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.sim.bounds import bounds_of
-from embomatrix.sim.candidates import Patch, candidates, patches, proposals
+from embomatrix.sim.candidates import candidates
 from embomatrix.sim.engine import FLOOR, TOLERANCE_M
-from embomatrix.sim.footprints import LEVEL_FLOOR, footprint_of, pose_box_asset
-from embomatrix.sim.spots import is_shut, is_upright, link_frame, link_under, links_with_spots
+from embomatrix.sim.lineup import Neighbours
+from embomatrix.sim.repertoire import Repertoire
+from embomatrix.sim.spots import is_shut, is_upright, link_frame, links_with_spots
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.limits import ROBOT
-from embomatrix.world.poses import PlacementKey
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Iterator, Sequence
 
     import numpy as np
 
     from embomatrix.sim.engine import PhysicsEngine
     from embomatrix.sim.relations import Relations
-    from embomatrix.world.asset import Asset
+    from embomatrix.sim.repertoire import Spots
     from embomatrix.world.geometry import Aabb, Pose
     from embomatrix.world.poses import PoseCache, StandPose
 
 UNDISTURBED_M: Final = 0.005
 """A pose that was verified offline is settled again when anything but its support is this near."""
-TAKEN_SHARE: Final = 0.16
-"""Boxes of two upright cylinders that overlap by this share of their extents along both axes are of cylinders that do."""
-SAME_LEVEL_M: Final = 0.02
 LIVE_TRIES: Final = 64
 """Candidates looked at beyond the cached ones."""
 LIVE_SETTLES: Final = 8
 """How many of them are simulated at most."""
-
-
-@dataclass(frozen=True, slots=True)
-class Spot:
-    """A pose in the frame of a support's link, which is the support's own for the base."""
-
-    pose: Pose
-    link: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,9 +58,7 @@ class Placer:
         self._engine = engine
         self._relations = relations
         self._scene = engine.scene
-        self._cache = cache
-        self._verified: dict[tuple[str, str, Relation], tuple[tuple[Spot, ...], tuple[Spot, ...]]] = {}
-        self._patches: dict[tuple[str, str, Relation], tuple[Patch, ...]] = {}
+        self._repertoire = Repertoire(engine.scene, cache)
 
     def find(
         self,
@@ -121,7 +108,7 @@ class Placer:
 
     def _fits(self, held: str, target: str, relation: Relation) -> bool:
         """Whether there is any pose for the one on, in or under the other when nothing else is there."""
-        if any(self._cached(held, target, relation)):
+        if any(map(len, self._repertoire.verified(held, target, relation))):
             return True
         one, other = self._scene.asset_of(held), self._scene.asset_of(target)
         return any(True for _ in candidates(one, other, relation, (0.5, 0.5), LIVE_TRIES))
@@ -129,15 +116,10 @@ class Placer:
     def _search(self, errand: Errand, rng: np.random.Generator | None) -> Iterator[Pose]:
         """Good poses: of those verified for the pair, then for the footprint's class, then of fresh ones."""
         frames = self._frames(errand)
-        for spots in self._cached(errand.held, errand.target, errand.relation):
+        for spots in self._repertoire.verified(errand.held, errand.target, errand.relation):
             order = range(len(spots)) if rng is None else rng.permutation(len(spots)).tolist()
-            poses = (
-                frames[spots[number].link] @ spots[number].pose
-                for number in order
-                if spots[number].link in frames
-            )
-            for pose in self._roomy_first(errand, poses):
-                found = self._accept_verified(errand, pose)
+            for number, nearest in self._roomy_first(errand, spots, frames, order):
+                found = self._accept_verified(errand, spots.pose(number, frames), nearest)
                 if found is not None:
                     yield found
         yield from self._fresh(errand, frames, rng)
@@ -147,62 +129,60 @@ class Placer:
     ) -> Iterator[Pose]:
         """Poses for pairs that the analysis did not foresee, and on surfaces that have filled up."""
         shift = (0.5, 0.5) if rng is None else (float(rng.random()), float(rng.random()))
-        found = self._patches_for(errand.held, errand.target, errand.relation)
-        poses = (
-            frames[patch.link] @ local
-            for patch, local in proposals(found, shift, LIVE_TRIES)
-            if patch.link in frames
-        )
+        spots = self._repertoire.fresh(errand.held, errand.target, errand.relation, shift, LIVE_TRIES)
         settles = 0
-        for pose in self._roomy_first(errand, poses):
+        for number, nearest in self._roomy_first(errand, spots, frames, range(len(spots))):
             if settles == LIVE_SETTLES:
                 return
-            if not self._is_free(errand, pose) or not self._holds(errand):
+            if not self._is_free(errand, spots.pose(number, frames), nearest) or not self._holds(errand):
                 continue
             settles += 1
             settled = self._accept_settled(errand)
             if settled is not None:
                 yield settled
 
-    def _roomy_first(self, errand: Errand, poses: Iterable[Pose]) -> Iterator[Pose]:
+    def _roomy_first(
+        self, errand: Errand, spots: Spots, frames: dict[str, Pose], order: Sequence[int]
+    ) -> Iterator[tuple[int, str]]:
         """Those in reach, in their order: first those around which there is nothing but the target, then the others.
 
-        Boxes decide that, so it is cheap; what is really free is looked at later. Where something stands for sure is left
-        out.
+        With each of the others comes the object that it is most likely to meet. Boxes decide that, so it is cheap; what is
+        really free is looked at later. Where something stands for sure is left out.
         """
-        bounds = bounds_of(self._scene.asset_of(errand.held))
-        fractions = self._engine.joints(errand.held)
-        known = frozenset((errand.held, errand.target))
-        close: list[Pose] = []
-        for pose in poses:
-            box = bounds.box(pose, fractions)
-            if not in_reach(box, errand.robot) or any(in_reach(box, stand) for stand in errand.passed_over):
-                continue
-            near = self._engine.near(box.grown(UNDISTURBED_M + TOLERANCE_M), known)
-            if not near:
-                yield pose
-            elif not any(self._is_taken(box, other) for other in near):
-                close.append(pose)
-        yield from close
+        if not order:
+            return
+        held, margin_m = errand.held, UNDISTURBED_M + TOLERANCE_M
+        boxes = spots.lineup(bounds_of(self._scene.asset_of(held)), self._engine.joints(held), frames)
+        reached = boxes.reached_from(errand.robot)
+        for stand in errand.passed_over:
+            reached &= ~boxes.reached_from(stand)
+        flags = reached.tolist()
+        rows = [number for number in order if flags[number]]
+        if not rows:
+            return
+        boxes = boxes.at(rows)
+        near = self._engine.near(boxes.around().grown(margin_m), frozenset((held, errand.target)))
+        if not near:
+            yield from ((number, "") for number in rows)
+            return
+        others = self._neighbours(near)
+        crowded = boxes.crowded(others, margin_m).tolist()
+        yield from ((number, "") for number, close in zip(rows, crowded, strict=True) if not close)
+        if not any(crowded):
+            return
+        taken, most = (answers.tolist() for answers in boxes.overlaps(others))
+        for number, close, full, nearest in zip(rows, crowded, taken, most, strict=True):
+            if close and not full:
+                yield number, near[nearest]
 
-    def _is_taken(self, box: Aabb, other: str) -> bool:
-        """Whether a thing in the box would surely meet another.
-
-        The boxes overlap by much, and the other is one convex body, or a vessel or the like that stands on the same level.
-        """
-        there = self._engine.aabb(other)
-        (low_x, low_y, low_z), (high_x, high_y, high_z) = box.low_m, box.high_m
-        (x, y, z), (to_x, to_y, to_z) = there.low_m, there.high_m
-        if (
-            min(high_x, to_x) - max(low_x, x) <= TAKEN_SHARE * (high_x - low_x + to_x - x)
-            or min(high_y, to_y) - max(low_y, y) <= TAKEN_SHARE * (high_y - low_y + to_y - y)
-            or min(high_z, to_z) - max(low_z, z) <= SAME_LEVEL_M
-        ):
-            return False
-        links = self._scene.asset_of(other).links
-        if len(links) == 1 and len(links[0].parts) == 1:
-            return True
-        return not self._scene.by_name[other].fixed and abs(low_z - z) <= SAME_LEVEL_M
+    def _neighbours(self, names: Sequence[str]) -> Neighbours:
+        items = [self._scene.by_name[name] for name in names]
+        links = [self._scene.assets[item.asset_id].links for item in items]
+        return Neighbours.of(
+            [self._engine.aabb(name) for name in names],
+            [len(chain) == 1 and len(chain[0].parts) == 1 for chain in links],
+            [not item.fixed for item in items],
+        )
 
     def _frames(self, errand: Errand) -> dict[str, Pose]:
         """Frame of each link of the target on which something can be placed; not of a drawer that is shut."""
@@ -216,59 +196,19 @@ class Placer:
         links = ({""} | links_with_spots(asset)) - shut
         return {link: link_frame(asset, pose, fractions, link) for link in sorted(links)}
 
-    def _cached(
-        self, held: str, target: str, relation: Relation
-    ) -> tuple[tuple[Spot, ...], tuple[Spot, ...]]:
-        """Spots verified for this pair of assets, and those verified for the footprint of what is held."""
-        one, other = self._scene.by_name[held].asset_id, self._scene.by_name[target].asset_id
-        key = (one, other, relation)
-        if key not in self._verified:
-            exact = self._cache.placements.get(PlacementKey(one, other, relation), ())
-            by_class = self._by_class(self._scene.assets[one], other, relation)
-            self._verified[key] = (
-                tuple(self._spot(held, target, relation, pose) for pose in exact),
-                tuple(self._spot(held, target, relation, pose) for pose in by_class),
-            )
-        return self._verified[key]
-
-    def _by_class(self, asset: Asset, support_id: str, relation: Relation) -> Sequence[Pose]:
-        standing = self._cache.placements.get(
-            PlacementKey(asset.asset_id, LEVEL_FLOOR.asset_id, Relation.ONTOP)
-        )
-        footprint = footprint_of(asset, standing[0]) if standing else None
-        if not standing or footprint is None:
-            return ()
-        poses = self._cache.placements.get(PlacementKey(footprint.name, support_id, relation), ())
-        pose_box_held = pose_box_asset(footprint, asset, standing[0])
-        return [pose_support_box @ pose_box_held for pose_support_box in poses]
-
-    def _spot(self, held: str, target: str, relation: Relation, pose: Pose) -> Spot:
-        return Spot(pose, self._link_of(held, target, relation, pose))
-
-    def _link_of(self, held: str, target: str, relation: Relation, pose: Pose) -> str:
-        asset = self._scene.asset_of(target)
-        if links_with_spots(asset) <= {""}:
-            return ""
-        return link_under(bounds_of(self._scene.asset_of(held)).box(pose), asset, relation)
-
-    def _patches_for(self, held: str, target: str, relation: Relation) -> tuple[Patch, ...]:
-        one, other = self._scene.asset_of(held), self._scene.asset_of(target)
-        key = (one.asset_id, other.asset_id, relation)
-        if key not in self._patches:
-            self._patches[key] = patches(bounds_of(one), other, relation)
-        return self._patches[key]
-
-    def _accept_verified(self, errand: Errand, pose: Pose) -> Pose | None:
+    def _accept_verified(self, errand: Errand, pose: Pose, nearest: str) -> Pose | None:
         """A pose that was verified with nothing but its support around; it is settled where anything else is near."""
         engine, held, target = self._engine, errand.held, errand.target
         engine.set_pose(held, pose)
+        if nearest and self._is_deep(held, nearest):
+            return None
         other = engine.penetrates(held, UNDISTURBED_M + TOLERANCE_M, frozenset((target, FLOOR)))
         if other in self._scene.by_name and self._is_deep(held, other):
             return None
         if other:
             return None if engine.penetrates(held) else self._accept_settled(errand)
-        # The support's own doors may have moved since.
-        if self._is_deep(held, target):
+        # It was verified with both their joints shut: while they are, it is as free of the support as it was then.
+        if any((*engine.joints(target), *engine.joints(held))) and self._is_deep(held, target):
             return None
         return pose if self._holds(errand) else self._accept_settled(errand)
 
@@ -279,16 +219,25 @@ class Placer:
     def _accept_settled(self, errand: Errand) -> Pose | None:
         """Let the object go where it is and take the pose where it comes to rest, if all still holds there."""
         settled = self._engine.settle(errand.held)
-        if not settled.stable or not self._is_free(errand, settled.pose) or not self._reaches(errand):
+        if not settled.stable or not self._is_free(errand, settled.pose, "") or not self._reaches(errand):
             return None
         return settled.pose if self._holds(errand) else None
 
     def _holds(self, errand: Errand) -> bool:
-        return self._relations.holds(errand.relation, errand.held, errand.target)
+        """Whether the relation holds where the object is being tried."""
+        match errand.relation:
+            case Relation.ONTOP:
+                return self._relations.footings.would_be_on(errand.held, errand.target)
+            case Relation.INSIDE:
+                return self._relations.footings.would_be_in(errand.held, errand.target)
+            case _:
+                return self._relations.holds(errand.relation, errand.held, errand.target)
 
-    def _is_free(self, errand: Errand, pose: Pose) -> bool:
-        """Put the object at the pose and tell whether it penetrates nothing there."""
+    def _is_free(self, errand: Errand, pose: Pose, nearest: str) -> bool:
+        """Put the object at the pose and tell whether it penetrates nothing there, ``nearest`` the least."""
         self._engine.set_pose(errand.held, pose)
+        if nearest and self._is_deep(errand.held, nearest):
+            return False
         return not self._engine.penetrates(errand.held)
 
     def _reaches(self, errand: Errand) -> bool:

@@ -11,10 +11,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from embomatrix.skills.appliance import cold_source, cooks, freezes, heat_source, heats
+from embomatrix.world.geometry import Aabb
 from embomatrix.world.state import Relation, State
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, MutableMapping
+    from collections.abc import Iterator, Mapping, MutableMapping, Sequence
 
     from embomatrix.sim.engine import PhysicsEngine
     from embomatrix.sim.relations import Relations
@@ -41,7 +42,8 @@ class Thermal:
         self._scene = engine.scene
         self._states = states
         self._sources: list[tuple[str, Source]] = []
-        self._acted = False
+        self._round = -1
+        self._read = 0
         for item in self._scene.objects:
             asset = self._scene.assets[item.asset_id]
             found = (heat_source(asset), cold_source(asset))
@@ -50,25 +52,44 @@ class Thermal:
     def apply(self) -> tuple[Change, ...]:
         """Let every working source act. Returns what changed, in scene order of the sources."""
         changes: list[Change] = []
+        places = self._changed_places()
         for name, source in self._sources:
-            if self._acted and self._has_nothing_new(name, source):
+            # One that acts by itself has acted on all that is there, unless something has changed there since.
+            if places is not None and not source.requires_on and not self._is_news(name, places):
                 continue
             if self.works(name, source):
                 for item in self._acted_on(name, source):
                     changes += self._expose(item, source)
-        self._acted = True
         return tuple(changes)
 
-    def _has_nothing_new(self, name: str, source: Source) -> bool:
-        """Whether a source that acts by itself on what is in it has done so before on all that is there now."""
-        by_itself = source.requires_inside and not source.requires_on
-        return by_itself and not self._relations.footings.is_disturbed(name)
+    def _changed_places(self) -> dict[str, list[Aabb]] | None:
+        """Where objects were that changed since the sources acted last, and where they are now; None: they never acted."""
+        journal = self._engine.journal
+        first = self._round < 0
+        if journal.rounds != self._round:
+            self._round, self._read = journal.rounds, 0
+        places: dict[str, list[Aabb]] = {}
+        for name, box in journal.entries[self._read :]:
+            if name not in places:
+                places[name] = [box] if box is not None else []
+        self._read = len(journal.entries)
+        for name, boxes in places.items():
+            if not self._engine.is_parked(name):
+                boxes.append(self._engine.aabb(name))
+        return None if first else places
+
+    def _is_news(self, name: str, places: Mapping[str, Sequence[Aabb]]) -> bool:
+        """Whether the source itself is among what changed, or anything where it acts."""
+        if not places:
+            return False
+        area = self._area(name)
+        return name in places or any(area.overlaps(box) for boxes in places.values() for box in boxes)
 
     def works(self, name: str, source: Source) -> bool:
         """Whether the source is on and closed, as far as it must be."""
         if self._engine.is_parked(name):
             return False
-        on = State.TOGGLED_ON in self._states[name]
+        on = State.TOGGLED_ON in self._states.get(name, ())
         return (on or not source.requires_on) and not (source.requires_closed and self._relations.open(name))
 
     def is_at(self, item: str, name: str, source: Source) -> bool:
@@ -91,10 +112,14 @@ class Thermal:
 
     def _above(self, name: str) -> tuple[str, ...]:
         """Movable objects in or near the source's box, or above it as far as vessels reach."""
-        box = self._engine.aabb(name)
-        (x, y, z) = box.high_m
-        near = self._engine.near(type(box)(box.low_m, (x, y, z + VESSEL_M)), frozenset((name,)))
+        near = self._engine.near(self._area(name), frozenset((name,)))
         return tuple(item for item in near if not self._scene.by_name[item].fixed)
+
+    def _area(self, name: str) -> Aabb:
+        """The source's box, and as far above it as vessels reach."""
+        box = self._engine.aabb(name)
+        x, y, z = box.high_m
+        return Aabb(box.low_m, (x, y, z + VESSEL_M))
 
     def _bears(self, vessel: str, item: str) -> bool:
         return self._relations.holds(Relation.INSIDE, item, vessel) or self._relations.ontop(item, vessel)

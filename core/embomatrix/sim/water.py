@@ -45,7 +45,7 @@ class Water:
     def apply(self) -> tuple[Change, ...]:
         """Let every source that runs act on what lies in it. Returns what changed since the last time, by hand or by itself."""
         for name in self._sources:
-            if State.TOGGLED_ON not in self._states[name] or self._engine.is_parked(name):
+            if State.TOGGLED_ON not in self._states.get(name, ()) or self._engine.is_parked(name):
                 continue
             asset = self._scene.asset_of(name)
             machine = washing(asset)

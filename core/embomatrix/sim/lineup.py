@@ -1,0 +1,147 @@
+"""Many poses of one thing at once: which of them are in reach, and which have room around them, as whole arrays.
+
+Boxes decide, so the answers are cheap and coarse. What is really free is looked at later, one pose at a time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from embomatrix.sim.bounds import IDENTITY
+from embomatrix.skills.limits import ROBOT
+from embomatrix.world.geometry import Aabb
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from embomatrix.sim.bounds import AssetBounds, IntArray
+    from embomatrix.world.geometry import FloatArray, Pose
+    from embomatrix.world.poses import StandPose
+
+    BoolArray = NDArray[np.bool_]
+
+TAKEN_SHARE: Final = 0.16
+"""Boxes of two upright cylinders that overlap by this share of their extents along both axes are of cylinders that do."""
+SAME_LEVEL_M: Final = 0.02
+NOWHERE: Final = (np.inf, np.inf, np.inf)
+
+
+@dataclass(frozen=True, slots=True)
+class Neighbours:
+    """Boxes of k objects, shape (k, 3) each corner.
+
+    ``one_part`` tells which are a single convex part, ``movable`` which are not fixed; shape (k,).
+    """
+
+    lows_m: FloatArray
+    highs_m: FloatArray
+    one_part: BoolArray
+    movable: BoolArray
+
+    @staticmethod
+    def of(boxes: Sequence[Aabb], one_part: Sequence[bool], movable: Sequence[bool]) -> Neighbours:
+        lows = np.array([box.low_m for box in boxes])
+        highs = np.array([box.high_m for box in boxes])
+        return Neighbours(lows, highs, np.array(one_part, dtype=np.bool_), np.array(movable, dtype=np.bool_))
+
+
+@dataclass(frozen=True, slots=True)
+class Lineup:
+    """Boxes in the world that one thing has at n poses, shape (n, 3) each corner. A pose that is none is at infinity."""
+
+    lows_m: FloatArray
+    highs_m: FloatArray
+
+    def at(self, rows: Sequence[int]) -> Lineup:
+        """Some of the poses, in the order of ``rows``."""
+        return Lineup(self.lows_m[rows], self.highs_m[rows])
+
+    def around(self) -> Aabb:
+        """Smallest box that holds all of them; there must be one."""
+        (a, b, c), (d, e, f) = self.lows_m.min(axis=0).tolist(), self.highs_m.max(axis=0).tolist()
+        return Aabb((a, b, c), (d, e, f))
+
+    def reached_from(self, stand: StandPose) -> BoolArray:
+        """Whether the arm reaches the nearest point of each box in the plane, and its middle's height; shape (n,)."""
+        base = (stand.x_m, stand.y_m)
+        away = np.maximum(self.lows_m[:, :2] - base, base - self.highs_m[:, :2])  # (n, 2)
+        np.maximum(away, 0.0, out=away)
+        heights = (self.lows_m[:, 2] + self.highs_m[:, 2]) / 2
+        reached = np.hypot(away[:, 0], away[:, 1]) <= ROBOT.reach_m
+        return np.asarray(reached & (heights >= ROBOT.reach_low_m) & (heights <= ROBOT.reach_high_m))
+
+    def crowded(self, others: Neighbours, margin_m: float) -> BoolArray:
+        """Whether each box, grown by a margin, overlaps that of any neighbour; shape (n,)."""
+        low = self.lows_m[:, None] - margin_m <= others.highs_m  # (n, k, 3)
+        high = self.highs_m[:, None] + margin_m >= others.lows_m
+        return np.asarray(np.asarray((low & high).all(axis=2)).any(axis=1))
+
+    def overlaps(self, others: Neighbours) -> tuple[BoolArray, IntArray]:
+        """Whether the thing would surely meet a neighbour at each pose, and the one whose box it shares the most with.
+
+        Surely is: the boxes overlap by much, and the other is one convex body, or a vessel or the like that stands on the
+        same level. Both answers have the shape (n,).
+        """
+        lows, highs = self.lows_m[:, None], self.highs_m[:, None]
+        shared = np.minimum(highs, others.highs_m) - np.maximum(lows, others.lows_m)  # (n, k, 3)
+        least = TAKEN_SHARE * (highs - lows + (others.highs_m - others.lows_m))
+        least[:, :, 2] = SAME_LEVEL_M
+        level = np.abs(lows[:, :, 2] - others.lows_m[:, 2]) <= SAME_LEVEL_M
+        meets = (shared > least).all(axis=2) & (others.one_part | (others.movable & level))
+        most = np.maximum(shared, 0.0).prod(axis=2).argmax(axis=1)
+        return np.asarray(meets.any(axis=1)), np.asarray(most)
+
+
+@dataclass(frozen=True, slots=True)
+class PoseSet:
+    """n poses of a thing in the frames of a support's links, as arrays.
+
+    ``positions_m`` has shape (n, 3), ``rotations`` (n, 3, 3); ``link_of``, shape (n,), tells where in ``links`` each rides.
+    """
+
+    positions_m: FloatArray
+    rotations: FloatArray
+    links: tuple[str, ...]
+    link_of: IntArray
+
+    @staticmethod
+    def of(poses: Sequence[Pose], links: Sequence[str], then: Pose = IDENTITY) -> PoseSet:
+        """Poses that ride on ``links``, one for each; ``then`` is the thing's pose in each of their frames."""
+        positions = np.array([pose.position_m for pose in poses]).reshape(-1, 3)
+        rotations = _rotations(np.array([pose.quat_xyzw for pose in poses]).reshape(-1, 4))
+        positions = positions + rotations @ np.array(then.position_m)
+        names = tuple(dict.fromkeys(links))
+        link_of = np.array([names.index(link) for link in links], dtype=np.int64)
+        return PoseSet(positions, rotations @ then.rotation, names, link_of)
+
+    def repeated_at(self, positions_m: FloatArray) -> PoseSet:
+        """The poses in turn, again and again, moved to positions on their links, shape (m, 3)."""
+        rows = np.arange(len(positions_m)) % max(len(self.link_of), 1)
+        return PoseSet(positions_m, self.rotations[rows], self.links, self.link_of[rows])
+
+    def lineup(self, bounds: AssetBounds, fractions: Sequence[float], frames: Mapping[str, Pose]) -> Lineup:
+        """Boxes of a thing with these bounds and joint positions, where the links are; at infinity on links without frame."""
+        if not self.links:
+            return Lineup(np.zeros((0, 3)), np.zeros((0, 3)))
+        known = [frames.get(link) for link in self.links]
+        turns = np.array([np.eye(3) if frame is None else frame.rotation for frame in known])[self.link_of]
+        origins = np.array([NOWHERE if frame is None else frame.position_m for frame in known])[self.link_of]
+        lows, highs = bounds.extents(turns @ self.rotations, fractions)
+        origins = origins + (turns @ self.positions_m[:, :, None])[:, :, 0]
+        return Lineup(origins + lows, origins + highs)
+
+
+def _rotations(quats_xyzw: FloatArray) -> FloatArray:
+    """Rotation matrices, shape (n, 3, 3), of unit quaternions, shape (n, 4)."""
+    x, y, z, w = quats_xyzw.T
+    rows = [
+        (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
+        (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
+        (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
+    ]
+    return np.moveaxis(np.array(rows), -1, 0)

@@ -1,0 +1,119 @@
+"""Where one thing may stand on, in or under another, before anything else is looked at: verified poses and fresh ones."""
+
+from __future__ import annotations
+
+from itertools import cycle, islice
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from embomatrix.sim.bounds import IDENTITY, bounds_of
+from embomatrix.sim.candidates import patches, proposed_places
+from embomatrix.sim.footprints import LEVEL_FLOOR, footprint_of, pose_box_asset
+from embomatrix.sim.lineup import PoseSet
+from embomatrix.sim.spots import link_under, links_with_spots
+from embomatrix.world.geometry import Aabb, Pose
+from embomatrix.world.poses import PlacementKey
+from embomatrix.world.state import Relation
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from embomatrix.sim.bounds import AssetBounds
+    from embomatrix.sim.candidates import Patch
+    from embomatrix.sim.lineup import Lineup
+    from embomatrix.world.asset import Asset
+    from embomatrix.world.geometry import Vec2
+    from embomatrix.world.poses import PoseCache
+    from embomatrix.world.scene import Scene
+
+LINEUPS_KEPT: Final = 16
+"""Answers in memory for each thing and support, about 2 kB each: as many as equal supports stand in a scene."""
+
+
+class Spots:
+    """Poses of one asset in the frames of a support's links. ``local`` gives a pose by its number."""
+
+    def __init__(self, local: Callable[[int], Pose], links: Sequence[str], places: PoseSet) -> None:
+        self._local = local
+        self._links = links
+        self._places = places
+        self._lineups: dict[tuple[object, ...], Lineup] = {}
+
+    def __len__(self) -> int:
+        return len(self._links)
+
+    def pose(self, number: int, frames: Mapping[str, Pose]) -> Pose:
+        """A pose in the world. Raises KeyError when its link has no frame."""
+        return frames[self._links[number]] @ self._local(number)
+
+    def lineup(self, bounds: AssetBounds, fractions: tuple[float, ...], frames: Mapping[str, Pose]) -> Lineup:
+        """Boxes at all the poses in the world, of the asset with these bounds; at infinity on links without a frame."""
+        key = (fractions, *frames.items())
+        known = self._lineups.get(key)
+        if known is None:
+            if len(self._lineups) >= LINEUPS_KEPT:
+                self._lineups.clear()
+            known = self._lineups[key] = self._places.lineup(bounds, fractions, frames)
+        return known
+
+
+class Repertoire:
+    """The poses that a cache and the surfaces of a scene's assets offer. Depends on no state of the world."""
+
+    def __init__(self, scene: Scene, cache: PoseCache) -> None:
+        self._scene = scene
+        self._cache = cache
+        self._verified: dict[PlacementKey, tuple[Spots, Spots]] = {}
+        self._patches: dict[PlacementKey, tuple[tuple[Patch, ...], PoseSet]] = {}
+
+    def verified(self, held: str, target: str, relation: Relation) -> tuple[Spots, Spots]:
+        """Spots verified for this pair of assets, and those verified for the footprint of what is held."""
+        one, other = self._scene.asset_of(held), self._scene.asset_of(target)
+        key = PlacementKey(one.asset_id, other.asset_id, relation)
+        if key not in self._verified:
+            exact = self._cache.placements.get(key, ())
+            boxes, pose_box_held = self._by_class(one, other.asset_id, relation)
+            self._verified[key] = (
+                _spots(exact, IDENTITY, one, other, relation),
+                _spots(boxes, pose_box_held, one, other, relation),
+            )
+        return self._verified[key]
+
+    def fresh(self, held: str, target: str, relation: Relation, shift: Vec2, tries: int) -> Spots:
+        """At most so many poses by geometry alone, spread over the surfaces; ``shift`` moves the whole pattern."""
+        one, other = self._scene.asset_of(held), self._scene.asset_of(target)
+        key = PlacementKey(one.asset_id, other.asset_id, relation)
+        if key not in self._patches:
+            found = patches(bounds_of(one), other, relation)
+            middles = [Pose.from_xyz_yaw(*patch.center_m, patch.yaw) for patch in found]
+            self._patches[key] = (found, PoseSet.of(middles, [patch.link for patch in found]))
+        found, middle = self._patches[key]
+        points = [point for _, point in proposed_places(found, shift, tries)]
+        yaws = [patch.yaw for patch in islice(cycle(found), len(points))]
+        links = [patch.link for patch in islice(cycle(found), len(points))]
+        places = middle.repeated_at(np.array(points).reshape(-1, 3))
+        return Spots(lambda number: Pose.from_xyz_yaw(*points[number], yaws[number]), links, places)
+
+    def _by_class(self, asset: Asset, support_id: str, relation: Relation) -> tuple[Sequence[Pose], Pose]:
+        """Poses of the box of the asset's footprint, and the asset's pose in the frame of that box."""
+        standing = self._cache.placements.get(
+            PlacementKey(asset.asset_id, LEVEL_FLOOR.asset_id, Relation.ONTOP)
+        )
+        footprint = footprint_of(asset, standing[0]) if standing else None
+        if not standing or footprint is None:
+            return (), IDENTITY
+        poses = self._cache.placements.get(PlacementKey(footprint.name, support_id, relation), ())
+        return poses, pose_box_asset(footprint, asset, standing[0])
+
+
+def _spots(poses: Sequence[Pose], then: Pose, held: Asset, support: Asset, relation: Relation) -> Spots:
+    """Spots at poses in the frame of a support with its joints shut; ``then`` is the thing's pose in each of their frames."""
+    plain = PoseSet.of(poses, [""] * len(poses), then)
+    links = [""] * len(poses)
+    if poses and not links_with_spots(support) <= {""}:
+        boxes = plain.lineup(bounds_of(held), (), {"": IDENTITY})
+        corners = zip(boxes.lows_m.tolist(), boxes.highs_m.tolist(), strict=True)
+        links = [link_under(Aabb(tuple(low), tuple(high)), support, relation) for low, high in corners]
+        plain = PoseSet.of(poses, links, then)
+    return Spots(lambda number: poses[number] @ then, links, plain)

@@ -1,0 +1,97 @@
+"""Many poses at once: the arrays must say what one pose at a time says."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from embomatrix.sim.bounds import bounds_of
+from embomatrix.sim.lineup import Lineup, Neighbours, PoseSet
+from embomatrix.sim.placement import in_reach
+from embomatrix.world.asset import Asset, Joint, JointKind, Link
+from embomatrix.world.geometry import Aabb, Part, Pose, Shape
+from embomatrix.world.poses import StandPose
+
+LAMP = Asset(
+    "lamp-test",
+    "lamp",
+    "",
+    (0.3, 0.2, 0.4),
+    1.0,
+    (
+        Link("base", (Part(Shape.CYLINDER, Pose((0.0, 0.0, 0.1)), (0.2, 0.2, 0.2)),)),
+        Link(
+            "arm",
+            (Part(Shape.SPHERE, Pose((0.1, 0.0, 0.3)), (0.1, 0.1, 0.1)),),
+            Joint(JointKind.REVOLUTE, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 1.0),
+        ),
+    ),
+)
+COORDINATE = st.floats(-2.0, 2.0)
+POSE = st.builds(Pose.from_xyz_yaw, COORDINATE, COORDINATE, COORDINATE, st.floats(-math.pi, math.pi))
+BOX = st.builds(
+    lambda low, size: Aabb(low, (low[0] + size[0], low[1] + size[1], low[2] + size[2])),
+    st.tuples(COORDINATE, COORDINATE, COORDINATE),
+    st.tuples(*[st.floats(0.02, 1.0)] * 3),
+)
+
+
+def lineup_of(boxes: list[Aabb]) -> Lineup:
+    return Lineup(np.array([box.low_m for box in boxes]), np.array([box.high_m for box in boxes]))
+
+
+@given(st.lists(st.tuples(POSE, st.sampled_from(("", "drawer"))), min_size=1, max_size=5), POSE, POSE, POSE)
+def test_boxes_of_many_poses_are_those_of_each(spots, frame, drawer, then) -> None:
+    poses, links = [pose for pose, _ in spots], [link for _, link in spots]
+    frames = {"": frame, "drawer": drawer}
+    bounds = bounds_of(LAMP)
+    lineup = PoseSet.of(poses, links, then).lineup(bounds, (0.5,), frames)
+    for row, (pose, link) in enumerate(spots):
+        box = bounds.box(frames[link] @ (pose @ then), (0.5,))
+        assert lineup.lows_m[row].tolist() == pytest.approx(box.low_m, abs=1e-9)
+        assert lineup.highs_m[row].tolist() == pytest.approx(box.high_m, abs=1e-9)
+
+
+@given(st.lists(BOX, min_size=1, max_size=6), COORDINATE, COORDINATE)
+def test_reach_to_many_boxes_is_that_to_each(boxes, x, y) -> None:
+    stand = StandPose(x, y, 0.0)
+    assert lineup_of(boxes).reached_from(stand).tolist() == [in_reach(box, stand) for box in boxes]
+
+
+@given(st.lists(BOX, min_size=1, max_size=5), st.lists(BOX, min_size=1, max_size=5))
+def test_a_box_is_crowded_when_any_neighbour_overlaps_it_grown(boxes, near) -> None:
+    others = Neighbours.of(near, [True] * len(near), [True] * len(near))
+    expected = [any(box.grown(0.006).overlaps(other) for other in near) for box in boxes]
+    assert lineup_of(boxes).crowded(others, 0.006).tolist() == expected
+
+
+def test_a_thing_in_the_middle_of_a_solid_one_is_taken_and_beside_it_not() -> None:
+    boxes = [Aabb((0.0, 0.0, 0.0), (0.1, 0.1, 0.1)), Aabb((0.19, 0.0, 0.0), (0.29, 0.1, 0.1))]
+    near = [Aabb((9.0, 9.0, 9.0), (9.1, 9.1, 9.1)), Aabb((0.0, 0.0, 0.0), (0.2, 0.2, 0.2))]
+    taken, most = lineup_of(boxes).overlaps(Neighbours.of(near, [True, True], [False, False]))
+    assert taken.tolist() == [True, False]
+    assert most.tolist() == [1, 1]
+
+
+def test_what_has_a_hollow_is_taken_only_on_its_own_level() -> None:
+    boxes = [Aabb((0.05, 0.05, z), (0.15, 0.15, z + 0.1)) for z in (0.0, 0.05)]
+    bowl = Neighbours.of([Aabb((0.0, 0.0, 0.0), (0.2, 0.2, 0.2))], [False], [True])
+    assert lineup_of(boxes).overlaps(bowl)[0].tolist() == [True, False]
+
+
+def test_a_pose_on_a_link_without_a_frame_is_in_nobodys_reach() -> None:
+    lineup = PoseSet.of([Pose((0.0, 0.0, 0.5))], ["drawer"]).lineup(
+        bounds_of(LAMP), (0.0,), {"": Pose((0.0, 0.0, 0.0))}
+    )
+    assert not lineup.reached_from(StandPose(0.0, 0.0, 0.0)).any()
+
+
+def test_poses_taken_in_turn_keep_their_rotations() -> None:
+    turned = PoseSet.of([Pose.from_xyz_yaw(0.0, 0.0, 0.0, yaw) for yaw in (0.0, 1.0)], ["", ""])
+    again = turned.repeated_at(np.arange(9.0).reshape(3, 3))
+    assert np.array_equal(again.rotations, turned.rotations[[0, 1, 0]])
+    assert again.positions_m[2].tolist() == [6.0, 7.0, 8.0]
