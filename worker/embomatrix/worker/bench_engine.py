@@ -17,12 +17,12 @@ import numpy as np
 from embomatrix.reward.hierarchy import score
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
-from embomatrix.sim.engine import NOTHING, SETTLE_STEPS
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.pose_cache import PlacementLibrary, analyse_scene
 from embomatrix.sim.prepared import Prepared
 from embomatrix.sim.zygote import resident_mb
 from embomatrix.skills.syntax import Skill
+from embomatrix.worker.bench_counting import CountingEngine
 from embomatrix.worker.bench_figures import BenchError, Better, Figure, quantile
 from embomatrix.worker.bench_slots import SlotSample, measure_slots
 from embomatrix.worker.bench_workload import SIZES
@@ -33,7 +33,6 @@ from embomatrix.world.dataset import DatasetError
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from embomatrix.sim.engine import Settled
     from embomatrix.worker.bench_workload import Execution, SceneWork, Workload
     from embomatrix.world.bundle import Bundle
     from embomatrix.world.dataset import Dataset
@@ -52,16 +51,6 @@ ANALYSIS_GOAL_S: Final = 20.0
 """Goals for one core and furnished scenes of about 300 bodies."""
 SAMPLE_EVERY: Final = 20
 """Cycles between two readings of the memory in use."""
-
-
-class CountingEngine(BulletEngine):
-    """The engine, and how often something was settled in it."""
-
-    settles = 0
-
-    def settle(self, name: str, steps: int = SETTLE_STEPS, ignore: frozenset[str] = NOTHING) -> Settled:
-        self.settles += 1
-        return super().settle(name, steps, ignore)
 
 
 @dataclass(frozen=True, slots=True)

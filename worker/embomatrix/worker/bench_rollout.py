@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.reward.hierarchy import score
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
-from embomatrix.sim.engine import NOTHING, SETTLE_STEPS
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.prepared import Prepared
 from embomatrix.skills.syntax import Skill
+from embomatrix.worker.bench_counting import CountingEngine
 from embomatrix.worker.bench_figures import Better, Figure, quantile, quantile_figure
 from embomatrix.worker.physics import CLIENTS_PER_SCENE
 from embomatrix.world.bundle import decode_bundle
@@ -22,7 +22,6 @@ from embomatrix.world.bundle import decode_bundle
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from embomatrix.sim.engine import Settled
     from embomatrix.worker.bench_scenes import BenchScene, Demonstration
     from embomatrix.world.bundle import Bundle
     from embomatrix.world.task import Task
@@ -37,16 +36,6 @@ SKILL_GOAL_US: Final = 200.0
 SETTLED_PLACE_GOAL_US: Final = 3000.0
 """Goals for one core and scenes of up to 300 bodies, set from what the physics engine alone needs."""
 SEED: Final = 0
-
-
-class CountingEngine(BulletEngine):
-    """The engine, and how often something was settled in it."""
-
-    settles = 0
-
-    def settle(self, name: str, steps: int = SETTLE_STEPS, ignore: frozenset[str] = NOTHING) -> Settled:
-        self.settles += 1
-        return super().settle(name, steps, ignore)
 
 
 @dataclass(frozen=True, slots=True)
