@@ -51,19 +51,22 @@ class Neighbourhood:
         (low_x, low_y, low_z), (high_x, high_y, high_z) = box.low_m, box.high_m
         low_x, low_y, low_z = low_x - reach_m, low_y - reach_m, low_z - reach_m
         high_x, high_y, high_z = high_x + reach_m, high_y + reach_m, high_z + reach_m
-        found: list[int] = []
-        for home in self._places(_span(low_x, low_y, high_x, high_y)):
-            found += [
-                number
-                for number, (a, b, c, d, e, f) in home.items()
-                if a <= high_x and d >= low_x and b <= high_y and e >= low_y and c <= high_z and f >= low_z
-            ]
-        return sorted(set(found))
+        places = self._places(_span(low_x, low_y, high_x, high_y))
+        found = [
+            number
+            for place in places
+            for number, (a, b, c, d, e, f) in place.items()
+            if c <= high_z and f >= low_z and a <= high_x and d >= low_x and b <= high_y and e >= low_y
+        ]
+        return sorted(set(found)) if len(places) > 1 else sorted(found)
 
     def _places(self, span: tuple[int, int, int, int]) -> list[dict[int, Extent]]:
         """Where the boxes over a span are kept; some may be in several places."""
         first_i, first_j, last_i, last_j = span
         places = [self._wide] if self._wide else []
+        if first_i == last_i and first_j == last_j:
+            place = self._cells.get((first_i, first_j))
+            return [*places, place] if place else places
         if (last_i - first_i + 1) * (last_j - first_j + 1) > WIDE_CELLS:
             return [*places, *self._cells.values()]
         cells = self._cells

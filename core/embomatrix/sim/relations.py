@@ -13,6 +13,8 @@ from embomatrix.sim.spots import REST_M, is_under
 from embomatrix.world.state import OPEN_FRACTION, Relation
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from embomatrix.sim.engine import PhysicsEngine
     from embomatrix.sim.footing import Enclosure, Host
     from embomatrix.world.geometry import Aabb
@@ -35,6 +37,8 @@ class Relations:
         self._engine = engine
         self._scene = engine.scene
         self.footings = Footings(engine)
+        self._kept: dict[tuple[str, str], tuple[str, ...]] = {}
+        self._kept_at = (-1, 0)
 
     def holds(self, relation: Relation, a: str, b: str) -> bool:
         """Whether ``relation(a, b)`` holds; ``b`` is a room for INROOM and an object otherwise."""
@@ -119,19 +123,37 @@ class Relations:
         """
         return self.footings.of(name).host
 
-    def hosts_of(self, name: str) -> list[str]:
+    def hosts_of(self, name: str) -> tuple[str, ...]:
         """What the object rests on or in, what that rests on or in, and so on."""
+        return self._answer("hosts", name, self._find_hosts)
+
+    def _find_hosts(self, name: str) -> tuple[str, ...]:
         chain = [name]
         while (host := self.host_of(chain[-1])) is not None and host.name not in chain:
             chain.append(host.name)
-        return chain[1:]
+        return tuple(chain[1:])
 
     def resting_on(self, name: str) -> tuple[str, ...]:
         """Objects whose host is this one, in scene order: on its surfaces and in its cavities."""
+        return self._answer("guests", name, self._find_guests)
+
+    def _find_guests(self, name: str) -> tuple[str, ...]:
         if self._engine.is_parked(name):
             return ()
         around = self._engine.near(self._engine.aabb(name).grown(REST_M), frozenset((name,)))
         return tuple(other for other in around if self._is_host(name, other))
+
+    def _answer(self, question: str, name: str, find: Callable[[str], tuple[str, ...]]) -> tuple[str, ...]:
+        """What is kept of a question since the last change of anything, or what ``find`` finds: a step asks the same often."""
+        journal = self._engine.journal
+        now = (journal.rounds, len(journal.entries))
+        if now != self._kept_at:
+            self._kept.clear()
+            self._kept_at = now
+        answer = self._kept.get((question, name))
+        if answer is None:
+            answer = self._kept[question, name] = find(name)
+        return answer
 
     def group_of(self, name: str) -> tuple[str, ...]:
         """The object and all that moves along with it: what lies in its cavities, and what rests on or in that."""
@@ -141,7 +163,7 @@ class Relations:
             other = waiting.pop(0)
             if other not in group:
                 group[other] = None
-                waiting += self.resting_on(other)
+                waiting.extend(self.resting_on(other))
         return tuple(group)
 
     def enclosing(self, name: str) -> tuple[Enclosure, ...]:

@@ -106,8 +106,9 @@ class Thermal:
         )
 
     def _acted_on(self, name: str, source: Source) -> Iterator[str]:
+        """Objects where the source acts, of those that it would change."""
         for item in self._above(name):
-            if item != name and self.is_at(item, name, source):
+            if self._gained(item, source) and self.is_at(item, name, source):
                 yield item
 
     def _above(self, name: str) -> tuple[str, ...]:
@@ -124,11 +125,14 @@ class Thermal:
     def _bears(self, vessel: str, item: str) -> bool:
         return self._relations.holds(Relation.INSIDE, item, vessel) or self._relations.ontop(item, vessel)
 
+    def _gained(self, item: str, source: Source) -> list[State]:
+        """States that the object would get from the source and does not have."""
+        states = self._states.get(item, ())
+        return [state for state in _states_at(self._scene.asset_of(item), source) if state not in states]
+
     def _expose(self, item: str, source: Source) -> list[Change]:
         """Give the object the states of the source's temperature that its asset can have."""
-        asset = self._scene.asset_of(item)
-        states = self._states[item]
-        gained = [state for state in _states_at(asset, source) if state not in states]
+        gained, states = self._gained(item, source), self._states[item]
         if State.HOT in gained:
             states.discard(State.FROZEN)
         if State.FROZEN in gained:

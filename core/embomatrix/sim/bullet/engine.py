@@ -36,8 +36,8 @@ if TYPE_CHECKING:
 
 BOX_SLACK_M: Final = 0.01
 """Boxes this far apart are still compared part by part: boxes of tilted cylinders may be a little too small."""
-SETTLE_RADIUS_M: Final = 0.05
-"""Parts whose boxes come this near take part in a settle: nothing that is stable moves a fifth as far."""
+SETTLE_RADIUS_M: Final = 0.02
+"""Parts whose boxes come this near take part in a settle: nothing that is stable moves more than half as far."""
 
 
 class BulletEngine:
