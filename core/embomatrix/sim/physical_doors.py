@@ -41,6 +41,8 @@ ALONG: Final = (0.0, 0.5, -0.5, 0.85)
 """Where along the edge, as shares of its half length."""
 FOLLOWED: Final = (1.0, 0.5, 0.0)
 """Shares of the leaf's turn that the hand turns along."""
+TILTS: Final = (0.0, 40.0, -40.0)
+"""Degrees by which the hand comes from above, or from below."""
 OFF_M: Final = 0.08
 PULL: Final = 0.4
 """Share of full speed at which a leaf is led."""
@@ -134,13 +136,13 @@ def close_all(stage: Stage, name: str, rng: np.random.Generator) -> Refusal | No
 def _lead_all(stage: Stage, name: str, goal: float, rng: np.random.Generator) -> Refusal | None:
     home = stage.world.robot
     refusal = None
-    for leaf in sorted(leaves_of(stage, name), key=lambda leaf: leaf.height_m, reverse=not goal):
-        now = stage.dynamic.joints(name)[leaf.number]
-        if abs(now - goal) <= SHUT:
+    row = sorted(leaves_of(stage, name), key=lambda leaf: leaf.height_m, reverse=not goal)
+    # Who leads a leaf may push one that is done: those have a second turn.
+    for leaf in (*row, *row):
+        if _is_done(stage.dynamic.joints(name)[leaf.number], goal):
             continue
         refusal = _lead(stage, leaf, goal, rng)
-        reached = stage.dynamic.joints(name)[leaf.number]
-        if reached >= ENOUGH if goal else reached <= SHUT:
+        if _is_done(stage.dynamic.joints(name)[leaf.number], goal):
             refusal = None
         elif refusal is None:
             refusal = refuse(FailureReason.DOOR_BLOCKED, target=name, other=SOMETHING)
@@ -149,6 +151,11 @@ def _lead_all(stage: Stage, name: str, goal: float, rng: np.random.Generator) ->
     # Where the robot ends up does not undo what became of the door.
     fold(stage, home, rng, name)
     return refusal
+
+
+def _is_done(reached: float, goal: float) -> bool:
+    """Whether a leaf is open, or shut, as far as cached mode asks."""
+    return reached >= ENOUGH if goal else reached <= SHUT
 
 
 def _lead(stage: Stage, leaf: Leaf, goal: float, rng: np.random.Generator) -> Refusal | None:
@@ -189,11 +196,13 @@ def _stretch(stage: Stage, leaf: Leaf, start: float, goal: float, rng: np.random
     reach = Reach(boxes, fixed, None, clear)
     tracks = list(_tracks(leaf, fractions))
     point = np.array(tracks[0].position[2])
-    for way in itertools.islice(reach.ways(tracks, stage.bases(point, 0.75, walk_m=FAR_M)), WAYS):
+    bases = stage.bases(point, 0.75, walk_m=FAR_M)
+    if goal > start:
+        bases = stage.floor.cut_off_last(bases, moving[-1])
+    for way in itertools.islice(reach.ways(tracks, bases), WAYS):
         swing = approach(stage, way, reach, rng, loaded=False)
-        if swing is None:
-            continue
-        return unfold(stage, swing) or _pull(stage, way, leaf, goal)
+        if swing is not None and unfold(stage, swing) is None:
+            return _pull(stage, way, leaf, goal)
     return refuse(FailureReason.ARM_BLOCKED, target=leaf.name, other=reach.hindrance or SOMETHING)
 
 
@@ -236,19 +245,23 @@ def _tracks(leaf: Leaf, fractions: FloatArray) -> Iterator[Track]:
         )
     else:
         spots = (Spot.OUTSIDE, Spot.EDGE)
-    for spot in spots:
-        for along in ALONG:
-            for followed in FOLLOWED:
-                yield _track(leaf, fractions, along, followed, spot)
+    turns = FOLLOWED if leaf.joint.kind is JointKind.REVOLUTE else FOLLOWED[:1]
+    for spot, tilt, along, followed in itertools.product(spots, TILTS, ALONG, turns):
+        yield _track(leaf, fractions, along, followed, spot, tilt)
 
 
-def _track(leaf: Leaf, fractions: FloatArray, along: float, followed: float, spot: Spot) -> Track:
+def _track(
+    leaf: Leaf, fractions: FloatArray, along: float, followed: float, spot: Spot, tilt: float
+) -> Track:
+    down = np.array([0.0, 0.0, -math.sin(math.radians(tilt))])
     start = float(fractions[0])
     rotations, positions = [], []
     for fraction in fractions.tolist():
         point, _, _ = leaf.grips(fraction, along, spot)
         _, out, edge = leaf.grips(start + followed * (fraction - start), along, spot)
-        rotations.append(facing(-out, 0.0 if abs(edge[2]) < 0.5 else math.pi / 2, edge))
+        course = down - math.cos(math.radians(tilt)) * out
+        course = course / np.linalg.norm(course)
+        rotations.append(facing(course, 0.0 if abs(edge[2]) < 0.5 else math.pi / 2, edge))
         positions.append(point)
     first, last = leaf.grips(start, along, spot)[1], -rotations[-1][:, 2]
     positions = [

@@ -13,10 +13,11 @@ from embomatrix.skills.limits import ROBOT
 from embomatrix.world.poses import StandPose
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from embomatrix.sim.engine import PhysicsEngine
     from embomatrix.sim.floor_grid import Cell
+    from embomatrix.sim.physical_space import Boxes
     from embomatrix.world.geometry import FloatArray, Vec2
 
 SPREAD_M: Final = 500.0
@@ -41,14 +42,32 @@ class Floor:
         state = self._engine.state_bytes()
         if self._grid is None or state != self._seen:
             everything = boxes_around(self._engine, (-SPREAD_M, -SPREAD_M), (SPREAD_M, SPREAD_M))
-            boxes = everything.without(("floor",))
-            half = np.einsum("mij,mj->mi", np.abs(boxes.rotation), boxes.half)
-            low, high = boxes.centre - half, boxes.centre + half
-            rows = np.column_stack([low[:, :2], high[:, :2], low[:, 2], high[:, 2]])
-            barring = (rows[:, 4] < ROBOT.height_m) & (rows[:, 5] > FLAT_M)
-            self._rows = rows[barring]
+            self._rows = _barring(everything.without(("floor",)))
             self._grid, self._seen = FloorGrid(self._engine.scene, self._rows), state
         return self._grid
+
+    def cut_off_last(self, bases: Sequence[FloatArray], leaf: Boxes) -> list[FloatArray]:
+        """Places to stand, groups of shape (b, 3), those last that a leaf cuts off when it gets to where some boxes are.
+
+        What is cut off is all but the largest part of the free floor that the place belongs to now.
+        """
+        grid = self.grid
+        after = grid.changed(np.zeros((0, 6)), _barring(leaf))
+        first, last = [], []
+        for group in bases:
+            good = np.array([self._stays_joined(grid, after, x, y) for x, y in group[:, :2].tolist()])
+            first.append(group[good])
+            last.append(group[~good])
+        return [group for group in (*first, *last) if len(group)]
+
+    def _stays_joined(self, grid: FloorGrid, after: FloorGrid, x_m: float, y_m: float) -> bool:
+        here = grid.cell(x_m, y_m)
+        if here is None:
+            return True
+        then = after.cell(x_m, y_m)
+        part = after.labels[grid.labels == grid.label(here)]
+        sizes = np.bincount(part[part > 0], minlength=1)
+        return then is not None and after.label(then) == int(sizes.argmax())
 
     def way(
         self, start: Vec2, goal: StandPose, serves: Callable[[StandPose], bool]
@@ -101,3 +120,11 @@ class Floor:
         order = [number for number in np.argsort(away, kind="stable").tolist() if away[number] <= ASIDE_M]
         near = [StandPose(float(spots[number, 0]), float(spots[number, 1]), goal.yaw) for number in order]
         return next((spot for spot in near[::4] if serves(spot)), near[0] if near else None)
+
+
+def _barring(boxes: Boxes) -> FloatArray:
+    """What of some boxes bars the robot's way: their bounds, rows of low x, low y, high x, high y, low z, high z."""
+    half = np.einsum("mij,mj->mi", np.abs(boxes.rotation), boxes.half)
+    low, high = boxes.centre - half, boxes.centre + half
+    rows = np.column_stack([low[:, :2], high[:, :2], low[:, 2], high[:, 2]])
+    return np.asarray(rows[(rows[:, 4] < ROBOT.height_m) & (rows[:, 5] > FLAT_M)])

@@ -17,12 +17,14 @@ if TYPE_CHECKING:
     from embomatrix.world.geometry import FloatArray, Pose
 
 OPEN_ELEVATIONS: Final = (30.0, 50.0, 10.0, 70.0, 90.0)
-ROOFED_ELEVATIONS: Final = (15.0, 0.0, 30.0, 45.0)
+ROOFED_ELEVATIONS: Final = (15.0, 30.0, 0.0, 45.0, 60.0)
 """Degrees by which the hand comes from above, in the order of preference."""
 OPEN_AZIMUTHS: Final = (0.0, 40.0, -40.0, 80.0, -80.0)
 ROOFED_AZIMUTHS: Final = (0.0, 25.0, -25.0)
 """Degrees by which it comes from aside."""
 ROLLS: Final = (0.0, 90.0)
+FORWARD: Final = 0.35
+"""The front of a thing is this share of its depth before its middle."""
 OPEN_BACK_M: Final = 0.10
 BEYOND_M: Final = 0.015
 """The way ends this far behind the surface: the hand stops when it touches."""
@@ -77,7 +79,7 @@ def grasp_tracks(
                 continue
             direction = _direction(course + math.radians(azimuth), math.radians(elevation))
             retreat = direction if out_m is None else _direction(course, 0.0)
-            for aim in _aims(asset, pose, boxes):
+            for aim in _aims(asset, pose, boxes, None if out_m is None else _direction(course, 0.0)):
                 point = surface_point(boxes, aim, direction)
                 if point is None:
                     continue
@@ -99,11 +101,20 @@ def _approach(
 
 
 def _aims(
-    asset: Asset, pose: Pose, boxes: Sequence[tuple[Pose, tuple[float, float, float]]]
+    asset: Asset,
+    pose: Pose,
+    boxes: Sequence[tuple[Pose, tuple[float, float, float]]],
+    inward: FloatArray | None,
 ) -> Iterator[FloatArray]:
-    """Points of the thing that the hand goes for: its middle, then the middles of its largest parts."""
+    """Points of the thing that the hand goes for: its middle, then the middles of its largest parts.
+
+    Where the hand goes inward under a roof, what is nearer to the front comes next after the middle.
+    """
     middle = np.array(pose.position_m)
     yield middle
+    if inward is not None:
+        depth = float(np.abs(pose.rotation.T @ inward) @ np.array(asset.size_m))
+        yield middle - FORWARD * depth * inward
     yield middle + np.array([0.0, 0.0, 0.25 * asset.size_m[2]])
     sizes = [size[0] * size[1] * size[2] for _, size in boxes]
     for number in np.argsort(sizes)[::-1][: 3 if len(boxes) > 1 else 0].tolist():

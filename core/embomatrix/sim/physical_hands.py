@@ -43,7 +43,9 @@ ROOM_M: Final = 0.45
 ATTEMPTS: Final = 3
 WAYS: Final = 16
 """Ways that are looked at, and that are tried, before a skill gives up."""
-PLACES: Final = 10
+PLACES: Final = 24
+FITS: Final = 64
+"""Turned poses that are looked at: those in the open first, then the less deep ones."""
 DROP_M: Final = 0.004
 """The hand lets go when what it holds touches, or this far below where it should."""
 LEVEL: Final = 0.3
@@ -128,7 +130,8 @@ def _lift(stage: Stage, way: Way, target: str, by_m: float) -> Refusal | None:
 def way_in(stage: Stage, name: str, box: Aabb, boxes: Boxes) -> tuple[float, float | None]:
     """Heading in which the hand goes to a place, and how long its way under a roof is; None in the open.
 
-    Under a roof the way follows the front of what roofs the place over.
+    Under a roof the way follows the front of what roofs the place over, when the thing is in or on that; what hangs over
+    another thing is entered from the side where the robot is.
     """
     robot, engine = stage.world.robot, stage.world.engine
     x, y, _ = box.center_m
@@ -140,10 +143,15 @@ def way_in(stage: Stage, name: str, box: Aabb, boxes: Boxes) -> tuple[float, flo
     ]
     if not hosts:
         return course, None
-    host = engine.pose(hosts[0])
-    front = math.remainder(host.yaw + math.pi, math.tau)
-    bounds = stage.world.relations.body(hosts[0])
-    ahead = np.array([math.cos(host.yaw), math.sin(host.yaw)])
+    own = stage.world.relations.hosts_of(name)
+    host = next((owner for owner in hosts if owner in own), hosts[0])
+    side = engine.pose(host).yaw
+    if host not in own:
+        # The nearest of its four sides: a quarter turn counts from its front.
+        side += round(math.remainder(course + math.pi - side, math.tau) / (math.pi / 2)) * math.pi / 2
+    front = math.remainder(side + math.pi, math.tau)
+    bounds = stage.world.relations.body(host)
+    ahead = np.array([math.cos(side), math.sin(side)])
     half = np.abs(ahead) @ (np.array(bounds.size_m[:2]) / 2)
     depth = float(ahead @ (np.array(bounds.center_m[:2]) - (x, y)) + half)
     extent = np.array(box.size_m[:2])
@@ -179,20 +187,22 @@ def _put(
     assert grip is not None
     boxes = stage.boxes()
     reach = stage.reach(boxes)
-    fits = _turned(stage, target, relation, poses, boxes)
-    tracks = list(_put_tracks(grip, fits))
     attempts, refusal = 0, None
-    pose, course, out_m = fits[0]
-    for way in itertools.islice(reach.ways(tracks, _bases(stage, pose, course, out_m)), WAYS):
-        if attempts == ATTEMPTS:
-            return refusal
-        swing = approach(stage, way, reach, rng, loaded=True)
-        if swing is None:
-            continue
-        attempts += 1
-        refusal = unfold(stage, swing)
-        if refusal is None:
-            return _set_down(stage, way, tracks[way.track])
+    # The first pose is where cached mode puts it: the others are for when the arm does not get there.
+    for some in (poses[:1], poses[1:]):
+        fits = _turned(stage, target, relation, some, boxes)[:FITS]
+        tracks = list(_put_tracks(grip, fits))
+        ways = reach.ways(tracks, _bases(stage, *fits[0])) if fits else iter(())
+        for way in itertools.islice(ways, WAYS):
+            if attempts == ATTEMPTS:
+                return refusal
+            swing = approach(stage, way, reach, rng, loaded=True)
+            if swing is None:
+                continue
+            attempts += 1
+            refusal = unfold(stage, swing)
+            if refusal is None:
+                return _set_down(stage, way, tracks[way.track])
     name = grip.name
     return refusal or refuse(
         FailureReason.ARM_BLOCKED, target=f"a place for {name}", other=reach.hindrance or target
@@ -227,6 +237,7 @@ def _turned(
                 fits.append((turned, course, out_m))
         fits.append((pose, course, out_m))
     world.engine.park(grip.name)
+    fits.sort(key=lambda fit: fit[2] or 0.0)
     return fits + [(pose, course, None) for pose, course, out_m in fits if out_m is not None]
 
 
