@@ -29,6 +29,8 @@ RIM_POINTS: Final = 24
 EXTENTS_KEPT: Final = 512
 """Answers in memory for each asset, about 300 bytes each; for its parts as much for each of them."""
 CORNERS: Final = 8
+SQUARE: Final = 5e-7
+"""Half the angle, in radians, up to which frames count as square to one another."""
 ASSETS_KEPT: Final = 512
 """Of this many assets the points are kept: more than a scene has, few enough for a process that loads many scenes."""
 IDENTITY: Final = Pose((0.0, 0.0, 0.0), IDENTITY_QUAT)
@@ -44,6 +46,21 @@ def joint_motion(joint: Joint, fraction: float) -> Pose:
     turn = Pose(joint.origin_m, (x * sine, y * sine, z * sine, cosine))
     ox, oy, oz = joint.origin_m
     return turn @ Pose((-ox, -oy, -oz))
+
+
+def square_box(box: Aabb, frame: Pose) -> Aabb | None:
+    """A box in the frame that ``frame`` leads to; None when its sides are not along that frame's axes, to a microradian."""
+    x, y, z, w = (abs(value) for value in frame.quat_xyzw)
+    if x > SQUARE or y > SQUARE:
+        return None
+    width, depth, height = box.size_m
+    if abs(z - w) <= SQUARE:
+        width, depth = depth, width
+    elif min(z, w) > SQUARE:
+        return None
+    cx, cy, cz = frame.apply(box.center_m)
+    low = (cx - width / 2, cy - depth / 2, cz - height / 2)
+    return Aabb(low, (cx + width / 2, cy + depth / 2, cz + height / 2))
 
 
 class AssetBounds:
@@ -101,15 +118,8 @@ class AssetBounds:
         return known
 
     def _reckon(self, pose: Pose, fractions: tuple[float, ...]) -> tuple[Vec3, Vec3]:
-        low, high = np.full(3, np.inf), np.full(3, -np.inf)
-        moving = iter(fractions)
-        for (points, radii), joint in self._clouds:
-            fraction = next(moving, 0.0) if joint is not None else 0.0
-            placed = pose @ joint_motion(joint, fraction) if joint is not None and fraction else pose
-            world = placed.apply_all(points)  # (n, 3)
-            np.minimum(low, (world - radii).min(axis=0), out=low)
-            np.maximum(high, (world + radii).max(axis=0), out=high)
-        (a, b, c), (d, e, f) = low.tolist(), high.tolist()
+        lows, highs = self.extents(pose.rotation[None], fractions)
+        (a, b, c), (d, e, f) = lows[0].tolist(), highs[0].tolist()
         return (a, b, c), (d, e, f)
 
 

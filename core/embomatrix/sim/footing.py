@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.sim.bounds import bounds_of
+from embomatrix.sim.bounds import bounds_of, square_box
 from embomatrix.sim.spots import REST_M, interior_around, is_shut, is_upright, link_frame, surface_under
 from embomatrix.world.state import Relation
 
@@ -214,7 +214,7 @@ class Footings:
                 if item.link == link
             ):
                 continue
-            placed = bounds_of(self._scene.asset_of(name)).box(
+            placed = square_box(box, inverse) or bounds_of(self._scene.asset_of(name)).box(
                 inverse @ engine.pose(name), engine.joints(name)
             )
             interior = interior_around(placed, asset, link)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from embomatrix.sim.bounds import bounds_of
+from embomatrix.sim.bounds import bounds_of, square_box
 from embomatrix.sim.lineup import Lineup, Neighbours, PoseSet
 from embomatrix.sim.placement import in_reach
 from embomatrix.world.asset import Asset, Joint, JointKind, Link
@@ -95,3 +95,25 @@ def test_poses_taken_in_turn_keep_their_rotations() -> None:
     again = turned.repeated_at(np.arange(9.0).reshape(3, 3))
     assert np.array_equal(again.rotations, turned.rotations[[0, 1, 0]])
     assert again.positions_m[2].tolist() == [6.0, 7.0, 8.0]
+
+
+@given(BOX, COORDINATE, COORDINATE, st.sampled_from((0, 1, 2, 3)))
+def test_a_box_is_turned_by_right_angles_as_its_solid_is(box, x, y, quarters) -> None:
+    solid = Asset(
+        "box-test",
+        "box",
+        "",
+        box.size_m,
+        1.0,
+        (Link("base", (Part(Shape.BOX, Pose((0.0, 0.0, 0.0)), box.size_m),)),),
+    )
+    frame = Pose.from_xyz_yaw(x, y, 0.3, quarters * math.pi / 2)
+    turned, exact = square_box(box, frame), bounds_of(solid).box(frame @ Pose(box.center_m))
+    assert turned is not None
+    assert turned.low_m == pytest.approx(exact.low_m, abs=1e-9)
+    assert turned.high_m == pytest.approx(exact.high_m, abs=1e-9)
+
+
+@pytest.mark.parametrize("quat", [(0.1, 0.0, 0.0, math.sqrt(0.99)), (0.0, 0.0, 0.1, math.sqrt(0.99))])
+def test_a_box_is_not_turned_by_any_other_angle(quat) -> None:
+    assert square_box(Aabb((0.0, 0.0, 0.0), (1.0, 2.0, 3.0)), Pose((0.0, 0.0, 0.0), quat)) is None
