@@ -1,12 +1,17 @@
 """The arm's kinematics: what is solved in closed form is where the chain of joints leads."""
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
+from tests.fakes.scenes import kitchen_scene
+
 from embomatrix.sim import physical_arm as arm
 from embomatrix.sim import physical_body as body
+from embomatrix.sim.bullet.engine import BulletEngine
+from embomatrix.sim.physical_floor import Floor
 from embomatrix.sim.physical_space import boxes_of, clearance, strikes
 from embomatrix.world.geometry import Pose
 
@@ -64,3 +69,26 @@ def test_balls_strike_a_turned_box_where_they_are_in_it():
     balls = np.array([[[0.5, 0.5, 0.0]], [[1.5, 0.5, 0.0]]])  # the beam runs along (-1, 1)
     assert strikes(boxes, balls, np.array([0.05]), 0.0).tolist() == [0, -1]
     np.testing.assert_allclose(clearance(boxes, balls, np.array([0.05])), (-0.15, 0.5571), atol=1e-3)
+
+
+def test_what_the_arm_touches_is_drawn_in_until_it_does_not_and_the_rest_stays():
+    near, far = Pose((1.0, 0.0, 0.0)), Pose((0.0, 2.0, 0.0))
+    boxes = boxes_of([(near, (0.2, 2.0, 0.2), "door"), (far, (0.2, 0.2, 0.2), "wall")])
+    ball, radius = np.array([[0.88, 0.0, 0.0]]), np.array([0.05])  # 3 cm deep in the door
+    assert strikes(boxes, ball[None], radius, 0.0).tolist() == [0]
+    freed = boxes.drawn_in(ball, radius, 0.012)
+    np.testing.assert_allclose(clearance(freed, ball[None], radius), [0.012], atol=1e-9)
+    np.testing.assert_array_equal(freed.half[1], boxes.half[1])
+
+
+@pytest.mark.parametrize(("leaf_m", "order"), [(2.4, [4.5, 3.3]), (3.6, [3.3, 4.5])])
+def test_places_that_a_leaf_cuts_off_come_last(leaf_m, order):
+    engine = BulletEngine(kitchen_scene())
+    try:
+        # From the south wall on: the long one reaches the furniture in the north.
+        leaf = boxes_of([(Pose((4.0, leaf_m / 2, 0.5)), (0.04, leaf_m, 1.0), "door")])
+        east, west = np.array([[4.5, 0.5, 0.0]]), np.array([[3.3, 2.6, 0.0]])
+        found = Floor(engine).cut_off_last([east, west], leaf)
+    finally:
+        engine.close()
+    assert [float(group[0, 0]) for group in found] == order
