@@ -59,6 +59,9 @@ class FakeScene:
             case "orphan":
                 os.kill(os.getppid(), signal.SIGKILL)
                 time.sleep(600)
+            case "stop":
+                os.kill(os.getppid(), signal.SIGSTOP)
+                time.sleep(1.0)
         return Completed(
             reward=RewardBreakdown(0.5, 0.2, 30.0, (AtomResult("done", True),), True),
             steps=(),

@@ -58,7 +58,7 @@ class Harness:
         (folder / "kitchen.bundle").write_bytes(data)
         self.paths = {self.digest: folder / "kitchen.bundle"}
         self.pool = SlotPool(
-            SlotLimits(slots, 1000.0, slot_memory_mb=512),
+            SlotLimits(slots, 1000.0, slot_memory_mb=512, fork_s=1.0),
             bundle_path=self._path,
             on_result=self._take,
             on_change=lambda: None,
@@ -170,6 +170,25 @@ async def test_a_slot_that_was_stopped_is_killed_at_the_deadline_and_the_next_ro
         harness.submit("next", harness.plan(PLANS[0]))
         assert (await harness.outcome("next")).trace_digest == first.trace_digest
         await harness.until(lambda: not psutil.pid_exists(slot.pid))
+
+
+async def test_a_scene_that_was_stopped_is_noticed_killed_and_loaded_anew_and_its_slots_finish(
+    tmp_path, kitchen
+):
+    async with running(tmp_path, kitchen, slots=2) as harness:
+        harness.submit("first", harness.plan(PLANS[0]))
+        first = await harness.outcome("first")
+        [slot] = harness.slots()
+        scene = slot.parent()
+        os.kill(scene.pid, signal.SIGSTOP)
+        await harness.until(lambda: not harness.pool.load)  # then both begin at once, and one needs a new slot
+        for name in ("in the old slot", "in a new one"):
+            harness.submit(name, harness.plan(PLANS[0]))
+        outcomes = [await harness.outcome(name) for name in ("in the old slot", "in a new one")]
+        assert [outcome.trace_digest for outcome in outcomes] == [first.trace_digest] * 2
+        await harness.until(lambda: not psutil.pid_exists(scene.pid))
+        assert scene.pid not in {other.parent().pid for other in harness.slots()}
+        assert [resident.state for resident in harness.pool.residents()] == [ResidentState.WARM]
 
 
 async def test_a_slot_that_was_killed_costs_its_rollout_and_no_other(tmp_path, kitchen):

@@ -30,12 +30,12 @@ from embomatrix.worker.slots import SlotPool
 class Harness:
     """A pool whose bundles are files that say how their scene behaves."""
 
-    def __init__(self, folder, *, slots=2, memory_mb=500.0, program=PROGRAM):
+    def __init__(self, folder, *, slots=2, memory_mb=500.0, program=PROGRAM, fork_s=10.0):
         self.folder = folder
         self.results = []
         self.fetched = []
         self.pool = SlotPool(
-            SlotLimits(slots, memory_mb, slot_memory_mb=256),
+            SlotLimits(slots, memory_mb, slot_memory_mb=256, fork_s=fork_s),
             bundle_path=self._path,
             on_result=self.results.append,
             on_change=lambda: None,
@@ -226,6 +226,24 @@ async def test_a_scene_whose_process_died_is_loaded_anew_for_the_next_lease(tmp_
     assert outcomes["l1"].code is InfraCode.SLOT_CRASHED
     assert isinstance(outcomes["l2"], Completed)
     assert harness.fetched == ["scene", "scene"]
+
+
+async def test_a_scene_whose_process_was_stopped_is_replaced_while_its_running_rollout_goes_on(tmp_path):
+    async with running(tmp_path, slots=2, fork_s=0.3) as harness:
+        harness.submit("other", digest="other")
+        await harness.outcomes(1)
+        harness.submit("running", "stop")  # its slot stops the scene's process and goes on for a second
+        [root] = [child for child in psutil.Process().children() if _is_simulator(child)]
+        await harness.until(lambda: any(scene.status() == psutil.STATUS_STOPPED for scene in root.children()))
+        [stopped] = [scene for scene in root.children() if scene.status() == psutil.STATUS_STOPPED]
+        harness.submit("next")
+        outcomes = await harness.outcomes(2)
+        assert isinstance(outcomes["next"], Completed)
+        assert stopped.is_running()  # the other rollout's slot would die with it
+        outcomes = await harness.outcomes(3)
+        assert isinstance(outcomes["running"], Completed)
+        await harness.until(lambda: not stopped.is_running())
+        assert harness.fetched == ["other", "scene", "scene"]
 
 
 async def test_a_root_that_was_killed_is_started_anew(tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import os
 import signal
 import socket
@@ -52,6 +53,12 @@ class Peer:
         return unpack(await self._receive(header_bytes + body_bytes), header_bytes)
 
     def close(self) -> None:
+        """Close the stream. Whoever still waits for an answer on it must be cancelled."""
+        if self._connection.fileno() >= 0:
+            # Left behind, these would hear what comes on the next socket that is given this one's number.
+            loop = asyncio.get_running_loop()
+            loop.remove_reader(self._connection)
+            loop.remove_writer(self._connection)
         self._connection.close()
 
     async def _send(self, frame: Frame) -> None:
@@ -80,13 +87,14 @@ class Zygote:
 
     def __init__(self, peer: Peer) -> None:
         self.peer = peer
+        self._questions: set[asyncio.Task[Frame]] = set()
 
-    async def fork(self) -> Child:
+    async def fork(self, limit_s: float = FORK_S) -> Child:
         """Have a child forked and speak to it. Raises ProcessGoneError when the zygote has died or does not answer."""
         ours, theirs = socket.socketpair()
         try:
             with theirs:
-                answer = await self._ask(Frame({"op": "fork"}, fds=(os.dup(theirs.fileno()),)), FORK_S)
+                answer = await self._ask(Frame({"op": "fork"}, fds=(os.dup(theirs.fileno()),)), limit_s)
         except BaseException:
             ours.close()
             raise
@@ -97,21 +105,33 @@ class Zygote:
         answer = await self._ask(Frame({"op": "reap", "pid": pid}), REAP_S)
         return describe_status(int(answer.header["status"]))
 
+    def close(self) -> None:
+        """Close the stream to a process that is given up: what was asked of it is never answered."""
+        for question in self._questions:
+            question.cancel()
+        self.peer.close()
+
     async def _ask(self, frame: Frame, limit_s: float) -> Frame:
         """Ask to the end even when the caller is cancelled: other slots depend on this stream staying in step."""
-        question = asyncio.create_task(self._ask_and_close(frame))
+        question = asyncio.create_task(self.peer.ask(frame))
+        self._questions.add(question)
+        question.add_done_callback(functools.partial(self._answered, frame))
         try:
             async with asyncio.timeout(limit_s):
-                return await asyncio.shield(question)
+                # Not awaited itself: when the process is given up, that cancels the question and not the asker.
+                await asyncio.wait((question,))
         except TimeoutError as error:
             raise ProcessGoneError(f"it did not answer within {limit_s:g} s") from error
+        if question.cancelled():
+            raise ProcessGoneError("it was ended")
+        return question.result()
 
-    async def _ask_and_close(self, frame: Frame) -> Frame:
-        try:
-            return await self.peer.ask(frame)
-        finally:
-            for fd in frame.fds:
-                os.close(fd)
+    def _answered(self, frame: Frame, question: asyncio.Task[Frame]) -> None:
+        self._questions.discard(question)
+        for fd in frame.fds:
+            os.close(fd)
+        if not question.cancelled():
+            question.exception()  # nobody may be left to look at it
 
 
 class Child(Zygote):
@@ -124,7 +144,7 @@ class Child(Zygote):
 
     def kill(self) -> None:
         """Have the process die, whatever it does. It must be ended later, or its id is never free again."""
-        self.peer.close()
+        self.close()
         with contextlib.suppress(ProcessLookupError):
             os.kill(self.pid, signal.SIGKILL)
 
@@ -151,7 +171,7 @@ class Root(Zygote):
 
     async def end(self) -> None:
         """Kill it; its children die with it."""
-        self.peer.close()
+        self.close()
         with contextlib.suppress(ProcessLookupError):
             self._process.kill()
         await self._process.wait()

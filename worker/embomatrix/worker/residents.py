@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.rpc.values import InfraCode, Resident, ResidentState
 from embomatrix.sim.zygote import Frame
-from embomatrix.worker.processes import SIMULATOR_PROGRAM, ProcessGoneError, start_root
+from embomatrix.worker.processes import FORK_S, SIMULATOR_PROGRAM, ProcessGoneError, start_root
 from embomatrix.worker.residency import Held, decide, surplus
 
 if TYPE_CHECKING:
@@ -45,11 +45,15 @@ class LoadError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class SlotLimits:
-    """What a worker may use. ``memory_mb`` is for all residents; one rollout may allocate ``slot_memory_mb``."""
+    """What a worker may use. ``memory_mb`` is for all residents; one rollout may allocate ``slot_memory_mb``.
+
+    A scene's process that takes longer than ``fork_s`` to fork a slot is given up.
+    """
 
     slots: int
     memory_mb: float
     slot_memory_mb: int = 2048
+    fork_s: float = FORK_S
 
     @property
     def idle_slots(self) -> int:
@@ -82,13 +86,16 @@ class Scene:
     running: int = 0
     idle: list[Slot] = field(default_factory=list)
 
-    async def take_slot(self) -> Slot:
-        """An idle slot, or a new fork of the scene. Raises ProcessGoneError when the scene's process has died."""
+    async def take_slot(self, fork_s: float) -> Slot:
+        """An idle slot, or a new fork of the scene, which may take ``fork_s`` seconds.
+
+        Raises ProcessGoneError when the scene's process has died, or does not answer.
+        """
         if self.idle:
             return self.idle.pop()
         if self.child is None:
             raise ProcessGoneError("the scene was evicted")
-        return Slot(await self.child.fork())
+        return Slot(await self.child.fork(fork_s))
 
 
 class Residents:
@@ -178,11 +185,21 @@ class Residents:
             self._on_change(scene)
             tasks.create_task(self._load(scene))
 
-    def lost(self, scene: Scene) -> None:
-        """The scene's process has died: drop the scene, so that it is loaded anew when it is wanted."""
+    def lost(self, scene: Scene, reason: str) -> None:
+        """The scene's process forks no more: forget the scene, so that it is loaded anew when it is wanted.
+
+        It may be stopped and not dead, and rollouts may run in slots that it forked before and that would die with it: it is
+        ended when the last of them is done.
+        """
         if self.keeps(scene):
-            logger.warning("scene lost scene=%s: its process died", scene.digest)
-            self._drop(scene)
+            logger.warning("scene lost scene=%s: %s", scene.digest, reason)
+            self._forget(scene)
+
+    def release(self, scene: Scene) -> None:
+        """A rollout in the scene is done."""
+        scene.running -= 1
+        if not scene.running and not self.keeps(scene):
+            self._end(scene)
 
     def keeps(self, scene: Scene) -> bool:
         """Whether this very scene is still held, not evicted or loaded anew."""
@@ -289,14 +306,20 @@ class Residents:
 
     def _drop(self, scene: Scene) -> None:
         """Forget a scene and end its process; its slots die with it."""
+        self._forget(scene)
+        self._end(scene)
+
+    def _forget(self, scene: Scene) -> None:
         del self._scenes[scene.digest]
         for slot in scene.idle:
-            slot.child.peer.close()
+            slot.child.close()
         scene.idle.clear()
+        self._on_change(scene)
+
+    def _end(self, scene: Scene) -> None:
         if scene.child is not None:
             self.end_later(scene.child)
             scene.child = None
-        self._on_change(scene)
 
 
 async def _collect(child: Child) -> str:

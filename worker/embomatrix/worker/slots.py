@@ -173,7 +173,7 @@ class SlotPool:
             ticket.task.add_done_callback(functools.partial(self._release, scene))
 
     def _release(self, scene: Scene, _: asyncio.Task[None]) -> None:
-        scene.running -= 1
+        self._residents.release(scene)
         self._running -= 1
         self._wake.set()
 
@@ -191,9 +191,9 @@ class SlotPool:
         """Run the rollout in a slot of its scene; None when the scene had died and the lease waits again."""
         started_s = time.monotonic()
         try:
-            slot = await scene.take_slot()
-        except ProcessGoneError:
-            return self._scene_died(ticket, scene)
+            slot = await scene.take_slot(self._limits.fork_s)
+        except ProcessGoneError as error:
+            return self._scene_died(ticket, scene, str(error))
         body = rollout_to_proto(ticket.lease.rollout).SerializeToString()
         try:
             async with asyncio.timeout(ticket.lease.deadline_s):
@@ -230,9 +230,9 @@ class SlotPool:
         completed = completed_from_proto(types_pb2.Completed.FromString(answer.body))
         return replace(completed, timings=timings, warm=ticket.found_warm)
 
-    def _scene_died(self, ticket: _Ticket, scene: Scene) -> InfraFailure | None:
+    def _scene_died(self, ticket: _Ticket, scene: Scene, reason: str) -> InfraFailure | None:
         """Have the scene loaded anew for this lease, once."""
-        self._residents.lost(scene)
+        self._residents.lost(scene, reason)
         if ticket.requeued:
             return InfraFailure(
                 InfraCode.SLOT_CRASHED, "the scene's process died twice before the rollout began"
