@@ -71,10 +71,13 @@ class Relations:
         return self._apart(a, b) and self.footings.is_in(a, b)
 
     def under(self, a: str, b: str) -> bool:
-        """Some part of ``b`` lies over the centre of ``a``, and all that do begin above its top, 1 cm deeper allowed."""
+        """Some part of ``b`` lies over the centre of ``a``, and all that do begin above its top, 1 cm deeper allowed.
+
+        Centre and top are those of ``a`` with its joints shut: a door that is ajar moves nothing out from under a shelf.
+        """
         if not self._apart(a, b):
             return False
-        return is_under(self._engine.aabb(a), self._scene.asset_of(b), self._engine.pose(b))
+        return is_under(self.body(a), self._scene.asset_of(b), self._engine.pose(b))
 
     def nextto(self, a: str, b: str) -> bool:
         """Side by side: their heights overlap, neither's centre is over the other, and the gap between them is small.

@@ -82,6 +82,17 @@ def test_thing_on_the_floor_below_the_board_is_under_the_table(engine, relations
     assert not relations.under("bowl_1", "breakfast_table_1")
 
 
+def test_opening_a_thing_does_not_move_it_out_from_under_another(engine, relations) -> None:
+    table, microwave = (engine.scene.asset_of(name) for name in ("breakfast_table_1", "microwave_1"))
+    x, y, _ = engine.pose("breakfast_table_1").position_m
+    edge = x + table.size_m[0] / 2
+    engine.set_pose("microwave_1", Pose((edge - 0.03, y, microwave.size_m[2] / 2)))
+    assert relations.under("microwave_1", "breakfast_table_1")
+    engine.set_joints("microwave_1", (1.0,))
+    assert engine.aabb("microwave_1").center_m[0] > edge
+    assert relations.under("microwave_1", "breakfast_table_1")
+
+
 def test_thing_on_a_shelf_board_is_not_under_the_shelf(relations) -> None:
     assert not relations.under("mug_1", "shelf_1")
 
