@@ -196,6 +196,9 @@ class Footings:
     def _interior(self, name: str, asset: Asset, pose: Pose, fractions: tuple[float, ...]) -> Interior | None:
         """The smallest cavity of an asset at a pose that the object is in."""
         engine = self._engine
+        _, middle, _ = sorted(self._scene.asset_of(name).size_m)
+        if all(middle > math.hypot(*item.size_m[:2]) + SLACK_M for item in asset.interiors):
+            return None  # It is too wide for any of them, however it lies.
         box = engine.aabb(name)
         # However the object turns, the centre of its box moves less than this.
         slack = math.dist(box.low_m, box.high_m) / 2

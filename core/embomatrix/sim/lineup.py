@@ -68,12 +68,13 @@ class Lineup:
 
     def reached_from(self, stand: StandPose) -> BoolArray:
         """Whether the arm reaches the nearest point of each box in the plane, and its middle's height; shape (n,)."""
-        base = (stand.x_m, stand.y_m)
+        base = np.array((stand.x_m, stand.y_m))
         away = np.maximum(self.lows_m[:, :2] - base, base - self.highs_m[:, :2])  # (n, 2)
         np.maximum(away, 0.0, out=away)
-        heights = (self.lows_m[:, 2] + self.highs_m[:, 2]) / 2
         reached = np.hypot(away[:, 0], away[:, 1]) <= ROBOT.reach_m
-        return np.asarray(reached & (heights >= ROBOT.reach_low_m) & (heights <= ROBOT.reach_high_m))
+        # Of lowest and highest: twice the height of the middle.
+        sums = self.lows_m[:, 2] + self.highs_m[:, 2]
+        return np.asarray(reached & (sums >= 2 * ROBOT.reach_low_m) & (sums <= 2 * ROBOT.reach_high_m))
 
     def crowded(self, others: Neighbours, margin_m: float) -> BoolArray:
         """Whether each box, grown by a margin, overlaps that of any neighbour; shape (n,)."""
