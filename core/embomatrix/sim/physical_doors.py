@@ -240,7 +240,7 @@ def _tracks(leaf: Leaf, fractions: FloatArray) -> Iterator[Track]:
     elif fractions[0] > AJAR:
         spots = (
             (Spot.EDGE, Spot.OUTSIDE, Spot.WITHIN)
-            if fractions[-1] < AJAR
+            if fractions[-1] < fractions[0]
             else (Spot.WITHIN, Spot.EDGE, Spot.OUTSIDE)
         )
     else:
