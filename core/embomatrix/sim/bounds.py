@@ -15,7 +15,7 @@ from embomatrix.world.asset import JointKind
 from embomatrix.world.geometry import IDENTITY_QUAT, Aabb, Part, Pose, Shape
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -207,6 +207,12 @@ def bounds_of(asset: Asset) -> AssetBounds:
 def parts_of(asset: Asset) -> AssetParts:
     """Parts of an asset, made at the first call for it."""
     return _known(asset)[1]
+
+
+def forget(assets: Iterable[Asset]) -> None:
+    """Drop what was made for these assets: a process that loads scene after scene would fill up with it."""
+    for asset in assets:
+        _KNOWN.pop(id(asset), None)
 
 
 _KNOWN: dict[int, tuple[Asset, AssetBounds, AssetParts]] = {}

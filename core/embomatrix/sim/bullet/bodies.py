@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from embomatrix.sim.bounds import IDENTITY, joint_motion
 from embomatrix.sim.bullet.client import pybullet
@@ -38,6 +38,18 @@ class Piece:
     origin_m: Vec3
     parent: int
     joint: Joint | None
+
+
+_ROWS: Final[list[list[float]]] = []
+"""What vertices are handed over in. pybullet never lets go of a vertex that it was given: these it is given again and again."""
+
+
+def _rows(vertices: Sequence[Sequence[float]]) -> list[list[float]]:
+    """The vertices, in lists that are good until the next call."""
+    _ROWS.extend([] for _ in range(len(vertices) - len(_ROWS)))
+    for row, vertex in zip(_ROWS, vertices, strict=False):
+        row[:] = vertex
+    return _ROWS[: len(vertices)]
 
 
 class BodyFactory:
@@ -160,7 +172,9 @@ class BodyFactory:
         return int(
             self._bullet.createCollisionShape(
                 self._bullet.GEOM_MESH,
-                vertices=[[v * s for v, s in zip(vertex, scale, strict=True)] for vertex in part.vertices_m],
+                vertices=_rows(
+                    [[v * s for v, s in zip(vertex, scale, strict=True)] for vertex in part.vertices_m]
+                ),
                 collisionFramePosition=pose.position_m,
                 collisionFrameOrientation=pose.quat_xyzw,
                 physicsClientId=self._client,

@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.sim.bounds import IDENTITY, AssetBounds
+from embomatrix.sim.bounds import IDENTITY, AssetBounds, forget
 from embomatrix.sim.bullet.bodies import PART_LIMIT
 from embomatrix.sim.bullet.client import ClientPool, pybullet
 from embomatrix.sim.bullet.mini_world import MiniWorld, Still
@@ -227,6 +227,7 @@ class BulletEngine:
     def close(self) -> None:
         """Free the physics clients. The engine can't be used afterwards."""
         self._mini.close()
+        forget(self._scene.assets.values())
         self._pool.give_back(self._client)
         if self._owns_pool:
             self._pool.close()
