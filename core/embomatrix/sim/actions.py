@@ -100,7 +100,7 @@ def _place(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refus
     target, held = target_of(world, call), world.carried[0]
     fails = FailureReason.NO_FREE_POSE
     tried: tuple[StandPose, ...] = ()
-    for stand in (world.robot, *_other_stands(world, target)):
+    for stand in (world.robot, *other_stands(world, target)):
         found = world.placer.find(held, target, Relation(call.relation.value), stand, rng, tried)
         if isinstance(found, Pose) and world.hand.let_go(found):
             world.robot = stand
@@ -113,7 +113,7 @@ def _place(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refus
     return refuse(fails, held=held, target=target, relation=preposition(call.relation))
 
 
-def _other_stands(world: LiveWorld, target: str) -> Iterator[StandPose]:
+def other_stands(world: LiveWorld, target: str) -> Iterator[StandPose]:
     """Where else the robot may stand to place something, apart from where it stands: from there it reaches other spots."""
     here = world.robot
     stands = world.navigator.stands(target, here)

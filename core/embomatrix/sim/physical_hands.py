@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from embomatrix.sim.actions import other_stands
 from embomatrix.sim.physical_fold import approach, fold, unfold
 from embomatrix.sim.physical_grasp import grasp_tracks
 from embomatrix.sim.physical_motion import raised
 from embomatrix.sim.physical_reach import Track
 from embomatrix.sim.physical_stage import TOOL
-from embomatrix.sim.physical_travel import SOMETHING
+from embomatrix.sim.physical_travel import SOMETHING, travel
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.view import preposition, refuse
 from embomatrix.world.geometry import Pose
@@ -165,9 +166,14 @@ def place(stage: Stage, target: str, asked: PlaceRelation, rng: np.random.Genera
     home, held = world.robot, grip.name
     relation = Relation(asked.value)
     words = {"held": held, "target": target, "relation": preposition(asked)}
-    found = world.placer.choices(held, target, relation, world.robot, rng, most=PLACES)
+    found, stand = _places(stage, target, relation, rng)
     if isinstance(found, FailureReason):
         return refuse(found, **words)
+    if stand is not home:
+        refusal = travel(stage, stand, target)
+        if refusal is not None:
+            return refusal
+        home = stand
     refusal = _put(stage, target, relation, found, rng)
     if stage.grip is not None:
         fold(stage, home, rng, target)
@@ -177,6 +183,21 @@ def place(stage: Stage, target: str, asked: PlaceRelation, rng: np.random.Genera
     if refusal is None and not world.relations.holds(relation, held, target):
         return refuse(FailureReason.FELL, **words)
     return refusal
+
+
+def _places(
+    stage: Stage, target: str, relation: Relation, rng: np.random.Generator
+) -> tuple[tuple[Pose, ...] | FailureReason, StandPose]:
+    """Poses for what is held, or why there are none, and where to stand for them: as in cached mode, here if there are any."""
+    world = stage.world
+    held, here = world.carried[0], world.robot
+    found = world.placer.choices(held, target, relation, here, rng, most=PLACES)
+    if found is FailureReason.NO_FREE_POSE:
+        for stand in other_stands(world, target):
+            more = world.placer.choices(held, target, relation, stand, rng, most=PLACES)
+            if not isinstance(more, FailureReason):
+                return more, stand
+    return found, here
 
 
 def _put(
