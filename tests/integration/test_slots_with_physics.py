@@ -181,7 +181,9 @@ async def test_a_scene_that_was_stopped_is_noticed_killed_and_loaded_anew_and_it
         [slot] = harness.slots()
         scene = slot.parent()
         os.kill(scene.pid, signal.SIGSTOP)
-        await harness.until(lambda: not harness.pool.load)  # then both begin at once, and one needs a new slot
+        await harness.until(
+            lambda: not harness.pool.load
+        )  # then both begin at once, and one needs a new slot
         for name in ("in the old slot", "in a new one"):
             harness.submit(name, harness.plan(PLANS[0]))
         outcomes = [await harness.outcome(name) for name in ("in the old slot", "in a new one")]
