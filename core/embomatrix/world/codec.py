@@ -18,7 +18,7 @@ from embomatrix.world.codec_asset import (
     pose_from_field,
     pose_to_json,
 )
-from embomatrix.world.codec_plain import plain_assets, plain_objects
+from embomatrix.world.codec_plain import OBJECT_KEYS, plain_assets, plain_objects
 from embomatrix.world.field import Field, SceneInvalidError
 from embomatrix.world.scene import Doorway, RobotStart, Room, Scene, SceneObject, Window
 from embomatrix.world.state import Relation, State, SubstanceFact, SubstanceRelation
@@ -222,18 +222,7 @@ def _objects(field: Field, assets: Mapping[str, Asset]) -> tuple[SceneObject, ..
 
 def object_from_field(field: Field, assets: Mapping[str, Asset]) -> SceneObject:
     """An object of one of the assets, with a joint position for each of its joints."""
-    fields = field.record(
-        "name",
-        "asset_id",
-        "room",
-        "pose",
-        "fixed",
-        "joints",
-        "host",
-        "relation",
-        "states",
-        optional=("substances", "absent", "pieces"),
-    )
+    fields = field.record(*OBJECT_KEYS, optional=("substances", "absent", "pieces"))
     asset_id = fields["asset_id"].text()
     if asset_id not in assets:
         fields["asset_id"].fail(f"unknown asset {asset_id[:80]!r}: the scene carries {len(assets)} others")

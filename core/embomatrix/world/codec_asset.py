@@ -25,6 +25,19 @@ if TYPE_CHECKING:
 
     Json = dict[str, Any]
 
+ASSET_KEYS: Final = (
+    "asset_id",
+    "category",
+    "synset",
+    "size_m",
+    "mass_kg",
+    "links",
+    "supports",
+    "interiors",
+    "abilities",
+)
+SUPPORT_KEYS: Final = ("name", "center_m", "size_m", "clearance_m", "interior")
+INTERIOR_KEYS: Final = ("name", "center_m", "size_m", "closed_by")
 MAX_PARTS: Final = 16
 """Parts of a link: Bullet drops the rest of a compound in silence."""
 MAX_LINKS: Final = 100
@@ -170,18 +183,7 @@ def joint_from_field(field: Field) -> Joint:
 
 
 def asset_from_field(field: Field) -> Asset:
-    fields = field.record(
-        "asset_id",
-        "category",
-        "synset",
-        "size_m",
-        "mass_kg",
-        "links",
-        "supports",
-        "interiors",
-        "abilities",
-        optional=("credit",),
-    )
+    fields = field.record(*ASSET_KEYS, optional=("credit",))
     links = tuple(_link(item) for item in fields["links"].items(at_most=MAX_LINKS))
     if not links or links[0].joint is not None or any(link.joint is None for link in links[1:]):
         fields["links"].fail("expected a base without a joint first, and a joint for every other link")
@@ -216,7 +218,7 @@ def _credit(field: Field) -> Credit:
 
 
 def _support(field: Field, interiors: tuple[Interior, ...], links: tuple[Link, ...]) -> SupportSurface:
-    fields = field.record("name", "center_m", "size_m", "clearance_m", "interior", optional=("link",))
+    fields = field.record(*SUPPORT_KEYS, optional=("link",))
     interior = fields["interior"].text()
     if interior and interior not in {item.name for item in interiors}:
         fields["interior"].fail(f"unknown interior {interior!r}")
@@ -234,7 +236,7 @@ def _support(field: Field, interiors: tuple[Interior, ...], links: tuple[Link, .
 
 
 def _interior(field: Field, links: tuple[Link, ...]) -> Interior:
-    fields = field.record("name", "center_m", "size_m", "closed_by", optional=("link",))
+    fields = field.record(*INTERIOR_KEYS, optional=("link",))
     closed_by = fields["closed_by"].texts()
     unknown = set(closed_by) - {link.name for link in links if link.joint is not None}
     if unknown:

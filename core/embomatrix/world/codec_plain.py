@@ -15,9 +15,12 @@ from typing import TYPE_CHECKING, Any, Final
 
 from embomatrix.world.asset import Asset, Interior, Link, SupportSurface
 from embomatrix.world.codec_asset import (
+    ASSET_KEYS,
+    INTERIOR_KEYS,
     MAX_LINKS,
     MAX_MASS_KG,
     MAX_PARTS,
+    SUPPORT_KEYS,
     asset_from_field,
     joint_from_field,
 )
@@ -43,19 +46,6 @@ OBJECT_KEYS: Final = (
     "relation",
     "states",
 )
-ASSET_KEYS: Final = (
-    "asset_id",
-    "category",
-    "synset",
-    "size_m",
-    "mass_kg",
-    "links",
-    "supports",
-    "interiors",
-    "abilities",
-)
-SUPPORT_KEYS: Final = ("name", "center_m", "size_m", "clearance_m", "interior")
-INTERIOR_KEYS: Final = ("name", "center_m", "size_m", "closed_by")
 _object: Final = itemgetter(*OBJECT_KEYS)
 _asset: Final = itemgetter(*ASSET_KEYS)
 _support: Final = itemgetter(*SUPPORT_KEYS)
@@ -245,7 +235,8 @@ def _vec3(value: Any, columns: _Columns, *, extent: bool = False) -> tuple[float
 
 def _list(value: Any) -> Sequence[Any]:
     _expect(type(value) is list)
-    return value  # type: ignore[no-any-return]
+    items: Sequence[Any] = value
+    return items
 
 
 def _expect(plain: bool) -> None:

@@ -22,9 +22,9 @@ from embomatrix.sim.pose_cache import PlacementLibrary, analyse_scene
 from embomatrix.sim.prepared import Prepared
 from embomatrix.sim.zygote import resident_mb
 from embomatrix.skills.syntax import Skill
-from embomatrix.worker.bench_counting import CountingEngine
 from embomatrix.worker.bench_figures import BenchError, Better, Figure, quantile
 from embomatrix.worker.bench_slots import SlotSample, measure_slots
+from embomatrix.worker.bench_subject import CountingEngine, frozen_heap
 from embomatrix.worker.bench_workload import SIZES
 from embomatrix.worker.physics import CLIENTS_PER_SCENE
 from embomatrix.world.bundle import decode_bundle
@@ -112,7 +112,7 @@ def _measure_rollouts(scene: SceneWork, data: bytes, samples: EngineSamples) -> 
     engine = CountingEngine(bundle.scene, clients, Prepared.of(bundle))
     simulator = Simulator(bundle, engine)
     try:
-        with _frozen_heap():
+        with frozen_heap():
             task = next(iter(bundle.tasks.values()))
             simulator.execute(
                 task, (), 0
@@ -232,14 +232,3 @@ def _cpu_timed(seconds: list[float]) -> Iterator[None]:
     started_s = time.thread_time()
     yield
     seconds.append(time.thread_time() - started_s)
-
-
-@contextlib.contextmanager
-def _frozen_heap() -> Iterator[None]:
-    """Keep what exists now out of garbage collections, as the worker's processes do before they fork."""
-    gc.collect()
-    gc.freeze()
-    try:
-        yield
-    finally:
-        gc.unfreeze()

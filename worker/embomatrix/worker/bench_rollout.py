@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import gc
 import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
@@ -14,8 +13,8 @@ from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.prepared import Prepared
 from embomatrix.skills.syntax import Skill
-from embomatrix.worker.bench_counting import CountingEngine
 from embomatrix.worker.bench_figures import Better, Figure, quantile, quantile_figure
+from embomatrix.worker.bench_subject import CountingEngine, frozen_heap
 from embomatrix.worker.physics import CLIENTS_PER_SCENE
 from embomatrix.world.bundle import decode_bundle
 
@@ -93,7 +92,7 @@ def _measure_scene(scene: BenchScene, repeats: int, samples: Samples) -> None:
     ready_s = decode_s + time.perf_counter() - started_s
     samples.ready_s.append(ready_s)
     try:
-        with _frozen_heap():
+        with frozen_heap():
             _measure_first(simulator, bundle, scene.demonstrations[0], ready_s, samples)
             for demonstration in scene.demonstrations:
                 _measure_task(simulator, counting, bundle, demonstration, repeats, samples)
@@ -218,14 +217,3 @@ def _timed(seconds: list[float]) -> Iterator[None]:
     started_s = time.perf_counter()
     yield
     seconds.append(time.perf_counter() - started_s)
-
-
-@contextlib.contextmanager
-def _frozen_heap() -> Iterator[None]:
-    """Keep what exists now out of garbage collections, as the worker's processes do before they fork."""
-    gc.collect()
-    gc.freeze()
-    try:
-        yield
-    finally:
-        gc.unfreeze()

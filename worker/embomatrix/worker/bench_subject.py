@@ -1,13 +1,17 @@
-"""The engine with a count of what benches ask about: how often something had to be settled."""
+"""What benches in one process measure: an engine that counts its settles, on a heap like a worker's."""
 
 from __future__ import annotations
 
+import contextlib
+import gc
 from typing import TYPE_CHECKING
 
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.engine import NOTHING, SETTLE_STEPS
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from embomatrix.sim.engine import Settled
 
 
@@ -19,3 +23,14 @@ class CountingEngine(BulletEngine):
     def settle(self, name: str, steps: int = SETTLE_STEPS, ignore: frozenset[str] = NOTHING) -> Settled:
         self.settles += 1
         return super().settle(name, steps, ignore)
+
+
+@contextlib.contextmanager
+def frozen_heap() -> Iterator[None]:
+    """Keep what exists now out of garbage collections, as the worker's processes do before they fork."""
+    gc.collect()
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
