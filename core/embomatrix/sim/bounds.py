@@ -6,6 +6,7 @@ Read from the parts, not from the physics engine: its boxes carry collision marg
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 from typing import TYPE_CHECKING, Final
 
@@ -130,6 +131,7 @@ class AssetParts:
         self._links = [(link.joint, link.parts) for link in asset.links if link.parts]
         self._of_base = len(asset.links[0].parts)
         self._extents: dict[tuple[Quat, tuple[float, ...]], list[tuple[Vec3, Vec3]]] = {}
+        self._leaves: dict[tuple[Quat, tuple[float, ...]], list[tuple[Vec3, Vec3]]] = {}
 
     def boxes(self, pose: Pose, fractions: Sequence[float]) -> list[Aabb]:
         """Box of every part in the world, in the order of the links, as ``Part.aabb`` has it."""
@@ -142,6 +144,17 @@ class AssetParts:
     def base_boxes(self, pose: Pose) -> list[Aabb]:
         """Box of every part of the base in the world."""
         return self.boxes(pose, ())[: self._of_base]
+
+    def leaves(self, pose: Pose, fractions: Sequence[float]) -> list[Aabb]:
+        """Box of every link that moves, in the world."""
+        x, y, z = pose.position_m
+        key = (pose.quat_xyzw, tuple(fractions))
+        known = self._leaves.get(key)
+        if known is None:
+            if len(self._leaves) >= EXTENTS_KEPT:
+                self._leaves.clear()
+            known = self._leaves[key] = self._reckon_leaves(*key)
+        return [Aabb((x + a, y + b, z + c), (x + d, y + e, z + f)) for (a, b, c), (d, e, f) in known]
 
     def within(self, pose: Pose, fractions: Sequence[float], box: Aabb) -> list[Part]:
         """Parts whose boxes overlap a box of the world, each at its pose in the world."""
@@ -171,6 +184,16 @@ class AssetParts:
                 self._extents.clear()
             known = self._extents[key] = self._reckon(Pose((0.0, 0.0, 0.0), quat_xyzw), fractions)
         return known
+
+    def _reckon_leaves(self, quat_xyzw: Quat, fractions: tuple[float, ...]) -> list[tuple[Vec3, Vec3]]:
+        extents = iter(self._extents_at(quat_xyzw, fractions))
+        found: list[tuple[Vec3, Vec3]] = []
+        for joint, parts in self._links:
+            boxes = [Aabb(low, high) for low, high in itertools.islice(extents, len(parts))]
+            if joint is not None:
+                box = Aabb.around(boxes)
+                found.append((box.low_m, box.high_m))
+        return found
 
     @functools.cached_property
     def _points(self) -> tuple[FloatArray, IntArray]:

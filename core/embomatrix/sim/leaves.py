@@ -41,7 +41,7 @@ class Leaves:
         self._before = engine.joints(name)
         self._riders = tuple(self._riders_of(relations))
         self._contacts: dict[str, frozenset[str]] = {}
-        self._around: dict[str, Aabb] = {}
+        self._around: frozenset[str] = frozenset()
 
     @property
     def riders(self) -> tuple[str, ...]:
@@ -56,7 +56,7 @@ class Leaves:
         """
         reached, last = 0, self._before
         stops = [self._before, *map(tuple, course)]
-        self._around = self._boxes_around(stops)
+        self._around = self._neighbours(stops)
         for fractions in stops[1:]:
             self._put(fractions)
             other = self._stopped_by()
@@ -93,24 +93,18 @@ class Leaves:
             return ""
         return self._engine.penetrates(name, ignore=ignore | self._contacts_of(name))
 
-    def _boxes_around(self, stops: Sequence[Sequence[float]]) -> dict[str, Aabb]:
-        """Boxes of the objects near the furniture as it swings from stop to stop, grown by a slack."""
+    def _neighbours(self, stops: Sequence[Sequence[float]]) -> frozenset[str]:
+        """Objects near the furniture as it swings from stop to stop."""
         bounds = bounds_of(self._asset)
-        swept = Aabb.around(bounds.box(self._base, fractions) for fractions in stops).grown(LEAF_SLACK_M)
-        near = self._engine.near(swept, frozenset((self._name,)))
-        return {other: self._engine.aabb(other).grown(LEAF_SLACK_M) for other in near}
+        swept = Aabb.around(bounds.box(self._base, fractions) for fractions in stops)
+        return frozenset(self._engine.near(swept.grown(LEAF_SLACK_M), frozenset((self._name,))))
 
     def _out_of_the_way(self) -> frozenset[str]:
         """Objects near the furniture that no leaf comes near to: most of what stands in and on it."""
-        leaves = self._leaf_boxes()
-        return frozenset(
-            other for other, box in self._around.items() if not any(box.overlaps(leaf) for leaf in leaves)
-        )
-
-    def _leaf_boxes(self) -> list[Aabb]:
-        boxes = parts_of(self._asset).boxes(self._base, self._engine.joints(self._name))
-        moves = [link.joint is not None for link in self._asset.links for _ in link.parts]
-        return [box for box, moving in zip(boxes, moves, strict=True) if moving]
+        near: set[str] = set()
+        for leaf in parts_of(self._asset).leaves(self._base, self._engine.joints(self._name)):
+            near.update(self._engine.near(leaf.grown(LEAF_SLACK_M)))
+        return self._around - near
 
     def _contacts_of(self, name: str) -> frozenset[str]:
         """Bodies that the object penetrated before anything moved: built-in neighbours, not in the way of a door."""

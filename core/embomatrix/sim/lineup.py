@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 TAKEN_SHARE: Final = 0.16
 """Boxes of two upright cylinders that overlap by this share of their extents along both axes are of cylinders that do."""
 SAME_LEVEL_M: Final = 0.02
-NOWHERE: Final = (np.inf, np.inf, np.inf)
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,47 +101,60 @@ class Lineup:
 class PoseSet:
     """n poses of a thing in the frames of a support's links, as arrays.
 
-    ``positions_m`` has shape (n, 3), ``rotations`` (n, 3, 3); ``link_of``, shape (n,), tells where in ``links`` each rides.
+    ``positions_m`` has shape (n, 3), ``rotations`` (k, 3, 3); ``turn_of``, shape (n,), tells which of these each pose has,
+    and ``link_of``, shape (n,), where in ``links`` it rides.
     """
 
     positions_m: FloatArray
     rotations: FloatArray
+    turn_of: IntArray
     links: tuple[str, ...]
     link_of: IntArray
 
     @staticmethod
-    def of(poses: Sequence[Pose], links: Sequence[str], then: Pose = IDENTITY) -> PoseSet:
-        """Poses that ride on ``links``, one for each; ``then`` is the thing's pose in each of their frames."""
-        positions = np.array([pose.position_m for pose in poses]).reshape(-1, 3)
-        rotations = _rotations(np.array([pose.quat_xyzw for pose in poses]).reshape(-1, 4))
-        positions = positions + rotations @ np.array(then.position_m)
+    def of(rows: FloatArray, links: Sequence[str], then: Pose = IDENTITY) -> PoseSet:
+        """Poses that ride on ``links``, one for each; ``then`` is the thing's pose in each of their frames.
+
+        ``rows``, shape (n, 7), are positions and quaternions.
+        """
+        rotations = _rotations(rows[:, 3:])
+        positions = rows[:, :3] + rotations @ np.array(then.position_m)
         names = tuple(dict.fromkeys(links))
         link_of = np.array([names.index(link) for link in links], dtype=np.int64)
-        return PoseSet(positions, rotations @ then.rotation, names, link_of)
+        return PoseSet(positions, rotations @ then.rotation, np.arange(len(rows)), names, link_of)
 
     def repeated_at(self, positions_m: FloatArray) -> PoseSet:
         """The poses in turn, again and again, moved to positions on their links, shape (m, 3)."""
         rows = np.arange(len(positions_m)) % max(len(self.link_of), 1)
-        return PoseSet(positions_m, self.rotations[rows], self.links, self.link_of[rows])
+        return PoseSet(positions_m, self.rotations, self.turn_of[rows], self.links, self.link_of[rows])
 
     def lineup(self, bounds: AssetBounds, fractions: Sequence[float], frames: Mapping[str, Pose]) -> Lineup:
         """Boxes of a thing with these bounds and joint positions, where the links are; at infinity on links without frame."""
         if not self.links:
             return Lineup(np.zeros((0, 3)), np.zeros((0, 3)))
-        known = [frames.get(link) for link in self.links]
-        turns = np.array([np.eye(3) if frame is None else frame.rotation for frame in known])[self.link_of]
-        origins = np.array([NOWHERE if frame is None else frame.position_m for frame in known])[self.link_of]
-        lows, highs = bounds.extents(turns @ self.rotations, fractions)
-        origins = origins + (turns @ self.positions_m[:, :, None])[:, :, 0]
-        return Lineup(origins + lows, origins + highs)
+        lows, highs = np.empty_like(self.positions_m), np.empty_like(self.positions_m)
+        for number, link in enumerate(self.links):
+            rows = np.s_[:] if len(self.links) == 1 else self.link_of == number
+            frame = frames.get(link)
+            if frame is None:
+                lows[rows] = highs[rows] = np.inf
+                continue
+            turn = frame.rotation
+            below, above = bounds.extents(turn @ self.rotations, fractions)  # (k, 3) each
+            origins = self.positions_m[rows] @ turn.T + frame.position_m
+            lows[rows] = origins + below[self.turn_of[rows]]
+            highs[rows] = origins + above[self.turn_of[rows]]
+        return Lineup(lows, highs)
 
 
 def _rotations(quats_xyzw: FloatArray) -> FloatArray:
     """Rotation matrices, shape (n, 3, 3), of unit quaternions, shape (n, 4)."""
     x, y, z, w = quats_xyzw.T
-    rows = [
-        (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
-        (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
-        (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
-    ]
-    return np.moveaxis(np.array(rows), -1, 0)
+    xx, yy, zz = 2 * x * x, 2 * y * y, 2 * z * z
+    xy, xz, yz = 2 * x * y, 2 * x * z, 2 * y * z
+    wx, wy, wz = 2 * w * x, 2 * w * y, 2 * w * z
+    found = np.empty((len(x), 3, 3))
+    found[:, 0, 0], found[:, 0, 1], found[:, 0, 2] = 1 - yy - zz, xy - wz, xz + wy
+    found[:, 1, 0], found[:, 1, 1], found[:, 1, 2] = xy + wz, 1 - xx - zz, yz - wx
+    found[:, 2, 0], found[:, 2, 1], found[:, 2, 2] = xz - wy, yz + wx, 1 - xx - yy
+    return found

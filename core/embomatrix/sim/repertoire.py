@@ -13,6 +13,7 @@ from embomatrix.sim.footprints import LEVEL_FLOOR, footprint_of, pose_box_asset
 from embomatrix.sim.lineup import PoseSet
 from embomatrix.sim.spots import link_under, links_with_spots
 from embomatrix.world.geometry import Aabb, Pose
+from embomatrix.world.placements import pose_rows, rows_of
 from embomatrix.world.poses import PlacementKey
 from embomatrix.world.state import Relation
 
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from embomatrix.sim.candidates import Patch
     from embomatrix.sim.lineup import Lineup
     from embomatrix.world.asset import Asset
-    from embomatrix.world.geometry import Vec2
+    from embomatrix.world.geometry import FloatArray, Vec2
     from embomatrix.world.poses import PoseCache
     from embomatrix.world.scene import Scene
 
@@ -65,20 +66,22 @@ class Repertoire:
         self._scene = scene
         self._cache = cache
         self._verified: dict[PlacementKey, tuple[Spots, Spots]] = {}
+        self._footprints: dict[str, tuple[str, Pose]] = {}
         self._patches: dict[PlacementKey, tuple[tuple[Patch, ...], PoseSet]] = {}
 
     def verified(self, held: str, target: str, relation: Relation) -> tuple[Spots, Spots]:
         """Spots verified for this pair of assets, and those verified for the footprint of what is held."""
         one, other = self._scene.asset_of(held), self._scene.asset_of(target)
         key = PlacementKey(one.asset_id, other.asset_id, relation)
-        if key not in self._verified:
-            exact = self._cache.placements.get(key, ())
+        known = self._verified.get(key)
+        if known is None:
+            exact = rows_of(self._cache.placements, key)
             boxes, pose_box_held = self._by_class(one, other.asset_id, relation)
-            self._verified[key] = (
+            known = self._verified[key] = (
                 _spots(exact, IDENTITY, one, other, relation),
                 _spots(boxes, pose_box_held, one, other, relation),
             )
-        return self._verified[key]
+        return known
 
     def fresh(self, held: str, target: str, relation: Relation, shift: Vec2, tries: int) -> Spots:
         """At most so many poses by geometry alone, spread over the surfaces; ``shift`` moves the whole pattern."""
@@ -87,7 +90,7 @@ class Repertoire:
         if key not in self._patches:
             found = patches(bounds_of(one), other, relation)
             middles = [Pose.from_xyz_yaw(*patch.center_m, patch.yaw) for patch in found]
-            self._patches[key] = (found, PoseSet.of(middles, [patch.link for patch in found]))
+            self._patches[key] = (found, PoseSet.of(pose_rows(middles), [patch.link for patch in found]))
         found, middle = self._patches[key]
         points = [point for _, point in proposed_places(found, shift, tries)]
         yaws = [patch.yaw for patch in islice(cycle(found), len(points))]
@@ -95,25 +98,45 @@ class Repertoire:
         places = middle.repeated_at(np.array(points).reshape(-1, 3))
         return Spots(lambda number: Pose.from_xyz_yaw(*points[number], yaws[number]), links, places)
 
-    def _by_class(self, asset: Asset, support_id: str, relation: Relation) -> tuple[Sequence[Pose], Pose]:
-        """Poses of the box of the asset's footprint, and the asset's pose in the frame of that box."""
-        standing = self._cache.placements.get(
-            PlacementKey(asset.asset_id, LEVEL_FLOOR.asset_id, Relation.ONTOP)
-        )
-        footprint = footprint_of(asset, standing[0]) if standing else None
-        if not standing or footprint is None:
-            return (), IDENTITY
-        poses = self._cache.placements.get(PlacementKey(footprint.name, support_id, relation), ())
-        return poses, pose_box_asset(footprint, asset, standing[0])
+    def _by_class(self, asset: Asset, support_id: str, relation: Relation) -> tuple[FloatArray, Pose]:
+        """Poses of the box of the asset's footprint, shape (n, 7), and the asset's pose in the frame of that box."""
+        name, pose_box_held = self.footprint(asset)
+        return rows_of(self._cache.placements, PlacementKey(name, support_id, relation)), pose_box_held
+
+    def footprint(self, asset: Asset) -> tuple[str, Pose]:
+        """Name of the footprint class of an asset, "" without one, and the asset's pose in the frame of the class's box."""
+        known = self._footprints.get(asset.asset_id)
+        if known is None:
+            key = PlacementKey(asset.asset_id, LEVEL_FLOOR.asset_id, Relation.ONTOP)
+            standing = self._cache.placements.get(key)
+            footprint = footprint_of(asset, standing[0]) if standing else None
+            known = ("", IDENTITY)
+            if standing and footprint is not None:
+                known = (footprint.name, pose_box_asset(footprint, asset, standing[0]))
+            self._footprints[asset.asset_id] = known
+        return known
 
 
-def _spots(poses: Sequence[Pose], then: Pose, held: Asset, support: Asset, relation: Relation) -> Spots:
-    """Spots at poses in the frame of a support with its joints shut; ``then`` is the thing's pose in each of their frames."""
-    plain = PoseSet.of(poses, [""] * len(poses), then)
-    links = [""] * len(poses)
-    if poses and not links_with_spots(support) <= {""}:
+NO_SPOTS: Final = Spots(lambda number: IDENTITY, (), PoseSet.of(pose_rows(()), ()))
+
+
+def _spots(rows: FloatArray, then: Pose, held: Asset, support: Asset, relation: Relation) -> Spots:
+    """Spots at poses in the frame of a support with its joints shut; ``then`` is the thing's pose in each of their frames.
+
+    ``rows``, shape (n, 7), are positions and quaternions.
+    """
+    if not len(rows):
+        return NO_SPOTS
+    links = [""] * len(rows)
+    plain = PoseSet.of(rows, links, then)
+    if not links_with_spots(support) <= {""}:
         boxes = plain.lineup(bounds_of(held), (), {"": IDENTITY})
         corners = zip(boxes.lows_m.tolist(), boxes.highs_m.tolist(), strict=True)
         links = [link_under(Aabb(tuple(low), tuple(high)), support, relation) for low, high in corners]
-        plain = PoseSet.of(poses, links, then)
-    return Spots(lambda number: poses[number] @ then, links, plain)
+        plain = PoseSet.of(rows, links, then)
+
+    def local(number: int) -> Pose:
+        x, y, z, a, b, c, d = rows[number].tolist()
+        return Pose((x, y, z), (a, b, c, d)) @ then
+
+    return Spots(local, links, plain)

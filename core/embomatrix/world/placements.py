@@ -74,6 +74,11 @@ class Placements(Mapping[PlacementKey, tuple[Pose, ...]]):
     def __len__(self) -> int:
         return len(self._spans)
 
+    def rows(self, key: PlacementKey) -> FloatArray:
+        """Poses of one set, shape (n, 7): position and quaternion. Empty where there is no such set."""
+        first, count = self._spans.get(self._index(key), (0, 0))
+        return self._spots[first : first + count]
+
     def _index(self, key: PlacementKey) -> tuple[int, int, int]:
         """The set's numbers; -1 stands for what is not there."""
         numbers = self._numbers
@@ -108,6 +113,19 @@ class Stands(Mapping[str, tuple[StandPose, ...]]):
 
     def __len__(self) -> int:
         return len(self._spans)
+
+
+def rows_of(placements: Mapping[PlacementKey, tuple[Pose, ...]], key: PlacementKey) -> FloatArray:
+    """Poses of one set, shape (n, 7): position and quaternion. Empty where there is no such set."""
+    if isinstance(placements, Placements):
+        return placements.rows(key)
+    return pose_rows(placements.get(key, ()))
+
+
+def pose_rows(poses: Sequence[Pose]) -> FloatArray:
+    """Poses as rows, shape (n, 7): position and quaternion."""
+    rows = [(*pose.position_m, *pose.quat_xyzw) for pose in poses]
+    return np.array(rows, dtype=np.float64).reshape(-1, 7)
 
 
 def flattened(

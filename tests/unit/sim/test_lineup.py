@@ -14,6 +14,7 @@ from embomatrix.sim.lineup import Lineup, Neighbours, PoseSet
 from embomatrix.sim.placement import in_reach
 from embomatrix.world.asset import Asset, Joint, JointKind, Link
 from embomatrix.world.geometry import Aabb, Part, Pose, Shape
+from embomatrix.world.placements import pose_rows
 from embomatrix.world.poses import StandPose
 
 LAMP = Asset(
@@ -49,7 +50,7 @@ def test_boxes_of_many_poses_are_those_of_each(spots, frame, drawer, then) -> No
     poses, links = [pose for pose, _ in spots], [link for _, link in spots]
     frames = {"": frame, "drawer": drawer}
     bounds = bounds_of(LAMP)
-    lineup = PoseSet.of(poses, links, then).lineup(bounds, (0.5,), frames)
+    lineup = PoseSet.of(pose_rows(poses), links, then).lineup(bounds, (0.5,), frames)
     for row, (pose, link) in enumerate(spots):
         box = bounds.box(frames[link] @ (pose @ then), (0.5,))
         assert lineup.lows_m[row].tolist() == pytest.approx(box.low_m, abs=1e-9)
@@ -84,16 +85,16 @@ def test_what_has_a_hollow_is_taken_only_on_its_own_level() -> None:
 
 
 def test_a_pose_on_a_link_without_a_frame_is_in_nobodys_reach() -> None:
-    lineup = PoseSet.of([Pose((0.0, 0.0, 0.5))], ["drawer"]).lineup(
+    lineup = PoseSet.of(pose_rows([Pose((0.0, 0.0, 0.5))]), ["drawer"]).lineup(
         bounds_of(LAMP), (0.0,), {"": Pose((0.0, 0.0, 0.0))}
     )
     assert not lineup.reached_from(StandPose(0.0, 0.0, 0.0)).any()
 
 
 def test_poses_taken_in_turn_keep_their_rotations() -> None:
-    turned = PoseSet.of([Pose.from_xyz_yaw(0.0, 0.0, 0.0, yaw) for yaw in (0.0, 1.0)], ["", ""])
+    turned = PoseSet.of(pose_rows([Pose.from_xyz_yaw(0.0, 0.0, 0.0, yaw) for yaw in (0.0, 1.0)]), ["", ""])
     again = turned.repeated_at(np.arange(9.0).reshape(3, 3))
-    assert np.array_equal(again.rotations, turned.rotations[[0, 1, 0]])
+    assert np.array_equal(again.rotations[again.turn_of], turned.rotations[[0, 1, 0]])
     assert again.positions_m[2].tolist() == [6.0, 7.0, 8.0]
 
 
