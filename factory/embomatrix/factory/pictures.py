@@ -40,6 +40,7 @@ _LEGEND: Final = (
     ("rug", "rug"),
     ("plant", "plant"),
 )
+_SIGNS: Final = ("triangle: front · red: doorway", "blue: window · ring: light or fan")
 _PLANTS: Final = frozenset({"tree", "low_resolution_tree", "bush", "pot_plant"})
 _WORKS: Final = ("toggleable", "heatSource", "coldSource", "particleSource")
 
@@ -96,7 +97,7 @@ class _Plan:
         width, height = ((high - low) * self._scale).astype(int)
         self._small = [o for o in scene.objects if self._is_small(o)]
         self._legend_x = int(width) + _MARGIN_PX
-        rows = len(self._small) + len(_LEGEND) + 6
+        rows = len(self._small) + len(_LEGEND) + len(_SIGNS) + 5
         columns = max(1, math.ceil(rows * _LINE_PX / max(int(height), 700)))
         size = (self._legend_x + columns * 300, max(int(height), 700) + 2 * _MARGIN_PX)
         self.image = Image.new("RGB", size, "white")
@@ -154,7 +155,8 @@ class _Plan:
             self._draw.rectangle((x, y + 2, x + 14, y + 12), fill=FILL[kind], outline="#555555")
             self._text((x + 22, y), words, 11, "black")
             self._row += 1
-        self._say("     triangle: front · red: doorway · blue: window · ring: light or fan")
+        for signs in _SIGNS:
+            self._say(f"      {signs}")
         self._say("")
         for number, item in enumerate(self._small, start=1):
             x, y = self._px(*item.pose_world_asset.position_m[:2])

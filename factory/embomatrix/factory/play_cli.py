@@ -28,6 +28,7 @@ from embomatrix.skills.parse import PlanError, argument, parse_plan
 from embomatrix.skills.syntax import MAX_PLAN_BYTES, SIGNATURES, Arg
 from embomatrix.world.dataset import Dataset, DatasetError
 from embomatrix.world.evaluate import GoalError
+from embomatrix.world.whole_file import check_writable
 
 if TYPE_CHECKING:
     from embomatrix.reward.breakdown import RewardBreakdown
@@ -88,7 +89,7 @@ def play(
     """
     try:
         if film is not None:
-            check_suffix(film)
+            _check_film(film)
         status = _play(task, plan, oracle, dataset, Take(mode, seed, film))
     except (PlayError, DatasetError, EngineError, FactError, FilmError, GoalError) as error:
         Console(stderr=True, highlight=False).print(f"embomatrix play: {error}", markup=False, soft_wrap=True)
@@ -169,10 +170,23 @@ def _draw(film: Film, path: Path) -> None:
     try:
         write_film(path, pictures)
     except OSError as error:
-        raise PlayError(
-            f"{path} can't be written ({error.strerror}): make room, or name another file with --film"
-        ) from None
+        raise _unwritable(path, error) from None
     console.print(f"\nfilm of {len(pictures)} frames: {path}", markup=False)
+
+
+def _check_film(path: Path) -> None:
+    """Before anything is executed: drawing takes minutes, and shall not end at a file that can't be written."""
+    check_suffix(path)
+    try:
+        check_writable(path)
+    except OSError as error:
+        raise _unwritable(path, error) from None
+
+
+def _unwritable(path: Path, error: OSError) -> PlayError:
+    return PlayError(
+        f"{path} can't be written ({error.strerror}): make room, or name another file with --film"
+    )
 
 
 def _show_task(task: Task) -> None:

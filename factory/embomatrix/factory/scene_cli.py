@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import os
@@ -21,16 +22,17 @@ from embomatrix.factory.importers.model import ModelFileError
 from embomatrix.factory.importers.shelf import read_assets
 from embomatrix.factory.pictures import draw_plan
 from embomatrix.factory.pictures_sheet import draw_sheet
+from embomatrix.factory.relation_pictures import draw_relations
 from embomatrix.factory.scene_batch import SceneJob, run_batch
 from embomatrix.factory.scene_build import build_base_scene
 from embomatrix.factory.scene_tables import problem_lines, report_table
-from embomatrix.sim.bullet.camera import render_oblique
+from embomatrix.sim.bullet.camera import render_egocentric, render_oblique
 from embomatrix.sim.engine import EngineError
 from embomatrix.world.catalog import Catalog, CatalogError
-from embomatrix.world.whole_file import write_whole
+from embomatrix.world.whole_file import check_writable, write_whole
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from embomatrix.factory.scene_report import SceneReport
     from embomatrix.world.scene import Scene
@@ -84,6 +86,7 @@ def build(
     """Lay out and furnish scenes, check them, and write them as JSON; exit status 1 when one has a problem."""
     chosen = _chosen(scene_ids, every)
     _check_assets(assets)
+    _check_writable(report)
     folder = _folder(out)
     several = len(set(seeds or ())) > 1
     orders = [
@@ -106,6 +109,7 @@ def check(
 ) -> None:
     """Test scenes for penetration, unstable and floating things and blocked ways; exit status 1 when something is wrong."""
     chosen = _chosen(scene_ids, every)
+    _check_writable(report)
     _tell(
         _run([SceneJob(name, seed) for name in chosen for seed in dict.fromkeys(seeds or (0,))], jobs), report
     )
@@ -132,18 +136,30 @@ def show(scene_id: SceneId, seed: Seed = 0) -> None:
 
 @app.command()
 def render(scene_id: SceneId, seed: Seed = 0, out: Out = Path()) -> None:
-    """Draw a plan from above and an oblique view, as PNG files."""
+    """Draw a plan from above, an oblique view, and what the robot sees where it starts, as PNG files."""
     _known([scene_id])
     folder = _folder(out)
     scene = _built(scene_id, seed)
-    plan, oblique = folder / f"{scene_id}_plan.png", folder / f"{scene_id}_view.png"
-    _write(plan, _png(draw_plan(scene)))
-    try:
-        view = render_oblique(scene)
-    except EngineError as error:
-        raise _refused(str(error)) from None
-    _write(oblique, _png(Image.fromarray(np.asarray(view))))
-    Console().print(f"{plan}\n{oblique}", highlight=False)
+    with _engine_refusals():
+        pictures = {
+            "plan": draw_plan(scene),
+            "view": Image.fromarray(np.asarray(render_oblique(scene))),
+            "eyes": Image.fromarray(np.asarray(render_egocentric(scene, width_px=640, height_px=480))),
+        }
+    for kind, picture in pictures.items():
+        path = folder / f"{scene_id}_{kind}.png"
+        _write(path, _png(picture))
+        Console().print(str(path), highlight=False)
+
+
+@app.command()
+def relations(out: Out = Path()) -> None:
+    """Draw what every relation means: cases in which it holds, and in which it does not, as a PNG file."""
+    path = _folder(out) / "relations.png"
+    with _engine_refusals():
+        picture = draw_relations()
+    _write(path, _png(picture.quantize(64)))
+    Console().print(str(path), highlight=False)
 
 
 @app.command()
@@ -155,6 +171,7 @@ def sheet(
 ) -> None:
     """Draw the plans of many scenes on one sheet, as a PNG file."""
     chosen = _chosen(scene_ids, every)
+    _check_writable(out)
     scenes = []
     with _progress(len(chosen)) as bar:
         for name in chosen:
@@ -172,6 +189,16 @@ def _check_assets(folder: Path | None) -> None:
             read_assets(folder)
     except ModelFileError as error:
         raise _refused(str(error)) from None
+
+
+def _check_writable(path: Path | None) -> None:
+    """Before anything is made: minutes of work shall not end at a file that can't be written."""
+    if path is None:
+        return
+    try:
+        check_writable(path)
+    except OSError as error:
+        raise _unwritable(path, error) from None
 
 
 def _run(orders: Sequence[SceneJob], jobs: int) -> list[SceneReport]:
@@ -233,6 +260,15 @@ def _progress(total: int) -> Progress:
     progress = Progress(*columns, console=Console(stderr=True), transient=True)
     progress.add_task("scenes", total=total)
     return progress
+
+
+@contextlib.contextmanager
+def _engine_refusals() -> Iterator[None]:
+    """A machine without pybullet gets a sentence."""
+    try:
+        yield
+    except EngineError as error:
+        raise _refused(str(error)) from None
 
 
 def _folder(out: Path) -> Path:

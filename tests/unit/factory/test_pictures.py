@@ -57,10 +57,11 @@ def test_an_unknown_scene_gets_one_sentence_with_close_names() -> None:
     assert "Traceback" not in result.output
 
 
-def test_render_writes_both_pictures(tmp_path: Path) -> None:
+def test_render_writes_plan_view_and_what_the_robot_sees(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, ["render", "hotel_suite_small", "--out", str(tmp_path)])
     assert result.exit_code == 0, result.output
     assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "hotel_suite_small_eyes.png",
         "hotel_suite_small_plan.png",
         "hotel_suite_small_view.png",
     ]
@@ -70,3 +71,18 @@ def test_check_finds_a_base_scene_in_order() -> None:
     result = CliRunner().invoke(app, ["check", "hotel_suite_small"])
     assert result.exit_code == 0, result.output
     assert "nothing wrong" in result.output
+
+
+def test_relations_are_drawn_by_a_command(tmp_path: Path) -> None:
+    result = CliRunner().invoke(app, ["relations", "--out", str(tmp_path)])
+    assert result.exit_code == 0, result.output
+    assert [path.name for path in tmp_path.iterdir()] == ["relations.png"]
+
+
+def test_a_report_that_can_not_be_written_is_told_before_the_work(tmp_path: Path) -> None:
+    report = tmp_path / "nowhere" / "report.json"
+    for arguments in (["check", "--all"], ["build", "--all", "--out", str(tmp_path / "out")]):
+        result = CliRunner().invoke(app, [*arguments, "--report", str(report)])
+        assert result.exit_code == 2
+        assert "report.json can't be written" in " ".join(result.output.split())
+    assert not any(tmp_path.iterdir())

@@ -146,3 +146,10 @@ def test_a_film_of_an_unknown_kind_is_refused_before_anything_runs(run):
     assert "film.mp4" in result.output
     assert ".gif" in result.output
     assert "✓" not in result.output
+
+
+def test_a_film_that_can_not_be_written_is_refused_before_anything_runs(run, tmp_path):
+    result = run("apple_to_counter", "--oracle", "--film", str(tmp_path / "nowhere" / "film.gif"))
+    assert result.exit_code == 2
+    assert "film.gif can't be written" in " ".join(result.output.split())
+    assert "✓" not in result.output

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from embomatrix.world.whole_file import write_whole
+from embomatrix.world.whole_file import check_writable, write_whole
 
 
 def test_file_is_written_and_nothing_else_remains(tmp_path: Path) -> None:
@@ -18,3 +18,13 @@ def test_failure_leaves_what_was_there(tmp_path: Path) -> None:
     with pytest.raises(OSError):
         write_whole(target, b"new")
     assert [path.name for path in tmp_path.iterdir()] == ["taken"]
+
+
+def test_asking_first_changes_nothing_and_tells_what_would_fail(tmp_path: Path) -> None:
+    target = tmp_path / "a.json"
+    target.write_bytes(b"old")
+    check_writable(target)
+    assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("a.json", b"old")]
+    for impossible in (tmp_path, tmp_path / "nowhere" / "a.json", target / "a.json"):
+        with pytest.raises(OSError):
+            check_writable(impossible)
