@@ -57,6 +57,7 @@ class DynamicWorld:
         self._known: dict[str, tuple[Vec3, tuple[float, ...]]] = {}
         self._movable = tuple(item.name for item in scene.objects if not item.fixed)
         self._jointed = tuple(item.name for item in scene.objects if item.fixed and item.joints)
+        self._still: list[int] = []
         self._held = ""
         self._hooked = ("", -1)
         self.steps = 0
@@ -73,6 +74,7 @@ class DynamicWorld:
         floor = self._factory.floor(0.0, 0.0, FLOOR_HALF_M)
         walls = self._factory.walls(self._scene.walls)
         self._names = {floor: FLOOR} | dict.fromkeys(walls, WALL)
+        self._still = [floor, *walls]
         self._held, self.steps = "", 0
         for number, item in enumerate(self._scene.objects):
             pose = poses.get(item.name, Pose((number * 3.0, 0.0, AWAY_M)))
@@ -82,6 +84,7 @@ class DynamicWorld:
         self.rest()
         self.step(1)
         self.rest()
+        self._still_sleep()
         for name in (*self._movable, *self._jointed):
             self._known[name] = self._state(name)
 
@@ -260,6 +263,7 @@ class DynamicWorld:
             self._bullet.resetBasePositionAndOrientation(
                 body, pose.position_m, pose.quat_xyzw, physicsClientId=self._client
             )
+            self._still.append(body)
         self._bodies[name], self._names[body] = body, name
 
     def _friction(self, body: int) -> None:
@@ -309,6 +313,13 @@ class DynamicWorld:
             return False
         linear, angular = self._bullet.getBaseVelocity(self._bodies[name], physicsClientId=self._client)
         return math.hypot(*linear) > SLOW_M_S or math.hypot(*angular) > SLOW_RAD_S
+
+    def _still_sleep(self) -> None:
+        """Put to sleep what never moves: else Bullet compares it in every step with all that lies on it, asleep or not."""
+        bullet = self._bullet
+        asleep = bullet.ACTIVATION_STATE_ENABLE_SLEEPING | bullet.ACTIVATION_STATE_SLEEP
+        for body in self._still:
+            bullet.changeDynamics(body, -1, activationState=asleep, physicsClientId=self._client)
 
     def _sleep(self, name: str) -> None:
         bullet, client, body = self._bullet, self._client, self._bodies[name]
