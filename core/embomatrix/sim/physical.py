@@ -17,7 +17,8 @@ from embomatrix.sim.barriers import no_way_into, no_way_to
 from embomatrix.sim.bullet.dynamic import DynamicWorld
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.physical_doors import close_all, open_all
-from embomatrix.sim.physical_hands import pick_up, place
+from embomatrix.sim.physical_hands import pick_up
+from embomatrix.sim.physical_place import place
 from embomatrix.sim.physical_press import press
 from embomatrix.sim.physical_stage import Stage
 from embomatrix.sim.physical_travel import drive, travel

@@ -28,6 +28,8 @@ FORWARD: Final = 0.35
 OPEN_BACK_M: Final = 0.10
 BEYOND_M: Final = 0.015
 """The way ends this far behind the surface: the hand stops when it touches."""
+SHEET_M: Final = 0.004
+"""It ends no farther behind than the thing is thick there, but at least this far: a sheet of paper lies on something."""
 
 
 def facing(direction: FloatArray, roll: float, aside: FloatArray) -> FloatArray:
@@ -43,10 +45,13 @@ def facing(direction: FloatArray, roll: float, aside: FloatArray) -> FloatArray:
 
 def surface_point(
     boxes: Sequence[tuple[Pose, tuple[float, float, float]]], aim: FloatArray, direction: FloatArray
-) -> FloatArray | None:
-    """Where a ray through a point first meets any of the boxes, None when it misses them all: slab test."""
+) -> tuple[FloatArray, float] | None:
+    """Where a ray through a point first meets any of the boxes, and how thick that box is there; None when it misses all.
+
+    Slab test.
+    """
     start = aim - 3.0 * direction
-    nearest = math.inf
+    nearest, thick_m = math.inf, 0.0
     for pose, size in boxes:
         back = pose.rotation.T
         origin, course = back @ (start - np.array(pose.position_m)), back @ direction
@@ -55,8 +60,8 @@ def surface_point(
         first, second = (-half - origin) / course, (half - origin) / course
         enter, leave = np.minimum(first, second).max(), np.maximum(first, second).min()
         if enter <= leave and enter < nearest:
-            nearest = float(enter)
-    return start + nearest * direction if math.isfinite(nearest) else None
+            nearest, thick_m = float(enter), float(leave - enter)
+    return (start + nearest * direction, thick_m) if math.isfinite(nearest) else None
 
 
 def grasp_tracks(
@@ -80,22 +85,24 @@ def grasp_tracks(
             direction = _direction(course + math.radians(azimuth), math.radians(elevation))
             retreat = direction if out_m is None else _direction(course, 0.0)
             for aim in _aims(asset, pose, boxes, None if out_m is None else _direction(course, 0.0)):
-                point = surface_point(boxes, aim, direction)
-                if point is None:
+                met = surface_point(boxes, aim, direction)
+                if met is None:
                     continue
+                point, thick_m = met
+                end = point + min(max(thick_m, SHEET_M), BEYOND_M) * direction
                 for roll in ROLLS:
                     rotation = facing(direction, math.radians(roll), aside)
-                    tracks.append(_approach(rotation, point, direction, retreat, back_m))
+                    tracks.append(_approach(rotation, point, end, retreat, back_m))
     return tracks
 
 
 def _approach(
-    rotation: FloatArray, point: FloatArray, direction: FloatArray, retreat: FloatArray, back_m: float
+    rotation: FloatArray, point: FloatArray, end: FloatArray, retreat: FloatArray, back_m: float
 ) -> Track:
-    near = point - 0.03 * direction
+    near = point - 0.03 * rotation[:, 2]
     count = max(2, math.ceil(back_m / 0.12) + 1)
     steps = np.linspace(back_m, 0.0, count)[:, None]
-    positions = np.concatenate([near - steps * retreat, [point, point + BEYOND_M * direction]])
+    positions = np.concatenate([near - steps * retreat, [point, end]])
     total = len(positions)
     return Track(np.tile(rotation, (total, 1, 1)), positions, np.zeros(total, dtype=bool), total - 2)
 

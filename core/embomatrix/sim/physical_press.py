@@ -86,9 +86,10 @@ def _tracks(stage: Stage, target: str) -> Iterator[Track]:
                     into = np.array(
                         [math.cos(heading) * level, math.sin(heading) * level, -math.sin(math.radians(down))]
                     )
-                    point = surface_point(boxes, np.array([x, y, z]), into)
-                    if point is None:
+                    met = surface_point(boxes, np.array([x, y, z]), into)
+                    if met is None:
                         continue
+                    point, _ = met
                     rotation = facing(into, 0.0, arm.about_z(np.array([course]))[0][:, 1])
                     positions = np.array([point - OFF_M * into, point - 0.01 * into, point + BEYOND_M * into])
                     yield Track(np.tile(rotation, (3, 1, 1)), positions, np.zeros(3, dtype=bool), 1)

@@ -39,6 +39,21 @@ class Pose:
         """Upright pose at (x, y, z), turned by ``yaw`` radians about z."""
         return Pose((x, y, z), (0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)))
 
+    @staticmethod
+    def from_rotation(position_m: Vec3, rotation: FloatArray) -> Pose:
+        """Pose with a rotation matrix, shape (3, 3): Bar-Itzhack, New Method for Extracting the Quaternion, 2000."""
+        (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
+        symmetric = np.array(
+            [
+                [a - e - i, d + b, g + c, h - f],
+                [d + b, e - a - i, h + f, c - g],
+                [g + c, h + f, i - a - e, d - b],
+                [h - f, c - g, d - b, a + e + i],
+            ]
+        )
+        x, y, z, w = np.linalg.eigh(symmetric)[1][:, -1].tolist()
+        return Pose(position_m, (x, y, z, w))
+
     @property
     def yaw(self) -> float:
         """Rotation about z in (-pi, pi], exact for upright poses."""

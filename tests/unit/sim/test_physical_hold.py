@@ -1,0 +1,81 @@
+"""How the hand takes hold of things: flat ones, and those that it must take otherwise before they go where they should."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from tests.fakes import furniture as make
+from tests.fakes.plans import executed, with_objects
+from tests.fakes.scenes import kitchen_scene, placed, upright
+
+from embomatrix.sim.physical import physical_simulator
+from embomatrix.sim.physical_grasp import SHEET_M, grasp_tracks, surface_point
+from embomatrix.world.bundle import Bundle
+from embomatrix.world.geometry import Pose
+
+TABLE_TOP_M = 0.75
+
+angles = st.floats(-3.1, 3.1)
+
+
+@pytest.fixture
+def play():
+    simulators = []
+
+    def executed_with(extra, text):
+        simulator = physical_simulator(Bundle(with_objects(kitchen_scene(), extra), {}))
+        simulators.append(simulator)
+        return executed(simulator, text), simulator
+
+    yield executed_with
+    for simulator in simulators:
+        simulator.close()
+
+
+@given(angles, angles, angles)
+def test_a_pose_is_found_again_from_its_rotation(roll, pitch, yaw):
+    half = Pose.from_xyz_yaw(0.0, 0.0, 0.0, yaw)
+    tilt = Pose((0.0, 0.0, 0.0), (np.sin(roll / 2), 0.0, 0.0, np.cos(roll / 2)))
+    nod = Pose((0.0, 0.0, 0.0), (0.0, np.sin(pitch / 2), 0.0, np.cos(pitch / 2)))
+    pose = half @ tilt @ nod
+    again = Pose.from_rotation((1.0, 2.0, 3.0), pose.rotation)
+    assert again.position_m == (1.0, 2.0, 3.0)
+    assert again.rotation == pytest.approx(pose.rotation, abs=1e-9)
+
+
+def test_a_ray_tells_where_it_enters_a_thing_and_how_thick_that_is():
+    boxes = [(Pose((0.0, 0.0, 1.0)), (0.2, 0.2, 0.04)), (Pose((0.0, 0.0, 0.5)), (0.2, 0.2, 0.1))]
+    point, thick_m = surface_point(boxes, np.zeros(3), np.array([0.0, 0.0, -1.0]))
+    assert point == pytest.approx([0.0, 0.0, 1.02])
+    assert thick_m == pytest.approx(0.04)
+    assert surface_point(boxes, np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, -1.0])) is None
+
+
+def test_the_hand_does_not_reach_through_a_sheet_into_what_it_lies_on():
+    sheet = make.block("sheet", "sheet.n.01", (0.2, 0.15, 0.003), {})
+    tracks = grasp_tracks(sheet, Pose((0.0, 0.0, 0.7515)), (), 0.0, None)
+    assert min(float(track.position[:, 2].min()) for track in tracks) >= 0.753 - SHEET_M - 1e-9
+
+
+def test_a_sheet_is_taken_off_a_table(play):
+    sheet = replace(make.block("sheet", "sheet.n.01", (0.2, 0.15, 0.003), {}), mass_kg=0.05)
+    pose = upright(2.0, 1.3, TABLE_TOP_M, sheet)
+    trace, simulator = play(
+        [(placed("sheet_1", sheet, "kitchen_0", pose), sheet)], "move sheet_1; pick_up sheet_1"
+    )
+    assert trace.failure is None, trace.steps[-1].message
+    assert simulator.world.carried == ("sheet_1",)
+
+
+def test_what_was_taken_from_aside_is_taken_from_above_to_go_to_the_bottom_of_a_crate(play):
+    crate = make.tub("crate", "crate.n.01", (0.24, 0.24, 0.2), 0.01, 0.01, mass_kg=1.0, abilities={})
+    die = replace(make.block("die", "die.n.01", (0.06, 0.06, 0.05), {}), mass_kg=0.1)
+    extra = [
+        (placed("crate_1", crate, "kitchen_0", upright(2.5, 2.6, 0.0, crate)), crate),
+        (placed("die_1", die, "kitchen_0", upright(2.0, 1.3, TABLE_TOP_M, die)), die),
+    ]
+    trace, simulator = play(extra, "move die_1; pick_up die_1; move crate_1; place crate_1 inside")
+    assert trace.failure is None, trace.steps[-1].message
+    assert simulator.world.relations.inside("die_1", "crate_1")
