@@ -7,29 +7,33 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.sim.bounds import bounds_of
+from embomatrix.sim.bounds import IDENTITY, bounds_of
 from embomatrix.sim.candidates import candidates
 from embomatrix.sim.engine import FLOOR, TOLERANCE_M
 from embomatrix.sim.lineup import Neighbours
 from embomatrix.sim.repertoire import Repertoire
 from embomatrix.sim.spots import is_shut, is_upright, link_frame, links_with_spots
+from embomatrix.sim.statics import is_level, rest_pose
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.limits import ROBOT
+from embomatrix.world.geometry import Pose
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     import numpy as np
 
     from embomatrix.sim.engine import PhysicsEngine
     from embomatrix.sim.relations import Relations
     from embomatrix.sim.repertoire import Spots
-    from embomatrix.world.geometry import Aabb, Pose
+    from embomatrix.world.geometry import Aabb
     from embomatrix.world.poses import PoseCache, StandPose
 
 UNDISTURBED_M: Final = 0.005
 """A pose that was verified offline is settled again when anything but its support is this near."""
+NEAR_M: Final = UNDISTURBED_M + TOLERANCE_M
+"""The margin of a question after what is that near: one about penetration forgives the tolerance."""
 LIVE_TRIES: Final = 64
 """Candidates looked at beyond the cached ones."""
 LIVE_SETTLES: Final = 8
@@ -51,7 +55,8 @@ class Placer:
     """Finds terminal poses in an engine's present state.
 
     A pose that is returned has the relation asked for, penetrates nothing, is within the robot's reach and stable: verified
-    offline with nothing but its support within 5 mm, or settled now. Doors in the way are the caller's to check.
+    offline or proved by statics, with nothing but its support within 5 mm, or settled now. Doors in the way are the caller's
+    to check.
     """
 
     def __init__(self, engine: PhysicsEngine, relations: Relations, cache: PoseCache) -> None:
@@ -134,12 +139,37 @@ class Placer:
         for number, nearest in self._roomy_first(errand, spots, frames, range(len(spots))):
             if settles == LIVE_SETTLES:
                 return
+            proved = self._prove(errand, spots, number, frames)
+            if proved is not None:
+                yield proved
+                continue
             if not self._is_free(errand, spots.pose(number, frames), nearest) or not self._holds(errand):
                 continue
             settles += 1
             settled = self._accept_settled(errand)
             if settled is not None:
                 yield settled
+
+    def _prove(self, errand: Errand, spots: Spots, number: int, frames: Mapping[str, Pose]) -> Pose | None:
+        """Where the thing rests for certain, with nothing but its support within 5 mm; None when it takes a settle to tell."""
+        engine, held, target = self._engine, errand.held, errand.target
+        one, other = self._scene.asset_of(held), self._scene.asset_of(target)
+        base = self._repertoire.base(one)
+        link, local = spots.ride(number)
+        if base is None or not is_level(frames[link]):
+            return None
+        fractions = engine.joints(target)
+        rest = rest_pose(one, base, link_frame(other, IDENTITY, fractions, link) @ local, other, fractions)
+        if rest is None:
+            return None
+        pose = engine.pose(target) @ rest
+        x, y, z = pose.position_m
+        # Looked at a margin higher up, where what lies below its underside, as the table under a sheet, is far enough away.
+        engine.set_pose(held, Pose((x, y, z + NEAR_M), pose.quat_xyzw))
+        if engine.penetrates(held, NEAR_M, frozenset((target, FLOOR))):
+            return None
+        engine.set_pose(held, pose)
+        return pose if self._holds(errand) and self._reaches(errand) else None
 
     def _roomy_first(
         self, errand: Errand, spots: Spots, frames: dict[str, Pose], order: Sequence[int]
@@ -151,7 +181,7 @@ class Placer:
         """
         if not order:
             return
-        held, margin_m = errand.held, UNDISTURBED_M + TOLERANCE_M
+        held, margin_m = errand.held, NEAR_M
         boxes = spots.lineup(bounds_of(self._scene.asset_of(held)), self._engine.joints(held), frames)
         reached = boxes.reached_from(errand.robot)
         for stand in errand.passed_over:
@@ -202,7 +232,7 @@ class Placer:
         engine.set_pose(held, pose)
         if nearest and self._is_deep(held, nearest):
             return None
-        other = engine.penetrates(held, UNDISTURBED_M + TOLERANCE_M, frozenset((target, FLOOR)))
+        other = engine.penetrates(held, NEAR_M, frozenset((target, FLOOR)))
         if other in self._scene.by_name and self._is_deep(held, other):
             return None
         if other:

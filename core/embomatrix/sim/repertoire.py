@@ -12,6 +12,7 @@ from embomatrix.sim.candidates import patches, proposed_places
 from embomatrix.sim.footprints import LEVEL_FLOOR, footprint_of, pose_box_asset
 from embomatrix.sim.lineup import PoseSet
 from embomatrix.sim.spots import link_under, links_with_spots
+from embomatrix.sim.statics import base_of
 from embomatrix.world.geometry import Aabb, Pose
 from embomatrix.world.placements import pose_rows, rows_of
 from embomatrix.world.poses import PlacementKey
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from embomatrix.sim.bounds import AssetBounds
     from embomatrix.sim.candidates import Patch
     from embomatrix.sim.lineup import Lineup
+    from embomatrix.sim.statics import Base
     from embomatrix.world.asset import Asset
     from embomatrix.world.geometry import FloatArray, Vec2
     from embomatrix.world.poses import PoseCache
@@ -48,6 +50,10 @@ class Spots:
         """A pose in the world. Raises KeyError when its link has no frame."""
         return frames[self._links[number]] @ self._local(number)
 
+    def ride(self, number: int) -> tuple[str, Pose]:
+        """The link that a pose rides on, and the pose in that link's frame."""
+        return self._links[number], self._local(number)
+
     def lineup(self, bounds: AssetBounds, fractions: tuple[float, ...], frames: Mapping[str, Pose]) -> Lineup:
         """Boxes at all the poses in the world, of the asset with these bounds; at infinity on links without a frame."""
         key = (fractions, *frames.items())
@@ -67,6 +73,7 @@ class Repertoire:
         self._cache = cache
         self._verified: dict[PlacementKey, tuple[Spots, Spots]] = {}
         self._footprints: dict[str, tuple[str, Pose]] = {}
+        self._bases: dict[str, Base | None] = {}
         self._patches: dict[PlacementKey, tuple[tuple[Patch, ...], PoseSet]] = {}
 
     def verified(self, held: str, target: str, relation: Relation) -> tuple[Spots, Spots]:
@@ -97,6 +104,12 @@ class Repertoire:
         links = [patch.link for patch in islice(cycle(found), len(points))]
         places = middle.repeated_at(np.array(points).reshape(-1, 3))
         return Spots(lambda number: Pose.from_xyz_yaw(*points[number], yaws[number]), links, places)
+
+    def base(self, asset: Asset) -> Base | None:
+        """What the asset stands on when it stands upright, as ``statics`` has it."""
+        if asset.asset_id not in self._bases:
+            self._bases[asset.asset_id] = base_of(asset)
+        return self._bases[asset.asset_id]
 
     def _by_class(self, asset: Asset, support_id: str, relation: Relation) -> tuple[FloatArray, Pose]:
         """Poses of the box of the asset's footprint, shape (n, 7), and the asset's pose in the frame of that box."""
