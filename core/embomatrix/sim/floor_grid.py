@@ -12,11 +12,13 @@ import numpy as np
 from scipy import ndimage, sparse
 from scipy.sparse import csgraph
 
+from embomatrix.sim.floor_parts import FloorParts, overlap
 from embomatrix.skills.limits import ROBOT
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from embomatrix.sim.floor_parts import Window
     from embomatrix.world.geometry import FloatArray, Vec2
     from embomatrix.world.scene import Scene
 
@@ -46,53 +48,73 @@ class FloorGrid:
     def __init__(self, scene: Scene, boxes: FloatArray) -> None:
         """Rasterise obstacles, shape (n, 6), and inflate them by the robot's radius."""
         self._lay_out(scene)
-        self.covered = (~self._floor_of(scene)).astype(np.int16)
-        """How many obstacles cover each cell, and one more where there is no floor."""
+        covered = (~self._floor_of(scene)).astype(np.int16)
         for box in boxes:
-            self.covered[self._window(box[:2], box[2:4])] += 1
+            covered[self._window(box[:2], box[2:4])] += 1
         for edge in (np.s_[0, :], np.s_[-1, :], np.s_[:, 0], np.s_[:, -1]):
-            self.covered[edge] += 1
-        self.free: BoolArray = self._clear_of_obstacles(np.s_[:, :])
+            covered[edge] += 1
+        self._covered = covered
+        self.free: BoolArray = _clear(covered)
 
     @classmethod
     def restored(cls, scene: Scene, covered: NDArray[np.int16], free: BoolArray) -> FloorGrid:
         """The grid of the scene that once had these arrays, of shape ``grid_shape``."""
         grid = cls.__new__(cls)
         grid._lay_out(scene)
-        grid.covered, grid.free = covered, free
+        grid._covered, grid.free = covered, free
         return grid
 
     def _lay_out(self, scene: Scene) -> None:
         self._origin = _origin_of(scene)
         self._origin_m = (float(self._origin[0]), float(self._origin[1]))
         self._shape = grid_shape(scene)
-        self._field = functools.lru_cache(maxsize=FIELDS_KEPT)(self._field_from)
+        self._changes: tuple[tuple[FloatArray, int], ...] = ()
+        self._fields: dict[Cell, FloatArray] = {}
+
+    @property
+    def covered(self) -> NDArray[np.int16]:
+        """How many obstacles cover each cell, and one more where there is no floor."""
+        return self._covered_in((slice(0, self._shape[0]), slice(0, self._shape[1])))
+
+    def _covered_in(self, window: Window) -> NDArray[np.int16]:
+        """The same for a window's cells. A changed grid shares the counts of the one that it was made from."""
+        covered = self._covered[window].copy()
+        for boxes, step in self._changes:
+            for box in boxes:
+                here, _ = overlap(window, self._window(box[:2], box[2:4]))
+                covered[here] += step
+        return covered
 
     def changed(self, gone: FloatArray, come: FloatArray) -> FloorGrid:
         """This grid without some of its obstacles and with others, each of shape (n, 6)."""
+        boxes = np.concatenate([gone, come])  # (n, 6)
+        if not len(boxes):
+            return self
         grid = copy.copy(self)
-        vars(grid).pop("labels", None)
         vars(grid).pop("_graph", None)
-        grid.covered, grid.free = self.covered.copy(), self.free.copy()
-        for boxes, step in ((gone, -1), (come, 1)):
-            for box in boxes:
-                grid.covered[self._window(box[:2], box[2:4])] += step
-        for box in (*gone, *come):
-            reach = ROBOT.radius_m + CELL_M
+        grid._fields = {}
+        grid._changes = (*self._changes, (gone, -1), (come, 1))
+        grid.free = self.free.copy()
+        reach = ROBOT.radius_m + CELL_M
+        for box in boxes:
             here = self._window(box[:2] - reach, box[2:4] + reach)
             around = self._window(box[:2] - 2 * reach, box[2:4] + 2 * reach)
-            inner = tuple(
-                slice(small.start - large.start, small.stop - large.start)
-                for small, large in zip(here, around, strict=True)
-            )
-            grid.free[here] = grid._clear_of_obstacles(around)[inner]
-        grid._field = functools.lru_cache(maxsize=FIELDS_KEPT)(grid._field_from)
+            _, inner = overlap(here, around)
+            grid.free[here] = _clear(grid._covered_in(around))[inner]
+        edge = reach + CELL_M
+        window = self._window(boxes[:, :2].min(axis=0) - edge, boxes[:, 2:4].max(axis=0) + edge)
+        vars(grid)["parts"] = self.parts.changed(grid.free, window)
         return grid
 
     @functools.cached_property
+    def parts(self) -> FloorParts:
+        """Which of the free cells hang together."""
+        return FloorParts.of(self.free)
+
+    @property
     def labels(self) -> IntArray:
-        """Number of the component of each free cell, 0 for the others: fewer than there may be objects in a scene."""
-        return np.asarray(ndimage.label(self.free, output=np.int16)[0])
+        """Number of the component of each free cell, 0 for the others. For reading only."""
+        return self.parts.numbers
 
     def cell(self, x_m: float, y_m: float) -> Cell | None:
         """The free cell at a point, or the nearest one within 30 cm; None when there is none."""
@@ -127,12 +149,14 @@ class FloorGrid:
 
     def label(self, cell: Cell) -> int:
         """Number of the component that a free cell belongs to; 0 for a blocked one."""
-        return int(self.labels[cell])
+        return self.parts.at(cell)
 
     def free_centers(self, low_m: Vec2, high_m: Vec2, label: int) -> FloatArray:
         """Middles of the component's cells in a rectangle, shape (n, 2), in the world."""
         window = self._window(np.asarray(low_m), np.asarray(high_m))
-        inside = np.argwhere(self.labels[window] == label) if label else np.zeros((0, 2), dtype=np.int64)
+        inside = (
+            np.argwhere(self.parts.within(window) == label) if label else np.zeros((0, 2), dtype=np.int64)
+        )
         corner = np.array([window[0].start, window[1].start])
         return np.asarray(self._origin + (inside + corner + 0.5) * CELL_M, dtype=np.float64)
 
@@ -145,7 +169,7 @@ class FloorGrid:
 
     def distance(self, start: Cell, end: Cell) -> float | None:
         """Length in metres of the shortest path over free cells, None when there is none."""
-        if not self.free[start] or self.labels[start] != self.labels[end]:
+        if not self.free[start] or self.label(start) != self.label(end):
             return None
         return float(self._field(end)[start[0] * self._shape[1] + start[1]])
 
@@ -216,9 +240,16 @@ class FloorGrid:
             and (not (di and dj) or (self.free[i + di, j] and self.free[i, j + dj]))
         ]
 
-    def _field_from(self, cell: Cell) -> FloatArray:
-        source = cell[0] * self._shape[1] + cell[1]
-        return np.asarray(csgraph.dijkstra(self._graph, indices=source), dtype=np.float32)
+    def _field(self, cell: Cell) -> FloatArray:
+        """Metres from every cell to this one, flattened."""
+        field = self._fields.get(cell)
+        if field is None:
+            if len(self._fields) == FIELDS_KEPT:
+                del self._fields[next(iter(self._fields))]
+            source = cell[0] * self._shape[1] + cell[1]
+            field = np.asarray(csgraph.dijkstra(self._graph, indices=source), dtype=np.float32)
+            self._fields[cell] = field
+        return field
 
     @functools.cached_property
     def _graph(self) -> sparse.csr_matrix:
@@ -244,13 +275,6 @@ class FloorGrid:
         low_x, low_y = self._origin_m
         return math.floor((x_m - low_x) / CELL_M), math.floor((y_m - low_y) / CELL_M)
 
-    def _clear_of_obstacles(self, window: tuple[slice, slice]) -> BoolArray:
-        """Which cells of a window are a robot's radius or more from every covered cell of it."""
-        clear = self.covered[window] == 0
-        if clear.all():  # there is nothing to measure the distance from
-            return np.asarray(clear)
-        return np.asarray(np.asarray(ndimage.distance_transform_edt(clear)) * CELL_M >= ROBOT.radius_m)
-
     def _floor_of(self, scene: Scene) -> BoolArray:
         floor = np.zeros(self._shape, dtype=np.bool_)
         for room in scene.rooms:
@@ -263,13 +287,21 @@ class FloorGrid:
                 floor[self._window(doorway.center_m - half, doorway.center_m + half)] = True
         return floor
 
-    def _window(self, low: FloatArray, high: FloatArray) -> tuple[slice, slice]:
+    def _window(self, low: FloatArray, high: FloatArray) -> Window:
         """Cells that a rectangle touches with more than its edge."""
         first = np.floor((low - self._origin) / CELL_M + 1e-9).astype(int)
         last = np.ceil((high - self._origin) / CELL_M - 1e-9).astype(int)
         first = np.clip(first, 0, self._shape)
         last = np.clip(last, first, self._shape)
         return slice(int(first[0]), int(last[0])), slice(int(first[1]), int(last[1]))
+
+
+def _clear(covered: NDArray[np.int16]) -> BoolArray:
+    """Which cells are a robot's radius or more from every covered one; shapes are equal."""
+    clear = covered == 0
+    if clear.all():  # there is nothing to measure the distance from
+        return np.asarray(clear)
+    return np.asarray(np.asarray(ndimage.distance_transform_edt(clear)) * CELL_M >= ROBOT.radius_m)
 
 
 def grid_shape(scene: Scene) -> tuple[int, int]:

@@ -1,0 +1,103 @@
+"""Which cells of a floor hang together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy import ndimage
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    BoolArray = NDArray[np.bool_]
+    IntArray = NDArray[np.int16]
+
+Window = tuple[slice, slice]
+
+
+@dataclass(frozen=True, slots=True)
+class FloorParts:
+    """The number of the part that each free cell belongs to, 0 for the others.
+
+    A change on the floor renumbers a window of it: the rest of the numbers is shared with the floor before it.
+    """
+
+    whole: IntArray
+    """Numbers of all cells, shape (rows, columns), before the window was renumbered."""
+    count: int
+    """No part's number is higher."""
+    window: Window = (slice(0, 0), slice(0, 0))
+    inner: IntArray | None = None
+    """Numbers of the window's cells."""
+
+    @staticmethod
+    def of(free: BoolArray) -> FloorParts:
+        """Parts of the free cells, which hang together by their sides: fewer than a scene may have objects."""
+        return FloorParts(*_numbered(free))
+
+    @property
+    def numbers(self) -> IntArray:
+        """Numbers of all cells, shape (rows, columns). For reading only."""
+        if self.inner is None:
+            return self.whole
+        numbers = self.whole.copy()
+        numbers[self.window] = self.inner
+        return numbers
+
+    def at(self, cell: tuple[int, int]) -> int:
+        """Number of one cell."""
+        (i, j), (rows, columns) = cell, self.window
+        if self.inner is not None and rows.start <= i < rows.stop and columns.start <= j < columns.stop:
+            return int(self.inner[i - rows.start, j - columns.start])
+        return int(self.whole[cell])
+
+    def within(self, window: Window) -> IntArray:
+        """Numbers of a window's cells. For reading only."""
+        numbers = self.whole[window]
+        if self.inner is None:
+            return numbers
+        here, there = overlap(window, self.window)
+        numbers = numbers.copy()
+        numbers[here] = self.inner[there]
+        return numbers
+
+    def changed(self, free: BoolArray, window: Window) -> FloorParts:
+        """Parts after cells in a window, but for those at its edge, were taken or freed; ``free`` are all free cells.
+
+        Where the cells of the edge hang together within the window as they did before, so do all cells beyond it.
+        """
+        old = self.within(window)
+        before, _ = _numbered(old > 0)
+        after, found = _numbered(free[window])
+        edge = np.ones(after.shape, dtype=np.bool_)
+        edge[1:-1, 1:-1] = False
+        pairs = set(zip(before[edge].tolist(), after[edge].tolist(), strict=True))
+        if not len(pairs) == len({first for first, _ in pairs}) == len({last for _, last in pairs}):
+            return FloorParts.of(free)
+        # A part that does not come to the edge is an island of its own.
+        names = np.arange(self.count, self.count + found + 1, dtype=np.int16)
+        names[0] = 0
+        names[after[edge]] = old[edge]
+        whole = self.numbers if self.inner is not None else self.whole
+        return FloorParts(whole, self.count + found, window, names[after])
+
+
+def _numbered(free: NDArray[Any]) -> tuple[IntArray, int]:
+    numbers, count = ndimage.label(free, output=np.int16)
+    return np.asarray(numbers), int(count)
+
+
+def overlap(first: Window, second: Window) -> tuple[Window, Window]:
+    """The cells that two windows share, as counted from each one's corner; empty slices when there are none."""
+    low = [max(a.start, b.start) for a, b in zip(first, second, strict=True)]
+    high = [max(start, min(a.stop, b.stop)) for start, a, b in zip(low, first, second, strict=True)]
+    return _seen_from(first, low, high), _seen_from(second, low, high)
+
+
+def _seen_from(window: Window, low: list[int], high: list[int]) -> Window:
+    rows, columns = window
+    return slice(low[0] - rows.start, high[0] - rows.start), slice(
+        low[1] - columns.start, high[1] - columns.start
+    )
