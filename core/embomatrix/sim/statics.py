@@ -26,11 +26,14 @@ FLAT_M: Final = 5e-5
 FALL_M: Final = 0.001
 """A thing that is further than this over a top falls too hard for a proof."""
 MARGIN_M: Final = 0.003
-"""The weight acts this far within the edge of what bears it, at least."""
+MARGIN_SHARE: Final = 0.15
+"""The weight acts this far within the edge of what bears it, and by this share of the base's width: nearer, things rock."""
 CLEAR_M: Final = 0.001
 """Nothing of the support but what bears the thing comes as near as this to it."""
 LEVEL_COSINE: Final = math.cos(math.radians(1.0))
 """Friction holds whatever stands on something that leans by less than a degree."""
+SHORTEST_M: Final = 1e-6
+"""Edges of a polygon that are shorter than this have no direction."""
 RIM_POINTS: Final = 16
 SQUARE: Final = 1e-6
 
@@ -39,11 +42,12 @@ SQUARE: Final = 1e-6
 class Base:
     """What an upright thing stands on: the corners of a convex polygon, anticlockwise, and its height, in the asset's frame.
 
-    The thing's weight acts at the frame's origin.
+    The thing's weight acts at the frame's origin; it has to be borne ``margin_m`` within an edge.
     """
 
     corners_m: tuple[Vec2, ...]
     height_m: float
+    margin_m: float
 
 
 def base_of(asset: Asset) -> Base | None:
@@ -53,7 +57,11 @@ def base_of(asset: Asset) -> Base | None:
     points = [point for link in asset.links for part in link.parts for point in _underside(part)]
     low = bounds_of(asset).box(IDENTITY).low_m[2]
     corners = _hull([(x, y) for x, y, z in points if z <= low + FLAT_M])
-    return Base(corners, low) if _bears((0.0, 0.0), corners) else None
+    if not corners:
+        return None
+    width = min(max(axis) - min(axis) for axis in zip(*corners, strict=True))
+    base = Base(corners, low, max(MARGIN_M, MARGIN_SHARE * width))
+    return base if _bears((0.0, 0.0), corners, base.margin_m) else None
 
 
 def rest_pose(held: Asset, base: Base, pose: Pose, support: Asset, fractions: Sequence[float]) -> Pose | None:
@@ -75,7 +83,7 @@ def rest_pose(held: Asset, base: Base, pose: Pose, support: Asset, fractions: Se
     for part, part_box in _parts_near(support, fractions, near):
         top = part_box.high_m[2]
         reaches = 0.0 <= low - top <= FALL_M
-        if reaches and part is not None and _bears((px, py), _borne(corners, part, part_box)):
+        if reaches and part is not None and _bears((px, py), _borne(corners, part, part_box), base.margin_m):
             found = top if found is None else max(found, top)
         elif top > low - FALL_M:
             return None
@@ -133,18 +141,20 @@ def _clipped(corners: Sequence[Vec2], axis: int, edge: float, sign: int) -> Sequ
     return found
 
 
-def _bears(point: Vec2, corners: Sequence[Vec2]) -> bool:
-    """Whether a point lies within a convex anticlockwise polygon, away from its edges by the margin."""
-    if len(corners) < 3:
-        return False
+def _bears(point: Vec2, corners: Sequence[Vec2], margin_m: float) -> bool:
+    """Whether a point lies within a convex anticlockwise polygon, away from its edges by a margin."""
     x, y = point
+    edges = 0
     for number, (to_x, to_y) in enumerate(corners):
         from_x, from_y = corners[number - 1]
         along_x, along_y = to_x - from_x, to_y - from_y
         length = math.hypot(along_x, along_y)
-        if length and along_x * (y - from_y) - along_y * (x - from_x) < MARGIN_M * length:
+        if length < SHORTEST_M:
+            continue
+        edges += 1
+        if along_x * (y - from_y) - along_y * (x - from_x) < margin_m * length:
             return False
-    return True
+    return edges > 2
 
 
 def _underside(part: Part) -> list[Vec3]:
