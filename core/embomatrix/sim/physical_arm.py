@@ -35,6 +35,7 @@ _UPPER = np.array([ELBOW_M, UPPER_M])
 _FORE = np.array([-ELBOW_M, FOREARM_M])
 _P = float(_UPPER @ _FORE)
 _Q = float(_UPPER[1] * _FORE[0] - _UPPER[0] * _FORE[1])
+_WRIST_SIGNS: Final = np.array([[1.0], [-1.0]])
 _ALONG, _SWAY = math.hypot(_P, _Q), math.atan2(_Q, _P)
 
 
@@ -44,15 +45,27 @@ def frames(joints: FloatArray) -> tuple[FloatArray, FloatArray]:
     joints: (n, 7). Returns rotations (n, 8, 3, 3) and positions (n, 8, 3); index 7 is the tool, at the fingertips' end with
     z out of the hand and y along the fingers' travel.
     """
-    n = len(joints)
-    rotation, position = np.zeros((n, 8, 3, 3)), np.zeros((n, 8, 3))
-    turn, place = np.broadcast_to(np.eye(3), (n, 3, 3)), np.zeros((n, 3))
-    for index, (offset, tilt) in enumerate(_CHAIN):
-        place = place + turn @ offset
-        turn = turn @ tilt @ about_z(joints[:, index])
-        rotation[:, index], position[:, index] = turn, place
-    rotation[:, 7] = turn @ about_z(np.full(n, HAND_TURN))
-    position[:, 7] = place + turn[:, :, 2] * (FLANGE_M + TOOL_M)
+    rotation, position = np.empty((len(joints), 8, 3, 3)), np.empty((len(joints), 8, 3))
+    sines, cosines = np.sin(joints.T), np.cos(joints.T)
+    x, y, z = np.broadcast_to(np.eye(3)[:, :, None], (3, 3, len(joints)))  # axes of the link, (3, n) each
+    place = np.zeros((3, len(joints)))
+    for index, (along_x, along_y, along_z, tilt) in enumerate(_CHAIN):
+        for axis, offset in ((x, along_x), (y, along_y), (z, along_z)):
+            if offset:
+                place = place + axis * offset
+        if tilt:
+            y, z = tilt * z, -tilt * y
+        x, y = cosines[index] * x + sines[index] * y, cosines[index] * y - sines[index] * x
+        for number, axis in enumerate((x, y, z)):
+            rotation[:, index, :, number] = axis.T
+        position[:, index] = place.T
+    x, y = (
+        math.cos(HAND_TURN) * x + math.sin(HAND_TURN) * y,
+        math.cos(HAND_TURN) * y - math.sin(HAND_TURN) * x,
+    )
+    for number, axis in enumerate((x, y, z)):
+        rotation[:, 7, :, number] = axis.T
+    position[:, 7] = (place + z * (FLANGE_M + TOOL_M)).T
     return rotation, position
 
 
@@ -61,79 +74,97 @@ def solve(rotation: FloatArray, position: FloatArray, last: FloatArray) -> Float
 
     rotation: (n, 3, 3), position: (n, 3), last: (n,) angles of the last joint. Angles keep the soft limits.
     """
-    seven = rotation @ about_z(np.full(len(last), -HAND_TURN))
-    six = seven @ about_z(-last) @ _tilt(-1)  # after joint 6, (n, 3, 3)
+    six = rotation @ _about_z_then_tilted(-HAND_TURN - last)  # after joint 6, (n, 3, 3)
     wrist = position - rotation[:, :, 2] * (FLANGE_M + TOOL_M) - six[:, :, 0] * WRIST_M
     back = np.array([0.0, 0.0, SHOULDER_M]) - wrist  # wrist to shoulder, (n, 3)
-    length = np.linalg.norm(back, axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
-        bend = _SWAY - np.arccos((length**2 - _UPPER @ _UPPER - _FORE @ _FORE) / (2 * _ALONG))  # joint 4
-        found = [
-            _rest(six, back, length, bend, last, wrist_sign, shoulder_sign)
-            for wrist_sign in (1.0, -1.0)
-            for shoulder_sign in (1.0, -1.0)
-        ]
-        angles = np.stack(found, axis=1)  # (n, 4, 7)
+        angles = _branches(six.transpose(2, 1, 0), back.T, last)
         good = ((angles >= LOW_RAD) & (angles <= HIGH_RAD)).all(axis=2)
     angles[~good] = np.nan
     return angles
 
 
-def _rest(
-    six: FloatArray,
-    back: FloatArray,
-    length: FloatArray,
-    bend: FloatArray,
-    last: FloatArray,
-    wrist_sign: float,
-    shoulder_sign: float,
-) -> FloatArray:
-    """All seven angles of one branch, shape (n, 7)."""
+def _branches(six: FloatArray, back: FloatArray, last: FloatArray) -> FloatArray:
+    """All seven angles of every branch, shape (n, 4, 7), whatever the joints' limits.
+
+    six: axes of the frame after joint 6, (3 axes, 3, n); back: from the wrist to the shoulder, (3, n). Vectors lie along the
+    first axis here and branches of the wrist along the second: (3, 2, n).
+    """
+    length = np.sqrt(_dot(back, back))
+    bend = _SWAY - np.arccos((length**2 - _UPPER @ _UPPER - _FORE @ _FORE) / (2 * _ALONG))  # joint 4
     s, c = np.sin(bend), np.cos(bend)
     out_x = ELBOW_M - ELBOW_M * c - FOREARM_M * s  # wrist seen from the shoulder, in the elbow's plane
     out_z = UPPER_M - ELBOW_M * s + FOREARM_M * c
-    cosine = (s * out_x - c * out_z) / length  # between the forearm's axis and the way back to the shoulder
-    toward = np.einsum("nji,nj->ni", six, back) / length[:, None]
-    reach = np.hypot(toward[:, 0], toward[:, 1])
-    q6 = np.arctan2(toward[:, 0], toward[:, 1]) + wrist_sign * np.arccos(cosine / reach)
+    cosine = (
+        s * out_x - c * out_z
+    )  # between the forearm's axis and the way back to the shoulder, times the length
+    ahead, aside = _dot(six[0], back), _dot(six[1], back)
+    q6 = np.arctan2(ahead, aside) + _WRIST_SIGNS * np.arccos(cosine / np.hypot(ahead, aside))
     q6 = np.remainder(q6 + math.pi / 2, math.tau) - math.pi / 2  # the joint's travel starts at about zero
-    forearm = six[:, :, 0] * np.sin(q6)[:, None] + six[:, :, 1] * np.cos(q6)[:, None]
-    normal = np.cross(forearm, back) / (-c * out_x - s * out_z)[:, None]  # y axis of link 3
-    normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
-    across = np.cross(forearm, -normal)  # x axis of link 4
-    five = six @ about_z(-q6) @ _tilt(-1)
-    elbow = np.stack([across, normal, forearm], axis=2)
-    turned = np.einsum("nji,njk->nik", elbow, five)
-    q5 = np.arctan2(turned[:, 1, 0], turned[:, 0, 0])
-    x3 = c[:, None] * across - s[:, None] * forearm
-    z3 = s[:, None] * across + c[:, None] * forearm
-    q2 = shoulder_sign * np.arctan2(np.hypot(z3[:, 0], z3[:, 1]), z3[:, 2])
-    q1 = np.arctan2(shoulder_sign * z3[:, 1], shoulder_sign * z3[:, 0])
-    # The third angle is what the first two leave: exact with the upper arm upright too, where they are arbitrary.
-    ahead = np.cos(q1) * x3[:, 0] + np.sin(q1) * x3[:, 1]
-    aside = np.cos(q1) * x3[:, 1] - np.sin(q1) * x3[:, 0]
-    q3 = np.arctan2(aside, np.cos(q2) * ahead - np.sin(q2) * x3[:, 2])
-    return np.stack([q1, q2, q3, bend, q5, q6, last], axis=1)
+    s6, c6 = np.sin(q6), np.cos(q6)
+    forearm = six[0][:, None] * s6 + six[1][:, None] * c6
+    normal = _cross(forearm, back[:, None]) * np.copysign(1.0, -c * out_x - s * out_z)  # y axis of link 3
+    normal = normal / np.sqrt(_dot(normal, normal))
+    across = _cross(normal, forearm)  # x axis of link 4
+    five = six[0][:, None] * c6 - six[1][:, None] * s6  # x axis of link 5
+    q5 = np.arctan2(_dot(normal, five), _dot(across, five))
+    x3 = c * across - s * forearm
+    z3 = s * across + c * forearm
+    tilt = np.arctan2(np.hypot(z3[0], z3[1]), z3[2])
+    angles = np.empty((len(last), BRANCHES, JOINTS))
+    for number, sign in enumerate((1.0, -1.0)):
+        q1, q2 = np.arctan2(sign * z3[1], sign * z3[0]), sign * tilt
+        # The third angle is what the first two leave: exact with the upper arm upright too, where they are arbitrary.
+        s1, c1 = np.sin(q1), np.cos(q1)
+        q3 = np.arctan2(c1 * x3[1] - s1 * x3[0], np.cos(q2) * (c1 * x3[0] + s1 * x3[1]) - np.sin(q2) * x3[2])
+        for joint, column in enumerate((q1, q2, q3, bend, q5, q6, last)):
+            angles[:, number::2, joint] = column.T if column.ndim == 2 else column[:, None]
+    return angles
+
+
+def _dot(one: FloatArray, other: FloatArray) -> FloatArray:
+    """Inner products of vectors that lie along the first axis: written out, as these arrays are small."""
+    return np.asarray(one[0] * other[0] + one[1] * other[1] + one[2] * other[2])
+
+
+def _cross(one: FloatArray, other: FloatArray) -> FloatArray:
+    """Cross products of vectors that lie along the first axis."""
+    return np.stack(
+        (
+            one[1] * other[2] - one[2] * other[1],
+            one[2] * other[0] - one[0] * other[2],
+            one[0] * other[1] - one[1] * other[0],
+        )
+    )
+
+
+def _about_z_then_tilted(angles: FloatArray) -> FloatArray:
+    """Rotations about z, then by a right angle back about x, shape (n, 3, 3)."""
+    found = np.zeros((len(angles), 3, 3))
+    found[:, 0, 0] = found[:, 1, 2] = np.cos(angles)
+    found[:, 1, 0] = np.sin(angles)
+    found[:, 0, 2] = -found[:, 1, 0]
+    found[:, 2, 1] = -1.0
+    return found
 
 
 def about_z(angles: FloatArray) -> FloatArray:
     """Rotations about z, shape (n, 3, 3)."""
-    s, c, o = np.sin(angles), np.cos(angles), np.zeros(len(angles))
-    return np.stack([np.stack([c, -s, o], 1), np.stack([s, c, o], 1), np.stack([o, o, o + 1], 1)], 1)
-
-
-def _tilt(sign: int) -> FloatArray:
-    """Rotation by a right angle about x."""
-    return np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -sign], [0.0, sign, 0.0]])
+    found = np.zeros((len(angles), 3, 3))
+    found[:, 0, 0] = found[:, 1, 1] = np.cos(angles)
+    found[:, 1, 0] = np.sin(angles)
+    found[:, 0, 1] = -found[:, 1, 0]
+    found[:, 2, 2] = 1.0
+    return found
 
 
 _CHAIN: Final = (
-    (np.array([0.0, 0.0, SHOULDER_M]), np.eye(3)),
-    (np.zeros(3), _tilt(-1)),
-    (np.array([0.0, -UPPER_M, 0.0]), _tilt(1)),
-    (np.array([ELBOW_M, 0.0, 0.0]), _tilt(1)),
-    (np.array([-ELBOW_M, FOREARM_M, 0.0]), _tilt(-1)),
-    (np.zeros(3), _tilt(1)),
-    (np.array([WRIST_M, 0.0, 0.0]), _tilt(1)),
+    (0.0, 0.0, SHOULDER_M, 0),
+    (0.0, 0.0, 0.0, -1),
+    (0.0, -UPPER_M, 0.0, 1),
+    (ELBOW_M, 0.0, 0.0, 1),
+    (-ELBOW_M, FOREARM_M, 0.0, -1),
+    (0.0, 0.0, 0.0, 1),
+    (WRIST_M, 0.0, 0.0, 1),
 )
-"""Where each joint sits on the link before it, and how its axis is tilted against that link."""
+"""Where each joint sits on the link before it, x, y, z, and by how many right angles about x its axis is tilted against it."""

@@ -36,6 +36,8 @@ LOOKED_AT: Final = 160
 """Of all solutions, this many of the most comfortable ones are compared with what is around."""
 RANK: Final = 0.2
 """What a place further down the list of tracks weighs against the strain of joints."""
+FOLLOWED: Final = 40
+"""Solutions whose ways are worked out at once: one way costs nearly as much as many do."""
 OFFERED: Final = 3
 """Ways of one batch that are offered."""
 BATCH: Final = 12
@@ -102,6 +104,7 @@ class Reach:
         """
         self._also = also
         self._boxes = boxes
+        self._standing = boxes.without(("floor",))
         self._at_work = at_work
         self._held = held
         self.hindrance = ""
@@ -171,21 +174,26 @@ class Reach:
         best = _best_of_each(base[rows], comfort, max(4, LOOKED_AT // len(bases)))
         rows, branches = rows[best], branches[best]
         clear = self._free(found[rows, branches], self._at_work, None, TOUCH_M)
+        rows, branches = rows[clear], branches[clear]
         ways: list[Way] = []
-        for row, branch in zip(rows[clear].tolist(), branches[clear].tolist(), strict=True):
-            number = numbers[int(track[row])]
-            postures = _followed(tracks[number], bases[base[row]], lift[row], last[row], branch)
-            if postures is None or any(_alike(postures[0], way.postures[0]) for way in ways):
-                continue
-            if self._passes(tracks[number], postures):
-                ways.append(Way(postures, number))
-                if len(ways) == OFFERED:
-                    break
+        for start in range(0, len(rows), FOLLOWED):
+            some = rows[start : start + FOLLOWED]
+            along = [tracks[numbers[number]] for number in track[some].tolist()]
+            followed = _followed(
+                along, bases[base[some]], lift[some], last[some], branches[start : start + FOLLOWED]
+            )
+            for row, one, postures in zip(some.tolist(), along, followed, strict=True):
+                if postures is None or any(_alike(postures[0], way.postures[0]) for way in ways):
+                    continue
+                if self._passes(one, postures):
+                    ways.append(Way(postures, numbers[int(track[row])]))
+                    if len(ways) == OFFERED:
+                        return ways
         return ways
 
     def _passes(self, track: Track, postures: FloatArray) -> bool:
         trunk, radii = body.trunk_balls(postures[:1])
-        hit = strikes(self._boxes.without(("floor",)), trunk, radii, TOUCH_M)
+        hit = strikes(self._standing, trunk, radii, TOUCH_M)
         if hit[0] >= 0:
             return False
         for mask, held in ((~track.loaded, None), (track.loaded, self._held)):
@@ -248,15 +256,27 @@ def _combinations(
     return track, base, np.clip(lift, 0.0, body.LIFT_M - LIFT_SPARE_M), last
 
 
-def _followed(track: Track, base: FloatArray, lift: float, last: float, branch: int) -> FloatArray | None:
-    """Postures along a track with base, lift and last joint at rest, None where it leaves the arm's reach or jumps."""
-    count = len(track.position)
-    found = body.solve(
-        track.rotation, track.position, np.tile(base, (count, 1)), np.full(count, lift), np.full(count, last)
-    )[:, branch]
-    if np.isnan(found).any() or np.abs(np.diff(found[:, 4:], axis=0)).max(initial=0.0) > JUMP_RAD:
-        return None
-    return found
+def _followed(
+    tracks: Sequence[Track], bases: FloatArray, lifts: FloatArray, last: FloatArray, branches: FloatArray
+) -> list[FloatArray | None]:
+    """Postures along each of n tracks with base, lift and last joint at rest, None where it leaves the arm's reach or jumps.
+
+    bases: (n, 3), lifts: (n,), last: (n,), branches: (n,).
+    """
+    counts = np.array([len(track.position) for track in tracks])
+    row = np.repeat(np.arange(len(tracks)), counts)
+    rotation = np.concatenate([track.rotation for track in tracks])
+    position = np.concatenate([track.position for track in tracks])
+    found = body.solve(rotation, position, bases[row], lifts[row], last[row])
+    chosen = found[np.arange(len(row)), branches[row]]
+    ends = np.cumsum(counts)
+    parts = [chosen[end - count : end] for count, end in zip(counts.tolist(), ends.tolist(), strict=True)]
+    return [
+        None
+        if np.isnan(part[:, -1]).any() or np.abs(np.diff(part[:, 4:], axis=0)).max(initial=0.0) > JUMP_RAD
+        else part
+        for part in parts
+    ]
 
 
 def _strain(postures: FloatArray) -> FloatArray:
