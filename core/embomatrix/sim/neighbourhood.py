@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 CELL_M: Final = 0.5
 WIDE_CELLS: Final = 64
 """A box over more cells than this is looked at in every query instead: a carpet, or a thing thrown far away."""
+SPANS_KEPT: Final = 1024
 
 Cell = tuple[int, int]
 Extent = tuple[float, float, float, float, float, float]
@@ -26,6 +27,8 @@ class Neighbourhood:
         self._cells: dict[Cell, dict[int, Extent]] = {}
         """The boxes over each cell. Those over very many are in one place of their own."""
         self._wide: dict[int, Extent] = {}
+        self._seen: dict[tuple[int, int, int, int], list[dict[int, Extent]]] = {}
+        """Places over spans that were asked for, good until there is another cell."""
         self._homes: dict[int, list[dict[int, Extent]]] = {}
         self._spans: dict[int, tuple[int, int, int, int]] = {}
 
@@ -58,34 +61,38 @@ class Neighbourhood:
             for number, (a, b, c, d, e, f) in place.items()
             if c <= high_z and f >= low_z and a <= high_x and d >= low_x and b <= high_y and e >= low_y
         ]
-        return sorted(set(found)) if len(places) > 1 else sorted(found)
+        return sorted(set(found))
 
     def _places(self, span: tuple[int, int, int, int]) -> list[dict[int, Extent]]:
         """Where the boxes over a span are kept; some may be in several places."""
+        known = self._seen.get(span)
+        if known is None:
+            if len(self._seen) >= SPANS_KEPT:
+                self._seen.clear()
+            known = self._seen[span] = [self._wide, *self._cells_of(span)]
+        return known
+
+    def _cells_of(self, span: tuple[int, int, int, int]) -> list[dict[int, Extent]]:
         first_i, first_j, last_i, last_j = span
-        places = [self._wide] if self._wide else []
-        if first_i == last_i and first_j == last_j:
-            place = self._cells.get((first_i, first_j))
-            return [*places, place] if place else places
         if (last_i - first_i + 1) * (last_j - first_j + 1) > WIDE_CELLS:
-            return [*places, *self._cells.values()]
+            return list(self._cells.values())
         cells = self._cells
-        for i in range(first_i, last_i + 1):
-            for j in range(first_j, last_j + 1):
-                place = cells.get((i, j))
-                if place:
-                    places.append(place)
-        return places
+        places = (cells.get((i, j)) for i in range(first_i, last_i + 1) for j in range(first_j, last_j + 1))
+        return [place for place in places if place is not None]
 
     def _homes_of(self, span: tuple[int, int, int, int]) -> list[dict[int, Extent]]:
         first_i, first_j, last_i, last_j = span
         if (last_i - first_i + 1) * (last_j - first_j + 1) > WIDE_CELLS:
             return [self._wide]
-        return [
+        count = len(self._cells)
+        homes = [
             self._cells.setdefault((i, j), {})
             for i in range(first_i, last_i + 1)
             for j in range(first_j, last_j + 1)
         ]
+        if len(self._cells) != count:
+            self._seen.clear()
+        return homes
 
 
 def _span(low_x: float, low_y: float, high_x: float, high_y: float) -> tuple[int, int, int, int]:

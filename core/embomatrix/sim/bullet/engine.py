@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.sim.bounds import IDENTITY, AssetBounds, forget
+from embomatrix.sim.bounds import IDENTITY, bounds_of, forget
 from embomatrix.sim.bullet.bodies import PART_LIMIT
 from embomatrix.sim.bullet.client import ClientPool, pybullet
 from embomatrix.sim.bullet.mini_world import MiniWorld, Still
@@ -30,6 +30,7 @@ from embomatrix.sim.validation import check_fractions, check_pose, check_scene
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+    from embomatrix.sim.bounds import AssetBounds
     from embomatrix.sim.prepared import Prepared
     from embomatrix.world.geometry import Aabb, Pose
     from embomatrix.world.scene import Scene
@@ -62,13 +63,14 @@ class BulletEngine:
         self._index = {item.name: number for number, item in enumerate(scene.objects)}
         self._names = tuple(self._index)
         self._assets = [scene.assets[item.asset_id] for item in scene.objects]
-        self._bounds: dict[str, AssetBounds] = {}
+        self._bounds: dict[int, AssetBounds] = {}
         self._poses = [item.pose_world_asset for item in scene.objects]
         self._fractions = [tuple(item.joints) for item in scene.objects]
         self._present = [not item.absent for item in scene.objects]
         self._boxes = (
             list(prepared.object_boxes) if prepared else list(map(self._box, range(len(self._names))))
         )
+        self._boxes_at_start = tuple(self._boxes)
         self._around = Neighbourhood()
         for number, box in enumerate(self._boxes):
             if self._present[number]:
@@ -79,6 +81,8 @@ class BulletEngine:
             self._walls_around.put(number, box)
         self._journal = Journal()
         self._changed: set[int] = set()
+        self._chunks: dict[int, bytes] = {}
+        """What ``state_bytes`` says of objects that changed, for as long as it is so."""
         self._bodies = SceneBodies(self._client, scene)
 
     @property
@@ -98,14 +102,22 @@ class BulletEngine:
         for number in sorted(self._changed):
             item = self._scene.objects[number]
             self._present[number] = not item.absent
-            self._put(number, item.pose_world_asset)
-            self._put_joints(number, tuple(item.joints))
+            self._poses[number] = item.pose_world_asset
+            self._bodies.move(number, item.pose_world_asset)
+            if self._fractions[number] != item.joints:
+                self._fractions[number] = tuple(item.joints)
+                self._bodies.turn(number, item.joints)
+            self._bound(number, self._boxes_at_start[number])
         self._changed.clear()
+        self._chunks.clear()
         self._journal.begin_round()
 
     def pose(self, name: str) -> Pose:
         """Pose of the object's asset frame in the world; of a parked object the last one that it had."""
-        return self._poses[self._number(name)]
+        try:
+            return self._poses[self._index[name]]
+        except KeyError:
+            raise self._unknown(name) from None
 
     def set_pose(self, name: str, pose: Pose) -> None:
         """Teleport the object. One that was parked is back in the world."""
@@ -119,11 +131,17 @@ class BulletEngine:
 
     def aabb(self, name: str) -> Aabb:
         """Bounding box in the world, with the joints as they are now."""
-        return self._boxes[self._number(name)]
+        try:
+            return self._boxes[self._index[name]]
+        except KeyError:
+            raise self._unknown(name) from None
 
     def joints(self, name: str) -> tuple[float, ...]:
         """Joint positions as shares of their travel: 0 closed, 1 open, in the order of the asset's joints."""
-        return self._fractions[self._number(name)]
+        try:
+            return self._fractions[self._index[name]]
+        except KeyError:
+            raise self._unknown(name) from None
 
     def set_joints(self, name: str, fractions: Sequence[float]) -> None:
         """Set every joint of the object. Raises EngineError for a wrong number of them or one outside 0..1."""
@@ -142,7 +160,10 @@ class BulletEngine:
         self._around.take_out(number)
 
     def is_parked(self, name: str) -> bool:
-        return not self._present[self._number(name)]
+        try:
+            return not self._present[self._index[name]]
+        except KeyError:
+            raise self._unknown(name) from None
 
     def penetrates(self, name: str, margin_m: float = 0.0, ignore: frozenset[str] = NOTHING) -> str:
         """Name of one body that the object, grown by ``margin_m``, penetrates by more than 1 mm; "" when there is none.
@@ -209,14 +230,19 @@ class BulletEngine:
 
     def state_bytes(self) -> bytes:
         """Poses, joints and parking of all objects in which they differ from the scene's, for the digest of a trace."""
-        chunks: list[bytes] = []
-        for number in sorted(self._changed):
-            item, pose = self._scene.objects[number], self._poses[number]
-            fractions, present = self._fractions[number], self._present[number]
-            if (pose, fractions, present) != (item.pose_world_asset, tuple(item.joints), not item.absent):
-                values = (*pose.position_m, *pose.quat_xyzw, *fractions)
-                chunks.append(struct.pack(f"<i?{len(values)}d", number, present, *values))
-        return b"".join(chunks)
+        chunks = self._chunks
+        for number in self._changed - chunks.keys():
+            chunks[number] = self._chunk(number)
+        return b"".join([chunks[number] for number in sorted(chunks)])
+
+    def _chunk(self, number: int) -> bytes:
+        """What ``state_bytes`` says of an object: nothing when it is as the scene has it."""
+        item, pose = self._scene.objects[number], self._poses[number]
+        fractions, present = self._fractions[number], self._present[number]
+        if (pose, fractions, present) == (item.pose_world_asset, tuple(item.joints), not item.absent):
+            return b""
+        values = (*pose.position_m, *pose.quat_xyzw, *fractions)
+        return struct.pack(f"<i?{len(values)}d", number, present, *values)
 
     def complete(self) -> Iterator[None]:
         """Make the bodies that nobody asked for yet, one at a step: work for a process that waits. Changes no answer."""
@@ -235,33 +261,36 @@ class BulletEngine:
     def _note(self, number: int) -> None:
         """Enter a change that is about to be made into the journal and the list of what a reset undoes."""
         self._changed.add(number)
+        self._chunks.pop(number, None)
         box = self._boxes[number] if self._present[number] else None
         self._journal.entries.append((self._names[number], box))
 
     def _number(self, name: str) -> int:
-        number = self._index.get(name)
-        if number is None:
-            raise EngineError(
-                f"there is no object {name!r} in scene {self._scene.scene_id!r}: expected one of its "
-                f"{len(self._names)} objects, such as {', '.join(self._names[:3])}"
-            )
-        return number
+        try:
+            return self._index[name]
+        except KeyError:
+            raise self._unknown(name) from None
+
+    def _unknown(self, name: str) -> EngineError:
+        return EngineError(
+            f"there is no object {name!r} in scene {self._scene.scene_id!r}: expected one of its "
+            f"{len(self._names)} objects, such as {', '.join(self._names[:3])}"
+        )
 
     def _put(self, number: int, pose: Pose) -> None:
         self._poses[number] = pose
         self._bodies.move(number, pose)
-        self._bound(number)
+        self._bound(number, self._box(number))
 
     def _put_joints(self, number: int, fractions: tuple[float, ...]) -> None:
         if not fractions:
             return
         self._fractions[number] = fractions
         self._bodies.turn(number, fractions)
-        self._bound(number)
+        self._bound(number, self._box(number))
 
-    def _bound(self, number: int) -> None:
-        """Bring the object's box up to date, and its place among its neighbours."""
-        box = self._box(number)
+    def _bound(self, number: int, box: Aabb) -> None:
+        """Keep the object's box, and its place among its neighbours."""
         self._boxes[number] = box
         if self._present[number]:
             self._around.put(number, box)
@@ -269,10 +298,9 @@ class BulletEngine:
             self._around.take_out(number)
 
     def _box(self, number: int) -> Aabb:
-        asset = self._assets[number]
-        bounds = self._bounds.get(asset.asset_id)
+        bounds = self._bounds.get(number)
         if bounds is None:
-            bounds = self._bounds[asset.asset_id] = AssetBounds(asset)
+            bounds = self._bounds[number] = bounds_of(self._assets[number])
         return bounds.box(self._poses[number], self._fractions[number])
 
     def _body(self, number: int) -> int:
