@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import secrets
 from dataclasses import dataclass
 from enum import StrEnum
@@ -18,7 +19,7 @@ from embomatrix.manager.events import (
 from embomatrix.rpc.status import NotFoundError, SupersededError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     from embomatrix.rpc.values import Resources
 
@@ -69,10 +70,20 @@ class Session:
 
 
 class Registry:
-    """Sessions by worker. Methods return what the state machines should hear of."""
+    """Sessions by worker; ``new_id`` names each, by default as nobody can guess.
 
-    def __init__(self, limits: LivenessLimits, *, first_epoch: int = 1) -> None:
+    Methods return what the state machines should hear of.
+    """
+
+    def __init__(
+        self,
+        limits: LivenessLimits,
+        *,
+        first_epoch: int = 1,
+        new_id: Callable[[], str] | None = None,
+    ) -> None:
         self._limits = limits
+        self._new_id = new_id or functools.partial(secrets.token_hex, 8)
         self._sessions: dict[str, Session] = {}
         self._worker_of: dict[str, str] = {}
         self._epoch = first_epoch - 1
@@ -98,7 +109,7 @@ class Registry:
         session = Session(
             worker_id=worker_id,
             boot_id=boot_id,
-            session_id=secrets.token_hex(8),
+            session_id=self._new_id(),
             epoch=self._epoch,
             resources=resources,
             last_seen_s=now_s,

@@ -21,7 +21,7 @@ from embomatrix.manager.commands import (
     SetDesired,
 )
 from embomatrix.manager.delivery import Delivery
-from embomatrix.manager.events import Event, LeaseFinished, LeasesRenewed, Tick, WorkerLost, WorkerReported
+from embomatrix.manager.intake import TICK_S, Heartbeat, Intake
 from embomatrix.manager.links import WorkerLink
 from embomatrix.manager.meter import Meter
 from embomatrix.manager.registry import Standing
@@ -40,7 +40,6 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-TICK_S: Final = 0.1
 CLEANUP_S: Final = 5.0
 
 
@@ -68,6 +67,7 @@ class ManagerRuntime:
         self.meter = Meter()
         self.runs = Runs(cluster, store, bundles, logs, self._carry_out, limits or RunLimits())
         self.started_s = time.monotonic()
+        self._intake = Intake(cluster, registry)
         self._delivery = Delivery(store, logs)
         self._links: dict[str, WorkerLink] = {}
 
@@ -84,9 +84,9 @@ class ManagerRuntime:
 
     def register(self, worker_id: str, boot_id: str, resources: Resources) -> tuple[Session, float]:
         """Open a session for a worker; returns it and the heartbeat's interval in seconds."""
-        session, events = self.registry.register(worker_id, boot_id, resources, now_s=time.monotonic())
+        session, commands = self._intake.register(worker_id, boot_id, resources, now_s=time.monotonic())
         self._close_link(worker_id)
-        self._feed(*events)
+        self._carry_out(commands)
         logger.info("worker registered worker=%s slots=%d", worker_id, resources.slots)
         return session, self.registry.interval_s
 
@@ -95,7 +95,7 @@ class ManagerRuntime:
         """The worker's stream is open for as long as this is held."""
         self._close_link(session.worker_id)
         link = self._links[session.worker_id] = WorkerLink(session)
-        self._feed(*self.registry.attach(session, now_s=time.monotonic()))
+        self._carry_out(self._intake.attach(session, now_s=time.monotonic()))
         if session.standing is Standing.DRAINING:
             link.drain()
         try:
@@ -110,36 +110,24 @@ class ManagerRuntime:
         self, link: WorkerLink, state: WorkerState | None, results: Sequence[LeaseResult], *, resync: bool
     ) -> None:
         """What a worker says on its stream; ``resync`` for the first message of a stream."""
-        session = self.registry.find(link.session.session_id, link.session.epoch)
-        events: list[Event] = self.registry.heard(session, now_s=time.monotonic())
-        finished = (*(state.finished if state is not None else ()), *results)
-        events += [LeaseFinished(session.worker_id, result.ref, result.outcome) for result in finished]
-        if state is not None:
-            if state.draining:
-                self.registry.draining(session)
-            report = WorkerReported(session.worker_id, state.residents, state.running, state.draining, resync)
-            events.append(report)
-        self._feed(*events)
+        self._carry_out(
+            self._intake.report(link.session, state, results, resync=resync, now_s=time.monotonic())
+        )
 
     def take_heartbeat(
         self, session_id: str, epoch: int, held: tuple[LeaseRef, ...], *, load: float, memory_mb: int
     ) -> float:
         """Renew the leases that the worker names; returns the seconds until the next heartbeat."""
-        session = self.registry.find(session_id, epoch)
-        session.load, session.memory_used_mb = load, memory_mb
-        events = self.registry.heard(session, now_s=time.monotonic())
-        self._feed(*events, LeasesRenewed(session.worker_id, held))
-        return self.registry.interval_s
+        beat = Heartbeat(held, load, memory_mb)
+        interval_s, commands = self._intake.heartbeat(session_id, epoch, beat, now_s=time.monotonic())
+        self._carry_out(commands)
+        return interval_s
 
     def drain_worker(self, worker_id: str) -> None:
         """The worker gets nothing new, and leaves when it has finished what it holds."""
-        self._feed(*self.registry.drain(worker_id))
+        self._carry_out(self._intake.feed(*self.registry.drain(worker_id), now_s=time.monotonic()))
         if worker_id in self._links:
             self._links[worker_id].drain()
-
-    def _feed(self, *events: Event) -> None:
-        for event in events:
-            self._carry_out(self.cluster.handle(event, now_s=time.monotonic()))
 
     def _carry_out(self, commands: Sequence[Command]) -> None:
         for command in commands:
@@ -164,12 +152,11 @@ class ManagerRuntime:
     async def _keep_time(self) -> None:
         while True:
             await asyncio.sleep(TICK_S)
-            events = self.registry.tick(now_s=time.monotonic())
-            for event in events:
-                if isinstance(event, WorkerLost):
-                    logger.warning("worker lost worker=%s: %s", event.worker_id, event.reason)
-                    self._close_link(event.worker_id)
-            self._feed(*events, Tick())
+            lost, commands = self._intake.tick(now_s=time.monotonic())
+            for event in lost:
+                logger.warning("worker lost worker=%s: %s", event.worker_id, event.reason)
+                self._close_link(event.worker_id)
+            self._carry_out(commands)
 
     async def _clean_up(self) -> None:
         while True:

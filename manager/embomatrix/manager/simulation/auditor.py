@@ -1,0 +1,149 @@
+"""The invariants, asserted on everything that the manager orders: a broken one ends the simulation."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from embomatrix.manager.commands import (
+    AcknowledgeLease,
+    CancelLease,
+    Command,
+    DeliverResult,
+    FinishBatch,
+    GiveLease,
+)
+from embomatrix.rpc.values import Completed, InfraFailure, ResidentState
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from embomatrix.rpc.values import Batch, LeaseRef, RolloutResult, WorkerState
+
+
+class BrokenInvariantError(Exception):
+    """The manager promised otherwise; says what happened to which rollout."""
+
+
+class Auditor:
+    """Watches from outside: it sees what is submitted, executed and ordered, and nothing of the manager's own books."""
+
+    def __init__(self) -> None:
+        self.submitted = 0
+        self.delivered = 0
+        self.infra_failures = 0
+        self._submitted: dict[tuple[str, str], set[str]] = {}
+        self._open: dict[tuple[str, str], set[str]] = {}
+        self._cursors: dict[tuple[str, str], int] = {}
+        self._epochs: set[int] = set()
+        self._holder: dict[str, str] = {}
+        """Who has the good lease of a rollout."""
+        self._held_by: dict[str, dict[str, LeaseRef]] = {}
+        """By worker: the good leases by rollout."""
+        self._warm: dict[str, set[str]] = {}
+        self._rollout_of: dict[LeaseRef, str] = {}
+        self._executed: set[tuple[str, str]] = set()
+
+    @property
+    def complete(self) -> bool:
+        """Whether every rollout has its outcome, and every batch its end."""
+        return not self._open
+
+    @property
+    def open_rollouts(self) -> int:
+        return self.submitted - self.delivered
+
+    def submit(self, batch: Batch) -> None:
+        key = batch.run_id, batch.batch_id
+        ids = {rollout.rollout_id for rollout in batch.rollouts}
+        self._submitted[key] = ids
+        self._open[key] = set(ids)
+        self.submitted += len(ids)
+
+    def executed(self, rollout_id: str, worker_id: str) -> None:
+        """A slot really executed this, and its result was not thrown away on the worker."""
+        self._executed.add((rollout_id, worker_id))
+
+    def watch(self, commands: Iterable[Command], *, lost: Iterable[str] = ()) -> None:
+        """Check what the manager orders; the leases of workers that it has just ``lost`` are void."""
+        for worker_id in lost:
+            for rollout_id in self._held_by.pop(worker_id, {}):
+                del self._holder[rollout_id]
+            self._warm.pop(worker_id, None)
+        for command in commands:
+            match command:
+                case GiveLease():
+                    self._give(command)
+                case CancelLease(worker_id, ref) | AcknowledgeLease(worker_id, ref):
+                    self._end(worker_id, ref)
+                case DeliverResult(run_id, batch_id, result):
+                    self._deliver((run_id, batch_id), result)
+                case FinishBatch(run_id, batch_id):
+                    self._finish((run_id, batch_id))
+                case _:
+                    pass
+
+    def report(self, worker_id: str, state: WorkerState, *, resync: bool) -> None:
+        """What the manager is about to hear. What a first state does not hold, the worker never got."""
+        self._warm[worker_id] = {
+            resident.bundle_digest for resident in state.residents if resident.state is ResidentState.WARM
+        }
+        if resync:
+            kept = set(state.running)
+            for rollout_id, ref in list(self._held_by.get(worker_id, {}).items()):
+                if ref not in kept:
+                    self._forget(rollout_id, worker_id)
+
+    def _give(self, command: GiveLease) -> None:
+        rollout_id, worker_id = command.rollout.rollout_id, command.worker_id
+        _check(
+            command.ref.lease_epoch not in self._epochs, f"epoch {command.ref.lease_epoch} was given twice"
+        )
+        _check(rollout_id not in self._holder, f"{rollout_id} has two leases at once")
+        _check(
+            command.rollout.bundle_digest in self._warm.get(worker_id, ()),
+            f"{rollout_id} was leased to {worker_id}, which never said that it has its scene",
+        )
+        self._epochs.add(command.ref.lease_epoch)
+        self._holder[rollout_id] = worker_id
+        self._held_by.setdefault(worker_id, {})[rollout_id] = command.ref
+        self._rollout_of[command.ref] = rollout_id
+
+    def _end(self, worker_id: str, ref: LeaseRef) -> None:
+        rollout_id = self._rollout_of.pop(ref, "")
+        if self._held_by.get(worker_id, {}).get(rollout_id) == ref:
+            self._forget(rollout_id, worker_id)
+
+    def _forget(self, rollout_id: str, worker_id: str) -> None:
+        del self._held_by[worker_id][rollout_id], self._holder[rollout_id]
+
+    def _deliver(self, key: tuple[str, str], result: RolloutResult) -> None:
+        rollout_id = result.rollout_id
+        _check(rollout_id in self._submitted.get(key, ()), f"{rollout_id} was never submitted")
+        _check(rollout_id in self._open.get(key, ()), f"{rollout_id} was delivered twice")
+        cursor = self._cursors.get(key, 0) + 1
+        _check(result.cursor == cursor, f"{rollout_id} has cursor {result.cursor}: expected {cursor}")
+        self._open[key].remove(rollout_id)
+        self._cursors[key] = cursor
+        self.delivered += 1
+        outcome = result.outcome
+        if isinstance(outcome, Completed):
+            evidence = (rollout_id, outcome.worker_id)
+            _check(
+                evidence in self._executed, f"{rollout_id} has a reward that {outcome.worker_id} never gave"
+            )
+            _check(
+                outcome.trace_digest == rollout_id, f"{rollout_id} has the reward of {outcome.trace_digest}"
+            )
+        elif isinstance(outcome, InfraFailure):
+            _check(not hasattr(outcome, "reward"), f"{rollout_id} failed and has a reward")
+            self.infra_failures += 1
+
+    def _finish(self, key: tuple[str, str]) -> None:
+        left = self._open.get(key)
+        _check(left is not None and not left, f"batch {key[1]} ended with {len(left or ())} rollouts open")
+        self._open.pop(key)
+
+
+def _check(holds: bool, what: str) -> None:
+    if not holds:
+        raise BrokenInvariantError(what)

@@ -1,0 +1,178 @@
+"""The manager in the simulation: its real intake, state machines and registry, with simulated streams around them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.manager.commands import (
+    AcknowledgeLease,
+    CancelLease,
+    DeliverResult,
+    FinishBatch,
+    GiveLease,
+    SetDesired,
+)
+from embomatrix.manager.events import BatchSubmitted, LookaheadAnnounced
+from embomatrix.manager.intake import TICK_S, Heartbeat
+from embomatrix.rpc.values import Lease
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+
+    from embomatrix.manager.commands import Command
+    from embomatrix.manager.intake import Intake
+    from embomatrix.manager.registry import Session
+    from embomatrix.manager.simulation.agenda import Agenda
+    from embomatrix.manager.simulation.auditor import Auditor
+    from embomatrix.manager.simulation.gauge import Gauge
+    from embomatrix.rpc.values import (
+        Batch,
+        LeaseRef,
+        LeaseResult,
+        LookaheadEntry,
+        Resources,
+        RolloutResult,
+        WorkerState,
+    )
+
+REPORTS: Final = {True: "first report", False: "report"}
+
+
+@dataclass(slots=True)
+class Letter:
+    """What a worker is told at once. ``desired`` is None when it did not change."""
+
+    desired: tuple[str, ...] | None = None
+    leases: list[Lease] = field(default_factory=list)
+    ended: list[LeaseRef] = field(default_factory=list)
+    """Acknowledged results: to be forgotten."""
+    cancelled: list[LeaseRef] = field(default_factory=list)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stream:
+    """Where a worker hears the manager. ``ended`` tells it that its session is over."""
+
+    take: Callable[[Letter], None]
+    ended: Callable[[], None]
+
+
+class Front:
+    """Calls arrive here in simulated time and are answered at once; deciding costs real CPU, which the gauge notes."""
+
+    def __init__(self, agenda: Agenda, intake: Intake, auditor: Auditor, gauge: Gauge) -> None:
+        self._agenda = agenda
+        self._intake = intake
+        self._auditor = auditor
+        self._gauge = gauge
+        self._streams: dict[str, Stream] = {}
+        self._trainers: dict[str, Callable[[Sequence[RolloutResult]], None]] = {}
+
+    def keep_time(self) -> None:
+        """Tick, for as long as the simulation runs."""
+        with self._gauge.deciding("tick"):
+            lost, commands = self._intake.tick(now_s=self._agenda.now_s)
+        names = [event.worker_id for event in lost]
+        for name in names:
+            self._gauge.counts["workers lost"] += 1
+            self._end_stream(name)
+        self._carry_out(commands, lost=names)
+        self._agenda.after(TICK_S, self.keep_time)
+
+    def register(self, worker_id: str, boot_id: str, resources: Resources) -> Session:
+        with self._gauge.deciding("register"):
+            session, commands = self._intake.register(worker_id, boot_id, resources, now_s=self._agenda.now_s)
+        self._end_stream(worker_id)
+        self._carry_out(commands, lost=(worker_id,))
+        return session
+
+    def attach(self, session: Session, state: WorkerState, stream: Stream) -> None:
+        """A stream opens with the worker's full state. Raises SupersededError."""
+        session = self._intake.registry.find(session.session_id, session.epoch)
+        self._end_stream(session.worker_id)
+        self._streams[session.worker_id] = stream
+        self._carry_out(self._intake.attach(session, now_s=self._agenda.now_s))
+        self.report(session, state, (), resync=True)
+
+    def detach(self, session: Session, stream: Stream) -> None:
+        if self._streams.get(session.worker_id) is stream:
+            del self._streams[session.worker_id]
+            self._intake.registry.detach(session, now_s=self._agenda.now_s)
+
+    def report(
+        self,
+        session: Session,
+        state: WorkerState | None,
+        results: Sequence[LeaseResult],
+        *,
+        resync: bool = False,
+    ) -> None:
+        """Raises SupersededError."""
+        if state is not None:
+            self._auditor.report(session.worker_id, state, resync=resync)
+        with self._gauge.deciding("result" if state is None else REPORTS[resync]):
+            commands = self._intake.report(session, state, results, resync=resync, now_s=self._agenda.now_s)
+        self._carry_out(commands)
+
+    def heartbeat(self, session: Session, held: tuple[LeaseRef, ...]) -> float:
+        """Raises SupersededError."""
+        with self._gauge.deciding("heartbeat"):
+            interval_s, commands = self._intake.heartbeat(
+                session.session_id, session.epoch, Heartbeat(held), now_s=self._agenda.now_s
+            )
+        self._carry_out(commands)
+        return interval_s
+
+    def open_run(self, run_id: str, take: Callable[[Sequence[RolloutResult]], None]) -> None:
+        """The run's results are handed to ``take`` as they come."""
+        self._trainers[run_id] = take
+
+    def announce(self, run_id: str, version: int, entries: tuple[LookaheadEntry, ...]) -> None:
+        with self._gauge.deciding("look-ahead"):
+            event = LookaheadAnnounced(run_id, version, entries)
+            commands = self._intake.feed(event, now_s=self._agenda.now_s)
+        self._carry_out(commands)
+
+    def submit(self, batch: Batch) -> None:
+        self._auditor.submit(batch)
+        with self._gauge.deciding("batch"):
+            commands = self._intake.feed(BatchSubmitted(batch), now_s=self._agenda.now_s)
+        self._carry_out(commands)
+
+    def _end_stream(self, worker_id: str) -> None:
+        stream = self._streams.pop(worker_id, None)
+        if stream is not None:
+            stream.ended()
+
+    def _carry_out(self, commands: Sequence[Command], *, lost: Iterable[str] = ()) -> None:
+        self._auditor.watch(commands, lost=lost)
+        letters: dict[str, Letter] = {}
+        results: dict[str, list[RolloutResult]] = {}
+        for command in commands:
+            match command:
+                case DeliverResult(run_id, _, result):
+                    results.setdefault(run_id, []).append(result)
+                case FinishBatch():
+                    pass
+                case _:
+                    _write(letters.setdefault(command.worker_id, Letter()), command)
+        for worker_id, letter in letters.items():
+            # Without a stream the command is lost; the worker's next full state shows that.
+            stream = self._streams.get(worker_id)
+            if stream is not None:
+                stream.take(letter)
+        for run_id, found in results.items():
+            self._trainers[run_id](found)
+
+
+def _write(letter: Letter, command: SetDesired | GiveLease | CancelLease | AcknowledgeLease) -> None:
+    match command:
+        case SetDesired(_, scenes):
+            letter.desired = scenes
+        case GiveLease(_, ref, rollout, deadline_s):
+            letter.leases.append(Lease(ref, rollout, deadline_s))
+        case CancelLease(_, ref):
+            letter.cancelled.append(ref)
+        case AcknowledgeLease(_, ref):
+            letter.ended.append(ref)

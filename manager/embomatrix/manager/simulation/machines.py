@@ -1,0 +1,98 @@
+"""The machines and scenes of a scenario, drawn from its seed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from embomatrix.rpc.values import Resources
+
+if TYPE_CHECKING:
+    from embomatrix.manager.simulation.scenario import MachineKind, Scenario
+
+DURATIONS = 4096
+"""Distinct execution times: rollouts take them in turn, which costs less than drawing one for each."""
+
+
+@dataclass(frozen=True, slots=True)
+class Machine:
+    """A worker's hardware and its way to the manager. ``speed`` is the true one; ``resources`` say what it claims."""
+
+    worker_id: str
+    kind: str
+    resources: Resources
+    speed: float
+    latency_s: float
+    bandwidth_mb_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class SceneSize:
+    """What a scene costs on a machine of speed 1."""
+
+    digest: str
+    memory_mb: float
+    load_s: float
+    bundle_mb: float
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """A scenario with its dice thrown. ``execute_s`` are the durations that rollouts take in turn."""
+
+    machines: tuple[Machine, ...]
+    scenes: dict[str, SceneSize]
+    execute_s: tuple[float, ...]
+
+    @property
+    def slots(self) -> int:
+        return sum(machine.resources.slots for machine in self.machines)
+
+
+def rng_for(scenario: Scenario, *key: int) -> np.random.Generator:
+    """The generator of one part of the scenario: parts do not disturb one another."""
+    return np.random.default_rng(np.random.SeedSequence((scenario.seed, *key)))
+
+
+def setting_of(scenario: Scenario) -> Setting:
+    """Draw machines, scenes and durations."""
+    rng = rng_for(scenario, 1)
+    sizes = scenario.scenes
+    memory = sizes.memory_mb * np.exp(rng.normal(0.0, sizes.memory_spread, sizes.count))
+    load = sizes.load_s * np.exp(rng.normal(0.0, sizes.load_spread, sizes.count))
+    digests = [f"scene-{index:05d}" for index in range(sizes.count)]
+    scenes = {
+        digest: SceneSize(digest, float(memory[at]), float(load[at]), sizes.bundle_mb)
+        for at, digest in enumerate(digests)
+    }
+    spread = np.exp(rng.normal(0.0, scenario.execute_spread, DURATIONS))
+    durations = tuple(float(value) for value in scenario.execute_s * spread)
+    return Setting(_machines(scenario, rng), scenes, durations)
+
+
+def _machines(scenario: Scenario, rng: np.random.Generator) -> tuple[Machine, ...]:
+    shares = np.array([kind.share for kind in scenario.kinds])
+    # The shares hold as exactly as whole machines allow, in an order that the seed gives.
+    edges = np.round(np.cumsum(shares) / shares.sum() * scenario.workers).astype(int)
+    kinds: list[MachineKind] = []
+    for kind, edge in zip(scenario.kinds, edges, strict=True):
+        kinds += [kind] * (int(edge) - len(kinds))
+    order = rng.permutation(len(kinds))
+    slow = rng.permutation(len(kinds)) < round(scenario.faults.slow_workers * len(kinds))
+    machines = []
+    for index, at in enumerate(order):
+        kind = kinds[at]
+        speed = kind.speed * float(rng.uniform(0.9, 1.1))
+        machines.append(
+            Machine(
+                worker_id=f"w{index:05d}",
+                kind=kind.name,
+                resources=Resources(kind.slots, kind.slots, kind.memory_mb, round(speed, 3)),
+                speed=speed / scenario.faults.slowness if slow[index] else speed,
+                latency_s=kind.latency_s * float(rng.uniform(0.5, 2.0)),
+                bandwidth_mb_s=kind.bandwidth_mb_s,
+            )
+        )
+    return tuple(machines)

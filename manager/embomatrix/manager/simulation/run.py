@@ -1,0 +1,184 @@
+"""A simulation from its scenario to its report. The invariants are asserted throughout; a broken one ends it."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.manager.cluster_state import ClusterState
+from embomatrix.manager.intake import Intake
+from embomatrix.manager.meter import quantile
+from embomatrix.manager.registry import Registry
+from embomatrix.manager.simulation.agenda import Agenda
+from embomatrix.manager.simulation.auditor import Auditor, BrokenInvariantError
+from embomatrix.manager.simulation.front import Front
+from embomatrix.manager.simulation.gauge import Gauge
+from embomatrix.manager.simulation.machines import rng_for, setting_of
+from embomatrix.manager.simulation.trainer import SimulatedTrainer
+from embomatrix.manager.simulation.worker import SimulatedWorker
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from embomatrix.manager.simulation.gauge import Cost
+    from embomatrix.manager.simulation.scenario import Scenario
+    from embomatrix.rpc.values import RunStats
+
+SAMPLE_S: Final = 0.1
+"""The slots are looked at this often, to see how many are at work while there is work for all."""
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """What came of a simulation. Times are simulated seconds, but for CPU times, which are real."""
+
+    scenario: Scenario
+    slots: int
+    submitted: int
+    delivered: int
+    infra_failures: int
+    stats: RunStats
+    elapsed_s: float
+    """From the first step's begin to the last result."""
+    waits_s: tuple[float, ...]
+    queued_p50_s: float
+    queued_p99_s: float
+    utilisation: float
+    """Share of the slots' time in which they executed something, from the first step's begin on."""
+    pressed_utilisation: float
+    """The same, while at least as many rollouts were open as there are slots; 1 when that never was."""
+    loads: int
+    loads_unused: int
+    cpu_s: float
+    costs: Mapping[str, Cost]
+    counts: Mapping[str, int]
+
+    @property
+    def hit_rate(self) -> float:
+        """Share of the batches whose scene was warm when they came."""
+        asked = self.stats.prewarm_hits + self.stats.prewarm_misses
+        return self.stats.prewarm_hits / asked if asked else 1.0
+
+    @property
+    def waste(self) -> float:
+        """Share of the loads that no rollout ever used."""
+        return self.loads_unused / self.loads if self.loads else 0.0
+
+    @property
+    def stall(self) -> float:
+        """Share of the time in which trainers waited for nothing but results."""
+        return sum(self.waits_s) / (self.elapsed_s * len(self.scenario.trainers))
+
+    @property
+    def cpu_us_per_rollout(self) -> float:
+        """The manager's decisions, all of them, shared among the rollouts."""
+        return 1e6 * self.cpu_s / self.delivered
+
+    @property
+    def manager_load(self) -> float:
+        """CPU seconds of decisions in a simulated second: above 1 one manager can't keep up."""
+        return self.cpu_s / (self.elapsed_s + self.scenario.trainers[0].start_s)
+
+
+class Simulation:
+    """One cluster. ``run`` once."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._scenario = scenario
+        self._setting = setting_of(scenario)
+        self._agenda = Agenda()
+        self._auditor = Auditor()
+        self._gauge = Gauge()
+        self._cluster = ClusterState(scenario.dispatch, scenario.schedule, boot_id="simulated")
+        numbers = iter(range(1 << 62))
+        registry = Registry(scenario.liveness, new_id=lambda: f"session-{next(numbers)}")
+        self._front = Front(self._agenda, Intake(self._cluster, registry), self._auditor, self._gauge)
+        self._workers = self._hire()
+        self._trainers = [
+            SimulatedTrainer(
+                plan,
+                list(self._setting.scenes),
+                self._agenda,
+                self._front,
+                self._gauge,
+                rng_for(scenario, 3, at),
+            )
+            for at, plan in enumerate(scenario.trainers)
+        ]
+
+    def run(self) -> Report:
+        """Raises BrokenInvariantError when an invariant does not hold, or rollouts have no outcome in time."""
+        self._front.keep_time()
+        self._agenda.after(0.0, self._look)
+        in_time = self._agenda.run(until=self._ended, limit_s=self._scenario.limit_s)
+        if not in_time or not self._auditor.complete or self._cluster.dispatcher.live_leases:
+            raise BrokenInvariantError(
+                f"after {self._agenda.now_s:.0f} s {self._auditor.delivered} of {self._scenario.rollouts} rollouts have "
+                f"an outcome, {len(self._cluster.dispatcher.live_leases)} leases live"
+            )
+        return self._report()
+
+    def _hire(self) -> list[SimulatedWorker]:
+        joins = rng_for(self._scenario, 2).uniform(0.0, self._scenario.join_s, len(self._setting.machines))
+        workers = []
+        for at, machine in enumerate(self._setting.machines):
+            worker = SimulatedWorker(
+                machine,
+                self._scenario,
+                self._setting,
+                self._agenda,
+                self._front,
+                self._auditor,
+                self._gauge,
+                random.Random(f"{self._scenario.seed}.{at}"),
+            )
+            self._agenda.after(float(joins[at]), worker.boot)
+            workers.append(worker)
+        return workers
+
+    def _ended(self) -> bool:
+        return all(trainer.done for trainer in self._trainers)
+
+    def _look(self) -> None:
+        open_now = self._auditor.open_rollouts
+        if open_now >= self._setting.slots:
+            at_work = sum(worker.slots.executing for worker in self._workers if worker.slots is not None)
+            self._gauge.pressed.append((at_work, self._setting.slots))
+        self._agenda.after(SAMPLE_S, self._look)
+
+    def _report(self) -> Report:
+        for worker in self._workers:
+            if worker.slots is not None:
+                worker.slots.count_unused()
+        began_s = min(plan.start_s for plan in self._scenario.trainers)
+        elapsed_s = max(trainer.ended_s for trainer in self._trainers) - began_s
+        gauge = self._gauge
+        at_work, there = (
+            (sum(column) for column in zip(*gauge.pressed, strict=True)) if gauge.pressed else (1, 1)
+        )
+        queued = sorted(gauge.queued_s)
+        return Report(
+            scenario=self._scenario,
+            slots=self._setting.slots,
+            submitted=self._auditor.submitted,
+            delivered=self._auditor.delivered,
+            infra_failures=self._auditor.infra_failures,
+            stats=self._cluster.totals(),
+            elapsed_s=elapsed_s,
+            waits_s=tuple(gauge.waits_s),
+            queued_p50_s=quantile(queued, 0.5),
+            queued_p99_s=quantile(queued, 0.99),
+            utilisation=gauge.busy_s / (elapsed_s * self._setting.slots),
+            pressed_utilisation=at_work / there,
+            loads=gauge.loads,
+            loads_unused=gauge.loads_unused,
+            cpu_s=gauge.cpu_s,
+            costs=gauge.costs,
+            counts=gauge.counts,
+        )
+
+
+def simulate(scenario: Scenario) -> Report:
+    """Run it to its end. Raises BrokenInvariantError."""
+    return Simulation(scenario).run()

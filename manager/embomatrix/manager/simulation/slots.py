@@ -1,0 +1,260 @@
+"""A simulated worker's slots and residents: what it was leased it executes, what it shall hold it loads, in simulated time."""
+
+from __future__ import annotations
+
+import zlib
+from collections import deque
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.reward.breakdown import RewardBreakdown
+from embomatrix.rpc.values import (
+    Completed,
+    InfraCode,
+    InfraFailure,
+    LeaseResult,
+    Resident,
+    ResidentState,
+    Timings,
+)
+
+if TYPE_CHECKING:
+    import random
+    from collections.abc import Callable
+
+    from embomatrix.manager.simulation.agenda import Agenda
+    from embomatrix.manager.simulation.gauge import Gauge
+    from embomatrix.manager.simulation.machines import Machine, Setting
+    from embomatrix.manager.simulation.scenario import Faults
+    from embomatrix.rpc.values import Lease, LeaseRef
+
+RETRY_LOAD_S: Final = 10.0
+"""A scene that failed to load is tried again after this long, as the real worker does."""
+RESPAWN_S: Final = 0.02
+"""A slot whose process was killed or crashed has a new one after this long."""
+REWARD: Final = RewardBreakdown(0.5, 0.2, 15.0, (), False)
+
+
+@dataclass(slots=True, eq=False)
+class _Scene:
+    memory_mb: float
+    load_s: float
+    state: ResidentState = ResidentState.LOADING
+    failed_s: float = 0.0
+    last_used: int = 0
+    running: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Surroundings:
+    """What slots need of the simulation, and whom they tell."""
+
+    agenda: Agenda
+    setting: Setting
+    faults: Faults
+    dice: random.Random
+    gauge: Gauge
+    on_result: Callable[[LeaseResult], None]
+    on_change: Callable[[], None]
+
+
+class SimulatedSlots:
+    """One life of a worker's process. After ``stop`` nothing happens any more; ``fetched`` bundles outlive it on disk."""
+
+    def __init__(self, machine: Machine, around: Surroundings, fetched: set[str]) -> None:
+        self._machine = machine
+        self._around = around
+        self._fetched = fetched
+        self._stopped = False
+        self._wanted: tuple[str, ...] = ()
+        self._scenes: dict[str, _Scene] = {}
+        self._waiting: deque[tuple[Lease, float]] = deque()
+        self._running: dict[LeaseRef, tuple[Lease, float]] = {}
+        self._free = machine.resources.slots
+        self._clock = 0
+
+    @property
+    def executing(self) -> int:
+        return len(self._running)
+
+    def held(self) -> tuple[LeaseRef, ...]:
+        """Leases that run or wait."""
+        return (*self._running, *(lease.ref for lease, _ in self._waiting))
+
+    def residents(self) -> tuple[Resident, ...]:
+        return tuple(
+            Resident(
+                digest,
+                scene.state,
+                scene.load_s if scene.state is ResidentState.WARM else 0.0,
+                scene.memory_mb if scene.state is ResidentState.WARM else 0.0,
+                "no such mesh" if scene.state is ResidentState.FAILED else "",
+            )
+            for digest, scene in self._scenes.items()
+        )
+
+    def stop(self) -> None:
+        """The process ended: what it loaded and did not use was in vain."""
+        self._stopped = True
+        self._running.clear()
+        self._waiting.clear()
+
+    def count_unused(self) -> None:
+        """The simulation is over: note what was loaded and never used."""
+        for scene in self._scenes.values():
+            self._around.gauge.loads_unused += not scene.last_used
+
+    def want(self, digests: tuple[str, ...]) -> None:
+        self._wanted = digests
+        self._settle()
+
+    def submit(self, lease: Lease) -> None:
+        scene = self._scenes.get(lease.rollout.bundle_digest)
+        if scene is not None and scene.state is ResidentState.FAILED:
+            del self._scenes[lease.rollout.bundle_digest]
+        self._waiting.append((lease, self._around.agenda.now_s))
+        if scene is None or scene.state is not ResidentState.WARM:
+            self._settle()
+        self._start()
+
+    def cancel(self, refs: set[LeaseRef]) -> None:
+        """Forget these leases; slots that run them are killed and come back."""
+        for ref in [ref for ref in self._running if ref in refs]:
+            lease, began_s = self._running.pop(ref)
+            self._leave(lease, began_s)
+            self._around.agenda.after(RESPAWN_S, self._free_slot)
+        self._waiting = deque(entry for entry in self._waiting if entry[0].ref not in refs)
+
+    def _settle(self) -> None:
+        """Load what is wanted first, as many at a time as there are slots."""
+        loading = sum(scene.state is ResidentState.LOADING for scene in self._scenes.values())
+        begun = False
+        while loading < self._machine.resources.slots and not self._stopped:
+            digest = self._next_load()
+            if not digest:
+                break
+            self._load(digest)
+            loading, begun = loading + 1, True
+        if begun:
+            self._around.on_change()
+
+    def _next_load(self) -> str:
+        """The most urgent scene that is missing and for which there is room, once others have gone; or none."""
+        now_s = self._around.agenda.now_s
+        for digest, scene in list(self._scenes.items()):
+            if scene.state is ResidentState.FAILED and now_s - scene.failed_s >= RETRY_LOAD_S:
+                del self._scenes[digest]
+        wanted = tuple(dict.fromkeys((*(x.rollout.bundle_digest for x, _ in self._waiting), *self._wanted)))
+        held = {d: s for d, s in self._scenes.items() if s.state is not ResidentState.FAILED}
+        place = next((at for at, digest in enumerate(wanted) if digest not in self._scenes), None)
+        if place is None:
+            return ""
+        digest = wanted[place]
+        need_mb = self._around.setting.scenes[digest].memory_mb
+        free_mb = self._machine.resources.memory_mb - sum(scene.memory_mb for scene in held.values())
+        evicted: list[str] = []
+        for victim in _victims(wanted, place, held):
+            if need_mb <= free_mb:
+                break
+            evicted.append(victim)
+            free_mb += held[victim].memory_mb
+        if need_mb > free_mb and len(evicted) < len(held):
+            return ""
+        for victim in evicted:
+            self._around.gauge.loads_unused += not self._scenes.pop(victim).last_used
+        return digest
+
+    def _load(self, digest: str) -> None:
+        size, machine = self._around.setting.scenes[digest], self._machine
+        load_s = size.load_s / machine.speed
+        fetch_s = 0.0
+        if digest not in self._fetched:
+            self._fetched.add(digest)
+            fetch_s = 2 * machine.latency_s + size.bundle_mb / machine.bandwidth_mb_s
+        scene = self._scenes[digest] = _Scene(size.memory_mb, load_s)
+        self._around.gauge.loads += 1
+        self._around.gauge.load_s += load_s
+        fails = self._around.dice.random() < self._around.faults.load_failure
+        self._around.agenda.after(fetch_s + load_s, lambda: self._loaded(digest, scene, fails=fails))
+
+    def _loaded(self, digest: str, scene: _Scene, *, fails: bool) -> None:
+        if self._stopped or self._scenes.get(digest) is not scene:
+            return
+        scene.state = ResidentState.FAILED if fails else ResidentState.WARM
+        if fails:
+            scene.failed_s = self._around.agenda.now_s
+            self._around.agenda.after(RETRY_LOAD_S, self._settle)
+            failure = InfraFailure(InfraCode.SCENE_LOAD_FAILED, "no such mesh", self._machine.worker_id)
+            for lease, _ in [entry for entry in self._waiting if entry[0].rollout.bundle_digest == digest]:
+                self.cancel({lease.ref})
+                self._around.on_result(LeaseResult(lease.ref, failure))
+        self._around.on_change()
+        self._settle()
+        self._start()
+
+    def _start(self) -> None:
+        """Give free slots the leases that wait and whose scene is warm, in order."""
+        for _ in range(len(self._waiting)):
+            if not self._free:
+                return
+            lease, taken_s = self._waiting.popleft()
+            scene = self._scenes.get(lease.rollout.bundle_digest)
+            if scene is None or scene.state is not ResidentState.WARM:
+                self._waiting.append((lease, taken_s))
+            else:
+                self._execute(lease, scene, taken_s)
+
+    def _execute(self, lease: Lease, scene: _Scene, taken_s: float) -> None:
+        around = self._around
+        self._clock += 1
+        scene.last_used = self._clock
+        scene.running += 1
+        self._free -= 1
+        began_s = around.agenda.now_s
+        self._running[lease.ref] = lease, began_s
+        rollout_id = lease.rollout.rollout_id
+        durations = around.setting.execute_s
+        seconds = durations[zlib.crc32(rollout_id.encode()) % len(durations)] / self._machine.speed
+        fate, crash, hang = around.dice.random(), around.faults.crash, around.faults.hang
+        outcome: Completed | InfraFailure
+        if fate < crash:
+            seconds *= fate / crash
+            outcome = InfraFailure(InfraCode.SLOT_CRASHED, "segmentation fault", self._machine.worker_id)
+        elif fate < crash + hang or seconds > lease.deadline_s:
+            seconds = lease.deadline_s
+            outcome = InfraFailure(InfraCode.SLOT_TIMEOUT, "killed", self._machine.worker_id)
+        else:
+            timings = Timings(began_s - taken_s, 0.0, seconds)
+            outcome = Completed(REWARD, (), (), rollout_id, self._machine.worker_id, timings, warm=True)
+        around.agenda.after(seconds, lambda: self._finished(lease, outcome))
+
+    def _finished(self, lease: Lease, outcome: Completed | InfraFailure) -> None:
+        entry = self._running.pop(lease.ref, None)
+        if self._stopped or entry is None:
+            return
+        self._leave(*entry)
+        if isinstance(outcome, Completed):
+            self._free += 1
+        else:
+            self._around.agenda.after(RESPAWN_S, self._free_slot)
+        self._around.on_result(LeaseResult(lease.ref, outcome))
+        self._start()
+
+    def _leave(self, lease: Lease, began_s: float) -> None:
+        self._around.gauge.busy_s += self._around.agenda.now_s - began_s
+        scene = self._scenes.get(lease.rollout.bundle_digest)
+        if scene is not None:
+            scene.running -= 1
+
+    def _free_slot(self) -> None:
+        self._free += 1
+        self._start()
+
+
+def _victims(wanted: tuple[str, ...], place: int, held: dict[str, _Scene]) -> list[str]:
+    """Who may go for the scene at that place, the most dispensable first: what nobody wants, then what is less urgent."""
+    kept = set(wanted)
+    unwanted = [digest for digest in held if digest not in kept and not held[digest].running]
+    unwanted.sort(key=lambda digest: held[digest].last_used)
+    later = [digest for digest in wanted[place + 1 :] if digest in held and not held[digest].running]
+    return unwanted + later[::-1]

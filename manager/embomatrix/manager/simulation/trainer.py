@@ -1,0 +1,107 @@
+"""A simulated trainer: announces its window, writes groups of plans, waits for their outcomes, and updates."""
+
+from __future__ import annotations
+
+import functools
+from typing import TYPE_CHECKING
+
+from embomatrix.rpc.values import Batch, Completed, LookaheadEntry, Rollout
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import numpy as np
+
+    from embomatrix.manager.simulation.agenda import Agenda
+    from embomatrix.manager.simulation.front import Front
+    from embomatrix.manager.simulation.gauge import Gauge
+    from embomatrix.manager.simulation.scenario import Trainer
+    from embomatrix.rpc.values import RolloutResult
+
+
+class SimulatedTrainer:
+    """One run over the scenes, in an order that ``rng`` gives: every epoch a permutation, as the real schedule."""
+
+    def __init__(
+        self,
+        plan: Trainer,
+        scenes: Sequence[str],
+        agenda: Agenda,
+        front: Front,
+        gauge: Gauge,
+        rng: np.random.Generator,
+    ) -> None:
+        self.plan = plan
+        self.done = False
+        self.ended_s = 0.0
+        self._agenda = agenda
+        self._front = front
+        self._gauge = gauge
+        self._announced, self._actual = _schedule(plan, scenes, rng)
+        self._step = 0
+        self._left = 0
+        self._sent_s = 0.0
+        front.open_run(plan.name, self._take)
+        agenda.after(plan.start_s, self._begin_step)
+
+    def _begin_step(self) -> None:
+        plan, step = self.plan, self._step
+        window = [(step, self._actual[step])] + [
+            (later, self._announced[later])
+            for later in range(step + 1, min(step + plan.lookahead, plan.steps - 1) + 1)
+        ]
+        entries = tuple(
+            LookaheadEntry(at + 1, scene, plan.group_size) for at, scenes in window for scene in scenes
+        )
+        self._agenda.after(plan.latency_s, lambda: self._front.announce(plan.name, step + 1, entries))
+        self._left = plan.groups * plan.group_size
+        for group in range(plan.groups):
+            written_s = (group + 1) / plan.groups * plan.write_s
+            self._agenda.after(written_s, functools.partial(self._send, group))
+
+    def _send(self, group: int) -> None:
+        """One batch for each group, as soon as its plans are written."""
+        plan, step = self.plan, self._step
+        name = f"{plan.name}.{step}.{group}"
+        scene = self._actual[step][group]
+        rollouts = tuple(
+            Rollout(f"{name}.{index}", name, scene, scene, (), step) for index in range(plan.group_size)
+        )
+        self._sent_s = self._agenda.now_s
+        batch = Batch(plan.name, name, step + 1, rollouts)
+        self._agenda.after(plan.latency_s, lambda: self._front.submit(batch))
+
+    def _take(self, results: Sequence[RolloutResult]) -> None:
+        self._gauge.queued_s += [
+            result.outcome.timings.queued_s for result in results if isinstance(result.outcome, Completed)
+        ]
+        self._agenda.after(self.plan.latency_s, lambda: self._count(len(results)))
+
+    def _count(self, results: int) -> None:
+        self._left -= results
+        if self._left:
+            return
+        self._gauge.waits_s.append(self._agenda.now_s - self._sent_s)
+        self._step += 1
+        if self._step < self.plan.steps:
+            self._agenda.after(self.plan.update_s, self._begin_step)
+        else:
+            self.done, self.ended_s = True, self._agenda.now_s
+
+
+def _schedule(
+    plan: Trainer, scenes: Sequence[str], rng: np.random.Generator
+) -> tuple[list[list[str]], list[list[str]]]:
+    """What each step's groups are announced to need, and what they will need."""
+    order: list[str] = []
+    while len(order) < plan.steps * plan.groups:
+        order += [scenes[at] for at in rng.permutation(len(scenes))]
+    announced = [order[step * plan.groups : (step + 1) * plan.groups] for step in range(plan.steps)]
+    actual = [
+        [
+            scenes[int(rng.integers(len(scenes)))] if rng.random() < plan.surprises else scene
+            for scene in groups
+        ]
+        for groups in announced
+    ]
+    return announced, actual
