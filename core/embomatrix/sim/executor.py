@@ -5,9 +5,10 @@ from __future__ import annotations
 import hashlib
 from typing import TYPE_CHECKING, Protocol
 
-from embomatrix.sim.actions import CachedActor
+from embomatrix.sim.actions import SWING, CachedActor
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.draws import Draws
+from embomatrix.sim.leaves import measure_swing
 from embomatrix.sim.live_world import LiveWorld
 from embomatrix.skills.check import check
 from embomatrix.skills.describe import Sight, done, final_lines, gained
@@ -19,7 +20,7 @@ from embomatrix.world.state import State
 from embomatrix.world.substances import in_words
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     import numpy as np
 
@@ -144,6 +145,20 @@ class Simulator:
         told = objects_of(task.goal, task.types) | self._touched
         names = [name for name in task.table if name in told]
         return final_lines([self._sight(name) for name in names])
+
+    def complete(self) -> Iterator[None]:
+        """Make what executions would make when they first need it, a little at a step. Changes no answer.
+
+        For a process that waits, and whose forks execute: what it makes they share.
+        """
+        world = self._world
+        yield from world.relations.footings.complete()
+        yield from world.placer.complete()
+        yield from world.navigator.complete()
+        for item in world.scene.objects:
+            if item.joints:
+                measure_swing(world.engine, item.name, (0.0, *SWING))
+                yield
 
     def close(self) -> None:
         """Free the engine and the actor. The simulator can't be used afterwards."""

@@ -11,6 +11,8 @@ from embomatrix.sim.spots import REST_M, interior_around, is_shut, is_upright, l
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from embomatrix.sim.engine import PhysicsEngine
     from embomatrix.world.asset import Asset, Interior
     from embomatrix.world.geometry import Aabb, Pose
@@ -75,6 +77,12 @@ class Footings:
         if footing is None:
             footing = known[name] = self._find(name)
         return footing
+
+    def complete(self) -> Iterator[None]:
+        """Find out how everything stands, one object at a step: work for a process that waits. Changes no answer."""
+        for item in self._scene.objects:
+            self.of(item.name)
+            yield
 
     def _read_journal(self) -> None:
         """Forget what is kept of the objects that were near to a change."""

@@ -138,3 +138,12 @@ class Leaves:
             pose = self._engine.pose(other)
             yield Rider(other, link, pose, frame.inverse() @ pose)
             waiting += [(item, link) for item in relations.resting_on(other)]
+
+
+def measure_swing(engine: PhysicsEngine, name: str, shares: Iterable[float]) -> None:
+    """Measure an object with all its joints at each of these shares of their travel, so that a swing finds it done."""
+    asset, pose = engine.scene.asset_of(name), engine.pose(name)
+    for share in shares:
+        fractions = (share,) * len(asset.joints)
+        bounds_of(asset).box(pose, fractions)
+        parts_of(asset).leaves(pose, fractions)

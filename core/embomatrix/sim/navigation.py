@@ -225,6 +225,12 @@ class Navigator:
         low, high = service.window
         return service.stands(self._grid.free_centers(low, high, self._grid.label(start)))
 
+    def complete(self) -> Iterator[None]:
+        """Find out what bars the arm's way to each object, one at a step: work for a process that waits. Changes no answer."""
+        for item in self._scene.objects:
+            self._blockers_of(item.name)
+            yield
+
     def service(self, name: str) -> Service:
         """What a place must offer from which the robot works on the object."""
         # The front is that of the fixed furniture which the object stands in or on, or its own.

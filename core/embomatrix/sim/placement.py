@@ -65,6 +65,15 @@ class Placer:
         self._scene = engine.scene
         self._repertoire = Repertoire(engine.scene, cache)
 
+    def complete(self) -> Iterator[None]:
+        """Find out how everything stands by itself, one object at a step: work for a process that waits. Changes no answer."""
+        for item in self._scene.objects:
+            if not item.fixed:
+                asset = self._scene.assets[item.asset_id]
+                self._repertoire.footprint(asset)
+                self._repertoire.base(asset)
+                yield
+
     def find(
         self,
         held: str,

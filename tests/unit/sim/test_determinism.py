@@ -9,6 +9,7 @@ import pytest
 from tests.fakes.plans import plan_of, task_over
 from tests.fakes.scenes import kitchen_scene
 
+from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.pose_cache import analyse_scene
 from embomatrix.world.bundle import Bundle, decode_bundle, encode_bundle
@@ -53,6 +54,21 @@ def test_traces_do_not_depend_on_what_was_executed_before(bundle) -> None:
         assert digests(bundle, shuffled) == first
     assert digests(bundle, order[::-1]) == first
     assert len(set(first.values())) > len(PLANS)
+
+
+def test_traces_do_not_depend_on_what_a_waiting_process_made(bundle) -> None:
+    order = [(plan, seed) for plan in range(len(PLANS)) for seed in SEEDS]
+    engine = BulletEngine(bundle.scene)
+    simulator = Simulator(bundle, engine)
+    steps = sum(1 for _ in (*engine.complete(), *simulator.complete()))
+    assert steps > 3 * len(bundle.scene.objects)
+    task = task_over(bundle.scene)
+    found = {}
+    for plan, seed in order:
+        trace = simulator.execute(task, plan_of(task, PLANS[plan]), seed)
+        found[plan, seed] = f"{trace.digest} {trace.final} {trace.failure}"
+    simulator.close()
+    assert found == digests(bundle, order)
 
 
 def test_traces_do_not_depend_on_the_process(bundle, tmp_path) -> None:

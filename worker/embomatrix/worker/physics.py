@@ -75,7 +75,8 @@ class PhysicsScene:
 
     def complete(self) -> Iterator[None]:
         """Make what executions would make when they first need it."""
-        return self._engine.complete()
+        yield from self._engine.complete()
+        yield from self._simulator.complete()
 
     def close(self) -> None:
         """Give the clients back. The scene can't be used afterwards."""
