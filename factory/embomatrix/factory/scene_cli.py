@@ -25,7 +25,7 @@ from embomatrix.factory.pictures_sheet import draw_sheet
 from embomatrix.factory.relation_pictures import draw_relations
 from embomatrix.factory.scene_batch import SceneJob, run_batch
 from embomatrix.factory.scene_build import build_base_scene
-from embomatrix.factory.scene_tables import problem_lines, report_table
+from embomatrix.factory.scene_tables import TABLE_COLUMNS, problem_lines, report_table
 from embomatrix.sim.bullet.camera import render_egocentric, render_oblique
 from embomatrix.sim.engine import EngineError
 from embomatrix.world.catalog import Catalog, CatalogError
@@ -215,7 +215,7 @@ def _run(orders: Sequence[SceneJob], jobs: int) -> list[SceneReport]:
 
 def _tell(reports: Sequence[SceneReport], path: Path | None) -> None:
     console = Console()
-    console.print(report_table(reports))
+    Console(width=max(console.width, TABLE_COLUMNS)).print(report_table(reports))
     for line in problem_lines(reports):
         console.print(line, highlight=False, markup=False, soft_wrap=True)
     if path is not None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from rich.table import Table
 
@@ -12,12 +12,16 @@ if TYPE_CHECKING:
     from embomatrix.factory.scene_report import SceneReport
 
 
+TABLE_COLUMNS: Final = 100
+"""Characters that ``report_table`` needs: a file or a narrow terminal shall not cut its figures off."""
+
+
 def report_table(reports: Sequence[SceneReport]) -> Table:
     """One row a scene, and a row of sums: times are CPU seconds, ``placed`` counts of what the inventory lists."""
     table = Table(box=None, pad_edge=False)
     table.add_column("scene", no_wrap=True)
     for name in ("build s", "rooms", "placed", "listed", "movable", "stable", "wrong"):
-        table.add_column(name, justify="right")
+        table.add_column(name, justify="right", no_wrap=True)
     for report in reports:
         if report.error:
             table.add_row(_name(report), "not built")

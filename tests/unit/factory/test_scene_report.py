@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import io
 import json
 import os
 from dataclasses import replace
@@ -8,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from rich.console import Console
 from typer.testing import CliRunner
 
 from embomatrix.factory.scene_batch import SceneJob, run_batch
@@ -15,6 +17,7 @@ from embomatrix.factory.scene_check import STABLE_SHARE, ProblemKind, check_scen
 from embomatrix.factory.scene_cli import app
 from embomatrix.factory.scene_floor import ReachableFloor
 from embomatrix.factory.scene_report import report_of, report_on, unaccounted
+from embomatrix.factory.scene_tables import TABLE_COLUMNS, report_table
 from embomatrix.world.catalog import Catalog, CatalogError
 from embomatrix.world.codec import scene_from_json
 from embomatrix.world.geometry import Part, Pose, Shape
@@ -193,3 +196,11 @@ def test_all_51_scenes_are_built_and_keep_every_rule(seed: int) -> None:
     assert sum(report.rooms for report in reports) == 374
     wrong = {report.scene_id: report.error or report.problems for report in reports if not report.sound}
     assert not wrong
+
+
+def test_a_table_of_scenes_with_seeds_fits_the_width_it_is_printed_with(flat: Scene) -> None:
+    report = replace(report_of(flat), scene_id="school_computer_lab_and_infirmary", seed=100)
+    out = io.StringIO()
+    Console(file=out, width=TABLE_COLUMNS).print(report_table([report, report]))
+    assert "…" not in out.getvalue()
+    assert out.getvalue().splitlines()[1].split()[-2:] == ["100.0%", "0"]

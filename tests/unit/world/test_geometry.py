@@ -1,0 +1,92 @@
+"""The algebra of poses, and what boxes say of the points and boxes within them."""
+
+import math
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from embomatrix.world.geometry import Aabb, Part, Pose, Shape
+
+METRES = st.floats(-50.0, 50.0)
+POINTS = st.tuples(METRES, METRES, METRES)
+SIZES = st.tuples(*[st.floats(0.001, 5.0)] * 3)
+
+
+def unit(values):
+    length = math.sqrt(sum(value * value for value in values))
+    return tuple(value / length for value in values) if length > 0.1 else (0.0, 0.0, 0.0, 1.0)
+
+
+POSES = st.builds(Pose, POINTS, st.tuples(*[st.floats(-1.0, 1.0)] * 4).map(unit))
+BOXES = st.builds(lambda low, size: Aabb(low, tuple(np.add(low, size).tolist())), POINTS, SIZES)
+
+
+def near(found, expected) -> bool:
+    return bool(np.allclose(found, expected, atol=1e-9))
+
+
+def same_frame(a: Pose, b: Pose) -> bool:
+    """Quaternions of opposite sign turn alike, so rotations are compared."""
+    return near(a.position_m, b.position_m) and near(a.rotation, b.rotation)
+
+
+@given(POSES, POSES, POSES)
+def test_products_chain_however_they_are_bracketed(a, b, c) -> None:
+    assert same_frame((a @ b) @ c, a @ (b @ c))
+
+
+@given(POSES)
+def test_a_pose_and_its_inverse_cancel_out_on_either_side(pose) -> None:
+    identity = Pose((0.0, 0.0, 0.0))
+    assert same_frame(pose @ pose.inverse(), identity)
+    assert same_frame(pose.inverse() @ pose, identity)
+    assert same_frame(pose @ identity, pose)
+
+
+@given(POSES, POSES, POINTS)
+def test_a_product_maps_a_point_as_its_factors_do_one_after_the_other(a, b, point) -> None:
+    assert near((a @ b).apply(point), a.apply(b.apply(point)))
+
+
+@given(POSES, st.lists(POINTS, min_size=1, max_size=5))
+def test_many_points_are_mapped_as_each_of_them(pose, points) -> None:
+    assert near(pose.apply_all(np.array(points)), [pose.apply(point) for point in points])
+
+
+@given(POSES, POINTS, POINTS)
+def test_poses_keep_distances(pose, one, other) -> None:
+    assert near(math.dist(pose.apply(one), pose.apply(other)), math.dist(one, other))
+
+
+@given(POSES)
+def test_a_rotation_is_one(pose) -> None:
+    assert near(pose.rotation @ pose.rotation.T, np.eye(3))
+    assert near(np.linalg.det(pose.rotation), 1.0)
+
+
+@given(METRES, METRES, METRES, st.floats(-math.pi + 1e-6, math.pi))
+def test_an_upright_pose_tells_the_yaw_that_it_was_made_of(x, y, z, yaw) -> None:
+    pose = Pose.from_xyz_yaw(x, y, z, yaw)
+    assert near(pose.yaw, yaw)
+    assert near(pose.apply((1.0, 0.0, 0.0)), (x + math.cos(yaw), y + math.sin(yaw), z))
+
+
+@given(BOXES, BOXES, st.floats(0.0, 1.0))
+def test_boxes_overlap_both_ways_and_exactly_when_the_grown_one_does(a, b, margin_m) -> None:
+    assert a.overlaps(b, margin_m) == b.overlaps(a, margin_m) == a.grown(margin_m).overlaps(b)
+
+
+@given(st.lists(BOXES, min_size=1, max_size=4))
+def test_the_box_around_boxes_holds_their_corners_and_touches_them(boxes) -> None:
+    whole = Aabb.around(boxes)
+    assert all(whole.contains(corner) for box in boxes for corner in (box.low_m, box.high_m))
+    assert whole.low_m == tuple(np.min([box.low_m for box in boxes], axis=0))
+    assert whole.high_m == tuple(np.max([box.high_m for box in boxes], axis=0))
+
+
+@given(POSES, SIZES, st.tuples(*[st.floats(-0.5, 0.5)] * 3))
+def test_every_point_of_a_part_lies_in_its_bounding_box(pose, size, share) -> None:
+    part = Part(Shape.BOX, Pose((0.0, 0.0, 0.0)), size)
+    point = pose.apply(tuple(np.multiply(size, share).tolist()))
+    assert part.aabb(pose).contains(point, margin_m=1e-9)
