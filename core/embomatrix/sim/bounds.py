@@ -119,8 +119,11 @@ class AssetBounds:
         return known
 
     def _reckon(self, pose: Pose, fractions: tuple[float, ...]) -> tuple[Vec3, Vec3]:
-        lows, highs = self.extents(pose.rotation[None], fractions)
-        (a, b, c), (d, e, f) = lows[0].tolist(), highs[0].tolist()
+        points, radii = self._placed(fractions)
+        turned = pose.rotation @ points  # (3, m)
+        lows, highs = (turned, turned) if radii is None else (turned - radii, turned + radii)
+        a, b, c = lows.min(axis=1).tolist()
+        d, e, f = highs.max(axis=1).tolist()
         return (a, b, c), (d, e, f)
 
 

@@ -112,6 +112,9 @@ class PhysicsEngine(Protocol):
     def near(self, box: Aabb, ignore: frozenset[str] = NOTHING) -> tuple[str, ...]:
         """Objects whose bounding boxes overlap the box, in scene order, without the parked ones."""
 
+    def is_at_wall(self, box: Aabb) -> bool:
+        """Whether the bounding box of a wall overlaps the box."""
+
     def gap(self, a: str, b: str, limit_m: float) -> float | None:
         """Smallest signed distance between two objects (negative: depth), None when it is more than ``limit_m``.
 

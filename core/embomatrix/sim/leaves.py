@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.sim.bounds import bounds_of, parts_of
+from embomatrix.sim.engine import FLOOR, WALL
 from embomatrix.sim.spots import link_frame
 from embomatrix.world.geometry import Aabb
 
@@ -54,16 +55,19 @@ class Leaves:
         Returns how many of them were reached, and what stopped the next: the name of a body, or of the rider that bumped
         into something; "" at the end of the course. The leaves stay at the last that was reached.
         """
-        reached, last = 0, self._before
         stops = [self._before, *map(tuple, course)]
         self._around = self._neighbours(stops)
+        reached, last = 0, self._before
         for fractions in stops[1:]:
-            self._put(fractions)
-            other = self._stopped_by()
-            if other:
-                self._put(last)
-                return reached, other
+            near = self._near_leaves(fractions)
+            if near or self._riders:
+                self._put(fractions)
+                other = self._stopped_by(near)
+                if other:
+                    self._put(last)
+                    return reached, other
             reached, last = reached + 1, fractions
+        self._put(last)
         return reached, ""
 
     def put_back(self) -> None:
@@ -78,10 +82,11 @@ class Leaves:
             frame = link_frame(self._asset, self._base, fractions, rider.link)
             self._engine.set_pose(rider.name, frame @ rider.pose_link_object)
 
-    def _stopped_by(self) -> str:
+    def _stopped_by(self, near: frozenset[str]) -> str:
         """A body that the leaves or their riders run into where they are; "" when there is none."""
         riders = frozenset(self.riders)
-        hit = self._hits(self._name, riders | self._out_of_the_way())
+        # Most of what stands in and on the furniture is near to no leaf: it is out of their way.
+        hit = self._hits(self._name, riders | (self._around - near))
         if hit:
             return hit
         # For a rider the furniture itself counts: what sticks out of a drawer keeps it from closing.
@@ -99,12 +104,17 @@ class Leaves:
         swept = Aabb.around(bounds.box(self._base, fractions) for fractions in stops)
         return frozenset(self._engine.near(swept.grown(LEAF_SLACK_M), frozenset((self._name,))))
 
-    def _out_of_the_way(self) -> frozenset[str]:
-        """Objects near the furniture that no leaf comes near to: most of what stands in and on it."""
-        near: set[str] = set()
-        for leaf in parts_of(self._asset).leaves(self._base, self._engine.joints(self._name)):
-            near.update(self._engine.near(leaf.grown(LEAF_SLACK_M)))
-        return self._around - near
+    def _near_leaves(self, fractions: Sequence[float]) -> frozenset[str]:
+        """Objects, walls and floor that some leaf comes near to at these joint positions."""
+        engine, near = self._engine, set[str]()
+        for leaf in parts_of(self._asset).leaves(self._base, fractions):
+            box = leaf.grown(LEAF_SLACK_M)
+            near.update(engine.near(box))
+            if leaf.low_m[2] < 0.0:
+                near.add(FLOOR)
+            if engine.is_at_wall(box):
+                near.add(WALL)
+        return frozenset(near - {self._name})
 
     def _contacts_of(self, name: str) -> frozenset[str]:
         """Bodies that the object penetrated before anything moved: built-in neighbours, not in the way of a door."""

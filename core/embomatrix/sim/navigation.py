@@ -16,6 +16,7 @@ from embomatrix.sim.bounds import AssetParts
 from embomatrix.sim.floor_grid import CELL_M, FloorGrid
 from embomatrix.sim.obstacles import WALLS, Obstacles, crosses
 from embomatrix.sim.standing import Service
+from embomatrix.skills.limits import ROBOT
 from embomatrix.world.geometry import Pose
 from embomatrix.world.poses import StandPose
 
@@ -243,18 +244,26 @@ class Navigator:
         """Whether no wall nor anything much taller than the object stands between the robot and the object's box."""
         box = self._relations.body(name)
         (low_x, low_y, _), (high_x, high_y, _) = box.low_m, box.high_m
+        here = (origin.x_m, origin.y_m)
         nearest = (min(max(origin.x_m, low_x), high_x), min(max(origin.y_m, low_y), high_y))
-        return not crosses((origin.x_m, origin.y_m), nearest, self._blockers_of(name))
+        near = math.dist(here, nearest) <= ROBOT.reach_m
+        return not crosses(here, nearest, self._blockers_of(name) if near else self._all_blockers_of(name))
 
     def _blockers_of(self, name: str) -> FloatArray:
-        """Rectangles that the arm can't pass on its way to the object, shape (4, n)."""
+        """Those rectangles within reach of the object that the arm can't pass on its way to it, shape (4, n)."""
         key = self._key(name)
         if key not in self._blockers:
             if len(self._blockers) == ANSWERS_KEPT:
                 self._blockers.clear()
-            own = [self._numbers[item] for item in (name, *self._relations.hosts_of(name))]
-            self._blockers[key] = self._obstacles.blockers(self._relations.body(name), own)
+            found, box = self._all_blockers_of(name), self._relations.body(name).grown(ROBOT.reach_m)
+            near = (found[0] <= box.high_m[0]) & (found[2] >= box.low_m[0])
+            near &= (found[1] <= box.high_m[1]) & (found[3] >= box.low_m[1])
+            self._blockers[key] = np.ascontiguousarray(found[:, near])
         return self._blockers[key]
+
+    def _all_blockers_of(self, name: str) -> FloatArray:
+        own = [self._numbers[item] for item in (name, *self._relations.hosts_of(name))]
+        return self._obstacles.blockers(self._relations.body(name), own)
 
     def _key(self, name: str) -> tuple[object, ...]:
         """All that standing poses and lines of approach depend on, but for where the robot is."""

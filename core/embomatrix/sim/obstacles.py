@@ -114,6 +114,8 @@ class Obstacles:
 
 def crosses(start: Vec2, end: Vec2, rectangles: FloatArray) -> bool:
     """Whether the segment between two points of the plane passes through any rectangle, shape (4, n): slab test."""
+    if not rectangles.shape[1]:
+        return False
     (x, y), (to_x, to_y) = start, end
     near = (rectangles[0] <= max(x, to_x)) & (rectangles[2] >= min(x, to_x))
     near &= (rectangles[1] <= max(y, to_y)) & (rectangles[3] >= min(y, to_y))

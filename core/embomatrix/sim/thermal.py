@@ -10,12 +10,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from embomatrix.sim.news import News
 from embomatrix.skills.appliance import cold_source, cooks, freezes, heat_source, heats
 from embomatrix.world.geometry import Aabb
 from embomatrix.world.state import Relation, State
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, MutableMapping, Sequence
+    from collections.abc import Iterator, MutableMapping
 
     from embomatrix.sim.engine import PhysicsEngine
     from embomatrix.sim.relations import Relations
@@ -42,8 +43,8 @@ class Thermal:
         self._scene = engine.scene
         self._states = states
         self._sources: list[tuple[str, Source]] = []
-        self._round = -1
-        self._read = 0
+        self._news = News(engine)
+        self._acted = False
         for item in self._scene.objects:
             asset = self._scene.assets[item.asset_id]
             found = (heat_source(asset), cold_source(asset))
@@ -52,38 +53,16 @@ class Thermal:
     def apply(self) -> tuple[Change, ...]:
         """Let every working source act. Returns what changed, in scene order of the sources."""
         changes: list[Change] = []
-        places = self._changed_places()
+        self._news.read()
+        first, self._acted = not self._acted, True
         for name, source in self._sources:
             # One that acts by itself has acted on all that is there, unless something has changed there since.
-            if places is not None and not source.requires_on and not self._is_news(name, places):
+            if not first and not source.requires_on and not self._news.concerns(name, self._area(name)):
                 continue
             if self.works(name, source):
                 for item in self._acted_on(name, source):
                     changes += self._expose(item, source)
         return tuple(changes)
-
-    def _changed_places(self) -> dict[str, list[Aabb]] | None:
-        """Where objects were that changed since the sources acted last, and where they are now; None: they never acted."""
-        journal = self._engine.journal
-        first = self._round < 0
-        if journal.rounds != self._round:
-            self._round, self._read = journal.rounds, 0
-        places: dict[str, list[Aabb]] = {}
-        for name, box in journal.entries[self._read :]:
-            if name not in places:
-                places[name] = [box] if box is not None else []
-        self._read = len(journal.entries)
-        for name, boxes in places.items():
-            if not self._engine.is_parked(name):
-                boxes.append(self._engine.aabb(name))
-        return None if first else places
-
-    def _is_news(self, name: str, places: Mapping[str, Sequence[Aabb]]) -> bool:
-        """Whether the source itself is among what changed, or anything where it acts."""
-        if not places:
-            return False
-        area = self._area(name)
-        return name in places or any(area.overlaps(box) for boxes in places.values() for box in boxes)
 
     def works(self, name: str, source: Source) -> bool:
         """Whether the source is on and closed, as far as it must be."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from embomatrix.sim.news import News
 from embomatrix.sim.thermal import Change
 from embomatrix.skills.household import coverings, liquids_given, soaked_with, washed_away, washing
 from embomatrix.world.state import State, SubstanceFact, SubstanceRelation
@@ -36,6 +37,9 @@ class Water:
         self._states = states
         self._substances = substances
         self._changes: list[Change] = []
+        self._news = News(engine)
+        self._acting: set[str] = set()
+        self._acting_at_start: frozenset[str] | None = None
         self._sources = [
             item.name
             for item in self._scene.objects
@@ -44,23 +48,37 @@ class Water:
 
     def apply(self) -> tuple[Change, ...]:
         """Let every source that runs act on what lies in it. Returns what changed since the last time, by hand or by itself."""
+        if self._news.read() and self._acting_at_start is not None:
+            self._acting = set(self._acting_at_start)
         for name in self._sources:
-            if State.TOGGLED_ON not in self._states.get(name, ()) or self._engine.is_parked(name):
-                continue
-            asset = self._scene.asset_of(name)
-            machine = washing(asset)
-            if machine is not None and machine.requires_closed and self._relations.open(name):
-                continue
-            liquids = liquids_given(asset, (), on=True)
-            for item in self._engine.near(self._engine.aabb(name), frozenset((name,))):
-                if self._scene.by_name[item].fixed or not self._relations.inside(item, name):
-                    continue
-                if machine is not None:
-                    self.take_off(item, washed_away(machine, coverings(self._substances[item])))
-                self.wet(item, liquids)
+            if not self._runs(name):
+                self._acting.discard(name)
+            # What a source did to a thing nothing undoes: it acts again when it was started, or something came.
+            elif name not in self._acting or self._news.concerns(name, self._engine.aabb(name)):
+                self._acting.add(name)
+                self._act(name)
+        if self._acting_at_start is None:
+            self._acting_at_start = frozenset(self._acting)
         changes = tuple(self._changes)
         self._changes.clear()
         return changes
+
+    def _runs(self, name: str) -> bool:
+        if State.TOGGLED_ON not in self._states.get(name, ()) or self._engine.is_parked(name):
+            return False
+        machine = washing(self._scene.asset_of(name))
+        return machine is None or not machine.requires_closed or not self._relations.open(name)
+
+    def _act(self, name: str) -> None:
+        asset = self._scene.asset_of(name)
+        machine = washing(asset)
+        liquids = liquids_given(asset, (), on=True)
+        for item in self._engine.near(self._engine.aabb(name), frozenset((name,))):
+            if self._scene.by_name[item].fixed or not self._relations.inside(item, name):
+                continue
+            if machine is not None:
+                self.take_off(item, washed_away(machine, coverings(self._substances[item])))
+            self.wet(item, liquids)
 
     def wet(self, name: str, liquids: tuple[str, ...]) -> None:
         """Let liquids run over an object."""

@@ -194,6 +194,10 @@ class BulletEngine:
             names[number] for number in self._around.near(box) if not ignore or names[number] not in ignore
         )
 
+    def is_at_wall(self, box: Aabb) -> bool:
+        """Whether the bounding box of a wall overlaps the box."""
+        return bool(self._walls_around.near(box))
+
     def gap(self, a: str, b: str, limit_m: float) -> float | None:
         """Smallest signed distance between two objects (negative: depth), None when it is more than ``limit_m``.
 
