@@ -17,6 +17,7 @@ from embomatrix.factory.furnish import Furnishing, furnish
 from embomatrix.factory.furnish_pieces import Piece
 from embomatrix.factory.furnish_roles import Role, is_portable, role_of
 from embomatrix.factory.furnish_space import RoomSpace
+from embomatrix.factory.scene_access import without_unserved_cabinets
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.scene import RobotStart, Scene, SceneObject
 
@@ -68,8 +69,13 @@ def build_base_scene(
         left_out=(*notes, *plan.left_out, *result.left_out),
         windows=plan.windows,
     )
+    scene = without_unserved_cabinets(scene)
     logger.info(
-        "scene built id=%s seed=%d objects=%d left_out=%d", scene_id, seed, len(objects), len(scene.left_out)
+        "scene built id=%s seed=%d objects=%d left_out=%d",
+        scene_id,
+        seed,
+        len(scene.objects),
+        len(scene.left_out),
     )
     return scene
 

@@ -11,8 +11,8 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.floorplan_spec import MIN_DOOR_M
-from embomatrix.factory.furnish_pieces import Access, Piece, access_of
-from embomatrix.factory.furnish_roles import role_of
+from embomatrix.factory.furnish_pieces import Access
+from embomatrix.factory.scene_access import unserved
 from embomatrix.factory.scene_clearance import Clearance
 from embomatrix.factory.scene_floor import ReachableFloor, box_of
 from embomatrix.factory.scene_solids import Solids, placed_parts
@@ -207,16 +207,9 @@ def reach_problems(scene: Scene) -> Iterator[Problem]:
         elif floor.cut_off_m2(room) > max(CUT_OFF_M2, CUT_OFF_SHARE * room.size_m[0] * room.size_m[1]):
             detail = f"furniture cuts off {floor.cut_off_m2(room):.1f} m2 of floor where the robot fits"
             yield Problem(ProblemKind.AISLE, (room.name,), detail)
-    for item in scene.objects:
-        asset = scene.assets[item.asset_id]
-        role = role_of(asset.category, asset.size_m, asset.mass_kg)
-        access = access_of(Piece(0, asset.category, asset, role))
-        if access is Access.NONE:
-            continue
-        front = None if access is Access.BESIDE else item.pose_world_asset
-        if not len(floor.spots(box_of(scene, item), front_of=front)):
-            where = "beside it" if front is None else "before its front"
-            yield Problem(ProblemKind.ACCESS, (item.name,), f"no reachable spot {where}")
+    for item, access in unserved(scene, floor):
+        where = "beside it" if access is Access.BESIDE else "before its front"
+        yield Problem(ProblemKind.ACCESS, (item.name,), f"no reachable spot {where}")
 
 
 def _openings(scene: Scene) -> Iterator[Problem]:

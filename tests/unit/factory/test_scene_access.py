@@ -1,0 +1,52 @@
+"""Cabinets on a wall that nobody can stand before are left out, with what lies in them, and said to be."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from embomatrix.factory.scene_access import unserved, without_unserved_cabinets
+from embomatrix.factory.scene_floor import ReachableFloor
+from embomatrix.factory.scene_report import unaccounted
+from embomatrix.world.geometry import Pose
+
+if TYPE_CHECKING:
+    from embomatrix.world.scene import Scene
+
+CABINET = "top_cabinet_1"
+
+
+def turned_to_the_wall(scene: Scene) -> Scene:
+    """The scene with a cabinet's front to the wall, and a thing of the living room in it."""
+    x, y, z = scene.by_name[CABINET].pose_world_asset.position_m
+    changed = {
+        CABINET: {
+            "pose_world_asset": Pose.from_xyz_yaw(
+                x, y, z, scene.by_name[CABINET].pose_world_asset.yaw + 3.14159
+            )
+        },
+        "laptop_1": {"host": CABINET},
+    }
+    return replace(
+        scene, objects=tuple(replace(item, **changed.get(item.name, {})) for item in scene.objects)
+    )
+
+
+def test_a_furnished_flat_loses_nothing(flat: Scene) -> None:
+    assert without_unserved_cabinets(flat) is flat
+
+
+def test_a_cabinet_that_faces_the_wall_goes_with_what_lies_in_it(flat: Scene) -> None:
+    scene = turned_to_the_wall(flat)
+    assert [item.name for item, _ in unserved(scene, ReachableFloor(scene))] == [CABINET]
+    left = without_unserved_cabinets(scene)
+    assert {item.name for item in scene.objects} - {item.name for item in left.objects} == {
+        CABINET,
+        "laptop_1",
+    }
+    assert [note.split(": ")[1] for note in left.left_out[len(flat.left_out) :]] == [
+        "nobody could stand before its front",
+        "it lay in a cabinet that nobody could stand before",
+    ]
+    assert unaccounted(left) == ()
+    assert {item.asset_id for item in left.objects} == set(left.assets)
