@@ -127,6 +127,8 @@ def _open(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusa
     leaves = Leaves(world.engine, world.relations, target)
     reached, other = leaves.swing([max(share, fraction) for fraction in before] for share in SWING)
     if reached and SWING[reached - 1] >= LEAST_OPEN:
+        world.navigator.refresh()
+        world.robot = world.navigator.aside(target, world.robot)
         return None
     leaves.put_back()
     return refuse(FailureReason.DOOR_BLOCKED, target=target, other=other)
@@ -139,6 +141,7 @@ def _close(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refus
     shares = (*reversed(SWING), 0.0)
     _, other = leaves.swing([min(share, fraction) for fraction in before] for share in shares)
     if not other:
+        world.navigator.refresh()
         return None
     leaves.put_back()
     return refuse(FailureReason.DOOR_BLOCKED, target=target, other=other)

@@ -11,6 +11,9 @@ from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.view import refuse
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from embomatrix.sim.floor_grid import FloorGrid
     from embomatrix.sim.live_world import LiveWorld
     from embomatrix.skills.view import Refusal
     from embomatrix.world.geometry import FloatArray, Vec2
@@ -23,10 +26,16 @@ WALL: Final = "a wall"
 def no_way_to(world: LiveWorld, target: str) -> Refusal:
     """Why the robot does not get to an object that it has no standing pose for, and who is in the way."""
     room = world.room_of(target)
+    service = world.navigator.service(target)
     if room in world.rooms and world.navigator.room_entry(room, world.robot) is None:
         return refuse(FailureReason.NO_PATH, target=target, other=_between(world, room))
-    low, high = world.navigator.service(target).window
-    points = world.navigator.service(target).serving(_on_floor(world, _raster(low, high)))
+    window = service.window
+    leaf = _leaf_in_the_way(
+        world, lambda grid, label: bool(service.stands(grid.free_centers(*window, label)))
+    )
+    if leaf:
+        return refuse(FailureReason.NO_STANDING_POSE, target=target, other=leaf)
+    points = service.serving(_on_floor(world, _raster(*window)))
     other = _most_in_the_way(world, points)
     return refuse(FailureReason.NO_STANDING_POSE, target=target, other=other)
 
@@ -36,16 +45,35 @@ def no_way_into(world: LiveWorld, room: str) -> Refusal:
     return refuse(FailureReason.NO_PATH, target=room, other=_between(world, room))
 
 
+def _leaf_in_the_way(world: LiveWorld, leads: Callable[[FloorGrid, int], bool]) -> str:
+    """The first object that would let the robot pass if its doors and drawers alone were shut; "" when there is none.
+
+    ``leads`` says of a grid whether the component of this number will do.
+    """
+    ground = world.navigator.ground
+    for owner in dict.fromkeys(ground.leaves.owners.tolist()):
+        grid = ground.with_shut(owner)
+        start = grid.cell(world.robot.x_m, world.robot.y_m)
+        if start is not None and leads(grid, grid.label(start)):
+            return str(world.scene.objects[owner].name)
+    return ""
+
+
 def _between(world: LiveWorld, room: str) -> str:
     """What the robot would have to drive through on the way to a room that costs the least."""
     area = next(item for item in world.scene.rooms if item.name == room)
+    leaf = _leaf_in_the_way(
+        world, lambda grid, label: bool(len(grid.free_centers(area.low_m, area.high_m, label)))
+    )
+    if leaf:
+        return leaf
     crossed = world.navigator.crossing(world.robot, area.low_m, area.high_m)
     return _most_in_the_way(world, crossed)
 
 
 def _most_in_the_way(world: LiveWorld, points: FloatArray) -> str:
     """The object that keeps the robot from the most of some points; a wall when none does."""
-    obstacles, _ = world.navigator.present
+    obstacles = world.navigator.ground.obstacles
     counts = obstacles.owners_near(points) if len(points) else {}
     counts.pop(WALLS, None)
     # Of equals the first in scene order: the answer is part of the trace.

@@ -106,6 +106,47 @@ class FloorGrid:
         vars(grid)["parts"] = self.parts.changed(grid.free, window)
         return grid
 
+    def narrowed(self, boxes: FloatArray) -> FloorGrid:
+        """This grid with more obstacles, shape (n, 6), which a ``changed`` grid forgets: for what comes and goes often.
+
+        It is the same grid where they leave as much floor. It costs less than ``changed``, which measures distances anew.
+        """
+        free = self.free
+        reached: list[Window] = []
+        for cells in sorted({self._cells(box) for box in boxes}):
+            around, blocked = self._blocked_by(cells)
+            if (free[around] & blocked).any():
+                free = free.copy() if free is self.free else free
+                free[around] &= ~blocked
+                reached.append(around)
+        if not reached:
+            return self
+        grid = copy.copy(self)
+        vars(grid).pop("_graph", None)
+        grid._fields = {}
+        grid.free = free
+        low = [max(0, min(window[axis].start for window in reached) - 1) for axis in (0, 1)]
+        high = [max(window[axis].stop for window in reached) + 1 for axis in (0, 1)]
+        vars(grid)["parts"] = self.parts.changed(free, (slice(low[0], high[0]), slice(low[1], high[1])))
+        return grid
+
+    def _cells(self, box: FloatArray) -> tuple[int, int, int, int]:
+        """The cells that a box covers: first and one past the last along x, then along y."""
+        rows, columns = self._window(box[:2], box[2:4])
+        return rows.start, rows.stop, columns.start, columns.stop
+
+    def _blocked_by(self, cells: tuple[int, int, int, int]) -> tuple[Window, BoolArray]:
+        """The window around some covered cells in which the robot may touch them, and where in it it does."""
+        first_i, last_i, first_j, last_j = cells
+        reach = math.ceil(ROBOT.radius_m / CELL_M)
+        rows = slice(max(0, first_i - reach), min(self._shape[0], last_i + reach))
+        columns = slice(max(0, first_j - reach), min(self._shape[1], last_j + reach))
+        i, j = np.arange(rows.start, rows.stop), np.arange(columns.start, columns.stop)
+        off_i = np.maximum(np.maximum(first_i - i, i - last_i + 1), 0)
+        off_j = np.maximum(np.maximum(first_j - j, j - last_j + 1), 0)
+        blocked = off_i[:, None] ** 2 + off_j[None] ** 2 < (ROBOT.radius_m / CELL_M) ** 2
+        return (rows, columns), np.asarray(blocked)
+
     @functools.cached_property
     def parts(self) -> FloorParts:
         """Which of the free cells hang together."""
@@ -150,6 +191,27 @@ class FloorGrid:
     def label(self, cell: Cell) -> int:
         """Number of the component that a free cell belongs to; 0 for a blocked one."""
         return self.parts.at(cell)
+
+    def label_at(self, x_m: float, y_m: float) -> int:
+        """Number of the component at a point, 0 where the robot does not fit."""
+        i, j = self._cell_at(x_m, y_m)
+        inside = 0 <= i < self._shape[0] and 0 <= j < self._shape[1]
+        return self.parts.at((i, j)) if inside else 0
+
+    def may_differ_at(self, wider: FloorGrid, x_m: float, y_m: float) -> bool:
+        """Whether a point may be taken, or cut off, that was not so on the grid that this one was narrowed from."""
+        if self is wider:
+            return False
+        renumbered = self.parts.whole is not wider.parts.whole
+        return renumbered or self.label_at(x_m, y_m) != wider.label_at(x_m, y_m)
+
+    def main_part_of(self, wider: FloorGrid, x_m: float, y_m: float) -> int:
+        """The largest component of this grid in the one that a point belongs to on the grid that it was narrowed from."""
+        cell = wider.cell(x_m, y_m)
+        if cell is None:
+            return 0
+        parts = self.labels[(wider.labels == wider.label(cell)) & self.free]
+        return int(np.bincount(parts, minlength=1).argmax())
 
     def free_centers(self, low_m: Vec2, high_m: Vec2, label: int) -> FloatArray:
         """Middles of the component's cells in a rectangle, shape (n, 2), in the world."""

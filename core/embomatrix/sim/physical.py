@@ -25,6 +25,7 @@ from embomatrix.sim.physical_travel import drive, travel
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.syntax import Skill
 from embomatrix.skills.view import metres, refuse, source_of, target_of
+from embomatrix.world.poses import StandPose
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -91,23 +92,26 @@ def _move(stage: Stage, call: SkillCall, rng: np.random.Generator) -> Refusal | 
 
 
 def _turn(stage: Stage, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
-    here = stage.mover.posture[:2]
-    return drive(stage, here[None], _heading(stage, call))
+    heading, told = _heading(stage, call), stage.told
+    refusal = drive(stage, stage.mover.posture[None, :2], heading)
+    stage.told = StandPose(told.x_m, told.y_m, heading)
+    return refusal
 
 
 def _move_forward(stage: Stage, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
     heading, distance_m = _heading(stage, call), call.distance or 0.0
     course = heading if distance_m >= 0 else heading + math.pi
-    free_m = stage.world.navigator.forward(stage.world.robot, course, abs(distance_m))
+    told = stage.told
+    free_m = stage.world.navigator.forward(told, course, abs(distance_m))
     if free_m < abs(distance_m):
         return refuse(FailureReason.BLOCKED, distance=metres(free_m))
     here = stage.mover.posture[:2]
-    there = here + abs(distance_m) * np.array([math.cos(course), math.sin(course)])
-    return drive(stage, here[None], heading) or drive(stage, np.stack([here, there]), heading)
+    x, y = told.x_m + abs(distance_m) * math.cos(course), told.y_m + abs(distance_m) * math.sin(course)
+    return drive(stage, here[None], heading) or drive(stage, np.array([here, (x, y)]), heading)
 
 
 def _heading(stage: Stage, call: SkillCall) -> float:
-    return math.remainder(stage.world.robot.yaw + math.remainder(call.yaw or 0.0, math.tau), math.tau)
+    return math.remainder(stage.told.yaw + math.remainder(call.yaw or 0.0, math.tau), math.tau)
 
 
 def _go_to_room(stage: Stage, call: SkillCall, rng: np.random.Generator) -> Refusal | None:

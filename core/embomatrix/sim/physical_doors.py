@@ -18,11 +18,13 @@ from embomatrix.sim.physical_hands import GENTLE, TOUCH_M, WAYS
 from embomatrix.sim.physical_reach import TOUCH_M as PRESS_M
 from embomatrix.sim.physical_reach import Reach, Track
 from embomatrix.sim.physical_space import boxes_of, part_boxes, strikes
+from embomatrix.sim.physical_stage import compact
 from embomatrix.sim.physical_travel import SOMETHING
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.view import refuse
 from embomatrix.world.asset import JointKind
 from embomatrix.world.geometry import Aabb, Pose
+from embomatrix.world.poses import StandPose
 from embomatrix.world.state import OPEN_FRACTION
 
 if TYPE_CHECKING:
@@ -134,7 +136,7 @@ def close_all(stage: Stage, name: str, rng: np.random.Generator) -> Refusal | No
 
 
 def _lead_all(stage: Stage, name: str, goal: float, rng: np.random.Generator) -> Refusal | None:
-    home = stage.world.robot
+    home = stage.told
     refusal = None
     row = sorted(leaves_of(stage, name), key=lambda leaf: leaf.height_m, reverse=not goal)
     # Who leads a leaf may push one that is done: those have a second turn.
@@ -149,7 +151,7 @@ def _lead_all(stage: Stage, name: str, goal: float, rng: np.random.Generator) ->
         if refusal is not None:
             break
     # Where the robot ends up does not undo what became of the door.
-    fold(stage, home, rng, name)
+    fold(stage, stage.world.navigator.aside(name, home), rng, name)
     return refusal
 
 
@@ -200,10 +202,18 @@ def _stretch(stage: Stage, leaf: Leaf, start: float, goal: float, rng: np.random
     if goal > start:
         bases = stage.floor.cut_off_last(bases, moving[-1])
     for way in itertools.islice(reach.ways(tracks, bases), WAYS):
+        _draw_in(stage, way, rng)
         swing = approach(stage, way, reach, rng, loaded=False)
         if swing is not None and unfold(stage, swing) is None:
             return _pull(stage, way, leaf, goal)
     return refuse(FailureReason.ARM_BLOCKED, target=leaf.name, other=reach.hindrance or SOMETHING)
+
+
+def _draw_in(stage: Stage, way: Way, rng: np.random.Generator) -> None:
+    """Fold the arm where the last pull left it, before the base goes elsewhere: out it sweeps all that stands around."""
+    now = stage.mover.posture
+    if math.dist(now[:2], way.postures[0, :2]) > 0.01 and not compact(stage, now):
+        fold(stage, StandPose(*now[:3].tolist()), rng)
 
 
 def _pull(stage: Stage, way: Way, leaf: Leaf, goal: float) -> Refusal | None:

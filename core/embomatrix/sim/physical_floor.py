@@ -1,4 +1,4 @@
-"""Where the base really fits: the floor with doors and drawers as they stand, which cached mode leaves out."""
+"""Ways of the base over the floor, out of the places where a leaf left it, and beside places that are taken."""
 
 from __future__ import annotations
 
@@ -6,21 +6,18 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.sim.floor_grid import FloorGrid
 from embomatrix.sim.obstacles import FLAT_M
-from embomatrix.sim.physical_space import boxes_around
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.poses import StandPose
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from embomatrix.sim.engine import PhysicsEngine
-    from embomatrix.sim.floor_grid import Cell
+    from embomatrix.sim.floor_grid import Cell, FloorGrid
+    from embomatrix.sim.navigation import Navigator
     from embomatrix.sim.physical_space import Boxes
     from embomatrix.world.geometry import FloatArray, Vec2
 
-SPREAD_M: Final = 500.0
 OUT_M: Final = 0.45
 OUT_TRIED: Final = 60
 ASIDE_M: Final = 0.9
@@ -30,21 +27,13 @@ ASIDE_M: Final = 0.9
 class Floor:
     """The free floor in the planning scene's present state."""
 
-    def __init__(self, engine: PhysicsEngine) -> None:
-        self._engine = engine
-        self._seen: bytes = b""
-        self._grid: FloorGrid | None = None
-        self._rows: FloatArray = np.zeros((0, 6))
+    def __init__(self, navigator: Navigator) -> None:
+        self._navigator = navigator
 
     @property
     def grid(self) -> FloorGrid:
-        """Made anew when anything has moved."""
-        state = self._engine.state_bytes()
-        if self._grid is None or state != self._seen:
-            everything = boxes_around(self._engine, (-SPREAD_M, -SPREAD_M), (SPREAD_M, SPREAD_M))
-            self._rows = _barring(everything.without(("floor",)))
-            self._grid, self._seen = FloorGrid(self._engine.scene, self._rows), state
-        return self._grid
+        """Where the base fits now."""
+        return self._navigator.ground.grid
 
     def cut_off_last(self, bases: Sequence[FloatArray], leaf: Boxes) -> list[FloatArray]:
         """Places to stand, groups of shape (b, 3), those last that a leaf cuts off when it gets to where some boxes are.
@@ -52,7 +41,7 @@ class Floor:
         What is cut off is all but the largest part of the free floor that the place belongs to now.
         """
         grid = self.grid
-        after = grid.changed(np.zeros((0, 6)), _barring(leaf))
+        after = grid.narrowed(_barring(leaf))
         first, last = [], []
         for group in bases:
             good = np.array([self._stays_joined(grid, after, x, y) for x, y in group[:, :2].tolist()])
@@ -61,13 +50,7 @@ class Floor:
         return [group for group in (*first, *last) if len(group)]
 
     def _stays_joined(self, grid: FloorGrid, after: FloorGrid, x_m: float, y_m: float) -> bool:
-        here = grid.cell(x_m, y_m)
-        if here is None:
-            return True
-        then = after.cell(x_m, y_m)
-        part = after.labels[grid.labels == grid.label(here)]
-        sizes = np.bincount(part[part > 0], minlength=1)
-        return then is not None and after.label(then) == int(sizes.argmax())
+        return after is grid or after.label_at(x_m, y_m) == after.main_part_of(grid, x_m, y_m)
 
     def way(
         self, start: Vec2, goal: StandPose, serves: Callable[[StandPose], bool]
@@ -105,7 +88,9 @@ class Floor:
 
     def _air(self, points: FloatArray) -> FloatArray:
         """Distance from points, (n, 2), to the nearest obstacle, (n,)."""
-        nearest = np.clip(points[:, None], self._rows[:, :2], self._rows[:, 2:4])
+        ground = self._navigator.ground
+        rows = np.concatenate([ground.obstacles.barring, ground.leaves.barring])
+        nearest = np.clip(points[:, None], rows[:, :2], rows[:, 2:4])
         return np.asarray(np.linalg.norm(points[:, None] - nearest, axis=2).min(axis=1, initial=np.inf))
 
     def _free_near(

@@ -94,6 +94,7 @@ def fold(stage: Stage, home: StandPose, rng: np.random.Generator, target: str = 
         or abs(math.remainder(now[2] - home.yaw, math.tau)) > 0.01
     ):
         return travel(stage, home, target)
+    stage.told = home
     return None
 
 

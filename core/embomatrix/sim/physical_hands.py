@@ -48,7 +48,7 @@ def bases_at(stage: Stage, pose: Pose, course: float, out_m: float | None) -> li
 
 def pick_up(stage: Stage, target: str, rng: np.random.Generator) -> Refusal | None:
     """Take an object that lies where the robot can reach it."""
-    home = stage.world.robot
+    home = stage.told
     refusal = _take(stage, target, rng)
     fold(stage, home, rng, target)
     if refusal is None and stage.has_slipped():

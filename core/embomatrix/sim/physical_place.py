@@ -29,7 +29,7 @@ def place(stage: Stage, target: str, asked: PlaceRelation, rng: np.random.Genera
     """Put what the hand holds where the planning scene has room for it, and see whether it stays."""
     world, grip = stage.world, stage.grip
     assert grip is not None
-    home, held = world.robot, grip.name
+    home, held = stage.told, grip.name
     relation = Relation(asked.value)
     words = {"held": held, "target": target, "relation": preposition(asked)}
     found, stand = _places(stage, target, relation, rng)
@@ -63,7 +63,7 @@ def _places(
 ) -> tuple[tuple[Pose, ...] | FailureReason, StandPose]:
     """Poses for what is held, or why there are none, and where to stand for them: as in cached mode, here if there are any."""
     world = stage.world
-    held, here = world.carried[0], world.robot
+    held, here = world.carried[0], stage.told
     found = world.placer.choices(held, target, relation, here, rng, most=PLACES)
     if found is FailureReason.NO_FREE_POSE:
         for stand in other_stands(world, target):

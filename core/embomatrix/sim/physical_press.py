@@ -35,7 +35,7 @@ ATTEMPTS: Final = 3
 
 def press(stage: Stage, target: str, rng: np.random.Generator) -> Refusal | None:
     """Touch a thing with the empty hand."""
-    home = stage.world.robot
+    home = stage.told
     refusal = _press(stage, target, rng)
     fold(stage, home, rng, target)
     return refusal

@@ -68,8 +68,10 @@ class Stage:
         self.world = world
         self.dynamic = dynamic
         self.mover = Mover(dynamic, watch)
-        self.floor = Floor(world.engine)
+        self.floor = Floor(world.navigator)
         self.grip: Grip | None = None
+        self.told = world.robot
+        """Where the robot was told to stand, which it leaves to work and comes back to: with a load it may face elsewhere."""
 
     def begin(self) -> None:
         """Build the dynamic world as the planning scene is."""
@@ -78,7 +80,7 @@ class Stage:
         poses = {name: engine.pose(name) for name in names if not engine.is_parked(name)}
         joints = {name: engine.joints(name) for name in names}
         self.dynamic.build(poses, joints, tucked(robot))
-        self.grip = None
+        self.grip, self.told = None, robot
 
     def boxes(self) -> Boxes:
         """Parts of things around the robot, without what it holds."""

@@ -55,7 +55,11 @@ def _serves(stage: Stage, spot: StandPose, target: str) -> bool:
 
 
 def drive(stage: Stage, points: FloatArray, yaw: float) -> Refusal | None:
-    """Drive along straight lines between points, (n, 2), the first of which is here, and end with a heading."""
+    """Drive along straight lines between points, (n, 2), the first of which is here, and end with a heading.
+
+    What the robot was told is the end, and the heading even where its load keeps it from facing there.
+    """
+    stage.told = StandPose(float(points[-1, 0]), float(points[-1, 1]), yaw)
     start = stage.mover.posture
     marks = _resampled(points)
     marks, headings = _headings(stage, start, marks, yaw)
@@ -88,7 +92,9 @@ def _headings(
     begin = start[body.YAW]
     end = begin + math.remainder(yaw - begin, math.tau)
     if compact(stage, start):
-        return marks, begin + (end - begin) * np.linspace(0.0, 1.0, len(marks))
+        # Who turns on the spot has one mark: it is the end.
+        shares = np.linspace(0.0, 1.0, len(marks)) if len(marks) > 1 else np.ones(1)
+        return marks, begin + (end - begin) * shares
     marks = np.concatenate([np.tile(marks[0], (TURNS, 1)), marks, np.tile(marks[-1], (TURNS, 1))])
     options = begin + np.arange(HEADINGS) * math.tau / HEADINGS
     danger = _danger(stage, start, marks[TURNS - 1 : 1 - TURNS], options)

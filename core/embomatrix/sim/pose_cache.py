@@ -215,9 +215,9 @@ def _placements(
 
 
 def standing_poses(engine: PhysicsEngine, names: Sequence[str]) -> dict[str, tuple[StandPose, ...]]:
-    """Where the robot can stand to work on each object, in the scene as it was loaded."""
+    """Where the robot can stand to work on each object, in the scene as it was loaded but with all leaves shut."""
     navigator = Navigator(engine, Relations(engine))
-    return {name: navigator.stands(name, navigator.start) for name in dict.fromkeys(names)}
+    return {name: navigator.stands_past_shut(name, navigator.start) for name in dict.fromkeys(names)}
 
 
 def _on_floor(support: Asset) -> Pose:

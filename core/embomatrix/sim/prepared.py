@@ -92,7 +92,7 @@ def prepare(bundle: Bundle, world: LiveWorld) -> Bundle:
     A floor where more than 255 obstacles lie over one another is left to the worker.
     """
     world.engine.reset()
-    obstacles, grid = world.navigator.at_start
+    obstacles, grid = world.navigator.ground.at_start
     if grid.covered.max(initial=0) > MOST_COVERED:
         return bundle
     scene = bundle.scene

@@ -63,6 +63,17 @@ class Service:
                 chosen.append(StandPose(x, y, math.atan2(ty - y, tx - x)))
         return tuple(chosen)
 
+    def nearest(self, centers: FloatArray, place: StandPose) -> StandPose | None:
+        """The pose at one of these points, shape (n, 2), that serves the thing and is nearest to a place; None without one."""
+        nearest, cost = self._weigh(centers)
+        away = np.hypot(centers[:, 0] - place.x_m, centers[:, 1] - place.y_m)
+        for index in np.argsort(away, kind="stable").tolist():
+            x, y = centers[index].tolist()
+            tx, ty = nearest[index].tolist()
+            if math.isfinite(cost[index]) and not crosses((x, y), (tx, ty), self.blockers):
+                return StandPose(x, y, math.atan2(ty - y, tx - x))
+        return None
+
     def serving(self, centers: FloatArray) -> FloatArray:
         """Those of some points, shape (n, 2), that serve the thing, were they free."""
         nearest, cost = self._weigh(centers)

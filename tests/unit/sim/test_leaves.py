@@ -7,12 +7,14 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule, run_state_machine_as_test
 from tests.fakes import furniture as make
+from tests.fakes.furniture import box
 from tests.fakes.plans import executed, plan_of, task_over, with_objects
 from tests.fakes.scenes import NORTH, kitchen_scene, placed, upright
 
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.leaves import Leaves
 from embomatrix.skills.failure import FailureReason
+from embomatrix.skills.limits import ROBOT
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.state import Relation
 
@@ -53,6 +55,48 @@ def test_what_lies_in_a_drawer_is_inside_and_shut_in(flat):
     assert flat.facts.holds("inside", ("mug_2", "bottom_cabinet_1"))
     assert flat.world.closed_around("mug_2") == "bottom_cabinet_1"
     assert flat.world.relations.host_of("book_1").spot == "upper"
+
+
+def test_robot_steps_out_of_the_place_that_a_drawer_takes_and_still_reaches_it(flat):
+    executed(flat, OPENED)
+    world = flat.world
+    ground, robot = world.navigator.ground, world.robot
+    assert ground.grid.is_free(robot.x_m, robot.y_m)
+    assert world.navigator.aside("bottom_cabinet_1", robot) == robot
+    assert (ground.grid.free < ground.shut.free).any(), "the drawers take floor"
+    assert world.reach("bottom_cabinet_1").distance_m <= ROBOT.reach_m
+    assert not executed(flat, f"{OPENED}; pick_up mug_2").failure
+
+
+def test_nobody_stands_in_an_open_drawer_and_a_shut_one_gives_its_room_back(flat):
+    executed(flat, "go_to_room kitchen_0")
+    navigator, origin = flat.world.navigator, flat.world.robot
+    before = navigator.stands("bottom_cabinet_1", origin)
+    executed(flat, OPENED)
+    beside = navigator.stands("bottom_cabinet_1", origin)
+    assert beside
+    assert beside != before
+    assert all(navigator.ground.grid.is_free(stand.x_m, stand.y_m) for stand in beside)
+    executed(flat, f"{OPENED}; close bottom_cabinet_1")
+    assert navigator.stands("bottom_cabinet_1", origin) == before
+
+
+def test_open_drawer_in_an_aisle_bars_the_way_by_name():
+    scene, can = drawer_scene(), make.apple()
+    aisle = box((4.2, 1.2, 1.2), (1.6, 0.1, 2.4))
+    at_its_end = placed("apple_9", can, "kitchen_0", upright(4.75, 0.3, 0.0, can))
+    empty = tuple(item for item in scene.objects if item.name != "mug_2")
+    scene = dataclasses.replace(scene, objects=empty, walls=(*scene.walls, aisle))
+    scene = with_objects(scene, [(at_its_end, can)])
+    simulator = Simulator(Bundle(scene, {}))
+    try:
+        assert not executed(simulator, "move apple_9").failure
+        trace = executed(simulator, f"{OPENED}; move apple_9")
+        assert trace.failure is FailureReason.NO_STANDING_POSE
+        assert "bottom_cabinet_1" in trace.steps[-1].message
+        assert not executed(simulator, f"{OPENED}; close bottom_cabinet_1; move apple_9").failure
+    finally:
+        simulator.close()
 
 
 def test_contents_ride_out_with_their_drawer_and_back_in(flat):

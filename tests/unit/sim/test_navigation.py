@@ -203,6 +203,33 @@ def test_changed_grid_is_the_one_that_would_be_made_anew(start, come, data) -> N
     assert (changed.covered == fresh.covered).all()
 
 
+@settings(max_examples=40, deadline=None)
+@given(st.lists(RECTANGLE, max_size=6), st.lists(RECTANGLE, max_size=3), st.lists(RECTANGLE, max_size=4))
+def test_narrowed_grid_is_the_one_that_would_be_made_anew(start, come, leaves) -> None:
+    scene = kitchen_scene()
+    grid = FloorGrid(scene, rows_of(start)).changed(rows_of([]), rows_of(come))
+    narrowed = grid.narrowed(rows_of(leaves))
+    fresh = FloorGrid(scene, rows_of(start + come + leaves))
+    assert (narrowed.free == fresh.free).all()
+    assert _parts_are_equal(narrowed, fresh)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(RECTANGLE, max_size=6), st.lists(RECTANGLE, min_size=1, max_size=3), COORDINATE, COORDINATE)
+def test_main_part_is_the_largest_that_is_left_of_the_floor_around_a_point(start, leaves, x, y) -> None:
+    wide = FloorGrid(kitchen_scene(), rows_of(start))
+    narrowed = wide.narrowed(rows_of(leaves))
+    cell = wide.cell(x, y)
+    if cell is None:
+        assert narrowed.main_part_of(wide, x, y) == 0
+        return
+    left = narrowed.labels[(wide.labels == wide.label(cell)) & narrowed.free]
+    main = narrowed.main_part_of(wide, x, y)
+    assert (left == main).sum() == max([0, *np.bincount(left)])
+    if wide.label_at(x, y) and not narrowed.may_differ_at(wide, x, y):
+        assert narrowed.label_at(x, y), "it is as free as before"
+
+
 def _parts_are_equal(grid: FloorGrid, other: FloorGrid) -> bool:
     """But for the numbers that the parts bear."""
     assert all(grid.label(cell) == grid.labels[cell] for cell in np.ndindex(grid.labels.shape))

@@ -42,7 +42,9 @@ def test_boxes_obstacles_and_floor_are_those_that_loading_would_derive(bundle):
     bare = replace(bundle, prepared={})
     with _loaded(bare) as derived, _loaded(bundle) as carried:
         boxes = tuple(derived.world.engine.aabb(item.name) for item in bundle.scene.objects)
-        (obstacles, grid), (others, other) = (world.world.navigator.at_start for world in (derived, carried))
+        (obstacles, grid), (others, other) = (
+            world.world.navigator.ground.at_start for world in (derived, carried)
+        )
     assert boxes == found.object_boxes
     assert np.array_equal(grid.covered, other.covered)
     assert np.array_equal(grid.free, other.free)

@@ -1,0 +1,165 @@
+"""What stands on the floor, and where the robot fits between it: as the scene was loaded, and as it is now."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.sim.bounds import AssetParts
+from embomatrix.sim.floor_grid import FloorGrid
+from embomatrix.sim.obstacles import WALLS, Obstacles
+from embomatrix.sim.open_leaves import OpenLeaves
+from embomatrix.world.geometry import Pose
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from embomatrix.sim.engine import PhysicsEngine
+    from embomatrix.sim.open_leaves import Ajar
+    from embomatrix.sim.prepared import Prepared
+
+ON_FLOOR_M: Final = 0.05
+"""A movable object whose underside is lower than this stands on the floor."""
+GRIDS_KEPT: Final = 3
+"""Floors in memory: a plan comes back to few of them, and each takes a megabyte in a house with a garden."""
+LEAVES_KEPT: Final = 12
+"""Floors with doors and drawers open in memory, for each of these: they share most with one another."""
+
+Floor = tuple[tuple[int, Pose | None], ...]
+"""Movable objects that stand on the floor otherwise than at the start: number and pose, None for what stands there no more."""
+
+
+@dataclass(slots=True)
+class Laid:
+    """A floor with its leaves shut: what bars the way, where the robot fits, and where it does with leaves open."""
+
+    obstacles: Obstacles
+    grid: FloorGrid
+    narrowed: OrderedDict[Ajar, FloorGrid]
+
+
+class Ground:
+    """The floor in an engine's present state. Call ``refresh`` after anything on it has moved, or a leaf."""
+
+    def __init__(self, engine: PhysicsEngine, prepared: Prepared | None = None) -> None:
+        """``prepared`` was found before, in this scene as it was loaded."""
+        self._engine = engine
+        self._scene = engine.scene
+        self.numbers = {item.name: number for number, item in enumerate(self._scene.objects)}
+        """Of the scene's objects, by their names."""
+        self._parts: dict[str, AssetParts] = {}
+        bars = [item for item in self._scene.objects if item.fixed or self._on_floor(item.name)]
+        self._on_floor_at_start = {self.numbers[item.name] for item in bars if not item.fixed}
+        if prepared is not None:
+            obstacles = prepared.obstacles
+            grid = FloorGrid.restored(self._scene, prepared.covered, prepared.free)
+        else:
+            obstacles = Obstacles.joined([self._walls(), *(self._parts_of(item.name) for item in bars)])
+            grid = FloorGrid(self._scene, obstacles.barring)
+        self._at_start = Laid(obstacles, grid, OrderedDict())
+        self._kept: OrderedDict[Floor, Laid] = OrderedDict()
+        self._moved: set[int] = set()
+        self._leaves = OpenLeaves(engine)
+        self._round, self._read = -1, 0
+        self._now: FloorGrid | None = None
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Bring the floor up to date. States seen before cost a look-up."""
+        journal = self._engine.journal
+        if journal.rounds != self._round:
+            self._moved.clear()
+            self._leaves.forget()
+            self._round, self._read = journal.rounds, 0
+        for name, _ in journal.entries[self._read :]:
+            number = self.numbers[name]
+            if self._scene.objects[number].fixed:
+                self._leaves.note(number)
+            else:
+                self._moved.add(number)
+        self._read = len(journal.entries)
+        self.floor: Floor = tuple(self._difference())
+        """What stands on the floor otherwise than at the start."""
+        self.ajar: Ajar = self._leaves.ajar()
+        """Whose leaves stand open."""
+        if self.floor not in self._kept:
+            self._kept[self.floor] = self._lay(self.floor)
+            if len(self._kept) > GRIDS_KEPT:
+                self._kept.popitem(last=False)
+        self._kept.move_to_end(self.floor)
+        self._laid = self._kept[self.floor]
+        self._now = None if self.ajar else self._laid.grid
+
+    @property
+    def obstacles(self) -> Obstacles:
+        """What stands in the way, all leaves shut. For reading only."""
+        return self._laid.obstacles
+
+    @property
+    def leaves(self) -> Obstacles:
+        """Doors and drawers that stand open."""
+        return self._leaves.obstacles(self.ajar)
+
+    @property
+    def shut(self) -> FloorGrid:
+        """Where the robot would fit if all leaves were shut."""
+        return self._laid.grid
+
+    @property
+    def grid(self) -> FloorGrid:
+        """Where the robot fits, made when it is asked for: many doors are shut again before it drives."""
+        if self._now is None:
+            kept = self._laid.narrowed
+            if self.ajar not in kept:
+                kept[self.ajar] = self.shut.narrowed(self.leaves.barring)
+                if len(kept) > LEAVES_KEPT:
+                    kept.popitem(last=False)
+            kept.move_to_end(self.ajar)
+            self._now = kept[self.ajar]
+        return self._now
+
+    @property
+    def at_start(self) -> tuple[Obstacles, FloorGrid]:
+        """``obstacles`` and ``shut`` in the scene as it was loaded. For reading only."""
+        return self._at_start.obstacles, self._at_start.grid
+
+    def with_shut(self, number: int) -> FloorGrid:
+        """Where the robot would fit if the leaves of one object were shut."""
+        return self.shut.narrowed(self.leaves.without([number]).barring)
+
+    def _difference(self) -> Iterator[tuple[int, Pose | None]]:
+        """Movable objects that stand on the floor otherwise than at the start, in scene order; None: no more."""
+        for number in sorted(self._moved):
+            item = self._scene.objects[number]
+            pose = self._engine.pose(item.name) if self._on_floor(item.name) else None
+            if pose != (item.pose_world_asset if number in self._on_floor_at_start else None):
+                yield number, pose
+
+    def _lay(self, floor: Floor) -> Laid:
+        if not floor:
+            return self._at_start
+        moved = [number for number, _ in floor]
+        names = [self._scene.objects[number].name for number, pose in floor if pose is not None]
+        come = Obstacles.joined([Obstacles.of([], WALLS, []), *map(self._parts_of, names)])
+        obstacles, grid = self.at_start
+        now = Obstacles.joined([obstacles.without(moved), come])
+        return Laid(now, grid.changed(obstacles.only(moved).barring, come.barring), OrderedDict())
+
+    def _on_floor(self, name: str) -> bool:
+        return not self._engine.is_parked(name) and self._engine.aabb(name).low_m[2] < ON_FLOOR_M
+
+    def _walls(self) -> Obstacles:
+        world = Pose((0.0, 0.0, 0.0))
+        boxes = [wall.aabb(world) for wall in self._scene.walls]
+        return Obstacles.of(boxes, WALLS, [False] * len(boxes))
+
+    def _parts_of(self, name: str) -> Obstacles:
+        """Boxes of the object's parts with its joints shut."""
+        asset = self._scene.asset_of(name)
+        if asset.asset_id not in self._parts:
+            self._parts[asset.asset_id] = AssetParts(asset)
+        shut = (0.0,) * len(asset.joints)
+        boxes = self._parts[asset.asset_id].boxes(self._engine.pose(name), shut)
+        leaves = [link.joint is not None for link in asset.links for _ in link.parts]
+        return Obstacles.of(boxes, self.numbers[name], leaves)
