@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.sim import physical_body as body
-from embomatrix.sim.bounds import joint_motion
+from embomatrix.sim.bounds import IDENTITY, joint_motion
 from embomatrix.sim.physical_fold import approach, fold, unfold
-from embomatrix.sim.physical_grasp import facing
+from embomatrix.sim.physical_grasp import cross, facing
 from embomatrix.sim.physical_hands import GENTLE, TOUCH_M, WAYS
 from embomatrix.sim.physical_reach import TOUCH_M as PRESS_M
 from embomatrix.sim.physical_reach import Reach, Track
@@ -80,6 +80,8 @@ class Leaf:
     joint: Joint
     asset: Asset
     pose: Pose
+    box: Aabb
+    """Around its parts, in the asset's frame with the joint at zero."""
 
     @property
     def height_m(self) -> float:
@@ -89,17 +91,16 @@ class Leaf:
 
     def grips(self, fraction: float, along: float, spot: Spot) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Point on the leaf in the world at a share of its travel, the way out of its surface there, and the edge's line."""
-        box = Aabb.around(part.aabb(Pose((0.0, 0.0, 0.0))) for part in self.link.parts)
-        centre, half = np.array(box.center_m), np.array(box.size_m) / 2
+        centre, half = np.array(self.box.center_m), np.array(self.box.size_m) / 2
         axis = np.array(self.joint.axis)
         if self.joint.kind is JointKind.PRISMATIC:
             out = axis * math.copysign(1.0, self.joint.upper)
-            edge = np.cross(out, [0.0, 0.0, 1.0])
+            edge = np.array([out[1], -out[0], 0.0])
             point = centre + out * (np.abs(out) @ half) + along * 0.5 * edge * (np.abs(edge) @ half)
         else:
             arm = centre - np.array(self.joint.origin_m)
             free = _main_axis(arm - axis * (axis @ arm))
-            face = np.cross(axis, free) * math.copysign(1.0, self.joint.upper)
+            face = cross(axis, free) * math.copysign(1.0, self.joint.upper)
             edge = axis
             hinge = np.array(self.joint.origin_m) @ free
             width = centre @ free + np.abs(free) @ half - hinge
@@ -119,7 +120,15 @@ def leaves_of(stage: Stage, name: str) -> list[Leaf]:
     asset, pose = stage.world.asset(name), stage.world.engine.pose(name)
     moving = [link for link in asset.links if link.joint is not None]
     return [
-        Leaf(name, number, link, link.joint, asset, pose)
+        Leaf(
+            name,
+            number,
+            link,
+            link.joint,
+            asset,
+            pose,
+            Aabb.around(part.aabb(IDENTITY) for part in link.parts),
+        )
         for number, link in enumerate(moving)
         if link.joint is not None
     ]
@@ -196,12 +205,13 @@ def _stretch(stage: Stage, leaf: Leaf, start: float, goal: float, rng: np.random
         )
 
     reach = Reach(boxes, fixed, None, clear)
-    tracks = list(_tracks(leaf, fractions))
-    point = np.array(tracks[0].position[2])
+    tracks = _tracks(leaf, fractions)
+    first = next(tracks)
+    point = first.position[2]
     bases = stage.bases(point, 0.75, walk_m=FAR_M)
     if goal > start:
         bases = stage.floor.cut_off_last(bases, moving[-1])
-    for way in itertools.islice(reach.ways(tracks, bases), WAYS):
+    for way in itertools.islice(reach.ways(itertools.chain([first], tracks), bases), WAYS):
         _draw_in(stage, way, rng)
         swing = approach(stage, way, reach, rng, loaded=False)
         if swing is not None and unfold(stage, swing) is None:

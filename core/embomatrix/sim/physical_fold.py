@@ -63,7 +63,7 @@ def unfold(stage: Stage, swing: FloatArray) -> Refusal | None:
         refusal = travel(stage, StandPose(*swing[0, :3].tolist()))
         if refusal is not None:
             return refusal
-    hit = stage.mover.follow(swing)
+    hit = stage.mover.sweep(swing)
     if hit is not None:
         return refuse(FailureReason.ARM_BLOCKED, target=SOMETHING, other=hit or SOMETHING)
     return None
@@ -86,7 +86,7 @@ def fold(stage: Stage, home: StandPose, rng: np.random.Generator, target: str = 
         there = standing(now, spot)
         swing = reach.transit(there, standing(folded, spot), rng, loaded=loaded)
         if swing is not None and reach.drives(now, there, loaded=loaded):
-            stage.mover.follow(swing)
+            stage.mover.sweep(swing)
             break
     now = stage.mover.posture
     if (

@@ -32,15 +32,21 @@ SHEET_M: Final = 0.004
 """It ends no farther behind than the thing is thick there, but at least this far: a sheet of paper lies on something."""
 
 
+def cross(one: FloatArray, other: FloatArray) -> FloatArray:
+    """Cross product of two vectors, (3,): in numbers, as numpy's own spends its time on shapes."""
+    (a, b, c), (d, e, f) = one.tolist(), other.tolist()
+    return np.array([b * f - c * e, c * d - a * f, a * e - b * d])
+
+
 def facing(direction: FloatArray, roll: float, aside: FloatArray) -> FloatArray:
     """Rotation, (3, 3), of a tool whose z axis points along a direction and whose y axis is level, turned by ``roll``."""
-    level = np.cross([0.0, 0.0, 1.0], direction)
+    level = np.array([-direction[1], direction[0], 0.0])
     if np.linalg.norm(level) < 0.05:
         level = aside
     level = level / np.linalg.norm(level)
-    across = np.cross(level, direction)
+    across = cross(level, direction)
     y = math.cos(roll) * level + math.sin(roll) * across
-    return np.stack([np.cross(y, direction), y, direction], axis=1)
+    return np.array([cross(y, direction), y, direction]).T
 
 
 def surface_point(

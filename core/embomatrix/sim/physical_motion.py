@@ -51,10 +51,24 @@ class Mover:
 
         None when the end is reached or ``until`` says so, else the name of what holds the robot up, "" when unknown.
         """
+        return self._along(postures, pace, self._world.step, until)
+
+    def sweep(self, postures: FloatArray) -> str | None:
+        """Move through postures, as ``follow`` does, where nothing is to be touched: time passes in coarser steps."""
+        return self._along(postures, 1.0, self._world.glide, None)
+
+    def _along(
+        self,
+        postures: FloatArray,
+        pace: float,
+        spend: Callable[[int], None],
+        until: Callable[[], bool] | None,
+    ) -> str | None:
         commands = _commands(np.concatenate([self.posture[None], postures]), pace)
         for command in commands:
             self._world.robot.steer(Posture.of(command.tolist()))
-            self.wait(STEERED)
+            spend(STEERED)
+            self._watch()
             if until is not None and until():
                 self._world.robot.steer(self._world.robot.posture)
                 return None

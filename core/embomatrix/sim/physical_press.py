@@ -42,7 +42,7 @@ def press(stage: Stage, target: str, rng: np.random.Generator) -> Refusal | None
 
 
 def _press(stage: Stage, target: str, rng: np.random.Generator) -> Refusal | None:
-    tracks = list(_tracks(stage, target))
+    tracks = _tracks(stage, target)
     reach = stage.reach(stage.boxes(), target)
     refusal, attempts = None, 0
     point = np.array(stage.world.relations.body(target).center_m)

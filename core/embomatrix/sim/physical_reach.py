@@ -6,6 +6,7 @@ together, and of what is left the most comfortable way that is free is taken.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -16,7 +17,7 @@ from embomatrix.sim import physical_body as body
 from embomatrix.sim.physical_space import Boxes, strikes
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -110,15 +111,17 @@ class Reach:
         self.hindrance = ""
         """Owner of the box that barred the last way that was not free."""
 
-    def ways(self, tracks: Sequence[Track], places: Sequence[FloatArray]) -> Iterator[Way]:
+    def ways(self, tracks: Iterable[Track], places: Sequence[FloatArray]) -> Iterator[Way]:
         """Free ways along any of the tracks, the preferred tracks first, from any base of groups of them, (b, 3) each.
 
-        A later group is looked at for what the ones before it do not reach.
+        A later group is looked at for what the ones before it do not reach, and a track is asked for when its turn comes.
         """
-        for start in range(0, len(tracks), BATCH):
-            numbers = range(start, min(start + BATCH, len(tracks)))
+        rest = iter(tracks)
+        start = 0
+        while batch := list(itertools.islice(rest, BATCH)):
             for bases in places:
-                yield from self._some(tracks, numbers, bases)
+                yield from self._some(batch, start, bases)
+            start += len(batch)
 
     def transit(
         self, start: FloatArray, end: FloatArray, rng: np.random.Generator, *, loaded: bool
@@ -161,11 +164,11 @@ class Reach:
         """Whether all but the first and the last posture keep clear: these are where the robot is, and where it must be."""
         return bool(self._free(postures[1:-1], self._boxes, held, AIR_M).all())
 
-    def _some(self, tracks: Sequence[Track], numbers: range, bases: FloatArray) -> list[Way]:
-        """Free ways along a batch of tracks, best first."""
-        track, base, lift, last = _combinations(tracks, numbers, bases)
-        key_rotation = np.stack([tracks[number].rotation[tracks[number].key] for number in numbers])
-        key_position = np.stack([tracks[number].position[tracks[number].key] for number in numbers])
+    def _some(self, tracks: Sequence[Track], first: int, bases: FloatArray) -> list[Way]:
+        """Free ways along a batch of tracks, best first. ``first`` is the number of its first track."""
+        track, base, lift, last = _combinations(tracks, bases)
+        key_rotation = np.stack([one.rotation[one.key] for one in tracks])
+        key_position = np.stack([one.position[one.key] for one in tracks])
         found = body.solve(key_rotation[track], key_position[track], bases[base], lift, last)
         rows, branches = np.nonzero(~np.isnan(found[:, :, -1]))
         if not len(rows):
@@ -178,7 +181,7 @@ class Reach:
         ways: list[Way] = []
         for start in range(0, len(rows), FOLLOWED):
             some = rows[start : start + FOLLOWED]
-            along = [tracks[numbers[number]] for number in track[some].tolist()]
+            along = [tracks[number] for number in track[some].tolist()]
             followed = _followed(
                 along, bases[base[some]], lift[some], last[some], branches[start : start + FOLLOWED]
             )
@@ -186,7 +189,7 @@ class Reach:
                 if postures is None or any(_alike(postures[0], way.postures[0]) for way in ways):
                     continue
                 if self._passes(one, postures):
-                    ways.append(Way(postures, numbers[int(track[row])]))
+                    ways.append(Way(postures, first + int(track[row])))
                     if len(ways) == OFFERED:
                         return ways
         return ways
@@ -236,20 +239,20 @@ def _alike(one: FloatArray, other: FloatArray) -> bool:
 
 
 def _combinations(
-    tracks: Sequence[Track], numbers: range, bases: FloatArray
+    tracks: Sequence[Track], bases: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Every track with every base, lift and last angle: numbers within the batch, numbers of bases, lifts, angles."""
     heights = np.array(
         [
             track.position[track.key][2] - track.rotation[track.key][2, 2] * (arm.FLANGE_M + arm.TOOL_M)
-            for track in (tracks[number] for number in numbers)
+            for track in tracks
         ]
     )
     offsets = np.array(OVER_WRIST_M)
     track, base, offset, last = (
         grid.ravel()
         for grid in np.meshgrid(
-            np.arange(len(numbers)), np.arange(len(bases)), offsets, LAST_RAD, indexing="ij"
+            np.arange(len(tracks)), np.arange(len(bases)), offsets, LAST_RAD, indexing="ij"
         )
     )
     lift = heights[track] + offset - arm.SHOULDER_M - body.MOUNT_LOW_M

@@ -9,10 +9,15 @@ from tests.fakes.scenes import kitchen_scene
 
 from embomatrix.sim import physical_arm as arm
 from embomatrix.sim import physical_body as body
+from embomatrix.sim.bullet.dynamic import DynamicWorld
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.physical_floor import Floor
+from embomatrix.sim.physical_grasp import cross
+from embomatrix.sim.physical_motion import Mover
 from embomatrix.sim.physical_space import boxes_of, clearance, strikes
+from embomatrix.sim.physical_stage import tucked
 from embomatrix.world.geometry import Pose
+from embomatrix.world.poses import StandPose
 
 SHARES = arrays.arrays(np.float64, (5, arm.JOINTS), elements=st.floats(0.02, 0.98))
 
@@ -91,3 +96,27 @@ def test_places_that_a_leaf_cuts_off_come_last(leaf_m, order):
     finally:
         engine.close()
     assert [float(group[0, 0]) for group in found] == order
+
+
+@given(arrays.arrays(np.float64, (2, 3), elements=st.floats(-10, 10)))
+def test_a_cross_product_in_numbers_is_that_of_numpy(vectors):
+    np.testing.assert_allclose(cross(*vectors), np.cross(*vectors), atol=1e-9)
+
+
+def test_what_is_swept_in_coarse_steps_ends_where_it_is_followed_in_fine_ones():
+    scene = kitchen_scene()
+    poses = {item.name: item.pose_world_asset for item in scene.objects}
+    joints = {
+        item.name: item.joints or (0.0,) * len(scene.asset_of(item.name).joints) for item in scene.objects
+    }
+    world = DynamicWorld(scene)
+    ends = []
+    for sweeps in (False, True):
+        world.build(poses, joints, tucked(StandPose(scene.robot.x_m, scene.robot.y_m, scene.robot.yaw)))
+        mover = Mover(world, lambda: None)
+        goal = mover.posture + np.array([0.1, -0.1, 1.0, 0.2, 0.3, 0.3, 0.3, 0.3, 0.3, 0.3, 0.3])
+        hit = mover.sweep(goal[None]) if sweeps else mover.follow(goal[None])
+        assert hit is None
+        ends.append(mover.posture)
+    world.close()
+    np.testing.assert_allclose(ends[1], ends[0], atol=0.01)
