@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 
 TAKEN_SHARE: Final = 0.16
 """Boxes of two upright cylinders that overlap by this share of their extents along both axes are of cylinders that do."""
+HANDY_M: Final = 0.75
+HANDY_HEIGHTS_M: Final = (0.35, 1.5)
+"""So near to the base's centre, and with its middle between these heights, a place is reached with ease."""
 SAME_LEVEL_M: Final = 0.02
 
 
@@ -67,13 +70,20 @@ class Lineup:
 
     def reached_from(self, stand: StandPose) -> BoolArray:
         """Whether the arm reaches the nearest point of each box in the plane, and its middle's height; shape (n,)."""
+        return self._within(stand, ROBOT.reach_m, ROBOT.reach_low_m, ROBOT.reach_high_m)
+
+    def handy_from(self, stand: StandPose) -> BoolArray:
+        """Whether the arm gets at each box with ease: neither far out nor near the floor or overhead; shape (n,)."""
+        return self._within(stand, HANDY_M, *HANDY_HEIGHTS_M)
+
+    def _within(self, stand: StandPose, away_m: float, low_m: float, high_m: float) -> BoolArray:
         base = np.array((stand.x_m, stand.y_m))
         away = np.maximum(self.lows_m[:, :2] - base, base - self.highs_m[:, :2])  # (n, 2)
         np.maximum(away, 0.0, out=away)
-        reached = np.hypot(away[:, 0], away[:, 1]) <= ROBOT.reach_m
+        reached = np.hypot(away[:, 0], away[:, 1]) <= away_m
         # Of lowest and highest: twice the height of the middle.
         sums = self.lows_m[:, 2] + self.highs_m[:, 2]
-        return np.asarray(reached & (sums >= 2 * ROBOT.reach_low_m) & (sums <= 2 * ROBOT.reach_high_m))
+        return np.asarray(reached & (sums >= 2 * low_m) & (sums <= 2 * high_m))
 
     def crowded(self, others: Neighbours, margin_m: float) -> BoolArray:
         """Whether each box, grown by a margin, overlaps that of any neighbour; shape (n,)."""

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from embomatrix.sim.physical_reach import Track
 from embomatrix.sim.physical_space import part_boxes
+from embomatrix.world.geometry import Shape
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -23,13 +25,20 @@ OPEN_AZIMUTHS: Final = (0.0, 40.0, -40.0, 80.0, -80.0)
 ROOFED_AZIMUTHS: Final = (0.0, 25.0, -25.0)
 """Degrees by which it comes from aside."""
 ROLLS: Final = (0.0, 90.0)
+STEEP: Final = 70.0
+STEEP_ROLLS: Final = (0.0, 90.0, 45.0, -45.0)
+"""From so steeply above the hand has no way of its own to lie: it comes between things as there is room."""
 FORWARD: Final = 0.35
 """The front of a thing is this share of its depth before its middle."""
 OPEN_BACK_M: Final = 0.10
+PIT_BACK_M: Final = 0.28
+"""Between tall things the hand comes straight down, from higher than they are."""
 BEYOND_M: Final = 0.015
 """The way ends this far behind the surface: the hand stops when it touches."""
 SHEET_M: Final = 0.004
 """It ends no farther behind than the thing is thick there, but at least this far: a sheet of paper lies on something."""
+HOLLOW_M: Final = 0.12
+"""Round things and hulls do not fill their boxes: to those it leads on to half their thickness, up to this far."""
 
 
 def cross(one: FloatArray, other: FloatArray) -> FloatArray:
@@ -51,14 +60,14 @@ def facing(direction: FloatArray, roll: float, aside: FloatArray) -> FloatArray:
 
 def surface_point(
     boxes: Sequence[tuple[Pose, tuple[float, float, float]]], aim: FloatArray, direction: FloatArray
-) -> tuple[FloatArray, float] | None:
-    """Where a ray through a point first meets any of the boxes, and how thick that box is there; None when it misses all.
+) -> tuple[FloatArray, float, int] | None:
+    """Where a ray through a point first meets any of the boxes, how thick that box is there, and its number: slab test.
 
-    Slab test.
+    None when it misses them all.
     """
     start = aim - 3.0 * direction
-    nearest, thick_m = math.inf, 0.0
-    for pose, size in boxes:
+    nearest, thick_m, met = math.inf, 0.0, 0
+    for number, (pose, size) in enumerate(boxes):
         back = pose.rotation.T
         origin, course = back @ (start - np.array(pose.position_m)), back @ direction
         course = np.where(np.abs(course) < 1e-9, 1e-9, course)
@@ -66,8 +75,8 @@ def surface_point(
         first, second = (-half - origin) / course, (half - origin) / course
         enter, leave = np.minimum(first, second).max(), np.maximum(first, second).min()
         if enter <= leave and enter < nearest:
-            nearest, thick_m = float(enter), float(leave - enter)
-    return (start + nearest * direction, thick_m) if math.isfinite(nearest) else None
+            nearest, thick_m, met = float(enter), float(leave - enter), number
+    return (start + nearest * direction, thick_m, met) if math.isfinite(nearest) else None
 
 
 def grasp_tracks(
@@ -78,37 +87,63 @@ def grasp_tracks(
     ``course`` is the heading, in the world, in which the hand goes; ``out_m`` the length of the way in when the thing stands
     under a roof, None in the open.
     """
-    boxes = part_boxes(asset, pose, fractions)
-    elevations = OPEN_ELEVATIONS if out_m is None else ROOFED_ELEVATIONS
-    azimuths = OPEN_AZIMUTHS if out_m is None else ROOFED_AZIMUTHS
-    back_m = OPEN_BACK_M if out_m is None else out_m
-    aside = np.array([-math.sin(course), math.cos(course), 0.0])
-    tracks = []
-    for azimuth in azimuths:
-        for elevation in elevations:
+    body = _Body(
+        part_boxes(asset, pose, fractions), [part.shape for link in asset.links for part in link.parts]
+    )
+    inward = None if out_m is None else _direction(course, 0.0)
+    aims = list(_aims(asset, pose, body.boxes, inward))
+    tracks: list[Track] = []
+    for azimuth in OPEN_AZIMUTHS if out_m is None else ROOFED_AZIMUTHS:
+        for elevation in OPEN_ELEVATIONS if out_m is None else ROOFED_ELEVATIONS:
             if elevation == 90.0 and azimuth != 0.0:
                 continue
             direction = _direction(course + math.radians(azimuth), math.radians(elevation))
-            retreat = direction if out_m is None else _direction(course, 0.0)
-            for aim in _aims(asset, pose, boxes, None if out_m is None else _direction(course, 0.0)):
-                met = surface_point(boxes, aim, direction)
-                if met is None:
-                    continue
-                point, thick_m = met
-                end = point + min(max(thick_m, SHEET_M), BEYOND_M) * direction
-                for roll in ROLLS:
-                    rotation = facing(direction, math.radians(roll), aside)
-                    tracks.append(_approach(rotation, point, end, retreat, back_m))
+            back = direction * OPEN_BACK_M if inward is None or out_m is None else inward * out_m
+            rolls = ROLLS if elevation < STEEP else STEEP_ROLLS
+            tracks += body.approaches(aims, direction, back, rolls, course)
+    if out_m is None:
+        for elevation in (90.0, STEEP):
+            direction = _direction(course, math.radians(elevation))
+            back = np.array([0.0, 0.0, -PIT_BACK_M])
+            tracks += body.approaches(aims[:1], direction, back, STEEP_ROLLS, course)
     return tracks
 
 
-def _approach(
-    rotation: FloatArray, point: FloatArray, end: FloatArray, retreat: FloatArray, back_m: float
-) -> Track:
+@dataclass(frozen=True, slots=True)
+class _Body:
+    """Boxes around the parts of a thing in the world, and the parts' shapes."""
+
+    boxes: Sequence[tuple[Pose, tuple[float, float, float]]]
+    shapes: Sequence[Shape]
+
+    def approaches(
+        self,
+        aims: Sequence[FloatArray],
+        direction: FloatArray,
+        back: FloatArray,
+        rolls: Sequence[float],
+        course: float,
+    ) -> Iterator[Track]:
+        """Ways on which the hand goes for each of the aims: ``back``, (3,), is how it comes near."""
+        aside = np.array([-math.sin(course), math.cos(course), 0.0])
+        for aim in aims:
+            met = surface_point(self.boxes, aim, direction)
+            if met is None:
+                continue
+            point, thick_m, number = met
+            beyond_m = min(max(thick_m, SHEET_M), BEYOND_M)
+            if self.shapes[number] is not Shape.BOX:
+                beyond_m = max(beyond_m, min(thick_m / 2, HOLLOW_M))
+            for roll in rolls:
+                rotation = facing(direction, math.radians(roll), aside)
+                yield _approach(rotation, point, point + beyond_m * direction, back)
+
+
+def _approach(rotation: FloatArray, point: FloatArray, end: FloatArray, back: FloatArray) -> Track:
     near = point - 0.03 * rotation[:, 2]
-    count = max(2, math.ceil(back_m / 0.12) + 1)
-    steps = np.linspace(back_m, 0.0, count)[:, None]
-    positions = np.concatenate([near - steps * retreat, [point, end]])
+    count = max(2, math.ceil(float(np.linalg.norm(back)) / 0.12) + 1)
+    steps = np.linspace(1.0, 0.0, count)[:, None]
+    positions = np.concatenate([near - steps * back, [point, end]])
     total = len(positions)
     return Track(np.tile(rotation, (total, 1, 1)), positions, np.zeros(total, dtype=bool), total - 2)
 

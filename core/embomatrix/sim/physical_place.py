@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.sim.actions import other_stands
 from embomatrix.sim.physical_fold import fold
-from embomatrix.sim.physical_put import put
+from embomatrix.sim.physical_put import drop, put
 from embomatrix.sim.physical_regrasp import regrasp
 from embomatrix.sim.physical_travel import travel
 from embomatrix.skills.failure import FailureReason
@@ -49,6 +49,8 @@ def place(stage: Stage, target: str, asked: PlaceRelation, rng: np.random.Genera
         fold(stage, home, rng, target)
         if regrasp(stage, found, counts, home, rng):
             refusal = put(stage, found, counts, rng, target)
+        if refusal is not None and stage.grip is not None:
+            refusal = drop(stage, found, counts, rng, target)
     fold(stage, home, rng, target)
     if stage.grip is not None:
         return refusal

@@ -89,7 +89,7 @@ def _tracks(stage: Stage, target: str) -> Iterator[Track]:
                     met = surface_point(boxes, np.array([x, y, z]), into)
                     if met is None:
                         continue
-                    point, _ = met
+                    point = met[0]
                     rotation = facing(into, 0.0, arm.about_z(np.array([course]))[0][:, 1])
                     positions = np.array([point - OFF_M * into, point - 0.01 * into, point + BEYOND_M * into])
                     yield Track(np.tile(rotation, (3, 1, 1)), positions, np.zeros(3, dtype=bool), 1)

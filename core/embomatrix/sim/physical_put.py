@@ -29,6 +29,8 @@ CHUNKS: Final = (0, 1, 4, 9, 16, 24)
 """Poses are looked at a few at a time: the robot stands elsewhere for each lot."""
 FITS: Final = 48
 """Turned poses of one lot that are looked at: those in the open first, then the less deep ones."""
+DROPS_M: Final = (0.03, 0.06, 0.12, 0.24, 0.4)
+"""Heights from which things are dropped where the hand can't follow."""
 DROP_M: Final = 0.004
 """The hand lets go when what it holds touches, or this far below where it should."""
 LEVEL: Final = 0.3
@@ -60,7 +62,7 @@ class Delivery:
         self._grip = grip
         self._poses = poses
         self._counts = counts
-        self._boxes = stage.boxes().without(stage.world.cargo(grip.name))
+        self._boxes = stage.boxes()
         self.reach = Reach(self._boxes, self._boxes, grip.held)
 
     def ways(self) -> Iterator[tuple[Way, Track]]:
@@ -71,6 +73,21 @@ class Delivery:
                 bases = bases_at(self._stage, fits[0].pose, fits[0].course, fits[0].out_m)
                 for way in self.reach.ways(tracks, bases):
                     yield way, tracks[way.track]
+
+    def drops(self) -> Iterator[tuple[Way, Track]]:
+        """Ways to let it fall from no higher than must be, as into a crate that is too narrow for the hand."""
+        open_fits = [
+            fit
+            for pose in self._poses[: CHUNKS[2]]
+            for fits in self._fits(pose)
+            for fit in fits
+            if fit.out_m is None
+        ]
+        for drop_m in DROPS_M if open_fits else ():
+            raised_fits = [Fit(Pose((0.0, 0.0, drop_m)) @ fit.pose, fit.course, None) for fit in open_fits]
+            tracks = list(_put_tracks(self._grip, raised_fits))
+            for way in self.reach.ways(tracks, bases_at(self._stage, open_fits[0].pose, 0.0, None)):
+                yield way, tracks[way.track]
 
     def _lots(self) -> Iterator[list[Fit]]:
         """The first pose with the thing as it was found good; then turned, as the hand comes best; then the other poses."""
@@ -87,7 +104,6 @@ class Delivery:
     def _fits(self, pose: Pose) -> tuple[list[Fit], list[Fit]]:
         """A pose as it is and the other way round, as far as the hand can come so; then turned to where the hand comes from."""
         engine, name = self._stage.world.engine, self._grip.name
-        before = None if engine.is_parked(name) else engine.pose(name)
         engine.set_pose(name, pose)
         course, out_m = way_in(self._stage, name, engine.aabb(name), self._boxes)
         pointing = (pose @ self._grip.pose_tool_object.inverse()).rotation[:, 2]
@@ -102,10 +118,7 @@ class Delivery:
             [Fit(turned, course, out_m) for turn in turns for turned in self._turned(pose, turn)]
             for turns in (same, other)
         ]
-        if before is None:
-            engine.park(name)
-        else:
-            engine.set_pose(name, before)
+        engine.park(name)
         return found[0], found[1]
 
     def _turned(self, pose: Pose, turn: float) -> Iterator[Pose]:
@@ -129,11 +142,31 @@ def put(
     ``counts`` tells whether what is held may stay where it stands in the planning scene. A refusal names the target where
     nothing else is known to bar the way; what is held may be in the hand still.
     """
+    assert stage.grip is not None
+    delivery = Delivery(stage, stage.grip, poses, counts)
+    return _bring(stage, delivery, delivery.ways(), rng, target)
+
+
+def drop(
+    stage: Stage, poses: Sequence[Pose], counts: Callable[[], bool], rng: np.random.Generator, target: str
+) -> Refusal | None:
+    """As ``put``, but let it fall from as little above one of the poses as the hand can come."""
+    assert stage.grip is not None
+    delivery = Delivery(stage, stage.grip, poses, counts)
+    return _bring(stage, delivery, delivery.drops(), rng, target)
+
+
+def _bring(
+    stage: Stage,
+    delivery: Delivery,
+    ways: Iterator[tuple[Way, Track]],
+    rng: np.random.Generator,
+    target: str,
+) -> Refusal | None:
     grip = stage.grip
     assert grip is not None
-    delivery = Delivery(stage, grip, poses, counts)
     attempts, refusal = 0, None
-    for way, track in itertools.islice(delivery.ways(), WAYS):
+    for way, track in itertools.islice(ways, WAYS):
         if attempts == ATTEMPTS:
             return refusal
         swing = approach(stage, way, delivery.reach, rng, loaded=True)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from embomatrix.sim.physical_reach import Track
-    from embomatrix.sim.physical_stage import Stage
+    from embomatrix.sim.physical_stage import Grip, Stage
     from embomatrix.world.poses import StandPose
 
 HOSTS: Final = 3
@@ -54,16 +54,21 @@ def regrasp(
     grip = stage.grip
     assert grip is not None
     name = grip.name
+    engine, asset = stage.world.engine, stage.world.asset(name)
     rests = list(_rests(stage, name, poses[0]))
-    if not rests or put(stage, rests, _anywhere, rng, name) is not None:
+    if not rests:
+        return False
+    # Where exactly it will rest makes no difference to which holds lead to the goal.
+    offered = grasp_tracks(asset, rests[0], engine.joints(name), home.yaw, None)
+    kinds = _promising(stage, grip, offered, rests[0], poses[:FORESEEN], counts)
+    if not kinds or put(stage, rests, _anywhere, rng, name) is not None:
         return False
     fold(stage, home, rng)
     stage.settle()
-    engine = stage.world.engine
     pose = engine.pose(name)
     course, out_m = way_in(stage, name, engine.aabb(name), stage.boxes())
-    tracks = grasp_tracks(stage.world.asset(name), pose, engine.joints(name), course, out_m)
-    good = _promising(stage, name, tracks, poses[:FORESEEN], counts)
+    tracks = grasp_tracks(asset, pose, engine.joints(name), course, out_m)
+    good = [track for track in tracks if _kind(track) in kinds]
     roofed = len(good) if out_m is not None else 0
     refusal = take_by(stage, name, good, roofed, bases_at(stage, pose, course, out_m), rng)
     fold(stage, home, rng)
@@ -74,28 +79,33 @@ def _anywhere() -> bool:
     return True
 
 
-def _promising(
-    stage: Stage, name: str, tracks: Sequence[Track], poses: Sequence[Pose], counts: Callable[[], bool]
-) -> list[Track]:
-    """Of the ways to take it, those after which there is a way to put it to one of the poses.
+def _kind(track: Track) -> tuple[float, float]:
+    """How the hand points down and rolls at the end: ways that differ by their heading alone are of one kind.
 
-    Ways that differ by nothing but their heading are equal in that: the thing may be turned about the vertical.
+    Which of these is taken makes no difference to what follows: the thing may be turned about the vertical.
     """
-    pose = stage.world.engine.pose(name)
+    rotation = track.rotation[track.key]
+    return round(float(rotation[2, 2]), 2), round(abs(float(rotation[2, 1])), 2)
+
+
+def _promising(
+    stage: Stage,
+    grip: Grip,
+    offered: Sequence[Track],
+    rest: Pose,
+    poses: Sequence[Pose],
+    counts: Callable[[], bool],
+) -> frozenset[tuple[float, float]]:
+    """Kinds of ways to take what is held, from where it would stand, after which there is a way to one of the poses."""
     known: dict[tuple[float, float], bool] = {}
-    found = []
-    for track in tracks:
-        rotation, position = track.rotation[track.key], track.position[track.key]
-        kind = (round(float(rotation[2, 2]), 2), round(abs(float(rotation[2, 1])), 2))
-        if kind not in known:
-            if len(known) == LOOKED_AT:
-                continue
-            tool = Pose.from_rotation(tuple(position.tolist()), rotation)
-            hold = stage.grip_on(name, tool.inverse() @ pose)
-            known[kind] = any(True for _ in itertools.islice(Delivery(stage, hold, poses, counts).ways(), 1))
-        if known[kind]:
-            found.append(track)
-    return found
+    for track in offered:
+        kind = _kind(track)
+        if kind not in known and len(known) < LOOKED_AT:
+            position = track.position[track.key]
+            tool = Pose.from_rotation(tuple(position.tolist()), track.rotation[track.key])
+            delivery = Delivery(stage, grip.otherwise(tool.inverse() @ rest), poses, counts)
+            known[kind] = next(delivery.ways(), None) is not None
+    return frozenset(kind for kind, good in known.items() if good)
 
 
 def _rests(stage: Stage, name: str, upright: Pose) -> Iterator[Pose]:

@@ -55,6 +55,12 @@ class Grip:
     pose_tool_object: Pose
     held: Held
 
+    def otherwise(self, pose_tool_object: Pose) -> Grip:
+        """What it would be to hold the same in another way."""
+        change = pose_tool_object @ self.pose_tool_object.inverse()
+        held = Held(change.apply_all(self.held.centres), self.held.radii)
+        return Grip(self.name, pose_tool_object, held)
+
 
 def tucked(at: StandPose) -> Posture:
     """The robot with its empty arm as it is while driving."""
@@ -140,12 +146,10 @@ class Stage:
     def take(self, name: str) -> None:
         """The hand holds what it touches."""
         pose_hand_object = self.dynamic.robot.hand_pose().inverse() @ self.dynamic.pose(name)
-        self.grip = self.grip_on(name, TOOL.inverse() @ pose_hand_object)
+        local = TOOL.inverse() @ pose_hand_object
+        centres, radii = self._balls(name, local)
+        self.grip = Grip(name, local, Held(centres, radii))
         self.dynamic.grasp(name)
-
-    def grip_on(self, name: str, pose_tool_object: Pose) -> Grip:
-        """What it would be to hold an object so."""
-        return Grip(name, pose_tool_object, Held(*self._balls(name, pose_tool_object)))
 
     def _balls(self, name: str, pose_tool_object: Pose) -> tuple[FloatArray, FloatArray]:
         """Balls of an object and of all that lies in it, in the tool's frame."""

@@ -183,7 +183,7 @@ class Placer:
     def _roomy_first(
         self, errand: Errand, spots: Spots, frames: dict[str, Pose], order: Sequence[int]
     ) -> Iterator[tuple[int, str]]:
-        """Those in reach, in their order: first those around which there is nothing but the target, then the others.
+        """Those in reach: first those around which there is nothing but the target, then the others, the handy ones before.
 
         With each of the others comes the object that it is most likely to meet. Boxes decide that, so it is cheap; what is
         really free is looked at later. Where something stands for sure is left out.
@@ -199,6 +199,8 @@ class Placer:
         rows = [number for number in order if flags[number]]
         if not rows:
             return
+        handy = boxes.handy_from(errand.robot).tolist()
+        rows.sort(key=lambda number: not handy[number])
         boxes = boxes.at(rows)
         near = self._engine.near(boxes.around().grown(margin_m), frozenset((held, errand.target)))
         if not near:

@@ -63,6 +63,15 @@ def test_reach_to_many_boxes_is_that_to_each(boxes, x, y) -> None:
     assert lineup_of(boxes).reached_from(stand).tolist() == [in_reach(box, stand) for box in boxes]
 
 
+@pytest.mark.parametrize(
+    ("away_m", "height_m", "handy"),
+    [(0.6, 0.8, True), (0.9, 0.8, False), (0.6, 0.1, False), (0.6, 1.8, False)],
+)
+def test_a_place_is_handy_that_is_near_and_neither_low_nor_overhead(away_m, height_m, handy) -> None:
+    cube = Aabb((away_m, -0.05, height_m - 0.05), (away_m + 0.1, 0.05, height_m + 0.05))
+    assert lineup_of([cube]).handy_from(StandPose(0.0, 0.0, 0.0)).tolist() == [handy]
+
+
 @given(st.lists(BOX, min_size=1, max_size=5), st.lists(BOX, min_size=1, max_size=5))
 def test_a_box_is_crowded_when_any_neighbour_overlaps_it_grown(boxes, near) -> None:
     others = Neighbours.of(near, [True] * len(near), [True] * len(near))

@@ -47,9 +47,10 @@ def test_a_pose_is_found_again_from_its_rotation(roll, pitch, yaw):
 
 def test_a_ray_tells_where_it_enters_a_thing_and_how_thick_that_is():
     boxes = [(Pose((0.0, 0.0, 1.0)), (0.2, 0.2, 0.04)), (Pose((0.0, 0.0, 0.5)), (0.2, 0.2, 0.1))]
-    point, thick_m = surface_point(boxes, np.zeros(3), np.array([0.0, 0.0, -1.0]))
+    point, thick_m, number = surface_point(boxes, np.zeros(3), np.array([0.0, 0.0, -1.0]))
     assert point == pytest.approx([0.0, 0.0, 1.02])
     assert thick_m == pytest.approx(0.04)
+    assert number == 0
     assert surface_point(boxes, np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, -1.0])) is None
 
 
@@ -71,6 +72,18 @@ def test_a_sheet_is_taken_off_a_table(play):
 
 def test_what_was_taken_from_aside_is_taken_from_above_to_go_to_the_bottom_of_a_crate(play):
     crate = make.tub("crate", "crate.n.01", (0.24, 0.24, 0.2), 0.01, 0.01, mass_kg=1.0, abilities={})
+    die = replace(make.block("die", "die.n.01", (0.06, 0.06, 0.05), {}), mass_kg=0.1)
+    extra = [
+        (placed("crate_1", crate, "kitchen_0", upright(2.5, 2.6, 0.0, crate)), crate),
+        (placed("die_1", die, "kitchen_0", upright(2.0, 1.3, TABLE_TOP_M, die)), die),
+    ]
+    trace, simulator = play(extra, "move die_1; pick_up die_1; move crate_1; place crate_1 inside")
+    assert trace.failure is None, trace.steps[-1].message
+    assert simulator.world.relations.inside("die_1", "crate_1")
+
+
+def test_what_goes_into_a_crate_too_narrow_for_the_hand_is_dropped_in(play):
+    crate = make.tub("crate", "crate.n.01", (0.16, 0.16, 0.3), 0.01, 0.01, mass_kg=1.0, abilities={})
     die = replace(make.block("die", "die.n.01", (0.06, 0.06, 0.05), {}), mass_kg=0.1)
     extra = [
         (placed("crate_1", crate, "kitchen_0", upright(2.5, 2.6, 0.0, crate)), crate),
