@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import psutil
 import pytest
@@ -245,6 +246,10 @@ async def test_a_bundle_of_a_gigabyte_or_of_another_digest_fails_its_leases_at_o
         assert "expected sha256:2222" in foreign.message
 
 
+def takes_small_pages(pid):
+    return "THP_enabled:\t0" in Path(f"/proc/{pid}/status").read_text()
+
+
 async def test_many_rollouts_leave_a_slot_as_small_as_a_few(tmp_path, kitchen):
     async with running(tmp_path, kitchen) as harness:
         sizes_mb = []
@@ -255,6 +260,7 @@ async def test_many_rollouts_leave_a_slot_as_small_as_a_few(tmp_path, kitchen):
             await harness.until(lambda expected=expected: len(harness.results) == expected)
             [slot] = harness.slots()
             sizes_mb.append(private_mb(slot.pid))
+            assert takes_small_pages(slot.pid)
         assert all(isinstance(outcome, Completed) for outcome in harness.results.values())
         assert sizes_mb[-1] - sizes_mb[1] < 4.0, sizes_mb
         assert harness.pool.residents()[0].state is ResidentState.WARM

@@ -29,6 +29,7 @@ from embomatrix.sim.zygote import (
     resident_mb,
     send,
     serve_forks,
+    take_small_pages,
 )
 
 if TYPE_CHECKING:
@@ -106,6 +107,7 @@ def _hold_scene(simulation: Simulation, connection: socket.socket) -> None:
 def _run_slot(scene: LoadedScene, connection: socket.socket, memory_mb: int) -> None:
     """Execute rollouts, one after another, until the daemon closes the stream."""
     limit_memory(memory_mb)
+    take_small_pages()
     while True:
         if not select.select([connection], [], [], IDLE_S)[0]:
             give_back_memory()

@@ -103,10 +103,8 @@ class BulletEngine:
             item = self._scene.objects[number]
             self._present[number] = not item.absent
             self._poses[number] = item.pose_world_asset
-            self._bodies.move(number, item.pose_world_asset)
-            if self._fractions[number] != item.joints:
-                self._fractions[number] = tuple(item.joints)
-                self._bodies.turn(number, item.joints)
+            self._fractions[number] = tuple(item.joints)
+            self._bodies.leave_behind(number)
             self._bound(number, self._boxes_at_start[number])
         self._changed.clear()
         self._chunks.clear()
@@ -283,14 +281,14 @@ class BulletEngine:
 
     def _put(self, number: int, pose: Pose) -> None:
         self._poses[number] = pose
-        self._bodies.move(number, pose)
+        self._bodies.leave_behind(number)
         self._bound(number, self._box(number))
 
     def _put_joints(self, number: int, fractions: tuple[float, ...]) -> None:
         if not fractions:
             return
         self._fractions[number] = fractions
-        self._bodies.turn(number, fractions)
+        self._bodies.leave_behind(number)
         self._bound(number, self._box(number))
 
     def _bound(self, number: int, box: Aabb) -> None:

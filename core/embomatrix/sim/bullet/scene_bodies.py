@@ -14,6 +14,7 @@ from embomatrix.sim.bullet.client import pybullet
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+    from embomatrix.world.asset import Asset
     from embomatrix.world.geometry import Pose
     from embomatrix.world.scene import Scene
 
@@ -27,18 +28,26 @@ class SceneBodies:
         self._scene = scene
         self._factory = BodyFactory(client)
         self._objects: dict[int, int] = {}
+        self._behind: set[int] = set()
         self._walls: dict[int, int] = {}
 
     def object(self, number: int, pose: Pose, fractions: Sequence[float]) -> int:
-        """Body of an object. One that is not there yet is put at the pose, with its joints at these shares of their travel."""
+        """Body of an object, at the pose, with its joints at these shares of their travel."""
         body = self._objects.get(number)
+        if body is not None and number not in self._behind:
+            return body
+        asset = self._scene.assets[self._scene.objects[number].asset_id]
         if body is None:
-            asset = self._scene.assets[self._scene.objects[number].asset_id]
             [body] = self._factory.jointed(asset, [pose])
             self._objects[number] = body
-            self.move(number, pose)
-            self.turn(number, fractions)
+        self._put(body, pose)
+        self._turn(body, asset, fractions)
+        self._behind.discard(number)
         return body
+
+    def leave_behind(self, number: int) -> None:
+        """The object moves: its body follows when it is next asked for. Most moves are undone before anybody asks."""
+        self._behind.add(number)
 
     def missing(self) -> Iterator[int]:
         """Numbers of the objects that have no body yet."""
@@ -51,20 +60,14 @@ class SceneBodies:
             [self._walls[chunk]] = self._factory.walls(parts)
         return self._walls[chunk]
 
-    def move(self, number: int, pose: Pose) -> None:
-        """Put the object's body at a pose, if there is one."""
-        body = self._objects.get(number)
-        if body is not None:
-            self._bullet.resetBasePositionAndOrientation(
-                body, pose.position_m, pose.quat_xyzw, physicsClientId=self._client
-            )
+    def _put(self, body: int, pose: Pose) -> None:
+        self._bullet.resetBasePositionAndOrientation(
+            body, pose.position_m, pose.quat_xyzw, physicsClientId=self._client
+        )
 
-    def turn(self, number: int, fractions: Sequence[float]) -> None:
-        """Put the joints of the object's body, if there is one, at these shares of their travel."""
-        body = self._objects.get(number)
-        if body is None or not fractions:
+    def _turn(self, body: int, asset: Asset, fractions: Sequence[float]) -> None:
+        if not fractions:
             return
-        asset = self._scene.assets[self._scene.objects[number].asset_id]
         links = self._factory.joint_indices(asset)
         for link, (_, joint), fraction in zip(links, asset.joints, fractions, strict=True):
             self._bullet.resetJointState(body, link, fraction * joint.upper, physicsClientId=self._client)
