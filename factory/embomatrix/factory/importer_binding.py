@@ -22,7 +22,7 @@ from embomatrix.world.state import Relation, State
 from embomatrix.world.substances import is_substance
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Container, Iterable, Iterator, Mapping
 
     import numpy as np
 
@@ -339,16 +339,7 @@ def _in_order(
     """Additions such that each host is there before its guest."""
     additions: list[Addition] = []
     ready = {*found, *floors}
-    absent = {half for halves in pieces_of(problem).values() for half in halves}
-    waiting = [
-        name
-        for name, type_name in problem.objects.items()
-        if name not in ready
-        and name not in absent
-        and type_name != AGENT
-        and type_name not in FLOORS
-        and not is_substance(type_name)
-    ]
+    waiting = _to_add(problem, ready)
     while waiting:
         name = next(
             (name for name in waiting if name in loose or placed.get(name, (None, ""))[1] in ready), None
@@ -360,21 +351,29 @@ def _in_order(
             )
         waiting.remove(name)
         ready.add(name)
-        if name in loose:
-            additions.append(Addition(name, problem.objects[name], None, "", loose[name]))
-            continue
-        relation, host = placed[name]
-        on_floor = host in floors
-        additions.append(
-            Addition(
-                name,
-                problem.objects[name],
-                None if on_floor else relation,
-                "" if on_floor else host,
-                floors.get(host, ""),
-            )
-        )
+        where = (None, "", loose[name]) if name in loose else _place_of(placed[name], floors)
+        additions.append(Addition(name, problem.objects[name], *where))
     return tuple(additions)
+
+
+def _to_add(problem: Problem, ready: Container[str]) -> list[str]:
+    """The problem's objects that the scene lacks: no halves, which come of slicing, and nothing without a body."""
+    absent = {half for halves in pieces_of(problem).values() for half in halves}
+    return [
+        name
+        for name, type_name in problem.objects.items()
+        if name not in ready
+        and name not in absent
+        and type_name != AGENT
+        and type_name not in FLOORS
+        and not is_substance(type_name)
+    ]
+
+
+def _place_of(at: tuple[Relation, str], floors: Mapping[str, str]) -> tuple[Relation | None, str, str]:
+    """Relation, host and room of an addition; what the start puts on a floor only has a room."""
+    relation, host = at
+    return (None, "", floors[host]) if host in floors else (relation, host, "")
 
 
 def _robot_room(

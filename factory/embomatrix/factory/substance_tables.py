@@ -9,7 +9,7 @@ import json
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
     from pathlib import Path
 
 Json = Any
@@ -44,26 +44,27 @@ def build_substances(folder: Path) -> Json:
     return {
         "kinds": {name: _kind(entry) for name, entry in sorted(knowledge.items()) if "substance" in entry},
         "removers": {
-            name: {
-                substance: number(options)
-                for substance, options in _removals(entry["particleRemover"]).items()
-            }
-            for name, entry in sorted(knowledge.items())
-            if entry.get("particleRemover", {}).get("conditions")
+            name: {substance: number(options) for substance, options in _removals(ability).items()}
+            for name, ability in _able(knowledge, "particleRemover", "conditions")
         },
         "washer": {substance: number(options) for substance, options in sorted(washer.items())},
         "sources": {
-            name: sorted(entry["particleSource"]["conditions"])
-            for name, entry in sorted(knowledge.items())
-            if entry.get("particleSource", {}).get("conditions")
+            name: sorted(ability["conditions"])
+            for name, ability in _able(knowledge, "particleSource", "conditions")
         },
         "halves": {
-            name: entry["sliceable"]["sliceable_derivative_synset"]
-            for name, entry in sorted(knowledge.items())
-            if "sliceable_derivative_synset" in entry.get("sliceable", {})
+            name: ability["sliceable_derivative_synset"]
+            for name, ability in _able(knowledge, "sliceable", "sliceable_derivative_synset")
         },
         "needs": needs,
     }
+
+
+def _able(knowledge: Mapping[str, Json], ability: str, parameter: str) -> Iterator[tuple[str, Json]]:
+    """Synsets whose ability has the parameter, in their order, with all parameters of the ability."""
+    for name, entry in sorted(knowledge.items()):
+        if entry.get(ability, {}).get(parameter):
+            yield name, entry[ability]
 
 
 def _kind(abilities: Mapping[str, Json]) -> str:

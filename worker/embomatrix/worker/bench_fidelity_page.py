@@ -40,50 +40,47 @@ MINUTES_GOAL: Final = 25.0
 def figures_of(outcome: Outcome, minutes: float | None) -> tuple[Figure, ...]:
     """All figures. ``minutes`` is the wall time of the whole suite, None when part of it was done before."""
     report = report_on(outcome.comparisons)
+    suite = (
+        () if minutes is None else (Figure("suite_minutes", minutes, "min", Better.LOWER, 1, MINUTES_GOAL),)
+    )
+    return (
+        *_agreement(report),
+        *_extent(outcome, report),
+        *_physical_times(report),
+        *_skill_figures(report),
+        *suite,
+    )
+
+
+def _agreement(report: FidelityReport) -> Iterator[Figure]:
+    """Shares of what was compared that is equal in both modes."""
+    for name, value, compared, goal in (
+        ("final_atoms_equal", report.atoms_equal, report.atoms, ATOMS_GOAL),
+        ("step_outcomes_equal", report.steps_equal, report.steps, STEPS_GOAL),
+        ("step_outcomes_equal_of_either", report.steps_equal_of_either, report.steps_of_either, None),
+        ("step_reasons_equal", report.reasons_equal, report.steps, None),
+        ("plans_equal", report.plans_equal, report.plans, None),
+    ):
+        yield Figure(name, value, "share", Better.HIGHER, compared, goal)
+
+
+def _extent(outcome: Outcome, report: FidelityReport) -> Iterator[Figure]:
+    """How much was compared, and of what kind."""
+    higher, plans, lost = Better.HIGHER, report.plans, len(outcome.lost)
     calls = calls_of(outcome.comparisons)
-    higher, lower = Better.HIGHER, Better.LOWER
-    plans, steps = report.plans, report.steps
-    found = [
-        Figure("final_atoms_equal", report.atoms_equal, "share", higher, report.atoms, ATOMS_GOAL),
-        Figure("step_outcomes_equal", report.steps_equal, "share", higher, steps, STEPS_GOAL),
-        Figure(
-            "step_outcomes_equal_of_either",
-            report.steps_equal_of_either,
-            "share",
-            higher,
-            report.steps_of_either,
-        ),
-        Figure("step_reasons_equal", report.reasons_equal, "share", higher, steps),
-        Figure("plans_equal", report.plans_equal, "share", higher, plans),
-        Figure("plans", float(plans), "", higher, plans, PLANS_GOAL),
-        Figure("plans_lost", float(len(outcome.lost)), "", lower, plans + len(outcome.lost), 0.0),
-        Figure("scenes", float(report.scenes), "", higher, report.scenes, SCENES_GOAL),
-        Figure("succeeded_in_cached_mode", report.succeeded, "share", higher, plans, SUCCEEDED_GOAL),
-        Figure(
-            "calls_of_the_rarest_skill",
-            float(min(calls[skill] for skill in SKILLS)),
-            "",
-            higher,
-            len(SKILLS),
-            CALLS_GOAL,
-        ),
-        Figure("physical_plan_s", report.plan_s, "s", lower, plans),
-    ]
-    if report.full_scene_plans:
-        found.append(
-            Figure(
-                "physical_plan_300_s",
-                report.full_scene_plan_s,
-                "s",
-                lower,
-                report.full_scene_plans,
-                PLAN_S_GOAL,
-            )
-        )
-    found += _skill_figures(report)
-    if minutes is not None:
-        found.append(Figure("suite_minutes", minutes, "min", lower, 1, MINUTES_GOAL))
-    return tuple(found)
+    rarest = float(min(calls[skill] for skill in SKILLS))
+    yield Figure("plans", float(plans), "", higher, plans, PLANS_GOAL)
+    yield Figure("plans_lost", float(lost), "", Better.LOWER, plans + lost, 0.0)
+    yield Figure("scenes", float(report.scenes), "", higher, report.scenes, SCENES_GOAL)
+    yield Figure("succeeded_in_cached_mode", report.succeeded, "share", higher, plans, SUCCEEDED_GOAL)
+    yield Figure("calls_of_the_rarest_skill", rarest, "", higher, len(SKILLS), CALLS_GOAL)
+
+
+def _physical_times(report: FidelityReport) -> Iterator[Figure]:
+    lower, full = Better.LOWER, report.full_scene_plans
+    yield Figure("physical_plan_s", report.plan_s, "s", lower, report.plans)
+    if full:
+        yield Figure("physical_plan_300_s", report.full_scene_plan_s, "s", lower, full, PLAN_S_GOAL)
 
 
 def _skill_figures(report: FidelityReport) -> Iterator[Figure]:
