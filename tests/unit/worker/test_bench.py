@@ -377,3 +377,32 @@ def test_a_busy_machine_and_missed_goals_are_said_on_the_page():
 
 def _result(*figures):
     return BenchResult("rollout", "abc", MACHINE, figures)
+
+
+def test_the_page_is_made_of_figures_that_were_measured_before(tmp_path):
+    speedup = Figure("skill_speedup_min", 250.0, "×", Better.HIGHER, 7, 100.0)
+    steps = Figure("step_outcomes_equal", 0.99, "share", Better.HIGHER, 5000, 0.98)
+    results = [
+        BenchResult("engine", "abc", MACHINE, (Figure("reset_ms", 0.05, "ms", Better.LOWER, 10, 0.1),)),
+        BenchResult("fidelity", "def", MACHINE, (steps, speedup)),
+    ]
+    files = [tmp_path / f"{result.bench}.json" for result in results]
+    for file, result in zip(files, results, strict=True):
+        file.write_text(json.dumps(result_to_json(result)))
+    out = tmp_path / "page.md"
+    answer = _bench("page", *map(str, files), "--out", str(out))
+    assert answer.exit_code == 0, answer.output
+    engine, fidelity = out.read_text().split("## Fidelity of the two modes")
+    assert "| skill_speedup_min | 250 × | ≥ 100 | reached | 7 |" in engine
+    assert "| step_outcomes_equal | 0.99 share | ≥ 0.98 | reached | 5,000 |" in fidelity
+    assert "commit `def`" in fidelity
+
+
+def test_a_file_that_holds_no_figures_is_named(tmp_path):
+    damaged = tmp_path / "engine.json"
+    for text in ("", "[]", '{"bench": "engine", "commit": "a", "machine": {}, "figures": []}'):
+        damaged.write_text(text)
+        answer = _bench("page", str(damaged), "--out", str(tmp_path / "page.md"))
+        assert answer.exit_code == 2
+        assert "holds no figures of a bench" in " ".join(answer.output.split())
+    assert not (tmp_path / "page.md").exists()

@@ -92,19 +92,39 @@ def result_to_json(result: BenchResult) -> dict[str, Any]:
     }
 
 
-def figure_in(path: Path, name: str) -> Figure:
-    """A figure of a file that another bench wrote. Raises BenchError when it has none of that name."""
+def read_result(path: Path) -> BenchResult:
+    """What `result_to_json` made of a result, from a file. Raises BenchError when it is none."""
     try:
-        found = {str(item["name"]): item for item in json.loads(path.read_text(encoding="utf-8"))["figures"]}
-        item = found[name]
-        better, goal = Better(item["better"]), item["goal"]
-        value = float(item["value"])
-        return Figure(
-            name, value, str(item["unit"]), better, int(item["n"]), None if goal is None else float(goal)
-        )
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        value = json.loads(path.read_text(encoding="utf-8"))
+        machine = dict(value["machine"])
+        float(machine["load_before"]), float(machine["cores"])
+        figures = tuple(_figure_from(item) for item in value["figures"])
+        return BenchResult(str(value["bench"]), str(value["commit"]), machine, figures)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise BenchError(
-            f"{path} has no figure {name!r} ({error}): expected a file that 'embomatrix bench fidelity --json' wrote"
+            f"{path} holds no figures of a bench ({error}): expected a file that 'embomatrix bench NAME --json' wrote"
+        ) from error
+
+
+def _figure_from(item: Mapping[str, Any]) -> Figure:
+    goal = None if item["goal"] is None else float(item["goal"])
+    return Figure(
+        str(item["name"]),
+        float(item["value"]),
+        str(item["unit"]),
+        Better(item["better"]),
+        int(item["n"]),
+        goal,
+    )
+
+
+def figure_in(path: Path, name: str) -> Figure:
+    """A figure of a file that `bench fidelity` wrote. Raises BenchError when it has none of that name."""
+    try:
+        return read_result(path).figure(name)
+    except (BenchError, KeyError) as error:
+        raise BenchError(
+            f"{path} has no figure {name!r}: expected a file that 'embomatrix bench fidelity --json' wrote"
         ) from error
 
 

@@ -40,6 +40,13 @@ TITLES: Final[Mapping[str, tuple[str, str]]] = {
         "precondition, every placed thing for penetration, relations and the reward. Names without a size are for scenes "
         "of about 300 bodies.",
     ),
+    "fidelity": (
+        "Fidelity of the two modes",
+        "`embomatrix bench fidelity --dataset=build/scenes --json FILE` on the dataset of `embomatrix factory build "
+        "--out=build/scenes --scenes=all --train=208 --heldout=0`: the same plans in cached and in physical mode, counted as "
+        "[decision 0010](decisions/0010-how-fidelity-is-counted.md) says. *physical_plan_300_s* is processor time of a plan in "
+        "scenes of about 300 bodies; *speed-up* is that of calls which succeed in both modes.",
+    ),
     "rollout": (
         "One process",
         "`embomatrix bench rollout`: oracle plans of the dataset, executed and scored in one simulator, without a cluster. "
@@ -58,7 +65,8 @@ TITLES: Final[Mapping[str, tuple[str, str]]] = {
 }
 """Heading and explanation of each bench, in the order of the page."""
 INTRODUCTION: Final = (
-    "`embomatrix bench all --dataset DIR --out docs/benchmarks.md` measures and writes this page. Ratios compare numbers of "
+    "`embomatrix bench all --dataset DIR --out docs/benchmarks.md` measures and writes this page; `embomatrix bench page "
+    "FILE...` writes it of figures that were measured before. Ratios compare numbers of "
     "one run on one machine. Goals are for one core and scenes of up to 300 bodies; they come from what the physics engine "
     "needs at the least."
 )
@@ -72,7 +80,11 @@ def render_page(results: Sequence[BenchResult], before: str) -> str:
     lines = [HEAD, "# Benchmarks", "", _paragraph(INTRODUCTION), "", *_machine_lines(results)]
     for result in sorted(results, key=lambda result: [*TITLES].index(result.bench)):
         heading, explanation = TITLES[result.bench]
-        lines += ["", f"## {heading}", "", _paragraph(explanation), "", *_table(result.figures)]
+        lines += ["", f"## {heading}", "", _paragraph(explanation), ""]
+        if result.commit != results[0].commit:
+            load = f"on {result.machine['cores']} cores with a load of {result.machine['load_before']} before"
+            lines += [_paragraph(f"Measured at commit `{result.commit}`, {load}."), ""]
+        lines += _table(result.figures)
     headings = dict(HAND_PARTS)
     for name in dict.fromkeys([*headings, *parts]):
         lines += [""] + ([f"## {headings[name]}", ""] if name in headings else [])
