@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     BoolArray = NDArray[np.bool_]
     IntArray = NDArray[np.int16]
+    Changes = tuple[tuple[FloatArray, int], ...]
 
 Cell = tuple[int, int]
 
@@ -54,32 +55,32 @@ class FloorGrid:
         for edge in (np.s_[0, :], np.s_[-1, :], np.s_[:, 0], np.s_[:, -1]):
             covered[edge] += 1
         self._covered = covered
-        self.free: BoolArray = _clear(covered)
+        self._free: BoolArray | None = _clear(covered)
 
     @classmethod
     def restored(cls, scene: Scene, covered: NDArray[np.int16], free: BoolArray) -> FloorGrid:
         """The grid of the scene that once had these arrays, of shape ``grid_shape``."""
         grid = cls.__new__(cls)
         grid._lay_out(scene)
-        grid._covered, grid.free = covered, free
+        grid._covered, grid._free = covered, free
         return grid
 
     def _lay_out(self, scene: Scene) -> None:
         self._origin = _origin_of(scene)
         self._origin_m = (float(self._origin[0]), float(self._origin[1]))
         self._shape = grid_shape(scene)
-        self._changes: tuple[tuple[FloatArray, int], ...] = ()
+        self._changes: Changes = ()
         self._fields: dict[Cell, FloatArray] = {}
 
     @property
     def covered(self) -> NDArray[np.int16]:
         """How many obstacles cover each cell, and one more where there is no floor."""
-        return self._covered_in((slice(0, self._shape[0]), slice(0, self._shape[1])))
+        return self._covered_in((slice(0, self._shape[0]), slice(0, self._shape[1])), self._changes)
 
-    def _covered_in(self, window: Window) -> NDArray[np.int16]:
-        """The same for a window's cells. A changed grid shares the counts of the one that it was made from."""
+    def _covered_in(self, window: Window, changes: Changes) -> NDArray[np.int16]:
+        """The same for a window's cells, after changes to the grid that was made first."""
         covered = self._covered[window].copy()
-        for boxes, step in self._changes:
+        for boxes, step in changes:
             for box in boxes:
                 here, _ = overlap(window, self._window(box[:2], box[2:4]))
                 covered[here] += step
@@ -90,20 +91,18 @@ class FloorGrid:
         boxes = np.concatenate([gone, come])  # (n, 6)
         if not len(boxes):
             return self
-        grid = copy.copy(self)
-        vars(grid).pop("_graph", None)
-        grid._fields = {}
-        grid._changes = (*self._changes, (gone, -1), (come, 1))
-        grid.free = self.free.copy()
         reach = ROBOT.radius_m + CELL_M
+        edge = reach + CELL_M
+        window = self._window(boxes[:, :2].min(axis=0) - edge, boxes[:, 2:4].max(axis=0) + edge)
+        free = self.parts.within(window) > 0
+        changes = (*self._changes, (gone, -1), (come, 1))
         for box in boxes:
             here = self._window(box[:2] - reach, box[2:4] + reach)
             around = self._window(box[:2] - 2 * reach, box[2:4] + 2 * reach)
             _, inner = overlap(here, around)
-            grid.free[here] = _clear(grid._covered_in(around))[inner]
-        edge = reach + CELL_M
-        window = self._window(boxes[:, :2].min(axis=0) - edge, boxes[:, 2:4].max(axis=0) + edge)
-        vars(grid)["parts"] = self.parts.changed(grid.free, window)
+            free[overlap(window, here)[0]] = _clear(self._covered_in(around, changes))[inner]
+        grid = self._with_parts(self.parts.changed(free, window))
+        grid._changes = changes
         return grid
 
     def narrowed(self, boxes: FloatArray) -> FloorGrid:
@@ -111,23 +110,27 @@ class FloorGrid:
 
         It is the same grid where they leave as much floor. It costs less than ``changed``, which measures distances anew.
         """
-        free = self.free
-        reached: list[Window] = []
+        taken: list[tuple[Window, BoolArray]] = []
         for cells in sorted({self._cells(box) for box in boxes}):
             around, blocked = self._blocked_by(cells)
-            if (free[around] & blocked).any():
-                free = free.copy() if free is self.free else free
-                free[around] &= ~blocked
-                reached.append(around)
-        if not reached:
+            if (self.parts.within(around)[blocked] > 0).any():
+                taken.append((around, blocked))
+        if not taken:
             return self
+        low = [max(0, min(around[axis].start for around, _ in taken) - 1) for axis in (0, 1)]
+        high = [max(around[axis].stop for around, _ in taken) + 1 for axis in (0, 1)]
+        window = slice(low[0], min(high[0], self._shape[0])), slice(low[1], min(high[1], self._shape[1]))
+        free = self.parts.within(window) > 0
+        for around, blocked in taken:
+            free[overlap(window, around)[0]] &= ~blocked
+        return self._with_parts(self.parts.changed(free, window))
+
+    def _with_parts(self, parts: FloorParts) -> FloorGrid:
+        """This grid with other free cells. It shares all it can: there are dozens of such grids in memory."""
         grid = copy.copy(self)
         vars(grid).pop("_graph", None)
-        grid._fields = {}
-        grid.free = free
-        low = [max(0, min(window[axis].start for window in reached) - 1) for axis in (0, 1)]
-        high = [max(window[axis].stop for window in reached) + 1 for axis in (0, 1)]
-        vars(grid)["parts"] = self.parts.changed(free, (slice(low[0], high[0]), slice(low[1], high[1])))
+        vars(grid)["parts"] = parts
+        grid._free, grid._fields = None, {}
         return grid
 
     def _cells(self, box: FloatArray) -> tuple[int, int, int, int]:
@@ -149,8 +152,13 @@ class FloorGrid:
 
     @functools.cached_property
     def parts(self) -> FloorParts:
-        """Which of the free cells hang together."""
+        """Which of the free cells hang together: of a changed grid this is all that is known of them."""
         return FloorParts.of(self.free)
+
+    @property
+    def free(self) -> BoolArray:
+        """Where the robot may be, shape (rows, columns). For reading only."""
+        return self._free if self._free is not None else self.parts.numbers > 0
 
     @property
     def labels(self) -> IntArray:
@@ -164,10 +172,11 @@ class FloorGrid:
         i, j = self._cell_at(x_m, y_m)
         if not (0 <= i < self._shape[0] and 0 <= j < self._shape[1]):
             return None
-        if self.free[i, j]:
+        if self.label((i, j)):
             return (i, j)
         first_i, first_j = max(0, i - SNAP_CELLS), max(0, j - SNAP_CELLS)
-        near = np.argwhere(self.free[first_i : i + SNAP_CELLS + 1, first_j : j + SNAP_CELLS + 1])
+        around = slice(first_i, i + SNAP_CELLS + 1), slice(first_j, j + SNAP_CELLS + 1)
+        near = np.argwhere(self.parts.within(around) > 0)
         if not len(near):
             return None
         away = (near[:, 0] + first_i - i) ** 2 + (near[:, 1] + first_j - j) ** 2  # (n,) in cells
@@ -185,8 +194,7 @@ class FloorGrid:
 
     def is_free(self, x_m: float, y_m: float) -> bool:
         """Whether the robot fits at a point."""
-        i, j = self._cell_at(x_m, y_m)
-        return bool(0 <= i < self._shape[0] and 0 <= j < self._shape[1] and self.free[i, j])
+        return self.label_at(x_m, y_m) > 0
 
     def label(self, cell: Cell) -> int:
         """Number of the component that a free cell belongs to; 0 for a blocked one."""
@@ -199,18 +207,20 @@ class FloorGrid:
         return self.parts.at((i, j)) if inside else 0
 
     def may_differ_at(self, wider: FloorGrid, x_m: float, y_m: float) -> bool:
-        """Whether a point may be taken, or cut off, that was not so on the grid that this one was narrowed from."""
+        """Whether a point may be taken, or cut off as it was not on the grid that this one was narrowed from."""
         if self is wider:
             return False
         renumbered = self.parts.whole is not wider.parts.whole
-        return renumbered or self.label_at(x_m, y_m) != wider.label_at(x_m, y_m)
+        label = self.label_at(x_m, y_m)
+        return renumbered or not label or label != wider.label_at(x_m, y_m)
 
     def main_part_of(self, wider: FloorGrid, x_m: float, y_m: float) -> int:
         """The largest component of this grid in the one that a point belongs to on the grid that it was narrowed from."""
         cell = wider.cell(x_m, y_m)
         if cell is None:
             return 0
-        parts = self.labels[(wider.labels == wider.label(cell)) & self.free]
+        labels = self.labels
+        parts = labels[(wider.labels == wider.label(cell)) & (labels > 0)]
         return int(np.bincount(parts, minlength=1).argmax())
 
     def free_centers(self, low_m: Vec2, high_m: Vec2, label: int) -> FloatArray:
@@ -226,12 +236,12 @@ class FloorGrid:
         """Middles of the free cells in a rectangle, whatever their component, shape (n, 2), in the world."""
         window = self._window(np.asarray(low_m), np.asarray(high_m))
         corner = np.array([window[0].start, window[1].start])
-        inside = np.argwhere(self.free[window])
+        inside = np.argwhere(self.parts.within(window) > 0)
         return np.asarray(self._origin + (inside + corner + 0.5) * CELL_M, dtype=np.float64)
 
     def distance(self, start: Cell, end: Cell) -> float | None:
         """Length in metres of the shortest path over free cells, None when there is none."""
-        if not self.free[start] or self.label(start) != self.label(end):
+        if not self.label(start) or self.label(start) != self.label(end):
             return None
         return float(self._field(end)[start[0] * self._shape[1] + start[1]])
 
@@ -258,7 +268,8 @@ class FloorGrid:
 
         The way leads over ``floor`` only, of the grid's shape. Empty when there is none.
         """
-        cost = np.where(self.free, 1.0, CROSSING_COST)
+        free = self.free
+        cost = np.where(free, 1.0, CROSSING_COST)
         seen = np.full(self._shape, np.inf)
         seen[start] = 0.0
         came: dict[Cell, Cell] = {}
@@ -268,7 +279,7 @@ class FloorGrid:
             spent, (i, j) = heapq.heappop(queue)
             if spent > seen[i, j]:
                 continue
-            if goal[0].start <= i < goal[0].stop and goal[1].start <= j < goal[1].stop and self.free[i, j]:
+            if goal[0].start <= i < goal[0].stop and goal[1].start <= j < goal[1].stop and free[i, j]:
                 break
             for cell in ((i + 1, j), (i - 1, j), (i, j + 1), (i, j - 1)):
                 if floor[cell] and spent + cost[cell] < seen[cell]:
@@ -280,7 +291,7 @@ class FloorGrid:
         way = [(i, j)]
         while way[-1] in came:
             way.append(came[way[-1]])
-        return np.array([self.center(cell) for cell in way if not self.free[cell]]).reshape(-1, 2)
+        return np.array([self.center(cell) for cell in way if not free[cell]]).reshape(-1, 2)
 
     def drives_straight(self, start: Vec2, end: Vec2) -> bool:
         """Whether the robot fits everywhere on the straight line between two points."""
@@ -288,18 +299,24 @@ class FloorGrid:
         shares = np.linspace(0.0, 1.0, count + 1)[:, None]
         points = np.asarray(start) + shares * (np.asarray(end) - np.asarray(start))  # (n, 2)
         cells = np.floor((points - self._origin) / CELL_M).astype(int)
-        inside = ((cells >= 0) & (cells < self._shape)).all()
-        return bool(inside and self.free[cells[:, 0], cells[:, 1]].all())
+        low, high = cells.min(axis=0), cells.max(axis=0)
+        if (low < 0).any() or (high >= self._shape).any():
+            return False
+        passed = self.parts.within(
+            (slice(int(low[0]), int(high[0]) + 1), slice(int(low[1]), int(high[1]) + 1))
+        )
+        return bool((passed[cells[:, 0] - low[0], cells[:, 1] - low[1]] > 0).all())
 
     def _neighbours(self, i: int, j: int) -> list[Cell]:
         """Free cells next to a cell; those across a corner only where both cells beside it are free."""
+        near = self.parts.within((slice(i - 1, i + 2), slice(j - 1, j + 2))) > 0  # (3, 3)
         return [
             (i + di, j + dj)
             for di in (-1, 0, 1)
             for dj in (-1, 0, 1)
             if (di or dj)
-            and self.free[i + di, j + dj]
-            and (not (di and dj) or (self.free[i + di, j] and self.free[i, j + dj]))
+            and near[1 + di, 1 + dj]
+            and (not (di and dj) or (near[1 + di, 1] and near[1, 1 + dj]))
         ]
 
     def _field(self, cell: Cell) -> FloatArray:
@@ -316,15 +333,15 @@ class FloorGrid:
     @functools.cached_property
     def _graph(self) -> sparse.csr_matrix:
         """Eight-neighbour graph of the free cells. Diagonals cut no corners: both cells beside them must be free."""
-        rows, columns = self._shape
+        (rows, columns), free = self._shape, self.free
         number = np.arange(rows * columns).reshape(self._shape)
         starts, ends, lengths = [], [], []
         for di, dj in ((1, 0), (0, 1), (1, 1), (1, -1)):
             a = (slice(0, rows - di), slice(max(0, -dj), columns - max(0, dj)))
             b = (slice(di, rows), slice(max(0, dj), columns - max(0, -dj)))
-            both = self.free[a] & self.free[b]
+            both = free[a] & free[b]
             if di and dj:
-                both &= self.free[a[0], b[1]] & self.free[b[0], a[1]]
+                both &= free[a[0], b[1]] & free[b[0], a[1]]
             starts.append(number[a][both])
             ends.append(number[b][both])
             lengths.append(np.full(int(both.sum()), CELL_M * math.hypot(di, dj)))

@@ -64,24 +64,30 @@ class FloorParts:
         return numbers
 
     def changed(self, free: BoolArray, window: Window) -> FloorParts:
-        """Parts after cells in a window, but for those at its edge, were taken or freed; ``free`` are all free cells.
+        """Parts after cells of a window were taken or freed: ``free`` are the window's. At its edge nothing has changed.
 
         Where the cells of the edge hang together within the window as they did before, so do all cells beyond it.
         """
         old = self.within(window)
         before, _ = _numbered(old > 0)
-        after, found = _numbered(free[window])
+        after, found = _numbered(free)
         edge = np.ones(after.shape, dtype=np.bool_)
         edge[1:-1, 1:-1] = False
         pairs = set(zip(before[edge].tolist(), after[edge].tolist(), strict=True))
         if not len(pairs) == len({first for first, _ in pairs}) == len({last for _, last in pairs}):
-            return FloorParts.of(free)
+            everywhere = self.numbers > 0
+            everywhere[window] = free
+            return FloorParts.of(everywhere)
         # A part that does not come to the edge is an island of its own.
         names = np.arange(self.count, self.count + found + 1, dtype=np.int16)
         names[0] = 0
         names[after[edge]] = old[edge]
-        whole = self.numbers if self.inner is not None else self.whole
-        return FloorParts(whole, self.count + found, window, names[after])
+        inner, both = names[after], window
+        if self.inner is not None:
+            both = _around(self.window, window)
+            inner = self.within(both).copy()
+            inner[overlap(both, window)[0]] = names[after]
+        return FloorParts(self.whole, self.count + found, both, inner)
 
 
 def _numbered(free: NDArray[Any]) -> tuple[IntArray, int]:
@@ -94,6 +100,14 @@ def overlap(first: Window, second: Window) -> tuple[Window, Window]:
     low = [max(a.start, b.start) for a, b in zip(first, second, strict=True)]
     high = [max(start, min(a.stop, b.stop)) for start, a, b in zip(low, first, second, strict=True)]
     return _seen_from(first, low, high), _seen_from(second, low, high)
+
+
+def _around(first: Window, second: Window) -> Window:
+    """The smallest window that holds both."""
+    rows, columns = (
+        slice(min(a.start, b.start), max(a.stop, b.stop)) for a, b in zip(first, second, strict=True)
+    )
+    return rows, columns
 
 
 def _seen_from(window: Window, low: list[int], high: list[int]) -> Window:

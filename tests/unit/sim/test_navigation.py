@@ -201,6 +201,7 @@ def test_changed_grid_is_the_one_that_would_be_made_anew(start, come, data) -> N
     assert (back.free == FloorGrid(scene, rows_of(start)).free).all()
     assert _parts_are_equal(back, FloorGrid(scene, rows_of(start)))
     assert (changed.covered == fresh.covered).all()
+    assert _parts_are_equal(changed.narrowed(rows_of(gone)), fresh.narrowed(rows_of(gone)))
 
 
 @settings(max_examples=40, deadline=None)
