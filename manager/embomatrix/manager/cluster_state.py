@@ -3,19 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.assignments import DispatchLimits
 from embomatrix.manager.dispatcher import Dispatcher
-from embomatrix.manager.events import (
-    BatchSubmitted,
-    LookaheadAnnounced,
-    RunClosed,
-    ScenesUnplaceable,
-    Tick,
-    WorkerLost,
-)
-from embomatrix.manager.scheduler import ScheduleLimits, Scheduler
+from embomatrix.manager.events import RunClosed, ScenesUnplaceable
+from embomatrix.manager.scheduler import ScheduleLimits, Scheduler, Urgency
 from embomatrix.rpc.values import RunStats
 
 if TYPE_CHECKING:
@@ -24,10 +18,13 @@ if TYPE_CHECKING:
     from embomatrix.manager.commands import Command
     from embomatrix.manager.events import Event
 
-PLACE_EVERY_S: Final = 0.02
-"""Reports and results come by the thousand: between two placements of their kind there is at least this."""
-PROMPT: Final = (BatchSubmitted, LookaheadAnnounced, WorkerLost, RunClosed, Tick)
-"""Events that are answered with a placement at once; what others leave open, the next tick decides."""
+EFFORT_S: Final = 1e-5
+"""What a placement is taken to cost for each need and worker that it looks at: what it costs sets how often it is made."""
+LATER_S: Final = 0.02
+LATER_SHARE: Final = 0.02
+"""Between placements that can wait there is at least this, and they take at most this share of the time."""
+NOW_SHARE: Final = 0.1
+"""The same of those that can't."""
 
 
 class ClusterState:
@@ -46,17 +43,20 @@ class ClusterState:
         self.dispatcher = Dispatcher(dispatch or DispatchLimits(), boot_id=boot_id)
         self.scheduler = Scheduler(schedule or ScheduleLimits())
         self._waiting = 0
-        self._placed_s = -PLACE_EVERY_S
+        self._placed_s = -math.inf
+        self._urgency = Urgency.NONE
         self._closed = RunStats()
         self._unplaceable: dict[str, str] = {}
 
     def handle(self, event: Event, *, now_s: float) -> list[Command]:
         """Take in one fact; returns what shall be done about it, in order."""
         commands = self.dispatcher.handle(event, now_s=now_s)
-        worth = self.scheduler.note(event, now_s=now_s)
-        # On the hot path residents matter only when a scene gets its first waiting rollout, or loses its last.
-        worth = worth or self.dispatcher.waiting_scenes != self._waiting
-        if worth and (isinstance(event, PROMPT) or now_s - self._placed_s >= PLACE_EVERY_S):
+        urgency = self.scheduler.note(event, now_s=now_s)
+        if self.dispatcher.waiting_scenes != self._waiting:
+            # A scene got its first waiting rollout, or lost its last.
+            urgency = max(urgency, Urgency.LATER)
+        self._urgency = max(urgency, self._urgency)
+        if self._urgency and now_s - self._placed_s >= self._pause_s():
             commands += self._place(now_s)
         return commands
 
@@ -85,8 +85,13 @@ class ClusterState:
         open_runs = [self.stats(run_id) for run_id in self.dispatcher.runs]
         return _sum([self._closed, *open_runs])
 
+    def _pause_s(self) -> float:
+        """How long after the last placement the next one may come. What is left open, a later event or tick decides."""
+        cost_s = EFFORT_S * self.scheduler.effort
+        return cost_s / NOW_SHARE if self._urgency is Urgency.NOW else max(LATER_S, cost_s / LATER_SHARE)
+
     def _place(self, now_s: float) -> list[Command]:
-        self._placed_s = now_s
+        self._placed_s, self._urgency = now_s, Urgency.NONE
         self._waiting = self.dispatcher.waiting_scenes
         self.scheduler.note(self.dispatcher.demand(), now_s=now_s)
         commands = self.scheduler.place(now_s=now_s)

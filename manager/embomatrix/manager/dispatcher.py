@@ -99,7 +99,7 @@ class Dispatcher:
             },
             in_use=frozenset(self._desk.leases.in_use),
             used=self._desk.leases.take_used(),
-            idle=frozenset(worker.worker_id for worker in self._desk.fleet.idle()),
+            idle=self._desk.fleet.idle,
         )
 
     @property
@@ -144,6 +144,7 @@ class Dispatcher:
             return
         worker.reported = True
         worker.draining = worker.draining or event.draining
+        self._desk.fleet.stand(worker)
         self._desk.fleet.set_warm(
             worker, (r.bundle_digest for r in event.residents if r.state is ResidentState.WARM)
         )
@@ -194,6 +195,7 @@ class Dispatcher:
             worker.draining = True
         else:
             worker.suspect = isinstance(event, WorkerSuspected)
+        self._desk.fleet.stand(worker)
         self._desk.fill([worker_id])
 
     def _on_tick(self) -> None:
@@ -205,7 +207,7 @@ class Dispatcher:
         for scene in self._desk.failures.scenes():
             self._desk.judge(scene)
         self._give_up_without_capacity()
-        self._desk.fill([worker.worker_id for worker in self._desk.fleet.idle()])
+        self._desk.fill(self._desk.fleet.thieves())
 
     def _expire(self, lease: LeaseRecord) -> None:
         worker = self._desk.fleet.workers[lease.worker_id]

@@ -29,7 +29,10 @@ class WorkerJoined:
 
 @dataclass(frozen=True, slots=True)
 class WorkerReported:
-    """The worker's full state. ``resync`` marks the first report of a stream: what it does not hold was never received."""
+    """The worker's full state. ``resync`` marks the first report of a stream: what it does not hold was never received.
+
+    ``held`` are the leases that run or wait there, and with a first report also those whose results come with it.
+    """
 
     worker_id: str
     residents: tuple[Resident, ...]

@@ -8,42 +8,58 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.manager.ledger import LeaseRecord, WorkerRecord
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable
 
-VICTIMS: Final = 32
-"""Busy workers looked at before stealing is given up: a bound, so that a large cluster costs no more than a small one."""
+VICTIMS: Final = 8
+THIEVES: Final = 64
+CANDIDATES: Final = 64
+"""Busy workers, idle workers and holders of a scene looked at in one go, each time others: bounds, so that a large cluster
+costs no more than a small one."""
 
 
 class Fleet:
-    """Live workers by id, with indices by warm scene and by backlog."""
+    """Live workers by id, with indices by warm scene, by backlog and by free slots."""
 
     def __init__(self) -> None:
         self.workers: dict[str, WorkerRecord] = {}
-        self._warm_on: dict[str, set[str]] = {}
+        self._warm_on: dict[str, dict[str, None]] = {}
         self._backlogged: dict[str, None] = {}
+        self._idle: dict[str, None] = {}
+        self._live: set[str] = set()
 
     def join(self, worker_id: str, slots: int) -> None:
         """A new worker, which can take nothing until it has reported."""
         slots = max(slots, 1)
         self.workers[worker_id] = WorkerRecord(worker_id, slots=slots, credits=2 * slots)
+        self._live.add(worker_id)
 
     def leave(self, worker_id: str) -> WorkerRecord | None:
         worker = self.workers.get(worker_id)
         if worker is not None:
             self.set_warm(worker, ())
-            self._backlogged.pop(worker_id, None)
             del self.workers[worker_id]
+            self._backlogged.pop(worker_id, None)
+            self._idle.pop(worker_id, None)
+            self._live.discard(worker_id)
         return worker
+
+    def stand(self, worker: WorkerRecord) -> None:
+        """The worker was told to drain, reported, fell silent or was heard again: it may take leases, or no longer."""
+        if worker.draining or worker.suspect:
+            self._live.discard(worker.worker_id)
+        else:
+            self._live.add(worker.worker_id)
+        self._weigh(worker)
 
     def set_warm(self, worker: WorkerRecord, scenes: Iterable[str]) -> None:
         """Replace the scenes that the worker holds warm."""
         warm = frozenset(scenes)
         for scene in worker.warm - warm:
-            self._warm_on[scene].discard(worker.worker_id)
+            del self._warm_on[scene][worker.worker_id]
             if not self._warm_on[scene]:
                 del self._warm_on[scene]
         for scene in warm - worker.warm:
-            self._warm_on.setdefault(scene, set()).add(worker.worker_id)
+            self._warm_on.setdefault(scene, {})[worker.worker_id] = None
         worker.warm = warm
 
     def has_warm(self, scene: str) -> bool:
@@ -51,21 +67,37 @@ class Fleet:
 
     def hold(self, worker: WorkerRecord, lease: LeaseRecord) -> None:
         worker.held[lease.ref.lease_id] = lease
-        if len(worker.held) > worker.slots:
-            self._backlogged[worker.worker_id] = None
+        self._weigh(worker)
 
     def release(self, lease: LeaseRecord) -> None:
         worker = self.workers.get(lease.worker_id)
         if worker is not None:
             worker.held.pop(lease.ref.lease_id, None)
-            if len(worker.held) <= worker.slots:
-                self._backlogged.pop(worker.worker_id, None)
+            self._weigh(worker)
 
     def best_for(self, scene: str) -> WorkerRecord | None:
-        """The least busy worker with the scene warm and a free credit; the id breaks ties."""
-        holders = (self.workers[worker_id] for worker_id in self._warm_on.get(scene, ()))
-        free = [worker for worker in holders if worker.open_credits > 0]
+        """The least busy worker with the scene warm and a free credit; the id breaks ties.
+
+        Where very many hold the scene, the best of some of them; None only if none of all has a credit.
+        """
+        holders = self._warm_on.get(scene, {})
+        if len(holders) > CANDIDATES:
+            return self._good_for(holders)
+        free = [worker for name in holders if (worker := self.workers[name]).open_credits > 0]
         return min(free, key=lambda worker: (worker.busyness, worker.worker_id), default=None)
+
+    def _good_for(self, holders: dict[str, None]) -> WorkerRecord | None:
+        looked_at: list[str] = []
+        best: WorkerRecord | None = None
+        for worker_id in holders:
+            if best is not None and len(looked_at) >= CANDIDATES:
+                break
+            looked_at.append(worker_id)
+            worker = self.workers[worker_id]
+            if worker.open_credits > 0 and (best is None or worker.busyness < best.busyness):
+                best = worker
+        _move_to_end(holders, looked_at)
+        return best
 
     def waiting_behind(self, thief: WorkerRecord, before_s: float) -> LeaseRecord | None:
         """A lease, given before that time, that waits behind a busy slot and whose scene the thief holds warm."""
@@ -79,11 +111,39 @@ class Fleet:
                 return lease
         return None
 
-    def idle(self) -> Iterator[WorkerRecord]:
-        """Workers with a free slot."""
-        return (worker for worker in self.workers.values() if worker.free_slots > 0)
+    @property
+    def idle(self) -> frozenset[str]:
+        """Ids of workers with a free slot."""
+        return frozenset(self._idle)
+
+    def thieves(self) -> list[str]:
+        """Some workers with a free slot, while others have leases behind a busy one."""
+        if not self._backlogged:
+            return []
+        some = list(islice(self._idle, THIEVES))
+        _move_to_end(self._idle, some)
+        _move_to_end(self._backlogged, list(islice(self._backlogged, VICTIMS)))
+        return some
 
     @property
     def live(self) -> int:
-        """Workers that could take work now or soon: neither draining nor suspected."""
-        return sum(not (worker.draining or worker.suspect) for worker in self.workers.values())
+        """How many workers could take work now or soon: neither draining nor suspected."""
+        return len(self._live)
+
+    def _weigh(self, worker: WorkerRecord) -> None:
+        """Have the indices by backlog and free slots follow what the worker holds and may take."""
+        name = worker.worker_id
+        if len(worker.held) > worker.slots:
+            self._backlogged.setdefault(name)
+        else:
+            self._backlogged.pop(name, None)
+        if worker.free_slots > 0:
+            self._idle.setdefault(name)
+        else:
+            self._idle.pop(name, None)
+
+
+def _move_to_end(order: dict[str, None], names: Iterable[str]) -> None:
+    for name in names:
+        del order[name]
+        order[name] = None

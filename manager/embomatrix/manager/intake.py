@@ -50,10 +50,6 @@ class Intake:
         session, events = self.registry.register(worker_id, boot_id, resources, now_s=now_s)
         return session, self.feed(*events, now_s=now_s)
 
-    def attach(self, session: Session, *, now_s: float) -> list[Command]:
-        """The worker's stream is open; its first report follows."""
-        return self.feed(*self.registry.attach(session, now_s=now_s), now_s=now_s)
-
     def report(
         self,
         session: Session,
@@ -65,15 +61,16 @@ class Intake:
     ) -> list[Command]:
         """What a worker says on its stream; ``resync`` for the first message of a stream."""
         session = self.registry.find(session.session_id, session.epoch)
-        events: list[Event] = self.registry.heard(session, now_s=now_s)
         finished = (*(state.finished if state is not None else ()), *results)
+        events: list[Event] = self.registry.heard(session, now_s=now_s)
         events += [LeaseFinished(session.worker_id, result.ref, result.outcome) for result in finished]
         if state is not None:
             if state.draining:
                 self.registry.draining(session)
-            events.append(
-                WorkerReported(session.worker_id, state.residents, state.running, state.draining, resync)
-            )
+            held = (*state.running, *(result.ref for result in state.finished))
+            reported = WorkerReported(session.worker_id, state.residents, held, state.draining, resync)
+            # A first state comes first: what is leased on the strength of its results was not there when it was written.
+            events.insert(0 if resync else len(events), reported)
         return self.feed(*events, now_s=now_s)
 
     def heartbeat(

@@ -142,9 +142,10 @@ class PendingQueues:
     def __init__(self) -> None:
         self._heaps: dict[str, list[tuple[int, RolloutRecord]]] = {}
         self._counts: Counter[str] = Counter()
+        self._total = 0
 
     def __len__(self) -> int:
-        return self._counts.total()
+        return self._total
 
     def __iter__(self) -> Iterator[RolloutRecord]:
         """Every waiting rollout, in no order."""
@@ -167,6 +168,7 @@ class PendingQueues:
         record.phase = Phase.PENDING
         heapq.heappush(self._heaps.setdefault(record.scene, []), (record.sequence, record))
         self._counts[record.scene] += 1
+        self._total += 1
 
     def remove(self, record: RolloutRecord) -> None:
         """Forget a waiting record; its caller moves it out of ``PENDING``."""
@@ -197,6 +199,7 @@ class PendingQueues:
 
     def _uncount(self, scene: str) -> None:
         self._counts[scene] -= 1
+        self._total -= 1
         if self._counts[scene] <= 0:
             # What is left in the heap are records that reached their outcome while they waited.
             del self._counts[scene]

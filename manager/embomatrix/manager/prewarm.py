@@ -28,14 +28,15 @@ class PrewarmLedger:
         self.lead_s: deque[float] = deque(maxlen=LEADS_KEPT)
         """Seconds between a scene being warm and the batch that needed it, of the latest hits."""
         self._counters: dict[str, PrewarmCounters] = {}
-        self._ahead: dict[tuple[str, str], str] = {}
+        self._ahead: dict[str, dict[str, str]] = {}
+        """The run that had a scene loaded, by worker and scene."""
 
     def counters(self, run_id: str) -> PrewarmCounters:
         return self._counters.setdefault(run_id, PrewarmCounters())
 
     def ordered(self, worker_id: str, scene: str, run_id: str) -> None:
         """The scene is to be loaded there because the run announced it."""
-        self._ahead.setdefault((worker_id, scene), run_id)
+        self._ahead.setdefault(worker_id, {}).setdefault(scene, run_id)
 
     def demanded(self, run_id: str, warm_since_s: float | None, now_s: float) -> None:
         """A batch needs a scene that has been warm since then, or is not warm anywhere (None)."""
@@ -47,32 +48,35 @@ class PrewarmLedger:
             self.lead_s.append(now_s - warm_since_s)
 
     def used(self, pairs: Iterable[tuple[str, str]]) -> None:
-        for pair in pairs:
-            self._ahead.pop(pair, None)
+        for worker_id, scene in pairs:
+            self._take(worker_id, scene)
 
     def evicted(self, worker_id: str, scene: str) -> None:
         """A warm scene left the worker; if it was loaded ahead and never used, the load was wasted."""
-        run_id = self._ahead.pop((worker_id, scene), None)
+        run_id = self._take(worker_id, scene)
         if run_id is not None:
             self.counters(run_id).wasted += 1
 
     def withdrawn(self, worker_id: str, scene: str) -> None:
         """The load was called off before it began: it cost nothing."""
-        self._ahead.pop((worker_id, scene), None)
+        self._take(worker_id, scene)
 
     def lost(self, worker_id: str) -> None:
         """The worker went with its scenes: nobody's waste."""
-        for pair in [pair for pair in self._ahead if pair[0] == worker_id]:
-            del self._ahead[pair]
+        self._ahead.pop(worker_id, None)
 
     def close(self, run_id: str) -> None:
         """The run is over: what it had loaded ahead and not used is waste."""
-        for pair in [pair for pair, owner in self._ahead.items() if owner == run_id]:
-            self.evicted(*pair)
+        for worker_id, scenes in self._ahead.items():
+            for scene in [scene for scene, owner in scenes.items() if owner == run_id]:
+                self.evicted(worker_id, scene)
 
     def forget(self, run_id: str) -> None:
         """Drop the counters of a closed run."""
         self._counters.pop(run_id, None)
+
+    def _take(self, worker_id: str, scene: str) -> str | None:
+        return self._ahead.get(worker_id, {}).pop(scene, None)
 
     @property
     def runs(self) -> tuple[PrewarmCounters, ...]:

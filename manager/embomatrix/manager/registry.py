@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import secrets
+from collections import OrderedDict
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING
@@ -40,7 +42,9 @@ class LivenessLimits:
     heartbeat_s: float = 1.0
     """Between two heartbeats of a worker, in a small cluster."""
     heartbeats_per_s: float = 100.0
-    """The interval grows with the cluster, so that the manager gets no more than this."""
+    """The interval grows with the cluster, so that the manager gets no more than this …"""
+    longest_heartbeat_s: float = 7.5
+    """… but not beyond this: a quarter of a lease's life, which heartbeats renew."""
     misses_suspect: int = 3
     """Intervals of silence after which a worker gets no new leases."""
     lost_after_s: float = 10.0
@@ -85,6 +89,10 @@ class Registry:
         self._limits = limits
         self._new_id = new_id or functools.partial(secrets.token_hex, 8)
         self._sessions: dict[str, Session] = {}
+        self._by_silence: OrderedDict[str, Session] = OrderedDict()
+        """Sessions that are not lost, those first that were heard longest ago: the silent are found without a search."""
+        self._detached: dict[str, Session] = {}
+        self._lost: OrderedDict[str, Session] = OrderedDict()
         self._worker_of: dict[str, str] = {}
         self._epoch = first_epoch - 1
 
@@ -96,8 +104,8 @@ class Registry:
     @property
     def interval_s(self) -> float:
         """Seconds between two heartbeats of a worker in a cluster of this size."""
-        live = sum(session.standing is not Standing.LOST for session in self._sessions.values())
-        return max(self._limits.heartbeat_s, live / self._limits.heartbeats_per_s)
+        fair_s = len(self._by_silence) / self._limits.heartbeats_per_s
+        return max(self._limits.heartbeat_s, min(fair_s, self._limits.longest_heartbeat_s))
 
     def register(
         self, worker_id: str, boot_id: str, resources: Resources, *, now_s: float
@@ -114,7 +122,10 @@ class Registry:
             resources=resources,
             last_seen_s=now_s,
         )
-        self._sessions[worker_id] = session
+        self._sessions[worker_id] = self._by_silence[worker_id] = session
+        self._by_silence.move_to_end(worker_id)
+        self._detached.pop(worker_id, None)
+        self._lost.pop(worker_id, None)
         self._worker_of[session.session_id] = worker_id
         if before is not None:
             self._worker_of.pop(before.session_id, None)
@@ -137,20 +148,23 @@ class Registry:
             raise SupersededError(f"worker {worker_id} was given up ({session.reason}): register again")
         return session
 
-    def attach(self, session: Session, *, now_s: float) -> list[Event]:
-        """The worker's stream is open."""
+    def attach(self, session: Session, *, now_s: float) -> None:
+        """The worker's stream is open. A suspect gets nothing before its first state was heard on it."""
         session.attached = True
         session.detached_s = None
-        return self.heard(session, now_s=now_s)
+        self._detached.pop(session.worker_id, None)
+        self._note(session, now_s)
 
     def detach(self, session: Session, *, now_s: float) -> None:
         """The worker's stream broke; unless it comes back within the grace, the worker is lost."""
         session.attached = False
         session.detached_s = now_s
+        if self._by_silence.get(session.worker_id) is session:
+            self._detached[session.worker_id] = session
 
     def heard(self, session: Session, *, now_s: float) -> list[Event]:
         """Any sign of life."""
-        session.last_seen_s = now_s
+        self._note(session, now_s)
         if session.standing is not Standing.SUSPECT:
             return []
         session.standing = Standing.READY
@@ -171,26 +185,46 @@ class Registry:
 
     def tick(self, *, now_s: float) -> list[Event]:
         """Suspect the silent, give up the lost, forget the long gone."""
+        self._forget_lost(now_s)
         events: list[Event] = []
         suspect_s = self._limits.misses_suspect * self.interval_s
-        for session in list(self._sessions.values()):
+        for session in self._silent_for(suspect_s, now_s):
             silent_s = now_s - session.last_seen_s
-            if session.standing is Standing.LOST:
-                if silent_s > self._limits.remember_lost_s:
-                    del self._sessions[session.worker_id]
-                    self._worker_of.pop(session.session_id, None)
-            elif silent_s >= max(self._limits.lost_after_s, suspect_s):
+            if silent_s >= max(self._limits.lost_after_s, suspect_s):
                 events.append(self._lose(session, f"not heard of for {silent_s:.1f} s"))
-            elif session.detached_s is not None and now_s - session.detached_s >= self._limits.stream_grace_s:
+            elif session.standing is Standing.READY:
+                session.standing = Standing.SUSPECT
+                events.append(WorkerSuspected(session.worker_id))
+        for session in list(self._detached.values()):
+            if session.detached_s is not None and now_s - session.detached_s >= self._limits.stream_grace_s:
                 left = session.standing is Standing.DRAINING
                 reason = "it drained and left" if left else "its connection broke and it did not come back"
                 events.append(self._lose(session, reason))
-            elif silent_s >= suspect_s and session.standing is Standing.READY:
-                session.standing = Standing.SUSPECT
-                events.append(WorkerSuspected(session.worker_id))
         return events
+
+    def _note(self, session: Session, now_s: float) -> None:
+        session.last_seen_s = now_s
+        if self._by_silence.get(session.worker_id) is session:
+            self._by_silence.move_to_end(session.worker_id)
+
+    def _silent_for(self, seconds: float, now_s: float) -> list[Session]:
+        silent = itertools.takewhile(
+            lambda session: now_s - session.last_seen_s >= seconds, self._by_silence.values()
+        )
+        return list(silent)
+
+    def _forget_lost(self, now_s: float) -> None:
+        while self._lost:
+            session = next(iter(self._lost.values()))
+            if now_s - session.last_seen_s <= self._limits.remember_lost_s:
+                return
+            del self._lost[session.worker_id], self._sessions[session.worker_id]
+            self._worker_of.pop(session.session_id, None)
 
     def _lose(self, session: Session, reason: str) -> WorkerLost:
         session.standing = Standing.LOST
         session.reason = reason
+        del self._by_silence[session.worker_id]
+        self._detached.pop(session.worker_id, None)
+        self._lost[session.worker_id] = session
         return WorkerLost(session.worker_id, reason)

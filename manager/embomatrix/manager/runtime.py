@@ -95,7 +95,7 @@ class ManagerRuntime:
         """The worker's stream is open for as long as this is held."""
         self._close_link(session.worker_id)
         link = self._links[session.worker_id] = WorkerLink(session)
-        self._carry_out(self._intake.attach(session, now_s=time.monotonic()))
+        self.registry.attach(session, now_s=time.monotonic())
         if session.standing is Standing.DRAINING:
             link.drain()
         try:

@@ -8,7 +8,8 @@ given again only when it changes.
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from enum import IntEnum
 from typing import TYPE_CHECKING
 
 from embomatrix.manager.commands import Command, SetDesired
@@ -26,12 +27,23 @@ from embomatrix.manager.events import (
     WorkerReported,
     WorkerSuspected,
 )
+from embomatrix.manager.holders import Holder, Holders
 from embomatrix.manager.placement import Need, Site, needs_of, place
 from embomatrix.manager.prewarm import PrewarmLedger
-from embomatrix.rpc.values import LookaheadEntry, Resident, ResidentState, Resources, Warmth
+from embomatrix.rpc.values import LookaheadEntry, Resident, ResidentState, Warmth
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable, Sequence
+
+
+class Urgency(IntEnum):
+    """What a fact means for where scenes should be."""
+
+    NONE = 0
+    LATER = 1
+    """Something may be better elsewhere."""
+    NOW = 2
+    """Something is needed that nobody was told to load."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,43 +58,71 @@ class ScheduleLimits:
     """A worker that failed to load a scene is not asked again for this long."""
 
 
-@dataclass(slots=True)
-class _Holder:
-    """A worker as the scheduler sees it. ``residents`` run from the most to the least recently used."""
-
-    resources: Resources
-    residents: dict[str, Resident] = field(default_factory=dict)
-    warm_since_s: dict[str, float] = field(default_factory=dict)
-    failed_s: dict[str, float] = field(default_factory=dict)
-    desired: tuple[str, ...] | None = None
-    reported: bool = False
-    suspect: bool = False
-    draining: bool = False
-
-    @property
-    def usable(self) -> bool:
-        return self.reported and not self.draining and not self.suspect
-
-    def standing(self) -> tuple[str, ...]:
-        """Scenes that it has or was told to have, by last use. What it was told counts: its reports lag behind."""
-        known = dict.fromkeys([*self.residents, *(self.desired or ())])
-        failed = {s for s, resident in self.residents.items() if resident.state is ResidentState.FAILED}
-        told = set(known if self.desired is None else self.desired)
-        return tuple(
-            sorted((scene for scene in known if scene not in failed), key=lambda scene: scene not in told)
-        )
-
-    def to_load(self, scenes: Iterable[str]) -> list[str]:
-        """Those that are not warm here yet, in the same order."""
-        return [scene for scene in scenes if scene not in self.warm_since_s]
-
-
-@dataclass(frozen=True, slots=True)
 class Window:
     """What a run announced last. Entries of steps that have come are dropped."""
 
-    version: int
-    entries: tuple[LookaheadEntry, ...]
+    def __init__(self, version: int, entries: tuple[LookaheadEntry, ...]) -> None:
+        self.version = version
+        self.entries = entries
+        self.scenes = {entry.bundle_digest for entry in entries}
+
+
+class _Places:
+    """The holders as a placement wants to see them, at one moment."""
+
+    def __init__(
+        self, holders: Holders, now_s: float, in_use: frozenset[tuple[str, str]], retry_s: float
+    ) -> None:
+        self._holders = holders
+        self._now_s = now_s
+        self._in_use = in_use
+        self._retry_s = retry_s
+        self._large: list[tuple[str, float]] = []
+
+    def refuse_where_too_large(self, needs: Iterable[Need], size_mb: dict[str, float]) -> None:
+        """Scenes that were measured and found larger than all the memory of a worker are not tried there again."""
+        least_mb = self._holders.least_memory_mb
+        sizes = ((need.bundle_digest, size_mb.get(need.bundle_digest, 0.0)) for need in needs)
+        self._large = [(scene, size) for scene, size in sizes if size > least_mb]
+
+    @property
+    def ids(self) -> Sequence[str]:
+        return self._holders.usable
+
+    @property
+    def slots(self) -> int:
+        return self._holders.slots
+
+    def site(self, worker_id: str) -> Site:
+        holder = self._holders.by_id[worker_id]
+        memory_mb = holder.resources.memory_mb
+        held = holder.standing()
+        return Site(
+            worker_id=worker_id,
+            slots=holder.slots,
+            score=holder.resources.score,
+            memory_mb=memory_mb,
+            residents=held,
+            pinned=frozenset(scene for scene in held if (worker_id, scene) in self._in_use),
+            refused=self.refused(holder),
+        )
+
+    def refused(self, holder: Holder) -> frozenset[str]:
+        """What failed to load there a moment ago, and what can't fit."""
+        failed = {scene for scene, at_s in holder.failed_s.items() if self._now_s - at_s < self._retry_s}
+        failed.update(scene for scene, size in self._large if size > holder.resources.memory_mb)
+        return frozenset(failed)
+
+    def having(self, scene: str) -> Iterable[str]:
+        return [holder.worker_id for holder in self._holders.having(scene)]
+
+    def changed(self) -> Iterable[str]:
+        return self._holders.fresh | self._holders.failing.intersection(self._holders.usable)
+
+    def nobody_takes(self, scene: str) -> bool:
+        """Whether every usable worker refuses the scene."""
+        workers = (self._holders.by_id[worker_id] for worker_id in self._holders.usable)
+        return bool(self._holders.usable) and all(scene in self.refused(holder) for holder in workers)
 
 
 class Scheduler:
@@ -94,65 +134,70 @@ class Scheduler:
         self.unplaceable: dict[str, str] = {}
         """Scenes that no worker can hold, with the reason."""
         self._limits = limits
-        self._holders: dict[str, _Holder] = {}
+        self._holders = Holders()
         self._demand = DemandObserved({})
         self._peaks: dict[str, int] = {}
         self._copies: dict[str, int] = {}
         self._size_mb: dict[str, float] = {}
         self._load_s: dict[str, float] = {}
         self._now_s = 0.0
+        self.effort = 0
+        """Needs and workers that the last placement looked at."""
 
     def handle(self, event: Event, *, now_s: float) -> list[Command]:
         """Take in one fact; returns the desired sets that changed."""
         return self.place(now_s=now_s) if self.note(event, now_s=now_s) else []
 
-    def note(self, event: Event, *, now_s: float) -> bool:
-        """Take in one fact without deciding on it yet; returns whether it may change what should be where."""
+    def note(self, event: Event, *, now_s: float) -> Urgency:
+        """Take in one fact without deciding on it yet; returns how soon it wants a decision."""
         self._now_s = now_s
         match event:
             case DemandObserved():
                 self._on_demand(event)
             case LookaheadAnnounced(run_id, version, entries):
                 if run_id in self.windows and version <= self.windows[run_id].version:
-                    return False
+                    return Urgency.NONE
                 self.windows[run_id] = Window(version, entries)
+                return Urgency.NOW
             case BatchSubmitted():
-                self._on_submitted(event)
+                return self._on_submitted(event)
             case RunClosed(run_id):
                 self.windows.pop(run_id, None)
             case WorkerReported():
-                self._on_reported(event)
+                return self._on_reported(event)
             case WorkerJoined() | WorkerLost() | WorkerDrained() | WorkerSuspected() | WorkerRecovered():
-                self._on_worker(event)
+                return self._on_worker(event)
             case Tick():
-                pass
+                return Urgency.LATER if self._demand.pending or self._holders.failing else Urgency.NONE
             case _:
-                return False
-        return True
+                return Urgency.NONE
+        return Urgency.LATER
 
     def place(self, *, now_s: float) -> list[Command]:
         """Decide where every scene should be; returns the desired sets that changed."""
         self._now_s = now_s
-        usable = {name: holder for name, holder in self._holders.items() if holder.usable}
         needs = needs_of(self._peaks, [window.entries for window in self.windows.values()])
-        needs = [self._spread(need, usable) for need in needs]
-        sites = [self._site(name, holder, needs) for name, holder in usable.items()]
+        needs = [self._spread(need) for need in needs]
+        places = _Places(self._holders, now_s, self._demand.in_use, self._limits.retry_load_s)
+        places.refuse_where_too_large(needs, self._size_mb)
+        placement = place(places, needs, self._estimate)
+        self._holders.fresh.clear()
         self.unplaceable = {
-            need.bundle_digest: self._why_not(need.bundle_digest)
-            for need in needs
-            if sites and all(need.bundle_digest in site.refused for site in sites)
+            scene: self._why_not(scene) for scene in placement.homeless if places.nobody_takes(scene)
         }
-        desired = place(sites, needs, self._estimate)
-        orders = (self._order(name, scenes) for name, scenes in desired.items())
+        self.effort = len(needs) + len(placement.desired)
+        orders = (self._order(name, scenes) for name, scenes in placement.desired.items())
         return [order for order in orders if order is not None]
 
     def warmth(self, scene: str) -> Warmth:
         """How far the scene is, seen from its trainer."""
-        if self._warm_since(scene) is not None:
+        if self._holders.warm_on(scene):
             return Warmth.WARM
         if scene in self.unplaceable:
             return Warmth.UNPLACEABLE
-        if any(scene in (holder.desired or ()) for holder in self._holders.values()):
+        if any(
+            scene in (self._holders.by_id[name].desired or ()) for name in self._holders.standing_on(scene)
+        ):
             return Warmth.WARMING
         return Warmth.QUEUED
 
@@ -161,12 +206,12 @@ class Scheduler:
         return self._load_s.get(scene, 0.0)
 
     def residents(self, worker_id: str) -> tuple[Resident, ...]:
-        holder = self._holders.get(worker_id)
+        holder = self._holders.by_id.get(worker_id)
         return tuple(holder.residents.values()) if holder else ()
 
     def desired(self, worker_id: str) -> tuple[str, ...]:
         """The last desired set that was given for the worker."""
-        holder = self._holders.get(worker_id)
+        holder = self._holders.by_id.get(worker_id)
         return (holder.desired or ()) if holder else ()
 
     def _on_demand(self, event: DemandObserved) -> None:
@@ -177,41 +222,50 @@ class Scheduler:
         self._peaks = {scene: max(count, self._peaks.get(scene, 0)) for scene, count in event.pending.items()}
         self._copies = {scene: self._copies[scene] for scene in event.pending if scene in self._copies}
 
-    def _on_submitted(self, event: BatchSubmitted) -> None:
-        batch = event.batch
+    def _on_submitted(self, event: BatchSubmitted) -> Urgency:
+        batch, urgency = event.batch, Urgency.LATER
         for scene in dict.fromkeys(rollout.bundle_digest for rollout in batch.rollouts):
             self.prewarm.demanded(batch.run_id, self._warm_since(scene), self._now_s)
+            if not self._holders.having(scene):
+                urgency = Urgency.NOW
         window = self.windows.get(batch.run_id)
-        if window is not None:
+        if window is not None and any(entry.step <= batch.step for entry in window.entries):
             coming = tuple(entry for entry in window.entries if entry.step > batch.step)
             self.windows[batch.run_id] = Window(window.version, coming)
+        return urgency
 
     def _on_worker(
         self, event: WorkerJoined | WorkerLost | WorkerDrained | WorkerSuspected | WorkerRecovered
-    ) -> None:
+    ) -> Urgency:
         match event:
             case WorkerJoined(worker_id, resources):
                 self.prewarm.lost(worker_id)
-                self._holders[worker_id] = _Holder(resources)
+                self._holders.join(worker_id, resources)
+                return Urgency.NONE
             case WorkerLost(worker_id):
                 self.prewarm.lost(worker_id)
-                self._holders.pop(worker_id, None)
-            case WorkerDrained(worker_id) if worker_id in self._holders:
-                self._holders[worker_id].draining = True
-            case WorkerSuspected(worker_id) | WorkerRecovered(worker_id) if worker_id in self._holders:
-                self._holders[worker_id].suspect = isinstance(event, WorkerSuspected)
-            case _:
-                pass
-
-    def _on_reported(self, event: WorkerReported) -> None:
-        holder = self._holders.get(event.worker_id)
+                self._holders.leave(worker_id)
+                return Urgency.NOW
+        holder = self._holders.by_id.get(event.worker_id)
         if holder is None:
-            return
+            return Urgency.NONE
+        if isinstance(event, WorkerDrained):
+            holder.draining = True
+        else:
+            holder.suspect = isinstance(event, WorkerSuspected)
+        self._holders.changed(holder)
+        return Urgency.NOW
+
+    def _on_reported(self, event: WorkerReported) -> Urgency:
+        holder = self._holders.by_id.get(event.worker_id)
+        if holder is None:
+            return Urgency.NONE
+        urgency = Urgency.LATER if holder.reported else Urgency.NOW
         holder.reported = True
         holder.draining = holder.draining or event.draining
         if event.resync:
             # Whatever was told before may be lost: the desired set is given again.
-            holder.desired = None
+            holder.desired, urgency = None, Urgency.NOW
         reported = {resident.bundle_digest: resident for resident in event.residents}
         for scene in holder.residents.keys() - reported.keys():
             holder.warm_since_s.pop(scene, None)
@@ -220,8 +274,10 @@ class Scheduler:
         holder.residents = {scene: reported[scene] for scene in dict.fromkeys([*known, *reported])}
         for resident in event.residents:
             self._learn(holder, resident)
+        self._holders.changed(holder)
+        return urgency
 
-    def _learn(self, holder: _Holder, resident: Resident) -> None:
+    def _learn(self, holder: Holder, resident: Resident) -> None:
         scene = resident.bundle_digest
         if resident.memory_mb > 0:
             self._size_mb[scene] = max(self._size_mb.get(scene, 0.0), resident.memory_mb)
@@ -241,51 +297,37 @@ class Scheduler:
 
     def _touch(self, used: Iterable[tuple[str, str]]) -> None:
         """Scenes that were just used move to the front, so that among the needless the oldest goes first."""
-        for worker_id, scene in used:
-            holder = self._holders.get(worker_id)
+        # Sorted: equal histories shall give equal decisions in every process.
+        for worker_id, scene in sorted(used):
+            holder = self._holders.by_id.get(worker_id)
             if holder is not None and scene in holder.residents:
                 holder.residents = {scene: holder.residents[scene], **holder.residents}
 
     def _warm_since(self, scene: str) -> float | None:
-        times = [h.warm_since_s[scene] for h in self._holders.values() if scene in h.warm_since_s]
-        return min(times, default=None)
+        names = self._holders.warm_on(scene)
+        return min((self._holders.by_id[name].warm_since_s[scene] for name in names), default=None)
 
-    def _site(self, name: str, holder: _Holder, needs: Iterable[Need]) -> Site:
-        memory_mb = holder.resources.memory_mb
-        refused = {
-            scene for scene, at_s in holder.failed_s.items() if self._now_s - at_s < self._limits.retry_load_s
-        }
-        refused.update(n.bundle_digest for n in needs if self._size_mb.get(n.bundle_digest, 0.0) > memory_mb)
-        held = holder.standing()
-        return Site(
-            worker_id=name,
-            slots=max(holder.resources.slots, 1),
-            score=holder.resources.score,
-            memory_mb=memory_mb,
-            residents=held,
-            pinned=frozenset(scene for scene in held if (name, scene) in self._demand.in_use),
-            refused=frozenset(refused),
-        )
-
-    def _spread(self, need: Need, usable: Mapping[str, _Holder]) -> Need:
+    def _spread(self, need: Need) -> Need:
         """One worker more for a scene whose rollouts wait while others are idle, unless one is loading it already."""
         scene = need.bundle_digest
         patience_s = max(self._limits.affinity_wait_s, self.load_s(scene))
         if self._demand.waited_s.get(scene, 0.0) >= patience_s:
-            holders = {name for name, holder in usable.items() if scene in (holder.desired or ())}
-            loading = any(scene not in usable[name].warm_since_s for name in holders)
-            if not loading and self._demand.idle - holders:
-                self._copies[scene] = len(holders) + 1
-        return dataclasses.replace(need, at_least=self._copies.get(scene, 1))
+            told = [holder for holder in self._holders.having(scene) if scene in (holder.desired or ())]
+            loading = any(scene not in holder.warm_since_s for holder in told)
+            if not loading and not self._demand.idle <= {holder.worker_id for holder in told}:
+                self._copies[scene] = len(told) + 1
+        copies = self._copies.get(scene, 1)
+        return need if copies == 1 else dataclasses.replace(need, at_least=copies)
 
     def _estimate(self, scene: str) -> float:
         return self._size_mb.get(scene, self._limits.scene_mb)
 
     def _why_not(self, scene: str) -> str:
-        errors = [h.residents[scene].error for h in self._holders.values() if scene in h.residents]
+        holders = (self._holders.by_id[name] for name in sorted(self._holders.failing))
+        errors = [holder.residents[scene].error for holder in holders if scene in holder.residents]
         if any(errors):
             return f"scene {scene} fails to load: {next(filter(None, errors))}"
-        largest_mb = max((holder.resources.memory_mb for holder in self._holders.values()), default=0)
+        largest_mb = self._holders.most_memory_mb
         return (
             f"scene {scene} needs {self._estimate(scene):.0f} MB and the largest worker gives {largest_mb} MB: "
             f"raise a worker's memory limit"
@@ -293,7 +335,7 @@ class Scheduler:
 
     def _order(self, name: str, scenes: tuple[str, ...]) -> SetDesired | None:
         """Tell the worker, if the set or the order of what it still has to load is another than it was told."""
-        holder = self._holders[name]
+        holder = self._holders.by_id[name]
         before = holder.desired
         if (
             before is not None
@@ -309,10 +351,9 @@ class Scheduler:
             if run_id is not None and not self._demand.pending.get(scene):
                 self.prewarm.ordered(name, scene, run_id)
         holder.desired = scenes
+        self._holders.changed(holder)
+        self._holders.fresh.discard(name)
         return SetDesired(name, scenes)
 
     def _announcer(self, scene: str) -> str | None:
-        for run_id, window in self.windows.items():
-            if any(entry.bundle_digest == scene for entry in window.entries):
-                return run_id
-        return None
+        return next((run_id for run_id, window in self.windows.items() if scene in window.scenes), None)

@@ -116,3 +116,17 @@ def test_draining_names_the_worker_or_the_ones_there_are(registry):
     assert registry.drain("w1") == [WorkerDrained("w1")]
     with pytest.raises(NotFoundError, match="connected are w1"):
         registry.drain("w2")
+
+
+def test_a_heartbeat_renews_a_lease_in_time_however_large_the_cluster_is(registry):
+    for index in range(5000):
+        join(registry, f"w{index}")
+    assert registry.interval_s == LIMITS.longest_heartbeat_s == 7.5
+
+
+def test_the_silence_of_one_among_many_is_found(registry):
+    sessions = [join(registry, f"w{index}")[0] for index in range(50)]
+    for at_s in (2.0, 4.0):
+        for session in sessions[1:]:
+            registry.heard(session, now_s=at_s)
+    assert registry.tick(now_s=4.0) == [WorkerSuspected("w0")]

@@ -299,6 +299,24 @@ def test_a_scene_counts_at_its_next_use():
     assert needs_of({"c": 3}, [entries]) == [Need("c", 0, 3), Need("a", 1, 2), Need("b", 1, 1)]
 
 
+class Listed:
+    """Sites in a list, all to be looked at."""
+
+    def __init__(self, sites):
+        self._sites = {site.worker_id: site for site in sites}
+        self.ids = sorted(self._sites)
+        self.slots = sum(site.slots for site in sites)
+
+    def site(self, worker_id):
+        return self._sites[worker_id]
+
+    def having(self, scene):
+        return [name for name, site in self._sites.items() if scene in site.residents]
+
+    def changed(self):
+        return self.ids
+
+
 scene_names = st.sampled_from("abcdefgh")
 
 
@@ -312,7 +330,7 @@ scene_names = st.sampled_from("abcdefgh")
 )
 def test_placement_keeps_to_memory_and_prefers_the_sooner_use(needs, memories, residents):
     sites = [Site(f"w{i}", 2, 1.0, mb, tuple(residents[i])) for i, mb in enumerate(memories)]
-    desired = place(sites, needs, lambda _: MB)
+    desired = place(Listed(sites), needs, lambda _: MB).desired
     for site in sites:
         assert len(desired[site.worker_id]) <= max(1, site.memory_mb // MB)
         assert set(desired[site.worker_id]) <= {n.bundle_digest for n in needs} | set(site.residents)
@@ -322,6 +340,6 @@ def test_placement_keeps_to_memory_and_prefers_the_sooner_use(needs, memories, r
         extra = sum(len(scenes) for scenes in desired.values()) - len(placed)
         assert max((n.rank for n in needs if n.bundle_digest in placed), default=0) <= min(left) or extra == 0
     again = [Site(s.worker_id, 2, 1.0, s.memory_mb, desired[s.worker_id]) for s in sites]
-    after = place(again, needs, lambda _: MB)
+    after = place(Listed(again), needs, lambda _: MB).desired
     lost = {scene for scenes in desired.values() for scene in scenes} - {s for d in after.values() for s in d}
     assert not lost & {need.bundle_digest for need in needs if need.rank == 0}

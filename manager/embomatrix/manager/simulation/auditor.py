@@ -41,6 +41,7 @@ class Auditor:
         """By worker: the good leases by rollout."""
         self._warm: dict[str, set[str]] = {}
         self._rollout_of: dict[LeaseRef, str] = {}
+        self._gone: frozenset[str] = frozenset()
         self._executed: set[tuple[str, str]] = set()
 
     @property
@@ -65,10 +66,9 @@ class Auditor:
 
     def watch(self, commands: Iterable[Command], *, lost: Iterable[str] = ()) -> None:
         """Check what the manager orders; the leases of workers that it has just ``lost`` are void."""
-        for worker_id in lost:
-            for rollout_id in self._held_by.pop(worker_id, {}):
-                del self._holder[rollout_id]
-            self._warm.pop(worker_id, None)
+        # Several may be lost at once, and what the first held may be given to the second before that one's loss is seen.
+        self._gone = frozenset(lost)
+        self._forget_all(self._gone)
         for command in commands:
             match command:
                 case GiveLease():
@@ -81,6 +81,7 @@ class Auditor:
                     self._finish((run_id, batch_id))
                 case _:
                     pass
+        self._forget_all(self._gone)
 
     def report(self, worker_id: str, state: WorkerState, *, resync: bool) -> None:
         """What the manager is about to hear. What a first state does not hold, the worker never got."""
@@ -88,7 +89,7 @@ class Auditor:
             resident.bundle_digest for resident in state.residents if resident.state is ResidentState.WARM
         }
         if resync:
-            kept = set(state.running)
+            kept = {*state.running, *(result.ref for result in state.finished)}
             for rollout_id, ref in list(self._held_by.get(worker_id, {}).items()):
                 if ref not in kept:
                     self._forget(rollout_id, worker_id)
@@ -98,6 +99,8 @@ class Auditor:
         _check(
             command.ref.lease_epoch not in self._epochs, f"epoch {command.ref.lease_epoch} was given twice"
         )
+        if self._holder.get(rollout_id) in self._gone:
+            self._forget(rollout_id, self._holder[rollout_id])
         _check(rollout_id not in self._holder, f"{rollout_id} has two leases at once")
         _check(
             command.rollout.bundle_digest in self._warm.get(worker_id, ()),
@@ -112,6 +115,11 @@ class Auditor:
         rollout_id = self._rollout_of.pop(ref, "")
         if self._held_by.get(worker_id, {}).get(rollout_id) == ref:
             self._forget(rollout_id, worker_id)
+
+    def _forget_all(self, workers: Iterable[str]) -> None:
+        for worker_id in workers:
+            for rollout_id in list(self._held_by.get(worker_id, ())):
+                self._forget(rollout_id, worker_id)
 
     def _forget(self, rollout_id: str, worker_id: str) -> None:
         del self._held_by[worker_id][rollout_id], self._holder[rollout_id]

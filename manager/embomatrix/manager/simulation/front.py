@@ -92,7 +92,7 @@ class Front:
         session = self._intake.registry.find(session.session_id, session.epoch)
         self._end_stream(session.worker_id)
         self._streams[session.worker_id] = stream
-        self._carry_out(self._intake.attach(session, now_s=self._agenda.now_s))
+        self._intake.registry.attach(session, now_s=self._agenda.now_s)
         self.report(session, state, (), resync=True)
 
     def detach(self, session: Session, stream: Stream) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import gc
 import random
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
@@ -19,7 +21,7 @@ from embomatrix.manager.simulation.trainer import SimulatedTrainer
 from embomatrix.manager.simulation.worker import SimulatedWorker
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
 
     from embomatrix.manager.simulation.gauge import Cost
     from embomatrix.manager.simulation.scenario import Scenario
@@ -111,7 +113,8 @@ class Simulation:
         """Raises BrokenInvariantError when an invariant does not hold, or rollouts have no outcome in time."""
         self._front.keep_time()
         self._agenda.after(0.0, self._look)
-        in_time = self._agenda.run(until=self._ended, limit_s=self._scenario.limit_s)
+        with _without_collector():
+            in_time = self._agenda.run(until=self._ended, limit_s=self._scenario.limit_s)
         if not in_time or not self._auditor.complete or self._cluster.dispatcher.live_leases:
             raise BrokenInvariantError(
                 f"after {self._agenda.now_s:.0f} s {self._auditor.delivered} of {self._scenario.rollouts} rollouts have "
@@ -177,6 +180,18 @@ class Simulation:
             costs=gauge.costs,
             counts=gauge.counts,
         )
+
+
+@contextlib.contextmanager
+def _without_collector() -> Iterator[None]:
+    """Python's search for cycles would walk through the whole simulated world, and be charged to the manager."""
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_on:
+            gc.enable()
 
 
 def simulate(scenario: Scenario) -> Report:

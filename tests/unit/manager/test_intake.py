@@ -1,0 +1,73 @@
+"""What workers say on their streams, in the order in which the state machines must hear it."""
+
+import pytest
+from tests.fakes.worker import completed
+
+from embomatrix.manager.cluster_state import ClusterState
+from embomatrix.manager.commands import CancelLease, GiveLease
+from embomatrix.manager.events import BatchSubmitted
+from embomatrix.manager.intake import Heartbeat, Intake
+from embomatrix.manager.registry import LivenessLimits, Registry
+from embomatrix.rpc.status import SupersededError
+from embomatrix.rpc.values import (
+    Batch,
+    LeaseResult,
+    Resident,
+    ResidentState,
+    Resources,
+    Rollout,
+    WorkerState,
+)
+
+WARM = (Resident("kitchen", ResidentState.WARM, 0.1, 50.0),)
+
+
+class Manager:
+    """An intake with one worker of one slot, which has the scene and as many leases as it may hold."""
+
+    def __init__(self, rollouts):
+        self.intake = Intake(ClusterState(boot_id="boot"), Registry(LivenessLimits()))
+        self.session, _ = self.intake.register("w1", "boot-1", Resources(1, 1, 1000), now_s=0.0)
+        self.report(WorkerState(WARM), now_s=0.0, resync=True)
+        batch = Batch(
+            "r", "b", 1, tuple(Rollout(f"x{i}", "g", "kitchen", "t", (), 0) for i in range(rollouts))
+        )
+        self.given = gives(self.intake.feed(BatchSubmitted(batch), now_s=0.1))
+
+    def report(self, state, now_s, resync=False):
+        return self.intake.report(self.session, state, (), resync=resync, now_s=now_s)
+
+
+def gives(commands):
+    return [command for command in commands if isinstance(command, GiveLease)]
+
+
+def test_what_is_leased_for_the_results_of_a_first_state_is_not_taken_for_lost():
+    manager = Manager(rollouts=4)
+    first, second = (command.ref for command in manager.given)
+    state = WorkerState(WARM, (second,), (LeaseResult(first, completed()),))
+    commands = manager.report(state, now_s=1.0, resync=True)
+    (lease,) = gives(commands)
+    assert lease.rollout.rollout_id == "x2"
+    assert not [command for command in commands if isinstance(command, CancelLease)]
+    assert set(manager.intake.cluster.dispatcher.live_leases) == {second.lease_id, lease.ref.lease_id}
+
+
+def test_a_suspect_that_comes_back_holds_each_rollout_once():
+    manager = Manager(rollouts=1)
+    (lease,) = manager.given
+    manager.intake.tick(now_s=4.0)
+    manager.intake.registry.attach(manager.session, now_s=5.0)
+    commands = manager.report(WorkerState(WARM), now_s=5.0, resync=True)
+    (again,) = gives(commands)
+    assert again.ref != lease.ref
+    assert set(manager.intake.cluster.dispatcher.live_leases) == {again.ref.lease_id}
+
+
+def test_a_call_under_a_session_that_ended_is_refused():
+    manager = Manager(rollouts=0)
+    manager.intake.register("w1", "boot-2", Resources(1, 1, 1000), now_s=1.0)
+    with pytest.raises(SupersededError):
+        manager.report(WorkerState(), now_s=1.0)
+    with pytest.raises(SupersededError):
+        manager.intake.heartbeat(manager.session.session_id, manager.session.epoch, Heartbeat(()), now_s=1.0)
