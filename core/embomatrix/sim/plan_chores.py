@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING
 
-from embomatrix.sim.plan_script import StuckError
+from embomatrix.sim.plan_calls import StuckError
 from embomatrix.skills.household import (
     cuts,
     gives_liquid,

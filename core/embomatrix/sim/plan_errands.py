@@ -10,8 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from embomatrix.sim.plan_calls import StuckError
 from embomatrix.sim.plan_chores import do_chores
-from embomatrix.sim.plan_script import StuckError
 from embomatrix.sim.plan_ways import ways
 from embomatrix.skills.appliance import cold_source, heat_source
 from embomatrix.skills.syntax import PlaceRelation

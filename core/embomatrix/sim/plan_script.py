@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.sim.plan_calls import PlanCalls, StuckError
 from embomatrix.skills.appliance import cold_source, heat_source, starts_closed
-from embomatrix.skills.check import within_reach
 from embomatrix.skills.failure import FailureReason
-from embomatrix.skills.syntax import MAX_STEPS, PlaceRelation, Skill, SkillCall
+from embomatrix.skills.syntax import PlaceRelation, Skill
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
@@ -30,44 +30,21 @@ SURFACES_TRIED: Final = 8
 """Surfaces that are tried for a thing that is in the way."""
 BLOCKERS: Final = 3
 """Things that are taken from before a door at most."""
-NEIGHBOURS: Final = 6
-"""Things beside another from which that is tried to be reached, when no place to stand serves it itself."""
-OUT_OF_ARM: Final = frozenset(
-    {
-        FailureReason.NO_STANDING_POSE,
-        FailureReason.NO_PATH,
-        FailureReason.OUT_OF_REACH,
-        FailureReason.NO_LINE_OF_APPROACH,
-    }
-)
-"""Failures that standing elsewhere may mend."""
-
-
-class StuckError(Exception):
-    """A routine can't go on. The sentence names the call and why it failed."""
 
 
 class PlanScript:
     """One attempt at a task, from its start. Every routine raises StuckError when a call of it fails for good."""
 
     def __init__(self, simulator: Simulator, task: Task, seed: int, wishes: Wishes) -> None:
-        simulator.reset(task, seed)
-        self._simulator = simulator
+        self._calls = PlanCalls(simulator, task, seed)
         self._world = simulator.world
         self._task = task
         self._wishes = wishes
-        self._at = ""
-        self._calls: list[SkillCall] = []
 
     @property
     def plan(self) -> Plan:
         """The calls so far. Of several moves in a row the last is kept, and none at the end."""
-        pairs = zip(self._calls, [*self._calls[1:], None], strict=True)
-        return tuple(
-            call
-            for call, following in pairs
-            if call.skill is not Skill.MOVE or (following is not None and following.skill is not Skill.MOVE)
-        )
+        return self._calls.plan
 
     @property
     def rows(self) -> tuple[str, ...]:
@@ -82,7 +59,7 @@ class PlanScript:
         while True:
             self._prepare(target, relation)
             self._take(name, depth)
-            step = self._try_place(target, relation)
+            step = self._calls.place(target, relation)
             if step.ok:
                 return
             burden = self._in_the_way_at(target, relation, name)
@@ -144,7 +121,7 @@ class PlanScript:
 
     def use_on(self, skill: Skill, name: str, source: str, at: str) -> None:
         """Use a source or a tool on an object, from beside ``at``."""
-        step = self._attempt(self._call(skill, name, source=source), at)
+        step = self._calls.use_on(skill, name, source, at)
         if not step.ok:
             raise StuckError(_sentence(step))
 
@@ -163,7 +140,7 @@ class PlanScript:
         """Place what the hand holds on the first surface with room."""
         reason = ""
         for _, surface in zip(range(SURFACES_TRIED), self._surfaces(name, avoid), strict=False):
-            step = self._try(Skill.PLACE, surface, PlaceRelation.ONTOP)
+            step = self._calls.use(Skill.PLACE, surface, PlaceRelation.ONTOP)
             if step.ok:
                 return
             reason = reason or _sentence(step)
@@ -217,10 +194,10 @@ class PlanScript:
         self.clear_way_to(name)
         while burden := self._world.burden(name):
             self._unload(burden, name, depth)
-        step = self._try(Skill.PICK_UP, name)
+        step = self._calls.use(Skill.PICK_UP, name)
         while step.failure is FailureReason.TOO_HEAVY and len(cargo := self._world.cargo(name)) > 1:
             self._unload(cargo[1], name, depth)
-            step = self._try(Skill.PICK_UP, name)
+            step = self._calls.use(Skill.PICK_UP, name)
         if not step.ok:
             raise StuckError(_sentence(step))
 
@@ -233,7 +210,7 @@ class PlanScript:
     def _swing(self, skill: Skill, name: str, depth: int) -> None:
         """Move a door; what can be carried away from before it is."""
         for _ in range(BLOCKERS):
-            step = self._try(skill, name)
+            step = self._calls.use(skill, name)
             if step.ok:
                 return
             blocker = self._named_in(step, name) if step.failure is FailureReason.DOOR_BLOCKED else ""
@@ -248,83 +225,9 @@ class PlanScript:
         return next((word for word in step.message.split() if word in known and word != name), "")
 
     def _use(self, skill: Skill, name: str) -> None:
-        step = self._try(skill, name)
+        step = self._calls.use(skill, name)
         if not step.ok:
             raise StuckError(_sentence(step))
-
-    def _try_place(self, target: str, relation: PlaceRelation) -> Step:
-        """Place what the hand holds; when nothing is free within reach, from beside other things on the target too."""
-        step = self._try(Skill.PLACE, target, relation)
-        if step.failure is FailureReason.NO_FREE_POSE:
-            for other in self._around(target):
-                if self._go_to(other).ok and within_reach(self._world, target) is None:
-                    again = self._run(self._call(Skill.PLACE, target, relation))
-                    if again.ok:
-                        return again
-        return step
-
-    def _try(self, skill: Skill, name: str, relation: PlaceRelation | None = None) -> Step:
-        """Go to the object unless the robot is there, then do it, from beside a neighbour if need be."""
-        return self._attempt(self._call(skill, name, relation), name)
-
-    def _attempt(self, call: SkillCall, name: str) -> Step:
-        if self._stands_at(name):
-            return self._run(call)
-        step = self._go_to(name)
-        step = self._run(call) if step.ok else step
-        if step.failure in OUT_OF_ARM:
-            for other in self._around(name):
-                if self._go_to(other).ok and within_reach(self._world, name) is None:
-                    return self._run(call)
-        return step
-
-    def _around(self, name: str) -> list[str]:
-        """Rows near an object, the nearest first: who stands at one of them may reach it."""
-        box = self._world.relations.body(name)
-        x, y, _ = box.center_m
-
-        def away(other: str) -> float:
-            ox, oy, _ = self._world.relations.body(other).center_m
-            return (ox - x) ** 2 + (oy - y) ** 2
-
-        others = [item for item in self._task.table if item != name and item not in self._world.carried]
-        return sorted(others, key=away)[:NEIGHBOURS]
-
-    def _go_to(self, name: str) -> Step:
-        step = self._run(self._call(Skill.MOVE, name))
-        if step.ok:
-            self._at = name
-        return step
-
-    def _stands_at(self, name: str) -> bool:
-        inside = self._world.relations.inside
-        sent = name == self._at or (self._at and (inside(name, self._at) or inside(self._at, name)))
-        return bool(sent) and within_reach(self._world, name) is None
-
-    def _call(
-        self, skill: Skill, name: str, relation: PlaceRelation | None = None, source: str = ""
-    ) -> SkillCall:
-        return SkillCall(
-            skill,
-            object_index=self._row(name),
-            source_index=self._row(source) if source else None,
-            relation=relation,
-        )
-
-    def _row(self, name: str) -> int:
-        row = self._task.index_of.get(name)
-        if row is None:
-            raise StuckError(f"{name} is not in the object table: no plan can name it")
-        return row
-
-    def _run(self, call: SkillCall) -> Step:
-        """Execute a call; one that succeeds is part of the plan."""
-        step = self._simulator.run_step(call)
-        if step.ok:
-            self._calls.append(call)
-            if len(self.plan) > MAX_STEPS:
-                raise StuckError(f"the plan needs more than {MAX_STEPS} steps")
-        return step
 
 
 def _sentence(step: Step) -> str:

@@ -13,10 +13,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.sim.goal_choices import choices
+from embomatrix.sim.plan_calls import StuckError
 from embomatrix.sim.plan_chores import chores_for, chosen, is_about_chores
 from embomatrix.sim.plan_errands import Errands, Warming
 from embomatrix.sim.plan_limits import is_hot_work, portables, sources_for, why_impossible
-from embomatrix.sim.plan_script import PlanScript, StuckError
+from embomatrix.sim.plan_script import PlanScript
 from embomatrix.sim.plan_ways import Placement
 from embomatrix.sim.plan_wishes import Wishes
 from embomatrix.sim.plan_wording import Wording

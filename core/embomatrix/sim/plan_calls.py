@@ -1,0 +1,134 @@
+"""Calls of a plan that is being written: each is executed, from a place where it can be, and kept when it succeeds."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.skills.check import within_reach
+from embomatrix.skills.failure import FailureReason
+from embomatrix.skills.syntax import MAX_STEPS, PlaceRelation, Skill, SkillCall
+
+if TYPE_CHECKING:
+    from embomatrix.sim.executor import Simulator
+    from embomatrix.skills.syntax import Plan
+    from embomatrix.skills.trace import Step
+    from embomatrix.world.task import Task
+
+NEIGHBOURS: Final = 6
+"""Things beside another from which that is tried to be reached, when no place to stand serves it itself."""
+OUT_OF_ARM: Final = frozenset(
+    {
+        FailureReason.NO_STANDING_POSE,
+        FailureReason.NO_PATH,
+        FailureReason.OUT_OF_REACH,
+        FailureReason.NO_LINE_OF_APPROACH,
+    }
+)
+"""Failures that standing elsewhere may mend."""
+
+
+class StuckError(Exception):
+    """A routine can't go on. The sentence names the call and why it failed."""
+
+
+class PlanCalls:
+    """The calls of one attempt at a task, from its start. A call that fails is told, and left out of the plan.
+
+    Every method raises StuckError when a call names an object outside the table, or the plan grows too long.
+    """
+
+    def __init__(self, simulator: Simulator, task: Task, seed: int) -> None:
+        simulator.reset(task, seed)
+        self._simulator = simulator
+        self._world = simulator.world
+        self._task = task
+        self._at = ""
+        self._calls: list[SkillCall] = []
+
+    @property
+    def plan(self) -> Plan:
+        """The calls so far. Of several moves in a row the last is kept, and none at the end."""
+        pairs = zip(self._calls, [*self._calls[1:], None], strict=True)
+        return tuple(
+            call
+            for call, following in pairs
+            if call.skill is not Skill.MOVE or (following is not None and following.skill is not Skill.MOVE)
+        )
+
+    def place(self, target: str, relation: PlaceRelation) -> Step:
+        """Place what the hand holds; when nothing is free within reach, from beside other things on the target too."""
+        step = self.use(Skill.PLACE, target, relation)
+        if step.failure is FailureReason.NO_FREE_POSE:
+            for other in self._around(target):
+                if self._go_to(other).ok and within_reach(self._world, target) is None:
+                    again = self._run(self._call(Skill.PLACE, target, relation))
+                    if again.ok:
+                        return again
+        return step
+
+    def use(self, skill: Skill, name: str, relation: PlaceRelation | None = None) -> Step:
+        """Go to the object unless the robot is there, then do it, from beside a neighbour if need be."""
+        return self._attempt(self._call(skill, name, relation), name)
+
+    def use_on(self, skill: Skill, name: str, source: str, at: str) -> Step:
+        """Use a source or a tool on an object, from beside ``at``."""
+        return self._attempt(self._call(skill, name, source=source), at)
+
+    def _attempt(self, call: SkillCall, name: str) -> Step:
+        if self._stands_at(name):
+            return self._run(call)
+        step = self._go_to(name)
+        step = self._run(call) if step.ok else step
+        if step.failure in OUT_OF_ARM:
+            for other in self._around(name):
+                if self._go_to(other).ok and within_reach(self._world, name) is None:
+                    return self._run(call)
+        return step
+
+    def _around(self, name: str) -> list[str]:
+        """Rows near an object, the nearest first: who stands at one of them may reach it."""
+        box = self._world.relations.body(name)
+        x, y, _ = box.center_m
+
+        def away(other: str) -> float:
+            ox, oy, _ = self._world.relations.body(other).center_m
+            return (ox - x) ** 2 + (oy - y) ** 2
+
+        others = [item for item in self._task.table if item != name and item not in self._world.carried]
+        return sorted(others, key=away)[:NEIGHBOURS]
+
+    def _go_to(self, name: str) -> Step:
+        step = self._run(self._call(Skill.MOVE, name))
+        if step.ok:
+            self._at = name
+        return step
+
+    def _stands_at(self, name: str) -> bool:
+        inside = self._world.relations.inside
+        sent = name == self._at or (self._at and (inside(name, self._at) or inside(self._at, name)))
+        return bool(sent) and within_reach(self._world, name) is None
+
+    def _call(
+        self, skill: Skill, name: str, relation: PlaceRelation | None = None, source: str = ""
+    ) -> SkillCall:
+        return SkillCall(
+            skill,
+            object_index=self._row(name),
+            source_index=self._row(source) if source else None,
+            relation=relation,
+        )
+
+    def _row(self, name: str) -> int:
+        row = self._task.index_of.get(name)
+        if row is None:
+            raise StuckError(f"{name} is not in the object table: no plan can name it")
+        return row
+
+    def _run(self, call: SkillCall) -> Step:
+        """Execute a call; one that succeeds is part of the plan."""
+        step = self._simulator.run_step(call)
+        if step.ok:
+            self._calls.append(call)
+            if len(self.plan) > MAX_STEPS:
+                raise StuckError(f"the plan needs more than {MAX_STEPS} steps")
+        return step
