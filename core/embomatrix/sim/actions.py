@@ -38,6 +38,8 @@ LEAST_OPEN: Final = 0.5
 class CachedActor:
     """The language-physics interface: outcomes found before are instantiated. Holds nothing of its own."""
 
+    drawing = frozenset({Skill.PLACE, Skill.SLICE})
+
     def reset(self, world: LiveWorld) -> None:
         """Nothing to do: all there is, is in the world."""
 

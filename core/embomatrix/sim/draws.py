@@ -12,10 +12,10 @@ class Draws:
 
     def __init__(self) -> None:
         self._bits = np.random.PCG64(0)
-        self._generator = np.random.Generator(self._bits)
+        self.generator = np.random.Generator(self._bits)
 
-    def at(self, seed: int, step: int) -> np.random.Generator:
-        """The generator at the start of a step's stream, until it is asked for another one.
+    def go_to(self, seed: int, step: int) -> None:
+        """Put the generator at the start of a step's stream.
 
         State and increment of PCG64 (O'Neill 2014) are the two halves of a hash; any state and any odd increment give a
         full period.
@@ -28,4 +28,3 @@ class Draws:
             "has_uint32": 0,
             "uinteger": 0,
         }
-        return self._generator

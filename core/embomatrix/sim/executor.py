@@ -20,7 +20,7 @@ from embomatrix.world.state import State
 from embomatrix.world.substances import in_words
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator, Sequence, Set
 
     import numpy as np
 
@@ -49,6 +49,10 @@ CHANGING = frozenset(
 
 class Actor(Protocol):
     """Carries out calls: the one thing in which the execution modes differ."""
+
+    @property
+    def drawing(self) -> Set[Skill]:
+        """Skills in which it draws random numbers. For the others it must not use those that it is given."""
 
     def reset(self, world: LiveWorld) -> None:
         """A rollout begins: ``world`` is at the scene's start."""
@@ -114,8 +118,10 @@ class Simulator:
         held = world.carried[:1]
         refusal = check(world, call)
         if refusal is None:
-            # Equal prefixes of plans meet equal numbers: the stream depends on the step, not on what was drawn before.
-            refusal = self._actor.act(world, call, self._draws.at(self._seed, self._count))
+            if call.skill in self._actor.drawing:
+                # Equal prefixes of plans meet equal numbers: the stream depends on the step, not on what was drawn before.
+                self._draws.go_to(self._seed, self._count)
+            refusal = self._actor.act(world, call, self._draws.generator)
         if refusal is not None:
             self._hash.update(world.state_bytes() + refusal.reason.encode())
             return Step(call, refusal.reason, refusal.sentence)

@@ -46,6 +46,8 @@ def physical_simulator(bundle: Bundle) -> Simulator:
 class PhysicalActor:
     """Carries out calls with the robot in a dynamic world of its own."""
 
+    drawing = frozenset(Skill)
+
     def __init__(self, bundle: Bundle) -> None:
         """Take a physics client; the world is built when a rollout begins."""
         self._dynamic = DynamicWorld(bundle.scene)

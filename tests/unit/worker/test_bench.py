@@ -150,8 +150,8 @@ def test_the_engine_is_measured_by_the_names_that_goals_are_set_for_and_by_size(
     assert {name.split(" at ")[1] for name in figures if " at " in name} == {"60 bodies"}
     assert figures["calls_succeeded"] | {"value": 1.0} == figures["calls_succeeded"]
     assert figures["rollout_p50_ms"]["n"] == 2 * 3
-    # The bundles have no pose cache: every place is settled.
-    assert figures["places_settled_live"]["value"] == 1.0
+    # The bundles have no pose cache: what statics does not prove is settled.
+    assert 0.0 < figures["places_settled_live"]["value"] < 1.0
 
 
 def test_the_least_speed_up_is_taken_from_the_figures_of_the_two_modes(tmp_path):

@@ -1,7 +1,8 @@
 """`bench engine`: what loading, executing and resetting cost on one core, for a pinned workload in furnished scenes.
 
 Durations are CPU time of the one thread that does the work, so that a busy machine changes them little. Every plan is
-executed once: nothing is measured that a rollout before it has computed.
+executed once: nothing is measured that a rollout before it has computed. The scene has waited for its first rollout as long as
+a worker's does that is announced: it has made what executions would make first.
 """
 
 from __future__ import annotations
@@ -114,10 +115,11 @@ def _measure_rollouts(scene: SceneWork, data: bytes, samples: EngineSamples) -> 
     try:
         with frozen_heap():
             task = next(iter(bundle.tasks.values()))
-            simulator.execute(
-                task, (), 0
-            )  # what is made when it is first needed, a worker makes before it forks slots
+            # What is made when it is first needed, a worker makes before it forks slots.
+            simulator.execute(task, (), 0)
             score(task, frozenset(), simulator.facts)
+            for _ in (*engine.complete(), *simulator.complete()):
+                pass
             for execution in scene.executions:
                 task = bundle.tasks[execution.task_id]
                 with _cpu_timed(samples.rollout_s):

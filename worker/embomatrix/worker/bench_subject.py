@@ -27,10 +27,12 @@ class CountingEngine(BulletEngine):
 
 @contextlib.contextmanager
 def frozen_heap() -> Iterator[None]:
-    """Keep what exists now out of garbage collections, as the worker's processes do before they fork."""
+    """Keep what exists now out of garbage collections, and those out of rollouts, as the worker's slots do."""
     gc.collect()
     gc.freeze()
+    gc.disable()
     try:
         yield
     finally:
+        gc.enable()
         gc.unfreeze()
