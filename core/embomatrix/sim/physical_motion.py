@@ -51,7 +51,7 @@ class Mover:
 
         None when the end is reached or ``until`` says so, else the name of what holds the robot up, "" when unknown.
         """
-        return self._along(postures, pace, self._world.step, until)
+        return self._along(postures, pace, self._world.go, until)
 
     def sweep(self, postures: FloatArray) -> str | None:
         """Move through postures, as ``follow`` does, where nothing is to be touched: time passes in coarser steps."""
@@ -61,13 +61,12 @@ class Mover:
         self,
         postures: FloatArray,
         pace: float,
-        spend: Callable[[int], None],
+        pursue: Callable[[Posture, int], None],
         until: Callable[[], bool] | None,
     ) -> str | None:
         commands = _commands(np.concatenate([self.posture[None], postures]), pace)
         for command in commands:
-            self._world.robot.steer(Posture.of(command.tolist()))
-            spend(STEERED)
+            pursue(Posture.of(command.tolist()), STEERED)
             self._watch()
             if until is not None and until():
                 self._world.robot.steer(self._world.robot.posture)
@@ -76,6 +75,7 @@ class Mover:
                 hindrance = self._world.hindrance()
                 self._world.robot.steer(self._world.robot.posture)
                 return hindrance
+        self._world.robot.steer(Posture.of(commands[-1].tolist()))
         self.wait(ARRIVAL_STEPS)
         return None
 

@@ -120,3 +120,18 @@ def test_what_is_swept_in_coarse_steps_ends_where_it_is_followed_in_fine_ones():
         ends.append(mover.posture)
     world.close()
     np.testing.assert_allclose(ends[1], ends[0], atol=0.01)
+
+
+def test_the_arm_bears_its_own_weight_stretched_out_in_coarse_steps_too():
+    scene = kitchen_scene()
+    joints = {
+        item.name: item.joints or (0.0,) * len(scene.asset_of(item.name).joints) for item in scene.objects
+    }
+    world = DynamicWorld(scene)
+    world.build({}, joints, tucked(StandPose(scene.robot.x_m, scene.robot.y_m, 0.0)))
+    mover = Mover(world, lambda: None)
+    stretched = mover.posture
+    stretched[body.LIFT], stretched[body.ARM] = 0.5, (0.0, 1.5, 0.0, -0.2, 0.0, 1.8, 0.785)
+    assert mover.sweep(stretched[None]) is None
+    assert np.abs(mover.posture - stretched).max() < 0.02
+    world.close()

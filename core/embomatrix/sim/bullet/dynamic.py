@@ -94,13 +94,20 @@ class DynamicWorld:
             self._bullet.stepSimulation(physicsClientId=self._client)
         self.steps += steps
 
-    def glide(self, steps: int) -> None:
-        """Let as much time pass, in steps of twice the length as long as the hand is empty: what is held needs short ones."""
+    def go(self, posture: Posture, steps: int) -> None:
+        """Let time pass while the motors pursue a posture."""
+        self.robot.steer(posture)
+        self.step(steps)
+
+    def glide(self, posture: Posture, steps: int) -> None:
+        """The same in steps of twice the length, as long as the hand is empty: what is held needs short ones."""
         if self._held:
-            self.step(steps)
+            self.go(posture, steps)
             return
         bullet, client = self._bullet, self._client
         bullet.setTimeStep(2 * STEP_S, physicsClientId=client)
+        # A motor's force becomes an impulse by the length that a step has when it is steered.
+        self.robot.steer(posture)
         for _ in range(0, steps, 2):
             bullet.stepSimulation(physicsClientId=client)
         bullet.setTimeStep(STEP_S, physicsClientId=client)
