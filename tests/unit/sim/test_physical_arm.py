@@ -11,11 +11,13 @@ from embomatrix.sim import physical_arm as arm
 from embomatrix.sim import physical_body as body
 from embomatrix.sim.bullet.dynamic import DynamicWorld
 from embomatrix.sim.bullet.engine import BulletEngine
+from embomatrix.sim.navigation import Navigator
 from embomatrix.sim.physical_floor import Floor
 from embomatrix.sim.physical_grasp import cross
 from embomatrix.sim.physical_motion import Mover
 from embomatrix.sim.physical_space import boxes_of, clearance, strikes
 from embomatrix.sim.physical_stage import tucked
+from embomatrix.sim.relations import Relations
 from embomatrix.world.geometry import Pose
 from embomatrix.world.poses import StandPose
 
@@ -92,7 +94,7 @@ def test_places_that_a_leaf_cuts_off_come_last(leaf_m, order):
         # From the south wall on: the long one reaches the furniture in the north, and more floor lies east of it.
         leaf = boxes_of([(Pose((4.0, leaf_m / 2, 0.5)), (0.04, leaf_m, 1.0), "door")])
         east, west = np.array([[4.5, 0.5, 0.0]]), np.array([[3.3, 2.6, 0.0]])
-        found = Floor(engine).cut_off_last([west, east], leaf)
+        found = Floor(Navigator(engine, Relations(engine))).cut_off_last([west, east], leaf)
     finally:
         engine.close()
     assert [float(group[0, 0]) for group in found] == order
