@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 GENTLE: Final = 0.25
 """Share of full speed on the last centimetres."""
 TOUCH_M: Final = 0.004
+PUSHED_M: Final = 0.01
 RAISE_M: Final = 0.06
 ROOFED_RAISE_M: Final = 0.015
 ROOF_M: Final = 1.0
@@ -49,7 +50,11 @@ def bases_at(stage: Stage, pose: Pose, course: float, out_m: float | None) -> li
 def pick_up(stage: Stage, target: str, rng: np.random.Generator) -> Refusal | None:
     """Take an object that lies where the robot can reach it."""
     home = stage.told
-    refusal = _take(stage, target, rng)
+    for _ in range(ATTEMPTS):
+        refusal = _take(stage, target, rng)
+        if refusal is None or not _was_pushed(stage, target):
+            break
+        stage.settle()
     fold(stage, home, rng, target)
     if refusal is None and stage.has_slipped():
         refusal = refuse(FailureReason.SLIPPED, target=target)
@@ -57,6 +62,12 @@ def pick_up(stage: Stage, target: str, rng: np.random.Generator) -> Refusal | No
         stage.release()
         stage.settle()
     return refusal
+
+
+def _was_pushed(stage: Stage, name: str) -> bool:
+    """Whether an object is not where the planning scene has it, so that ways to it lead past it."""
+    now, then = stage.dynamic.pose(name), stage.world.engine.pose(name)
+    return stage.grip is None and math.dist(now.position_m, then.position_m) > PUSHED_M
 
 
 def _take(stage: Stage, target: str, rng: np.random.Generator) -> Refusal | None:
@@ -95,6 +106,8 @@ def take_by(
         if refusal is None:
             return _lift(stage, way, target, ROOFED_RAISE_M if way.track < roofed else RAISE_M)
         fold(stage, StandPose(*stage.mover.posture[:3].tolist()), rng)
+        if _was_pushed(stage, target):
+            return refusal
     return refusal or refuse(FailureReason.ARM_BLOCKED, target=target, other=reach.hindrance or SOMETHING)
 
 

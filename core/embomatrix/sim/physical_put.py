@@ -31,6 +31,7 @@ FITS: Final = 48
 """Turned poses of one lot that are looked at: those in the open first, then the less deep ones."""
 DROPS_M: Final = (0.03, 0.06, 0.12, 0.24, 0.4)
 """Heights from which things are dropped where the hand can't follow."""
+RISE_M: Final = 0.01
 DROP_M: Final = 0.004
 """The hand lets go when what it holds touches, or this far below where it should."""
 LEVEL: Final = 0.3
@@ -70,24 +71,36 @@ class Delivery:
         for fits in self._lots():
             if fits:
                 tracks = list(_put_tracks(self._grip, fits))
-                bases = bases_at(self._stage, fits[0].pose, fits[0].course, fits[0].out_m)
-                for way in self.reach.ways(tracks, bases):
+                for way in self.reach.ways(tracks, bases_at(self._stage, *_at(fits[0]))):
                     yield way, tracks[way.track]
 
     def drops(self) -> Iterator[tuple[Way, Track]]:
         """Ways to let it fall from no higher than must be, as into a crate that is too narrow for the hand."""
-        open_fits = [
-            fit
-            for pose in self._poses[: CHUNKS[2]]
-            for fits in self._fits(pose)
-            for fit in fits
-            if fit.out_m is None
-        ]
-        for drop_m in DROPS_M if open_fits else ():
-            raised_fits = [Fit(Pose((0.0, 0.0, drop_m)) @ fit.pose, fit.course, None) for fit in open_fits]
-            tracks = list(_put_tracks(self._grip, raised_fits))
-            for way in self.reach.ways(tracks, bases_at(self._stage, open_fits[0].pose, 0.0, None)):
+        fits = [fit for pose in self._poses[: CHUNKS[2]] for some in self._fits(pose) for fit in some]
+        clear_m = [self._clear_above(fit.pose) for fit in fits]
+        for drop_m in DROPS_M:
+            higher = [
+                Fit(Pose((0.0, 0.0, drop_m)) @ fit.pose, fit.course, fit.out_m)
+                for fit, most_m in zip(fits, clear_m, strict=True)
+                if drop_m <= most_m
+            ]
+            if not higher:
+                return
+            tracks = list(_put_tracks(self._grip, higher))
+            for way in self.reach.ways(tracks, bases_at(self._stage, *_at(higher[0]))):
                 yield way, tracks[way.track]
+
+    def _clear_above(self, pose: Pose) -> float:
+        """How far straight up from a pose the thing could come from, as far as drops go."""
+        engine, name = self._stage.world.engine, self._grip.name
+        risen = 0
+        while risen * RISE_M < DROPS_M[-1]:
+            engine.set_pose(name, Pose((0.0, 0.0, (risen + 1) * RISE_M)) @ pose)
+            if engine.penetrates(name):
+                break
+            risen += 1
+        engine.park(name)
+        return risen * RISE_M
 
     def _lots(self) -> Iterator[list[Fit]]:
         """The first pose with the thing as it was found good; then turned, as the hand comes best; then the other poses."""
@@ -132,6 +145,10 @@ class Delivery:
         engine.set_pose(name, turned)
         if not engine.penetrates(name) and self._counts():
             yield turned
+
+
+def _at(fit: Fit) -> tuple[Pose, float, float | None]:
+    return fit.pose, fit.course, fit.out_m
 
 
 def put(
