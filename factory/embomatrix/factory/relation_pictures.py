@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -19,6 +19,8 @@ from embomatrix.world.scene import RobotStart, Room, Scene, SceneObject
 from embomatrix.world.state import Relation, State
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from embomatrix.world.asset import Asset
     from embomatrix.world.geometry import Vec3
 
@@ -33,6 +35,10 @@ MODELS: Final = {
     "mug": ("mug", "ntgftr"),
     "carton": ("carton", "libote"),
 }
+ROOMS: Final = (
+    Room("kitchen_0", "kitchen", (-2.0, -2.0), (2.0, -0.06)),
+    Room("bathroom_0", "bathroom", (-2.0, 0.06), (2.0, 2.0)),
+)
 COLUMNS: Final = 4
 PANEL_PX: Final = (300, 240)
 LABEL_PX: Final = 40
@@ -44,8 +50,9 @@ LEAST_SPAN_M: Final = 0.42
 class Panel:
     """One case. ``at_m`` is the middle of the first object's underside, from the second's middle and from ``on``.
 
-    ``on`` names a surface of the second, "top" its top; empty: the floor. The second stands upright with its front at +x, its
-    joints at ``open``. A relation of one object has no first.
+    The second may be one of `ROOMS`: then ``at_m`` is in the world. ``on`` names a surface of the second, "top" its top;
+    empty: the floor. The second stands upright with its front at +x, its joints at ``open``. A relation of one object has
+    no first.
     """
 
     predicate: str
@@ -85,6 +92,8 @@ PANELS: Final = (
     Panel("nextto", "apple", "mug", (0.0, 0.35, 0.0), "too far for their sizes"),
     Panel("touching", "apple", "carton", (0.0, -0.147, 0.0), "5 mm apart or less"),
     Panel("touching", "apple", "carton", (0.0, -0.19, 0.0), "nextto, and not touching"),
+    Panel("inroom", "carton", "kitchen_0", (0.0, -0.11, 0.0), "its middle is over the floor"),
+    Panel("inroom", "carton", "kitchen_0", (0.0, 0.11, 0.0), "its middle is over the next room's"),
     Panel("open", "", "cabinet", (0.0, 0.0, 0.0), "a joint past 5 % of its travel", open=0.5),
     Panel("open", "", "cabinet", (0.0, 0.0, 0.0), "ajar by 4 %", open=0.04),
 )
@@ -116,30 +125,30 @@ def verdict(panel: Panel) -> bool:
 def panel_scene(panel: Panel) -> Scene:
     """The objects of a panel on an empty floor."""
     catalog = Catalog.load()
-    assets = {name: build_asset(catalog, *MODELS[name]) for name in (panel.b, panel.a) if name}
-    stands = {panel.b: (0.0, 0.0, 0.0), **({panel.a: _at(panel, assets[panel.b])} if panel.a else {})}
+    assets = {name: build_asset(catalog, *MODELS[name]) for name in (panel.b, panel.a) if name in MODELS}
+    stands = {panel.b: (0.0, 0.0, 0.0), **({panel.a: _at(panel, assets)} if panel.a else {})}
     objects = tuple(
         SceneObject(
             name,
             asset.asset_id,
-            "floor_0",
+            ROOMS[0].name,
             _standing(asset, stands[name]),
             fixed=name == panel.b,
             joints=(panel.open if name == panel.b else 0.0,) * len(asset.joints),
         )
         for name, asset in assets.items()
     )
-    room = Room("floor_0", "living_room", (-2.0, -2.0), (2.0, 2.0))
-    start = RobotStart(-1.5, -1.5, 0.0, room.name)
+    start = RobotStart(-1.5, -1.5, 0.0, ROOMS[0].name)
     by_id = {asset.asset_id: asset for asset in assets.values()}
-    return Scene("relations", "relations", 0, (room,), (), (), objects, by_id, start)
+    return Scene("relations", "relations", 0, ROOMS, (), (), objects, by_id, start)
 
 
-def _at(panel: Panel, support: Asset) -> Vec3:
+def _at(panel: Panel, assets: Mapping[str, Asset]) -> Vec3:
     """Where the first object's underside is in the world; the second one's lies on the floor."""
     x, y, z = panel.at_m
     if not panel.on:
         return panel.at_m
+    support = assets[panel.b]
     surface = {item.name: item for item in support.supports}.get(panel.on)
     cx, cy, cz = surface.center_m if surface else (0.0, 0.0, support.size_m[2] / 2)
     return (cx + x, cy + y, cz + z + support.size_m[2] / 2)
@@ -152,7 +161,9 @@ def _standing(asset: Asset, at_m: Vec3) -> Pose:
 
 def _drawn(panel: Panel) -> Image.Image:
     scene = panel_scene(panel)
-    with Stage(replace(scene, rooms=())) as stage:
+    with Stage(scene) as stage:
+        if panel.predicate == Relation.INROOM:
+            stage.add_floors()
         stage.add_objects()
         picture = Image.fromarray(np.asarray(_photographed(stage, _framed(scene, panel), panel.side)))
     whole = Image.new("RGB", (PANEL_PX[0], PANEL_PX[1] + LABEL_PX), "white")
