@@ -1,4 +1,7 @@
-"""Doors, drawers and lids of furniture that stand open: which of them do, and the room that they take."""
+"""Doors, drawers and lids of furniture that stand open: which of them do, and the room that they take.
+
+One that is ajar by no more than what counts as shut takes none.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from embomatrix.sim.bounds import parts_of
 from embomatrix.sim.obstacles import WALLS, Obstacles
+from embomatrix.world.state import OPEN_FRACTION
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -39,7 +43,7 @@ class OpenLeaves:
     def ajar(self) -> Ajar:
         """What stands open now, in scene order."""
         joints = ((number, self._engine.joints(self._objects[number].name)) for number in sorted(self._swung))
-        return tuple((number, fractions) for number, fractions in joints if any(fractions))
+        return tuple((number, fractions) for number, fractions in joints if max(fractions) > OPEN_FRACTION)
 
     def obstacles(self, ajar: Ajar) -> Obstacles:
         """Boxes of the parts of leaves that stand open so."""
@@ -56,5 +60,5 @@ class OpenLeaves:
         """For each part of an object, in the order of its links, whether it belongs to a leaf that stands open."""
         moving = iter(fractions)
         for link in self._engine.scene.asset_of(self._objects[number].name).links:
-            is_out = link.joint is not None and next(moving, 0.0) > 0.0
+            is_out = link.joint is not None and next(moving, 0.0) > OPEN_FRACTION
             yield from (is_out for _ in link.parts)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ from embomatrix.sim.physical_grasp import cross, facing
 from embomatrix.sim.physical_hands import GENTLE, TOUCH_M, WAYS
 from embomatrix.sim.physical_reach import TOUCH_M as PRESS_M
 from embomatrix.sim.physical_reach import Reach, Track
-from embomatrix.sim.physical_space import boxes_of, part_boxes, strikes
+from embomatrix.sim.physical_space import Boxes, boxes_of, part_boxes, strikes
 from embomatrix.sim.physical_stage import compact
 from embomatrix.sim.physical_travel import SOMETHING
 from embomatrix.skills.failure import FailureReason
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from embomatrix.sim.physical_reach import Way
-    from embomatrix.sim.physical_space import Boxes
     from embomatrix.sim.physical_stage import Stage
     from embomatrix.skills.view import Refusal
     from embomatrix.world.asset import Asset, Joint, Link
@@ -210,7 +210,9 @@ def _stretch(stage: Stage, leaf: Leaf, start: float, goal: float, rng: np.random
     point = first.position[2]
     bases = stage.bases(point, 0.75, walk_m=FAR_M)
     if goal > start:
-        bases = stage.floor.cut_off_last(bases, moving[-1])
+        # The others of the object will stand open too.
+        ends = [_leaf_boxes(other, goal) for other in leaves_of(stage, leaf.name)]
+        bases = stage.floor.cut_off_last(bases, functools.reduce(Boxes.joined, ends))
     for way in itertools.islice(reach.ways(itertools.chain([first], tracks), bases), WAYS):
         _draw_in(stage, way, rng)
         swing = approach(stage, way, reach, rng, loaded=False)
@@ -244,13 +246,23 @@ def _pull(stage: Stage, way: Way, leaf: Leaf, goal: float) -> Refusal | None:
     stage.dynamic.part()
     stage.mover.wait(4)
     if stage.dynamic.hindrance() == leaf.name:
-        # The arm leans on the leaf: back as it came it leaves it.
-        stage.mover.follow(way.postures[-3:0:-1], 0.6)
+        _lean_off(stage, way, leaf)
     reached = stage.dynamic.joints(leaf.name)[leaf.number]
     stage.settle()
     if abs(reached - goal) > 0.12 and hit is not None:
         return refuse(FailureReason.DOOR_BLOCKED, target=leaf.name, other=hit or SOMETHING)
     return None
+
+
+def _lean_off(stage: Stage, way: Way, leaf: Leaf) -> None:
+    """Draw the arm back as it came, as far as it leans on the leaf and does not take the leaf along."""
+    let_go = stage.dynamic.joints(leaf.name)[leaf.number]
+
+    def is_off() -> bool:
+        moved = abs(stage.dynamic.joints(leaf.name)[leaf.number] - let_go)
+        return moved > SHUT or stage.dynamic.hindrance() != leaf.name
+
+    stage.mover.follow(way.postures[-3:0:-1], 0.6, is_off)
 
 
 def _tracks(leaf: Leaf, fractions: FloatArray) -> Iterator[Track]:
