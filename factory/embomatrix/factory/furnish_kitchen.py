@@ -50,6 +50,8 @@ _CARRIED: Final = 0.3
 _STEP_M: Final = 0.003
 _LEVEL_M: Final = 0.035
 _HIGHEST_M: Final = 0.95
+_OVERHANG_M: Final = 0.15
+"""No slab reaches farther than this over the fronts below it."""
 _WORKTOP_M: Final = 0.72
 _BASIN_RIM_M: Final = 0.86
 
@@ -149,14 +151,18 @@ def _best_row(candidates: Sequence[Piece], width: float) -> list[Piece]:
 
 
 def _counter_members(slab: Piece, row: Sequence[Piece]) -> tuple[Member, ...]:
-    """Cabinets side by side, backs aligned with the slab's, the slab on the tallest of them."""
+    """Cabinets side by side, backs aligned with the slab's, the slab on the tallest of them.
+
+    Under a deep slab they stand forward: who opens a drawer stands before the slab's edge and reaches under it.
+    """
     total = sum(p.size_m[1] + _STEP_M for p in row) - _STEP_M
     left = -total / 2
     members = []
     back = -slab.size_m[0] / 2
     for piece in row:
         depth, width, _ = piece.size_m
-        members.append(Member(piece, back + depth / 2, left + width / 2))
+        forward = max(0.0, slab.size_m[0] - depth - _OVERHANG_M)
+        members.append(Member(piece, back + forward + depth / 2, left + width / 2))
         left += width + _STEP_M
     tallest = max(range(len(row)), key=lambda i: row[i].size_m[2])
     bottom = row[tallest].size_m[2] + REST_GAP_M

@@ -82,6 +82,16 @@ def test_a_counter_slab_lies_on_its_tallest_cabinet() -> None:
     assert not left_out
 
 
+@pytest.mark.parametrize("depth_m", [0.6, 0.7, 0.9, 1.2])
+def test_no_slab_reaches_far_over_the_drawers_below_it(depth_m) -> None:
+    cabinet = block("bottom_cabinet", (0.5, 0.9, 0.55), door=True)
+    (counter,), _ = room_groups(pieces(block("countertop", (depth_m, 1.0, 0.03)), cabinet))
+    under, slab = counter.members
+    front = under.x + under.piece.size_m[0] / 2
+    assert -1e-9 <= slab.x + slab.piece.size_m[0] / 2 - front <= 0.15 + 1e-9
+    assert front - under.piece.size_m[0] >= slab.x - slab.piece.size_m[0] / 2 - 1e-9
+
+
 def test_a_slab_without_cabinets_is_left_out_with_a_sentence() -> None:
     groups, left_out = room_groups(pieces(block("countertop", (0.6, 1.0, 0.03))), "kitchen")
     assert groups == []

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 TRAVEL_SHARE: Final = 0.8
 """How much of its depth a drawer comes out: the rest stays on the rails."""
+TRAVEL_M: Final = 0.6
+"""No rails are longer, however deep the furniture: the inventories have a cabinet of three metres."""
 PLAY_M: Final = 0.004
 """Gap between a drawer and what it slides past."""
 DRAWER_M: Final = 0.21
@@ -49,7 +51,7 @@ def _add_drawer(body: Body, name: str, panel: Aabb, room: Aabb) -> None:
         JointKind.PRISMATIC,
         rounded(*panel.center_m),
         (1.0, 0.0, 0.0),
-        round(TRAVEL_SHARE * (panel.high_m[0] - outer.low_m[0]), 6),
+        round(min(TRAVEL_SHARE * (panel.high_m[0] - outer.low_m[0]), TRAVEL_M), 6),
     )
     body.moving.append(Link(name, (box_of(panel), *boards), joint))
     free = Aabb(cavity.low_m, (*cavity.high_m[:2], top))
