@@ -50,6 +50,8 @@ TOUCH_M: Final = -0.003
 SAMPLED: Final = np.array([0.06, 0.06, 0.1, 0.06, 0.1, 0.1, 0.12, 0.12, 0.25, 0.25, 0.4])
 """Metres, and radians, of each number of a posture between two that are looked at."""
 MOST_SAMPLES: Final = 36
+COARSE: Final = 5
+"""Of so many postures of a motion one is looked at first."""
 VIAS: Final = 60
 TRIED: Final = 16
 """Postures by way of which a swing may lead, and how many of the free ones are tried."""
@@ -135,10 +137,23 @@ class Reach:
         ready = np.concatenate([start[:3], end[3:]])
         if not self._is_free(_between(ready, end), held):
             return None
-        for via in self._vias(start, ready, rng, held):
-            if self._is_free(np.concatenate([_between(start, via), _between(via, ready)[1:]]), held):
-                return np.stack([start, via, ready, end])
+        vias = self._vias(start, ready, rng, held)
+        # Mostly the first will do; of the others, what bars a motion does so for a while, and a few postures of each tell.
+        for some in (vias[:1], vias[1:]):
+            motions = [np.concatenate([_between(start, via), _between(via, ready)[1:]]) for via in some]
+            for number in self._seem_free(motions, held):
+                if self._is_free(motions[number], held):
+                    return np.stack([start, some[number], ready, end])
         return None
+
+    def _seem_free(self, motions: Sequence[FloatArray], held: Held | None) -> list[int]:
+        """Numbers of the motions, (n, 11) each, that are free as far as every few of their postures tell."""
+        few = [motion[1:-1:COARSE] for motion in motions]
+        if len(few) < 2:
+            return list(range(len(few)))
+        free = self._free(np.concatenate(few), self._boxes, held, AIR_M)
+        of = np.repeat(np.arange(len(few)), [len(part) for part in few])
+        return [number for number in range(len(few)) if free[of == number].all()]
 
     def drives(self, start: FloatArray, end: FloatArray, *, loaded: bool) -> bool:
         """Whether the base can drive straight from one posture to another with the arm as it is."""
@@ -210,7 +225,6 @@ class Reach:
             return np.zeros(0, dtype=np.bool_)
         load = held.placed(postures) if held is not None else None
         sizes = held.radii if held is not None else None
-        own = body.strikes_itself(postures, load, sizes)
         centres = body.balls(postures)
         radii = body.RADII
         if load is not None and sizes is not None:
@@ -222,7 +236,9 @@ class Reach:
         hit = strikes(close, centres, radii, margin_m)
         if (hit >= 0).any():
             self.hindrance = close.owners[int(hit[hit >= 0][0])]
-        return np.asarray(~own & (hit < 0))
+        free = hit < 0
+        free[free] = ~body.strikes_itself(postures[free], load[free] if load is not None else None, sizes)
+        return np.asarray(free)
 
 
 def _best_of_each(base: FloatArray, cost: FloatArray, most: int) -> FloatArray:
