@@ -18,6 +18,7 @@ _ORIGIN: Final = Pose((0.0, 0.0, 0.0))
 _MARGIN_PX: Final = 30
 _LONG_SIDE_PX: Final = 1500
 _LINE_PX: Final = 15
+_COLUMN_PX: Final = 330
 _PANE_M: Final = 0.03
 """Half the thickness at which windows are drawn."""
 _SMALL_M: Final = 0.3
@@ -99,7 +100,7 @@ class _Plan:
         self._legend_x = int(width) + _MARGIN_PX
         rows = len(self._small) + len(_LEGEND) + len(_SIGNS) + 5
         columns = max(1, math.ceil(rows * _LINE_PX / max(int(height), 700)))
-        size = (self._legend_x + columns * 300, max(int(height), 700) + 2 * _MARGIN_PX)
+        size = (self._legend_x + columns * _COLUMN_PX, max(int(height), 700) + 2 * _MARGIN_PX)
         self.image = Image.new("RGB", size, "white")
         self._draw = ImageDraw.Draw(self.image)
         self._row = 0
@@ -223,7 +224,7 @@ class _Plan:
 
     def _place(self) -> tuple[int, int]:
         rows = (self.image.height - 2 * _MARGIN_PX) // _LINE_PX
-        return (self._legend_x + 300 * (self._row // rows), _MARGIN_PX + _LINE_PX * (self._row % rows))
+        return (self._legend_x + _COLUMN_PX * (self._row // rows), _MARGIN_PX + _LINE_PX * (self._row % rows))
 
     def _text(self, at: tuple[float, float], words: str, size: int, color: str) -> None:
         self._draw.text(at, words, fill=color, font=ImageFont.load_default(size))
