@@ -186,10 +186,6 @@ class DynamicWorld:
                 physicsClientId=self._client,
             )
 
-    def touched_by_hand(self, name: str) -> bool:
-        """Whether fingers or palm touch the object at this step."""
-        return any(contact[3] in self.robot.tips for contact in self._contacts(name))
-
     def touched_by(self, held: str, ignore: frozenset[str]) -> str:
         """What an object touches but those in ``ignore``; "" for nothing."""
         contacts = self._bullet.getContactPoints(bodyA=self._bodies[held], physicsClientId=self._client)
@@ -314,12 +310,6 @@ class DynamicWorld:
 
     def _angle(self, name: str, index: int) -> float:
         return float(self._bullet.getJointState(self._bodies[name], index, physicsClientId=self._client)[0])
-
-    def _contacts(self, name: str) -> tuple[tuple[float, ...], ...]:
-        return tuple(
-            self._bullet.getContactPoints(self.robot.body, self._bodies[name], physicsClientId=self._client)
-            or ()
-        )
 
     def _state(self, name: str) -> tuple[Vec3, tuple[float, ...]]:
         if name in self._joints:
