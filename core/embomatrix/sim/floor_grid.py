@@ -217,11 +217,7 @@ class FloorGrid:
     def main_part_of(self, wider: FloorGrid, x_m: float, y_m: float) -> int:
         """The largest component of this grid in the one that a point belongs to on the grid that it was narrowed from."""
         cell = wider.cell(x_m, y_m)
-        if cell is None:
-            return 0
-        labels = self.labels
-        parts = labels[(wider.labels == wider.label(cell)) & (labels > 0)]
-        return int(np.bincount(parts, minlength=1).argmax())
+        return self.parts.largest_in(wider.parts, wider.label(cell)) if cell is not None else 0
 
     def free_centers(self, low_m: Vec2, high_m: Vec2, label: int) -> FloatArray:
         """Middles of the component's cells in a rectangle, shape (n, 2), in the world."""

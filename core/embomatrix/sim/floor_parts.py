@@ -63,6 +63,27 @@ class FloorParts:
         numbers[here] = self.inner[there]
         return numbers
 
+    def largest_in(self, before: FloorParts, number: int) -> int:
+        """The largest of these parts in the one that bore a number before the last changes; 0 when nothing of it is left."""
+        if self.inner is None or self.whole is not before.whole:
+            sizes = np.bincount(self.numbers[before.numbers == number], minlength=1)
+        else:
+            # Beyond the window nothing has changed: a house with a garden has half a million cells.
+            window = self.window if before.inner is None else _around(self.window, before.window)
+            was = before.within(window) == number
+            sizes = np.bincount(self.within(window)[was], minlength=number + 1)
+            sizes[number] += before._count_of(number) - np.count_nonzero(was)
+        sizes[0] = 0
+        return int(sizes.argmax())
+
+    def _count_of(self, number: int) -> int:
+        """Cells of a part."""
+        count = np.count_nonzero(self.whole == number)
+        if self.inner is not None:
+            before = np.count_nonzero(self.whole[self.window] == number)
+            count += np.count_nonzero(self.inner == number) - before
+        return int(count)
+
     def changed(self, free: BoolArray, window: Window) -> FloorParts:
         """Parts after cells of a window were taken or freed: ``free`` are the window's. At its edge nothing has changed.
 

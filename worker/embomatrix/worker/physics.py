@@ -70,11 +70,12 @@ class PhysicsScene:
             # An empty plan: what the simulator makes when it is first needed is made before the slots are forked.
             self._simulator.execute(task, (), 0)
             score(task, frozenset(), self._simulator.facts)
-            navigator = self._simulator.world.navigator
-            navigator.reachable(navigator.start, navigator.start)
 
     def complete(self) -> Iterator[None]:
         """Make what executions would make when they first need it."""
+        navigator = self._simulator.world.navigator
+        navigator.reachable(navigator.start, navigator.start)
+        yield
         yield from self._engine.complete()
         yield from self._simulator.complete()
 

@@ -52,7 +52,7 @@ class LoadedScene(Protocol):
     def execute(self, rollout: Rollout) -> Completed: ...
 
     def complete(self) -> Iterator[None]:
-        """Steps, each shorter than a millisecond, that make later executions faster and change nothing else."""
+        """Steps of a millisecond or two that make later executions faster and change nothing else."""
 
 
 class Simulation(Protocol):
