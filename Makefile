@@ -39,6 +39,7 @@ compose-check: $(VENV)/.dev
 
 pictures: $(VENV)/.dev
 	for scene in Rs_int Wainscott_0_int restaurant_diner; do $(BIN)/embomatrix scene render $$scene --out docs/pictures || exit 1; done
+	$(BIN)/embomatrix scene views Rs_int Wainscott_0_int restaurant_diner --out docs/pictures/scenes.png
 	$(BIN)/embomatrix scene sheet --all --out docs/pictures/base_scenes.png
 	$(BIN)/embomatrix scene relations --out docs/pictures
 

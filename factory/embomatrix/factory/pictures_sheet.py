@@ -1,4 +1,4 @@
-"""Many plans on one sheet, without labels: to see at a glance what became of every inventory."""
+"""Many scenes in one picture, without labels: plans on a sheet, to see at a glance what became of each, and views."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from embomatrix.factory.pictures import FILL, PALE, footprint, is_overhead, kind_of
+from embomatrix.sim.bullet.camera import render_oblique
 from embomatrix.world.geometry import Pose
 
 if TYPE_CHECKING:
@@ -33,6 +34,18 @@ def draw_sheet(scenes: Sequence[Scene], *, columns: int = 9, cell_px: int = 200)
         sheet.paste(draw_thumbnail(scene, cell_px - 6), (x + 3, y + 3))
         draw.text((x + 4, y + cell_px), scene.scene_id, fill="black", font=font)
     return sheet
+
+
+def draw_views(scenes: Sequence[Scene], *, width_px: int = 560) -> Image.Image:
+    """Oblique views side by side, each ``width_px`` wide and three quarters as high. Raises EngineError without pybullet."""
+    height_px = width_px * 3 // 4
+    row = Image.new("RGB", (len(scenes) * width_px, height_px), "white")
+    for number, scene in enumerate(scenes):
+        # drawn at twice the size: Bullet's renderer leaves edges jagged
+        view = render_oblique(scene, width_px=2 * width_px, height_px=2 * height_px)
+        smooth = Image.fromarray(np.asarray(view)).resize((width_px, height_px), Image.Resampling.LANCZOS)
+        row.paste(smooth, (number * width_px, 0))
+    return row
 
 
 def draw_thumbnail(scene: Scene, side_px: int) -> Image.Image:

@@ -21,7 +21,7 @@ from embomatrix.factory.floorplan_spec import FloorPlanError
 from embomatrix.factory.importers.model import ModelFileError
 from embomatrix.factory.importers.shelf import read_assets
 from embomatrix.factory.pictures import draw_plan
-from embomatrix.factory.pictures_sheet import draw_sheet
+from embomatrix.factory.pictures_sheet import draw_sheet, draw_views
 from embomatrix.factory.relation_pictures import draw_relations
 from embomatrix.factory.scene_batch import SceneJob, run_batch
 from embomatrix.factory.scene_build import build_base_scene
@@ -54,6 +54,7 @@ Seeds = Annotated[
     typer.Option("--seed", min=0, help="Arrangement of the inventory; give it again for more. Default: 0."),
 ]
 Out = Annotated[Path, typer.Option(help="Folder for the files.")]
+Picture = Annotated[Path, typer.Option(help="PNG file to write.")]
 Jobs = Annotated[int, typer.Option(min=1, help="Processes at a time.")]
 Report = Annotated[
     Path | None, typer.Option(help="JSON file for all figures, problems and what was left out.")
@@ -167,19 +168,36 @@ def sheet(
     scene_ids: SceneIds = None,
     every: All = False,
     seed: Seed = 0,
-    out: Annotated[Path, typer.Option(help="PNG file to write.")] = Path("scenes.png"),
+    out: Picture = Path("scenes.png"),
 ) -> None:
     """Draw the plans of many scenes on one sheet, as a PNG file."""
     chosen = _chosen(scene_ids, every)
     _check_writable(out)
+    _write(out, _png(draw_sheet(_built_all(chosen, seed)).quantize(64)))
+    Console().print(str(out), highlight=False)
+
+
+@app.command()
+def views(scene_ids: SceneIds = None, seed: Seed = 0, out: Picture = Path("views.png")) -> None:
+    """Draw oblique views of some scenes side by side, as a PNG file."""
+    chosen = _chosen(scene_ids, every=False)
+    _check_writable(out)
+    scenes = _built_all(chosen, seed)
+    with _engine_refusals():
+        picture = draw_views(scenes)
+    _write(out, _png(picture.quantize(128)))
+    Console().print(str(out), highlight=False)
+
+
+def _built_all(names: Sequence[str], seed: int) -> list[Scene]:
+    """The scenes, one after another, with a bar that tells how far it is."""
     scenes = []
-    with _progress(len(chosen)) as bar:
-        for name in chosen:
+    with _progress(len(names)) as bar:
+        for name in names:
             bar.update(bar.task_ids[0], description=name)
             scenes.append(_built(name, seed))
             bar.advance(bar.task_ids[0])
-    _write(out, _png(draw_sheet(scenes).quantize(64)))
-    Console().print(str(out), highlight=False)
+    return scenes
 
 
 def _check_assets(folder: Path | None) -> None:

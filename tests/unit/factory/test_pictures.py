@@ -7,7 +7,7 @@ import numpy as np
 from typer.testing import CliRunner
 
 from embomatrix.factory.pictures import draw_plan
-from embomatrix.factory.pictures_sheet import draw_sheet
+from embomatrix.factory.pictures_sheet import draw_sheet, draw_views
 from embomatrix.factory.scene_cli import app
 from embomatrix.sim.bullet.camera import render_oblique
 
@@ -86,3 +86,10 @@ def test_a_report_that_can_not_be_written_is_told_before_the_work(tmp_path: Path
         assert result.exit_code == 2
         assert "report.json can't be written" in " ".join(result.output.split())
     assert not any(tmp_path.iterdir())
+
+
+def test_views_of_several_scenes_stand_side_by_side(flat: Scene) -> None:
+    pixels = np.asarray(draw_views([flat, flat], width_px=120))
+    assert pixels.shape == (90, 240, 3)
+    assert (pixels[:, :120] == pixels[:, 120:]).all()
+    assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > 50
