@@ -234,10 +234,11 @@ def _set_down(stage: Stage, way: Way, track: Track) -> Refusal | None:
     stage.mover.follow(
         np.stack([way.postures[key], lower]), GENTLE, lambda: bool(stage.dynamic.touched_by(name, ignore))
     )
-    stage.release()
+    stage.loosen()
     stage.mover.wait(16)
     _let_go(stage)
     stage.mover.follow(way.postures[key + 1 :], 0.5)
+    stage.dynamic.part_from(name)
     return None
 
 

@@ -165,7 +165,14 @@ class Stage:
 
     def release(self) -> None:
         """The hand lets go."""
-        self.dynamic.release()
+        held = self.grip.name if self.grip is not None else ""
+        self.loosen()
+        if held:
+            self.dynamic.part_from(held)
+
+    def loosen(self) -> None:
+        """The hand lets go, and leaves what it held without dragging it along until they part in the dynamic world."""
+        self.dynamic.loosen()
         self.grip = None
 
     def has_slipped(self) -> bool:

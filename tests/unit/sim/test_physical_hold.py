@@ -92,3 +92,12 @@ def test_what_goes_into_a_crate_too_narrow_for_the_hand_is_dropped_in(play):
     trace, simulator = play(extra, "move die_1; pick_up die_1; move crate_1; place crate_1 inside")
     assert trace.failure is None, trace.steps[-1].message
     assert simulator.world.relations.inside("die_1", "crate_1")
+
+
+def test_a_cup_taken_at_its_thin_wall_stays_where_it_is_put(play):
+    cup = make.tub("cup", "cup.n.01", (0.08, 0.08, 0.08), 0.003, 0.005, mass_kg=0.1, abilities={})
+    pose = upright(2.0, 1.3, TABLE_TOP_M, cup)
+    text = "move cup_1; pick_up cup_1; move countertop_1; place countertop_1 ontop"
+    trace, simulator = play([(placed("cup_1", cup, "kitchen_0", pose), cup)], text)
+    assert trace.failure is None, trace.steps[-1].message
+    assert simulator.world.relations.ontop("cup_1", "countertop_1")

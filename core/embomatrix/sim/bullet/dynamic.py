@@ -227,13 +227,16 @@ class DynamicWorld:
         self.robot.collide(body, range(-1, self._count(name)), on=False)
         self._held = name
 
-    def release(self) -> None:
-        """Let go of what the hand holds."""
+    def loosen(self) -> None:
+        """Let go of what the hand holds. The hand passes through it until ``part_from``: fingers do not drag it along."""
         self.robot.let_go()
         if self._held:
-            self.robot.collide(self._bodies[self._held], range(-1, self._count(self._held)), on=True)
             self.wake((self._held,))
             self._held = ""
+
+    def part_from(self, name: str) -> None:
+        """The hand has left an object that it held, and meets it again."""
+        self.robot.collide(self._bodies[name], range(-1, self._count(name)), on=True)
 
     def hook(self, name: str, joint: int) -> None:
         """Hold the leaf that a joint of the object moves by the point that the hand is at."""
