@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.sim.bounds import IDENTITY, bounds_of
+from embomatrix.sim.bounds import IDENTITY, bounds_of, parts_of
 from embomatrix.sim.candidates import candidates
 from embomatrix.sim.engine import FLOOR, TOLERANCE_M
 from embomatrix.sim.lineup import Neighbours
@@ -66,13 +66,18 @@ class Placer:
         self._repertoire = Repertoire(engine.scene, cache)
 
     def complete(self) -> Iterator[None]:
-        """Find out how everything stands by itself, one object at a step: work for a process that waits. Changes no answer."""
-        for item in self._scene.objects:
-            if not item.fixed:
-                asset = self._scene.assets[item.asset_id]
+        """Find out what everything stands on, and where the parts of what it may be put on are, one asset at a step.
+
+        Work for a process that waits. Changes no answer.
+        """
+        movable = {item.asset_id for item in self._scene.objects if not item.fixed}
+        for asset_id, asset in self._scene.assets.items():
+            if asset_id in movable:
                 self._repertoire.footprint(asset)
                 self._repertoire.base(asset)
                 yield
+            parts_of(asset).boxes(IDENTITY, (0.0,) * len(asset.joints))
+            yield
 
     def find(
         self,
