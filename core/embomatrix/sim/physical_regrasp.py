@@ -68,9 +68,14 @@ def regrasp(
     pose = engine.pose(name)
     course, out_m = way_in(stage, name, engine.aabb(name), stage.boxes())
     tracks = grasp_tracks(asset, pose, engine.joints(name), course, out_m)
-    good = [track for track in tracks if _kind(track) in kinds]
-    roofed = len(good) if out_m is not None else 0
-    refusal = take_by(stage, name, good, roofed, bases_at(stage, pose, course, out_m), rng)
+    bases = bases_at(stage, pose, course, out_m)
+    refusal = None
+    # Where none of the holds that lead to the goal can be taken, any is better than to leave the thing there.
+    for wanted in (True, False):
+        some = [track for track in tracks if (_kind(track) in kinds) is wanted]
+        refusal = take_by(stage, name, some, len(some) if out_m is not None else 0, bases, rng)
+        if refusal is None:
+            break
     fold(stage, home, rng)
     return refusal is None and stage.grip is not None
 
