@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from embomatrix.sim.bullet.camera import furnish_cutaway, shoot_egocentric, shoot_oblique
+from embomatrix.sim.bullet.camera import furnish_cutaway, furnish_whole, shoot_egocentric, shoot_oblique
 from embomatrix.sim.bullet.stage import Stage
 from embomatrix.sim.film import FRAMES_PER_S
 from embomatrix.sim.physical_stage import tucked
@@ -91,13 +91,15 @@ def check_suffix(path: Path) -> None:
 
 
 class _Cutter:
-    """One process's stage, brought from frame to frame."""
+    """One process's stages, brought from frame to frame: one with low walls to look into, one as the robot sees it."""
 
     def __init__(self, scene: Scene, rooms: Mapping[int, tuple[Room, ...]]) -> None:
-        self._stage = Stage(scene)
-        furnish_cutaway(self._stage)
+        self._scene = scene
+        self._open, self._whole = Stage(scene), Stage(scene)
+        furnish_cutaway(self._open)
+        furnish_whole(self._whole)
         self._rooms = rooms
-        self._robot = self._stage.add_robot()
+        self._robot = self._open.add_robot()
         self._changed: set[str] = set()
 
     def shoot(self, frame: Frame) -> tuple[Image.Image, Image.Image]:
@@ -107,18 +109,19 @@ class _Cutter:
             self._show(frame, name)
         self._changed = changed
         self._robot.stand(frame.posture or tucked(frame.robot))
-        room = shoot_oblique(self._stage, self._rooms[frame.step], *ROOM_PX)
-        self._robot.leave()
-        eye = shoot_egocentric(self._stage, frame.robot, *EYE_PX)
+        room = shoot_oblique(self._open, self._rooms[frame.step], *ROOM_PX)
+        eye = shoot_egocentric(self._whole, frame.robot, *EYE_PX)
         return Image.fromarray(np.asarray(room)), Image.fromarray(np.asarray(eye))
 
     def _show(self, frame: Frame, name: str) -> None:
-        item = self._stage.scene.by_name[name]
-        if name in frame.hidden or (item.absent and name not in frame.poses):
-            self._stage.hide(name)
-            return
+        item = self._scene.by_name[name]
+        gone = name in frame.hidden or (item.absent and name not in frame.poses)
         pose = frame.poses.get(name, item.pose_world_asset)
-        self._stage.put(name, pose, frame.joints.get(name, item.joints))
+        for stage in (self._open, self._whole):
+            if gone:
+                stage.hide(name)
+            else:
+                stage.put(name, pose, frame.joints.get(name, item.joints))
 
 
 _cutter: _Cutter | None = None

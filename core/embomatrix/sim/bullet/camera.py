@@ -58,9 +58,7 @@ def render_egocentric(
     Raises EngineError where pybullet is missing.
     """
     with Stage(scene) as stage:
-        stage.add_floors()
-        stage.add_walls(lambda wall: wall)
-        stage.add_objects()
+        furnish_whole(stage)
         return shoot_egocentric(stage, stand or _start(scene), width_px, height_px)
 
 
@@ -69,6 +67,13 @@ def furnish_cutaway(stage: Stage) -> None:
     stage.add_floors()
     stage.add_walls(lambda wall: _cut(stage.scene, wall))
     stage.add_objects(lambda item: not _hangs_at_ceiling(stage.scene, item))
+
+
+def furnish_whole(stage: Stage) -> None:
+    """Fill a stage for pictures from within: all walls in full, and what hangs at the ceiling."""
+    stage.add_floors()
+    stage.add_walls(lambda wall: wall)
+    stage.add_objects()
 
 
 def shoot_oblique(stage: Stage, rooms: tuple[Room, ...], width_px: int, height_px: int) -> NDArray[np.uint8]:
