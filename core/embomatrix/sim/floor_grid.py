@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import copy
 import functools
-import heapq
 import math
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from scipy import ndimage, sparse
-from scipy.sparse import csgraph
+from scipy import ndimage
 
 from embomatrix.sim.floor_parts import FloorParts, overlap
+from embomatrix.sim.floor_ways import Distances, cheapest_way
 from embomatrix.skills.limits import ROBOT
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from embomatrix.sim.floor_parts import Window
+    from embomatrix.sim.floor_ways import Cell
     from embomatrix.world.geometry import FloatArray, Vec2
     from embomatrix.world.scene import Scene
 
@@ -26,17 +26,11 @@ if TYPE_CHECKING:
     IntArray = NDArray[np.int16]
     Changes = tuple[tuple[FloatArray, int], ...]
 
-Cell = tuple[int, int]
-
 CELL_M: Final = 0.05
 SNAP_CELLS: Final = 6
 """A robot that stands within 30 cm of a free cell counts as standing on it."""
 DOORWAY_DEPTH_M: Final = 0.4
 """How far the floor of a doorway reaches, centred on the wall: more than any wall's thickness."""
-CROSSING_COST: Final = 100.0
-"""To drive through a thing is as bad as a detour of this many cells for each of its own."""
-FIELDS_KEPT: Final = 64
-"""Distance fields in memory, 0.2 MB each in a flat of 120 m2."""
 
 
 class FloorGrid:
@@ -70,7 +64,6 @@ class FloorGrid:
         self._origin_m = (float(self._origin[0]), float(self._origin[1]))
         self._shape = grid_shape(scene)
         self._changes: Changes = ()
-        self._fields: dict[Cell, FloatArray] = {}
 
     @property
     def covered(self) -> NDArray[np.int16]:
@@ -111,8 +104,7 @@ class FloorGrid:
         It is the same grid where they leave as much floor. It costs less than ``changed``, which measures distances anew.
         """
         taken: list[tuple[Window, BoolArray]] = []
-        for cells in sorted({self._cells(box) for box in boxes}):
-            around, blocked = self._blocked_by(cells)
+        for around, blocked in self._blocked_by(boxes):
             if (self.parts.within(around)[blocked] > 0).any():
                 taken.append((around, blocked))
         if not taken:
@@ -125,30 +117,19 @@ class FloorGrid:
             free[overlap(window, around)[0]] &= ~blocked
         return self._with_parts(self.parts.changed(free, window))
 
+    def _blocked_by(self, boxes: FloatArray) -> list[tuple[Window, BoolArray]]:
+        """For each lot of cells that boxes cover, the window in which the robot may touch them, and where in it it does."""
+        windows = (self._window(box[:2], box[2:4]) for box in boxes)
+        lots = sorted({(rows.start, rows.stop, cols.start, cols.stop) for rows, cols in windows})
+        return [_blocked(slice(*lot[:2]), slice(*lot[2:]), self._shape) for lot in lots]
+
     def _with_parts(self, parts: FloorParts) -> FloorGrid:
         """This grid with other free cells. It shares all it can: there are dozens of such grids in memory."""
         grid = copy.copy(self)
-        vars(grid).pop("_graph", None)
+        vars(grid).pop("_distances", None)
         vars(grid)["parts"] = parts
-        grid._free, grid._fields = None, {}
+        grid._free = None
         return grid
-
-    def _cells(self, box: FloatArray) -> tuple[int, int, int, int]:
-        """The cells that a box covers: first and one past the last along x, then along y."""
-        rows, columns = self._window(box[:2], box[2:4])
-        return rows.start, rows.stop, columns.start, columns.stop
-
-    def _blocked_by(self, cells: tuple[int, int, int, int]) -> tuple[Window, BoolArray]:
-        """The window around some covered cells in which the robot may touch them, and where in it it does."""
-        first_i, last_i, first_j, last_j = cells
-        reach = math.ceil(ROBOT.radius_m / CELL_M)
-        rows = slice(max(0, first_i - reach), min(self._shape[0], last_i + reach))
-        columns = slice(max(0, first_j - reach), min(self._shape[1], last_j + reach))
-        i, j = np.arange(rows.start, rows.stop), np.arange(columns.start, columns.stop)
-        off_i = np.maximum(np.maximum(first_i - i, i - last_i + 1), 0)
-        off_j = np.maximum(np.maximum(first_j - j, j - last_j + 1), 0)
-        blocked = off_i[:, None] ** 2 + off_j[None] ** 2 < (ROBOT.radius_m / CELL_M) ** 2
-        return (rows, columns), np.asarray(blocked)
 
     @functools.cached_property
     def parts(self) -> FloorParts:
@@ -203,8 +184,7 @@ class FloorGrid:
     def label_at(self, x_m: float, y_m: float) -> int:
         """Number of the component at a point, 0 where the robot does not fit."""
         i, j = self._cell_at(x_m, y_m)
-        inside = 0 <= i < self._shape[0] and 0 <= j < self._shape[1]
-        return self.parts.at((i, j)) if inside else 0
+        return self.parts.at((i, j)) if 0 <= i < self._shape[0] and 0 <= j < self._shape[1] else 0
 
     def may_differ_at(self, wider: FloorGrid, x_m: float, y_m: float) -> bool:
         """Whether a point may be taken, or cut off as it was not on the grid that this one was narrowed from."""
@@ -222,9 +202,7 @@ class FloorGrid:
     def free_centers(self, low_m: Vec2, high_m: Vec2, label: int) -> FloatArray:
         """Middles of the component's cells in a rectangle, shape (n, 2), in the world."""
         window = self._window(np.asarray(low_m), np.asarray(high_m))
-        inside = (
-            np.argwhere(self.parts.within(window) == label) if label else np.zeros((0, 2), dtype=np.int64)
-        )
+        inside = np.argwhere((self.parts.within(window) == label) & (label > 0))
         corner = np.array([window[0].start, window[1].start])
         return np.asarray(self._origin + (inside + corner + 0.5) * CELL_M, dtype=np.float64)
 
@@ -239,7 +217,7 @@ class FloorGrid:
         """Length in metres of the shortest path over free cells, None when there is none."""
         if not self.label(start) or self.label(start) != self.label(end):
             return None
-        return float(self._field(end)[start[0] * self._shape[1] + start[1]])
+        return float(self._distances.to(end)[start])
 
     def path(self, start: Cell, end: Cell) -> tuple[Vec2, ...] | None:
         """Corners of a short way over free cells, both ends included, in the world; None when there is none.
@@ -248,11 +226,7 @@ class FloorGrid:
         """
         if self.distance(start, end) is None:
             return None
-        field = self._field(end).reshape(self._shape)
-        cells = [start]
-        while cells[-1] != end:
-            i, j = cells[-1]
-            cells.append(min(self._neighbours(i, j), key=lambda cell: (float(field[cell]), cell)))
+        cells = self._distances.descent(start, end)
         corners = [self.center(cells[0])]
         for number in range(2, len(cells)):
             if not self.drives_straight(corners[-1], self.center(cells[number])):
@@ -264,29 +238,8 @@ class FloorGrid:
 
         The way leads over ``floor`` only, of the grid's shape. Empty when there is none.
         """
-        free = self.free
-        cost = np.where(free, 1.0, CROSSING_COST)
-        seen = np.full(self._shape, np.inf)
-        seen[start] = 0.0
-        came: dict[Cell, Cell] = {}
-        queue = [(0.0, start)]
-        goal = self._window(np.asarray(low_m), np.asarray(high_m))
-        while queue:
-            spent, (i, j) = heapq.heappop(queue)
-            if spent > seen[i, j]:
-                continue
-            if goal[0].start <= i < goal[0].stop and goal[1].start <= j < goal[1].stop and free[i, j]:
-                break
-            for cell in ((i + 1, j), (i - 1, j), (i, j + 1), (i, j - 1)):
-                if floor[cell] and spent + cost[cell] < seen[cell]:
-                    seen[cell] = spent + cost[cell]
-                    came[cell] = (i, j)
-                    heapq.heappush(queue, (float(seen[cell]), cell))
-        else:
-            return np.zeros((0, 2))
-        way = [(i, j)]
-        while way[-1] in came:
-            way.append(came[way[-1]])
+        free, goal = self.free, self._window(np.asarray(low_m), np.asarray(high_m))
+        way = cheapest_way(free, floor, start, goal)
         return np.array([self.center(cell) for cell in way if not free[cell]]).reshape(-1, 2)
 
     def drives_straight(self, start: Vec2, end: Vec2) -> bool:
@@ -303,48 +256,9 @@ class FloorGrid:
         )
         return bool((passed[cells[:, 0] - low[0], cells[:, 1] - low[1]] > 0).all())
 
-    def _neighbours(self, i: int, j: int) -> list[Cell]:
-        """Free cells next to a cell; those across a corner only where both cells beside it are free."""
-        near = self.parts.within((slice(i - 1, i + 2), slice(j - 1, j + 2))) > 0  # (3, 3)
-        return [
-            (i + di, j + dj)
-            for di in (-1, 0, 1)
-            for dj in (-1, 0, 1)
-            if (di or dj)
-            and near[1 + di, 1 + dj]
-            and (not (di and dj) or (near[1 + di, 1] and near[1, 1 + dj]))
-        ]
-
-    def _field(self, cell: Cell) -> FloatArray:
-        """Metres from every cell to this one, flattened."""
-        field = self._fields.get(cell)
-        if field is None:
-            if len(self._fields) == FIELDS_KEPT:
-                del self._fields[next(iter(self._fields))]
-            source = cell[0] * self._shape[1] + cell[1]
-            field = np.asarray(csgraph.dijkstra(self._graph, indices=source), dtype=np.float32)
-            self._fields[cell] = field
-        return field
-
     @functools.cached_property
-    def _graph(self) -> sparse.csr_matrix:
-        """Eight-neighbour graph of the free cells. Diagonals cut no corners: both cells beside them must be free."""
-        (rows, columns), free = self._shape, self.free
-        number = np.arange(rows * columns).reshape(self._shape)
-        starts, ends, lengths = [], [], []
-        for di, dj in ((1, 0), (0, 1), (1, 1), (1, -1)):
-            a = (slice(0, rows - di), slice(max(0, -dj), columns - max(0, dj)))
-            b = (slice(di, rows), slice(max(0, dj), columns - max(0, -dj)))
-            both = free[a] & free[b]
-            if di and dj:
-                both &= free[a[0], b[1]] & free[b[0], a[1]]
-            starts.append(number[a][both])
-            ends.append(number[b][both])
-            lengths.append(np.full(int(both.sum()), CELL_M * math.hypot(di, dj)))
-        source, target, weight = (np.concatenate(items) for items in (starts, ends, lengths))
-        size = rows * columns
-        one_way = sparse.coo_matrix((weight, (source, target)), shape=(size, size))
-        return (one_way + one_way.T).tocsr()
+    def _distances(self) -> Distances:
+        return Distances(self.free, CELL_M)
 
     def _cell_at(self, x_m: float, y_m: float) -> Cell:
         low_x, low_y = self._origin_m
@@ -377,6 +291,18 @@ def _clear(covered: NDArray[np.int16]) -> BoolArray:
     if clear.all():  # there is nothing to measure the distance from
         return np.asarray(clear)
     return np.asarray(np.asarray(ndimage.distance_transform_edt(clear)) * CELL_M >= ROBOT.radius_m)
+
+
+def _blocked(rows: slice, columns: slice, shape: tuple[int, int]) -> tuple[Window, BoolArray]:
+    """The window around a rectangle of cells in which the robot may touch it, and where in it it does."""
+    reach = math.ceil(ROBOT.radius_m / CELL_M)
+    around_i = slice(max(0, rows.start - reach), min(shape[0], rows.stop + reach))
+    around_j = slice(max(0, columns.start - reach), min(shape[1], columns.stop + reach))
+    i, j = np.arange(around_i.start, around_i.stop), np.arange(around_j.start, around_j.stop)
+    off_i = np.maximum(np.maximum(rows.start - i, i - rows.stop + 1), 0)
+    off_j = np.maximum(np.maximum(columns.start - j, j - columns.stop + 1), 0)
+    blocked = off_i[:, None] ** 2 + off_j[None] ** 2 < (ROBOT.radius_m / CELL_M) ** 2
+    return (around_i, around_j), np.asarray(blocked)
 
 
 def grid_shape(scene: Scene) -> tuple[int, int]:

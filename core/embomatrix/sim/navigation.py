@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from embomatrix.sim.engine import PhysicsEngine
-    from embomatrix.sim.floor_grid import Cell
+    from embomatrix.sim.floor_ways import Cell
     from embomatrix.sim.open_leaves import Ajar
     from embomatrix.sim.prepared import Prepared
     from embomatrix.sim.relations import Relations

@@ -13,7 +13,8 @@ from embomatrix.world.poses import StandPose
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from embomatrix.sim.floor_grid import Cell, FloorGrid
+    from embomatrix.sim.floor_grid import FloorGrid
+    from embomatrix.sim.floor_ways import Cell
     from embomatrix.sim.navigation import Navigator
     from embomatrix.sim.physical_space import Boxes
     from embomatrix.world.geometry import FloatArray, Vec2
