@@ -11,6 +11,19 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.sim import physical_arm as arm
+from embomatrix.sim.robot_dimensions import (
+    ASKEW_RAD,
+    BASE_RADIUS_M,
+    BASE_TOP_M,
+    GROUND_M,
+    MAST_SIZE_M,
+    MAST_TOP_M,
+    MAST_X_M,
+    MOUNT_AXES,
+    MOUNT_X_M,
+    SHOULDER_LOW_M,
+    STAGE_SHARE,
+)
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -19,13 +32,8 @@ if TYPE_CHECKING:
 
     BoolArray = NDArray[np.bool_]
 
-MOUNT_LOW_M: Final = 0.43
-MOUNT_AHEAD_M: Final = 0.12
-LIFT_M: Final = 0.76
-COLUMN_M: Final = 0.10
-"""Radius of the column below the arm, with a little air."""
-BASE_M: Final = 0.26
-BASE_TOP_M: Final = 0.31
+AIR_M: Final = 0.01
+"""Distance that the arm keeps from the robot's own trunk."""
 NUMBERS: Final = 4 + arm.JOINTS
 X, Y, YAW, LIFT, ARM = 0, 1, 2, 3, slice(4, None)
 
@@ -62,17 +70,52 @@ RADII: Final = np.array([ball[3] for _, balls in _BALLS for ball in balls])
 """Radius of each ball of the arm."""
 HAND_BALLS: Final = _LINK == 7
 """Which of them are the hand's."""
-_MOVING: Final = _LINK >= 3
-_TRUNK: Final = np.array([[-0.06, 0.0, 0.06, 0.085], [0.0, 0.0, 0.06, 0.09]])
-"""Balls of the arm's foot, in the mount's frame."""
+_SWINGING: Final = _LINK >= 1
+"""Balls that can come to base and mast."""
+_MOVING: Final = _LINK[_SWINGING] >= 3
+"""Which of these can come to the arm's own foot and shoulder too."""
+_MOUNT: Final = np.array(MOUNT_AXES)
+_FOOT_LOW: Final = np.array([-0.154, -0.095, MAST_X_M - MOUNT_X_M])
+_FOOT_HIGH: Final = np.array([0.072, 0.095, 0.14])
+"""The arm's foot with the carriage behind it, in the mount's frame."""
+_MAST_LOW: Final = np.array([MAST_X_M - MAST_SIZE_M[0] / 2, -MAST_SIZE_M[1] / 2, 0.0])
+_MAST_HIGH: Final = np.array([MAST_X_M + MAST_SIZE_M[0] / 2, MAST_SIZE_M[1] / 2, MAST_TOP_M])
+_STUB_M: Final = 0.055
+"""Radius of the arm between its foot and its shoulder."""
+
+_STAGE_BALLS: Final = 4
+"""Pairs of balls at the top of the mast's inner stage, as far as it rises."""
+
+
+def _trunk() -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Balls of base, mast, carriage and foot, the lift down: centres (k, 3) and radii (k,).
+
+    With them the share of the lift's height by which each rises, (k,).
+    """
+    thick = (BASE_TOP_M - GROUND_M) / 2
+    ring = np.arange(10) * math.tau / 10
+    around = (BASE_RADIUS_M - thick) * np.stack([np.cos(ring), np.sin(ring)], axis=1)
+    base = np.column_stack([around, np.full(len(ring), GROUND_M + thick)])
+    heights = np.arange(BASE_TOP_M, MAST_TOP_M, 0.09)
+    mast = np.array([(MAST_X_M, y, z) for z in heights for y in (-0.04, 0.04)])
+    foot = np.array([(x, y, SHOULDER_LOW_M) for x in (MOUNT_X_M, MOUNT_X_M + 0.09) for y in (-0.03, 0.08)])
+    radii = np.concatenate(
+        [np.full(len(base), thick), np.full(len(mast) + 2 * _STAGE_BALLS, 0.05), np.full(len(foot), 0.085)]
+    )
+    stage = mast[-2 * _STAGE_BALLS :]
+    rises = np.repeat([0.0, STAGE_SHARE, 1.0], [len(base) + len(mast), len(stage), len(foot)])
+    return np.concatenate([base, mast, stage, foot]), radii, rises
+
+
+_TRUNK, _TRUNK_RADII, _RISES = _trunk()
 
 
 def mounts(postures: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Frames of the arm's mount in the world: rotations (n, 3, 3) and positions (n, 3)."""
-    turn = arm.about_z(postures[:, YAW])
-    place = turn[:, :, 0] * MOUNT_AHEAD_M
-    place = place + np.stack([postures[:, X], postures[:, Y], postures[:, LIFT] + MOUNT_LOW_M], axis=1)
-    return turn, place
+    turn = arm.about_z(postures[:, YAW] + ASKEW_RAD)
+    place = turn[:, :, 0] * MOUNT_X_M
+    place = place + np.stack([postures[:, X], postures[:, Y], postures[:, LIFT] + SHOULDER_LOW_M], axis=1)
+    return turn @ _MOUNT, place
 
 
 def tools(postures: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -91,43 +134,46 @@ def balls(postures: FloatArray) -> FloatArray:
 
 
 def trunk_balls(postures: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Centres (n, balls, 3) and radii (balls,) of the base, the column and the arm's foot."""
-    turn, place = mounts(postures)
-    foot = place[:, None] + np.einsum("nij,bj->nbi", turn, _TRUNK[:, :3])
-    ring = np.array([(0.125 * math.cos(a), 0.125 * math.sin(a)) for a in np.arange(6) * math.pi / 3])
-    base = np.zeros((len(postures), 6, 3))
-    base[:, :, :2] = postures[:, None, :2] + ring
-    base[:, :, 2] = 0.17
-    column = np.zeros((len(postures), 6, 3))
-    column[:, :, :2] = postures[:, None, :2]
-    shares = np.linspace(0.0, 1.0, 6)
-    column[:, :, 2] = 0.4 + shares * (place[:, 2, None] - 0.45)
-    radii = np.concatenate([_TRUNK[:, 3], np.full(6, 0.13), np.full(6, 0.085)])
-    return np.concatenate([foot, base, column], axis=1), radii
+    """Centres (n, balls, 3) and radii (balls,) of the base, the mast, the carriage and the arm's foot."""
+    centres = np.einsum("nij,bj->nbi", arm.about_z(postures[:, YAW] + ASKEW_RAD), _TRUNK)
+    centres[:, :, :2] += postures[:, None, :2]
+    centres[:, :, 2] += postures[:, LIFT, None] * _RISES
+    return centres, _TRUNK_RADII
 
 
 def strikes_itself(
     postures: FloatArray, extra: FloatArray | None = None, radii: FloatArray | None = None
 ) -> BoolArray:
-    """Whether forearm, hand or what it holds touch the robot's own foot, column or base, shape (n,).
+    """Whether arm, hand or what it holds touch the robot's own base, mast or carriage, or the arm's foot, shape (n,).
 
     ``extra``: (n, k, 3) centres of balls that the hand holds, with their ``radii`` (k,).
     """
-    points = balls(postures)[:, _MOVING]
-    sizes = RADII[_MOVING]
+    points, sizes, moving = balls(postures)[:, _SWINGING], RADII[_SWINGING], _MOVING
     if extra is not None and radii is not None:
         points = np.concatenate([points, extra], axis=1)
         sizes = np.concatenate([sizes, radii])
+        moving = np.concatenate([moving, np.ones(len(radii), dtype=np.bool_)])
+    sizes = sizes + AIR_M
     turn, place = mounts(postures)
     seen = np.einsum("nji,nbj->nbi", turn, points - place[:, None])  # in the mount's frame
-    x, y, z = seen[..., 0] + MOUNT_AHEAD_M, seen[..., 1], seen[..., 2]
-    off = np.hypot(x, y)
-    floor = -place[:, 2, None]
-    column = (off < COLUMN_M + sizes) & (z < sizes)
-    base = (off < BASE_M + sizes) & (z < floor + BASE_TOP_M + sizes)
-    foot = (np.hypot(seen[..., 0], y) < 0.09 + sizes) & (z < 0.14 + sizes)
-    foot |= (np.hypot(seen[..., 0], y) < 0.055 + sizes) & (z < 0.38 + sizes)
-    return np.asarray((column | base | foot).any(axis=1))
+    local = np.einsum("ij,nbj->nbi", _MOUNT, seen)
+    local += np.array([MOUNT_X_M, 0.0, 0.0])
+    local[:, :, 2] += place[:, None, 2]
+    off = np.maximum(np.hypot(local[..., 0], local[..., 1]) - BASE_RADIUS_M, 0.0)
+    base = np.hypot(off, np.maximum(local[..., 2] - BASE_TOP_M, 0.0)) < sizes
+    local[:, :, 2] -= (postures[:, LIFT, None] * STAGE_SHARE) * (local[:, :, 2] > MAST_TOP_M)
+    mast = _outside(local, _MAST_LOW, _MAST_HIGH) < sizes
+    seen, sizes = seen[:, moving], sizes[moving]
+    foot = _outside(seen, _FOOT_LOW, _FOOT_HIGH) < sizes
+    beyond = np.maximum(np.abs(seen[..., 2] - arm.SHOULDER_M / 2) - arm.SHOULDER_M / 2, 0.0)
+    foot |= np.hypot(np.hypot(seen[..., 0], seen[..., 1]), beyond) < _STUB_M + sizes
+    return np.asarray((base | mast).any(axis=1) | foot.any(axis=1))
+
+
+def _outside(points: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+    """Distances of points, (n, b, 3), from a box between two corners, (n, b)."""
+    off = np.maximum(np.maximum(low - points, points - high), 0.0)
+    return np.asarray(np.sqrt((off**2).sum(axis=-1)))
 
 
 def solve(
@@ -137,10 +183,7 @@ def solve(
 
     rotation: (n, 3, 3), position: (n, 3), bases: (n, 3) x, y, heading; lifts: (n,); last: (n,) angles of the last joint.
     """
-    turn = arm.about_z(bases[:, 2])
-    place = turn[:, :, 0] * MOUNT_AHEAD_M
-    place[:, :2] += bases[:, :2]
-    place[:, 2] = lifts + MOUNT_LOW_M
+    turn, place = mounts(np.column_stack([bases, lifts]))
     local = np.einsum("nji,njk->nik", turn, rotation)
     found = arm.solve(local, np.einsum("nji,nj->ni", turn, position - place), last)
     postures = np.empty((len(bases), arm.BRANCHES, NUMBERS))

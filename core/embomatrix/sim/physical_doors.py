@@ -245,13 +245,19 @@ def _pull(stage: Stage, way: Way, leaf: Leaf, goal: float) -> Refusal | None:
     stage.mover.follow(way.postures[-1:], 0.6)
     stage.dynamic.part()
     stage.mover.wait(4)
-    if stage.dynamic.hindrance() == leaf.name:
+    if stage.dynamic.hindrance() == leaf.name and not _pushes(way.postures[-2], way.postures[-3]):
         _lean_off(stage, way, leaf)
     reached = stage.dynamic.joints(leaf.name)[leaf.number]
     stage.settle()
     if abs(reached - goal) > 0.12 and hit is not None:
         return refuse(FailureReason.DOOR_BLOCKED, target=leaf.name, other=hit or SOMETHING)
     return None
+
+
+def _pushes(start: FloatArray, end: FloatArray) -> bool:
+    """Whether the hand goes where it points between two postures, each of shape (11,): back along a pull it shuts the leaf."""
+    rotation, position = body.tools(np.stack([start, end]))
+    return bool((position[1] - position[0]) @ rotation[0, :, 2] > 0.0)
 
 
 def _lean_off(stage: Stage, way: Way, leaf: Leaf) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import TYPE_CHECKING, Final
 
@@ -14,6 +15,7 @@ from embomatrix.sim.physical_reach import AIR_M
 from embomatrix.sim.physical_space import clearance
 from embomatrix.sim.physical_stage import TUCKED, TUCKED_LIFT_M
 from embomatrix.sim.physical_travel import SOMETHING, travel
+from embomatrix.sim.robot_dimensions import SHOULDER_LOW_M
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.limits import ROBOT
 from embomatrix.skills.view import refuse
@@ -29,7 +31,12 @@ if TYPE_CHECKING:
 
 BACK_OFF_M: Final = (0.0, 0.3, 0.55)
 """How far before the place of work the arm is unfolded."""
-CARRY_LIFT_M: Final = 0.35
+RETREATS_M: Final = (0.2, 0.4, 0.6)
+ASIDES: Final = (0.0, 45.0, -45.0, 90.0, -90.0, 135.0, -135.0)
+"""How far, and in which directions in degrees from straight back, the base draws the arm to where there is room to fold."""
+DRAWS: Final = 100
+"""Random postures by which the arm may find its way to be folded: one that stays out bars every way that comes."""
+CARRY_LIFT_M: Final = 0.6
 """Height of the lift while the robot drives with a load."""
 SURROUNDINGS_M: Final = np.array([0.8, 0.8, 9.0])
 OVER_M: Final = 1.0
@@ -82,10 +89,10 @@ def fold(stage: Stage, home: StandPose, rng: np.random.Generator, target: str = 
     reach = stage.reach(stage.boxes().drawn_in(*_limbs(stage, now), AIR_M))
     loaded = stage.grip is not None
     folded = carrying(stage, now)
-    for spot in _retreats(stage, now, home):
+    for spot in _retreats(reach, now, loaded):
         there = standing(now, spot)
-        swing = reach.transit(there, standing(folded, spot), rng, loaded=loaded)
-        if swing is not None and reach.drives(now, there, loaded=loaded):
+        swing = reach.transit(there, standing(folded, spot), rng, loaded=loaded, draws=DRAWS)
+        if swing is not None:
             stage.mover.sweep(swing)
             break
     now = stage.mover.posture
@@ -107,13 +114,13 @@ def _limbs(stage: Stage, now: FloatArray) -> tuple[FloatArray, FloatArray]:
     return points, radii
 
 
-def _retreats(stage: Stage, now: FloatArray, home: StandPose) -> Iterator[FloatArray]:
-    """Bases, (3,), at which the arm may fold: here, then straight back, then where the robot stood."""
+def _retreats(reach: Reach, now: FloatArray, loaded: bool) -> Iterator[FloatArray]:
+    """Bases, (3,), at which the arm may fold: here, then where the base gets to straight on, back before aside."""
     yield now[:3]
-    back = -np.array([math.cos(now[body.YAW]), math.sin(now[body.YAW]), 0.0])
-    spots = [now[:3] + away * back for away in (0.2, 0.4, 0.6)]
-    for spot in (*spots, np.array([home.x_m, home.y_m, now[body.YAW]])):
-        if stage.floor.grid.drives_straight(_pair(now), _pair(spot)):
+    for away, aside in itertools.product(RETREATS_M, ASIDES):
+        course = now[body.YAW] + math.pi + math.radians(aside)
+        spot = now[:3] + away * np.array([math.cos(course), math.sin(course), 0.0])
+        if reach.drives(now, standing(now, spot), loaded=loaded):
             yield spot
 
 
@@ -130,7 +137,7 @@ def carrying(stage: Stage, now: FloatArray) -> FloatArray:
             np.arange(8) * math.pi / 4,
             (0.1, 0.2, 0.3, 0.4, 0.5),
             (-0.25, 0.0, 0.25),
-            (0.35, 0.6, 0.85),
+            (0.1, 0.3, 0.5),
             indexing="ij",
         )
     )
@@ -141,7 +148,7 @@ def carrying(stage: Stage, now: FloatArray) -> FloatArray:
     local = np.stack([xs, ys, np.zeros(count)], axis=1)
     lift = np.full(count, CARRY_LIFT_M)
     where = local @ yaw.T + np.array([now[0], now[1], 0.0])
-    where[:, 2] = body.MOUNT_LOW_M + CARRY_LIFT_M + heights
+    where[:, 2] = SHOULDER_LOW_M + CARRY_LIFT_M + heights
     boxes = stage.boxes_within(now[:3] - SURROUNDINGS_M, now[:3] + SURROUNDINGS_M)
     radii = np.concatenate([body.RADII, stage.grip.held.radii])
     best, found = math.inf, now

@@ -14,7 +14,9 @@ import numpy as np
 
 from embomatrix.sim import physical_arm as arm
 from embomatrix.sim import physical_body as body
+from embomatrix.sim.physical_roadmap import way_between
 from embomatrix.sim.physical_space import Boxes, strikes
+from embomatrix.sim.robot_dimensions import LIFT_M, SHOULDER_LOW_M
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -33,8 +35,8 @@ LAST_RAD: Final = np.array([0.785, -0.785, 2.3, -2.3, 0.0, 1.57, -1.57])
 ALIKE_RAD: Final = 0.5
 JUMP_RAD: Final = 1.3
 """Between two waypoints of a way no joint turns further."""
-LOOKED_AT: Final = 160
-"""Of all solutions, this many of the most comfortable ones are compared with what is around."""
+LOOKED_AT: Final = (0, 160, 640)
+"""Of all solutions, this many of the most comfortable ones are compared with what is around, and more where none is free."""
 RANK: Final = 0.2
 """What a place further down the list of tracks weighs against the strain of joints."""
 FOLLOWED: Final = 40
@@ -50,24 +52,34 @@ TOUCH_M: Final = -0.003
 SAMPLED: Final = np.array([0.06, 0.06, 0.1, 0.06, 0.1, 0.1, 0.12, 0.12, 0.25, 0.25, 0.4])
 """Metres, and radians, of each number of a posture between two that are looked at."""
 MOST_SAMPLES: Final = 36
-COARSE: Final = 5
-"""Of so many postures of a motion one is looked at first."""
-VIAS: Final = 60
-TRIED: Final = 16
-"""Postures by way of which a swing may lead, and how many of the free ones are tried."""
+LEVEL: Final = 0.93
+"""Cosine of the steepest tilt, 21 degrees, at which what lies in a bowl stays there."""
+DRAWS: Final = 24
+"""Random postures by which the arm may find its way to one place of work."""
 
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """Balls of what the hand holds, in the tool's frame: centres (k, 3), radii (k,)."""
+    """Balls of what the hand holds, in the tool's frame: centres (k, 3), radii (k,).
+
+    ``up``, (3,), is the way up in that frame where something lies in what is held, so that it must stay level.
+    """
 
     centres: FloatArray
     radii: FloatArray
+    up: FloatArray | None = None
 
     def placed(self, postures: FloatArray) -> FloatArray:
         """Centres in the world, (n, k, 3)."""
         rotation, position = body.tools(postures)
         return np.asarray(position[:, None] + np.einsum("nij,kj->nki", rotation, self.centres))
+
+    def is_level(self, postures: FloatArray) -> BoolArray:
+        """Whether nothing falls out of what is held, (n,)."""
+        if self.up is None:
+            return np.ones(len(postures), dtype=np.bool_)
+        rotation, _ = body.tools(postures)
+        return np.asarray(rotation[:, 2] @ self.up > LEVEL)
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,54 +138,45 @@ class Reach:
             start += len(batch)
 
     def transit(
-        self, start: FloatArray, end: FloatArray, rng: np.random.Generator, *, loaded: bool
+        self,
+        start: FloatArray,
+        end: FloatArray,
+        rng: np.random.Generator,
+        *,
+        loaded: bool,
+        draws: int = DRAWS,
     ) -> FloatArray | None:
         """Postures (w, 11) that lead from one to another without touching anything, None when none are found.
 
-        The arm moves where the base is at the start; then the base drives to where it is at the end. First straight on, then
-        by way of one posture more.
+        The arm moves where the base is at the start; then the base drives to where it is at the end. Straight on, or by way
+        of what ``draws`` random postures lead to.
         """
         held = self._held if loaded else None
         ready = np.concatenate([start[:3], end[3:]])
         if not self._is_free(_between(ready, end), held):
             return None
-        vias = self._vias(start, ready, rng, held)
-        # Mostly the first will do; of the others, what bars a motion does so for a while, and a few postures of each tell.
-        for some in (vias[:1], vias[1:]):
-            motions = [np.concatenate([_between(start, via), _between(via, ready)[1:]]) for via in some]
-            for number in self._seem_free(motions, held):
-                if self._is_free(motions[number], held):
-                    return np.stack([start, some[number], ready, end])
-        return None
 
-    def _seem_free(self, motions: Sequence[FloatArray], held: Held | None) -> list[int]:
-        """Numbers of the motions, (n, 11) each, that are free as far as every few of their postures tell."""
-        few = [motion[1:-1:COARSE] for motion in motions]
-        if len(few) < 2:
-            return list(range(len(few)))
-        free = self._free(np.concatenate(few), self._boxes, held, AIR_M)
-        of = np.repeat(np.arange(len(few)), [len(part) for part in few])
-        return [number for number in range(len(few)) if free[of == number].all()]
+        def free_up_to(one: FloatArray, other: FloatArray) -> FloatArray:
+            between = _between(one, other)[1:]
+            free = self._free(between[:-1], self._boxes, held, AIR_M)
+            # Start and end are where the robot is and where it must be, whatever is near them.
+            last = bool(np.array_equal(other, ready) or np.array_equal(other, start))
+            if free.all() and (last or self._free(other[None], self._boxes, held, AIR_M)[0]):
+                return other
+            reached = int(free.argmin()) if not free.all() else len(free)
+            return between[reached - 1] if reached else one
+
+        drawn = _drawn(start, draws, rng, level=held is not None and held.up is not None)
+        drawn[:1] = (start + ready) / 2
+        way = way_between(start, ready, drawn, SAMPLED, free_up_to)
+        return None if way is None else np.concatenate([way, end[None]])
 
     def drives(self, start: FloatArray, end: FloatArray, *, loaded: bool) -> bool:
         """Whether the base can drive straight from one posture to another with the arm as it is."""
-        return self._is_free(_between(start, end), self._held if loaded else None)
-
-    def _vias(
-        self, start: FloatArray, end: FloatArray, rng: np.random.Generator, held: Held | None
-    ) -> FloatArray:
-        """Free postures between two, (n, 11): half way, one after the other, then at random and ever farther off."""
-        low = np.concatenate([[0.0], arm.LOW_RAD * 0.9])
-        high = np.concatenate([[body.LIFT_M], arm.HIGH_RAD * 0.9])
-        middle = (start + end) / 2
-        vias = np.tile(middle, (VIAS + 3, 1))
-        vias[1] = np.concatenate([start[:4], end[4:]])
-        vias[2] = np.concatenate([end[:4], start[4:]])
-        spread = np.linspace(0.15, 1.0, VIAS)[:, None]
-        vias[3:, 3:] += spread * (rng.uniform(low, high, (VIAS, len(low))) - middle[3:])
-        free = self._free(vias, self._boxes, held, AIR_M)
-        free[0] = True
-        return np.asarray(vias[free][:TRIED])
+        line = _between(start, end)
+        trunk, radii = body.trunk_balls(line)
+        gaps = strikes(self._standing, trunk, radii, 0.0)
+        return bool((gaps < 0).all()) and self._is_free(line, self._held if loaded else None)
 
     def _is_free(self, postures: FloatArray, held: Held | None) -> bool:
         """Whether all but the first and the last posture keep clear: these are where the robot is, and where it must be."""
@@ -189,22 +192,35 @@ class Reach:
         if not len(rows):
             return []
         comfort = _strain(found[rows, branches]) + RANK * track[rows]
-        best = _best_of_each(base[rows], comfort, max(4, LOOKED_AT // len(bases)))
-        rows, branches = rows[best], branches[best]
-        clear = self._free(found[rows, branches], self._at_work, None, TOUCH_M)
-        rows, branches = rows[clear], branches[clear]
-        ways: list[Way] = []
-        for start in range(0, len(rows), FOLLOWED):
-            some = rows[start : start + FOLLOWED]
-            along = [tracks[number] for number in track[some].tolist()]
-            followed = _followed(
-                along, bases[base[some]], lift[some], last[some], branches[start : start + FOLLOWED]
+        for fore, end in itertools.pairwise(LOOKED_AT):
+            best = _best_of_each(base[rows], comfort, _share(fore, bases), _share(end, bases))
+            some = best[self._free(found[rows[best], branches[best]], self._at_work, None, TOUCH_M)]
+            row = rows[some]
+            ways = self._along(
+                [tracks[number] for number in track[row].tolist()],
+                [first + number for number in track[row].tolist()],
+                (bases[base[row]], lift[row], last[row], branches[some]),
             )
-            for row, one, postures in zip(some.tolist(), along, followed, strict=True):
+            if ways:
+                return ways
+        return []
+
+    def _along(
+        self,
+        tracks: Sequence[Track],
+        numbers: Sequence[int],
+        starts: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
+    ) -> list[Way]:
+        """The first free ways, each unlike those before it, from bases, lifts, last angles and branches along tracks."""
+        ways: list[Way] = []
+        for start in range(0, len(tracks), FOLLOWED):
+            some = slice(start, start + FOLLOWED)
+            followed = _followed(tracks[some], *(values[some] for values in starts))
+            for number, track, postures in zip(numbers[some], tracks[some], followed, strict=True):
                 if postures is None or any(_alike(postures[0], way.postures[0]) for way in ways):
                     continue
-                if self._passes(one, postures):
-                    ways.append(Way(postures, first + int(track[row])))
+                if self._passes(track, postures):
+                    ways.append(Way(postures, number))
                     if len(ways) == OFFERED:
                         return ways
         return ways
@@ -238,13 +254,20 @@ class Reach:
             self.hindrance = close.owners[int(hit[hit >= 0][0])]
         free = hit < 0
         free[free] = ~body.strikes_itself(postures[free], load[free] if load is not None else None, sizes)
+        if held is not None and held.up is not None:
+            free[free] = held.is_level(postures[free])
         return np.asarray(free)
 
 
-def _best_of_each(base: FloatArray, cost: FloatArray, most: int) -> FloatArray:
-    """Numbers of the cheapest solutions, at most so many for each base, the cheapest first."""
+def _share(most: int, bases: FloatArray) -> int:
+    """How many of a number of solutions each base gets."""
+    return max(4, most // len(bases)) if most else 0
+
+
+def _best_of_each(base: FloatArray, cost: FloatArray, first: int, end: int) -> FloatArray:
+    """Numbers of the cheapest solutions for each base, from the first to before the end, the cheapest first."""
     order = np.argsort(cost, kind="stable")
-    kept = [order[base[order] == number][:most] for number in np.unique(base)]
+    kept = [order[base[order] == number][first:end] for number in np.unique(base)]
     chosen = np.concatenate(kept)
     return np.asarray(chosen[np.argsort(cost[chosen], kind="stable")])
 
@@ -271,8 +294,8 @@ def _combinations(
             np.arange(len(tracks)), np.arange(len(bases)), offsets, LAST_RAD, indexing="ij"
         )
     )
-    lift = heights[track] + offset - arm.SHOULDER_M - body.MOUNT_LOW_M
-    return track, base, np.clip(lift, 0.0, body.LIFT_M - LIFT_SPARE_M), last
+    lift = heights[track] + offset - SHOULDER_LOW_M
+    return track, base, np.clip(lift, 0.0, LIFT_M - LIFT_SPARE_M), last
 
 
 def _followed(
@@ -302,6 +325,24 @@ def _strain(postures: FloatArray) -> FloatArray:
     """How far the arm is from the middle of its travel, (n,)."""
     middle, half = (arm.HIGH_RAD + arm.LOW_RAD) / 2, (arm.HIGH_RAD - arm.LOW_RAD) / 2
     return np.asarray((((postures[:, 4:] - middle) / half) ** 4).sum(axis=1))
+
+
+def _drawn(start: FloatArray, count: int, rng: np.random.Generator, *, level: bool) -> FloatArray:
+    """Random postures, (n, 11), with the base where it is at the start; ``level``: what is held there turned about z alone."""
+    low = np.concatenate([[0.0], arm.LOW_RAD * 0.9])
+    high = np.concatenate([[LIFT_M], arm.HIGH_RAD * 0.9])
+    drawn = np.tile(start, (count, 1))
+    drawn[:, body.LIFT :] = rng.uniform(low, high, (count, len(low)))
+    if not level:
+        return drawn
+    turn = arm.about_z(rng.uniform(-np.pi, np.pi, count)) @ body.tools(start[None])[0]
+    ahead = rng.uniform((0.1, -0.4, -0.2), (0.8, 0.4, 0.4), (count, 3))
+    ahead[:, 2] += drawn[:, body.LIFT] + SHOULDER_LOW_M
+    place = ahead @ arm.about_z(start[None, body.YAW])[0].T + np.array([start[0], start[1], 0.0])
+    found = body.solve(turn, place, drawn[:, :3], drawn[:, body.LIFT], rng.choice(LAST_RAD, count))
+    rows = found.reshape(-1, body.NUMBERS)
+    rows = rows[~np.isnan(rows[:, -1])]
+    return rows if len(rows) else drawn[:1]
 
 
 def _between(start: FloatArray, end: FloatArray) -> FloatArray:

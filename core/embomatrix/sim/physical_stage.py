@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from embomatrix.sim.physical_space import Boxes
     from embomatrix.world.geometry import FloatArray
 
-TUCKED: Final = np.array([0.0, -1.57, 0.0, -2.97, 0.0, 0.05, 0.785])
-"""The empty arm while driving: folded over the base, within its disc, lower than a counter is wide."""
+TUCKED: Final = np.array([-1.57, 1.57, 0.0, -0.4, 0.0, 2.6, 0.785])
+"""The empty arm while driving: upright over the base, within its disc, lower than what the base passes under."""
 TUCKED_LIFT_M: Final = 0.0
 SETTLE_STEPS: Final = 240
 """After a second the world is taken as it is, at rest or not."""
@@ -58,7 +58,8 @@ class Grip:
     def otherwise(self, pose_tool_object: Pose) -> Grip:
         """What it would be to hold the same in another way."""
         change = pose_tool_object @ self.pose_tool_object.inverse()
-        held = Held(change.apply_all(self.held.centres), self.held.radii)
+        up = None if self.held.up is None else change.rotation @ self.held.up
+        held = Held(change.apply_all(self.held.centres), self.held.radii, up)
         return Grip(self.name, pose_tool_object, held)
 
 
@@ -148,7 +149,8 @@ class Stage:
         pose_hand_object = self.dynamic.robot.hand_pose().inverse() @ self.dynamic.pose(name)
         local = TOOL.inverse() @ pose_hand_object
         centres, radii = self._balls(name, local)
-        self.grip = Grip(name, local, Held(centres, radii))
+        up = local.rotation @ self.dynamic.pose(name).rotation[2] if len(self.world.cargo(name)) > 1 else None
+        self.grip = Grip(name, local, Held(centres, radii, up))
         self.dynamic.grasp(name)
 
     def _balls(self, name: str, pose_tool_object: Pose) -> tuple[FloatArray, FloatArray]:

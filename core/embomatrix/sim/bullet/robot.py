@@ -14,8 +14,11 @@ from embomatrix.sim.bullet.robot_model import (
     FINGER_JOINTS,
     HAND,
     LIFT_JOINTS,
+    SHOULDER_EFFORT_NM,
+    WRIST_EFFORT_NM,
     robot_urdf,
 )
+from embomatrix.sim.robot_dimensions import STAGE_SHARE
 from embomatrix.world.geometry import Pose
 
 if TYPE_CHECKING:
@@ -24,8 +27,6 @@ if TYPE_CHECKING:
 BASE_N: Final = 1000.0
 BASE_NM: Final = 200.0
 LIFT_N: Final = 1500.0
-SHOULDER_NM: Final = 87.0
-WRIST_NM: Final = 40.0
 FINGER_N: Final = 30.0
 GRIP_N: Final = 400.0
 """What the hand's hold on a thing can bear."""
@@ -76,7 +77,7 @@ class RobotBody:
         self.base = links["base"]
         self._driven = [joints[name] for name in (*BASE_JOINTS, *LIFT_JOINTS, *ARM_JOINTS, *FINGER_JOINTS)]
         self._forces = [BASE_N] * 2 + [BASE_NM] + [LIFT_N] * 2
-        self._forces += [SHOULDER_NM] * 4 + [WRIST_NM] * 3 + [FINGER_N] * 2
+        self._forces += [SHOULDER_EFFORT_NM] * 4 + [WRIST_EFFORT_NM] * 3 + [FINGER_N] * 2
         self._inertial = Pose(tuple(bullet.getDynamicsInfo(self.body, self.hand, physicsClientId=client)[3]))
         self._hold = -1
         for joint, value in zip(self._driven, spread(posture), strict=True):
@@ -168,14 +169,14 @@ class RobotBody:
 
 
 def spread(posture: Posture) -> list[float]:
-    """Values of the driven joints, base first, fingers last: both stages of the lift share its height."""
-    half = posture.lift_m / 2
+    """Values of the driven joints, base first, fingers last: the mast's inner stage rises with the carriage."""
+    stage = posture.lift_m * STAGE_SHARE
     return [
         posture.x_m,
         posture.y_m,
         posture.yaw,
-        half,
-        half,
+        stage,
+        posture.lift_m - stage,
         *posture.arm,
         FINGERS_OPEN_M,
         FINGERS_OPEN_M,

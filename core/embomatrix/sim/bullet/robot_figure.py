@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from embomatrix.sim.bullet.robot import Posture
 
 _CHASSIS: Final = (0.78, 0.16, 0.14, 1.0)
-_OWN_LINKS: Final = frozenset({"base", "column_low", "column_high"})
+_OWN_LINKS: Final = frozenset({"base", "stage", "carriage"})
 
 
 class RobotFigure:

@@ -1,4 +1,4 @@
-"""The robot as URDF text: a holonomic base and a lifting column under the arm of the installed ``pybullet_data`` package.
+"""The robot as URDF text: a holonomic base, a mast and a carriage under the arm of the installed ``pybullet_data`` package.
 
 The arm's links, meshes and inertias are read from the package's ``panda.urdf`` when a robot is made; nothing of it is copied.
 """
@@ -9,29 +9,36 @@ import functools
 import importlib.util
 import xml.etree.ElementTree as ET
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from embomatrix.sim.engine import EngineMissingError
+from embomatrix.sim.robot_dimensions import (
+    ASKEW_RAD,
+    BASE_RADIUS_M,
+    BASE_TOP_M,
+    CARRIAGE_SIZE_M,
+    GROUND_M,
+    LIFT_M,
+    MAST_SIZE_M,
+    MAST_TOP_M,
+    MAST_X_M,
+    MOUNT_RPY,
+    MOUNT_X_M,
+    SHOULDER_LOW_M,
+    STAGE_SHARE,
+)
+
+if TYPE_CHECKING:
+    from embomatrix.world.geometry import Vec3
 
 BASE_JOINTS: Final = ("base_x", "base_y", "base_yaw")
-LIFT_JOINTS: Final = ("lift_low", "lift_high")
+LIFT_JOINTS: Final = ("mast", "lift")
 ARM_JOINTS: Final = tuple(f"panda_joint{number}" for number in range(1, 8))
 FINGER_JOINTS: Final = ("panda_finger_joint1", "panda_finger_joint2")
 HAND: Final = "panda_hand"
-BASE_RADIUS_M: Final = 0.25
-GROUND_M: Final = 0.035
-"""The base passes over rugs up to this height."""
-BASE_TOP_M: Final = 0.30
-HOUSING_M: Final = 0.42
-"""Height of the column's fixed part."""
-MOUNT_LOW_M: Final = 0.43
-"""Height of the arm's mount with the lift down."""
-LIFT_M: Final = 0.76
-MOUNT_AHEAD_M: Final = 0.12
-"""The arm sits this far ahead of the base's centre."""
-STAGE_M: Final = 0.38
+SHOULDER_EFFORT_NM: Final = 87.0
 WRIST_EFFORT_NM: Final = 40.0
-"""Three times a Panda's: the table of limits lets the robot lift 8 kg."""
+"""A Panda's own at the shoulder, three times that at the wrist: the table of limits lets the robot lift 8 kg."""
 
 
 @functools.cache
@@ -61,54 +68,63 @@ def robot_urdf(*, visuals: bool = False) -> str:
         if not visuals:
             for shown in part.findall("visual"):
                 part.remove(shown)
-        if part.get("name") in ARM_JOINTS[4:]:
+        if part.get("name") in ARM_JOINTS:
             for limit in part.findall("limit"):
-                limit.set("effort", str(WRIST_EFFORT_NM))
+                wrist = part.get("name") in ARM_JOINTS[4:]
+                limit.set("effort", str(WRIST_EFFORT_NM if wrist else SHOULDER_EFFORT_NM))
         robot.append(part)
     return ET.tostring(robot, encoding="unicode")
 
 
 def _below_the_arm() -> list[ET.Element]:
-    """Base and column, down to the joint on which the arm is mounted."""
-    radius, top = BASE_RADIUS_M, BASE_TOP_M
+    """Base, mast and carriage, down to the joint by which the arm is bolted on."""
+    high = MAST_TOP_M - BASE_TOP_M
+    low = (0.0, 0.0, SHOULDER_LOW_M)
+    inner = MAST_SIZE_M[0] * 0.9
+    plate = MOUNT_X_M - CARRIAGE_SIZE_M[0] / 2
+    disc = _cylinder(BASE_RADIUS_M, BASE_TOP_M - GROUND_M, (0.0, 0.0, (BASE_TOP_M + GROUND_M) / 2))
+    mast = _box((*MAST_SIZE_M, high), (MAST_X_M, 0.0, BASE_TOP_M + high / 2))
     return [
-        _link("ground", mass=1.0),
-        _link("rail_x", mass=1.0),
-        _link("rail_y", mass=1.0),
-        _link(
-            "base",
-            mass=60.0,
-            cylinders=(
-                (radius, top - GROUND_M, 0.0, (top + GROUND_M) / 2),
-                (0.1, HOUSING_M - top, 0.0, (HOUSING_M + top) / 2),
-            ),
-        ),
-        _link("column_low", mass=4.0, cylinders=((0.085, STAGE_M, 0.0, -STAGE_M / 2),)),
-        _link("column_high", mass=4.0, cylinders=((0.07, STAGE_M, 0.0, -STAGE_M / 2),)),
+        _link("ground", 1.0),
+        _link("rail_x", 1.0),
+        _link("rail_y", 1.0),
+        _link("base", 60.0, disc, mast),
+        _link("stage", 4.0, _box((inner, inner, high), (MAST_X_M, 0.0, BASE_TOP_M + high / 2))),
+        _link("carriage", 6.0, _box(CARRIAGE_SIZE_M, (plate, 0.0, 0.0))),
         _joint("base_x", "prismatic", "ground", "rail_x", "1 0 0", 100.0),
         _joint("base_y", "prismatic", "rail_x", "rail_y", "0 1 0", 100.0),
-        _joint("base_yaw", "continuous", "rail_y", "base", "0 0 1", 0.0),
-        _joint("lift_low", "prismatic", "base", "column_low", "0 0 1", LIFT_M / 2, z=MOUNT_LOW_M, low=0.0),
-        _joint("lift_high", "prismatic", "column_low", "column_high", "0 0 1", LIFT_M / 2, low=0.0),
-        _joint("mount", "fixed", "column_high", "panda_link0", "0 0 1", 0.0, x=MOUNT_AHEAD_M),
+        _joint("base_yaw", "continuous", "rail_y", "base", "0 0 1", 0.0, rpy=(0.0, 0.0, ASKEW_RAD)),
+        _joint("mast", "prismatic", "base", "stage", "0 0 1", LIFT_M * STAGE_SHARE, low=0.0),
+        _joint(
+            "lift", "prismatic", "stage", "carriage", "0 0 1", LIFT_M * (1 - STAGE_SHARE), low=0.0, at=low
+        ),
+        _joint(
+            "mount", "fixed", "carriage", "panda_link0", "0 0 1", 0.0, at=(MOUNT_X_M, 0.0, 0.0), rpy=MOUNT_RPY
+        ),
     ]
 
 
-def _link(
-    name: str, *, mass: float = 0.0, cylinders: tuple[tuple[float, float, float, float], ...] = ()
-) -> ET.Element:
-    """A link of upright cylinders, each (radius, length, x, z)."""
+def _cylinder(radius_m: float, length_m: float, at: Vec3) -> tuple[ET.Element, Vec3]:
+    """An upright cylinder and where its middle is in its link."""
+    return ET.Element("cylinder", radius=str(radius_m), length=str(length_m)), at
+
+
+def _box(size_m: Vec3, at: Vec3) -> tuple[ET.Element, Vec3]:
+    """A box and where its middle is in its link."""
+    return ET.Element("box", size=_row(size_m)), at
+
+
+def _link(name: str, mass: float, *shapes: tuple[ET.Element, Vec3]) -> ET.Element:
+    """A link that looks as what it collides with."""
     link = ET.Element("link", name=name)
-    if mass:
-        inertial = ET.SubElement(link, "inertial")
-        ET.SubElement(inertial, "mass", value=str(mass))
-        ET.SubElement(inertial, "inertia", ixx="0.5", ixy="0", ixz="0", iyy="0.5", iyz="0", izz="0.5")
+    inertial = ET.SubElement(link, "inertial")
+    ET.SubElement(inertial, "mass", value=str(mass))
+    ET.SubElement(inertial, "inertia", ixx="0.5", ixy="0", ixz="0", iyy="0.5", iyz="0", izz="0.5")
     for kind in ("visual", "collision"):
-        for radius, length, x, z in cylinders:
+        for solid, at in shapes:
             shape = ET.SubElement(link, kind)
-            ET.SubElement(shape, "origin", xyz=f"{x} 0 {z}")
-            geometry = ET.SubElement(shape, "geometry")
-            ET.SubElement(geometry, "cylinder", radius=str(radius), length=str(length))
+            ET.SubElement(shape, "origin", xyz=_row(at))
+            ET.SubElement(shape, "geometry").append(solid)
     return link
 
 
@@ -121,11 +137,11 @@ def _joint(
     upper: float,
     *,
     low: float | None = None,
-    x: float = 0.0,
-    z: float = 0.0,
+    at: Vec3 = (0.0, 0.0, 0.0),
+    rpy: Vec3 = (0.0, 0.0, 0.0),
 ) -> ET.Element:
     joint = ET.Element("joint", name=name, type=kind)
-    ET.SubElement(joint, "origin", xyz=f"{x} 0 {z}")
+    ET.SubElement(joint, "origin", xyz=_row(at), rpy=_row(rpy))
     ET.SubElement(joint, "parent", link=parent)
     ET.SubElement(joint, "child", link=child)
     ET.SubElement(joint, "axis", xyz=axis)
@@ -133,3 +149,7 @@ def _joint(
         lower = -upper if low is None else low
         ET.SubElement(joint, "limit", lower=str(lower), upper=str(upper), effort="1000", velocity="3")
     return joint
+
+
+def _row(numbers: Vec3) -> str:
+    return " ".join(str(number) for number in numbers)
