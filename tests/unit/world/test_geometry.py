@@ -1,8 +1,11 @@
 """The algebra of poses, and what boxes say of the points and boxes within them."""
 
+import dataclasses
 import math
+import pickle
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -90,3 +93,18 @@ def test_every_point_of_a_part_lies_in_its_bounding_box(pose, size, share) -> No
     part = Part(Shape.BOX, Pose((0.0, 0.0, 0.0)), size)
     point = pose.apply(tuple(np.multiply(size, share).tolist()))
     assert part.aabb(pose).contains(point, margin_m=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("value", "change"),
+    [
+        (Pose((1.0, 2.0, 3.0)), {"quat_xyzw": (0.0, 0.0, 1.0, 0.0)}),
+        (Aabb((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), {"high_m": (2.0, 2.0, 2.0)}),
+    ],
+)
+def test_poses_and_boxes_are_values_that_nobody_changes(value, change) -> None:
+    assert pickle.loads(pickle.dumps(value)) == value == dataclasses.replace(value)
+    assert hash(value) == hash(dataclasses.replace(value))
+    assert dataclasses.replace(value, **change) != value
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        setattr(value, next(iter(change)), (0.0, 0.0, 0.0))
