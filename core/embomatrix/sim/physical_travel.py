@@ -24,11 +24,13 @@ if TYPE_CHECKING:
 HEADINGS: Final = 24
 SPACING_M: Final = 0.12
 """Along the way the load's room is looked at this often."""
-TURNS: Final = 8
+TURNS: Final = 12
 """Marks at either end at which the robot may turn on the spot."""
-MOST_STEPS: Final = 2
+MOST_STEPS: Final = 1
 """Headings that it may turn by from one mark to the next."""
-BLOCKED_COST: Final = 20.0
+BACK_OUT_M: Final = (0.2, 0.4, 0.6)
+"""So far the robot draws a load straight back where it can't turn with it."""
+BLOCKED_COST: Final = 100.0
 BESIDE_COST: Final = 1.0
 STRUCK_M: Final = 0.005
 BESIDE_M: Final = 0.05
@@ -61,8 +63,7 @@ def drive(stage: Stage, points: FloatArray, yaw: float) -> Refusal | None:
     """
     stage.told = StandPose(float(points[-1, 0]), float(points[-1, 1]), yaw)
     start = stage.mover.posture
-    marks = _resampled(points)
-    marks, headings = _headings(stage, start, marks, yaw)
+    marks, headings = _course(stage, start, points, yaw)
     postures = np.tile(start, (len(marks), 1))
     postures[:, : body.LIFT] = np.column_stack([marks, headings])
     hit = stage.mover.sweep(postures[1:] if len(postures) > 1 else postures)
@@ -71,6 +72,21 @@ def drive(stage: Stage, points: FloatArray, yaw: float) -> Refusal | None:
     if stage.has_slipped():
         return refuse(FailureReason.SLIPPED, target=stage.grip.name if stage.grip else "")
     return None
+
+
+def _course(stage: Stage, start: FloatArray, points: FloatArray, yaw: float) -> tuple[FloatArray, FloatArray]:
+    """Marks, (n, 2), and headings, (n,), along lines between points: where a load finds no room to turn, back out first."""
+    marks, headings, struck = _headings(stage, start, _resampled(points), yaw)
+    grid, here = stage.floor.grid, (float(points[0, 0]), float(points[0, 1]))
+    for away in BACK_OUT_M if struck and len(points) > 1 else ():
+        spot = (here[0] - away * math.cos(start[body.YAW]), here[1] - away * math.sin(start[body.YAW]))
+        onward = (float(points[1, 0]), float(points[1, 1]))
+        if grid.drives_straight(here, spot) and grid.drives_straight(spot, onward):
+            longer = _resampled(np.array([here, spot, *points[1:]]))
+            other, turned, less = _headings(stage, start, longer, yaw)
+            if less < struck:
+                marks, headings, struck = other, turned, less
+    return marks, headings
 
 
 def _resampled(points: FloatArray) -> FloatArray:
@@ -84,17 +100,18 @@ def _resampled(points: FloatArray) -> FloatArray:
 
 def _headings(
     stage: Stage, start: FloatArray, marks: FloatArray, yaw: float
-) -> tuple[FloatArray, FloatArray]:
-    """Marks, (n, 2), and a heading at each, (n,): any where the arm is folded, else one that lets arm and load pass.
+) -> tuple[FloatArray, FloatArray, int]:
+    """Marks, (n, 2), a heading at each, (n,), and at how many something is struck all the same.
 
-    With a load there is time to turn at both ends.
+    Any heading will do where the arm is folded, else one that lets arm and load pass. With a load there is time to turn at both
+    ends.
     """
     begin = start[body.YAW]
     end = begin + math.remainder(yaw - begin, math.tau)
     if compact(stage, start):
         # Who turns on the spot has one mark: it is the end.
         shares = np.linspace(0.0, 1.0, len(marks)) if len(marks) > 1 else np.ones(1)
-        return marks, begin + (end - begin) * shares
+        return marks, begin + (end - begin) * shares, 0
     marks = np.concatenate([np.tile(marks[0], (TURNS, 1)), marks, np.tile(marks[-1], (TURNS, 1))])
     options = begin + np.arange(HEADINGS) * math.tau / HEADINGS
     danger = _danger(stage, start, marks[TURNS - 1 : 1 - TURNS], options)
@@ -113,12 +130,15 @@ def _headings(
     chosen = [int((cost + 2.0 * wanted).argmin())]
     for number in range(len(marks) - 1, 0, -1):
         chosen.append(int(back[number][chosen[-1]]))
-    found = np.unwrap(options[chosen[::-1]])
+    chosen.reverse()
+    # The first mark is where the robot is: what it touches there it touches already.
+    struck = int((danger[np.arange(1, len(marks)), chosen[1:]] >= BLOCKED_COST).sum())
+    found = np.unwrap(options[chosen])
     nearest = found[-1] + math.remainder(end - found[-1], math.tau)
     close = abs(nearest - found[-1]) <= math.tau / HEADINGS
     if close and _danger(stage, start, marks[-1:], np.array([nearest]))[0, 0] < BLOCKED_COST:
         found[-1] = nearest
-    return marks, found
+    return marks, found, struck
 
 
 def _danger(stage: Stage, start: FloatArray, marks: FloatArray, options: FloatArray) -> FloatArray:
