@@ -89,17 +89,14 @@ class Dispatcher:
     def demand(self) -> DemandObserved:
         """What the Resource-Scheduler should know now. Forgets which leases were given since the last call."""
         pending = self._desk.pending.counts()
-        heads = {scene: self._desk.pending.head(scene) for scene in pending}
+        heads = [head for scene in pending if (head := self._desk.pending.head(scene)) is not None]
+        heads.sort(key=lambda head: head.sequence)
         return DemandObserved(
             pending=pending,
-            waited_s={
-                scene: self._desk.now_s - head.submitted_s
-                for scene, head in heads.items()
-                if head is not None
-            },
+            waited_s={head.scene: self._desk.now_s - head.submitted_s for head in heads},
             in_use=frozenset(self._desk.leases.in_use),
             used=self._desk.leases.take_used(),
-            idle=self._desk.fleet.idle,
+            idle=self._desk.fleet.idle if pending else frozenset(),
         )
 
     @property

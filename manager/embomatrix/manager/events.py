@@ -121,9 +121,10 @@ class LookaheadAnnounced:
 class DemandObserved:
     """What the Task-Dispatcher needs now.
 
-    ``pending`` counts waiting rollouts by scene, ``waited_s`` says how long the oldest of each has waited, ``in_use``
-    are the (worker, scene) pairs with live leases, ``used`` those that were given a lease since the last observation.
-    ``idle`` are the workers that have a free slot and nothing to do with it.
+    ``pending`` counts waiting rollouts by scene, ``waited_s`` says how long the oldest of each has waited, the first in the
+    queue first, ``in_use`` are the (worker, scene) pairs with live leases, ``used`` those that were given a lease since the
+    last observation.
+    ``idle`` are the workers that have a free slot and nothing to do with it; nobody is named while nothing is pending.
     """
 
     pending: Mapping[str, int]

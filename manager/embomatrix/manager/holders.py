@@ -7,11 +7,14 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from embomatrix.manager.placement import Site
 from embomatrix.rpc.values import Resident, ResidentState, Resources
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
     from collections.abc import Set as AbstractSet
+
+    from embomatrix.manager.placement import Need
 
 
 @dataclass(slots=True, eq=False)
@@ -36,6 +39,11 @@ class Holder:
     def slots(self) -> int:
         return max(self.resources.slots, 1)
 
+    @property
+    def capacity(self) -> float:
+        """How many slots of speed 1 it is worth."""
+        return self.slots * max(self.resources.score, 1e-3)
+
     def standing(self) -> tuple[str, ...]:
         """Scenes that it has or was told to have, by last use. What it was told counts: its reports lag behind."""
         scenes = [
@@ -58,8 +66,8 @@ class Holders:
 
     def __init__(self) -> None:
         self.by_id: dict[str, Holder] = {}
-        self.usable: list[str] = []
-        """Ids of those that can be given scenes, ascending."""
+        self.order: list[tuple[float, str]] = []
+        """The usable ones, which can be given scenes: their capacity below zero and their ids, ascending."""
         self.slots = 0
         """Of the usable ones together."""
         self.fresh: set[str] = set()
@@ -118,13 +126,14 @@ class Holders:
         return max(self._memory_mb, default=0)
 
     def _use(self, holder: Holder, *, usable: bool) -> None:
-        at = bisect.bisect_left(self.usable, holder.worker_id)
-        listed = at < len(self.usable) and self.usable[at] == holder.worker_id
+        key = (-holder.capacity, holder.worker_id)
+        at = bisect.bisect_left(self.order, key)
+        listed = at < len(self.order) and self.order[at] == key
         if usable and not listed:
-            self.usable.insert(at, holder.worker_id)
+            self.order.insert(at, key)
             self.slots += holder.slots
         elif listed and not usable:
-            del self.usable[at]
+            del self.order[at]
             self.slots -= holder.slots
         if not usable:
             self.fresh.discard(holder.worker_id)
@@ -145,3 +154,62 @@ class Holders:
                 of[worker_id] = scenes
             else:
                 of.pop(worker_id, None)
+
+
+class Places:
+    """The holders as a placement wants to see them, at one moment."""
+
+    def __init__(
+        self, holders: Holders, now_s: float, in_use: frozenset[tuple[str, str]], retry_s: float
+    ) -> None:
+        self._holders = holders
+        self._now_s = now_s
+        self._in_use = in_use
+        self._retry_s = retry_s
+        self._large: list[tuple[str, float]] = []
+
+    def refuse_where_too_large(self, needs: Iterable[Need], size_mb: Mapping[str, float]) -> None:
+        """Scenes that were measured and found larger than all the memory of a worker are not tried there again."""
+        least_mb = self._holders.least_memory_mb
+        sizes = ((need.bundle_digest, size_mb.get(need.bundle_digest, 0.0)) for need in needs)
+        self._large = [(scene, size) for scene, size in sizes if size > least_mb]
+
+    @property
+    def ids(self) -> Iterable[str]:
+        return (worker_id for _, worker_id in self._holders.order)
+
+    @property
+    def slots(self) -> int:
+        return self._holders.slots
+
+    def site(self, worker_id: str) -> Site:
+        holder = self._holders.by_id[worker_id]
+        memory_mb = holder.resources.memory_mb
+        held = holder.standing()
+        return Site(
+            worker_id=worker_id,
+            slots=holder.slots,
+            score=holder.resources.score,
+            memory_mb=memory_mb,
+            residents=held,
+            pinned=frozenset(scene for scene in held if (worker_id, scene) in self._in_use),
+            refused=self.refused(holder),
+        )
+
+    def refused(self, holder: Holder) -> frozenset[str]:
+        """What failed to load there a moment ago, and what can't fit."""
+        failed = {scene for scene, at_s in holder.failed_s.items() if self._now_s - at_s < self._retry_s}
+        failed.update(scene for scene, size in self._large if size > holder.resources.memory_mb)
+        return frozenset(failed)
+
+    def having(self, scene: str) -> Iterable[str]:
+        return [holder.worker_id for holder in self._holders.having(scene)]
+
+    def changed(self) -> Iterable[str]:
+        by_id = self._holders.by_id
+        return self._holders.fresh | {name for name in self._holders.failing if by_id[name].usable}
+
+    def nobody_takes(self, scene: str) -> bool:
+        """Whether every usable worker refuses the scene."""
+        workers = (self._holders.by_id[worker_id] for worker_id in self.ids)
+        return bool(self._holders.order) and all(scene in self.refused(holder) for holder in workers)

@@ -9,14 +9,16 @@ A placement looks only at workers that get, have or lose something needed: its c
 
 from __future__ import annotations
 
+import contextlib
 import heapq
 import itertools
 import math
+from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 
     from embomatrix.rpc.values import LookaheadEntry
 
@@ -25,13 +27,18 @@ if TYPE_CHECKING:
 class Need:
     """A scene, how soon it is needed (0: rollouts wait for it; 1: in the next announced step …) and for how many.
 
-    ``at_least`` workers should have it: more than its share when rollouts wait while slots elsewhere are idle.
+    ``at_least`` workers should have it: more than its share when rollouts wait while slots elsewhere are idle. Where they are
+    known, ``load_s`` is what loading it takes and ``work_s`` what its rollouts take on one slot of speed 1. ``turn`` is
+    the place of its first rollout in the queue: what a lost worker left behind comes before what was sent after it.
     """
 
     bundle_digest: str
     rank: int
     count: int
     at_least: int = 1
+    load_s: float = 0.0
+    work_s: float = 0.0
+    turn: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,13 +56,18 @@ class Site:
     pinned: frozenset[str] = frozenset()
     refused: frozenset[str] = frozenset()
 
+    @property
+    def capacity(self) -> float:
+        """How many slots of speed 1 it is worth."""
+        return self.slots * max(self.score, 1e-3)
+
 
 class Sites(Protocol):
     """All workers that can be given scenes, looked at one by one."""
 
     @property
-    def ids(self) -> Sequence[str]:
-        """Ascending."""
+    def ids(self) -> Iterable[str]:
+        """Those with the most capacity first."""
         ...
 
     @property
@@ -131,51 +143,52 @@ class _Shelf:
             if scene not in self.chosen and self.has_room_for(scene):
                 self.take(scene)
 
-    @property
-    def load(self) -> float:
-        """Work per slot, weighed by the worker's speed."""
-        return self.work / (self.site.slots * max(self.site.score, 1e-3))
-
-    @property
-    def order(self) -> tuple[float, str]:
-        return self.load, self.site.worker_id
+    def order(self, unit: float) -> tuple[float, str]:
+        """By the work for each slot of speed 1 that there would be with ``unit`` more: a small worker is full sooner."""
+        return (self.work + unit) / self.site.capacity, self.site.worker_id
 
 
 class _Shelves:
-    """Shelves of the workers that were looked at; the rest have no work and are taken in order of their ids."""
+    """Shelves of the workers that were looked at; the rest have no work, and wait in the order of their capacity."""
 
-    def __init__(self, sites: Sites, size_mb: Callable[[str], float], smallest_mb: float) -> None:
+    def __init__(self, sites: Sites, needs: Sequence[Need], size_mb: Callable[[str], float]) -> None:
         self._sites = sites
         self._size_mb = size_mb
-        self._smallest_mb = smallest_mb
+        self._smallest_mb = min((size_mb(need.bundle_digest) for need in needs), default=0.0)
+        self._unit = sum(need.count for need in needs) / max(len(needs), 1)
         self._opened: dict[str, _Shelf] = {}
         self._unopened = iter(sites.ids)
         self._queue: list[tuple[float, str]] = []
+        self._border = ""
+        self._move_border()
 
     def of(self, worker_id: str) -> _Shelf:
         shelf = self._opened.get(worker_id)
         if shelf is None:
             shelf = self._opened[worker_id] = _Shelf(self._sites.site(worker_id), self._size_mb)
-            heapq.heappush(self._queue, shelf.order)
+            heapq.heappush(self._queue, shelf.order(self._unit))
         return shelf
 
     def add_work(self, shelf: _Shelf, work: float) -> None:
         shelf.work += work
-        heapq.heappush(self._queue, shelf.order)
+        heapq.heappush(self._queue, shelf.order(self._unit))
 
-    def least_loaded(self, scene: str, count: int) -> list[_Shelf]:
-        """Up to ``count`` shelves without the scene that accept it, in order of their load."""
-        found: list[_Shelf] = []
+    def in_order(self, shelves: Iterable[_Shelf]) -> list[_Shelf]:
+        return sorted(shelves, key=lambda shelf: shelf.order(self._unit))
+
+    def accepting(self, scene: str) -> Generator[_Shelf]:
+        """Shelves without the scene that accept it, the least loaded first. To be closed when there are enough."""
         passed: list[tuple[float, str]] = []
-        while len(found) < count and (shelf := self._next()) is not None:
-            if scene not in shelf.chosen and shelf.accepts(scene):
-                found.append(shelf)
-            # Who has no room for the smallest has none for any: it need not be looked at again.
-            if not shelf.chosen or shelf.free_mb >= self._smallest_mb:
-                passed.append(shelf.order)
-        for order in passed:
-            heapq.heappush(self._queue, order)
-        return found
+        try:
+            while (shelf := self._next()) is not None:
+                # Who has no room for the smallest has none for any: it need not be looked at again.
+                if not shelf.chosen or shelf.free_mb >= self._smallest_mb:
+                    passed.append(shelf.order(self._unit))
+                if scene not in shelf.chosen and shelf.accepts(scene):
+                    yield shelf
+        finally:
+            for order in passed:
+                heapq.heappush(self._queue, order)
 
     def close(self) -> dict[str, tuple[str, ...]]:
         for worker_id in sorted(self._sites.changed()):
@@ -186,86 +199,117 @@ class _Shelves:
 
     def _next(self) -> _Shelf | None:
         """Take the least loaded out of the queue."""
-        while True:
-            if not self._queue or self._queue[0][0] > 0.0:
-                self._open_one()
-            if not self._queue:
-                return None
+        while self._queue:
             order = heapq.heappop(self._queue)
+            if order[1] == self._border:
+                self._move_border()
             shelf = self._opened[order[1]]
             # An entry from before the shelf got more work has a later one behind it.
-            if order == shelf.order:
+            if order == shelf.order(self._unit):
                 return shelf
+        return None
 
-    def _open_one(self) -> None:
-        for worker_id in self._unopened:
-            if worker_id not in self._opened:
-                self.of(worker_id)
-                return
+    def _move_border(self) -> None:
+        """Open the next of those without work: none of the others comes before it in the queue."""
+        self._border = next((name for name in self._unopened if name not in self._opened), "")
+        if self._border:
+            self.of(self._border)
 
 
 def place(sites: Sites, needs: Sequence[Need], size_mb: Callable[[str], float]) -> Placement:
     """What workers should hold. ``size_mb`` estimates the memory of a scene. Deterministic."""
-    smallest_mb = min((size_mb(need.bundle_digest) for need in needs), default=0.0)
-    shelves = _Shelves(sites, size_mb, smallest_mb)
-    totals: dict[int, int] = {}
+    shelves = _Shelves(sites, needs, size_mb)
+    totals = Counter[int]()
     for need in needs:
-        totals[need.rank] = totals.get(need.rank, 0) + need.count
+        totals[need.rank] += need.count
+    # Groups of a step come one by one: those that are here share the slots with those that come next.
+    totals[0] += totals[1]
     having = {need.bundle_digest: sorted(sites.having(need.bundle_digest)) for need in needs}
     # Among what is needed now, what is resident goes first: evicting it to load another would only cost a load.
-    ordered = sorted(needs, key=lambda n: (n.rank, not having[n.bundle_digest], -n.count, n.bundle_digest))
+    ordered = sorted(
+        needs, key=lambda n: (n.rank, not having[n.bundle_digest], n.turn, -n.count, n.bundle_digest)
+    )
     homeless: list[str] = []
     for rank, group in itertools.groupby(ordered, key=lambda need: need.rank):
         spreads = [
-            _Spread(need, _copies(need, sites, totals[rank]), shelves, having[need.bundle_digest])
+            _Spread(need, _slots_wanted(need, sites, totals[rank]), shelves, having[need.bundle_digest])
             for need in group
         ]
         # One copy of each before a second of any: a second shall not push out another's only one.
-        for copies_at_most in (1, len(sites.ids)):
-            for spread in spreads:
-                spread.place(copies_at_most)
+        for spread in spreads:
+            spread.place_one()
+        for spread in spreads:
+            spread.place_more()
         homeless += [spread.need.bundle_digest for spread in spreads if not spread.placed]
     return Placement(shelves.close(), tuple(homeless))
+
+
+def _slots_wanted(need: Need, sites: Sites, total: int) -> int:
+    """The scene's share of all slots, no more than its rollouts can keep busy."""
+    return min(need.count, math.ceil(sites.slots * need.count / max(total, 1) - 1e-9))
 
 
 class _Spread:
     """One need on its way to as many workers as it should be on: where it is first, then where there is least to do."""
 
-    def __init__(self, need: Need, copies: int, shelves: _Shelves, having: Sequence[str]) -> None:
+    def __init__(self, need: Need, slots: int, shelves: _Shelves, having: Sequence[str]) -> None:
         self.need = need
         self.placed: list[_Shelf] = []
-        self._copies = copies
+        self._slots = slots
         self._shelves = shelves
         self._here = [shelves.of(worker_id) for worker_id in having]
 
-    def place(self, copies_at_most: int) -> None:
-        """Add copies until there are as many as it should have, or as are allowed for now."""
-        scene, copies = self.need.bundle_digest, min(self._copies, copies_at_most)
-        if len(self.placed) >= copies:
-            return
-        before = len(self.placed)
+    def place_one(self) -> None:
+        """Put it on one worker, with all its work."""
+        scene = self.need.bundle_digest
         # Where rollouts run it stays: that needs no room.
-        here = sorted(self._here, key=lambda shelf: (scene not in shelf.chosen, shelf.order))
+        here = sorted(self._shelves.in_order(self._here), key=lambda shelf: scene not in shelf.chosen)
         for shelf in here:
-            if len(self.placed) < copies and shelf not in self.placed:
-                if scene not in shelf.chosen:
-                    if not shelf.accepts(scene):
-                        continue
-                    shelf.take(scene)
-                self.placed.append(shelf)
-        for shelf in self._shelves.least_loaded(scene, copies - len(self.placed)):
-            shelf.take(scene)
-            self.placed.append(shelf)
-        for shelf in self.placed[before:]:
-            self._shelves.add_work(shelf, self.need.count / self._copies)
+            if scene in shelf.chosen or shelf.accepts(scene):
+                self._put(shelf)
+                break
+        else:
+            self._put_on_others(one=True)
+        if self.placed:
+            self._shelves.add_work(self.placed[0], self.need.count)
 
+    def place_more(self) -> None:
+        """Put it on more workers while that is worth it, and share the work among them all."""
+        if not self.placed or not self._wants_more():
+            return
+        scene = self.need.bundle_digest
+        for shelf in self._shelves.in_order(self._here):
+            if shelf in self.placed or not self._wants_more():
+                continue
+            if scene in shelf.chosen or shelf.accepts(scene):
+                self._put(shelf)
+        if self._wants_more():
+            self._put_on_others(one=False)
+        capacity = self._capacity()
+        self._shelves.add_work(self.placed[0], -self.need.count)
+        for shelf in self.placed:
+            self._shelves.add_work(shelf, self.need.count * shelf.site.capacity / capacity)
 
-def _copies(need: Need, sites: Sites, total: int) -> int:
-    """On how many workers: the scene's share of all slots, no more than its rollouts can keep busy."""
-    slots, workers = sites.slots, len(sites.ids)
-    if not slots or not total:
-        return 1
-    slots_each = slots / workers
-    share = slots * need.count / total / slots_each
-    busy = math.ceil(need.count / slots_each)
-    return min(workers, max(1, need.at_least, min(math.ceil(share - 1e-9), busy)))
+    def _put_on_others(self, *, one: bool) -> None:
+        with contextlib.closing(self._shelves.accepting(self.need.bundle_digest)) as others:
+            for shelf in others:
+                self._put(shelf)
+                if one or not self._wants_more():
+                    break
+
+    def _put(self, shelf: _Shelf) -> None:
+        if self.need.bundle_digest not in shelf.chosen:
+            shelf.take(self.need.bundle_digest)
+        self.placed.append(shelf)
+
+    def _wants_more(self) -> bool:
+        """Whether it should be on one more: that has slots for it, and is done loading before the others are with the work."""
+        if len(self.placed) < self.need.at_least:
+            return True
+        if sum(shelf.site.slots for shelf in self.placed) >= self._slots:
+            return False
+        known = self.need.load_s and self.need.work_s
+        return not known or self.need.work_s / self._capacity() > self.need.load_s
+
+    def _capacity(self) -> float:
+        return sum(shelf.site.capacity for shelf in self.placed)

@@ -10,13 +10,14 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.commands import Command, SetDesired
 from embomatrix.manager.events import (
     BatchSubmitted,
     DemandObserved,
     Event,
+    LeaseFinished,
     LookaheadAnnounced,
     RunClosed,
     Tick,
@@ -27,13 +28,21 @@ from embomatrix.manager.events import (
     WorkerReported,
     WorkerSuspected,
 )
-from embomatrix.manager.holders import Holder, Holders
-from embomatrix.manager.placement import Need, Site, needs_of, place
+from embomatrix.manager.holders import Holder, Holders, Places
+from embomatrix.manager.placement import Need, needs_of, place
 from embomatrix.manager.prewarm import PrewarmLedger
-from embomatrix.rpc.values import LookaheadEntry, Resident, ResidentState, Warmth
+from embomatrix.rpc.values import Completed, LookaheadEntry, Resident, ResidentState, Warmth
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable
+
+    from embomatrix.rpc.values import Batch
+
+
+LEARNING: Final = 0.05
+"""Weight of the latest of a row of measurements."""
+LEASES_AT_A_TIME: Final = 64
+"""So many leases are told of at the price of looking at one worker."""
 
 
 class Urgency(IntEnum):
@@ -59,70 +68,22 @@ class ScheduleLimits:
 
 
 class Window:
-    """What a run announced last. Entries of steps that have come are dropped."""
+    """What a run announced last, without what has come."""
 
     def __init__(self, version: int, entries: tuple[LookaheadEntry, ...]) -> None:
         self.version = version
         self.entries = entries
         self.scenes = {entry.bundle_digest for entry in entries}
 
-
-class _Places:
-    """The holders as a placement wants to see them, at one moment."""
-
-    def __init__(
-        self, holders: Holders, now_s: float, in_use: frozenset[tuple[str, str]], retry_s: float
-    ) -> None:
-        self._holders = holders
-        self._now_s = now_s
-        self._in_use = in_use
-        self._retry_s = retry_s
-        self._large: list[tuple[str, float]] = []
-
-    def refuse_where_too_large(self, needs: Iterable[Need], size_mb: dict[str, float]) -> None:
-        """Scenes that were measured and found larger than all the memory of a worker are not tried there again."""
-        least_mb = self._holders.least_memory_mb
-        sizes = ((need.bundle_digest, size_mb.get(need.bundle_digest, 0.0)) for need in needs)
-        self._large = [(scene, size) for scene, size in sizes if size > least_mb]
-
-    @property
-    def ids(self) -> Sequence[str]:
-        return self._holders.usable
-
-    @property
-    def slots(self) -> int:
-        return self._holders.slots
-
-    def site(self, worker_id: str) -> Site:
-        holder = self._holders.by_id[worker_id]
-        memory_mb = holder.resources.memory_mb
-        held = holder.standing()
-        return Site(
-            worker_id=worker_id,
-            slots=holder.slots,
-            score=holder.resources.score,
-            memory_mb=memory_mb,
-            residents=held,
-            pinned=frozenset(scene for scene in held if (worker_id, scene) in self._in_use),
-            refused=self.refused(holder),
+    def after(self, batch: Batch) -> Window:
+        """Without the steps before the batch's, and of its own step without its scenes: the other groups are still to come."""
+        here = {rollout.bundle_digest for rollout in batch.rollouts}
+        coming = tuple(
+            entry
+            for entry in self.entries
+            if entry.step > batch.step or (entry.step == batch.step and entry.bundle_digest not in here)
         )
-
-    def refused(self, holder: Holder) -> frozenset[str]:
-        """What failed to load there a moment ago, and what can't fit."""
-        failed = {scene for scene, at_s in holder.failed_s.items() if self._now_s - at_s < self._retry_s}
-        failed.update(scene for scene, size in self._large if size > holder.resources.memory_mb)
-        return frozenset(failed)
-
-    def having(self, scene: str) -> Iterable[str]:
-        return [holder.worker_id for holder in self._holders.having(scene)]
-
-    def changed(self) -> Iterable[str]:
-        return self._holders.fresh | self._holders.failing.intersection(self._holders.usable)
-
-    def nobody_takes(self, scene: str) -> bool:
-        """Whether every usable worker refuses the scene."""
-        workers = (self._holders.by_id[worker_id] for worker_id in self._holders.usable)
-        return bool(self._holders.usable) and all(scene in self.refused(holder) for holder in workers)
+        return self if len(coming) == len(self.entries) else Window(self.version, coming)
 
 
 class Scheduler:
@@ -140,9 +101,12 @@ class Scheduler:
         self._copies: dict[str, int] = {}
         self._size_mb: dict[str, float] = {}
         self._load_s: dict[str, float] = {}
+        self._typical_load_s = 0.0
+        self._execute_s = 0.0
+        """Of an execution on a worker of speed 1, as lately measured; 0 before the first."""
         self._now_s = 0.0
         self.effort = 0
-        """Needs and workers that the last placement looked at."""
+        """Needs and workers that the last placement looked at, and what it took to know what is in use."""
 
     def handle(self, event: Event, *, now_s: float) -> list[Command]:
         """Take in one fact; returns the desired sets that changed."""
@@ -165,6 +129,11 @@ class Scheduler:
                 self.windows.pop(run_id, None)
             case WorkerReported():
                 return self._on_reported(event)
+            case LeaseFinished(outcome=Completed(timings=timings)):
+                holder = self._holders.by_id.get(event.worker_id)
+                speed = max(holder.resources.score, 1e-3) if holder is not None else 1.0
+                self._execute_s = _learned(self._execute_s, timings.execute_s * speed)
+                return Urgency.NONE
             case WorkerJoined() | WorkerLost() | WorkerDrained() | WorkerSuspected() | WorkerRecovered():
                 return self._on_worker(event)
             case Tick():
@@ -177,15 +146,16 @@ class Scheduler:
         """Decide where every scene should be; returns the desired sets that changed."""
         self._now_s = now_s
         needs = needs_of(self._peaks, [window.entries for window in self.windows.values()])
-        needs = [self._spread(need) for need in needs]
-        places = _Places(self._holders, now_s, self._demand.in_use, self._limits.retry_load_s)
+        turns = {scene: turn for turn, scene in enumerate(self._demand.waited_s)}
+        needs = [self._spread(need, turns.get(need.bundle_digest, 0)) for need in needs]
+        places = Places(self._holders, now_s, self._demand.in_use, self._limits.retry_load_s)
         places.refuse_where_too_large(needs, self._size_mb)
         placement = place(places, needs, self._estimate)
         self._holders.fresh.clear()
         self.unplaceable = {
             scene: self._why_not(scene) for scene in placement.homeless if places.nobody_takes(scene)
         }
-        self.effort = len(needs) + len(placement.desired)
+        self.effort = len(needs) + len(placement.desired) + len(self._demand.in_use) // LEASES_AT_A_TIME
         orders = (self._order(name, scenes) for name, scenes in placement.desired.items())
         return [order for order in orders if order is not None]
 
@@ -229,9 +199,8 @@ class Scheduler:
             if not self._holders.having(scene):
                 urgency = Urgency.NOW
         window = self.windows.get(batch.run_id)
-        if window is not None and any(entry.step <= batch.step for entry in window.entries):
-            coming = tuple(entry for entry in window.entries if entry.step > batch.step)
-            self.windows[batch.run_id] = Window(window.version, coming)
+        if window is not None:
+            self.windows[batch.run_id] = window.after(batch)
         return urgency
 
     def _on_worker(
@@ -288,6 +257,7 @@ class Scheduler:
                 if resident.load_s > 0:
                     before_s = self._load_s.get(scene, resident.load_s)
                     self._load_s[scene] = 0.5 * (before_s + resident.load_s)
+                    self._typical_load_s = _learned(self._typical_load_s, resident.load_s)
             case ResidentState.FAILED:
                 holder.failed_s.setdefault(scene, self._now_s)
                 holder.warm_since_s.pop(scene, None)
@@ -307,17 +277,22 @@ class Scheduler:
         names = self._holders.warm_on(scene)
         return min((self._holders.by_id[name].warm_since_s[scene] for name in names), default=None)
 
-    def _spread(self, need: Need) -> Need:
+    def _spread(self, need: Need, turn: int) -> Need:
         """One worker more for a scene whose rollouts wait while others are idle, unless one is loading it already."""
         scene = need.bundle_digest
-        patience_s = max(self._limits.affinity_wait_s, self.load_s(scene))
-        if self._demand.waited_s.get(scene, 0.0) >= patience_s:
+        waited_s = self._demand.waited_s.get(scene, 0.0)
+        if waited_s >= max(self._limits.affinity_wait_s, self.load_s(scene)):
             told = [holder for holder in self._holders.having(scene) if scene in (holder.desired or ())]
             loading = any(scene not in holder.warm_since_s for holder in told)
             if not loading and not self._demand.idle <= {holder.worker_id for holder in told}:
                 self._copies[scene] = len(told) + 1
-        copies = self._copies.get(scene, 1)
-        return need if copies == 1 else dataclasses.replace(need, at_least=copies)
+        return dataclasses.replace(
+            need,
+            at_least=self._copies.get(scene, 1),
+            load_s=self._load_s.get(scene, self._typical_load_s),
+            work_s=need.count * self._execute_s,
+            turn=turn,
+        )
 
     def _estimate(self, scene: str) -> float:
         return self._size_mb.get(scene, self._limits.scene_mb)
@@ -357,3 +332,7 @@ class Scheduler:
 
     def _announcer(self, scene: str) -> str | None:
         return next((run_id for run_id, window in self.windows.items() if scene in window.scenes), None)
+
+
+def _learned(before: float, measured: float) -> float:
+    return before + LEARNING * (measured - before) if before else measured

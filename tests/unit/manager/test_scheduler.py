@@ -1,13 +1,17 @@
 """The Resource-Scheduler: who holds which scene, when, and what that was worth."""
 
+from dataclasses import replace
+
 import hypothesis.strategies as st
 import pytest
 from hypothesis import given
+from tests.fakes.worker import completed
 
 from embomatrix.manager.commands import SetDesired
 from embomatrix.manager.events import (
     BatchSubmitted,
     DemandObserved,
+    LeaseFinished,
     LookaheadAnnounced,
     RunClosed,
     Tick,
@@ -21,11 +25,13 @@ from embomatrix.manager.placement import Need, Site, needs_of, place
 from embomatrix.manager.scheduler import ScheduleLimits, Scheduler
 from embomatrix.rpc.values import (
     Batch,
+    LeaseRef,
     LookaheadEntry,
     Resident,
     ResidentState,
     Resources,
     Rollout,
+    Timings,
     Warmth,
 )
 
@@ -304,7 +310,7 @@ class Listed:
 
     def __init__(self, sites):
         self._sites = {site.worker_id: site for site in sites}
-        self.ids = sorted(self._sites)
+        self.ids = sorted(self._sites, key=lambda name: (-self._sites[name].capacity, name))
         self.slots = sum(site.slots for site in sites)
 
     def site(self, worker_id):
@@ -343,3 +349,31 @@ def test_placement_keeps_to_memory_and_prefers_the_sooner_use(needs, memories, r
     after = place(Listed(again), needs, lambda _: MB).desired
     lost = {scene for scenes in desired.values() for scene in scenes} - {s for d in after.values() for s in d}
     assert not lost & {need.bundle_digest for need in needs if need.rank == 0}
+
+
+def test_the_other_groups_of_a_step_that_has_begun_stay_in_the_window(cluster):
+    cluster.worker()
+    cluster.announce(["a", "b"], ["c"])
+    cluster.submit("a", step=1)
+    assert [entry.bundle_digest for entry in cluster.scheduler.windows["r1"].entries] == ["b", "c"]
+
+
+def test_a_scene_is_not_loaded_again_where_that_takes_longer_than_it_saves(cluster):
+    for name in ("w1", "w2", "w3"):
+        cluster.worker(name, slots=1)
+    cluster.demand(known=1)
+    for name in ("w1", "w2", "w3"):
+        cluster.report(name)
+    done = replace(completed(), timings=Timings(execute_s=0.01))
+    cluster.tell(LeaseFinished("w1", LeaseRef("lease", 1), done))
+    cluster.demand(quick=16)
+    assert sum("quick" in scenes for scenes in cluster.desired.values()) == 1
+    cluster.tell(LeaseFinished("w1", LeaseRef("lease", 2), replace(done, timings=Timings(execute_s=100.0))))
+    cluster.demand(long=16)
+    assert sum("long" in scenes for scenes in cluster.desired.values()) == 3
+
+
+def test_what_a_lost_worker_left_behind_is_loaded_before_what_was_sent_later(cluster):
+    cluster.worker()
+    cluster.tell(DemandObserved({"later": 30, "earlier": 2}, {"earlier": 5.0, "later": 1.0}))
+    assert cluster.desired["w1"] == ("earlier", "later")

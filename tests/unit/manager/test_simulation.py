@@ -103,7 +103,7 @@ REWARD = RewardBreakdown(0.5, 0.0, 0.0, (), False)
 @pytest.fixture
 def auditor():
     """One rollout was submitted; two workers said that they have its scene."""
-    auditor = Auditor()
+    auditor = Auditor(Agenda())
     auditor.submit(Batch("r", "b", 1, (ROLLOUT,)))
     warm = WorkerState((Resident("kitchen", ResidentState.WARM),))
     for worker in ("w1", "w2"):

@@ -44,6 +44,7 @@ from embomatrix.worker.bench_figures import (
 from embomatrix.worker.bench_page import hand_parts, render_page
 from embomatrix.worker.bench_rollout import bench_rollout
 from embomatrix.worker.bench_scenes import scenes_of
+from embomatrix.worker.bench_simulation import bench_simulation
 from embomatrix.worker.bench_workload import PINNED, SIZES, read_workload, workload_to_text, write_workload
 from embomatrix.world.bundle import BundleError
 from embomatrix.world.dataset import Dataset, DatasetError
@@ -78,6 +79,7 @@ DATASET = Path("build/dataset")
 ENGINE_DATASET = Path("build/engine")
 FIDELITY_DATASET = Path("build/scenes")
 FIDELITY_OUT = Path("build/fidelity")
+SIMULATION_OUT = Path("build/simulation")
 PAGE = Path("docs/benchmarks.md")
 SPEEDUP = "skill_speedup_min"
 MODES = Modes(cached=Simulator, physical=physical_simulator)
@@ -169,8 +171,22 @@ def cluster(
     slots: Slots = 1,
     scenes: PhaseScenes = 16,
     limit_s: LimitS = 60.0,
+    simulate: Annotated[
+        bool,
+        typer.Option(
+            "--simulate", help="Simulate large clusters instead: no dataset, no processes, pictures."
+        ),
+    ] = False,
+    most_workers: Annotated[
+        int, typer.Option(min=10, max=100_000, help="Workers of the largest simulated cluster.")
+    ] = 10_000,
+    out: Annotated[Path, typer.Option(help="Folder for the pictures of the simulation.")] = SIMULATION_OUT,
 ) -> None:
-    """Measure a manager and workers on loopback: cold, prewarmed and warm."""
+    """Measure a manager and workers on loopback: cold, prewarmed and warm. Or simulate thousands of workers."""
+    if simulate:
+        with _refusals():
+            _hand_in(_simulation(out, most_workers), json_file)
+        return
     load = ClusterLoad(workers=workers, slots=slots, scenes=scenes, limit_s=limit_s)
     with _refusals():
         _hand_in(_cluster(dataset, load), json_file)
@@ -288,6 +304,18 @@ def _cluster(dataset: Path, load: ClusterLoad) -> BenchResult:
             status.update(f"cluster: {what}")
 
         return BenchResult("cluster", commit_here(), machine, bench_cluster_load(chosen, load, on_phase))
+
+
+def _simulation(out: Path, most_workers: int) -> BenchResult:
+    machine = describe_machine() | {"most_workers": most_workers}
+    with errors.status("simulated cluster") as status:
+
+        def on_step(what: str) -> None:
+            status.update(f"simulated cluster: {what}")
+
+        figures = bench_simulation(out, most_workers, on_step)
+    console.print(f"pictures are in {out}", highlight=False)
+    return BenchResult("simulated-cluster", commit_here(), machine, figures)
 
 
 def _hand_in(result: BenchResult, json_file: Path | None) -> None:

@@ -17,6 +17,7 @@ from embomatrix.rpc.values import Completed, InfraFailure, ResidentState
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from embomatrix.manager.simulation.agenda import Agenda
     from embomatrix.rpc.values import Batch, LeaseRef, RolloutResult, WorkerState
 
 
@@ -27,7 +28,11 @@ class BrokenInvariantError(Exception):
 class Auditor:
     """Watches from outside: it sees what is submitted, executed and ordered, and nothing of the manager's own books."""
 
-    def __init__(self) -> None:
+    def __init__(self, agenda: Agenda) -> None:
+        self.orphaned_s: list[float] = []
+        """From the loss of a worker to the next lease of each rollout that it held."""
+        self._agenda = agenda
+        self._lost_s: dict[str, float] = {}
         self.submitted = 0
         self.delivered = 0
         self.infra_failures = 0
@@ -68,6 +73,8 @@ class Auditor:
         """Check what the manager orders; the leases of workers that it has just ``lost`` are void."""
         # Several may be lost at once, and what the first held may be given to the second before that one's loss is seen.
         self._gone = frozenset(lost)
+        for worker_id in self._gone:
+            self._lost_s |= dict.fromkeys(self._held_by.get(worker_id, ()), self._agenda.now_s)
         self._forget_all(self._gone)
         for command in commands:
             match command:
@@ -106,6 +113,8 @@ class Auditor:
             command.rollout.bundle_digest in self._warm.get(worker_id, ()),
             f"{rollout_id} was leased to {worker_id}, which never said that it has its scene",
         )
+        if rollout_id in self._lost_s:
+            self.orphaned_s.append(self._agenda.now_s - self._lost_s.pop(rollout_id))
         self._epochs.add(command.ref.lease_epoch)
         self._holder[rollout_id] = worker_id
         self._held_by.setdefault(worker_id, {})[rollout_id] = command.ref

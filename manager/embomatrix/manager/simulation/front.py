@@ -76,6 +76,7 @@ class Front:
         names = [event.worker_id for event in lost]
         for name in names:
             self._gauge.counts["workers lost"] += 1
+            self._gauge.lost(name, self._agenda.now_s)
             self._end_stream(name)
         self._carry_out(commands, lost=names)
         self._agenda.after(TICK_S, self.keep_time)
@@ -83,9 +84,15 @@ class Front:
     def register(self, worker_id: str, boot_id: str, resources: Resources) -> Session:
         with self._gauge.deciding("register"):
             session, commands = self._intake.register(worker_id, boot_id, resources, now_s=self._agenda.now_s)
+        self._gauge.lost(worker_id, self._agenda.now_s)
         self._end_stream(worker_id)
         self._carry_out(commands, lost=(worker_id,))
         return session
+
+    def drain(self, worker_id: str) -> None:
+        """An operator takes the worker out."""
+        events = self._intake.registry.drain(worker_id)
+        self._carry_out(self._intake.feed(*events, now_s=self._agenda.now_s))
 
     def attach(self, session: Session, state: WorkerState, stream: Stream) -> None:
         """A stream opens with the worker's full state. Raises SupersededError."""

@@ -20,6 +20,10 @@ class Cost:
     total_s: float = 0.0
     longest_s: float = 0.0
 
+    @property
+    def mean_s(self) -> float:
+        return self.total_s / self.count
+
 
 class Gauge:
     """Counters of one simulation, for reading when it is over."""
@@ -32,16 +36,29 @@ class Gauge:
         """From the last submission of each step to its last result: the time that a trainer stands still."""
         self.queued_s: list[float] = []
         """From the submission of each completed rollout to the start of its execution."""
+        self.first_queued_s: list[float] = []
+        """The same of the first rollout of each group: what its scene was waited for."""
+        self.foretold = self.warm = 0
+        """Groups of steps after the first, which could be announced in time, and those whose scene was warm when they came."""
         self.loads = 0
         self.loads_unused = 0
         self.load_s = 0.0
         self.pressed: list[tuple[int, int]] = []
         """Executing and existing slots, while there is work for every slot."""
+        self.died_s: dict[str, float] = {}
+        """When each worker died last, until the manager knows."""
+        self.detected_s: list[float] = []
+        """From each death of a worker to the manager's knowing of it."""
         self.counts: Counter[str] = Counter()
 
     @property
     def cpu_s(self) -> float:
         return sum(cost.total_s for cost in self.costs.values())
+
+    def lost(self, worker_id: str, now_s: float) -> None:
+        """The manager gave the worker up, or heard of its next life."""
+        if worker_id in self.died_s:
+            self.detected_s.append(now_s - self.died_s.pop(worker_id))
 
     @contextmanager
     def deciding(self, kind: str) -> Iterator[None]:

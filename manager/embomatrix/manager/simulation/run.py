@@ -6,6 +6,7 @@ import contextlib
 import gc
 import random
 from dataclasses import dataclass
+from statistics import fmean
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.cluster_state import ClusterState
@@ -50,17 +51,23 @@ class Report:
     """Share of the slots' time in which they executed something, from the first step's begin on."""
     pressed_utilisation: float
     """The same, while at least as many rollouts were open as there are slots; 1 when that never was."""
+    foretold: int
+    """Groups after the first step of their run: their scenes could be announced in time."""
+    hit_rate: float
+    """Share of those whose scene was warm when they came; 1 where there were none."""
     loads: int
     loads_unused: int
     cpu_s: float
+    detected_s: tuple[float, ...]
+    """From each death of a worker to the manager's knowing of it."""
+    orphaned_s: tuple[float, ...]
+    """From the loss of a worker to the next lease of each rollout that it held."""
+    start_latency_s: float
+    """From a group's submission to the start of its first execution, the mean."""
+    first_result_s: float
+    """From the first submission of a run to its first result, the longest of all runs."""
     costs: Mapping[str, Cost]
     counts: Mapping[str, int]
-
-    @property
-    def hit_rate(self) -> float:
-        """Share of the batches whose scene was warm when they came."""
-        asked = self.stats.prewarm_hits + self.stats.prewarm_misses
-        return self.stats.prewarm_hits / asked if asked else 1.0
 
     @property
     def waste(self) -> float:
@@ -84,25 +91,25 @@ class Report:
 
 
 class Simulation:
-    """One cluster. ``run`` once."""
+    """One cluster. ``run`` once; before it, ``agenda`` takes what shall happen to ``workers`` and ``front``."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
         self._setting = setting_of(scenario)
-        self._agenda = Agenda()
-        self._auditor = Auditor()
+        self.agenda = Agenda()
+        self._auditor = Auditor(self.agenda)
         self._gauge = Gauge()
         self._cluster = ClusterState(scenario.dispatch, scenario.schedule, boot_id="simulated")
         numbers = iter(range(1 << 62))
         registry = Registry(scenario.liveness, new_id=lambda: f"session-{next(numbers)}")
-        self._front = Front(self._agenda, Intake(self._cluster, registry), self._auditor, self._gauge)
-        self._workers = self._hire()
+        self.front = Front(self.agenda, Intake(self._cluster, registry), self._auditor, self._gauge)
+        self.workers = self._hire()
         self._trainers = [
             SimulatedTrainer(
                 plan,
                 list(self._setting.scenes),
-                self._agenda,
-                self._front,
+                self.agenda,
+                self.front,
                 self._gauge,
                 rng_for(scenario, 3, at),
             )
@@ -111,13 +118,13 @@ class Simulation:
 
     def run(self) -> Report:
         """Raises BrokenInvariantError when an invariant does not hold, or rollouts have no outcome in time."""
-        self._front.keep_time()
-        self._agenda.after(0.0, self._look)
+        self.front.keep_time()
+        self.agenda.after(0.0, self._look)
         with _without_collector():
-            in_time = self._agenda.run(until=self._ended, limit_s=self._scenario.limit_s)
+            in_time = self.agenda.run(until=self._ended, limit_s=self._scenario.limit_s)
         if not in_time or not self._auditor.complete or self._cluster.dispatcher.live_leases:
             raise BrokenInvariantError(
-                f"after {self._agenda.now_s:.0f} s {self._auditor.delivered} of {self._scenario.rollouts} rollouts have "
+                f"after {self.agenda.now_s:.0f} s {self._auditor.delivered} of {self._scenario.rollouts} rollouts have "
                 f"an outcome, {len(self._cluster.dispatcher.live_leases)} leases live"
             )
         return self._report()
@@ -130,13 +137,13 @@ class Simulation:
                 machine,
                 self._scenario,
                 self._setting,
-                self._agenda,
-                self._front,
+                self.agenda,
+                self.front,
                 self._auditor,
                 self._gauge,
                 random.Random(f"{self._scenario.seed}.{at}"),
             )
-            self._agenda.after(float(joins[at]), worker.boot)
+            self.agenda.after(float(joins[at]), worker.boot)
             workers.append(worker)
         return workers
 
@@ -146,12 +153,12 @@ class Simulation:
     def _look(self) -> None:
         open_now = self._auditor.open_rollouts
         if open_now >= self._setting.slots:
-            at_work = sum(worker.slots.executing for worker in self._workers if worker.slots is not None)
+            at_work = sum(worker.slots.executing for worker in self.workers if worker.slots is not None)
             self._gauge.pressed.append((at_work, self._setting.slots))
-        self._agenda.after(SAMPLE_S, self._look)
+        self.agenda.after(SAMPLE_S, self._look)
 
     def _report(self) -> Report:
-        for worker in self._workers:
+        for worker in self.workers:
             if worker.slots is not None:
                 worker.slots.count_unused()
         began_s = min(plan.start_s for plan in self._scenario.trainers)
@@ -174,9 +181,15 @@ class Simulation:
             queued_p99_s=quantile(queued, 0.99),
             utilisation=gauge.busy_s / (elapsed_s * self._setting.slots),
             pressed_utilisation=at_work / there,
+            foretold=gauge.foretold,
+            hit_rate=gauge.warm / gauge.foretold if gauge.foretold else 1.0,
             loads=gauge.loads,
             loads_unused=gauge.loads_unused,
             cpu_s=gauge.cpu_s,
+            detected_s=tuple(gauge.detected_s),
+            orphaned_s=tuple(self._auditor.orphaned_s),
+            start_latency_s=fmean(gauge.first_queued_s) if gauge.first_queued_s else 0.0,
+            first_result_s=max(trainer.first_result_s for trainer in self._trainers),
             costs=gauge.costs,
             counts=gauge.counts,
         )

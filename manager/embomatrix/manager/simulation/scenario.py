@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from embomatrix.manager.assignments import DispatchLimits
 from embomatrix.manager.registry import LivenessLimits
@@ -33,6 +33,8 @@ MIXED = (
     MachineKind("spare PC", 0.2, 2, 512, 0.6, 0.06, 4.0),
 )
 """Servers, workstations, machines of a cloud and idle PCs at people's homes."""
+INTERNET = tuple(replace(kind, latency_s=0.08, bandwidth_mb_s=4.0) for kind in MIXED)
+"""The same machines, all of them far away."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from typing import TYPE_CHECKING
 
 from embomatrix.rpc.values import Batch, Completed, LookaheadEntry, Rollout
@@ -34,12 +35,17 @@ class SimulatedTrainer:
         self.plan = plan
         self.done = False
         self.ended_s = 0.0
+        self.first_result_s = math.inf
+        """From the first submission to the first result."""
         self._agenda = agenda
         self._front = front
         self._gauge = gauge
         self._announced, self._actual = _schedule(plan, scenes, rng)
         self._step = 0
         self._left = 0
+        self._starts_s: dict[str, list[float]] = {}
+        self._warm: dict[str, bool] = {}
+        self._began_s = math.inf
         self._sent_s = 0.0
         front.open_run(plan.name, self._take)
         agenda.after(plan.start_s, self._begin_step)
@@ -68,19 +74,29 @@ class SimulatedTrainer:
             Rollout(f"{name}.{index}", name, scene, scene, (), step) for index in range(plan.group_size)
         )
         self._sent_s = self._agenda.now_s
+        self._began_s = min(self._began_s, self._sent_s)
         batch = Batch(plan.name, name, step + 1, rollouts)
         self._agenda.after(plan.latency_s, lambda: self._front.submit(batch))
 
     def _take(self, results: Sequence[RolloutResult]) -> None:
-        self._gauge.queued_s += [
-            result.outcome.timings.queued_s for result in results if isinstance(result.outcome, Completed)
-        ]
+        for result in results:
+            if isinstance(result.outcome, Completed):
+                self._gauge.queued_s.append(result.outcome.timings.queued_s)
+                self._starts_s.setdefault(result.group_id, []).append(result.outcome.timings.queued_s)
+                self._warm[result.group_id] = result.outcome.warm
         self._agenda.after(self.plan.latency_s, lambda: self._count(len(results)))
 
     def _count(self, results: int) -> None:
+        self.first_result_s = min(self.first_result_s, self._agenda.now_s - self._began_s)
         self._left -= results
         if self._left:
             return
+        self._gauge.first_queued_s += [min(starts) for starts in self._starts_s.values()]
+        if self._step:
+            self._gauge.foretold += len(self._warm)
+            self._gauge.warm += sum(self._warm.values())
+        self._starts_s.clear()
+        self._warm.clear()
         self._gauge.waits_s.append(self._agenda.now_s - self._sent_s)
         self._step += 1
         if self._step < self.plan.steps:

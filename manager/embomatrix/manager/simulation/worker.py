@@ -75,29 +75,42 @@ class SimulatedWorker:
         self._session, self._outbox = None, {}
         self.slots = SimulatedSlots(self.machine, self._around, self._fetched)
         self._register()
-        faults = self._scenario.faults
-        for rate, happen in ((faults.death_rate, self._die), (faults.partition_rate, self._lose_network)):
-            if rate:
-                self._later(self._dice.expovariate(rate), happen)
+        self._later_at_random(self._scenario.faults.death_rate, self._die)
+        self._later_at_random(self._scenario.faults.partition_rate, self._lose_network)
 
-    def _die(self) -> None:
-        silent = self._dice.random() < self._scenario.faults.silent_deaths
+    def kill(self, *, silent: bool) -> None:
+        """The process ends, and another starts later. A silent death breaks no connection: nobody is told."""
+        if self.slots is None:
+            return
         self._gauge.counts["silent deaths" if silent else "deaths"] += 1
+        self._gauge.died_s[self.machine.worker_id] = self._agenda.now_s
         self._hang_up(silent=silent)
-        if self.slots is not None:
-            self.slots.stop()
+        self.slots.stop()
         self.slots = None
         self._life += 1
         self._agenda.after(self._scenario.faults.respawn_s, self.boot)
+
+    def cut(self, seconds: float, *, up: bool = True, down: bool = True) -> None:
+        """Its network is gone for so long, both ways or one."""
+        self._gauge.counts["partitions"] += 1
+        self._line.cut(seconds, up=up, down=down)
+
+    def _die(self) -> None:
+        self.kill(silent=self._dice.random() < self._scenario.faults.silent_deaths)
 
     def _lose_network(self) -> None:
         faults = self._scenario.faults
         fate = self._dice.random()
         half = fate < faults.half_open
         up = not half or fate < faults.half_open / 2
-        self._line.cut(faults.partition_s, up=up, down=not half or not up)
-        self._gauge.counts["partitions"] += 1
-        self._later(faults.partition_s + self._dice.expovariate(faults.partition_rate), self._lose_network)
+        self.cut(faults.partition_s, up=up, down=not half or not up)
+        self._later(
+            faults.partition_s, lambda: self._later_at_random(faults.partition_rate, self._lose_network)
+        )
+
+    def _later_at_random(self, rate: float, action: Callable[[], None]) -> None:
+        if rate:
+            self._later(self._dice.expovariate(rate), action)
 
     def _later(self, delay_s: float, action: Callable[[], None]) -> None:
         """Have it happen to this life of the worker, not to a later one."""
