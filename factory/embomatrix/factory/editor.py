@@ -12,6 +12,7 @@ from embomatrix.factory.furnish_roles import is_portable
 from embomatrix.factory.scene_check import reach_problems
 from embomatrix.factory.scene_clearance import Clearance
 from embomatrix.factory.scene_floor import ReachableFloor, box_of
+from embomatrix.factory.scene_joints import with_joints
 from embomatrix.factory.scene_solids import Solids, placed_parts
 from embomatrix.sim.candidates import candidates
 from embomatrix.skills.limits import ROBOT
@@ -142,14 +143,17 @@ class SceneEditor:
         self._objects[name] = replace(self._known(name), states=frozenset(states))
 
     def set_joints(self, name: str, fractions: Sequence[float]) -> None:
-        """Open or shut an object's joints: one share of the travel for each. Raises PlacementError, ValueError."""
+        """Open or shut an object's joints, one share of the travel for each, with all that lies in its drawers.
+
+        Raises PlacementError, ValueError.
+        """
         item = self._known(name)
         joints = self._assets[item.asset_id].joints
         if len(fractions) != len(joints) or not all(0.0 <= f <= 1.0 for f in fractions):
             raise ValueError(
                 f"{name!r} was given joints {tuple(fractions)}: expected {len(joints)} numbers between 0 and 1"
             )
-        self._objects[name] = replace(item, joints=tuple(float(f) for f in fractions))
+        self._objects.update(with_joints(self._objects, self._assets, name, fractions))
 
     def freeze(self, scene_id: str) -> Scene:
         """The scene as it is now, with the assets that it uses."""

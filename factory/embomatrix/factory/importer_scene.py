@@ -9,6 +9,7 @@ import numpy as np
 
 from embomatrix.factory.refusal import RefusalReason, RefusedError
 from embomatrix.factory.scene_floor import ReachableFloor
+from embomatrix.factory.scene_joints import with_joints
 from embomatrix.world.scene import RobotStart
 from embomatrix.world.state import State, SubstanceFact, SubstanceRelation
 
@@ -54,11 +55,12 @@ def with_states(scene: Scene, literals: Iterable[Literal]) -> Scene:
             (gained if literal.positive else lost).setdefault(name, set()).add(state)
 
     def changed(item: SceneObject) -> SceneObject:
-        joints = item.joints
-        if item.name in shares:
-            joints = (shares[item.name],) * len(scene.assets[item.asset_id].joints)
         states = (item.states | gained.get(item.name, set())) - lost.get(item.name, set())
         substances = (item.substances | facts.get(item.name, set())) - denied.get(item.name, set())
-        return dataclasses.replace(item, joints=joints, states=states, substances=substances)
+        return dataclasses.replace(item, states=states, substances=substances)
 
-    return dataclasses.replace(scene, objects=tuple(changed(item) for item in scene.objects))
+    objects = {item.name: item for item in scene.objects}
+    for name, share in shares.items():
+        joints = (share,) * len(scene.asset_of(name).joints)
+        objects |= with_joints(objects, scene.assets, name, joints)
+    return dataclasses.replace(scene, objects=tuple(changed(item) for item in objects.values()))

@@ -1,0 +1,60 @@
+"""Furniture that stands open at a scene's start holds what it held when it was shut."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+import pytest
+from tests.fakes import furniture as make
+from tests.fakes.scenes import NORTH, placed, upright
+
+from embomatrix.factory.scene_joints import with_joints
+from embomatrix.world.geometry import Pose
+from embomatrix.world.state import Relation
+
+if TYPE_CHECKING:
+    from embomatrix.world.asset import Asset
+    from embomatrix.world.scene import SceneObject
+
+TRAVEL_M = 0.36
+"""The fake cabinet's drawers come out by this much; it faces north."""
+
+
+def cabinet_with_a_bowl_in_its_lower_drawer() -> tuple[dict[str, SceneObject], dict[str, Asset]]:
+    """The objects by name, and their assets: a mug lies in the bowl, a book in the upper drawer, another on top."""
+    cabinet, bowl, mug = make.drawer_cabinet(), make.mug(), make.mug()
+    book = make.block("book", "book.n.02", (0.2, 0.15, 0.04), {})
+    rows = [
+        ("cabinet_1", cabinet, upright(4.0, 0.26, 0.0, cabinet, NORTH), "", None),
+        ("bowl_1", bowl, upright(4.0, 0.3, 0.03, bowl), "cabinet_1", Relation.INSIDE),
+        ("mug_1", mug, upright(4.0, 0.3, 0.035, mug), "bowl_1", Relation.INSIDE),
+        ("book_1", book, upright(4.0, 0.2, 0.26, book), "cabinet_1", Relation.INSIDE),
+        ("book_2", book, upright(4.0, 0.26, 0.5, book), "cabinet_1", Relation.ONTOP),
+    ]
+    objects = {
+        name: dataclasses.replace(
+            placed(name, asset, "kitchen_0", pose, fixed=not host), host=host, relation=relation
+        )
+        for name, asset, pose, host, relation in rows
+    }
+    return objects, {asset.asset_id: asset for _, asset, *_ in rows}
+
+
+def test_what_lies_in_a_drawer_comes_out_with_it_and_what_lies_in_that_too() -> None:
+    objects, assets = cabinet_with_a_bowl_in_its_lower_drawer()
+    changed = with_joints(objects, assets, "cabinet_1", (0.0, 0.5))
+    assert set(changed) == {"cabinet_1", "bowl_1", "mug_1", "book_1"}
+    assert changed["cabinet_1"].joints == (0.0, 0.5)
+    for name, out_m in (("bowl_1", TRAVEL_M / 2), ("mug_1", TRAVEL_M / 2), ("book_1", 0.0)):
+        moved = objects[name].pose_world_asset.inverse() @ changed[name].pose_world_asset
+        assert moved.position_m == pytest.approx((0.0, out_m, 0.0))
+
+
+def test_a_drawer_that_is_shut_again_brings_its_things_back() -> None:
+    objects, assets = cabinet_with_a_bowl_in_its_lower_drawer()
+    opened = objects | with_joints(objects, assets, "cabinet_1", (1.0, 1.0))
+    shut = opened | with_joints(opened, assets, "cabinet_1", (0.0, 0.0))
+    for name, item in objects.items():
+        there, back = item.pose_world_asset, shut[name].pose_world_asset
+        assert (there.inverse() @ back).position_m == pytest.approx(Pose((0.0, 0.0, 0.0)).position_m)
