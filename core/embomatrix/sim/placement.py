@@ -11,6 +11,7 @@ from embomatrix.sim.bounds import IDENTITY, bounds_of, parts_of
 from embomatrix.sim.candidates import candidates
 from embomatrix.sim.engine import FLOOR, TOLERANCE_M
 from embomatrix.sim.lineup import Neighbours
+from embomatrix.sim.past_leaves import behind_leaves
 from embomatrix.sim.repertoire import Repertoire
 from embomatrix.sim.spots import is_shut, is_upright, link_frame, links_with_spots
 from embomatrix.sim.statics import is_level, rest_pose
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from embomatrix.sim.engine import PhysicsEngine
+    from embomatrix.sim.lineup import BoolArray, Lineup
     from embomatrix.sim.relations import Relations
     from embomatrix.sim.repertoire import Spots
     from embomatrix.world.geometry import Aabb
@@ -197,9 +199,9 @@ class Placer:
             return
         held, margin_m = errand.held, NEAR_M
         boxes = spots.lineup(bounds_of(self._scene.asset_of(held)), self._engine.joints(held), frames)
-        reached = boxes.reached_from(errand.robot)
+        reached = self._served(boxes, errand.target, errand.robot)
         for stand in errand.passed_over:
-            reached &= ~boxes.reached_from(stand)
+            reached &= ~self._served(boxes, errand.target, stand)
         flags = reached.tolist()
         rows = [number for number in order if flags[number]]
         if not rows:
@@ -220,6 +222,15 @@ class Placer:
         for number, close, full, nearest in zip(rows, crowded, taken, most, strict=True):
             if close and not full:
                 yield number, near[nearest]
+
+    def _served(self, boxes: Lineup, target: str, stand: StandPose) -> BoolArray:
+        """Which boxes, shape (n,), the arm reaches from a standing pose, past what doors of the target stand open."""
+        reached = boxes.reached_from(stand)
+        fractions = self._engine.joints(target)
+        if any(fractions):
+            asset, pose = self._scene.asset_of(target), self._engine.pose(target)
+            reached &= ~behind_leaves(boxes, asset, pose, fractions, stand)
+        return reached
 
     def _neighbours(self, names: Sequence[str]) -> Neighbours:
         items = [self._scene.by_name[name] for name in names]
