@@ -13,7 +13,7 @@ from embomatrix.sim import physical_body as body
 from embomatrix.sim.physical_motion import standing, with_arm
 from embomatrix.sim.physical_reach import AIR_M
 from embomatrix.sim.physical_space import clearance
-from embomatrix.sim.physical_stage import TUCKED, TUCKED_LIFT_M
+from embomatrix.sim.physical_stage import TUCKED, TUCKED_LIFT_M, compact
 from embomatrix.sim.physical_travel import SOMETHING, travel
 from embomatrix.sim.robot_dimensions import SHOULDER_LOW_M
 from embomatrix.skills.failure import FailureReason
@@ -36,6 +36,9 @@ ASIDES: Final = (0.0, 45.0, -45.0, 90.0, -90.0, 135.0, -135.0)
 """How far, and in which directions in degrees from straight back, the base draws the arm to where there is room to fold."""
 DRAWS: Final = 100
 """Random postures by which the arm may find its way to be folded: one that stays out bars every way that comes."""
+TURN_RAD: Final = 0.01
+FOLDS: Final = 3
+"""Ways that the arm tries to get folded: what stops it on one shows where the next begins."""
 CARRY_LIFT_M: Final = 0.6
 """Height of the lift while the robot drives with a load."""
 SURROUNDINGS_M: Final = np.array([0.8, 0.8, 9.0])
@@ -66,7 +69,9 @@ def approach(
 def unfold(stage: Stage, swing: FloatArray) -> Refusal | None:
     """Drive to where a swing begins, and make it."""
     now = stage.mover.posture
-    if math.dist(now[:2], swing[0, :2]) > 0.01:
+    turns = abs(math.remainder(now[body.YAW] - swing[0, body.YAW], math.tau)) > TURN_RAD
+    # An arm that stays out sweeps over what is around while the base turns.
+    if math.dist(now[:2], swing[0, :2]) > 0.01 or (turns and not compact(stage, now)):
         refusal = travel(stage, StandPose(*swing[0, :3].tolist()))
         if refusal is not None:
             return refusal
@@ -85,15 +90,8 @@ def fold(stage: Stage, home: StandPose, rng: np.random.Generator, target: str = 
 
     Where the arm has no room to fold, the base first draws it back. What the hand still touches does not keep it there.
     """
-    now = stage.mover.posture
-    reach = stage.reach(stage.boxes().drawn_in(*_limbs(stage, now), AIR_M))
-    loaded = stage.grip is not None
-    folded = carrying(stage, now)
-    for spot in _retreats(reach, now, loaded):
-        there = standing(now, spot)
-        swing = reach.transit(there, standing(folded, spot), rng, loaded=loaded, draws=DRAWS)
-        if swing is not None:
-            stage.mover.sweep(swing)
+    for _ in range(FOLDS):
+        if _drawn_over_base(stage, rng):
             break
     now = stage.mover.posture
     if (
@@ -103,6 +101,20 @@ def fold(stage: Stage, home: StandPose, rng: np.random.Generator, target: str = 
         return travel(stage, home, target)
     stage.told = home
     return None
+
+
+def _drawn_over_base(stage: Stage, rng: np.random.Generator) -> bool:
+    """Whether the arm is over the base, or finds no way there; not where something stopped it on the way it took."""
+    now = stage.mover.posture
+    reach = stage.reach(stage.boxes().drawn_in(*_limbs(stage, now), AIR_M))
+    loaded = stage.grip is not None
+    folded = carrying(stage, now)
+    for spot in _retreats(reach, now, loaded):
+        there = standing(now, spot)
+        swing = reach.transit(there, standing(folded, spot), rng, loaded=loaded, draws=DRAWS)
+        if swing is not None:
+            return stage.mover.sweep(swing) is None
+    return True
 
 
 def _limbs(stage: Stage, now: FloatArray) -> tuple[FloatArray, FloatArray]:
