@@ -36,6 +36,9 @@ SLOW_M_S: Final = 0.01
 SLOW_RAD_S: Final = 0.1
 TIP_M: Final = 0.1122
 """From the hand's frame to the fingertips' end."""
+GLIDE_EMPTY: Final = 4
+GLIDE_LOADED: Final = 2
+"""How many steps one step lasts where nothing is to be touched: with an empty hand, and with a load."""
 AWAY_M: Final = -50.0
 """Depth at which things that are not in the world are kept."""
 
@@ -100,15 +103,13 @@ class DynamicWorld:
         self.step(steps)
 
     def glide(self, posture: Posture, steps: int) -> None:
-        """The same in steps of twice the length, as long as the hand is empty: what is held needs short ones."""
-        if self._held:
-            self.go(posture, steps)
-            return
+        """The same in longer steps, which what is held bears less well than an empty hand."""
+        each = GLIDE_LOADED if self._held else GLIDE_EMPTY
         bullet, client = self._bullet, self._client
-        bullet.setTimeStep(2 * STEP_S, physicsClientId=client)
+        bullet.setTimeStep(each * STEP_S, physicsClientId=client)
         # A motor's force becomes an impulse by the length that a step has when it is steered.
         self.robot.steer(posture)
-        for _ in range(0, steps, 2):
+        for _ in range(0, steps, each):
             bullet.stepSimulation(physicsClientId=client)
         bullet.setTimeStep(STEP_S, physicsClientId=client)
         self.steps += steps
