@@ -127,8 +127,11 @@ def _open(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusa
     target = target_of(world, call)
     before = world.engine.joints(target)
     leaves = Leaves(world.engine, world.relations, target)
-    reached, other = leaves.swing([max(share, fraction) for fraction in before] for share in SWING)
+    course = [[max(share, fraction) for fraction in before] for share in SWING]
+    reached, other = leaves.swing(course)
     if reached and SWING[reached - 1] >= LEAST_OPEN:
+        if other:
+            leaves.go_on(course[reached - 1], course[reached])
         world.navigator.refresh()
         world.robot = world.navigator.aside(target, world.robot)
         return None

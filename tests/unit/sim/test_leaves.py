@@ -141,6 +141,23 @@ def test_nothing_is_placed_in_a_shut_drawer(flat):
     assert trace.failure is FailureReason.CONTAINER_CLOSED
 
 
+def test_a_drawer_that_something_stops_comes_out_up_to_it():
+    wall = box((4.0, 0.8, 0.25), (1.0, 0.1, 0.5))
+    scene = dataclasses.replace(drawer_scene(), walls=(*drawer_scene().walls, wall))
+    simulator = Simulator(Bundle(scene, {}))
+    try:
+        leaves = Leaves(simulator.world.engine, simulator.world.relations, "bottom_cabinet_1")
+        course = [(share, share) for share in (0.25, 0.5, 0.75, 1.0)]
+        reached, other = leaves.swing(course)
+        assert reached < len(course)
+        assert other
+        leaves.go_on(course[reached - 1], course[reached])
+        front = simulator.world.engine.aabb("bottom_cabinet_1").high_m[1]
+        assert front == pytest.approx(0.75, abs=0.003)
+    finally:
+        simulator.close()
+
+
 def test_what_sticks_out_of_a_drawer_keeps_it_from_closing(flat):
     task = task_over(flat.world.scene)
     flat.reset(task, 0)
