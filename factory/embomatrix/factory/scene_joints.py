@@ -5,15 +5,17 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from embomatrix.factory.scene_solids import placed_parts
 from embomatrix.sim.bounds import bounds_of
 from embomatrix.sim.spots import link_frame, link_under, links_with_spots
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
+    from embomatrix.factory.scene_solids import Solids
     from embomatrix.world.asset import Asset
     from embomatrix.world.geometry import Pose
-    from embomatrix.world.scene import SceneObject
+    from embomatrix.world.scene import Scene, SceneObject
 
 
 def with_joints(
@@ -34,6 +36,19 @@ def with_joints(
             for guest in _with_guests(objects, rider):
                 changed[guest.name] = replace(guest, pose_world_asset=motion @ guest.pose_world_asset)
     return changed
+
+
+def bumped_into(scene: Scene, solids: Solids, name: str, fractions: Sequence[float]) -> frozenset[str]:
+    """Owners of solids that an object, or what rides on it, would be in with its joints set, and is not in as it stands."""
+    before = scene.by_name
+    found: set[str] = set()
+    changed = with_joints(before, scene.assets, name, fractions)
+    for item in changed.values():
+        asset, was = scene.asset_of(item.name), before[item.name]
+        there = solids.overlaps(placed_parts(asset, item.pose_world_asset, item.joints))
+        here = solids.overlaps(placed_parts(asset, was.pose_world_asset, was.joints))
+        found |= there.keys() - here.keys()
+    return frozenset(found - changed.keys())
 
 
 def _riders(

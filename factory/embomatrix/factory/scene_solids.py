@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from scipy.spatial import ConvexHull
 
+from embomatrix.sim.bounds import joint_motion
 from embomatrix.world.geometry import Pose, Shape
 
 if TYPE_CHECKING:
@@ -136,6 +137,12 @@ class Solids:
         return found
 
 
-def placed_parts(asset: Asset, pose: Pose) -> list[Convex]:
-    """All parts of an asset at a pose, joints shut."""
-    return [convex_of(part, pose) for link in asset.links for part in link.parts]
+def placed_parts(asset: Asset, pose: Pose, fractions: Sequence[float] = ()) -> list[Convex]:
+    """All parts of an asset at a pose, its joints at these shares of their travel: shut without any."""
+    shares = iter(fractions)
+    placed: list[Convex] = []
+    for link in asset.links:
+        share = next(shares, 0.0) if link.joint is not None else 0.0
+        frame = pose @ joint_motion(link.joint, share) if link.joint is not None and share else pose
+        placed += [convex_of(part, frame) for part in link.parts]
+    return placed

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.editor import PlacementError, SceneEditor
+from embomatrix.factory.scene_joints import bumped_into
+from embomatrix.factory.scene_solids import Solids, placed_parts
 from embomatrix.factory.writer_tables import BASKETS, MEMBERS, Group, groups_for, suits
 from embomatrix.factory.writer_view import SceneView, is_liftable
 from embomatrix.world.catalog import Catalog
@@ -122,10 +124,15 @@ def _model(category: str, rng: np.random.Generator) -> str:
 def _set_doors_and_lights(
     editor: SceneEditor, view: SceneView, rooms: Sequence[str], rng: np.random.Generator
 ) -> None:
-    """Open some doors, switch some things on. What runs only when closed stays off: its door may be open."""
+    """Open some doors that have room, switch some things on. What runs only when closed stays off: its door may be open."""
+    scene = editor.freeze(view.scene.scene_id)
+    solids = Solids.of_scene(scene)
     for room in rooms:
         for name in view.in_room[room]:
             if view.is_openable(name) and rng.random() < OPEN_SHARE:
-                editor.set_joints(name, [1.0] * len(view.asset(name).joints))
+                asset, wide = view.asset(name), [1.0] * len(view.asset(name).joints)
+                if not bumped_into(scene, solids, name, wide):
+                    editor.set_joints(name, wide)
+                    solids.add(name, placed_parts(asset, view.item(name).pose_world_asset, wide))
             elif view.is_toggleable(name) and not view.asset(name).joints and rng.random() < ON_SHARE:
                 editor.set_states(name, view.item(name).states | {State.TOGGLED_ON})

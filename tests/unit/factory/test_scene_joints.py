@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 from tests.fakes import furniture as make
-from tests.fakes.scenes import NORTH, placed, upright
+from tests.fakes.scenes import NORTH, placed, scene_of, upright
 
-from embomatrix.factory.scene_joints import with_joints
+from embomatrix.factory.scene_joints import bumped_into, with_joints
+from embomatrix.factory.scene_solids import Solids
 from embomatrix.world.geometry import Pose
 from embomatrix.world.state import Relation
 
@@ -49,6 +50,19 @@ def test_what_lies_in_a_drawer_comes_out_with_it_and_what_lies_in_that_too() -> 
     for name, out_m in (("bowl_1", TRAVEL_M / 2), ("mug_1", TRAVEL_M / 2), ("book_1", 0.0)):
         moved = objects[name].pose_world_asset.inverse() @ changed[name].pose_world_asset
         assert moved.position_m == pytest.approx((0.0, out_m, 0.0))
+
+
+def test_a_drawer_bumps_into_what_stands_before_it_unless_it_stands_off() -> None:
+    objects, assets = cabinet_with_a_bowl_in_its_lower_drawer()
+    for off_m, expected in ((0.2, {"book_9"}), (0.6, set())):
+        block = make.block("book", "book.n.02", (0.2, 0.15, 0.4), {})
+        block = dataclasses.replace(block, asset_id="tall-book")
+        before = placed("book_9", block, "kitchen_0", upright(4.0, 0.26 + 0.25 + off_m, 0.0, block))
+        scene = scene_of(
+            "drawers", [*((item, assets[item.asset_id]) for item in objects.values()), (before, block)]
+        )
+        solids = Solids.of_scene(scene)
+        assert bumped_into(scene, solids, "cabinet_1", (1.0, 1.0)) == expected
 
 
 def test_a_drawer_that_is_shut_again_brings_its_things_back() -> None:
