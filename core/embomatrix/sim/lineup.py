@@ -63,6 +63,12 @@ class Lineup:
         """Some of the poses, in the order of ``rows``."""
         return Lineup(self.lows_m[rows], self.highs_m[rows])
 
+    def raised_over(self, height_m: float) -> Lineup:
+        """The boxes as high up as they must come on their way, those that begin lower over a height."""
+        rise = np.zeros_like(self.lows_m)
+        rise[:, 2] = np.maximum(height_m - self.lows_m[:, 2], 0.0)
+        return Lineup(self.lows_m + rise, self.highs_m + rise)
+
     def around(self) -> Aabb:
         """Smallest box that holds all of them; there must be one."""
         (a, b, c), (d, e, f) = self.lows_m.min(axis=0).tolist(), self.highs_m.max(axis=0).tolist()

@@ -11,6 +11,7 @@ from embomatrix.sim.bounds import IDENTITY, bounds_of, parts_of
 from embomatrix.sim.candidates import candidates
 from embomatrix.sim.engine import FLOOR, TOLERANCE_M
 from embomatrix.sim.lineup import Neighbours
+from embomatrix.sim.navigation import has_front
 from embomatrix.sim.past_leaves import behind_leaves
 from embomatrix.sim.repertoire import Repertoire
 from embomatrix.sim.spots import is_shut, is_upright, link_frame, links_with_spots
@@ -40,6 +41,8 @@ LIVE_TRIES: Final = 64
 """Candidates looked at beyond the cached ones."""
 LIVE_SETTLES: Final = 8
 """How many of them are simulated at most."""
+HIGH_RIM_M: Final = ROBOT.reach_high_m - ROBOT.extent_m / 2
+"""Over a rim that is no higher than this the arm lifts whatever it can hold."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,9 +202,9 @@ class Placer:
             return
         held, margin_m = errand.held, NEAR_M
         boxes = spots.lineup(bounds_of(self._scene.asset_of(held)), self._engine.joints(held), frames)
-        reached = self._served(boxes, errand.target, errand.robot)
+        reached = self._served(errand, boxes, errand.robot)
         for stand in errand.passed_over:
-            reached &= ~self._served(boxes, errand.target, stand)
+            reached &= ~self._served(errand, boxes, stand)
         flags = reached.tolist()
         rows = [number for number in order if flags[number]]
         if not rows:
@@ -223,13 +226,16 @@ class Placer:
             if close and not full:
                 yield number, near[nearest]
 
-    def _served(self, boxes: Lineup, target: str, stand: StandPose) -> BoolArray:
-        """Which boxes, shape (n,), the arm reaches from a standing pose, past what doors of the target stand open."""
+    def _served(self, errand: Errand, boxes: Lineup, stand: StandPose) -> BoolArray:
+        """Which boxes, shape (n,), the arm reaches from a standing pose, over the target's rim and past its open doors."""
+        target = errand.target
+        asset, fractions = self._scene.asset_of(target), self._engine.joints(target)
         reached = boxes.reached_from(stand)
-        fractions = self._engine.joints(target)
+        rim_m = self._engine.aabb(target).high_m[2]
+        if errand.relation is Relation.INSIDE and rim_m > HIGH_RIM_M and not has_front(asset):
+            reached &= boxes.raised_over(rim_m).reached_from(stand)
         if any(fractions):
-            asset, pose = self._scene.asset_of(target), self._engine.pose(target)
-            reached &= ~behind_leaves(boxes, asset, pose, fractions, stand)
+            reached &= ~behind_leaves(boxes, asset, self._engine.pose(target), fractions, stand)
         return reached
 
     def _neighbours(self, names: Sequence[str]) -> Neighbours:

@@ -127,3 +127,12 @@ def test_a_box_is_turned_by_right_angles_as_its_solid_is(box, x, y, quarters) ->
 @pytest.mark.parametrize("quat", [(0.1, 0.0, 0.0, math.sqrt(0.99)), (0.0, 0.0, 0.1, math.sqrt(0.99))])
 def test_a_box_is_not_turned_by_any_other_angle(quat) -> None:
     assert square_box(Aabb((0.0, 0.0, 0.0), (1.0, 2.0, 3.0)), Pose((0.0, 0.0, 0.0), quat)) is None
+
+
+@given(st.lists(BOX, min_size=1, max_size=5), COORDINATE)
+def test_raised_boxes_begin_over_the_height_and_rise_no_farther(boxes, height) -> None:
+    raised = lineup_of(boxes).raised_over(height)
+    for box, low, high in zip(boxes, raised.lows_m, raised.highs_m, strict=True):
+        assert low[2] == pytest.approx(max(box.low_m[2], height))
+        assert (high - low).tolist() == pytest.approx(box.size_m)
+        assert low[:2].tolist() == list(box.low_m[:2])

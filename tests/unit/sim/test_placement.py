@@ -1,5 +1,7 @@
 """Placing: the first verified pose that is free and in reach, or a reason."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from tests.fakes.scenes import kitchen_scene
@@ -149,3 +151,21 @@ def test_reach_is_measured_to_the_nearest_point_of_the_box() -> None:
     assert in_reach(Aabb((1.09, -1.0, 0.5), (1.5, 1.0, 0.6)), robot)
     assert not in_reach(Aabb((1.11, -1.0, 0.5), (1.5, 1.0, 0.6)), robot)
     assert not in_reach(Aabb((0.5, -1.0, 2.0), (1.5, 1.0, 2.2)), robot)
+
+
+@pytest.mark.parametrize(("rim_m", "is_found"), [(1.5, True), (1.99, False)])
+def test_what_goes_into_an_open_bowl_must_get_over_its_rim_within_reach(rim_m, is_found) -> None:
+    scene = kitchen_scene()
+    bowl = scene.asset_of("bowl_1")
+    open_bowl = replace(bowl, supports=tuple(replace(item, clearance_m=2.0) for item in bowl.supports))
+    pool = ClientPool()
+    engine = BulletEngine(replace(scene, assets={**scene.assets, bowl.asset_id: open_bowl}), pool)
+    raised = Pose((0.0, 0.0, rim_m - engine.aabb("bowl_1").high_m[2])) @ engine.pose("bowl_1")
+    engine.set_pose("bowl_1", raised)
+    engine.park("apple_1")
+    x, y, _ = raised.position_m
+    placer = Placer(engine, Relations(engine), PoseCache())
+    found = placer.find("apple_1", "bowl_1", Relation.INSIDE, StandPose(x - 0.5, y, 0.0))
+    assert isinstance(found, Pose) if is_found else found is FailureReason.NO_FREE_POSE
+    engine.close()
+    pool.close()
