@@ -62,7 +62,7 @@ class ScheduleLimits:
     scene_mb: float = 64.0
     """Memory of a scene that no worker has loaded yet."""
     affinity_wait_s: float = 0.5
-    """Rollouts wait this long for a worker that has their scene, or as long as loading it takes, before idle ones load it."""
+    """Rollouts wait as long as loading their scene takes before idle workers load it too; this long while that isn't known."""
     retry_load_s: float = 10.0
     """A worker that failed to load a scene is not asked again for this long."""
 
@@ -72,18 +72,23 @@ class Window:
 
     def __init__(self, version: int, entries: tuple[LookaheadEntry, ...]) -> None:
         self.version = version
-        self.entries = entries
-        self.scenes = {entry.bundle_digest for entry in entries}
+        self._steps: dict[int, dict[str, list[LookaheadEntry]]] = {}
+        for entry in entries:
+            self._steps.setdefault(entry.step, {}).setdefault(entry.bundle_digest, []).append(entry)
 
-    def after(self, batch: Batch) -> Window:
-        """Without the steps before the batch's, and of its own step without its scenes: the other groups are still to come."""
-        here = {rollout.bundle_digest for rollout in batch.rollouts}
-        coming = tuple(
-            entry
-            for entry in self.entries
-            if entry.step > batch.step or (entry.step == batch.step and entry.bundle_digest not in here)
-        )
-        return self if len(coming) == len(self.entries) else Window(self.version, coming)
+    @property
+    def entries(self) -> tuple[LookaheadEntry, ...]:
+        return tuple(entry for step in self._steps.values() for found in step.values() for entry in found)
+
+    def announces(self, scene: str) -> bool:
+        return any(scene in step for step in self._steps.values())
+
+    def come(self, batch: Batch) -> None:
+        """Drop the steps before the batch's, and of its own step its scenes: the other groups are still to come."""
+        for step in [step for step in self._steps if step < batch.step]:
+            del self._steps[step]
+        for scene in {rollout.bundle_digest for rollout in batch.rollouts}:
+            self._steps.get(batch.step, {}).pop(scene, None)
 
 
 class Scheduler:
@@ -200,7 +205,7 @@ class Scheduler:
                 urgency = Urgency.NOW
         window = self.windows.get(batch.run_id)
         if window is not None:
-            self.windows[batch.run_id] = window.after(batch)
+            window.come(batch)
         return urgency
 
     def _on_worker(
@@ -281,7 +286,7 @@ class Scheduler:
         """One worker more for a scene whose rollouts wait while others are idle, unless one is loading it already."""
         scene = need.bundle_digest
         waited_s = self._demand.waited_s.get(scene, 0.0)
-        if waited_s >= max(self._limits.affinity_wait_s, self.load_s(scene)):
+        if waited_s >= (self.load_s(scene) or self._limits.affinity_wait_s):
             told = [holder for holder in self._holders.having(scene) if scene in (holder.desired or ())]
             loading = any(scene not in holder.warm_since_s for holder in told)
             if not loading and not self._demand.idle <= {holder.worker_id for holder in told}:
@@ -331,7 +336,7 @@ class Scheduler:
         return SetDesired(name, scenes)
 
     def _announcer(self, scene: str) -> str | None:
-        return next((run_id for run_id, window in self.windows.items() if scene in window.scenes), None)
+        return next((run_id for run_id, window in self.windows.items() if window.announces(scene)), None)
 
 
 def _learned(before: float, measured: float) -> float:

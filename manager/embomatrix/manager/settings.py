@@ -58,7 +58,7 @@ class ManagerSettings(BaseModel):
     no_capacity_s: float = Field(60.0, gt=0)
     """How long rollouts wait while no worker could take them."""
     affinity_wait_s: float = Field(0.5, ge=0)
-    """How long rollouts wait for workers that have their scene before idle ones load it."""
+    """How long rollouts wait for workers that have their scene before idle ones load it, while its load time isn't known."""
     max_attempts: int = Field(3, ge=1)
     """Started leases of one rollout before it ends as an infrastructure failure."""
     results_ttl_s: float = Field(3600.0, gt=0)

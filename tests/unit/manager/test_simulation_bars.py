@@ -1,5 +1,6 @@
 """Time bars of a cluster, on the simulator's clock: the manager's own decisions, and machines that fail when they are told."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -109,15 +110,24 @@ def test_a_drained_worker_gets_nothing_new_and_costs_no_attempt():
     assert report.stats.redispatched == report.infra_failures == 0
 
 
-def test_unlike_workers_finish_within_a_quarter_of_the_bound():
+@pytest.mark.parametrize("slow", [0.0, 0.125])
+def test_unlike_workers_finish_within_a_quarter_of_the_bound(slow):
+    """One of the eight may be ten times slower than it says."""
     kinds = tuple(
         MachineKind(f"{slots} slots", 1.0, slots, 2048, 1.0, 0.0005, 100.0) for slots in (8, 4, 2, 1)
     )
-    scenario = replace(BUSY, workers=8, kinds=kinds, scenes=Scenes(count=200, load_s=0.2))
+    scenario = replace(
+        BUSY,
+        workers=8,
+        kinds=kinds,
+        scenes=Scenes(count=200, load_s=0.2),
+        faults=Faults(slow_workers=slow),
+    )
     simulation = Simulation(scenario)
     speed = sum(worker.machine.resources.slots * worker.machine.speed for worker in simulation.workers)
     report = simulation.run()
-    bound_s = ROLLOUTS * 0.5 * 1.02 / speed
+    # The mean of a log-normal duration is above its median by exp(spread² / 2).
+    bound_s = ROLLOUTS * 0.5 * math.exp(0.2**2 / 2) / speed
     assert report.elapsed_s <= 1.25 * bound_s
 
 

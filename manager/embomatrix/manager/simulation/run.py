@@ -50,7 +50,9 @@ class Report:
     utilisation: float
     """Share of the slots' time in which they executed something, from the first step's begin on."""
     pressed_utilisation: float
-    """The same, while at least as many rollouts were open as there are slots; 1 when that never was."""
+    """The same, while at least as many rollouts were open as there are slots, after the first step of each run."""
+    stall: float
+    """Share of the time after that in which trainers waited for nothing but results."""
     foretold: int
     """Groups after the first step of their run: their scenes could be announced in time."""
     hit_rate: float
@@ -73,11 +75,6 @@ class Report:
     def waste(self) -> float:
         """Share of the loads that no rollout ever used."""
         return self.loads_unused / self.loads if self.loads else 0.0
-
-    @property
-    def stall(self) -> float:
-        """Share of the time in which trainers waited for nothing but results."""
-        return sum(self.waits_s) / (self.elapsed_s * len(self.scenario.trainers))
 
     @property
     def cpu_us_per_rollout(self) -> float:
@@ -151,8 +148,8 @@ class Simulation:
         return all(trainer.done for trainer in self._trainers)
 
     def _look(self) -> None:
-        open_now = self._auditor.open_rollouts
-        if open_now >= self._setting.slots:
+        warmed_up = all(trainer.warmed_up for trainer in self._trainers)
+        if warmed_up and self._auditor.open_rollouts >= self._setting.slots:
             at_work = sum(worker.slots.executing for worker in self.workers if worker.slots is not None)
             self._gauge.pressed.append((at_work, self._setting.slots))
         self.agenda.after(SAMPLE_S, self._look)
@@ -181,6 +178,7 @@ class Simulation:
             queued_p99_s=quantile(queued, 0.99),
             utilisation=gauge.busy_s / (elapsed_s * self._setting.slots),
             pressed_utilisation=at_work / there,
+            stall=fmean(t.waited_s / (t.ended_s - t.warmed_up_s) for t in self._trainers),
             foretold=gauge.foretold,
             hit_rate=gauge.warm / gauge.foretold if gauge.foretold else 1.0,
             loads=gauge.loads,

@@ -35,6 +35,10 @@ class SimulatedTrainer:
         self.plan = plan
         self.done = False
         self.ended_s = 0.0
+        self.warmed_up_s = plan.start_s
+        """When its first step was over, which nobody could announce in time; where there is only one, when it began."""
+        self.waited_s = 0.0
+        """Since then: from the last submission of each step to its last result."""
         self.first_result_s = math.inf
         """From the first submission to the first result."""
         self._agenda = agenda
@@ -49,6 +53,10 @@ class SimulatedTrainer:
         self._sent_s = 0.0
         front.open_run(plan.name, self._take)
         agenda.after(plan.start_s, self._begin_step)
+
+    @property
+    def warmed_up(self) -> bool:
+        return self._step > 0 or self.plan.steps == 1
 
     def _begin_step(self) -> None:
         plan, step = self.plan, self._step
@@ -98,6 +106,10 @@ class SimulatedTrainer:
         self._starts_s.clear()
         self._warm.clear()
         self._gauge.waits_s.append(self._agenda.now_s - self._sent_s)
+        if self._step or self.plan.steps == 1:
+            self.waited_s += self._agenda.now_s - self._sent_s
+        else:
+            self.warmed_up_s = self._agenda.now_s
         self._step += 1
         if self._step < self.plan.steps:
             self._agenda.after(self.plan.update_s, self._begin_step)
