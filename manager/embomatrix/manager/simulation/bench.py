@@ -82,6 +82,7 @@ def bench_simulated_cluster(
     (out / "simulated_manager.svg").write_text(_manager_page(workers, flights), encoding="utf-8")
     return [
         *_flight_figures(flights),
+        *_worker_figures(workers["own network"]),
         *_saturation_figures(workers["own network"]),
         *_lookahead_figures(ahead),
         _figure("sim_simulations", bench.simulations, "count", "higher", bench.simulations),
@@ -187,6 +188,18 @@ def _flight_figures(flights: Mapping[int, Report]) -> list[dict[str, Any]]:
     return figures
 
 
+def _worker_figures(reports: Mapping[float, Report]) -> list[dict[str, Any]]:
+    figures = []
+    for count, report in reports.items():
+        workers, rollouts = f"{int(count):,} workers", report.delivered
+        figures += [
+            _figure(f"sim_cpu_us, {workers}", report.cpu_us_per_rollout, "µs", "lower", rollouts),
+            _figure(f"sim_slots_at_work, {workers}", report.pressed_utilisation, "share", "higher", rollouts),
+            _figure(f"sim_stall, {workers}", report.stall, "share", "lower", rollouts),
+        ]
+    return figures
+
+
 def _saturation_figures(reports: Mapping[float, Report]) -> list[dict[str, Any]]:
     """What one core can decide: what is left of it beside what the workers' mere presence costs, over a rollout's cost."""
     most = int(max(reports))
@@ -199,9 +212,6 @@ def _saturation_figures(reports: Mapping[float, Report]) -> list[dict[str, Any]]
     present_s = sum(costs[kind].total_s for kind in ("heartbeat", "tick") if kind in costs)
     share = present_s / (report.elapsed_s + report.scenario.trainers[0].start_s)
     return [
-        _figure(
-            f"sim_cpu_us, {most:,} workers", report.cpu_us_per_rollout, "µs", "lower", report.delivered, None
-        ),
         _figure(f"sim_presence, {most:,} workers", share, "share", "lower", most, None),
         _figure(
             f"sim_saturation_rollouts_per_s, {most:,} workers",
