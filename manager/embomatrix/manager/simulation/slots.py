@@ -94,7 +94,7 @@ class SimulatedSlots:
         )
 
     def stop(self) -> None:
-        """The process ended: what it loaded and did not use was in vain."""
+        """The process ended: nothing of what it had begun happens any more."""
         self._stopped = True
         self._running.clear()
         self._waiting.clear()
@@ -102,7 +102,7 @@ class SimulatedSlots:
     def count_unused(self) -> None:
         """The simulation is over: note what was loaded and never used."""
         for scene in self._scenes.values():
-            self._around.gauge.loads_unused += not scene.last_used
+            self._around.gauge.loads_unused += scene.state is ResidentState.WARM and not scene.last_used
 
     def want(self, digests: tuple[str, ...]) -> None:
         self._wanted = digests

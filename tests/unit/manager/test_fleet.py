@@ -1,0 +1,75 @@
+"""Workers in a large cluster: found by scene, by free slots and by backlog, without looking at all of them."""
+
+from embomatrix.manager.fleet import CANDIDATES, THIEVES, Fleet
+from embomatrix.manager.ledger import LeaseRecord, RolloutKey, RolloutRecord
+from embomatrix.rpc.values import LeaseRef, Rollout
+
+MANY = 3 * CANDIDATES
+
+
+def fleet_of(count, scene="kitchen"):
+    """So many workers with one slot each, all with the scene warm."""
+    fleet = Fleet()
+    for index in range(count):
+        fleet.join(f"w{index:04d}", 1)
+        worker = fleet.workers[f"w{index:04d}"]
+        worker.reported = True
+        fleet.stand(worker)
+        fleet.set_warm(worker, [scene])
+    return fleet
+
+
+def load(fleet, worker_id, leases, given_s=0.0):
+    worker = fleet.workers[worker_id]
+    for _ in range(leases):
+        name = f"{worker_id}.{len(worker.held)}"
+        rollout = Rollout(name, "g", "kitchen", "t", (), 0)
+        record = RolloutRecord(RolloutKey("r", "b", name), rollout, 0, 0.0, True)
+        fleet.hold(worker, LeaseRecord(LeaseRef(name, 1), worker_id, record, given_s, 30.0, 180.0))
+
+
+def test_the_only_one_of_many_holders_with_a_credit_is_found():
+    fleet = fleet_of(MANY)
+    for worker_id in list(fleet.workers)[:-1]:
+        load(fleet, worker_id, 2)
+    assert fleet.best_for("kitchen").worker_id == f"w{MANY - 1:04d}"
+    load(fleet, f"w{MANY - 1:04d}", 2)
+    assert fleet.best_for("kitchen") is None
+
+
+def test_all_of_many_holders_get_their_turn():
+    fleet = fleet_of(MANY)
+    chosen = []
+    for _ in range(MANY):
+        chosen.append(fleet.best_for("kitchen").worker_id)
+        load(fleet, chosen[-1], 1)
+    assert len(set(chosen)) == MANY
+
+
+def test_an_idle_worker_finds_a_lease_behind_a_busy_slot():
+    fleet = fleet_of(2)
+    load(fleet, "w0000", 2, given_s=1.0)
+    thief = fleet.workers["w0001"]
+    assert fleet.thieves() == ["w0001"]
+    assert fleet.waiting_behind(thief, before_s=0.5) is None
+    assert fleet.waiting_behind(thief, before_s=1.0).ref.lease_id == "w0000.1"
+
+
+def test_different_idle_workers_are_asked_each_time_and_none_while_nobody_waits():
+    fleet = fleet_of(2 * THIEVES + 1)
+    assert fleet.thieves() == []
+    load(fleet, "w0000", 2)
+    first, second = fleet.thieves(), fleet.thieves()
+    assert len(set(first) | set(second)) == 2 * THIEVES
+
+
+def test_a_worker_that_drains_or_is_suspected_is_neither_live_nor_idle():
+    fleet = fleet_of(3)
+    fleet.workers["w0000"].draining = True
+    fleet.workers["w0001"].suspect = True
+    for worker in fleet.workers.values():
+        fleet.stand(worker)
+    assert fleet.live == 1
+    assert fleet.idle == {"w0002"}
+    fleet.leave("w0002")
+    assert (fleet.live, fleet.idle) == (0, frozenset())
