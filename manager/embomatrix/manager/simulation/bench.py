@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from embomatrix.manager.simulation.scenario import Scenario
     from embomatrix.manager.simulation.sweeps import Sweep
 
-FLIGHTS: Final = {512: 64, 4_096: 512, 16_000: 2_000}
-"""Rollouts in flight, and the workers that execute them."""
+FLIGHTS: Final = {512: 32, 4_096: 256, 16_000: 1_000}
+"""Rollouts in flight, and the workers of eight slots that execute them: two rollouts for each slot."""
 LOOKAHEADS: Final = (0, 1, 2, 4)
 MOST_CPU_US: Final = 150.0
 
@@ -31,7 +31,7 @@ class Measure:
     """One row of charts: what is read off a report."""
 
     title: str
-    value: Callable[[Report], float]
+    value: Callable[[Report], float | None]
     mark: float | None = None
 
 
@@ -170,20 +170,11 @@ def _dearest_kinds(reports: Mapping[float, Report]) -> list[str]:
 def _flight_figures(flights: Mapping[int, Report]) -> list[dict[str, Any]]:
     figures = []
     for count, report in flights.items():
-        rollouts = report.delivered
+        what, rollouts = f"{count:,} in flight", report.delivered
         figures += [
-            _figure(
-                f"sim_cpu_us, {count:,} in flight", report.cpu_us_per_rollout, "µs", "lower", rollouts, 150
-            ),
-            _figure(f"sim_first_result_s, {count:,} in flight", report.first_result_s, "s", "lower", 1, None),
-            _figure(
-                f"sim_slots_at_work, {count:,} in flight",
-                report.pressed_utilisation,
-                "share",
-                "higher",
-                rollouts,
-                0.8,
-            ),
+            _figure(f"sim_cpu_us, {what}", report.cpu_us_per_rollout, "µs", "lower", rollouts, MOST_CPU_US),
+            _figure(f"sim_first_result_s, {what}", report.first_result_s, "s", "lower", 1),
+            *_at_work(what, report, 0.8),
         ]
     return figures
 
@@ -194,7 +185,7 @@ def _worker_figures(reports: Mapping[float, Report]) -> list[dict[str, Any]]:
         workers, rollouts = f"{int(count):,} workers", report.delivered
         figures += [
             _figure(f"sim_cpu_us, {workers}", report.cpu_us_per_rollout, "µs", "lower", rollouts),
-            _figure(f"sim_slots_at_work, {workers}", report.pressed_utilisation, "share", "higher", rollouts),
+            *_at_work(workers, report),
             _figure(f"sim_stall, {workers}", report.stall, "share", "lower", rollouts),
         ]
     return figures
@@ -249,6 +240,14 @@ def _lookahead_figures(ahead: Mapping[int, Report]) -> list[dict[str, Any]]:
                 )
             )
     return figures
+
+
+def _at_work(what: str, report: Report, goal: float | None = None) -> list[dict[str, Any]]:
+    """Nothing where there was never work for all slots at once."""
+    share = report.pressed_utilisation
+    if share is None:
+        return []
+    return [_figure(f"sim_slots_at_work, {what}", share, "share", "higher", report.delivered, goal)]
 
 
 def _figure(

@@ -23,11 +23,11 @@ GRID: Final = "#ddd"
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """One chart. ``lines`` hold the values of each series by x; ``most`` is the top of the axis where one is natural."""
+    """One chart. ``lines`` hold the values of each series by x, None where nothing was measured; ``most`` tops the axis."""
 
     title: str
     x_label: str
-    lines: Mapping[str, Mapping[float, float]]
+    lines: Mapping[str, Mapping[float, float | None]]
     x_logarithmic: bool = False
     y_logarithmic: bool = False
     percent: bool = False
@@ -109,7 +109,9 @@ def _panel(panel: Panel, colours: Mapping[str, str]) -> list[str]:
             f'<path d="M{LEFT} {at:.1f}H{WIDTH - RIGHT}" stroke="{INK}" stroke-dasharray="4 3" stroke-opacity=".6"/>'
         )
     for name, line in panel.lines.items():
-        parts += _line([(x.px(at), y.px(value)) for at, value in sorted(line.items())], colours[name])
+        parts += _line(
+            [(x.px(at), y.px(line[at] or 0.0)) for at in sorted(line) if line[at] is not None], colours[name]
+        )
     return parts
 
 
@@ -121,7 +123,7 @@ def _line(points: Sequence[tuple[float, float]], colour: str) -> list[str]:
 
 def _scales(panel: Panel) -> tuple[_Scale, _Scale]:
     xs = [x for line in panel.lines.values() for x in line]
-    ys = [y for line in panel.lines.values() for y in line.values()]
+    ys = [y for line in panel.lines.values() for y in line.values() if y is not None]
     ys += [] if panel.mark is None else [panel.mark]
     most = max(ys) if panel.most is None else panel.most
     least = 0.0

@@ -49,8 +49,8 @@ class Report:
     queued_p99_s: float
     utilisation: float
     """Share of the slots' time in which they executed something, from the first step's begin on."""
-    pressed_utilisation: float
-    """The same, while at least as many rollouts were open as there are slots, after the first step of each run."""
+    pressed_utilisation: float | None
+    """The same, while at least as many rollouts were open as there are slots, after each run's first step; None if never."""
     stall: float
     """Share of the time after that in which trainers waited for nothing but results."""
     foretold: int
@@ -161,9 +161,7 @@ class Simulation:
         began_s = min(plan.start_s for plan in self._scenario.trainers)
         elapsed_s = max(trainer.ended_s for trainer in self._trainers) - began_s
         gauge = self._gauge
-        at_work, there = (
-            (sum(column) for column in zip(*gauge.pressed, strict=True)) if gauge.pressed else (1, 1)
-        )
+        at_work, there = (sum(column) for column in zip((0, 0), *gauge.pressed, strict=True))
         queued = sorted(gauge.queued_s)
         return Report(
             scenario=self._scenario,
@@ -177,7 +175,7 @@ class Simulation:
             queued_p50_s=quantile(queued, 0.5),
             queued_p99_s=quantile(queued, 0.99),
             utilisation=gauge.busy_s / (elapsed_s * self._setting.slots),
-            pressed_utilisation=at_work / there,
+            pressed_utilisation=at_work / there if there else None,
             stall=fmean(t.waited_s / (t.ended_s - t.warmed_up_s) for t in self._trainers),
             foretold=gauge.foretold,
             hit_rate=gauge.warm / gauge.foretold if gauge.foretold else 1.0,

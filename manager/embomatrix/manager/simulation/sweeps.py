@@ -40,13 +40,13 @@ def sweeps(most_workers: int) -> list[Sweep]:
 def in_flight(workers: int, rollouts: int) -> Scenario:
     """So many rollouts at once on so many servers with 8 slots: what the manager's CPU is measured with."""
     trainer = Trainer(
-        steps=2, groups=rollouts // GROUP, group_size=GROUP, write_s=2.0, update_s=1.0, start_s=10.0
+        steps=2, groups=rollouts // GROUP, group_size=GROUP, write_s=0.0, update_s=1.0, start_s=10.0
     )
     return Scenario(
         workers=workers,
         kinds=(LOCAL,),
         scenes=Scenes(count=max(200, 2 * trainer.groups)),
-        execute_s=max(1.0, rollouts / (8 * workers)),
+        execute_s=1.0,
         execute_spread=0.3,
         trainers=(trainer,),
         join_s=8.0,
@@ -76,7 +76,7 @@ def _sweep(name: str, axis: str, scenarios: Mapping[float, Scenario], *, logarit
 def _cluster(workers: int) -> Scenario:
     """Trainers write and update between steps, and in each there is more than a rollout for each slot."""
     # The largest clusters take fewer and smaller steps: what a step costs is the same in each.
-    steps, each = (6, 15) if workers <= 300 else (2, 15) if workers <= 1_000 else (2, 9)
+    steps, each = (6, 15) if workers <= 300 else (2, 15) if workers <= 3_000 else (2, 9)
     groups = max(2, workers * each // GROUP)
     trainer = Trainer(
         steps=steps, groups=groups, group_size=GROUP, lookahead=2, write_s=2.0, update_s=2.0, start_s=12.0
