@@ -57,6 +57,10 @@ class Mover:
         """Move through postures, as ``follow`` does, where nothing is to be touched: time passes in coarser steps."""
         return self._along(postures, 1.0, self._world.glide, None)
 
+    def drive(self, postures: FloatArray) -> str | None:
+        """Move the base through postures, as ``follow`` does, with the arm at rest."""
+        return self._along(postures, 1.0, self._world.roll, None)
+
     def _along(
         self,
         postures: FloatArray,

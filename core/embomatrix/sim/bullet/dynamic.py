@@ -36,9 +36,9 @@ SLOW_M_S: Final = 0.01
 SLOW_RAD_S: Final = 0.1
 TIP_M: Final = 0.1122
 """From the hand's frame to the fingertips' end."""
-GLIDE_EMPTY: Final = 4
-GLIDE_LOADED: Final = 2
-"""How many steps one step lasts where nothing is to be touched: with an empty hand, and with a load."""
+GLIDE: Final = 2
+ROLL: Final = 4
+"""How many steps one step lasts where nothing is to be touched: while the arm moves, and while an empty robot drives."""
 AWAY_M: Final = -50.0
 """Depth at which things that are not in the world are kept."""
 
@@ -103,8 +103,15 @@ class DynamicWorld:
         self.step(steps)
 
     def glide(self, posture: Posture, steps: int) -> None:
-        """The same in longer steps, which what is held bears less well than an empty hand."""
-        each = GLIDE_LOADED if self._held else GLIDE_EMPTY
+        """The same in longer steps, for where nothing is to be touched."""
+        self._pursue_coarsely(posture, steps, GLIDE)
+
+    def roll(self, posture: Posture, steps: int) -> None:
+        """The same for a drive: longer steps yet with an empty hand, as the base alone is to move."""
+        self._pursue_coarsely(posture, steps, GLIDE if self._held else ROLL)
+
+    def _pursue_coarsely(self, posture: Posture, steps: int, each: int) -> None:
+        """Let steps pass, so many at once."""
         bullet, client = self._bullet, self._client
         bullet.setTimeStep(each * STEP_S, physicsClientId=client)
         # A motor's force becomes an impulse by the length that a step has when it is steered.
