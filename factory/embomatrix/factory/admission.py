@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final, Protocol, TypeVar
 
 from embomatrix.factory.refusal import Refusal, RefusalReason
 from embomatrix.reward.hierarchy import score
-from embomatrix.sim.planner import PlanNotFound
+from embomatrix.sim.planner.oracle import PlanNotFound
 from embomatrix.world.evaluate import evaluate, render, scored_atoms
 from embomatrix.world.goal import Not
 

@@ -13,8 +13,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from embomatrix.factory.assets_cli import app as assets_app
-from embomatrix.factory.importer_batch import Verified, bind_first, verify_first
-from embomatrix.factory.importer_sources import (
+from embomatrix.factory.pipeline.build import DEFAULT_SCENES, BuildSettings, Summary, build_dataset
+from embomatrix.factory.refusal import Refusal
+from embomatrix.factory.scenes.build import build_base_scene
+from embomatrix.factory.task_import.batch import Verified, bind_first, verify_first
+from embomatrix.factory.task_import.sources import (
     SourceError,
     SourceText,
     activity_names,
@@ -22,9 +25,6 @@ from embomatrix.factory.importer_sources import (
     read_file,
     read_jsonl,
 )
-from embomatrix.factory.pipeline import DEFAULT_SCENES, BuildSettings, Summary, build_dataset
-from embomatrix.factory.refusal import Refusal
-from embomatrix.factory.scene_build import build_base_scene
 from embomatrix.sim.engine import EngineMissingError
 from embomatrix.sim.pose_cache import PlacementLibrary
 from embomatrix.world.bddl import BddlError, parse_problem
@@ -35,7 +35,7 @@ from embomatrix.world.task import TaskCategory
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from embomatrix.factory.importer import Imported
+    from embomatrix.factory.task_import.task import Imported
     from embomatrix.world.scene import Scene
 
 app = typer.Typer(

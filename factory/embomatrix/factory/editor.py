@@ -8,12 +8,12 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.assets.library import build_asset
-from embomatrix.factory.furnish_roles import is_portable
-from embomatrix.factory.scene_check import reach_problems
-from embomatrix.factory.scene_clearance import Clearance
-from embomatrix.factory.scene_floor import ReachableFloor, box_of
-from embomatrix.factory.scene_joints import with_joints
-from embomatrix.factory.scene_solids import Solids, placed_parts
+from embomatrix.factory.furnish.roles import is_portable
+from embomatrix.factory.scenes.check import reach_problems
+from embomatrix.factory.scenes.clearance import Clearance
+from embomatrix.factory.scenes.floor import ReachableFloor, box_of
+from embomatrix.factory.scenes.joints import with_joints
+from embomatrix.factory.scenes.solids import Solids, placed_parts
 from embomatrix.sim.candidates import candidates
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.asset import Asset, Link, SupportSurface

@@ -15,15 +15,15 @@ from rich.markup import escape
 from rich.progress import Progress
 from rich.table import Table
 
-from embomatrix.factory.film_pictures import Caption, FilmError, check_suffix, draw_film, write_film
+from embomatrix.factory.pictures.film import Caption, FilmError, check_suffix, draw_film, write_film
 from embomatrix.reward.hierarchy import score, unparsable
 from embomatrix.sim.engine import EngineError
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.facts import FactError
 from embomatrix.sim.film import film_cached
-from embomatrix.sim.physical import PhysicalActor
-from embomatrix.sim.physical_film import film_physical
-from embomatrix.sim.planner import PlanNotFound, find_plan
+from embomatrix.sim.physical.actor import PhysicalActor
+from embomatrix.sim.physical.film import film_physical
+from embomatrix.sim.planner.oracle import PlanNotFound, find_plan
 from embomatrix.skills.parse import PlanError, argument, parse_plan
 from embomatrix.skills.syntax import MAX_PLAN_BYTES, SIGNATURES, Arg
 from embomatrix.world.dataset import Dataset, DatasetError

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from embomatrix.factory.scene_build import build_base_scene
+from embomatrix.factory.scenes.build import build_base_scene
 
 if TYPE_CHECKING:
     from embomatrix.world.scene import Scene

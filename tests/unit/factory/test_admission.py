@@ -4,7 +4,7 @@ import pytest
 
 from embomatrix.factory.admission import Admitted, admit
 from embomatrix.factory.refusal import Refusal, RefusalReason
-from embomatrix.sim.planner import PlanNotFound
+from embomatrix.sim.planner.oracle import PlanNotFound
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.syntax import Plan, Skill, SkillCall
 from embomatrix.skills.trace import Step, Trace

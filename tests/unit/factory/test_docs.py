@@ -7,11 +7,12 @@ from pathlib import Path
 import typer
 from tests.fakes.scenes import kitchen_scene
 
-from embomatrix.factory import cli, play_cli, scene_cli
-from embomatrix.factory.importer import Imported, import_problem
-from embomatrix.factory.importer_reach import HELD
-from embomatrix.factory.importer_sources import SourceText
+from embomatrix.factory import cli, play_cli
 from embomatrix.factory.refusal import RefusalReason
+from embomatrix.factory.scenes import cli as scene_cli
+from embomatrix.factory.task_import.reach import HELD
+from embomatrix.factory.task_import.sources import SourceText
+from embomatrix.factory.task_import.task import Imported, import_problem
 from embomatrix.skills.parse import plan_to_json
 from embomatrix.skills.syntax import Skill, SkillCall
 from embomatrix.world.codec_task import task_to_json

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from embomatrix.factory.editor import PlacementError, PlacementReason, SceneEditor
-from embomatrix.factory.scene_check import check_scene
-from embomatrix.factory.scene_floor import ReachableFloor, box_of
+from embomatrix.factory.scenes.check import check_scene
+from embomatrix.factory.scenes.floor import ReachableFloor, box_of
 from embomatrix.world.state import Relation, State
 
 if TYPE_CHECKING:

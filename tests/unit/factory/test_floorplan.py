@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from embomatrix.factory.floorplan import FloorPlan, plan_floor
-from embomatrix.factory.floorplan_spec import MIN_DOOR_M, DoorSpec, FloorPlanError, RoomSpec
-from embomatrix.factory.floorplan_walls import WALL_HEIGHT_M, WALL_M
-from embomatrix.factory.scene_build import room_spec
+from embomatrix.factory.floorplan.layout import FloorPlan, plan_floor
+from embomatrix.factory.floorplan.spec import MIN_DOOR_M, DoorSpec, FloorPlanError, RoomSpec
+from embomatrix.factory.floorplan.walls import WALL_HEIGHT_M, WALL_M
+from embomatrix.factory.scenes.build import room_spec
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.geometry import Pose
 

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from embomatrix.factory.floorplan import FloorPlan, plan_floor
-from embomatrix.factory.floorplan_spec import DoorSpec, RoomSpec, WindowSpec
-from embomatrix.factory.floorplan_walls import PANE_M, WALL_HEIGHT_M
-from embomatrix.factory.floorplan_windows import GAP_M, HEAD_M, LEAST_SILL_M, sill_and_head
+from embomatrix.factory.floorplan.layout import FloorPlan, plan_floor
+from embomatrix.factory.floorplan.spec import DoorSpec, RoomSpec, WindowSpec
+from embomatrix.factory.floorplan.walls import PANE_M, WALL_HEIGHT_M
+from embomatrix.factory.floorplan.windows import GAP_M, HEAD_M, LEAST_SILL_M, sill_and_head
 from embomatrix.world.geometry import Aabb, Pose
 
 if TYPE_CHECKING:

@@ -8,17 +8,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from embomatrix.factory.floorplan import plan_floor
-from embomatrix.factory.floorplan_spec import RoomSpec
-from embomatrix.factory.furnish import MAX_EQUAL, furnish
-from embomatrix.factory.furnish_groups import room_groups
-from embomatrix.factory.furnish_hosts import hosts_of, kept_behind_doors
-from embomatrix.factory.furnish_panel import panel_of
-from embomatrix.factory.furnish_pieces import REST_GAP_M, Group, Piece, around_table, front_depth_m
-from embomatrix.factory.furnish_roles import HUNG_BOTTOM_M, Role, role_of
-from embomatrix.factory.furnish_space import RoomSpace, Target
-from embomatrix.factory.scene_build import build_base_scene
-from embomatrix.factory.scene_floor import box_of
+from embomatrix.factory.floorplan.layout import plan_floor
+from embomatrix.factory.floorplan.spec import RoomSpec
+from embomatrix.factory.furnish.groups import room_groups
+from embomatrix.factory.furnish.hosts import hosts_of, kept_behind_doors
+from embomatrix.factory.furnish.panel import panel_of
+from embomatrix.factory.furnish.pieces import REST_GAP_M, Group, Piece, around_table, front_depth_m
+from embomatrix.factory.furnish.roles import HUNG_BOTTOM_M, Role, role_of
+from embomatrix.factory.furnish.rooms import MAX_EQUAL, furnish
+from embomatrix.factory.furnish.space import RoomSpace, Target
+from embomatrix.factory.scenes.build import build_base_scene
+from embomatrix.factory.scenes.floor import box_of
 from embomatrix.world.asset import Asset, Joint, JointKind, Link, SupportSurface
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.geometry import Part, Pose, Shape, Vec3
@@ -26,7 +26,7 @@ from embomatrix.world.scene import Doorway, Room, Scene, Window
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
-    from embomatrix.factory.furnish import Furnishing
+    from embomatrix.factory.furnish.rooms import Furnishing
 
 ROOM = Room("kitchen_0", "kitchen", (0.0, 0.0), (4.0, 3.0))
 DOOR = Doorway(("kitchen_0", "hall_0"), (2.0, -0.06), 0.9, 2.0, "x")

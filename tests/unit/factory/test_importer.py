@@ -11,12 +11,13 @@ import pytest
 from tests.fakes.plans import plan_of
 from tests.fakes.scenes import kitchen_scene
 
-from embomatrix.factory.importer import Imported, category_of, import_problem, instruction_of
-from embomatrix.factory.importer_batch import Verified, bind_first, verify
-from embomatrix.factory.importer_binding import bind, check_expressible
-from embomatrix.factory.importer_reach import Horizon
-from embomatrix.factory.importer_scene import with_states
-from embomatrix.factory.importer_sources import (
+from embomatrix.factory.refusal import Refusal, RefusalReason, RefusedError
+from embomatrix.factory.scenes.build import build_base_scene
+from embomatrix.factory.task_import.batch import Verified, bind_first, verify
+from embomatrix.factory.task_import.binding import bind, check_expressible
+from embomatrix.factory.task_import.reach import Horizon
+from embomatrix.factory.task_import.scene import with_states
+from embomatrix.factory.task_import.sources import (
     SourceError,
     SourceText,
     activity_names,
@@ -24,8 +25,7 @@ from embomatrix.factory.importer_sources import (
     read_file,
     read_jsonl,
 )
-from embomatrix.factory.refusal import Refusal, RefusalReason, RefusedError
-from embomatrix.factory.scene_build import build_base_scene
+from embomatrix.factory.task_import.task import Imported, category_of, import_problem, instruction_of
 from embomatrix.sim.engine import FLOOR
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.pose_cache import PlacementLibrary

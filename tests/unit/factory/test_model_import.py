@@ -22,8 +22,8 @@ from embomatrix.factory.importers.convex import MAX_HULLS, MAX_VERTICES, Coacd, 
 from embomatrix.factory.importers.model import Mesh, ModelFileError
 from embomatrix.factory.importers.shelf import read_assets, save_asset
 from embomatrix.factory.importers.urdf import read_urdf
-from embomatrix.factory.scene_build import build_base_scene
-from embomatrix.factory.scene_cli import app as scene_app
+from embomatrix.factory.scenes.build import build_base_scene
+from embomatrix.factory.scenes.cli import app as scene_app
 from embomatrix.world.asset import Credit, JointKind
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.geometry import Aabb, Pose, Shape

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from typer.testing import CliRunner
 
-from embomatrix.factory.pictures import draw_plan
-from embomatrix.factory.pictures_sheet import draw_sheet, draw_views
-from embomatrix.factory.scene_cli import app
+from embomatrix.factory.pictures.scene import draw_plan
+from embomatrix.factory.pictures.sheet import draw_sheet, draw_views
+from embomatrix.factory.scenes.cli import app
 from embomatrix.sim.bullet.camera import render_oblique
 
 if TYPE_CHECKING:

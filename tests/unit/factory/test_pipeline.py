@@ -8,10 +8,10 @@ import pytest
 from typer.testing import CliRunner
 
 from embomatrix.factory.cli import app
-from embomatrix.factory.pipeline import BuildSettings, Summary, build_dataset, split_rooms
-from embomatrix.factory.pipeline_store import BuildStore
-from embomatrix.factory.scene_build import build_base_scene
-from embomatrix.factory.writer import is_heldout_signature
+from embomatrix.factory.pipeline.build import BuildSettings, Summary, build_dataset, split_rooms
+from embomatrix.factory.pipeline.store import BuildStore
+from embomatrix.factory.scenes.build import build_base_scene
+from embomatrix.factory.writer.tasks import is_heldout_signature
 from embomatrix.reward.hierarchy import score
 from embomatrix.sim.executor import Simulator
 from embomatrix.skills.parse import plan_from_json

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from embomatrix.factory.relation_pictures import COLUMNS, PANELS, draw_relations, verdict
+from embomatrix.factory.pictures.relations import COLUMNS, PANELS, draw_relations, verdict
 
 HOLDING = {
     "rests on its top",

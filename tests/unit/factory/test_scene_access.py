@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from embomatrix.factory.scene_access import unserved, without_unserved_cabinets
-from embomatrix.factory.scene_floor import ReachableFloor
-from embomatrix.factory.scene_report import unaccounted
+from embomatrix.factory.scenes.access import unserved, without_unserved_cabinets
+from embomatrix.factory.scenes.floor import ReachableFloor
+from embomatrix.factory.scenes.report import unaccounted
 from embomatrix.world.geometry import Pose
 
 if TYPE_CHECKING:

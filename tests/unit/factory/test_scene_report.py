@@ -12,12 +12,12 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
-from embomatrix.factory.scene_batch import SceneJob, run_batch
-from embomatrix.factory.scene_check import STABLE_SHARE, ProblemKind, check_scene, check_settled
-from embomatrix.factory.scene_cli import app
-from embomatrix.factory.scene_floor import ReachableFloor
-from embomatrix.factory.scene_report import report_of, report_on, unaccounted
-from embomatrix.factory.scene_tables import TABLE_COLUMNS, report_table
+from embomatrix.factory.scenes.batch import SceneJob, run_batch
+from embomatrix.factory.scenes.check import STABLE_SHARE, ProblemKind, check_scene, check_settled
+from embomatrix.factory.scenes.cli import app
+from embomatrix.factory.scenes.floor import ReachableFloor
+from embomatrix.factory.scenes.report import report_of, report_on, unaccounted
+from embomatrix.factory.scenes.tables import TABLE_COLUMNS, report_table
 from embomatrix.world.catalog import Catalog, CatalogError
 from embomatrix.world.codec import scene_from_json
 from embomatrix.world.geometry import Part, Pose, Shape

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from tests.fakes.scenes import kitchen_scene
 
-from embomatrix.factory.writer import Draft, is_heldout_signature, object_table, write_task
-from embomatrix.factory.writer_tables import (
+from embomatrix.factory.writer.tables import (
     HOST_GROUPS,
     MEMBERS,
     NEVER_SWITCHED,
@@ -16,9 +15,10 @@ from embomatrix.factory.writer_tables import (
     groups_for,
     suits,
 )
-from embomatrix.factory.writer_variant import Variant
-from embomatrix.factory.writer_view import SceneView, is_liftable
-from embomatrix.factory.writer_words import refer, room_words, sentence
+from embomatrix.factory.writer.tasks import Draft, is_heldout_signature, object_table, write_task
+from embomatrix.factory.writer.variant import Variant
+from embomatrix.factory.writer.view import SceneView, is_liftable
+from embomatrix.factory.writer.words import refer, room_words, sentence
 from embomatrix.world.bddl import ROOM_TYPES, parse_formula
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.evaluate import objects_of

@@ -8,7 +8,7 @@ from tests.fakes.plans import plan_of, task_over
 from tests.fakes.scenes import kitchen_scene, kitchen_tasks
 
 from embomatrix.sim.executor import Simulator
-from embomatrix.sim.fidelity import (
+from embomatrix.sim.fidelity.compare import (
     Comparison,
     ModeRun,
     PlanKind,
@@ -18,17 +18,17 @@ from embomatrix.sim.fidelity import (
     objects_in,
     run_trial,
 )
-from embomatrix.sim.fidelity_plans import Example, Request, write_trials
-from embomatrix.sim.fidelity_records import (
+from embomatrix.sim.fidelity.plans import Example, Request, write_trials
+from embomatrix.sim.fidelity.records import (
     comparison_from_json,
     comparison_to_json,
     disagreement_to_json,
     trial_from_json,
     trial_to_json,
 )
-from embomatrix.sim.fidelity_report import report_on
-from embomatrix.sim.fidelity_sampler import ROUTINES, SKILLS
-from embomatrix.sim.planner import find_plan
+from embomatrix.sim.fidelity.report import report_on
+from embomatrix.sim.fidelity.sampler import ROUTINES, SKILLS
+from embomatrix.sim.planner.oracle import find_plan
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.syntax import Skill
 from embomatrix.world.bundle import Bundle

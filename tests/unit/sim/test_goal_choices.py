@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from hypothesis import given
 from hypothesis import strategies as st
 
-from embomatrix.sim.goal_choices import choices
+from embomatrix.sim.planner.choices import choices
 from embomatrix.world.evaluate import evaluate
 from embomatrix.world.goal import (
     And,

@@ -8,7 +8,7 @@ from tests.fakes.plans import executed, with_objects
 from tests.fakes.scenes import kitchen_scene, placed, upright
 
 from embomatrix.sim.executor import Simulator
-from embomatrix.sim.physical import MOTIONS, PhysicalActor, physical_simulator
+from embomatrix.sim.physical.actor import MOTIONS, PhysicalActor, physical_simulator
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.library import MISHAPS, reasons_of
 from embomatrix.skills.syntax import Skill

@@ -7,16 +7,15 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from tests.fakes.scenes import kitchen_scene
 
-from embomatrix.sim import physical_arm as arm
-from embomatrix.sim import physical_body as body
 from embomatrix.sim.bullet.dynamic import DynamicWorld
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.navigation import Navigator
-from embomatrix.sim.physical_floor import Floor
-from embomatrix.sim.physical_grasp import cross
-from embomatrix.sim.physical_motion import Mover
-from embomatrix.sim.physical_space import boxes_of, clearance, strikes
-from embomatrix.sim.physical_stage import tucked
+from embomatrix.sim.physical import arm, body
+from embomatrix.sim.physical.floor import Floor
+from embomatrix.sim.physical.grasp import cross
+from embomatrix.sim.physical.motion import Mover
+from embomatrix.sim.physical.space import boxes_of, clearance, strikes
+from embomatrix.sim.physical.stage import tucked
 from embomatrix.sim.relations import Relations
 from embomatrix.world.geometry import Pose
 from embomatrix.world.poses import StandPose
@@ -60,7 +59,7 @@ def test_the_base_the_lift_and_the_heading_carry_the_tool_along():
 
 
 def test_the_folded_arm_keeps_within_the_robots_disc_and_off_its_own_trunk():
-    from embomatrix.sim.physical_stage import TUCKED
+    from embomatrix.sim.physical.stage import TUCKED
     from embomatrix.skills.limits import ROBOT
 
     posture = np.concatenate([[0.0, 0.0, 0.0, 0.0], TUCKED])[None]

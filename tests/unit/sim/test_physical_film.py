@@ -8,8 +8,8 @@ from tests.fakes.plans import plan_of, task_over
 from tests.fakes.scenes import kitchen_scene
 
 from embomatrix.sim.executor import Simulator
-from embomatrix.sim.physical import PhysicalActor
-from embomatrix.sim.physical_film import film_physical
+from embomatrix.sim.physical.actor import PhysicalActor
+from embomatrix.sim.physical.film import film_physical
 from embomatrix.world.bundle import Bundle
 
 

@@ -10,8 +10,8 @@ from tests.fakes import furniture as make
 from tests.fakes.plans import executed, with_objects
 from tests.fakes.scenes import kitchen_scene, placed, upright
 
-from embomatrix.sim.physical import physical_simulator
-from embomatrix.sim.physical_grasp import SHEET_M, grasp_tracks, surface_point
+from embomatrix.sim.physical.actor import physical_simulator
+from embomatrix.sim.physical.grasp import SHEET_M, grasp_tracks, surface_point
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.geometry import Pose
 

@@ -5,15 +5,14 @@ import itertools
 import numpy as np
 import pytest
 
-from embomatrix.sim import physical_arm as arm
-from embomatrix.sim import physical_body as body
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.robot import Posture, RobotBody
-from embomatrix.sim.physical_grasp import facing
-from embomatrix.sim.physical_reach import Held, Reach, Track
-from embomatrix.sim.physical_roadmap import way_between
-from embomatrix.sim.physical_space import boxes_of
-from embomatrix.sim.physical_stage import TOOL, TUCKED
+from embomatrix.sim.physical import arm, body
+from embomatrix.sim.physical.grasp import facing
+from embomatrix.sim.physical.reach import Held, Reach, Track
+from embomatrix.sim.physical.roadmap import way_between
+from embomatrix.sim.physical.space import boxes_of
+from embomatrix.sim.physical.stage import TOOL, TUCKED
 from embomatrix.sim.robot_dimensions import LIFT_M, MAST_TOP_M, SHOULDER_LOW_M
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.geometry import Pose

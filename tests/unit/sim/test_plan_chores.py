@@ -8,7 +8,7 @@ from tests.fakes.household import household_scene
 from tests.fakes.plans import task_over, words_of
 
 from embomatrix.sim.executor import Simulator
-from embomatrix.sim.planner import PlanNotFound, find_plan
+from embomatrix.sim.planner.oracle import PlanNotFound, find_plan
 from embomatrix.skills.syntax import Skill
 from embomatrix.world.bddl import parse_formula
 from embomatrix.world.bundle import Bundle

@@ -7,7 +7,7 @@ from tests.fakes.plans import awkward_scene, task_over, words_of
 from tests.fakes.scenes import kitchen_scene, kitchen_tasks
 
 from embomatrix.sim.executor import Simulator
-from embomatrix.sim.planner import PROOF_SEEDS, PlanNotFound, find_plan
+from embomatrix.sim.planner.oracle import PROOF_SEEDS, PlanNotFound, find_plan
 from embomatrix.sim.pose_cache import build_pose_cache
 from embomatrix.skills.syntax import MAX_STEPS, Skill
 from embomatrix.world.bundle import Bundle

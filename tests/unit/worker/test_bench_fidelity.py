@@ -8,8 +8,8 @@ from tests.fakes.fidelity import clumsy, dying, hanging, raising
 from typer.testing import CliRunner
 
 from embomatrix.sim.executor import Simulator
-from embomatrix.sim.fidelity import PlanKind, Trial
-from embomatrix.sim.fidelity_sampler import SKILLS
+from embomatrix.sim.fidelity.compare import PlanKind, Trial
+from embomatrix.sim.fidelity.sampler import SKILLS
 from embomatrix.skills.parse import parse_plan
 from embomatrix.worker.bench_cli import app
 from embomatrix.worker.bench_fidelity import (

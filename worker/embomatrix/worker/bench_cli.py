@@ -16,8 +16,8 @@ from rich.table import Table
 from embomatrix.rpc.status import ClusterError
 from embomatrix.sim.engine import EngineError
 from embomatrix.sim.executor import Simulator
-from embomatrix.sim.fidelity_report import report_on
-from embomatrix.sim.physical import physical_simulator
+from embomatrix.sim.fidelity.report import report_on
+from embomatrix.sim.physical.actor import physical_simulator
 from embomatrix.worker.bench_cluster import ClusterLoad, bench_cluster_load
 from embomatrix.worker.bench_engine import bench_engine, check_scenes
 from embomatrix.worker.bench_fidelity import (

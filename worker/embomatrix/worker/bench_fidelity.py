@@ -13,15 +13,15 @@ from collections import Counter
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from embomatrix.sim.fidelity import PlanKind
-from embomatrix.sim.fidelity_plans import Example, Request, write_trials
-from embomatrix.sim.fidelity_records import (
+from embomatrix.sim.fidelity.compare import PlanKind
+from embomatrix.sim.fidelity.plans import Example, Request, write_trials
+from embomatrix.sim.fidelity.records import (
     comparison_from_json,
     disagreement_to_json,
     trial_from_json,
     trial_to_json,
 )
-from embomatrix.sim.fidelity_sampler import SKILLS
+from embomatrix.sim.fidelity.sampler import SKILLS
 from embomatrix.skills.parse import PlanError, plan_from_json
 from embomatrix.worker.bench_fidelity_pool import LOST, FidelityPool, Modes, SceneJob
 from embomatrix.worker.bench_figures import BenchError
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from embomatrix.sim.fidelity import Comparison, Trial
+    from embomatrix.sim.fidelity.compare import Comparison, Trial
     from embomatrix.skills.syntax import Skill
     from embomatrix.world.dataset import Dataset, TaskRecord
 

@@ -8,18 +8,18 @@ from typing import TYPE_CHECKING, Final
 
 from rich.table import Table
 
-from embomatrix.sim.fidelity import objects_in, true_atoms
-from embomatrix.sim.fidelity_records import trial_from_json
-from embomatrix.sim.fidelity_report import MANIPULATION, calls_of, report_on
-from embomatrix.sim.fidelity_sampler import SKILLS
+from embomatrix.sim.fidelity.compare import objects_in, true_atoms
+from embomatrix.sim.fidelity.records import trial_from_json
+from embomatrix.sim.fidelity.report import MANIPULATION, calls_of, report_on
+from embomatrix.sim.fidelity.sampler import SKILLS
 from embomatrix.worker.bench_figures import BenchError, Better, Figure
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from embomatrix.sim.executor import Simulator
-    from embomatrix.sim.fidelity import Trial
-    from embomatrix.sim.fidelity_report import FidelityReport
+    from embomatrix.sim.fidelity.compare import Trial
+    from embomatrix.sim.fidelity.report import FidelityReport
     from embomatrix.skills.trace import Step
     from embomatrix.worker.bench_fidelity import Outcome
     from embomatrix.worker.bench_fidelity_pool import Modes

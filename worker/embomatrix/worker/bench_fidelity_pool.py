@@ -13,8 +13,8 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from embomatrix.sim.fidelity import Trial, compare
-from embomatrix.sim.fidelity_records import comparison_to_json, trial_to_json
+from embomatrix.sim.fidelity.compare import Trial, compare
+from embomatrix.sim.fidelity.records import comparison_to_json, trial_to_json
 from embomatrix.world.dataset import Dataset
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ import numpy as np
 
 from embomatrix.sim.bounds import IDENTITY
 from embomatrix.sim.bullet.stage import Stage
-from embomatrix.sim.physical_stage import tucked
+from embomatrix.sim.physical.stage import tucked
 from embomatrix.world.geometry import Pose
 from embomatrix.world.poses import StandPose
 

@@ -1,0 +1,186 @@
+"""The physical mode: every skill is carried out by a robot in a world where time passes.
+
+Preconditions, relations and effects are those of cached mode, read in the same planning scene. What differs is how an
+outcome comes about: the robot drives, reaches, touches, lifts and lets go, and physics says what became of it. A skill that
+fails leaves what it did.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from embomatrix.sim.actions import ACTIONS
+from embomatrix.sim.barriers import no_way_into, no_way_to
+from embomatrix.sim.bullet.dynamic import DynamicWorld
+from embomatrix.sim.executor import Simulator
+from embomatrix.sim.physical.doors import close_all, open_all
+from embomatrix.sim.physical.hands import pick_up
+from embomatrix.sim.physical.place import place
+from embomatrix.sim.physical.press import press
+from embomatrix.sim.physical.stage import Stage
+from embomatrix.sim.physical.travel import drive, travel
+from embomatrix.skills.failure import FailureReason
+from embomatrix.skills.syntax import Skill
+from embomatrix.skills.view import metres, refuse, source_of, target_of
+from embomatrix.world.poses import StandPose
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from embomatrix.sim.live_world import LiveWorld
+    from embomatrix.skills.syntax import SkillCall
+    from embomatrix.skills.view import Refusal
+    from embomatrix.world.bundle import Bundle
+
+    Motion = Callable[[Stage, SkillCall, np.random.Generator], Refusal | None]
+
+
+def physical_simulator(bundle: Bundle) -> Simulator:
+    """A simulator that executes plans physically. Raises EngineError when the scene can't be loaded."""
+    return Simulator(bundle, actor=PhysicalActor(bundle))
+
+
+class PhysicalActor:
+    """Carries out calls with the robot in a dynamic world of its own."""
+
+    drawing = frozenset(Skill)
+
+    def __init__(self, bundle: Bundle) -> None:
+        """Take a physics client; the world is built when a rollout begins."""
+        self._dynamic = DynamicWorld(bundle.scene)
+        self._stage: Stage | None = None
+        self._watch: Callable[[], None] | None = None
+
+    @property
+    def dynamic(self) -> DynamicWorld:
+        """The world in which time passes, for reading."""
+        return self._dynamic
+
+    def watch(self, watch: Callable[[], None] | None) -> None:
+        """Call something after every few steps of simulated time, or nothing any more."""
+        self._watch = watch
+
+    def reset(self, world: LiveWorld) -> None:
+        """Build the dynamic world as the scene is at its start."""
+        self._stage = Stage(world, self._dynamic, self._tick)
+        self._stage.begin()
+
+    def act(self, world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+        """Carry out a call whose preconditions hold, let the world settle, and copy what moved."""
+        assert self._stage is not None
+        refusal = MOTIONS[call.skill](self._stage, call, rng)
+        self._stage.settle()
+        return refusal
+
+    def close(self) -> None:
+        """Free the physics client."""
+        self._dynamic.close()
+
+    def _tick(self) -> None:
+        if self._watch is not None:
+            self._watch()
+
+
+def _move(stage: Stage, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+    world = stage.world
+    target = target_of(world, call)
+    stands = world.navigator.stands(target, world.robot)
+    if stands:
+        return travel(stage, stands[0], target)
+    return no_way_to(world, target)
+
+
+def _turn(stage: Stage, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+    heading, told = _heading(stage, call), stage.told
+    refusal = drive(stage, stage.mover.posture[None, :2], heading)
+    stage.told = StandPose(told.x_m, told.y_m, heading)
+    return refusal
+
+
+def _move_forward(stage: Stage, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+    heading, distance_m = _heading(stage, call), call.distance or 0.0
+    course = heading if distance_m >= 0 else heading + math.pi
+    told = stage.told
+    free_m = stage.world.navigator.forward(told, course, abs(distance_m))
+    if free_m < abs(distance_m):
+        return refuse(FailureReason.BLOCKED, distance=metres(free_m))
+    here = stage.mover.posture[:2]
+    x, y = told.x_m + abs(distance_m) * math.cos(course), told.y_m + abs(distance_m) * math.sin(course)
+    return drive(stage, here[None], heading) or drive(stage, np.array([here, (x, y)]), heading)
+
+
+def _heading(stage: Stage, call: SkillCall) -> float:
+    return math.remainder(stage.told.yaw + math.remainder(call.yaw or 0.0, math.tau), math.tau)
+
+
+def _go_to_room(stage: Stage, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+    room = call.room_name or ""
+    entry = stage.world.navigator.room_entry(room, stage.world.robot)
+    if entry is None:
+        return no_way_into(stage.world, room)
+    return travel(stage, entry)
+
+
+def _pick_up(stage: Stage, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+    return pick_up(stage, target_of(stage.world, call), rng)
+
+
+def _place(stage: Stage, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+    assert call.relation is not None
+    return place(stage, target_of(stage.world, call), call.relation, rng)
+
+
+def _open(stage: Stage, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+    return open_all(stage, target_of(stage.world, call), rng)
+
+
+def _close(stage: Stage, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+    return close_all(stage, target_of(stage.world, call), rng)
+
+
+def _toggle(stage: Stage, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+    """Press the switch; what that means is the same as in cached mode."""
+    return press(stage, target_of(stage.world, call), rng) or ACTIONS[call.skill](stage.world, call, rng)
+
+
+def _work(stage: Stage, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+    """Touch what is cut, wiped or wetted; what that does to it is the same as in cached mode."""
+    world = stage.world
+    target = target_of(world, call)
+    touched = source_of(world, call) if target in world.carried else target
+    free = touched not in world.carried and not world.carried
+    refusal = press(stage, touched, rng) if free else None
+    refusal = refusal or ACTIONS[call.skill](world, call, rng)
+    if refusal is None:
+        stage.bring_in_step()
+    return refusal
+
+
+def _wait(stage: Stage, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+    """The source acts by itself; the world only settles."""
+    stage.mover.wait(60)
+    return None
+
+
+MOTIONS: Final[Mapping[Skill, Motion]] = {
+    Skill.MOVE: _move,
+    Skill.TURN: _turn,
+    Skill.PICK_UP: _pick_up,
+    Skill.PLACE: _place,
+    Skill.MOVE_FORWARD: _move_forward,
+    Skill.OPEN: _open,
+    Skill.CLOSE: _close,
+    Skill.TOGGLE_ON: _toggle,
+    Skill.TOGGLE_OFF: _toggle,
+    Skill.HEAT: _wait,
+    Skill.COOK: _wait,
+    Skill.FREEZE: _wait,
+    Skill.GO_TO_ROOM: _go_to_room,
+    Skill.SLICE: _work,
+    Skill.CLEAN: _work,
+    Skill.SOAK: _work,
+}
+"""One motion for each skill."""

@@ -1,0 +1,116 @@
+"""Ways of the base over the floor, out of the places where a leaf left it, and beside places that are taken."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from embomatrix.sim.obstacles import FLAT_M
+from embomatrix.skills.limits import ROBOT
+from embomatrix.world.poses import StandPose
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from embomatrix.sim.floor_grid import FloorGrid
+    from embomatrix.sim.floor_ways import Cell
+    from embomatrix.sim.navigation import Navigator
+    from embomatrix.sim.physical.space import Boxes
+    from embomatrix.world.geometry import FloatArray, Vec2
+
+OUT_M: Final = 0.45
+OUT_TRIED: Final = 60
+ASIDE_M: Final = 0.9
+"""When a place to stand is taken, one this near does."""
+
+
+class Floor:
+    """The free floor in the planning scene's present state."""
+
+    def __init__(self, navigator: Navigator) -> None:
+        self._navigator = navigator
+
+    @property
+    def grid(self) -> FloorGrid:
+        """Where the base fits now."""
+        return self._navigator.ground.grid
+
+    def cut_off_last(self, bases: Sequence[FloatArray], leaf: Boxes) -> list[FloatArray]:
+        """Places to stand, groups of shape (b, 3), those last that a leaf cuts off when it gets to where some boxes are.
+
+        What is cut off is all but the largest part of the free floor that the place belongs to now.
+        """
+        grid = self.grid
+        after = grid.narrowed(_barring(leaf))
+        first, last = [], []
+        for group in bases:
+            good = np.array([self._stays_joined(grid, after, x, y) for x, y in group[:, :2].tolist()])
+            first.append(group[good])
+            last.append(group[~good])
+        return [group for group in (*first, *last) if len(group)]
+
+    def _stays_joined(self, grid: FloorGrid, after: FloorGrid, x_m: float, y_m: float) -> bool:
+        return after is grid or after.label_at(x_m, y_m) == after.main_part_of(grid, x_m, y_m)
+
+    def way(
+        self, start: Vec2, goal: StandPose, serves: Callable[[StandPose], bool]
+    ) -> tuple[FloatArray, StandPose] | None:
+        """Points, (n, 2), from here to a pose, and that pose; None when there are none.
+
+        Where the pose is taken, the nearest free one that ``serves`` as well is meant, or else the nearest.
+        """
+        grid = self.grid
+        first = self._way_out(start)
+        if first is None:
+            return None
+        end = self._free_near(goal, grid.label(first), serves)
+        last = grid.cell(end.x_m, end.y_m) if end is not None else None
+        corners = grid.path(first, last) if last is not None else None
+        if end is None or corners is None:
+            return None
+        out = () if grid.is_free(*start) else (grid.center(first),)
+        return np.array([start, *out, *corners[1:-1], (end.x_m, end.y_m)]), end
+
+    def _way_out(self, start: Vec2) -> Cell | None:
+        """The free cell to begin at: from beside a door the robot first goes where it fits, not through the door."""
+        grid = self.grid
+        if grid.is_free(*start):
+            return grid.cell(*start)
+        low, high = (start[0] - OUT_M, start[1] - OUT_M), (start[0] + OUT_M, start[1] + OUT_M)
+        spots = grid.all_free_centers(low, high)
+        here = np.array(start)
+        air = self._air(here[None])[0]
+        for number in np.argsort(np.linalg.norm(spots - here, axis=1), kind="stable")[:OUT_TRIED].tolist():
+            line = here + np.linspace(0.2, 1.0, 5)[:, None] * (spots[number] - here)
+            if self._air(line).min() >= min(air, ROBOT.radius_m) - 0.01:
+                return grid.cell(float(spots[number, 0]), float(spots[number, 1]))
+        return grid.cell(*start)
+
+    def _air(self, points: FloatArray) -> FloatArray:
+        """Distance from points, (n, 2), to the nearest obstacle, (n,)."""
+        ground = self._navigator.ground
+        rows = np.concatenate([ground.obstacles.barring, ground.leaves.barring])
+        nearest = np.clip(points[:, None], rows[:, :2], rows[:, 2:4])
+        return np.asarray(np.linalg.norm(points[:, None] - nearest, axis=2).min(axis=1, initial=np.inf))
+
+    def _free_near(
+        self, goal: StandPose, label: int, serves: Callable[[StandPose], bool]
+    ) -> StandPose | None:
+        cell = self.grid.cell(goal.x_m, goal.y_m)
+        if cell is not None and self.grid.is_free(goal.x_m, goal.y_m) and self.grid.label(cell) == label:
+            return goal
+        low, high = (goal.x_m - ASIDE_M, goal.y_m - ASIDE_M), (goal.x_m + ASIDE_M, goal.y_m + ASIDE_M)
+        spots = self.grid.free_centers(low, high, label)
+        away = np.hypot(spots[:, 0] - goal.x_m, spots[:, 1] - goal.y_m)
+        order = [number for number in np.argsort(away, kind="stable").tolist() if away[number] <= ASIDE_M]
+        near = [StandPose(float(spots[number, 0]), float(spots[number, 1]), goal.yaw) for number in order]
+        return next((spot for spot in near[::4] if serves(spot)), near[0] if near else None)
+
+
+def _barring(boxes: Boxes) -> FloatArray:
+    """What of some boxes bars the robot's way: their bounds, rows of low x, low y, high x, high y, low z, high z."""
+    half = np.einsum("mij,mj->mi", np.abs(boxes.rotation), boxes.half)
+    low, high = boxes.centre - half, boxes.centre + half
+    rows = np.column_stack([low[:, :2], high[:, :2], low[:, 2], high[:, 2]])
+    return np.asarray(rows[(rows[:, 4] < ROBOT.height_m) & (rows[:, 5] > FLAT_M)])

@@ -1,0 +1,189 @@
+"""Folding and unfolding: the arm gets to its work and back over the base without touching anything on the way."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from embomatrix.sim.physical import arm, body
+from embomatrix.sim.physical.motion import standing, with_arm
+from embomatrix.sim.physical.reach import AIR_M
+from embomatrix.sim.physical.space import clearance
+from embomatrix.sim.physical.stage import TUCKED, TUCKED_LIFT_M, compact
+from embomatrix.sim.physical.travel import SOMETHING, travel
+from embomatrix.sim.robot_dimensions import SHOULDER_LOW_M
+from embomatrix.skills.failure import FailureReason
+from embomatrix.skills.limits import ROBOT
+from embomatrix.skills.view import refuse
+from embomatrix.world.poses import StandPose
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from embomatrix.sim.physical.reach import Reach, Way
+    from embomatrix.sim.physical.stage import Stage
+    from embomatrix.skills.view import Refusal
+    from embomatrix.world.geometry import FloatArray
+
+BACK_OFF_M: Final = (0.0, 0.3, 0.55)
+"""How far before the place of work the arm is unfolded."""
+RETREATS_M: Final = (0.2, 0.4, 0.6)
+ASIDES: Final = (0.0, 45.0, -45.0, 90.0, -90.0, 135.0, -135.0)
+"""How far, and in which directions in degrees from straight back, the base draws the arm to where there is room to fold."""
+DRAWS: Final = 100
+"""Random postures by which the arm may find its way to be folded: one that stays out bars every way that comes."""
+TURN_RAD: Final = 0.01
+FOLDS: Final = 3
+"""Ways that the arm tries to get folded: what stops it on one shows where the next begins."""
+CARRY_LIFT_M: Final = 0.6
+"""Height of the lift while the robot drives with a load."""
+SURROUNDINGS_M: Final = np.array([0.8, 0.8, 9.0])
+OVER_M: Final = 1.0
+"""Loads are carried higher than this where that is possible: over counters."""
+
+
+def approach(
+    stage: Stage, way: Way, reach: Reach, rng: np.random.Generator, *, loaded: bool
+) -> FloatArray | None:
+    """Postures that lead to the start of a way, (w, 11), None when none are found.
+
+    The arm unfolds where it will work, or some way back from there, whence the base then drives on with the arm ready.
+    """
+    start = way.postures[0]
+    now = stage.mover.posture
+    back = -np.array([math.cos(start[body.YAW]), math.sin(start[body.YAW]), 0.0])
+    for away in BACK_OFF_M:
+        spot = start[:3] + away * back
+        if away and not stage.floor.grid.drives_straight(_pair(spot), _pair(start)):
+            continue
+        swing = reach.transit(standing(now, spot), start, rng, loaded=loaded)
+        if swing is not None:
+            return swing
+    return None
+
+
+def unfold(stage: Stage, swing: FloatArray) -> Refusal | None:
+    """Drive to where a swing begins, and make it."""
+    now = stage.mover.posture
+    turns = abs(math.remainder(now[body.YAW] - swing[0, body.YAW], math.tau)) > TURN_RAD
+    # An arm that stays out sweeps over what is around while the base turns.
+    if math.dist(now[:2], swing[0, :2]) > 0.01 or (turns and not compact(stage, now)):
+        refusal = travel(stage, StandPose(*swing[0, :3].tolist()))
+        if refusal is not None:
+            return refusal
+    hit = stage.mover.sweep(swing)
+    if hit is not None:
+        return refuse(FailureReason.ARM_BLOCKED, target=SOMETHING, other=hit or SOMETHING)
+    return None
+
+
+def _pair(point: FloatArray) -> tuple[float, float]:
+    return float(point[0]), float(point[1])
+
+
+def fold(stage: Stage, home: StandPose, rng: np.random.Generator, target: str = "") -> Refusal | None:
+    """Bring the arm, with what it holds, over the base, and the base back to where it stood to serve a target.
+
+    Where the arm has no room to fold, the base first draws it back. What the hand still touches does not keep it there.
+    """
+    for _ in range(FOLDS):
+        if _drawn_over_base(stage, rng):
+            break
+    now = stage.mover.posture
+    if (
+        math.dist(now[:2], (home.x_m, home.y_m)) > 0.01
+        or abs(math.remainder(now[2] - home.yaw, math.tau)) > 0.01
+    ):
+        return travel(stage, home, target)
+    stage.told = home
+    return None
+
+
+def _drawn_over_base(stage: Stage, rng: np.random.Generator) -> bool:
+    """Whether the arm is over the base, or finds no way there; not where something stopped it on the way it took."""
+    now = stage.mover.posture
+    reach = stage.reach(stage.boxes().drawn_in(*_limbs(stage, now), AIR_M))
+    loaded = stage.grip is not None
+    folded = carrying(stage, now)
+    for spot in _retreats(reach, now, loaded):
+        there = standing(now, spot)
+        swing = reach.transit(there, standing(folded, spot), rng, loaded=loaded, draws=DRAWS)
+        if swing is not None:
+            return stage.mover.sweep(swing) is None
+    return True
+
+
+def _limbs(stage: Stage, now: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Balls of the arm and of what it holds: centres (k, 3) and radii (k,)."""
+    points, radii = body.balls(now[None])[0], body.RADII
+    if stage.grip is not None:
+        points = np.concatenate([points, stage.grip.held.placed(now[None])[0]])
+        radii = np.concatenate([radii, stage.grip.held.radii])
+    return points, radii
+
+
+def _retreats(reach: Reach, now: FloatArray, loaded: bool) -> Iterator[FloatArray]:
+    """Bases, (3,), at which the arm may fold: here, then where the base gets to straight on, back before aside."""
+    yield now[:3]
+    for away, aside in itertools.product(RETREATS_M, ASIDES):
+        course = now[body.YAW] + math.pi + math.radians(aside)
+        spot = now[:3] + away * np.array([math.cos(course), math.sin(course), 0.0])
+        if reach.drives(now, standing(now, spot), loaded=loaded):
+            yield spot
+
+
+def carrying(stage: Stage, now: FloatArray) -> FloatArray:
+    """The posture in which the robot drives: folded when the hand is empty, else with the load upright and near."""
+    if stage.grip is None:
+        folded = with_arm(now, TUCKED)
+        folded[body.LIFT] = TUCKED_LIFT_M
+        return folded
+    rotation, _ = body.tools(now[None])
+    turns, xs, ys, heights = (
+        grid.ravel()
+        for grid in np.meshgrid(
+            np.arange(8) * math.pi / 4,
+            (0.1, 0.2, 0.3, 0.4, 0.5),
+            (-0.25, 0.0, 0.25),
+            (0.1, 0.3, 0.5),
+            indexing="ij",
+        )
+    )
+    count = len(turns)
+    turn = arm.about_z(turns)
+    yaw = arm.about_z(now[None, body.YAW])[0]
+    wanted = turn @ rotation[0]
+    local = np.stack([xs, ys, np.zeros(count)], axis=1)
+    lift = np.full(count, CARRY_LIFT_M)
+    where = local @ yaw.T + np.array([now[0], now[1], 0.0])
+    where[:, 2] = SHOULDER_LOW_M + CARRY_LIFT_M + heights
+    boxes = stage.boxes_within(now[:3] - SURROUNDINGS_M, now[:3] + SURROUNDINGS_M)
+    radii = np.concatenate([body.RADII, stage.grip.held.radii])
+    best, found = math.inf, now
+    for last in (0.785, -0.785, 2.3, -2.3, 1.57):
+        postures = body.solve(wanted, where, np.tile(now[:3], (count, 1)), lift, np.full(count, last))
+        rows = postures.reshape(-1, body.NUMBERS)
+        rows = rows[~np.isnan(rows[:, -1])]
+        if not len(rows):
+            continue
+        load = stage.grip.held.placed(rows)
+        wide = np.linalg.norm(load[:, :, :2] - now[:2], axis=2) + stage.grip.held.radii
+        arms = body.balls(rows)
+        limbs = np.linalg.norm(arms[:, :, :2] - now[:2], axis=2) + body.RADII
+        top = np.maximum(
+            (load[:, :, 2] + stage.grip.held.radii).max(axis=1), (arms[:, :, 2] + body.RADII).max(axis=1)
+        )
+        bottom = (load[:, :, 2] - stage.grip.held.radii).min(axis=1)
+        cost = np.maximum(top - ROBOT.height_m, 0.0) + 0.3 * np.maximum(OVER_M - bottom, 0.0)
+        cost += 0.02 * np.abs(rows[:, 4:] - now[4:]).max(axis=1)
+        cost += np.maximum(wide.max(axis=1), limbs.max(axis=1)) + 0.02 * np.abs(rows[:, 4:] - now[4:]).max(
+            axis=1
+        )
+        cost += np.where(clearance(boxes, np.concatenate([arms, load], axis=1), radii) < AIR_M, 2.0, 0.0)
+        cost = np.where(body.strikes_itself(rows, load, stage.grip.held.radii), math.inf, cost)
+        if cost.min() < best:
+            best, found = float(cost.min()), rows[int(cost.argmin())]
+    return found

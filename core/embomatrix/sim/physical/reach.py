@@ -1,0 +1,351 @@
+"""How the arm gets the tool along a short way: postures in closed form, judged by joint limits and by what is around.
+
+Nothing is searched at random where geometry answers: bases, heights of the lift and angles of the last joint are tried
+together, and of what is left the most comfortable way that is free is taken.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from embomatrix.sim.physical import arm, body
+from embomatrix.sim.physical.roadmap import way_between
+from embomatrix.sim.physical.space import Boxes, strikes
+from embomatrix.sim.robot_dimensions import LIFT_M, SHOULDER_LOW_M
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Sequence
+
+    from numpy.typing import NDArray
+
+    from embomatrix.world.geometry import FloatArray
+
+    BoolArray = NDArray[np.bool_]
+
+OVER_WRIST_M: Final = (0.0, 0.2, 0.4, -0.2)
+"""Heights of the shoulder over the wrist that are tried."""
+LIFT_SPARE_M: Final = 0.08
+"""The lift keeps this much travel to raise what the hand takes."""
+LAST_RAD: Final = np.array([0.785, -0.785, 2.3, -2.3, 0.0, 1.57, -1.57])
+ALIKE_RAD: Final = 0.5
+JUMP_RAD: Final = 1.3
+"""Between two waypoints of a way no joint turns further."""
+LOOKED_AT: Final = (0, 160, 640)
+"""Of all solutions, this many of the most comfortable ones are compared with what is around, and more where none is free."""
+RANK: Final = 0.2
+"""What a place further down the list of tracks weighs against the strain of joints."""
+FOLLOWED: Final = 40
+"""Solutions whose ways are worked out at once: one way costs nearly as much as many do."""
+OFFERED: Final = 3
+"""Ways of one batch that are offered."""
+BATCH: Final = 12
+"""Ways that are looked at together."""
+AIR_M: Final = 0.012
+"""Distance that the arm keeps from things."""
+TOUCH_M: Final = -0.003
+"""How deep balls of the hand, or of what it holds, may seem to be in things: they are a little larger than the truth."""
+SAMPLED: Final = np.array([0.06, 0.06, 0.1, 0.06, 0.1, 0.1, 0.12, 0.12, 0.25, 0.25, 0.4])
+"""Metres, and radians, of each number of a posture between two that are looked at."""
+MOST_SAMPLES: Final = 36
+LEVEL: Final = 0.93
+"""Cosine of the steepest tilt, 21 degrees, at which what lies in a bowl stays there."""
+DRAWS: Final = 24
+"""Random postures by which the arm may find its way to one place of work."""
+
+
+@dataclass(frozen=True, slots=True)
+class Held:
+    """Balls of what the hand holds, in the tool's frame: centres (k, 3), radii (k,).
+
+    ``up``, (3,), is the way up in that frame where something lies in what is held, so that it must stay level.
+    """
+
+    centres: FloatArray
+    radii: FloatArray
+    up: FloatArray | None = None
+
+    def placed(self, postures: FloatArray) -> FloatArray:
+        """Centres in the world, (n, k, 3)."""
+        rotation, position = body.tools(postures)
+        return np.asarray(position[:, None] + np.einsum("nij,kj->nki", rotation, self.centres))
+
+    def is_level(self, postures: FloatArray) -> BoolArray:
+        """Whether nothing falls out of what is held, (n,)."""
+        if self.up is None:
+            return np.ones(len(postures), dtype=np.bool_)
+        rotation, _ = body.tools(postures)
+        return np.asarray(rotation[:, 2] @ self.up > LEVEL)
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """A way of the tool: rotations (w, 3, 3) and positions (w, 3) in the world.
+
+    ``loaded`` marks the waypoints, (w,), at which the hand holds what it holds. ``key`` is the waypoint that matters most.
+    """
+
+    rotation: FloatArray
+    position: FloatArray
+    loaded: BoolArray
+    key: int
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """Postures (w, 11) that follow a track, and the track's number."""
+
+    postures: FloatArray
+    track: int
+
+
+class Reach:
+    """Ways of one hand, empty or not, among boxes."""
+
+    def __init__(
+        self,
+        boxes: Boxes,
+        at_work: Boxes,
+        held: Held | None = None,
+        also: Callable[[FloatArray], bool] | None = None,
+    ) -> None:
+        """``at_work`` are the boxes without those that the hand may touch at the end of its way.
+
+        ``also`` has a say in which ways, (w, 11), are free.
+        """
+        self._also = also
+        self._boxes = boxes
+        self._standing = boxes.without(("floor",))
+        self._at_work = at_work
+        self._held = held
+        self.hindrance = ""
+        """Owner of the box that barred the last way that was not free."""
+
+    def ways(self, tracks: Iterable[Track], places: Sequence[FloatArray]) -> Iterator[Way]:
+        """Free ways along any of the tracks, the preferred tracks first, from any base of groups of them, (b, 3) each.
+
+        A later group is looked at for what the ones before it do not reach, and a track is asked for when its turn comes.
+        """
+        rest = iter(tracks)
+        start = 0
+        while batch := list(itertools.islice(rest, BATCH)):
+            for bases in places:
+                yield from self._some(batch, start, bases)
+            start += len(batch)
+
+    def transit(
+        self,
+        start: FloatArray,
+        end: FloatArray,
+        rng: np.random.Generator,
+        *,
+        loaded: bool,
+        draws: int = DRAWS,
+    ) -> FloatArray | None:
+        """Postures (w, 11) that lead from one to another without touching anything, None when none are found.
+
+        The arm moves where the base is at the start; then the base drives to where it is at the end. Straight on, or by way
+        of what ``draws`` random postures lead to.
+        """
+        held = self._held if loaded else None
+        ready = np.concatenate([start[:3], end[3:]])
+        if not self._is_free(_between(ready, end), held):
+            return None
+
+        def free_up_to(one: FloatArray, other: FloatArray) -> FloatArray:
+            between = _between(one, other)[1:]
+            free = self._free(between[:-1], self._boxes, held, AIR_M)
+            # Start and end are where the robot is and where it must be, whatever is near them.
+            last = bool(np.array_equal(other, ready) or np.array_equal(other, start))
+            if free.all() and (last or self._free(other[None], self._boxes, held, AIR_M)[0]):
+                return other
+            reached = int(free.argmin()) if not free.all() else len(free)
+            return between[reached - 1] if reached else one
+
+        drawn = _drawn(start, draws, rng, level=held is not None and held.up is not None)
+        drawn[:1] = (start + ready) / 2
+        way = way_between(start, ready, drawn, SAMPLED, free_up_to)
+        return None if way is None else np.concatenate([way, end[None]])
+
+    def drives(self, start: FloatArray, end: FloatArray, *, loaded: bool) -> bool:
+        """Whether the base can drive straight from one posture to another with the arm as it is."""
+        line = _between(start, end)
+        trunk, radii = body.trunk_balls(line)
+        gaps = strikes(self._standing, trunk, radii, 0.0)
+        return bool((gaps < 0).all()) and self._is_free(line, self._held if loaded else None)
+
+    def _is_free(self, postures: FloatArray, held: Held | None) -> bool:
+        """Whether all but the first and the last posture keep clear: these are where the robot is, and where it must be."""
+        return bool(self._free(postures[1:-1], self._boxes, held, AIR_M).all())
+
+    def _some(self, tracks: Sequence[Track], first: int, bases: FloatArray) -> list[Way]:
+        """Free ways along a batch of tracks, best first. ``first`` is the number of its first track."""
+        track, base, lift, last = _combinations(tracks, bases)
+        key_rotation = np.stack([one.rotation[one.key] for one in tracks])
+        key_position = np.stack([one.position[one.key] for one in tracks])
+        found = body.solve(key_rotation[track], key_position[track], bases[base], lift, last)
+        rows, branches = np.nonzero(~np.isnan(found[:, :, -1]))
+        if not len(rows):
+            return []
+        comfort = _strain(found[rows, branches]) + RANK * track[rows]
+        for fore, end in itertools.pairwise(LOOKED_AT):
+            best = _best_of_each(base[rows], comfort, _share(fore, bases), _share(end, bases))
+            some = best[self._free(found[rows[best], branches[best]], self._at_work, None, TOUCH_M)]
+            row = rows[some]
+            ways = self._along(
+                [tracks[number] for number in track[row].tolist()],
+                [first + number for number in track[row].tolist()],
+                (bases[base[row]], lift[row], last[row], branches[some]),
+            )
+            if ways:
+                return ways
+        return []
+
+    def _along(
+        self,
+        tracks: Sequence[Track],
+        numbers: Sequence[int],
+        starts: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
+    ) -> list[Way]:
+        """The first free ways, each unlike those before it, from bases, lifts, last angles and branches along tracks."""
+        ways: list[Way] = []
+        for start in range(0, len(tracks), FOLLOWED):
+            some = slice(start, start + FOLLOWED)
+            followed = _followed(tracks[some], *(values[some] for values in starts))
+            for number, track, postures in zip(numbers[some], tracks[some], followed, strict=True):
+                if postures is None or any(_alike(postures[0], way.postures[0]) for way in ways):
+                    continue
+                if self._passes(track, postures):
+                    ways.append(Way(postures, number))
+                    if len(ways) == OFFERED:
+                        return ways
+        return ways
+
+    def _passes(self, track: Track, postures: FloatArray) -> bool:
+        trunk, radii = body.trunk_balls(postures[:1])
+        hit = strikes(self._standing, trunk, radii, TOUCH_M)
+        if hit[0] >= 0:
+            return False
+        for mask, held in ((~track.loaded, None), (track.loaded, self._held)):
+            if mask.any() and not self._free(postures[mask], self._at_work, held, TOUCH_M).all():
+                return False
+        return self._also is None or self._also(postures)
+
+    def _free(self, postures: FloatArray, boxes: Boxes, held: Held | None, margin_m: float) -> BoolArray:
+        """Whether arm and load keep a margin from the boxes and from the robot's own trunk, shape (n,)."""
+        if not len(postures):
+            return np.zeros(0, dtype=np.bool_)
+        load = held.placed(postures) if held is not None else None
+        sizes = held.radii if held is not None else None
+        centres = body.balls(postures)
+        radii = body.RADII
+        if load is not None and sizes is not None:
+            centres = np.concatenate([centres, load], axis=1)
+            radii = np.concatenate([radii, sizes])
+        low = (centres - radii[None, :, None]).min(axis=(0, 1)) - 0.05
+        high = (centres + radii[None, :, None]).max(axis=(0, 1)) + 0.05
+        close = boxes.near(low, high)
+        hit = strikes(close, centres, radii, margin_m)
+        if (hit >= 0).any():
+            self.hindrance = close.owners[int(hit[hit >= 0][0])]
+        free = hit < 0
+        free[free] = ~body.strikes_itself(postures[free], load[free] if load is not None else None, sizes)
+        if held is not None and held.up is not None:
+            free[free] = held.is_level(postures[free])
+        return np.asarray(free)
+
+
+def _share(most: int, bases: FloatArray) -> int:
+    """How many of a number of solutions each base gets."""
+    return max(4, most // len(bases)) if most else 0
+
+
+def _best_of_each(base: FloatArray, cost: FloatArray, first: int, end: int) -> FloatArray:
+    """Numbers of the cheapest solutions for each base, from the first to before the end, the cheapest first."""
+    order = np.argsort(cost, kind="stable")
+    kept = [order[base[order] == number][first:end] for number in np.unique(base)]
+    chosen = np.concatenate(kept)
+    return np.asarray(chosen[np.argsort(cost[chosen], kind="stable")])
+
+
+def _alike(one: FloatArray, other: FloatArray) -> bool:
+    """Whether two postures differ so little that what bars the one bars the other."""
+    return bool(np.abs(one[:2] - other[:2]).max() < 0.1 and np.abs(one[4:] - other[4:]).max() < ALIKE_RAD)
+
+
+def _combinations(
+    tracks: Sequence[Track], bases: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Every track with every base, lift and last angle: numbers within the batch, numbers of bases, lifts, angles."""
+    heights = np.array(
+        [
+            track.position[track.key][2] - track.rotation[track.key][2, 2] * (arm.FLANGE_M + arm.TOOL_M)
+            for track in tracks
+        ]
+    )
+    offsets = np.array(OVER_WRIST_M)
+    track, base, offset, last = (
+        grid.ravel()
+        for grid in np.meshgrid(
+            np.arange(len(tracks)), np.arange(len(bases)), offsets, LAST_RAD, indexing="ij"
+        )
+    )
+    lift = heights[track] + offset - SHOULDER_LOW_M
+    return track, base, np.clip(lift, 0.0, LIFT_M - LIFT_SPARE_M), last
+
+
+def _followed(
+    tracks: Sequence[Track], bases: FloatArray, lifts: FloatArray, last: FloatArray, branches: FloatArray
+) -> list[FloatArray | None]:
+    """Postures along each of n tracks with base, lift and last joint at rest, None where it leaves the arm's reach or jumps.
+
+    bases: (n, 3), lifts: (n,), last: (n,), branches: (n,).
+    """
+    counts = np.array([len(track.position) for track in tracks])
+    row = np.repeat(np.arange(len(tracks)), counts)
+    rotation = np.concatenate([track.rotation for track in tracks])
+    position = np.concatenate([track.position for track in tracks])
+    found = body.solve(rotation, position, bases[row], lifts[row], last[row])
+    chosen = found[np.arange(len(row)), branches[row]]
+    ends = np.cumsum(counts)
+    parts = [chosen[end - count : end] for count, end in zip(counts.tolist(), ends.tolist(), strict=True)]
+    return [
+        None
+        if np.isnan(part[:, -1]).any() or np.abs(np.diff(part[:, 4:], axis=0)).max(initial=0.0) > JUMP_RAD
+        else part
+        for part in parts
+    ]
+
+
+def _strain(postures: FloatArray) -> FloatArray:
+    """How far the arm is from the middle of its travel, (n,)."""
+    middle, half = (arm.HIGH_RAD + arm.LOW_RAD) / 2, (arm.HIGH_RAD - arm.LOW_RAD) / 2
+    return np.asarray((((postures[:, 4:] - middle) / half) ** 4).sum(axis=1))
+
+
+def _drawn(start: FloatArray, count: int, rng: np.random.Generator, *, level: bool) -> FloatArray:
+    """Random postures, (n, 11), with the base where it is at the start; ``level``: what is held there turned about z alone."""
+    low = np.concatenate([[0.0], arm.LOW_RAD * 0.9])
+    high = np.concatenate([[LIFT_M], arm.HIGH_RAD * 0.9])
+    drawn = np.tile(start, (count, 1))
+    drawn[:, body.LIFT :] = rng.uniform(low, high, (count, len(low)))
+    if not level:
+        return drawn
+    turn = arm.about_z(rng.uniform(-np.pi, np.pi, count)) @ body.tools(start[None])[0]
+    ahead = rng.uniform((0.1, -0.4, -0.2), (0.8, 0.4, 0.4), (count, 3))
+    ahead[:, 2] += drawn[:, body.LIFT] + SHOULDER_LOW_M
+    place = ahead @ arm.about_z(start[None, body.YAW])[0].T + np.array([start[0], start[1], 0.0])
+    found = body.solve(turn, place, drawn[:, :3], drawn[:, body.LIFT], rng.choice(LAST_RAD, count))
+    rows = found.reshape(-1, body.NUMBERS)
+    rows = rows[~np.isnan(rows[:, -1])]
+    return rows if len(rows) else drawn[:1]
+
+
+def _between(start: FloatArray, end: FloatArray) -> FloatArray:
+    """Postures from one to another, (n, 11), so close that nothing thin is passed unseen."""
+    count = int(np.ceil((np.abs(end - start) / SAMPLED).max())) + 2
+    shares = np.linspace(0.0, 1.0, min(count, MOST_SAMPLES))[:, None]
+    return np.asarray(start + shares * (end - start))

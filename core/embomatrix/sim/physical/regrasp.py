@@ -1,0 +1,146 @@
+"""Taking another hold: what the hand can't bring where it goes as it holds it is put down nearby and taken otherwise."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.sim.physical.fold import fold
+from embomatrix.sim.physical.grasp import grasp_tracks
+from embomatrix.sim.physical.hands import bases_at, take_by, way_in
+from embomatrix.sim.physical.put import Delivery, put
+from embomatrix.sim.placement import in_reach
+from embomatrix.skills.failure import FailureReason
+from embomatrix.skills.limits import ROBOT
+from embomatrix.world.geometry import Aabb, Pose
+from embomatrix.world.state import Relation
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+    import numpy as np
+
+    from embomatrix.sim.physical.reach import Track
+    from embomatrix.sim.physical.stage import Grip, Stage
+    from embomatrix.world.poses import StandPose
+
+HOSTS: Final = 3
+"""Surfaces nearby that are looked at."""
+ON_EACH: Final = 4
+"""Poses on each of them."""
+RING_M: Final = (0.6, 0.75)
+RING_DEGREES: Final = (0.0, 40.0, -40.0, 80.0, -80.0, 130.0, -130.0, 180.0)
+"""Places on the floor around the robot."""
+LOOKED_AT: Final = 10
+"""Holds that are looked at."""
+FORESEEN: Final = 4
+"""Poses at the goal for which a hold is looked at."""
+LIFT_M: Final = 0.001
+"""Above the floor, when nothing is known of how the thing stands on it."""
+
+
+def regrasp(
+    stage: Stage,
+    poses: Sequence[Pose],
+    counts: Callable[[], bool],
+    home: StandPose,
+    rng: np.random.Generator,
+) -> bool:
+    """Put down what is held and take it so that the hand can bring it to one of some poses. Whether it is held again.
+
+    ``counts`` tells whether it may stay where it stands in the planning scene, with the poses in mind.
+    """
+    grip = stage.grip
+    assert grip is not None
+    name = grip.name
+    engine, asset = stage.world.engine, stage.world.asset(name)
+    rests = list(_rests(stage, name, poses[0]))
+    if not rests:
+        return False
+    # Where exactly it will rest makes no difference to which holds lead to the goal.
+    offered = grasp_tracks(asset, rests[0], engine.joints(name), home.yaw, None)
+    kinds = _promising(stage, grip, offered, rests[0], poses[:FORESEEN], counts)
+    if not kinds or put(stage, rests, _anywhere, rng, name) is not None:
+        return False
+    fold(stage, home, rng)
+    stage.settle()
+    pose = engine.pose(name)
+    course, out_m = way_in(stage, name, engine.aabb(name), stage.boxes())
+    tracks = grasp_tracks(asset, pose, engine.joints(name), course, out_m)
+    bases = bases_at(stage, pose, course, out_m)
+    refusal = None
+    # Where none of the holds that lead to the goal can be taken, any is better than to leave the thing there.
+    for wanted in (True, False):
+        some = [track for track in tracks if (_kind(track) in kinds) is wanted]
+        refusal = take_by(stage, name, some, len(some) if out_m is not None else 0, bases, rng)
+        if refusal is None:
+            break
+    fold(stage, home, rng)
+    return refusal is None and stage.grip is not None
+
+
+def _anywhere() -> bool:
+    return True
+
+
+def _kind(track: Track) -> tuple[float, float]:
+    """How the hand points down and rolls at the end: ways that differ by their heading alone are of one kind.
+
+    Which of these is taken makes no difference to what follows: the thing may be turned about the vertical.
+    """
+    rotation = track.rotation[track.key]
+    return round(float(rotation[2, 2]), 2), round(abs(float(rotation[2, 1])), 2)
+
+
+def _promising(
+    stage: Stage,
+    grip: Grip,
+    offered: Sequence[Track],
+    rest: Pose,
+    poses: Sequence[Pose],
+    counts: Callable[[], bool],
+) -> frozenset[tuple[float, float]]:
+    """Kinds of ways to take what is held, from where it would stand, after which there is a way to one of the poses."""
+    known: dict[tuple[float, float], bool] = {}
+    for track in offered:
+        kind = _kind(track)
+        if kind not in known and len(known) < LOOKED_AT:
+            position = track.position[track.key]
+            tool = Pose.from_rotation(tuple(position.tolist()), track.rotation[track.key])
+            delivery = Delivery(stage, grip.otherwise(tool.inverse() @ rest), poses, counts)
+            known[kind] = next(delivery.ways(), None) is not None
+    return frozenset(kind for kind, good in known.items() if good)
+
+
+def _rests(stage: Stage, name: str, upright: Pose) -> Iterator[Pose]:
+    """Where what is held may stand for a while: on furniture in reach, the nearest first, then on the floor."""
+    world, robot = stage.world, stage.world.robot
+    x, y, wide = robot.x_m, robot.y_m, ROBOT.reach_m
+    around = Aabb((x - wide, y - wide, 0.0), (x + wide, y + wide, ROBOT.reach_high_m))
+    hosts = [
+        other for other in world.engine.near(around) if world.is_fixed(other) and world.asset(other).supports
+    ]
+    hosts.sort(key=lambda other: math.dist(world.engine.aabb(other).center_m[:2], (x, y)))
+    for host in hosts[:HOSTS]:
+        found = world.placer.choices(name, host, Relation.ONTOP, robot, most=ON_EACH)
+        if not isinstance(found, FailureReason):
+            yield from found
+    yield from _on_floor(stage, name, upright)
+
+
+def _on_floor(stage: Stage, name: str, upright: Pose) -> Iterator[Pose]:
+    """Free places on the floor around the robot, for a thing that stands as it does at a pose."""
+    engine, robot = stage.world.engine, stage.world.robot
+    engine.set_pose(name, upright)
+    above = upright.position_m[2] - engine.aabb(name).low_m[2] + LIFT_M
+    found = []
+    for away, degrees in itertools.product(RING_M, RING_DEGREES):
+        course = robot.yaw + math.radians(degrees)
+        x, y = robot.x_m + away * math.cos(course), robot.y_m + away * math.sin(course)
+        pose = Pose((x, y, above), upright.quat_xyzw)
+        engine.set_pose(name, pose)
+        if in_reach(engine.aabb(name), robot) and not engine.penetrates(name):
+            found.append(pose)
+    engine.park(name)
+    yield from found

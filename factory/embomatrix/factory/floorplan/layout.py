@@ -1,0 +1,95 @@
+"""Floor plans: pack a house's true floor rectangles edge to edge and join them by doorways.
+
+Every room is packed as its floor grown by half a wall on each side, so neighbouring floors lie exactly one wall apart. Rooms
+attach one by one to a side of a room that is already placed (slot packing); the best of many seeded trials wins.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from embomatrix.factory.floorplan.doors import place_doorways
+from embomatrix.factory.floorplan.packing import pack
+from embomatrix.factory.floorplan.spec import MIN_DOOR_M, FloorPlanError
+from embomatrix.factory.floorplan.walls import WALL_M, build_walls
+from embomatrix.factory.floorplan.windows import place_windows
+from embomatrix.world.scene import Room
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from embomatrix.factory.floorplan.packing import Packing
+    from embomatrix.factory.floorplan.spec import RoomSpec
+    from embomatrix.world.geometry import Part
+    from embomatrix.world.scene import Doorway, Window
+
+TRIALS: Final = 80
+FINALISTS: Final = 6
+"""Packings that get doors and windows before one is chosen."""
+WINDOW_COST_M2: Final = 3.0
+"""What a window without a wall costs a plan, in square metres of extent."""
+
+
+@dataclass(frozen=True, slots=True)
+class FloorPlan:
+    """Rooms, walls, doorways and windows, and a sentence for every listed door or window without a place.
+
+    The last doorway leads outside; it is filled by a closed leaf, part of ``walls``, as windows are by their panes.
+    """
+
+    rooms: tuple[Room, ...]
+    walls: tuple[Part, ...]
+    doorways: tuple[Doorway, ...]
+    windows: tuple[Window, ...] = ()
+    left_out: tuple[str, ...] = ()
+
+    @property
+    def compactness(self) -> float:
+        """Share of the plan's bounding box that is room floor or wall, in (0, 1]."""
+        return compactness(self.rooms)
+
+
+def compactness(rooms: Sequence[Room]) -> float:
+    """Share of the rooms' bounding box that is floor or wall, in (0, 1]."""
+    low = np.min([r.low_m for r in rooms], axis=0) - WALL_M / 2
+    high = np.max([r.high_m for r in rooms], axis=0) + WALL_M / 2
+    used = sum((r.size_m[0] + WALL_M) * (r.size_m[1] + WALL_M) for r in rooms)
+    return float(used / np.prod(high - low))
+
+
+def plan_floor(rooms: Sequence[RoomSpec], rng: np.random.Generator, *, trials: int = TRIALS) -> FloorPlan:
+    """Pack the rooms, connect all of them by doorways and raise the walls.
+
+    Deterministic for a given generator state. Raises FloorPlanError when there are no rooms or they can't be joined by doors.
+    """
+    if not rooms:
+        raise FloorPlanError("no rooms to pack: expected at least one")
+    packings = [p for p in (pack(rooms, rng) for _ in range(trials)) if p is not None]
+    if not packings:
+        raise FloorPlanError(
+            f"{len(rooms)} rooms found no joint plan in {trials} trials: every room needs a side of at least {MIN_DOOR_M} m"
+        )
+    finished = [
+        _finish(rooms, packing, rng) for packing in sorted(packings, key=lambda p: p.score)[:FINALISTS]
+    ]
+    return min(finished, key=lambda pair: pair[0])[1]
+
+
+def _finish(rooms: Sequence[RoomSpec], packing: Packing, rng: np.random.Generator) -> tuple[float, FloorPlan]:
+    """Doorways, windows and walls for a packing, and its score with what every window without a wall costs."""
+    low = np.min([r.low for r in packing.rects.values()], axis=0)
+    rects = {name: rect.moved(-float(low[0]), -float(low[1])) for name, rect in packing.rects.items()}
+    doors, unused = place_doorways(rooms, rects, packing.parents, rng)
+    panes, walled_up = place_windows(rooms, rects, doors)
+    plan = FloorPlan(
+        rooms=tuple(Room(s.name, s.type, *rects[s.name].floor) for s in rooms),
+        walls=build_walls(rects, doors, panes),
+        doorways=tuple(cut.doorway for cut in doors),
+        windows=tuple(cut.window for cut in panes),
+        left_out=(*unused, *walled_up),
+    )
+    listed = sum(len(room.windows) for room in rooms)
+    return packing.score + WINDOW_COST_M2 * (listed - len(panes)), plan

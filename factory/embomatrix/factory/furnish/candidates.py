@@ -1,0 +1,231 @@
+"""Where a group may stand: stops along the walls, a lattice over the open floor, and what each place costs."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from embomatrix.factory.furnish.pieces import Style
+from embomatrix.factory.furnish.roles import Role
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from numpy.typing import NDArray
+
+    from embomatrix.factory.furnish.boxes import FloatArray
+    from embomatrix.factory.furnish.pieces import Group, Placed
+    from embomatrix.factory.furnish.space import RoomSpace
+
+WALL_GAP_M: Final = 0.006
+SIDE_GAP_M: Final = 0.005
+STEP_M: Final = 0.05
+AHEAD: Final = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])
+"""The way that a group looks at each number of quarter turns."""
+_RUN_ROLES: Final = (Role.RUN, Role.COUNTERTOP, Role.HUNG_CABINET)
+_SIGHT_M: Final = 0.8
+_MANY: Final = 4
+_BED_SHARE: Final = 0.28
+"""Planting keeps this close to a garden's edges, as a share of its shorter side."""
+
+
+@dataclass(frozen=True, slots=True)
+class Candidates:
+    """Group frames: x, y and quarter turns, with the cost of each. All arrays have n rows."""
+
+    x: FloatArray
+    y: FloatArray
+    turns: NDArray[np.int64]
+    cost: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+    def take(self, rows: NDArray[np.int64]) -> Candidates:
+        return Candidates(self.x[rows], self.y[rows], self.turns[rows], self.cost[rows])
+
+
+class Surroundings:
+    """What stands in a room, looked up by category: middles and headings, and the edges of runs."""
+
+    def __init__(self, space: RoomSpace) -> None:
+        self._spots: dict[str, list[tuple[float, float, float]]] = defaultdict(list)
+        self._spots["doorway"] = [(*d.center_m, 0.0) for d in space.doorways]
+        self._spots["window"] = [(*w.center_m, 0.0) for w in space.windows]
+        self._runs: list[tuple[float, ...]] = []
+
+    def add(self, items: Iterable[Placed]) -> None:
+        for item in items:
+            self._spots[item.piece.category].append((item.x, item.y, item.yaw))
+            if item.piece.role in _RUN_ROLES:
+                self._runs.append(item.box)
+
+    def of(self, categories: Iterable[str]) -> FloatArray:
+        """(x, y, yaw) of everything of these categories, shape (k, 3)."""
+        found = [spot for category in categories for spot in self._spots.get(category, ())]
+        return np.array(found).reshape(-1, 3)
+
+    def runs(self, level_m: float) -> FloatArray:
+        """Boxes of counters, cabinets and appliances whose underside is within a metre of a height, shape (k, 6)."""
+        boxes = np.array(self._runs).reshape(-1, 6)
+        return boxes[np.abs(boxes[:, 2] - level_m) < 1.0]
+
+
+def candidates_of(group: Group, space: RoomSpace, around: Surroundings) -> Candidates:
+    """All places that the group's style allows, with their costs; none is checked against what stands there."""
+    if group.style in (Style.FREE, Style.OVERHEAD, Style.AISLE):
+        x, y, turns = _open_floor(group, space)
+    else:
+        x, y, turns = _along_walls(group, space)
+    if group.style is Style.EDGE:
+        x, y, turns = (
+            np.concatenate(both) for both in zip((x, y, turns), _open_floor(group, space), strict=True)
+        )
+        # The middle of a garden stays open.
+        near = _to_edge(space, x, y) <= _BED_SHARE * min(space.room.size_m)
+        x, y, turns = x[near], y[near], turns[near]
+    if not len(x):
+        return Candidates(x, y, turns, np.empty(0))
+    cost = _style_cost(group, space, around, x, y, turns)
+    cost = cost + 1.2 * _nearest(around.of(group.near), x, y) + _sight(around.of(group.faces), x, y, turns)
+    # Equal things keep apart: up to 2.5 m count.
+    cost = cost - 1.5 * np.minimum(_nearest(around.of(group.spread), x, y), 2.5)
+    return Candidates(x, y, turns, np.asarray(cost))
+
+
+def _along_walls(group: Group, space: RoomSpace) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
+    gx0, gy0, _, gy1 = group.bounds
+    (x0, y0), (x1, y1) = space.room.low_m, space.room.high_m
+    xs, ys, ts = [np.empty(0)], [np.empty(0)], [np.empty(0, dtype=np.int64)]
+    for turns in range(4):
+        along_y = turns % 2 == 0  # the front looks along x, so the wall runs along y
+        low, high = (y0, y1) if along_y else (x0, x1)
+        left, right = (gy0, gy1) if turns in (0, 3) else (-gy1, -gy0)
+        first, last = low + WALL_GAP_M - left, high - WALL_GAP_M - right
+        if last < first:
+            continue
+        stops = np.concatenate([np.arange(first, last, STEP_M), [last], _flush(space, along_y, left, right)])
+        stops = np.unique(stops[(stops >= first - 1e-9) & (stops <= last + 1e-9)].round(6))
+        back = WALL_GAP_M - gx0
+        fixed = (x0 + back, y0 + back, x1 - back, y1 - back)[turns]
+        xs.append(np.full_like(stops, fixed) if along_y else stops)
+        ys.append(stops if along_y else np.full_like(stops, fixed))
+        ts.append(np.full(len(stops), turns))
+    return np.concatenate(xs), np.concatenate(ys), np.concatenate(ts)
+
+
+def _flush(space: RoomSpace, along_y: bool, left: float, right: float) -> FloatArray:
+    """Stops that leave 5 mm to something that stands already."""
+    axis = 1 if along_y else 0
+    solids = space.solids.rows
+    return np.concatenate([solids[:, axis + 3] + SIDE_GAP_M - left, solids[:, axis] - SIDE_GAP_M - right])
+
+
+def _open_floor(group: Group, space: RoomSpace) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
+    (x0, y0), (x1, y1) = space.room.low_m, space.room.high_m
+    # About 60 x 60 places at most, so that a hall takes no longer than a parlour.
+    step = max(0.1, math.sqrt((x1 - x0) * (y1 - y0)) / 60)
+    gx, gy = np.meshgrid(np.arange(x0 + 0.1, x1, step), np.arange(y0 + 0.1, y1, step), indexing="ij")
+    ways = {Style.OVERHEAD: 2, Style.AISLE: 2, Style.EDGE: 1}.get(group.style, 4)
+    turns = np.repeat(np.arange(ways), gx.size)
+    return np.tile(gx.ravel(), ways), np.tile(gy.ravel(), ways), turns
+
+
+def _style_cost(
+    group: Group,
+    space: RoomSpace,
+    around: Surroundings,
+    x: FloatArray,
+    y: FloatArray,
+    turns: NDArray[np.int64],
+) -> FloatArray:
+    """Lower is better; the unit is about a metre."""
+    room = space.room
+    cx, cy = room.center_m
+    along = np.where(turns % 2 == 0, y, x)
+    middle = np.where(turns % 2 == 0, cy, cx)
+    half = np.where(turns % 2 == 0, room.size_m[1], room.size_m[0]) / 2
+    off = np.abs(along - middle)
+    match group.style:
+        case Style.CENTERED:
+            cost = 0.8 * off - 0.3 * half
+        case Style.CORNER:
+            cost = 1.5 * (half - off)
+        case Style.NOOK:
+            right = np.where((turns == 0) | (turns == 3), middle - along, along - middle)
+            cost = 1.5 * (half - right)
+        case Style.RUN:
+            cost = 0.3 * (half - off) + 3.0 * _gap_to_run(group, around, x, y, turns)
+        case Style.FREE:
+            cost = 0.6 * np.hypot(x - cx, y - cy)
+        case Style.AISLE:
+            # Lines of shelves fill the hall from one side, each an aisle away from the last.
+            across = np.where(turns % 2 == 0, x - room.low_m[0], y - room.low_m[1])
+            shorter = np.where(turns % 2 == 0, room.size_m[0], room.size_m[1])
+            cost = 0.4 * across + 0.8 * off - 0.6 * shorter
+        case Style.EDGE:
+            cost = 0.6 * _to_edge(space, x, y)
+        case Style.OVERHEAD:
+            cost = 0.1 * np.hypot(x - cx, y - cy)
+        case Style.ALONG:
+            cost = np.zeros(len(x))
+    return np.asarray(cost)
+
+
+def _to_edge(space: RoomSpace, x: FloatArray, y: FloatArray) -> FloatArray:
+    """Distance from each place to the nearest edge of the room."""
+    (x0, y0), (x1, y1) = space.room.low_m, space.room.high_m
+    return np.asarray(np.minimum(np.minimum(x - x0, x1 - x), np.minimum(y - y0, y1 - y)))
+
+
+def _gap_to_run(
+    group: Group, around: Surroundings, x: FloatArray, y: FloatArray, turns: NDArray[np.int64]
+) -> FloatArray:
+    """Distance from the group's edge to the nearest counter, cabinet or appliance at its height."""
+    boxes = around.runs(group.members[0].bottom)
+    if not len(boxes):
+        return np.zeros(len(x))
+    gx0, gy0, gx1, gy1 = group.bounds
+    hx = np.where(turns % 2 == 0, gx1 - gx0, gy1 - gy0)[:, None] / 2
+    hy = np.where(turns % 2 == 0, gy1 - gy0, gx1 - gx0)[:, None] / 2
+    mx, my = (gx0 + gx1) / 2, (gy0 + gy1) / 2
+    c, s = AHEAD[turns, 0], AHEAD[turns, 1]
+    x, y = x + c * mx - s * my, y + s * mx + c * my
+    dx = np.maximum(0, np.maximum(boxes[:, 0] - x[:, None], x[:, None] - boxes[:, 3]) - hx)
+    dy = np.maximum(0, np.maximum(boxes[:, 1] - y[:, None], y[:, None] - boxes[:, 4]) - hy)
+    return np.asarray(np.hypot(dx, dy).min(axis=1))
+
+
+def _nearest(spots: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
+    """Distance from each place to the nearest of the spots, shape (k, 3); zero where there are none."""
+    if not len(spots):
+        return np.zeros(len(x))
+    if len(spots) <= 2 * _MANY:
+        return np.asarray(np.hypot(x[:, None] - spots[:, 0], y[:, None] - spots[:, 1]).min(axis=1))
+    return np.asarray(cKDTree(spots[:, :2]).query(np.stack([x, y], axis=1))[0])
+
+
+def _sight(partners: FloatArray, x: FloatArray, y: FloatArray, turns: NDArray[np.int64]) -> FloatArray:
+    """Sideways distance of the best partner from the line of sight, theirs and ours; one that is behind costs more.
+
+    Many partners, a class and its board, count as one in their middle.
+    """
+    if not len(partners):
+        return np.zeros(len(x))
+    if len(partners) > _MANY:
+        heading = float(np.median(partners[:, 2]))
+        partners = np.array([(*partners[:, :2].mean(axis=0), heading)])
+    ahead = AHEAD[turns]  # (n, 2)
+    delta = partners[None, :, :2] - np.stack([x, y], axis=1)[:, None]  # (n, k, 2)
+    forward = np.einsum("nkd,nd->nk", delta, ahead)
+    aside = np.abs(delta[..., 0] * ahead[:, None, 1] - delta[..., 1] * ahead[:, None, 0])
+    theirs = np.stack([np.cos(partners[:, 2]), np.sin(partners[:, 2])], axis=1)  # (k, 2)
+    back = -np.einsum("nkd,kd->nk", delta, theirs)
+    off = np.abs(delta[..., 0] * theirs[:, 1] - delta[..., 1] * theirs[:, 0])
+    cost = np.where(forward > _SIGHT_M, 1.2 * aside, 6.0) + np.where(back > _SIGHT_M, off, 4.0)
+    return np.asarray(cost.min(axis=1))

@@ -1,0 +1,198 @@
+"""Grouping: which pieces of a room belong together (counters, seating, table sets) and in what order they are placed."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.factory.furnish.halls import hall_groups, mat_rows, planting_groups
+from embomatrix.factory.furnish.hung import ceiling_groups, hung_groups, on_wall, rug_groups
+from embomatrix.factory.furnish.kitchen import COOKERS, SINKS, basin, run_groups, worktop
+from embomatrix.factory.furnish.pieces import CORNER_SOFA_M, Group, Member, Rows, Style, stacked, top_of
+from embomatrix.factory.furnish.pool import Pool, worth
+from embomatrix.factory.furnish.roles import Role
+from embomatrix.factory.furnish.tables import table_groups, work_groups
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from embomatrix.factory.furnish.pieces import Piece
+
+_COFFEE_GAP_M: Final = 0.38
+_CORNER_SEAT_M: Final = 0.95
+"""Depth of a corner sofa's two seats; its table stands in the nook between them."""
+_TV_STANDS: Final = ("console_table", "bottom_cabinet", "bookcase", "coffee_table", "breakfast_table")
+_CLEAR_M: Final = 0.8
+"""Free floor on all sides of what stands in the open."""
+_ISLANDS: Final = ("commercial_kitchen_table", "display_case", "bar")
+_LONG_SIDE: Final = ("bathtub", "bicycle")
+_ISLAND_M: Final = 2.0
+"""Longer kitchen tables stand in the middle of the kitchen."""
+_IN_LINE: Final = 3
+"""This many equal pieces stand side by side: lockers, toilets, shelves."""
+_NEAR: Final[Mapping[str, tuple[str, ...]]] = {
+    "armchair": ("coffee_table", "sofa"),
+    "ottoman": ("sofa", "armchair"),
+    "floor_lamp": ("sofa", "armchair", "bed"),
+    "standing_loudspeaker": ("standing_tv", "sofa"),
+    "public_trash_can": SINKS,
+    "trash_can": SINKS,
+    "hamper": ("desk", "cubicle"),
+    "shredder": ("desk", "conference_table"),
+    "desktop_computer": ("desk", "conference_table"),
+    "radiator": ("window",),
+    "nightstand": ("bed",),
+    "serving_cart": COOKERS,
+    "coatrack": ("doorway",),
+    "hall_tree": ("doorway",),
+    "umbrella_rack": ("doorway",),
+    "checkout_counter": ("doorway",),
+    "reception_desk": ("doorway",),
+    "shopping_cart": ("doorway",),
+    "turnstile": ("doorway",),
+    "cash_register": ("checkout_counter", "reception_desk"),
+}
+_OFF_FLOOR: Final = frozenset(
+    (Role.WALL, Role.CEILING, Role.RUG, Role.HUNG_CABINET, Role.SURFACE, Role.STRUCTURE)
+)
+
+
+def room_groups(
+    pieces: Sequence[Piece], room_type: str = "", floor_m: tuple[float, float] = (5.0, 5.0)
+) -> tuple[list[Group | Rows], list[tuple[Piece, str]]]:
+    """Everything that stands on the floor, as groups, the important ones first; and what no group takes, with the reason."""
+    pool = Pool((p for p in pieces if p.role not in _OFF_FLOOR), room_type, floor_m)
+    left_out: list[tuple[Piece, str]] = []
+    screens = [p for p in pieces if p.category == "wall_mounted_tv"]
+    found: list[Group | Rows] = [
+        *_television(pool, [p for p in pieces if p.category == "standing_tv"]),
+        *(_first(on_wall(p)) for p in screens[:1] if pool.of("sofa")),
+        *hall_groups(pool),
+        *work_groups(pool),
+        *run_groups(pool, left_out),
+        *table_groups(pool),
+        *_beds(pool),
+        *_sofas(pool),
+        *planting_groups(pool),
+        *_singles(pool),
+    ]
+    found.sort(key=lambda g: (-g.importance, -_area(g)))
+    return found, left_out
+
+
+def hung_and_laid(pieces: Sequence[Piece], taken: set[int]) -> list[Group | Rows]:
+    """What hangs on walls and ceilings, then mats and rugs; without the pieces that a group on the floor has taken."""
+    rest = [p for p in pieces if p.number not in taken]
+    rugs = Pool(p for p in rest if p.role is Role.RUG)
+    mats = mat_rows(rugs)
+    return [*hung_groups(rest), *ceiling_groups(rest), *mats, *rug_groups(rugs.rest)]
+
+
+def alone(piece: Piece) -> Group:
+    """A piece that its group found no place for, by itself at a wall; a worktop on brackets, a basin at its height."""
+    if piece.role is Role.COUNTERTOP:
+        return worktop(piece)
+    if piece.role is Role.FITTED:
+        return basin(piece)
+    return Group((_sideways(piece),), Style.ALONG, worth([Member(piece)]), _NEAR.get(piece.category, ()))
+
+
+def in_the_open(piece: Piece) -> Group | None:
+    """A piece that found no wall, in the middle of the room; None for what belongs to a wall."""
+    if piece.role in (Role.TABLE, Role.LOW_TABLE, Role.OPEN) or piece.category in _ISLANDS:
+        return Group((Member(piece),), Style.FREE, worth([Member(piece)]), clear_m=_CLEAR_M)
+    return None
+
+
+def _sideways(piece: Piece) -> Member:
+    """The piece in its group: a bathtub and a bench that is modelled end on have their long side at the wall."""
+    return Member(piece, turns=1 if piece.category in _LONG_SIDE and piece.size_m[0] > piece.size_m[1] else 0)
+
+
+def _first(group: Group) -> Group:
+    """A screen goes up before the sofa, which then looks at it."""
+    return replace(group, style=Style.CENTERED, importance=9.6)
+
+
+def _area(group: Group | Rows) -> float:
+    if isinstance(group, Rows):
+        return sum(_area(g) for g in group.groups)
+    x0, y0, x1, y1 = group.bounds
+    return (x1 - x0) * (y1 - y0)
+
+
+def _television(pool: Pool, screens: Sequence[Piece]) -> list[Group]:
+    groups = []
+    for tv in screens:
+        stands = [
+            p
+            for p in pool.of(*_TV_STANDS)
+            if top_of(p) <= 0.75 and p.size_m[0] >= 0.9 * tv.size_m[0] and p.size_m[1] >= 0.7 * tv.size_m[1]
+        ]
+        if stands:
+            base = Member(pool.take([stands[0]])[0])
+            members = (base, stacked(base, tv, 0))
+            groups.append(Group(members, Style.CENTERED, 9.55, faces=("sofa", "armchair")))
+    return groups
+
+
+def _beds(pool: Pool) -> list[Group]:
+    groups = []
+    for bed in pool.take(pool.of("bed", "hospital_bed", "crib")):
+        members = [Member(bed)]
+        stands = [p for p in pool.of("nightstand", "stand") if p.size_m[2] <= 0.75][:2]
+        for stand, side in zip(pool.take(stands if bed.category == "bed" else []), (1, -1), strict=False):
+            x = (stand.size_m[0] - bed.size_m[0]) / 2
+            members.append(Member(stand, x, side * (bed.size_m[1] + stand.size_m[1] + 0.08) / 2))
+        style = Style.CENTERED if bed.category == "bed" else Style.ALONG
+        groups.append(Group(tuple(members), style, worth(members), spread=(bed.category,)))
+    return groups
+
+
+def _sofas(pool: Pool) -> list[Group]:
+    """Sofas with a coffee table before them and armchairs at its ends; corner sofas in a corner, the table in the nook."""
+    groups = []
+    sofas = pool.take(sorted(pool.of("sofa"), key=lambda p: -p.size_m[1]))
+    armchairs = pool.of("armchair") if pool.room_type in ("living_room", "lobby", "garden") else []
+    each = len(armchairs) // max(1, len(sofas))
+    for sofa in sofas:
+        members = [Member(sofa)]
+        nook = min(sofa.size_m[:2]) > CORNER_SOFA_M
+        tables = [p for p in pool.of("coffee_table", "garden_coffee_table") if p.size_m[1] <= sofa.size_m[1]]
+        for table in pool.take(tables[:1]):
+            at = sofa.size_m[0] / 2 + _COFFEE_GAP_M + table.size_m[0] / 2
+            if nook and max(table.size_m[:2]) + 0.3 <= min(sofa.size_m[:2]) - _CORNER_SEAT_M:
+                members.append(Member(table, _CORNER_SEAT_M / 2 + 0.1, _CORNER_SEAT_M / 2 + 0.1))
+                continue
+            members.append(Member(table, at))
+            mine = pool.take(armchairs[: min(each, 2)])
+            armchairs = armchairs[len(mine) :]
+            for chair, side in zip(mine, (1, -1), strict=False):
+                y = side * (table.size_m[1] / 2 + 0.3 + chair.size_m[0] / 2)
+                members.append(
+                    Member(chair, max(at, (sofa.size_m[0] + chair.size_m[1]) / 2 + 0.1), y, turns=2 + side)
+                )
+        style = Style.NOOK if nook else Style.CENTERED
+        screens = ("standing_tv", "wall_mounted_tv")
+        groups.append(Group(tuple(members), style, worth(members), faces=screens, spread=("sofa",)))
+    return groups
+
+
+def _singles(pool: Pool) -> list[Group]:
+    counts = Counter(p.category for p in pool.rest)
+    groups = []
+    for piece in pool.take(list(pool.rest)):
+        style = Style.CORNER if piece.role is Role.CORNER else Style.ALONG
+        if piece.category == "commercial_kitchen_table" and piece.size_m[1] > _ISLAND_M:
+            style = Style.FREE
+        near = _NEAR.get(piece.category, ())
+        if near:
+            style = Style.ALONG
+        if not near and counts[piece.category] >= _IN_LINE and piece.role in (Role.BACKED, Role.RUN):
+            near = (piece.category,)
+        if pool.room_type == "locker_room" and piece.category == "bench":
+            style = Style.FREE
+        clear = _CLEAR_M if style is Style.FREE else 0.0
+        groups.append(Group((_sideways(piece),), style, worth([Member(piece)]), near, clear_m=clear))
+    return groups

@@ -1,0 +1,116 @@
+"""What hangs: cabinets and hoods over the counters, things on walls, lights under the ceiling; and rugs on the floor."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.factory.floorplan.walls import WALL_HEIGHT_M
+from embomatrix.factory.furnish.kitchen import COOKERS, SINKS, UNDER_COUNTER
+from embomatrix.factory.furnish.pieces import REST_GAP_M, Group, Member, Rows, Style
+from embomatrix.factory.furnish.roles import HUNG_BOTTOM_M, Role, wall_height_m
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from embomatrix.factory.furnish.pieces import Piece
+
+_NEAR_ON_WALL: Final[Mapping[str, tuple[str, ...]]] = {
+    "mirror": SINKS,
+    "makeup_mirror": SINKS,
+    "wall_mounted_soap_dispenser": SINKS,
+    "paper_towel_dispenser": SINKS,
+    "hand_dryer": SINKS,
+    "toilet_paper_dispenser": ("toilet",),
+    "toilet_paper_holder": ("toilet",),
+    "showerhead": ("shower_stall", "bathtub"),
+    "towel_rack": ("shower_stall", "bathtub", *SINKS),
+    "electric_switch": ("doorway",),
+}
+_FACES_ON_WALL: Final[Mapping[str, tuple[str, ...]]] = {
+    "blackboard": ("straight_chair", "swivel_chair", "armchair", "taboret"),
+    "whiteboard": ("straight_chair", "swivel_chair", "armchair", "taboret"),
+    "projection_screen": ("straight_chair", "swivel_chair", "armchair", "eames_chair"),
+    "wall_mounted_tv": ("sofa", "bar", "straight_chair", "swivel_chair", "armchair", "bed"),
+}
+_TABLES_UNDER_LIGHTS: Final = (
+    "booth",
+    "pedestal_table",
+    "breakfast_table",
+    "commercial_kitchen_table",
+    "bar",
+    "conference_table",
+)
+_HEAD_ROOM_M: Final = 1.45
+_SMALL_M: Final = 0.3
+_HOOD_M: Final = 1.5
+_EVENLY: Final = 3
+_ANY_PITCH: Final = 100.0
+_RUGS_NEAR: Final = (
+    "coffee_table",
+    "sofa",
+    "bed",
+    "shower_stall",
+    "bathtub",
+    "pedestal_sink",
+    "furniture_sink",
+)
+
+
+def hung_groups(pieces: Sequence[Piece]) -> list[Group]:
+    """Wall cabinets and hoods over the counters, then what hangs on the walls, big things first."""
+    groups = []
+    for piece in pieces:
+        if piece.role is Role.HUNG_CABINET:
+            hood = piece.category == "range_hood"
+            near: tuple[str, ...] = COOKERS if hood else ("countertop", *SINKS, *UNDER_COUNTER)
+            highest = WALL_HEIGHT_M - piece.size_m[2] - 0.01
+            # A hood too high for the room reaches into the ceiling rather than into the cook's way.
+            bottom = _HOOD_M if hood else max(min(HUNG_BOTTOM_M, highest), 0.9)
+            member = Member(piece, bottom=bottom)
+            groups.append(Group((member,), Style.RUN, 8.0 if hood else 5.0, near))
+        elif piece.role is Role.WALL:
+            groups.append(on_wall(piece))
+    return sorted(groups, key=lambda g: -g.importance)
+
+
+def on_wall(piece: Piece) -> Group:
+    """A thing at its height on a wall; taller than the wall, just above the floor."""
+    height = piece.size_m[2]
+    bottom = max(0.05, min(wall_height_m(piece.category) - height / 2, WALL_HEIGHT_M - height - 0.02))
+    near = _NEAR_ON_WALL.get(piece.category, ())
+    faces = _FACES_ON_WALL.get(piece.category, ())
+    style = Style.ALONG if near or faces or piece.size_m[1] < _SMALL_M else Style.CENTERED
+    spread = () if piece.category == "electric_switch" else (piece.category,)
+    return Group((Member(piece, bottom=bottom),), style, 1.0 + piece.size_m[1], near, faces, spread)
+
+
+def ceiling_groups(pieces: Sequence[Piece]) -> list[Group | Rows]:
+    """Lights, fans and racks under the ceiling: equal ones evenly over the room, those that hang low over a table."""
+    groups: list[Group | Rows] = []
+    kinds: dict[str, list[Group]] = defaultdict(list)
+    for piece in pieces:
+        if piece.role is Role.CEILING:
+            bottom = WALL_HEIGHT_M - piece.size_m[2]
+            low = bottom < _HEAD_ROOM_M
+            member = Member(piece, bottom=max(bottom, 0.9))
+            tables = _TABLES_UNDER_LIGHTS if low else ()
+            group = Group((member,), Style.OVERHEAD, 1.0 + piece.size_m[1], tables, spread=(piece.category,))
+            if low:
+                groups.append(group)
+            else:
+                kinds[piece.category].append(group)
+    for equal in kinds.values():
+        if len(equal) >= _EVENLY:
+            groups.append(Rows(tuple(equal), equal[0].importance, (0.5, 0.5), stretch=_ANY_PITCH))
+        else:
+            groups += equal
+    return sorted(groups, key=lambda g: -g.importance)
+
+
+def rug_groups(pieces: Sequence[Piece]) -> list[Group]:
+    """Rugs lie on free floor before the sofa, the bed or the sink."""
+    return [
+        Group((Member(p, bottom=REST_GAP_M),), Style.FREE, 1.0, _RUGS_NEAR, spread=("carpet",))
+        for p in pieces
+    ]

@@ -1,0 +1,333 @@
+"""Pieces and groups: the inventory's items of a room, arranged into the units that furnishing places as a whole.
+
+A group's own frame has x towards the room and y to its left; the wall, if it stands at one, is behind it at -x.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from embomatrix.factory.furnish.roles import Role
+from embomatrix.world.geometry import Pose
+from embomatrix.world.state import Relation
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from embomatrix.factory.furnish.boxes import Box
+    from embomatrix.world.asset import Asset, Joint, Link
+    from embomatrix.world.geometry import Part, Vec3
+
+CORNER_SOFA_M: Final = 1.4
+"""A sofa that exceeds this along both sides goes round a corner, its second arm on its right: the nook is open floor."""
+REST_GAP_M: Final = 0.0005
+"""Things rest half a millimetre above what carries them: close enough to be on it, far enough not to be in it."""
+FRONT_M: Final = 0.6
+_UPENDED: Final = Pose((0.0, 0.0, 0.0), (0.0, math.sqrt(0.5), 0.0, math.sqrt(0.5)))
+"""A flat model's face, at +z of its asset frame, turned to +x."""
+
+Rect4 = tuple[float, float, float, float]
+
+
+class Access(StrEnum):
+    """What the robot must be able to reach of a piece."""
+
+    NONE = "none"
+    BESIDE = "beside"  # some free spot near it
+    FRONT = "front"  # a free strip before its front
+    HUNG = "hung"  # some free spot near it, and room before it at its own height
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """One item of a room's inventory. ``number`` tells it from its equals; ``upended`` models hang with z to the room."""
+
+    number: int
+    category: str
+    asset: Asset
+    role: Role
+    upended: bool = False
+
+    @property
+    def size_m(self) -> Vec3:
+        """Extent along x, y and z as it is placed at zero yaw."""
+        x, y, z = self.asset.size_m
+        return (z, y, x) if self.upended else (x, y, z)
+
+    @property
+    def blocks(self) -> tuple[Box, ...]:
+        """What it takes up, about its middle and above its underside: one box, or what an open shape is made of."""
+        corner = self.category == "sofa" and min(self.size_m[:2]) > CORNER_SOFA_M
+        if (corner or self.category in _OPEN_SHAPES) and not self.upended:
+            return _blocks_of(self.asset.links[0].parts, self.asset.size_m[2] / 2)
+        x, y, z = (extent / 2 for extent in self.size_m)
+        return ((-x, -y, 0.0, x, y, 2 * z),)
+
+    def pose(self, x: float, y: float, bottom: float, yaw: float) -> Pose:
+        """Pose of the asset with its lowest point at height ``bottom``."""
+        upright = Pose.from_xyz_yaw(x, y, bottom + self.size_m[2] / 2, yaw)
+        return upright @ _UPENDED if self.upended else upright
+
+
+@dataclass(frozen=True, slots=True)
+class Placed:
+    """A piece with its place: centre of the footprint, underside, heading, and its host's number (-1: none)."""
+
+    piece: Piece
+    room: str
+    x: float
+    y: float
+    bottom: float
+    yaw: float
+    host: int = -1
+    relation: Relation | None = None
+    interior: str = ""
+
+    @property
+    def pose(self) -> Pose:
+        return self.piece.pose(self.x, self.y, self.bottom, self.yaw)
+
+    @property
+    def box(self) -> Box:
+        """Bounding box in the world."""
+        sx, sy, sz = self.piece.size_m
+        c, s = abs(math.cos(self.yaw)), abs(math.sin(self.yaw))
+        hx, hy = (sx * c + sy * s) / 2, (sx * s + sy * c) / 2
+        return (self.x - hx, self.y - hy, self.bottom, self.x + hx, self.y + hy, self.bottom + sz)
+
+    @property
+    def boxes(self) -> tuple[Box, ...]:
+        """The boxes in the world that the piece takes up, at quarter turns; its bounding box at any other heading."""
+        blocks = self.piece.blocks
+        c, s = math.cos(self.yaw), math.sin(self.yaw)
+        if len(blocks) == 1 or abs(c * s) > 1e-6:
+            return (self.box,)
+        found = []
+        for x0, y0, z0, x1, y1, z1 in blocks:
+            xs = sorted((c * x0 - s * y0, c * x1 - s * y1))
+            ys = sorted((s * x0 + c * y0, s * x1 + c * y1))
+            low, high = self.bottom + z0, self.bottom + z1
+            found.append((self.x + xs[0], self.y + ys[0], low, self.x + xs[1], self.y + ys[1], high))
+        return tuple(found)
+
+
+@dataclass(frozen=True, slots=True)
+class Member:
+    """A piece in its group's frame: centre of its footprint, underside, quarter turns; ``on`` is its host's position."""
+
+    piece: Piece
+    x: float = 0.0
+    y: float = 0.0
+    bottom: float = 0.0
+    turns: int = 0
+    on: int = -1
+
+    @property
+    def half(self) -> tuple[float, float]:
+        x, y, _ = self.piece.size_m
+        return (y / 2, x / 2) if self.turns % 2 else (x / 2, y / 2)
+
+
+class Style(StrEnum):
+    """Where a group looks for its place."""
+
+    RUN = "run"
+    CENTERED = "centered"  # at the middle of a wall
+    ALONG = "along"  # anywhere along a wall
+    CORNER = "corner"
+    NOOK = "nook"  # in a corner with the right side at the other wall
+    FREE = "free"  # in the middle of the room
+    EDGE = "edge"  # along the walls and, where those are taken, next to what stands there
+    AISLE = "aisle"  # lines across the room, an aisle apart
+    OVERHEAD = "overhead"
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """Pieces that are placed as one. ``near`` and ``faces`` name categories whose closeness or sight is worth something.
+
+    ``spread`` names categories that it keeps away from; ``clear_m`` is free floor on all sides to anything else.
+    """
+
+    members: tuple[Member, ...]
+    style: Style
+    importance: float
+    near: tuple[str, ...] = ()
+    faces: tuple[str, ...] = ()
+    spread: tuple[str, ...] = field(default=())
+    clear_m: float = 0.0
+
+    @property
+    def bounds(self) -> Rect4:
+        """(x0, y0, x1, y1) of all footprints in the group's frame."""
+        low = np.min([(m.x - m.half[0], m.y - m.half[1]) for m in self.members], axis=0)
+        high = np.max([(m.x + m.half[0], m.y + m.half[1]) for m in self.members], axis=0)
+        return (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+
+
+@dataclass(frozen=True, slots=True)
+class Rows:
+    """Equal groups that stand in rows and columns, all looking one way; ``gap_m`` is free floor behind and beside each.
+
+    They spread over the room up to ``stretch`` times their closest pitch.
+    """
+
+    groups: tuple[Group, ...]
+    importance: float
+    gap_m: tuple[float, float]
+    stretch: float = 1.35
+
+
+_FRONTED_NAMES: Final = (
+    "fridge freezer oven stove dishwasher washer clothes_dryer furniture_sink commercial_kitchen_sink toilet pedestal_sink "
+    "multi_station_furniture_sink flat_top_grill deep_fryer bookcase jukebox wardrobe urinal electric_cauldron "
+    "vending_machine grocery_shelf photocopier locker wall_mounted_sink"
+)
+_FRONTED: Final = frozenset(_FRONTED_NAMES.split())
+_BESIDE: Final = frozenset((Role.TABLE, Role.LOW_TABLE, Role.FITTED))
+
+
+def access_of(piece: Piece) -> Access:
+    """What access the piece needs: a free front where it opens or works, a spot beside it where one puts things on it."""
+    if piece.role is Role.SURFACE:
+        return Access.NONE
+    if piece.role is Role.HUNG_CABINET:
+        return Access.HUNG if piece.asset.can("openable") else Access.NONE
+    if piece.category in _FRONTED or piece.asset.can("openable"):
+        return Access.FRONT
+    if piece.role in _BESIDE or piece.category in (
+        "bed",
+        "sofa",
+        "armchair",
+        "countertop",
+        "bar",
+        "commercial_kitchen_table",
+        "shower_stall",
+        "bathtub",
+    ):
+        return Access.BESIDE
+    return Access.NONE
+
+
+_OPEN_SHAPES: Final = frozenset(("tree", "low_resolution_tree"))
+"""What one can walk under: a tree takes up its trunk and its crown, not the box around both."""
+
+
+@functools.lru_cache(maxsize=1024)
+def _blocks_of(parts: tuple[Part, ...], half_m: float) -> tuple[Box, ...]:
+    """Boxes around the parts of an asset, with heights above its underside."""
+    boxes = [part.aabb(Pose((0.0, 0.0, half_m))) for part in parts]
+    return tuple((*box.low_m, *box.high_m) for box in boxes)
+
+
+def front_depth_m(asset: Asset) -> float:
+    """Free depth that the front needs: 0.6 m, or as far as its doors and drawers come out."""
+    return max(FRONT_M, min(_furthest_out(asset.links) - asset.size_m[0] / 2 + 0.02, 1.0))
+
+
+@functools.lru_cache(maxsize=4096)
+def _furthest_out(links: tuple[Link, ...]) -> float:
+    """How far moving links come before the asset's middle on their way, along x."""
+    out = 0.0
+    for link in links:
+        if link.joint is None:
+            continue
+        for fraction in (0.5, 1.0):
+            moved = _joint_pose(link.joint, fraction)
+            out = max([out, *(part.aabb(moved).high_m[0] for part in link.parts)])
+    return out
+
+
+def _joint_pose(joint: Joint, fraction: float) -> Pose:
+    """Displacement of a link, in the asset's frame, at a share of its joint's travel."""
+    ax, ay, az = joint.axis
+    q = fraction * joint.upper
+    if joint.kind == "prismatic":
+        return Pose((ax * q, ay * q, az * q))
+    s = math.sin(q / 2)
+    turn = Pose((0.0, 0.0, 0.0), (ax * s, ay * s, az * s, math.cos(q / 2)))
+    ox, oy, oz = joint.origin_m
+    return Pose(joint.origin_m) @ turn @ Pose((-ox, -oy, -oz))
+
+
+def top_of(piece: Piece) -> float:
+    """Height of the piece's main top surface above its underside; its full height when it has no surface in the open."""
+    half = piece.asset.size_m[2] / 2
+    tops = [(s.size_m[0] * s.size_m[1], s.center_m[2] + half) for s in piece.asset.supports if not s.interior]
+    return max(tops)[1] if tops else piece.asset.size_m[2]
+
+
+def stacked(base: Member, piece: Piece, index: int) -> Member:
+    """The piece centred on top of the group's member at ``index``."""
+    return Member(piece, base.x, base.y, base.bottom + top_of(base.piece) + REST_GAP_M, base.turns, on=index)
+
+
+def relation_of(member: Member) -> Relation | None:
+    return Relation.ONTOP if member.on >= 0 else None
+
+
+def around_table(table: Piece, chairs: Sequence[Piece], gap_m: float = 0.04) -> tuple[Member, ...]:
+    """A table with chairs facing it: along the long sides first, then at the ends."""
+    side, end = _places(table, max((c.size_m[1] for c in chairs), default=0.5))
+    ends = end if len(chairs) > 2 * side else 0
+    counts = _seats(len(chairs), (side, side, ends, ends))
+    members = [Member(table)]
+    rest = list(chairs)
+    for direction, count in zip((0, 2, 1, 3), counts, strict=True):
+        members += _line(table, rest[:count], direction, gap_m)
+        rest = rest[count:]
+    return tuple(members)
+
+
+def before_table(table: Piece, chairs: Sequence[Piece], gap_m: float = 0.04) -> tuple[Member, ...]:
+    """A table with chairs on its front side only, facing it: a workplace, a row of a class."""
+    return (Member(table), *_line(table, list(chairs), 0, gap_m))
+
+
+def seats_around(table: Piece, seat_m: float) -> int:
+    """How many chairs of this width find a place around the table."""
+    side, end = _places(table, seat_m)
+    return 2 * (side + end)
+
+
+def _places(table: Piece, seat_m: float) -> tuple[int, int]:
+    """Chairs along a long side and at an end of the table."""
+    depth, width, _ = table.size_m
+    seat = seat_m + 0.08
+    return max(1, int(width / seat)), max(0, int(depth / seat))
+
+
+def _line(table: Piece, chairs: Sequence[Piece], direction: int, gap_m: float) -> list[Member]:
+    """Chairs side by side along the table's side that looks this many quarter turns away from its front."""
+    depth, width, _ = table.size_m
+    across, run = (depth, width) if direction % 2 == 0 else (width, depth)
+    seat = max((c.size_m[1] for c in chairs), default=0.5) + 0.08
+    members = []
+    for place, chair in enumerate(chairs):
+        offset = across / 2 + gap_m + chair.size_m[0] / 2
+        shift = ((place + 0.5) / len(chairs) - 0.5) * max(run, len(chairs) * seat)
+        x, y = ((offset, shift), (shift, offset), (-offset, shift), (shift, -offset))[direction]
+        members.append(Member(chair, x, y, turns=(direction + 2) % 4))
+    return members
+
+
+def _seats(chairs: int, places: tuple[int, int, int, int]) -> tuple[int, ...]:
+    """Chairs per side: the two long sides share them, the ends take the rest."""
+    counts = [0, 0, 0, 0]
+    for _ in range(chairs):
+        open_sides = [i for i in range(4) if counts[i] < places[i]]
+        if not open_sides:
+            break
+        pick = min(open_sides, key=lambda i: (i >= 2, counts[i]))
+        counts[pick] += 1
+    return tuple(counts)
+
+
+def shifted(members: Sequence[Member], dx: float, dy: float) -> tuple[Member, ...]:
+    return tuple(replace(m, x=m.x + dx, y=m.y + dy) for m in members)

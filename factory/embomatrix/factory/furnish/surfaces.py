@@ -1,0 +1,192 @@
+"""Small things: free places on the surfaces and in the cavities of furniture that stands already."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, defaultdict
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from embomatrix.factory.furnish.boxes import BoxStack
+from embomatrix.factory.furnish.hosts import NO_HOSTS, hosts_of, kept_behind_doors
+from embomatrix.factory.furnish.pieces import REST_GAP_M, Placed
+from embomatrix.factory.furnish.roles import Role
+from embomatrix.world.state import Relation
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from numpy.typing import NDArray
+
+    from embomatrix.factory.furnish.pieces import Piece
+
+    FloatArray = NDArray[np.float64]
+
+TOP_ROOM_M: Final = 1.0
+"""Clearance at least assumed over a surface in the open; what stands above it is tested as a solid."""
+_EDGE_M: Final = 0.01
+_SAMPLES: Final = 60
+_SPACING_M: Final = np.array([0.01, 0.01, 0.0])
+"""Free space to other things along each axis."""
+_HIGHEST_M: Final = 1.75
+_TALL_M: Final = 1.3
+"""The top of a higher cabinet is no place to put things down, its boards are."""
+_SAME_KIND: Final = 2.0
+"""Equal things stand together: a surface that holds one already goes this many ranks before others."""
+
+
+@dataclass(frozen=True, slots=True)
+class Surface:
+    """A support surface in the world: axis-aligned, ``host`` is the number of the piece that owns it."""
+
+    host: int
+    name: str
+    interior: str
+    x0: float
+    y0: float
+    x1: float
+    y1: float
+    z: float
+    clearance_m: float
+    shut: bool
+
+
+def surfaces_of(placed: Placed, number: int) -> list[Surface]:
+    """The support surfaces of a placed piece at a quarter turn."""
+    found = []
+    turned = abs(math.sin(placed.yaw)) > 0.5
+    asset = placed.piece.asset
+    doored = {interior.name for interior in asset.interiors if interior.closed_by}
+    for support in asset.supports:
+        cx, cy, cz = placed.pose.apply(support.center_m)
+        sx, sy = support.size_m[::-1] if turned else support.size_m
+        edges = (cx - sx / 2, cy - sy / 2, cx + sx / 2, cy + sy / 2)
+        inner = support.interior
+        found.append(Surface(number, support.name, inner, *edges, cz, support.clearance_m, inner in doored))
+    return found
+
+
+class SurfacePlacer:
+    """Sets small things on surfaces, none closer than a centimetre to another."""
+
+    def __init__(self, placed: list[Placed], rng: np.random.Generator) -> None:
+        self.placed = placed
+        self._rng = rng
+        self._surfaces: dict[str, list[Surface]] = defaultdict(list)
+        for number, item in enumerate(placed):
+            self._surfaces[item.room] += self._usable(item, number)
+        self._boxes = BoxStack(p.box for p in placed)
+        self._used = Counter(p.host for p in placed)
+        self._holds: set[tuple[str, int, str]] = set()
+
+    def place(self, piece: Piece, rooms: Sequence[str]) -> bool:
+        """Set the piece on the best surface with room, in the first of the rooms that has one. False when none has."""
+        for room in rooms:
+            for surface in self._ranked(piece, room):
+                if self._set_on(piece, surface):
+                    return True
+        return False
+
+    def _usable(self, placed: Placed, number: int) -> Iterable[Surface]:
+        flat = not placed.piece.upended and abs(math.sin(2 * placed.yaw)) < 1e-6
+        if placed.piece.role in (Role.RUG, Role.CEILING, Role.SURFACE, Role.STRUCTURE) or not flat:
+            return []
+        if placed.piece.role is Role.WALL and placed.piece.category != "shelf":
+            return []
+        tall = placed.bottom + placed.piece.size_m[2] > _TALL_M and placed.piece.role is not Role.WALL
+        return [
+            s
+            for s in surfaces_of(placed, number)
+            if 0.05 < s.z < _HIGHEST_M and not (tall and s.z > _TALL_M and not s.interior)
+        ]
+
+    def _ranked(self, piece: Piece, room: str) -> list[Surface]:
+        """Surfaces of the room in the order of preference: the listed hosts, then any other in the open."""
+        wanted = {host: rank for rank, host in enumerate(hosts_of(piece.category))}
+        surfaces = self._surfaces[room]
+        noise = self._rng.uniform(0.0, 0.8, len(surfaces))
+        ranked = []
+        for surface, extra in zip(surfaces, noise, strict=True):
+            category = self.placed[surface.host].piece.category
+            if surface.shut and not kept_behind_doors(piece.category, category):
+                continue
+            rank = wanted.get(category)
+            if rank is None:
+                if category in NO_HOSTS or surface.interior:
+                    continue
+                rank = len(wanted) + 3
+            together = (piece.category, surface.host, surface.name) in self._holds
+            cost = rank + min(0.35 * self._used[surface.host], 4.0) + float(extra) - _SAME_KIND * together
+            ranked.append((cost, surface))
+        return [s for _, s in sorted(ranked, key=lambda item: item[0])]
+
+    def _set_on(self, piece: Piece, surface: Surface) -> bool:
+        """Try sampled spots on the surface and take the first that is free."""
+        if piece.size_m[2] + 0.01 > surface.clearance_m:
+            return False
+        host = self.placed[surface.host]
+        # Screens and machines look where their host looks; loose things lie as they were put down.
+        square = max(piece.size_m[:2]) > 0.3 or bool(hosts_of(piece.category) and piece.asset.joints)
+        turn = np.zeros(_SAMPLES) if square else self._rng.uniform(-0.6, 0.6, _SAMPLES)
+        x, y, half, fits = self._spots(piece, surface, host.yaw + turn)
+        bottom = surface.z + REST_GAP_M
+        low = np.column_stack([x - half[:, 0], y - half[:, 1], np.full(_SAMPLES, bottom)])
+        high = np.column_stack([x + half[:, 0], y + half[:, 1], np.full(_SAMPLES, bottom + piece.size_m[2])])
+        free = np.flatnonzero(fits & ~self._hits(low, high, surface.host))
+        if not len(free):
+            return False
+        pick = int(free[0])
+        relation = Relation.INSIDE if surface.interior else Relation.ONTOP
+        yaw = host.yaw + float(turn[pick])
+        self._add(
+            Placed(
+                piece,
+                host.room,
+                float(x[pick]),
+                float(y[pick]),
+                bottom,
+                yaw,
+                surface.host,
+                relation,
+                surface.interior,
+            )
+        )
+        self._holds.add((piece.category, surface.host, surface.name))
+        return True
+
+    def _spots(
+        self, piece: Piece, surface: Surface, yaw: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
+        """Random middles on the surface, the half extents there (n, 2), and which of them keep to its edges."""
+        overhang = 0.2 if piece.category == "standing_tv" else 0.0
+        depth, width, _ = piece.size_m
+        cos, sin = np.abs(np.cos(yaw)), np.abs(np.sin(yaw))
+        half = np.column_stack([depth * cos + width * sin, depth * sin + width * cos]) / 2
+        room = np.array([surface.x1 - surface.x0, surface.y1 - surface.y0])
+        slack = room - 2 * half * (1 - 2 * overhang) - 2 * _EDGE_M  # (n, 2)
+        middle = np.array([surface.x0 + surface.x1, surface.y0 + surface.y1]) / 2
+        spots = middle + self._rng.uniform(-0.5, 0.5, (len(yaw), 2)) * slack
+        return spots[:, 0], spots[:, 1], half, np.asarray(slack.min(axis=1) >= 0)
+
+    def _hits(self, low: FloatArray, high: FloatArray, host: int) -> NDArray[np.bool_]:
+        """Which of the boxes, given by corners of shape (n, 3), meet anything but their host and what carries it."""
+        boxes = self._boxes.rows
+        near = ~np.any(
+            (boxes[:, 3:] <= low.min(axis=0) - _SPACING_M) | (boxes[:, :3] >= high.max(axis=0) + _SPACING_M),
+            axis=1,
+        )
+        while host >= 0:
+            near[host] = False
+            host = self.placed[host].host
+        others = boxes[near]  # (m, 6)
+        apart = (others[None, :, 3:] <= low[:, None] - _SPACING_M) | (
+            others[None, :, :3] >= high[:, None] + _SPACING_M
+        )
+        return np.asarray(np.any(~np.any(apart, axis=2), axis=1))
+
+    def _add(self, item: Placed) -> None:
+        self.placed.append(item)
+        self._boxes.extend([item.box])
+        self._used[item.host] += 1

@@ -1,0 +1,172 @@
+"""Draw films: the room that the robot is in, what it sees, and its plan beside that, in processes of their own."""
+
+from __future__ import annotations
+
+import multiprocessing
+import textwrap
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from embomatrix.sim.bullet.camera import furnish_cutaway, furnish_whole, shoot_egocentric, shoot_oblique
+from embomatrix.sim.bullet.stage import Stage
+from embomatrix.sim.film import FRAMES_PER_S
+from embomatrix.sim.physical.stage import tucked
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+    from pathlib import Path
+
+    from embomatrix.sim.film import Film, Frame
+    from embomatrix.world.scene import Room, Scene
+
+ROOM_PX: Final = (640, 480)
+EYE_PX: Final = (256, 192)
+LINE_PX: Final = 17
+LINES: Final = 15
+"""Lines of the plan that fit beside the picture."""
+LINE_CHARACTERS: Final = 38
+COLORS: Final = 128
+"""Of a frame's palette: flat shading needs no more."""
+CHUNK: Final = 6
+"""Frames that a process draws for one request."""
+HOLD_MS: Final = 1500
+"""How long the last frame stays."""
+SUFFIXES: Final = (".gif", ".webp", ".png")
+
+
+class FilmError(ValueError):
+    """A film can't be drawn. The message tells what was found and what was expected."""
+
+
+@dataclass(frozen=True, slots=True)
+class Caption:
+    """One line of the plan: the call in words, and whether it succeeded; None for a call that was not executed."""
+
+    text: str
+    ok: bool | None
+
+
+def draw_film(
+    film: Film,
+    captions: Sequence[Caption],
+    *,
+    processes: int = 2,
+    on_frame: Callable[[int, int], None] = lambda done, count: None,
+) -> list[Image.Image]:
+    """Pictures of all frames, RGB, 896 x 480 pixels: the room on the left, the robot's view and ``captions`` on the right.
+
+    There is a caption for each call of the plan. Frames are drawn by processes that share nothing with this one;
+    ``on_frame`` hears how many of how many are done.
+    """
+    rooms = _rooms_seen(film)
+    chunks = [film.frames[start : start + CHUNK] for start in range(0, len(film.frames), CHUNK)]
+    pictures: list[Image.Image] = []
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(processes, context, _open_stage, (film.scene, rooms)) as pool:
+        for chunk, drawn in zip(chunks, pool.map(_draw, chunks), strict=True):
+            for frame, (room, eye) in zip(chunk, drawn, strict=True):
+                pictures.append(_page(room, eye, captions, frame.step))
+            on_frame(len(pictures), len(film.frames))
+    return pictures
+
+
+def write_film(path: Path, pictures: Sequence[Image.Image]) -> None:
+    """Write an animation, its kind chosen by the suffix: GIF, WebP or animated PNG. Raises FilmError for another suffix."""
+    check_suffix(path)
+    frames = [picture.quantize(COLORS) for picture in pictures] if path.suffix == ".gif" else [*pictures]
+    durations = [round(1000 / FRAMES_PER_S)] * (len(frames) - 1) + [HOLD_MS]
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=durations, loop=0)
+
+
+def check_suffix(path: Path) -> None:
+    """Raise FilmError when no film can be written to a file of this name."""
+    if path.suffix not in SUFFIXES:
+        raise FilmError(
+            f"a film can't be written as {path.name!r}: expected a name that ends in {', '.join(SUFFIXES)}"
+        )
+
+
+class _Cutter:
+    """One process's stages, brought from frame to frame: one with low walls to look into, one as the robot sees it."""
+
+    def __init__(self, scene: Scene, rooms: Mapping[int, tuple[Room, ...]]) -> None:
+        self._scene = scene
+        self._open, self._whole = Stage(scene), Stage(scene)
+        furnish_cutaway(self._open)
+        furnish_whole(self._whole)
+        self._rooms = rooms
+        self._robot = self._open.add_robot()
+        self._changed: set[str] = set()
+
+    def shoot(self, frame: Frame) -> tuple[Image.Image, Image.Image]:
+        """The rooms of the frame's step from above and aside, and what the robot sees."""
+        changed = {*frame.poses, *frame.joints, *frame.hidden}
+        for name in sorted(changed | self._changed):
+            self._show(frame, name)
+        self._changed = changed
+        self._robot.stand(frame.posture or tucked(frame.robot))
+        room = shoot_oblique(self._open, self._rooms[frame.step], *ROOM_PX)
+        eye = shoot_egocentric(self._whole, frame.robot, *EYE_PX)
+        return Image.fromarray(np.asarray(room)), Image.fromarray(np.asarray(eye))
+
+    def _show(self, frame: Frame, name: str) -> None:
+        item = self._scene.by_name[name]
+        gone = name in frame.hidden or (item.absent and name not in frame.poses)
+        pose = frame.poses.get(name, item.pose_world_asset)
+        for stage in (self._open, self._whole):
+            if gone:
+                stage.hide(name)
+            else:
+                stage.put(name, pose, frame.joints.get(name, item.joints))
+
+
+_cutter: _Cutter | None = None
+
+
+def _open_stage(scene: Scene, rooms: Mapping[int, tuple[Room, ...]]) -> None:
+    global _cutter  # a pool's initializer has no other way to leave something for its tasks
+    _cutter = _Cutter(scene, rooms)
+
+
+def _draw(frames: Sequence[Frame]) -> list[tuple[Image.Image, Image.Image]]:
+    assert _cutter is not None
+    return [_cutter.shoot(frame) for frame in frames]
+
+
+def _rooms_seen(film: Film) -> dict[int, tuple[Room, ...]]:
+    """Of each step the rooms that the robot is in while it lasts; all of them where it is in none."""
+    names: dict[int, set[str]] = {}
+    for frame in film.frames:
+        names.setdefault(frame.step, set()).add(film.scene.room_at((frame.robot.x_m, frame.robot.y_m)))
+    rooms = film.scene.rooms
+    return {step: tuple(room for room in rooms if room.name in seen) or rooms for step, seen in names.items()}
+
+
+def _page(room: Image.Image, eye: Image.Image, captions: Sequence[Caption], step: int) -> Image.Image:
+    """One frame: the room, the robot's view, and the plan with the step that is under way."""
+    whole = Image.new("RGB", (ROOM_PX[0] + EYE_PX[0], ROOM_PX[1]), "white")
+    whole.paste(room, (0, 0))
+    whole.paste(eye, (ROOM_PX[0], 0))
+    pen, font = ImageDraw.Draw(whole), ImageFont.load_default(13)
+    first = max(0, min(step - LINES // 2, len(captions) - LINES))
+    for line, caption in enumerate(captions[first : first + LINES]):
+        number = first + line + 1
+        words = textwrap.shorten(f"{number}  {caption.text}", LINE_CHARACTERS, placeholder=" …")
+        at = (ROOM_PX[0] + 10, EYE_PX[1] + 10 + line * LINE_PX)
+        if number == step:
+            pen.rectangle((ROOM_PX[0] + 4, at[1] - 1, whole.width - 4, at[1] + LINE_PX - 2), fill="#eef2f6")
+        pen.text(at, words, fill=_color(caption, number, step), font=font)
+    return whole
+
+
+def _color(caption: Caption, number: int, step: int) -> str:
+    """Calls to come are grey, the present one is dark, those behind it green, and what failed red."""
+    if number > step or caption.ok is None:
+        return "#a0a7b0"
+    if not caption.ok:
+        return "#b42318"
+    return "#1f2933" if number == step else "#1a7f37"

@@ -1,0 +1,85 @@
+"""Many scenes in one picture, without labels: plans on a sheet, to see at a glance what became of each, and views."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from embomatrix.factory.pictures.scene import FILL, PALE, footprint, is_overhead, kind_of
+from embomatrix.sim.bullet.camera import render_oblique
+from embomatrix.world.geometry import Pose
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from embomatrix.world.scene import Scene
+
+_ORIGIN: Final = Pose((0.0, 0.0, 0.0))
+_MARGIN_M: Final = 0.3
+_CAPTION_PX: Final = 16
+_PANE_M: Final = 0.03
+
+
+def draw_sheet(scenes: Sequence[Scene], *, columns: int = 9, cell_px: int = 200) -> Image.Image:
+    """Plans side by side, row by row, each fitted into a square cell with its name below. Returns an RGB image."""
+    rows = math.ceil(len(scenes) / columns)
+    sheet = Image.new("RGB", (columns * cell_px, rows * (cell_px + _CAPTION_PX)), "white")
+    draw = ImageDraw.Draw(sheet)
+    font = ImageFont.load_default(10)
+    for number, scene in enumerate(scenes):
+        x, y = number % columns * cell_px, number // columns * (cell_px + _CAPTION_PX)
+        sheet.paste(draw_thumbnail(scene, cell_px - 6), (x + 3, y + 3))
+        draw.text((x + 4, y + cell_px), scene.scene_id, fill="black", font=font)
+    return sheet
+
+
+def draw_views(scenes: Sequence[Scene], *, width_px: int = 560) -> Image.Image:
+    """Oblique views side by side, each ``width_px`` wide and three quarters as high. Raises EngineError without pybullet."""
+    height_px = width_px * 3 // 4
+    row = Image.new("RGB", (len(scenes) * width_px, height_px), "white")
+    for number, scene in enumerate(scenes):
+        # drawn at twice the size: Bullet's renderer leaves edges jagged
+        view = render_oblique(scene, width_px=2 * width_px, height_px=2 * height_px)
+        smooth = Image.fromarray(np.asarray(view)).resize((width_px, height_px), Image.Resampling.LANCZOS)
+        row.paste(smooth, (number * width_px, 0))
+    return row
+
+
+def draw_thumbnail(scene: Scene, side_px: int) -> Image.Image:
+    """One plan, north up, in the middle of a square: rooms, walls, windows, doorways and furniture by kind."""
+    low = np.min([room.low_m for room in scene.rooms], axis=0) - _MARGIN_M
+    high = np.max([room.high_m for room in scene.rooms], axis=0) + _MARGIN_M
+    scale = side_px / float(max(high - low))
+    shift = (side_px - (high - low) * scale) / 2
+    image = Image.new("RGB", (side_px, side_px), "white")
+    draw = ImageDraw.Draw(image)
+
+    def box(x0: float, y0: float, x1: float, y1: float) -> tuple[float, float, float, float]:
+        left, right = shift[0] + (x0 - low[0]) * scale, shift[0] + (x1 - low[0]) * scale
+        top, bottom = shift[1] + (high[1] - y1) * scale, shift[1] + (high[1] - y0) * scale
+        return (round(left), round(top), max(round(left), round(right)), max(round(top), round(bottom)))
+
+    for number, room in enumerate(scene.rooms):
+        draw.rectangle(box(*room.low_m, *room.high_m), fill=PALE[number % len(PALE)])
+    for wall in scene.walls:
+        around = wall.aabb(_ORIGIN)
+        if around.low_m[2] < 0.1:
+            leaf = min(wall.size_m[:2]) < 0.1
+            draw.rectangle(box(*around.low_m[:2], *around.high_m[:2]), fill="#b5522b" if leaf else "#3a3a3a")
+    for window in scene.windows:
+        a, b = (window.width_m / 2, _PANE_M) if window.along == "x" else (_PANE_M, window.width_m / 2)
+        x, y = window.center_m
+        draw.rectangle(box(x - a, y - b, x + a, y + b), fill="#6fc3e8")
+    boxes = {item.name: footprint(scene, item) for item in scene.objects}
+    kinds = {item.name: kind_of(scene, item, boxes[item.name]) for item in scene.objects}
+    # Plants first: a tree's crown would hide what stands under it.
+    for item in sorted(scene.objects, key=lambda o: kinds[o.name] != "plant"):
+        around = boxes[item.name]
+        if not is_overhead(around) and kinds[item.name] != "hung":
+            outline = None if item.host else "#8a8a8a"
+            fill = FILL[kinds[item.name]]
+            draw.rectangle(box(*around.low_m[:2], *around.high_m[:2]), fill=fill, outline=outline)
+    return image

@@ -1,0 +1,74 @@
+"""Many scenes at once: each is built and checked in a process of its own, the largest inventories first."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from embomatrix.factory.importers.shelf import read_assets
+from embomatrix.factory.scenes.report import SceneReport, report_on
+from embomatrix.world.catalog import Catalog
+from embomatrix.world.codec import scene_to_json
+from embomatrix.world.whole_file import write_whole
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from pathlib import Path
+
+
+@dataclass(frozen=True, slots=True)
+class SceneJob:
+    """One scene to build and check; ``path`` is the file to write it to, ``assets`` a folder of imported ones."""
+
+    scene_id: str
+    seed: int
+    path: Path | None = None
+    assets: Path | None = None
+
+
+def run_batch(jobs: Sequence[SceneJob], *, processes: int) -> Iterator[SceneReport]:
+    """Reports in the order in which they are finished; a single scene is built here.
+
+    Raises CatalogError for an unknown scene before anything is built, ModelFileError for a damaged asset, OSError when a file
+    can't be written. A process that dies
+    is told in the reports of all that it leaves undone.
+    """
+    catalog = Catalog.load()
+    things = {job.scene_id: _things(catalog, job.scene_id) for job in jobs}
+    if len(jobs) == 1:
+        yield _run(jobs[0])
+        return
+    # spawned, not forked: a child shall not inherit what the parent's libraries hold
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(processes, len(jobs)), context) as pool:
+        largest_first = sorted(jobs, key=lambda job: -things[job.scene_id])
+        waiting = {pool.submit(_run, job): job for job in largest_first}
+        try:
+            for done in as_completed(waiting):
+                job = waiting[done]
+                try:
+                    yield done.result()
+                except BrokenExecutor:
+                    yield SceneReport(job.scene_id, job.seed, error="its process died: is memory short?")
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def _run(job: SceneJob) -> SceneReport:
+    imported = read_assets(job.assets) if job.assets is not None else {}
+    report, scene = report_on(job.scene_id, job.seed, imported)
+    if scene is not None and job.path is not None:
+        try:
+            write_whole(job.path, json.dumps(scene_to_json(scene)).encode("utf-8"))
+        except OSError as error:
+            # a full disk doesn't say which file it is about
+            raise OSError(error.errno, error.strerror, str(job.path)) from error
+    return report
+
+
+def _things(catalog: Catalog, scene_id: str) -> int:
+    """How much there is to place: the time that a scene takes follows it."""
+    return sum(count for room in catalog.inventory(scene_id).rooms for _, _, count in room.items)

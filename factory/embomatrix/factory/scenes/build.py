@@ -1,0 +1,189 @@
+"""Base scenes: an inventory becomes rooms, walls, doorways and furniture."""
+
+from __future__ import annotations
+
+import logging
+import zlib
+from collections import Counter
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from embomatrix.factory.assets.library import build_asset
+from embomatrix.factory.floorplan.layout import FloorPlan, plan_floor
+from embomatrix.factory.floorplan.spec import DoorSpec, RoomSpec, WindowSpec
+from embomatrix.factory.furnish.pieces import Piece
+from embomatrix.factory.furnish.roles import Role, is_portable, role_of
+from embomatrix.factory.furnish.rooms import Furnishing, furnish
+from embomatrix.factory.furnish.space import RoomSpace
+from embomatrix.factory.scenes.access import without_unserved_cabinets
+from embomatrix.world.catalog import Catalog
+from embomatrix.world.scene import RobotStart, Scene, SceneObject
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from embomatrix.factory.furnish.pieces import Placed
+    from embomatrix.world.asset import Asset
+    from embomatrix.world.catalog import RoomInventory, SceneInventory
+
+logger = logging.getLogger(__name__)
+
+PLANS: Final = 4
+SMALL_HOUSE: Final = 250
+LOSS_TAKEN: Final = 4.0
+"""Plans are drawn again while more than this is left out: a cabinet, a bed; not for a trash can."""
+_FLAT_NAMES: Final = (
+    "picture painting portrait information_bulletin periodic_table map projection_screen hanging_banners hanging "
+    "architectural_plan"
+)
+_FLAT_ON_WALL: Final = frozenset(_FLAT_NAMES.split())
+
+
+def build_base_scene(
+    scene_id: str, *, seed: int = 0, imported: Mapping[str, Asset] = MappingProxyType({})
+) -> Scene:
+    """Lay out and furnish one of the catalog's inventories.
+
+    ``imported`` assets, by their id, stand in place of the generated ones. Equal arguments give equal scenes.
+    Raises CatalogError for an unknown id, FloorPlanError when its rooms can't be joined.
+    """
+    catalog = Catalog.load()
+    inventory = catalog.inventory(scene_id)
+    rng = np.random.default_rng(np.random.SeedSequence((seed, zlib.crc32(scene_id.encode()))))
+    pieces, notes = _pieces(catalog, inventory, imported)
+    specs = [room_spec(catalog, room) for room in inventory.rooms]
+    plan, result = _best_plan(specs, pieces, rng)
+    objects, assets = _objects(result.placed)
+    scene = Scene(
+        scene_id=scene_id,
+        base=scene_id,
+        seed=seed,
+        rooms=plan.rooms,
+        walls=plan.walls,
+        doorways=plan.doorways,
+        objects=objects,
+        assets=assets,
+        robot=_robot_start(plan, result.placed),
+        left_out=(*notes, *plan.left_out, *result.left_out),
+        windows=plan.windows,
+    )
+    scene = without_unserved_cabinets(scene)
+    logger.info(
+        "scene built id=%s seed=%d objects=%d left_out=%d",
+        scene_id,
+        seed,
+        len(scene.objects),
+        len(scene.left_out),
+    )
+    return scene
+
+
+def _best_plan(
+    specs: Sequence[RoomSpec], pieces: dict[str, list[Piece]], rng: np.random.Generator
+) -> tuple[FloorPlan, Furnishing]:
+    """Furnish a few plans until one loses nothing of importance; houses with much to place get one."""
+    best: tuple[FloorPlan, Furnishing] | None = None
+    small_house = sum(len(mine) for mine in pieces.values()) < SMALL_HOUSE
+    for _ in range(PLANS if small_house else 1):
+        plan = plan_floor(specs, rng)
+        result = furnish(plan, pieces, rng)
+        if best is None or result.loss < best[1].loss:
+            best = (plan, result)
+        if best[1].loss < LOSS_TAKEN:
+            break
+    if best is None:
+        raise ValueError(f"PLANS is {PLANS}: expected at least one")
+    return best
+
+
+def room_spec(catalog: Catalog, room: RoomInventory) -> RoomSpec:
+    """Floor, doors and windows of an inventory's room, each as often as it is listed."""
+    doors = []
+    for category, model, count in room.doors:
+        _, width, height = catalog.model(category, model).size_m
+        doors += [DoorSpec(model, width, height)] * count
+    windows = []
+    for category, model, count in room.windows:
+        depth, width, height = catalog.model(category, model).size_m
+        # A flat model's face is at its top: it is listed as it lies, not as it stands.
+        face = (depth, width) if height < 0.1 else (max(depth, width), height)
+        windows += [WindowSpec(model, *face)] * count
+    return RoomSpec(room.name, room.type, room.floor_m, tuple(doors), tuple(windows))
+
+
+def _pieces(
+    catalog: Catalog, inventory: SceneInventory, imported: Mapping[str, Asset]
+) -> tuple[dict[str, list[Piece]], list[str]]:
+    """The items of every room as pieces, and sentences on what is listed twice or not modelled."""
+    notes = [note for room in inventory.rooms for note in _floor_notes(room)]
+    pieces: dict[str, list[Piece]] = {}
+    seen: set[str] = set()
+    number = 0
+    # Large rooms first: what spans two rooms, a bar, is listed in both and stands where it fits.
+    for room in sorted(inventory.rooms, key=lambda r: -r.floor_m[0] * r.floor_m[1]):
+        mine = pieces.setdefault(room.name, [])
+        for category, model, count in room.items:
+            asset = imported.get(f"{category}-{model}") or build_asset(catalog, category, model)
+            if asset.asset_id in seen and max(asset.size_m[:2]) > max(room.floor_m) - 0.02:
+                notes.append(
+                    f"{count} {asset.asset_id} in {room.name}: listed in two rooms, it stands in the larger one"
+                )
+                continue
+            seen.add(asset.asset_id)
+            role = role_of(category, asset.size_m, asset.mass_kg)
+            flat = category in _FLAT_ON_WALL and asset.size_m[2] < min(asset.size_m[:2])
+            for _ in range(count):
+                mine.append(Piece(number, category, asset, role, upended=flat and role is Role.WALL))
+                number += 1
+    return pieces, notes
+
+
+def _floor_notes(room: RoomInventory) -> list[str]:
+    """Where the floor is not the inventory's own, or not all of it."""
+    notes = []
+    if room.floor_estimated:
+        notes.append(f"floor of {room.name}: none is listed; the median of its room type stands for it")
+    if room.more_floors_m:
+        more = ", ".join(f"{x:.1f} x {y:.1f} m" for x, y in room.more_floors_m)
+        notes.append(
+            f"{len(room.more_floors_m)} more floors of {room.name} ({more}): its largest one is the room"
+        )
+    return notes
+
+
+def _objects(placed: Sequence[Placed]) -> tuple[tuple[SceneObject, ...], dict[str, Asset]]:
+    counts: Counter[str] = Counter()
+    names = []
+    for item in placed:
+        counts[item.piece.category] += 1
+        names.append(f"{item.piece.category}_{counts[item.piece.category]}")
+    objects = tuple(
+        SceneObject(
+            name=name,
+            asset_id=item.piece.asset.asset_id,
+            room=item.room,
+            pose_world_asset=item.pose,
+            fixed=item.piece.role is not Role.SURFACE or not is_portable(item.piece.asset),
+            joints=(0.0,) * len(item.piece.asset.joints),
+            host=names[item.host] if item.host >= 0 else "",
+            relation=item.relation,
+        )
+        for name, item in zip(names, placed, strict=True)
+    )
+    return objects, {item.piece.asset.asset_id: item.piece.asset for item in placed}
+
+
+def _robot_start(plan: FloorPlan, placed: Sequence[Placed]) -> RobotStart:
+    """The free spot nearest to the middle of the largest public room, looking along x."""
+    public = ("living_room", "corridor", "lobby", "entryway", "dining_room", "kitchen")
+    rooms = sorted(plan.rooms, key=lambda r: (r.type not in public, -r.size_m[0] * r.size_m[1]))
+    for room in rooms:
+        space = RoomSpace(room, plan.doorways)
+        space.occupy([box for p in placed if p.room == room.name for box in p.boxes])
+        cells = space.free_cells()
+        if len(cells):
+            x, y = cells[np.argmin(np.hypot(*(cells - np.asarray(room.center_m)).T))]
+            return RobotStart(float(x), float(y), 0.0, room.name)
+    raise ValueError(f"no room of {[r.name for r in plan.rooms]} has a free spot for the robot: expected one")

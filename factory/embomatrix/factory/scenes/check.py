@@ -1,0 +1,227 @@
+"""What a scene must keep: nothing interpenetrates, everything rests or hangs, the robot gets to all that it may use.
+
+Geometry tells most of it; the engine finds penetrations once more, and lets go of everything that can move.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.factory.floorplan.spec import MIN_DOOR_M
+from embomatrix.factory.furnish.pieces import Access
+from embomatrix.factory.scenes.access import unserved
+from embomatrix.factory.scenes.clearance import Clearance
+from embomatrix.factory.scenes.floor import ReachableFloor, box_of
+from embomatrix.factory.scenes.solids import Solids, placed_parts
+from embomatrix.sim.bullet.engine import BulletEngine
+from embomatrix.sim.bullet.settling import settle_scene
+from embomatrix.sim.engine import FLOOR
+from embomatrix.world.state import Relation
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from embomatrix.world.geometry import Aabb
+    from embomatrix.world.scene import Scene, SceneObject
+
+REST_M: Final = 0.002
+HANG_M: Final = 0.03
+CEILING_M: Final = 2.4
+CUT_OFF_M2: Final = 1.0
+CUT_OFF_SHARE: Final = 0.01
+"""Floor that the robot fits on but can't get to: more of it in a room, by both counts, is an aisle that is barred."""
+STABLE_SHARE: Final = 0.96
+"""Share of the movable objects that must stay within 1 cm and 10 degrees when all are let go at once."""
+_EDGE_M: Final = 0.005
+
+
+class ProblemKind(StrEnum):
+    NAME = "name"
+    PENETRATION = "penetration"
+    FLOATING = "floating"
+    ROOM = "room"
+    ACCESS = "access"
+    UNREACHABLE_ROOM = "unreachable_room"
+    AISLE = "aisle"
+    DOORWAY = "doorway"
+    WINDOW = "window"
+    UNSTABLE = "unstable"
+    SUNKEN = "sunken"
+    UNACCOUNTED = "unaccounted"
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """One broken rule: which objects (or rooms) break it and by how much, in words."""
+
+    kind: ProblemKind
+    names: tuple[str, ...]
+    detail: str
+
+
+def check_scene(scene: Scene) -> tuple[Problem, ...]:
+    """All broken rules by geometry alone; empty for a good scene."""
+    return (
+        *_names(scene),
+        *_penetrations(scene),
+        *_supports(scene),
+        *_rooms(scene),
+        *reach_problems(scene),
+        *_openings(scene),
+    )
+
+
+def check_in_engine(scene: Scene) -> tuple[Problem, ...]:
+    """Penetrations of more than 1 mm that Bullet finds. Raises EngineError where the engine is missing."""
+    engine = BulletEngine(scene)
+    try:
+        found = []
+        for item in scene.objects:
+            other = engine.penetrates(item.name, ignore=frozenset({FLOOR}))
+            if other:
+                found.append(Problem(ProblemKind.PENETRATION, (item.name, other), "found by the engine"))
+        return tuple(found)
+    finally:
+        engine.close()
+
+
+@dataclass(frozen=True, slots=True)
+class Settlement:
+    """What became of a scene that was let go: how many objects can move, which did, and who sank into whom."""
+
+    movable: int
+    unstable: tuple[str, ...]
+    problems: tuple[Problem, ...]
+
+    @property
+    def stable_share(self) -> float:
+        """Share of the movable objects that stayed; 1 where nothing can move."""
+        return 1.0 - len(self.unstable) / self.movable if self.movable else 1.0
+
+
+def check_settled(scene: Scene) -> Settlement:
+    """Let go of everything that can move, at once. Raises EngineError where the engine is missing."""
+    settled = settle_scene(scene)
+    problems = [
+        Problem(ProblemKind.SUNKEN, pair, f"{depth * 1000:.1f} mm into one another after settling")
+        for pair, depth in settled.overlaps.items()
+    ]
+    found = Settlement(len(settled.objects), settled.unstable, ())
+    if found.stable_share < STABLE_SHARE:
+        moved = max(settled.objects[name].moved_m for name in found.unstable)
+        detail = (
+            f"{found.stable_share:.1%} of {found.movable} movable objects stay, one moves {moved:.2f} m: "
+            f"expected {STABLE_SHARE:.0%}"
+        )
+        problems.append(Problem(ProblemKind.UNSTABLE, found.unstable, detail))
+    return replace(found, problems=tuple(problems))
+
+
+def _names(scene: Scene) -> Iterator[Problem]:
+    for name, count in Counter(item.name for item in scene.objects).items():
+        if count > 1:
+            yield Problem(ProblemKind.NAME, (name,), f"the name stands {count} times: expected unique names")
+    known = {item.name for item in scene.objects}
+    for item in scene.objects:
+        if item.host and item.host not in known:
+            yield Problem(ProblemKind.NAME, (item.name,), f"its host {item.host!r} is not in the scene")
+
+
+def _penetrations(scene: Scene) -> Iterator[Problem]:
+    solids = Solids.of_scene(scene)
+    seen: set[frozenset[str]] = set()
+    for item in scene.objects:
+        parts = placed_parts(scene.assets[item.asset_id], item.pose_world_asset)
+        for other, depth in solids.overlaps(parts, ignore=item.name).items():
+            pair = frozenset((item.name, other))
+            if pair not in seen:
+                seen.add(pair)
+                detail = f"{item.name} and {other} overlap by {depth * 1000:.1f} mm"
+                yield Problem(ProblemKind.PENETRATION, (item.name, other), detail)
+
+
+def _supports(scene: Scene) -> Iterator[Problem]:
+    for item in scene.objects:
+        box = box_of(scene, item)
+        if box.low_m[2] < -REST_M:
+            yield Problem(ProblemKind.FLOATING, (item.name,), f"{-box.low_m[2]:.3f} m below the floor")
+        elif item.host:
+            if item.host in scene.by_name and not _rests(scene, item, box):
+                detail = f"underside at {box.low_m[2]:.3f} m rests on no surface of {item.host}"
+                yield Problem(ProblemKind.FLOATING, (item.name, item.host), detail)
+        elif box.low_m[2] > REST_M and not _hangs(scene, item, box):
+            detail = f"underside at {box.low_m[2]:.3f} m, no host, no wall or ceiling within {HANG_M} m"
+            yield Problem(ProblemKind.FLOATING, (item.name,), detail)
+
+
+def _rests(scene: Scene, item: SceneObject, box: Aabb) -> bool:
+    """Whether the underside lies on a surface of the host with the box's middle above it."""
+    host = scene.by_name[item.host]
+    for support in scene.assets[host.asset_id].supports:
+        if bool(support.interior) < (item.relation is Relation.INSIDE):
+            continue
+        x, y, z = host.pose_world_asset.inverse().apply((*box.center_m[:2], box.low_m[2]))
+        cx, cy, cz = support.center_m
+        on = abs(x - cx) <= support.size_m[0] / 2 + _EDGE_M and abs(y - cy) <= support.size_m[1] / 2 + _EDGE_M
+        if on and -1e-6 <= z - cz <= REST_M:
+            return True
+    top = box_of(scene, host).high_m[2]
+    return item.relation is Relation.ONTOP and -1e-6 <= box.low_m[2] - top <= REST_M
+
+
+def _hangs(scene: Scene, item: SceneObject, box: Aabb) -> bool:
+    if not item.fixed:
+        return False
+    room = next((r for r in scene.rooms if r.name == item.room), None)
+    if room is None or box.high_m[2] > CEILING_M - HANG_M:
+        return room is not None
+    gaps = (
+        *(abs(low - edge) for low, edge in zip(box.low_m, room.low_m, strict=False)),
+        *(abs(high - edge) for high, edge in zip(box.high_m, room.high_m, strict=False)),
+    )
+    return min(gaps) <= HANG_M
+
+
+def _rooms(scene: Scene) -> Iterator[Problem]:
+    rooms = {room.name: room for room in scene.rooms}
+    for item in scene.objects:
+        x, y, _ = item.pose_world_asset.position_m
+        if item.room not in rooms or not rooms[item.room].contains(x, y):
+            yield Problem(ProblemKind.ROOM, (item.name,), f"its middle lies outside its room {item.room!r}")
+
+
+def reach_problems(scene: Scene) -> Iterator[Problem]:
+    """Rooms that no free floor leads into, and furniture that the robot can't get at."""
+    floor = ReachableFloor(scene)
+    if not floor.has_start:
+        yield Problem(
+            ProblemKind.UNREACHABLE_ROOM, (scene.robot.room,), "the robot's start is not free floor"
+        )
+        return
+    for room in scene.rooms:
+        if not floor.enters(room):
+            yield Problem(ProblemKind.UNREACHABLE_ROOM, (room.name,), "no free floor leads into it")
+        elif floor.cut_off_m2(room) > max(CUT_OFF_M2, CUT_OFF_SHARE * room.size_m[0] * room.size_m[1]):
+            detail = f"furniture cuts off {floor.cut_off_m2(room):.1f} m2 of floor where the robot fits"
+            yield Problem(ProblemKind.AISLE, (room.name,), detail)
+    for item, access in unserved(scene, floor):
+        where = "beside it" if access is Access.BESIDE else "before its front"
+        yield Problem(ProblemKind.ACCESS, (item.name,), f"no reachable spot {where}")
+
+
+def _openings(scene: Scene) -> Iterator[Problem]:
+    for doorway in scene.doorways:
+        if doorway.width_m < MIN_DOOR_M - _EDGE_M:
+            detail = f"{doorway.width_m:.2f} m wide: expected {MIN_DOOR_M} m"
+            yield Problem(ProblemKind.DOORWAY, doorway.rooms, detail)
+    clearance = Clearance(scene)
+    for doorway, room, names in clearance.before_doorways():
+        if names:
+            beyond = next((other for other in doorway.rooms if other != room), "") or "outside"
+            yield Problem(ProblemKind.DOORWAY, names, f"before the doorway from {room} to {beyond}")
+    for _, room, names in clearance.before_windows():
+        if names:
+            yield Problem(ProblemKind.WINDOW, names, f"before a window of {room}")

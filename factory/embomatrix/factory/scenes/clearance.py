@@ -1,0 +1,103 @@
+"""What must stay free: the floor before doorways and the space before windows, by the parts of objects with joints shut."""
+
+from __future__ import annotations
+
+import functools
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from embomatrix.factory.furnish.space import (
+    DOOR_CLEAR_M,
+    DOOR_HEIGHT_M,
+    LOW_M,
+    WINDOW_CLEAR_M,
+    WINDOW_FROM_M,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+    from embomatrix.world.geometry import Aabb, FloatArray
+    from embomatrix.world.scene import Doorway, Room, Scene, Window
+
+    BoolArray = NDArray[np.bool_]
+
+SHALLOW: Final = 0.7
+"""Share of a room's shorter side that is kept free before a door or window where the full clearance is deeper than that."""
+_TOUCH_M: Final = 1e-3
+
+
+class Clearance:
+    """Boxes of everything that stands or hangs in a scene on its own; what rests on furniture is left out."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        self._rooms = {room.name: room for room in scene.rooms}
+        rows, names = [], []
+        for item in scene.objects:
+            if item.host:
+                continue
+            for link in scene.assets[item.asset_id].links:
+                for part in link.parts:
+                    box = part.aabb(item.pose_world_asset)
+                    rows.append((*box.low_m, *box.high_m))
+                    names.append(item.name)
+        self._boxes = np.array(rows).reshape(-1, 6)
+        self._names = names
+
+    def before_doorways(self) -> Iterator[tuple[Doorway, str, tuple[str, ...]]]:
+        """Every side of every doorway: the doorway, the room on this side, and what stands in its clear floor."""
+        for doorway, room, zone in self._door_zones:
+            yield doorway, room, self._within(zone)
+
+    def bars_a_doorway(self, box: Aabb) -> bool:
+        """Whether a box reaches into the clear floor before any doorway."""
+        corners = np.array((*box.low_m, *box.high_m))
+        return any(_overlap(corners[None], zone)[0] for _, _, zone in self._door_zones)
+
+    def before_windows(self) -> Iterator[tuple[Window, str, tuple[str, ...]]]:
+        """Every side of every window, and what takes its light."""
+        for window in self._scene.windows:
+            low = max(window.sill_m, WINDOW_FROM_M)
+            for room in self._sides(window):
+                zone = self._zone(window, self._rooms[room], WINDOW_CLEAR_M, low, window.head_m)
+                yield window, room, self._within(zone)
+
+    @functools.cached_property
+    def _door_zones(self) -> list[tuple[Doorway, str, FloatArray]]:
+        return [
+            (doorway, room, self._zone(doorway, self._rooms[room], DOOR_CLEAR_M, LOW_M, DOOR_HEIGHT_M))
+            for doorway in self._scene.doorways
+            for room in self._sides(doorway)
+        ]
+
+    def _sides(self, opening: Doorway | Window) -> list[str]:
+        return [room for room in opening.rooms if room in self._rooms]
+
+    @staticmethod
+    def _zone(
+        opening: Doorway | Window, room: Room, depth_m: float, low_m: float, high_m: float
+    ) -> FloatArray:
+        """Corners (6,) of the space before an opening, from the room's wall inwards."""
+        depth = min(depth_m, SHALLOW * min(room.size_m))
+        across = 1 if opening.along == "x" else 0
+        half = opening.width_m / 2
+        low, high = np.array(opening.center_m) - half, np.array(opening.center_m) + half
+        if opening.center_m[across] < room.center_m[across]:
+            low[across], high[across] = room.low_m[across], room.low_m[across] + depth
+        else:
+            low[across], high[across] = room.high_m[across] - depth, room.high_m[across]
+        return np.array([*low, low_m, *high, high_m])
+
+    def _within(self, zone: FloatArray) -> tuple[str, ...]:
+        hits = np.flatnonzero(_overlap(self._boxes, zone))
+        return tuple(dict.fromkeys(self._names[hit] for hit in hits))
+
+
+def _overlap(boxes: FloatArray, zone: FloatArray) -> BoolArray:
+    """Which of the boxes, shape (n, 6), share more than a millimetre with a zone (6,)."""
+    over = np.minimum(boxes[:, 3:], zone[3:]) - np.maximum(boxes[:, :3], zone[:3])
+    return np.asarray((over > _TOUCH_M).all(axis=1))

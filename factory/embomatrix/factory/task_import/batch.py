@@ -1,0 +1,87 @@
+"""Imports of many problems: each is bound to the first scene that has what it needs, then judged in the simulator."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeVar
+
+from embomatrix.factory.admission import Admitted, admit
+from embomatrix.factory.pipeline.poses import Needs, cache_poses
+from embomatrix.factory.refusal import Refusal, RefusalReason
+from embomatrix.factory.task_import.task import Imported, import_problem
+from embomatrix.factory.writer.view import SceneView
+from embomatrix.sim.executor import Simulator
+from embomatrix.sim.planner.oracle import find_plan
+from embomatrix.sim.prepared import prepare
+from embomatrix.skills.parse import plan_to_json
+from embomatrix.world.bundle import Bundle, bundle_digest, encode_bundle
+from embomatrix.world.dataset import TaskRecord
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from embomatrix.factory.task_import.sources import SourceText
+    from embomatrix.sim.pose_cache import PlacementLibrary
+    from embomatrix.world.scene import Scene
+
+
+@dataclass(frozen=True, slots=True)
+class Verified:
+    """An imported task that was admitted, with its bundle."""
+
+    record: TaskRecord
+    bundle: bytes
+
+
+def bind_first(source: SourceText, bases: Sequence[Scene], *, seed: int = 0) -> Imported | Refusal:
+    """The problem in the first scene that it can be bound to, else the refusal that came furthest. Raises BddlError."""
+    return _first(import_problem(source, base, seed=seed) for base in bases)
+
+
+def verify_first(
+    source: SourceText, bases: Sequence[Scene], library: PlacementLibrary, *, seed: int = 0
+) -> Verified | Refusal:
+    """The problem in the first scene in which it is admitted, else the refusal that came furthest. Raises BddlError."""
+
+    def judged(base: Scene) -> Verified | Refusal:
+        imported = import_problem(source, base, seed=seed)
+        return imported if isinstance(imported, Refusal) else verify(imported, library, seed=seed)
+
+    return _first(judged(base) for base in bases)
+
+
+T = TypeVar("T", Imported, Verified)
+
+
+def _first(outcomes: Iterable[T | Refusal]) -> T | Refusal:
+    refusals: list[Refusal] = []
+    for outcome in outcomes:
+        if not isinstance(outcome, Refusal):
+            return outcome
+        refusals.append(outcome)
+    if not refusals:
+        raise ValueError("no scene to bind to: expected at least one")
+    order = list(RefusalReason)
+    return max(refusals, key=lambda refusal: order.index(refusal.reason))
+
+
+def verify(imported: Imported, library: PlacementLibrary, *, seed: int = 0) -> Verified | Refusal:
+    """Judge an imported task by execution, and pack it when it is admitted."""
+    needs = Needs(imported.about, imported.task.table)
+    poses = cache_poses(SceneView(imported.scene), [needs], library, seed)
+    with contextlib.closing(Simulator(Bundle(imported.scene, {}, poses))) as stage:
+        verdict = admit(stage, imported.task, find_plan, imported.init)
+        if not isinstance(verdict, Admitted):
+            return verdict
+        bundle = Bundle(imported.scene, {imported.task.task_id: imported.task}, poses)
+        data = encode_bundle(prepare(bundle, stage.world))
+    record = TaskRecord(
+        task=imported.task,
+        bundle_digest=bundle_digest(data),
+        split="train",
+        oracle=tuple(plan_to_json(verdict.plan)),
+        rooms=imported.rooms,
+        signature=imported.signature,
+    )
+    return Verified(record, data)

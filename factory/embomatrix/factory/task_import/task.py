@@ -1,0 +1,268 @@
+"""The importer: a BDDL problem becomes a task in a scene of its own, or a refusal with a reason."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from embomatrix.factory.editor import PlacementError, SceneEditor
+from embomatrix.factory.refusal import Refusal, RefusalReason, RefusedError
+from embomatrix.factory.task_import.binding import AGENT, FLOORS, bind
+from embomatrix.factory.task_import.reach import FUTURE, INSOURCE, REAL, pieces_of, profile_for
+from embomatrix.factory.task_import.scene import with_robot_in, with_states
+from embomatrix.factory.writer.tasks import object_table
+from embomatrix.factory.writer.view import SceneView, is_liftable
+from embomatrix.world.bddl import ROOM_TYPES, Literal, is_room_instance, parse_problem
+from embomatrix.world.catalog import Catalog
+from embomatrix.world.evaluate import atoms_of, objects_of, render, substitute, types_of
+from embomatrix.world.goal import Atom
+from embomatrix.world.state import Relation, State, SubstanceRelation
+from embomatrix.world.substances import MEANINGS, flows_from, is_substance
+from embomatrix.world.task import MAX_TABLE, Task, TaskCategory
+
+if TYPE_CHECKING:
+    from embomatrix.factory.task_import.binding import Addition, Binding
+    from embomatrix.factory.task_import.sources import SourceText
+    from embomatrix.world.bddl import Problem
+    from embomatrix.world.catalog import Model
+    from embomatrix.world.geometry import Vec3
+    from embomatrix.world.goal import Formula
+    from embomatrix.world.scene import Scene
+
+_ROOM_OR_TEXT: Final = re.compile(
+    rf"(?:{'|'.join(sorted(ROOM_TYPES, key=len, reverse=True))})_\d+|.+?(?=(?:{'|'.join(sorted(ROOM_TYPES))})_\d|$)",
+    re.IGNORECASE,
+)
+MODEL_TRIES: Final = 5
+"""Models of a type that are tried before it counts as not fitting its place."""
+KITCHEN: Final = frozenset({State.COOKED, State.FROZEN, State.HOT, State.SLICED, REAL})
+SWITCHED: Final = frozenset({State.OPEN, State.TOGGLED_ON})
+CLEANED: Final = frozenset((*MEANINGS, *SubstanceRelation))
+
+
+@dataclass(frozen=True, slots=True)
+class Imported:
+    """A task bound to a scene. ``init`` is what must hold at the start; the simulator has not seen it yet."""
+
+    scene: Scene
+    task: Task
+    init: tuple[Literal, ...]
+    about: tuple[str, ...]
+    """The problem's objects, by their names in the scene."""
+    rooms: tuple[str, ...]
+    signature: str
+
+
+def import_problem(source: SourceText, base: Scene, *, seed: int = 0) -> Imported | Refusal:
+    """Bind a problem to a base scene. Raises BddlError when the text can't be read."""
+    problem = parse_problem(source.text)
+    digest = hashlib.sha256(f"{seed} {base.scene_id} {source.text}".encode()).digest()
+    rng = np.random.default_rng(np.random.SeedSequence(list(digest[:8])))
+    try:
+        return _Binder(source, problem, base, rng, digest.hex()[:6]).imported()
+    except RefusedError as error:
+        return error.refusal
+
+
+class _Binder:
+    """One import. ``names`` grows from the found objects to all of the problem's."""
+
+    def __init__(
+        self, source: SourceText, problem: Problem, base: Scene, rng: np.random.Generator, key: str
+    ) -> None:
+        self._source = source
+        self._problem = problem
+        self._substances = {name: synset for name, synset in problem.objects.items() if is_substance(synset)}
+        self._base = base
+        self._rng = rng
+        self._scene_id = f"{base.base}-{_slug(source.name)}-{key}"
+        self._hosts = {
+            atom.args[1].lstrip("?")
+            for atom in (*atoms_of(problem.goal), *(item.atom for item in problem.init))
+            if atom.predicate in {Relation.INSIDE, Relation.ONTOP}
+        }
+        """Objects, and types that variables range over, on or in which something is or is to be."""
+
+    def imported(self) -> Imported:
+        binding = bind(self._problem, self._base, self._rng)
+        self._problem = binding.problem
+        editor = SceneEditor(self._base, self._rng)
+        names = dict(binding.found)
+        for addition in binding.additions:
+            names[addition.name] = self._add(editor, addition, names)
+        for whole, halves in pieces_of(self._problem).items():
+            names |= zip(halves, self._add_pieces(editor, names[whole], halves), strict=True)
+        for floor in self._floors_asked_for():
+            names[floor] = self._add_floor(editor, floor, binding)
+        start = self._start(names, binding)
+        scene = with_states(with_robot_in(editor.freeze(self._scene_id), binding.robot_room), start)
+        return self._task(scene, names, binding, start)
+
+    def _add_floor(self, editor: SceneEditor, floor: str, binding: Binding) -> str:
+        if floor not in binding.floors:
+            raise RefusedError(
+                RefusalReason.NO_PLACE_GIVEN, f"the start does not say of which room {floor!r} is the floor"
+            )
+        return editor.add_floor(binding.floors[floor])
+
+    def _floors_asked_for(self) -> tuple[str, ...]:
+        """Floors that the goal is about: these become objects. Others are just where things stand."""
+        about = {arg for atom in atoms_of(self._problem.goal) for arg in atom.args} | types_of(
+            self._problem.goal
+        )
+        return tuple(
+            name
+            for name, type_name in self._problem.objects.items()
+            if type_name in FLOORS and {name, type_name} & about
+        )
+
+    def _add(self, editor: SceneEditor, addition: Addition, names: dict[str, str]) -> str:
+        host = names[addition.host] if addition.host else addition.room
+        reason = "its type has no model"
+        for model in self._models(addition)[:MODEL_TRIES]:
+            try:
+                return editor.add(model.category, model.model_id, addition.relation, host, room=addition.room)
+            except PlacementError as error:
+                reason = str(error)
+        raise RefusedError(
+            RefusalReason.DOES_NOT_FIT,
+            f"{addition.name!r} has no place {addition.relation or 'on the floor of'} {host}: {reason}",
+        )
+
+    def _add_pieces(self, editor: SceneEditor, whole: str, halves: tuple[str, ...]) -> tuple[str, ...]:
+        """The halves of a thing, of the model whose volume is nearest to half of the whole's."""
+        catalog = Catalog.load()
+        half_m3 = math.prod(self._size_of(editor, whole)) / 2
+        models = [
+            model
+            for category in catalog.categories_of(self._problem.objects[halves[0]])
+            for model in catalog.models_of(category)
+        ]
+        model = min(models, key=lambda model: abs(math.prod(model.size_m) - half_m3))
+        return editor.add_pieces(whole, model.category, model.model_id, len(halves))
+
+    def _size_of(self, editor: SceneEditor, name: str) -> Vec3:
+        category, _, model = editor.objects[name].asset_id.rpartition("-")
+        return Catalog.load().model(category, model).size_m
+
+    def _models(self, addition: Addition) -> list[Model]:
+        """Models of the type: liftable ones first; large ones for what must hold others, else small ones."""
+        catalog = Catalog.load()
+        ranked: list[tuple[bool, float, Model]] = []
+        for category in catalog.categories_of(addition.type):
+            mass = catalog.category(category).mass_kg
+            for model in catalog.models_of(category):
+                volume = math.prod(model.size_m) * float(self._rng.uniform(0.7, 1.4))
+                holds = addition.name in self._hosts or addition.type in self._hosts
+                ranked.append((not is_liftable(model.size_m, mass), -volume if holds else volume, model))
+        return [model for _, _, model in sorted(ranked, key=lambda item: item[:2])]
+
+    def _task(
+        self, scene: Scene, names: dict[str, str], binding: Binding, start: tuple[Literal, ...]
+    ) -> Imported:
+        view = SceneView(scene)
+        types = {
+            type_name: tuple({**names, **self._substances}[name] for name in self._problem.types[type_name])
+            for type_name in sorted(types_of(self._problem.goal))
+        }
+        goal = substitute(self._problem.goal, {**names, **self._substances, **binding.rooms})
+        about = objects_of(goal, types)
+        table = object_table(view, tuple(dict.fromkeys(names.values())), self._rng)
+        missing = about - set(table)
+        if missing:
+            raise RefusedError(
+                RefusalReason.TABLE_TOO_LONG,
+                f"the goal is about {len(about)} objects: a table has at most {MAX_TABLE} rows",
+            )
+        task = Task(
+            task_id=self._scene_id,
+            scene_id=scene.scene_id,
+            instruction=instruction_of(self._source, self._problem),
+            category=category_of(goal),
+            goal=goal,
+            goal_bddl=render(goal),
+            table=table,
+            types=types,
+            source=self._source.source,
+            profile=profile_for(goal),
+        )
+        rooms = tuple(sorted({view.room(name) for name in about}))
+        return Imported(scene, task, start, tuple(names.values()), rooms, signature_of(goal, view))
+
+    def _start(self, names: dict[str, str], binding: Binding) -> tuple[Literal, ...]:
+        """``:init`` in the scene's names, without the floors that are no objects, the robot, and what is not the case.
+
+        What a thing is the source of, a shaker of its salt, it contains; water flows out of a sink by itself.
+        """
+        skipped = {
+            name
+            for name, type_name in self._problem.objects.items()
+            if type_name == AGENT or (type_name in FLOORS and name not in names)
+        }
+        scene_names = {**names, **self._substances, **binding.rooms}
+        return tuple(
+            Literal(_renamed(literal, scene_names), literal.positive)
+            for literal in self._problem.init
+            if not skipped & set(literal.atom.args)
+            and (literal.positive or literal.atom.predicate in SWITCHED)
+            and not self._is_understood(literal.atom)
+        )
+
+    def _is_understood(self, atom: Atom) -> bool:
+        """Whether the scene need not be told: a substance is to come, or flows out of what it is said to come from."""
+        type_name = self._problem.objects.get(atom.args[0], "")
+        if atom.predicate == INSOURCE:
+            return self._substances.get(atom.args[1], "") in flows_from(type_name)
+        return atom.predicate in (REAL, FUTURE) and is_substance(type_name)
+
+
+def _renamed(literal: Literal, names: dict[str, str]) -> Atom:
+    predicate = literal.atom.predicate
+    return Atom(
+        SubstanceRelation.CONTAINS.value if predicate == INSOURCE else predicate,
+        tuple(names.get(arg, arg) for arg in literal.atom.args),
+    )
+
+
+def instruction_of(source: SourceText, problem: Problem) -> str:
+    """What a person asks for. The paper's tasks carry it as the problem's name, with underscores for spaces."""
+    words = source.request or problem.name
+    words = re.sub(r"-\d+$", "", words)
+    words = re.sub(r"\.n\.\d+(_\d+)?", "", words)
+    spaced = " ".join(
+        word if is_room_instance(word.lower()) else word.replace("_", " ")
+        for word in _ROOM_OR_TEXT.findall(words)
+    )
+    words = re.sub(r"\s+([.,]|$)", r"\1", re.sub(r"\s+", " ", spaced)).strip(" .")
+    return f"{words[:1].upper()}{words[1:]}."
+
+
+def category_of(goal: Formula) -> TaskCategory:
+    """Which of the paper's four kinds a goal is."""
+    predicates = {atom.predicate for atom in atoms_of(goal)}
+    moves = bool(predicates & set(Relation))
+    switches = bool(predicates & (SWITCHED | CLEANED))
+    if predicates & KITCHEN:
+        outside = {Relation.ONTOP, Relation.UNDER, Relation.NEXTTO, State.OPEN} & predicates
+        return TaskCategory.COMPOUND if outside else TaskCategory.KITCHEN_OPERATION
+    if moves and switches:
+        return TaskCategory.COMPOUND
+    return TaskCategory.APPLIANCE_USE if switches else TaskCategory.PICK_AND_PLACE
+
+
+def signature_of(goal: Formula, view: SceneView) -> str:
+    """Kind of a goal: its predicates over categories, sorted. Variables stand for their type."""
+    signs = []
+    for atom in atoms_of(goal):
+        args = (view.category(arg) if arg in view.scene.by_name else arg.lstrip("?") for arg in atom.args)
+        signs.append(f"{atom.predicate}({','.join(args)})")
+    return " ".join(sorted(signs))
+
+
+def _slug(name: str) -> str:
+    return re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")[:40]

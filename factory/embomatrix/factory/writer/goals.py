@@ -1,0 +1,191 @@
+"""Pieces of goals: each kind of thing that a task can ask for, with the words that ask for it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.factory.writer.tables import suits
+from embomatrix.factory.writer.words import phrase, refer, spoken
+from embomatrix.world.goal import And, Atom, Exists, Formula, Not
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    import numpy as np
+
+    from embomatrix.factory.writer.variant import Variant
+    from embomatrix.factory.writer.view import SceneView
+
+MAX_ALIKE: Final = 4
+"""Furniture of one category in one room, of which a goal may mean any."""
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """One conjunct of a goal. ``objects`` are all that it is about, ``signs`` its part of the goal's signature."""
+
+    goal: Formula
+    clause: str
+    objects: tuple[str, ...]
+    signs: tuple[str, ...]
+    types: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Workshop:
+    """What the makers of pieces draw from. ``used`` are objects that earlier pieces of the same goal are about."""
+
+    view: SceneView
+    variant: Variant
+    rng: np.random.Generator
+    used: frozenset[str] = frozenset()
+
+    def pick(self, names: list[str]) -> str | None:
+        fresh = [name for name in names if name not in self.used]
+        return fresh[int(self.rng.integers(len(fresh)))] if fresh else None
+
+    def fixtures(self, wanted: Callable[[str], bool]) -> list[str]:
+        """Objects of the variant's rooms that are wanted and that words can name, alone or as one of a few alike."""
+        return [
+            name
+            for room in self.variant.rooms
+            for name in self.view.in_room[room]
+            if wanted(name) and len(self.view.alike(name)) <= MAX_ALIKE
+        ]
+
+    def things(self) -> list[str]:
+        """Small things that can be carried and that bear nothing themselves."""
+        hosts = {item.host for item in self.view.scene.objects}
+        return [name for name in self.variant.added if self.view.is_portable(name) and name not in hosts]
+
+
+def place_piece(shop: Workshop) -> Piece | None:
+    """Put a thing on or in another: furniture, an appliance or a basket."""
+    thing = shop.pick([name for name in shop.things() if not shop.view.is_basket(name)])
+    if thing is None:
+        return None
+    return _placed(shop, thing, refer(shop.view, thing, shop.rng))
+
+
+def _placed(shop: Workshop, thing: str, called: str) -> Piece | None:
+    """Put the thing, called so in the request, on or in something that it is not at already and that is large enough."""
+    view, rng = shop.view, shop.rng
+    inside = rng.random() < 0.5
+    baskets = [name for name in shop.variant.added if view.is_basket(name) and name != thing]
+    targets = (
+        [*shop.fixtures(view.is_container), *baskets, *baskets] if inside else shop.fixtures(view.is_surface)
+    )
+    here = {view.category(host) for host in view.hosts(thing)}
+    category = view.category(thing)
+    target = shop.pick(
+        [
+            name
+            for name in targets
+            if view.category(name) not in here
+            and suits(category, view.category(name))
+            and view.takes(name, thing, inside=inside)
+        ]
+    )
+    if target is None:
+        return None
+    predicate = "inside" if inside else "ontop"
+    goal, types, objects, place = _one_of(shop, target, lambda host: Atom(predicate, (thing, host)))
+    return Piece(
+        goal=goal,
+        clause=phrase(predicate, rng, thing=called, place=place),
+        objects=(thing, *objects),
+        signs=(f"{predicate}({view.category(thing)},{view.category(target)})",),
+        types=types,
+    )
+
+
+def _one_of(
+    shop: Workshop, target: str, atom: Callable[[str], Formula]
+) -> tuple[Formula, Mapping[str, tuple[str, ...]], tuple[str, ...], str]:
+    """The atom about the target, or about any of those that the same words mean; with the words."""
+    view = shop.view
+    alike = view.alike(target)
+    if len(alike) == 1:
+        return atom(target), {}, (target,), refer(view, target, shop.rng)
+    synset = view.asset(target).synset
+    variable = f"?{synset}"
+    return (
+        Exists(variable, synset, atom(variable)),
+        {synset: alike},
+        alike,
+        refer(view, target, shop.rng),
+    )
+
+
+def switch_piece(shop: Workshop) -> Piece | None:
+    """Open or close a door, switch an appliance or a light on or off."""
+    view, rng = shop.view, shop.rng
+    name = shop.pick(shop.fixtures(view.is_switchable))
+    if name is None:
+        return None
+    options = [("open", view.is_open(name))] * view.is_openable(name)
+    options += [("toggled_on", view.is_on(name))] * view.is_toggleable(name)
+    predicate, holds = options[int(rng.integers(len(options)))]
+    if len(view.alike(name)) > 1 and any(
+        _holds(view, predicate, other) != holds for other in view.alike(name)
+    ):
+        return None  # "open a cabinet" asks for nothing where one is open already
+    kind = f"not {predicate}" if holds else predicate
+
+    def atom(target: str) -> Formula:
+        return Not(Atom(predicate, (target,))) if holds else Atom(predicate, (target,))
+
+    goal, types, objects, words = _one_of(shop, name, atom)
+    return Piece(goal, phrase(kind, rng, thing=words), objects, (f"{kind}({view.category(name)})",), types)
+
+
+def _holds(view: SceneView, predicate: str, name: str) -> bool:
+    return view.is_open(name) if predicate == "open" else view.is_on(name)
+
+
+def thermal_piece(shop: Workshop) -> Piece | None:
+    """Heat, cook or freeze food with a source of the variant's rooms, and now and then leave it there."""
+    view, rng = shop.view, shop.rng
+    food = shop.pick([name for name in shop.things() if view.asset(name).can("cookable")])
+    source = shop.pick(shop.fixtures(view.is_source))
+    if food is None or source is None or source in view.hosts(food):
+        return None
+    effects = view.thermal_effects(food, source)
+    if not effects:
+        return None
+    predicate = effects[int(rng.integers(len(effects)))].value
+    return _thermal(shop, food, source, predicate)
+
+
+def _thermal(shop: Workshop, food: str, source: str, predicate: str) -> Piece:
+    view, rng = shop.view, shop.rng
+    place = refer(view, source, rng)
+    goal: Formula = Atom(predicate, (food,))
+    objects: tuple[str, ...] = (food,)
+    signs: tuple[str, ...] = (f"{predicate}({view.category(food)})",)
+    clause = phrase(predicate, rng, thing=refer(view, food, rng), place=place)
+    if view.is_container(source) and len(view.alike(source)) == 1 and rng.random() < 0.35:
+        goal = And((goal, Atom("inside", (food, source))))
+        objects = (food, source)
+        signs = (*signs, f"inside({view.category(food)},{view.category(source)})")
+        clause += f" and leave it in the {spoken(view.category(source))}"
+    return Piece(goal, clause, (*objects, *(view.alike(source))), signs)
+
+
+def serve_piece(shop: Workshop) -> Piece | None:
+    """Heat, cook or freeze food, then put it somewhere else."""
+    first = thermal_piece(shop)
+    if first is None or isinstance(first.goal, And):
+        return None
+    food = first.objects[0]
+    second = _placed(shop, food, "it")
+    if second is None or set(second.objects[1:]) & set(first.objects[1:]):
+        return None
+    return Piece(
+        goal=And((first.goal, second.goal)),
+        clause=f"{first.clause}, then {second.clause}",
+        objects=tuple(dict.fromkeys((*first.objects, *second.objects))),
+        signs=(*first.signs, *second.signs),
+        types=second.types,
+    )

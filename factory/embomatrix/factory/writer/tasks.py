@@ -1,0 +1,182 @@
+"""The task writer: seeded tasks over what a scene variant holds, in the paper's four categories."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.factory.writer.goals import (
+    Piece,
+    Workshop,
+    place_piece,
+    serve_piece,
+    switch_piece,
+    thermal_piece,
+)
+from embomatrix.factory.writer.words import sentence
+from embomatrix.world.evaluate import render
+from embomatrix.world.goal import And, Formula
+from embomatrix.world.task import MAX_TABLE, Task, TaskCategory
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    import numpy as np
+
+    from embomatrix.factory.writer.variant import Variant
+    from embomatrix.factory.writer.view import SceneView
+
+    Maker = Callable[[Workshop], Piece | None]
+
+ROWS: Final = (16, 24)
+"""Rows of an object table, least and most, where the rooms hold enough."""
+TRIES: Final = 12
+HELDOUT_OF: Final = 4
+"""One goal signature in this many belongs to the held-out split."""
+
+_RECIPES: Final[Mapping[TaskCategory, tuple[tuple[Maker, ...], ...]]] = {
+    TaskCategory.PICK_AND_PLACE: (
+        (place_piece,),
+        (place_piece,),
+        (place_piece, place_piece),
+    ),
+    TaskCategory.APPLIANCE_USE: (
+        (switch_piece,),
+        (switch_piece, switch_piece),
+        (switch_piece, switch_piece),
+    ),
+    TaskCategory.KITCHEN_OPERATION: ((thermal_piece,), (thermal_piece,), (serve_piece,)),
+    TaskCategory.COMPOUND: (
+        (place_piece, switch_piece),
+        (switch_piece, place_piece),
+        (thermal_piece, switch_piece),
+        (thermal_piece, place_piece),
+        (serve_piece, switch_piece),
+        (place_piece, place_piece, switch_piece),
+    ),
+}
+"""The pieces that make up a goal of each category; those written twice are twice as likely."""
+
+
+@dataclass(frozen=True, slots=True)
+class Draft:
+    """A written task, not yet known to be feasible.
+
+    ``about`` are the goal's objects and the appliances that it takes, ``rooms`` the rooms that they are in.
+    """
+
+    task: Task
+    about: tuple[str, ...]
+    rooms: tuple[str, ...]
+    signature: str
+
+
+def write_task(
+    variant: Variant,
+    view: SceneView,
+    category: TaskCategory,
+    task_id: str,
+    rng: np.random.Generator,
+) -> Draft | None:
+    """A task of the category in the variant, None when its rooms hold nothing for one. The generator decides all."""
+    recipes = _RECIPES[category]
+    for _ in range(TRIES):
+        pieces = _pieces(variant, view, recipes[int(rng.integers(len(recipes)))], rng)
+        if pieces:
+            return _draft(variant, view, category, task_id, pieces, rng)
+    return None
+
+
+def _pieces(
+    variant: Variant, view: SceneView, recipe: Sequence[Maker], rng: np.random.Generator
+) -> list[Piece]:
+    """One piece by each maker about objects of its own, or none at all."""
+    pieces: list[Piece] = []
+    for make in recipe:
+        used = frozenset(name for piece in pieces for name in piece.objects)
+        piece = make(Workshop(view, variant, rng, used))
+        if piece is None or any(set(piece.types) & set(other.types) for other in pieces):
+            return []
+        if used & set(piece.objects):
+            return []
+        pieces.append(piece)
+    return pieces
+
+
+def _draft(
+    variant: Variant,
+    view: SceneView,
+    category: TaskCategory,
+    task_id: str,
+    pieces: list[Piece],
+    rng: np.random.Generator,
+) -> Draft:
+    goal = _conjunction([piece.goal for piece in pieces])
+    types = {key: names for piece in pieces for key, names in piece.types.items()}
+    needed = dict.fromkeys(name for piece in pieces for name in piece.objects)
+    task = Task(
+        task_id=task_id,
+        scene_id=variant.scene.scene_id,
+        instruction=sentence([piece.clause for piece in pieces], rng),
+        category=category,
+        goal=goal,
+        goal_bddl=render(goal),
+        table=object_table(view, tuple(needed), rng),
+        types=types,
+        source="writer",
+    )
+    return Draft(
+        task=task,
+        about=tuple(needed),
+        rooms=tuple(sorted({view.room(name) for name in needed})),
+        signature=" ".join(sorted(sign for piece in pieces for sign in piece.signs)),
+    )
+
+
+def _conjunction(parts: list[Formula]) -> Formula:
+    flat: list[Formula] = []
+    for part in parts:
+        flat += part.parts if isinstance(part, And) else (part,)
+    return flat[0] if len(flat) == 1 else And(tuple(flat))
+
+
+def object_table(view: SceneView, needed: Sequence[str], rng: np.random.Generator) -> tuple[str, ...]:
+    """The needed objects with all that they rest on or in, and distractors of the same rooms, shuffled.
+
+    Distractors bring their own hosts along, so a row's place can always be told.
+    """
+    rows: dict[str, None] = {}
+
+    def add(name: str) -> None:
+        rows.update(dict.fromkeys((name, *view.hosts(name))))
+
+    for name in needed:
+        add(name)
+    rooms = dict.fromkeys(view.room(name) for name in needed)
+    others = [name for room in rooms for name in view.in_room.get(room, ())]
+    telling = [name for name in others if _is_telling(view, name)]
+    wanted = int(rng.integers(ROWS[0], ROWS[1] + 1))
+    for name in rng.permutation(telling) if telling else ():
+        if len(rows) >= wanted:
+            break
+        add(str(name))
+    table = list(rows)
+    return tuple(table[int(index)] for index in rng.permutation(len(table)))[:MAX_TABLE]
+
+
+def _is_telling(view: SceneView, name: str) -> bool:
+    """Whether a plan could have any use for the object: pictures and blinds fill a table with noise."""
+    return (
+        view.is_portable(name)
+        or view.is_surface(name)
+        or view.is_container(name)
+        or view.is_openable(name)
+        or view.is_toggleable(name)
+    )
+
+
+def is_heldout_signature(signature: str, seed: int) -> bool:
+    """Whether goals of this signature belong to the held-out split: a fair draw by hash, fixed for a seed."""
+    digest = hashlib.sha256(f"{seed} {signature}".encode()).digest()
+    return digest[0] % HELDOUT_OF == 0

@@ -1,0 +1,86 @@
+"""Instructions: how a person refers to things and asks for what the goal says. A bounded vocabulary with natural variation."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.world.bddl import is_room_instance
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    import numpy as np
+
+    from embomatrix.factory.writer.view import SceneView
+
+PHRASES: Final[Mapping[str, tuple[str, ...]]] = {
+    "ontop": (
+        "put {thing} on {place}",
+        "place {thing} on {place}",
+        "move {thing} onto {place}",
+        "set {thing} down on {place}",
+    ),
+    "inside": (
+        "put {thing} in {place}",
+        "place {thing} inside {place}",
+        "store {thing} in {place}",
+        "put {thing} away in {place}",
+    ),
+    "open": ("open {thing}", "open up {thing}", "leave {thing} open"),
+    "not open": ("close {thing}", "shut {thing}", "make sure that {thing} is closed"),
+    "toggled_on": ("turn on {thing}", "switch on {thing}", "switch {thing} on"),
+    "not toggled_on": ("turn off {thing}", "switch off {thing}", "switch {thing} off"),
+    "cooked": ("cook {thing}", "cook {thing} with {place}", "use {place} to cook {thing}"),
+    "hot": ("heat {thing}", "heat up {thing} with {place}", "warm {thing} with {place}"),
+    "frozen": ("freeze {thing}", "freeze {thing} in {place}", "chill {thing} in {place} until it is frozen"),
+}
+"""Ways to ask for an atom, by predicate; ``place`` is the host or the source."""
+
+_OPENERS: Final = (
+    "{request}.",
+    "Please {request}.",
+    "Could you {request}?",
+    "I would like you to {request}.",
+)
+_JOINS: Final = (" and ", ", then ", " and then ")
+
+
+def spoken(name: str) -> str:
+    """A category or a room type in words."""
+    return name.replace("_", " ")
+
+
+def room_words(view: SceneView, room: str) -> str:
+    """``the kitchen`` where there is one, else the room's own name: ``living_room_2``."""
+    types = [item.type for item in view.scene.rooms]
+    stem = room.rpartition("_")[0] if is_room_instance(room) else room
+    return f"the {spoken(stem)}" if types.count(stem) == 1 else room
+
+
+def refer(view: SceneView, name: str, rng: np.random.Generator) -> str:
+    """A noun phrase for an object, or for any of those of its category in its room.
+
+    The room is named where the category does not tell which one is meant.
+    """
+    noun = spoken(view.category(name))
+    article = "the" if len(view.alike(name)) == 1 else "an" if noun[0] in "aeiou" else "a"
+    words = f"{article} {noun}"
+    ambiguous = len(view.rooms_with(view.category(name))) > 1
+    if ambiguous or rng.random() < 0.35:
+        words += f" in {room_words(view, view.room(name))}"
+    return words
+
+
+def phrase(kind: str, rng: np.random.Generator, *, thing: str, place: str = "") -> str:
+    """One imperative clause. Without a place, only phrases that name none."""
+    options = [text for text in PHRASES[kind] if place or "{place}" not in text]
+    return options[int(rng.integers(len(options)))].format(thing=thing, place=place)
+
+
+def sentence(phrases: Sequence[str], rng: np.random.Generator) -> str:
+    """The clauses, in their order, as one request."""
+    request = phrases[0]
+    for clause in phrases[1:]:
+        request += _JOINS[int(rng.integers(len(_JOINS)))] + clause
+    text = _OPENERS[int(rng.integers(len(_OPENERS)))].format(request=request)
+    return text[0].upper() + text[1:]
