@@ -150,10 +150,10 @@ def _lead_all(stage: Stage, name: str, goal: float, rng: np.random.Generator) ->
     row = sorted(leaves_of(stage, name), key=lambda leaf: leaf.height_m, reverse=not goal)
     # Who leads a leaf may push one that is done: those have a second turn.
     for leaf in (*row, *row):
-        if _is_done(stage.dynamic.joints(name)[leaf.number], goal):
+        if _is_done(stage.dynamic.bodies.joints(name)[leaf.number], goal):
             continue
         refusal = _lead(stage, leaf, goal, rng)
-        if _is_done(stage.dynamic.joints(name)[leaf.number], goal):
+        if _is_done(stage.dynamic.bodies.joints(name)[leaf.number], goal):
             refusal = None
         elif refusal is None:
             refusal = refuse(FailureReason.DOOR_BLOCKED, target=name, other=SOMETHING)
@@ -173,9 +173,9 @@ def _lead(stage: Stage, leaf: Leaf, goal: float, rng: np.random.Generator) -> Re
     """Move one leaf to a share of its travel: in one stretch, else in ever more of them with steps between."""
     refusal: Refusal | None = None
     for stretches in STRETCHES:
-        start = stage.dynamic.joints(leaf.name)[leaf.number]
+        start = stage.dynamic.bodies.joints(leaf.name)[leaf.number]
         for number in range(stretches):
-            now = stage.dynamic.joints(leaf.name)[leaf.number]
+            now = stage.dynamic.bodies.joints(leaf.name)[leaf.number]
             aim = start + (number + 1) / stretches * (goal - start)
             refusal = _stretch(stage, leaf, now, aim, rng) if abs(aim - now) > SHUT else None
             if refusal is not None:
@@ -247,7 +247,7 @@ def _pull(stage: Stage, way: Way, leaf: Leaf, goal: float) -> Refusal | None:
     stage.mover.wait(4)
     if stage.dynamic.hindrance() == leaf.name and not _pushes(way.postures[-2], way.postures[-3]):
         _lean_off(stage, way, leaf)
-    reached = stage.dynamic.joints(leaf.name)[leaf.number]
+    reached = stage.dynamic.bodies.joints(leaf.name)[leaf.number]
     stage.settle()
     if abs(reached - goal) > 0.12 and hit is not None:
         return refuse(FailureReason.DOOR_BLOCKED, target=leaf.name, other=hit or SOMETHING)
@@ -262,10 +262,10 @@ def _pushes(start: FloatArray, end: FloatArray) -> bool:
 
 def _lean_off(stage: Stage, way: Way, leaf: Leaf) -> None:
     """Draw the arm back as it came, as far as it leans on the leaf and does not take the leaf along."""
-    let_go = stage.dynamic.joints(leaf.name)[leaf.number]
+    let_go = stage.dynamic.bodies.joints(leaf.name)[leaf.number]
 
     def is_off() -> bool:
-        moved = abs(stage.dynamic.joints(leaf.name)[leaf.number] - let_go)
+        moved = abs(stage.dynamic.bodies.joints(leaf.name)[leaf.number] - let_go)
         return moved > SHUT or stage.dynamic.hindrance() != leaf.name
 
     stage.mover.follow(way.postures[-3:0:-1], 0.6, is_off)

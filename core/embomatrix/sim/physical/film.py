@@ -66,15 +66,15 @@ class _Camera:
         for item in self._scene.objects:
             if item.fixed and not item.joints:
                 continue
-            if not self._dynamic.is_in(item.name):
+            if not self._dynamic.bodies.is_in(item.name):
                 hidden.add(item.name)
                 continue
-            pose = self._dynamic.pose(item.name)
+            pose = self._dynamic.bodies.pose(item.name)
             if item.absent or _moved(pose, item.pose_world_asset):
                 poses[item.name] = pose
             # Lids of small boxes don't move in the dynamic world.
             if item.fixed and item.joints:
-                joints[item.name] = self._dynamic.joints(item.name)
+                joints[item.name] = self._dynamic.bodies.joints(item.name)
         posture = self._dynamic.robot.posture
         base = StandPose(posture.x_m, posture.y_m, posture.yaw)
         self.frames.append(Frame(base, self.step, poses, joints, frozenset(hidden), posture))

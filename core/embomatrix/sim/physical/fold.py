@@ -23,7 +23,8 @@ from embomatrix.world.poses import StandPose
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from embomatrix.sim.physical.reach import Reach, Way
+    from embomatrix.sim.physical.reach import Held, Reach, Way
+    from embomatrix.sim.physical.space import Boxes
     from embomatrix.sim.physical.stage import Stage
     from embomatrix.skills.view import Refusal
     from embomatrix.world.geometry import FloatArray
@@ -141,6 +142,24 @@ def carrying(stage: Stage, now: FloatArray) -> FloatArray:
         folded = with_arm(now, TUCKED)
         folded[body.LIFT] = TUCKED_LIFT_M
         return folded
+    rotation, where = _carried_to(now)
+    count = len(where)
+    boxes = stage.boxes_within(now[:3] - SURROUNDINGS_M, now[:3] + SURROUNDINGS_M)
+    bases, lift = np.tile(now[:3], (count, 1)), np.full(count, CARRY_LIFT_M)
+    best, found = math.inf, now
+    for last in (0.785, -0.785, 2.3, -2.3, 1.57):
+        rows = body.solve(rotation, where, bases, lift, np.full(count, last)).reshape(-1, body.NUMBERS)
+        rows = rows[~np.isnan(rows[:, -1])]
+        if not len(rows):
+            continue
+        cost = _carrying_cost(rows, now, stage.grip.held, boxes)
+        if cost.min() < best:
+            best, found = float(cost.min()), rows[int(cost.argmin())]
+    return found
+
+
+def _carried_to(now: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Poses of the tool over the base, as it is but turned about the vertical: rotations (n, 3, 3) and positions (n, 3)."""
     rotation, _ = body.tools(now[None])
     turns, xs, ys, heights = (
         grid.ravel()
@@ -152,38 +171,23 @@ def carrying(stage: Stage, now: FloatArray) -> FloatArray:
             indexing="ij",
         )
     )
-    count = len(turns)
-    turn = arm.about_z(turns)
     yaw = arm.about_z(now[None, body.YAW])[0]
-    wanted = turn @ rotation[0]
-    local = np.stack([xs, ys, np.zeros(count)], axis=1)
-    lift = np.full(count, CARRY_LIFT_M)
+    local = np.stack([xs, ys, np.zeros(len(turns))], axis=1)
     where = local @ yaw.T + np.array([now[0], now[1], 0.0])
     where[:, 2] = SHOULDER_LOW_M + CARRY_LIFT_M + heights
-    boxes = stage.boxes_within(now[:3] - SURROUNDINGS_M, now[:3] + SURROUNDINGS_M)
-    radii = np.concatenate([body.RADII, stage.grip.held.radii])
-    best, found = math.inf, now
-    for last in (0.785, -0.785, 2.3, -2.3, 1.57):
-        postures = body.solve(wanted, where, np.tile(now[:3], (count, 1)), lift, np.full(count, last))
-        rows = postures.reshape(-1, body.NUMBERS)
-        rows = rows[~np.isnan(rows[:, -1])]
-        if not len(rows):
-            continue
-        load = stage.grip.held.placed(rows)
-        wide = np.linalg.norm(load[:, :, :2] - now[:2], axis=2) + stage.grip.held.radii
-        arms = body.balls(rows)
-        limbs = np.linalg.norm(arms[:, :, :2] - now[:2], axis=2) + body.RADII
-        top = np.maximum(
-            (load[:, :, 2] + stage.grip.held.radii).max(axis=1), (arms[:, :, 2] + body.RADII).max(axis=1)
-        )
-        bottom = (load[:, :, 2] - stage.grip.held.radii).min(axis=1)
-        cost = np.maximum(top - ROBOT.height_m, 0.0) + 0.3 * np.maximum(OVER_M - bottom, 0.0)
-        cost += 0.02 * np.abs(rows[:, 4:] - now[4:]).max(axis=1)
-        cost += np.maximum(wide.max(axis=1), limbs.max(axis=1)) + 0.02 * np.abs(rows[:, 4:] - now[4:]).max(
-            axis=1
-        )
-        cost += np.where(clearance(boxes, np.concatenate([arms, load], axis=1), radii) < AIR_M, 2.0, 0.0)
-        cost = np.where(body.strikes_itself(rows, load, stage.grip.held.radii), math.inf, cost)
-        if cost.min() < best:
-            best, found = float(cost.min()), rows[int(cost.argmin())]
-    return found
+    return arm.about_z(turns) @ rotation[0], where
+
+
+def _carrying_cost(rows: FloatArray, now: FloatArray, held: Held, boxes: Boxes) -> FloatArray:
+    """How ill postures, (n, 11), suit a drive: wide, high, low over counters, far from now, in things; shape (n,)."""
+    load, arms = held.placed(rows), body.balls(rows)
+    wide = np.linalg.norm(load[:, :, :2] - now[:2], axis=2) + held.radii
+    limbs = np.linalg.norm(arms[:, :, :2] - now[:2], axis=2) + body.RADII
+    top = np.maximum((load[:, :, 2] + held.radii).max(axis=1), (arms[:, :, 2] + body.RADII).max(axis=1))
+    bottom = (load[:, :, 2] - held.radii).min(axis=1)
+    cost = np.maximum(top - ROBOT.height_m, 0.0) + 0.3 * np.maximum(OVER_M - bottom, 0.0)
+    cost += 0.04 * np.abs(rows[:, 4:] - now[4:]).max(axis=1)
+    cost += np.maximum(wide.max(axis=1), limbs.max(axis=1))
+    radii = np.concatenate([body.RADII, held.radii])
+    cost += np.where(clearance(boxes, np.concatenate([arms, load], axis=1), radii) < AIR_M, 2.0, 0.0)
+    return np.where(body.strikes_itself(rows, load, held.radii), math.inf, cost)

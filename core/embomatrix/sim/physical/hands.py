@@ -66,7 +66,7 @@ def pick_up(stage: Stage, target: str, rng: np.random.Generator) -> Refusal | No
 
 def _was_pushed(stage: Stage, name: str) -> bool:
     """Whether an object is not where the planning scene has it, so that ways to it lead past it."""
-    now, then = stage.dynamic.pose(name), stage.world.engine.pose(name)
+    now, then = stage.dynamic.bodies.pose(name), stage.world.engine.pose(name)
     return stage.grip is None and math.dist(now.position_m, then.position_m) > PUSHED_M
 
 
@@ -133,7 +133,7 @@ def _lift(stage: Stage, way: Way, target: str, by_m: float) -> Refusal | None:
         stage.mover.follow(raised(way.postures[-3::-1], by_m))
     if stage.has_slipped():
         stage.release()
-        world.hand.let_go(stage.dynamic.pose(target))
+        world.hand.let_go(stage.dynamic.bodies.pose(target))
         return refuse(FailureReason.SLIPPED, target=target)
     return None
 

@@ -248,5 +248,5 @@ def _let_go(stage: Stage) -> None:
     group = world.carried
     world.hand.forget()
     for name in group:
-        world.engine.set_pose(name, stage.dynamic.pose(name))
+        world.engine.set_pose(name, stage.dynamic.bodies.pose(name))
     world.navigator.refresh()

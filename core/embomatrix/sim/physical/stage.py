@@ -145,10 +145,14 @@ class Stage:
 
     def take(self, name: str) -> None:
         """The hand holds what it touches."""
-        pose_hand_object = self.dynamic.robot.hand_pose().inverse() @ self.dynamic.pose(name)
+        pose_hand_object = self.dynamic.robot.hand_pose().inverse() @ self.dynamic.bodies.pose(name)
         local = TOOL.inverse() @ pose_hand_object
         centres, radii = self._balls(name, local)
-        up = local.rotation @ self.dynamic.pose(name).rotation[2] if len(self.world.cargo(name)) > 1 else None
+        up = (
+            local.rotation @ self.dynamic.bodies.pose(name).rotation[2]
+            if len(self.world.cargo(name)) > 1
+            else None
+        )
         self.grip = Grip(name, local, Held(centres, radii, up))
         self.dynamic.grasp(name)
 
@@ -182,7 +186,7 @@ class Stage:
             return False
         tool = self.dynamic.robot.hand_pose() @ TOOL
         wanted = tool @ self.grip.pose_tool_object
-        return math.dist(wanted.position_m, self.dynamic.pose(self.grip.name).position_m) > SLIP_M
+        return math.dist(wanted.position_m, self.dynamic.bodies.pose(self.grip.name).position_m) > SLIP_M
 
     def wake_around(self, name: str) -> None:
         """Wake what lies at or on an object that is about to move."""
@@ -192,7 +196,7 @@ class Stage:
 
     def wake(self, names: Iterable[str]) -> None:
         """Wake movable objects."""
-        self.dynamic.wake(name for name in names if not self.world.is_fixed(name))
+        self.dynamic.bodies.wake(name for name in names if not self.world.is_fixed(name))
 
     def bring_in_step(self) -> None:
         """Take out of the dynamic world what left the planning scene, and bring in what came: things that were cut."""
@@ -200,10 +204,10 @@ class Stage:
         for item in self.world.scene.objects:
             if item.fixed or item.name in self.world.carried:
                 continue
-            if engine.is_parked(item.name) and self.dynamic.is_in(item.name):
-                self.dynamic.take_out(item.name)
-            elif not engine.is_parked(item.name) and not self.dynamic.is_in(item.name):
-                self.dynamic.put(item.name, engine.pose(item.name))
+            if engine.is_parked(item.name) and self.dynamic.bodies.is_in(item.name):
+                self.dynamic.bodies.take_out(item.name)
+            elif not engine.is_parked(item.name) and not self.dynamic.bodies.is_in(item.name):
+                self.dynamic.bodies.put(item.name, engine.pose(item.name))
 
     def settle(self) -> None:
         """Let the world come to rest and copy what moved into the planning scene."""
@@ -220,9 +224,9 @@ class Stage:
             if engine.is_parked(name):
                 continue
             if world.is_fixed(name):
-                engine.set_joints(name, self.dynamic.joints(name))
+                engine.set_joints(name, self.dynamic.bodies.joints(name))
             else:
-                engine.set_pose(name, self.dynamic.pose(name))
+                engine.set_pose(name, self.dynamic.bodies.pose(name))
             moved = True
         if moved:
             world.navigator.refresh()

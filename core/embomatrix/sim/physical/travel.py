@@ -116,21 +116,7 @@ def _headings(
     options = begin + np.arange(HEADINGS) * math.tau / HEADINGS
     danger = _danger(stage, start, marks[TURNS - 1 : 1 - TURNS], options)
     danger = np.concatenate([np.tile(danger[0], (TURNS - 1, 1)), danger, np.tile(danger[-1], (TURNS - 1, 1))])
-    step = np.abs(np.arange(HEADINGS)[:, None] - np.arange(HEADINGS)[None])
-    step = np.minimum(step, HEADINGS - step)
-    turn = np.where(step <= MOST_STEPS, step * math.tau / HEADINGS, np.inf)
-    # Cheapest chain of headings: little turning, nothing struck, and the wanted heading in the end.
-    wanted = np.abs([math.remainder(option - end, math.tau) for option in options])
-    cost = np.where(np.arange(HEADINGS) == 0, 0.0, np.inf)
-    back = np.zeros((len(marks), HEADINGS), dtype=int)
-    for number in range(1, len(marks)):
-        total = cost[:, None] + turn
-        back[number] = total.argmin(axis=0)
-        cost = total.min(axis=0) + danger[number]
-    chosen = [int((cost + 2.0 * wanted).argmin())]
-    for number in range(len(marks) - 1, 0, -1):
-        chosen.append(int(back[number][chosen[-1]]))
-    chosen.reverse()
+    chosen = _cheapest_chain(danger, np.abs([math.remainder(option - end, math.tau) for option in options]))
     # The first mark is where the robot is: what it touches there it touches already.
     struck = int((danger[np.arange(1, len(marks)), chosen[1:]] >= BLOCKED_COST).sum())
     found = np.unwrap(options[chosen])
@@ -139,6 +125,26 @@ def _headings(
     if close and _danger(stage, start, marks[-1:], np.array([nearest]))[0, 0] < BLOCKED_COST:
         found[-1] = nearest
     return marks, found, struck
+
+
+def _cheapest_chain(danger: FloatArray, off: FloatArray) -> list[int]:
+    """Numbers of headings, one a mark, the first of them 0: little turning, nothing struck, and the wanted heading in the end.
+
+    danger: (marks, headings); off: (headings,) how far each is from the one that is wanted.
+    """
+    step = np.abs(np.arange(HEADINGS)[:, None] - np.arange(HEADINGS)[None])
+    step = np.minimum(step, HEADINGS - step)
+    turn = np.where(step <= MOST_STEPS, step * math.tau / HEADINGS, np.inf)
+    cost = np.where(np.arange(HEADINGS) == 0, 0.0, np.inf)
+    back = np.zeros((len(danger), HEADINGS), dtype=int)
+    for number in range(1, len(danger)):
+        total = cost[:, None] + turn
+        back[number] = total.argmin(axis=0)
+        cost = total.min(axis=0) + danger[number]
+    chosen = [int((cost + 2.0 * off).argmin())]
+    for number in range(len(danger) - 1, 0, -1):
+        chosen.append(int(back[number][chosen[-1]]))
+    return chosen[::-1]
 
 
 def _danger(stage: Stage, start: FloatArray, marks: FloatArray, options: FloatArray) -> FloatArray:

@@ -1,0 +1,206 @@
+"""The bodies of a scene in which time passes: put in, moved, put to sleep and woken, each called by its object's name.
+
+What rests is put to sleep, which costs nearly nothing and keeps it where it is.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.sim.bullet.bodies import BodyFactory
+from embomatrix.sim.bullet.client import pybullet
+from embomatrix.sim.bullet.mini_world import ROLLING_FRICTION
+from embomatrix.sim.engine import FLOOR, WALL
+from embomatrix.world.geometry import Pose
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    from embomatrix.world.geometry import Vec3
+    from embomatrix.world.scene import Scene
+
+    BodyState = tuple[Vec3, tuple[float, ...]]
+    """Position and quaternion of what is movable; zeros and the joints' positions of furniture."""
+
+FLOOR_HALF_M: Final = 200.0
+HINGE_NM: Final = 0.4
+RUNNER_N: Final = 2.0
+"""Friction of doors and of drawers."""
+SLOW_M_S: Final = 0.01
+SLOW_RAD_S: Final = 0.1
+MOVED_M: Final = 5e-4
+TURNED: Final = 2e-3
+"""Less than this is the solver's sagging, not motion."""
+AWAY_M: Final = -50.0
+"""Depth at which things that are not in the world are kept."""
+
+
+class DynamicBodies:
+    """Bodies of one scene in one client."""
+
+    def __init__(self, scene: Scene, client: int) -> None:
+        """``fill`` makes the bodies."""
+        self._scene = scene
+        self._bullet = pybullet()
+        self._client = client
+        self._factory = BodyFactory(client, self._bullet.URDF_ENABLE_SLEEPING)
+        self._bodies: dict[str, int] = {}
+        self._names: dict[int, str] = {}
+        self._joints: dict[str, tuple[int, ...]] = {}
+        self._still: list[int] = []
+        self.movable = tuple(item.name for item in scene.objects if not item.fixed)
+        self.moving = (*self.movable, *(item.name for item in scene.objects if item.fixed and item.joints))
+        """What can move: movable things, then furniture with joints."""
+
+    def fill(self, poses: Mapping[str, Pose], joints: Mapping[str, tuple[float, ...]]) -> None:
+        """Fill an empty client: floor, walls, and objects at these poses and joint positions; those without a pose are away."""
+        self._factory.forget_shapes()
+        floor = self._factory.floor(0.0, 0.0, FLOOR_HALF_M)
+        walls = self._factory.walls(self._scene.walls)
+        self._names = {floor: FLOOR} | dict.fromkeys(walls, WALL)
+        self._still = [floor, *walls]
+        for number, item in enumerate(self._scene.objects):
+            pose = poses.get(item.name, Pose((number * 3.0, 0.0, AWAY_M)))
+            self._add(item.name, pose, joints[item.name])
+
+    def body(self, name: str) -> int:
+        """The number of an object's body."""
+        return self._bodies[name]
+
+    def links(self, name: str) -> range:
+        """The numbers of a body's links, its base first."""
+        return range(-1, int(self._bullet.getNumJoints(self._bodies[name], physicsClientId=self._client)))
+
+    def leaf(self, name: str, joint: int) -> int:
+        """The link that a joint of an object moves."""
+        return self._joints[name][joint]
+
+    def name(self, body: int) -> str:
+        """What a body is called, "" for one that is not of the scene."""
+        return self._names.get(body, "")
+
+    def pose(self, name: str) -> Pose:
+        """Pose of the object's asset frame."""
+        position, quat = self._bullet.getBasePositionAndOrientation(
+            self._bodies[name], physicsClientId=self._client
+        )
+        return Pose(tuple(position), tuple(quat))
+
+    def joints(self, name: str) -> tuple[float, ...]:
+        """Joint positions as shares of their travel, kept within 0..1."""
+        asset = self._scene.asset_of(name)
+        return tuple(
+            min(1.0, max(0.0, self._angle(name, index) / joint.upper))
+            for index, (_, joint) in zip(self._joints[name], asset.joints, strict=True)
+        )
+
+    def is_in(self, name: str) -> bool:
+        """Whether the object is in the world, be it in the hand."""
+        return self.pose(name).position_m[2] > AWAY_M / 2
+
+    def put(self, name: str, pose: Pose) -> None:
+        """Bring in an object that was out of the world, or take it out: what is cut becomes its pieces."""
+        self._bullet.resetBasePositionAndOrientation(
+            self._bodies[name], pose.position_m, pose.quat_xyzw, physicsClientId=self._client
+        )
+        self.wake((name,))
+
+    def take_out(self, name: str) -> None:
+        """Take an object out of the world."""
+        self._bullet.resetBasePositionAndOrientation(
+            self._bodies[name],
+            (self._bodies[name] * 3.0, 0.0, AWAY_M),
+            (0, 0, 0, 1),
+            physicsClientId=self._client,
+        )
+        self.sleep(name)
+
+    def wake(self, names: Iterable[str]) -> None:
+        """Wake objects whose support may have gone."""
+        for name in names:
+            self._bullet.changeDynamics(
+                self._bodies[name],
+                -1,
+                activationState=self._bullet.ACTIVATION_STATE_WAKE_UP,
+                physicsClientId=self._client,
+            )
+
+    def state(self, name: str) -> BodyState:
+        """Where something that can move is."""
+        if name in self._joints:
+            return (0.0, 0.0, 0.0), tuple(self._angle(name, index) for index in self._joints[name])
+        pose = self.pose(name)
+        return pose.position_m, pose.quat_xyzw
+
+    def is_in_motion(self, name: str) -> bool:
+        """Whether a movable object moves faster than what rests."""
+        linear, angular = self._bullet.getBaseVelocity(self._bodies[name], physicsClientId=self._client)
+        return math.hypot(*linear) > SLOW_M_S or math.hypot(*angular) > SLOW_RAD_S
+
+    def still_sleep(self) -> None:
+        """Put to sleep what never moves: else Bullet compares it in every step with all that lies on it, asleep or not."""
+        bullet = self._bullet
+        asleep = bullet.ACTIVATION_STATE_ENABLE_SLEEPING | bullet.ACTIVATION_STATE_SLEEP
+        for body in self._still:
+            bullet.changeDynamics(body, -1, activationState=asleep, physicsClientId=self._client)
+
+    def sleep(self, name: str) -> None:
+        """Put an object to sleep where it is."""
+        bullet, client, body = self._bullet, self._client, self._bodies[name]
+        if name in self._joints:
+            for index in self._joints[name]:
+                bullet.resetJointState(body, index, self._angle(name, index), physicsClientId=client)
+        else:
+            bullet.resetBaseVelocity(body, (0, 0, 0), (0, 0, 0), physicsClientId=client)
+        bullet.changeDynamics(body, -1, activationState=bullet.ACTIVATION_STATE_SLEEP, physicsClientId=client)
+
+    def _add(self, name: str, pose: Pose, joints: tuple[float, ...]) -> None:
+        item, asset = self._scene.by_name[name], self._scene.asset_of(name)
+        if not item.fixed:
+            body = self._factory.rigid(asset, pose, joints, asset.mass_kg)
+            self._friction(body)
+        elif asset.joints:
+            body = self._factory.hinged(asset, pose)
+            self._joints[name] = self._factory.joint_indices(asset)
+            self._swing(body, name, joints)
+        else:
+            (body,) = self._factory.jointed(asset, [pose])
+            self._bullet.resetBasePositionAndOrientation(
+                body, pose.position_m, pose.quat_xyzw, physicsClientId=self._client
+            )
+            self._still.append(body)
+        self._bodies[name], self._names[body] = body, name
+
+    def _friction(self, body: int) -> None:
+        self._bullet.changeDynamics(
+            body,
+            -1,
+            rollingFriction=ROLLING_FRICTION,
+            spinningFriction=ROLLING_FRICTION,
+            physicsClientId=self._client,
+        )
+
+    def _swing(self, body: int, name: str, joints: tuple[float, ...]) -> None:
+        """Give the joints their limits and friction, and set them."""
+        bullet, client = self._bullet, self._client
+        asset = self._scene.asset_of(name)
+        for index, (_, joint), fraction in zip(self._joints[name], asset.joints, joints, strict=True):
+            low, high = min(0.0, joint.upper), max(0.0, joint.upper)
+            bullet.changeDynamics(
+                body, index, jointLowerLimit=low, jointUpperLimit=high, physicsClientId=client
+            )
+            bullet.resetJointState(body, index, fraction * joint.upper, physicsClientId=client)
+            force = HINGE_NM if joint.kind == "revolute" else RUNNER_N
+            bullet.setJointMotorControl2(
+                body, index, bullet.VELOCITY_CONTROL, targetVelocity=0, force=force, physicsClientId=client
+            )
+
+    def _angle(self, name: str, index: int) -> float:
+        return float(self._bullet.getJointState(self._bodies[name], index, physicsClientId=self._client)[0])
+
+
+def differ(now: BodyState, before: BodyState) -> bool:
+    """Whether something moved between two states."""
+    turned = max((abs(a - b) for a, b in zip(now[1], before[1], strict=True)), default=0.0)
+    return math.dist(now[0], before[0]) > MOVED_M or turned > TURNED
