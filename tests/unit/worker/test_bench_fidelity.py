@@ -79,6 +79,18 @@ def test_a_suite_that_was_cut_short_goes_on_where_it_was(suite, dataset, tmp_pat
     ]
 
 
+def test_without_processes_the_results_so_far_are_summed_up(suite, dataset, tmp_path):
+    folder, _ = suite
+    for name in (PLANS_FILE, "settings.json"):
+        (tmp_path / name).write_text((folder / name).read_text())
+    modes = Modes(Simulator, clumsy)
+    with pytest.raises(BenchError, match="no result to sum up"):
+        run_fidelity(dataset, SMALL, tmp_path, 0, modes, QUIET)
+    lines = (folder / RESULTS_FILE).read_text().splitlines()
+    (tmp_path / RESULTS_FILE).write_text("\n".join(lines[:3]) + "\n")
+    assert len(run_fidelity(dataset, SMALL, tmp_path, 0, modes, QUIET).comparisons) == 3
+
+
 def test_a_folder_of_other_settings_is_refused(suite, dataset):
     with pytest.raises(BenchError, match="other settings"):
         run_fidelity(dataset, FidelitySettings(21, 0, 0), suite[0], 1, Modes(Simulator, clumsy), QUIET)

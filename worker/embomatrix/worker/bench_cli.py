@@ -117,7 +117,9 @@ def fidelity(
     dataset: DataSet = FIDELITY_DATASET,
     json_file: Json = None,
     out: Annotated[Path, typer.Option(help="Folder for plans, results and disagreements.")] = FIDELITY_OUT,
-    jobs: Annotated[int, typer.Option(min=1, max=64, help="Processes.")] = 2,
+    jobs: Annotated[
+        int, typer.Option(min=0, max=64, help="Processes; with 0 the results so far are summed up.")
+    ] = 2,
     plans: Annotated[int, typer.Option(min=1, help="Plans at least.")] = 1_000,
     calls: Annotated[int, typer.Option(min=0, help="Calls of every skill at least.")] = 200,
     seed: Annotated[int, typer.Option(min=0, help="Equal seeds and datasets give equal plans.")] = 0,

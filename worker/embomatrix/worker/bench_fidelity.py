@@ -88,6 +88,8 @@ def run_fidelity(
 ) -> Outcome:
     """Write the trials, or read them; execute those without a result; save the disagreements.
 
+    Without processes nothing is executed: the outcome is that of the results so far.
+
     Raises BenchError when the folder holds a suite of other settings or can't be read, DatasetError and EngineError.
     """
     with _told(folder):
@@ -103,7 +105,10 @@ def run_fidelity(
                 done[value["trial"]] = dict(value)
                 progress.executed(len(done), len(trials))
 
-            FidelityPool(dataset.folder, modes, processes, LIMIT_S).run(jobs, keep)
+            if processes:
+                FidelityPool(dataset.folder, modes, processes, LIMIT_S).run(jobs, keep)
+        if not done:
+            raise BenchError(f"{folder} holds no result to sum up: run the suite with one process or more")
         return _outcome(trials, done, folder)
 
 
