@@ -11,14 +11,14 @@ import numpy as np
 from scipy import ndimage
 
 from embomatrix.sim.floor_parts import FloorParts, overlap
-from embomatrix.sim.floor_ways import Distances, cheapest_way
+from embomatrix.sim.floor_ways import RecentDistances, cheapest_way
 from embomatrix.skills.limits import ROBOT
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from embomatrix.sim.floor_parts import Window
-    from embomatrix.sim.floor_ways import Cell
+    from embomatrix.sim.floor_ways import Cell, Distances
     from embomatrix.world.geometry import FloatArray, Vec2
     from embomatrix.world.scene import Scene
 
@@ -64,6 +64,7 @@ class FloorGrid:
         self._origin_m = (float(self._origin[0]), float(self._origin[1]))
         self._shape = grid_shape(scene)
         self._changes: Changes = ()
+        self._recent, self._own = RecentDistances(CELL_M), object()
 
     @property
     def covered(self) -> NDArray[np.int16]:
@@ -126,9 +127,8 @@ class FloorGrid:
     def _with_parts(self, parts: FloorParts) -> FloorGrid:
         """This grid with other free cells. It shares all it can: there are dozens of such grids in memory."""
         grid = copy.copy(self)
-        vars(grid).pop("_distances", None)
         vars(grid)["parts"] = parts
-        grid._free = None
+        grid._free, grid._own = None, object()
         return grid
 
     @functools.cached_property
@@ -256,9 +256,9 @@ class FloorGrid:
         )
         return bool((passed[cells[:, 0] - low[0], cells[:, 1] - low[1]] > 0).all())
 
-    @functools.cached_property
+    @property
     def _distances(self) -> Distances:
-        return Distances(self.free, CELL_M)
+        return self._recent.over(self._own, lambda: self.free)
 
     def _cell_at(self, x_m: float, y_m: float) -> Cell:
         low_x, low_y = self._origin_m

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import heapq
 import math
+from collections import OrderedDict
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -12,6 +13,8 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
     from embomatrix.sim.floor_parts import Window
@@ -21,6 +24,7 @@ if TYPE_CHECKING:
 
 Cell = tuple[int, int]
 
+FLOORS_KEPT: Final = 6
 CROSSING_COST: Final = 100.0
 """To drive through a thing is as bad as a detour of this many cells for each of its own."""
 FIELDS_KEPT: Final = 64
@@ -85,6 +89,23 @@ class Distances:
         size = rows * columns
         one_way = sparse.coo_matrix((weight, (source, target)), shape=(size, size))
         return (one_way + one_way.T).tocsr()
+
+
+class RecentDistances:
+    """Distances over the floors that were asked for last, of many that are in memory: a house with a garden takes 20 MB."""
+
+    def __init__(self, cell_m: float) -> None:
+        self._cell_m = cell_m
+        self._kept: OrderedDict[object, Distances] = OrderedDict()
+
+    def over(self, floor: object, free: Callable[[], BoolArray]) -> Distances:
+        """Those over a floor, whose free cells are asked for when it is not known any more."""
+        if floor not in self._kept:
+            if len(self._kept) == FLOORS_KEPT:
+                self._kept.popitem(last=False)
+            self._kept[floor] = Distances(free(), self._cell_m)
+        self._kept.move_to_end(floor)
+        return self._kept[floor]
 
 
 def cheapest_way(free: BoolArray, floor: BoolArray, start: Cell, goal: Window) -> list[Cell]:

@@ -14,6 +14,7 @@ from tests.fakes.scenes import kitchen_scene
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.floor_grid import CELL_M, FloorGrid
+from embomatrix.sim.floor_ways import FLOORS_KEPT, RecentDistances
 from embomatrix.sim.navigation import Navigator
 from embomatrix.sim.relations import Relations
 from embomatrix.skills.limits import ROBOT
@@ -258,3 +259,17 @@ def test_robot_beside_a_free_cell_counts_as_on_the_nearest_one(x, y) -> None:
     else:
         assert grid.free[cell]
         assert float(np.linalg.norm(np.array(grid.center(cell)) - (x, y))) <= nearest + CELL_M
+
+
+def test_only_the_floors_that_were_asked_for_last_keep_their_distances():
+    free = np.zeros((5, 5), dtype=np.bool_)
+    free[1:4, 1:4] = True
+    recent = RecentDistances(CELL_M)
+    floors = [object() for _ in range(FLOORS_KEPT + 1)]
+    first = recent.over(floors[0], lambda: free)
+    assert recent.over(floors[0], lambda: free) is first
+    for floor in floors[1:]:
+        recent.over(floor, lambda: free)
+    again = recent.over(floors[0], lambda: free)
+    assert again is not first
+    assert again.to((1, 1))[3, 3] == first.to((1, 1))[3, 3]
