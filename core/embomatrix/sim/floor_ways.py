@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 Cell = tuple[int, int]
 
-FLOORS_KEPT: Final = 6
+FLOORS_KEPT: Final = 3
 CROSSING_COST: Final = 100.0
 """To drive through a thing is as bad as a detour of this many cells for each of its own."""
 FIELDS_KEPT: Final = 64
