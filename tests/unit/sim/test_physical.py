@@ -114,6 +114,13 @@ def test_a_heavy_thing_before_a_door_bars_it_really():
     }
 
 
+def test_the_lid_of_what_can_be_carried_is_no_door_to_the_robot():
+    scene = kitchen_scene()
+    objects = tuple(replace(item, fixed=item.fixed and item.name != "microwave_1") for item in scene.objects)
+    trace = executed_physically(replace(scene, objects=objects), "move microwave_1; open microwave_1")
+    assert trace.failure is FailureReason.ARM_BLOCKED
+
+
 def test_what_stands_walled_in_by_heavy_things_can_not_be_taken():
     wall = replace(make.block("slab", "slab.n.01", (0.04, 0.6, 0.5), {}), mass_kg=50.0)
     lid = replace(make.block("lid", "lid.n.01", (0.6, 0.6, 0.04), {}), mass_kg=50.0)

@@ -95,6 +95,10 @@ class DynamicBodies:
             for index, (_, joint) in zip(self._joints[name], asset.joints, strict=True)
         )
 
+    def has_leaves(self, name: str) -> bool:
+        """Whether an object's joints move: what can be carried, as a laptop, is one rigid body with its lid as it is."""
+        return name in self._joints
+
     def is_in(self, name: str) -> bool:
         """Whether the object is in the world, be it in the hand."""
         return self.pose(name).position_m[2] > AWAY_M / 2

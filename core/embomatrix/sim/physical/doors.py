@@ -145,6 +145,8 @@ def close_all(stage: Stage, name: str, rng: np.random.Generator) -> Refusal | No
 
 
 def _lead_all(stage: Stage, name: str, goal: float, rng: np.random.Generator) -> Refusal | None:
+    if not stage.dynamic.bodies.has_leaves(name):
+        return refuse(FailureReason.ARM_BLOCKED, target=name, other=name)
     home = stage.told
     refusal = None
     row = sorted(leaves_of(stage, name), key=lambda leaf: leaf.height_m, reverse=not goal)
