@@ -70,8 +70,7 @@ def test_a_sheet_is_taken_off_a_table(play):
     assert simulator.world.carried == ("sheet_1",)
 
 
-def test_what_was_taken_from_aside_is_taken_from_above_to_go_to_the_bottom_of_a_crate(play):
-    crate = make.tub("crate", "crate.n.01", (0.24, 0.24, 0.2), 0.01, 0.01, mass_kg=1.0, abilities={})
+def goes_to_the_bottom(play, crate):
     die = replace(make.block("die", "die.n.01", (0.06, 0.06, 0.05), {}), mass_kg=0.1)
     extra = [
         (placed("crate_1", crate, "kitchen_0", upright(2.5, 2.6, 0.0, crate)), crate),
@@ -80,18 +79,16 @@ def test_what_was_taken_from_aside_is_taken_from_above_to_go_to_the_bottom_of_a_
     trace, simulator = play(extra, "move die_1; pick_up die_1; move crate_1; place crate_1 inside")
     assert trace.failure is None, trace.steps[-1].message
     assert simulator.world.relations.inside("die_1", "crate_1")
+
+
+def test_what_was_taken_from_aside_is_taken_from_above_to_go_to_the_bottom_of_a_crate(play):
+    crate = make.tub("crate", "crate.n.01", (0.24, 0.24, 0.2), 0.01, 0.01, mass_kg=1.0, abilities={})
+    goes_to_the_bottom(play, crate)
 
 
 def test_what_goes_into_a_crate_too_narrow_for_the_hand_is_dropped_in(play):
     crate = make.tub("crate", "crate.n.01", (0.16, 0.16, 0.3), 0.01, 0.01, mass_kg=1.0, abilities={})
-    die = replace(make.block("die", "die.n.01", (0.06, 0.06, 0.05), {}), mass_kg=0.1)
-    extra = [
-        (placed("crate_1", crate, "kitchen_0", upright(2.5, 2.6, 0.0, crate)), crate),
-        (placed("die_1", die, "kitchen_0", upright(2.0, 1.3, TABLE_TOP_M, die)), die),
-    ]
-    trace, simulator = play(extra, "move die_1; pick_up die_1; move crate_1; place crate_1 inside")
-    assert trace.failure is None, trace.steps[-1].message
-    assert simulator.world.relations.inside("die_1", "crate_1")
+    goes_to_the_bottom(play, crate)
 
 
 def test_a_cup_taken_at_its_thin_wall_stays_where_it_is_put(play):

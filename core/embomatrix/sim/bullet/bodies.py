@@ -25,6 +25,8 @@ HULL_MARGIN_M = 0.001
 """Bullet rounds hulls outwards by this much; their vertices are drawn in by the same."""
 PART_LIMIT = 16
 """Parts of a compound: Bullet drops the rest silently."""
+ROLLING_FRICTION: Final = 2e-3
+"""Round food is not a ball bearing: a little resistance to rolling lets an apple come to rest."""
 NO_SHAPE = -1
 LEAST_LEAF_KG = 0.2
 """No door weighs less: the solver wants masses of one order."""
@@ -93,6 +95,16 @@ class BodyFactory:
             for (_, joint), fraction in zip(asset.joints, fractions, strict=True)
         ]
         return self._create([mass_kg / len(pieces)] * len(pieces), pieces, pose, motions)
+
+    def brake(self, body: int) -> None:
+        """Give a body a little resistance to rolling and to spinning."""
+        self._bullet.changeDynamics(
+            body,
+            -1,
+            rollingFriction=ROLLING_FRICTION,
+            spinningFriction=ROLLING_FRICTION,
+            physicsClientId=self._client,
+        )
 
     def hinged(self, asset: Asset, pose: Pose) -> int:
         """One body whose base is immovable and whose leaves have mass and free joints: physics moves them.

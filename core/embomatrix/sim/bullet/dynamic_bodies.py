@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.sim.bullet.bodies import BodyFactory
 from embomatrix.sim.bullet.client import pybullet
-from embomatrix.sim.bullet.mini_world import ROLLING_FRICTION
 from embomatrix.sim.engine import FLOOR, WALL
 from embomatrix.world.geometry import Pose
 
@@ -163,7 +162,7 @@ class DynamicBodies:
         item, asset = self._scene.by_name[name], self._scene.asset_of(name)
         if not item.fixed:
             body = self._factory.rigid(asset, pose, joints, asset.mass_kg)
-            self._friction(body)
+            self._factory.brake(body)
         elif asset.joints:
             body = self._factory.hinged(asset, pose)
             self._joints[name] = self._factory.joint_indices(asset)
@@ -175,15 +174,6 @@ class DynamicBodies:
             )
             self._still.append(body)
         self._bodies[name], self._names[body] = body, name
-
-    def _friction(self, body: int) -> None:
-        self._bullet.changeDynamics(
-            body,
-            -1,
-            rollingFriction=ROLLING_FRICTION,
-            spinningFriction=ROLLING_FRICTION,
-            physicsClientId=self._client,
-        )
 
     def _swing(self, body: int, name: str, joints: tuple[float, ...]) -> None:
         """Give the joints their limits and friction, and set them."""

@@ -27,8 +27,6 @@ SLOW_RAD_S: Final = 2e-2
 REST_M_S: Final = 2e-2
 REST_RAD_S: Final = 0.2
 """Above either speed the object is not at rest when time is up."""
-ROLLING_FRICTION: Final = 2e-3
-"""Round food is not a ball bearing: a little resistance to rolling lets an apple come to rest."""
 ROUND: Final = frozenset((Shape.CYLINDER, Shape.SPHERE, Shape.HULL))
 """Shapes that may roll. Boxes go without: with it the solver uses all its iterations, and a step costs five times as much."""
 FLOOR_M: Final = 6.0
@@ -95,13 +93,7 @@ class MiniWorld:
         self._still = self._factory.walls(parts)
         self._body = self._factory.rigid(asset, pose, fractions, asset.mass_kg)
         if any(part.shape in ROUND for link in asset.links for part in link.parts):
-            self._bullet.changeDynamics(
-                self._body,
-                -1,
-                rollingFriction=ROLLING_FRICTION,
-                spinningFriction=ROLLING_FRICTION,
-                physicsClientId=self._client,
-            )
+            self._factory.brake(self._body)
 
     def _clear(self) -> None:
         self._stages += 1

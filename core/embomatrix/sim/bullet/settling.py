@@ -15,7 +15,6 @@ from embomatrix.sim.bullet.mini_world import (
     GRAVITY_M_S2,
     REST_M_S,
     REST_RAD_S,
-    ROLLING_FRICTION,
     SLOW_M_S,
     SLOW_RAD_S,
     tilt_between,
@@ -86,7 +85,7 @@ class _Fall:
             self._names[body] = item.name
             if not item.fixed:
                 self._starts[body] = item.pose_world_asset
-                self._brake(body)
+                factory.brake(body)
 
     def run(self) -> SettledScene:
         done = 0
@@ -96,15 +95,6 @@ class _Fall:
             done += CHUNK_STEPS
         objects = {self._names[body]: self._settled(body, start) for body, start in self._starts.items()}
         return SettledScene(objects, self._overlaps())
-
-    def _brake(self, body: int) -> None:
-        self._bullet.changeDynamics(
-            body,
-            -1,
-            rollingFriction=ROLLING_FRICTION,
-            spinningFriction=ROLLING_FRICTION,
-            physicsClientId=self._client,
-        )
 
     def _moves(self) -> bool:
         for body in self._starts:

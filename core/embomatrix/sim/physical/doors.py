@@ -13,9 +13,9 @@ import numpy as np
 
 from embomatrix.sim.bounds import IDENTITY, joint_motion
 from embomatrix.sim.physical import body
-from embomatrix.sim.physical.fold import approach, fold, unfold
+from embomatrix.sim.physical.fold import WAYS, approach, fold, unfold
 from embomatrix.sim.physical.grasp import cross, facing
-from embomatrix.sim.physical.hands import GENTLE, TOUCH_M, WAYS
+from embomatrix.sim.physical.hands import GENTLE, TOUCH_M
 from embomatrix.sim.physical.reach import TOUCH_M as PRESS_M
 from embomatrix.sim.physical.reach import Reach, Track
 from embomatrix.sim.physical.space import Boxes, boxes_of, part_boxes, strikes

@@ -21,7 +21,7 @@ from embomatrix.skills.view import refuse
 from embomatrix.world.poses import StandPose
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
 
     from embomatrix.sim.physical.reach import Held, Reach, Way
     from embomatrix.sim.physical.space import Boxes
@@ -29,6 +29,9 @@ if TYPE_CHECKING:
     from embomatrix.skills.view import Refusal
     from embomatrix.world.geometry import FloatArray
 
+WAYS: Final = 16
+ATTEMPTS: Final = 3
+"""Ways that are looked at, and how many of them the arm sets out for."""
 BACK_OFF_M: Final = (0.0, 0.3, 0.55)
 """How far before the place of work the arm is unfolded."""
 RETREATS_M: Final = (0.2, 0.4, 0.6)
@@ -64,6 +67,21 @@ def approach(
         if swing is not None:
             return swing
     return None
+
+
+def arrivals(
+    stage: Stage, ways: Iterable[Way], reach: Reach, rng: np.random.Generator, *, loaded: bool
+) -> Iterator[tuple[Way, Refusal | None]]:
+    """Bring the arm to the start of one way after another, each with why it did not get there; it tries a few, no more."""
+    attempts = 0
+    for way in itertools.islice(ways, WAYS):
+        swing = approach(stage, way, reach, rng, loaded=loaded)
+        if swing is None:
+            continue
+        attempts += 1
+        yield way, unfold(stage, swing)
+        if attempts == ATTEMPTS:
+            return
 
 
 def unfold(stage: Stage, swing: FloatArray) -> Refusal | None:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.sim.physical.fold import approach, fold, unfold
+from embomatrix.sim.physical.fold import ATTEMPTS, arrivals, fold
 from embomatrix.sim.physical.grasp import grasp_tracks
 from embomatrix.sim.physical.motion import raised
 from embomatrix.sim.physical.travel import SOMETHING
@@ -36,9 +35,6 @@ ROOF_M: Final = 1.0
 WAY_OUT_M: Final = 0.04
 ROOM_M: Final = 0.45
 """From the base's centre to where the hand is before its way in."""
-ATTEMPTS: Final = 3
-WAYS: Final = 16
-"""Ways that are looked at, and that are tried, before a skill gives up."""
 
 
 def bases_at(stage: Stage, pose: Pose, course: float, out_m: float | None) -> list[FloatArray]:
@@ -94,17 +90,10 @@ def take_by(
     """Take an object on any of some ways, the first ``roofed`` of which lead in under a roof, from any of the bases, (b, 3)."""
     reach = stage.reach(stage.boxes(), target)
     refusal = None
-    attempts = 0
-    for way in itertools.islice(reach.ways(tracks, bases), WAYS):
-        if attempts == ATTEMPTS:
-            return refusal
-        swing = approach(stage, way, reach, rng, loaded=False)
-        if swing is None:
-            continue
-        attempts += 1
-        refusal = unfold(stage, swing) or _touch(stage, way, target)
+    for way, lost in arrivals(stage, reach.ways(tracks, bases), reach, rng, loaded=False):
+        refusal = lost or _touch(stage, way, target)
         if refusal is None:
-            return _lift(stage, way, target, ROOFED_RAISE_M if way.track < roofed else RAISE_M)
+            return _lift(stage, way, target, ROOFED_RAISE_M if way.number < roofed else RAISE_M)
         fold(stage, StandPose(*stage.mover.posture[:3].tolist()), rng)
         if _was_pushed(stage, target):
             return refusal

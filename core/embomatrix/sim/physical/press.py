@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from embomatrix.sim.physical import arm
-from embomatrix.sim.physical.fold import approach, fold, unfold
+from embomatrix.sim.physical.fold import arrivals, fold
 from embomatrix.sim.physical.grasp import facing, surface_point
-from embomatrix.sim.physical.hands import GENTLE, TOUCH_M, WAYS
+from embomatrix.sim.physical.hands import GENTLE, TOUCH_M
 from embomatrix.sim.physical.reach import Track
 from embomatrix.sim.physical.space import part_boxes
 from embomatrix.sim.physical.travel import SOMETHING
@@ -30,7 +29,6 @@ DOWNS: Final = (0.0, 35.0, 70.0, 90.0)
 ASIDES: Final = (0.0, 30.0, -30.0)
 OFF_M: Final = 0.08
 BEYOND_M: Final = 0.02
-ATTEMPTS: Final = 3
 
 
 def press(stage: Stage, target: str, rng: np.random.Generator) -> Refusal | None:
@@ -44,16 +42,9 @@ def press(stage: Stage, target: str, rng: np.random.Generator) -> Refusal | None
 def _press(stage: Stage, target: str, rng: np.random.Generator) -> Refusal | None:
     tracks = _tracks(stage, target)
     reach = stage.reach(stage.boxes(), target)
-    refusal, attempts = None, 0
+    refusal = None
     point = np.array(stage.world.relations.body(target).center_m)
-    for way in itertools.islice(reach.ways(tracks, stage.bases(point)), WAYS):
-        if attempts == ATTEMPTS:
-            return refusal
-        swing = approach(stage, way, reach, rng, loaded=False)
-        if swing is None:
-            continue
-        attempts += 1
-        refusal = unfold(stage, swing)
+    for way, refusal in arrivals(stage, reach.ways(tracks, stage.bases(point)), reach, rng, loaded=False):
         if refusal is not None:
             continue
         stage.wake_around(target)

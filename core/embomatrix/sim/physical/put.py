@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.sim.physical.fold import approach, unfold
-from embomatrix.sim.physical.hands import ATTEMPTS, GENTLE, ROOFED_RAISE_M, WAYS, bases_at, way_in
+from embomatrix.sim.physical.fold import arrivals
+from embomatrix.sim.physical.hands import GENTLE, ROOFED_RAISE_M, bases_at, way_in
 from embomatrix.sim.physical.motion import raised
 from embomatrix.sim.physical.reach import Reach, Track
 from embomatrix.sim.physical.travel import SOMETHING
@@ -66,15 +66,14 @@ class Delivery:
         self._boxes = stage.boxes()
         self.reach = Reach(self._boxes, self._boxes, grip.held)
 
-    def ways(self) -> Iterator[tuple[Way, Track]]:
-        """Ways to put it down, to the first pose while there are any, and the tracks that they follow."""
+    def ways(self) -> Iterator[Way]:
+        """Ways to put it down, to the first pose while there are any."""
         for fits in self._lots():
             if fits:
                 tracks = list(_put_tracks(self._grip, fits))
-                for way in self.reach.ways(tracks, bases_at(self._stage, *_at(fits[0]))):
-                    yield way, tracks[way.track]
+                yield from self.reach.ways(tracks, bases_at(self._stage, *_at(fits[0])))
 
-    def drops(self) -> Iterator[tuple[Way, Track]]:
+    def drops(self) -> Iterator[Way]:
         """Ways to let it fall from no higher than must be, as into a crate that is too narrow for the hand."""
         fits = [fit for pose in self._poses[: CHUNKS[2]] for some in self._fits(pose) for fit in some]
         clear_m = [self._clear_above(fit.pose) for fit in fits]
@@ -87,8 +86,7 @@ class Delivery:
             if not higher:
                 return
             tracks = list(_put_tracks(self._grip, higher))
-            for way in self.reach.ways(tracks, bases_at(self._stage, *_at(higher[0]))):
-                yield way, tracks[way.track]
+            yield from self.reach.ways(tracks, bases_at(self._stage, *_at(higher[0])))
 
     def _clear_above(self, pose: Pose) -> float:
         """How far straight up from a pose the thing could come from, as far as drops go."""
@@ -176,23 +174,16 @@ def drop(
 def _bring(
     stage: Stage,
     delivery: Delivery,
-    ways: Iterator[tuple[Way, Track]],
+    ways: Iterator[Way],
     rng: np.random.Generator,
     target: str,
 ) -> Refusal | None:
     grip = stage.grip
     assert grip is not None
-    attempts, refusal = 0, None
-    for way, track in itertools.islice(ways, WAYS):
-        if attempts == ATTEMPTS:
-            return refusal
-        swing = approach(stage, way, delivery.reach, rng, loaded=True)
-        if swing is None:
-            continue
-        attempts += 1
-        refusal = unfold(stage, swing)
+    refusal = None
+    for way, refusal in arrivals(stage, ways, delivery.reach, rng, loaded=True):
         if refusal is None:
-            return _set_down(stage, way, track)
+            return _set_down(stage, way)
     other = delivery.reach.hindrance or target
     return refusal or refuse(FailureReason.ARM_BLOCKED, target=f"a place for {grip.name}", other=other)
 
@@ -219,12 +210,12 @@ def _put_tracks(grip: Grip, fits: Sequence[Fit]) -> Iterator[Track]:
         yield Track(np.tile(rotation, (len(positions), 1, 1)), positions, loaded, len(before))
 
 
-def _set_down(stage: Stage, way: Way, track: Track) -> Refusal | None:
+def _set_down(stage: Stage, way: Way) -> Refusal | None:
     """Follow a way down to where the thing touches, let go, and follow it out."""
     grip, world = stage.grip, stage.world
     assert grip is not None
     name = grip.name
-    key = track.key
+    key = way.track.key
     hit = stage.mover.follow(way.postures[1:key])
     if hit is not None or stage.has_slipped():
         reason = FailureReason.SLIPPED if stage.has_slipped() else FailureReason.ARM_BLOCKED

@@ -96,10 +96,11 @@ class Track:
 
 @dataclass(frozen=True, slots=True)
 class Way:
-    """Postures (w, 11) that follow a track, and the track's number."""
+    """Postures (w, 11) that follow a track, and the track's number among those that were offered."""
 
     postures: FloatArray
-    track: int
+    number: int
+    track: Track
 
 
 class Reach:
@@ -219,7 +220,7 @@ class Reach:
                 if postures is None or any(_alike(postures[0], way.postures[0]) for way in ways):
                     continue
                 if self._passes(track, postures):
-                    ways.append(Way(postures, number))
+                    ways.append(Way(postures, number, track))
                     if len(ways) == OFFERED:
                         return ways
         return ways
