@@ -27,29 +27,67 @@ from embomatrix.proto.v1 import types_pb2 as embomatrix_dot_proto_dot_v1_dot_typ
 from embomatrix.proto.v1 import worker_service_pb2 as embomatrix_dot_proto_dot_v1_dot_worker__service__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\'embomatrix/proto/v1/admin_service.proto\x12\x13\x65mbomatrix.proto.v1\x1a)embomatrix/proto/v1/rollout_service.proto\x1a\x1f\x65mbomatrix/proto/v1/types.proto\x1a(embomatrix/proto/v1/worker_service.proto\"\x14\n\x12ListWorkersRequest\"\xcc\x01\n\nWorkerInfo\x12\x11\n\tworker_id\x18\x01 \x01(\t\x12\r\n\x05state\x18\x02 \x01(\t\x12\x31\n\tresources\x18\x03 \x01(\x0b\x32\x1e.embomatrix.proto.v1.Resources\x12\x30\n\tresidents\x18\x04 \x03(\x0b\x32\x1d.embomatrix.proto.v1.Resident\x12\x0f\n\x07running\x18\x05 \x01(\r\x12\x11\n\tcompleted\x18\x06 \x01(\x04\x12\x13\n\x0blast_seen_s\x18\x07 \x01(\x01\"G\n\x13ListWorkersResponse\x12\x30\n\x07workers\x18\x01 \x03(\x0b\x32\x1f.embomatrix.proto.v1.WorkerInfo\"\x11\n\x0fListRunsRequest\"f\n\x07RunInfo\x12\x0e\n\x06run_id\x18\x01 \x01(\t\x12\x0c\n\x04name\x18\x02 \x01(\t\x12,\n\x05stats\x18\x03 \x01(\x0b\x32\x1d.embomatrix.proto.v1.RunStats\x12\x0f\n\x07pending\x18\x04 \x01(\r\">\n\x10ListRunsResponse\x12*\n\x04runs\x18\x01 \x03(\x0b\x32\x1c.embomatrix.proto.v1.RunInfo\"\'\n\x12\x44rainWorkerRequest\x12\x11\n\tworker_id\x18\x01 \x01(\t\"\x15\n\x13\x44rainWorkerResponse2\xab\x02\n\x0c\x41\x64minService\x12`\n\x0bListWorkers\x12\'.embomatrix.proto.v1.ListWorkersRequest\x1a(.embomatrix.proto.v1.ListWorkersResponse\x12W\n\x08ListRuns\x12$.embomatrix.proto.v1.ListRunsRequest\x1a%.embomatrix.proto.v1.ListRunsResponse\x12`\n\x0b\x44rainWorker\x12\'.embomatrix.proto.v1.DrainWorkerRequest\x1a(.embomatrix.proto.v1.DrainWorkerResponseb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\'embomatrix/proto/v1/admin_service.proto\x12\x13\x65mbomatrix.proto.v1\x1a)embomatrix/proto/v1/rollout_service.proto\x1a\x1f\x65mbomatrix/proto/v1/types.proto\x1a(embomatrix/proto/v1/worker_service.proto\"(\n\x13ResumeWorkerRequest\x12\x11\n\tworker_id\x18\x01 \x01(\t\"\x16\n\x14ResumeWorkerResponse\"8\n\x13RevokeWorkerRequest\x12\x11\n\tworker_id\x18\x01 \x01(\t\x12\x0e\n\x06reason\x18\x02 \x01(\t\"\x16\n\x14RevokeWorkerResponse\" \n\x0eGetPlanRequest\x12\x0e\n\x06run_id\x18\x01 \x01(\t\"\x8f\x01\n\x08PlanCell\x12\x0e\n\x06run_id\x18\x01 \x01(\t\x12\x0c\n\x04step\x18\x02 \x01(\x04\x12\x15\n\rbundle_digest\x18\x03 \x01(\t\x12\r\n\x05\x63ount\x18\x04 \x01(\r\x12+\n\x06warmth\x18\x05 \x01(\x0e\x32\x1b.embomatrix.proto.v1.Warmth\x12\x12\n\nworker_ids\x18\x06 \x03(\t\"?\n\x0fGetPlanResponse\x12,\n\x05\x63\x65lls\x18\x01 \x03(\x0b\x32\x1d.embomatrix.proto.v1.PlanCell\"\x16\n\x14PauseDispatchRequest\"\x17\n\x15PauseDispatchResponse\"\x17\n\x15ResumeDispatchRequest\"\x18\n\x16ResumeDispatchResponse\"\\\n\x11IssueTokenRequest\x12\'\n\x04role\x18\x01 \x01(\x0e\x32\x19.embomatrix.proto.v1.Role\x12\x0f\n\x07valid_s\x18\x02 \x01(\x01\x12\r\n\x05label\x18\x03 \x01(\t\"5\n\x12IssueTokenResponse\x12\r\n\x05token\x18\x01 \x01(\t\x12\x10\n\x08token_id\x18\x02 \x01(\t\"\x13\n\x11ListTokensRequest\"x\n\tTokenInfo\x12\x10\n\x08token_id\x18\x01 \x01(\t\x12\'\n\x04role\x18\x02 \x01(\x0e\x32\x19.embomatrix.proto.v1.Role\x12\r\n\x05label\x18\x03 \x01(\t\x12\x0e\n\x06left_s\x18\x04 \x01(\x01\x12\x11\n\tworker_id\x18\x05 \x01(\t\"D\n\x12ListTokensResponse\x12.\n\x06tokens\x18\x01 \x03(\x0b\x32\x1e.embomatrix.proto.v1.TokenInfo\"&\n\x12RevokeTokenRequest\x12\x10\n\x08token_id\x18\x01 \x01(\t\"\x15\n\x13RevokeTokenResponse\"\x14\n\x12ListWorkersRequest\"\x87\x02\n\nWorkerInfo\x12\x11\n\tworker_id\x18\x01 \x01(\t\x12\r\n\x05state\x18\x02 \x01(\t\x12\x31\n\tresources\x18\x03 \x01(\x0b\x32\x1e.embomatrix.proto.v1.Resources\x12\x30\n\tresidents\x18\x04 \x03(\x0b\x32\x1d.embomatrix.proto.v1.Resident\x12\x0f\n\x07running\x18\x05 \x01(\r\x12\x11\n\tcompleted\x18\x06 \x01(\x04\x12\x13\n\x0blast_seen_s\x18\x07 \x01(\x01\x12\x0e\n\x06reason\x18\x08 \x01(\t\x12\x0f\n\x07\x61udited\x18\t \x01(\x04\x12\x18\n\x10\x61udit_mismatches\x18\n \x01(\x04\"G\n\x13ListWorkersResponse\x12\x30\n\x07workers\x18\x01 \x03(\x0b\x32\x1f.embomatrix.proto.v1.WorkerInfo\"\x11\n\x0fListRunsRequest\"f\n\x07RunInfo\x12\x0e\n\x06run_id\x18\x01 \x01(\t\x12\x0c\n\x04name\x18\x02 \x01(\t\x12,\n\x05stats\x18\x03 \x01(\x0b\x32\x1d.embomatrix.proto.v1.RunStats\x12\x0f\n\x07pending\x18\x04 \x01(\r\">\n\x10ListRunsResponse\x12*\n\x04runs\x18\x01 \x03(\x0b\x32\x1c.embomatrix.proto.v1.RunInfo\"\'\n\x12\x44rainWorkerRequest\x12\x11\n\tworker_id\x18\x01 \x01(\t\"\x15\n\x13\x44rainWorkerResponse*o\n\x04Role\x12\x14\n\x10ROLE_UNSPECIFIED\x10\x00\x12\r\n\tROLE_JOIN\x10\x01\x12\x0f\n\x0bROLE_WORKER\x10\x02\x12\x10\n\x0cROLE_TRAINER\x10\x03\x12\x0f\n\x0bROLE_VIEWER\x10\x04\x12\x0e\n\nROLE_ADMIN\x10\x05\x32\xbe\x08\n\x0c\x41\x64minService\x12`\n\x0bListWorkers\x12\'.embomatrix.proto.v1.ListWorkersRequest\x1a(.embomatrix.proto.v1.ListWorkersResponse\x12W\n\x08ListRuns\x12$.embomatrix.proto.v1.ListRunsRequest\x1a%.embomatrix.proto.v1.ListRunsResponse\x12`\n\x0b\x44rainWorker\x12\'.embomatrix.proto.v1.DrainWorkerRequest\x1a(.embomatrix.proto.v1.DrainWorkerResponse\x12\x63\n\x0cResumeWorker\x12(.embomatrix.proto.v1.ResumeWorkerRequest\x1a).embomatrix.proto.v1.ResumeWorkerResponse\x12\x63\n\x0cRevokeWorker\x12(.embomatrix.proto.v1.RevokeWorkerRequest\x1a).embomatrix.proto.v1.RevokeWorkerResponse\x12T\n\x07GetPlan\x12#.embomatrix.proto.v1.GetPlanRequest\x1a$.embomatrix.proto.v1.GetPlanResponse\x12\x66\n\rPauseDispatch\x12).embomatrix.proto.v1.PauseDispatchRequest\x1a*.embomatrix.proto.v1.PauseDispatchResponse\x12i\n\x0eResumeDispatch\x12*.embomatrix.proto.v1.ResumeDispatchRequest\x1a+.embomatrix.proto.v1.ResumeDispatchResponse\x12]\n\nIssueToken\x12&.embomatrix.proto.v1.IssueTokenRequest\x1a\'.embomatrix.proto.v1.IssueTokenResponse\x12]\n\nListTokens\x12&.embomatrix.proto.v1.ListTokensRequest\x1a\'.embomatrix.proto.v1.ListTokensResponse\x12`\n\x0bRevokeToken\x12\'.embomatrix.proto.v1.RevokeTokenRequest\x1a(.embomatrix.proto.v1.RevokeTokenResponseb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'embomatrix.proto.v1.admin_service_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_LISTWORKERSREQUEST']._serialized_start=182
-  _globals['_LISTWORKERSREQUEST']._serialized_end=202
-  _globals['_WORKERINFO']._serialized_start=205
-  _globals['_WORKERINFO']._serialized_end=409
-  _globals['_LISTWORKERSRESPONSE']._serialized_start=411
-  _globals['_LISTWORKERSRESPONSE']._serialized_end=482
-  _globals['_LISTRUNSREQUEST']._serialized_start=484
-  _globals['_LISTRUNSREQUEST']._serialized_end=501
-  _globals['_RUNINFO']._serialized_start=503
-  _globals['_RUNINFO']._serialized_end=605
-  _globals['_LISTRUNSRESPONSE']._serialized_start=607
-  _globals['_LISTRUNSRESPONSE']._serialized_end=669
-  _globals['_DRAINWORKERREQUEST']._serialized_start=671
-  _globals['_DRAINWORKERREQUEST']._serialized_end=710
-  _globals['_DRAINWORKERRESPONSE']._serialized_start=712
-  _globals['_DRAINWORKERRESPONSE']._serialized_end=733
-  _globals['_ADMINSERVICE']._serialized_start=736
-  _globals['_ADMINSERVICE']._serialized_end=1035
+  _globals['_ROLE']._serialized_start=1712
+  _globals['_ROLE']._serialized_end=1823
+  _globals['_RESUMEWORKERREQUEST']._serialized_start=182
+  _globals['_RESUMEWORKERREQUEST']._serialized_end=222
+  _globals['_RESUMEWORKERRESPONSE']._serialized_start=224
+  _globals['_RESUMEWORKERRESPONSE']._serialized_end=246
+  _globals['_REVOKEWORKERREQUEST']._serialized_start=248
+  _globals['_REVOKEWORKERREQUEST']._serialized_end=304
+  _globals['_REVOKEWORKERRESPONSE']._serialized_start=306
+  _globals['_REVOKEWORKERRESPONSE']._serialized_end=328
+  _globals['_GETPLANREQUEST']._serialized_start=330
+  _globals['_GETPLANREQUEST']._serialized_end=362
+  _globals['_PLANCELL']._serialized_start=365
+  _globals['_PLANCELL']._serialized_end=508
+  _globals['_GETPLANRESPONSE']._serialized_start=510
+  _globals['_GETPLANRESPONSE']._serialized_end=573
+  _globals['_PAUSEDISPATCHREQUEST']._serialized_start=575
+  _globals['_PAUSEDISPATCHREQUEST']._serialized_end=597
+  _globals['_PAUSEDISPATCHRESPONSE']._serialized_start=599
+  _globals['_PAUSEDISPATCHRESPONSE']._serialized_end=622
+  _globals['_RESUMEDISPATCHREQUEST']._serialized_start=624
+  _globals['_RESUMEDISPATCHREQUEST']._serialized_end=647
+  _globals['_RESUMEDISPATCHRESPONSE']._serialized_start=649
+  _globals['_RESUMEDISPATCHRESPONSE']._serialized_end=673
+  _globals['_ISSUETOKENREQUEST']._serialized_start=675
+  _globals['_ISSUETOKENREQUEST']._serialized_end=767
+  _globals['_ISSUETOKENRESPONSE']._serialized_start=769
+  _globals['_ISSUETOKENRESPONSE']._serialized_end=822
+  _globals['_LISTTOKENSREQUEST']._serialized_start=824
+  _globals['_LISTTOKENSREQUEST']._serialized_end=843
+  _globals['_TOKENINFO']._serialized_start=845
+  _globals['_TOKENINFO']._serialized_end=965
+  _globals['_LISTTOKENSRESPONSE']._serialized_start=967
+  _globals['_LISTTOKENSRESPONSE']._serialized_end=1035
+  _globals['_REVOKETOKENREQUEST']._serialized_start=1037
+  _globals['_REVOKETOKENREQUEST']._serialized_end=1075
+  _globals['_REVOKETOKENRESPONSE']._serialized_start=1077
+  _globals['_REVOKETOKENRESPONSE']._serialized_end=1098
+  _globals['_LISTWORKERSREQUEST']._serialized_start=1100
+  _globals['_LISTWORKERSREQUEST']._serialized_end=1120
+  _globals['_WORKERINFO']._serialized_start=1123
+  _globals['_WORKERINFO']._serialized_end=1386
+  _globals['_LISTWORKERSRESPONSE']._serialized_start=1388
+  _globals['_LISTWORKERSRESPONSE']._serialized_end=1459
+  _globals['_LISTRUNSREQUEST']._serialized_start=1461
+  _globals['_LISTRUNSREQUEST']._serialized_end=1478
+  _globals['_RUNINFO']._serialized_start=1480
+  _globals['_RUNINFO']._serialized_end=1582
+  _globals['_LISTRUNSRESPONSE']._serialized_start=1584
+  _globals['_LISTRUNSRESPONSE']._serialized_end=1646
+  _globals['_DRAINWORKERREQUEST']._serialized_start=1648
+  _globals['_DRAINWORKERREQUEST']._serialized_end=1687
+  _globals['_DRAINWORKERRESPONSE']._serialized_start=1689
+  _globals['_DRAINWORKERRESPONSE']._serialized_end=1710
+  _globals['_ADMINSERVICE']._serialized_start=1826
+  _globals['_ADMINSERVICE']._serialized_end=2912
 # @@protoc_insertion_point(module_scope)

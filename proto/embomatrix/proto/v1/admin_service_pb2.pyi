@@ -10,6 +10,7 @@ import embomatrix.proto.v1.types_pb2
 import embomatrix.proto.v1.worker_service_pb2
 import google.protobuf.descriptor
 import google.protobuf.internal.containers
+import google.protobuf.internal.enum_type_wrapper
 import google.protobuf.message
 import sys
 import typing
@@ -20,6 +21,310 @@ else:
     import typing_extensions
 
 DESCRIPTOR: google.protobuf.descriptor.FileDescriptor
+
+class _Role:
+    ValueType = typing.NewType("ValueType", builtins.int)
+    V: typing_extensions.TypeAlias = ValueType
+
+class _RoleEnumTypeWrapper(google.protobuf.internal.enum_type_wrapper._EnumTypeWrapper[_Role.ValueType], builtins.type):
+    DESCRIPTOR: google.protobuf.descriptor.EnumDescriptor
+    ROLE_UNSPECIFIED: _Role.ValueType  # 0
+    ROLE_JOIN: _Role.ValueType  # 1
+    """Registers once; changed for a credential of the worker then."""
+    ROLE_WORKER: _Role.ValueType  # 2
+    ROLE_TRAINER: _Role.ValueType  # 3
+    ROLE_VIEWER: _Role.ValueType  # 4
+    ROLE_ADMIN: _Role.ValueType  # 5
+
+class Role(_Role, metaclass=_RoleEnumTypeWrapper): ...
+
+ROLE_UNSPECIFIED: Role.ValueType  # 0
+ROLE_JOIN: Role.ValueType  # 1
+"""Registers once; changed for a credential of the worker then."""
+ROLE_WORKER: Role.ValueType  # 2
+ROLE_TRAINER: Role.ValueType  # 3
+ROLE_VIEWER: Role.ValueType  # 4
+ROLE_ADMIN: Role.ValueType  # 5
+Global___Role: typing_extensions.TypeAlias = Role
+
+@typing.final
+class ResumeWorkerRequest(google.protobuf.message.Message):
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    WORKER_ID_FIELD_NUMBER: builtins.int
+    worker_id: builtins.str
+    def __init__(
+        self,
+        *,
+        worker_id: builtins.str = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["worker_id", b"worker_id"]) -> None: ...
+
+Global___ResumeWorkerRequest: typing_extensions.TypeAlias = ResumeWorkerRequest
+
+@typing.final
+class ResumeWorkerResponse(google.protobuf.message.Message):
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    def __init__(
+        self,
+    ) -> None: ...
+
+Global___ResumeWorkerResponse: typing_extensions.TypeAlias = ResumeWorkerResponse
+
+@typing.final
+class RevokeWorkerRequest(google.protobuf.message.Message):
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    WORKER_ID_FIELD_NUMBER: builtins.int
+    REASON_FIELD_NUMBER: builtins.int
+    worker_id: builtins.str
+    reason: builtins.str
+    def __init__(
+        self,
+        *,
+        worker_id: builtins.str = ...,
+        reason: builtins.str = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["reason", b"reason", "worker_id", b"worker_id"]) -> None: ...
+
+Global___RevokeWorkerRequest: typing_extensions.TypeAlias = RevokeWorkerRequest
+
+@typing.final
+class RevokeWorkerResponse(google.protobuf.message.Message):
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    def __init__(
+        self,
+    ) -> None: ...
+
+Global___RevokeWorkerResponse: typing_extensions.TypeAlias = RevokeWorkerResponse
+
+@typing.final
+class GetPlanRequest(google.protobuf.message.Message):
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    RUN_ID_FIELD_NUMBER: builtins.int
+    run_id: builtins.str
+    """Empty: of all runs."""
+    def __init__(
+        self,
+        *,
+        run_id: builtins.str = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["run_id", b"run_id"]) -> None: ...
+
+Global___GetPlanRequest: typing_extensions.TypeAlias = GetPlanRequest
+
+@typing.final
+class PlanCell(google.protobuf.message.Message):
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    RUN_ID_FIELD_NUMBER: builtins.int
+    STEP_FIELD_NUMBER: builtins.int
+    BUNDLE_DIGEST_FIELD_NUMBER: builtins.int
+    COUNT_FIELD_NUMBER: builtins.int
+    WARMTH_FIELD_NUMBER: builtins.int
+    WORKER_IDS_FIELD_NUMBER: builtins.int
+    run_id: builtins.str
+    step: builtins.int
+    bundle_digest: builtins.str
+    count: builtins.int
+    warmth: embomatrix.proto.v1.types_pb2.Warmth.ValueType
+    @property
+    def worker_ids(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.str]:
+        """Workers that hold the scene or load it."""
+
+    def __init__(
+        self,
+        *,
+        run_id: builtins.str = ...,
+        step: builtins.int = ...,
+        bundle_digest: builtins.str = ...,
+        count: builtins.int = ...,
+        warmth: embomatrix.proto.v1.types_pb2.Warmth.ValueType = ...,
+        worker_ids: collections.abc.Iterable[builtins.str] | None = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["bundle_digest", b"bundle_digest", "count", b"count", "run_id", b"run_id", "step", b"step", "warmth", b"warmth", "worker_ids", b"worker_ids"]) -> None: ...
+
+Global___PlanCell: typing_extensions.TypeAlias = PlanCell
+
+@typing.final
+class GetPlanResponse(google.protobuf.message.Message):
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    CELLS_FIELD_NUMBER: builtins.int
+    @property
+    def cells(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___PlanCell]: ...
+    def __init__(
+        self,
+        *,
+        cells: collections.abc.Iterable[Global___PlanCell] | None = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["cells", b"cells"]) -> None: ...
+
+Global___GetPlanResponse: typing_extensions.TypeAlias = GetPlanResponse
+
+@typing.final
+class PauseDispatchRequest(google.protobuf.message.Message):
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    def __init__(
+        self,
+    ) -> None: ...
+
+Global___PauseDispatchRequest: typing_extensions.TypeAlias = PauseDispatchRequest
+
+@typing.final
+class PauseDispatchResponse(google.protobuf.message.Message):
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    def __init__(
+        self,
+    ) -> None: ...
+
+Global___PauseDispatchResponse: typing_extensions.TypeAlias = PauseDispatchResponse
+
+@typing.final
+class ResumeDispatchRequest(google.protobuf.message.Message):
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    def __init__(
+        self,
+    ) -> None: ...
+
+Global___ResumeDispatchRequest: typing_extensions.TypeAlias = ResumeDispatchRequest
+
+@typing.final
+class ResumeDispatchResponse(google.protobuf.message.Message):
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    def __init__(
+        self,
+    ) -> None: ...
+
+Global___ResumeDispatchResponse: typing_extensions.TypeAlias = ResumeDispatchResponse
+
+@typing.final
+class IssueTokenRequest(google.protobuf.message.Message):
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    ROLE_FIELD_NUMBER: builtins.int
+    VALID_S_FIELD_NUMBER: builtins.int
+    LABEL_FIELD_NUMBER: builtins.int
+    role: Global___Role.ValueType
+    valid_s: builtins.float
+    """Seconds of validity; 0: until revoked. A token to join is valid for a day at most."""
+    label: builtins.str
+    """For people: whom it was given to."""
+    def __init__(
+        self,
+        *,
+        role: Global___Role.ValueType = ...,
+        valid_s: builtins.float = ...,
+        label: builtins.str = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["label", b"label", "role", b"role", "valid_s", b"valid_s"]) -> None: ...
+
+Global___IssueTokenRequest: typing_extensions.TypeAlias = IssueTokenRequest
+
+@typing.final
+class IssueTokenResponse(google.protobuf.message.Message):
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    TOKEN_FIELD_NUMBER: builtins.int
+    TOKEN_ID_FIELD_NUMBER: builtins.int
+    token: builtins.str
+    token_id: builtins.str
+    def __init__(
+        self,
+        *,
+        token: builtins.str = ...,
+        token_id: builtins.str = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["token", b"token", "token_id", b"token_id"]) -> None: ...
+
+Global___IssueTokenResponse: typing_extensions.TypeAlias = IssueTokenResponse
+
+@typing.final
+class ListTokensRequest(google.protobuf.message.Message):
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    def __init__(
+        self,
+    ) -> None: ...
+
+Global___ListTokensRequest: typing_extensions.TypeAlias = ListTokensRequest
+
+@typing.final
+class TokenInfo(google.protobuf.message.Message):
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    TOKEN_ID_FIELD_NUMBER: builtins.int
+    ROLE_FIELD_NUMBER: builtins.int
+    LABEL_FIELD_NUMBER: builtins.int
+    LEFT_S_FIELD_NUMBER: builtins.int
+    WORKER_ID_FIELD_NUMBER: builtins.int
+    token_id: builtins.str
+    role: Global___Role.ValueType
+    label: builtins.str
+    left_s: builtins.float
+    """Seconds left; 0: until revoked."""
+    worker_id: builtins.str
+    """The worker that the credential belongs to."""
+    def __init__(
+        self,
+        *,
+        token_id: builtins.str = ...,
+        role: Global___Role.ValueType = ...,
+        label: builtins.str = ...,
+        left_s: builtins.float = ...,
+        worker_id: builtins.str = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["label", b"label", "left_s", b"left_s", "role", b"role", "token_id", b"token_id", "worker_id", b"worker_id"]) -> None: ...
+
+Global___TokenInfo: typing_extensions.TypeAlias = TokenInfo
+
+@typing.final
+class ListTokensResponse(google.protobuf.message.Message):
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    TOKENS_FIELD_NUMBER: builtins.int
+    @property
+    def tokens(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___TokenInfo]: ...
+    def __init__(
+        self,
+        *,
+        tokens: collections.abc.Iterable[Global___TokenInfo] | None = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["tokens", b"tokens"]) -> None: ...
+
+Global___ListTokensResponse: typing_extensions.TypeAlias = ListTokensResponse
+
+@typing.final
+class RevokeTokenRequest(google.protobuf.message.Message):
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    TOKEN_ID_FIELD_NUMBER: builtins.int
+    token_id: builtins.str
+    def __init__(
+        self,
+        *,
+        token_id: builtins.str = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["token_id", b"token_id"]) -> None: ...
+
+Global___RevokeTokenRequest: typing_extensions.TypeAlias = RevokeTokenRequest
+
+@typing.final
+class RevokeTokenResponse(google.protobuf.message.Message):
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    def __init__(
+        self,
+    ) -> None: ...
+
+Global___RevokeTokenResponse: typing_extensions.TypeAlias = RevokeTokenResponse
 
 @typing.final
 class ListWorkersRequest(google.protobuf.message.Message):
@@ -42,12 +347,19 @@ class WorkerInfo(google.protobuf.message.Message):
     RUNNING_FIELD_NUMBER: builtins.int
     COMPLETED_FIELD_NUMBER: builtins.int
     LAST_SEEN_S_FIELD_NUMBER: builtins.int
+    REASON_FIELD_NUMBER: builtins.int
+    AUDITED_FIELD_NUMBER: builtins.int
+    AUDIT_MISMATCHES_FIELD_NUMBER: builtins.int
     worker_id: builtins.str
     state: builtins.str
-    """"ready", "suspect", "lost" or "draining"."""
+    """"ready", "paused", "suspect", "lost", "draining" or "quarantined"."""
     running: builtins.int
     completed: builtins.int
     last_seen_s: builtins.float
+    reason: builtins.str
+    """Why it is paused, draining or in quarantine."""
+    audited: builtins.int
+    audit_mismatches: builtins.int
     @property
     def resources(self) -> embomatrix.proto.v1.types_pb2.Resources: ...
     @property
@@ -62,9 +374,12 @@ class WorkerInfo(google.protobuf.message.Message):
         running: builtins.int = ...,
         completed: builtins.int = ...,
         last_seen_s: builtins.float = ...,
+        reason: builtins.str = ...,
+        audited: builtins.int = ...,
+        audit_mismatches: builtins.int = ...,
     ) -> None: ...
     def HasField(self, field_name: typing.Literal["resources", b"resources"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["completed", b"completed", "last_seen_s", b"last_seen_s", "residents", b"residents", "resources", b"resources", "running", b"running", "state", b"state", "worker_id", b"worker_id"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["audit_mismatches", b"audit_mismatches", "audited", b"audited", "completed", b"completed", "last_seen_s", b"last_seen_s", "reason", b"reason", "residents", b"residents", "resources", b"resources", "running", b"running", "state", b"state", "worker_id", b"worker_id"]) -> None: ...
 
 Global___WorkerInfo: typing_extensions.TypeAlias = WorkerInfo
 

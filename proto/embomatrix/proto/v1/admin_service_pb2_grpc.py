@@ -50,6 +50,46 @@ class AdminServiceStub(object):
                 request_serializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.DrainWorkerRequest.SerializeToString,
                 response_deserializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.DrainWorkerResponse.FromString,
                 _registered_method=True)
+        self.ResumeWorker = channel.unary_unary(
+                '/embomatrix.proto.v1.AdminService/ResumeWorker',
+                request_serializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ResumeWorkerRequest.SerializeToString,
+                response_deserializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ResumeWorkerResponse.FromString,
+                _registered_method=True)
+        self.RevokeWorker = channel.unary_unary(
+                '/embomatrix.proto.v1.AdminService/RevokeWorker',
+                request_serializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.RevokeWorkerRequest.SerializeToString,
+                response_deserializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.RevokeWorkerResponse.FromString,
+                _registered_method=True)
+        self.GetPlan = channel.unary_unary(
+                '/embomatrix.proto.v1.AdminService/GetPlan',
+                request_serializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.GetPlanRequest.SerializeToString,
+                response_deserializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.GetPlanResponse.FromString,
+                _registered_method=True)
+        self.PauseDispatch = channel.unary_unary(
+                '/embomatrix.proto.v1.AdminService/PauseDispatch',
+                request_serializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.PauseDispatchRequest.SerializeToString,
+                response_deserializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.PauseDispatchResponse.FromString,
+                _registered_method=True)
+        self.ResumeDispatch = channel.unary_unary(
+                '/embomatrix.proto.v1.AdminService/ResumeDispatch',
+                request_serializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ResumeDispatchRequest.SerializeToString,
+                response_deserializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ResumeDispatchResponse.FromString,
+                _registered_method=True)
+        self.IssueToken = channel.unary_unary(
+                '/embomatrix.proto.v1.AdminService/IssueToken',
+                request_serializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.IssueTokenRequest.SerializeToString,
+                response_deserializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.IssueTokenResponse.FromString,
+                _registered_method=True)
+        self.ListTokens = channel.unary_unary(
+                '/embomatrix.proto.v1.AdminService/ListTokens',
+                request_serializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ListTokensRequest.SerializeToString,
+                response_deserializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ListTokensResponse.FromString,
+                _registered_method=True)
+        self.RevokeToken = channel.unary_unary(
+                '/embomatrix.proto.v1.AdminService/RevokeToken',
+                request_serializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.RevokeTokenRequest.SerializeToString,
+                response_deserializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.RevokeTokenResponse.FromString,
+                _registered_method=True)
 
 
 class AdminServiceServicer(object):
@@ -74,6 +114,59 @@ class AdminServiceServicer(object):
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def ResumeWorker(self, request, context):
+        """Takes a drain back.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def RevokeWorker(self, request, context):
+        """The worker's credential is void, its session ends, and what it held goes to others.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def GetPlan(self, request, context):
+        """The look-ahead grid: steps by scenes, and who holds them.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def PauseDispatch(self, request, context):
+        """No new leases are given until ResumeDispatch; what runs goes on.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def ResumeDispatch(self, request, context):
+        """Missing associated documentation comment in .proto file."""
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def IssueToken(self, request, context):
+        """A token of a role, told once and kept as a hash.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def ListTokens(self, request, context):
+        """Missing associated documentation comment in .proto file."""
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def RevokeToken(self, request, context):
+        """Missing associated documentation comment in .proto file."""
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
 
 def add_AdminServiceServicer_to_server(servicer, server):
     rpc_method_handlers = {
@@ -91,6 +184,46 @@ def add_AdminServiceServicer_to_server(servicer, server):
                     servicer.DrainWorker,
                     request_deserializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.DrainWorkerRequest.FromString,
                     response_serializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.DrainWorkerResponse.SerializeToString,
+            ),
+            'ResumeWorker': grpc.unary_unary_rpc_method_handler(
+                    servicer.ResumeWorker,
+                    request_deserializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ResumeWorkerRequest.FromString,
+                    response_serializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ResumeWorkerResponse.SerializeToString,
+            ),
+            'RevokeWorker': grpc.unary_unary_rpc_method_handler(
+                    servicer.RevokeWorker,
+                    request_deserializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.RevokeWorkerRequest.FromString,
+                    response_serializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.RevokeWorkerResponse.SerializeToString,
+            ),
+            'GetPlan': grpc.unary_unary_rpc_method_handler(
+                    servicer.GetPlan,
+                    request_deserializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.GetPlanRequest.FromString,
+                    response_serializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.GetPlanResponse.SerializeToString,
+            ),
+            'PauseDispatch': grpc.unary_unary_rpc_method_handler(
+                    servicer.PauseDispatch,
+                    request_deserializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.PauseDispatchRequest.FromString,
+                    response_serializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.PauseDispatchResponse.SerializeToString,
+            ),
+            'ResumeDispatch': grpc.unary_unary_rpc_method_handler(
+                    servicer.ResumeDispatch,
+                    request_deserializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ResumeDispatchRequest.FromString,
+                    response_serializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ResumeDispatchResponse.SerializeToString,
+            ),
+            'IssueToken': grpc.unary_unary_rpc_method_handler(
+                    servicer.IssueToken,
+                    request_deserializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.IssueTokenRequest.FromString,
+                    response_serializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.IssueTokenResponse.SerializeToString,
+            ),
+            'ListTokens': grpc.unary_unary_rpc_method_handler(
+                    servicer.ListTokens,
+                    request_deserializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ListTokensRequest.FromString,
+                    response_serializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ListTokensResponse.SerializeToString,
+            ),
+            'RevokeToken': grpc.unary_unary_rpc_method_handler(
+                    servicer.RevokeToken,
+                    request_deserializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.RevokeTokenRequest.FromString,
+                    response_serializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.RevokeTokenResponse.SerializeToString,
             ),
     }
     generic_handler = grpc.method_handlers_generic_handler(
@@ -175,6 +308,222 @@ class AdminService(object):
             '/embomatrix.proto.v1.AdminService/DrainWorker',
             embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.DrainWorkerRequest.SerializeToString,
             embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.DrainWorkerResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def ResumeWorker(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/embomatrix.proto.v1.AdminService/ResumeWorker',
+            embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ResumeWorkerRequest.SerializeToString,
+            embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ResumeWorkerResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def RevokeWorker(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/embomatrix.proto.v1.AdminService/RevokeWorker',
+            embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.RevokeWorkerRequest.SerializeToString,
+            embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.RevokeWorkerResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def GetPlan(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/embomatrix.proto.v1.AdminService/GetPlan',
+            embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.GetPlanRequest.SerializeToString,
+            embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.GetPlanResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def PauseDispatch(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/embomatrix.proto.v1.AdminService/PauseDispatch',
+            embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.PauseDispatchRequest.SerializeToString,
+            embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.PauseDispatchResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def ResumeDispatch(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/embomatrix.proto.v1.AdminService/ResumeDispatch',
+            embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ResumeDispatchRequest.SerializeToString,
+            embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ResumeDispatchResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def IssueToken(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/embomatrix.proto.v1.AdminService/IssueToken',
+            embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.IssueTokenRequest.SerializeToString,
+            embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.IssueTokenResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def ListTokens(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/embomatrix.proto.v1.AdminService/ListTokens',
+            embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ListTokensRequest.SerializeToString,
+            embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ListTokensResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def RevokeToken(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/embomatrix.proto.v1.AdminService/RevokeToken',
+            embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.RevokeTokenRequest.SerializeToString,
+            embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.RevokeTokenResponse.FromString,
             options,
             channel_credentials,
             insecure,

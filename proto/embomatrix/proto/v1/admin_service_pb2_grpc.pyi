@@ -73,7 +73,135 @@ _AdminServiceDrainWorkerType = typing_extensions.TypeVar(
     ],
 )
 
-class AdminServiceStub(typing.Generic[_AdminServiceListWorkersType, _AdminServiceListRunsType, _AdminServiceDrainWorkerType]):
+_AdminServiceResumeWorkerType = typing_extensions.TypeVar(
+    '_AdminServiceResumeWorkerType',
+    grpc.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.ResumeWorkerRequest,
+        embomatrix.proto.v1.admin_service_pb2.ResumeWorkerResponse,
+    ],
+    grpc.aio.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.ResumeWorkerRequest,
+        embomatrix.proto.v1.admin_service_pb2.ResumeWorkerResponse,
+    ],
+    default=grpc.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.ResumeWorkerRequest,
+        embomatrix.proto.v1.admin_service_pb2.ResumeWorkerResponse,
+    ],
+)
+
+_AdminServiceRevokeWorkerType = typing_extensions.TypeVar(
+    '_AdminServiceRevokeWorkerType',
+    grpc.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.RevokeWorkerRequest,
+        embomatrix.proto.v1.admin_service_pb2.RevokeWorkerResponse,
+    ],
+    grpc.aio.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.RevokeWorkerRequest,
+        embomatrix.proto.v1.admin_service_pb2.RevokeWorkerResponse,
+    ],
+    default=grpc.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.RevokeWorkerRequest,
+        embomatrix.proto.v1.admin_service_pb2.RevokeWorkerResponse,
+    ],
+)
+
+_AdminServiceGetPlanType = typing_extensions.TypeVar(
+    '_AdminServiceGetPlanType',
+    grpc.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.GetPlanRequest,
+        embomatrix.proto.v1.admin_service_pb2.GetPlanResponse,
+    ],
+    grpc.aio.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.GetPlanRequest,
+        embomatrix.proto.v1.admin_service_pb2.GetPlanResponse,
+    ],
+    default=grpc.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.GetPlanRequest,
+        embomatrix.proto.v1.admin_service_pb2.GetPlanResponse,
+    ],
+)
+
+_AdminServicePauseDispatchType = typing_extensions.TypeVar(
+    '_AdminServicePauseDispatchType',
+    grpc.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.PauseDispatchRequest,
+        embomatrix.proto.v1.admin_service_pb2.PauseDispatchResponse,
+    ],
+    grpc.aio.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.PauseDispatchRequest,
+        embomatrix.proto.v1.admin_service_pb2.PauseDispatchResponse,
+    ],
+    default=grpc.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.PauseDispatchRequest,
+        embomatrix.proto.v1.admin_service_pb2.PauseDispatchResponse,
+    ],
+)
+
+_AdminServiceResumeDispatchType = typing_extensions.TypeVar(
+    '_AdminServiceResumeDispatchType',
+    grpc.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.ResumeDispatchRequest,
+        embomatrix.proto.v1.admin_service_pb2.ResumeDispatchResponse,
+    ],
+    grpc.aio.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.ResumeDispatchRequest,
+        embomatrix.proto.v1.admin_service_pb2.ResumeDispatchResponse,
+    ],
+    default=grpc.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.ResumeDispatchRequest,
+        embomatrix.proto.v1.admin_service_pb2.ResumeDispatchResponse,
+    ],
+)
+
+_AdminServiceIssueTokenType = typing_extensions.TypeVar(
+    '_AdminServiceIssueTokenType',
+    grpc.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.IssueTokenRequest,
+        embomatrix.proto.v1.admin_service_pb2.IssueTokenResponse,
+    ],
+    grpc.aio.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.IssueTokenRequest,
+        embomatrix.proto.v1.admin_service_pb2.IssueTokenResponse,
+    ],
+    default=grpc.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.IssueTokenRequest,
+        embomatrix.proto.v1.admin_service_pb2.IssueTokenResponse,
+    ],
+)
+
+_AdminServiceListTokensType = typing_extensions.TypeVar(
+    '_AdminServiceListTokensType',
+    grpc.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.ListTokensRequest,
+        embomatrix.proto.v1.admin_service_pb2.ListTokensResponse,
+    ],
+    grpc.aio.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.ListTokensRequest,
+        embomatrix.proto.v1.admin_service_pb2.ListTokensResponse,
+    ],
+    default=grpc.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.ListTokensRequest,
+        embomatrix.proto.v1.admin_service_pb2.ListTokensResponse,
+    ],
+)
+
+_AdminServiceRevokeTokenType = typing_extensions.TypeVar(
+    '_AdminServiceRevokeTokenType',
+    grpc.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.RevokeTokenRequest,
+        embomatrix.proto.v1.admin_service_pb2.RevokeTokenResponse,
+    ],
+    grpc.aio.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.RevokeTokenRequest,
+        embomatrix.proto.v1.admin_service_pb2.RevokeTokenResponse,
+    ],
+    default=grpc.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.RevokeTokenRequest,
+        embomatrix.proto.v1.admin_service_pb2.RevokeTokenResponse,
+    ],
+)
+
+class AdminServiceStub(typing.Generic[_AdminServiceListWorkersType, _AdminServiceListRunsType, _AdminServiceDrainWorkerType, _AdminServiceResumeWorkerType, _AdminServiceRevokeWorkerType, _AdminServiceGetPlanType, _AdminServicePauseDispatchType, _AdminServiceResumeDispatchType, _AdminServiceIssueTokenType, _AdminServiceListTokensType, _AdminServiceRevokeTokenType]):
     """Operators: what the cluster is doing, and a way to take a worker out."""
 
     @typing.overload
@@ -89,6 +217,38 @@ class AdminServiceStub(typing.Generic[_AdminServiceListWorkersType, _AdminServic
         grpc.UnaryUnaryMultiCallable[
             embomatrix.proto.v1.admin_service_pb2.DrainWorkerRequest,
             embomatrix.proto.v1.admin_service_pb2.DrainWorkerResponse,
+        ],
+        grpc.UnaryUnaryMultiCallable[
+            embomatrix.proto.v1.admin_service_pb2.ResumeWorkerRequest,
+            embomatrix.proto.v1.admin_service_pb2.ResumeWorkerResponse,
+        ],
+        grpc.UnaryUnaryMultiCallable[
+            embomatrix.proto.v1.admin_service_pb2.RevokeWorkerRequest,
+            embomatrix.proto.v1.admin_service_pb2.RevokeWorkerResponse,
+        ],
+        grpc.UnaryUnaryMultiCallable[
+            embomatrix.proto.v1.admin_service_pb2.GetPlanRequest,
+            embomatrix.proto.v1.admin_service_pb2.GetPlanResponse,
+        ],
+        grpc.UnaryUnaryMultiCallable[
+            embomatrix.proto.v1.admin_service_pb2.PauseDispatchRequest,
+            embomatrix.proto.v1.admin_service_pb2.PauseDispatchResponse,
+        ],
+        grpc.UnaryUnaryMultiCallable[
+            embomatrix.proto.v1.admin_service_pb2.ResumeDispatchRequest,
+            embomatrix.proto.v1.admin_service_pb2.ResumeDispatchResponse,
+        ],
+        grpc.UnaryUnaryMultiCallable[
+            embomatrix.proto.v1.admin_service_pb2.IssueTokenRequest,
+            embomatrix.proto.v1.admin_service_pb2.IssueTokenResponse,
+        ],
+        grpc.UnaryUnaryMultiCallable[
+            embomatrix.proto.v1.admin_service_pb2.ListTokensRequest,
+            embomatrix.proto.v1.admin_service_pb2.ListTokensResponse,
+        ],
+        grpc.UnaryUnaryMultiCallable[
+            embomatrix.proto.v1.admin_service_pb2.RevokeTokenRequest,
+            embomatrix.proto.v1.admin_service_pb2.RevokeTokenResponse,
         ],
     ], channel: grpc.Channel) -> None: ...
 
@@ -106,6 +266,38 @@ class AdminServiceStub(typing.Generic[_AdminServiceListWorkersType, _AdminServic
             embomatrix.proto.v1.admin_service_pb2.DrainWorkerRequest,
             embomatrix.proto.v1.admin_service_pb2.DrainWorkerResponse,
         ],
+        grpc.aio.UnaryUnaryMultiCallable[
+            embomatrix.proto.v1.admin_service_pb2.ResumeWorkerRequest,
+            embomatrix.proto.v1.admin_service_pb2.ResumeWorkerResponse,
+        ],
+        grpc.aio.UnaryUnaryMultiCallable[
+            embomatrix.proto.v1.admin_service_pb2.RevokeWorkerRequest,
+            embomatrix.proto.v1.admin_service_pb2.RevokeWorkerResponse,
+        ],
+        grpc.aio.UnaryUnaryMultiCallable[
+            embomatrix.proto.v1.admin_service_pb2.GetPlanRequest,
+            embomatrix.proto.v1.admin_service_pb2.GetPlanResponse,
+        ],
+        grpc.aio.UnaryUnaryMultiCallable[
+            embomatrix.proto.v1.admin_service_pb2.PauseDispatchRequest,
+            embomatrix.proto.v1.admin_service_pb2.PauseDispatchResponse,
+        ],
+        grpc.aio.UnaryUnaryMultiCallable[
+            embomatrix.proto.v1.admin_service_pb2.ResumeDispatchRequest,
+            embomatrix.proto.v1.admin_service_pb2.ResumeDispatchResponse,
+        ],
+        grpc.aio.UnaryUnaryMultiCallable[
+            embomatrix.proto.v1.admin_service_pb2.IssueTokenRequest,
+            embomatrix.proto.v1.admin_service_pb2.IssueTokenResponse,
+        ],
+        grpc.aio.UnaryUnaryMultiCallable[
+            embomatrix.proto.v1.admin_service_pb2.ListTokensRequest,
+            embomatrix.proto.v1.admin_service_pb2.ListTokensResponse,
+        ],
+        grpc.aio.UnaryUnaryMultiCallable[
+            embomatrix.proto.v1.admin_service_pb2.RevokeTokenRequest,
+            embomatrix.proto.v1.admin_service_pb2.RevokeTokenResponse,
+        ],
     ], channel: grpc.aio.Channel) -> None: ...
 
     ListWorkers: _AdminServiceListWorkersType
@@ -113,6 +305,27 @@ class AdminServiceStub(typing.Generic[_AdminServiceListWorkersType, _AdminServic
     ListRuns: _AdminServiceListRunsType
 
     DrainWorker: _AdminServiceDrainWorkerType
+
+    ResumeWorker: _AdminServiceResumeWorkerType
+    """Takes a drain back."""
+
+    RevokeWorker: _AdminServiceRevokeWorkerType
+    """The worker's credential is void, its session ends, and what it held goes to others."""
+
+    GetPlan: _AdminServiceGetPlanType
+    """The look-ahead grid: steps by scenes, and who holds them."""
+
+    PauseDispatch: _AdminServicePauseDispatchType
+    """No new leases are given until ResumeDispatch; what runs goes on."""
+
+    ResumeDispatch: _AdminServiceResumeDispatchType
+
+    IssueToken: _AdminServiceIssueTokenType
+    """A token of a role, told once and kept as a hash."""
+
+    ListTokens: _AdminServiceListTokensType
+
+    RevokeToken: _AdminServiceRevokeTokenType
 
 AdminServiceAsyncStub: typing_extensions.TypeAlias = AdminServiceStub[
     grpc.aio.UnaryUnaryMultiCallable[
@@ -126,6 +339,38 @@ AdminServiceAsyncStub: typing_extensions.TypeAlias = AdminServiceStub[
     grpc.aio.UnaryUnaryMultiCallable[
         embomatrix.proto.v1.admin_service_pb2.DrainWorkerRequest,
         embomatrix.proto.v1.admin_service_pb2.DrainWorkerResponse,
+    ],
+    grpc.aio.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.ResumeWorkerRequest,
+        embomatrix.proto.v1.admin_service_pb2.ResumeWorkerResponse,
+    ],
+    grpc.aio.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.RevokeWorkerRequest,
+        embomatrix.proto.v1.admin_service_pb2.RevokeWorkerResponse,
+    ],
+    grpc.aio.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.GetPlanRequest,
+        embomatrix.proto.v1.admin_service_pb2.GetPlanResponse,
+    ],
+    grpc.aio.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.PauseDispatchRequest,
+        embomatrix.proto.v1.admin_service_pb2.PauseDispatchResponse,
+    ],
+    grpc.aio.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.ResumeDispatchRequest,
+        embomatrix.proto.v1.admin_service_pb2.ResumeDispatchResponse,
+    ],
+    grpc.aio.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.IssueTokenRequest,
+        embomatrix.proto.v1.admin_service_pb2.IssueTokenResponse,
+    ],
+    grpc.aio.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.ListTokensRequest,
+        embomatrix.proto.v1.admin_service_pb2.ListTokensResponse,
+    ],
+    grpc.aio.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.RevokeTokenRequest,
+        embomatrix.proto.v1.admin_service_pb2.RevokeTokenResponse,
     ],
 ]
 
@@ -152,5 +397,66 @@ class AdminServiceServicer(metaclass=abc.ABCMeta):
         request: embomatrix.proto.v1.admin_service_pb2.DrainWorkerRequest,
         context: _ServicerContext,
     ) -> typing.Union[embomatrix.proto.v1.admin_service_pb2.DrainWorkerResponse, collections.abc.Awaitable[embomatrix.proto.v1.admin_service_pb2.DrainWorkerResponse]]: ...
+
+    @abc.abstractmethod
+    def ResumeWorker(
+        self,
+        request: embomatrix.proto.v1.admin_service_pb2.ResumeWorkerRequest,
+        context: _ServicerContext,
+    ) -> typing.Union[embomatrix.proto.v1.admin_service_pb2.ResumeWorkerResponse, collections.abc.Awaitable[embomatrix.proto.v1.admin_service_pb2.ResumeWorkerResponse]]:
+        """Takes a drain back."""
+
+    @abc.abstractmethod
+    def RevokeWorker(
+        self,
+        request: embomatrix.proto.v1.admin_service_pb2.RevokeWorkerRequest,
+        context: _ServicerContext,
+    ) -> typing.Union[embomatrix.proto.v1.admin_service_pb2.RevokeWorkerResponse, collections.abc.Awaitable[embomatrix.proto.v1.admin_service_pb2.RevokeWorkerResponse]]:
+        """The worker's credential is void, its session ends, and what it held goes to others."""
+
+    @abc.abstractmethod
+    def GetPlan(
+        self,
+        request: embomatrix.proto.v1.admin_service_pb2.GetPlanRequest,
+        context: _ServicerContext,
+    ) -> typing.Union[embomatrix.proto.v1.admin_service_pb2.GetPlanResponse, collections.abc.Awaitable[embomatrix.proto.v1.admin_service_pb2.GetPlanResponse]]:
+        """The look-ahead grid: steps by scenes, and who holds them."""
+
+    @abc.abstractmethod
+    def PauseDispatch(
+        self,
+        request: embomatrix.proto.v1.admin_service_pb2.PauseDispatchRequest,
+        context: _ServicerContext,
+    ) -> typing.Union[embomatrix.proto.v1.admin_service_pb2.PauseDispatchResponse, collections.abc.Awaitable[embomatrix.proto.v1.admin_service_pb2.PauseDispatchResponse]]:
+        """No new leases are given until ResumeDispatch; what runs goes on."""
+
+    @abc.abstractmethod
+    def ResumeDispatch(
+        self,
+        request: embomatrix.proto.v1.admin_service_pb2.ResumeDispatchRequest,
+        context: _ServicerContext,
+    ) -> typing.Union[embomatrix.proto.v1.admin_service_pb2.ResumeDispatchResponse, collections.abc.Awaitable[embomatrix.proto.v1.admin_service_pb2.ResumeDispatchResponse]]: ...
+
+    @abc.abstractmethod
+    def IssueToken(
+        self,
+        request: embomatrix.proto.v1.admin_service_pb2.IssueTokenRequest,
+        context: _ServicerContext,
+    ) -> typing.Union[embomatrix.proto.v1.admin_service_pb2.IssueTokenResponse, collections.abc.Awaitable[embomatrix.proto.v1.admin_service_pb2.IssueTokenResponse]]:
+        """A token of a role, told once and kept as a hash."""
+
+    @abc.abstractmethod
+    def ListTokens(
+        self,
+        request: embomatrix.proto.v1.admin_service_pb2.ListTokensRequest,
+        context: _ServicerContext,
+    ) -> typing.Union[embomatrix.proto.v1.admin_service_pb2.ListTokensResponse, collections.abc.Awaitable[embomatrix.proto.v1.admin_service_pb2.ListTokensResponse]]: ...
+
+    @abc.abstractmethod
+    def RevokeToken(
+        self,
+        request: embomatrix.proto.v1.admin_service_pb2.RevokeTokenRequest,
+        context: _ServicerContext,
+    ) -> typing.Union[embomatrix.proto.v1.admin_service_pb2.RevokeTokenResponse, collections.abc.Awaitable[embomatrix.proto.v1.admin_service_pb2.RevokeTokenResponse]]: ...
 
 def add_AdminServiceServicer_to_server(servicer: AdminServiceServicer, server: typing.Union[grpc.Server, grpc.aio.Server]) -> None: ...

@@ -8,6 +8,7 @@ import collections.abc
 import embomatrix.proto.v1.types_pb2
 import google.protobuf.descriptor
 import google.protobuf.internal.containers
+import google.protobuf.internal.enum_type_wrapper
 import google.protobuf.message
 import sys
 import typing
@@ -19,22 +20,116 @@ else:
 
 DESCRIPTOR: google.protobuf.descriptor.FileDescriptor
 
+class _GroupPolicy:
+    ValueType = typing.NewType("ValueType", builtins.int)
+    V: typing_extensions.TypeAlias = ValueType
+
+class _GroupPolicyEnumTypeWrapper(google.protobuf.internal.enum_type_wrapper._EnumTypeWrapper[_GroupPolicy.ValueType], builtins.type):
+    DESCRIPTOR: google.protobuf.descriptor.EnumDescriptor
+    GROUP_POLICY_UNSPECIFIED: _GroupPolicy.ValueType  # 0
+    """The manager's default: retry, then fail the group."""
+    GROUP_POLICY_RETRY_THEN_FAIL_GROUP: _GroupPolicy.ValueType  # 1
+    """Members without an outcome are cancelled: the group is left out of the update as a whole."""
+    GROUP_POLICY_PARTIAL: _GroupPolicy.ValueType  # 2
+    """The others go on; the trainer masks the member."""
+    GROUP_POLICY_FAIL_FAST: _GroupPolicy.ValueType  # 3
+    """The first failure, without a retry, cancels the whole batch."""
+
+class GroupPolicy(_GroupPolicy, metaclass=_GroupPolicyEnumTypeWrapper):
+    """What becomes of a group when a member of it ends as an infrastructure failure, after its retries."""
+
+GROUP_POLICY_UNSPECIFIED: GroupPolicy.ValueType  # 0
+"""The manager's default: retry, then fail the group."""
+GROUP_POLICY_RETRY_THEN_FAIL_GROUP: GroupPolicy.ValueType  # 1
+"""Members without an outcome are cancelled: the group is left out of the update as a whole."""
+GROUP_POLICY_PARTIAL: GroupPolicy.ValueType  # 2
+"""The others go on; the trainer masks the member."""
+GROUP_POLICY_FAIL_FAST: GroupPolicy.ValueType  # 3
+"""The first failure, without a retry, cancels the whole batch."""
+Global___GroupPolicy: typing_extensions.TypeAlias = GroupPolicy
+
+@typing.final
+class GetCapabilitiesRequest(google.protobuf.message.Message):
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    def __init__(
+        self,
+    ) -> None: ...
+
+Global___GetCapabilitiesRequest: typing_extensions.TypeAlias = GetCapabilitiesRequest
+
+@typing.final
+class GetCapabilitiesResponse(google.protobuf.message.Message):
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    PROTOCOL_LOW_FIELD_NUMBER: builtins.int
+    PROTOCOL_HIGH_FIELD_NUMBER: builtins.int
+    VERSION_FIELD_NUMBER: builtins.int
+    BATCH_ROLLOUTS_FIELD_NUMBER: builtins.int
+    BUNDLE_BYTES_FIELD_NUMBER: builtins.int
+    protocol_low: builtins.int
+    """The versions of the protocol that the manager speaks, both ends included."""
+    protocol_high: builtins.int
+    version: builtins.str
+    """Of the software."""
+    batch_rollouts: builtins.int
+    bundle_bytes: builtins.int
+    def __init__(
+        self,
+        *,
+        protocol_low: builtins.int = ...,
+        protocol_high: builtins.int = ...,
+        version: builtins.str = ...,
+        batch_rollouts: builtins.int = ...,
+        bundle_bytes: builtins.int = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["batch_rollouts", b"batch_rollouts", "bundle_bytes", b"bundle_bytes", "protocol_high", b"protocol_high", "protocol_low", b"protocol_low", "version", b"version"]) -> None: ...
+
+Global___GetCapabilitiesResponse: typing_extensions.TypeAlias = GetCapabilitiesResponse
+
 @typing.final
 class OpenRunRequest(google.protobuf.message.Message):
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
     NAME_FIELD_NUMBER: builtins.int
     RUN_ID_FIELD_NUMBER: builtins.int
+    GROUP_POLICY_FIELD_NUMBER: builtins.int
+    WEIGHT_FIELD_NUMBER: builtins.int
+    PRIORITY_FIELD_NUMBER: builtins.int
+    ROLLOUT_DEADLINE_S_FIELD_NUMBER: builtins.int
+    REWARD_FIELD_NUMBER: builtins.int
+    VERIFIED_FIELD_NUMBER: builtins.int
+    PROTOCOL_VERSION_FIELD_NUMBER: builtins.int
     name: builtins.str
     run_id: builtins.str
     """Empty: the manager makes one."""
+    group_policy: Global___GroupPolicy.ValueType
+    weight: builtins.float
+    """Share of the cluster among runs of one priority; 0 stands for 1."""
+    priority: builtins.int
+    """A run of a higher priority is served first."""
+    rollout_deadline_s: builtins.float
+    """From submission to outcome; 0: the manager's default."""
+    verified: builtins.bool
+    """Results of workers on probation are delivered only when a second worker agreed."""
+    protocol_version: builtins.int
+    @property
+    def reward(self) -> embomatrix.proto.v1.types_pb2.RewardSettings: ...
     def __init__(
         self,
         *,
         name: builtins.str = ...,
         run_id: builtins.str = ...,
+        group_policy: Global___GroupPolicy.ValueType = ...,
+        weight: builtins.float = ...,
+        priority: builtins.int = ...,
+        rollout_deadline_s: builtins.float = ...,
+        reward: embomatrix.proto.v1.types_pb2.RewardSettings | None = ...,
+        verified: builtins.bool = ...,
+        protocol_version: builtins.int = ...,
     ) -> None: ...
-    def ClearField(self, field_name: typing.Literal["name", b"name", "run_id", b"run_id"]) -> None: ...
+    def HasField(self, field_name: typing.Literal["reward", b"reward"]) -> builtins.bool: ...
+    def ClearField(self, field_name: typing.Literal["group_policy", b"group_policy", "name", b"name", "priority", b"priority", "protocol_version", b"protocol_version", "reward", b"reward", "rollout_deadline_s", b"rollout_deadline_s", "run_id", b"run_id", "verified", b"verified", "weight", b"weight"]) -> None: ...
 
 Global___OpenRunRequest: typing_extensions.TypeAlias = OpenRunRequest
 
@@ -103,15 +198,23 @@ class LookaheadAnswer(google.protobuf.message.Message):
 
     BUNDLE_DIGEST_FIELD_NUMBER: builtins.int
     WARMTH_FIELD_NUMBER: builtins.int
+    ETA_S_FIELD_NUMBER: builtins.int
+    REASON_FIELD_NUMBER: builtins.int
     bundle_digest: builtins.str
     warmth: embomatrix.proto.v1.types_pb2.Warmth.ValueType
+    eta_s: builtins.float
+    """Seconds until it is warm, as far as load times are known; 0 when warm or unknown."""
+    reason: builtins.str
+    """Why it can't be placed."""
     def __init__(
         self,
         *,
         bundle_digest: builtins.str = ...,
         warmth: embomatrix.proto.v1.types_pb2.Warmth.ValueType = ...,
+        eta_s: builtins.float = ...,
+        reason: builtins.str = ...,
     ) -> None: ...
-    def ClearField(self, field_name: typing.Literal["bundle_digest", b"bundle_digest", "warmth", b"warmth"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["bundle_digest", b"bundle_digest", "eta_s", b"eta_s", "reason", b"reason", "warmth", b"warmth"]) -> None: ...
 
 Global___LookaheadAnswer: typing_extensions.TypeAlias = LookaheadAnswer
 
@@ -139,9 +242,12 @@ class ExecuteRequest(google.protobuf.message.Message):
     BATCH_ID_FIELD_NUMBER: builtins.int
     STEP_FIELD_NUMBER: builtins.int
     ROLLOUTS_FIELD_NUMBER: builtins.int
+    POLICY_VERSION_FIELD_NUMBER: builtins.int
     run_id: builtins.str
     batch_id: builtins.str
     step: builtins.int
+    policy_version: builtins.int
+    """Of the weights that wrote the plans; for people and logs."""
     @property
     def rollouts(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[embomatrix.proto.v1.types_pb2.Rollout]: ...
     def __init__(
@@ -151,24 +257,55 @@ class ExecuteRequest(google.protobuf.message.Message):
         batch_id: builtins.str = ...,
         step: builtins.int = ...,
         rollouts: collections.abc.Iterable[embomatrix.proto.v1.types_pb2.Rollout] | None = ...,
+        policy_version: builtins.int = ...,
     ) -> None: ...
-    def ClearField(self, field_name: typing.Literal["batch_id", b"batch_id", "rollouts", b"rollouts", "run_id", b"run_id", "step", b"step"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["batch_id", b"batch_id", "policy_version", b"policy_version", "rollouts", b"rollouts", "run_id", b"run_id", "step", b"step"]) -> None: ...
 
 Global___ExecuteRequest: typing_extensions.TypeAlias = ExecuteRequest
+
+@typing.final
+class GroupDone(google.protobuf.message.Message):
+    """All members of a group have their outcome."""
+
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    GROUP_ID_FIELD_NUMBER: builtins.int
+    COMPLETED_FIELD_NUMBER: builtins.int
+    INFRA_FAILURES_FIELD_NUMBER: builtins.int
+    CANCELLED_FIELD_NUMBER: builtins.int
+    group_id: builtins.str
+    completed: builtins.int
+    infra_failures: builtins.int
+    cancelled: builtins.int
+    def __init__(
+        self,
+        *,
+        group_id: builtins.str = ...,
+        completed: builtins.int = ...,
+        infra_failures: builtins.int = ...,
+        cancelled: builtins.int = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["cancelled", b"cancelled", "completed", b"completed", "group_id", b"group_id", "infra_failures", b"infra_failures"]) -> None: ...
+
+Global___GroupDone: typing_extensions.TypeAlias = GroupDone
 
 @typing.final
 class ExecuteResponse(google.protobuf.message.Message):
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
     RESULTS_FIELD_NUMBER: builtins.int
+    GROUPS_FIELD_NUMBER: builtins.int
     @property
     def results(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[embomatrix.proto.v1.types_pb2.RolloutResult]: ...
+    @property
+    def groups(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___GroupDone]: ...
     def __init__(
         self,
         *,
         results: collections.abc.Iterable[embomatrix.proto.v1.types_pb2.RolloutResult] | None = ...,
+        groups: collections.abc.Iterable[Global___GroupDone] | None = ...,
     ) -> None: ...
-    def ClearField(self, field_name: typing.Literal["results", b"results"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["groups", b"groups", "results", b"results"]) -> None: ...
 
 Global___ExecuteResponse: typing_extensions.TypeAlias = ExecuteResponse
 
@@ -198,14 +335,18 @@ class WaitExecutionResponse(google.protobuf.message.Message):
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
     RESULTS_FIELD_NUMBER: builtins.int
+    GROUPS_FIELD_NUMBER: builtins.int
     @property
     def results(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[embomatrix.proto.v1.types_pb2.RolloutResult]: ...
+    @property
+    def groups(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___GroupDone]: ...
     def __init__(
         self,
         *,
         results: collections.abc.Iterable[embomatrix.proto.v1.types_pb2.RolloutResult] | None = ...,
+        groups: collections.abc.Iterable[Global___GroupDone] | None = ...,
     ) -> None: ...
-    def ClearField(self, field_name: typing.Literal["results", b"results"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["groups", b"groups", "results", b"results"]) -> None: ...
 
 Global___WaitExecutionResponse: typing_extensions.TypeAlias = WaitExecutionResponse
 
@@ -282,6 +423,10 @@ class RunStats(google.protobuf.message.Message):
     PREWARM_HITS_FIELD_NUMBER: builtins.int
     PREWARM_MISSES_FIELD_NUMBER: builtins.int
     PREWARM_WASTED_FIELD_NUMBER: builtins.int
+    HEDGED_FIELD_NUMBER: builtins.int
+    AUDITED_FIELD_NUMBER: builtins.int
+    AUDIT_MISMATCHES_FIELD_NUMBER: builtins.int
+    GROUPS_FAILED_FIELD_NUMBER: builtins.int
     delivered: builtins.int
     infra_failures: builtins.int
     redispatched: builtins.int
@@ -291,6 +436,10 @@ class RunStats(google.protobuf.message.Message):
     prewarm_hits: builtins.int
     prewarm_misses: builtins.int
     prewarm_wasted: builtins.int
+    hedged: builtins.int
+    audited: builtins.int
+    audit_mismatches: builtins.int
+    groups_failed: builtins.int
     def __init__(
         self,
         *,
@@ -303,7 +452,11 @@ class RunStats(google.protobuf.message.Message):
         prewarm_hits: builtins.int = ...,
         prewarm_misses: builtins.int = ...,
         prewarm_wasted: builtins.int = ...,
+        hedged: builtins.int = ...,
+        audited: builtins.int = ...,
+        audit_mismatches: builtins.int = ...,
+        groups_failed: builtins.int = ...,
     ) -> None: ...
-    def ClearField(self, field_name: typing.Literal["cold_starts", b"cold_starts", "delivered", b"delivered", "infra_failures", b"infra_failures", "prewarm_hits", b"prewarm_hits", "prewarm_misses", b"prewarm_misses", "prewarm_wasted", b"prewarm_wasted", "redispatched", b"redispatched", "stale_results", b"stale_results", "warm_starts", b"warm_starts"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["audit_mismatches", b"audit_mismatches", "audited", b"audited", "cold_starts", b"cold_starts", "delivered", b"delivered", "groups_failed", b"groups_failed", "hedged", b"hedged", "infra_failures", b"infra_failures", "prewarm_hits", b"prewarm_hits", "prewarm_misses", b"prewarm_misses", "prewarm_wasted", b"prewarm_wasted", "redispatched", b"redispatched", "stale_results", b"stale_results", "warm_starts", b"warm_starts"]) -> None: ...
 
 Global___RunStats: typing_extensions.TypeAlias = RunStats

@@ -35,6 +35,11 @@ class RolloutServiceStub(object):
         Args:
             channel: A grpc.Channel.
         """
+        self.GetCapabilities = channel.unary_unary(
+                '/embomatrix.proto.v1.RolloutService/GetCapabilities',
+                request_serializer=embomatrix_dot_proto_dot_v1_dot_rollout__service__pb2.GetCapabilitiesRequest.SerializeToString,
+                response_deserializer=embomatrix_dot_proto_dot_v1_dot_rollout__service__pb2.GetCapabilitiesResponse.FromString,
+                _registered_method=True)
         self.OpenRun = channel.unary_unary(
                 '/embomatrix.proto.v1.RolloutService/OpenRun',
                 request_serializer=embomatrix_dot_proto_dot_v1_dot_rollout__service__pb2.OpenRunRequest.SerializeToString,
@@ -70,6 +75,13 @@ class RolloutServiceStub(object):
 class RolloutServiceServicer(object):
     """Trainer to manager.
     """
+
+    def GetCapabilities(self, request, context):
+        """Which protocol versions and limits this manager has.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
 
     def OpenRun(self, request, context):
         """Missing associated documentation comment in .proto file."""
@@ -113,6 +125,11 @@ class RolloutServiceServicer(object):
 
 def add_RolloutServiceServicer_to_server(servicer, server):
     rpc_method_handlers = {
+            'GetCapabilities': grpc.unary_unary_rpc_method_handler(
+                    servicer.GetCapabilities,
+                    request_deserializer=embomatrix_dot_proto_dot_v1_dot_rollout__service__pb2.GetCapabilitiesRequest.FromString,
+                    response_serializer=embomatrix_dot_proto_dot_v1_dot_rollout__service__pb2.GetCapabilitiesResponse.SerializeToString,
+            ),
             'OpenRun': grpc.unary_unary_rpc_method_handler(
                     servicer.OpenRun,
                     request_deserializer=embomatrix_dot_proto_dot_v1_dot_rollout__service__pb2.OpenRunRequest.FromString,
@@ -154,6 +171,33 @@ def add_RolloutServiceServicer_to_server(servicer, server):
 class RolloutService(object):
     """Trainer to manager.
     """
+
+    @staticmethod
+    def GetCapabilities(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/embomatrix.proto.v1.RolloutService/GetCapabilities',
+            embomatrix_dot_proto_dot_v1_dot_rollout__service__pb2.GetCapabilitiesRequest.SerializeToString,
+            embomatrix_dot_proto_dot_v1_dot_rollout__service__pb2.GetCapabilitiesResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
 
     @staticmethod
     def OpenRun(request,

@@ -25,6 +25,22 @@ class _ServicerContext(grpc.ServicerContext, grpc.aio.ServicerContext):  # type:
 
 GRPC_GENERATED_VERSION: str
 GRPC_VERSION: str
+_RolloutServiceGetCapabilitiesType = typing_extensions.TypeVar(
+    '_RolloutServiceGetCapabilitiesType',
+    grpc.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.rollout_service_pb2.GetCapabilitiesRequest,
+        embomatrix.proto.v1.rollout_service_pb2.GetCapabilitiesResponse,
+    ],
+    grpc.aio.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.rollout_service_pb2.GetCapabilitiesRequest,
+        embomatrix.proto.v1.rollout_service_pb2.GetCapabilitiesResponse,
+    ],
+    default=grpc.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.rollout_service_pb2.GetCapabilitiesRequest,
+        embomatrix.proto.v1.rollout_service_pb2.GetCapabilitiesResponse,
+    ],
+)
+
 _RolloutServiceOpenRunType = typing_extensions.TypeVar(
     '_RolloutServiceOpenRunType',
     grpc.UnaryUnaryMultiCallable[
@@ -121,11 +137,15 @@ _RolloutServiceCloseRunType = typing_extensions.TypeVar(
     ],
 )
 
-class RolloutServiceStub(typing.Generic[_RolloutServiceOpenRunType, _RolloutServiceAnnounceLookaheadType, _RolloutServiceExecuteType, _RolloutServiceWaitExecutionType, _RolloutServiceCancelBatchType, _RolloutServiceCloseRunType]):
+class RolloutServiceStub(typing.Generic[_RolloutServiceGetCapabilitiesType, _RolloutServiceOpenRunType, _RolloutServiceAnnounceLookaheadType, _RolloutServiceExecuteType, _RolloutServiceWaitExecutionType, _RolloutServiceCancelBatchType, _RolloutServiceCloseRunType]):
     """Trainer to manager."""
 
     @typing.overload
     def __init__(self: RolloutServiceStub[
+        grpc.UnaryUnaryMultiCallable[
+            embomatrix.proto.v1.rollout_service_pb2.GetCapabilitiesRequest,
+            embomatrix.proto.v1.rollout_service_pb2.GetCapabilitiesResponse,
+        ],
         grpc.UnaryUnaryMultiCallable[
             embomatrix.proto.v1.rollout_service_pb2.OpenRunRequest,
             embomatrix.proto.v1.rollout_service_pb2.OpenRunResponse,
@@ -155,6 +175,10 @@ class RolloutServiceStub(typing.Generic[_RolloutServiceOpenRunType, _RolloutServ
     @typing.overload
     def __init__(self: RolloutServiceStub[
         grpc.aio.UnaryUnaryMultiCallable[
+            embomatrix.proto.v1.rollout_service_pb2.GetCapabilitiesRequest,
+            embomatrix.proto.v1.rollout_service_pb2.GetCapabilitiesResponse,
+        ],
+        grpc.aio.UnaryUnaryMultiCallable[
             embomatrix.proto.v1.rollout_service_pb2.OpenRunRequest,
             embomatrix.proto.v1.rollout_service_pb2.OpenRunResponse,
         ],
@@ -180,6 +204,9 @@ class RolloutServiceStub(typing.Generic[_RolloutServiceOpenRunType, _RolloutServ
         ],
     ], channel: grpc.aio.Channel) -> None: ...
 
+    GetCapabilities: _RolloutServiceGetCapabilitiesType
+    """Which protocol versions and limits this manager has."""
+
     OpenRun: _RolloutServiceOpenRunType
 
     AnnounceLookahead: _RolloutServiceAnnounceLookaheadType
@@ -196,6 +223,10 @@ class RolloutServiceStub(typing.Generic[_RolloutServiceOpenRunType, _RolloutServ
     CloseRun: _RolloutServiceCloseRunType
 
 RolloutServiceAsyncStub: typing_extensions.TypeAlias = RolloutServiceStub[
+    grpc.aio.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.rollout_service_pb2.GetCapabilitiesRequest,
+        embomatrix.proto.v1.rollout_service_pb2.GetCapabilitiesResponse,
+    ],
     grpc.aio.UnaryUnaryMultiCallable[
         embomatrix.proto.v1.rollout_service_pb2.OpenRunRequest,
         embomatrix.proto.v1.rollout_service_pb2.OpenRunResponse,
@@ -224,6 +255,14 @@ RolloutServiceAsyncStub: typing_extensions.TypeAlias = RolloutServiceStub[
 
 class RolloutServiceServicer(metaclass=abc.ABCMeta):
     """Trainer to manager."""
+
+    @abc.abstractmethod
+    def GetCapabilities(
+        self,
+        request: embomatrix.proto.v1.rollout_service_pb2.GetCapabilitiesRequest,
+        context: _ServicerContext,
+    ) -> typing.Union[embomatrix.proto.v1.rollout_service_pb2.GetCapabilitiesResponse, collections.abc.Awaitable[embomatrix.proto.v1.rollout_service_pb2.GetCapabilitiesResponse]]:
+        """Which protocol versions and limits this manager has."""
 
     @abc.abstractmethod
     def OpenRun(

@@ -80,6 +80,12 @@ class _InfraCodeEnumTypeWrapper(google.protobuf.internal.enum_type_wrapper._Enum
     INFRA_CODE_NO_CAPACITY: _InfraCode.ValueType  # 7
     INFRA_CODE_DEADLINE: _InfraCode.ValueType  # 8
     INFRA_CODE_MANAGER_RESTARTED: _InfraCode.ValueType  # 9
+    INFRA_CODE_STALLED: _InfraCode.ValueType  # 10
+    """The slot lived and did no step for too long."""
+    INFRA_CODE_SLOT_OOM: _InfraCode.ValueType  # 11
+    INFRA_CODE_VERSION_SKEW: _InfraCode.ValueType  # 12
+    INFRA_CODE_RESULT_MISMATCH: _InfraCode.ValueType  # 13
+    """Two workers answered differently, and no third one could tell which is right."""
 
 class InfraCode(_InfraCode, metaclass=_InfraCodeEnumTypeWrapper): ...
 
@@ -93,6 +99,12 @@ INFRA_CODE_BUNDLE_CORRUPT: InfraCode.ValueType  # 6
 INFRA_CODE_NO_CAPACITY: InfraCode.ValueType  # 7
 INFRA_CODE_DEADLINE: InfraCode.ValueType  # 8
 INFRA_CODE_MANAGER_RESTARTED: InfraCode.ValueType  # 9
+INFRA_CODE_STALLED: InfraCode.ValueType  # 10
+"""The slot lived and did no step for too long."""
+INFRA_CODE_SLOT_OOM: InfraCode.ValueType  # 11
+INFRA_CODE_VERSION_SKEW: InfraCode.ValueType  # 12
+INFRA_CODE_RESULT_MISMATCH: InfraCode.ValueType  # 13
+"""Two workers answered differently, and no third one could tell which is right."""
 Global___InfraCode: typing_extensions.TypeAlias = InfraCode
 
 class _Warmth:
@@ -271,22 +283,35 @@ Global___StepResult: typing_extensions.TypeAlias = StepResult
 
 @typing.final
 class Timings(google.protobuf.message.Message):
+    """Where the time of a rollout went, in seconds. Durations only: clocks of two machines are never compared."""
+
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
     QUEUED_S_FIELD_NUMBER: builtins.int
     LOAD_S_FIELD_NUMBER: builtins.int
     EXECUTE_S_FIELD_NUMBER: builtins.int
+    LEASE_S_FIELD_NUMBER: builtins.int
+    DELIVER_S_FIELD_NUMBER: builtins.int
     queued_s: builtins.float
+    """From submission to the lease that delivered, on the manager's clock."""
     load_s: builtins.float
+    """Waiting for the scene, on the worker's clock."""
     execute_s: builtins.float
+    """In the slot, on the worker's clock."""
+    lease_s: builtins.float
+    """From the lease to its result, less load_s and execute_s: the network, and the wait for a slot. On the manager's clock."""
+    deliver_s: builtins.float
+    """From the result's arrival to its row in the result log, on the manager's clock."""
     def __init__(
         self,
         *,
         queued_s: builtins.float = ...,
         load_s: builtins.float = ...,
         execute_s: builtins.float = ...,
+        lease_s: builtins.float = ...,
+        deliver_s: builtins.float = ...,
     ) -> None: ...
-    def ClearField(self, field_name: typing.Literal["execute_s", b"execute_s", "load_s", b"load_s", "queued_s", b"queued_s"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["deliver_s", b"deliver_s", "execute_s", b"execute_s", "lease_s", b"lease_s", "load_s", b"load_s", "queued_s", b"queued_s"]) -> None: ...
 
 Global___Timings: typing_extensions.TypeAlias = Timings
 
@@ -353,11 +378,18 @@ Global___InfraFailure: typing_extensions.TypeAlias = InfraFailure
 
 @typing.final
 class Cancelled(google.protobuf.message.Message):
+    """Called off: by its trainer, or because its group or batch can't be completed any more."""
+
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
+    REASON_FIELD_NUMBER: builtins.int
+    reason: builtins.str
     def __init__(
         self,
+        *,
+        reason: builtins.str = ...,
     ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["reason", b"reason"]) -> None: ...
 
 Global___Cancelled: typing_extensions.TypeAlias = Cancelled
 
@@ -419,6 +451,22 @@ class Resources(google.protobuf.message.Message):
         ) -> None: ...
         def ClearField(self, field_name: typing.Literal["key", b"key", "value", b"value"]) -> None: ...
 
+    @typing.final
+    class LabelsEntry(google.protobuf.message.Message):
+        DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+        KEY_FIELD_NUMBER: builtins.int
+        VALUE_FIELD_NUMBER: builtins.int
+        key: builtins.str
+        value: builtins.str
+        def __init__(
+            self,
+            *,
+            key: builtins.str = ...,
+            value: builtins.str = ...,
+        ) -> None: ...
+        def ClearField(self, field_name: typing.Literal["key", b"key", "value", b"value"]) -> None: ...
+
     SLOTS_FIELD_NUMBER: builtins.int
     CORES_FIELD_NUMBER: builtins.int
     MEMORY_MB_FIELD_NUMBER: builtins.int
@@ -426,14 +474,25 @@ class Resources(google.protobuf.message.Message):
     GPU_FIELD_NUMBER: builtins.int
     VRAM_MB_FIELD_NUMBER: builtins.int
     VERSIONS_FIELD_NUMBER: builtins.int
+    DISK_MB_FIELD_NUMBER: builtins.int
+    RENDER_SLOTS_FIELD_NUMBER: builtins.int
+    LABELS_FIELD_NUMBER: builtins.int
     slots: builtins.int
     cores: builtins.int
     memory_mb: builtins.int
     score: builtins.float
     gpu: builtins.str
     vram_mb: builtins.int
+    disk_mb: builtins.int
+    """Free space for bundles."""
+    render_slots: builtins.int
+    """Slots of them that render on the GPU; gated by vram_mb."""
     @property
     def versions(self) -> google.protobuf.internal.containers.ScalarMap[builtins.str, builtins.str]: ...
+    @property
+    def labels(self) -> google.protobuf.internal.containers.ScalarMap[builtins.str, builtins.str]:
+        """What the operator calls this machine by: room=lab, owner=ann."""
+
     def __init__(
         self,
         *,
@@ -444,7 +503,39 @@ class Resources(google.protobuf.message.Message):
         gpu: builtins.str = ...,
         vram_mb: builtins.int = ...,
         versions: collections.abc.Mapping[builtins.str, builtins.str] | None = ...,
+        disk_mb: builtins.int = ...,
+        render_slots: builtins.int = ...,
+        labels: collections.abc.Mapping[builtins.str, builtins.str] | None = ...,
     ) -> None: ...
-    def ClearField(self, field_name: typing.Literal["cores", b"cores", "gpu", b"gpu", "memory_mb", b"memory_mb", "score", b"score", "slots", b"slots", "versions", b"versions", "vram_mb", b"vram_mb"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["cores", b"cores", "disk_mb", b"disk_mb", "gpu", b"gpu", "labels", b"labels", "memory_mb", b"memory_mb", "render_slots", b"render_slots", "score", b"score", "slots", b"slots", "versions", b"versions", "vram_mb", b"vram_mb"]) -> None: ...
 
 Global___Resources: typing_extensions.TypeAlias = Resources
+
+@typing.final
+class RewardSettings(google.protobuf.message.Message):
+    """Coefficients of the three tiers; all of them, or none for the worker's defaults."""
+
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    UNPARSABLE_FIELD_NUMBER: builtins.int
+    FORMAT_FIELD_NUMBER: builtins.int
+    RELEVANCE_PER_OBJECT_FIELD_NUMBER: builtins.int
+    RELEVANCE_LIMIT_FIELD_NUMBER: builtins.int
+    GOAL_FIELD_NUMBER: builtins.int
+    unparsable: builtins.float
+    format: builtins.float
+    relevance_per_object: builtins.float
+    relevance_limit: builtins.float
+    goal: builtins.float
+    def __init__(
+        self,
+        *,
+        unparsable: builtins.float = ...,
+        format: builtins.float = ...,
+        relevance_per_object: builtins.float = ...,
+        relevance_limit: builtins.float = ...,
+        goal: builtins.float = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["format", b"format", "goal", b"goal", "relevance_limit", b"relevance_limit", "relevance_per_object", b"relevance_per_object", "unparsable", b"unparsable"]) -> None: ...
+
+Global___RewardSettings: typing_extensions.TypeAlias = RewardSettings

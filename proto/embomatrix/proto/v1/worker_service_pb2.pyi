@@ -48,11 +48,16 @@ class RegisterRequest(google.protobuf.message.Message):
     PROTOCOL_VERSION_FIELD_NUMBER: builtins.int
     RESOURCES_FIELD_NUMBER: builtins.int
     JOIN_TOKEN_FIELD_NUMBER: builtins.int
+    PROTOCOL_LOW_FIELD_NUMBER: builtins.int
     worker_id: builtins.str
     boot_id: builtins.str
     """New for every process."""
     protocol_version: builtins.int
+    """The newest version of the protocol that the worker speaks."""
     join_token: builtins.str
+    """One-time, for the first registration; after it the worker shows its credential."""
+    protocol_low: builtins.int
+    """The oldest version that the worker speaks; 0 stands for protocol_version."""
     @property
     def resources(self) -> embomatrix.proto.v1.types_pb2.Resources: ...
     def __init__(
@@ -63,9 +68,10 @@ class RegisterRequest(google.protobuf.message.Message):
         protocol_version: builtins.int = ...,
         resources: embomatrix.proto.v1.types_pb2.Resources | None = ...,
         join_token: builtins.str = ...,
+        protocol_low: builtins.int = ...,
     ) -> None: ...
     def HasField(self, field_name: typing.Literal["resources", b"resources"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["boot_id", b"boot_id", "join_token", b"join_token", "protocol_version", b"protocol_version", "resources", b"resources", "worker_id", b"worker_id"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["boot_id", b"boot_id", "join_token", b"join_token", "protocol_low", b"protocol_low", "protocol_version", b"protocol_version", "resources", b"resources", "worker_id", b"worker_id"]) -> None: ...
 
 Global___RegisterRequest: typing_extensions.TypeAlias = RegisterRequest
 
@@ -77,10 +83,16 @@ class RegisterResponse(google.protobuf.message.Message):
     SESSION_EPOCH_FIELD_NUMBER: builtins.int
     HEARTBEAT_INTERVAL_S_FIELD_NUMBER: builtins.int
     LEASE_TTL_S_FIELD_NUMBER: builtins.int
+    PROTOCOL_VERSION_FIELD_NUMBER: builtins.int
+    CREDENTIAL_FIELD_NUMBER: builtins.int
     session_id: builtins.str
     session_epoch: builtins.int
     heartbeat_interval_s: builtins.float
     lease_ttl_s: builtins.float
+    protocol_version: builtins.int
+    """The version both sides speak from here on; 0 stands for 1."""
+    credential: builtins.str
+    """What the worker authenticates with from here on; empty when it had one already, or none is needed."""
     def __init__(
         self,
         *,
@@ -88,10 +100,40 @@ class RegisterResponse(google.protobuf.message.Message):
         session_epoch: builtins.int = ...,
         heartbeat_interval_s: builtins.float = ...,
         lease_ttl_s: builtins.float = ...,
+        protocol_version: builtins.int = ...,
+        credential: builtins.str = ...,
     ) -> None: ...
-    def ClearField(self, field_name: typing.Literal["heartbeat_interval_s", b"heartbeat_interval_s", "lease_ttl_s", b"lease_ttl_s", "session_epoch", b"session_epoch", "session_id", b"session_id"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["credential", b"credential", "heartbeat_interval_s", b"heartbeat_interval_s", "lease_ttl_s", b"lease_ttl_s", "protocol_version", b"protocol_version", "session_epoch", b"session_epoch", "session_id", b"session_id"]) -> None: ...
 
 Global___RegisterResponse: typing_extensions.TypeAlias = RegisterResponse
+
+@typing.final
+class DeregisterRequest(google.protobuf.message.Message):
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    SESSION_ID_FIELD_NUMBER: builtins.int
+    SESSION_EPOCH_FIELD_NUMBER: builtins.int
+    session_id: builtins.str
+    session_epoch: builtins.int
+    def __init__(
+        self,
+        *,
+        session_id: builtins.str = ...,
+        session_epoch: builtins.int = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["session_epoch", b"session_epoch", "session_id", b"session_id"]) -> None: ...
+
+Global___DeregisterRequest: typing_extensions.TypeAlias = DeregisterRequest
+
+@typing.final
+class DeregisterResponse(google.protobuf.message.Message):
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    def __init__(
+        self,
+    ) -> None: ...
+
+Global___DeregisterResponse: typing_extensions.TypeAlias = DeregisterResponse
 
 @typing.final
 class Resident(google.protobuf.message.Message):
@@ -149,7 +191,10 @@ class WorkerState(google.protobuf.message.Message):
     RUNNING_FIELD_NUMBER: builtins.int
     FINISHED_FIELD_NUMBER: builtins.int
     DRAINING_FIELD_NUMBER: builtins.int
+    PAUSED_FIELD_NUMBER: builtins.int
     draining: builtins.bool
+    paused: builtins.str
+    """Why the worker takes nothing new for now, though it stays; empty while it works."""
     @property
     def residents(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___Resident]: ...
     @property
@@ -163,8 +208,9 @@ class WorkerState(google.protobuf.message.Message):
         running: collections.abc.Iterable[Global___LeaseRef] | None = ...,
         finished: collections.abc.Iterable[Global___LeaseResult] | None = ...,
         draining: builtins.bool = ...,
+        paused: builtins.str = ...,
     ) -> None: ...
-    def ClearField(self, field_name: typing.Literal["draining", b"draining", "finished", b"finished", "residents", b"residents", "running", b"running"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["draining", b"draining", "finished", b"finished", "paused", b"paused", "residents", b"residents", "running", b"running"]) -> None: ...
 
 Global___WorkerState: typing_extensions.TypeAlias = WorkerState
 
@@ -232,20 +278,26 @@ class Lease(google.protobuf.message.Message):
     REF_FIELD_NUMBER: builtins.int
     ROLLOUT_FIELD_NUMBER: builtins.int
     DEADLINE_S_FIELD_NUMBER: builtins.int
+    REWARD_FIELD_NUMBER: builtins.int
     deadline_s: builtins.float
     @property
     def ref(self) -> Global___LeaseRef: ...
     @property
     def rollout(self) -> embomatrix.proto.v1.types_pb2.Rollout: ...
+    @property
+    def reward(self) -> embomatrix.proto.v1.types_pb2.RewardSettings:
+        """The run's coefficients; absent for the worker's defaults."""
+
     def __init__(
         self,
         *,
         ref: Global___LeaseRef | None = ...,
         rollout: embomatrix.proto.v1.types_pb2.Rollout | None = ...,
         deadline_s: builtins.float = ...,
+        reward: embomatrix.proto.v1.types_pb2.RewardSettings | None = ...,
     ) -> None: ...
-    def HasField(self, field_name: typing.Literal["ref", b"ref", "rollout", b"rollout"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["deadline_s", b"deadline_s", "ref", b"ref", "rollout", b"rollout"]) -> None: ...
+    def HasField(self, field_name: typing.Literal["ref", b"ref", "reward", b"reward", "rollout", b"rollout"]) -> builtins.bool: ...
+    def ClearField(self, field_name: typing.Literal["deadline_s", b"deadline_s", "ref", b"ref", "reward", b"reward", "rollout", b"rollout"]) -> None: ...
 
 Global___Lease: typing_extensions.TypeAlias = Lease
 
@@ -300,6 +352,29 @@ class DesiredResidents(google.protobuf.message.Message):
 Global___DesiredResidents: typing_extensions.TypeAlias = DesiredResidents
 
 @typing.final
+class LeaseProgress(google.protobuf.message.Message):
+    """How far a lease that runs has come."""
+
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    REF_FIELD_NUMBER: builtins.int
+    STEPS_FIELD_NUMBER: builtins.int
+    steps: builtins.int
+    """Steps of the plan that are done; never falls."""
+    @property
+    def ref(self) -> Global___LeaseRef: ...
+    def __init__(
+        self,
+        *,
+        ref: Global___LeaseRef | None = ...,
+        steps: builtins.int = ...,
+    ) -> None: ...
+    def HasField(self, field_name: typing.Literal["ref", b"ref"]) -> builtins.bool: ...
+    def ClearField(self, field_name: typing.Literal["ref", b"ref", "steps", b"steps"]) -> None: ...
+
+Global___LeaseProgress: typing_extensions.TypeAlias = LeaseProgress
+
+@typing.final
 class HeartbeatRequest(google.protobuf.message.Message):
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
@@ -308,12 +383,15 @@ class HeartbeatRequest(google.protobuf.message.Message):
     RUNNING_FIELD_NUMBER: builtins.int
     LOAD_FIELD_NUMBER: builtins.int
     MEMORY_USED_MB_FIELD_NUMBER: builtins.int
+    PROGRESS_FIELD_NUMBER: builtins.int
     session_id: builtins.str
     session_epoch: builtins.int
     load: builtins.float
     memory_used_mb: builtins.int
     @property
     def running(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___LeaseRef]: ...
+    @property
+    def progress(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___LeaseProgress]: ...
     def __init__(
         self,
         *,
@@ -322,8 +400,9 @@ class HeartbeatRequest(google.protobuf.message.Message):
         running: collections.abc.Iterable[Global___LeaseRef] | None = ...,
         load: builtins.float = ...,
         memory_used_mb: builtins.int = ...,
+        progress: collections.abc.Iterable[Global___LeaseProgress] | None = ...,
     ) -> None: ...
-    def ClearField(self, field_name: typing.Literal["load", b"load", "memory_used_mb", b"memory_used_mb", "running", b"running", "session_epoch", b"session_epoch", "session_id", b"session_id"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["load", b"load", "memory_used_mb", b"memory_used_mb", "progress", b"progress", "running", b"running", "session_epoch", b"session_epoch", "session_id", b"session_id"]) -> None: ...
 
 Global___HeartbeatRequest: typing_extensions.TypeAlias = HeartbeatRequest
 

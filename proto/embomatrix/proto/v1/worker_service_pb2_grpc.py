@@ -55,6 +55,11 @@ class WorkerServiceStub(object):
                 request_serializer=embomatrix_dot_proto_dot_v1_dot_worker__service__pb2.FetchBundleRequest.SerializeToString,
                 response_deserializer=embomatrix_dot_proto_dot_v1_dot_worker__service__pb2.FetchBundleResponse.FromString,
                 _registered_method=True)
+        self.Deregister = channel.unary_unary(
+                '/embomatrix.proto.v1.WorkerService/Deregister',
+                request_serializer=embomatrix_dot_proto_dot_v1_dot_worker__service__pb2.DeregisterRequest.SerializeToString,
+                response_deserializer=embomatrix_dot_proto_dot_v1_dot_worker__service__pb2.DeregisterResponse.FromString,
+                _registered_method=True)
 
 
 class WorkerServiceServicer(object):
@@ -88,6 +93,13 @@ class WorkerServiceServicer(object):
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def Deregister(self, request, context):
+        """The worker leaves for good: what it held is given to others at once.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
 
 def add_WorkerServiceServicer_to_server(servicer, server):
     rpc_method_handlers = {
@@ -110,6 +122,11 @@ def add_WorkerServiceServicer_to_server(servicer, server):
                     servicer.FetchBundle,
                     request_deserializer=embomatrix_dot_proto_dot_v1_dot_worker__service__pb2.FetchBundleRequest.FromString,
                     response_serializer=embomatrix_dot_proto_dot_v1_dot_worker__service__pb2.FetchBundleResponse.SerializeToString,
+            ),
+            'Deregister': grpc.unary_unary_rpc_method_handler(
+                    servicer.Deregister,
+                    request_deserializer=embomatrix_dot_proto_dot_v1_dot_worker__service__pb2.DeregisterRequest.FromString,
+                    response_serializer=embomatrix_dot_proto_dot_v1_dot_worker__service__pb2.DeregisterResponse.SerializeToString,
             ),
     }
     generic_handler = grpc.method_handlers_generic_handler(
@@ -221,6 +238,33 @@ class WorkerService(object):
             '/embomatrix.proto.v1.WorkerService/FetchBundle',
             embomatrix_dot_proto_dot_v1_dot_worker__service__pb2.FetchBundleRequest.SerializeToString,
             embomatrix_dot_proto_dot_v1_dot_worker__service__pb2.FetchBundleResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def Deregister(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/embomatrix.proto.v1.WorkerService/Deregister',
+            embomatrix_dot_proto_dot_v1_dot_worker__service__pb2.DeregisterRequest.SerializeToString,
+            embomatrix_dot_proto_dot_v1_dot_worker__service__pb2.DeregisterResponse.FromString,
             options,
             channel_credentials,
             insecure,

@@ -89,7 +89,23 @@ _WorkerServiceFetchBundleType = typing_extensions.TypeVar(
     ],
 )
 
-class WorkerServiceStub(typing.Generic[_WorkerServiceRegisterType, _WorkerServiceSessionType, _WorkerServiceHeartbeatType, _WorkerServiceFetchBundleType]):
+_WorkerServiceDeregisterType = typing_extensions.TypeVar(
+    '_WorkerServiceDeregisterType',
+    grpc.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.worker_service_pb2.DeregisterRequest,
+        embomatrix.proto.v1.worker_service_pb2.DeregisterResponse,
+    ],
+    grpc.aio.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.worker_service_pb2.DeregisterRequest,
+        embomatrix.proto.v1.worker_service_pb2.DeregisterResponse,
+    ],
+    default=grpc.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.worker_service_pb2.DeregisterRequest,
+        embomatrix.proto.v1.worker_service_pb2.DeregisterResponse,
+    ],
+)
+
+class WorkerServiceStub(typing.Generic[_WorkerServiceRegisterType, _WorkerServiceSessionType, _WorkerServiceHeartbeatType, _WorkerServiceFetchBundleType, _WorkerServiceDeregisterType]):
     """Worker to manager; the worker always dials out."""
 
     @typing.overload
@@ -109,6 +125,10 @@ class WorkerServiceStub(typing.Generic[_WorkerServiceRegisterType, _WorkerServic
         grpc.UnaryStreamMultiCallable[
             embomatrix.proto.v1.worker_service_pb2.FetchBundleRequest,
             embomatrix.proto.v1.worker_service_pb2.FetchBundleResponse,
+        ],
+        grpc.UnaryUnaryMultiCallable[
+            embomatrix.proto.v1.worker_service_pb2.DeregisterRequest,
+            embomatrix.proto.v1.worker_service_pb2.DeregisterResponse,
         ],
     ], channel: grpc.Channel) -> None: ...
 
@@ -130,6 +150,10 @@ class WorkerServiceStub(typing.Generic[_WorkerServiceRegisterType, _WorkerServic
             embomatrix.proto.v1.worker_service_pb2.FetchBundleRequest,
             embomatrix.proto.v1.worker_service_pb2.FetchBundleResponse,
         ],
+        grpc.aio.UnaryUnaryMultiCallable[
+            embomatrix.proto.v1.worker_service_pb2.DeregisterRequest,
+            embomatrix.proto.v1.worker_service_pb2.DeregisterResponse,
+        ],
     ], channel: grpc.aio.Channel) -> None: ...
 
     Register: _WorkerServiceRegisterType
@@ -142,6 +166,9 @@ class WorkerServiceStub(typing.Generic[_WorkerServiceRegisterType, _WorkerServic
     """On its own channel, so that no bundle transfer delays it. Renews the leases it names."""
 
     FetchBundle: _WorkerServiceFetchBundleType
+
+    Deregister: _WorkerServiceDeregisterType
+    """The worker leaves for good: what it held is given to others at once."""
 
 WorkerServiceAsyncStub: typing_extensions.TypeAlias = WorkerServiceStub[
     grpc.aio.UnaryUnaryMultiCallable[
@@ -159,6 +186,10 @@ WorkerServiceAsyncStub: typing_extensions.TypeAlias = WorkerServiceStub[
     grpc.aio.UnaryStreamMultiCallable[
         embomatrix.proto.v1.worker_service_pb2.FetchBundleRequest,
         embomatrix.proto.v1.worker_service_pb2.FetchBundleResponse,
+    ],
+    grpc.aio.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.worker_service_pb2.DeregisterRequest,
+        embomatrix.proto.v1.worker_service_pb2.DeregisterResponse,
     ],
 ]
 
@@ -195,5 +226,13 @@ class WorkerServiceServicer(metaclass=abc.ABCMeta):
         request: embomatrix.proto.v1.worker_service_pb2.FetchBundleRequest,
         context: _ServicerContext,
     ) -> typing.Union[collections.abc.Iterator[embomatrix.proto.v1.worker_service_pb2.FetchBundleResponse], collections.abc.AsyncIterator[embomatrix.proto.v1.worker_service_pb2.FetchBundleResponse]]: ...
+
+    @abc.abstractmethod
+    def Deregister(
+        self,
+        request: embomatrix.proto.v1.worker_service_pb2.DeregisterRequest,
+        context: _ServicerContext,
+    ) -> typing.Union[embomatrix.proto.v1.worker_service_pb2.DeregisterResponse, collections.abc.Awaitable[embomatrix.proto.v1.worker_service_pb2.DeregisterResponse]]:
+        """The worker leaves for good: what it held is given to others at once."""
 
 def add_WorkerServiceServicer_to_server(servicer: WorkerServiceServicer, server: typing.Union[grpc.Server, grpc.aio.Server]) -> None: ...
