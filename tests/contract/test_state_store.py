@@ -5,7 +5,15 @@ import itertools
 import pytest
 
 from embomatrix.manager.store.memory import MemoryState, MemoryStore
-from embomatrix.manager.store.protocol import BatchRow, FencedError, PutOutcome, ResultRow, RunRow, StateError
+from embomatrix.manager.store.protocol import (
+    BatchRow,
+    CredentialRow,
+    FencedError,
+    PutOutcome,
+    ResultRow,
+    RunRow,
+    StateError,
+)
 from embomatrix.manager.store.redis import RedisStore
 from embomatrix.manager.store.sqlite import SqliteStore
 from embomatrix.manager.store.url import open_store
@@ -141,6 +149,19 @@ async def test_another_process_finds_everything_again(store, openings):
     assert await again.results_after("r1", "b1", 1, 100) == rows(2)
 
 
+async def test_credentials_are_known_to_whoever_opens_the_state_and_the_last_word_on_one_counts(openings):
+    store = openings()
+    await store.claim()
+    await store.put_credentials([CredentialRow("a", b"\x00first"), CredentialRow("b", b"of b")])
+    await store.put_credentials([CredentialRow("a", b"second\xff")])
+    again = openings()
+    found = await again.credentials()
+    assert sorted(found, key=lambda row: row.token_id) == [
+        CredentialRow("a", b"second\xff"),
+        CredentialRow("b", b"of b"),
+    ]
+
+
 async def test_the_manager_that_claimed_last_is_the_only_one_that_writes(store, openings):
     await store.open_run(RunRow("r1", ""))
     await store.put_batch(BATCH)
@@ -152,6 +173,7 @@ async def test_the_manager_that_claimed_last_is_the_only_one_that_writes(store, 
         store.append_results("r1", "b1", rows(1)),
         store.drop_batch("r1", "b1"),
         store.close_run("r1"),
+        store.put_credentials([CredentialRow("a", b"")]),
     ):
         with pytest.raises(FencedError, match="another manager"):
             await write

@@ -4,7 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from embomatrix.manager.store.protocol import BatchRow, FencedError, PutOutcome, ResultRow, RunRow
+from embomatrix.manager.store.protocol import (
+    BatchRow,
+    CredentialRow,
+    FencedError,
+    PutOutcome,
+    ResultRow,
+    RunRow,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -18,6 +25,7 @@ class MemoryState:
         self.runs: dict[str, RunRow] = {}
         self.batches: dict[tuple[str, str], BatchRow] = {}
         self.results: dict[tuple[str, str], dict[str, ResultRow]] = {}
+        self.credentials: dict[str, CredentialRow] = {}
 
 
 class MemoryStore:
@@ -74,6 +82,13 @@ class MemoryStore:
 
     async def batches(self, run_id: str) -> list[BatchRow]:
         return [batch for key, batch in self._state.batches.items() if key[0] == run_id]
+
+    async def put_credentials(self, rows: Sequence[CredentialRow]) -> None:
+        self._check()
+        self._state.credentials.update((row.token_id, row) for row in rows)
+
+    async def credentials(self) -> list[CredentialRow]:
+        return list(self._state.credentials.values())
 
     async def close(self) -> None:
         """Nothing is held."""

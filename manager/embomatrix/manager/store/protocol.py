@@ -57,6 +57,14 @@ class ResultRow:
     payload: bytes
 
 
+@dataclass(frozen=True, slots=True)
+class CredentialRow:
+    """Who may call: ``payload`` is opaque to the store and holds no secret, only its hash."""
+
+    token_id: str
+    payload: bytes
+
+
 class StateStore(Protocol):
     """Every write belongs to the manager that claimed the store last; an older one gets ``FencedError``."""
 
@@ -86,6 +94,12 @@ class StateStore(Protocol):
 
     async def batches(self, run_id: str) -> list[BatchRow]:
         """Batches of a run, oldest first."""
+
+    async def put_credentials(self, rows: Sequence[CredentialRow]) -> None:
+        """Note these, all or none; one of a known id replaces it."""
+
+    async def credentials(self) -> list[CredentialRow]:
+        """Every credential that was ever put, in no order."""
 
     async def close(self) -> None:
         """Let go of connections and files."""

@@ -1,8 +1,9 @@
 """State in Redis (6.2 command set, also Valkey): for clusters, and for another manager to take over.
 
-Keys, all below one prefix: ``epoch``; ``runs`` (hash id -> name) with ``run_order`` (list); of a run ``batches:RUN`` (list of
-ids); of a batch ``batch:RUN:BATCH`` (hash digest, payload), ``done:RUN:BATCH`` (set of rollouts), ``results:RUN:BATCH`` (sorted
-set of "rollout id length:rollout id payload" by cursor). Every conditional write is one Lua script that checks the epoch first.
+Keys, all below one prefix: ``epoch``; ``credentials`` (hash token id -> payload); ``runs`` (hash id -> name) with
+``run_order`` (list); of a run ``batches:RUN`` (list of ids); of a batch ``batch:RUN:BATCH`` (hash digest, payload),
+``done:RUN:BATCH`` (set of rollouts), ``results:RUN:BATCH`` (sorted set of "rollout id length:rollout id payload" by cursor).
+Every conditional write is one Lua script that checks the epoch first.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from redis.exceptions import RedisError, ResponseError
 
 from embomatrix.manager.store.protocol import (
     BatchRow,
+    CredentialRow,
     FencedError,
     PutOutcome,
     ResultRow,
@@ -81,6 +83,13 @@ redis.call('DEL', KEYS[4])
 return 1
 """
 )
+_PUT_CREDENTIALS: Final = (
+    _GUARD
+    + """
+for index = 2, #ARGV, 2 do redis.call('HSET', KEYS[2], ARGV[index], ARGV[index + 1]) end
+return 1
+"""
+)
 
 
 class RedisStore:
@@ -143,6 +152,14 @@ class RedisStore:
             if fields:
                 rows.append(BatchRow(run_id, batch_id, fields[b"digest"].decode(), fields[b"payload"]))
         return rows
+
+    async def put_credentials(self, rows: Sequence[CredentialRow]) -> None:
+        flat = [value for row in rows for value in (row.token_id, row.payload)]
+        await self._script(_PUT_CREDENTIALS, ("credentials",), *flat)
+
+    async def credentials(self) -> list[CredentialRow]:
+        found = await self._call(self._redis.hgetall(self._key("credentials")))
+        return [CredentialRow(token_id.decode(), payload) for token_id, payload in found.items()]
 
     async def close(self) -> None:
         await self._redis.aclose()

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from embomatrix.manager.store.protocol import (
     BatchRow,
+    CredentialRow,
     FencedError,
     PutOutcome,
     ResultRow,
@@ -35,6 +36,7 @@ CREATE TABLE IF NOT EXISTS result (
     run_id TEXT NOT NULL, batch_id TEXT NOT NULL, rollout_id TEXT NOT NULL, cursor INTEGER NOT NULL,
     payload BLOB NOT NULL, PRIMARY KEY (run_id, batch_id, rollout_id)
 ) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS credential (token_id TEXT PRIMARY KEY, payload BLOB NOT NULL);
 CREATE INDEX IF NOT EXISTS result_order ON result (run_id, batch_id, cursor);
 """
 
@@ -119,6 +121,15 @@ class SqliteStore:
     async def batches(self, run_id: str) -> list[BatchRow]:
         query = "SELECT run_id, batch_id, digest, payload FROM batch WHERE run_id = ? ORDER BY rowid"
         return [BatchRow(*row) for row in await self._read(query, run_id)]
+
+    async def put_credentials(self, rows: Sequence[CredentialRow]) -> None:
+        values = [(row.token_id, row.payload) for row in rows]
+        await self._run(
+            lambda: self._db.executemany("INSERT OR REPLACE INTO credential VALUES (?, ?)", values)
+        )
+
+    async def credentials(self) -> list[CredentialRow]:
+        return [CredentialRow(*row) for row in await self._read("SELECT token_id, payload FROM credential")]
 
     async def close(self) -> None:
         async with self._lock:
