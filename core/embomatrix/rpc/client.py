@@ -24,10 +24,14 @@ from embomatrix.rpc.convert import (
     batch_to_proto,
     each,
     inside,
-    lookahead_entry_to_proto,
     rollout_result_from_proto,
+)
+from embomatrix.rpc.convert_run import (
+    group_done_from_proto,
+    lookahead_answer_from_proto,
+    lookahead_entry_to_proto,
     run_stats_from_proto,
-    warmth_from_proto,
+    run_terms_to_proto,
 )
 from embomatrix.rpc.convert_session import run_info_from_proto, worker_info_from_proto
 from embomatrix.rpc.status import (
@@ -39,6 +43,7 @@ from embomatrix.rpc.status import (
     cluster_error,
     cluster_errors,
 )
+from embomatrix.rpc.values import RolloutResult, RunTerms
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, AsyncIterator, Iterable, Mapping, Sequence
@@ -46,8 +51,9 @@ if TYPE_CHECKING:
     from embomatrix.rpc.status import ClusterError
     from embomatrix.rpc.values import (
         Batch,
+        GroupDone,
+        LookaheadAnswer,
         LookaheadEntry,
-        RolloutResult,
         RunInfo,
         RunStats,
         Warmth,
@@ -73,6 +79,7 @@ class ClientLimits:
 
 
 DEFAULT_LIMITS: Final = ClientLimits()
+DEFAULT_TERMS: Final = RunTerms()
 _TRANSIENT: Final = (UnavailableError, InternalError, OverloadedError)
 """Errors after which the same batch is attached again rather than given up."""
 
@@ -97,9 +104,10 @@ class ClusterClient:
     async def __aexit__(self, *_: object) -> None:
         await self._channel.close()
 
-    async def open_run(self, name: str, run_id: str = "") -> str:
-        """Open a run, or attach to the one of this id; returns its id."""
-        request = rollout_service_pb2.OpenRunRequest(name=name, run_id=run_id)
+    async def open_run(self, name: str, run_id: str = "", terms: RunTerms = DEFAULT_TERMS) -> str:
+        """Open a run, or attach to the one of this id, which keeps its terms; returns its id."""
+        request = run_terms_to_proto(terms)
+        request.name, request.run_id = name, run_id
         with cluster_errors(self._address):
             answer = await self._rollouts.OpenRun(request, timeout=self._limits.call_s)
         return str(answer.run_id)
@@ -108,12 +116,19 @@ class ClusterClient:
         self, run_id: str, version: int, entries: Iterable[LookaheadEntry]
     ) -> dict[str, Warmth]:
         """Replace the run's window of coming scenes; tells by bundle digest how warm each is."""
+        answers = await self.announce_window(run_id, version, entries)
+        return {answer.bundle_digest: answer.warmth for answer in answers}
+
+    async def announce_window(
+        self, run_id: str, version: int, entries: Iterable[LookaheadEntry]
+    ) -> tuple[LookaheadAnswer, ...]:
+        """The same; tells of each scene as well when it will be warm, or why it can't be."""
         request = rollout_service_pb2.AnnounceLookaheadRequest(
             run_id=run_id, version=version, entries=[lookahead_entry_to_proto(entry) for entry in entries]
         )
         with cluster_errors(self._address):
             answer = await self._rollouts.AnnounceLookahead(request, timeout=self._limits.call_s)
-            return {item.bundle_digest: warmth_from_proto(item.warmth) for item in answer.answers}
+            return each("answers", lookahead_answer_from_proto, answer.answers)
 
     async def put_bundles(self, bundles: Mapping[str, bytes]) -> tuple[str, ...]:
         """Give the manager the bundles (by digest) that it lacks; returns the digests that were sent."""
@@ -129,7 +144,16 @@ class ClusterClient:
     async def execute(
         self, batch: Batch, *, deadline_s: float | None = None
     ) -> AsyncGenerator[RolloutResult]:
-        """Execute the batch; yields each rollout's one outcome as it comes.
+        """Execute the batch; yields each rollout's one outcome as it comes, as ``events`` does."""
+        async with contextlib.aclosing(self.events(batch, deadline_s=deadline_s)) as events:
+            async for event in events:
+                if isinstance(event, RolloutResult):
+                    yield event
+
+    async def events(
+        self, batch: Batch, *, deadline_s: float | None = None
+    ) -> AsyncGenerator[RolloutResult | GroupDone]:
+        """Execute the batch; yields each rollout's one outcome, and once for each group that all of it have theirs.
 
         A broken stream is attached again from the last cursor, also across a restart of the manager, until
         every rollout has its outcome. After ``deadline_s`` seconds (by default the limit for a batch) it
@@ -142,9 +166,11 @@ class ClusterClient:
             before = len(attached.missing)
             try:
                 async with contextlib.aclosing(self._stream(attached)) as stream:
-                    async for results in stream:
+                    async for results, groups in stream:
                         for result in attached.new(results):
                             yield result
+                        for group in attached.ended(groups):
+                            yield group
                 attached.submitted = True
             except _TRANSIENT as error:
                 logger.info("batch %s: attaching again after: %s", batch.batch_id, error)
@@ -158,7 +184,9 @@ class ClusterClient:
             if attached.missing:
                 await asyncio.sleep(min(wait_s, attached.time_left(within_s)))
 
-    async def _stream(self, attached: _AttachedBatch) -> AsyncGenerator[Sequence[RolloutResult]]:
+    async def _stream(
+        self, attached: _AttachedBatch
+    ) -> AsyncGenerator[tuple[Sequence[RolloutResult], Sequence[GroupDone]]]:
         """One stream of the batch: the first submits it, later ones continue after the cursor."""
         timeout_s = attached.time_left(self._limits.batch_s)
         call: grpc.aio.UnaryStreamCall
@@ -171,7 +199,8 @@ class ClusterClient:
                 attached.submitted = True
                 with cluster_errors(self._address):
                     results = each("results", rollout_result_from_proto, response.results)
-                yield results
+                    groups = each("groups", group_done_from_proto, response.groups)
+                yield results, groups
         except grpc.aio.AioRpcError as error:
             raise attached.explain(cluster_error(error, self._address)) from error
         finally:
@@ -219,6 +248,7 @@ class _AttachedBatch:
         self.missing = {rollout.rollout_id for rollout in batch.rollouts}
         self.submitted = False
         self._cursor = 0
+        self._groups: set[str] = set()
         self._ends_s = ends_s
 
     def new(self, results: Sequence[RolloutResult]) -> Iterable[RolloutResult]:
@@ -228,6 +258,13 @@ class _AttachedBatch:
             if result.rollout_id in self.missing:
                 self.missing.discard(result.rollout_id)
                 yield result
+
+    def ended(self, groups: Sequence[GroupDone]) -> Iterable[GroupDone]:
+        """Those groups whose end was not told before."""
+        for group in groups:
+            if group.group_id not in self._groups:
+                self._groups.add(group.group_id)
+                yield group
 
     def forget_cursor(self) -> None:
         self.submitted = False

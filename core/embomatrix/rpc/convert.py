@@ -13,13 +13,10 @@ from embomatrix.rpc.values import (
     Completed,
     InfraCode,
     InfraFailure,
-    LookaheadEntry,
     Resources,
     Rollout,
     RolloutResult,
-    RunStats,
     Timings,
-    Warmth,
 )
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.syntax import MAX_STEPS, SIGNATURES, Arg, PlaceRelation, Plan, Skill, SkillCall
@@ -56,10 +53,6 @@ _INFRA_CODES: Final[Mapping[InfraCode, types_pb2.InfraCode.ValueType]] = {
     code: types_pb2.InfraCode.Value(f"INFRA_CODE_{code.name}") for code in InfraCode
 }
 _INFRA_VALUES: Final = {number: code for code, number in _INFRA_CODES.items()}
-_WARMTHS: Final[Mapping[Warmth, types_pb2.Warmth.ValueType]] = {
-    warmth: types_pb2.Warmth.Value(f"WARMTH_{warmth.name}") for warmth in Warmth
-}
-_WARMTH_VALUES: Final = {number: warmth for warmth, number in _WARMTHS.items()}
 
 
 class ConvertError(ValueError):
@@ -167,6 +160,7 @@ def rollout_to_proto(rollout: Rollout) -> types_pb2.Rollout:
         task_id=rollout.task_id,
         plan=plan_to_proto(rollout.plan),
         seed=rollout.seed,
+        render=rollout.render,
     )
 
 
@@ -178,6 +172,7 @@ def rollout_from_proto(message: types_pb2.Rollout) -> Rollout:
         task_id=required("task_id", message.task_id),
         plan=plan_from_proto(message.plan),
         seed=message.seed,
+        render=message.render,
     )
 
 
@@ -305,8 +300,8 @@ def rollout_result_to_proto(result: RolloutResult) -> types_pb2.RolloutResult:
             message.completed.CopyFrom(completed_to_proto(completed))
         case InfraFailure() as failure:
             message.infra_failure.CopyFrom(infra_failure_to_proto(failure))
-        case Cancelled():
-            message.cancelled.SetInParent()
+        case Cancelled() as cancelled:
+            message.cancelled.CopyFrom(types_pb2.Cancelled(reason=cancelled.reason))
     return message
 
 
@@ -327,7 +322,7 @@ def _outcome(message: types_pb2.RolloutResult) -> Outcome:
         case "infra_failure":
             return inside("infra_failure", infra_failure_from_proto, message.infra_failure)
         case "cancelled":
-            return Cancelled()
+            return Cancelled(message.cancelled.reason)
         case None:
             raise ConvertError("outcome", "is missing: a result has exactly one")
 
@@ -341,6 +336,7 @@ def resources_to_proto(resources: Resources) -> types_pb2.Resources:
         gpu=resources.gpu,
         vram_mb=resources.vram_mb,
         versions=dict(resources.versions),
+        render_slots=resources.render_slots,
     )
 
 
@@ -355,33 +351,5 @@ def resources_from_proto(message: types_pb2.Resources) -> Resources:
         gpu=message.gpu,
         vram_mb=message.vram_mb,
         versions=dict(message.versions),
+        render_slots=message.render_slots,
     )
-
-
-def lookahead_entry_to_proto(entry: LookaheadEntry) -> rollout_service_pb2.LookaheadEntry:
-    return rollout_service_pb2.LookaheadEntry(
-        step=entry.step, bundle_digest=entry.bundle_digest, count=entry.count
-    )
-
-
-def lookahead_entry_from_proto(message: rollout_service_pb2.LookaheadEntry) -> LookaheadEntry:
-    return LookaheadEntry(message.step, required("bundle_digest", message.bundle_digest), message.count)
-
-
-def warmth_to_proto(warmth: Warmth) -> types_pb2.Warmth.ValueType:
-    return _WARMTHS[warmth]
-
-
-def warmth_from_proto(number: types_pb2.Warmth.ValueType) -> Warmth:
-    warmth = _WARMTH_VALUES.get(number)
-    if warmth is None:
-        raise ConvertError("warmth", f"{number} is no known value: is the sender newer than this side?")
-    return warmth
-
-
-def run_stats_to_proto(stats: RunStats) -> rollout_service_pb2.RunStats:
-    return rollout_service_pb2.RunStats(**{name: getattr(stats, name) for name in RunStats.__slots__})
-
-
-def run_stats_from_proto(message: rollout_service_pb2.RunStats) -> RunStats:
-    return RunStats(**{name: getattr(message, name) for name in RunStats.__slots__})

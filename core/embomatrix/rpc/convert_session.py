@@ -19,15 +19,21 @@ from embomatrix.rpc.convert import (
     resources_to_proto,
     rollout_from_proto,
     rollout_to_proto,
+)
+from embomatrix.rpc.convert_run import (
     run_stats_from_proto,
     run_stats_to_proto,
+    warmth_from_proto,
+    warmth_to_proto,
 )
 from embomatrix.rpc.values import (
     Completed,
     InfraFailure,
     Lease,
+    LeaseProgress,
     LeaseRef,
     LeaseResult,
+    PlanCell,
     Resident,
     ResidentState,
     RunInfo,
@@ -75,6 +81,14 @@ def lease_ref_from_proto(message: worker_service_pb2.LeaseRef) -> LeaseRef:
     return LeaseRef(required("lease_id", message.lease_id), message.lease_epoch)
 
 
+def lease_progress_to_proto(progress: LeaseProgress) -> worker_service_pb2.LeaseProgress:
+    return worker_service_pb2.LeaseProgress(ref=lease_ref_to_proto(progress.ref), steps=progress.steps)
+
+
+def lease_progress_from_proto(message: worker_service_pb2.LeaseProgress) -> LeaseProgress:
+    return LeaseProgress(inside("ref", lease_ref_from_proto, message.ref), message.steps)
+
+
 def lease_to_proto(lease: Lease) -> worker_service_pb2.Lease:
     return worker_service_pb2.Lease(
         ref=lease_ref_to_proto(lease.ref),
@@ -117,6 +131,7 @@ def worker_state_to_proto(state: WorkerState) -> worker_service_pb2.WorkerState:
         running=[lease_ref_to_proto(ref) for ref in state.running],
         finished=[lease_result_to_proto(result) for result in state.finished],
         draining=state.draining,
+        paused=state.paused,
     )
 
 
@@ -126,6 +141,7 @@ def worker_state_from_proto(message: worker_service_pb2.WorkerState) -> WorkerSt
         running=each("running", lease_ref_from_proto, message.running),
         finished=each("finished", lease_result_from_proto, message.finished),
         draining=message.draining,
+        paused=message.paused,
     )
 
 
@@ -138,6 +154,7 @@ def worker_info_to_proto(info: WorkerInfo) -> admin_service_pb2.WorkerInfo:
         running=info.running,
         completed=info.completed,
         last_seen_s=info.last_seen_s,
+        reason=info.reason,
     )
 
 
@@ -150,6 +167,7 @@ def worker_info_from_proto(message: admin_service_pb2.WorkerInfo) -> WorkerInfo:
         running=message.running,
         completed=message.completed,
         last_seen_s=finite("last_seen_s", message.last_seen_s),
+        reason=message.reason,
     )
 
 
@@ -162,4 +180,26 @@ def run_info_to_proto(info: RunInfo) -> admin_service_pb2.RunInfo:
 def run_info_from_proto(message: admin_service_pb2.RunInfo) -> RunInfo:
     return RunInfo(
         required("run_id", message.run_id), message.name, run_stats_from_proto(message.stats), message.pending
+    )
+
+
+def plan_cell_to_proto(cell: PlanCell) -> admin_service_pb2.PlanCell:
+    return admin_service_pb2.PlanCell(
+        run_id=cell.run_id,
+        step=cell.step,
+        bundle_digest=cell.bundle_digest,
+        count=cell.count,
+        warmth=warmth_to_proto(cell.warmth),
+        worker_ids=cell.worker_ids,
+    )
+
+
+def plan_cell_from_proto(message: admin_service_pb2.PlanCell) -> PlanCell:
+    return PlanCell(
+        run_id=required("run_id", message.run_id),
+        step=message.step,
+        bundle_digest=required("bundle_digest", message.bundle_digest),
+        count=message.count,
+        warmth=warmth_from_proto(message.warmth),
+        worker_ids=tuple(message.worker_ids),
     )

@@ -27,6 +27,8 @@ class Rollout:
     task_id: str
     plan: Plan
     seed: int
+    render: bool = False
+    """It needs a slot that renders on a GPU."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +75,10 @@ class InfraCode(StrEnum):
     NO_CAPACITY = "no_capacity"
     DEADLINE = "deadline"
     MANAGER_RESTARTED = "manager_restarted"
+    STALLED = "stalled"
+    SLOT_OOM = "slot_oom"
+    VERSION_SKEW = "version_skew"
+    RESULT_MISMATCH = "result_mismatch"
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +92,9 @@ class InfraFailure:
 
 @dataclass(frozen=True, slots=True)
 class Cancelled:
-    """The trainer called it off before it ended."""
+    """Called off before it ended: by the trainer, or because its group or batch can't be completed any more."""
+
+    reason: str = ""
 
 
 Outcome = Completed | InfraFailure | Cancelled
@@ -101,6 +109,38 @@ class RolloutResult:
     cursor: int
     attempt: int
     outcome: Outcome
+
+
+@dataclass(frozen=True, slots=True)
+class GroupDone:
+    """Every member of a group has its outcome: how many of each kind."""
+
+    group_id: str
+    completed: int = 0
+    infra_failures: int = 0
+    cancelled: int = 0
+
+
+class GroupPolicy(StrEnum):
+    """What becomes of a group when one of its rollouts ends as a failure of the infrastructure."""
+
+    RETRY_THEN_FAIL_GROUP = "retry_then_fail_group"
+    """After the retries the others are cancelled: the group is left out of the update as a whole."""
+    PARTIAL = "partial"
+    """The others go on."""
+    FAIL_FAST = "fail_fast"
+    """No retries: the first failure cancels the whole batch."""
+
+
+@dataclass(frozen=True, slots=True)
+class RunTerms:
+    """What a run asks of the cluster. A higher ``priority`` is served first, equal ones share by ``weight``."""
+
+    group_policy: GroupPolicy = GroupPolicy.RETRY_THEN_FAIL_GROUP
+    weight: float = 1.0
+    priority: int = 0
+    rollout_deadline_s: float = 0.0
+    """From submission to outcome; 0 for the manager's default."""
 
 
 class Warmth(StrEnum):
@@ -119,6 +159,31 @@ class LookaheadEntry:
     step: int
     bundle_digest: str
     count: int
+    render: bool = False
+    """They need slots that render on a GPU."""
+
+
+@dataclass(frozen=True, slots=True)
+class LookaheadAnswer:
+    """How far a scene is. ``eta_s`` are the seconds until it is warm: 0 when it is, or when nobody can tell."""
+
+    bundle_digest: str
+    warmth: Warmth
+    eta_s: float = 0.0
+    reason: str = ""
+    """Why no worker can hold it."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlanCell:
+    """One cell of the look-ahead grid. ``worker_ids`` hold the scene or load it."""
+
+    run_id: str
+    step: int
+    bundle_digest: str
+    count: int
+    warmth: Warmth
+    worker_ids: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,6 +198,8 @@ class Resources:
     vram_mb: int = 0
     versions: Mapping[str, str] = field(default_factory=dict)
     """Of the package, Python, the engine's wheel, and the platform fingerprint."""
+    render_slots: int = 0
+    """Slots of them that render on the GPU."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,6 +215,8 @@ class RunStats:
     prewarm_hits: int = 0
     prewarm_misses: int = 0
     prewarm_wasted: int = 0
+    hedged: int = 0
+    groups_failed: int = 0
 
 
 class ResidentState(StrEnum):
@@ -195,6 +264,14 @@ class LeaseResult:
 
 
 @dataclass(frozen=True, slots=True)
+class LeaseProgress:
+    """Steps of the plan that a lease which runs has done; the number never falls."""
+
+    ref: LeaseRef
+    steps: int
+
+
+@dataclass(frozen=True, slots=True)
 class WorkerState:
     """Everything that a worker holds. ``finished`` are results that no one has acknowledged yet."""
 
@@ -202,11 +279,13 @@ class WorkerState:
     running: tuple[LeaseRef, ...] = ()
     finished: tuple[LeaseResult, ...] = ()
     draining: bool = False
+    paused: str = ""
+    """Why the worker takes nothing new for now, though it stays; empty while it works."""
 
 
 @dataclass(frozen=True, slots=True)
 class WorkerInfo:
-    """A worker as the manager sees it. ``state`` is "ready", "suspect", "lost" or "draining"."""
+    """A worker as the manager sees it. ``state`` is "ready", "paused", "suspect", "lost" or "draining"."""
 
     worker_id: str
     state: str
@@ -215,6 +294,8 @@ class WorkerInfo:
     running: int
     completed: int
     last_seen_s: float
+    reason: str = ""
+    """Why it is paused, draining or lost."""
 
 
 @dataclass(frozen=True, slots=True)

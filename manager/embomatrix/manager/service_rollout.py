@@ -9,10 +9,8 @@ from embomatrix.proto.v1 import rollout_service_pb2_grpc, types_pb2
 from embomatrix.rpc.convert import (
     batch_from_proto,
     each,
-    lookahead_entry_from_proto,
-    run_stats_to_proto,
-    warmth_to_proto,
 )
+from embomatrix.rpc.convert_run import lookahead_entry_from_proto, run_stats_to_proto, warmth_to_proto
 from embomatrix.rpc.status import NotFoundError, TrimmedError, translate
 
 if TYPE_CHECKING:

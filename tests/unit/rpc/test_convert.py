@@ -8,19 +8,23 @@ from hypothesis import strategies as st
 
 from embomatrix.proto.v1 import rollout_service_pb2, types_pb2
 from embomatrix.reward.breakdown import AtomResult, RewardBreakdown
-from embomatrix.rpc import convert
+from embomatrix.rpc import convert, convert_run
 from embomatrix.rpc.convert import ConvertError
 from embomatrix.rpc.values import (
     Batch,
     Cancelled,
     Completed,
+    GroupDone,
+    GroupPolicy,
     InfraCode,
     InfraFailure,
+    LookaheadAnswer,
     LookaheadEntry,
     Resources,
     Rollout,
     RolloutResult,
     RunStats,
+    RunTerms,
     Timings,
     Warmth,
 )
@@ -50,7 +54,14 @@ def _call_of(skill):
 
 CALLS = st.sampled_from(Skill).flatmap(_call_of)
 ROLLOUTS = st.builds(
-    Rollout, NAMES, NAMES, NAMES, NAMES, plan=st.lists(CALLS, max_size=5).map(tuple), seed=UINT64
+    Rollout,
+    NAMES,
+    NAMES,
+    NAMES,
+    NAMES,
+    plan=st.lists(CALLS, max_size=5).map(tuple),
+    seed=UINT64,
+    render=st.booleans(),
 )
 REWARDS = st.builds(
     RewardBreakdown,
@@ -72,7 +83,9 @@ COMPLETED = st.builds(
     st.booleans(),
 )
 FAILURES = st.builds(InfraFailure, st.sampled_from(InfraCode), TEXTS, TEXTS)
-RESULTS = st.builds(RolloutResult, NAMES, NAMES, UINT64, UINT32, COMPLETED | FAILURES | st.just(Cancelled()))
+RESULTS = st.builds(
+    RolloutResult, NAMES, NAMES, UINT64, UINT32, COMPLETED | FAILURES | st.builds(Cancelled, TEXTS)
+)
 RESOURCES = st.builds(
     Resources,
     slots=st.integers(1, 512),
@@ -82,6 +95,7 @@ RESOURCES = st.builds(
     gpu=TEXTS,
     vram_mb=UINT64,
     versions=st.dictionaries(NAMES, TEXTS, max_size=3),
+    render_slots=UINT32,
 )
 
 
@@ -113,18 +127,52 @@ def test_resources_come_back_equal(resources):
 
 @given(st.builds(RunStats, *[UINT64] * len(RunStats.__slots__)))
 def test_run_counters_come_back_equal(stats):
-    assert convert.run_stats_from_proto(_over_the_wire(convert.run_stats_to_proto(stats))) == stats
+    assert convert_run.run_stats_from_proto(_over_the_wire(convert_run.run_stats_to_proto(stats))) == stats
 
 
-@given(st.builds(LookaheadEntry, UINT64, NAMES, UINT32))
+@given(st.builds(LookaheadEntry, UINT64, NAMES, UINT32, st.booleans()))
 def test_an_announced_scene_comes_back_equal(entry):
-    message = _over_the_wire(convert.lookahead_entry_to_proto(entry))
-    assert convert.lookahead_entry_from_proto(message) == entry
+    message = _over_the_wire(convert_run.lookahead_entry_to_proto(entry))
+    assert convert_run.lookahead_entry_from_proto(message) == entry
+
+
+@given(
+    st.builds(
+        RunTerms,
+        st.sampled_from(GroupPolicy),
+        st.floats(0.001, 1e6),
+        st.integers(-(2**31), 2**31 - 1),
+        st.floats(0, 1e6),
+    )
+)
+def test_what_a_run_asks_for_comes_back_equal(terms):
+    message = _over_the_wire(convert_run.run_terms_to_proto(terms))
+    assert convert_run.run_terms_from_proto(message) == terms
+
+
+def test_a_run_that_asks_for_nothing_gets_the_defaults():
+    assert convert_run.run_terms_from_proto(rollout_service_pb2.OpenRunRequest(name="old")) == RunTerms()
+
+
+def test_a_weight_below_zero_is_refused_with_its_field():
+    with pytest.raises(ConvertError, match=r"weight: is -1\.0"):
+        convert_run.run_terms_from_proto(rollout_service_pb2.OpenRunRequest(weight=-1.0))
+
+
+@given(st.builds(GroupDone, NAMES, UINT32, UINT32, UINT32))
+def test_the_end_of_a_group_comes_back_equal(done):
+    assert convert_run.group_done_from_proto(_over_the_wire(convert_run.group_done_to_proto(done))) == done
+
+
+@given(st.builds(LookaheadAnswer, NAMES, st.sampled_from(Warmth), NUMBERS, TEXTS))
+def test_an_answer_to_the_look_ahead_comes_back_equal(answer):
+    message = _over_the_wire(convert_run.lookahead_answer_to_proto(answer))
+    assert convert_run.lookahead_answer_from_proto(message) == answer
 
 
 @pytest.mark.parametrize("warmth", Warmth)
 def test_every_warmth_comes_back_equal(warmth):
-    assert convert.warmth_from_proto(convert.warmth_to_proto(warmth)) is warmth
+    assert convert_run.warmth_from_proto(convert_run.warmth_to_proto(warmth)) is warmth
 
 
 def test_every_enum_value_of_the_wire_has_a_meaning_here():

@@ -13,8 +13,10 @@ from embomatrix.rpc.values import (
     InfraCode,
     InfraFailure,
     Lease,
+    LeaseProgress,
     LeaseRef,
     LeaseResult,
+    PlanCell,
     Resident,
     ResidentState,
     Resources,
@@ -22,6 +24,7 @@ from embomatrix.rpc.values import (
     RunInfo,
     RunStats,
     Timings,
+    Warmth,
     WorkerInfo,
     WorkerState,
 )
@@ -50,6 +53,7 @@ STATES = st.builds(
     st.lists(REFS, max_size=3).map(tuple),
     st.lists(RESULTS, max_size=3).map(tuple),
     st.booleans(),
+    NAMES | st.just(""),
 )
 PLAN = (SkillCall(Skill.TURN, yaw=0.5),)
 
@@ -61,6 +65,27 @@ def _over_the_wire(message):
 @given(STATES)
 def test_the_state_of_a_worker_comes_back_equal(state):
     assert convert.worker_state_from_proto(_over_the_wire(convert.worker_state_to_proto(state))) == state
+
+
+@given(st.builds(LeaseProgress, REFS, st.integers(0, 2**64 - 1)))
+def test_the_progress_of_a_lease_comes_back_equal(progress):
+    message = _over_the_wire(convert.lease_progress_to_proto(progress))
+    assert convert.lease_progress_from_proto(message) == progress
+
+
+@given(
+    st.builds(
+        PlanCell,
+        NAMES,
+        st.integers(0, 2**64 - 1),
+        NAMES,
+        st.integers(0, 2**32 - 1),
+        st.sampled_from(Warmth),
+        st.lists(NAMES, max_size=3).map(tuple),
+    )
+)
+def test_a_cell_of_the_look_ahead_grid_comes_back_equal(cell):
+    assert convert.plan_cell_from_proto(_over_the_wire(convert.plan_cell_to_proto(cell))) == cell
 
 
 @given(

@@ -25,15 +25,15 @@ _sym_db = _symbol_database.Default()
 from embomatrix.proto.v1 import types_pb2 as embomatrix_dot_proto_dot_v1_dot_types__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n)embomatrix/proto/v1/rollout_service.proto\x12\x13\x65mbomatrix.proto.v1\x1a\x1f\x65mbomatrix/proto/v1/types.proto\"\x18\n\x16GetCapabilitiesRequest\"\x85\x01\n\x17GetCapabilitiesResponse\x12\x14\n\x0cprotocol_low\x18\x01 \x01(\r\x12\x15\n\rprotocol_high\x18\x02 \x01(\r\x12\x0f\n\x07version\x18\x03 \x01(\t\x12\x16\n\x0e\x62\x61tch_rollouts\x18\x04 \x01(\r\x12\x14\n\x0c\x62undle_bytes\x18\x05 \x01(\x04\"\x85\x02\n\x0eOpenRunRequest\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0e\n\x06run_id\x18\x02 \x01(\t\x12\x36\n\x0cgroup_policy\x18\x03 \x01(\x0e\x32 .embomatrix.proto.v1.GroupPolicy\x12\x0e\n\x06weight\x18\x04 \x01(\x01\x12\x10\n\x08priority\x18\x05 \x01(\x05\x12\x1a\n\x12rollout_deadline_s\x18\x06 \x01(\x01\x12\x33\n\x06reward\x18\x07 \x01(\x0b\x32#.embomatrix.proto.v1.RewardSettings\x12\x10\n\x08verified\x18\x08 \x01(\x08\x12\x18\n\x10protocol_version\x18\t \x01(\r\"!\n\x0fOpenRunResponse\x12\x0e\n\x06run_id\x18\x01 \x01(\t\"D\n\x0eLookaheadEntry\x12\x0c\n\x04step\x18\x01 \x01(\x04\x12\x15\n\rbundle_digest\x18\x02 \x01(\t\x12\r\n\x05\x63ount\x18\x03 \x01(\r\"q\n\x18\x41nnounceLookaheadRequest\x12\x0e\n\x06run_id\x18\x01 \x01(\t\x12\x0f\n\x07version\x18\x02 \x01(\x04\x12\x34\n\x07\x65ntries\x18\x03 \x03(\x0b\x32#.embomatrix.proto.v1.LookaheadEntry\"t\n\x0fLookaheadAnswer\x12\x15\n\rbundle_digest\x18\x01 \x01(\t\x12+\n\x06warmth\x18\x02 \x01(\x0e\x32\x1b.embomatrix.proto.v1.Warmth\x12\r\n\x05\x65ta_s\x18\x03 \x01(\x01\x12\x0e\n\x06reason\x18\x04 \x01(\t\"R\n\x19\x41nnounceLookaheadResponse\x12\x35\n\x07\x61nswers\x18\x01 \x03(\x0b\x32$.embomatrix.proto.v1.LookaheadAnswer\"\x88\x01\n\x0e\x45xecuteRequest\x12\x0e\n\x06run_id\x18\x01 \x01(\t\x12\x10\n\x08\x62\x61tch_id\x18\x02 \x01(\t\x12\x0c\n\x04step\x18\x03 \x01(\x04\x12.\n\x08rollouts\x18\x04 \x03(\x0b\x32\x1c.embomatrix.proto.v1.Rollout\x12\x16\n\x0epolicy_version\x18\x05 \x01(\x04\"[\n\tGroupDone\x12\x10\n\x08group_id\x18\x01 \x01(\t\x12\x11\n\tcompleted\x18\x02 \x01(\r\x12\x16\n\x0einfra_failures\x18\x03 \x01(\r\x12\x11\n\tcancelled\x18\x04 \x01(\r\"v\n\x0f\x45xecuteResponse\x12\x33\n\x07results\x18\x01 \x03(\x0b\x32\".embomatrix.proto.v1.RolloutResult\x12.\n\x06groups\x18\x02 \x03(\x0b\x32\x1e.embomatrix.proto.v1.GroupDone\"N\n\x14WaitExecutionRequest\x12\x0e\n\x06run_id\x18\x01 \x01(\t\x12\x10\n\x08\x62\x61tch_id\x18\x02 \x01(\t\x12\x14\n\x0c\x61\x66ter_cursor\x18\x03 \x01(\x04\"|\n\x15WaitExecutionResponse\x12\x33\n\x07results\x18\x01 \x03(\x0b\x32\".embomatrix.proto.v1.RolloutResult\x12.\n\x06groups\x18\x02 \x03(\x0b\x32\x1e.embomatrix.proto.v1.GroupDone\"6\n\x12\x43\x61ncelBatchRequest\x12\x0e\n\x06run_id\x18\x01 \x01(\t\x12\x10\n\x08\x62\x61tch_id\x18\x02 \x01(\t\"\x15\n\x13\x43\x61ncelBatchResponse\"!\n\x0f\x43loseRunRequest\x12\x0e\n\x06run_id\x18\x01 \x01(\t\"@\n\x10\x43loseRunResponse\x12,\n\x05stats\x18\x01 \x01(\x0b\x32\x1d.embomatrix.proto.v1.RunStats\"\xa4\x02\n\x08RunStats\x12\x11\n\tdelivered\x18\x01 \x01(\x04\x12\x16\n\x0einfra_failures\x18\x02 \x01(\x04\x12\x14\n\x0credispatched\x18\x03 \x01(\x04\x12\x15\n\rstale_results\x18\x04 \x01(\x04\x12\x13\n\x0bwarm_starts\x18\x05 \x01(\x04\x12\x13\n\x0b\x63old_starts\x18\x06 \x01(\x04\x12\x14\n\x0cprewarm_hits\x18\x07 \x01(\x04\x12\x16\n\x0eprewarm_misses\x18\x08 \x01(\x04\x12\x16\n\x0eprewarm_wasted\x18\t \x01(\x04\x12\x0e\n\x06hedged\x18\n \x01(\x04\x12\x0f\n\x07\x61udited\x18\x0b \x01(\x04\x12\x18\n\x10\x61udit_mismatches\x18\x0c \x01(\x04\x12\x15\n\rgroups_failed\x18\r \x01(\x04*\x89\x01\n\x0bGroupPolicy\x12\x1c\n\x18GROUP_POLICY_UNSPECIFIED\x10\x00\x12&\n\"GROUP_POLICY_RETRY_THEN_FAIL_GROUP\x10\x01\x12\x18\n\x14GROUP_POLICY_PARTIAL\x10\x02\x12\x1a\n\x16GROUP_POLICY_FAIL_FAST\x10\x03\x32\xc5\x05\n\x0eRolloutService\x12l\n\x0fGetCapabilities\x12+.embomatrix.proto.v1.GetCapabilitiesRequest\x1a,.embomatrix.proto.v1.GetCapabilitiesResponse\x12T\n\x07OpenRun\x12#.embomatrix.proto.v1.OpenRunRequest\x1a$.embomatrix.proto.v1.OpenRunResponse\x12r\n\x11\x41nnounceLookahead\x12-.embomatrix.proto.v1.AnnounceLookaheadRequest\x1a..embomatrix.proto.v1.AnnounceLookaheadResponse\x12V\n\x07\x45xecute\x12#.embomatrix.proto.v1.ExecuteRequest\x1a$.embomatrix.proto.v1.ExecuteResponse0\x01\x12h\n\rWaitExecution\x12).embomatrix.proto.v1.WaitExecutionRequest\x1a*.embomatrix.proto.v1.WaitExecutionResponse0\x01\x12`\n\x0b\x43\x61ncelBatch\x12\'.embomatrix.proto.v1.CancelBatchRequest\x1a(.embomatrix.proto.v1.CancelBatchResponse\x12W\n\x08\x43loseRun\x12$.embomatrix.proto.v1.CloseRunRequest\x1a%.embomatrix.proto.v1.CloseRunResponseb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n)embomatrix/proto/v1/rollout_service.proto\x12\x13\x65mbomatrix.proto.v1\x1a\x1f\x65mbomatrix/proto/v1/types.proto\"\x18\n\x16GetCapabilitiesRequest\"\x85\x01\n\x17GetCapabilitiesResponse\x12\x14\n\x0cprotocol_low\x18\x01 \x01(\r\x12\x15\n\rprotocol_high\x18\x02 \x01(\r\x12\x0f\n\x07version\x18\x03 \x01(\t\x12\x16\n\x0e\x62\x61tch_rollouts\x18\x04 \x01(\r\x12\x14\n\x0c\x62undle_bytes\x18\x05 \x01(\x04\"\x85\x02\n\x0eOpenRunRequest\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0e\n\x06run_id\x18\x02 \x01(\t\x12\x36\n\x0cgroup_policy\x18\x03 \x01(\x0e\x32 .embomatrix.proto.v1.GroupPolicy\x12\x0e\n\x06weight\x18\x04 \x01(\x01\x12\x10\n\x08priority\x18\x05 \x01(\x05\x12\x1a\n\x12rollout_deadline_s\x18\x06 \x01(\x01\x12\x33\n\x06reward\x18\x07 \x01(\x0b\x32#.embomatrix.proto.v1.RewardSettings\x12\x10\n\x08verified\x18\x08 \x01(\x08\x12\x18\n\x10protocol_version\x18\t \x01(\r\"!\n\x0fOpenRunResponse\x12\x0e\n\x06run_id\x18\x01 \x01(\t\"T\n\x0eLookaheadEntry\x12\x0c\n\x04step\x18\x01 \x01(\x04\x12\x15\n\rbundle_digest\x18\x02 \x01(\t\x12\r\n\x05\x63ount\x18\x03 \x01(\r\x12\x0e\n\x06render\x18\x04 \x01(\x08\"q\n\x18\x41nnounceLookaheadRequest\x12\x0e\n\x06run_id\x18\x01 \x01(\t\x12\x0f\n\x07version\x18\x02 \x01(\x04\x12\x34\n\x07\x65ntries\x18\x03 \x03(\x0b\x32#.embomatrix.proto.v1.LookaheadEntry\"t\n\x0fLookaheadAnswer\x12\x15\n\rbundle_digest\x18\x01 \x01(\t\x12+\n\x06warmth\x18\x02 \x01(\x0e\x32\x1b.embomatrix.proto.v1.Warmth\x12\r\n\x05\x65ta_s\x18\x03 \x01(\x01\x12\x0e\n\x06reason\x18\x04 \x01(\t\"R\n\x19\x41nnounceLookaheadResponse\x12\x35\n\x07\x61nswers\x18\x01 \x03(\x0b\x32$.embomatrix.proto.v1.LookaheadAnswer\"\x88\x01\n\x0e\x45xecuteRequest\x12\x0e\n\x06run_id\x18\x01 \x01(\t\x12\x10\n\x08\x62\x61tch_id\x18\x02 \x01(\t\x12\x0c\n\x04step\x18\x03 \x01(\x04\x12.\n\x08rollouts\x18\x04 \x03(\x0b\x32\x1c.embomatrix.proto.v1.Rollout\x12\x16\n\x0epolicy_version\x18\x05 \x01(\x04\"[\n\tGroupDone\x12\x10\n\x08group_id\x18\x01 \x01(\t\x12\x11\n\tcompleted\x18\x02 \x01(\r\x12\x16\n\x0einfra_failures\x18\x03 \x01(\r\x12\x11\n\tcancelled\x18\x04 \x01(\r\"v\n\x0f\x45xecuteResponse\x12\x33\n\x07results\x18\x01 \x03(\x0b\x32\".embomatrix.proto.v1.RolloutResult\x12.\n\x06groups\x18\x02 \x03(\x0b\x32\x1e.embomatrix.proto.v1.GroupDone\"N\n\x14WaitExecutionRequest\x12\x0e\n\x06run_id\x18\x01 \x01(\t\x12\x10\n\x08\x62\x61tch_id\x18\x02 \x01(\t\x12\x14\n\x0c\x61\x66ter_cursor\x18\x03 \x01(\x04\"|\n\x15WaitExecutionResponse\x12\x33\n\x07results\x18\x01 \x03(\x0b\x32\".embomatrix.proto.v1.RolloutResult\x12.\n\x06groups\x18\x02 \x03(\x0b\x32\x1e.embomatrix.proto.v1.GroupDone\"6\n\x12\x43\x61ncelBatchRequest\x12\x0e\n\x06run_id\x18\x01 \x01(\t\x12\x10\n\x08\x62\x61tch_id\x18\x02 \x01(\t\"\x15\n\x13\x43\x61ncelBatchResponse\"!\n\x0f\x43loseRunRequest\x12\x0e\n\x06run_id\x18\x01 \x01(\t\"@\n\x10\x43loseRunResponse\x12,\n\x05stats\x18\x01 \x01(\x0b\x32\x1d.embomatrix.proto.v1.RunStats\"\xa4\x02\n\x08RunStats\x12\x11\n\tdelivered\x18\x01 \x01(\x04\x12\x16\n\x0einfra_failures\x18\x02 \x01(\x04\x12\x14\n\x0credispatched\x18\x03 \x01(\x04\x12\x15\n\rstale_results\x18\x04 \x01(\x04\x12\x13\n\x0bwarm_starts\x18\x05 \x01(\x04\x12\x13\n\x0b\x63old_starts\x18\x06 \x01(\x04\x12\x14\n\x0cprewarm_hits\x18\x07 \x01(\x04\x12\x16\n\x0eprewarm_misses\x18\x08 \x01(\x04\x12\x16\n\x0eprewarm_wasted\x18\t \x01(\x04\x12\x0e\n\x06hedged\x18\n \x01(\x04\x12\x0f\n\x07\x61udited\x18\x0b \x01(\x04\x12\x18\n\x10\x61udit_mismatches\x18\x0c \x01(\x04\x12\x15\n\rgroups_failed\x18\r \x01(\x04*\x89\x01\n\x0bGroupPolicy\x12\x1c\n\x18GROUP_POLICY_UNSPECIFIED\x10\x00\x12&\n\"GROUP_POLICY_RETRY_THEN_FAIL_GROUP\x10\x01\x12\x18\n\x14GROUP_POLICY_PARTIAL\x10\x02\x12\x1a\n\x16GROUP_POLICY_FAIL_FAST\x10\x03\x32\xc5\x05\n\x0eRolloutService\x12l\n\x0fGetCapabilities\x12+.embomatrix.proto.v1.GetCapabilitiesRequest\x1a,.embomatrix.proto.v1.GetCapabilitiesResponse\x12T\n\x07OpenRun\x12#.embomatrix.proto.v1.OpenRunRequest\x1a$.embomatrix.proto.v1.OpenRunResponse\x12r\n\x11\x41nnounceLookahead\x12-.embomatrix.proto.v1.AnnounceLookaheadRequest\x1a..embomatrix.proto.v1.AnnounceLookaheadResponse\x12V\n\x07\x45xecute\x12#.embomatrix.proto.v1.ExecuteRequest\x1a$.embomatrix.proto.v1.ExecuteResponse0\x01\x12h\n\rWaitExecution\x12).embomatrix.proto.v1.WaitExecutionRequest\x1a*.embomatrix.proto.v1.WaitExecutionResponse0\x01\x12`\n\x0b\x43\x61ncelBatch\x12\'.embomatrix.proto.v1.CancelBatchRequest\x1a(.embomatrix.proto.v1.CancelBatchResponse\x12W\n\x08\x43loseRun\x12$.embomatrix.proto.v1.CloseRunRequest\x1a%.embomatrix.proto.v1.CloseRunResponseb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'embomatrix.proto.v1.rollout_service_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_GROUPPOLICY']._serialized_start=1981
-  _globals['_GROUPPOLICY']._serialized_end=2118
+  _globals['_GROUPPOLICY']._serialized_start=1997
+  _globals['_GROUPPOLICY']._serialized_end=2134
   _globals['_GETCAPABILITIESREQUEST']._serialized_start=99
   _globals['_GETCAPABILITIESREQUEST']._serialized_end=123
   _globals['_GETCAPABILITIESRESPONSE']._serialized_start=126
@@ -43,33 +43,33 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_OPENRUNRESPONSE']._serialized_start=525
   _globals['_OPENRUNRESPONSE']._serialized_end=558
   _globals['_LOOKAHEADENTRY']._serialized_start=560
-  _globals['_LOOKAHEADENTRY']._serialized_end=628
-  _globals['_ANNOUNCELOOKAHEADREQUEST']._serialized_start=630
-  _globals['_ANNOUNCELOOKAHEADREQUEST']._serialized_end=743
-  _globals['_LOOKAHEADANSWER']._serialized_start=745
-  _globals['_LOOKAHEADANSWER']._serialized_end=861
-  _globals['_ANNOUNCELOOKAHEADRESPONSE']._serialized_start=863
-  _globals['_ANNOUNCELOOKAHEADRESPONSE']._serialized_end=945
-  _globals['_EXECUTEREQUEST']._serialized_start=948
-  _globals['_EXECUTEREQUEST']._serialized_end=1084
-  _globals['_GROUPDONE']._serialized_start=1086
-  _globals['_GROUPDONE']._serialized_end=1177
-  _globals['_EXECUTERESPONSE']._serialized_start=1179
-  _globals['_EXECUTERESPONSE']._serialized_end=1297
-  _globals['_WAITEXECUTIONREQUEST']._serialized_start=1299
-  _globals['_WAITEXECUTIONREQUEST']._serialized_end=1377
-  _globals['_WAITEXECUTIONRESPONSE']._serialized_start=1379
-  _globals['_WAITEXECUTIONRESPONSE']._serialized_end=1503
-  _globals['_CANCELBATCHREQUEST']._serialized_start=1505
-  _globals['_CANCELBATCHREQUEST']._serialized_end=1559
-  _globals['_CANCELBATCHRESPONSE']._serialized_start=1561
-  _globals['_CANCELBATCHRESPONSE']._serialized_end=1582
-  _globals['_CLOSERUNREQUEST']._serialized_start=1584
-  _globals['_CLOSERUNREQUEST']._serialized_end=1617
-  _globals['_CLOSERUNRESPONSE']._serialized_start=1619
-  _globals['_CLOSERUNRESPONSE']._serialized_end=1683
-  _globals['_RUNSTATS']._serialized_start=1686
-  _globals['_RUNSTATS']._serialized_end=1978
-  _globals['_ROLLOUTSERVICE']._serialized_start=2121
-  _globals['_ROLLOUTSERVICE']._serialized_end=2830
+  _globals['_LOOKAHEADENTRY']._serialized_end=644
+  _globals['_ANNOUNCELOOKAHEADREQUEST']._serialized_start=646
+  _globals['_ANNOUNCELOOKAHEADREQUEST']._serialized_end=759
+  _globals['_LOOKAHEADANSWER']._serialized_start=761
+  _globals['_LOOKAHEADANSWER']._serialized_end=877
+  _globals['_ANNOUNCELOOKAHEADRESPONSE']._serialized_start=879
+  _globals['_ANNOUNCELOOKAHEADRESPONSE']._serialized_end=961
+  _globals['_EXECUTEREQUEST']._serialized_start=964
+  _globals['_EXECUTEREQUEST']._serialized_end=1100
+  _globals['_GROUPDONE']._serialized_start=1102
+  _globals['_GROUPDONE']._serialized_end=1193
+  _globals['_EXECUTERESPONSE']._serialized_start=1195
+  _globals['_EXECUTERESPONSE']._serialized_end=1313
+  _globals['_WAITEXECUTIONREQUEST']._serialized_start=1315
+  _globals['_WAITEXECUTIONREQUEST']._serialized_end=1393
+  _globals['_WAITEXECUTIONRESPONSE']._serialized_start=1395
+  _globals['_WAITEXECUTIONRESPONSE']._serialized_end=1519
+  _globals['_CANCELBATCHREQUEST']._serialized_start=1521
+  _globals['_CANCELBATCHREQUEST']._serialized_end=1575
+  _globals['_CANCELBATCHRESPONSE']._serialized_start=1577
+  _globals['_CANCELBATCHRESPONSE']._serialized_end=1598
+  _globals['_CLOSERUNREQUEST']._serialized_start=1600
+  _globals['_CLOSERUNREQUEST']._serialized_end=1633
+  _globals['_CLOSERUNRESPONSE']._serialized_start=1635
+  _globals['_CLOSERUNRESPONSE']._serialized_end=1699
+  _globals['_RUNSTATS']._serialized_start=1702
+  _globals['_RUNSTATS']._serialized_end=1994
+  _globals['_ROLLOUTSERVICE']._serialized_start=2137
+  _globals['_ROLLOUTSERVICE']._serialized_end=2846
 # @@protoc_insertion_point(module_scope)

@@ -155,17 +155,21 @@ class LookaheadEntry(google.protobuf.message.Message):
     STEP_FIELD_NUMBER: builtins.int
     BUNDLE_DIGEST_FIELD_NUMBER: builtins.int
     COUNT_FIELD_NUMBER: builtins.int
+    RENDER_FIELD_NUMBER: builtins.int
     step: builtins.int
     bundle_digest: builtins.str
     count: builtins.int
+    render: builtins.bool
+    """Its rollouts need slots that render on a GPU."""
     def __init__(
         self,
         *,
         step: builtins.int = ...,
         bundle_digest: builtins.str = ...,
         count: builtins.int = ...,
+        render: builtins.bool = ...,
     ) -> None: ...
-    def ClearField(self, field_name: typing.Literal["bundle_digest", b"bundle_digest", "count", b"count", "step", b"step"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["bundle_digest", b"bundle_digest", "count", b"count", "render", b"render", "step", b"step"]) -> None: ...
 
 Global___LookaheadEntry: typing_extensions.TypeAlias = LookaheadEntry
 

@@ -188,11 +188,14 @@ class Rollout(google.protobuf.message.Message):
     TASK_ID_FIELD_NUMBER: builtins.int
     PLAN_FIELD_NUMBER: builtins.int
     SEED_FIELD_NUMBER: builtins.int
+    RENDER_FIELD_NUMBER: builtins.int
     rollout_id: builtins.str
     group_id: builtins.str
     bundle_digest: builtins.str
     task_id: builtins.str
     seed: builtins.int
+    render: builtins.bool
+    """Needs a slot that renders on a GPU."""
     @property
     def plan(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___SkillCall]: ...
     def __init__(
@@ -204,8 +207,9 @@ class Rollout(google.protobuf.message.Message):
         task_id: builtins.str = ...,
         plan: collections.abc.Iterable[Global___SkillCall] | None = ...,
         seed: builtins.int = ...,
+        render: builtins.bool = ...,
     ) -> None: ...
-    def ClearField(self, field_name: typing.Literal["bundle_digest", b"bundle_digest", "group_id", b"group_id", "plan", b"plan", "rollout_id", b"rollout_id", "seed", b"seed", "task_id", b"task_id"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["bundle_digest", b"bundle_digest", "group_id", b"group_id", "plan", b"plan", "render", b"render", "rollout_id", b"rollout_id", "seed", b"seed", "task_id", b"task_id"]) -> None: ...
 
 Global___Rollout: typing_extensions.TypeAlias = Rollout
 

@@ -310,7 +310,10 @@ class SessionResponse(google.protobuf.message.Message):
     ACKNOWLEDGED_FIELD_NUMBER: builtins.int
     CANCELLED_FIELD_NUMBER: builtins.int
     DRAIN_FIELD_NUMBER: builtins.int
+    RESUME_FIELD_NUMBER: builtins.int
     drain: builtins.bool
+    resume: builtins.bool
+    """Takes an earlier drain back: the worker stays, if it has not left yet."""
     @property
     def desired(self) -> Global___DesiredResidents:
         """The full set of scenes that should be resident, most urgent first; others may be evicted."""
@@ -329,9 +332,10 @@ class SessionResponse(google.protobuf.message.Message):
         acknowledged: collections.abc.Iterable[Global___LeaseRef] | None = ...,
         cancelled: collections.abc.Iterable[Global___LeaseRef] | None = ...,
         drain: builtins.bool = ...,
+        resume: builtins.bool = ...,
     ) -> None: ...
     def HasField(self, field_name: typing.Literal["desired", b"desired"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["acknowledged", b"acknowledged", "cancelled", b"cancelled", "desired", b"desired", "drain", b"drain", "leases", b"leases"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["acknowledged", b"acknowledged", "cancelled", b"cancelled", "desired", b"desired", "drain", b"drain", "leases", b"leases", "resume", b"resume"]) -> None: ...
 
 Global___SessionResponse: typing_extensions.TypeAlias = SessionResponse
 

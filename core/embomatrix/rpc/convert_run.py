@@ -1,0 +1,107 @@
+"""What a run asks and is told: terms, look-ahead, groups and counters, to wire messages and back."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.proto.v1 import rollout_service_pb2, types_pb2
+from embomatrix.rpc.convert import ConvertError, finite, required
+from embomatrix.rpc.values import (
+    GroupDone,
+    GroupPolicy,
+    LookaheadAnswer,
+    LookaheadEntry,
+    RunStats,
+    RunTerms,
+    Warmth,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+_WARMTHS: Final[Mapping[Warmth, types_pb2.Warmth.ValueType]] = {
+    warmth: types_pb2.Warmth.Value(f"WARMTH_{warmth.name}") for warmth in Warmth
+}
+_WARMTH_VALUES: Final = {number: warmth for warmth, number in _WARMTHS.items()}
+_POLICIES: Final[Mapping[GroupPolicy, rollout_service_pb2.GroupPolicy.ValueType]] = {
+    policy: rollout_service_pb2.GroupPolicy.Value(f"GROUP_POLICY_{policy.name}") for policy in GroupPolicy
+}
+_POLICY_VALUES: Final = {
+    rollout_service_pb2.GROUP_POLICY_UNSPECIFIED: RunTerms().group_policy,
+    **{number: policy for policy, number in _POLICIES.items()},
+}
+
+
+def lookahead_entry_to_proto(entry: LookaheadEntry) -> rollout_service_pb2.LookaheadEntry:
+    return rollout_service_pb2.LookaheadEntry(
+        step=entry.step, bundle_digest=entry.bundle_digest, count=entry.count, render=entry.render
+    )
+
+
+def lookahead_entry_from_proto(message: rollout_service_pb2.LookaheadEntry) -> LookaheadEntry:
+    digest = required("bundle_digest", message.bundle_digest)
+    return LookaheadEntry(message.step, digest, message.count, message.render)
+
+
+def lookahead_answer_to_proto(answer: LookaheadAnswer) -> rollout_service_pb2.LookaheadAnswer:
+    return rollout_service_pb2.LookaheadAnswer(
+        bundle_digest=answer.bundle_digest,
+        warmth=warmth_to_proto(answer.warmth),
+        eta_s=answer.eta_s,
+        reason=answer.reason,
+    )
+
+
+def lookahead_answer_from_proto(message: rollout_service_pb2.LookaheadAnswer) -> LookaheadAnswer:
+    warmth = warmth_from_proto(message.warmth)
+    return LookaheadAnswer(message.bundle_digest, warmth, finite("eta_s", message.eta_s), message.reason)
+
+
+def group_done_to_proto(done: GroupDone) -> rollout_service_pb2.GroupDone:
+    return rollout_service_pb2.GroupDone(**{name: getattr(done, name) for name in GroupDone.__slots__})
+
+
+def group_done_from_proto(message: rollout_service_pb2.GroupDone) -> GroupDone:
+    return GroupDone(
+        required("group_id", message.group_id), message.completed, message.infra_failures, message.cancelled
+    )
+
+
+def run_terms_to_proto(terms: RunTerms) -> rollout_service_pb2.OpenRunRequest:
+    """The part of a request to open a run that says what the run asks for."""
+    return rollout_service_pb2.OpenRunRequest(
+        group_policy=_POLICIES[terms.group_policy],
+        weight=terms.weight,
+        priority=terms.priority,
+        rollout_deadline_s=terms.rollout_deadline_s,
+    )
+
+
+def run_terms_from_proto(message: rollout_service_pb2.OpenRunRequest) -> RunTerms:
+    policy = _POLICY_VALUES.get(message.group_policy)
+    if policy is None:
+        raise ConvertError("group_policy", f"{message.group_policy} is no known policy: leave it out")
+    for field in ("weight", "rollout_deadline_s"):
+        if finite(field, getattr(message, field)) < 0:
+            raise ConvertError(field, f"is {getattr(message, field)}: it can't be below 0")
+    # A message without a weight has 0 there.
+    return RunTerms(policy, message.weight or 1.0, message.priority, message.rollout_deadline_s)
+
+
+def warmth_to_proto(warmth: Warmth) -> types_pb2.Warmth.ValueType:
+    return _WARMTHS[warmth]
+
+
+def warmth_from_proto(number: types_pb2.Warmth.ValueType) -> Warmth:
+    warmth = _WARMTH_VALUES.get(number)
+    if warmth is None:
+        raise ConvertError("warmth", f"{number} is no known value: is the sender newer than this side?")
+    return warmth
+
+
+def run_stats_to_proto(stats: RunStats) -> rollout_service_pb2.RunStats:
+    return rollout_service_pb2.RunStats(**{name: getattr(stats, name) for name in RunStats.__slots__})
+
+
+def run_stats_from_proto(message: rollout_service_pb2.RunStats) -> RunStats:
+    return RunStats(**{name: getattr(message, name) for name in RunStats.__slots__})
