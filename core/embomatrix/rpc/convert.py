@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import TYPE_CHECKING, Final, TypeVar
 
@@ -48,6 +49,8 @@ SKILL_KINDS: Final[Mapping[Skill, types_pb2.SkillKind.ValueType]] = {
     Skill.CLEAN: types_pb2.SKILL_KIND_CLEAN,
     Skill.SOAK: types_pb2.SKILL_KIND_SOAK,
 }
+KNOWN: Final = 65_536
+"""Calls and steps that a process remembers by their bytes: plans of one model repeat them, and so do the results."""
 _SKILLS: Final = {kind: skill for skill, kind in SKILL_KINDS.items()}
 _INFRA_CODES: Final[Mapping[InfraCode, types_pb2.InfraCode.ValueType]] = {
     code: types_pb2.InfraCode.Value(f"INFRA_CODE_{code.name}") for code in InfraCode
@@ -115,6 +118,12 @@ def skill_call_to_proto(call: SkillCall) -> types_pb2.SkillCall:
 
 def skill_call_from_proto(message: types_pb2.SkillCall) -> SkillCall:
     """The call, with exactly the arguments that its skill takes; any other set is a ``ConvertError``."""
+    return _call_of(message.SerializeToString())
+
+
+@functools.lru_cache(KNOWN)
+def _call_of(data: bytes) -> SkillCall:
+    message = types_pb2.SkillCall.FromString(data)
     skill = _SKILLS.get(message.skill)
     if skill is None:
         raise ConvertError("skill", f"{message.skill} is no known skill: is the sender newer than this side?")
@@ -153,6 +162,8 @@ def plan_from_proto(messages: Iterable[types_pb2.SkillCall]) -> Plan:
 
 
 def rollout_to_proto(rollout: Rollout) -> types_pb2.Rollout:
+    if rollout.wire:
+        return types_pb2.Rollout.FromString(rollout.wire)
     return types_pb2.Rollout(
         rollout_id=rollout.rollout_id,
         group_id=rollout.group_id,
@@ -165,7 +176,7 @@ def rollout_to_proto(rollout: Rollout) -> types_pb2.Rollout:
 
 
 def rollout_from_proto(message: types_pb2.Rollout) -> Rollout:
-    return Rollout(
+    rollout = Rollout(
         rollout_id=required("rollout_id", message.rollout_id),
         group_id=required("group_id", message.group_id),
         bundle_digest=required("bundle_digest", message.bundle_digest),
@@ -174,6 +185,8 @@ def rollout_from_proto(message: types_pb2.Rollout) -> Rollout:
         seed=message.seed,
         render=message.render,
     )
+    object.__setattr__(rollout, "wire", message.SerializeToString())
+    return rollout
 
 
 def batch_to_proto(batch: Batch) -> rollout_service_pb2.ExecuteRequest:
@@ -226,6 +239,12 @@ def step_to_proto(step: Step) -> types_pb2.StepResult:
 
 
 def step_from_proto(message: types_pb2.StepResult) -> Step:
+    return _step_of(message.SerializeToString())
+
+
+@functools.lru_cache(KNOWN)
+def _step_of(data: bytes) -> Step:
+    message = types_pb2.StepResult.FromString(data)
     call = inside("call", skill_call_from_proto, message.call)
     return Step(call, _failure_reason(message.failure), message.message)
 
@@ -252,22 +271,30 @@ def timings_from_proto(message: types_pb2.Timings) -> Timings:
 
 
 def completed_to_proto(completed: Completed) -> types_pb2.Completed:
-    return types_pb2.Completed(
-        reward=reward_to_proto(completed.reward),
-        steps=[step_to_proto(step) for step in completed.steps],
-        final_state=completed.final,
-        trace_digest=completed.trace_digest,
-        worker_id=completed.worker_id,
-        timings=timings_to_proto(completed.timings),
-        warm=completed.warm,
-    )
+    message = types_pb2.Completed()
+    write_completed(completed, message)
+    return message
+
+
+def write_completed(completed: Completed, message: types_pb2.Completed) -> None:
+    """Fill an empty message. What came as a message is passed on as it came, but for what was noted on its way."""
+    if completed.wire:
+        message.MergeFromString(completed.wire)
+    else:
+        message.reward.CopyFrom(reward_to_proto(completed.reward))
+        message.steps.extend(step_to_proto(step) for step in completed.steps)
+        message.final_state.extend(completed.final)
+        message.trace_digest = completed.trace_digest
+    message.worker_id = completed.worker_id
+    message.timings.CopyFrom(timings_to_proto(completed.timings))
+    message.warm = completed.warm
 
 
 def completed_from_proto(message: types_pb2.Completed) -> Completed:
     """The result. A missing reward is a ``ConvertError``, for it is no reward of 0."""
     if not message.HasField("reward"):
         raise ConvertError("reward", "is missing: a completed rollout has one")
-    return Completed(
+    completed = Completed(
         reward=inside("reward", reward_from_proto, message.reward),
         steps=each("steps", step_from_proto, message.steps),
         final=tuple(message.final_state),
@@ -276,6 +303,8 @@ def completed_from_proto(message: types_pb2.Completed) -> Completed:
         timings=inside("timings", timings_from_proto, message.timings),
         warm=message.warm,
     )
+    object.__setattr__(completed, "wire", message.SerializeToString())
+    return completed
 
 
 def infra_failure_to_proto(failure: InfraFailure) -> types_pb2.InfraFailure:
@@ -297,7 +326,7 @@ def rollout_result_to_proto(result: RolloutResult) -> types_pb2.RolloutResult:
     )
     match result.outcome:
         case Completed() as completed:
-            message.completed.CopyFrom(completed_to_proto(completed))
+            write_completed(completed, message.completed)
         case InfraFailure() as failure:
             message.infra_failure.CopyFrom(infra_failure_to_proto(failure))
         case Cancelled() as cancelled:

@@ -8,7 +8,6 @@ from embomatrix.proto.v1 import admin_service_pb2, worker_service_pb2
 from embomatrix.rpc.convert import (
     ConvertError,
     completed_from_proto,
-    completed_to_proto,
     each,
     finite,
     infra_failure_from_proto,
@@ -19,6 +18,7 @@ from embomatrix.rpc.convert import (
     resources_to_proto,
     rollout_from_proto,
     rollout_to_proto,
+    write_completed,
 )
 from embomatrix.rpc.convert_run import (
     run_stats_from_proto,
@@ -108,7 +108,7 @@ def lease_result_to_proto(result: LeaseResult) -> worker_service_pb2.LeaseResult
     message = worker_service_pb2.LeaseResult(lease=lease_ref_to_proto(result.ref))
     match result.outcome:
         case Completed() as completed:
-            message.completed.CopyFrom(completed_to_proto(completed))
+            write_completed(completed, message.completed)
         case InfraFailure() as failure:
             message.infra_failure.CopyFrom(infra_failure_to_proto(failure))
     return message

@@ -29,6 +29,8 @@ class Rollout:
     seed: int
     render: bool = False
     """It needs a slot that renders on a GPU."""
+    wire: bytes = field(default=b"", init=False, compare=False, repr=False)
+    """The message that it came in, which is passed on instead of written anew; a changed copy has none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +63,25 @@ class Completed:
     worker_id: str
     timings: Timings
     warm: bool
+    wire: bytes = field(default=b"", init=False, compare=False, repr=False)
+    """The message that it came in, which is passed on instead of written anew, but for what was ``noted``; a copy that was
+    changed otherwise has none."""
+
+    def noted(
+        self, *, timings: Timings | None = None, worker_id: str | None = None, warm: bool | None = None
+    ) -> Completed:
+        """The same result with what is noted on its way."""
+        copy = Completed(
+            self.reward,
+            self.steps,
+            self.final,
+            self.trace_digest,
+            self.worker_id if worker_id is None else worker_id,
+            self.timings if timings is None else timings,
+            self.warm if warm is None else warm,
+        )
+        object.__setattr__(copy, "wire", self.wire)
+        return copy
 
 
 class InfraCode(StrEnum):

@@ -237,7 +237,7 @@ class Assignments:
         queued_s = lease.given_s - record.submitted_s + completed.timings.queued_s
         timings = dataclasses.replace(completed.timings, queued_s=queued_s)
         warm = record.warm and completed.warm
-        self.finish(record, dataclasses.replace(completed, timings=timings, warm=warm))
+        self.finish(record, completed.noted(timings=timings, warm=warm))
 
     def _fail(self, lease: LeaseRecord, failure: InfraFailure) -> None:
         worker = self.fleet.workers[lease.worker_id]

@@ -1,5 +1,6 @@
 """What goes over the wire comes back equal, and a malformed message names its field."""
 
+import dataclasses
 import math
 
 import pytest
@@ -32,6 +33,8 @@ from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.syntax import MAX_STEPS, SIGNATURES, Arg, PlaceRelation, Skill, SkillCall
 from embomatrix.skills.trace import Step
 
+NEWER = bytes.fromhex("f80705")
+"""Field 127, a varint: what a later version of the protocol may add to a message."""
 UINT32 = st.integers(0, 2**32 - 1)
 UINT64 = st.integers(0, 2**64 - 1)
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
@@ -118,6 +121,29 @@ def test_a_batch_comes_back_equal(rollouts, name, step):
 def test_a_result_comes_back_equal_whatever_its_outcome(result):
     message = _over_the_wire(convert.rollout_result_to_proto(result))
     assert convert.rollout_result_from_proto(message) == result
+
+
+@given(COMPLETED, NUMBERS, NAMES, st.booleans())
+def test_a_result_that_is_passed_on_says_what_was_noted_on_its_way(completed, queued_s, worker_id, warm):
+    message = _over_the_wire(convert.completed_to_proto(completed))
+    timings = Timings(queued_s, completed.timings.load_s, completed.timings.execute_s)
+    came = convert.completed_from_proto(message)
+    noted = came.noted(timings=timings, worker_id=worker_id, warm=warm)
+    passed = convert.completed_from_proto(_over_the_wire(convert.completed_to_proto(noted)))
+    assert passed == noted == dataclasses.replace(completed, timings=timings, worker_id=worker_id, warm=warm)
+
+
+def test_fields_that_this_side_does_not_know_are_passed_on():
+    rollout = convert.rollout_to_proto(Rollout("r", "g", "b", "t", (), 1)).SerializeToString()
+    passed = convert.rollout_to_proto(
+        convert.rollout_from_proto(types_pb2.Rollout.FromString(rollout + NEWER))
+    )
+    assert passed.SerializeToString() == rollout + NEWER
+
+
+def test_a_rollout_that_is_changed_is_not_passed_on_as_it_came():
+    came = convert.rollout_from_proto(convert.rollout_to_proto(Rollout("r", "g", "b", "t", (), 1)))
+    assert convert.rollout_to_proto(dataclasses.replace(came, rollout_id="other")).rollout_id == "other"
 
 
 @given(RESOURCES)

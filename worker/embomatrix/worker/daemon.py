@@ -30,7 +30,7 @@ from embomatrix.worker.slots import SlotPool
 if TYPE_CHECKING:
     import numpy as np
 
-    from embomatrix.rpc.values import LeaseResult, Resources
+    from embomatrix.rpc.values import InfraFailure, LeaseResult, Resources
     from embomatrix.worker.session import Registration
     from embomatrix.worker.settings import WorkerSettings
 
@@ -233,10 +233,12 @@ class Daemon:
 
     def _take_result(self, result: LeaseResult) -> None:
         """Keep a result for the manager, signed with this worker's name."""
-        outcome = replace(result.outcome, worker_id=self._settings.name)
-        if isinstance(outcome, Completed):
+        outcome: Completed | InfraFailure
+        if isinstance(result.outcome, Completed):
+            outcome = result.outcome.noted(worker_id=self._settings.name)
             logger.debug("rollout completed lease=%s reward=%.1f", result.ref.lease_id, outcome.reward.total)
         else:
+            outcome = replace(result.outcome, worker_id=self._settings.name)
             logger.warning(
                 "rollout failed lease=%s %s: %s", result.ref.lease_id, outcome.code, outcome.message
             )

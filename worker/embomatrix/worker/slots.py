@@ -8,7 +8,7 @@ import functools
 import logging
 import time
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.proto.v1 import types_pb2
@@ -228,7 +228,7 @@ class SlotPool:
             execute_s=float(header["execute_s"]),
         )
         completed = completed_from_proto(types_pb2.Completed.FromString(answer.body))
-        return replace(completed, timings=timings, warm=ticket.found_warm)
+        return completed.noted(timings=timings, warm=ticket.found_warm)
 
     def _scene_died(self, ticket: _Ticket, scene: Scene, reason: str) -> InfraFailure | None:
         """Have the scene loaded anew for this lease, once."""
