@@ -30,6 +30,8 @@ from embomatrix.rpc.values import (
     Completed,
     InfraFailure,
     Lease,
+    LeaseClaim,
+    LeaseOrigin,
     LeaseProgress,
     LeaseRef,
     LeaseResult,
@@ -89,11 +91,40 @@ def lease_progress_from_proto(message: worker_service_pb2.LeaseProgress) -> Leas
     return LeaseProgress(inside("ref", lease_ref_from_proto, message.ref), message.steps)
 
 
+def lease_origin_to_proto(origin: LeaseOrigin) -> worker_service_pb2.LeaseOrigin:
+    return worker_service_pb2.LeaseOrigin(
+        run_id=origin.run_id, batch_id=origin.batch_id, rollout_id=origin.rollout_id, attempt=origin.attempt
+    )
+
+
+def lease_origin_from_proto(message: worker_service_pb2.LeaseOrigin) -> LeaseOrigin:
+    return LeaseOrigin(
+        run_id=required("run_id", message.run_id),
+        batch_id=required("batch_id", message.batch_id),
+        rollout_id=required("rollout_id", message.rollout_id),
+        attempt=max(message.attempt, 1),
+    )
+
+
+def lease_claim_to_proto(claim: LeaseClaim) -> worker_service_pb2.LeaseClaim:
+    return worker_service_pb2.LeaseClaim(
+        ref=lease_ref_to_proto(claim.ref), origin=lease_origin_to_proto(claim.origin)
+    )
+
+
+def lease_claim_from_proto(message: worker_service_pb2.LeaseClaim) -> LeaseClaim:
+    return LeaseClaim(
+        inside("ref", lease_ref_from_proto, message.ref),
+        inside("origin", lease_origin_from_proto, message.origin),
+    )
+
+
 def lease_to_proto(lease: Lease) -> worker_service_pb2.Lease:
     return worker_service_pb2.Lease(
         ref=lease_ref_to_proto(lease.ref),
         rollout=rollout_to_proto(lease.rollout),
         deadline_s=lease.deadline_s,
+        origin=None if lease.origin is None else lease_origin_to_proto(lease.origin),
     )
 
 
@@ -101,7 +132,10 @@ def lease_from_proto(message: worker_service_pb2.Lease) -> Lease:
     ref = inside("ref", lease_ref_from_proto, message.ref)
     if finite("deadline_s", message.deadline_s) <= 0:
         raise ConvertError("deadline_s", f"is {message.deadline_s}: it must be above 0")
-    return Lease(ref, inside("rollout", rollout_from_proto, message.rollout), message.deadline_s)
+    origin = None
+    if message.HasField("origin"):
+        origin = inside("origin", lease_origin_from_proto, message.origin)
+    return Lease(ref, inside("rollout", rollout_from_proto, message.rollout), message.deadline_s, origin)
 
 
 def lease_result_to_proto(result: LeaseResult) -> worker_service_pb2.LeaseResult:
@@ -132,6 +166,7 @@ def worker_state_to_proto(state: WorkerState) -> worker_service_pb2.WorkerState:
         finished=[lease_result_to_proto(result) for result in state.finished],
         draining=state.draining,
         paused=state.paused,
+        claims=[lease_claim_to_proto(claim) for claim in state.claims],
     )
 
 
@@ -142,6 +177,7 @@ def worker_state_from_proto(message: worker_service_pb2.WorkerState) -> WorkerSt
         finished=each("finished", lease_result_from_proto, message.finished),
         draining=message.draining,
         paused=message.paused,
+        claims=each("claims", lease_claim_from_proto, message.claims),
     )
 
 

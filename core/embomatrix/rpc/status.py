@@ -63,6 +63,10 @@ class SupersededError(ClusterError):
     """Another session of the same worker id took over, or the epoch is stale: this side must stop."""
 
 
+class UnknownSessionError(SupersededError):
+    """The session was opened by a former manager: register again, and say what is held; this manager may take it up."""
+
+
 class TrimmedError(ClusterError):
     """The results at this cursor are no longer kept."""
 
@@ -90,6 +94,10 @@ STATUS: Final[Mapping[type[ClusterError], grpc.StatusCode]] = {
     InternalError: grpc.StatusCode.INTERNAL,
 }
 _ERRORS: Final = {code: error for error, code in STATUS.items()}
+_PLAIN: Final = "1"
+_NAMED: Final[Mapping[str, type[ClusterError]]] = {"unknown-session": UnknownSessionError}
+"""Errors that share a status with others, by the value of ``ERROR_KEY`` that tells them apart."""
+_NAMES: Final = {error: name for name, error in _NAMED.items()}
 
 
 @contextlib.asynccontextmanager
@@ -98,7 +106,7 @@ async def translate(context: grpc.aio.ServicerContext) -> AsyncIterator[None]:
     try:
         yield
     except ClusterError as error:
-        await _abort(context, _status_of(error), str(error))
+        await _abort(context, _status_of(error), str(error), _NAMES.get(type(error), _PLAIN))
     except ConvertError as error:
         await _abort(context, grpc.StatusCode.INVALID_ARGUMENT, f"malformed message: {error}")
     except grpc.aio.AbortError:
@@ -110,8 +118,10 @@ async def translate(context: grpc.aio.ServicerContext) -> AsyncIterator[None]:
         )
 
 
-async def _abort(context: grpc.aio.ServicerContext, code: grpc.StatusCode, sentence: str) -> None:
-    await context.abort(code, sentence, trailing_metadata=((ERROR_KEY, "1"),))
+async def _abort(
+    context: grpc.aio.ServicerContext, code: grpc.StatusCode, sentence: str, name: str = _PLAIN
+) -> None:
+    await context.abort(code, sentence, trailing_metadata=((ERROR_KEY, name),))
 
 
 def _status_of(error: ClusterError) -> grpc.StatusCode:
@@ -125,8 +135,9 @@ def cluster_error(error: grpc.aio.AioRpcError, address: str) -> ClusterError:
     """The error of ours for a failed call to ``address`` (HOST:PORT)."""
     code = error.code()
     details = error.details() or ""
-    if any(key == ERROR_KEY for key, _ in error.trailing_metadata() or ()):
-        return _ERRORS.get(code, InternalError)(details)
+    for key, value in error.trailing_metadata() or ():
+        if key == ERROR_KEY:
+            return (_NAMED.get(str(value)) or _ERRORS.get(code, InternalError))(details)
     match code:
         case grpc.StatusCode.UNAVAILABLE:
             return ManagerUnreachableError(

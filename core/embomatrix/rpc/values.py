@@ -268,20 +268,41 @@ class LeaseRef:
 
 
 @dataclass(frozen=True, slots=True)
+class LeaseOrigin:
+    """Which rollout a lease is for, and which attempt at it, from 1."""
+
+    run_id: str
+    batch_id: str
+    rollout_id: str
+    attempt: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class LeaseClaim:
+    """A worker holds this lease, or its result: a manager that did not give it may take it up."""
+
+    ref: LeaseRef
+    origin: LeaseOrigin
+
+
+@dataclass(frozen=True, slots=True)
 class Lease:
     """The right to execute one rollout. ``deadline_s`` is how long the execution may take, from its start."""
 
     ref: LeaseRef
     rollout: Rollout
     deadline_s: float
+    origin: LeaseOrigin | None = None
+    """None from a manager that does not take leases up."""
 
 
 @dataclass(frozen=True, slots=True)
 class LeaseResult:
-    """What became of a lease."""
+    """What became of a lease. ``origin`` stays with the worker, and travels in its claims."""
 
     ref: LeaseRef
     outcome: Completed | InfraFailure
+    origin: LeaseOrigin | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -294,7 +315,10 @@ class LeaseProgress:
 
 @dataclass(frozen=True, slots=True)
 class WorkerState:
-    """Everything that a worker holds. ``finished`` are results that no one has acknowledged yet."""
+    """Everything that a worker holds. ``finished`` are results that no one has acknowledged yet.
+
+    ``claims`` tell what the leases of both are for; only the first state of a stream has them.
+    """
 
     residents: tuple[Resident, ...] = ()
     running: tuple[LeaseRef, ...] = ()
@@ -302,6 +326,7 @@ class WorkerState:
     draining: bool = False
     paused: str = ""
     """Why the worker takes nothing new for now, though it stays; empty while it works."""
+    claims: tuple[LeaseClaim, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -107,6 +107,7 @@ async def _start_runtime(
         rollout_deadline_s=settings.rollout_deadline_s,
         no_capacity_s=settings.no_capacity_s,
         max_attempts=settings.max_attempts,
+        restart_grace_s=settings.restart_grace_s,
     )
     schedule = ScheduleLimits(affinity_wait_s=settings.affinity_wait_s)
     liveness = LivenessLimits(
@@ -114,9 +115,10 @@ async def _start_runtime(
         lost_after_s=settings.lost_after_s,
         stream_grace_s=settings.stream_grace_s,
     )
-    # Epochs of this manager's sessions lie above those of every manager before it.
-    registry = Registry(liveness, first_epoch=(epoch << 32) + 1)
-    cluster = ClusterState(dispatch, schedule, boot_id=secrets.token_hex(4))
+    # Epochs of this manager's sessions and leases lie above those of every manager before it.
+    first_epoch = (epoch << 32) + 1
+    registry = Registry(liveness, first_epoch=first_epoch)
+    cluster = ClusterState(dispatch, schedule, boot_id=secrets.token_hex(4), first_epoch=first_epoch)
     runtime = ManagerRuntime(cluster, registry, store, bundles, results_ttl_s=settings.results_ttl_s)
     await runtime.start()
     return runtime

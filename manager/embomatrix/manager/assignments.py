@@ -29,12 +29,21 @@ from embomatrix.manager.ledger import (
     WorkerRecord,
 )
 from embomatrix.manager.load_failures import LoadFailures
-from embomatrix.rpc.values import Cancelled, Completed, InfraCode, InfraFailure, Outcome, RolloutResult
+from embomatrix.rpc.values import (
+    Cancelled,
+    Completed,
+    InfraCode,
+    InfraFailure,
+    LeaseOrigin,
+    Outcome,
+    RolloutResult,
+)
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping, Sequence
 
     from embomatrix.manager.events import BatchSubmitted, LeaseFinished
+    from embomatrix.rpc.values import Batch
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +65,8 @@ class DispatchLimits:
     steal_after_s: float = 0.05
     """A lease may be taken from behind a busy slot when it waited for this long and another slot is idle."""
     max_attempts: int = 3
+    restart_grace_s: float = 5.0
+    """How long a manager that took over waits for workers to say what they hold, before it gives the same to others."""
 
 
 class Assignments:
@@ -64,12 +75,16 @@ class Assignments:
     ``now_s`` is set before each change; what shall be done is collected in ``commands``.
     """
 
-    def __init__(self, limits: DispatchLimits, *, boot_id: str) -> None:
+    def __init__(self, limits: DispatchLimits, *, boot_id: str, first_epoch: int = 1) -> None:
         self.now_s = 0.0
         self.commands: list[Command] = []
         self.fleet = Fleet()
         self.leases = LeaseBook(
-            self.fleet, boot_id=boot_id, ttl_s=limits.lease_ttl_s, limit_s=limits.lease_limit_s
+            self.fleet,
+            boot_id=boot_id,
+            ttl_s=limits.lease_ttl_s,
+            limit_s=limits.lease_limit_s,
+            first_epoch=first_epoch,
         )
         self.pending = PendingQueues()
         self.failures = LoadFailures()
@@ -95,15 +110,26 @@ class Assignments:
         return sum(len(batch.open) for key, batch in self.batches.items() if key[0] == run_id)
 
     def submit(self, event: BatchSubmitted) -> None:
-        key = (event.batch.run_id, event.batch.batch_id)
+        self.queue(self.take_in(event.batch, {}))
+
+    def queue(self, records: Sequence[RolloutRecord]) -> None:
+        """Give these to whoever has their scenes warm; the others wait."""
+        for record in records:
+            self.pending.push(record)
+        for scene in dict.fromkeys(record.scene for record in records):
+            self.offer(scene)
+
+    def take_in(self, batch: Batch, delivered: Mapping[str, int]) -> list[RolloutRecord]:
+        """Note a batch; returns its rollouts without an outcome, which nobody holds. None of a batch that is known."""
+        key = (batch.run_id, batch.batch_id)
         if key in self.batches:
-            return
-        batch = self.batches[key] = BatchRecord(*key, {}, cursor=max(event.delivered.values(), default=0))
-        scenes = dict.fromkeys(rollout.bundle_digest for rollout in event.batch.rollouts)
+            return []
+        noted = self.batches[key] = BatchRecord(*key, {}, cursor=max(delivered.values(), default=0))
+        scenes = dict.fromkeys(rollout.bundle_digest for rollout in batch.rollouts)
         warm = {scene: self.fleet.has_warm(scene) for scene in scenes}
         due_s = self.now_s + self._limits.rollout_deadline_s
-        for rollout in event.batch.rollouts:
-            if rollout.rollout_id in event.delivered:
+        for rollout in batch.rollouts:
+            if rollout.rollout_id in delivered:
                 continue
             record = RolloutRecord(
                 key=RolloutKey(*key, rollout.rollout_id),
@@ -112,13 +138,11 @@ class Assignments:
                 submitted_s=self.now_s,
                 warm=warm[rollout.bundle_digest],
             )
-            batch.open[rollout.rollout_id] = record
-            self.pending.push(record)
+            noted.open[rollout.rollout_id] = record
             heapq.heappush(self._due, (due_s, record.sequence, record))
-        if not batch.open:
-            self._close(batch)
-        for scene in scenes:
-            self.offer(scene)
+        if not noted.open:
+            self._close(noted)
+        return list(noted.open.values())
 
     def cancel(self, key: tuple[str, str]) -> None:
         batch = self.batches.get(key)
@@ -139,7 +163,7 @@ class Assignments:
         if record.phase is Phase.PENDING:
             self.pending.remove(record)
         if record.lease is not None:
-            self._void(record.lease)
+            self.void(record.lease)
         record.phase = Phase.DONE
         batch = self.batches[record.key[:2]]
         del batch.open[record.key.rollout_id]
@@ -192,9 +216,10 @@ class Assignments:
     def _give(self, record: RolloutRecord, worker: WorkerRecord) -> None:
         lease = self.leases.give(record, worker, self.now_s)
         deadline_s = self._limits.execute_deadline_s
-        self.commands.append(GiveLease(worker.worker_id, lease.ref, record.rollout, deadline_s))
+        origin = LeaseOrigin(*record.key, attempt=record.attempts + 1)
+        self.commands.append(GiveLease(worker.worker_id, lease.ref, record.rollout, deadline_s, origin))
 
-    def _void(self, lease: LeaseRecord) -> None:
+    def void(self, lease: LeaseRecord) -> None:
         """Take a lease back from a worker that may still hold it."""
         self.leases.end(lease)
         self.commands.append(CancelLease(lease.worker_id, lease.ref))
@@ -206,7 +231,7 @@ class Assignments:
             lease = self.fleet.waiting_behind(worker, before_s)
             if lease is None:
                 return
-            self._void(lease)
+            self.void(lease)
             self._give(lease.record, worker)
 
     def settle(self, event: LeaseFinished) -> None:

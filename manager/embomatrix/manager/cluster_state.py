@@ -30,7 +30,7 @@ NOW_SHARE: Final = 0.1
 class ClusterState:
     """Everything that the manager decides. Events in, commands out, the clock an argument, no I/O.
 
-    ``boot_id`` is new for every process of the manager.
+    ``boot_id`` is new for every process of the manager; the epochs of its leases begin with ``first_epoch``.
     """
 
     def __init__(
@@ -39,8 +39,9 @@ class ClusterState:
         schedule: ScheduleLimits | None = None,
         *,
         boot_id: str,
+        first_epoch: int = 1,
     ) -> None:
-        self.dispatcher = Dispatcher(dispatch or DispatchLimits(), boot_id=boot_id)
+        self.dispatcher = Dispatcher(dispatch or DispatchLimits(), boot_id=boot_id, first_epoch=first_epoch)
         self.scheduler = Scheduler(schedule or ScheduleLimits())
         self._waiting = 0
         self._placed_s = -math.inf

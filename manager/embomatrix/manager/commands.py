@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from embomatrix.rpc.values import LeaseRef, Rollout, RolloutResult
+    from embomatrix.rpc.values import LeaseOrigin, LeaseRef, Rollout, RolloutResult
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,6 +25,8 @@ class GiveLease:
     ref: LeaseRef
     rollout: Rollout
     deadline_s: float
+    origin: LeaseOrigin
+    """Comes back in the worker's claims when another manager asks."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,8 +13,9 @@ from embomatrix.manager.records import result_row
 from embomatrix.manager.store.protocol import FencedError, StateError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
+    from embomatrix.manager.commands import AcknowledgeLease
     from embomatrix.manager.results import BatchLog, ResultLogs
     from embomatrix.manager.store.protocol import StateStore
 
@@ -25,17 +26,30 @@ STORE_RETRY_S: Final = 0.5
 
 
 class Delivery:
-    """Owns the way of results. What a trainer saw, a restarted manager knows, so no cursor is ever given twice."""
+    """Owns the way of results. What a trainer saw, a restarted manager knows, so no cursor is ever given twice.
 
-    def __init__(self, store: StateStore, logs: ResultLogs) -> None:
+    A worker hears that it may forget a result (``acknowledge``) only after the store has it: until then it is not lost
+    with the manager.
+    """
+
+    def __init__(
+        self, store: StateStore, logs: ResultLogs, acknowledge: Callable[[AcknowledgeLease], None]
+    ) -> None:
         self._store = store
         self._logs = logs
+        self._acknowledge = acknowledge
         self._waiting: list[DeliverResult | FinishBatch] = []
+        self._acknowledgements: list[AcknowledgeLease] = []
         self._fresh = asyncio.Event()
 
     def put(self, command: DeliverResult | FinishBatch) -> None:
         """Queue a result, or the end of a batch. There are never more than there are rollouts in the cluster."""
         self._waiting.append(command)
+        self._fresh.set()
+
+    def put_acknowledgement(self, command: AcknowledgeLease) -> None:
+        """Queue what a worker may forget; said once everything that was queued before is written."""
+        self._acknowledgements.append(command)
         self._fresh.set()
 
     async def serve(self) -> None:
@@ -44,6 +58,7 @@ class Delivery:
             await self._fresh.wait()
             self._fresh.clear()
             commands, self._waiting = self._waiting, []
+            acknowledgements, self._acknowledgements = self._acknowledgements, []
             by_batch: dict[tuple[str, str], list[DeliverResult | FinishBatch]] = {}
             for command in commands:
                 by_batch.setdefault((command.run_id, command.batch_id), []).append(command)
@@ -51,6 +66,8 @@ class Delivery:
                 log = self._logs.get(*key)
                 if log is not None:
                     await self._publish(log, ended)
+            for acknowledgement in acknowledgements:
+                self._acknowledge(acknowledgement)
 
     async def give_up_outdated(self, now_s: float) -> None:
         """Drop logs that are too old, or too many."""

@@ -18,6 +18,7 @@ from embomatrix.manager.assignments import Assignments, DispatchLimits
 from embomatrix.manager.commands import CancelLease, Command
 from embomatrix.manager.events import (
     BatchCancelled,
+    BatchRestored,
     BatchSubmitted,
     DemandObserved,
     Event,
@@ -33,6 +34,7 @@ from embomatrix.manager.events import (
     WorkerReported,
     WorkerSuspected,
 )
+from embomatrix.manager.recovery import Recovery
 from embomatrix.rpc.values import InfraCode, InfraFailure, ResidentState
 
 if TYPE_CHECKING:
@@ -42,11 +44,15 @@ if TYPE_CHECKING:
 
 
 class Dispatcher:
-    """Batches in, leases and results out. ``boot_id`` keeps lease ids of different manager processes apart."""
+    """Batches in, leases and results out. ``boot_id`` keeps lease ids of different manager processes apart.
 
-    def __init__(self, limits: DispatchLimits, *, boot_id: str) -> None:
+    ``first_epoch`` lies above the epochs of every lease that a former manager gave.
+    """
+
+    def __init__(self, limits: DispatchLimits, *, boot_id: str, first_epoch: int = 1) -> None:
         self._limits = limits
-        self._desk = Assignments(limits, boot_id=boot_id)
+        self._desk = Assignments(limits, boot_id=boot_id, first_epoch=first_epoch)
+        self._recovery = Recovery(self._desk, grace_s=limits.restart_grace_s)
         self._unplaceable: dict[str, tuple[float, str]] = {}
         self._alone_since_s = 0.0
 
@@ -60,6 +66,8 @@ class Dispatcher:
                 self._desk.leases.renew(worker_id, held, now_s)
             case BatchSubmitted():
                 self._desk.submit(event)
+            case BatchRestored():
+                self._recovery.restore(event)
             case BatchCancelled(run_id, batch_id):
                 self._desk.cancel((run_id, batch_id))
             case RunClosed(run_id):
@@ -91,9 +99,14 @@ class Dispatcher:
         pending = self._desk.pending.counts()
         heads = [head for scene in pending if (head := self._desk.pending.head(scene)) is not None]
         heads.sort(key=lambda head: head.sequence)
+        waited_s = {head.scene: self._desk.now_s - head.submitted_s for head in heads}
+        for scene, count in self._recovery.awaited().items():
+            # They will be executed somewhere: their scenes are loaded while their workers are waited for.
+            pending[scene] = pending.get(scene, 0) + count
+            waited_s.setdefault(scene, 0.0)
         return DemandObserved(
             pending=pending,
-            waited_s={head.scene: self._desk.now_s - head.submitted_s for head in heads},
+            waited_s=waited_s,
             in_use=frozenset(self._desk.leases.in_use),
             used=self._desk.leases.take_used(),
             idle=self._desk.fleet.idle if pending else frozenset(),
@@ -102,12 +115,12 @@ class Dispatcher:
     @property
     def waiting_scenes(self) -> int:
         """How many scenes have waiting rollouts; when it changes, the scheduler should look again."""
-        return self._desk.pending.scenes
+        return self._desk.pending.scenes + len(self._recovery.awaited())
 
     @property
     def queued(self) -> int:
         """Rollouts that wait for a lease."""
-        return len(self._desk.pending)
+        return len(self._desk.pending) + self._recovery.waiting
 
     @property
     def live_leases(self) -> Mapping[str, LeaseRecord]:
@@ -159,7 +172,10 @@ class Dispatcher:
         self._desk.fill([worker.worker_id])
 
     def _reconcile(self, worker: WorkerRecord, event: WorkerReported) -> None:
-        """After a reconnect: what the worker does not hold never reached it; what it holds beyond our book is void."""
+        """After a reconnect: what the worker does not hold never reached it.
+
+        What it holds beyond our book, a former manager gave: it is taken up, or void.
+        """
         held = set(event.held)
         failure = InfraFailure(
             InfraCode.WORKER_LOST, "the lease was lost with a broken session", worker.worker_id
@@ -167,8 +183,11 @@ class Dispatcher:
         for lease in [lease for lease in worker.held.values() if lease.ref not in held]:
             self._desk.give_back(lease, failure, counted=False)
             self._desk.offer(lease.record.scene)
+        origins = {claim.ref: claim.origin for claim in event.claims}
         for ref in event.held:
-            if self._desk.leases.find(worker.worker_id, ref) is None:
+            if self._desk.leases.find(worker.worker_id, ref) is not None:
+                continue
+            if not self._recovery.adopt(worker, ref, origins.get(ref)):
                 self._desk.commands.append(CancelLease(worker.worker_id, ref))
 
     def _on_lost(self, event: WorkerLost) -> None:
@@ -196,6 +215,7 @@ class Dispatcher:
         self._desk.fill([worker_id])
 
     def _on_tick(self) -> None:
+        self._recovery.tick()
         for lease in self._desk.leases.due(self._desk.now_s):
             self._expire(lease)
         for record in self._desk.overdue():

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
         Batch,
         Completed,
         InfraFailure,
+        LeaseClaim,
         LeaseRef,
         LookaheadEntry,
         Resident,
@@ -39,6 +40,7 @@ class WorkerReported:
     held: tuple[LeaseRef, ...] = ()
     draining: bool = False
     resync: bool = False
+    claims: tuple[LeaseClaim, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,10 +91,22 @@ class LeaseFinished:
 
 @dataclass(frozen=True, slots=True)
 class BatchSubmitted:
-    """A trainer wants these plans executed. ``delivered`` maps rollouts to cursors that a former manager delivered."""
+    """A trainer wants these plans executed."""
+
+    batch: Batch
+
+
+@dataclass(frozen=True, slots=True)
+class BatchRestored:
+    """A former manager took this batch. ``delivered`` maps rollouts to the cursors under which it delivered them.
+
+    What is left may run somewhere: it waits for the workers to come back before it is given to others.
+    """
 
     batch: Batch
     delivered: Mapping[str, int] = field(default_factory=dict)
+    infra_failures: int = 0
+    """Of those that were delivered."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,6 +170,7 @@ Event = (
     | LeasesRenewed
     | LeaseFinished
     | BatchSubmitted
+    | BatchRestored
     | BatchCancelled
     | RunClosed
     | LookaheadAnnounced

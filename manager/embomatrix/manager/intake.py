@@ -68,7 +68,9 @@ class Intake:
             if state.draining:
                 self.registry.draining(session)
             held = (*state.running, *(result.ref for result in state.finished))
-            reported = WorkerReported(session.worker_id, state.residents, held, state.draining, resync)
+            reported = WorkerReported(
+                session.worker_id, state.residents, held, state.draining, resync, state.claims
+            )
             # A first state comes first: what is leased on the strength of its results was not there when it was written.
             events.insert(0 if resync else len(events), reported)
         return self.feed(*events, now_s=now_s)

@@ -20,9 +20,14 @@ STALE_MEMORY: Final = 65_536
 
 
 class LeaseBook:
-    """``boot_id`` makes the lease ids of this manager's process unlike those of any other."""
+    """``boot_id`` makes the lease ids of this manager's process unlike those of any other.
 
-    def __init__(self, fleet: Fleet, *, boot_id: str, ttl_s: float, limit_s: float) -> None:
+    Epochs rise from ``first_epoch``: what lies below was given by a former manager.
+    """
+
+    def __init__(
+        self, fleet: Fleet, *, boot_id: str, ttl_s: float, limit_s: float, first_epoch: int = 1
+    ) -> None:
         self.live: dict[str, LeaseRecord] = {}
         self.in_use: Counter[tuple[str, str]] = Counter()
         """Live leases by (worker, scene)."""
@@ -31,15 +36,20 @@ class LeaseBook:
         self._boot_id = boot_id
         self._ttl_s = ttl_s
         self._limit_s = limit_s
-        self._epochs = itertools.count(1)
+        self._first_epoch = first_epoch
+        self._epochs = itertools.count(first_epoch)
         self._due: list[tuple[float, int, LeaseRecord]] = []
         self._ended: OrderedDict[str, str] = OrderedDict()
 
     def give(self, record: RolloutRecord, worker: WorkerRecord, now_s: float) -> LeaseRecord:
         """Lease a rollout that no one holds to the worker."""
         epoch = next(self._epochs)
+        return self.note(LeaseRef(f"{self._boot_id}-{epoch}", epoch), record, worker, now_s)
+
+    def note(self, ref: LeaseRef, record: RolloutRecord, worker: WorkerRecord, now_s: float) -> LeaseRecord:
+        """Enter a lease that the worker holds from now on, or held under a former manager."""
         lease = LeaseRecord(
-            ref=LeaseRef(f"{self._boot_id}-{epoch}", epoch),
+            ref=ref,
             worker_id=worker.worker_id,
             record=record,
             given_s=now_s,
@@ -50,10 +60,19 @@ class LeaseBook:
         record.lease = lease
         self.live[lease.ref.lease_id] = lease
         self._fleet.hold(worker, lease)
-        heapq.heappush(self._due, (lease.due_s, epoch, lease))
+        heapq.heappush(self._due, (lease.due_s, ref.lease_epoch, lease))
         self._used.add((worker.worker_id, record.scene))
         self.in_use[worker.worker_id, record.scene] += 1
         return lease
+
+    def is_former(self, ref: LeaseRef) -> bool:
+        """Whether a former manager gave it."""
+        return ref.lease_epoch < self._first_epoch
+
+    def disown(self, ref: LeaseRef, run_id: str) -> None:
+        """A lease that is not taken up: a result of it is stale."""
+        self._ended[ref.lease_id] = run_id
+        self._forget_ended()
 
     def end(self, lease: LeaseRecord) -> None:
         """The lease is over, whatever its worker still does. The rollout is nobody's until its caller decides."""
@@ -65,6 +84,9 @@ class LeaseBook:
         if not self.in_use[pair]:
             del self.in_use[pair]
         self._ended[lease.ref.lease_id] = lease.record.key.run_id
+        self._forget_ended()
+
+    def _forget_ended(self) -> None:
         while len(self._ended) > STALE_MEMORY:
             self._ended.popitem(last=False)
 

@@ -42,7 +42,9 @@ class WorkerLink:
             case SetDesired():
                 self._outbox.desired = command.bundle_digests
             case GiveLease():
-                self._outbox.leases.append(Lease(command.ref, command.rollout, command.deadline_s))
+                self._outbox.leases.append(
+                    Lease(command.ref, command.rollout, command.deadline_s, command.origin)
+                )
             case CancelLease():
                 self._outbox.cancelled.append(command.ref)
             case AcknowledgeLease():

@@ -6,10 +6,12 @@ import hashlib
 from typing import TYPE_CHECKING
 
 from embomatrix.manager.store.protocol import BatchRow, ResultRow
-from embomatrix.proto.v1 import rollout_service_pb2
+from embomatrix.proto.v1 import rollout_service_pb2, types_pb2
 from embomatrix.rpc.convert import batch_from_proto, batch_to_proto, rollout_result_to_proto
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from embomatrix.rpc.values import Batch, RolloutResult
 
 
@@ -21,6 +23,12 @@ def batch_row(batch: Batch) -> BatchRow:
 
 def batch_of(row: BatchRow) -> Batch:
     return batch_from_proto(rollout_service_pb2.ExecuteRequest.FromString(row.payload))
+
+
+def failed_rows(rows: Iterable[ResultRow]) -> int:
+    """How many of these ended as a failure of the infrastructure."""
+    results = (types_pb2.RolloutResult.FromString(row.payload) for row in rows)
+    return sum(result.WhichOneof("outcome") == "infra_failure" for result in results)
 
 
 def result_row(result: RolloutResult) -> ResultRow:

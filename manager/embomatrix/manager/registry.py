@@ -18,7 +18,7 @@ from embomatrix.manager.events import (
     WorkerRecovered,
     WorkerSuspected,
 )
-from embomatrix.rpc.status import NotFoundError, SupersededError
+from embomatrix.rpc.status import NotFoundError, SupersededError, UnknownSessionError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -95,6 +95,7 @@ class Registry:
         self._lost: OrderedDict[str, Session] = OrderedDict()
         self._worker_of: dict[str, str] = {}
         self._epoch = first_epoch - 1
+        self._first_epoch = first_epoch
 
     @property
     def sessions(self) -> Mapping[str, Session]:
@@ -137,7 +138,14 @@ class Registry:
         return session, [*lost, WorkerJoined(worker_id, resources)]
 
     def find(self, session_id: str, epoch: int) -> Session:
-        """The live session of that name; raises ``SupersededError`` for one that ended, so that its worker stops."""
+        """The live session of that name; raises ``SupersededError`` for one that ended, so that its worker stops.
+
+        ``UnknownSessionError`` for one that a former manager opened: its worker keeps what it holds, and registers.
+        """
+        if epoch < self._first_epoch:
+            raise UnknownSessionError(
+                "this manager took over from the one that opened the session: register again"
+            )
         worker_id = self._worker_of.get(session_id, "")
         session = self._sessions.get(worker_id)
         if session is None or session.session_id != session_id or session.epoch != epoch:

@@ -10,8 +10,8 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.manager.events import BatchCancelled, BatchSubmitted, LookaheadAnnounced
-from embomatrix.manager.records import batch_of, batch_row
+from embomatrix.manager.events import BatchCancelled, BatchRestored, BatchSubmitted, LookaheadAnnounced
+from embomatrix.manager.records import batch_of, batch_row, failed_rows
 from embomatrix.manager.results import BatchLog
 from embomatrix.manager.store.protocol import PutOutcome, RunRow, StateError
 from embomatrix.rpc.status import (
@@ -74,7 +74,6 @@ class Runs:
         self._limits = limits
         self._runs: dict[str, RunRow] = {}
         self._heard_s: dict[str, float] = {}
-        self._dormant: dict[tuple[str, str], BatchSubmitted] = {}
 
     @property
     def open(self) -> Mapping[str, RunRow]:
@@ -82,7 +81,7 @@ class Runs:
         return self._runs
 
     async def restore(self) -> None:
-        """Take up what a former manager left. Its open batches go on when their trainer asks for them again."""
+        """Take up what a former manager left. Its open batches go on at once, whether their trainer asks for them or not."""
         for run in await self._store.runs():
             self._runs[run.run_id] = run
             self._heard_s[run.run_id] = time.monotonic()
@@ -92,7 +91,7 @@ class Runs:
                     log.append(page)
                 self._logs.add(log)
                 delivered = {result.rollout_id: result.cursor for result in log.rows}
-                self._dormant[run.run_id, row.batch_id] = BatchSubmitted(batch_of(row), delivered)
+                self._feed(BatchRestored(batch_of(row), delivered, failed_rows(log.rows)))
         if self._runs:
             logger.info("took up %d runs of a former manager", len(self._runs))
 
@@ -152,16 +151,13 @@ class Runs:
         return log
 
     def log_of(self, run_id: str, batch_id: str) -> BatchLog:
-        """The results of a batch that was submitted; one of a former manager goes on from here."""
+        """The results of a batch that was submitted."""
         self._check_run(run_id)
         log = self._logs.get(run_id, batch_id)
         if log is None:
             raise NotFoundError(
                 f"batch {batch_id!r} of run {run_id!r} is not known (any more): submit it again"
             )
-        dormant = self._dormant.pop((run_id, batch_id), None)
-        if dormant is not None:
-            self._feed(dormant)
         return log
 
     def cancel(self, run_id: str, batch_id: str) -> None:
@@ -173,8 +169,6 @@ class Runs:
         """End the run and forget its results; returns its final counters."""
         self._check_run(run_id)
         del self._runs[run_id], self._heard_s[run_id]
-        for key in [key for key in self._dormant if key[0] == run_id]:
-            del self._dormant[key]
         stats, commands = self._cluster.close_run(run_id, now_s=time.monotonic())
         self._logs.close_run(run_id)
         self._carry_out(commands)

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
     from embomatrix.manager.bundles import BundleStore
     from embomatrix.manager.cluster_state import ClusterState
+    from embomatrix.manager.links import WorkerCommand
     from embomatrix.manager.registry import Registry, Session
     from embomatrix.manager.store.protocol import StateStore
     from embomatrix.rpc.values import LeaseRef, LeaseResult, Resources, WorkerState
@@ -68,7 +69,7 @@ class ManagerRuntime:
         self.runs = Runs(cluster, store, bundles, logs, self._carry_out, limits or RunLimits())
         self.started_s = time.monotonic()
         self._intake = Intake(cluster, registry)
-        self._delivery = Delivery(store, logs)
+        self._delivery = Delivery(store, logs, self._say)
         self._links: dict[str, WorkerLink] = {}
 
     async def start(self) -> None:
@@ -132,17 +133,21 @@ class ManagerRuntime:
     def _carry_out(self, commands: Sequence[Command]) -> None:
         for command in commands:
             match command:
-                case SetDesired() | GiveLease() | CancelLease() | AcknowledgeLease():
-                    # Without a stream the command is lost; the worker's next full state shows that, and it is
-                    # given again.
-                    link = self._links.get(command.worker_id)
-                    if link is not None:
-                        link.put(command)
+                case SetDesired() | GiveLease() | CancelLease():
+                    self._say(command)
+                case AcknowledgeLease():
+                    self._delivery.put_acknowledgement(command)
                 case DeliverResult():
                     self.meter.observe(command.run_id, command.result, time.monotonic())
                     self._delivery.put(command)
                 case FinishBatch():
                     self._delivery.put(command)
+
+    def _say(self, command: WorkerCommand) -> None:
+        """Without a stream the command is lost; the worker's next full state shows that, and it is given again."""
+        link = self._links.get(command.worker_id)
+        if link is not None:
+            link.put(command)
 
     def _close_link(self, worker_id: str) -> None:
         link = self._links.pop(worker_id, None)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.commands import Command, SetDesired
 from embomatrix.manager.events import (
+    BatchRestored,
     BatchSubmitted,
     DemandObserved,
     Event,
@@ -130,6 +131,8 @@ class Scheduler:
                 return Urgency.NOW
             case BatchSubmitted():
                 return self._on_submitted(event)
+            case BatchRestored():
+                return Urgency.LATER
             case RunClosed(run_id):
                 self.windows.pop(run_id, None)
             case WorkerReported():

@@ -61,6 +61,8 @@ class ManagerSettings(BaseModel):
     """How long rollouts wait for workers that have their scene before idle ones load it, while its load time isn't known."""
     max_attempts: int = Field(3, ge=1)
     """Started leases of one rollout before it ends as an infrastructure failure."""
+    restart_grace_s: float = Field(5.0, ge=0)
+    """How long a manager that took over waits for workers to say what they run, before it gives the same to others."""
     results_ttl_s: float = Field(3600.0, gt=0)
     """How long results are kept after their batch ended."""
 

@@ -136,20 +136,6 @@ def test_the_batch_ends_after_its_last_result_with_cursors_from_one(table):
     assert [result.cursor for result in table.results.values()] == [1, 2, 3]
 
 
-def test_an_empty_rest_of_a_restored_batch_ends_at_once(table):
-    rollout = Rollout("x", "g", "kitchen", "t", (), 0)
-    commands = table.tell(BatchSubmitted(Batch("r1", "b1", 1, (rollout,)), {"x": 1}))
-    assert commands == [FinishBatch("r1", "b1")]
-
-
-def test_cursors_of_a_restored_batch_continue(table):
-    table.worker()
-    rollouts = tuple(Rollout(name, "g", "kitchen", "t", (), 0) for name in ("x", "y"))
-    (lease,) = leases(table.tell(BatchSubmitted(Batch("r1", "b1", 1, rollouts), {"x": 7})))
-    table.finish(lease)
-    assert table.results["y"].cursor == 8
-
-
 def test_a_lost_worker_gives_its_rollouts_back_at_once(table):
     table.worker("w1", slots=2)
     table.submit(4)

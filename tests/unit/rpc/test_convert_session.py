@@ -13,6 +13,8 @@ from embomatrix.rpc.values import (
     InfraCode,
     InfraFailure,
     Lease,
+    LeaseClaim,
+    LeaseOrigin,
     LeaseProgress,
     LeaseRef,
     LeaseResult,
@@ -33,6 +35,7 @@ from embomatrix.skills.syntax import Skill, SkillCall
 NAMES = st.text("abcdefgh-0123", min_size=1, max_size=12)
 SECONDS = st.floats(0.001, 1e6)
 REFS = st.builds(LeaseRef, NAMES, st.integers(0, 2**64 - 1))
+ORIGINS = st.builds(LeaseOrigin, NAMES, NAMES, NAMES, st.integers(1, 9))
 RESIDENTS = st.builds(Resident, NAMES, st.sampled_from(ResidentState), SECONDS, SECONDS, NAMES)
 COMPLETED = st.builds(
     Completed,
@@ -54,6 +57,7 @@ STATES = st.builds(
     st.lists(RESULTS, max_size=3).map(tuple),
     st.booleans(),
     NAMES | st.just(""),
+    st.lists(st.builds(LeaseClaim, REFS, ORIGINS), max_size=3).map(tuple),
 )
 PLAN = (SkillCall(Skill.TURN, yaw=0.5),)
 

@@ -15,7 +15,8 @@ class Backoff:
 
     rng: np.random.Generator
     first_s: float = 0.2
-    longest_s: float = 20.0
+    longest_s: float = 4.0
+    """A manager that comes back has its workers within five seconds."""
     _attempts: int = 0
 
     def next_s(self) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import math
 import secrets
 import time
 from dataclasses import replace
@@ -17,6 +18,7 @@ from embomatrix.rpc.status import (
     OverloadedError,
     SupersededError,
     UnavailableError,
+    UnknownSessionError,
 )
 from embomatrix.rpc.values import Completed, InfraCode
 from embomatrix.worker.backoff import Backoff
@@ -77,6 +79,8 @@ class Daemon:
             program=program,
         )
         self._session: Session | None = None
+        self._renewed_s = time.monotonic()
+        self._lease_ttl_s = math.inf
         self._registration: Registration | None = None
         self._takeovers: list[float] = []
         self._draining = asyncio.Event()
@@ -137,6 +141,10 @@ class Daemon:
                     self._registration = await self._register()
                 await self._serve(self._registration)
                 return
+            except UnknownSessionError as error:
+                # A manager took over. It takes up what is held here once this worker has said what that is.
+                self._registration = None
+                await self._wait_before_next(error)
             except SupersededError as error:
                 self._give_up_leases(str(error))
                 self._count_takeover(error)
@@ -173,8 +181,14 @@ class Daemon:
         return registration
 
     async def _serve(self, registration: Registration) -> None:
+        self._lease_ttl_s = registration.lease_ttl_s
         session = Session(
-            self._settings.manager, self._settings.token, registration, self._pool, self._outbox
+            self._settings.manager,
+            self._settings.token,
+            registration,
+            self._pool,
+            self._outbox,
+            renewed_s=self._renewed(),
         )
         if self._draining.is_set():
             session.drain()
@@ -193,11 +207,15 @@ class Daemon:
         """Stop executing what can't be renewed: the manager has given it to others by then."""
         while True:
             await asyncio.sleep(FENCE_CHECK_S)
-            if self._session is None or self._registration is None or not self._pool.held():
-                continue
-            silent_s = time.monotonic() - self._session.renewed_s
-            if silent_s > self._registration.lease_ttl_s:
+            silent_s = time.monotonic() - self._renewed()
+            if self._pool.held() and silent_s > self._lease_ttl_s:
                 self._give_up_leases(f"no heartbeat was answered for {silent_s:.0f} s")
+
+    def _renewed(self) -> float:
+        """When a manager last renewed what is held here, in whichever session."""
+        if self._session is not None:
+            self._renewed_s = max(self._renewed_s, self._session.renewed_s)
+        return self._renewed_s
 
     def _give_up_leases(self, reason: str) -> None:
         held = self._pool.held()

@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.rpc.values import LeaseClaim
+
 if TYPE_CHECKING:
     from embomatrix.rpc.values import LeaseRef, LeaseResult
 
@@ -38,6 +40,14 @@ class Outbox:
         """Forget a result; one that is not kept is ignored."""
         self._results.pop(ref, None)
         self._unsent.pop(ref, None)
+
+    def claims(self) -> tuple[LeaseClaim, ...]:
+        """What the results that are kept are for."""
+        return tuple(
+            LeaseClaim(result.ref, result.origin)
+            for result in self._results.values()
+            if result.origin is not None
+        )
 
     def take_unsent(self, count: int) -> tuple[LeaseResult, ...]:
         """Up to ``count`` results that this stream has not carried yet."""

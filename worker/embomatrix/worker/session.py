@@ -84,7 +84,14 @@ class Session:
     """The streams of one connection. ``serve`` ends with a ClusterError, or without one once the worker has drained."""
 
     def __init__(
-        self, address: str, token: str, registration: Registration, pool: SlotPool, outbox: Outbox
+        self,
+        address: str,
+        token: str,
+        registration: Registration,
+        pool: SlotPool,
+        outbox: Outbox,
+        *,
+        renewed_s: float,
     ) -> None:
         self._address = address
         self._token = token
@@ -97,8 +104,8 @@ class Session:
         self._data_channel: grpc.aio.Channel | None = None
         self.attached = asyncio.Event()
         """Set once the manager was heard on the stream."""
-        self.renewed_s = time.monotonic()
-        """When the manager last renewed the leases."""
+        self.renewed_s = renewed_s
+        """When a manager last renewed the leases, in this session or before it."""
 
     def tell(self) -> None:
         """There are results to send."""
@@ -159,7 +166,10 @@ class Session:
         stub = worker_service_pb2_grpc.WorkerServiceStub(channel)
         with cluster_errors(self._address):
             async for response in stub.Session(self._requests()):
-                self.attached.set()
+                if not self.attached.is_set():
+                    # The manager answers once it has heard the full state, which renews what it names.
+                    self.renewed_s = time.monotonic()
+                    self.attached.set()
                 self._take(response)
         if not self._drained():
             raise UnavailableError(f"the manager at {self._address} ended the session")
@@ -168,8 +178,11 @@ class Session:
         """Full state first; then results as they come, and the state again whenever it changed."""
         self._outbox.begin_stream()
         finished = self._outbox.take_unsent(len(self._outbox))
+        claims = (*self._pool.claims(), *self._outbox.claims())
         yield self._request(
-            state=WorkerState(self._pool.residents(), self._pool.held(), finished, self._draining)
+            state=WorkerState(
+                self._pool.residents(), self._pool.held(), finished, self._draining, claims=claims
+            )
         )
         while not self._drained():
             await self._news.wait()

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.proto.v1 import types_pb2
 from embomatrix.rpc.convert import completed_from_proto, rollout_to_proto
-from embomatrix.rpc.values import InfraCode, InfraFailure, LeaseResult, ResidentState, Timings
+from embomatrix.rpc.values import InfraCode, InfraFailure, LeaseClaim, LeaseResult, ResidentState, Timings
 from embomatrix.sim.zygote import Frame
 from embomatrix.worker.processes import SIMULATOR_PROGRAM, ProcessGoneError
 from embomatrix.worker.residents import Residents
@@ -93,6 +93,11 @@ class SlotPool:
     def held(self) -> tuple[LeaseRef, ...]:
         """Leases that wait or run here: those to renew."""
         return tuple(self._tickets)
+
+    def claims(self) -> tuple[LeaseClaim, ...]:
+        """What these leases are for."""
+        leases = (ticket.lease for ticket in self._tickets.values())
+        return tuple(LeaseClaim(lease.ref, lease.origin) for lease in leases if lease.origin is not None)
 
     def want(self, digests: Iterable[str]) -> None:
         """Replace the scenes that should be resident, the most urgent first."""
@@ -243,7 +248,7 @@ class SlotPool:
 
     def _finish(self, ticket: _Ticket, outcome: Completed | InfraFailure) -> None:
         if self._tickets.pop(ticket.lease.ref, None) is not None:
-            self._on_result(LeaseResult(ticket.lease.ref, outcome))
+            self._on_result(LeaseResult(ticket.lease.ref, outcome, ticket.lease.origin))
 
 
 def _worn(slot: Slot, resident_mb: float) -> bool:

@@ -1,6 +1,6 @@
 """What the manager writes down, so that another process of it can go on: runs, batches, and delivered results.
 
-Leases are not among it: they rest on sessions, which end with the process. Rollouts without a result are executed again.
+Leases are not among it: the workers that hold them say so when they come back.
 """
 
 from __future__ import annotations

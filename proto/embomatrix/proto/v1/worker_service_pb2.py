@@ -25,15 +25,15 @@ _sym_db = _symbol_database.Default()
 from embomatrix.proto.v1 import types_pb2 as embomatrix_dot_proto_dot_v1_dot_types__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n(embomatrix/proto/v1/worker_service.proto\x12\x13\x65mbomatrix.proto.v1\x1a\x1f\x65mbomatrix/proto/v1/types.proto\"\xac\x01\n\x0fRegisterRequest\x12\x11\n\tworker_id\x18\x01 \x01(\t\x12\x0f\n\x07\x62oot_id\x18\x02 \x01(\t\x12\x18\n\x10protocol_version\x18\x03 \x01(\r\x12\x31\n\tresources\x18\x04 \x01(\x0b\x32\x1e.embomatrix.proto.v1.Resources\x12\x12\n\njoin_token\x18\x05 \x01(\t\x12\x14\n\x0cprotocol_low\x18\x06 \x01(\r\"\x9e\x01\n\x10RegisterResponse\x12\x12\n\nsession_id\x18\x01 \x01(\t\x12\x15\n\rsession_epoch\x18\x02 \x01(\x04\x12\x1c\n\x14heartbeat_interval_s\x18\x03 \x01(\x01\x12\x13\n\x0blease_ttl_s\x18\x04 \x01(\x01\x12\x18\n\x10protocol_version\x18\x05 \x01(\r\x12\x12\n\ncredential\x18\x06 \x01(\t\">\n\x11\x44\x65registerRequest\x12\x12\n\nsession_id\x18\x01 \x01(\t\x12\x15\n\rsession_epoch\x18\x02 \x01(\x04\"\x14\n\x12\x44\x65registerResponse\"\x86\x01\n\x08Resident\x12\x15\n\rbundle_digest\x18\x01 \x01(\t\x12\x31\n\x05state\x18\x02 \x01(\x0e\x32\".embomatrix.proto.v1.ResidentState\x12\x0e\n\x06load_s\x18\x03 \x01(\x01\x12\x11\n\tmemory_mb\x18\x04 \x01(\x01\x12\r\n\x05\x65rror\x18\x05 \x01(\t\"1\n\x08LeaseRef\x12\x10\n\x08lease_id\x18\x01 \x01(\t\x12\x13\n\x0blease_epoch\x18\x02 \x01(\x04\"\xc5\x01\n\x0bWorkerState\x12\x30\n\tresidents\x18\x01 \x03(\x0b\x32\x1d.embomatrix.proto.v1.Resident\x12.\n\x07running\x18\x02 \x03(\x0b\x32\x1d.embomatrix.proto.v1.LeaseRef\x12\x32\n\x08\x66inished\x18\x03 \x03(\x0b\x32 .embomatrix.proto.v1.LeaseResult\x12\x10\n\x08\x64raining\x18\x04 \x01(\x08\x12\x0e\n\x06paused\x18\x05 \x01(\t\"\xb7\x01\n\x0bLeaseResult\x12,\n\x05lease\x18\x01 \x01(\x0b\x32\x1d.embomatrix.proto.v1.LeaseRef\x12\x33\n\tcompleted\x18\x02 \x01(\x0b\x32\x1e.embomatrix.proto.v1.CompletedH\x00\x12:\n\rinfra_failure\x18\x03 \x01(\x0b\x32!.embomatrix.proto.v1.InfraFailureH\x00\x42\t\n\x07outcome\"\x9f\x01\n\x0eSessionRequest\x12\x12\n\nsession_id\x18\x01 \x01(\t\x12\x15\n\rsession_epoch\x18\x02 \x01(\x04\x12/\n\x05state\x18\x03 \x01(\x0b\x32 .embomatrix.proto.v1.WorkerState\x12\x31\n\x07results\x18\x04 \x03(\x0b\x32 .embomatrix.proto.v1.LeaseResult\"\xab\x01\n\x05Lease\x12*\n\x03ref\x18\x01 \x01(\x0b\x32\x1d.embomatrix.proto.v1.LeaseRef\x12-\n\x07rollout\x18\x02 \x01(\x0b\x32\x1c.embomatrix.proto.v1.Rollout\x12\x12\n\ndeadline_s\x18\x03 \x01(\x01\x12\x33\n\x06reward\x18\x04 \x01(\x0b\x32#.embomatrix.proto.v1.RewardSettings\"\xfb\x01\n\x0fSessionResponse\x12\x36\n\x07\x64\x65sired\x18\x01 \x01(\x0b\x32%.embomatrix.proto.v1.DesiredResidents\x12*\n\x06leases\x18\x02 \x03(\x0b\x32\x1a.embomatrix.proto.v1.Lease\x12\x33\n\x0c\x61\x63knowledged\x18\x03 \x03(\x0b\x32\x1d.embomatrix.proto.v1.LeaseRef\x12\x30\n\tcancelled\x18\x04 \x03(\x0b\x32\x1d.embomatrix.proto.v1.LeaseRef\x12\r\n\x05\x64rain\x18\x05 \x01(\x08\x12\x0e\n\x06resume\x18\x06 \x01(\x08\"*\n\x10\x44\x65siredResidents\x12\x16\n\x0e\x62undle_digests\x18\x01 \x03(\t\"J\n\rLeaseProgress\x12*\n\x03ref\x18\x01 \x01(\x0b\x32\x1d.embomatrix.proto.v1.LeaseRef\x12\r\n\x05steps\x18\x02 \x01(\x04\"\xc9\x01\n\x10HeartbeatRequest\x12\x12\n\nsession_id\x18\x01 \x01(\t\x12\x15\n\rsession_epoch\x18\x02 \x01(\x04\x12.\n\x07running\x18\x03 \x03(\x0b\x32\x1d.embomatrix.proto.v1.LeaseRef\x12\x0c\n\x04load\x18\x04 \x01(\x01\x12\x16\n\x0ememory_used_mb\x18\x05 \x01(\x04\x12\x34\n\x08progress\x18\x06 \x03(\x0b\x32\".embomatrix.proto.v1.LeaseProgress\",\n\x11HeartbeatResponse\x12\x17\n\x0fnext_interval_s\x18\x01 \x01(\x01\"?\n\x12\x46\x65tchBundleRequest\x12\x12\n\nsession_id\x18\x01 \x01(\t\x12\x15\n\rbundle_digest\x18\x02 \x01(\t\"$\n\x13\x46\x65tchBundleResponse\x12\r\n\x05\x63hunk\x18\x01 \x01(\x0c*\x7f\n\rResidentState\x12\x1e\n\x1aRESIDENT_STATE_UNSPECIFIED\x10\x00\x12\x1a\n\x16RESIDENT_STATE_LOADING\x10\x01\x12\x17\n\x13RESIDENT_STATE_WARM\x10\x02\x12\x19\n\x15RESIDENT_STATE_FAILED\x10\x03\x32\xe1\x03\n\rWorkerService\x12W\n\x08Register\x12$.embomatrix.proto.v1.RegisterRequest\x1a%.embomatrix.proto.v1.RegisterResponse\x12X\n\x07Session\x12#.embomatrix.proto.v1.SessionRequest\x1a$.embomatrix.proto.v1.SessionResponse(\x01\x30\x01\x12Z\n\tHeartbeat\x12%.embomatrix.proto.v1.HeartbeatRequest\x1a&.embomatrix.proto.v1.HeartbeatResponse\x12\x62\n\x0b\x46\x65tchBundle\x12\'.embomatrix.proto.v1.FetchBundleRequest\x1a(.embomatrix.proto.v1.FetchBundleResponse0\x01\x12]\n\nDeregister\x12&.embomatrix.proto.v1.DeregisterRequest\x1a\'.embomatrix.proto.v1.DeregisterResponseb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n(embomatrix/proto/v1/worker_service.proto\x12\x13\x65mbomatrix.proto.v1\x1a\x1f\x65mbomatrix/proto/v1/types.proto\"\xac\x01\n\x0fRegisterRequest\x12\x11\n\tworker_id\x18\x01 \x01(\t\x12\x0f\n\x07\x62oot_id\x18\x02 \x01(\t\x12\x18\n\x10protocol_version\x18\x03 \x01(\r\x12\x31\n\tresources\x18\x04 \x01(\x0b\x32\x1e.embomatrix.proto.v1.Resources\x12\x12\n\njoin_token\x18\x05 \x01(\t\x12\x14\n\x0cprotocol_low\x18\x06 \x01(\r\"\x9e\x01\n\x10RegisterResponse\x12\x12\n\nsession_id\x18\x01 \x01(\t\x12\x15\n\rsession_epoch\x18\x02 \x01(\x04\x12\x1c\n\x14heartbeat_interval_s\x18\x03 \x01(\x01\x12\x13\n\x0blease_ttl_s\x18\x04 \x01(\x01\x12\x18\n\x10protocol_version\x18\x05 \x01(\r\x12\x12\n\ncredential\x18\x06 \x01(\t\">\n\x11\x44\x65registerRequest\x12\x12\n\nsession_id\x18\x01 \x01(\t\x12\x15\n\rsession_epoch\x18\x02 \x01(\x04\"\x14\n\x12\x44\x65registerResponse\"\x86\x01\n\x08Resident\x12\x15\n\rbundle_digest\x18\x01 \x01(\t\x12\x31\n\x05state\x18\x02 \x01(\x0e\x32\".embomatrix.proto.v1.ResidentState\x12\x0e\n\x06load_s\x18\x03 \x01(\x01\x12\x11\n\tmemory_mb\x18\x04 \x01(\x01\x12\r\n\x05\x65rror\x18\x05 \x01(\t\"1\n\x08LeaseRef\x12\x10\n\x08lease_id\x18\x01 \x01(\t\x12\x13\n\x0blease_epoch\x18\x02 \x01(\x04\"T\n\x0bLeaseOrigin\x12\x0e\n\x06run_id\x18\x01 \x01(\t\x12\x10\n\x08\x62\x61tch_id\x18\x02 \x01(\t\x12\x12\n\nrollout_id\x18\x03 \x01(\t\x12\x0f\n\x07\x61ttempt\x18\x04 \x01(\r\"j\n\nLeaseClaim\x12*\n\x03ref\x18\x01 \x01(\x0b\x32\x1d.embomatrix.proto.v1.LeaseRef\x12\x30\n\x06origin\x18\x02 \x01(\x0b\x32 .embomatrix.proto.v1.LeaseOrigin\"\xf6\x01\n\x0bWorkerState\x12\x30\n\tresidents\x18\x01 \x03(\x0b\x32\x1d.embomatrix.proto.v1.Resident\x12.\n\x07running\x18\x02 \x03(\x0b\x32\x1d.embomatrix.proto.v1.LeaseRef\x12\x32\n\x08\x66inished\x18\x03 \x03(\x0b\x32 .embomatrix.proto.v1.LeaseResult\x12\x10\n\x08\x64raining\x18\x04 \x01(\x08\x12\x0e\n\x06paused\x18\x05 \x01(\t\x12/\n\x06\x63laims\x18\x06 \x03(\x0b\x32\x1f.embomatrix.proto.v1.LeaseClaim\"\xb7\x01\n\x0bLeaseResult\x12,\n\x05lease\x18\x01 \x01(\x0b\x32\x1d.embomatrix.proto.v1.LeaseRef\x12\x33\n\tcompleted\x18\x02 \x01(\x0b\x32\x1e.embomatrix.proto.v1.CompletedH\x00\x12:\n\rinfra_failure\x18\x03 \x01(\x0b\x32!.embomatrix.proto.v1.InfraFailureH\x00\x42\t\n\x07outcome\"\x9f\x01\n\x0eSessionRequest\x12\x12\n\nsession_id\x18\x01 \x01(\t\x12\x15\n\rsession_epoch\x18\x02 \x01(\x04\x12/\n\x05state\x18\x03 \x01(\x0b\x32 .embomatrix.proto.v1.WorkerState\x12\x31\n\x07results\x18\x04 \x03(\x0b\x32 .embomatrix.proto.v1.LeaseResult\"\xdd\x01\n\x05Lease\x12*\n\x03ref\x18\x01 \x01(\x0b\x32\x1d.embomatrix.proto.v1.LeaseRef\x12-\n\x07rollout\x18\x02 \x01(\x0b\x32\x1c.embomatrix.proto.v1.Rollout\x12\x12\n\ndeadline_s\x18\x03 \x01(\x01\x12\x33\n\x06reward\x18\x04 \x01(\x0b\x32#.embomatrix.proto.v1.RewardSettings\x12\x30\n\x06origin\x18\x05 \x01(\x0b\x32 .embomatrix.proto.v1.LeaseOrigin\"\xfb\x01\n\x0fSessionResponse\x12\x36\n\x07\x64\x65sired\x18\x01 \x01(\x0b\x32%.embomatrix.proto.v1.DesiredResidents\x12*\n\x06leases\x18\x02 \x03(\x0b\x32\x1a.embomatrix.proto.v1.Lease\x12\x33\n\x0c\x61\x63knowledged\x18\x03 \x03(\x0b\x32\x1d.embomatrix.proto.v1.LeaseRef\x12\x30\n\tcancelled\x18\x04 \x03(\x0b\x32\x1d.embomatrix.proto.v1.LeaseRef\x12\r\n\x05\x64rain\x18\x05 \x01(\x08\x12\x0e\n\x06resume\x18\x06 \x01(\x08\"*\n\x10\x44\x65siredResidents\x12\x16\n\x0e\x62undle_digests\x18\x01 \x03(\t\"J\n\rLeaseProgress\x12*\n\x03ref\x18\x01 \x01(\x0b\x32\x1d.embomatrix.proto.v1.LeaseRef\x12\r\n\x05steps\x18\x02 \x01(\x04\"\xc9\x01\n\x10HeartbeatRequest\x12\x12\n\nsession_id\x18\x01 \x01(\t\x12\x15\n\rsession_epoch\x18\x02 \x01(\x04\x12.\n\x07running\x18\x03 \x03(\x0b\x32\x1d.embomatrix.proto.v1.LeaseRef\x12\x0c\n\x04load\x18\x04 \x01(\x01\x12\x16\n\x0ememory_used_mb\x18\x05 \x01(\x04\x12\x34\n\x08progress\x18\x06 \x03(\x0b\x32\".embomatrix.proto.v1.LeaseProgress\",\n\x11HeartbeatResponse\x12\x17\n\x0fnext_interval_s\x18\x01 \x01(\x01\"?\n\x12\x46\x65tchBundleRequest\x12\x12\n\nsession_id\x18\x01 \x01(\t\x12\x15\n\rbundle_digest\x18\x02 \x01(\t\"$\n\x13\x46\x65tchBundleResponse\x12\r\n\x05\x63hunk\x18\x01 \x01(\x0c*\x7f\n\rResidentState\x12\x1e\n\x1aRESIDENT_STATE_UNSPECIFIED\x10\x00\x12\x1a\n\x16RESIDENT_STATE_LOADING\x10\x01\x12\x17\n\x13RESIDENT_STATE_WARM\x10\x02\x12\x19\n\x15RESIDENT_STATE_FAILED\x10\x03\x32\xe1\x03\n\rWorkerService\x12W\n\x08Register\x12$.embomatrix.proto.v1.RegisterRequest\x1a%.embomatrix.proto.v1.RegisterResponse\x12X\n\x07Session\x12#.embomatrix.proto.v1.SessionRequest\x1a$.embomatrix.proto.v1.SessionResponse(\x01\x30\x01\x12Z\n\tHeartbeat\x12%.embomatrix.proto.v1.HeartbeatRequest\x1a&.embomatrix.proto.v1.HeartbeatResponse\x12\x62\n\x0b\x46\x65tchBundle\x12\'.embomatrix.proto.v1.FetchBundleRequest\x1a(.embomatrix.proto.v1.FetchBundleResponse0\x01\x12]\n\nDeregister\x12&.embomatrix.proto.v1.DeregisterRequest\x1a\'.embomatrix.proto.v1.DeregisterResponseb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'embomatrix.proto.v1.worker_service_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_RESIDENTSTATE']._serialized_start=2157
-  _globals['_RESIDENTSTATE']._serialized_end=2284
+  _globals['_RESIDENTSTATE']._serialized_start=2450
+  _globals['_RESIDENTSTATE']._serialized_end=2577
   _globals['_REGISTERREQUEST']._serialized_start=99
   _globals['_REGISTERREQUEST']._serialized_end=271
   _globals['_REGISTERRESPONSE']._serialized_start=274
@@ -46,28 +46,32 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_RESIDENT']._serialized_end=655
   _globals['_LEASEREF']._serialized_start=657
   _globals['_LEASEREF']._serialized_end=706
-  _globals['_WORKERSTATE']._serialized_start=709
-  _globals['_WORKERSTATE']._serialized_end=906
-  _globals['_LEASERESULT']._serialized_start=909
-  _globals['_LEASERESULT']._serialized_end=1092
-  _globals['_SESSIONREQUEST']._serialized_start=1095
-  _globals['_SESSIONREQUEST']._serialized_end=1254
-  _globals['_LEASE']._serialized_start=1257
-  _globals['_LEASE']._serialized_end=1428
-  _globals['_SESSIONRESPONSE']._serialized_start=1431
-  _globals['_SESSIONRESPONSE']._serialized_end=1682
-  _globals['_DESIREDRESIDENTS']._serialized_start=1684
-  _globals['_DESIREDRESIDENTS']._serialized_end=1726
-  _globals['_LEASEPROGRESS']._serialized_start=1728
-  _globals['_LEASEPROGRESS']._serialized_end=1802
-  _globals['_HEARTBEATREQUEST']._serialized_start=1805
-  _globals['_HEARTBEATREQUEST']._serialized_end=2006
-  _globals['_HEARTBEATRESPONSE']._serialized_start=2008
-  _globals['_HEARTBEATRESPONSE']._serialized_end=2052
-  _globals['_FETCHBUNDLEREQUEST']._serialized_start=2054
-  _globals['_FETCHBUNDLEREQUEST']._serialized_end=2117
-  _globals['_FETCHBUNDLERESPONSE']._serialized_start=2119
-  _globals['_FETCHBUNDLERESPONSE']._serialized_end=2155
-  _globals['_WORKERSERVICE']._serialized_start=2287
-  _globals['_WORKERSERVICE']._serialized_end=2768
+  _globals['_LEASEORIGIN']._serialized_start=708
+  _globals['_LEASEORIGIN']._serialized_end=792
+  _globals['_LEASECLAIM']._serialized_start=794
+  _globals['_LEASECLAIM']._serialized_end=900
+  _globals['_WORKERSTATE']._serialized_start=903
+  _globals['_WORKERSTATE']._serialized_end=1149
+  _globals['_LEASERESULT']._serialized_start=1152
+  _globals['_LEASERESULT']._serialized_end=1335
+  _globals['_SESSIONREQUEST']._serialized_start=1338
+  _globals['_SESSIONREQUEST']._serialized_end=1497
+  _globals['_LEASE']._serialized_start=1500
+  _globals['_LEASE']._serialized_end=1721
+  _globals['_SESSIONRESPONSE']._serialized_start=1724
+  _globals['_SESSIONRESPONSE']._serialized_end=1975
+  _globals['_DESIREDRESIDENTS']._serialized_start=1977
+  _globals['_DESIREDRESIDENTS']._serialized_end=2019
+  _globals['_LEASEPROGRESS']._serialized_start=2021
+  _globals['_LEASEPROGRESS']._serialized_end=2095
+  _globals['_HEARTBEATREQUEST']._serialized_start=2098
+  _globals['_HEARTBEATREQUEST']._serialized_end=2299
+  _globals['_HEARTBEATRESPONSE']._serialized_start=2301
+  _globals['_HEARTBEATRESPONSE']._serialized_end=2345
+  _globals['_FETCHBUNDLEREQUEST']._serialized_start=2347
+  _globals['_FETCHBUNDLEREQUEST']._serialized_end=2410
+  _globals['_FETCHBUNDLERESPONSE']._serialized_start=2412
+  _globals['_FETCHBUNDLERESPONSE']._serialized_end=2448
+  _globals['_WORKERSERVICE']._serialized_start=2580
+  _globals['_WORKERSERVICE']._serialized_end=3061
 # @@protoc_insertion_point(module_scope)

@@ -182,6 +182,55 @@ class LeaseRef(google.protobuf.message.Message):
 Global___LeaseRef: typing_extensions.TypeAlias = LeaseRef
 
 @typing.final
+class LeaseOrigin(google.protobuf.message.Message):
+    """Which rollout a lease is for, and which attempt at it this is: enough for a manager to take up a lease that a
+    former one gave.
+    """
+
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    RUN_ID_FIELD_NUMBER: builtins.int
+    BATCH_ID_FIELD_NUMBER: builtins.int
+    ROLLOUT_ID_FIELD_NUMBER: builtins.int
+    ATTEMPT_FIELD_NUMBER: builtins.int
+    run_id: builtins.str
+    batch_id: builtins.str
+    rollout_id: builtins.str
+    attempt: builtins.int
+    def __init__(
+        self,
+        *,
+        run_id: builtins.str = ...,
+        batch_id: builtins.str = ...,
+        rollout_id: builtins.str = ...,
+        attempt: builtins.int = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["attempt", b"attempt", "batch_id", b"batch_id", "rollout_id", b"rollout_id", "run_id", b"run_id"]) -> None: ...
+
+Global___LeaseOrigin: typing_extensions.TypeAlias = LeaseOrigin
+
+@typing.final
+class LeaseClaim(google.protobuf.message.Message):
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    REF_FIELD_NUMBER: builtins.int
+    ORIGIN_FIELD_NUMBER: builtins.int
+    @property
+    def ref(self) -> Global___LeaseRef: ...
+    @property
+    def origin(self) -> Global___LeaseOrigin: ...
+    def __init__(
+        self,
+        *,
+        ref: Global___LeaseRef | None = ...,
+        origin: Global___LeaseOrigin | None = ...,
+    ) -> None: ...
+    def HasField(self, field_name: typing.Literal["origin", b"origin", "ref", b"ref"]) -> builtins.bool: ...
+    def ClearField(self, field_name: typing.Literal["origin", b"origin", "ref", b"ref"]) -> None: ...
+
+Global___LeaseClaim: typing_extensions.TypeAlias = LeaseClaim
+
+@typing.final
 class WorkerState(google.protobuf.message.Message):
     """Everything the worker holds at this moment."""
 
@@ -192,6 +241,7 @@ class WorkerState(google.protobuf.message.Message):
     FINISHED_FIELD_NUMBER: builtins.int
     DRAINING_FIELD_NUMBER: builtins.int
     PAUSED_FIELD_NUMBER: builtins.int
+    CLAIMS_FIELD_NUMBER: builtins.int
     draining: builtins.bool
     paused: builtins.str
     """Why the worker takes nothing new for now, though it stays; empty while it works."""
@@ -201,6 +251,10 @@ class WorkerState(google.protobuf.message.Message):
     def running(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___LeaseRef]: ...
     @property
     def finished(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___LeaseResult]: ...
+    @property
+    def claims(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___LeaseClaim]:
+        """In the first state of a stream: what every lease in `running` and `finished` is for."""
+
     def __init__(
         self,
         *,
@@ -209,8 +263,9 @@ class WorkerState(google.protobuf.message.Message):
         finished: collections.abc.Iterable[Global___LeaseResult] | None = ...,
         draining: builtins.bool = ...,
         paused: builtins.str = ...,
+        claims: collections.abc.Iterable[Global___LeaseClaim] | None = ...,
     ) -> None: ...
-    def ClearField(self, field_name: typing.Literal["draining", b"draining", "finished", b"finished", "paused", b"paused", "residents", b"residents", "running", b"running"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["claims", b"claims", "draining", b"draining", "finished", b"finished", "paused", b"paused", "residents", b"residents", "running", b"running"]) -> None: ...
 
 Global___WorkerState: typing_extensions.TypeAlias = WorkerState
 
@@ -279,6 +334,7 @@ class Lease(google.protobuf.message.Message):
     ROLLOUT_FIELD_NUMBER: builtins.int
     DEADLINE_S_FIELD_NUMBER: builtins.int
     REWARD_FIELD_NUMBER: builtins.int
+    ORIGIN_FIELD_NUMBER: builtins.int
     deadline_s: builtins.float
     @property
     def ref(self) -> Global___LeaseRef: ...
@@ -288,6 +344,10 @@ class Lease(google.protobuf.message.Message):
     def reward(self) -> embomatrix.proto.v1.types_pb2.RewardSettings:
         """The run's coefficients; absent for the worker's defaults."""
 
+    @property
+    def origin(self) -> Global___LeaseOrigin:
+        """The worker repeats it in its claims."""
+
     def __init__(
         self,
         *,
@@ -295,9 +355,10 @@ class Lease(google.protobuf.message.Message):
         rollout: embomatrix.proto.v1.types_pb2.Rollout | None = ...,
         deadline_s: builtins.float = ...,
         reward: embomatrix.proto.v1.types_pb2.RewardSettings | None = ...,
+        origin: Global___LeaseOrigin | None = ...,
     ) -> None: ...
-    def HasField(self, field_name: typing.Literal["ref", b"ref", "reward", b"reward", "rollout", b"rollout"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["deadline_s", b"deadline_s", "ref", b"ref", "reward", b"reward", "rollout", b"rollout"]) -> None: ...
+    def HasField(self, field_name: typing.Literal["origin", b"origin", "ref", b"ref", "reward", b"reward", "rollout", b"rollout"]) -> builtins.bool: ...
+    def ClearField(self, field_name: typing.Literal["deadline_s", b"deadline_s", "origin", b"origin", "ref", b"ref", "reward", b"reward", "rollout", b"rollout"]) -> None: ...
 
 Global___Lease: typing_extensions.TypeAlias = Lease
 

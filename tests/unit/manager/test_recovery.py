@@ -1,0 +1,224 @@
+"""A manager that took over: what workers still hold is taken up, what nobody holds is given out after a while."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from tests.fakes.worker import completed
+
+from embomatrix.manager.assignments import DispatchLimits
+from embomatrix.manager.commands import AcknowledgeLease, CancelLease, DeliverResult, FinishBatch, GiveLease
+from embomatrix.manager.dispatcher import Dispatcher
+from embomatrix.manager.events import (
+    BatchCancelled,
+    BatchRestored,
+    BatchSubmitted,
+    LeaseFinished,
+    Tick,
+    WorkerJoined,
+    WorkerLost,
+    WorkerReported,
+)
+from embomatrix.rpc.values import (
+    Batch,
+    LeaseClaim,
+    LeaseOrigin,
+    LeaseRef,
+    Resident,
+    ResidentState,
+    Resources,
+    Rollout,
+)
+
+GRACE_S = 5.0
+FIRST_EPOCH = 1 << 32
+WARM = (Resident("kitchen", ResidentState.WARM),)
+
+
+def batch(count, batch_id="b1"):
+    return Batch("r1", batch_id, 1, tuple(Rollout(f"x{i}", "g", "kitchen", "t", (), 0) for i in range(count)))
+
+
+def claim(rollout_id, epoch=1, attempt=1, batch_id="b1"):
+    return LeaseClaim(LeaseRef(f"old-{epoch}", epoch), LeaseOrigin("r1", batch_id, rollout_id, attempt))
+
+
+class Successor:
+    """A manager that has just taken a batch over, and its clock."""
+
+    def __init__(self, count=2, delivered=(), failures=0):
+        limits = DispatchLimits(restart_grace_s=GRACE_S)
+        self.dispatcher = Dispatcher(limits, boot_id="new", first_epoch=FIRST_EPOCH)
+        self.now_s = 100.0
+        cursors = {name: number + 1 for number, name in enumerate(delivered)}
+        self.first = self.tell(BatchRestored(batch(count), cursors, failures))
+
+    def tell(self, *events, after_s=0.0):
+        self.now_s += after_s
+        return [command for event in events for command in self.dispatcher.handle(event, now_s=self.now_s)]
+
+    def worker(self, worker_id="w1", *claims, slots=1):
+        """A worker comes back and says what it holds."""
+        held = tuple(claim.ref for claim in claims)
+        return self.tell(
+            WorkerJoined(worker_id, Resources(slots, slots, 1024)),
+            WorkerReported(worker_id, WARM, held, resync=True, claims=claims),
+        )
+
+    def wait_out_the_grace(self):
+        return self.tell(Tick(), after_s=GRACE_S)
+
+
+def kinds(commands, kind):
+    return [command for command in commands if isinstance(command, kind)]
+
+
+def given_to(commands):
+    return [(command.worker_id, command.rollout.rollout_id) for command in kinds(commands, GiveLease)]
+
+
+def test_a_lease_that_still_runs_is_taken_up_and_its_result_counts():
+    successor = Successor(1)
+    assert successor.worker("w1", claim("x0")) == []
+    assert successor.wait_out_the_grace() == []
+    commands = successor.tell(LeaseFinished("w1", claim("x0").ref, completed()))
+    assert [command.result.rollout_id for command in kinds(commands, DeliverResult)] == ["x0"]
+    assert commands[-1] == FinishBatch("r1", "b1")
+
+
+def test_a_result_that_nobody_acknowledged_counts_when_its_worker_comes_back():
+    successor = Successor(1)
+    successor.worker("w1", claim("x0"))
+    commands = successor.tell(LeaseFinished("w1", claim("x0").ref, completed()))
+    assert kinds(commands, AcknowledgeLease) == [AcknowledgeLease("w1", claim("x0").ref)]
+    assert len(kinds(commands, DeliverResult)) == 1
+
+
+def test_what_nobody_holds_is_given_out_only_after_the_grace():
+    successor = Successor(2)
+    assert given_to(successor.worker("w1", slots=4)) == []
+    assert given_to(successor.tell(Tick(), after_s=GRACE_S - 0.1)) == []
+    assert given_to(successor.tell(Tick(), after_s=0.2)) == [("w1", "x0"), ("w1", "x1")]
+
+
+def test_a_batch_that_comes_meanwhile_does_not_wait():
+    successor = Successor(1)
+    successor.worker("w1", slots=4)
+    assert given_to(successor.tell(BatchSubmitted(batch(1, "b2")))) == [("w1", "x0")]
+
+
+def test_scenes_of_awaited_rollouts_are_asked_for_already():
+    demand = Successor(3).dispatcher.demand()
+    assert demand.pending == {"kitchen": 3}
+    assert demand.waited_s == {"kitchen": 0.0}
+
+
+def test_of_two_workers_that_hold_one_rollout_the_later_lease_counts():
+    for order in (("w1", "w2"), ("w2", "w1")):
+        successor = Successor(1)
+        claims = {"w1": claim("x0", epoch=5), "w2": claim("x0", epoch=9)}
+        commands = [command for name in order for command in successor.worker(name, claims[name])]
+        assert kinds(commands, CancelLease) == [CancelLease("w1", claims["w1"].ref)]
+        late = successor.tell(LeaseFinished("w1", claims["w1"].ref, completed()))
+        assert kinds(late, DeliverResult) == []
+        assert successor.dispatcher.counters("r1").stale_results == 1
+        good = successor.tell(LeaseFinished("w2", claims["w2"].ref, completed()))
+        assert len(kinds(good, DeliverResult)) == 1
+
+
+def test_whoever_comes_back_after_the_rollout_was_given_out_again_is_too_late():
+    successor = Successor(1)
+    successor.worker("w2")
+    assert given_to(successor.wait_out_the_grace()) == [("w2", "x0")]
+    assert kinds(successor.worker("w1", claim("x0")), CancelLease) == [CancelLease("w1", claim("x0").ref)]
+
+
+def test_whoever_comes_back_late_but_before_anyone_else_could_take_it_keeps_it():
+    successor = Successor(1)
+    successor.wait_out_the_grace()
+    assert successor.worker("w1", claim("x0")) == []
+    assert successor.dispatcher.queued == 0
+
+
+@pytest.mark.parametrize(
+    "stray",
+    [
+        claim("x0"),  # it was delivered
+        claim("unknown"),
+        claim("x1", batch_id="other"),
+        claim("x1", epoch=FIRST_EPOCH + 7),  # as if this manager had given it: its book would know
+    ],
+)
+def test_what_cannot_be_taken_up_is_cancelled(stray):
+    successor = Successor(2, delivered=("x0",))
+    assert kinds(successor.worker("w1", stray), CancelLease) == [CancelLease("w1", stray.ref)]
+
+
+def test_a_worker_that_does_not_say_what_its_leases_are_for_executes_nothing_twice_at_once():
+    successor = Successor(1)
+    old = claim("x0").ref
+    successor.tell(WorkerJoined("w1", Resources(1, 1, 1024)))
+    commands = successor.tell(WorkerReported("w1", WARM, (old,), resync=True))
+    assert kinds(commands, CancelLease) == [CancelLease("w1", old)]
+    assert given_to(successor.wait_out_the_grace()) == [("w1", "x0")]
+
+
+def test_attempts_made_under_the_former_manager_still_count():
+    successor = Successor(1)
+    successor.worker("w1", claim("x0", attempt=3))
+    (delivered,) = kinds(successor.tell(WorkerLost("w1", "killed")), DeliverResult)
+    assert "attempt 3 of 3" in delivered.result.outcome.message
+
+
+def test_a_taken_up_lease_runs_out_like_any_other():
+    successor = Successor(1)
+    successor.worker("w1", claim("x0"))
+    successor.worker("w2")
+    commands = successor.tell(Tick(), after_s=31.0)
+    assert kinds(commands, CancelLease) == [CancelLease("w1", claim("x0").ref)]
+    assert len(given_to(commands)) == 1
+
+
+def test_a_batch_that_was_delivered_wholly_ends_at_once_and_counts():
+    successor = Successor(2, delivered=("x0", "x1"), failures=1)
+    assert successor.first == [FinishBatch("r1", "b1")]
+    counters = successor.dispatcher.counters("r1")
+    assert (counters.delivered, counters.infra_failures) == (2, 1)
+
+
+def test_cursors_go_on_where_the_former_manager_stopped():
+    successor = Successor(3, delivered=("x0", "x1"))
+    successor.worker("w1", claim("x2"))
+    (delivered,) = kinds(successor.tell(LeaseFinished("w1", claim("x2").ref, completed())), DeliverResult)
+    assert delivered.result.cursor == 3
+
+
+def test_a_batch_called_off_while_its_workers_are_awaited_is_not_given_out():
+    successor = Successor(2)
+    assert len(kinds(successor.tell(BatchCancelled("r1", "b1")), DeliverResult)) == 2
+    successor.worker("w1", slots=4)
+    assert given_to(successor.wait_out_the_grace()) == []
+
+
+@given(
+    held=st.lists(st.tuples(st.sampled_from(["w1", "w2", "w3"]), st.integers(0, 5)), max_size=12),
+    back=st.permutations(["w1", "w2", "w3"]),
+)
+def test_every_rollout_gets_one_outcome_whoever_says_to_hold_it(held, back):
+    successor = Successor(6)
+    claims = {name: [] for name in back}
+    for epoch, (name, number) in enumerate(held, 1):
+        claims[name].append(claim(f"x{number}", epoch=epoch))
+    delivered, running = [], []
+
+    def settle(commands):
+        delivered.extend(command.result.rollout_id for command in kinds(commands, DeliverResult))
+        running.extend((command.worker_id, command.ref) for command in kinds(commands, GiveLease))
+
+    for name in back:
+        settle(successor.worker(name, *claims[name], slots=2))
+        running.extend((name, one.ref) for one in claims[name])
+    settle(successor.wait_out_the_grace())
+    while running:
+        name, ref = running.pop()
+        settle(successor.tell(LeaseFinished(name, ref, completed(name))))
+    assert sorted(delivered) == [f"x{number}" for number in range(6)]
