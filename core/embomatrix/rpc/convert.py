@@ -259,15 +259,11 @@ def _failure_reason(text: str) -> FailureReason | None:
 
 
 def timings_to_proto(timings: Timings) -> types_pb2.Timings:
-    return types_pb2.Timings(queued_s=timings.queued_s, load_s=timings.load_s, execute_s=timings.execute_s)
+    return types_pb2.Timings(**{name: getattr(timings, name) for name in Timings.__slots__})
 
 
 def timings_from_proto(message: types_pb2.Timings) -> Timings:
-    return Timings(
-        queued_s=finite("queued_s", message.queued_s),
-        load_s=finite("load_s", message.load_s),
-        execute_s=finite("execute_s", message.execute_s),
-    )
+    return Timings(**{name: finite(name, getattr(message, name)) for name in Timings.__slots__})
 
 
 def completed_to_proto(completed: Completed) -> types_pb2.Completed:

@@ -139,7 +139,9 @@ def lease_from_proto(message: worker_service_pb2.Lease) -> Lease:
 
 
 def lease_result_to_proto(result: LeaseResult) -> worker_service_pb2.LeaseResult:
-    message = worker_service_pb2.LeaseResult(lease=lease_ref_to_proto(result.ref))
+    message = worker_service_pb2.LeaseResult(
+        lease=lease_ref_to_proto(result.ref), slot=result.slot, held_s=result.held_s
+    )
     match result.outcome:
         case Completed() as completed:
             write_completed(completed, message.completed)
@@ -150,13 +152,15 @@ def lease_result_to_proto(result: LeaseResult) -> worker_service_pb2.LeaseResult
 
 def lease_result_from_proto(message: worker_service_pb2.LeaseResult) -> LeaseResult:
     ref = inside("lease", lease_ref_from_proto, message.lease)
+    outcome: Completed | InfraFailure
     match message.WhichOneof("outcome"):
         case "completed":
-            return LeaseResult(ref, inside("completed", completed_from_proto, message.completed))
+            outcome = inside("completed", completed_from_proto, message.completed)
         case "infra_failure":
-            return LeaseResult(ref, inside("infra_failure", infra_failure_from_proto, message.infra_failure))
+            outcome = inside("infra_failure", infra_failure_from_proto, message.infra_failure)
         case None:
             raise ConvertError("outcome", "is missing: a result has exactly one")
+    return LeaseResult(ref, outcome, slot=message.slot, held_s=finite("held_s", message.held_s))
 
 
 def worker_state_to_proto(state: WorkerState) -> worker_service_pb2.WorkerState:
@@ -209,13 +213,23 @@ def worker_info_from_proto(message: admin_service_pb2.WorkerInfo) -> WorkerInfo:
 
 def run_info_to_proto(info: RunInfo) -> admin_service_pb2.RunInfo:
     return admin_service_pb2.RunInfo(
-        run_id=info.run_id, name=info.name, stats=run_stats_to_proto(info.stats), pending=info.pending
+        run_id=info.run_id,
+        name=info.name,
+        stats=run_stats_to_proto(info.stats),
+        pending=info.pending,
+        opened_s=info.opened_s,
+        closed_s=info.closed_s,
     )
 
 
 def run_info_from_proto(message: admin_service_pb2.RunInfo) -> RunInfo:
     return RunInfo(
-        required("run_id", message.run_id), message.name, run_stats_from_proto(message.stats), message.pending
+        required("run_id", message.run_id),
+        message.name,
+        run_stats_from_proto(message.stats),
+        message.pending,
+        finite("opened_s", message.opened_s),
+        finite("closed_s", message.closed_s),
     )
 
 

@@ -45,11 +45,18 @@ class Batch:
 
 @dataclass(frozen=True, slots=True)
 class Timings:
-    """Seconds that a rollout spent waiting, loading its scene (0 when warm) and executing."""
+    """Where the seconds of a rollout went. Durations only: clocks of two machines are never compared."""
 
     queued_s: float = 0.0
+    """From submission to the lease that delivered, on the manager's clock."""
     load_s: float = 0.0
+    """Waiting for the scene, on the worker's clock; 0 when it was warm."""
     execute_s: float = 0.0
+    """In the slot, on the worker's clock."""
+    lease_s: float = 0.0
+    """The lease's life less loading and executing: the network and the wait for a slot, on the manager's clock."""
+    deliver_s: float = 0.0
+    """From the result's arrival to its row in the result log, on the manager's clock."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -298,11 +305,16 @@ class Lease:
 
 @dataclass(frozen=True, slots=True)
 class LeaseResult:
-    """What became of a lease. ``origin`` stays with the worker, and travels in its claims."""
+    """What became of a lease. It ran in ``slot``, counted from 1, for ``held_s`` seconds; 0 when it never ran.
+
+    ``origin`` stays with the worker, and travels in its claims.
+    """
 
     ref: LeaseRef
     outcome: Completed | InfraFailure
     origin: LeaseOrigin | None = None
+    slot: int = 0
+    held_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -346,9 +358,14 @@ class WorkerInfo:
 
 @dataclass(frozen=True, slots=True)
 class RunInfo:
-    """An open run: its counters so far, and how many of its rollouts have no outcome yet."""
+    """A run: its counters so far, and how many of its rollouts have no outcome yet.
+
+    Times are seconds since the epoch on the manager's clock; ``closed_s`` is 0 while it is open.
+    """
 
     run_id: str
     name: str
     stats: RunStats
     pending: int
+    opened_s: float = 0.0
+    closed_s: float = 0.0

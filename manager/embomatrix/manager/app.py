@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 import uvicorn
 
 from embomatrix.manager.api import build_api
+from embomatrix.manager.archive import RunArchive
 from embomatrix.manager.assignments import DispatchLimits
 from embomatrix.manager.bundles import BundleStore
 from embomatrix.manager.cluster_state import ClusterState
@@ -119,7 +120,8 @@ async def _start_runtime(
     first_epoch = (epoch << 32) + 1
     registry = Registry(liveness, first_epoch=first_epoch)
     cluster = ClusterState(dispatch, schedule, boot_id=secrets.token_hex(4), first_epoch=first_epoch)
-    runtime = ManagerRuntime(cluster, registry, store, bundles, results_ttl_s=settings.results_ttl_s)
+    archive = RunArchive(settings.data_dir / "runs")
+    runtime = ManagerRuntime(cluster, registry, store, bundles, archive, results_ttl_s=settings.results_ttl_s)
     await runtime.start()
     return runtime
 

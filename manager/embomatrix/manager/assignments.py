@@ -259,8 +259,7 @@ class Assignments:
         counters.warm_starts += record.warm
         counters.cold_starts += not record.warm
         self.fleet.workers[lease.worker_id].completed += 1
-        queued_s = lease.given_s - record.submitted_s + completed.timings.queued_s
-        timings = dataclasses.replace(completed.timings, queued_s=queued_s)
+        timings = lease.timings(completed.timings, self.now_s)
         warm = record.warm and completed.warm
         self.finish(record, completed.noted(timings=timings, warm=warm))
 

@@ -6,11 +6,12 @@ import asyncio
 import contextlib
 import logging
 import time
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from embomatrix.manager.commands import DeliverResult, FinishBatch
-from embomatrix.manager.records import result_row
+from embomatrix.manager.records import result_row, timed_row
 from embomatrix.manager.store.protocol import FencedError, StateError
+from embomatrix.rpc.values import Completed
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -29,22 +30,27 @@ class Delivery:
     """Owns the way of results. What a trainer saw, a restarted manager knows, so no cursor is ever given twice.
 
     A worker hears that it may forget a result (``acknowledge``) only after the store has it: until then it is not lost
-    with the manager.
+    with the manager. ``on_logged`` is told of each run whose results are in their log, and how many seconds each took.
     """
 
     def __init__(
-        self, store: StateStore, logs: ResultLogs, acknowledge: Callable[[AcknowledgeLease], None]
+        self,
+        store: StateStore,
+        logs: ResultLogs,
+        acknowledge: Callable[[AcknowledgeLease], None],
+        on_logged: Callable[[str, Sequence[float]], None],
     ) -> None:
         self._store = store
         self._logs = logs
         self._acknowledge = acknowledge
-        self._waiting: list[DeliverResult | FinishBatch] = []
+        self._on_logged = on_logged
+        self._waiting: list[_Waiting] = []
         self._acknowledgements: list[AcknowledgeLease] = []
         self._fresh = asyncio.Event()
 
     def put(self, command: DeliverResult | FinishBatch) -> None:
         """Queue a result, or the end of a batch. There are never more than there are rollouts in the cluster."""
-        self._waiting.append(command)
+        self._waiting.append(_Waiting(command, time.monotonic()))
         self._fresh.set()
 
     def put_acknowledgement(self, command: AcknowledgeLease) -> None:
@@ -57,11 +63,11 @@ class Delivery:
         while True:
             await self._fresh.wait()
             self._fresh.clear()
-            commands, self._waiting = self._waiting, []
+            waiting, self._waiting = self._waiting, []
             acknowledgements, self._acknowledgements = self._acknowledgements, []
-            by_batch: dict[tuple[str, str], list[DeliverResult | FinishBatch]] = {}
-            for command in commands:
-                by_batch.setdefault((command.run_id, command.batch_id), []).append(command)
+            by_batch: dict[tuple[str, str], list[_Waiting]] = {}
+            for entry in waiting:
+                by_batch.setdefault((entry.command.run_id, entry.command.batch_id), []).append(entry)
             for key, ended in by_batch.items():
                 log = self._logs.get(*key)
                 if log is not None:
@@ -76,8 +82,13 @@ class Delivery:
             with contextlib.suppress(StateError):
                 await self._store.drop_batch(log.run_id, log.batch_id)
 
-    async def _publish(self, log: BatchLog, ended: Sequence[DeliverResult | FinishBatch]) -> None:
-        rows = [result_row(command.result) for command in ended if isinstance(command, DeliverResult)]
+    async def _publish(self, log: BatchLog, ended: Sequence[_Waiting]) -> None:
+        results = [
+            (entry.command.result, entry.arrived_s)
+            for entry in ended
+            if isinstance(entry.command, DeliverResult)
+        ]
+        rows = [result_row(result) for result, _ in results]
         while rows and not log.dropped:
             try:
                 await self._store.append_results(log.run_id, log.batch_id, rows)
@@ -87,6 +98,20 @@ class Delivery:
             except StateError as error:
                 logger.warning("results wait for the store: %s", error)
                 await asyncio.sleep(STORE_RETRY_S)
-        log.append(rows)
-        if any(isinstance(command, FinishBatch) for command in ended):
-            log.finish(time.monotonic())
+        now_s = time.monotonic()
+        log.append(
+            [
+                timed_row(row, now_s - arrived_s) if isinstance(result.outcome, Completed) else row
+                for row, (result, arrived_s) in zip(rows, results, strict=True)
+            ]
+        )
+        self._on_logged(log.run_id, [now_s - arrived_s for _, arrived_s in results])
+        if any(isinstance(entry.command, FinishBatch) for entry in ended):
+            log.finish(now_s)
+
+
+class _Waiting(NamedTuple):
+    """A command that waits to be written, and when it came, on the monotonic clock."""
+
+    command: DeliverResult | FinishBatch
+    arrived_s: float

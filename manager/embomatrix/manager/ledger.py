@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from enum import Enum, auto
 from typing import TYPE_CHECKING, NamedTuple
 
-from embomatrix.rpc.values import RunStats
+from embomatrix.rpc.values import RunStats, Timings
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -66,6 +66,17 @@ class LeaseRecord:
     @property
     def due_s(self) -> float:
         return min(self.expires_s, self.limit_s)
+
+    def timings(self, told: Timings, now_s: float) -> Timings:
+        """What the worker told of its part, with the manager's own: of a lease that ends now."""
+        lease_s = now_s - self.given_s - told.load_s - told.execute_s
+        return Timings(
+            queued_s=self.given_s - self.record.submitted_s,
+            load_s=told.load_s,
+            execute_s=told.execute_s,
+            # The worker's clock may run faster.
+            lease_s=max(0.0, lease_s),
+        )
 
 
 @dataclass(slots=True, eq=False)

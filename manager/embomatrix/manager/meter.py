@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import bisect
 import time
 from collections import Counter, deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.manager.histogram import quantile
 from embomatrix.rpc.values import Cancelled, Completed, InfraFailure
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from embomatrix.rpc.values import RolloutResult
 
 WINDOW_S: Final = 120
 """Length of the throughput's history."""
 SAMPLES: Final = 2048
 FAILURES_KEPT: Final = 50
-BUCKETS_S: Final = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,24 +31,11 @@ class FailureNote:
     rollout_id: str
 
 
-class Histogram:
-    """Cumulative counts by upper bound, as Prometheus wants them."""
-
-    def __init__(self) -> None:
-        self.counts = [0] * (len(BUCKETS_S) + 1)
-        self.sum_s = 0.0
-
-    def observe(self, seconds: float) -> None:
-        self.counts[bisect.bisect_left(BUCKETS_S, seconds)] += 1
-        self.sum_s += seconds
-
-
 class Meter:
     """Takes every delivered result. The clock of its history is the caller's monotonic one."""
 
     def __init__(self) -> None:
         self.outcomes: Counter[str] = Counter()
-        self.phases: dict[str, Histogram] = {name: Histogram() for name in ("queue", "load", "execute")}
         self.failures: deque[FailureNote] = deque(maxlen=FAILURES_KEPT)
         self._latency_s: deque[float] = deque(maxlen=SAMPLES)
         self._per_second: deque[tuple[int, int]] = deque(maxlen=WINDOW_S)
@@ -60,10 +44,8 @@ class Meter:
         match result.outcome:
             case Completed(timings=timings):
                 self.outcomes["completed"] += 1
-                self.phases["queue"].observe(timings.queued_s)
-                self.phases["load"].observe(timings.load_s)
-                self.phases["execute"].observe(timings.execute_s)
-                self._latency_s.append(timings.queued_s + timings.load_s + timings.execute_s)
+                lease_s = timings.lease_s + timings.load_s + timings.execute_s
+                self._latency_s.append(timings.queued_s + lease_s)
                 self._count(int(now_s))
             case InfraFailure(code, message, worker_id):
                 self.outcomes[code.value] += 1
@@ -86,8 +68,3 @@ class Meter:
             self._per_second[-1] = (second, self._per_second[-1][1] + 1)
         else:
             self._per_second.append((second, 1))
-
-
-def quantile(ordered: Sequence[float], share: float) -> float:
-    """The value at that share of an ascending sequence; 0 for an empty one."""
-    return ordered[min(int(share * len(ordered)), len(ordered) - 1)] if ordered else 0.0

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections import deque
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from embomatrix.manager.histogram import Histogram
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
-
-LEADS_KEPT: Final = 1024
 
 
 @dataclass(slots=True)
@@ -19,14 +18,16 @@ class PrewarmCounters:
     hits: int = 0
     misses: int = 0
     wasted: int = 0
+    leads: Histogram = field(default_factory=Histogram)
+    """Of its hits: between a scene being warm and the batch that needed it."""
 
 
 class PrewarmLedger:
     """Follows each (worker, scene) from the load that a look-ahead caused to its first use, or its eviction."""
 
     def __init__(self) -> None:
-        self.lead_s: deque[float] = deque(maxlen=LEADS_KEPT)
-        """Seconds between a scene being warm and the batch that needed it, of the latest hits."""
+        self.leads = Histogram()
+        """Of the hits of all runs."""
         self._counters: dict[str, PrewarmCounters] = {}
         self._ahead: dict[str, dict[str, str]] = {}
         """The run that had a scene loaded, by worker and scene."""
@@ -45,7 +46,8 @@ class PrewarmLedger:
             counters.misses += 1
         else:
             counters.hits += 1
-            self.lead_s.append(now_s - warm_since_s)
+            counters.leads.observe(now_s - warm_since_s)
+            self.leads.observe(now_s - warm_since_s)
 
     def used(self, pairs: Iterable[tuple[str, str]]) -> None:
         for worker_id, scene in pairs:

@@ -6,7 +6,7 @@ from collections import Counter
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING
 
-from embomatrix.manager.meter import BUCKETS_S
+from embomatrix.manager.histogram import BOUNDS_S
 from embomatrix.manager.registry import Standing
 from embomatrix.manager.views import overview
 from embomatrix.rpc.values import InfraCode, ResidentState
@@ -14,8 +14,9 @@ from embomatrix.rpc.values import InfraCode, ResidentState
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from embomatrix.manager.meter import Histogram
+    from embomatrix.manager.histogram import Histogram
     from embomatrix.manager.runtime import ManagerRuntime
+    from embomatrix.rpc.run_log import Phase
 
 
 class _Page:
@@ -32,15 +33,14 @@ class _Page:
             for labels, value in values.items()
         ]
 
-    def histogram(self, name: str, text: str, phases: Mapping[str, Histogram]) -> None:
+    def histogram(self, name: str, text: str, phases: Mapping[Phase, Histogram]) -> None:
         self._lines += [f"# HELP {name} {text}", f"# TYPE {name} histogram"]
         for phase, histogram in phases.items():
-            total = 0
-            for bound, count in zip((*map(str, BUCKETS_S), "+Inf"), histogram.counts, strict=True):
-                total += count
-                self._lines.append(f'{name}_bucket{{phase="{phase}",le="{bound}"}} {total}')
+            for bound_s, total in zip(BOUNDS_S, histogram.cumulative(), strict=True):
+                self._lines.append(f'{name}_bucket{{phase="{phase}",le="{bound_s:.6g}"}} {total}')
+            self._lines.append(f'{name}_bucket{{phase="{phase}",le="+Inf"}} {histogram.count}')
             self._lines.append(f'{name}_sum{{phase="{phase}"}} {histogram.sum_s:g}')
-            self._lines.append(f'{name}_count{{phase="{phase}"}} {total}')
+            self._lines.append(f'{name}_count{{phase="{phase}"}} {histogram.count}')
 
     def text(self) -> str:
         return "\n".join(self._lines) + "\n"
@@ -65,7 +65,7 @@ def metrics_page(runtime: ManagerRuntime) -> str:
         "Rollouts by outcome.",
         {f'outcome="{name}"': view.outcomes.get(name, 0) for name in outcomes},
     )
-    page.histogram("embo_rollout_seconds", "Time of completed rollouts by phase.", runtime.meter.phases)
+    page.histogram("embo_rollout_seconds", "Time of completed rollouts by phase.", runtime.chronicle.phases())
     lead = {"": view.prewarm_lead_s}
     page.family(
         "embo_prewarm_lead_seconds", "gauge", "Median time between a scene being warm and its demand.", lead

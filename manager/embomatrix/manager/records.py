@@ -33,3 +33,14 @@ def failed_rows(rows: Iterable[ResultRow]) -> int:
 
 def result_row(result: RolloutResult) -> ResultRow:
     return ResultRow(result.cursor, result.rollout_id, rollout_result_to_proto(result).SerializeToString())
+
+
+def timed_row(row: ResultRow, deliver_s: float) -> ResultRow:
+    """A completed rollout's row with how long its way into the log took: known only then, so the store's row lacks it.
+
+    Bytes of the same message that follow one another are one message (protobuf, "last one wins", merging nested ones),
+    so a row of kilobytes isn't parsed for one number.
+    """
+    timed = types_pb2.Completed(timings=types_pb2.Timings(deliver_s=deliver_s))
+    told = types_pb2.RolloutResult(completed=timed).SerializeToString()
+    return ResultRow(row.cursor, row.rollout_id, row.payload + told)

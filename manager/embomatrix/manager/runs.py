@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from embomatrix.manager.cluster_state import ClusterState
     from embomatrix.manager.commands import Command
     from embomatrix.manager.events import Event
+    from embomatrix.manager.history import RunHistory
     from embomatrix.manager.results import ResultLogs
     from embomatrix.manager.store.protocol import StateStore
     from embomatrix.rpc.values import Batch, LookaheadEntry, RunStats, Warmth
@@ -65,6 +66,7 @@ class Runs:
         logs: ResultLogs,
         carry_out: Callable[[Sequence[Command]], None],
         limits: RunLimits,
+        history: RunHistory,
     ) -> None:
         self._cluster = cluster
         self._store = store
@@ -72,6 +74,7 @@ class Runs:
         self._logs = logs
         self._carry_out = carry_out
         self._limits = limits
+        self._history = history
         self._runs: dict[str, RunRow] = {}
         self._heard_s: dict[str, float] = {}
 
@@ -84,6 +87,7 @@ class Runs:
         """Take up what a former manager left. Its open batches go on at once, whether their trainer asks for them or not."""
         for run in await self._store.runs():
             self._runs[run.run_id] = run
+            self._history.opened(run.run_id, run.name)
             self._heard_s[run.run_id] = time.monotonic()
             for row in await self._store.batches(run.run_id):
                 log = BatchLog(run.run_id, row.batch_id, row.digest)
@@ -91,7 +95,9 @@ class Runs:
                     log.append(page)
                 self._logs.add(log)
                 delivered = {result.rollout_id: result.cursor for result in log.rows}
-                self._feed(BatchRestored(batch_of(row), delivered, failed_rows(log.rows)))
+                batch = batch_of(row)
+                self._history.submitted(batch)
+                self._feed(BatchRestored(batch, delivered, failed_rows(log.rows)))
         if self._runs:
             logger.info("took up %d runs of a former manager", len(self._runs))
 
@@ -109,6 +115,7 @@ class Runs:
             with _store_errors():
                 await self._store.open_run(run)
             self._runs.setdefault(run_id, run)
+            self._history.opened(run_id, run.name)
         self._heard_s[run_id] = time.monotonic()
         return run_id
 
@@ -147,6 +154,7 @@ class Runs:
         except BaseException:
             self._logs.remove(log)
             raise
+        self._history.submitted(batch)
         self._feed(BatchSubmitted(batch))
         return log
 
@@ -169,9 +177,11 @@ class Runs:
         """End the run and forget its results; returns its final counters."""
         self._check_run(run_id)
         del self._runs[run_id], self._heard_s[run_id]
+        leads = self._history.leads(run_id)
         stats, commands = self._cluster.close_run(run_id, now_s=time.monotonic())
         self._logs.close_run(run_id)
         self._carry_out(commands)
+        await self._history.closed(run_id, stats, leads)
         with _store_errors():
             await self._store.close_run(run_id)
         return stats

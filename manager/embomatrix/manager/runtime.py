@@ -11,6 +11,7 @@ import logging
 import time
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.manager.chronicle import Chronicle
 from embomatrix.manager.commands import (
     AcknowledgeLease,
     CancelLease,
@@ -21,6 +22,7 @@ from embomatrix.manager.commands import (
     SetDesired,
 )
 from embomatrix.manager.delivery import Delivery
+from embomatrix.manager.history import RunHistory
 from embomatrix.manager.intake import TICK_S, Heartbeat, Intake
 from embomatrix.manager.links import WorkerLink
 from embomatrix.manager.meter import Meter
@@ -32,6 +34,7 @@ from embomatrix.rpc.status import SupersededError
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+    from embomatrix.manager.archive import RunArchive
     from embomatrix.manager.bundles import BundleStore
     from embomatrix.manager.cluster_state import ClusterState
     from embomatrix.manager.links import WorkerCommand
@@ -56,6 +59,7 @@ class ManagerRuntime:
         registry: Registry,
         store: StateStore,
         bundles: BundleStore,
+        archive: RunArchive,
         *,
         limits: RunLimits | None = None,
         results_ttl_s: float = 3600.0,
@@ -66,10 +70,12 @@ class ManagerRuntime:
         self.registry = registry
         self.bundles = bundles
         self.meter = Meter()
-        self.runs = Runs(cluster, store, bundles, logs, self._carry_out, limits or RunLimits())
         self.started_s = time.monotonic()
+        self.chronicle = Chronicle(epoch_s=time.time() - self.started_s)
+        self.history = RunHistory(self.chronicle, archive, cluster)
+        self.runs = Runs(cluster, store, bundles, logs, self._carry_out, limits or RunLimits(), self.history)
         self._intake = Intake(cluster, registry)
-        self._delivery = Delivery(store, logs, self._say)
+        self._delivery = Delivery(store, logs, self._say, self.chronicle.in_log)
         self._links: dict[str, WorkerLink] = {}
 
     async def start(self) -> None:
@@ -87,6 +93,7 @@ class ManagerRuntime:
         """Open a session for a worker; returns it and the heartbeat's interval in seconds."""
         session, commands = self._intake.register(worker_id, boot_id, resources, now_s=time.monotonic())
         self._close_link(worker_id)
+        self.chronicle.fleet.joined(worker_id, resources, now_s=time.monotonic())
         self._carry_out(commands)
         logger.info("worker registered worker=%s slots=%d", worker_id, resources.slots)
         return session, self.registry.interval_s
@@ -111,9 +118,13 @@ class ManagerRuntime:
         self, link: WorkerLink, state: WorkerState | None, results: Sequence[LeaseResult], *, resync: bool
     ) -> None:
         """What a worker says on its stream; ``resync`` for the first message of a stream."""
-        self._carry_out(
-            self._intake.report(link.session, state, results, resync=resync, now_s=time.monotonic())
-        )
+        now_s, worker_id = time.monotonic(), link.session.worker_id
+        ended = (*state.finished, *results) if state is not None else results
+        self.chronicle.reported(worker_id, ended, self.cluster.dispatcher.live_leases, now_s=now_s)
+        commands = self._intake.report(link.session, state, results, resync=resync, now_s=now_s)
+        if state is not None:
+            self.chronicle.fleet.residents(worker_id, state.residents, now_s=now_s)
+        self._carry_out(commands)
 
     def take_heartbeat(
         self, session_id: str, epoch: int, held: tuple[LeaseRef, ...], *, load: float, memory_mb: int
@@ -131,14 +142,19 @@ class ManagerRuntime:
             self._links[worker_id].drain()
 
     def _carry_out(self, commands: Sequence[Command]) -> None:
+        now_s = time.monotonic()
         for command in commands:
             match command:
-                case SetDesired() | GiveLease() | CancelLease():
+                case SetDesired() | CancelLease():
                     self._say(command)
+                case GiveLease():
+                    self._say(command)
+                    self.chronicle.leased(command, now_s=now_s)
                 case AcknowledgeLease():
                     self._delivery.put_acknowledgement(command)
                 case DeliverResult():
-                    self.meter.observe(command.run_id, command.result, time.monotonic())
+                    self.meter.observe(command.run_id, command.result, now_s)
+                    self.chronicle.delivered(command, now_s=now_s)
                     self._delivery.put(command)
                 case FinishBatch():
                     self._delivery.put(command)
@@ -160,6 +176,7 @@ class ManagerRuntime:
             lost, commands = self._intake.tick(now_s=time.monotonic())
             for event in lost:
                 logger.warning("worker lost worker=%s: %s", event.worker_id, event.reason)
+                self.chronicle.fleet.lost(event.worker_id, event.reason, now_s=time.monotonic())
                 self._close_link(event.worker_id)
             self._carry_out(commands)
 

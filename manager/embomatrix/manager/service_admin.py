@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from embomatrix.manager.views import run_infos, worker_infos
 from embomatrix.proto.v1 import admin_service_pb2 as pb
 from embomatrix.proto.v1 import admin_service_pb2_grpc
+from embomatrix.rpc.convert_log import event_page_to_proto, run_summary_to_proto
 from embomatrix.rpc.convert_session import run_info_to_proto, worker_info_to_proto
 from embomatrix.rpc.status import translate
 
@@ -31,8 +32,21 @@ class AdminServicer(admin_service_pb2_grpc.AdminServiceServicer):
         self, request: pb.ListRunsRequest, context: grpc.aio.ServicerContext
     ) -> pb.ListRunsResponse:
         async with translate(context):
-            runs = [run_info_to_proto(info) for info in run_infos(self._runtime)]
+            found = await self._runtime.history.kept() if request.closed else run_infos(self._runtime)
+            runs = [run_info_to_proto(info) for info in found]
         return pb.ListRunsResponse(runs=runs)
+
+    async def GetRun(self, request: pb.GetRunRequest, context: grpc.aio.ServicerContext) -> pb.GetRunResponse:
+        async with translate(context):
+            summary = await self._runtime.history.summary(request.run_id)
+        return run_summary_to_proto(summary)
+
+    async def ReadEvents(
+        self, request: pb.ReadEventsRequest, context: grpc.aio.ServicerContext
+    ) -> pb.ReadEventsResponse:
+        async with translate(context):
+            page = await self._runtime.history.events(request.run_id, request.after, request.limit)
+        return event_page_to_proto(page)
 
     async def DrainWorker(
         self, request: pb.DrainWorkerRequest, context: grpc.aio.ServicerContext

@@ -7,7 +7,6 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from embomatrix.manager.meter import quantile
 from embomatrix.manager.registry import Standing
 from embomatrix.rpc.values import Resident, ResidentState, RunInfo, RunStats, WorkerInfo
 
@@ -92,7 +91,6 @@ def overview(runtime: ManagerRuntime) -> Overview:
     now_s = time.monotonic()
     cluster, meter = runtime.cluster, runtime.meter
     totals = cluster.totals()
-    leads = sorted(cluster.scheduler.prewarm.lead_s)
     workers = list(cluster.dispatcher.workers.values())
     return Overview(
         uptime_s=now_s - runtime.started_s,
@@ -109,7 +107,7 @@ def overview(runtime: ManagerRuntime) -> Overview:
         prewarm_hits=totals.prewarm_hits,
         prewarm_misses=totals.prewarm_misses,
         prewarm_wasted=totals.prewarm_wasted,
-        prewarm_lead_s=quantile(leads, 0.5),
+        prewarm_lead_s=cluster.scheduler.prewarm.leads.quantile(0.5),
         redispatched=totals.redispatched,
         stale_results=totals.stale_results,
         failures=list(meter.failures),
@@ -122,7 +120,7 @@ def workers(runtime: ManagerRuntime) -> list[WorkerView]:
 
 
 def runs(runtime: ManagerRuntime) -> list[RunView]:
-    """Open runs, oldest first."""
+    """Open runs, oldest first, as the page shows them."""
     return [RunView(info.run_id, info.name, info.pending, info.stats) for info in run_infos(runtime)]
 
 
@@ -159,11 +157,8 @@ def worker_infos(runtime: ManagerRuntime) -> list[WorkerInfo]:
 
 
 def run_infos(runtime: ManagerRuntime) -> list[RunInfo]:
-    cluster = runtime.cluster
-    return [
-        RunInfo(run.run_id, run.name, cluster.stats(run.run_id), cluster.dispatcher.pending_of(run.run_id))
-        for run in runtime.runs.open.values()
-    ]
+    """Open runs, oldest first."""
+    return [runtime.history.info(record) for record in runtime.chronicle.runs.values()]
 
 
 def _worker(runtime: ManagerRuntime, worker_id: str) -> WorkerView:

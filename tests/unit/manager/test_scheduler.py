@@ -271,7 +271,8 @@ def test_a_scene_that_was_warm_in_time_is_a_hit_with_its_lead(cluster):
     cluster.submit("b", step=2)
     counters = cluster.scheduler.prewarm.counters("r1")
     assert (counters.hits, counters.misses) == (1, 1)
-    assert list(cluster.scheduler.prewarm.lead_s) == [3.0]
+    assert cluster.scheduler.prewarm.leads.sum_s == 3.0
+    assert cluster.scheduler.prewarm.counters("r1").leads.count == 1
 
 
 def test_a_load_ahead_that_nobody_used_is_waste(cluster):

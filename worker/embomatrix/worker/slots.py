@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import functools
+import heapq
 import logging
 import time
 from collections import deque
@@ -41,6 +42,10 @@ class _Ticket:
     taken_s: float
     found_warm: bool
     requeued: bool = False
+    slot: int = 0
+    """The permit that it has, from 1; 0 before."""
+    began_s: float = 0.0
+    """When it got the permit, on the monotonic clock."""
     task: asyncio.Task[None] | None = None
 
     @property
@@ -74,14 +79,15 @@ class SlotPool:
         self._wanted: tuple[str, ...] = ()
         self._waiting: deque[_Ticket] = deque()
         self._tickets: dict[LeaseRef, _Ticket] = {}
-        self._running = 0
+        self._free = list(range(1, limits.slots + 1))
+        """Permits that nobody has, as a heap: the lowest is given first, so that a little work stays on few."""
         self._clock = 0
         self._wake = asyncio.Event()
 
     @property
     def load(self) -> float:
         """Share of the slots that execute something, 0 to 1."""
-        return self._running / self._limits.slots
+        return 1.0 - len(self._free) / self._limits.slots
 
     @property
     def memory_used_mb(self) -> float:
@@ -163,7 +169,7 @@ class SlotPool:
 
     def _start_leases(self, tasks: asyncio.TaskGroup) -> None:
         for ticket in list(self._waiting):
-            if self._running >= self._limits.slots:
+            if not self._free:
                 return
             scene = self._residents.warm(ticket.digest)
             if scene is None:
@@ -172,14 +178,14 @@ class SlotPool:
             self._clock += 1
             scene.last_used = self._clock
             scene.running += 1
-            self._running += 1
+            ticket.slot, ticket.began_s = heapq.heappop(self._free), time.monotonic()
             ticket.task = tasks.create_task(self._run_lease(ticket, scene))
             # A task that is cancelled before its first step runs no `finally` of its own.
-            ticket.task.add_done_callback(functools.partial(self._release, scene))
+            ticket.task.add_done_callback(functools.partial(self._release, scene, ticket.slot))
 
-    def _release(self, scene: Scene, _: asyncio.Task[None]) -> None:
+    def _release(self, scene: Scene, slot: int, _: asyncio.Task[None]) -> None:
         self._residents.release(scene)
-        self._running -= 1
+        heapq.heappush(self._free, slot)
         self._wake.set()
 
     async def _run_lease(self, ticket: _Ticket, scene: Scene) -> None:
@@ -194,7 +200,6 @@ class SlotPool:
 
     async def _execute(self, ticket: _Ticket, scene: Scene) -> Completed | InfraFailure | None:
         """Run the rollout in a slot of its scene; None when the scene had died and the lease waits again."""
-        started_s = time.monotonic()
         try:
             slot = await scene.take_slot(self._limits.fork_s)
         except ProcessGoneError as error:
@@ -213,11 +218,9 @@ class SlotPool:
         except asyncio.CancelledError:
             self._residents.end_later(slot.child)
             raise
-        return self._outcome(ticket, scene, slot, answer, started_s)
+        return self._outcome(ticket, scene, slot, answer)
 
-    def _outcome(
-        self, ticket: _Ticket, scene: Scene, slot: Slot, answer: Frame, started_s: float
-    ) -> Completed | InfraFailure:
+    def _outcome(self, ticket: _Ticket, scene: Scene, slot: Slot, answer: Frame) -> Completed | InfraFailure:
         header = answer.header
         if "error" in header:
             # What an exception left behind in the process is unknown.
@@ -228,8 +231,8 @@ class SlotPool:
         else:
             self._residents.keep_slot(scene, slot)
         timings = Timings(
-            queued_s=started_s - ticket.taken_s,
-            load_s=0.0 if ticket.found_warm else scene.load_s,
+            # Loading may have begun before the lease came.
+            load_s=0.0 if ticket.found_warm else min(scene.load_s, ticket.began_s - ticket.taken_s),
             execute_s=float(header["execute_s"]),
         )
         completed = completed_from_proto(types_pb2.Completed.FromString(answer.body))
@@ -242,13 +245,15 @@ class SlotPool:
             return InfraFailure(
                 InfraCode.SLOT_CRASHED, "the scene's process died twice before the rollout began"
             )
-        ticket.requeued, ticket.found_warm, ticket.task = True, False, None
+        ticket.requeued, ticket.found_warm, ticket.task, ticket.slot = True, False, None, 0
         self._waiting.appendleft(ticket)
         return None
 
     def _finish(self, ticket: _Ticket, outcome: Completed | InfraFailure) -> None:
         if self._tickets.pop(ticket.lease.ref, None) is not None:
-            self._on_result(LeaseResult(ticket.lease.ref, outcome, ticket.lease.origin))
+            held_s = time.monotonic() - ticket.began_s if ticket.slot else 0.0
+            result = LeaseResult(ticket.lease.ref, outcome, ticket.lease.origin, ticket.slot, held_s)
+            self._on_result(result)
 
 
 def _worn(slot: Slot, resident_mb: float) -> bool:

@@ -10,8 +10,8 @@ from statistics import fmean
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.cluster_state import ClusterState
+from embomatrix.manager.histogram import quantile
 from embomatrix.manager.intake import Intake
-from embomatrix.manager.meter import quantile
 from embomatrix.manager.registry import Registry
 from embomatrix.manager.simulation.agenda import Agenda
 from embomatrix.manager.simulation.auditor import Auditor, BrokenInvariantError

@@ -68,7 +68,7 @@ class SimulatedSlots:
         self._stopped = False
         self._wanted: tuple[str, ...] = ()
         self._scenes: dict[str, _Scene] = {}
-        self._waiting: deque[tuple[Lease, float]] = deque()
+        self._waiting: deque[Lease] = deque()
         self._running: dict[LeaseRef, tuple[Lease, float]] = {}
         self._free = machine.resources.slots
         self._clock = 0
@@ -79,7 +79,7 @@ class SimulatedSlots:
 
     def held(self) -> tuple[LeaseRef, ...]:
         """Leases that run or wait."""
-        return (*self._running, *(lease.ref for lease, _ in self._waiting))
+        return (*self._running, *(lease.ref for lease in self._waiting))
 
     def residents(self) -> tuple[Resident, ...]:
         return tuple(
@@ -112,7 +112,7 @@ class SimulatedSlots:
         scene = self._scenes.get(lease.rollout.bundle_digest)
         if scene is not None and scene.state is ResidentState.FAILED:
             del self._scenes[lease.rollout.bundle_digest]
-        self._waiting.append((lease, self._around.agenda.now_s))
+        self._waiting.append(lease)
         if scene is None or scene.state is not ResidentState.WARM:
             self._settle()
         self._start()
@@ -123,7 +123,7 @@ class SimulatedSlots:
             lease, began_s = self._running.pop(ref)
             self._leave(lease, began_s)
             self._around.agenda.after(RESPAWN_S, self._free_slot)
-        self._waiting = deque(entry for entry in self._waiting if entry[0].ref not in refs)
+        self._waiting = deque(lease for lease in self._waiting if lease.ref not in refs)
 
     def _settle(self) -> None:
         """Load what is wanted first, as many at a time as there are slots."""
@@ -144,7 +144,9 @@ class SimulatedSlots:
         for digest, scene in list(self._scenes.items()):
             if scene.state is ResidentState.FAILED and now_s - scene.failed_s >= RETRY_LOAD_S:
                 del self._scenes[digest]
-        wanted = tuple(dict.fromkeys((*(x.rollout.bundle_digest for x, _ in self._waiting), *self._wanted)))
+        wanted = tuple(
+            dict.fromkeys((*(lease.rollout.bundle_digest for lease in self._waiting), *self._wanted))
+        )
         held = {d: s for d, s in self._scenes.items() if s.state is not ResidentState.FAILED}
         place = next((at for at, digest in enumerate(wanted) if digest not in self._scenes), None)
         if place is None:
@@ -185,7 +187,7 @@ class SimulatedSlots:
             scene.failed_s = self._around.agenda.now_s
             self._around.agenda.after(RETRY_LOAD_S, self._settle)
             failure = InfraFailure(InfraCode.SCENE_LOAD_FAILED, "no such mesh", self._machine.worker_id)
-            for lease, _ in [entry for entry in self._waiting if entry[0].rollout.bundle_digest == digest]:
+            for lease in [lease for lease in self._waiting if lease.rollout.bundle_digest == digest]:
                 self.cancel({lease.ref})
                 self._around.on_result(LeaseResult(lease.ref, failure))
         self._around.on_change()
@@ -197,14 +199,14 @@ class SimulatedSlots:
         for _ in range(len(self._waiting)):
             if not self._free:
                 return
-            lease, taken_s = self._waiting.popleft()
+            lease = self._waiting.popleft()
             scene = self._scenes.get(lease.rollout.bundle_digest)
             if scene is None or scene.state is not ResidentState.WARM:
-                self._waiting.append((lease, taken_s))
+                self._waiting.append(lease)
             else:
-                self._execute(lease, scene, taken_s)
+                self._execute(lease, scene)
 
-    def _execute(self, lease: Lease, scene: _Scene, taken_s: float) -> None:
+    def _execute(self, lease: Lease, scene: _Scene) -> None:
         around = self._around
         self._clock += 1
         scene.last_used = self._clock
@@ -224,7 +226,7 @@ class SimulatedSlots:
             seconds = lease.deadline_s
             outcome = InfraFailure(InfraCode.SLOT_TIMEOUT, "killed", self._machine.worker_id)
         else:
-            timings = Timings(began_s - taken_s, 0.0, seconds)
+            timings = Timings(execute_s=seconds)
             outcome = Completed(REWARD, (), (), rollout_id, self._machine.worker_id, timings, warm=True)
         around.agenda.after(seconds, lambda: self._finished(lease, outcome))
 

@@ -47,6 +47,51 @@ ROLE_VIEWER: Role.ValueType  # 4
 ROLE_ADMIN: Role.ValueType  # 5
 Global___Role: typing_extensions.TypeAlias = Role
 
+class _EventKind:
+    ValueType = typing.NewType("ValueType", builtins.int)
+    V: typing_extensions.TypeAlias = ValueType
+
+class _EventKindEnumTypeWrapper(google.protobuf.internal.enum_type_wrapper._EnumTypeWrapper[_EventKind.ValueType], builtins.type):
+    DESCRIPTOR: google.protobuf.descriptor.EnumDescriptor
+    EVENT_KIND_UNSPECIFIED: _EventKind.ValueType  # 0
+    EVENT_KIND_RUN_OPENED: _EventKind.ValueType  # 1
+    EVENT_KIND_RUN_CLOSED: _EventKind.ValueType  # 2
+    EVENT_KIND_SUBMITTED: _EventKind.ValueType  # 3
+    """A batch of so many rollouts came."""
+    EVENT_KIND_LEASED: _EventKind.ValueType  # 4
+    EVENT_KIND_COMPLETED: _EventKind.ValueType  # 5
+    """A lease ended with a result. When it began follows from its timings."""
+    EVENT_KIND_FAILED: _EventKind.ValueType  # 6
+    """A lease ended without one, in the worker's own words."""
+    EVENT_KIND_ENDED: _EventKind.ValueType  # 7
+    """A rollout reached its outcome, and it is no result."""
+    EVENT_KIND_WORKER_JOINED: _EventKind.ValueType  # 8
+    EVENT_KIND_WORKER_LOST: _EventKind.ValueType  # 9
+    EVENT_KIND_SCENE_WARM: _EventKind.ValueType  # 10
+    EVENT_KIND_SCENE_EVICTED: _EventKind.ValueType  # 11
+    EVENT_KIND_SCENE_FAILED: _EventKind.ValueType  # 12
+
+class EventKind(_EventKind, metaclass=_EventKindEnumTypeWrapper): ...
+
+EVENT_KIND_UNSPECIFIED: EventKind.ValueType  # 0
+EVENT_KIND_RUN_OPENED: EventKind.ValueType  # 1
+EVENT_KIND_RUN_CLOSED: EventKind.ValueType  # 2
+EVENT_KIND_SUBMITTED: EventKind.ValueType  # 3
+"""A batch of so many rollouts came."""
+EVENT_KIND_LEASED: EventKind.ValueType  # 4
+EVENT_KIND_COMPLETED: EventKind.ValueType  # 5
+"""A lease ended with a result. When it began follows from its timings."""
+EVENT_KIND_FAILED: EventKind.ValueType  # 6
+"""A lease ended without one, in the worker's own words."""
+EVENT_KIND_ENDED: EventKind.ValueType  # 7
+"""A rollout reached its outcome, and it is no result."""
+EVENT_KIND_WORKER_JOINED: EventKind.ValueType  # 8
+EVENT_KIND_WORKER_LOST: EventKind.ValueType  # 9
+EVENT_KIND_SCENE_WARM: EventKind.ValueType  # 10
+EVENT_KIND_SCENE_EVICTED: EventKind.ValueType  # 11
+EVENT_KIND_SCENE_FAILED: EventKind.ValueType  # 12
+Global___EventKind: typing_extensions.TypeAlias = EventKind
+
 @typing.final
 class ResumeWorkerRequest(google.protobuf.message.Message):
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
@@ -403,9 +448,15 @@ Global___ListWorkersResponse: typing_extensions.TypeAlias = ListWorkersResponse
 class ListRunsRequest(google.protobuf.message.Message):
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
+    CLOSED_FIELD_NUMBER: builtins.int
+    closed: builtins.bool
+    """Those that were closed and are still kept, instead of those that are open."""
     def __init__(
         self,
+        *,
+        closed: builtins.bool = ...,
     ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["closed", b"closed"]) -> None: ...
 
 Global___ListRunsRequest: typing_extensions.TypeAlias = ListRunsRequest
 
@@ -417,9 +468,14 @@ class RunInfo(google.protobuf.message.Message):
     NAME_FIELD_NUMBER: builtins.int
     STATS_FIELD_NUMBER: builtins.int
     PENDING_FIELD_NUMBER: builtins.int
+    OPENED_S_FIELD_NUMBER: builtins.int
+    CLOSED_S_FIELD_NUMBER: builtins.int
     run_id: builtins.str
     name: builtins.str
     pending: builtins.int
+    opened_s: builtins.float
+    """Seconds since the epoch on the manager's clock; closed_s is 0 while it is open."""
+    closed_s: builtins.float
     @property
     def stats(self) -> embomatrix.proto.v1.rollout_service_pb2.RunStats: ...
     def __init__(
@@ -429,9 +485,11 @@ class RunInfo(google.protobuf.message.Message):
         name: builtins.str = ...,
         stats: embomatrix.proto.v1.rollout_service_pb2.RunStats | None = ...,
         pending: builtins.int = ...,
+        opened_s: builtins.float = ...,
+        closed_s: builtins.float = ...,
     ) -> None: ...
     def HasField(self, field_name: typing.Literal["stats", b"stats"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["name", b"name", "pending", b"pending", "run_id", b"run_id", "stats", b"stats"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["closed_s", b"closed_s", "name", b"name", "opened_s", b"opened_s", "pending", b"pending", "run_id", b"run_id", "stats", b"stats"]) -> None: ...
 
 Global___RunInfo: typing_extensions.TypeAlias = RunInfo
 
@@ -475,3 +533,295 @@ class DrainWorkerResponse(google.protobuf.message.Message):
     ) -> None: ...
 
 Global___DrainWorkerResponse: typing_extensions.TypeAlias = DrainWorkerResponse
+
+@typing.final
+class RunEvent(google.protobuf.message.Message):
+    """One fact of the log. What does not apply is empty."""
+
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    SEQUENCE_FIELD_NUMBER: builtins.int
+    AT_S_FIELD_NUMBER: builtins.int
+    KIND_FIELD_NUMBER: builtins.int
+    RUN_ID_FIELD_NUMBER: builtins.int
+    BATCH_ID_FIELD_NUMBER: builtins.int
+    ROLLOUT_ID_FIELD_NUMBER: builtins.int
+    WORKER_ID_FIELD_NUMBER: builtins.int
+    BUNDLE_DIGEST_FIELD_NUMBER: builtins.int
+    SLOT_FIELD_NUMBER: builtins.int
+    ATTEMPT_FIELD_NUMBER: builtins.int
+    CODE_FIELD_NUMBER: builtins.int
+    MESSAGE_FIELD_NUMBER: builtins.int
+    TIMINGS_FIELD_NUMBER: builtins.int
+    HELD_S_FIELD_NUMBER: builtins.int
+    SIZE_FIELD_NUMBER: builtins.int
+    sequence: builtins.int
+    """Rises by one from event to event of this manager."""
+    at_s: builtins.float
+    """Seconds since the epoch, on the manager's clock."""
+    kind: Global___EventKind.ValueType
+    run_id: builtins.str
+    batch_id: builtins.str
+    rollout_id: builtins.str
+    worker_id: builtins.str
+    bundle_digest: builtins.str
+    slot: builtins.int
+    attempt: builtins.int
+    code: builtins.str
+    """Of a failure."""
+    message: builtins.str
+    held_s: builtins.float
+    """Seconds that the slot was taken, on the worker's clock."""
+    size: builtins.int
+    """Rollouts of a batch, or slots of a worker."""
+    @property
+    def timings(self) -> embomatrix.proto.v1.types_pb2.Timings:
+        """Of a lease that ended: deliver_s is not known by then."""
+
+    def __init__(
+        self,
+        *,
+        sequence: builtins.int = ...,
+        at_s: builtins.float = ...,
+        kind: Global___EventKind.ValueType = ...,
+        run_id: builtins.str = ...,
+        batch_id: builtins.str = ...,
+        rollout_id: builtins.str = ...,
+        worker_id: builtins.str = ...,
+        bundle_digest: builtins.str = ...,
+        slot: builtins.int = ...,
+        attempt: builtins.int = ...,
+        code: builtins.str = ...,
+        message: builtins.str = ...,
+        timings: embomatrix.proto.v1.types_pb2.Timings | None = ...,
+        held_s: builtins.float = ...,
+        size: builtins.int = ...,
+    ) -> None: ...
+    def HasField(self, field_name: typing.Literal["timings", b"timings"]) -> builtins.bool: ...
+    def ClearField(self, field_name: typing.Literal["at_s", b"at_s", "attempt", b"attempt", "batch_id", b"batch_id", "bundle_digest", b"bundle_digest", "code", b"code", "held_s", b"held_s", "kind", b"kind", "message", b"message", "rollout_id", b"rollout_id", "run_id", b"run_id", "sequence", b"sequence", "size", b"size", "slot", b"slot", "timings", b"timings", "worker_id", b"worker_id"]) -> None: ...
+
+Global___RunEvent: typing_extensions.TypeAlias = RunEvent
+
+@typing.final
+class ReadEventsRequest(google.protobuf.message.Message):
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    RUN_ID_FIELD_NUMBER: builtins.int
+    AFTER_FIELD_NUMBER: builtins.int
+    LIMIT_FIELD_NUMBER: builtins.int
+    run_id: builtins.str
+    """Empty: what concerns no run, of workers and scenes."""
+    after: builtins.int
+    """Events after this one."""
+    limit: builtins.int
+    """At most; 0 stands for as many as a message takes."""
+    def __init__(
+        self,
+        *,
+        run_id: builtins.str = ...,
+        after: builtins.int = ...,
+        limit: builtins.int = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["after", b"after", "limit", b"limit", "run_id", b"run_id"]) -> None: ...
+
+Global___ReadEventsRequest: typing_extensions.TypeAlias = ReadEventsRequest
+
+@typing.final
+class ReadEventsResponse(google.protobuf.message.Message):
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    EVENTS_FIELD_NUMBER: builtins.int
+    DROPPED_FIELD_NUMBER: builtins.int
+    dropped: builtins.int
+    """Of the log so far: the oldest make room."""
+    @property
+    def events(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___RunEvent]: ...
+    def __init__(
+        self,
+        *,
+        events: collections.abc.Iterable[Global___RunEvent] | None = ...,
+        dropped: builtins.int = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["dropped", b"dropped", "events", b"events"]) -> None: ...
+
+Global___ReadEventsResponse: typing_extensions.TypeAlias = ReadEventsResponse
+
+@typing.final
+class GetRunRequest(google.protobuf.message.Message):
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    RUN_ID_FIELD_NUMBER: builtins.int
+    run_id: builtins.str
+    def __init__(
+        self,
+        *,
+        run_id: builtins.str = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["run_id", b"run_id"]) -> None: ...
+
+Global___GetRunRequest: typing_extensions.TypeAlias = GetRunRequest
+
+@typing.final
+class PhaseSummary(google.protobuf.message.Message):
+    """Completed rollouts by the time that a phase took. Quantiles are right to 4 %."""
+
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    PHASE_FIELD_NUMBER: builtins.int
+    COUNT_FIELD_NUMBER: builtins.int
+    SUM_S_FIELD_NUMBER: builtins.int
+    P50_S_FIELD_NUMBER: builtins.int
+    P95_S_FIELD_NUMBER: builtins.int
+    P99_S_FIELD_NUMBER: builtins.int
+    phase: builtins.str
+    count: builtins.int
+    sum_s: builtins.float
+    p50_s: builtins.float
+    p95_s: builtins.float
+    p99_s: builtins.float
+    def __init__(
+        self,
+        *,
+        phase: builtins.str = ...,
+        count: builtins.int = ...,
+        sum_s: builtins.float = ...,
+        p50_s: builtins.float = ...,
+        p95_s: builtins.float = ...,
+        p99_s: builtins.float = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["count", b"count", "p50_s", b"p50_s", "p95_s", b"p95_s", "p99_s", b"p99_s", "phase", b"phase", "sum_s", b"sum_s"]) -> None: ...
+
+Global___PhaseSummary: typing_extensions.TypeAlias = PhaseSummary
+
+@typing.final
+class RunWorker(google.protobuf.message.Message):
+    """What a worker did for a run."""
+
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    WORKER_ID_FIELD_NUMBER: builtins.int
+    COMPLETED_FIELD_NUMBER: builtins.int
+    FAILED_FIELD_NUMBER: builtins.int
+    EXECUTE_S_FIELD_NUMBER: builtins.int
+    LOAD_S_FIELD_NUMBER: builtins.int
+    worker_id: builtins.str
+    completed: builtins.int
+    failed: builtins.int
+    execute_s: builtins.float
+    load_s: builtins.float
+    def __init__(
+        self,
+        *,
+        worker_id: builtins.str = ...,
+        completed: builtins.int = ...,
+        failed: builtins.int = ...,
+        execute_s: builtins.float = ...,
+        load_s: builtins.float = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["completed", b"completed", "execute_s", b"execute_s", "failed", b"failed", "load_s", b"load_s", "worker_id", b"worker_id"]) -> None: ...
+
+Global___RunWorker: typing_extensions.TypeAlias = RunWorker
+
+@typing.final
+class RunSeries(google.protobuf.message.Message):
+    """Outcomes by time: one number for each step since the run was opened."""
+
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    STEP_S_FIELD_NUMBER: builtins.int
+    COMPLETED_FIELD_NUMBER: builtins.int
+    FAILED_FIELD_NUMBER: builtins.int
+    step_s: builtins.float
+    @property
+    def completed(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.int]: ...
+    @property
+    def failed(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.int]: ...
+    def __init__(
+        self,
+        *,
+        step_s: builtins.float = ...,
+        completed: collections.abc.Iterable[builtins.int] | None = ...,
+        failed: collections.abc.Iterable[builtins.int] | None = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["completed", b"completed", "failed", b"failed", "step_s", b"step_s"]) -> None: ...
+
+Global___RunSeries: typing_extensions.TypeAlias = RunSeries
+
+@typing.final
+class GetRunResponse(google.protobuf.message.Message):
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    RUN_FIELD_NUMBER: builtins.int
+    PHASES_FIELD_NUMBER: builtins.int
+    WORKERS_FIELD_NUMBER: builtins.int
+    SERIES_FIELD_NUMBER: builtins.int
+    FAILURES_FIELD_NUMBER: builtins.int
+    MANAGER_CPU_S_FIELD_NUMBER: builtins.int
+    PREWARM_LEAD_FIELD_NUMBER: builtins.int
+    SCENE_LOAD_FIELD_NUMBER: builtins.int
+    EVENTS_DROPPED_FIELD_NUMBER: builtins.int
+    VERSION_FIELD_NUMBER: builtins.int
+    manager_cpu_s: builtins.float
+    """CPU seconds of the manager while the run was open, for all runs."""
+    events_dropped: builtins.int
+    version: builtins.str
+    """Of the manager's software."""
+    @property
+    def run(self) -> Global___RunInfo: ...
+    @property
+    def phases(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___PhaseSummary]: ...
+    @property
+    def workers(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___RunWorker]: ...
+    @property
+    def series(self) -> Global___RunSeries: ...
+    @property
+    def failures(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___RunEvent]:
+        """The latest leases and rollouts that failed, in the words of whoever saw it."""
+
+    @property
+    def prewarm_lead(self) -> Global___PhaseSummary:
+        """Between a scene being warm and its first demand."""
+
+    @property
+    def scene_load(self) -> Global___PhaseSummary: ...
+    def __init__(
+        self,
+        *,
+        run: Global___RunInfo | None = ...,
+        phases: collections.abc.Iterable[Global___PhaseSummary] | None = ...,
+        workers: collections.abc.Iterable[Global___RunWorker] | None = ...,
+        series: Global___RunSeries | None = ...,
+        failures: collections.abc.Iterable[Global___RunEvent] | None = ...,
+        manager_cpu_s: builtins.float = ...,
+        prewarm_lead: Global___PhaseSummary | None = ...,
+        scene_load: Global___PhaseSummary | None = ...,
+        events_dropped: builtins.int = ...,
+        version: builtins.str = ...,
+    ) -> None: ...
+    def HasField(self, field_name: typing.Literal["prewarm_lead", b"prewarm_lead", "run", b"run", "scene_load", b"scene_load", "series", b"series"]) -> builtins.bool: ...
+    def ClearField(self, field_name: typing.Literal["events_dropped", b"events_dropped", "failures", b"failures", "manager_cpu_s", b"manager_cpu_s", "phases", b"phases", "prewarm_lead", b"prewarm_lead", "run", b"run", "scene_load", b"scene_load", "series", b"series", "version", b"version", "workers", b"workers"]) -> None: ...
+
+Global___GetRunResponse: typing_extensions.TypeAlias = GetRunResponse
+
+@typing.final
+class KeptRun(google.protobuf.message.Message):
+    """A closed run, as the manager keeps it on disk."""
+
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    SUMMARY_FIELD_NUMBER: builtins.int
+    EVENTS_FIELD_NUMBER: builtins.int
+    @property
+    def summary(self) -> Global___GetRunResponse: ...
+    @property
+    def events(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___RunEvent]: ...
+    def __init__(
+        self,
+        *,
+        summary: Global___GetRunResponse | None = ...,
+        events: collections.abc.Iterable[Global___RunEvent] | None = ...,
+    ) -> None: ...
+    def HasField(self, field_name: typing.Literal["summary", b"summary"]) -> builtins.bool: ...
+    def ClearField(self, field_name: typing.Literal["events", b"events", "summary", b"summary"]) -> None: ...
+
+Global___KeptRun: typing_extensions.TypeAlias = KeptRun

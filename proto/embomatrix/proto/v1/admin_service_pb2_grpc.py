@@ -90,6 +90,16 @@ class AdminServiceStub(object):
                 request_serializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.RevokeTokenRequest.SerializeToString,
                 response_deserializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.RevokeTokenResponse.FromString,
                 _registered_method=True)
+        self.GetRun = channel.unary_unary(
+                '/embomatrix.proto.v1.AdminService/GetRun',
+                request_serializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.GetRunRequest.SerializeToString,
+                response_deserializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.GetRunResponse.FromString,
+                _registered_method=True)
+        self.ReadEvents = channel.unary_unary(
+                '/embomatrix.proto.v1.AdminService/ReadEvents',
+                request_serializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ReadEventsRequest.SerializeToString,
+                response_deserializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ReadEventsResponse.FromString,
+                _registered_method=True)
 
 
 class AdminServiceServicer(object):
@@ -167,6 +177,20 @@ class AdminServiceServicer(object):
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def GetRun(self, request, context):
+        """What a run came to so far, or in the end: closed ones are kept for a while.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def ReadEvents(self, request, context):
+        """A page of the event log of a run, or of the cluster.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
 
 def add_AdminServiceServicer_to_server(servicer, server):
     rpc_method_handlers = {
@@ -224,6 +248,16 @@ def add_AdminServiceServicer_to_server(servicer, server):
                     servicer.RevokeToken,
                     request_deserializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.RevokeTokenRequest.FromString,
                     response_serializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.RevokeTokenResponse.SerializeToString,
+            ),
+            'GetRun': grpc.unary_unary_rpc_method_handler(
+                    servicer.GetRun,
+                    request_deserializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.GetRunRequest.FromString,
+                    response_serializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.GetRunResponse.SerializeToString,
+            ),
+            'ReadEvents': grpc.unary_unary_rpc_method_handler(
+                    servicer.ReadEvents,
+                    request_deserializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ReadEventsRequest.FromString,
+                    response_serializer=embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ReadEventsResponse.SerializeToString,
             ),
     }
     generic_handler = grpc.method_handlers_generic_handler(
@@ -524,6 +558,60 @@ class AdminService(object):
             '/embomatrix.proto.v1.AdminService/RevokeToken',
             embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.RevokeTokenRequest.SerializeToString,
             embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.RevokeTokenResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def GetRun(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/embomatrix.proto.v1.AdminService/GetRun',
+            embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.GetRunRequest.SerializeToString,
+            embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.GetRunResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def ReadEvents(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/embomatrix.proto.v1.AdminService/ReadEvents',
+            embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ReadEventsRequest.SerializeToString,
+            embomatrix_dot_proto_dot_v1_dot_admin__service__pb2.ReadEventsResponse.FromString,
             options,
             channel_credentials,
             insecure,

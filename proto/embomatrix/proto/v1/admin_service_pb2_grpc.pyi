@@ -201,7 +201,39 @@ _AdminServiceRevokeTokenType = typing_extensions.TypeVar(
     ],
 )
 
-class AdminServiceStub(typing.Generic[_AdminServiceListWorkersType, _AdminServiceListRunsType, _AdminServiceDrainWorkerType, _AdminServiceResumeWorkerType, _AdminServiceRevokeWorkerType, _AdminServiceGetPlanType, _AdminServicePauseDispatchType, _AdminServiceResumeDispatchType, _AdminServiceIssueTokenType, _AdminServiceListTokensType, _AdminServiceRevokeTokenType]):
+_AdminServiceGetRunType = typing_extensions.TypeVar(
+    '_AdminServiceGetRunType',
+    grpc.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.GetRunRequest,
+        embomatrix.proto.v1.admin_service_pb2.GetRunResponse,
+    ],
+    grpc.aio.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.GetRunRequest,
+        embomatrix.proto.v1.admin_service_pb2.GetRunResponse,
+    ],
+    default=grpc.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.GetRunRequest,
+        embomatrix.proto.v1.admin_service_pb2.GetRunResponse,
+    ],
+)
+
+_AdminServiceReadEventsType = typing_extensions.TypeVar(
+    '_AdminServiceReadEventsType',
+    grpc.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.ReadEventsRequest,
+        embomatrix.proto.v1.admin_service_pb2.ReadEventsResponse,
+    ],
+    grpc.aio.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.ReadEventsRequest,
+        embomatrix.proto.v1.admin_service_pb2.ReadEventsResponse,
+    ],
+    default=grpc.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.ReadEventsRequest,
+        embomatrix.proto.v1.admin_service_pb2.ReadEventsResponse,
+    ],
+)
+
+class AdminServiceStub(typing.Generic[_AdminServiceListWorkersType, _AdminServiceListRunsType, _AdminServiceDrainWorkerType, _AdminServiceResumeWorkerType, _AdminServiceRevokeWorkerType, _AdminServiceGetPlanType, _AdminServicePauseDispatchType, _AdminServiceResumeDispatchType, _AdminServiceIssueTokenType, _AdminServiceListTokensType, _AdminServiceRevokeTokenType, _AdminServiceGetRunType, _AdminServiceReadEventsType]):
     """Operators: what the cluster is doing, and a way to take a worker out."""
 
     @typing.overload
@@ -249,6 +281,14 @@ class AdminServiceStub(typing.Generic[_AdminServiceListWorkersType, _AdminServic
         grpc.UnaryUnaryMultiCallable[
             embomatrix.proto.v1.admin_service_pb2.RevokeTokenRequest,
             embomatrix.proto.v1.admin_service_pb2.RevokeTokenResponse,
+        ],
+        grpc.UnaryUnaryMultiCallable[
+            embomatrix.proto.v1.admin_service_pb2.GetRunRequest,
+            embomatrix.proto.v1.admin_service_pb2.GetRunResponse,
+        ],
+        grpc.UnaryUnaryMultiCallable[
+            embomatrix.proto.v1.admin_service_pb2.ReadEventsRequest,
+            embomatrix.proto.v1.admin_service_pb2.ReadEventsResponse,
         ],
     ], channel: grpc.Channel) -> None: ...
 
@@ -298,6 +338,14 @@ class AdminServiceStub(typing.Generic[_AdminServiceListWorkersType, _AdminServic
             embomatrix.proto.v1.admin_service_pb2.RevokeTokenRequest,
             embomatrix.proto.v1.admin_service_pb2.RevokeTokenResponse,
         ],
+        grpc.aio.UnaryUnaryMultiCallable[
+            embomatrix.proto.v1.admin_service_pb2.GetRunRequest,
+            embomatrix.proto.v1.admin_service_pb2.GetRunResponse,
+        ],
+        grpc.aio.UnaryUnaryMultiCallable[
+            embomatrix.proto.v1.admin_service_pb2.ReadEventsRequest,
+            embomatrix.proto.v1.admin_service_pb2.ReadEventsResponse,
+        ],
     ], channel: grpc.aio.Channel) -> None: ...
 
     ListWorkers: _AdminServiceListWorkersType
@@ -326,6 +374,12 @@ class AdminServiceStub(typing.Generic[_AdminServiceListWorkersType, _AdminServic
     ListTokens: _AdminServiceListTokensType
 
     RevokeToken: _AdminServiceRevokeTokenType
+
+    GetRun: _AdminServiceGetRunType
+    """What a run came to so far, or in the end: closed ones are kept for a while."""
+
+    ReadEvents: _AdminServiceReadEventsType
+    """A page of the event log of a run, or of the cluster."""
 
 AdminServiceAsyncStub: typing_extensions.TypeAlias = AdminServiceStub[
     grpc.aio.UnaryUnaryMultiCallable[
@@ -371,6 +425,14 @@ AdminServiceAsyncStub: typing_extensions.TypeAlias = AdminServiceStub[
     grpc.aio.UnaryUnaryMultiCallable[
         embomatrix.proto.v1.admin_service_pb2.RevokeTokenRequest,
         embomatrix.proto.v1.admin_service_pb2.RevokeTokenResponse,
+    ],
+    grpc.aio.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.GetRunRequest,
+        embomatrix.proto.v1.admin_service_pb2.GetRunResponse,
+    ],
+    grpc.aio.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.admin_service_pb2.ReadEventsRequest,
+        embomatrix.proto.v1.admin_service_pb2.ReadEventsResponse,
     ],
 ]
 
@@ -458,5 +520,21 @@ class AdminServiceServicer(metaclass=abc.ABCMeta):
         request: embomatrix.proto.v1.admin_service_pb2.RevokeTokenRequest,
         context: _ServicerContext,
     ) -> typing.Union[embomatrix.proto.v1.admin_service_pb2.RevokeTokenResponse, collections.abc.Awaitable[embomatrix.proto.v1.admin_service_pb2.RevokeTokenResponse]]: ...
+
+    @abc.abstractmethod
+    def GetRun(
+        self,
+        request: embomatrix.proto.v1.admin_service_pb2.GetRunRequest,
+        context: _ServicerContext,
+    ) -> typing.Union[embomatrix.proto.v1.admin_service_pb2.GetRunResponse, collections.abc.Awaitable[embomatrix.proto.v1.admin_service_pb2.GetRunResponse]]:
+        """What a run came to so far, or in the end: closed ones are kept for a while."""
+
+    @abc.abstractmethod
+    def ReadEvents(
+        self,
+        request: embomatrix.proto.v1.admin_service_pb2.ReadEventsRequest,
+        context: _ServicerContext,
+    ) -> typing.Union[embomatrix.proto.v1.admin_service_pb2.ReadEventsResponse, collections.abc.Awaitable[embomatrix.proto.v1.admin_service_pb2.ReadEventsResponse]]:
+        """A page of the event log of a run, or of the cluster."""
 
 def add_AdminServiceServicer_to_server(servicer: AdminServiceServicer, server: typing.Union[grpc.Server, grpc.aio.Server]) -> None: ...

@@ -276,6 +276,12 @@ class LeaseResult(google.protobuf.message.Message):
     LEASE_FIELD_NUMBER: builtins.int
     COMPLETED_FIELD_NUMBER: builtins.int
     INFRA_FAILURE_FIELD_NUMBER: builtins.int
+    SLOT_FIELD_NUMBER: builtins.int
+    HELD_S_FIELD_NUMBER: builtins.int
+    slot: builtins.int
+    """The permit under which it ran, from 1; 0: it never ran, or the worker does not tell."""
+    held_s: builtins.float
+    """Seconds that it had the permit, on the worker's clock."""
     @property
     def lease(self) -> Global___LeaseRef: ...
     @property
@@ -288,9 +294,11 @@ class LeaseResult(google.protobuf.message.Message):
         lease: Global___LeaseRef | None = ...,
         completed: embomatrix.proto.v1.types_pb2.Completed | None = ...,
         infra_failure: embomatrix.proto.v1.types_pb2.InfraFailure | None = ...,
+        slot: builtins.int = ...,
+        held_s: builtins.float = ...,
     ) -> None: ...
     def HasField(self, field_name: typing.Literal["completed", b"completed", "infra_failure", b"infra_failure", "lease", b"lease", "outcome", b"outcome"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["completed", b"completed", "infra_failure", b"infra_failure", "lease", b"lease", "outcome", b"outcome"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["completed", b"completed", "held_s", b"held_s", "infra_failure", b"infra_failure", "lease", b"lease", "outcome", b"outcome", "slot", b"slot"]) -> None: ...
     def WhichOneof(self, oneof_group: typing.Literal["outcome", b"outcome"]) -> typing.Literal["completed", "infra_failure"] | None: ...
 
 Global___LeaseResult: typing_extensions.TypeAlias = LeaseResult

@@ -1,0 +1,81 @@
+"""The operator's side of the cluster: what it does and did, and the levers on it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final, Self
+
+from embomatrix.proto.v1 import admin_service_pb2 as pb
+from embomatrix.proto.v1 import admin_service_pb2_grpc
+from embomatrix.rpc.channel import DEFAULT_ADDRESS, open_channel
+from embomatrix.rpc.convert import each, inside
+from embomatrix.rpc.convert_log import event_page_from_proto, run_summary_from_proto
+from embomatrix.rpc.convert_session import run_info_from_proto, worker_info_from_proto
+from embomatrix.rpc.status import cluster_errors
+
+if TYPE_CHECKING:
+    from embomatrix.rpc.run_log import EventPage, RunEvent, RunSummary
+    from embomatrix.rpc.values import RunInfo, WorkerInfo
+
+CALL_S: Final = 10.0
+"""For the answer to one call."""
+
+
+class AdminClient:
+    """Async context manager over one channel to the manager at HOST:PORT. Every failure is a ``ClusterError``."""
+
+    def __init__(self, address: str = DEFAULT_ADDRESS, token: str = "", *, call_s: float = CALL_S) -> None:
+        self._address = address
+        self._token = token
+        self._call_s = call_s
+
+    async def __aenter__(self) -> Self:
+        self._channel = open_channel(self._address, self._token)
+        self._stub = admin_service_pb2_grpc.AdminServiceStub(self._channel)
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self._channel.close()
+
+    async def workers(self) -> tuple[WorkerInfo, ...]:
+        """The workers that the manager knows, also those that it lost a moment ago."""
+        with cluster_errors(self._address):
+            answer = await self._stub.ListWorkers(pb.ListWorkersRequest(), timeout=self._call_s)
+            return each("workers", worker_info_from_proto, answer.workers)
+
+    async def open_runs(self) -> tuple[RunInfo, ...]:
+        """Oldest first."""
+        return await self._runs(pb.ListRunsRequest())
+
+    async def closed_runs(self) -> tuple[RunInfo, ...]:
+        """Those that the manager still keeps, the one that was closed last first."""
+        return await self._runs(pb.ListRunsRequest(closed=True))
+
+    async def run(self, run_id: str) -> RunSummary:
+        """What a run came to, so far or in the end. Raises NotFoundError."""
+        with cluster_errors(self._address):
+            answer = await self._stub.GetRun(pb.GetRunRequest(run_id=run_id), timeout=self._call_s)
+            return inside("summary", run_summary_from_proto, answer)
+
+    async def events(self, run_id: str = "", *, after: int = 0) -> EventPage:
+        """One page of a run's log, or of the fleet's, of what came after that sequence. Raises NotFoundError."""
+        request = pb.ReadEventsRequest(run_id=run_id, after=after)
+        with cluster_errors(self._address):
+            answer = await self._stub.ReadEvents(request, timeout=self._call_s)
+            return inside("page", event_page_from_proto, answer)
+
+    async def all_events(self, run_id: str = "") -> tuple[RunEvent, ...]:
+        """The whole log, as it is by now."""
+        found: list[RunEvent] = []
+        while page := (await self.events(run_id, after=found[-1].sequence if found else 0)).events:
+            found += page
+        return tuple(found)
+
+    async def drain(self, worker_id: str) -> None:
+        """The worker gets nothing new and leaves when it has finished what it holds. Raises NotFoundError."""
+        with cluster_errors(self._address):
+            await self._stub.DrainWorker(pb.DrainWorkerRequest(worker_id=worker_id), timeout=self._call_s)
+
+    async def _runs(self, request: pb.ListRunsRequest) -> tuple[RunInfo, ...]:
+        with cluster_errors(self._address):
+            answer = await self._stub.ListRuns(request, timeout=self._call_s)
+            return each("runs", run_info_from_proto, answer.runs)
