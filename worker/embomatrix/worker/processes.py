@@ -21,6 +21,8 @@ START_S: Final = 60.0
 """Limit for a root to import the engine, on a machine that is busy."""
 FORK_S: Final = 10.0
 REAP_S: Final = 5.0
+READ_BYTES: Final = 64 * 1024
+"""Taken from a process's stream at once: more than most answers have."""
 
 
 class ProcessGoneError(Exception):
@@ -28,12 +30,17 @@ class ProcessGoneError(Exception):
 
 
 class Peer:
-    """Asks one process, one question at a time."""
+    """Asks one process, one question at a time. Made and used on one event loop, which it stays registered with."""
 
     def __init__(self, connection: socket.socket) -> None:
         connection.setblocking(False)
         self._connection = connection
         self._turn = asyncio.Lock()
+        self._heard = bytearray()
+        self._gone = ""
+        self._listener: asyncio.Future[None] | None = None
+        # For good, not for each answer: taking it out and in again costs more than the answer itself.
+        asyncio.get_running_loop().add_reader(connection, self._readable)
 
     async def ask(self, frame: Frame) -> Frame:
         """Send the frame with its descriptors and wait for the answer. Raises ProcessGoneError.
@@ -43,14 +50,14 @@ class Peer:
         async with self._turn:
             try:
                 await self._send(frame)
-                return await self.hear()
             except OSError as error:
                 raise ProcessGoneError(str(error)) from error
+            return await self.hear()
 
     async def hear(self) -> Frame:
         """The next frame that comes unasked."""
-        header_bytes, body_bytes = frame_lengths(await self._receive(PREFIX_BYTES))
-        return unpack(await self._receive(header_bytes + body_bytes), header_bytes)
+        header_bytes, body_bytes = frame_lengths(await self._take(PREFIX_BYTES))
+        return unpack(await self._take(header_bytes + body_bytes), header_bytes)
 
     def close(self) -> None:
         """Close the stream. Whoever still waits for an answer on it must be cancelled."""
@@ -62,24 +69,47 @@ class Peer:
         self._connection.close()
 
     async def _send(self, frame: Frame) -> None:
-        loop = asyncio.get_running_loop()
         data = pack(frame)
-        if not frame.fds:
-            await loop.sock_sendall(self._connection, data)
-            return
-        # Requests with descriptors are a few bytes long and find the buffer empty: they never block.
-        sent = socket.send_fds(self._connection, [data], list(frame.fds))
-        await loop.sock_sendall(self._connection, data[sent:])
+        # A question finds the buffer empty: all but the largest are taken at once. Descriptors go with the first byte.
+        sent = (
+            socket.send_fds(self._connection, [data], list(frame.fds)) if frame.fds else self._send_now(data)
+        )
+        if sent < len(data):
+            await asyncio.get_running_loop().sock_sendall(self._connection, data[sent:])
 
-    async def _receive(self, count: int) -> bytes:
-        loop = asyncio.get_running_loop()
-        parts = bytearray()
-        while len(parts) < count:
-            part = await loop.sock_recv(self._connection, count - len(parts))
-            if not part:
-                raise ProcessGoneError("its stream ended")
-            parts += part
-        return bytes(parts)
+    def _send_now(self, data: bytes) -> int:
+        try:
+            return self._connection.send(data)
+        except BlockingIOError:
+            return 0
+
+    async def _take(self, count: int) -> bytes:
+        """The next so many bytes, waited for. Raises ProcessGoneError when the stream ends before."""
+        while len(self._heard) < count:
+            if self._gone:
+                raise ProcessGoneError(self._gone)
+            self._listener = asyncio.get_running_loop().create_future()
+            try:
+                await self._listener
+            finally:
+                self._listener = None
+        taken = bytes(memoryview(self._heard)[:count])
+        del self._heard[:count]
+        return taken
+
+    def _readable(self) -> None:
+        try:
+            part = self._connection.recv(READ_BYTES)
+            self._gone = "" if part else "its stream ended"
+        except BlockingIOError:
+            return
+        except OSError as error:
+            part, self._gone = b"", str(error)
+        self._heard += part
+        if self._gone:
+            asyncio.get_running_loop().remove_reader(self._connection)
+        if self._listener is not None and not self._listener.done():
+            self._listener.set_result(None)
 
 
 class Zygote:
