@@ -1,5 +1,8 @@
-"""A dataset of four tasks in the flat, small enough for commands under test."""
+"""Datasets in the flat, small enough for commands under test."""
 
+from dataclasses import replace
+
+from tests.fakes.plans import plan_of
 from tests.fakes.scenes import kitchen_scene, kitchen_tasks
 
 from embomatrix.sim.executor import Simulator
@@ -31,4 +34,27 @@ def write_kitchen_dataset(folder):
         for task in tasks.values()
     ]
     write_dataset(folder, records, {digest: data})
+    return folder
+
+
+def write_flats_dataset(folder, count, plans):
+    """The flat ``count`` times, under as many names, with a task for each of ``plans``, text by task id."""
+    records, bundles = [], {}
+    for number in range(count):
+        scene = replace(kitchen_scene(), scene_id=f"flat_{number}")
+        tasks = [task for task in kitchen_tasks(scene) if task.task_id in plans]
+        data = encode_bundle(Bundle(scene, {task.task_id: task for task in tasks}))
+        bundles[bundle_digest(data)] = data
+        records += [
+            TaskRecord(
+                task,
+                bundle_digest(data),
+                "train",
+                tuple(plan_to_json(plan_of(task, plans[task.task_id]))),
+                ("kitchen_0",),
+                "",
+            )
+            for task in tasks
+        ]
+    write_dataset(folder, records, bundles)
     return folder

@@ -9,11 +9,9 @@ from dataclasses import replace
 
 import psutil
 import pytest
-from tests.fakes.plans import plan_of
-from tests.fakes.scenes import kitchen_scene, kitchen_tasks
+from tests.fakes.datasets import write_flats_dataset
 from typer.testing import CliRunner
 
-from embomatrix.skills.parse import plan_to_json
 from embomatrix.skills.syntax import Skill
 from embomatrix.worker.bench_cli import app
 from embomatrix.worker.bench_figures import (
@@ -31,8 +29,7 @@ from embomatrix.worker.bench_page import END, render_page
 from embomatrix.worker.bench_processes import bench_cluster
 from embomatrix.worker.bench_scenes import scenes_of
 from embomatrix.worker.bench_workload import read_workload, workload_to_text, write_workload
-from embomatrix.world.bundle import Bundle, bundle_digest, encode_bundle
-from embomatrix.world.dataset import Dataset, TaskRecord, write_dataset
+from embomatrix.world.dataset import Dataset, write_dataset
 
 PLANS = {
     "apple_to_counter": "move apple_1; pick_up apple_1; move countertop_1; place countertop_1 ontop",
@@ -50,26 +47,7 @@ pytestmark = pytest.mark.timeout(240)
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
     """The flat five times, under five names, with two tasks each."""
-    folder = tmp_path_factory.mktemp("dataset")
-    records, bundles = [], {}
-    for number in range(SCENES):
-        scene = replace(kitchen_scene(), scene_id=f"flat_{number}")
-        tasks = [task for task in kitchen_tasks(scene) if task.task_id in PLANS]
-        data = encode_bundle(Bundle(scene, {task.task_id: task for task in tasks}))
-        bundles[bundle_digest(data)] = data
-        records += [
-            TaskRecord(
-                task,
-                bundle_digest(data),
-                "train",
-                tuple(plan_to_json(plan_of(task, PLANS[task.task_id]))),
-                ("kitchen_0",),
-                "",
-            )
-            for task in tasks
-        ]
-    write_dataset(folder, records, bundles)
-    return folder
+    return write_flats_dataset(tmp_path_factory.mktemp("dataset"), SCENES, PLANS)
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +68,13 @@ def everything(dataset, workload, tmp_path_factory):
     page = f"{out / 'benchmarks.md'}"
     engine = (f"--engine-dataset={dataset}", f"--workload={workload}", "--cycles=80")
     result = _bench(
-        "all", f"--dataset={dataset}", f"--out={page}", f"--json-dir={out}", "--limit-s=200", *engine
+        "all",
+        f"--dataset={dataset}",
+        f"--out={page}",
+        f"--json-dir={out}",
+        "--limit-s=200",
+        "--part=phases",
+        *engine,
     )
     assert result.exit_code == 0, result.output
     return result.output, out

@@ -2,23 +2,33 @@
 
 from __future__ import annotations
 
-import contextlib
-import json
 import time
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
-from embomatrix.rpc.status import ClusterError
-from embomatrix.sim.engine import EngineError
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.fidelity.report import report_on
 from embomatrix.sim.physical.actor import physical_simulator
-from embomatrix.worker.bench_cluster import ClusterLoad, bench_cluster_load
+from embomatrix.worker.bench_cluster import ClusterLoad
+from embomatrix.worker.bench_cluster_cli import (
+    DATASET,
+    ENGINE_DATASET,
+    LIMIT_S,
+    NAIVE,
+    DataSet,
+    EngineDataSet,
+    Json,
+    LimitS,
+    Naive,
+    Parts,
+    Work,
+    cluster,
+    cluster_job,
+    measure_cluster,
+)
 from embomatrix.worker.bench_engine import bench_engine, check_scenes
 from embomatrix.worker.bench_fidelity import (
     DISAGREEMENTS_FILE,
@@ -30,27 +40,16 @@ from embomatrix.worker.bench_fidelity import (
 from embomatrix.worker.bench_fidelity_page import figures_of, read_disagreement, skill_table
 from embomatrix.worker.bench_fidelity_page import replay as replayed
 from embomatrix.worker.bench_fidelity_pool import Modes
-from embomatrix.worker.bench_figures import (
-    BenchError,
-    BenchResult,
-    commit_here,
-    describe_machine,
-    figure_in,
-    is_shared,
-    read_result,
-    result_to_json,
-    shown,
-)
+from embomatrix.worker.bench_figures import BenchResult, commit_here, describe_machine, figure_in, read_result
+from embomatrix.worker.bench_output import console, errors, hand_in, refusals, write
 from embomatrix.worker.bench_page import hand_parts, render_page
 from embomatrix.worker.bench_rollout import bench_rollout
 from embomatrix.worker.bench_scenes import scenes_of
-from embomatrix.worker.bench_simulation import bench_simulation
 from embomatrix.worker.bench_workload import PINNED, SIZES, read_workload, workload_to_text, write_workload
-from embomatrix.world.bundle import BundleError
-from embomatrix.world.dataset import Dataset, DatasetError
+from embomatrix.world.dataset import Dataset
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Sequence
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -58,31 +57,18 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Measure the engine, rollouts and the cluster on this machine.",
 )
-console = Console()
-errors = Console(stderr=True, soft_wrap=True)
-
-DataSet = Annotated[Path, typer.Option("--dataset", help="Folder that `embomatrix factory build` wrote.")]
-Json = Annotated[Path | None, typer.Option("--json", help="File for the figures.")]
 Scenes = Annotated[int, typer.Option(min=1, help="Scenes to measure in.")]
-PhaseScenes = Annotated[int, typer.Option(min=1, help="Scenes of each phase, at most.")]
 Repeats = Annotated[int, typer.Option(min=1, help="Executions of each plan.")]
-Workers = Annotated[int, typer.Option(min=1, max=64, help="Worker daemons.")]
-Slots = Annotated[int, typer.Option(min=1, max=64, help="Slots of each worker.")]
-LimitS = Annotated[float, typer.Option(min=5.0, help="Seconds for the whole bench of the cluster.")]
-
-Work = Annotated[Path, typer.Option("--workload", help="File that `embomatrix bench workload` wrote.")]
-EngineDataSet = Annotated[Path, typer.Option(help="Dataset that the workload was written for.")]
 Page = Annotated[Path, typer.Option(help="Page to write; parts written by hand are kept.")]
 Cycles = Annotated[int, typer.Option(min=80, help="Cycles of loading and resetting, to see growth.")]
 
-DATASET = Path("build/dataset")
-ENGINE_DATASET = Path("build/engine")
 FIDELITY_DATASET = Path("build/scenes")
 FIDELITY_OUT = Path("build/fidelity")
-SIMULATION_OUT = Path("build/simulation")
 PAGE = Path("docs/benchmarks.md")
 SPEEDUP = "skill_speedup_min"
 MODES = Modes(cached=Simulator, physical=physical_simulator)
+
+app.command()(cluster)
 
 
 @app.command()
@@ -90,8 +76,8 @@ def rollout(
     dataset: DataSet = DATASET, json_file: Json = None, scenes: Scenes = 24, repeats: Repeats = 3
 ) -> None:
     """Measure loading, skills, rollouts, reset and reward in one process."""
-    with _refusals():
-        _hand_in(_rollout(dataset, scenes, repeats), json_file)
+    with refusals():
+        hand_in(_rollout(dataset, scenes, repeats), json_file)
 
 
 @app.command()
@@ -106,10 +92,10 @@ def engine(
     ] = None,
 ) -> None:
     """Measure the engine on one core with a pinned workload in furnished scenes."""
-    with _refusals():
+    with refusals():
         speedup = (figure_in(fidelity, SPEEDUP),) if fidelity is not None else ()
         result = _engine(dataset, workload, cycles)
-        _hand_in(replace(result, figures=(*result.figures, *speedup)), json_file)
+        hand_in(replace(result, figures=(*result.figures, *speedup)), json_file)
 
 
 @app.command()
@@ -128,13 +114,13 @@ def fidelity(
     ] = "",
 ) -> None:
     """Run the same plans in both execution modes and tell how far they agree; goes on where it was cut short."""
-    with _refusals():
+    with refusals():
         if replay:
             for line in replayed(Dataset.load(dataset), read_disagreement(replay), MODES):
                 console.print(line, highlight=False, markup=False, soft_wrap=True)
             return
         settings = FidelitySettings(plans, calls, seed)
-        _hand_in(_fidelity(Dataset.load(dataset), settings, out, jobs), json_file)
+        hand_in(_fidelity(Dataset.load(dataset), settings, out, jobs), json_file)
 
 
 @app.command()
@@ -151,7 +137,7 @@ def workload(
     """Write the plans that `bench engine` executes: after a change of scenes, their digests are no longer the same."""
     if bodies not in SIZES:
         raise typer.BadParameter(f"found {bodies}: expected one of {', '.join(map(str, SIZES))}")
-    with _refusals(), errors.status("reading the dataset") as status:
+    with refusals(), errors.status("reading the dataset") as status:
         written = write_workload(
             Dataset.load(dataset),
             seed=seed,
@@ -160,38 +146,9 @@ def workload(
             plans=plans,
             on_scene=lambda scene_id: status.update(f"writing plans for {scene_id}"),
         )
-        _write(out, workload_to_text(written))
+        write(out, workload_to_text(written))
     count = sum(len(scene.executions) for scene in written.scenes)
     console.print(f"wrote {count} plans in {len(written.scenes)} scenes to {out}", highlight=False)
-
-
-@app.command()
-def cluster(
-    dataset: DataSet = DATASET,
-    json_file: Json = None,
-    workers: Workers = 2,
-    slots: Slots = 1,
-    scenes: PhaseScenes = 16,
-    limit_s: LimitS = 60.0,
-    simulate: Annotated[
-        bool,
-        typer.Option(
-            "--simulate", help="Simulate large clusters instead: no dataset, no processes, pictures."
-        ),
-    ] = False,
-    most_workers: Annotated[
-        int, typer.Option(min=10, max=100_000, help="Workers of the largest simulated cluster.")
-    ] = 10_000,
-    out: Annotated[Path, typer.Option(help="Folder for the pictures of the simulation.")] = SIMULATION_OUT,
-) -> None:
-    """Measure a manager and workers on loopback: cold, prewarmed and warm. Or simulate thousands of workers."""
-    if simulate:
-        with _refusals():
-            _hand_in(_simulation(out, most_workers), json_file)
-        return
-    load = ClusterLoad(workers=workers, slots=slots, scenes=scenes, limit_s=limit_s)
-    with _refusals():
-        _hand_in(_cluster(dataset, load), json_file)
 
 
 @app.command(name="all")
@@ -199,7 +156,9 @@ def everything(
     dataset: DataSet = DATASET,
     out: Page = PAGE,
     json_dir: Annotated[Path | None, typer.Option(help="Folder for one JSON file for each bench.")] = None,
-    limit_s: LimitS = 60.0,
+    limit_s: LimitS = LIMIT_S,
+    part: Parts = None,
+    naive: Naive = NAIVE,
     engine_dataset: EngineDataSet = ENGINE_DATASET,
     workload: Work = PINNED,
     cycles: Cycles = 2000,
@@ -208,20 +167,21 @@ def everything(
     ] = None,
 ) -> None:
     """Run every bench but that of fidelity, which takes its time, and render the page."""
-    with _refusals():
+    with refusals():
         # What can't be read or replaced is refused before minutes are spent.
         hand_parts(_present(out))
         check_scenes(Dataset.load(engine_dataset), read_workload(workload))
+        job = cluster_job(dataset, engine_dataset, workload, part, naive, ClusterLoad(limit_s=limit_s))
         agreement = [read_result(fidelity)] if fidelity is not None else []
         results = [
             _engine(engine_dataset, workload, cycles),
             _rollout(dataset, scenes=24, repeats=3),
-            _cluster(dataset, ClusterLoad(limit_s=limit_s)),
+            measure_cluster(job),
         ]
         results = _with_speedup([*results, *agreement])
         for result in results:
-            _hand_in(result, json_dir / f"{result.bench}.json" if json_dir is not None else None)
-        _write(out, render_page(results, _present(out)))
+            hand_in(result, json_dir / f"{result.bench}.json" if json_dir is not None else None)
+        write(out, render_page(results, _present(out)))
         console.print(f"wrote {out}", highlight=False)
 
 
@@ -231,9 +191,9 @@ def page(
     out: Page = PAGE,
 ) -> None:
     """Render the page of figures that were measured before."""
-    with _refusals():
+    with refusals():
         results = _with_speedup([read_result(file) for file in files])
-        _write(out, render_page(results, _present(out)))
+        write(out, render_page(results, _present(out)))
         console.print(f"wrote {out}", highlight=False)
 
 
@@ -297,70 +257,5 @@ def _fidelity(dataset: Dataset, settings: FidelitySettings, out: Path, jobs: int
     return BenchResult("fidelity", commit_here(), machine, figures_of(outcome, minutes))
 
 
-def _cluster(dataset: Path, load: ClusterLoad) -> BenchResult:
-    machine = describe_machine() | {"workers": load.workers, "slots_each": load.slots}
-    chosen = scenes_of(Dataset.load(dataset), 2 * load.scenes + load.all_slots)
-    with errors.status("cluster") as status:
-
-        def on_phase(what: str) -> None:
-            status.update(f"cluster: {what}")
-
-        return BenchResult("cluster", commit_here(), machine, bench_cluster_load(chosen, load, on_phase))
-
-
-def _simulation(out: Path, most_workers: int) -> BenchResult:
-    machine = describe_machine() | {"most_workers": most_workers}
-    with errors.status("simulated cluster") as status:
-
-        def on_step(what: str) -> None:
-            status.update(f"simulated cluster: {what}")
-
-        figures = bench_simulation(out, most_workers, on_step)
-    console.print(f"pictures are in {out}", highlight=False)
-    return BenchResult("simulated-cluster", commit_here(), machine, figures)
-
-
-def _hand_in(result: BenchResult, json_file: Path | None) -> None:
-    """Show the table, and write the file when one is asked for."""
-    cores, load = result.machine["cores"], result.machine["load_before"]
-    table = Table(
-        title=f"bench {result.bench} at {result.commit}, {cores} cores, load before {load}",
-        title_justify="left",
-    )
-    table.add_column("figure")
-    for heading in ("value", "goal"):
-        table.add_column(heading, justify="right")
-    table.add_column("")
-    table.add_column("n", justify="right")
-    for figure in result.figures:
-        goal = "" if figure.goal is None else shown(figure.goal)
-        table.add_row(
-            figure.name, f"{shown(figure.value)} {figure.unit}", goal, figure.verdict, f"{figure.n:,}"
-        )
-    console.print(table)
-    if is_shared(result.machine):
-        console.print("The machine was busy before the bench began: the figures are worse than they need be.")
-    if json_file is not None:
-        _write(json_file, json.dumps(result_to_json(result), indent=2, ensure_ascii=False) + "\n")
-
-
 def _present(page: Path) -> str:
     return page.read_text(encoding="utf-8") if page.exists() else ""
-
-
-def _write(path: Path, text: str) -> None:
-    """Write beside and rename, so that a page with parts written by hand is never half a page."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f"{path.name}.part")
-    part.write_text(text, encoding="utf-8")
-    part.replace(path)
-
-
-@contextlib.contextmanager
-def _refusals() -> Iterator[None]:
-    """One sentence and status 2 for what a person can mend."""
-    try:
-        yield
-    except (BenchError, BundleError, ClusterError, DatasetError, EngineError, OSError) as error:
-        errors.print(f"embomatrix bench: {error}", highlight=False, markup=False)
-        raise typer.Exit(2) from None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import itertools
 import tempfile
 import time
@@ -12,10 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.rpc.client import ClusterClient
-from embomatrix.rpc.status import ClusterError
 from embomatrix.rpc.values import Batch, Completed, LookaheadEntry, ResidentState, Rollout, RunStats, Warmth
 from embomatrix.worker.bench_figures import BenchError, Better, Figure, quantile_figure
 from embomatrix.worker.bench_processes import bench_cluster
+from embomatrix.worker.bench_trainer import connected
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -132,7 +131,7 @@ async def _measure(
 
     try:
         async with asyncio.timeout(deadline_s - time.monotonic()), ClusterClient(cluster.address) as client:
-            await _connected(client, cluster)
+            await connected(client, cluster)
             await client.put_bundles({scene.bundle_digest: scene.data for scene in scenes})
             return await _phases(Session(client, load.all_slots), scenes, load, begin)
     except TimeoutError:
@@ -141,17 +140,6 @@ async def _measure(
             f"the bench took longer than {load.limit_s:g} s and was ended while {doing}: "
             "ask for fewer --scenes or allow more with --limit-s"
         ) from None
-
-
-async def _connected(client: ClusterClient, cluster: BenchCluster) -> None:
-    """Wait until every worker has joined."""
-    while True:
-        cluster.check()
-        with contextlib.suppress(ClusterError):
-            workers = await client.list_workers()
-            if cluster.workers <= {worker.worker_id for worker in workers if worker.state == "ready"}:
-                return
-        await asyncio.sleep(0.05)
 
 
 async def _phases(

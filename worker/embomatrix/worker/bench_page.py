@@ -6,10 +6,11 @@ import re
 import textwrap
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.worker.bench_ablation_page import EXPLANATION, ablation_lines
 from embomatrix.worker.bench_figures import BenchError, is_shared, shown
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
     from typing import Any
 
     from embomatrix.worker.bench_figures import BenchResult, Figure
@@ -85,12 +86,21 @@ def render_page(results: Sequence[BenchResult], before: str) -> str:
         if result.commit != results[0].commit:
             load = f"on {result.machine['cores']} cores with a load of {result.machine['load_before']} before"
             lines += [_paragraph(f"Measured at commit `{result.commit}`, {load}."), ""]
+        for subheading, words, rows in _subparts(result):
+            lines += [f"### {subheading}", "", _paragraph(words), "", *rows, ""]
         lines += _table(result.figures)
     headings = dict(HAND_PARTS)
     for name in dict.fromkeys([*headings, *parts]):
         lines += [""] + ([f"## {headings[name]}", ""] if name in headings else [])
         lines += [f"<!-- by hand: {name} -->\n{parts.get(name, '')}{END}"]
     return "\n".join(lines) + "\n"
+
+
+def _subparts(result: BenchResult) -> Iterator[tuple[str, str, list[str]]]:
+    """Heading, explanation and table of what has a table of its own form, before the bench's own table."""
+    ablation = ablation_lines(result.figures)
+    if ablation:
+        yield "The paper's ablation", EXPLANATION, ablation
 
 
 def hand_parts(page: str) -> dict[str, str]:

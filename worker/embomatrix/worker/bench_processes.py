@@ -61,44 +61,52 @@ class BenchCluster:
 
 
 @contextlib.contextmanager
-def bench_cluster(folder: Path, *, workers: int, slots: int, deadline_s: float) -> Iterator[BenchCluster]:
+def bench_cluster(
+    folder: Path, *, workers: int, slots: int, deadline_s: float, load_delay_s: float = 0.0
+) -> Iterator[BenchCluster]:
     """Start the processes, with state and logs below ``folder``; end them at the end, whatever happens.
 
-    The workers may still be connecting. ``deadline_s`` is on the monotonic clock: raises BenchError when the manager does
-    not serve by then, or ends.
+    The workers may still be connecting. With ``load_delay_s`` they load every scene so many seconds later.
+    ``deadline_s`` is on the monotonic clock: raises BenchError when the manager does not serve by then, or ends.
     """
     with contextlib.ExitStack() as started:
         manager = started.enter_context(
             _running(
                 folder,
                 "manager",
-                *("manager", "serve", "--port=0", "--http-port=0"),
+                *("embomatrix.cli", "manager", "serve", "--port=0", "--http-port=0"),
                 *(f"--state=sqlite:{folder / 'state.sqlite'}", f"--data-dir={folder / 'manager'}"),
             )
         )
         address = _address_of(manager, deadline_s)
         daemons = tuple(
             started.enter_context(
-                _running(
-                    folder,
-                    name,
-                    *("worker", "run", f"--manager={address}", f"--name={name}", f"--slots={slots}"),
-                    # As polite as the bench itself: manager, workers and trainer share the cores alike.
-                    *(f"--cache-dir={folder / 'cache' / name}", "--nice=0"),
-                )
+                _running(folder, name, *_worker_command(folder, address, name, slots, load_delay_s))
             )
             for name in (f"worker-{number}" for number in range(1, workers + 1))
         )
         yield BenchCluster(address, (manager, *daemons))
 
 
+def _worker_command(
+    folder: Path, address: str, name: str, slots: int, load_delay_s: float
+) -> tuple[str, ...]:
+    cache = folder / "cache" / name
+    if load_delay_s:
+        slow = "embomatrix.worker.bench_slow_worker"
+        return (slow, str(load_delay_s), address, name, str(slots), str(cache))
+    worker = ("embomatrix.cli", "worker", "run", f"--manager={address}", f"--name={name}", f"--slots={slots}")
+    # As polite as the bench itself: manager, workers and trainer share the cores alike.
+    return (*worker, f"--cache-dir={cache}", "--nice=0")
+
+
 @contextlib.contextmanager
 def _running(folder: Path, name: str, *arguments: str) -> Iterator[Process]:
-    """One `embomatrix` command of this interpreter in the background."""
+    """A module of this interpreter with its arguments, in the background."""
     log = folder / f"{name}.log"
     with log.open("wb") as file:
         child = subprocess.Popen(
-            (sys.executable, "-m", "embomatrix.cli", *arguments),
+            (sys.executable, "-m", *arguments),
             env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"},
             stdin=subprocess.DEVNULL,
             stdout=file,

@@ -48,9 +48,9 @@ class PhysicalActor:
 
     drawing = frozenset(Skill)
 
-    def __init__(self, bundle: Bundle) -> None:
-        """Take a physics client; the world is built when a rollout begins."""
-        self._dynamic = DynamicWorld(bundle.scene)
+    def __init__(self, bundle: Bundle, dynamic: DynamicWorld | None = None) -> None:
+        """Take a physics client, or the world that is given; it is built when a rollout begins, and closed with the actor."""
+        self._dynamic = dynamic if dynamic is not None else DynamicWorld(bundle.scene)
         self._stage: Stage | None = None
         self._watch: Callable[[], None] | None = None
 

@@ -1,0 +1,172 @@
+"""The paper's ablation on one and the same work: what a rollout costs without the system, and with more and more of it.
+
+The rows are those of the paper's table on simulation latency: naive, with pre-cached execution, with the
+Resource-Scheduler, with the Task-Dispatcher. Without a scheduler every rollout loads its scene; without a dispatcher the next
+rollout is submitted when the one before it has its result. Loading takes milliseconds here and most of a second in the paper,
+so the rows are told twice: as they are, and with a wait at every load.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from embomatrix.worker.bench_cpu import cpu_use
+from embomatrix.worker.bench_figures import Better, Figure
+from embomatrix.worker.bench_one_process import cached_s, naive_s
+from embomatrix.worker.bench_processes import bench_cluster
+from embomatrix.worker.bench_stepping import Stepping, take_steps
+from embomatrix.worker.bench_trainer import BenchTrainer, trainer_on
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from embomatrix.worker.bench_cpu import CpuUse
+    from embomatrix.worker.bench_stepping import Push
+    from embomatrix.worker.bench_trainer import Pushed
+    from embomatrix.worker.bench_work import Work
+
+FULL_GOAL_MS: Final = 2.0
+RATIO_GOAL: Final = 500.0
+RATE_GOAL_PER_SLOT: Final = 500.0
+OVERHEAD_GOAL: Final = 0.1
+DELAY_S: Final = 0.7
+"""What loading costs in the paper: the cached row's 0.85 s less the 0.14 s of the scheduler's."""
+PAUSE_OVER_DELAY: Final = 1.5
+"""Where loading is slowed, a language model writes a step's plans for that many loads."""
+
+
+@dataclass(frozen=True, slots=True)
+class AblationSizes:
+    """Rollouts of each row, all of the same work. A naive one takes seconds."""
+
+    naive: int = 16
+    cached: int = 80
+    singly: int = 80
+    rounds: int = 3
+    """Clusters that are brought up for the last row: each executes every plan once, so that no rollout repeats another."""
+    delay_s: float = DELAY_S
+    slots: int = 2
+    limit_s: float = 120.0
+    """For one cluster, from its first process to its last result."""
+
+
+@dataclass(frozen=True, slots=True)
+class ClusterRows:
+    """Of the rows that have a cluster: one by one, and all at once in every round."""
+
+    singly: Pushed
+    at_once: tuple[Pushed, ...]
+    used: tuple[CpuUse, ...]
+    """Processor time of each round while all went at once."""
+
+
+def bench_ablation(work: Work, sizes: AblationSizes, on_step: Callable[[str], None]) -> tuple[Figure, ...]:
+    """All rows. Raises BenchError when a process dies or a rollout is lost, EngineError when a scene can't be loaded."""
+    on_step("loading and executing physically, rollout by rollout")
+    naive = naive_s(work.sample(sizes.naive), work.bundles)
+    on_step("loading and executing in cached mode, rollout by rollout")
+    cached = cached_s(work.sample(sizes.cached), work.bundles)
+    rows = _cluster_rows(work, sizes, on_step)
+    on_step("executing with loading slowed")
+    singly = _slowed(work, sizes, BenchTrainer.push_singly)
+    at_once = _slowed(work, sizes, BenchTrainer.push)
+    scheduler = [arrival.latency_s for arrival in rows.singly.arrivals]
+    full_ms = _ms_each(rows.at_once)
+    ratio = float(np.mean(naive)) * 1e3 / full_ms
+    count = sum(len(pushed.arrivals) for pushed in rows.at_once)
+    return (
+        *_row("ablation_naive_ms", naive),
+        *_row("ablation_cached_ms", cached),
+        *_row("ablation_scheduler_ms", scheduler),
+        Figure("ablation_dispatcher_ms", full_ms, "ms", Better.LOWER, count, FULL_GOAL_MS),
+        Figure("ablation_ratio", ratio, "×", Better.HIGHER, len(naive), RATIO_GOAL),
+        Figure("ablation_ratio, equal cores", ratio / sizes.slots, "×", Better.HIGHER, len(naive)),
+        _slow("ablation_naive_slow_ms", float(np.mean(naive)) + sizes.delay_s, len(naive)),
+        _slow("ablation_cached_slow_ms", float(np.mean(cached)) + sizes.delay_s, len(cached)),
+        _slow("ablation_scheduler_slow_ms", _ms_each(singly) / 1e3, _count(singly)),
+        _slow("ablation_dispatcher_slow_ms", _ms_each(at_once) / 1e3, _count(at_once)),
+        *_throughput(rows, sizes),
+    )
+
+
+def _cluster_rows(work: Work, sizes: AblationSizes, on_step: Callable[[str], None]) -> ClusterRows:
+    rounds = []
+    for number in range(sizes.rounds):
+        on_step(f"executing at once, round {number + 1} of {sizes.rounds}")
+        rounds.append(_round(work, sizes))
+    pushed, used, singly = zip(*rounds, strict=True)
+    return ClusterRows(singly[-1], pushed, used)
+
+
+def _round(work: Work, sizes: AblationSizes) -> tuple[Pushed, CpuUse, Pushed]:
+    """In a fresh cluster with all scenes warm: every plan at once, then some one by one."""
+    deadline_s = time.monotonic() + sizes.limit_s
+    with (
+        tempfile.TemporaryDirectory(prefix="embomatrix-bench-") as name,
+        bench_cluster(Path(name), workers=1, slots=sizes.slots, deadline_s=deadline_s) as cluster,
+    ):
+
+        async def measure() -> tuple[Pushed, CpuUse, Pushed]:
+            async with trainer_on(cluster, work.bundles, deadline_s - time.monotonic()) as trainer:
+                await trainer.warm_up(work.rollouts)
+                before = cpu_use(cluster)
+                pushed = await trainer.push(work.rollouts)
+                used = cpu_use(cluster).since(before)
+                return pushed, used, await trainer.push_singly(work.sample(sizes.singly))
+
+        return asyncio.run(measure())
+
+
+def _slowed(work: Work, sizes: AblationSizes, push: Push) -> tuple[Pushed, ...]:
+    """Steps of a trainer that announces two steps ahead, on a worker that loads slowly."""
+    stepping = Stepping(work.steps(sizes.slots), pause_s=PAUSE_OVER_DELAY * sizes.delay_s, push=push)
+    return take_steps(work.bundles, stepping, sizes.slots, sizes.delay_s, sizes.limit_s).steps
+
+
+def _row(name: str, seconds: Sequence[float]) -> tuple[Figure, Figure]:
+    count = len(seconds)
+    mean_ms, spread_ms = float(np.mean(seconds)) * 1e3, float(np.std(seconds)) * 1e3
+    return (
+        Figure(name, mean_ms, "ms", Better.LOWER, count),
+        Figure(f"{name}, standard deviation", spread_ms, "ms", Better.LOWER, count),
+    )
+
+
+def _slow(name: str, seconds: float, count: int) -> Figure:
+    return Figure(name, seconds * 1e3, "ms", Better.LOWER, count)
+
+
+def _throughput(rows: ClusterRows, sizes: AblationSizes) -> tuple[Figure, ...]:
+    count = _count(rows.at_once)
+    goal = RATE_GOAL_PER_SLOT * sizes.slots
+    overhead = float(np.median([use.overhead for use in rows.used]))
+    parts = (
+        ("manager", sum(use.manager_s for use in rows.used)),
+        ("worker beside its slots", sum(use.daemons_s for use in rows.used)),
+        ("trainer", sum(use.trainer_s for use in rows.used)),
+        ("slots", sum(use.slots_s for use in rows.used)),
+    )
+    return (
+        Figure("rollouts_per_s", 1e3 / _ms_each(rows.at_once), "1/s", Better.HIGHER, count, goal),
+        Figure("overhead_ratio", overhead, "share", Better.LOWER, count, OVERHEAD_GOAL),
+        *(
+            Figure(f"CPU of a rollout: {who}", seconds / count * 1e6, "µs", Better.LOWER, count)
+            for who, seconds in parts
+        ),
+    )
+
+
+def _ms_each(pushed: Sequence[Pushed]) -> float:
+    """The time that all took together, for each rollout."""
+    return sum(item.wall_s for item in pushed) / _count(pushed) * 1e3
+
+
+def _count(pushed: Sequence[Pushed]) -> int:
+    return sum(len(item.arrivals) for item in pushed)

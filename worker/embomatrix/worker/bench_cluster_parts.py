@@ -1,0 +1,76 @@
+"""The parts of `bench cluster`, each measured on its own: all of them make one result."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.worker.bench_ablation import AblationSizes, bench_ablation
+from embomatrix.worker.bench_cluster import ClusterLoad, bench_cluster_load
+from embomatrix.worker.bench_prewarm import PrewarmSizes, bench_prewarm
+from embomatrix.worker.bench_scenes import scenes_of
+from embomatrix.worker.bench_work import main_work, whole_work
+from embomatrix.worker.bench_workload import read_workload
+from embomatrix.world.dataset import Dataset
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+    from pathlib import Path
+
+    from embomatrix.worker.bench_figures import Figure
+
+    OnStep = Callable[[str], None]
+
+
+class ClusterPart(StrEnum):
+    """What can be measured of a cluster, in the order of the page."""
+
+    PHASES = "phases"
+    ABLATION = "ablation"
+    PREWARM = "prewarm"
+
+
+@dataclass(frozen=True, slots=True)
+class ClusterJob:
+    """What is measured, and on what."""
+
+    dataset: Path
+    """Tasks with their oracle plans, for the phases."""
+    engine_dataset: Path
+    workload: Path
+    """The pinned plans for all other parts, and the dataset that they were written for."""
+    parts: tuple[ClusterPart, ...] = tuple(ClusterPart)
+    load: ClusterLoad = field(default_factory=ClusterLoad)
+    ablation: AblationSizes = field(default_factory=AblationSizes)
+    prewarm: PrewarmSizes = field(default_factory=PrewarmSizes)
+
+
+def bench_cluster_parts(job: ClusterJob, on_step: OnStep) -> tuple[Figure, ...]:
+    """Measure the job's parts one after another. Raises what they raise: see each."""
+    return tuple(
+        figure for part in ClusterPart if part in job.parts for figure in MEASURES[part](job, on_step)
+    )
+
+
+def _phases(job: ClusterJob, on_step: OnStep) -> tuple[Figure, ...]:
+    load = job.load
+    scenes = scenes_of(Dataset.load(job.dataset), 2 * load.scenes + load.all_slots)
+    return bench_cluster_load(scenes, load, on_step)
+
+
+def _ablation(job: ClusterJob, on_step: OnStep) -> tuple[Figure, ...]:
+    work = main_work(Dataset.load(job.engine_dataset), read_workload(job.workload))
+    return bench_ablation(work, job.ablation, on_step)
+
+
+def _prewarm(job: ClusterJob, on_step: OnStep) -> tuple[Figure, ...]:
+    work = whole_work(Dataset.load(job.engine_dataset), read_workload(job.workload))
+    return bench_prewarm(work, job.prewarm, on_step)
+
+
+MEASURES: Final[Mapping[ClusterPart, Callable[[ClusterJob, OnStep], tuple[Figure, ...]]]] = {
+    ClusterPart.PHASES: _phases,
+    ClusterPart.ABLATION: _ablation,
+    ClusterPart.PREWARM: _prewarm,
+}
