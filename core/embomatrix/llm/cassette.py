@@ -1,0 +1,109 @@
+"""Recorded traffic: what a model answered once is answered again, so that a run can be repeated without it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections import Counter
+from enum import StrEnum
+from typing import TYPE_CHECKING, Any
+
+from embomatrix.llm.values import CassetteError, Reply, Usage
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from embomatrix.llm.values import ChatModel, ChatRequest
+
+
+class CassetteMode(StrEnum):
+    REPLAY = "replay"  # never ask: an unknown question is an error
+    RECORD = "record"  # always ask, and write down
+    AUTO = "auto"  # ask what is not written down
+
+
+class Cassette:
+    """A model behind a recording: a file of JSON lines, one answer each, appended as they come.
+
+    Equal questions are told apart by how often they were asked: the first gets the first answer. ``model`` may be absent
+    for replay. Raises CassetteError where the file is damaged or lacks a question.
+    """
+
+    def __init__(self, path: Path, mode: CassetteMode, model: ChatModel | None = None) -> None:
+        if model is None and mode is not CassetteMode.REPLAY:
+            raise CassetteError(
+                f"the cassette {path} is to be written, and there is no model to ask: pass one, or replay"
+            )
+        self._path = path
+        self._mode = mode
+        self._model = model
+        self._asked: Counter[str] = Counter()
+        self._answers = _read(path) if mode is not CassetteMode.RECORD and path.exists() else {}
+        if mode is CassetteMode.REPLAY and not path.exists():
+            raise CassetteError(f"there is no cassette at {path}: record one first")
+
+    async def complete(self, request: ChatRequest) -> Reply:
+        """The recorded answer, or the model's, which is then written down."""
+        question = digest(request)
+        number = self._asked[question]
+        self._asked[question] += 1
+        found = self._answers.get((question, number))
+        if found is not None:
+            return found
+        if self._model is None or self._mode is CassetteMode.REPLAY:
+            raise CassetteError(
+                f"{request.purpose}: the cassette {self._path} has no answer {number + 1} to question {question[:12]}: what is "
+                "asked has changed since it was recorded; record it again"
+            )
+        reply = await self._model.complete(request)
+        self._write(question, number, request.purpose, reply)
+        return reply
+
+    def _write(self, question: str, number: int, purpose: str, reply: Reply) -> None:
+        line = {
+            "question": question,
+            "number": number,
+            "purpose": purpose,
+            "text": reply.text,
+            "model": reply.model,
+            "prompt_tokens": reply.usage.prompt_tokens,
+            "completion_tokens": reply.usage.completion_tokens,
+            "finish": reply.finish,
+        }
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        with self._path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(line, ensure_ascii=False) + "\n")
+
+
+def digest(request: ChatRequest) -> str:
+    """SHA-256, in hex, of all that is asked; who asks is not part of it, nor is the model's name."""
+    content: dict[str, Any] = {
+        "messages": [
+            [
+                message.speaker.value,
+                message.text,
+                [hashlib.sha256(image).hexdigest() for image in message.images],
+            ]
+            for message in request.messages
+        ],
+        "max_tokens": request.max_tokens,
+        "temperature": request.temperature,
+        "seed": request.seed,
+        "schema": request.json_schema,
+    }
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def _read(path: Path) -> dict[tuple[str, int], Reply]:
+    answers = {}
+    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+        try:
+            value = json.loads(line)
+            usage = Usage(int(value["prompt_tokens"]), int(value["completion_tokens"]))
+            reply = Reply(str(value["text"]), str(value["model"]), usage, str(value["finish"]), seconds=0.0)
+            answers[str(value["question"]), int(value["number"])] = reply
+        except (ValueError, KeyError, TypeError) as error:
+            raise CassetteError(
+                f"{path}, line {number}, is no recorded answer ({error}): remove the line"
+            ) from error
+    return answers

@@ -1,0 +1,205 @@
+"""Any OpenAI-compatible endpoint: bounded retries, bounded concurrency, and errors that say what to mend.
+
+The wire is the subset of the chat completions API that hosted services, vLLM, SGLang, llama.cpp and Ollama share.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import json
+import random
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, Self
+
+import httpx
+
+from embomatrix.llm.values import EndpointError, Reply, Usage
+
+if TYPE_CHECKING:
+    from embomatrix.llm.values import ChatRequest, Message
+
+RETRIED: Final = frozenset({408, 425, 429, 500, 502, 503, 504})
+"""Statuses that another attempt may mend."""
+MAX_REPLY_BYTES: Final = 8 * 1024 * 1024
+MAX_RETRY_AFTER_S: Final = 60.0
+QUOTED: Final = 300
+"""Characters of an endpoint's own words that an error repeats."""
+
+
+@dataclass(frozen=True, slots=True)
+class EndpointLimits:
+    """Bounds of one question. Waits double from ``first_wait_s`` to ``longest_wait_s``, each drawn from its upper half."""
+
+    attempts: int = 6
+    timeout_s: float = 120.0
+    """Of one attempt."""
+    deadline_s: float = 600.0
+    """Of all attempts together."""
+    first_wait_s: float = 0.5
+    longest_wait_s: float = 30.0
+    concurrent: int = 8
+
+
+class Endpoint:
+    """Async context manager over one endpoint: ``base_url`` is what comes before ``/chat/completions``.
+
+    ``jitter`` draws the waits: calls that failed together shall not come back together.
+    """
+
+    def __init__(
+        self,
+        base_url: str,
+        model: str,
+        *,
+        api_key: str = "",
+        limits: EndpointLimits | None = None,
+        constrain: bool = False,
+        jitter: random.Random | None = None,
+    ) -> None:
+        self.model = model
+        self._url = f"{base_url.rstrip('/')}/chat/completions"
+        self._limits = limits or EndpointLimits()
+        self._constrain = constrain
+        self._jitter = jitter or random.Random()
+        self._gate = asyncio.Semaphore(self._limits.concurrent)
+        headers = {"authorization": f"Bearer {api_key}"} if api_key else {}
+        self._http = httpx.AsyncClient(headers=headers, timeout=self._limits.timeout_s)
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self._http.aclose()
+
+    async def complete(self, request: ChatRequest) -> Reply:
+        """Ask once, and again where that may help. Raises EndpointError."""
+        body = self._body(request)
+        async with self._gate:
+            began_s = time.monotonic()
+            for attempt in range(self._limits.attempts):
+                failure = await self._attempt(body)
+                if isinstance(failure, _Answer):
+                    return _reply(failure.value, self.model, time.monotonic() - began_s, attempt)
+                wait_s = self._wait_s(attempt, failure)
+                elapsed_s = time.monotonic() - began_s
+                last = attempt + 1 == self._limits.attempts or elapsed_s + wait_s > self._limits.deadline_s
+                if not failure.passing or last:
+                    raise EndpointError(self._sentence(request, failure, attempt + 1))
+                await asyncio.sleep(wait_s)
+        raise AssertionError("the last attempt returns or raises")
+
+    def _body(self, request: ChatRequest) -> dict[str, Any]:
+        body: dict[str, Any] = {
+            "model": self.model,
+            "messages": [_message(message) for message in request.messages],
+            "max_tokens": request.max_tokens,
+            "temperature": request.temperature,
+        }
+        if request.seed is not None:
+            body["seed"] = request.seed
+        if self._constrain and request.json_schema is not None:
+            schema = {"name": "answer", "schema": request.json_schema, "strict": True}
+            body["response_format"] = {"type": "json_schema", "json_schema": schema}
+        return body
+
+    async def _attempt(self, body: dict[str, Any]) -> _Answer | _Failure:
+        try:
+            async with self._http.stream("POST", self._url, json=body) as response:
+                data = bytearray()
+                async for part in response.aiter_bytes():
+                    data += part
+                    if len(data) > MAX_REPLY_BYTES:
+                        return _Failure(f"it answered with more than {MAX_REPLY_BYTES} bytes", passing=False)
+        except httpx.TimeoutException:
+            return _Failure(f"it gave no answer within {self._limits.timeout_s:g} s", passing=True)
+        except (httpx.TransportError, httpx.StreamError) as error:
+            return _Failure(f"it can't be reached ({error or type(error).__name__})", passing=True)
+        except httpx.InvalidURL as error:
+            return _Failure(f"this is no address ({error})", passing=False)
+        return _judged(response, bytes(data))
+
+    def _wait_s(self, attempt: int, failure: _Failure) -> float:
+        if failure.retry_after_s is not None:
+            return min(failure.retry_after_s, MAX_RETRY_AFTER_S)
+        wait_s = min(self._limits.first_wait_s * 2.0**attempt, self._limits.longest_wait_s)
+        return wait_s * self._jitter.uniform(0.5, 1.0)
+
+    def _sentence(self, request: ChatRequest, failure: _Failure, attempts: int) -> str:
+        tries = "" if attempts == 1 else f", {attempts} times"
+        return f"{request.purpose}: the endpoint {self._url}: {failure.found}{tries}: {failure.remedy}"
+
+
+@dataclass(frozen=True, slots=True)
+class _Answer:
+    value: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class _Failure:
+    found: str
+    passing: bool
+    retry_after_s: float | None = None
+    remedy: str = "check its address, its model's name and its key"
+
+
+def _judged(response: httpx.Response, data: bytes) -> _Answer | _Failure:
+    if response.status_code in RETRIED:
+        return _Failure(
+            f"it answered {response.status_code} ({_quoted(data)})",
+            passing=True,
+            retry_after_s=_retry_after(response),
+            remedy="it is overloaded or broken: try again later",
+        )
+    if response.status_code != httpx.codes.OK:
+        return _Failure(f"it answered {response.status_code} ({_quoted(data)})", passing=False)
+    try:
+        value = json.loads(data)
+        if isinstance(value["choices"][0]["message"], dict):
+            return _Answer(value)
+    except (ValueError, KeyError, IndexError, TypeError):
+        pass
+    # A proxy that is starting up may say anything with a 200.
+    return _Failure(f"it answered what is no chat completion ({_quoted(data)})", passing=True)
+
+
+def _retry_after(response: httpx.Response) -> float | None:
+    try:
+        return max(0.0, float(response.headers["retry-after"]))
+    except (KeyError, ValueError):
+        return None
+
+
+def _quoted(data: bytes) -> str:
+    text = " ".join(data.decode("utf-8", errors="replace").split())
+    return f"{text[:QUOTED]}…" if len(text) > QUOTED else text or "no text"
+
+
+def _message(message: Message) -> dict[str, Any]:
+    if not message.images:
+        return {"role": message.speaker.value, "content": message.text}
+    parts: list[dict[str, Any]] = [{"type": "text", "text": message.text}]
+    for image in message.images:
+        url = f"data:image/png;base64,{base64.b64encode(image).decode()}"
+        parts.append({"type": "image_url", "image_url": {"url": url}})
+    return {"role": message.speaker.value, "content": parts}
+
+
+def _reply(value: dict[str, Any], model: str, seconds: float, retries: int) -> Reply:
+    choice = value["choices"][0]
+    content = choice["message"].get("content")
+    usage = value.get("usage")
+    counts = usage if isinstance(usage, dict) else {}
+    return Reply(
+        text=content if isinstance(content, str) else "",
+        model=str(value.get("model") or model),
+        usage=Usage(_count(counts.get("prompt_tokens")), _count(counts.get("completion_tokens"))),
+        finish=str(choice.get("finish_reason") or ""),
+        seconds=seconds,
+        retries=retries,
+    )
+
+
+def _count(value: object) -> int:
+    return value if isinstance(value, int) and value >= 0 else 0

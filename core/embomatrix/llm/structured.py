@@ -1,0 +1,115 @@
+"""Typed answers: a reply is read as JSON, validated, and asked for again with the error quoted. Text is never evaluated."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from embomatrix.llm.values import Message, Speaker, UnusableReplyError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from embomatrix.llm.values import ChatModel, ChatRequest, Reply
+
+T = TypeVar("T", bound=BaseModel)
+
+MAX_STARTS: Final = 256
+"""Brackets at which JSON is looked for: bounds the work on adversarial text."""
+SHOWN_PROBLEMS: Final = 5
+_FENCE: Final = re.compile(r"```(?:json)?\s*\n(.*?)```", re.DOTALL)
+_BRACKET: Final = re.compile(r"[{\[]")
+
+
+@dataclass(frozen=True, slots=True)
+class Answer(Generic[T]):
+    """A valid answer, and every reply on the way to it."""
+
+    value: T
+    replies: tuple[Reply, ...]
+
+
+async def ask(
+    model: ChatModel,
+    request: ChatRequest,
+    shape: type[T],
+    *,
+    check: Callable[[T], None] | None = None,
+    attempts: int = 3,
+) -> Answer[T]:
+    """Ask until the answer has the shape and passes ``check``, which raises ValueError with a sentence for the model.
+
+    Raises UnusableReplyError after ``attempts`` answers, EndpointError where none came.
+    """
+    request = replace(request, json_schema=request.json_schema or shape.model_json_schema())
+    replies: list[Reply] = []
+    problem = ""
+    for _ in range(attempts):
+        reply = await model.complete(request)
+        replies.append(reply)
+        try:
+            value = read_json(reply.text, shape)
+            if check is not None:
+                check(value)
+            return Answer(value, tuple(replies))
+        except ValueError as error:
+            problem = str(error)
+        if reply.finish == "length":
+            problem = f"the answer was cut off after {request.max_tokens} tokens: {problem}"
+        request = replace(request, messages=(*request.messages, *_objection(reply, problem)))
+    raise UnusableReplyError(
+        f"{request.purpose}: {attempts} answers of {replies[-1].model}, none usable, the last because {problem}",
+        tuple(reply.text for reply in replies),
+    )
+
+
+def _objection(reply: Reply, problem: str) -> tuple[Message, Message]:
+    return (
+        Message(Speaker.ASSISTANT, reply.text),
+        Message(Speaker.USER, f"That can't be used: {problem}. Answer again, with the corrected JSON only."),
+    )
+
+
+def read_json(text: str, shape: type[T]) -> T:
+    """The first JSON value of the text that has the shape. Raises ValueError with a sentence.
+
+    Looked for after any closed reasoning, in code fences first, then anywhere among prose.
+    """
+    answer = text.rpartition("</think>")[2]
+    answer = answer if answer.strip() else text
+    first_problem = ""
+    for value in _json_values(answer):
+        try:
+            return shape.model_validate(value)
+        except ValidationError as error:
+            first_problem = first_problem or _problems(error)
+    raise ValueError(first_problem or "it holds no complete JSON value")
+
+
+def _json_values(text: str) -> Iterator[Any]:
+    """JSON objects and arrays in the text: fenced ones first; a value inside another that was read is not given."""
+    decoder = json.JSONDecoder()
+    for part in (*(match[1] for match in _FENCE.finditer(text)), text):
+        at, starts = 0, 0
+        while starts < MAX_STARTS and (bracket := _BRACKET.search(part, at)) is not None:
+            starts += 1
+            try:
+                value, at = decoder.raw_decode(part, bracket.start())
+            except (ValueError, RecursionError):
+                at = bracket.end()
+                continue
+            yield value
+
+
+def _problems(error: ValidationError) -> str:
+    """What is wrong, field by field, in words that a model can act on."""
+    found = [
+        f"{'.'.join(map(str, problem['loc'])) or 'the value'}: {problem['msg'][:1].lower()}{problem['msg'][1:]}"
+        for problem in error.errors(include_url=False)[:SHOWN_PROBLEMS]
+    ]
+    more = error.error_count() - len(found)
+    return "; ".join(found) + (f"; and {more} more" if more > 0 else "")

@@ -1,0 +1,100 @@
+"""Recorded answers stand in for the model, and accounts are kept of what was asked."""
+
+import json
+from dataclasses import replace
+
+import pytest
+from tests.fakes.chat_server import ChatServer
+
+from embomatrix.llm.cassette import Cassette, CassetteMode, digest
+from embomatrix.llm.endpoint import Endpoint, EndpointLimits
+from embomatrix.llm.ledger import Ledger, Price
+from embomatrix.llm.values import CassetteError, ChatRequest, EndpointError, Message, Speaker
+
+QUESTION = ChatRequest("cast", (Message(Speaker.USER, "Who?", (b"png",)),))
+OTHER = replace(QUESTION, messages=(Message(Speaker.USER, "Where?"),))
+
+
+async def recorded(path, *questions, mode=CassetteMode.RECORD):
+    server = ChatServer("Ann.", "Bo.", "Cy.")
+    with server.serving() as url:
+        async with Endpoint(url, "small-1") as endpoint:
+            cassette = Cassette(path, mode, endpoint)
+            return [(await cassette.complete(question)).text for question in questions], len(server.requests)
+
+
+async def replayed(path, *questions):
+    cassette = Cassette(path, CassetteMode.REPLAY)
+    return [(await cassette.complete(question)).text for question in questions]
+
+
+async def test_what_was_recorded_is_answered_again_in_its_order(tmp_path):
+    path = tmp_path / "tapes" / "cast.jsonl"
+    assert await recorded(path, QUESTION, OTHER, QUESTION) == (["Ann.", "Bo.", "Cy."], 3)
+    assert await replayed(path, QUESTION, QUESTION, OTHER) == ["Ann.", "Cy.", "Bo."]
+
+
+async def test_auto_asks_only_what_is_not_recorded(tmp_path):
+    path = tmp_path / "cast.jsonl"
+    await recorded(path, QUESTION)
+    texts, asked = await recorded(path, QUESTION, OTHER, mode=CassetteMode.AUTO)
+    assert (texts, asked) == (["Ann.", "Ann."], 1)
+    assert len(path.read_text().splitlines()) == 2
+
+
+async def test_a_question_that_changed_is_named(tmp_path):
+    path = tmp_path / "cast.jsonl"
+    await recorded(path, QUESTION)
+    with pytest.raises(
+        CassetteError, match=r"cast: the cassette .* has no answer 1 to question .* record it again"
+    ):
+        await replayed(path, OTHER)
+
+
+@pytest.mark.parametrize("line", ["{", "[]", '{"question": 3}'])
+async def test_a_damaged_line_is_named(tmp_path, line):
+    path = tmp_path / "cast.jsonl"
+    await recorded(path, QUESTION)
+    with path.open("a") as file:
+        file.write(f"{line}\n")
+    with pytest.raises(CassetteError, match="line 2, is no recorded answer"):
+        Cassette(path, CassetteMode.REPLAY)
+
+
+def test_a_cassette_that_is_not_there_or_has_no_model_to_ask_is_refused(tmp_path):
+    with pytest.raises(CassetteError, match="record one first"):
+        Cassette(tmp_path / "none.jsonl", CassetteMode.REPLAY)
+    with pytest.raises(CassetteError, match="there is no model to ask"):
+        Cassette(tmp_path / "none.jsonl", CassetteMode.RECORD)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        replace(QUESTION, seed=1),
+        replace(QUESTION, temperature=0.1),
+        replace(QUESTION, messages=(Message(Speaker.USER, "Who?", (b"gif",)),)),
+    ],
+)
+def test_all_that_is_asked_counts_and_who_asks_does_not(changed):
+    assert digest(changed) != digest(QUESTION)
+    assert digest(replace(QUESTION, purpose="someone else")) == digest(QUESTION)
+
+
+async def test_accounts_say_who_spent_what(tmp_path):
+    server = ChatServer("Ann is here.", "Bo.", (400, {}, "no", 0.0))
+    path = tmp_path / "ledger.jsonl"
+    with server.serving() as url:
+        async with Endpoint(url, "small-1", limits=EndpointLimits(attempts=1)) as endpoint:
+            ledger = Ledger(endpoint, price=Price(1.0, 10.0), path=path)
+            await ledger.complete(QUESTION)
+            await ledger.complete(replace(OTHER, purpose="dialogue"))
+            with pytest.raises(EndpointError):
+                await ledger.complete(QUESTION)
+    assert ledger.accounts["cast"].calls == 1
+    assert ledger.accounts["cast"].failed == 1
+    assert ledger.accounts["cast"].cost == pytest.approx((11 + 30) / 1e6)
+    assert ledger.total().prompt_tokens == 22
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    assert [line["purpose"] for line in lines] == ["cast", "dialogue", "cast"]
+    assert "answered 400" in lines[2]["failed"]

@@ -1,0 +1,114 @@
+"""An endpoint is asked with patience that ends, and what is wrong with it is said."""
+
+import asyncio
+import base64
+
+import pytest
+from tests.fakes.chat_server import ChatServer
+
+from embomatrix.llm.endpoint import MAX_REPLY_BYTES, Endpoint, EndpointLimits
+from embomatrix.llm.values import ChatRequest, EndpointError, Message, Speaker, Usage
+
+QUICK = EndpointLimits(attempts=3, timeout_s=5.0, first_wait_s=0.01, longest_wait_s=0.02)
+QUESTION = ChatRequest(
+    "cast", (Message(Speaker.SYSTEM, "Be brief."), Message(Speaker.USER, "Who lives here?")), seed=7
+)
+
+
+async def asked(server, question=QUESTION, limits=QUICK, **options):
+    with server.serving() as url:
+        async with Endpoint(url, "small-1", limits=limits, **options) as endpoint:
+            return await endpoint.complete(question)
+
+
+async def test_a_question_goes_out_whole_and_its_answer_comes_back_counted():
+    server = ChatServer("Ann and Bo.")
+    reply = await asked(server, api_key="key-1")
+    sent = server.requests[0]
+    assert (sent["_path"], sent["_authorization"]) == ("/v1/chat/completions", "Bearer key-1")
+    assert (sent["model"], sent["seed"], sent["temperature"]) == ("small-1", 7, 0.7)
+    assert sent["messages"][1] == {"role": "user", "content": "Who lives here?"}
+    assert "response_format" not in sent
+    assert (reply.text, reply.model, reply.finish, reply.retries) == ("Ann and Bo.", "scripted-1", "stop", 0)
+    assert reply.usage == Usage(11, 3)
+
+
+async def test_pictures_travel_as_data_and_a_schema_where_it_is_wanted():
+    server = ChatServer("{}")
+    question = ChatRequest(
+        "view", (Message(Speaker.USER, "Look.", (b"png",)),), json_schema={"type": "object"}
+    )
+    await asked(server, question, constrain=True)
+    text, image = server.requests[0]["messages"][0]["content"]
+    assert text == {"type": "text", "text": "Look."}
+    assert image["image_url"]["url"] == f"data:image/png;base64,{base64.b64encode(b'png').decode()}"
+    assert server.requests[0]["response_format"]["json_schema"]["schema"] == {"type": "object"}
+
+
+@pytest.mark.parametrize(
+    "trouble",
+    [
+        (429, {"retry-after": "0"}, "slow down", 0.0),
+        (503, {}, "<html>starting</html>", 0.0),
+        (200, {}, "<html>a proxy</html>", 0.0),
+        (200, {}, '{"choices": []}', 0.0),
+    ],
+)
+async def test_what_may_pass_is_tried_again(trouble):
+    server = ChatServer(trouble, trouble, "Ann.")
+    reply = await asked(server)
+    assert (reply.text, reply.retries, len(server.requests)) == ("Ann.", 2, 3)
+
+
+@pytest.mark.parametrize(
+    ("trouble", "sentence"),
+    [
+        (
+            (500, {}, "out of memory", 0.0),
+            r"cast: the endpoint http.*answered 500 \(out of memory\), 3 times",
+        ),
+        ((200, {}, "[]", 0.0), r"what is no chat completion \(\[\]\), 3 times"),
+    ],
+)
+async def test_patience_ends(trouble, sentence):
+    server = ChatServer(trouble)
+    with pytest.raises(EndpointError, match=sentence):
+        await asked(server)
+    assert len(server.requests) == 3
+
+
+@pytest.mark.parametrize("status", [400, 401, 404])
+async def test_what_no_attempt_mends_is_said_at_once(status):
+    server = ChatServer((status, {}, '{"error": {"message": "no model small-1"}}', 0.0))
+    with pytest.raises(EndpointError, match=rf"answered {status} .*no model small-1.*check its address"):
+        await asked(server)
+    assert len(server.requests) == 1
+
+
+async def test_a_dead_endpoint_is_named():
+    async with Endpoint("http://127.0.0.1:9/v1", "small-1", limits=QUICK) as endpoint:
+        with pytest.raises(
+            EndpointError, match=r"http://127.0.0.1:9/v1/chat/completions: it can't be reached"
+        ):
+            await endpoint.complete(QUESTION)
+
+
+async def test_an_answer_that_does_not_come_is_given_up():
+    slow = (200, {}, "{}", 1.0)
+    limits = EndpointLimits(attempts=2, timeout_s=0.1, first_wait_s=0.01)
+    with pytest.raises(EndpointError, match=r"gave no answer within 0.1 s, 2 times"):
+        await asked(ChatServer(slow), limits=limits)
+
+
+async def test_an_answer_without_end_is_cut_off():
+    with pytest.raises(EndpointError, match="more than 8388608 bytes"):
+        await asked(ChatServer((200, {}, b"x" * (MAX_REPLY_BYTES + 1), 0.0)))
+
+
+async def test_no_more_questions_are_under_way_than_allowed():
+    server = ChatServer((200, {}, '{"choices": [{"message": {"content": "a"}}]}', 0.03))
+    with server.serving() as url:
+        async with Endpoint(url, "small-1", limits=EndpointLimits(concurrent=3)) as endpoint:
+            replies = await asyncio.gather(*(endpoint.complete(QUESTION) for _ in range(12)))
+    assert [reply.text for reply in replies] == ["a"] * 12
+    assert server.most_at_once == 3
