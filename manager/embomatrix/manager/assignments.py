@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import heapq
-import itertools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from embomatrix.manager.batch_book import BatchBook
 from embomatrix.manager.commands import (
     AcknowledgeLease,
     CancelLease,
@@ -17,18 +16,19 @@ from embomatrix.manager.commands import (
     GiveLease,
 )
 from embomatrix.manager.fleet import Fleet
+from embomatrix.manager.group_policy import attempts_allowed, failed_with
 from embomatrix.manager.lease_book import LeaseBook
 from embomatrix.manager.ledger import (
     BatchRecord,
+    GroupRecord,
     LeaseRecord,
-    PendingQueues,
     Phase,
-    RolloutKey,
     RolloutRecord,
-    RunCounters,
     WorkerRecord,
 )
 from embomatrix.manager.load_failures import LoadFailures
+from embomatrix.manager.pending import PendingQueues
+from embomatrix.manager.run_book import RunBook
 from embomatrix.rpc.values import (
     Cancelled,
     Completed,
@@ -40,10 +40,12 @@ from embomatrix.rpc.values import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from embomatrix.manager.events import BatchSubmitted, LeaseFinished
     from embomatrix.rpc.values import Batch
+
+CALLED_OFF = Cancelled("the trainer called it off")
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,50 +66,55 @@ class DispatchLimits:
     """How long a scene may fail to load on the only worker before its rollouts are given up."""
     steal_after_s: float = 0.05
     """A lease may be taken from behind a busy slot when it waited for this long and another slot is idle."""
+    elsewhere_s: float = 5.0
+    """A rollout that failed on a worker is not given to it again for this long, while there are others."""
     max_attempts: int = 3
+    hedge_after_s: float = 1.0
+    """A rollout that runs for longer than this, and than twice the 95th percentile of its run, may be started once more …"""
+    hedge_share: float = 0.05
+    """… but no more than this share of its run's rollouts."""
+    known_after: int = 16
+    """So many executions of a run tell how long the others may take."""
+    stall_after_s: float = 10.0
+    """A lease that runs and does no step for longer than this, and than five times the 99th percentile of its run, is void."""
     restart_grace_s: float = 5.0
     """How long a manager that took over waits for workers to say what they hold, before it gives the same to others."""
 
 
 class Assignments:
-    """Every rollout without an outcome is either queued under its scene or held by exactly one live lease.
+    """Every rollout without an outcome is either queued under its scene or held by live leases: one, or two once hedged.
 
-    ``now_s`` is set before each change; what shall be done is collected in ``commands``.
+    ``now_s`` is set before each change; what shall be done is collected in ``commands``. ``settled`` ends a change.
     """
 
     def __init__(self, limits: DispatchLimits, *, boot_id: str, first_epoch: int = 1) -> None:
         self.now_s = 0.0
+        self.paused = False
+        """No leases are given."""
         self.commands: list[Command] = []
         self.fleet = Fleet()
+        self.runs = RunBook(limits.known_after)
         self.leases = LeaseBook(
             self.fleet,
+            self.runs,
             boot_id=boot_id,
             ttl_s=limits.lease_ttl_s,
             limit_s=limits.lease_limit_s,
             first_epoch=first_epoch,
         )
-        self.pending = PendingQueues()
+        self.pending = PendingQueues(self.runs.turn)
         self.failures = LoadFailures()
-        self.batches: dict[tuple[str, str], BatchRecord] = {}
+        self.batches = BatchBook()
         self._limits = limits
-        self._counters: dict[str, RunCounters] = {}
-        self._sequences = itertools.count(1)
-        self._due: list[tuple[float, int, RolloutRecord]] = []
+        self._freed: dict[str, None] = {}
 
-    @property
-    def runs(self) -> tuple[str, ...]:
-        return tuple(self._counters)
-
-    def counters(self, run_id: str) -> RunCounters:
-        return self._counters.setdefault(run_id, RunCounters())
-
-    def forget_run(self, run_id: str) -> None:
-        """Drop the counters of a closed run."""
-        self._counters.pop(run_id, None)
-
-    def pending_of(self, run_id: str) -> int:
-        """Rollouts of the run without an outcome."""
-        return sum(len(batch.open) for key, batch in self.batches.items() if key[0] == run_id)
+    def settled(self) -> list[Command]:
+        """Use what became free; returns what shall be done about all since the last call, in order."""
+        while self._freed:
+            freed, self._freed = self._freed, {}
+            self.fill(freed)
+        commands, self.commands = self.commands, []
+        return commands
 
     def submit(self, event: BatchSubmitted) -> None:
         self.queue(self.take_in(event.batch, {}))
@@ -115,7 +122,7 @@ class Assignments:
     def queue(self, records: Sequence[RolloutRecord]) -> None:
         """Give these to whoever has their scenes warm; the others wait."""
         for record in records:
-            self.pending.push(record)
+            self._queue(record)
         for scene in dict.fromkeys(record.scene for record in records):
             self.offer(scene)
 
@@ -124,111 +131,153 @@ class Assignments:
         key = (batch.run_id, batch.batch_id)
         if key in self.batches:
             return []
-        noted = self.batches[key] = BatchRecord(*key, {}, cursor=max(delivered.values(), default=0))
         scenes = dict.fromkeys(rollout.bundle_digest for rollout in batch.rollouts)
+        run = self.runs.of(batch.run_id)
+        due_s = self.now_s + (run.terms.rollout_deadline_s or self._limits.rollout_deadline_s)
         warm = {scene: self.fleet.has_warm(scene) for scene in scenes}
-        due_s = self.now_s + self._limits.rollout_deadline_s
-        for rollout in batch.rollouts:
-            if rollout.rollout_id in delivered:
-                continue
-            record = RolloutRecord(
-                key=RolloutKey(*key, rollout.rollout_id),
-                rollout=rollout,
-                sequence=next(self._sequences),
-                submitted_s=self.now_s,
-                warm=warm[rollout.bundle_digest],
-            )
-            noted.open[rollout.rollout_id] = record
-            heapq.heappush(self._due, (due_s, record.sequence, record))
+        noted = self.batches.open(batch, delivered, now_s=self.now_s, due_s=due_s, warm=warm)
+        run.submitted += len(noted.open)
         if not noted.open:
             self._close(noted)
         return list(noted.open.values())
 
     def cancel(self, key: tuple[str, str]) -> None:
         batch = self.batches.get(key)
-        if batch is None:
-            return
-        records = list(batch.open.values())
-        freed = {record.lease.worker_id: None for record in records if record.lease is not None}
-        for record in records:
-            self.finish(record, Cancelled())
-        self.fill(freed)
+        for record in list(batch.open.values()) if batch is not None else ():
+            self._conclude(record, CALLED_OFF)
 
     def cancel_run(self, run_id: str) -> None:
-        for key in [key for key in self.batches if key[0] == run_id]:
-            self.cancel(key)
+        for batch in self.batches.of_run(run_id):
+            self.cancel((run_id, batch.batch_id))
 
     def finish(self, record: RolloutRecord, outcome: Outcome) -> None:
-        """The one place where a rollout gets its outcome."""
+        """The one place where a rollout gets its outcome, and its group or batch what follows from it."""
+        batch = self.batches.of(record)
+        group = batch.groups[record.rollout.group_id]
+        self._conclude(record, outcome)
+        if isinstance(outcome, InfraFailure):
+            self._fail(batch, group, f"rollout {record.key.rollout_id} was lost: {outcome.code}")
+
+    def _fail(self, batch: BatchRecord, group: GroupRecord, why: str) -> None:
+        """A member was lost: what becomes of the others is the run's policy."""
+        run = self.runs.of(batch.run_id)
+        failed, lost = failed_with(run.terms.group_policy, batch, group)
+        for one in failed:
+            run.counters.groups_failed += not one.failed
+            one.failed = True
+        for record in lost:
+            self._conclude(record, Cancelled(why))
+
+    def _conclude(self, record: RolloutRecord, outcome: Outcome) -> None:
         if record.phase is Phase.PENDING:
             self.pending.remove(record)
-        if record.lease is not None:
-            self.void(record.lease)
-        record.phase = Phase.DONE
-        batch = self.batches[record.key[:2]]
-        del batch.open[record.key.rollout_id]
-        batch.cursor += 1
-        counters = self.counters(record.key.run_id)
+        for lease in list(record.leases):
+            self.void(lease)
+        batch = self.batches.of(record)
+        cursor = self.batches.conclude(record)
+        counters = self.runs.of(record.key.run_id).counters
         counters.delivered += 1
         counters.infra_failures += isinstance(outcome, InfraFailure)
         result = RolloutResult(
-            record.key.rollout_id, record.rollout.group_id, batch.cursor, max(record.attempts, 1), outcome
+            record.key.rollout_id, record.rollout.group_id, cursor, max(record.attempts, 1), outcome
         )
         self.commands.append(DeliverResult(batch.run_id, batch.batch_id, result))
         if not batch.open:
             self._close(batch)
 
     def _close(self, batch: BatchRecord) -> None:
-        del self.batches[batch.run_id, batch.batch_id]
+        self.batches.close(batch)
         self.commands.append(FinishBatch(batch.run_id, batch.batch_id))
 
     def give_back(self, lease: LeaseRecord, failure: InfraFailure, *, counted: bool) -> None:
-        """A lease ended without a result: queue the rollout again, or end it when its attempts are used up."""
+        """A lease ended without a result: unless another one of it goes on, queue the rollout again, or end it.
+
+        One that ended meanwhile, with its group, is left alone.
+        """
         record = lease.record
-        self.leases.end(lease)
-        record.attempts += counted
-        if record.attempts >= self._limits.max_attempts:
-            message = f"{failure.message} (attempt {record.attempts} of {self._limits.max_attempts})"
+        if lease not in record.leases:
+            return
+        self._end(lease)
+        if counted:
+            self._blame(record, lease.worker_id, failure)
+        if record.leases:
+            return
+        run = self.runs.of(record.key.run_id)
+        most = attempts_allowed(run.terms.group_policy, self._limits.max_attempts)
+        if record.attempts >= most:
+            message = f"{failure.message} (attempt {record.attempts} of {most})"
             self.finish(record, dataclasses.replace(failure, message=message))
         else:
-            self.counters(record.key.run_id).redispatched += 1
-            self.pending.push(record)
+            run.counters.redispatched += 1
+            self._queue(record)
+
+    def _blame(self, record: RolloutRecord, worker_id: str, failure: InfraFailure) -> None:
+        """Count an attempt, and have the next one elsewhere if there is another worker at all."""
+        record.attempts += 1
+        record.out_of_memory |= failure.code is InfraCode.SLOT_OOM
+        if self.fleet.live > 1:
+            record.failed_on, record.avoid_until_s = worker_id, self.now_s + self._limits.elsewhere_s
+
+    def _queue(self, record: RolloutRecord) -> None:
+        if not self.pending.of_run(record.key.run_id):
+            self.runs.wake(record.key.run_id)
+        self.pending.push(record)
 
     def offer(self, scene: str) -> None:
         """Give waiting rollouts of the scene to the least busy workers that hold it warm."""
-        while self.pending.count(scene):
-            worker = self.fleet.best_for(scene)
-            if worker is None:
+        while not self.paused:
+            for record in self.pending.heads(scene):
+                worker = self.fleet.best_for(scene, self._free_for(record))
+                if worker is not None:
+                    self.pending.take(record)
+                    self._give(record, worker)
+                    break
+            else:
                 return
-            self._give(self.pending.pop(scene), worker)
+
+    def _free_for(self, record: RolloutRecord) -> Callable[[WorkerRecord], bool]:
+        return lambda worker: worker.open_credits > 0 and worker.takes(record, self.now_s)
 
     def fill(self, worker_ids: Iterable[str]) -> None:
-        """Give freed workers the oldest waiting rollouts of their warm scenes; the idle take from behind the busy."""
+        """Give freed workers the waiting rollouts of their warm scenes, by turns; the idle take from behind the busy."""
         for worker_id in worker_ids:
             worker = self.fleet.workers.get(worker_id)
-            while worker is not None and worker.open_credits > 0:
-                scene = self.pending.first_of(worker.warm)
-                if scene is None:
+            while worker is not None and worker.open_credits > 0 and not self.paused:
+                record = self.pending.next_for(worker, self.now_s)
+                if record is None:
                     self._steal_for(worker)
                     break
-                self._give(self.pending.pop(scene), worker)
+                self.pending.take(record)
+                self._give(record, worker)
 
-    def _give(self, record: RolloutRecord, worker: WorkerRecord) -> None:
+    def hedge(self, record: RolloutRecord, worker: WorkerRecord) -> None:
+        """Lease a rollout that runs elsewhere a second time; whoever is first counts."""
+        record.hedged = True
+        self.runs.of(record.key.run_id).counters.hedged += 1
+        self._give(record, worker, hedge=True)
+
+    def _give(self, record: RolloutRecord, worker: WorkerRecord, *, hedge: bool = False) -> None:
         lease = self.leases.give(record, worker, self.now_s)
         deadline_s = self._limits.execute_deadline_s
         origin = LeaseOrigin(*record.key, attempt=record.attempts + 1)
-        self.commands.append(GiveLease(worker.worker_id, lease.ref, record.rollout, deadline_s, origin))
+        self.commands.append(
+            GiveLease(worker.worker_id, lease.ref, record.rollout, deadline_s, origin, hedge)
+        )
+
+    def _end(self, lease: LeaseRecord) -> None:
+        self.leases.end(lease, self.now_s)
+        self._freed[lease.worker_id] = None
 
     def void(self, lease: LeaseRecord) -> None:
         """Take a lease back from a worker that may still hold it."""
-        self.leases.end(lease)
+        self._end(lease)
         self.commands.append(CancelLease(lease.worker_id, lease.ref))
 
     def _steal_for(self, worker: WorkerRecord) -> None:
         """Idle slots take leases that wait behind busy slots elsewhere. They were not started: no attempt is lost."""
         before_s = self.now_s - self._limits.steal_after_s
         while worker.free_slots > 0:
-            lease = self.fleet.waiting_behind(worker, before_s)
+            lease = self.fleet.waiting_behind(worker, before_s, self.now_s)
             if lease is None:
                 return
             self.void(lease)
@@ -239,31 +288,32 @@ class Assignments:
         lease = self.leases.find(event.worker_id, event.ref)
         if lease is None:
             run_id = self.leases.run_of_ended(event.ref)
-            if run_id in self._counters:
-                self._counters[run_id].stale_results += 1
+            if run_id is not None and run_id in self.runs:
+                self.runs.of(run_id).counters.stale_results += 1
             return
         match event.outcome:
             case Completed() as completed:
                 self._complete(lease, completed)
             case InfraFailure() as failure:
-                self._fail(
+                self._take_failure(
                     lease, dataclasses.replace(failure, worker_id=failure.worker_id or event.worker_id)
                 )
-        self.fill([event.worker_id])
 
     def _complete(self, lease: LeaseRecord, completed: Completed) -> None:
         record = lease.record
-        self.leases.end(lease)
+        self._end(lease)
         record.attempts += 1
-        counters = self.counters(record.key.run_id)
-        counters.warm_starts += record.warm
-        counters.cold_starts += not record.warm
+        run = self.runs.of(record.key.run_id)
+        if lease.started_s is not None:
+            run.times.add(self.now_s - lease.started_s)
+        run.counters.warm_starts += record.warm
+        run.counters.cold_starts += not record.warm
         self.fleet.workers[lease.worker_id].completed += 1
         timings = lease.timings(completed.timings, self.now_s)
         warm = record.warm and completed.warm
         self.finish(record, completed.noted(timings=timings, warm=warm))
 
-    def _fail(self, lease: LeaseRecord, failure: InfraFailure) -> None:
+    def _take_failure(self, lease: LeaseRecord, failure: InfraFailure) -> None:
         worker = self.fleet.workers[lease.worker_id]
         scene = lease.record.scene
         if failure.code in (InfraCode.SCENE_LOAD_FAILED, InfraCode.BUNDLE_CORRUPT):
@@ -281,15 +331,5 @@ class Assignments:
         verdict = self.failures.verdict(
             scene, live=self.fleet.live, patience_s=self._limits.lone_load_failure_s, now_s=self.now_s
         )
-        while verdict is not None and self.pending.count(scene):
-            self.finish(self.pending.pop(scene), verdict)
-
-    def overdue(self) -> list[RolloutRecord]:
-        """Rollouts whose deadline has passed without an outcome."""
-        late: list[RolloutRecord] = []
-        # Deadlines come in order of submission: what is done leaves at the head and doesn't pile up until its deadline.
-        while self._due and (self._due[0][2].phase is Phase.DONE or self._due[0][0] <= self.now_s):
-            record = heapq.heappop(self._due)[2]
-            if record.phase is not Phase.DONE:
-                late.append(record)
-        return late
+        while verdict is not None and (record := self.pending.oldest(scene)) is not None:
+            self.finish(record, verdict)

@@ -19,7 +19,10 @@ class SetDesired:
 
 @dataclass(frozen=True, slots=True)
 class GiveLease:
-    """The worker shall execute the rollout, within ``deadline_s`` seconds of execution."""
+    """The worker shall execute the rollout, within ``deadline_s`` seconds of execution.
+
+    ``hedge`` marks the second lease of a rollout whose first is late and still good.
+    """
 
     worker_id: str
     ref: LeaseRef
@@ -27,6 +30,7 @@ class GiveLease:
     deadline_s: float
     origin: LeaseOrigin
     """Comes back in the worker's claims when another manager asks."""
+    hedge: bool = False
 
 
 @dataclass(frozen=True, slots=True)

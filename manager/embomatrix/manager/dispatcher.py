@@ -7,12 +7,15 @@ as commands. The rules it keeps:
   Resource-Scheduler sees it and has the scene loaded.
 * Whoever has a free credit and a warm scene never waits while a rollout of that scene does.
 * Every lease has an epoch of its own. A result under any other epoch is acknowledged, counted as stale and dropped.
-* Only leases that were started cost an attempt. After ``max_attempts`` the rollout ends as an infrastructure failure.
+* Only leases that were started cost an attempt. After ``max_attempts`` the rollout ends as an infrastructure failure, and
+  what becomes of its group is the run's policy.
+* A rollout has one live lease, or two on different workers when the first is late; the first good result counts.
+* Runs take turns by weight; the slot time that they had decides, not how many leases.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.assignments import Assignments, DispatchLimits
 from embomatrix.manager.commands import CancelLease, Command
@@ -21,10 +24,13 @@ from embomatrix.manager.events import (
     BatchRestored,
     BatchSubmitted,
     DemandObserved,
+    DispatchPaused,
+    DispatchResumed,
     Event,
     LeaseFinished,
     LeasesRenewed,
     RunClosed,
+    RunOpened,
     ScenesUnplaceable,
     Tick,
     WorkerDrained,
@@ -32,8 +38,10 @@ from embomatrix.manager.events import (
     WorkerLost,
     WorkerRecovered,
     WorkerReported,
+    WorkerResumed,
     WorkerSuspected,
 )
+from embomatrix.manager.hedging import Hedger
 from embomatrix.manager.recovery import Recovery
 from embomatrix.rpc.values import InfraCode, InfraFailure, ResidentState
 
@@ -41,6 +49,10 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from embomatrix.manager.ledger import LeaseRecord, RunCounters, WorkerRecord
+
+
+STALL_TIMES: Final = 5.0
+"""A lease has stalled after so many times the 99th percentile of its run's slot times without a step."""
 
 
 class Dispatcher:
@@ -53,6 +65,7 @@ class Dispatcher:
         self._limits = limits
         self._desk = Assignments(limits, boot_id=boot_id, first_epoch=first_epoch)
         self._recovery = Recovery(self._desk, grace_s=limits.restart_grace_s)
+        self._hedger = Hedger(self._desk, limits)
         self._unplaceable: dict[str, tuple[float, str]] = {}
         self._alone_since_s = 0.0
 
@@ -62,8 +75,13 @@ class Dispatcher:
         match event:
             case LeaseFinished():
                 self._desk.settle(event)
-            case LeasesRenewed(worker_id, held):
-                self._desk.leases.renew(worker_id, held, now_s)
+            case LeasesRenewed():
+                self._on_renewed(event)
+            case RunOpened(run_id, terms):
+                self._desk.runs.open(run_id, terms)
+            case DispatchPaused() | DispatchResumed():
+                self._desk.paused = isinstance(event, DispatchPaused)
+                self._desk.fill(list(self._desk.fleet.workers))
             case BatchSubmitted():
                 self._desk.submit(event)
             case BatchRestored():
@@ -74,13 +92,13 @@ class Dispatcher:
                 self._desk.cancel_run(run_id)
             case WorkerJoined(worker_id, resources):
                 self._on_lost(WorkerLost(worker_id, "a newer session of the same worker took over"))
-                self._desk.fleet.join(worker_id, resources.slots)
+                self._desk.fleet.join(worker_id, resources.slots, resources.render_slots)
             case WorkerReported():
                 self._on_reported(event)
             case WorkerLost():
                 self._on_lost(event)
-            case WorkerSuspected(worker_id) | WorkerRecovered(worker_id) | WorkerDrained(worker_id):
-                self._on_standing(worker_id, event)
+            case WorkerSuspected() | WorkerRecovered() | WorkerDrained() | WorkerResumed():
+                self._on_standing(event)
             case ScenesUnplaceable(reasons):
                 known = self._unplaceable
                 self._unplaceable = {
@@ -91,31 +109,39 @@ class Dispatcher:
                 self._on_tick()
             case _:
                 pass
-        commands, self._desk.commands = self._desk.commands, []
-        return commands
+        return self._desk.settled()
 
     def demand(self) -> DemandObserved:
         """What the Resource-Scheduler should know now. Forgets which leases were given since the last call."""
-        pending = self._desk.pending.counts()
-        heads = [head for scene in pending if (head := self._desk.pending.head(scene)) is not None]
-        heads.sort(key=lambda head: head.sequence)
-        waited_s = {head.scene: self._desk.now_s - head.submitted_s for head in heads}
-        for scene, count in self._recovery.awaited().items():
-            # They will be executed somewhere: their scenes are loaded while their workers are waited for.
+        desk = self._desk
+        pending = desk.pending.counts()
+        lanes = [heads for scene in pending if (heads := desk.pending.heads(scene))]
+        lanes.sort(key=lambda heads: desk.runs.turn(heads[0]))
+        waited_s = {heads[0].scene: desk.now_s - min(h.submitted_s for h in heads) for heads in lanes}
+        # What is waited for will be executed somewhere, and what is late elsewhere as well: their scenes are loaded meanwhile.
+        awaited = {scene: (count, 0.0) for scene, count in self._recovery.awaited().items()}
+        for scene, (count, held_s) in (*awaited.items(), *self._hedger.wanted.items()):
             pending[scene] = pending.get(scene, 0) + count
-            waited_s.setdefault(scene, 0.0)
+            waited_s.setdefault(scene, held_s)
         return DemandObserved(
             pending=pending,
             waited_s=waited_s,
-            in_use=frozenset(self._desk.leases.in_use),
-            used=self._desk.leases.take_used(),
-            idle=self._desk.fleet.idle if pending else frozenset(),
+            in_use=frozenset(desk.leases.in_use),
+            used=desk.leases.take_used(),
+            idle=desk.fleet.idle if pending else frozenset(),
+            runs={heads[0].scene: heads[0].key.run_id for heads in lanes},
+            rendering=frozenset(h.scene for heads in lanes for h in heads if h.rollout.render),
         )
 
     @property
     def waiting_scenes(self) -> int:
-        """How many scenes have waiting rollouts; when it changes, the scheduler should look again."""
-        return self._desk.pending.scenes + len(self._recovery.awaited())
+        """How many scenes have waiting or late rollouts; when it changes, the scheduler should look again."""
+        return self._desk.pending.scenes + len(self._recovery.awaited()) + len(self._hedger.wanted)
+
+    @property
+    def paused(self) -> bool:
+        """Whether no leases are given."""
+        return self._desk.paused
 
     @property
     def queued(self) -> int:
@@ -133,18 +159,18 @@ class Dispatcher:
     @property
     def runs(self) -> tuple[str, ...]:
         """Runs with counters."""
-        return self._desk.runs
+        return tuple(self._desk.runs)
 
     def counters(self, run_id: str) -> RunCounters:
-        return self._desk.counters(run_id)
+        return self._desk.runs.of(run_id).counters
 
     def forget_run(self, run_id: str) -> None:
         """Drop the counters of a closed run."""
-        self._desk.forget_run(run_id)
+        self._desk.runs.forget(run_id)
 
     def pending_of(self, run_id: str) -> int:
         """Rollouts of the run without an outcome."""
-        return self._desk.pending_of(run_id)
+        return sum(len(batch.open) for batch in self._desk.batches.of_run(run_id))
 
     # Workers and time
 
@@ -153,7 +179,7 @@ class Dispatcher:
         if worker is None:
             return
         worker.reported = True
-        worker.draining = worker.draining or event.draining
+        worker.leaving, worker.paused = event.draining, event.paused
         self._desk.fleet.stand(worker)
         self._desk.fleet.set_warm(
             worker, (r.bundle_digest for r in event.residents if r.state is ResidentState.WARM)
@@ -194,54 +220,74 @@ class Dispatcher:
         worker = self._desk.fleet.workers.get(event.worker_id)
         if worker is None:
             return
-        started = {lease.ref for lease in worker.started()}
         leases = list(worker.held.values())
         self._desk.fleet.leave(worker.worker_id)
         failure = InfraFailure(InfraCode.WORKER_LOST, f"worker lost: {event.reason}", worker.worker_id)
         for lease in leases:
-            self._desk.give_back(lease, failure, counted=lease.ref in started)
+            self._desk.give_back(lease, failure, counted=lease.started_s is not None)
         for scene in dict.fromkeys(lease.record.scene for lease in leases):
             self._desk.offer(scene)
 
-    def _on_standing(self, worker_id: str, event: Event) -> None:
-        worker = self._desk.fleet.workers.get(worker_id)
+    def _on_standing(self, event: WorkerSuspected | WorkerRecovered | WorkerDrained | WorkerResumed) -> None:
+        worker = self._desk.fleet.workers.get(event.worker_id)
         if worker is None:
             return
-        if isinstance(event, WorkerDrained):
-            worker.draining = True
-        else:
-            worker.suspect = isinstance(event, WorkerSuspected)
+        match event:
+            case WorkerDrained() | WorkerResumed():
+                worker.drained = isinstance(event, WorkerDrained)
+            case WorkerSuspected() | WorkerRecovered():
+                worker.suspect = isinstance(event, WorkerSuspected)
         self._desk.fleet.stand(worker)
-        self._desk.fill([worker_id])
+        self._desk.fill([event.worker_id])
+
+    def _on_renewed(self, event: LeasesRenewed) -> None:
+        """Whoever lives and does no step any more is stuck: liveness alone renews no lease for ever."""
+        leases, now_s = self._desk.leases, self._desk.now_s
+        leases.renew(event.worker_id, event.held, now_s)
+        for lease in leases.note_progress(event.worker_id, event.progress, now_s):
+            flat_s = now_s - lease.moved_s
+            if flat_s >= self._stall_after_s(lease):
+                text = f"{event.worker_id} did no step for {flat_s:.0f} s, after {lease.steps}"
+                self._take_away(lease, InfraFailure(InfraCode.STALLED, text, event.worker_id))
+
+    def _stall_after_s(self, lease: LeaseRecord) -> float:
+        usual_s = self._desk.runs.of(lease.record.key.run_id).times.quantile_s(0.99)
+        if usual_s is None:
+            return self._limits.execute_deadline_s  # nobody knows yet how long a step of this run may take
+        return max(self._limits.stall_after_s, STALL_TIMES * usual_s)
 
     def _on_tick(self) -> None:
         self._recovery.tick()
         for lease in self._desk.leases.due(self._desk.now_s):
             self._expire(lease)
-        for record in self._desk.overdue():
-            message = f"no outcome within {self._limits.rollout_deadline_s:g} s of its submission"
+        for record, had_s in self._desk.batches.overdue(self._desk.now_s):
+            message = f"no outcome within {had_s:g} s of its submission"
             self._desk.finish(record, InfraFailure(InfraCode.DEADLINE, message))
         for scene in self._desk.failures.scenes():
             self._desk.judge(scene)
         self._give_up_without_capacity()
         self._desk.fill(self._desk.fleet.thieves())
+        self._hedger.look()
 
     def _expire(self, lease: LeaseRecord) -> None:
-        worker = self._desk.fleet.workers[lease.worker_id]
-        counted = lease in worker.started()
         if lease.expires_s <= self._desk.now_s:
-            message = f"{worker.worker_id} did not renew the lease for {self._limits.lease_ttl_s:g} s"
+            message = f"{lease.worker_id} did not renew the lease for {self._limits.lease_ttl_s:g} s"
         else:
-            message = f"{worker.worker_id} gave no result within {self._limits.lease_limit_s:g} s"
+            message = f"{lease.worker_id} gave no result within {self._limits.lease_limit_s:g} s"
+        self._take_away(lease, InfraFailure(InfraCode.LEASE_EXPIRED, message, lease.worker_id))
+
+    def _take_away(self, lease: LeaseRecord, failure: InfraFailure) -> None:
+        """The worker had its chance: another one gets the rollout."""
+        if lease not in lease.record.leases:
+            return  # it ended with its group a moment ago
         self._desk.commands.append(CancelLease(lease.worker_id, lease.ref))
-        failure = InfraFailure(InfraCode.LEASE_EXPIRED, message, worker.worker_id)
-        self._desk.give_back(lease, failure, counted=counted)
+        self._desk.give_back(lease, failure, counted=lease.started_s is not None)
         self._desk.offer(lease.record.scene)
 
     def _give_up_without_capacity(self) -> None:
         """End rollouts that waited long enough while no worker was there, or none that could hold their scene."""
-        limit_s = self._limits.no_capacity_s
-        if self._desk.fleet.live:
+        limit_s, fleet = self._limits.no_capacity_s, self._desk.fleet
+        if fleet.live or self._desk.paused:
             self._alone_since_s = self._desk.now_s
             hopeless = [
                 (scene, text)
@@ -249,7 +295,10 @@ class Dispatcher:
                 if self._desk.now_s - since_s >= limit_s and self._desk.pending.count(scene)
             ]
         elif self._desk.now_s - self._alone_since_s >= limit_s:
-            text = f"no worker was connected for {limit_s:g} s: start one with `embomatrix worker run`"
+            there = (
+                f"{len(fleet.workers)} are paused, draining or silent" if fleet.workers else "none is there"
+            )
+            text = f"no worker took work for {limit_s:g} s, {there}: start one with `embomatrix worker run`"
             hopeless = [(scene, text) for scene in self._desk.pending.counts()]
         else:
             return
@@ -258,7 +307,7 @@ class Dispatcher:
 
     def _end_waiting(self, scene: str, failure: InfraFailure) -> None:
         """End those rollouts of the scene that waited for the bounded time; later ones keep their own wait."""
-        while (head := self._desk.pending.head(scene)) is not None:
-            if self._desk.now_s - head.submitted_s < self._limits.no_capacity_s:
+        while (record := self._desk.pending.oldest(scene)) is not None:
+            if self._desk.now_s - record.submitted_s < self._limits.no_capacity_s:
                 return
-            self._desk.finish(self._desk.pending.pop(scene), failure)
+            self._desk.finish(record, failure)

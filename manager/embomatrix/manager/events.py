@@ -13,10 +13,12 @@ if TYPE_CHECKING:
         Completed,
         InfraFailure,
         LeaseClaim,
+        LeaseProgress,
         LeaseRef,
         LookaheadEntry,
         Resident,
         Resources,
+        RunTerms,
     )
 
 
@@ -41,6 +43,8 @@ class WorkerReported:
     draining: bool = False
     resync: bool = False
     claims: tuple[LeaseClaim, ...] = ()
+    paused: str = ""
+    """Why it takes nothing new for now; empty while it works."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,11 +77,19 @@ class WorkerDrained:
 
 
 @dataclass(frozen=True, slots=True)
+class WorkerResumed:
+    """An operator takes the drain back."""
+
+    worker_id: str
+
+
+@dataclass(frozen=True, slots=True)
 class LeasesRenewed:
-    """A heartbeat named the leases that the worker still holds, running or waiting for a slot."""
+    """A heartbeat named the leases that the worker still holds, and how far those have come that run."""
 
     worker_id: str
     held: tuple[LeaseRef, ...]
+    progress: tuple[LeaseProgress, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +99,14 @@ class LeaseFinished:
     worker_id: str
     ref: LeaseRef
     outcome: Completed | InfraFailure
+
+
+@dataclass(frozen=True, slots=True)
+class RunOpened:
+    """A run asks for these terms. One that never said so has the defaults."""
+
+    run_id: str
+    terms: RunTerms
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,9 +155,10 @@ class LookaheadAnnounced:
 class DemandObserved:
     """What the Task-Dispatcher needs now.
 
-    ``pending`` counts waiting rollouts by scene, ``waited_s`` says how long the oldest of each has waited, the first in the
-    queue first, ``in_use`` are the (worker, scene) pairs with live leases, ``used`` those that were given a lease since the
-    last observation.
+    ``pending`` counts waiting rollouts by scene, and those that run for too long and would be started elsewhere as well.
+    ``waited_s`` says how long the first of each has waited, whose turn it is first, and ``runs`` whose it is; ``rendering``
+    are the scenes that need slots which render. ``in_use`` are the (worker, scene) pairs with live leases, ``used`` those
+    that were given a lease since the last observation.
     ``idle`` are the workers that have a free slot and nothing to do with it; nobody is named while nothing is pending.
     """
 
@@ -146,6 +167,8 @@ class DemandObserved:
     in_use: frozenset[tuple[str, str]] = frozenset()
     used: frozenset[tuple[str, str]] = frozenset()
     idle: frozenset[str] = frozenset()
+    runs: Mapping[str, str] = field(default_factory=dict)
+    rendering: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,6 +176,16 @@ class ScenesUnplaceable:
     """The Resource-Scheduler finds no worker for these scenes; the reason of each, in words."""
 
     reasons: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class DispatchPaused:
+    """An operator wants no new leases for now."""
+
+
+@dataclass(frozen=True, slots=True)
+class DispatchResumed:
+    """Leases are given again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,8 +200,10 @@ Event = (
     | WorkerRecovered
     | WorkerLost
     | WorkerDrained
+    | WorkerResumed
     | LeasesRenewed
     | LeaseFinished
+    | RunOpened
     | BatchSubmitted
     | BatchRestored
     | BatchCancelled
@@ -176,5 +211,7 @@ Event = (
     | LookaheadAnnounced
     | DemandObserved
     | ScenesUnplaceable
+    | DispatchPaused
+    | DispatchResumed
     | Tick
 )

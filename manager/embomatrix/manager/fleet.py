@@ -8,13 +8,18 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.manager.ledger import LeaseRecord, WorkerRecord
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
 
 VICTIMS: Final = 8
 THIEVES: Final = 64
 CANDIDATES: Final = 64
 """Busy workers, idle workers and holders of a scene looked at in one go, each time others: bounds, so that a large cluster
 costs no more than a small one."""
+
+
+def has_credit(worker: WorkerRecord) -> bool:
+    """Whether it may be given a lease at all."""
+    return worker.open_credits > 0
 
 
 class Fleet:
@@ -27,10 +32,13 @@ class Fleet:
         self._idle: dict[str, None] = {}
         self._live: set[str] = set()
 
-    def join(self, worker_id: str, slots: int) -> None:
+    def join(self, worker_id: str, slots: int, render_slots: int = 0) -> None:
         """A new worker, which can take nothing until it has reported."""
         slots = max(slots, 1)
-        self.workers[worker_id] = WorkerRecord(worker_id, slots=slots, credits=2 * slots)
+        record = WorkerRecord(
+            worker_id, slots=slots, credits=2 * slots, render_slots=min(render_slots, slots)
+        )
+        self.workers[worker_id] = record
         self._live.add(worker_id)
 
     def leave(self, worker_id: str) -> WorkerRecord | None:
@@ -44,8 +52,8 @@ class Fleet:
         return worker
 
     def stand(self, worker: WorkerRecord) -> None:
-        """The worker was told to drain, reported, fell silent or was heard again: it may take leases, or no longer."""
-        if worker.draining or worker.suspect:
+        """The worker drains, paused, reported, fell silent or was heard again: it may take leases, or no longer."""
+        if worker.draining or worker.suspect or worker.paused:
             self._live.discard(worker.worker_id)
         else:
             self._live.add(worker.worker_id)
@@ -67,26 +75,35 @@ class Fleet:
 
     def hold(self, worker: WorkerRecord, lease: LeaseRecord) -> None:
         worker.held[lease.ref.lease_id] = lease
+        worker.rendering += lease.record.rollout.render
+        if len(worker.held) <= worker.slots:
+            lease.started_s = lease.given_s
         self._weigh(worker)
 
-    def release(self, lease: LeaseRecord) -> None:
+    def release(self, lease: LeaseRecord, now_s: float) -> None:
         worker = self.workers.get(lease.worker_id)
-        if worker is not None:
-            worker.held.pop(lease.ref.lease_id, None)
-            self._weigh(worker)
+        if worker is None or worker.held.pop(lease.ref.lease_id, None) is None:
+            return
+        worker.rendering -= lease.record.rollout.render
+        if lease.started_s is not None and len(worker.held) >= worker.slots:
+            # Its slot goes to the first of those that waited behind.
+            next(islice(worker.held.values(), worker.slots - 1, None)).started_s = now_s
+        self._weigh(worker)
 
-    def best_for(self, scene: str) -> WorkerRecord | None:
-        """The least busy worker with the scene warm and a free credit; the id breaks ties.
+    def best_for(self, scene: str, fits: Callable[[WorkerRecord], bool] = has_credit) -> WorkerRecord | None:
+        """The least busy worker with the scene warm that fits; the id breaks ties.
 
-        Where very many hold the scene, the best of some of them; None only if none of all has a credit.
+        Where very many hold the scene, the best of some of them; None only if none of all fits.
         """
         holders = self._warm_on.get(scene, {})
         if len(holders) > CANDIDATES:
-            return self._good_for(holders)
-        free = [worker for name in holders if (worker := self.workers[name]).open_credits > 0]
+            return self._good_for(holders, fits)
+        free = [worker for name in holders if fits(worker := self.workers[name])]
         return min(free, key=lambda worker: (worker.busyness, worker.worker_id), default=None)
 
-    def _good_for(self, holders: dict[str, None]) -> WorkerRecord | None:
+    def _good_for(
+        self, holders: dict[str, None], fits: Callable[[WorkerRecord], bool]
+    ) -> WorkerRecord | None:
         looked_at: list[str] = []
         best: WorkerRecord | None = None
         for worker_id in holders:
@@ -94,19 +111,20 @@ class Fleet:
                 break
             looked_at.append(worker_id)
             worker = self.workers[worker_id]
-            if worker.open_credits > 0 and (best is None or worker.busyness < best.busyness):
+            if fits(worker) and (best is None or worker.busyness < best.busyness):
                 best = worker
         _move_to_end(holders, looked_at)
         return best
 
-    def waiting_behind(self, thief: WorkerRecord, before_s: float) -> LeaseRecord | None:
-        """A lease, given before that time, that waits behind a busy slot and whose scene the thief holds warm."""
+    def waiting_behind(self, thief: WorkerRecord, before_s: float, now_s: float) -> LeaseRecord | None:
+        """A lease, given before that time, that waits behind a busy slot and that the thief, with its scene warm, may take."""
         for worker_id in islice(self._backlogged, VICTIMS):
             lease = next(reversed(self.workers[worker_id].held.values()))
             if (
                 worker_id != thief.worker_id
                 and lease.record.scene in thief.warm
                 and lease.given_s <= before_s
+                and thief.takes(lease.record, now_s)
             ):
                 return lease
         return None
@@ -127,7 +145,7 @@ class Fleet:
 
     @property
     def live(self) -> int:
-        """How many workers could take work now or soon: neither draining nor suspected."""
+        """How many workers could take work now or soon: neither draining nor paused nor suspected."""
         return len(self._live)
 
     def _weigh(self, worker: WorkerRecord) -> None:

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from embomatrix.manager.fleet import Fleet
+    from embomatrix.manager.run_book import RunBook
+    from embomatrix.rpc.values import LeaseProgress
 
 STALE_MEMORY: Final = 65_536
 """Ended leases of which the book still knows the run, to count a late result where it belongs."""
@@ -22,17 +24,26 @@ STALE_MEMORY: Final = 65_536
 class LeaseBook:
     """``boot_id`` makes the lease ids of this manager's process unlike those of any other.
 
+
     Epochs rise from ``first_epoch``: what lies below was given by a former manager.
     """
 
     def __init__(
-        self, fleet: Fleet, *, boot_id: str, ttl_s: float, limit_s: float, first_epoch: int = 1
+        self,
+        fleet: Fleet,
+        runs: RunBook,
+        *,
+        boot_id: str,
+        ttl_s: float,
+        limit_s: float,
+        first_epoch: int = 1,
     ) -> None:
         self.live: dict[str, LeaseRecord] = {}
         self.in_use: Counter[tuple[str, str]] = Counter()
         """Live leases by (worker, scene)."""
         self._used: set[tuple[str, str]] = set()
         self._fleet = fleet
+        self._runs = runs
         self._boot_id = boot_id
         self._ttl_s = ttl_s
         self._limit_s = limit_s
@@ -42,7 +53,7 @@ class LeaseBook:
         self._ended: OrderedDict[str, str] = OrderedDict()
 
     def give(self, record: RolloutRecord, worker: WorkerRecord, now_s: float) -> LeaseRecord:
-        """Lease a rollout that no one holds to the worker."""
+        """Lease the rollout to the worker: one that no one holds, or one that is to run twice at once."""
         epoch = next(self._epochs)
         return self.note(LeaseRef(f"{self._boot_id}-{epoch}", epoch), record, worker, now_s)
 
@@ -57,7 +68,8 @@ class LeaseBook:
             limit_s=now_s + self._limit_s,
         )
         record.phase = Phase.LEASED
-        record.lease = lease
+        record.leases.append(lease)
+        self._runs.charge(lease)
         self.live[lease.ref.lease_id] = lease
         self._fleet.hold(worker, lease)
         heapq.heappush(self._due, (lease.due_s, ref.lease_epoch, lease))
@@ -74,11 +86,12 @@ class LeaseBook:
         self._ended[ref.lease_id] = run_id
         self._forget_ended()
 
-    def end(self, lease: LeaseRecord) -> None:
-        """The lease is over, whatever its worker still does. The rollout is nobody's until its caller decides."""
-        lease.record.lease = None
+    def end(self, lease: LeaseRecord, now_s: float) -> None:
+        """The lease is over, whatever its worker still does. What becomes of the rollout, its caller decides."""
+        lease.record.leases.remove(lease)
         del self.live[lease.ref.lease_id]
-        self._fleet.release(lease)
+        self._fleet.release(lease, now_s)
+        self._runs.settle(lease, now_s)
         pair = (lease.worker_id, lease.record.scene)
         self.in_use[pair] -= 1
         if not self.in_use[pair]:
@@ -104,6 +117,18 @@ class LeaseBook:
             lease = self.find(worker_id, ref)
             if lease is not None:
                 lease.expires_s = now_s + self._ttl_s
+
+    def note_progress(self, worker_id: str, told: Iterable[LeaseProgress], now_s: float) -> list[LeaseRecord]:
+        """Take in how far the worker's leases have come; returns those of them that are live."""
+        running: list[LeaseRecord] = []
+        for progress in told:
+            lease = self.find(worker_id, progress.ref)
+            if lease is None:
+                continue
+            if progress.steps > lease.steps:
+                lease.steps, lease.moved_s = progress.steps, now_s
+            running.append(lease)
+        return running
 
     def due(self, now_s: float) -> list[LeaseRecord]:
         """Live leases whose time is up."""

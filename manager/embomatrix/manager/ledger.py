@@ -1,9 +1,8 @@
-"""What the Task-Dispatcher remembers: rollouts, leases, workers, and who waits for which scene."""
+"""What the Task-Dispatcher remembers: rollouts and their groups, leases, workers and runs."""
 
 from __future__ import annotations
 
-import heapq
-from collections import Counter
+import math
 from dataclasses import dataclass, field
 from enum import Enum, auto
 from typing import TYPE_CHECKING, NamedTuple
@@ -11,8 +10,6 @@ from typing import TYPE_CHECKING, NamedTuple
 from embomatrix.rpc.values import RunStats, Timings
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from embomatrix.rpc.values import LeaseRef, Rollout
 
 
@@ -34,7 +31,10 @@ class Phase(Enum):
 
 @dataclass(slots=True, eq=False)
 class RolloutRecord:
-    """A rollout on its way to its outcome. ``sequence`` is its place in the queue, kept when it is given back."""
+    """A rollout on its way to its outcome. ``sequence`` is its place in the queue, kept when it is given back.
+
+    It has at most one live lease, or two on different workers once it was hedged.
+    """
 
     key: RolloutKey
     rollout: Rollout
@@ -45,7 +45,13 @@ class RolloutRecord:
     phase: Phase = Phase.LEASED
     attempts: int = 0
     """Leases that were started and did not deliver."""
-    lease: LeaseRecord | None = None
+    leases: list[LeaseRecord] = field(default_factory=list)
+    hedged: bool = False
+    out_of_memory: bool = False
+    """An attempt ended for lack of memory: another one beside it would only need more."""
+    failed_on: str = ""
+    avoid_until_s: float = -math.inf
+    """The worker that it failed on last gets it again only from then on, while there are others."""
 
     @property
     def scene(self) -> str:
@@ -62,6 +68,13 @@ class LeaseRecord:
     given_s: float
     expires_s: float
     limit_s: float
+    charged_s: float = 0.0
+    """Slot time that its run was charged in advance."""
+    started_s: float | None = None
+    """When a slot became free for it, as the manager reckons: the first leases of a worker run, the others wait behind."""
+    steps: int = -1
+    moved_s: float = 0.0
+    """Steps that it has done, as a heartbeat told last, and when they rose; -1 before a heartbeat told of any."""
 
     @property
     def due_s(self) -> float:
@@ -91,12 +104,28 @@ class WorkerRecord:
     held: dict[str, LeaseRecord] = field(default_factory=dict)
     reported: bool = False
     suspect: bool = False
-    draining: bool = False
+    drained: bool = False
+    """By an operator."""
+    leaving: bool = False
+    """It said so itself."""
+    paused: str = ""
+    """Why it takes nothing new for now, in its own words."""
+    render_slots: int = 0
+    rendering: int = 0
+    """Leases among ``held`` that need a slot which renders: no more than there are such slots."""
     completed: int = 0
 
     @property
+    def draining(self) -> bool:
+        return self.drained or self.leaving
+
+    @property
     def usable(self) -> bool:
-        return self.reported and not self.suspect and not self.draining
+        return self.reported and not (self.suspect or self.drained or self.leaving or self.paused)
+
+    @property
+    def free_render_slots(self) -> int:
+        return self.render_slots - self.rendering
 
     @property
     def open_credits(self) -> int:
@@ -110,19 +139,43 @@ class WorkerRecord:
     def busyness(self) -> float:
         return len(self.held) / self.slots
 
-    def started(self) -> list[LeaseRecord]:
-        """The leases that run: the first ones, one per slot. The others wait behind them and cost no attempt."""
-        return list(self.held.values())[: self.slots]
+    def takes(self, record: RolloutRecord, now_s: float) -> bool:
+        """Whether this rollout may go here, as far as it is not a question of credits or of the scene."""
+        if record.failed_on == self.worker_id and now_s < record.avoid_until_s:
+            return False
+        if record.rollout.render and self.rendering >= self.render_slots:
+            return False
+        return not any(lease.worker_id == self.worker_id for lease in record.leases)
+
+
+@dataclass(slots=True, eq=False)
+class GroupRecord:
+    """A group, or a whole batch as far as its tail goes: ``size`` rollouts, of which ``open`` have no outcome."""
+
+    size: int
+    open: dict[str, RolloutRecord] = field(default_factory=dict)
+    failed: bool = False
+    """The infrastructure lost a member."""
+
+    @property
+    def in_tail(self) -> bool:
+        """Three quarters are done, and something is left."""
+        return 0 < 4 * len(self.open) <= self.size
 
 
 @dataclass(slots=True, eq=False)
 class BatchRecord:
-    """An open batch: its rollouts without an outcome, and the last cursor that was given."""
+    """An open batch: its rollouts by group, those without an outcome, and the last cursor that was given."""
 
     run_id: str
     batch_id: str
-    open: dict[str, RolloutRecord]
+    whole: GroupRecord
+    groups: dict[str, GroupRecord] = field(default_factory=dict)
     cursor: int = 0
+
+    @property
+    def open(self) -> dict[str, RolloutRecord]:
+        return self.whole.open
 
 
 @dataclass(slots=True)
@@ -135,6 +188,8 @@ class RunCounters:
     stale_results: int = 0
     warm_starts: int = 0
     cold_starts: int = 0
+    hedged: int = 0
+    groups_failed: int = 0
 
     def stats(self) -> RunStats:
         return RunStats(
@@ -144,74 +199,6 @@ class RunCounters:
             stale_results=self.stale_results,
             warm_starts=self.warm_starts,
             cold_starts=self.cold_starts,
+            hedged=self.hedged,
+            groups_failed=self.groups_failed,
         )
-
-
-class PendingQueues:
-    """Waiting rollouts by scene, each a heap by sequence. Records that left ``PENDING`` are skipped when they surface."""
-
-    def __init__(self) -> None:
-        self._heaps: dict[str, list[tuple[int, RolloutRecord]]] = {}
-        self._counts: Counter[str] = Counter()
-        self._total = 0
-
-    def __len__(self) -> int:
-        return self._total
-
-    def __iter__(self) -> Iterator[RolloutRecord]:
-        """Every waiting rollout, in no order."""
-        for heap in self._heaps.values():
-            yield from {record.key: record for _, record in heap if record.phase is Phase.PENDING}.values()
-
-    @property
-    def scenes(self) -> int:
-        """How many scenes somebody waits for."""
-        return len(self._counts)
-
-    def counts(self) -> dict[str, int]:
-        return dict(self._counts)
-
-    def count(self, scene: str) -> int:
-        return self._counts[scene]
-
-    def push(self, record: RolloutRecord) -> None:
-        """Queue a rollout that no one holds."""
-        record.phase = Phase.PENDING
-        heapq.heappush(self._heaps.setdefault(record.scene, []), (record.sequence, record))
-        self._counts[record.scene] += 1
-        self._total += 1
-
-    def remove(self, record: RolloutRecord) -> None:
-        """Forget a waiting record; its caller moves it out of ``PENDING``."""
-        self._uncount(record.scene)
-
-    def head(self, scene: str) -> RolloutRecord | None:
-        """The first in line for the scene."""
-        heap = self._heaps.get(scene)
-        while heap and heap[0][1].phase is not Phase.PENDING:
-            heapq.heappop(heap)
-        return heap[0][1] if heap else None
-
-    def pop(self, scene: str) -> RolloutRecord:
-        """Take the first in line. KeyError when nobody waits for the scene."""
-        record = self.head(scene)
-        if record is None:
-            raise KeyError(scene)
-        heapq.heappop(self._heaps[scene])
-        self._uncount(scene)
-        record.phase = Phase.LEASED
-        return record
-
-    def first_of(self, scenes: frozenset[str]) -> str | None:
-        """The scene among these whose first in line is the oldest."""
-        few, many = (scenes, self._counts) if len(scenes) < len(self._counts) else (self._counts, scenes)
-        heads = [head for scene in few if scene in many and (head := self.head(scene)) is not None]
-        return min(heads, key=lambda head: head.sequence).scene if heads else None
-
-    def _uncount(self, scene: str) -> None:
-        self._counts[scene] -= 1
-        self._total -= 1
-        if self._counts[scene] <= 0:
-            # What is left in the heap are records that reached their outcome while they waited.
-            del self._counts[scene]
-            self._heaps.pop(scene, None)

@@ -41,7 +41,7 @@ class Recovery:
 
     def restore(self, event: BatchRestored) -> None:
         """Take over a batch. Its counters and cursors go on where they were."""
-        counters = self._desk.counters(event.batch.run_id)
+        counters = self._desk.runs.of(event.batch.run_id).counters
         counters.delivered += len(event.delivered)
         counters.infra_failures += event.infra_failures
         for record in self._desk.take_in(event.batch, event.delivered):
@@ -58,13 +58,13 @@ class Recovery:
             return False
         batch = self._desk.batches.get((origin.run_id, origin.batch_id))
         record = batch.open.get(origin.rollout_id) if batch is not None else None
-        other = record.lease if record is not None else None
-        if record is None or (other is not None and other.ref.lease_epoch >= ref.lease_epoch):
+        others = list(record.leases) if record is not None else []
+        if record is None or any(other.ref.lease_epoch >= ref.lease_epoch for other in others):
             self._desk.leases.disown(ref, origin.run_id)
             return False
-        if other is not None:
+        for other in others:
             self._desk.void(other)
-        elif record.phase is Phase.PENDING:
+        if record.phase is Phase.PENDING:
             self._desk.pending.remove(record)
         self._forget(record)
         record.attempts = max(record.attempts, origin.attempt - 1)

@@ -65,9 +65,12 @@ class Table:
         residents += [Resident(scene, ResidentState.FAILED, error="no mesh") for scene in failed]
         return self.tell(WorkerReported(worker_id, tuple(residents), tuple(held), draining, resync))
 
-    def submit(self, count=1, scene="kitchen", batch_id="b1"):
-        rollouts = tuple(Rollout(f"{batch_id}-{i}", "g", scene, "t", (), 0) for i in range(count))
-        return self.tell(BatchSubmitted(Batch("r1", batch_id, 1, rollouts)))
+    def submit(self, count=1, scene="kitchen", batch_id="b1", group_size=1, run_id="r1"):
+        rollouts = tuple(
+            Rollout(f"{batch_id}-{i}", f"{batch_id}-g{i // group_size}", scene, "t", (), 0)
+            for i in range(count)
+        )
+        return self.tell(BatchSubmitted(Batch(run_id, batch_id, 1, rollouts)))
 
     def finish(self, lease, outcome=None):
         return self.tell(LeaseFinished(lease.worker_id, lease.ref, outcome or completed(lease.worker_id)))

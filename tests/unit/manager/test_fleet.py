@@ -51,8 +51,8 @@ def test_an_idle_worker_finds_a_lease_behind_a_busy_slot():
     load(fleet, "w0000", 2, given_s=1.0)
     thief = fleet.workers["w0001"]
     assert fleet.thieves() == ["w0001"]
-    assert fleet.waiting_behind(thief, before_s=0.5) is None
-    assert fleet.waiting_behind(thief, before_s=1.0).ref.lease_id == "w0000.1"
+    assert fleet.waiting_behind(thief, before_s=0.5, now_s=2.0) is None
+    assert fleet.waiting_behind(thief, before_s=1.0, now_s=2.0).ref.lease_id == "w0000.1"
 
 
 def test_different_idle_workers_are_asked_each_time_and_none_while_nobody_waits():
@@ -65,7 +65,7 @@ def test_different_idle_workers_are_asked_each_time_and_none_while_nobody_waits(
 
 def test_a_worker_that_drains_or_is_suspected_is_neither_live_nor_idle():
     fleet = fleet_of(3)
-    fleet.workers["w0000"].draining = True
+    fleet.workers["w0000"].drained = True
     fleet.workers["w0001"].suspect = True
     for worker in fleet.workers.values():
         fleet.stand(worker)

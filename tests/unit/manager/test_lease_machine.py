@@ -1,8 +1,16 @@
-"""The whole machine against chaos: crashes, lost messages, late, repeated and reordered results, in any order."""
+"""A19: the whole machine against chaos: crashes, lost messages, late, repeated and reordered results, in any order."""
 
 import hypothesis.strategies as st
-from hypothesis import settings
-from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+import pytest
+from hypothesis import HealthCheck, settings
+from hypothesis.stateful import (
+    RuleBasedStateMachine,
+    initialize,
+    invariant,
+    precondition,
+    rule,
+    run_state_machine_as_test,
+)
 from tests.fakes.worker import completed
 
 from embomatrix.manager.assignments import DispatchLimits
@@ -11,32 +19,59 @@ from embomatrix.manager.commands import AcknowledgeLease, CancelLease, DeliverRe
 from embomatrix.manager.events import (
     BatchCancelled,
     BatchSubmitted,
+    DispatchPaused,
+    DispatchResumed,
     LeaseFinished,
     LeasesRenewed,
     LookaheadAnnounced,
+    RunOpened,
     Tick,
     WorkerDrained,
     WorkerJoined,
     WorkerLost,
     WorkerRecovered,
     WorkerReported,
+    WorkerResumed,
     WorkerSuspected,
 )
 from embomatrix.rpc.values import (
     Batch,
+    Cancelled,
     Completed,
+    GroupPolicy,
     InfraCode,
     InfraFailure,
+    LeaseProgress,
     LookaheadEntry,
     Resident,
     ResidentState,
     Resources,
     Rollout,
+    RunTerms,
 )
 
 WORKERS = ("w1", "w2", "w3")
 SCENES = ("kitchen", "bedroom", "hall", "bath")
-LIMITS = DispatchLimits(lease_ttl_s=5, lease_limit_s=20, rollout_deadline_s=60, no_capacity_s=15)
+LIMITS = DispatchLimits(
+    lease_ttl_s=5,
+    lease_limit_s=20,
+    rollout_deadline_s=60,
+    no_capacity_s=15,
+    elsewhere_s=2.0,
+    hedge_share=0.5,
+    known_after=2,
+    stall_after_s=3.0,
+    execute_deadline_s=4.0,
+)
+RUNS = ("r1", "r2", "r3")
+TERMS = st.builds(
+    RunTerms,
+    st.sampled_from(GroupPolicy),
+    st.sampled_from([0.5, 1.0, 4.0]),
+    st.integers(0, 1),
+    st.sampled_from([0.0, 30.0]),
+)
+STANDINGS = (WorkerSuspected, WorkerRecovered, WorkerRecovered, WorkerDrained, WorkerResumed, WorkerResumed)
 workers = st.sampled_from(WORKERS)
 
 
@@ -54,9 +89,14 @@ class LeaseMachine(RuleBasedStateMachine):
         self.leases = {}
         self.old = []
         self.epochs = set()
-        self.batches = 0
+        self.batches = {}
+        self.steps = {}
+        self.hedges = 0
+        for worker in WORKERS:
+            self.a_worker_joins(worker, 2, 1000)
 
     def tell(self, event, *, lost=False):
+        self.now_s += 0.01
         for command in self.cluster.handle(event, now_s=self.now_s):
             match command:
                 case DeliverResult(result=result):
@@ -66,7 +106,9 @@ class LeaseMachine(RuleBasedStateMachine):
                 case GiveLease():
                     assert command.ref.lease_epoch not in self.epochs, "an epoch given twice"
                     assert command.rollout.rollout_id not in self.delivered, "a lease after the outcome"
+                    assert not (command.rollout.render and command.worker_id == "w3"), "w3 renders nothing"
                     self.epochs.add(command.ref.lease_epoch)
+                    self.hedges += command.hedge
                     if not lost:
                         self.live[command.worker_id][command.ref] = command
                     self.old.append(command)
@@ -81,18 +123,26 @@ class LeaseMachine(RuleBasedStateMachine):
     def a_worker_joins(self, worker, slots, memory_mb):
         self.live[worker] = {}
         self.desired.pop(worker, None)
-        self.tell(WorkerJoined(worker, Resources(slots, slots, memory_mb)))
+        renders = 0 if worker == "w3" else slots
+        self.tell(WorkerJoined(worker, Resources(slots, slots, memory_mb, render_slots=renders)))
         self.tell(WorkerReported(worker, (), resync=True))
 
-    @rule(worker=workers, failing=st.sets(st.sampled_from(SCENES), max_size=1), reconnect=st.booleans())
-    def a_worker_reports(self, worker, failing, reconnect):
+    @rule(
+        worker=workers,
+        failing=st.sets(st.sampled_from(SCENES), max_size=1),
+        reconnect=st.booleans(),
+        paused=st.sampled_from([*[""] * 7, "the owner is back"]),
+    )
+    def a_worker_reports(self, worker, failing, reconnect, paused=""):
         if worker not in self.live:
             return
         residents = tuple(
             Resident(scene, ResidentState.FAILED if scene in failing else ResidentState.WARM, 0.1, 60.0)
             for scene in self.desired.get(worker, ())
         )
-        self.tell(WorkerReported(worker, residents, tuple(self.live[worker]), resync=reconnect))
+        self.tell(
+            WorkerReported(worker, residents, tuple(self.live[worker]), resync=reconnect, paused=paused)
+        )
 
     @rule(worker=workers)
     def a_worker_is_killed(self, worker):
@@ -104,28 +154,58 @@ class LeaseMachine(RuleBasedStateMachine):
         if self.live.get(worker):
             self.live[worker].popitem()
 
-    @rule(worker=workers, event=st.sampled_from([WorkerSuspected, WorkerRecovered, WorkerDrained]))
+    @rule(
+        worker=workers,
+        event=st.sampled_from(STANDINGS),
+    )
     def a_worker_changes_its_standing(self, worker, event):
         self.tell(event(worker))
 
-    @rule(count=st.integers(1, 8), scene=st.sampled_from(SCENES))
-    def a_batch_comes(self, count, scene):
-        self.batches += 1
-        rollouts = tuple(Rollout(f"{self.batches}-{i}", "g", scene, "t", (), 0) for i in range(count))
+    @rule(paused=st.sampled_from([True, False, False, False]))
+    def an_operator_pauses_or_resumes(self, paused):
+        self.tell(DispatchPaused() if paused else DispatchResumed())
+
+    @rule(run=st.sampled_from(RUNS), terms=TERMS)
+    def a_run_is_opened(self, run, terms):
+        self.tell(RunOpened(run, terms))
+
+    @rule(
+        run=st.sampled_from(RUNS),
+        count=st.integers(1, 8),
+        size=st.integers(1, 8),
+        scene=st.sampled_from(SCENES),
+        render=st.sampled_from([False, False, True]),
+    )
+    def a_batch_comes(self, run, count, size, scene, render):
+        name = f"b{len(self.batches)}"
+        rollouts = tuple(
+            Rollout(f"{name}-{i}", f"{name}.{i // size}", scene, "t", (), 0, render) for i in range(count)
+        )
         self.submitted.update({rollout.rollout_id: rollout for rollout in rollouts})
-        batch = Batch("r1", f"b{self.batches}", self.batches, rollouts)
+        self.batches[name] = batch = Batch(run, name, len(self.batches) + 1, rollouts)
         self.tell(BatchSubmitted(batch))
         self.tell(BatchSubmitted(batch))
 
     @rule(scenes=st.lists(st.sampled_from(SCENES), max_size=4))
     def a_window_comes(self, scenes):
-        entries = tuple(LookaheadEntry(self.batches + 1 + i, scene, 4) for i, scene in enumerate(scenes))
-        self.tell(LookaheadAnnounced("r1", self.batches + 1, entries))
+        entries = tuple(LookaheadEntry(len(self.batches) + 1 + i, scene, 4) for i, scene in enumerate(scenes))
+        self.tell(LookaheadAnnounced("r1", len(self.batches) + 1, entries))
 
-    @precondition(lambda self: self.batches)
+    @precondition(lambda self: len(self.batches) % 4 == 3)
     @rule(data=st.data())
     def a_batch_is_cancelled(self, data):
-        self.tell(BatchCancelled("r1", f"b{data.draw(st.integers(1, self.batches))}"))
+        batch = data.draw(st.sampled_from(list(self.batches.values())))
+        self.tell(BatchCancelled(batch.run_id, batch.batch_id))
+
+    @rule(rounds=st.integers(1, 6))
+    def the_cluster_works(self, rounds):
+        """Otherwise too much goes wrong for anything to come about."""
+        for _ in range(rounds):
+            for worker in list(self.live):
+                self.a_worker_reports(worker, set(), False)
+            for worker in list(self.live)[:-1]:
+                self.a_lease_ends(worker, None, 1)
+            self.time_passes(0.5, True, 1)
 
     @rule(worker=workers, failing=st.sampled_from([None, None, None, *InfraCode]), repeats=st.integers(1, 2))
     def a_lease_ends(self, worker, failing, repeats):
@@ -145,12 +225,19 @@ class LeaseMachine(RuleBasedStateMachine):
             held.pop(lease.ref, None)
         self.tell(LeaseFinished(worker, lease.ref, completed(worker)))
 
-    @rule(seconds=st.sampled_from([0.1, 1.0, 6.0, 20.0]), renewing=st.booleans())
-    def time_passes(self, seconds, renewing):
+    @rule(
+        seconds=st.sampled_from([0.1, 1.0, 6.0, 20.0]),
+        renewing=st.booleans(),
+        moving=st.sampled_from([0, 1, 1]),
+    )
+    def time_passes(self, seconds, renewing, moving):
         self.now_s += seconds
         if renewing:
-            for worker, held in self.live.items():
-                self.tell(LeasesRenewed(worker, tuple(held)))
+            for worker, held in list(self.live.items()):
+                for ref in held:
+                    self.steps[ref] = self.steps.get(ref, -1) + moving
+                told = tuple(LeaseProgress(ref, self.steps[ref]) for ref in held if self.steps[ref] >= 0)
+                self.tell(LeasesRenewed(worker, tuple(held), told))
         self.tell(Tick())
 
     @invariant()
@@ -158,11 +245,27 @@ class LeaseMachine(RuleBasedStateMachine):
         if not hasattr(self, "cluster"):
             return
         dispatcher = self.cluster.dispatcher
-        leased = [lease.record.key.rollout_id for lease in dispatcher.live_leases.values()]
-        assert len(leased) == len(set(leased)), "two live leases of one rollout"
-        assert not set(leased) & set(self.delivered)
-        assert len(leased) + dispatcher.queued == len(self.submitted) - len(self.delivered)
-        assert dispatcher.pending_of("r1") == len(self.submitted) - len(self.delivered)
+        leases = {}
+        for lease in dispatcher.live_leases.values():
+            leases.setdefault(lease.record.key.rollout_id, []).append(lease)
+        assert not set(leases) & set(self.delivered)
+        for held in leases.values():
+            assert len({lease.worker_id for lease in held}) == len(held) <= 2
+            assert len(held) == 1 or held[0].record.hedged
+        assert len(leases) + dispatcher.queued == len(self.submitted) - len(self.delivered)
+        assert sum(map(dispatcher.pending_of, RUNS)) == len(self.submitted) - len(self.delivered)
+
+    @invariant()
+    def second_leases_keep_to_their_budget(self):
+        if hasattr(self, "cluster"):
+            counted = sum(self.cluster.dispatcher.counters(run).hedged for run in RUNS)
+            assert counted == self.hedges <= LIMITS.hedge_share * len(self.submitted)
+
+    @invariant()
+    def nobody_is_called_off_without_a_reason(self):
+        if hasattr(self, "cluster"):
+            outcomes = [result.outcome for result in self.delivered.values()]
+            assert all(outcome.reason for outcome in outcomes if isinstance(outcome, Cancelled))
 
     @invariant()
     def workers_hold_no_more_than_their_credits(self):
@@ -183,6 +286,7 @@ class LeaseMachine(RuleBasedStateMachine):
         """With a sound worker and enough time, everything ends: nothing is lost."""
         if not hasattr(self, "cluster"):
             return
+        self.tell(DispatchResumed())
         for worker in WORKERS:
             self.a_worker_is_killed(worker)
         self.a_worker_joins("w1", 3, 1000)
@@ -190,10 +294,24 @@ class LeaseMachine(RuleBasedStateMachine):
             self.a_worker_reports("w1", set(), False)
             while self.live["w1"]:
                 self.a_lease_ends("w1", None, 1)
-            self.time_passes(1.0, True)
+            self.time_passes(1.0, True, 1)
         assert set(self.delivered) == set(self.submitted)
         assert not self.cluster.dispatcher.live_leases
 
 
 TestLeaseMachine = LeaseMachine.TestCase
-TestLeaseMachine.settings = settings(max_examples=150, stateful_step_count=40, deadline=None)
+TestLeaseMachine.settings = settings(max_examples=100, stateful_step_count=40, deadline=None)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_the_lease_machine_holds_for_a_hundred_thousand_steps():
+    run_state_machine_as_test(
+        LeaseMachine,
+        settings=settings(
+            max_examples=1_000,
+            stateful_step_count=100,
+            deadline=None,
+            suppress_health_check=list(HealthCheck),
+        ),
+    )

@@ -19,6 +19,7 @@ from embomatrix.rpc.values import (
     Completed,
     InfraCode,
     InfraFailure,
+    LeaseOrigin,
     LeaseRef,
     Resident,
     ResidentState,
@@ -96,6 +97,7 @@ def test_whatever_dies_each_rollout_has_one_outcome_and_no_failure_a_reward(scen
 
 
 REF = LeaseRef("lease", 1)
+ORIGIN = LeaseOrigin("run", "batch", "rollout")
 ROLLOUT = Rollout("x1", "g", "kitchen", "t", (), 0)
 REWARD = RewardBreakdown(0.5, 0.0, 0.0, (), False)
 
@@ -139,21 +141,21 @@ def test_the_reward_of_another_rollout_is_found(auditor):
 
 
 def test_two_good_leases_of_a_rollout_are_found_and_a_new_one_after_the_old_is_none(auditor):
-    auditor.watch([GiveLease("w1", REF, ROLLOUT, 1.0), AcknowledgeLease("w1", REF)])
-    auditor.watch([GiveLease("w1", LeaseRef("lease", 2), ROLLOUT, 1.0)])
+    auditor.watch([GiveLease("w1", REF, ROLLOUT, 1.0, ORIGIN), AcknowledgeLease("w1", REF)])
+    auditor.watch([GiveLease("w1", LeaseRef("lease", 2), ROLLOUT, 1.0, ORIGIN)])
     with pytest.raises(BrokenInvariantError, match="x1 has two leases at once"):
-        auditor.watch([GiveLease("w2", LeaseRef("lease", 3), ROLLOUT, 1.0)])
+        auditor.watch([GiveLease("w2", LeaseRef("lease", 3), ROLLOUT, 1.0, ORIGIN)])
 
 
 def test_an_epoch_that_is_given_twice_is_found(auditor):
-    auditor.watch([GiveLease("w1", REF, ROLLOUT, 1.0), AcknowledgeLease("w1", REF)])
+    auditor.watch([GiveLease("w1", REF, ROLLOUT, 1.0, ORIGIN), AcknowledgeLease("w1", REF)])
     with pytest.raises(BrokenInvariantError, match="epoch 1 was given twice"):
-        auditor.watch([GiveLease("w2", REF, ROLLOUT, 1.0)])
+        auditor.watch([GiveLease("w2", REF, ROLLOUT, 1.0, ORIGIN)])
 
 
 def test_a_lease_to_a_worker_that_never_reported_the_scene_is_found(auditor):
     with pytest.raises(BrokenInvariantError, match="w3, which never said"):
-        auditor.watch([GiveLease("w3", REF, ROLLOUT, 1.0)])
+        auditor.watch([GiveLease("w3", REF, ROLLOUT, 1.0, ORIGIN)])
 
 
 def test_a_batch_that_ends_too_early_is_found(auditor):

@@ -40,8 +40,9 @@ class Auditor:
         self._open: dict[tuple[str, str], set[str]] = {}
         self._cursors: dict[tuple[str, str], int] = {}
         self._epochs: set[int] = set()
-        self._holder: dict[str, str] = {}
-        """Who has the good lease of a rollout."""
+        self._holders: dict[str, list[str]] = {}
+        """Who has good leases of a rollout."""
+        self.hedges = 0
         self._held_by: dict[str, dict[str, LeaseRef]] = {}
         """By worker: the good leases by rollout."""
         self._warm: dict[str, set[str]] = {}
@@ -106,9 +107,13 @@ class Auditor:
         _check(
             command.ref.lease_epoch not in self._epochs, f"epoch {command.ref.lease_epoch} was given twice"
         )
-        if self._holder.get(rollout_id) in self._gone:
-            self._forget(rollout_id, self._holder[rollout_id])
-        _check(rollout_id not in self._holder, f"{rollout_id} has two leases at once")
+        for name in self._gone.intersection(self._holders.get(rollout_id, ())):
+            self._forget(rollout_id, name)
+        holders = self._holders.setdefault(rollout_id, [])
+        _check(command.hedge or not holders, f"{rollout_id} has two leases at once")
+        _check(not command.hedge or len(holders) == 1, f"{rollout_id} is hedged with {len(holders)} leases")
+        _check(worker_id not in holders, f"{rollout_id} has two leases on {worker_id}")
+        self.hedges += command.hedge
         _check(
             command.rollout.bundle_digest in self._warm.get(worker_id, ()),
             f"{rollout_id} was leased to {worker_id}, which never said that it has its scene",
@@ -116,7 +121,7 @@ class Auditor:
         if rollout_id in self._lost_s:
             self.orphaned_s.append(self._agenda.now_s - self._lost_s.pop(rollout_id))
         self._epochs.add(command.ref.lease_epoch)
-        self._holder[rollout_id] = worker_id
+        holders.append(worker_id)
         self._held_by.setdefault(worker_id, {})[rollout_id] = command.ref
         self._rollout_of[command.ref] = rollout_id
 
@@ -131,7 +136,10 @@ class Auditor:
                 self._forget(rollout_id, worker_id)
 
     def _forget(self, rollout_id: str, worker_id: str) -> None:
-        del self._held_by[worker_id][rollout_id], self._holder[rollout_id]
+        del self._held_by[worker_id][rollout_id]
+        self._holders[rollout_id].remove(worker_id)
+        if not self._holders[rollout_id]:
+            del self._holders[rollout_id]
 
     def _deliver(self, key: tuple[str, str], result: RolloutResult) -> None:
         rollout_id = result.rollout_id
