@@ -68,10 +68,10 @@ def rows(*cursors):
 
 
 async def test_a_run_is_there_until_it_is_closed(store):
-    await store.open_run(RunRow("r1", "first"))
+    await store.open_run(RunRow("r1", "first", b"\x08\x01 terms"))
     await store.open_run(RunRow("r2", "second"))
-    await store.open_run(RunRow("r1", "another name"))
-    assert await store.runs() == [RunRow("r1", "first"), RunRow("r2", "second")]
+    await store.open_run(RunRow("r1", "another name", b"others"))
+    assert await store.runs() == [RunRow("r1", "first", b"\x08\x01 terms"), RunRow("r2", "second")]
     await store.close_run("r1")
     await store.close_run("never opened")
     assert await store.runs() == [RunRow("r2", "second")]

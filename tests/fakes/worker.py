@@ -60,6 +60,8 @@ class FakeWorker:
     acknowledged: list = field(default_factory=list)
     cancelled: list = field(default_factory=list)
     residents: dict = field(default_factory=dict)
+    paused: str = ""
+    resumed: bool = False
 
     async def __aenter__(self):
         self._channel = open_channel(self.address, self.token)
@@ -96,6 +98,11 @@ class FakeWorker:
         """Send a result, whatever became of its lease."""
         self._send(results=[LeaseResult(ref, outcome)])
 
+    def pause(self, reason):
+        """Take nothing new from now on, or again with an empty reason."""
+        self.paused = reason
+        self._send(state=self._state())
+
     def _start(self, coroutine):
         task = asyncio.create_task(self._until_the_manager_goes(coroutine))
         self._tasks.add(task)
@@ -106,7 +113,8 @@ class FakeWorker:
             await coroutine
 
     def _state(self):
-        return WorkerState(tuple(self.residents.values()), tuple(lease.ref for lease in self.leases.values()))
+        held = tuple(lease.ref for lease in self.leases.values())
+        return WorkerState(tuple(self.residents.values()), held, paused=self.paused)
 
     def _send(self, state=None, results=()):
         session_id, epoch = self.session
@@ -124,6 +132,7 @@ class FakeWorker:
         async for response in self._stub.Session(self._requests()):
             if response.HasField("desired"):
                 self._want(tuple(response.desired.bundle_digests))
+            self.resumed = self.resumed or response.resume
             for message in response.leases:
                 lease = lease_from_proto(message)
                 self.leases[lease.ref.lease_id] = lease

@@ -29,10 +29,12 @@ from embomatrix.rpc.values import (
     Batch,
     Cancelled,
     Completed,
+    GroupPolicy,
     InfraCode,
     InfraFailure,
     LookaheadEntry,
     Rollout,
+    RunTerms,
     Warmth,
 )
 
@@ -59,7 +61,7 @@ async def manager(tmp_path, **changes):
 @contextlib.asynccontextmanager
 async def open_run(address, run_id="r1", token=""):
     async with ClusterClient(address, token) as client:
-        await client.open_run("test", run_id)
+        await client.open_run("test", run_id, RunTerms(GroupPolicy.PARTIAL))
         await client.put_bundles(BUNDLES)
         yield client
 

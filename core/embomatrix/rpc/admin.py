@@ -9,12 +9,12 @@ from embomatrix.proto.v1 import admin_service_pb2_grpc
 from embomatrix.rpc.channel import DEFAULT_ADDRESS, open_channel
 from embomatrix.rpc.convert import each, inside
 from embomatrix.rpc.convert_log import event_page_from_proto, run_summary_from_proto
-from embomatrix.rpc.convert_session import run_info_from_proto, worker_info_from_proto
+from embomatrix.rpc.convert_session import plan_cell_from_proto, run_info_from_proto, worker_info_from_proto
 from embomatrix.rpc.status import cluster_errors
 
 if TYPE_CHECKING:
     from embomatrix.rpc.run_log import EventPage, RunEvent, RunSummary
-    from embomatrix.rpc.values import RunInfo, WorkerInfo
+    from embomatrix.rpc.values import PlanCell, RunInfo, WorkerInfo
 
 CALL_S: Final = 10.0
 """For the answer to one call."""
@@ -74,6 +74,28 @@ class AdminClient:
         """The worker gets nothing new and leaves when it has finished what it holds. Raises NotFoundError."""
         with cluster_errors(self._address):
             await self._stub.DrainWorker(pb.DrainWorkerRequest(worker_id=worker_id), timeout=self._call_s)
+
+    async def resume(self, worker_id: str) -> None:
+        """Take a drain back, as long as the worker has not left. Raises NotFoundError."""
+        request = pb.ResumeWorkerRequest(worker_id=worker_id)
+        with cluster_errors(self._address):
+            await self._stub.ResumeWorker(request, timeout=self._call_s)
+
+    async def plan(self, run_id: str = "") -> tuple[PlanCell, ...]:
+        """The look-ahead grid of one run, or of all: what each coming step needs, and who has it."""
+        with cluster_errors(self._address):
+            answer = await self._stub.GetPlan(pb.GetPlanRequest(run_id=run_id), timeout=self._call_s)
+            return each("cells", plan_cell_from_proto, answer.cells)
+
+    async def pause_dispatch(self) -> None:
+        """Have no new leases given; what runs goes on."""
+        with cluster_errors(self._address):
+            await self._stub.PauseDispatch(pb.PauseDispatchRequest(), timeout=self._call_s)
+
+    async def resume_dispatch(self) -> None:
+        """Have leases given again."""
+        with cluster_errors(self._address):
+            await self._stub.ResumeDispatch(pb.ResumeDispatchRequest(), timeout=self._call_s)
 
     async def _runs(self, request: pb.ListRunsRequest) -> tuple[RunInfo, ...]:
         with cluster_errors(self._address):

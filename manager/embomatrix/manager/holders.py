@@ -29,11 +29,21 @@ class Holder:
     desired: tuple[str, ...] | None = None
     reported: bool = False
     suspect: bool = False
-    draining: bool = False
+    drained: bool = False
+    """By an operator."""
+    leaving: bool = False
+    paused: bool = False
+    """It said so itself. While it is paused, what it holds stays."""
+    loading_since_s: dict[str, float] = field(default_factory=dict)
 
     @property
     def usable(self) -> bool:
-        return self.reported and not self.draining and not self.suspect
+        return self.reported and not (self.suspect or self.drained or self.leaving or self.paused)
+
+    @property
+    def renders(self) -> bool:
+        """Whether it has slots that render, and the memory for it."""
+        return self.resources.render_slots > 0 and self.resources.vram_mb > 0
 
     @property
     def slots(self) -> int:
@@ -167,12 +177,17 @@ class Places:
         self._in_use = in_use
         self._retry_s = retry_s
         self._large: list[tuple[str, float]] = []
+        self._rendering: frozenset[str] = frozenset()
 
     def refuse_where_too_large(self, needs: Iterable[Need], size_mb: Mapping[str, float]) -> None:
         """Scenes that were measured and found larger than all the memory of a worker are not tried there again."""
         least_mb = self._holders.least_memory_mb
         sizes = ((need.bundle_digest, size_mb.get(need.bundle_digest, 0.0)) for need in needs)
         self._large = [(scene, size) for scene, size in sizes if size > least_mb]
+
+    def refuse_where_nothing_renders(self, needs: Iterable[Need]) -> None:
+        """Scenes whose rollouts render go to workers that can."""
+        self._rendering = frozenset(need.bundle_digest for need in needs if need.render)
 
     @property
     def ids(self) -> Iterable[str]:
@@ -197,9 +212,11 @@ class Places:
         )
 
     def refused(self, holder: Holder) -> frozenset[str]:
-        """What failed to load there a moment ago, and what can't fit."""
+        """What failed to load there a moment ago, what can't fit, and what needs a GPU that is not there."""
         failed = {scene for scene, at_s in holder.failed_s.items() if self._now_s - at_s < self._retry_s}
         failed.update(scene for scene, size in self._large if size > holder.resources.memory_mb)
+        if self._rendering and not holder.renders:
+            failed.update(self._rendering)
         return frozenset(failed)
 
     def having(self, scene: str) -> Iterable[str]:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from embomatrix.manager.cluster_state import ClusterState
     from embomatrix.manager.commands import Command
     from embomatrix.manager.registry import Registry, Session
-    from embomatrix.rpc.values import LeaseRef, LeaseResult, Resources, WorkerState
+    from embomatrix.rpc.values import LeaseProgress, LeaseRef, LeaseResult, Resources, WorkerState
 
 
 TICK_S: Final = 0.1
@@ -25,11 +25,12 @@ TICK_S: Final = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Heartbeat:
-    """What a worker says between its reports: the leases that it holds, and how busy it is."""
+    """What a worker says between its reports: the leases that it holds, how far those are that run, and how busy it is."""
 
     held: tuple[LeaseRef, ...]
     load: float = 0.0
     memory_mb: int = 0
+    progress: tuple[LeaseProgress, ...] = ()
 
 
 class Intake:
@@ -65,11 +66,10 @@ class Intake:
         events: list[Event] = self.registry.heard(session, now_s=now_s)
         events += [LeaseFinished(session.worker_id, result.ref, result.outcome) for result in finished]
         if state is not None:
-            if state.draining:
-                self.registry.draining(session)
+            self.registry.told(session, draining=state.draining, paused=state.paused)
             held = (*state.running, *(result.ref for result in state.finished))
             reported = WorkerReported(
-                session.worker_id, state.residents, held, state.draining, resync, state.claims
+                session.worker_id, state.residents, held, state.draining, resync, state.claims, state.paused
             )
             # A first state comes first: what is leased on the strength of its results was not there when it was written.
             events.insert(0 if resync else len(events), reported)
@@ -82,7 +82,8 @@ class Intake:
         session = self.registry.find(session_id, epoch)
         session.load, session.memory_used_mb = beat.load, beat.memory_mb
         events = self.registry.heard(session, now_s=now_s)
-        commands = self.feed(*events, LeasesRenewed(session.worker_id, beat.held), now_s=now_s)
+        renewed = LeasesRenewed(session.worker_id, beat.held, beat.progress)
+        commands = self.feed(*events, renewed, now_s=now_s)
         return self.registry.interval_s, commands
 
     def tick(self, *, now_s: float) -> tuple[list[WorkerLost], list[Command]]:

@@ -26,6 +26,7 @@ class Outbox:
     acknowledged: list[LeaseRef] = field(default_factory=list)
     cancelled: list[LeaseRef] = field(default_factory=list)
     drain: bool = False
+    resume: bool = False
 
 
 class WorkerLink:
@@ -52,7 +53,12 @@ class WorkerLink:
         self._ready.set()
 
     def drain(self) -> None:
-        self._outbox.drain = True
+        self._outbox.drain, self._outbox.resume = True, False
+        self._ready.set()
+
+    def resume(self) -> None:
+        """Take a drain back."""
+        self._outbox.drain, self._outbox.resume = False, True
         self._ready.set()
 
     def close(self, reason: ClusterError) -> None:

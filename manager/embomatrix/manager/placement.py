@@ -15,12 +15,17 @@ import itertools
 import math
 from collections import Counter
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
+
+from embomatrix.manager.shares import Share, in_turns, quotas
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 
     from embomatrix.rpc.values import LookaheadEntry
+
+
+EVERYONE: Final = Share()
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +44,10 @@ class Need:
     load_s: float = 0.0
     work_s: float = 0.0
     turn: int = 0
+    share: Share = EVERYONE
+    """Of the run that needs it."""
+    render: bool = False
+    """Some of its rollouts need slots that render."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,9 +117,12 @@ def needs_of(pending: Mapping[str, int], windows: Iterable[Sequence[LookaheadEnt
             rank, known = ranks[entry.step], needs.get(entry.bundle_digest)
             count = max(entry.count, 1)
             if known is None or rank < known.rank:
-                needs[entry.bundle_digest] = Need(entry.bundle_digest, rank, count)
+                needs[entry.bundle_digest] = Need(entry.bundle_digest, rank, count, render=entry.render)
             elif rank == known.rank:
-                needs[entry.bundle_digest] = Need(entry.bundle_digest, rank, known.count + count)
+                render = known.render or entry.render
+                needs[entry.bundle_digest] = Need(
+                    entry.bundle_digest, rank, known.count + count, render=render
+                )
     return list(needs.values())
 
 
@@ -219,22 +231,16 @@ class _Shelves:
 def place(sites: Sites, needs: Sequence[Need], size_mb: Callable[[str], float]) -> Placement:
     """What workers should hold. ``size_mb`` estimates the memory of a scene. Deterministic."""
     shelves = _Shelves(sites, needs, size_mb)
-    totals = Counter[int]()
-    for need in needs:
-        totals[need.rank] += need.count
-    # Groups of a step come one by one: those that are here share the slots with those that come next.
-    totals[0] += totals[1]
+    wanted = _SlotsWanted(needs, sites.slots)
     having = {need.bundle_digest: sorted(sites.having(need.bundle_digest)) for need in needs}
     # Among what is needed now, what is resident goes first: evicting it to load another would only cost a load.
     ordered = sorted(
         needs, key=lambda n: (n.rank, not having[n.bundle_digest], n.turn, -n.count, n.bundle_digest)
     )
+    ordered = in_turns(ordered, lambda need: size_mb(need.bundle_digest))
     homeless: list[str] = []
-    for rank, group in itertools.groupby(ordered, key=lambda need: need.rank):
-        spreads = [
-            _Spread(need, _slots_wanted(need, sites, totals[rank]), shelves, having[need.bundle_digest])
-            for need in group
-        ]
+    for _, group in itertools.groupby(ordered, key=lambda need: need.rank):
+        spreads = [_Spread(need, wanted.of(need), shelves, having[need.bundle_digest]) for need in group]
         # One copy of each before a second of any: a second shall not push out another's only one.
         for spread in spreads:
             spread.place_one()
@@ -244,9 +250,22 @@ def place(sites: Sites, needs: Sequence[Need], size_mb: Callable[[str], float]) 
     return Placement(shelves.close(), tuple(homeless))
 
 
-def _slots_wanted(need: Need, sites: Sites, total: int) -> int:
-    """The scene's share of all slots, no more than its rollouts can keep busy."""
-    return min(need.count, math.ceil(sites.slots * need.count / max(total, 1) - 1e-9))
+class _SlotsWanted:
+    """What each need may have of all slots: its part of what its run may have, no more than its rollouts can keep busy."""
+
+    def __init__(self, needs: Sequence[Need], slots: int) -> None:
+        self._totals: dict[int, Counter[Share]] = {}
+        for need in needs:
+            self._totals.setdefault(need.rank, Counter())[need.share] += need.count
+        # Groups of a step come one by one: those that are here share the slots with those that come next.
+        if 0 in self._totals:
+            self._totals[0] += self._totals.get(1, Counter())
+        self._quotas = {rank: quotas(totals, slots) for rank, totals in self._totals.items()}
+
+    def of(self, need: Need) -> int:
+        total = self._totals[need.rank][need.share]
+        part = self._quotas[need.rank][need.share] * need.count / total
+        return min(need.count, math.ceil(part - 1e-9))
 
 
 class _Spread:

@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING
 from embomatrix.manager.store.protocol import BatchRow, ResultRow
 from embomatrix.proto.v1 import rollout_service_pb2, types_pb2
 from embomatrix.rpc.convert import batch_from_proto, batch_to_proto, rollout_result_to_proto
+from embomatrix.rpc.convert_run import run_terms_from_proto, run_terms_to_proto
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from embomatrix.rpc.values import Batch, RolloutResult
+    from embomatrix.manager.store.protocol import RunRow
+    from embomatrix.rpc.values import Batch, RolloutResult, RunTerms
 
 
 def batch_row(batch: Batch) -> BatchRow:
@@ -44,3 +46,12 @@ def timed_row(row: ResultRow, deliver_s: float) -> ResultRow:
     timed = types_pb2.Completed(timings=types_pb2.Timings(deliver_s=deliver_s))
     told = types_pb2.RolloutResult(completed=timed).SerializeToString()
     return ResultRow(row.cursor, row.rollout_id, row.payload + told)
+
+
+def terms_payload(terms: RunTerms) -> bytes:
+    return run_terms_to_proto(terms).SerializeToString(deterministic=True)
+
+
+def terms_of(row: RunRow) -> RunTerms:
+    """What a run asked for; the defaults for one that an older manager noted."""
+    return run_terms_from_proto(rollout_service_pb2.OpenRunRequest.FromString(row.terms))

@@ -16,6 +16,7 @@ from embomatrix.manager.events import (
     WorkerJoined,
     WorkerLost,
     WorkerRecovered,
+    WorkerResumed,
     WorkerSuspected,
 )
 from embomatrix.rpc.status import NotFoundError, SupersededError, UnknownSessionError
@@ -33,6 +34,7 @@ class Standing(StrEnum):
     SUSPECT = "suspect"
     LOST = "lost"
     DRAINING = "draining"
+    PAUSED = "paused"
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +70,9 @@ class Session:
     attached: bool = False
     detached_s: float | None = None
     reason: str = ""
-    """Why it was lost."""
+    """Why it was lost, or is paused."""
+    drained: bool = False
+    """An operator takes it out."""
     load: float = 0.0
     memory_used_mb: int = 0
 
@@ -180,16 +184,23 @@ class Registry:
 
     def drain(self, worker_id: str) -> list[Event]:
         """Take a worker out of service once it has finished what it holds."""
-        session = self._sessions.get(worker_id)
-        if session is None or session.standing is Standing.LOST:
-            known = ", ".join(sorted(self._sessions)) or "none"
-            raise NotFoundError(f"there is no worker {worker_id!r}: connected are {known}")
-        session.standing = Standing.DRAINING
+        session = self._there(worker_id)
+        session.drained, session.standing = True, Standing.DRAINING
         return [WorkerDrained(worker_id)]
 
-    def draining(self, session: Session) -> None:
-        """The worker itself says that it will leave."""
-        session.standing = Standing.DRAINING
+    def resume(self, worker_id: str) -> list[Event]:
+        """Take a drain back. The worker says itself whether it still leaves."""
+        session = self._there(worker_id)
+        session.drained, session.standing = False, Standing.READY
+        return [WorkerResumed(worker_id)]
+
+    def told(self, session: Session, *, draining: bool, paused: str) -> None:
+        """The worker itself says whether it will leave, or why it takes nothing new for now."""
+        if draining or session.drained:
+            session.standing = Standing.DRAINING
+        else:
+            session.standing = Standing.PAUSED if paused else Standing.READY
+        session.reason = paused
 
     def tick(self, *, now_s: float) -> list[Event]:
         """Suspect the silent, give up the lost, forget the long gone."""
@@ -209,6 +220,13 @@ class Registry:
                 reason = "it drained and left" if left else "its connection broke and it did not come back"
                 events.append(self._lose(session, reason))
         return events
+
+    def _there(self, worker_id: str) -> Session:
+        session = self._sessions.get(worker_id)
+        if session is None or session.standing is Standing.LOST:
+            known = ", ".join(sorted(self._sessions)) or "none"
+            raise NotFoundError(f"there is no worker {worker_id!r}: connected are {known}")
+        return session
 
     def _note(self, session: Session, now_s: float) -> None:
         session.last_seen_s = now_s

@@ -6,7 +6,7 @@ import asyncio
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from embomatrix.manager.store.protocol import ResultRow
 
@@ -18,11 +18,20 @@ LINGER_S: Final = 0.005
 class BatchLog:
     """The results of one batch in the order of their cursors, which run from 1 without gaps."""
 
-    def __init__(self, run_id: str, batch_id: str, digest: str, rows: Sequence[ResultRow] = ()) -> None:
+    def __init__(
+        self,
+        run_id: str,
+        batch_id: str,
+        digest: str,
+        rows: Sequence[ResultRow] = (),
+        groups: Mapping[str, int] | None = None,
+    ) -> None:
         self.run_id = run_id
         self.batch_id = batch_id
         self.digest = digest
         self.rows = list(rows)
+        self.groups = groups or {}
+        """How many rollouts each group has."""
         self.finished_s: float | None = None
         """When every rollout had its outcome; None before."""
         self.dropped = False

@@ -10,8 +10,15 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.manager.events import BatchCancelled, BatchRestored, BatchSubmitted, LookaheadAnnounced
-from embomatrix.manager.records import batch_of, batch_row, failed_rows
+from embomatrix.manager.events import (
+    BatchCancelled,
+    BatchRestored,
+    BatchSubmitted,
+    LookaheadAnnounced,
+    RunOpened,
+)
+from embomatrix.manager.group_ends import group_sizes
+from embomatrix.manager.records import batch_of, batch_row, failed_rows, terms_of, terms_payload
 from embomatrix.manager.results import BatchLog
 from embomatrix.manager.store.protocol import PutOutcome, RunRow, StateError
 from embomatrix.rpc.status import (
@@ -22,6 +29,7 @@ from embomatrix.rpc.status import (
     PreconditionError,
     UnavailableError,
 )
+from embomatrix.rpc.values import RunTerms
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -33,10 +41,11 @@ if TYPE_CHECKING:
     from embomatrix.manager.history import RunHistory
     from embomatrix.manager.results import ResultLogs
     from embomatrix.manager.store.protocol import StateStore
-    from embomatrix.rpc.values import Batch, LookaheadEntry, RunStats, Warmth
+    from embomatrix.rpc.values import Batch, LookaheadAnswer, LookaheadEntry, RunStats
 
 logger = logging.getLogger(__name__)
 
+DEFAULT_TERMS: Final = RunTerms()
 PAGE: Final = 4096
 _RUN_ID: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
 
@@ -87,22 +96,23 @@ class Runs:
         """Take up what a former manager left. Its open batches go on at once, whether their trainer asks for them or not."""
         for run in await self._store.runs():
             self._runs[run.run_id] = run
+            self._feed(RunOpened(run.run_id, terms_of(run)))
             self._history.opened(run.run_id, run.name)
             self._heard_s[run.run_id] = time.monotonic()
             for row in await self._store.batches(run.run_id):
-                log = BatchLog(run.run_id, row.batch_id, row.digest)
+                batch = batch_of(row)
+                log = BatchLog(run.run_id, row.batch_id, row.digest, groups=group_sizes(batch))
                 while page := await self._store.results_after(run.run_id, row.batch_id, len(log.rows), PAGE):
                     log.append(page)
                 self._logs.add(log)
                 delivered = {result.rollout_id: result.cursor for result in log.rows}
-                batch = batch_of(row)
                 self._history.submitted(batch)
                 self._feed(BatchRestored(batch, delivered, failed_rows(log.rows)))
         if self._runs:
             logger.info("took up %d runs of a former manager", len(self._runs))
 
-    async def open_run(self, name: str, run_id: str) -> str:
-        """Open a run, or attach to the one of that id; an empty id gets a new one."""
+    async def open_run(self, name: str, run_id: str, terms: RunTerms = DEFAULT_TERMS) -> str:
+        """Open a run, or attach to the one of that id, which keeps its terms; an empty id gets a new one."""
         run_id = run_id or f"run-{secrets.token_hex(6)}"
         if not _RUN_ID.fullmatch(run_id):
             raise InvalidRequestError(
@@ -111,15 +121,19 @@ class Runs:
         if run_id not in self._runs:
             if len(self._runs) >= self._limits.runs:
                 raise OverloadedError(f"{len(self._runs)} runs are open: close some with CloseRun")
-            run = RunRow(run_id, name[:200])
+            run = RunRow(run_id, name[:200], terms_payload(terms))
             with _store_errors():
                 await self._store.open_run(run)
-            self._runs.setdefault(run_id, run)
+            if run_id not in self._runs:
+                self._runs[run_id] = run
+                self._feed(RunOpened(run_id, terms))
             self._history.opened(run_id, run.name)
         self._heard_s[run_id] = time.monotonic()
         return run_id
 
-    def announce(self, run_id: str, version: int, entries: tuple[LookaheadEntry, ...]) -> dict[str, Warmth]:
+    def announce(
+        self, run_id: str, version: int, entries: tuple[LookaheadEntry, ...]
+    ) -> list[LookaheadAnswer]:
         """Replace the run's window; answers how far each scene is."""
         self._check_run(run_id)
         if len(entries) > self._limits.lookahead_entries:
@@ -128,7 +142,8 @@ class Runs:
             )
         self._feed(LookaheadAnnounced(run_id, version, entries))
         scenes = dict.fromkeys(entry.bundle_digest for entry in entries)
-        return {scene: self._cluster.scheduler.warmth(scene) for scene in scenes}
+        outlook = self._cluster.scheduler.outlook
+        return [outlook.answer(scene) for scene in scenes]
 
     async def submit(self, batch: Batch) -> BatchLog:
         """Have the batch executed, or attach to it when it was submitted before; returns its results' log."""
@@ -143,7 +158,7 @@ class Runs:
                 raise taken
             return self.log_of(batch.run_id, batch.batch_id)
         self._check_batch(batch)
-        log = BatchLog(batch.run_id, batch.batch_id, row.digest)
+        log = BatchLog(batch.run_id, batch.batch_id, row.digest, groups=group_sizes(batch))
         self._logs.add(log)
         try:
             with _store_errors():

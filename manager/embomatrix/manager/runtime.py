@@ -22,11 +22,11 @@ from embomatrix.manager.commands import (
     SetDesired,
 )
 from embomatrix.manager.delivery import Delivery
+from embomatrix.manager.events import DispatchPaused, DispatchResumed
 from embomatrix.manager.history import RunHistory
 from embomatrix.manager.intake import TICK_S, Heartbeat, Intake
 from embomatrix.manager.links import WorkerLink
 from embomatrix.manager.meter import Meter
-from embomatrix.manager.registry import Standing
 from embomatrix.manager.results import ResultLogs
 from embomatrix.manager.runs import RunLimits, Runs
 from embomatrix.rpc.status import SupersededError
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from embomatrix.manager.links import WorkerCommand
     from embomatrix.manager.registry import Registry, Session
     from embomatrix.manager.store.protocol import StateStore
-    from embomatrix.rpc.values import LeaseRef, LeaseResult, Resources, WorkerState
+    from embomatrix.rpc.values import LeaseResult, Resources, WorkerState
 
 logger = logging.getLogger(__name__)
 
@@ -104,7 +104,7 @@ class ManagerRuntime:
         self._close_link(session.worker_id)
         link = self._links[session.worker_id] = WorkerLink(session)
         self.registry.attach(session, now_s=time.monotonic())
-        if session.standing is Standing.DRAINING:
+        if session.drained:
             link.drain()
         try:
             yield link
@@ -126,11 +126,8 @@ class ManagerRuntime:
             self.chronicle.fleet.residents(worker_id, state.residents, now_s=now_s)
         self._carry_out(commands)
 
-    def take_heartbeat(
-        self, session_id: str, epoch: int, held: tuple[LeaseRef, ...], *, load: float, memory_mb: int
-    ) -> float:
+    def take_heartbeat(self, session_id: str, epoch: int, beat: Heartbeat) -> float:
         """Renew the leases that the worker names; returns the seconds until the next heartbeat."""
-        beat = Heartbeat(held, load, memory_mb)
         interval_s, commands = self._intake.heartbeat(session_id, epoch, beat, now_s=time.monotonic())
         self._carry_out(commands)
         return interval_s
@@ -140,6 +137,20 @@ class ManagerRuntime:
         self._carry_out(self._intake.feed(*self.registry.drain(worker_id), now_s=time.monotonic()))
         if worker_id in self._links:
             self._links[worker_id].drain()
+
+    def resume_worker(self, worker_id: str) -> None:
+        """Take a drain back; a worker that has left stays away."""
+        self._carry_out(self._intake.feed(*self.registry.resume(worker_id), now_s=time.monotonic()))
+        if worker_id in self._links:
+            self._links[worker_id].resume()
+
+    def pause_dispatch(self) -> None:
+        """No new leases are given; what runs goes on."""
+        self._carry_out(self._intake.feed(DispatchPaused(), now_s=time.monotonic()))
+
+    def resume_dispatch(self) -> None:
+        """Leases are given again."""
+        self._carry_out(self._intake.feed(DispatchResumed(), now_s=time.monotonic()))
 
     def _carry_out(self, commands: Sequence[Command]) -> None:
         now_s = time.monotonic()

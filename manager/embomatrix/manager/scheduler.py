@@ -21,25 +21,29 @@ from embomatrix.manager.events import (
     LeaseFinished,
     LookaheadAnnounced,
     RunClosed,
+    RunOpened,
     Tick,
     WorkerDrained,
     WorkerJoined,
     WorkerLost,
     WorkerRecovered,
     WorkerReported,
+    WorkerResumed,
     WorkerSuspected,
 )
 from embomatrix.manager.holders import Holder, Holders, Places
+from embomatrix.manager.outlook import Outlook
 from embomatrix.manager.placement import Need, needs_of, place
 from embomatrix.manager.prewarm import PrewarmLedger
-from embomatrix.rpc.values import Completed, LookaheadEntry, Resident, ResidentState, Warmth
+from embomatrix.manager.shares import Share
+from embomatrix.manager.window import Window
+from embomatrix.rpc.values import Completed, Resident, ResidentState, RunTerms
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from embomatrix.rpc.values import Batch
 
-
+DEFAULT_TERMS: Final = RunTerms()
 LEARNING: Final = 0.05
 """Weight of the latest of a row of measurements."""
 LEASES_AT_A_TIME: Final = 64
@@ -68,30 +72,6 @@ class ScheduleLimits:
     """A worker that failed to load a scene is not asked again for this long."""
 
 
-class Window:
-    """What a run announced last, without what has come."""
-
-    def __init__(self, version: int, entries: tuple[LookaheadEntry, ...]) -> None:
-        self.version = version
-        self._steps: dict[int, dict[str, list[LookaheadEntry]]] = {}
-        for entry in entries:
-            self._steps.setdefault(entry.step, {}).setdefault(entry.bundle_digest, []).append(entry)
-
-    @property
-    def entries(self) -> tuple[LookaheadEntry, ...]:
-        return tuple(entry for step in self._steps.values() for found in step.values() for entry in found)
-
-    def announces(self, scene: str) -> bool:
-        return any(scene in step for step in self._steps.values())
-
-    def come(self, batch: Batch) -> None:
-        """Drop the steps before the batch's, and of its own step its scenes: the other groups are still to come."""
-        for step in [step for step in self._steps if step < batch.step]:
-            del self._steps[step]
-        for scene in {rollout.bundle_digest for rollout in batch.rollouts}:
-            self._steps.get(batch.step, {}).pop(scene, None)
-
-
 class Scheduler:
     """Residents by memory. ``windows``, ``prewarm`` and ``unplaceable`` are for reading."""
 
@@ -102,6 +82,7 @@ class Scheduler:
         """Scenes that no worker can hold, with the reason."""
         self._limits = limits
         self._holders = Holders()
+        self._terms: dict[str, RunTerms] = {}
         self._demand = DemandObserved({})
         self._peaks: dict[str, int] = {}
         self._copies: dict[str, int] = {}
@@ -133,8 +114,11 @@ class Scheduler:
                 return self._on_submitted(event)
             case BatchRestored():
                 return Urgency.LATER
+            case RunOpened(run_id, terms):
+                self._terms[run_id] = terms
             case RunClosed(run_id):
                 self.windows.pop(run_id, None)
+                self._terms.pop(run_id, None)
             case WorkerReported():
                 return self._on_reported(event)
             case LeaseFinished(outcome=Completed(timings=timings)):
@@ -142,8 +126,10 @@ class Scheduler:
                 speed = max(holder.resources.score, 1e-3) if holder is not None else 1.0
                 self._execute_s = _learned(self._execute_s, timings.execute_s * speed)
                 return Urgency.NONE
-            case WorkerJoined() | WorkerLost() | WorkerDrained() | WorkerSuspected() | WorkerRecovered():
-                return self._on_worker(event)
+            case WorkerJoined() | WorkerLost():
+                return self._on_presence(event)
+            case WorkerDrained() | WorkerResumed() | WorkerSuspected() | WorkerRecovered():
+                return self._on_standing(event)
             case Tick():
                 return Urgency.LATER if self._demand.pending or self._holders.failing else Urgency.NONE
             case _:
@@ -154,10 +140,17 @@ class Scheduler:
         """Decide where every scene should be; returns the desired sets that changed."""
         self._now_s = now_s
         needs = needs_of(self._peaks, [window.entries for window in self.windows.values()])
+        owners = {**self._announcers(), **self._demand.runs}
         turns = {scene: turn for turn, scene in enumerate(self._demand.waited_s)}
-        needs = [self._spread(need, turns.get(need.bundle_digest, 0)) for need in needs]
+        needs = [
+            self._spread(
+                need, turns.get(need.bundle_digest, 0), self._share(owners.get(need.bundle_digest, ""))
+            )
+            for need in needs
+        ]
         places = Places(self._holders, now_s, self._demand.in_use, self._limits.retry_load_s)
         places.refuse_where_too_large(needs, self._size_mb)
+        places.refuse_where_nothing_renders(needs)
         placement = place(places, needs, self._estimate)
         self._holders.fresh.clear()
         self.unplaceable = {
@@ -167,21 +160,18 @@ class Scheduler:
         orders = (self._order(name, scenes) for name, scenes in placement.desired.items())
         return [order for order in orders if order is not None]
 
-    def warmth(self, scene: str) -> Warmth:
-        """How far the scene is, seen from its trainer."""
-        if self._holders.warm_on(scene):
-            return Warmth.WARM
-        if scene in self.unplaceable:
-            return Warmth.UNPLACEABLE
-        if any(
-            scene in (self._holders.by_id[name].desired or ()) for name in self._holders.standing_on(scene)
-        ):
-            return Warmth.WARMING
-        return Warmth.QUEUED
+    @property
+    def outlook(self) -> Outlook:
+        """How far scenes are, at this moment."""
+        return Outlook(self._holders, self.unplaceable, self.usual_load_s, self._now_s)
 
     def load_s(self, scene: str) -> float:
         """Measured seconds to load the scene; 0 when nobody has."""
         return self._load_s.get(scene, 0.0)
+
+    def usual_load_s(self, scene: str) -> float:
+        """What loading the scene takes, or a scene as a rule while nobody knows; 0 before the first."""
+        return self._load_s.get(scene, self._typical_load_s)
 
     def residents(self, worker_id: str) -> tuple[Resident, ...]:
         holder = self._holders.by_id.get(worker_id)
@@ -211,25 +201,27 @@ class Scheduler:
             window.come(batch)
         return urgency
 
-    def _on_worker(
-        self, event: WorkerJoined | WorkerLost | WorkerDrained | WorkerSuspected | WorkerRecovered
-    ) -> Urgency:
+    def _on_presence(self, event: WorkerJoined | WorkerLost) -> Urgency:
+        self.prewarm.lost(event.worker_id)
         match event:
             case WorkerJoined(worker_id, resources):
-                self.prewarm.lost(worker_id)
                 self._holders.join(worker_id, resources)
                 return Urgency.NONE
             case WorkerLost(worker_id):
-                self.prewarm.lost(worker_id)
                 self._holders.leave(worker_id)
                 return Urgency.NOW
+
+    def _on_standing(
+        self, event: WorkerDrained | WorkerResumed | WorkerSuspected | WorkerRecovered
+    ) -> Urgency:
         holder = self._holders.by_id.get(event.worker_id)
         if holder is None:
             return Urgency.NONE
-        if isinstance(event, WorkerDrained):
-            holder.draining = True
-        else:
-            holder.suspect = isinstance(event, WorkerSuspected)
+        match event:
+            case WorkerDrained() | WorkerResumed():
+                holder.drained = isinstance(event, WorkerDrained)
+            case WorkerSuspected() | WorkerRecovered():
+                holder.suspect = isinstance(event, WorkerSuspected)
         self._holders.changed(holder)
         return Urgency.NOW
 
@@ -237,15 +229,16 @@ class Scheduler:
         holder = self._holders.by_id.get(event.worker_id)
         if holder is None:
             return Urgency.NONE
-        urgency = Urgency.LATER if holder.reported else Urgency.NOW
-        holder.reported = True
-        holder.draining = holder.draining or event.draining
+        was_usable, holder.reported = holder.usable, True
+        holder.leaving, holder.paused = event.draining, bool(event.paused)
+        urgency = Urgency.LATER if holder.usable == was_usable else Urgency.NOW
         if event.resync:
             # Whatever was told before may be lost: the desired set is given again.
             holder.desired, urgency = None, Urgency.NOW
         reported = {resident.bundle_digest: resident for resident in event.residents}
         for scene in holder.residents.keys() - reported.keys():
             holder.warm_since_s.pop(scene, None)
+            holder.loading_since_s.pop(scene, None)
             self.prewarm.evicted(event.worker_id, scene)
         known = [scene for scene in holder.residents if scene in reported]
         holder.residents = {scene: reported[scene] for scene in dict.fromkeys([*known, *reported])}
@@ -258,6 +251,8 @@ class Scheduler:
         scene = resident.bundle_digest
         if resident.memory_mb > 0:
             self._size_mb[scene] = max(self._size_mb.get(scene, 0.0), resident.memory_mb)
+        if resident.state is not ResidentState.LOADING:
+            holder.loading_since_s.pop(scene, None)
         match resident.state:
             case ResidentState.WARM:
                 holder.warm_since_s.setdefault(scene, self._now_s)
@@ -270,6 +265,7 @@ class Scheduler:
                 holder.failed_s.setdefault(scene, self._now_s)
                 holder.warm_since_s.pop(scene, None)
             case ResidentState.LOADING:
+                holder.loading_since_s.setdefault(scene, self._now_s)
                 holder.warm_since_s.pop(scene, None)
                 holder.failed_s.pop(scene, None)
 
@@ -285,7 +281,19 @@ class Scheduler:
         names = self._holders.warm_on(scene)
         return min((self._holders.by_id[name].warm_since_s[scene] for name in names), default=None)
 
-    def _spread(self, need: Need, turn: int) -> Need:
+    def _share(self, run_id: str) -> Share:
+        terms = self._terms.get(run_id, DEFAULT_TERMS)
+        return Share(run_id, terms.weight, terms.priority)
+
+    def _announcers(self) -> dict[str, str]:
+        """Whose look-ahead a scene is in; the run that was there first where it is in several."""
+        found: dict[str, str] = {}
+        for run_id, window in self.windows.items():
+            for scene in window.scenes:
+                found.setdefault(scene, run_id)
+        return found
+
+    def _spread(self, need: Need, turn: int, share: Share) -> Need:
         """One worker more for a scene whose rollouts wait while others are idle, unless one is loading it already."""
         scene = need.bundle_digest
         waited_s = self._demand.waited_s.get(scene, 0.0)
@@ -297,9 +305,11 @@ class Scheduler:
         return dataclasses.replace(
             need,
             at_least=self._copies.get(scene, 1),
-            load_s=self._load_s.get(scene, self._typical_load_s),
+            load_s=self.usual_load_s(scene),
             work_s=need.count * self._execute_s,
             turn=turn,
+            share=share,
+            render=need.render or scene in self._demand.rendering,
         )
 
     def _estimate(self, scene: str) -> float:
@@ -310,6 +320,10 @@ class Scheduler:
         errors = [holder.residents[scene].error for holder in holders if scene in holder.residents]
         if any(errors):
             return f"scene {scene} fails to load: {next(filter(None, errors))}"
+        if not any(holder.renders for holder in self._holders.by_id.values()):
+            rendering = {e.bundle_digest for w in self.windows.values() for e in w.entries if e.render}
+            if scene in rendering | self._demand.rendering:
+                return f"scene {scene} needs slots that render on a GPU, and no worker has any"
         largest_mb = self._holders.most_memory_mb
         return (
             f"scene {scene} needs {self._estimate(scene):.0f} MB and the largest worker gives {largest_mb} MB: "

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from embomatrix.manager.views import run_infos, worker_infos
+from embomatrix.manager.views import plan, run_infos, worker_infos
 from embomatrix.proto.v1 import admin_service_pb2 as pb
 from embomatrix.proto.v1 import admin_service_pb2_grpc
 from embomatrix.rpc.convert_log import event_page_to_proto, run_summary_to_proto
-from embomatrix.rpc.convert_session import run_info_to_proto, worker_info_to_proto
+from embomatrix.rpc.convert_session import plan_cell_to_proto, run_info_to_proto, worker_info_to_proto
 from embomatrix.rpc.status import translate
 
 if TYPE_CHECKING:
@@ -54,3 +54,31 @@ class AdminServicer(admin_service_pb2_grpc.AdminServiceServicer):
         async with translate(context):
             self._runtime.drain_worker(request.worker_id)
         return pb.DrainWorkerResponse()
+
+    async def ResumeWorker(
+        self, request: pb.ResumeWorkerRequest, context: grpc.aio.ServicerContext
+    ) -> pb.ResumeWorkerResponse:
+        async with translate(context):
+            self._runtime.resume_worker(request.worker_id)
+        return pb.ResumeWorkerResponse()
+
+    async def GetPlan(
+        self, request: pb.GetPlanRequest, context: grpc.aio.ServicerContext
+    ) -> pb.GetPlanResponse:
+        async with translate(context):
+            cells = [plan_cell_to_proto(cell) for cell in plan(self._runtime, request.run_id)]
+        return pb.GetPlanResponse(cells=cells)
+
+    async def PauseDispatch(
+        self, request: pb.PauseDispatchRequest, context: grpc.aio.ServicerContext
+    ) -> pb.PauseDispatchResponse:
+        async with translate(context):
+            self._runtime.pause_dispatch()
+        return pb.PauseDispatchResponse()
+
+    async def ResumeDispatch(
+        self, request: pb.ResumeDispatchRequest, context: grpc.aio.ServicerContext
+    ) -> pb.ResumeDispatchResponse:
+        async with translate(context):
+            self._runtime.resume_dispatch()
+        return pb.ResumeDispatchResponse()

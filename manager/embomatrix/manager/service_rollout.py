@@ -4,22 +4,29 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from embomatrix.manager.group_ends import GroupEnds
 from embomatrix.proto.v1 import rollout_service_pb2 as pb
 from embomatrix.proto.v1 import rollout_service_pb2_grpc, types_pb2
 from embomatrix.rpc.convert import (
     batch_from_proto,
     each,
 )
-from embomatrix.rpc.convert_run import lookahead_entry_from_proto, run_stats_to_proto, warmth_to_proto
+from embomatrix.rpc.convert_run import (
+    lookahead_answer_to_proto,
+    lookahead_entry_from_proto,
+    run_stats_to_proto,
+    run_terms_from_proto,
+)
 from embomatrix.rpc.status import NotFoundError, TrimmedError, translate
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Sequence
 
     import grpc
 
     from embomatrix.manager.results import BatchLog
     from embomatrix.manager.runs import Runs
+    from embomatrix.manager.store.protocol import ResultRow
 
 
 class RolloutServicer(rollout_service_pb2_grpc.RolloutServiceServicer):
@@ -30,7 +37,7 @@ class RolloutServicer(rollout_service_pb2_grpc.RolloutServiceServicer):
         self, request: pb.OpenRunRequest, context: grpc.aio.ServicerContext
     ) -> pb.OpenRunResponse:
         async with translate(context):
-            run_id = await self._runs.open_run(request.name, request.run_id)
+            run_id = await self._runs.open_run(request.name, request.run_id, run_terms_from_proto(request))
         return pb.OpenRunResponse(run_id=run_id)
 
     async def AnnounceLookahead(
@@ -39,28 +46,23 @@ class RolloutServicer(rollout_service_pb2_grpc.RolloutServiceServicer):
         async with translate(context):
             entries = each("entries", lookahead_entry_from_proto, request.entries)
             answers = self._runs.announce(request.run_id, request.version, entries)
-        return pb.AnnounceLookaheadResponse(
-            answers=[
-                pb.LookaheadAnswer(bundle_digest=scene, warmth=warmth_to_proto(warmth))
-                for scene, warmth in answers.items()
-            ]
-        )
+        return pb.AnnounceLookaheadResponse(answers=[lookahead_answer_to_proto(one) for one in answers])
 
     async def Execute(
         self, request: pb.ExecuteRequest, context: grpc.aio.ServicerContext
     ) -> AsyncIterator[pb.ExecuteResponse]:
         async with translate(context):
             log = await self._runs.submit(batch_from_proto(request))
-            async for results in _results(log, 0):
-                yield pb.ExecuteResponse(results=results)
+            async for results, groups in _results(log, 0):
+                yield pb.ExecuteResponse(results=results, groups=groups)
 
     async def WaitExecution(
         self, request: pb.WaitExecutionRequest, context: grpc.aio.ServicerContext
     ) -> AsyncIterator[pb.WaitExecutionResponse]:
         async with translate(context):
             log = self._runs.log_of(request.run_id, request.batch_id)
-            async for results in _results(log, request.after_cursor):
-                yield pb.WaitExecutionResponse(results=results)
+            async for results, groups in _results(log, request.after_cursor):
+                yield pb.WaitExecutionResponse(results=results, groups=groups)
 
     async def CancelBatch(
         self, request: pb.CancelBatchRequest, context: grpc.aio.ServicerContext
@@ -77,12 +79,21 @@ class RolloutServicer(rollout_service_pb2_grpc.RolloutServiceServicer):
         return pb.CloseRunResponse(stats=run_stats_to_proto(stats))
 
 
-async def _results(log: BatchLog, cursor: int) -> AsyncIterator[list[types_pb2.RolloutResult]]:
-    """All results beyond the cursor, as they come, to the end of the batch."""
+async def _results(
+    log: BatchLog, cursor: int
+) -> AsyncIterator[tuple[list[types_pb2.RolloutResult], list[pb.GroupDone]]]:
+    """All results beyond the cursor, as they come, to the end of the batch, and the groups that end with each."""
     if cursor > len(log.rows) and log.ended:
         raise TrimmedError(f"batch {log.batch_id!r} ends at cursor {len(log.rows)}: {cursor} lies beyond it")
+    ends = GroupEnds(log.groups)
+    ends.take(_messages(log.rows[:cursor]))
     while rows := await log.after(cursor):
         cursor = rows[-1].cursor
-        yield [types_pb2.RolloutResult.FromString(row.payload) for row in rows]
+        results = _messages(rows)
+        yield results, ends.take(results)
     if log.dropped:
         raise NotFoundError(f"batch {log.batch_id!r} is no longer kept: its run was closed")
+
+
+def _messages(rows: Sequence[ResultRow]) -> list[types_pb2.RolloutResult]:
+    return [types_pb2.RolloutResult.FromString(row.payload) for row in rows]

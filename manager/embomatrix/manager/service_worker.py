@@ -6,11 +6,13 @@ import asyncio
 import re
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.manager.intake import Heartbeat
 from embomatrix.proto.v1 import worker_service_pb2 as pb
 from embomatrix.proto.v1 import worker_service_pb2_grpc
 from embomatrix.rpc.channel import PROTOCOL_VERSION
 from embomatrix.rpc.convert import each, inside, resources_from_proto
 from embomatrix.rpc.convert_session import (
+    lease_progress_from_proto,
     lease_ref_from_proto,
     lease_ref_to_proto,
     lease_result_from_proto,
@@ -71,9 +73,12 @@ class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
             interval_s = self._runtime.take_heartbeat(
                 request.session_id,
                 request.session_epoch,
-                each("running", lease_ref_from_proto, request.running),
-                load=request.load,
-                memory_mb=request.memory_used_mb,
+                Heartbeat(
+                    each("running", lease_ref_from_proto, request.running),
+                    request.load,
+                    request.memory_used_mb,
+                    each("progress", lease_progress_from_proto, request.progress),
+                ),
             )
         return pb.HeartbeatResponse(next_interval_s=interval_s)
 
@@ -107,6 +112,7 @@ def _messages(outbox: Outbox) -> list[pb.SessionResponse]:
         acknowledged=[lease_ref_to_proto(ref) for ref in outbox.acknowledged],
         cancelled=[lease_ref_to_proto(ref) for ref in outbox.cancelled],
         drain=outbox.drain,
+        resume=outbox.resume,
     )
     if outbox.desired is not None:
         head.desired.CopyFrom(pb.DesiredResidents(bundle_digests=outbox.desired))

@@ -5,14 +5,19 @@ from __future__ import annotations
 import time
 from collections import Counter
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.registry import Standing
+from embomatrix.manager.window import Window
+from embomatrix.rpc.status import NotFoundError
 from embomatrix.rpc.values import Resident, ResidentState, RunInfo, RunStats, WorkerInfo
 
 if TYPE_CHECKING:
     from embomatrix.manager.meter import FailureNote
     from embomatrix.manager.runtime import ManagerRuntime
+    from embomatrix.rpc.values import PlanCell
+
+NOTHING: Final = Window(0, ())
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,15 +131,20 @@ def runs(runtime: ManagerRuntime) -> list[RunView]:
 
 def lookahead(runtime: ManagerRuntime) -> list[LookaheadStep]:
     """The grid: steps by scenes, with how far each scene is."""
-    scheduler = runtime.cluster.scheduler
     steps: dict[tuple[str, int], list[LookaheadCell]] = {}
-    for run_id, window in scheduler.windows.items():
-        for entry in window.entries:
-            cell = LookaheadCell(
-                entry.bundle_digest, entry.count, scheduler.warmth(entry.bundle_digest).value
-            )
-            steps.setdefault((run_id, entry.step), []).append(cell)
+    for cell in plan(runtime):
+        found = LookaheadCell(cell.bundle_digest, cell.count, cell.warmth.value)
+        steps.setdefault((cell.run_id, cell.step), []).append(found)
     return [LookaheadStep(run_id, step, cells) for (run_id, step), cells in sorted(steps.items())]
+
+
+def plan(runtime: ManagerRuntime, run_id: str = "") -> list[PlanCell]:
+    """What the run announced, or all of them; NotFoundError for a run that is not open."""
+    scheduler = runtime.cluster.scheduler
+    if run_id and run_id not in runtime.runs.open:
+        raise NotFoundError(f"run {run_id!r} is not open: leave its id out to see all runs")
+    windows = scheduler.windows if not run_id else {run_id: scheduler.windows.get(run_id, NOTHING)}
+    return scheduler.outlook.grid(windows)
 
 
 def worker_infos(runtime: ManagerRuntime) -> list[WorkerInfo]:
@@ -151,6 +161,7 @@ def worker_infos(runtime: ManagerRuntime) -> list[WorkerInfo]:
                 running=view.busy,
                 completed=view.completed,
                 last_seen_s=view.silent_s,
+                reason=view.reason,
             )
         )
     return infos

@@ -91,7 +91,7 @@ def test_memory_bounds_what_is_loaded_and_the_furthest_use_is_left_out(cluster):
     cluster.worker(memory_mb=250)
     cluster.announce(["a"], ["b"], ["c"])
     assert cluster.desired["w1"] == ("a", "b")
-    assert [cluster.scheduler.warmth(scene) for scene in "abc"] == [
+    assert [cluster.scheduler.outlook.warmth(scene) for scene in "abc"] == [
         Warmth.WARMING,
         Warmth.WARMING,
         Warmth.QUEUED,
@@ -227,9 +227,9 @@ def test_a_scene_larger_than_every_worker_is_unplaceable_and_says_why(cluster):
     cluster.announce(["a"])
     cluster.report(memory_mb=900.0)
     cluster.tell(Tick())
-    assert cluster.scheduler.warmth("a") is Warmth.WARM
+    assert cluster.scheduler.outlook.warmth("a") is Warmth.WARM
     cluster.report(scenes=[])
-    assert cluster.scheduler.warmth("a") is Warmth.UNPLACEABLE
+    assert cluster.scheduler.outlook.warmth("a") is Warmth.UNPLACEABLE
     assert "900 MB" in cluster.scheduler.unplaceable["a"]
 
 

@@ -34,8 +34,11 @@ class PutOutcome(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class RunRow:
+    """``terms`` is what the run asked for, opaque to the store."""
+
     run_id: str
     name: str
+    terms: bytes = b""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +75,7 @@ class StateStore(Protocol):
         """Become the one manager that writes. Returns its epoch, higher than any before."""
 
     async def open_run(self, run: RunRow) -> None:
-        """Note a run; the same id again keeps the first name."""
+        """Note a run; the same id again keeps the first name and terms."""
 
     async def close_run(self, run_id: str) -> None:
         """Forget the run with its batches and results; unknown ids are no error."""

@@ -1,8 +1,9 @@
 """State in Redis (6.2 command set, also Valkey): for clusters, and for another manager to take over.
 
-Keys, all below one prefix: ``epoch``; ``credentials`` (hash token id -> payload); ``runs`` (hash id -> name) with
-``run_order`` (list); of a run ``batches:RUN`` (list of ids); of a batch ``batch:RUN:BATCH`` (hash digest, payload),
-``done:RUN:BATCH`` (set of rollouts), ``results:RUN:BATCH`` (sorted set of "rollout id length:rollout id payload" by cursor).
+Keys, all below one prefix: ``epoch``; ``credentials`` (hash token id -> payload); ``runs`` (hash id -> name), ``run_terms``
+(hash id -> terms) and ``run_order`` (list); of a run ``batches:RUN`` (list of ids); of a batch ``batch:RUN:BATCH`` (hash
+digest, payload), ``done:RUN:BATCH`` (set of rollouts), ``results:RUN:BATCH`` (sorted set of "rollout id length:rollout id
+payload" by cursor).
 Every conditional write is one Lua script that checks the epoch first.
 """
 
@@ -34,7 +35,10 @@ if redis.call('GET', KEYS[1]) ~= ARGV[1] then return redis.error_reply('{_FENCED
 _OPEN_RUN: Final = (
     _GUARD
     + """
-if redis.call('HSETNX', KEYS[2], ARGV[2], ARGV[3]) == 1 then redis.call('RPUSH', KEYS[3], ARGV[2]) end
+if redis.call('HSETNX', KEYS[2], ARGV[2], ARGV[3]) == 1 then
+    redis.call('RPUSH', KEYS[3], ARGV[2])
+    redis.call('HSET', KEYS[4], ARGV[2], ARGV[4])
+end
 return 1
 """
 )
@@ -80,6 +84,7 @@ _CLOSE_RUN: Final = (
 redis.call('HDEL', KEYS[2], ARGV[2])
 redis.call('LREM', KEYS[3], 0, ARGV[2])
 redis.call('DEL', KEYS[4])
+redis.call('HDEL', KEYS[5], ARGV[2])
 return 1
 """
 )
@@ -113,12 +118,12 @@ class RedisStore:
         return self._epoch
 
     async def open_run(self, run: RunRow) -> None:
-        await self._script(_OPEN_RUN, ("runs", "run_order"), run.run_id, run.name)
+        await self._script(_OPEN_RUN, ("runs", "run_order", "run_terms"), run.run_id, run.name, run.terms)
 
     async def close_run(self, run_id: str) -> None:
         for batch_id in await self._batch_ids(run_id):
             await self.drop_batch(run_id, batch_id)
-        await self._script(_CLOSE_RUN, ("runs", "run_order", f"batches:{run_id}"), run_id)
+        await self._script(_CLOSE_RUN, ("runs", "run_order", f"batches:{run_id}", "run_terms"), run_id)
 
     async def put_batch(self, batch: BatchRow) -> PutOutcome:
         keys = ("runs", f"batch:{batch.run_id}:{batch.batch_id}", f"batches:{batch.run_id}")
@@ -143,7 +148,8 @@ class RedisStore:
     async def runs(self) -> list[RunRow]:
         names = await self._call(self._redis.hgetall(self._key("runs")))
         order = await self._call(cast("Awaitable[Any]", self._redis.lrange(self._key("run_order"), 0, -1)))
-        return [RunRow(run_id.decode(), names[run_id].decode()) for run_id in order]
+        terms = await self._call(self._redis.hgetall(self._key("run_terms")))
+        return [RunRow(run_id.decode(), names[run_id].decode(), terms.get(run_id, b"")) for run_id in order]
 
     async def batches(self, run_id: str) -> list[BatchRow]:
         rows: list[BatchRow] = []

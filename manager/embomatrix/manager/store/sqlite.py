@@ -27,7 +27,7 @@ PRAGMA journal_mode = WAL;
 PRAGMA synchronous = NORMAL;
 CREATE TABLE IF NOT EXISTS manager (only_row INTEGER PRIMARY KEY CHECK (only_row = 1), epoch INTEGER NOT NULL);
 INSERT OR IGNORE INTO manager VALUES (1, 0);
-CREATE TABLE IF NOT EXISTS run (run_id TEXT PRIMARY KEY, name TEXT NOT NULL);
+CREATE TABLE IF NOT EXISTS run (run_id TEXT PRIMARY KEY, name TEXT NOT NULL, terms BLOB NOT NULL DEFAULT x'');
 CREATE TABLE IF NOT EXISTS batch (
     run_id TEXT NOT NULL, batch_id TEXT NOT NULL, digest TEXT NOT NULL, payload BLOB NOT NULL,
     PRIMARY KEY (run_id, batch_id)
@@ -52,6 +52,9 @@ class SqliteStore:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._db = sqlite3.connect(path, timeout=5.0, check_same_thread=False, isolation_level=None)
             self._db.executescript(_SCHEMA)
+            if all(column[1] != "terms" for column in self._db.execute("PRAGMA table_info(run)")):
+                # The file of an older manager.
+                self._db.execute("ALTER TABLE run ADD COLUMN terms BLOB NOT NULL DEFAULT x''")
         except (sqlite3.Error, OSError) as error:
             raise StateError(
                 f"the state file {path} can't be used ({error}): check its folder's permissions, or pass --state"
@@ -66,7 +69,7 @@ class SqliteStore:
         return self._epoch
 
     async def open_run(self, run: RunRow) -> None:
-        await self._write("INSERT OR IGNORE INTO run VALUES (?, ?)", run.run_id, run.name)
+        await self._write("INSERT OR IGNORE INTO run VALUES (?, ?, ?)", run.run_id, run.name, run.terms)
 
     async def close_run(self, run_id: str) -> None:
         def delete() -> None:
@@ -116,7 +119,9 @@ class SqliteStore:
         await self._run(delete)
 
     async def runs(self) -> list[RunRow]:
-        return [RunRow(*row) for row in await self._read("SELECT run_id, name FROM run ORDER BY rowid")]
+        return [
+            RunRow(*row) for row in await self._read("SELECT run_id, name, terms FROM run ORDER BY rowid")
+        ]
 
     async def batches(self, run_id: str) -> list[BatchRow]:
         query = "SELECT run_id, batch_id, digest, payload FROM batch WHERE run_id = ? ORDER BY rowid"

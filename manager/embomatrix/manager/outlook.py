@@ -1,0 +1,70 @@
+"""How far scenes are, as trainers and operators are told: warm, when they will be, or why not."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from embomatrix.rpc.values import LookaheadAnswer, PlanCell, Warmth
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping
+
+    from embomatrix.manager.holders import Holder, Holders
+    from embomatrix.manager.window import Window
+
+
+class Outlook:
+    """Of one moment. ``usual_load_s`` tells the seconds that loading a scene takes, 0 where nobody knows."""
+
+    def __init__(
+        self,
+        holders: Holders,
+        unplaceable: Mapping[str, str],
+        usual_load_s: Callable[[str], float],
+        now_s: float,
+    ) -> None:
+        self._holders = holders
+        self._unplaceable = unplaceable
+        self._usual_load_s = usual_load_s
+        self._now_s = now_s
+
+    def warmth(self, scene: str) -> Warmth:
+        if self._holders.warm_on(scene):
+            return Warmth.WARM
+        if scene in self._unplaceable:
+            return Warmth.UNPLACEABLE
+        return Warmth.WARMING if self._loading(scene) else Warmth.QUEUED
+
+    def answer(self, scene: str) -> LookaheadAnswer:
+        """What its trainer is told."""
+        warmth = self.warmth(scene)
+        eta_s = 0.0
+        if warmth is Warmth.WARMING:
+            eta_s = min(self._left_s(holder, scene) for holder in self._loading(scene))
+        return LookaheadAnswer(scene, warmth, eta_s, self._unplaceable.get(scene, ""))
+
+    def grid(self, windows: Mapping[str, Window]) -> list[PlanCell]:
+        """What the runs announced: by run, step and scene."""
+        cells: dict[tuple[str, int, str], int] = {}
+        for run_id, window in windows.items():
+            for entry in window.entries:
+                key = (run_id, entry.step, entry.bundle_digest)
+                cells[key] = cells.get(key, 0) + entry.count
+        return [
+            PlanCell(*key, count, self.warmth(key[2]), tuple(sorted(self._holders.standing_on(key[2]))))
+            for key, count in sorted(cells.items())
+        ]
+
+    def _loading(self, scene: str) -> list[Holder]:
+        """Those that were told to load it."""
+        told: Iterable[Holder] = (self._holders.by_id[name] for name in self._holders.standing_on(scene))
+        return [holder for holder in told if scene in (holder.desired or ())]
+
+    def _left_s(self, holder: Holder, scene: str) -> float:
+        """A worker loads as many scenes at a time as it has slots, in the order in which it was told of them."""
+        load_s = self._usual_load_s(scene)
+        since_s = holder.loading_since_s.get(scene)
+        if since_s is not None:
+            return max(0.0, load_s - (self._now_s - since_s))
+        ahead = holder.to_load(holder.desired or ()).index(scene)
+        return load_s * (1 + ahead // holder.slots)
