@@ -13,7 +13,13 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from embomatrix.factory.assets_cli import app as assets_app
-from embomatrix.factory.pipeline.build import DEFAULT_SCENES, BuildSettings, Summary, build_dataset
+from embomatrix.factory.pipeline.build import (
+    DEFAULT_SCENES,
+    BuildSettings,
+    Summary,
+    WriterKind,
+    build_dataset,
+)
 from embomatrix.factory.refusal import Refusal
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.task_import.batch import Verified, bind_first, verify_first
@@ -62,13 +68,29 @@ def build(
     scenes: Scenes = None,
 ) -> None:
     """Write tasks over base scenes, keep those that the oracle solves, and save them with their scenes."""
-    settings = BuildSettings(train, heldout, seed, _scene_ids(scenes))
+    _make(out, BuildSettings(train, heldout, seed, _scene_ids(scenes)))
+
+
+@app.command()
+def generate(
+    out: Out,
+    tasks: Annotated[int, typer.Option(min=0, help="Tasks to train on.")] = 480,
+    heldout: Annotated[int, typer.Option(min=0, help="Tasks to evaluate on, in other rooms.")] = 0,
+    seed: Seed = 0,
+    scenes: Scenes = None,
+) -> None:
+    """Play the people of each scene, and make tasks of what they come to ask the robot for; keep what they said."""
+    _make(out, BuildSettings(tasks, heldout, seed, _scene_ids(scenes), WriterKind.SOCIAL))
+
+
+def _make(out: Path, settings: BuildSettings) -> None:
+    """A data set in the folder, with progress and a summary."""
     console = Console()
     kept = f": what was built is kept in {out}, and the same command goes on from there"
     with _mended(out, kept), _progress(console) as bars:
         tasks = {
-            "heldout": bars.add_task("held-out tasks", total=heldout),
-            "train": bars.add_task("training tasks", total=train),
+            "heldout": bars.add_task("held-out tasks", total=settings.heldout),
+            "train": bars.add_task("training tasks", total=settings.train),
         }
         summary = build_dataset(
             out, settings, lambda split, admitted: bars.update(tasks[split], completed=admitted)
@@ -77,7 +99,7 @@ def build(
             bars.update(bar, completed=summary.total(split))
     _print_summary(console, summary)
     console.print(f"dataset: {out}", highlight=False)
-    for split, wanted in (("train", train), ("heldout", heldout)):
+    for split, wanted in (("train", settings.train), ("heldout", settings.heldout)):
         if summary.total(split) < wanted:
             _fail(
                 f"only {summary.total(split)} of {wanted} {split} tasks were admitted: see {out}/rejections.jsonl, "

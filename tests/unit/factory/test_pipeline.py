@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from embomatrix.factory.cli import app
-from embomatrix.factory.pipeline.build import BuildSettings, Summary, build_dataset, split_rooms
+from embomatrix.factory.pipeline.build import BuildSettings, Summary, WriterKind, build_dataset, split_rooms
 from embomatrix.factory.pipeline.store import BuildStore
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.writer.tasks import is_heldout_signature
@@ -186,3 +186,14 @@ def test_unknown_names_are_one_sentence_and_exit_2(
     assert code == 2
     assert message in " ".join(output.split())
     assert "Traceback" not in output
+
+
+def test_tasks_of_conversations_are_verified_and_their_transcripts_kept(tmp_path):
+    settings = BuildSettings(train=4, heldout=0, seed=1, scenes=("Rs_int",), writer=WriterKind.SOCIAL)
+    summary = build_dataset(tmp_path, settings)
+    dataset = Dataset.load(tmp_path)
+    assert summary.total("train") == len(dataset.train) == 4
+    for record in dataset.train:
+        transcript = (tmp_path / "transcripts" / f"{record.task.task_id}.md").read_text(encoding="utf-8")
+        assert transcript.startswith(f"# {record.task.instruction}\n")
+        assert record.oracle

@@ -15,7 +15,7 @@ from embomatrix.factory.writer.tables import (
     groups_for,
     suits,
 )
-from embomatrix.factory.writer.tasks import Draft, is_heldout_signature, object_table, write_task
+from embomatrix.factory.writer.tasks import Draft, PlainWriter, is_heldout_signature, object_table
 from embomatrix.factory.writer.variant import Variant
 from embomatrix.factory.writer.view import SceneView, is_liftable
 from embomatrix.factory.writer.words import refer, room_words, sentence
@@ -47,7 +47,9 @@ def variant(scene: Scene) -> Variant:
 
 
 def drafts(variant: Variant, view: SceneView, category: TaskCategory, count: int = 30) -> list[Draft]:
-    found = (write_task(variant, view, category, f"t{i}", np.random.default_rng(i)) for i in range(count))
+    found = (
+        PlainWriter().write(variant, view, category, f"t{i}", np.random.default_rng(i)) for i in range(count)
+    )
     return [draft for draft in found if draft is not None]
 
 

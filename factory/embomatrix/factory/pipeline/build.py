@@ -7,6 +7,7 @@ import dataclasses
 import zlib
 from collections import Counter, defaultdict
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -15,7 +16,8 @@ from embomatrix.factory.admission import Admitted, admit
 from embomatrix.factory.pipeline.poses import Needs, cache_poses
 from embomatrix.factory.pipeline.store import BuildStore, Rejection, VariantResult
 from embomatrix.factory.scenes.build import build_base_scene
-from embomatrix.factory.writer.tasks import Draft, is_heldout_signature, write_task
+from embomatrix.factory.social.writer import SocialWriter
+from embomatrix.factory.writer.tasks import PlainWriter, is_heldout_signature
 from embomatrix.factory.writer.variant import Variant, build_variant
 from embomatrix.factory.writer.view import SceneView
 from embomatrix.sim.executor import Simulator
@@ -32,6 +34,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
     from pathlib import Path
 
+    from embomatrix.factory.writer.tasks import Draft, TaskWriter
     from embomatrix.skills.syntax import Plan
     from embomatrix.world.scene import Scene
 
@@ -48,6 +51,13 @@ VARIANTS_FOR: Final = 4
 """Variants at most, for each one that would do if every draft were admitted."""
 
 
+class WriterKind(StrEnum):
+    """Where tasks come from."""
+
+    PLAIN = "plain"  # what a goal says, in a bounded vocabulary: small policies learn from it
+    SOCIAL = "social"  # what people come to ask for in conversations, each with its transcript
+
+
 @dataclass(frozen=True, slots=True)
 class BuildSettings:
     """What decides a build: equal settings give equal data sets."""
@@ -56,6 +66,7 @@ class BuildSettings:
     heldout: int = 40
     seed: int = 0
     scenes: tuple[str, ...] = DEFAULT_SCENES
+    writer: WriterKind = WriterKind.PLAIN
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,12 +126,11 @@ def build_dataset(
     store = BuildStore.open(folder, dataclasses.asdict(settings))
     bases = [build_base_scene(scene_id, seed=settings.seed) for scene_id in settings.scenes]
     rooms = split_rooms(bases, settings.seed)
-    library = PlacementLibrary()
-    try:
+    writer = SocialWriter(settings.seed) if settings.writer is WriterKind.SOCIAL else PlainWriter()
+    with contextlib.closing(PlacementLibrary()) as library:
+        bench = _Workbench(settings, writer, library, progress)
         for split, target in (("heldout", settings.heldout), ("train", settings.train)):
-            _fill_split(store, bases, rooms[split], split, target, settings, library, progress)
-    finally:
-        library.close()
+            _fill_split(store, bases, rooms[split], split, target, bench)
     records = [record for result in store.results for record in result.records]
     write_dataset(folder, records, {})
     store.write_rejections()
@@ -133,16 +143,15 @@ def _fill_split(
     rooms: Mapping[str, tuple[str, ...]],
     split: str,
     target: int,
-    settings: BuildSettings,
-    library: PlacementLibrary,
-    progress: Callable[[str, int], None],
+    bench: _Workbench,
 ) -> None:
     """Variant after variant until the split has its tasks, the scenes taking turns."""
+    settings = bench.settings
     quota = {category: _share(target, index) for index, category in enumerate(TaskCategory)}
     homes = [base for base in bases if _is_home(base, rooms[base.base])]
     for number in range(VARIANTS_FOR * (target // TASKS_EACH + 1)):
         done = Counter(record.task.category for record in store.records_of(split))
-        progress(split, done.total())
+        bench.progress(split, done.total())
         missing = {category: quota[category] - done[category] for category in TaskCategory}
         if not homes or all(count <= 0 for count in missing.values()):
             break
@@ -157,8 +166,9 @@ def _fill_split(
         known = frozenset(
             f"{record.signature}|{record.task.instruction}" for record in store.records_of(split)
         )
-        result, data = _VariantJob(variant, split, number, settings.seed, library, known).run(missing, rng)
-        store.add(result, data)
+        job = _VariantJob(variant, split, number, bench, known)
+        result, data = job.run(missing, rng)
+        store.add(result, data, job.transcripts())
 
 
 def _is_home(base: Scene, rooms: Sequence[str]) -> bool:
@@ -187,6 +197,16 @@ def _focus(
     return tuple(order[:FOCUS_ROOMS])
 
 
+@dataclass(frozen=True)
+class _Workbench:
+    """What all variants of a build share."""
+
+    settings: BuildSettings
+    writer: TaskWriter
+    library: PlacementLibrary
+    progress: Callable[[str, int], None]
+
+
 class _VariantJob:
     """Writes and judges the tasks of one variant."""
 
@@ -195,15 +215,15 @@ class _VariantJob:
         variant: Variant,
         split: str,
         number: int,
-        seed: int,
-        library: PlacementLibrary,
+        bench: _Workbench,
         known: frozenset[str],
     ) -> None:
         self._variant = variant
         self._split = split
         self._number = number
-        self._seed = seed
-        self._library = library
+        self._seed = bench.settings.seed
+        self._writer = bench.writer
+        self._library = bench.library
         self._known = set(known)
         self._view = SceneView(variant.scene)
         self._admitted: list[tuple[Draft, Plan]] = []
@@ -235,11 +255,16 @@ class _VariantJob:
             if len(drafts) == DRAFTS:
                 break
             task_id = f"{self._variant.scene.scene_id}-{len(drafts):02d}"
-            draft = write_task(self._variant, self._view, wanted[attempt % len(wanted)], task_id, rng)
+            category = wanted[attempt % len(wanted)]
+            draft = self._writer.write(self._variant, self._view, category, task_id, rng)
             if draft is not None and self._is_new(draft):
                 drafts.append(draft)
                 self._known.add(f"{draft.signature}|{draft.task.instruction}")
         return drafts
+
+    def transcripts(self) -> dict[str, str]:
+        """Of the admitted tasks that somebody talked about, by task id."""
+        return {draft.task.task_id: draft.transcript for draft, _ in self._admitted if draft.transcript}
 
     def _is_new(self, draft: Draft) -> bool:
         """Whether the goal's kind belongs to this split, and nothing like it was asked for in these words."""

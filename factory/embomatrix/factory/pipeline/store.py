@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 BUILD_FILE: Final = "build.jsonl"
 REJECTIONS_FILE: Final = "rejections.jsonl"
+TRANSCRIPTS_FOLDER: Final = "transcripts"
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,11 +87,15 @@ class BuildStore:
     def records_of(self, split: str) -> list[TaskRecord]:
         return [record for result in self.results if result.split == split for record in result.records]
 
-    def add(self, result: VariantResult, bundle: bytes) -> None:
-        """Keep a variant's result. The bundle goes first: a line in the file means that it is there."""
+    def add(self, result: VariantResult, bundle: bytes, transcripts: Mapping[str, str]) -> None:
+        """Keep a variant's result. Bundle and transcripts go first: a line in the file means that they are there."""
         if result.records:
             path = self.folder / BUNDLES_FOLDER / bundle_file(result.records[0].bundle_digest)
             write_whole(path, bundle)
+        if transcripts:
+            (self.folder / TRANSCRIPTS_FOLDER).mkdir(exist_ok=True)
+        for task_id, text in transcripts.items():
+            write_whole(self.folder / TRANSCRIPTS_FOLDER / f"{task_id}.md", text.encode("utf-8"))
         with (self.folder / BUILD_FILE).open("a", encoding="utf-8") as file:
             file.write(json.dumps(_to_json(result)) + "\n")
         self.results.append(result)

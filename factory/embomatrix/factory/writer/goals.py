@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.writer.tables import suits
-from embomatrix.factory.writer.words import phrase, refer, spoken
+from embomatrix.factory.writer.words import PHRASES, phrase, refer, spoken
 from embomatrix.world.goal import And, Atom, Exists, Formula, Not
 
 if TYPE_CHECKING:
@@ -23,23 +24,36 @@ MAX_ALIKE: Final = 4
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """One conjunct of a goal. ``objects`` are all that it is about, ``signs`` its part of the goal's signature."""
+    """One conjunct of a goal. ``objects`` are all that it is about, ``signs`` its part of the goal's signature.
+
+    ``clause`` asks for it; ``thing`` is what it is about, in words; ``kind`` is "place", "switch" or "thermal".
+    """
 
     goal: Formula
     clause: str
     objects: tuple[str, ...]
     signs: tuple[str, ...]
+    kind: str
+    thing: str
     types: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Workshop:
-    """What the makers of pieces draw from. ``used`` are objects that earlier pieces of the same goal are about."""
+    """What the makers of pieces draw from. ``used`` are objects that earlier pieces of the same goal are about.
+
+    ``phrases`` are the ways to ask for an atom, by predicate.
+    """
 
     view: SceneView
     variant: Variant
     rng: np.random.Generator
     used: frozenset[str] = frozenset()
+    phrases: Mapping[str, tuple[str, ...]] = field(default_factory=lambda: PHRASES)
+
+    def phrase(self, kind: str, *, thing: str, place: str = "") -> str:
+        """One imperative clause."""
+        return phrase(self.phrases[kind], self.rng, thing=thing, place=place)
 
     def pick(self, names: list[str]) -> str | None:
         fresh = [name for name in names if name not in self.used]
@@ -93,11 +107,21 @@ def _placed(shop: Workshop, thing: str, called: str) -> Piece | None:
     goal, types, objects, place = _one_of(shop, target, lambda host: Atom(predicate, (thing, host)))
     return Piece(
         goal=goal,
-        clause=phrase(predicate, rng, thing=called, place=place),
+        clause=shop.phrase(predicate, thing=called, place=place),
         objects=(thing, *objects),
         signs=(f"{predicate}({view.category(thing)},{view.category(target)})",),
+        kind="place",
+        thing=called,
         types=types,
     )
+
+
+def placed_elsewhere(shop: Workshop, piece: Piece) -> Piece | None:
+    """The thing of a piece put in another place than the piece says; None where it is about no thing to be placed."""
+    if piece.kind != "place":
+        return None
+    other = dataclasses.replace(shop, used=shop.used | frozenset(piece.objects[1:]))
+    return _placed(other, piece.objects[0], piece.thing)
 
 
 def _one_of(
@@ -137,7 +161,15 @@ def switch_piece(shop: Workshop) -> Piece | None:
         return Not(Atom(predicate, (target,))) if holds else Atom(predicate, (target,))
 
     goal, types, objects, words = _one_of(shop, name, atom)
-    return Piece(goal, phrase(kind, rng, thing=words), objects, (f"{kind}({view.category(name)})",), types)
+    return Piece(
+        goal=goal,
+        clause=shop.phrase(kind, thing=words),
+        objects=objects,
+        signs=(f"{kind}({view.category(name)})",),
+        kind="switch",
+        thing=words,
+        types=types,
+    )
 
 
 def _holds(view: SceneView, predicate: str, name: str) -> bool:
@@ -164,13 +196,14 @@ def _thermal(shop: Workshop, food: str, source: str, predicate: str) -> Piece:
     goal: Formula = Atom(predicate, (food,))
     objects: tuple[str, ...] = (food,)
     signs: tuple[str, ...] = (f"{predicate}({view.category(food)})",)
-    clause = phrase(predicate, rng, thing=refer(view, food, rng), place=place)
+    called = refer(view, food, rng)
+    clause = shop.phrase(predicate, thing=called, place=place)
     if view.is_container(source) and len(view.alike(source)) == 1 and rng.random() < 0.35:
         goal = And((goal, Atom("inside", (food, source))))
         objects = (food, source)
         signs = (*signs, f"inside({view.category(food)},{view.category(source)})")
         clause += f" and leave it in the {spoken(view.category(source))}"
-    return Piece(goal, clause, (*objects, *(view.alike(source))), signs)
+    return Piece(goal, clause, (*objects, *(view.alike(source))), signs, "thermal", called)
 
 
 def serve_piece(shop: Workshop) -> Piece | None:
@@ -187,5 +220,7 @@ def serve_piece(shop: Workshop) -> Piece | None:
         clause=f"{first.clause}, then {second.clause}",
         objects=tuple(dict.fromkeys((*first.objects, *second.objects))),
         signs=(*first.signs, *second.signs),
+        kind=first.kind,
+        thing=first.thing,
         types=second.types,
     )

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Protocol
 
 from embomatrix.factory.writer.goals import (
     Piece,
@@ -70,32 +71,59 @@ class Draft:
     about: tuple[str, ...]
     rooms: tuple[str, ...]
     signature: str
+    transcript: str = ""
+    """How the request came about, in Markdown; empty where nobody talked."""
 
 
-def write_task(
-    variant: Variant,
-    view: SceneView,
-    category: TaskCategory,
-    task_id: str,
-    rng: np.random.Generator,
-) -> Draft | None:
-    """A task of the category in the variant, None when its rooms hold nothing for one. The generator decides all."""
+class TaskWriter(Protocol):
+    """Writes tasks about the things of a variant."""
+
+    def write(
+        self,
+        variant: Variant,
+        view: SceneView,
+        category: TaskCategory,
+        task_id: str,
+        rng: np.random.Generator,
+    ) -> Draft | None:
+        """A task of the category, None when the variant's rooms hold nothing for one. The generator decides all."""
+        ...
+
+
+class PlainWriter:
+    """Asks for what a goal says in a bounded vocabulary, and no more."""
+
+    def write(
+        self,
+        variant: Variant,
+        view: SceneView,
+        category: TaskCategory,
+        task_id: str,
+        rng: np.random.Generator,
+    ) -> Draft | None:
+        shop = Workshop(view, variant, rng)
+        pieces = pieces_of(shop, category)
+        if not pieces:
+            return None
+        return draft_of(shop, category, task_id, pieces, sentence([piece.clause for piece in pieces], rng))
+
+
+def pieces_of(shop: Workshop, category: TaskCategory) -> list[Piece]:
+    """Pieces that make up a goal of the category; none where the variant's rooms hold nothing for one."""
     recipes = _RECIPES[category]
     for _ in range(TRIES):
-        pieces = _pieces(variant, view, recipes[int(rng.integers(len(recipes)))], rng)
+        pieces = _made(shop, recipes[int(shop.rng.integers(len(recipes)))])
         if pieces:
-            return _draft(variant, view, category, task_id, pieces, rng)
-    return None
+            return pieces
+    return []
 
 
-def _pieces(
-    variant: Variant, view: SceneView, recipe: Sequence[Maker], rng: np.random.Generator
-) -> list[Piece]:
+def _made(shop: Workshop, recipe: Sequence[Maker]) -> list[Piece]:
     """One piece by each maker about objects of its own, or none at all."""
     pieces: list[Piece] = []
     for make in recipe:
         used = frozenset(name for piece in pieces for name in piece.objects)
-        piece = make(Workshop(view, variant, rng, used))
+        piece = make(dataclasses.replace(shop, used=used))
         if piece is None or any(set(piece.types) & set(other.types) for other in pieces):
             return []
         if used & set(piece.objects):
@@ -104,25 +132,27 @@ def _pieces(
     return pieces
 
 
-def _draft(
-    variant: Variant,
-    view: SceneView,
+def draft_of(
+    shop: Workshop,
     category: TaskCategory,
     task_id: str,
-    pieces: list[Piece],
-    rng: np.random.Generator,
+    pieces: Sequence[Piece],
+    instruction: str,
+    transcript: str = "",
 ) -> Draft:
+    """The task that asks for these pieces in these words."""
+    view = shop.view
     goal = _conjunction([piece.goal for piece in pieces])
     types = {key: names for piece in pieces for key, names in piece.types.items()}
     needed = dict.fromkeys(name for piece in pieces for name in piece.objects)
     task = Task(
         task_id=task_id,
-        scene_id=variant.scene.scene_id,
-        instruction=sentence([piece.clause for piece in pieces], rng),
+        scene_id=shop.variant.scene.scene_id,
+        instruction=instruction,
         category=category,
         goal=goal,
         goal_bddl=render(goal),
-        table=object_table(view, tuple(needed), rng),
+        table=object_table(view, tuple(needed), shop.rng),
         types=types,
         source="writer",
     )
@@ -131,6 +161,7 @@ def _draft(
         about=tuple(needed),
         rooms=tuple(sorted({view.room(name) for name in needed})),
         signature=" ".join(sorted(sign for piece in pieces for sign in piece.signs)),
+        transcript=transcript,
     )
 
 

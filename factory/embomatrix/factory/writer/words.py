@@ -71,9 +71,9 @@ def refer(view: SceneView, name: str, rng: np.random.Generator) -> str:
     return words
 
 
-def phrase(kind: str, rng: np.random.Generator, *, thing: str, place: str = "") -> str:
+def phrase(phrases: Sequence[str], rng: np.random.Generator, *, thing: str, place: str = "") -> str:
     """One imperative clause. Without a place, only phrases that name none."""
-    options = [text for text in PHRASES[kind] if place or "{place}" not in text]
+    options = [text for text in phrases if place or "{place}" not in text]
     return options[int(rng.integers(len(options)))].format(thing=thing, place=place)
 
 

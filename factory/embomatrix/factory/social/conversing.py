@@ -1,0 +1,109 @@
+"""Social Simulation Agent, offline: a conversation in which a request takes shape over several rounds.
+
+The wishes that it ends with are pieces of a goal that the scene allows. What comes before is made from them: a vague need, a
+question, a first answer that is changed later, a chore that the robot has to refuse, a wish more.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.factory.social.chores import impossible_chore
+from embomatrix.factory.social.phrases import JOINS, MATTERS, QUESTIONS, TURNS, filled, pick
+from embomatrix.factory.social.values import ROBOT, Act, Conversation, Turn
+from embomatrix.factory.writer.goals import placed_elsewhere
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import numpy as np
+
+    from embomatrix.factory.social.values import Cast, DaySlot
+    from embomatrix.factory.writer.goals import Piece, Workshop
+
+REFUSED_SHARE: Final = 0.35
+AMENDED_SHARE: Final = 0.6
+INTERJECTED_SHARE: Final = 0.4
+"""Of amendments, those that somebody else brings up who is at home in the same room."""
+
+
+@dataclass(frozen=True, slots=True)
+class Scenario:
+    """Who needs what, where, when. ``pieces`` are the wishes that the conversation is to end with."""
+
+    cast: Cast
+    slot: DaySlot
+    pieces: tuple[Piece, ...]
+
+
+class GrammarConversation:
+    """One conversation, turn by turn."""
+
+    def __init__(self, scenario: Scenario, shop: Workshop) -> None:
+        self._scenario = scenario
+        self._shop = shop
+        self._rng = shop.rng
+        self._turns: list[Turn] = []
+
+    def run(self) -> Conversation:
+        """Need, question, answer, changes, wishes more, confirmation."""
+        slot, pieces = self._scenario.slot, self._scenario.pieces
+        first = pieces[0]
+        self._open(first)
+        if self._rng.random() < REFUSED_SHARE:
+            chore, reason = impossible_chore(self._shop.view, slot.room, self._rng)
+            self._say(slot.person, Act.ADD, clause=chore)
+            self._say(ROBOT, Act.REFUSE, chore=chore, reason=reason)
+        earlier = placed_elsewhere(self._shop, first) if self._rng.random() < AMENDED_SHARE else None
+        wished = self._settle(first, earlier)
+        for piece in pieces[1:]:
+            self._say(self._someone_near(), Act.ADD, clause=piece.clause)
+        self._say(ROBOT, Act.CONFIRM, clauses=self._joined(pieces))
+        return Conversation(
+            slot=slot,
+            turns=tuple(self._turns),
+            first_wish=wished,
+            last_wishes=tuple(piece.clause for piece in pieces),
+        )
+
+    def _open(self, first: Piece) -> None:
+        matter = filled(pick(MATTERS[first.kind], self._rng), thing=first.thing)
+        self._say(self._scenario.slot.person, Act.NEED, activity=self._scenario.slot.activity, matter=matter)
+        question = filled(pick(QUESTIONS[first.kind], self._rng), thing=first.thing)
+        self._say(ROBOT, Act.CLARIFY, question=question)
+
+    def _settle(self, first: Piece, earlier: Piece | None) -> str:
+        """The first wish is agreed on, at once or after a change; returns what was wished at first."""
+        person = self._scenario.slot.person
+        if earlier is None:
+            self._say(person, Act.ANSWER, clause=first.clause)
+            return first.clause
+        self._say(person, Act.ANSWER, clause=earlier.clause)
+        self._say(ROBOT, Act.CONFIRM, clauses=earlier.clause)
+        changer = self._someone_near() if self._rng.random() < INTERJECTED_SHARE else person
+        self._say(changer, Act.AMEND, clause=first.clause)
+        return earlier.clause
+
+    def _someone_near(self) -> str:
+        """The person, or another one who is at home in this room: who hears what is said here."""
+        slot, cast = self._scenario.slot, self._scenario.cast
+        near = [
+            person.name for person in cast.people if slot.room in person.rooms and person.name != slot.person
+        ]
+        return near[int(self._rng.integers(len(near)))] if near and self._rng.random() < 0.5 else slot.person
+
+    def _joined(self, pieces: Sequence[Piece]) -> str:
+        text = pieces[0].clause
+        for piece in pieces[1:]:
+            text += pick(JOINS, self._rng) + piece.clause
+        return text
+
+    def _say(self, speaker: str, act: Act, **words: str) -> None:
+        self._turns.append(Turn(speaker=speaker, act=act, text=filled(pick(TURNS[act], self._rng), **words)))
+
+
+def starting_slots(cast: Cast, rooms: Sequence[str], rng: np.random.Generator) -> list[DaySlot]:
+    """The day's slots in random order, those in the given rooms first."""
+    order = [cast.day[int(at)] for at in rng.permutation(len(cast.day))]
+    return sorted(order, key=lambda slot: slot.room not in rooms)

@@ -1,0 +1,220 @@
+"""Who is found in which kind of scene: roles with ages, jobs and ties, and what people do in which room at which hour."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+
+@dataclass(frozen=True, slots=True)
+class Role:
+    """A part that a person can play. ``tie`` is what they are to the first of the cast, ``back`` what that one is to them."""
+
+    job: tuple[str, ...]
+    age: tuple[int, int]
+    tie: str
+    back: str
+    rooms: tuple[str, ...] = ()
+    """Types of rooms that are theirs, as far as the scene has them."""
+
+
+@dataclass(frozen=True, slots=True)
+class Milieu:
+    """The first role is always played; others are drawn."""
+
+    setting: tuple[str, ...]
+    roles: tuple[Role, ...]
+
+
+_OFFICES: Final = ("private_office", "shared_office", "meeting_room", "break_room", "copy_room", "phone_room")
+_HOME: Final = Milieu(
+    ("a family home", "a shared house", "a house with three generations under one roof"),
+    (
+        Role(("nurse", "architect", "bus driver", "tax adviser", "carpenter"), (32, 55), "partner", "partner",
+             ("bedroom", "kitchen", "private_office")),
+        Role(("teacher", "cook", "translator", "electrician", "librarian"), (30, 58), "partner", "partner",
+             ("bedroom", "living_room", "garden")),
+        Role(("pupil",), (6, 12), "child", "parent", ("childs_room", "playroom", "bedroom")),
+        Role(("student", "apprentice"), (16, 22), "child", "parent", ("childs_room", "bedroom", "television_room")),
+        Role(("pensioner",), (66, 84), "parent", "grown-up child", ("bedroom", "living_room", "garden")),
+        Role(("student", "musician", "paramedic"), (21, 34), "lodger", "landlord", ("bedroom", "bathroom")),
+    ),
+)  # fmt: skip
+_RESTAURANT: Final = Milieu(
+    (
+        "a restaurant before the evening service",
+        "a restaurant on a quiet afternoon",
+        "a restaurant that opens at noon",
+    ),
+    (
+        Role(("head chef",), (30, 58), "colleague", "colleague", ("kitchen", "pantry_room", "storage_room")),
+        Role(("waiter", "waitress"), (19, 45), "waiter", "chef", ("dining_room", "bar", "lobby")),
+        Role(("kitchen hand",), (18, 40), "kitchen hand", "chef", ("kitchen", "bathroom", "storage_room")),
+        Role(("owner",), (38, 66), "boss", "chef", ("private_office", "dining_room", "bar")),
+        Role(("regular guest",), (25, 80), "guest", "chef", ("dining_room", "bathroom")),
+    ),
+)
+_GROCERY: Final = Milieu(
+    ("a grocery store before it opens", "a grocery store on a Saturday"),
+    (
+        Role(
+            ("shop manager",),
+            (30, 60),
+            "colleague",
+            "colleague",
+            ("grocery_store", "private_office", "storage_room"),
+        ),
+        Role(("cashier",), (18, 50), "cashier", "manager", ("grocery_store", "break_room")),
+        Role(
+            ("shelf stacker",),
+            (18, 45),
+            "shelf stacker",
+            "manager",
+            ("grocery_store", "storage_room", "corridor"),
+        ),
+        Role(("customer",), (20, 85), "customer", "manager", ("grocery_store", "bathroom")),
+    ),
+)
+_OFFICE: Final = Milieu(
+    ("an office on a Monday morning", "an office before a visit of clients", "an office late in the day"),
+    (
+        Role(("team lead",), (32, 58), "colleague", "colleague", _OFFICES),
+        Role(("programmer", "accountant", "designer"), (23, 50), "colleague", "team lead", _OFFICES),
+        Role(
+            ("receptionist",),
+            (22, 60),
+            "receptionist",
+            "team lead",
+            ("lobby", "copy_room", "break_room", "entryway"),
+        ),
+        Role(("trainee",), (17, 24), "trainee", "team lead", ("shared_office", "copy_room", "corridor")),
+        Role(
+            ("caretaker",), (35, 63), "caretaker", "team lead", ("utility_room", "storage_room", "bathroom")
+        ),
+    ),
+)
+_SCHOOL: Final = Milieu(
+    ("a school before the first lesson", "a school during the long break", "a school on the eve of an open day"),
+    (
+        Role(("teacher",), (26, 62), "colleague", "colleague",
+             ("classroom", "biology_lab", "chemistry_lab", "computer_lab", "gym", "private_office")),
+        Role(("pupil",), (11, 17), "pupil", "teacher", ("classroom", "gym", "locker_room", "corridor")),
+        Role(("school nurse",), (28, 60), "school nurse", "teacher", ("infirmary", "bathroom")),
+        Role(("caretaker",), (35, 63), "caretaker", "teacher", ("utility_room", "storage_room", "locker_room")),
+        Role(("head teacher",), (42, 64), "head", "teacher", ("private_office", "meeting_room")),
+    ),
+)  # fmt: skip
+_HOTEL: Final = Milieu(
+    ("a hotel on the day of arrival", "a hotel between two conferences"),
+    (
+        Role(
+            ("housekeeper",),
+            (22, 58),
+            "colleague",
+            "colleague",
+            ("bedroom", "bathroom", "closet", "living_room"),
+        ),
+        Role(
+            ("receptionist",),
+            (20, 50),
+            "receptionist",
+            "housekeeper",
+            ("lobby", "entryway", "private_office"),
+        ),
+        Role(("guest",), (24, 75), "guest", "housekeeper", ("bedroom", "bathroom", "spa", "sauna", "gym")),
+        Role(
+            ("masseur", "fitness coach"),
+            (24, 50),
+            "coach",
+            "housekeeper",
+            ("spa", "gym", "hammam", "locker_room"),
+        ),
+    ),
+)
+_HALL: Final = Milieu(
+    ("a hall on the morning of a conference", "a hall while a fair is being set up"),
+    (
+        Role(
+            ("organiser",), (28, 58), "colleague", "colleague", ("conference_hall", "lobby", "meeting_room")
+        ),
+        Role(
+            ("sound engineer",), (22, 55), "sound engineer", "organiser", ("conference_hall", "storage_room")
+        ),
+        Role(("speaker",), (26, 70), "speaker", "organiser", ("conference_hall", "bathroom")),
+        Role(("visitor",), (18, 75), "visitor", "organiser", ("lobby", "corridor", "bar")),
+    ),
+)
+_BY_STEM: Final[Mapping[str, Milieu]] = {
+    "restaurant": _RESTAURANT,
+    "grocery": _GROCERY,
+    "office": _OFFICE,
+    "school": _SCHOOL,
+    "hotel": _HOTEL,
+    "hall": _HALL,
+}
+
+NAMES: Final = (
+    "Aiko", "Amara", "Anton", "Bela", "Carla", "Chidi", "Clara", "Dario", "Elif", "Emil", "Farid", "Greta", "Hana", "Hugo",
+    "Ines", "Ivo", "Jonas", "Kalea", "Kofi", "Lena", "Liam", "Lucia", "Maja", "Malik", "Mia", "Nadia", "Niko", "Noor", "Olga",
+    "Omar", "Pablo", "Petra", "Priya", "Quinn", "Rafael", "Rosa", "Samira", "Sven", "Tariq", "Tess", "Theo", "Ulla", "Viktor",
+    "Wanda", "Xenia", "Yusuf", "Zoe", "Zuri",
+)  # fmt: skip
+HOBBIES: Final = (
+    "baking bread", "chess", "bird watching", "drawing comics", "the piano", "running", "old radios", "gardening", "swimming",
+    "jigsaw puzzles", "photography", "football", "knitting", "model trains", "pottery", "crime novels", "cycling", "karaoke",
+)  # fmt: skip
+
+ACTIVITIES: Final[Mapping[str, tuple[tuple[int, str], ...]]] = {
+    "kitchen": ((7, "making breakfast"), (12, "preparing lunch"), (18, "cooking dinner"), (21, "tidying up after a meal")),
+    "pantry_room": ((8, "checking the stocks"), (16, "looking for ingredients")),
+    "dining_room": ((7, "laying the tables"), (13, "waiting for a late lunch"), (19, "having people over for dinner")),
+    "bar": ((17, "getting the bar ready"), (20, "talking with a friend over a drink")),
+    "living_room": ((10, "reading the paper"), (16, "resting after a long day"), (20, "expecting friends for a film")),
+    "television_room": ((19, "watching the match"), (21, "choosing a film")),
+    "bedroom": ((6, "getting up early"), (14, "lying down with a headache"), (22, "going to bed")),
+    "childs_room": ((15, "doing homework"), (17, "playing on the floor"), (19, "clearing up before the bedtime story")),
+    "playroom": ((15, "building a tower"), (17, "having two friends to play")),
+    "bathroom": ((6, "brushing teeth"), (8, "getting ready to leave"), (21, "running a bath")),
+    "garden": ((11, "repotting plants"), (17, "setting up a small party"), (19, "eating outside")),
+    "private_office": ((9, "sorting the mail"), (11, "preparing a video call"), (16, "finishing a report")),
+    "shared_office": ((8, "starting the week"), (13, "working against a deadline"), (17, "clearing the desk")),
+    "meeting_room": ((9, "expecting clients"), (14, "preparing a workshop")),
+    "copy_room": ((10, "printing handouts"), (15, "looking for envelopes")),
+    "phone_room": ((10, "waiting for a call"),),
+    "break_room": ((10, "taking a short break"), (13, "eating a late lunch")),
+    "lobby": ((8, "welcoming visitors"), (18, "waiting for a taxi")),
+    "corridor": ((8, "passing by in a hurry"), (17, "getting ready to go home")),
+    "entryway": ((8, "leaving for work"), (18, "coming home with both hands full")),
+    "grocery_store": ((7, "filling the shelves"), (11, "helping a customer"), (18, "cashing up")),
+    "storage_room": ((9, "taking stock"), (15, "making room for a delivery")),
+    "utility_room": ((9, "doing the laundry"), (19, "looking for a tool")),
+    "closet": ((7, "choosing what to wear"), (20, "packing for a trip")),
+    "garage": ((10, "mending a bicycle"),),
+    "classroom": ((8, "preparing the first lesson"), (14, "correcting tests")),
+    "biology_lab": ((9, "setting up the microscopes"),),
+    "chemistry_lab": ((9, "setting up an experiment"),),
+    "computer_lab": ((11, "getting ready for a class"),),
+    "infirmary": ((10, "looking after a child with a scraped knee"),),
+    "gym": ((8, "preparing a circuit"), (17, "cooling down after practice")),
+    "exercise_room": ((7, "stretching"),),
+    "locker_room": ((16, "changing after practice"),),
+    "spa": ((10, "getting the treatment room ready"),),
+    "sauna": ((18, "cooling off"),),
+    "hammam": ((17, "resting on the warm stone"),),
+    "conference_hall": ((8, "setting up for the first talk"), (12, "clearing up after a session")),
+}  # fmt: skip
+"""What people do in a type of room, with the hour."""
+ELSEWHERE: Final = ((9, "passing through"), (16, "looking for something"), (19, "putting things in order"))
+
+
+def milieu_of(base: str) -> Milieu:
+    """Of a base scene, by the first word of its name; houses that are named after places are homes."""
+    return _BY_STEM.get(base.split("_")[0], _HOME)
+
+
+def activities_in(room_type: str) -> tuple[tuple[int, str], ...]:
+    """Hour and activity, for rooms of any type."""
+    return ACTIVITIES.get(room_type, ELSEWHERE)

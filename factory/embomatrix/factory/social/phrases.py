@@ -1,0 +1,217 @@
+"""What people and the robot say: templates by speech act, wider than those of the plain task writer."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.factory.social.values import Act
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    import numpy as np
+
+CLAUSES: Final[Mapping[str, tuple[str, ...]]] = {
+    "ontop": (
+        "put {thing} on {place}",
+        "lay {thing} on {place}",
+        "set {thing} down on {place}",
+        "carry {thing} over and leave it on {place}",
+        "find {thing} and place it on top of {place}",
+        "get {thing} onto {place}",
+        "see to it that {thing} ends up on {place}",
+        "take {thing} along and rest it on {place}",
+        "bring {thing} over and place it on {place}",
+    ),
+    "inside": (
+        "put {thing} in {place}",
+        "tuck {thing} away in {place}",
+        "stow {thing} inside {place}",
+        "drop {thing} into {place}",
+        "clear {thing} away into {place}",
+        "find {thing} and store it in {place}",
+        "see to it that {thing} ends up inside {place}",
+        "take {thing} along and leave it inside {place}",
+        "make room for {thing} in {place} and put it there",
+    ),
+    "open": (
+        "open {thing}",
+        "leave {thing} standing open",
+        "pull {thing} open",
+        "see to it that {thing} is open",
+        "get {thing} open",
+    ),
+    "not open": (
+        "close {thing}",
+        "shut {thing} properly",
+        "push {thing} shut",
+        "see to it that {thing} is closed",
+        "leave {thing} closed behind you",
+    ),
+    "toggled_on": (
+        "switch {thing} on",
+        "turn on {thing}",
+        "leave {thing} switched on",
+        "see to it that {thing} is on",
+    ),
+    "not toggled_on": (
+        "switch {thing} off",
+        "turn off {thing}",
+        "leave {thing} switched off",
+        "see to it that {thing} is off",
+    ),
+    "cooked": (
+        "cook {thing} with {place}",
+        "use {place} to cook {thing}",
+        "get {thing} cooked with {place}",
+        "cook {thing} through",
+        "prepare {thing} with {place} until it is done",
+    ),
+    "hot": (
+        "warm up {thing} with {place}",
+        "heat {thing} with {place}",
+        "use {place} to get {thing} hot",
+        "see that {thing} is served hot",
+        "give {thing} some heat with {place}",
+    ),
+    "frozen": (
+        "freeze {thing} in {place}",
+        "use {place} to freeze {thing}",
+        "get {thing} frozen in {place}",
+        "leave {thing} to freeze in {place}",
+        "chill {thing} in {place} until it is frozen",
+    ),
+}
+"""Ways to ask for an atom. ``place`` is the host or the source."""
+
+TURNS: Final[Mapping[Act, tuple[str, ...]]] = {
+    Act.NEED: (
+        "I am {activity}, and {matter}.",
+        "Robot, have you got a moment? I am {activity} and {matter}.",
+        "Good that you are here. {Matter}, and I am {activity}.",
+        "{Matter}. Could you help, while I am {activity}?",
+        "Sorry to bother you, but {matter}. I am {activity}, you see.",
+        "Listen: {matter}, and I can't see to it, I am {activity}.",
+    ),
+    Act.CLARIFY: (
+        "Gladly. {Question}",
+        "I can do that. {Question}",
+        "Of course. Just so that I get it right: {question}",
+        "Let me ask first: {question}",
+        "With pleasure. {Question}",
+    ),
+    Act.ANSWER: (
+        "I would say: {clause}.",
+        "The simplest would be this: {clause}.",
+        "Oh, right. Please {clause}.",
+        "Best to {clause}.",
+        "Could you {clause}?",
+    ),
+    Act.REFUSE: (
+        "I can't {chore}: {reason}.",
+        "That is beyond me, I am afraid. To {chore}, I would need more than I have: {reason}.",
+        "Not that, sorry: {reason}. So I can't {chore}.",
+        "I wish I could {chore}, but {reason}.",
+    ),
+    Act.PROPOSE: (
+        "What I can do is this: {clause}.",
+        "But I could {clause}.",
+        "Shall I {clause} in its place?",
+        "Would it help if I {clause}?",
+    ),
+    Act.AMEND: (
+        "No, wait. Better {clause}.",
+        "On second thoughts: {clause}, please.",
+        "Hm, that would be in the way. {Clause}, then.",
+        "Not there, I still need the room. Rather {clause}.",
+        "Actually, no: {clause}.",
+    ),
+    Act.ADD: (
+        "And while you are at it, {clause}.",
+        "One more thing: {clause}.",
+        "Oh, and {clause}, would you?",
+        "Then also {clause}, or I will forget.",
+        "If you pass by, {clause} too.",
+    ),
+    Act.CONFIRM: (
+        "Then I will do this: {clauses}.",
+        "Understood: {clauses}.",
+        "All right. I will {clauses}.",
+        "Consider it done: {clauses}.",
+    ),
+}
+"""Sentences by act. A name with a capital stands for the same words at the start of a sentence."""
+
+MATTERS: Final[Mapping[str, tuple[str, ...]]] = {
+    "place": (
+        "{thing} is not where it belongs",
+        "{thing} has been lying about since yesterday",
+        "I keep running into {thing}",
+        "nobody has cleared away {thing}",
+        "{thing} is needed elsewhere",
+        "I don't know what to do with {thing}",
+    ),
+    "thermal": (
+        "{thing} is not ready yet",
+        "somebody should see to {thing}",
+        "I had hoped to have {thing} prepared by now",
+        "nobody has taken care of {thing}",
+    ),
+    "switch": (
+        "something is the matter with {thing}",
+        "{thing} is not as I want it",
+        "nobody has thought of {thing}",
+        "I can't leave {thing} like that",
+    ),
+}
+"""What is the matter, by kind of wish."""
+
+QUESTIONS: Final[Mapping[str, tuple[str, ...]]] = {
+    "place": (
+        "where shall {thing} go?",
+        "which place have you got in mind for {thing}?",
+        "where would you like to have {thing}?",
+    ),
+    "thermal": ("what shall I do with {thing}?", "how would you like to have {thing}?"),
+    "switch": ("how do you want {thing} to be?", "what shall I do about {thing}?"),
+}
+
+INSTRUCTIONS: Final = (
+    "{Who} is {activity}: {what}.",
+    "Before {who} starts {activity}, {what}.",
+    "It is {time} and {who} is {activity}. Could you {what}?",
+    "Lend {who} a hand, who is {activity}: {what}.",
+    "{Who} asks you to {what}.",
+    "For {who}, the {job}: {what}.",
+    "While {who} is {activity}, {what}.",
+    "{What}. That is what {who} needs now.",
+    "{Who} will be {activity} at {time}. By then, {what}.",
+    "Do {who} a favour and {what}.",
+    "{Who} ({age}) is {activity} and can't see to it. Please {what}.",
+    "As {who} is {activity} in {room}, {what}.",
+    "{Other} says you should {what}, for {who}.",
+    "You promised {who} to {what}.",
+    "{Who} loves {hobby} and wants to get back to it: {what}.",
+    "{What}, so that {who} has one thing less to think of.",
+    "On behalf of {who}, {what}.",
+    "{Who} has asked twice already. Now {what}.",
+    "Next on the list of {who}: {what}.",
+    "{Who} would be glad if you were to {what}.",
+)
+"""The request as a robot is given it; every one names a person."""
+
+JOINS: Final = (", then ", ", and ", ", after that ", "; also ", ", and then ")
+
+
+def pick(options: tuple[str, ...], rng: np.random.Generator) -> str:
+    return options[int(rng.integers(len(options)))]
+
+
+def filled(template: str, **words: str) -> str:
+    """The template with its words, each also with a capital where the template's name has one."""
+    capitals = {name.capitalize(): capital(text) for name, text in words.items()}
+    return template.format(**words, **capitals)
+
+
+def capital(text: str) -> str:
+    return text[:1].upper() + text[1:]

@@ -1,0 +1,36 @@
+"""Summarization Agent, offline: from a conversation to one instruction that names who asks and why."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from embomatrix.factory.social.phrases import INSTRUCTIONS, JOINS, filled, pick
+from embomatrix.factory.writer.words import room_words
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from embomatrix.factory.social.values import Cast, Conversation
+    from embomatrix.factory.writer.view import SceneView
+
+
+def instruction_of(conversation: Conversation, cast: Cast, view: SceneView, rng: np.random.Generator) -> str:
+    """One or two sentences. What the robot is to do are the conversation's last wishes, in their order."""
+    slot = conversation.slot
+    who = cast.of(slot.person)
+    others = [person.name for person in cast.people if person.name != who.name]
+    what = conversation.last_wishes[0]
+    for clause in conversation.last_wishes[1:]:
+        what += pick(JOINS, rng) + clause
+    return filled(
+        pick(INSTRUCTIONS, rng),
+        who=who.name,
+        other=others[int(rng.integers(len(others)))],
+        what=what,
+        activity=slot.activity,
+        time=slot.time,
+        room=room_words(view, slot.room),
+        job=who.job,
+        age=str(who.age),
+        hobby=who.hobby,
+    )

@@ -1,0 +1,137 @@
+"""Tasks come of conversations: a cast that covers the scene, wishes that change, instructions that name who asks."""
+
+import re
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from embomatrix.factory.scenes.build import build_base_scene
+from embomatrix.factory.social.casting import GrammarRolePlayer
+from embomatrix.factory.social.milieus import HOBBIES, NAMES
+from embomatrix.factory.social.phrases import CLAUSES, TURNS
+from embomatrix.factory.social.values import ROBOT, Act, Cast, DaySlot, Person
+from embomatrix.factory.social.writer import SocialWriter
+from embomatrix.factory.writer.variant import build_variant
+from embomatrix.factory.writer.view import SceneView
+from embomatrix.factory.writer.words import PHRASES
+from embomatrix.world.task import TaskCategory
+
+SCENE = build_base_scene("Rs_int", seed=0)
+ROOMS = tuple(room.name for room in SCENE.rooms)
+
+
+@pytest.fixture(scope="module")
+def drafts():
+    """What is asked for in one variant, with the view of it."""
+    rng = np.random.default_rng(5)
+    variant = build_variant(SCENE, ROOMS[:4], "Rs_int-talk", rng)
+    view, writer = SceneView(variant.scene), SocialWriter(seed=2)
+    categories = list(TaskCategory)
+    found = [writer.write(variant, view, categories[at % 4], f"t{at}", rng) for at in range(60)]
+    return [draft for draft in found if draft is not None], writer.cast_of(SCENE)
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 2**32))
+def test_every_room_sees_somebody_and_ties_go_both_ways(seed):
+    cast = GrammarRolePlayer().cast(SCENE, np.random.default_rng(seed))
+    assert cast.rooms_without_anyone(ROOMS) == ()
+    for person in cast.people:
+        for other in person.ties:
+            assert person.name in cast.of(other).ties
+    assert all(earlier.time <= later.time for earlier, later in pairwise(cast.day))
+
+
+@pytest.mark.parametrize(
+    "base", ["restaurant_diner", "school_gym", "office_bike", "hotel_gym_spa", "grocery_store_cafe"]
+)
+def test_other_scenes_have_other_people(base):
+    scene = build_base_scene(base, seed=0)
+    cast = GrammarRolePlayer().cast(scene, np.random.default_rng(0))
+    assert cast.rooms_without_anyone(tuple(room.name for room in scene.rooms)) == ()
+    assert {person.job for person in cast.people}.isdisjoint({"pensioner", "lodger"})
+
+
+def test_a_seed_gives_a_scene_its_people_once_and_for_all():
+    assert SocialWriter(3).cast_of(SCENE) == SocialWriter(3).cast_of(SCENE)
+    assert SocialWriter(3).cast_of(SCENE) != SocialWriter(4).cast_of(SCENE)
+
+
+def test_nearly_every_category_finds_somebody_who_asks(drafts):
+    found, _ = drafts
+    assert len(found) >= 40
+    assert {draft.task.category for draft in found} == set(TaskCategory)
+
+
+def test_instructions_name_somebody_and_say_what_was_confirmed_last(drafts):
+    found, cast = drafts
+    for draft in found:
+        assert any(name in draft.task.instruction for name in cast.names)
+        assert draft.transcript.startswith(f"# {draft.task.instruction}\n")
+        assert not re.search(r"[{}]|  |\.\.", draft.task.instruction)
+        last_turn = draft.transcript.split("## What is to be true")[0].strip().splitlines()[-1]
+        assert last_turn.startswith("**Robot** (confirm)")
+
+
+def test_requests_change_on_the_way(drafts):
+    found, _ = drafts
+    amended = [draft for draft in found if "(amend)" in draft.transcript]
+    refused = [draft for draft in found if "(refuse)" in draft.transcript]
+    assert len(amended) >= len(found) // 8
+    assert len(refused) >= len(found) // 8
+
+
+def test_the_same_generator_writes_the_same_tasks():
+    def written():
+        rng = np.random.default_rng(9)
+        variant = build_variant(SCENE, ROOMS[:3], "Rs_int-same", rng)
+        draft = SocialWriter(1).write(variant, SceneView(variant.scene), TaskCategory.COMPOUND, "t", rng)
+        return draft.task.instruction, draft.transcript, draft.signature
+
+    assert written() == written()
+
+
+def test_every_way_to_ask_of_the_plain_writer_has_its_own_here():
+    assert set(CLAUSES) == set(PHRASES)
+    assert all(len(set(options)) >= 4 for options in CLAUSES.values())
+    assert set(TURNS) == set(Act)
+    assert len(set(NAMES)) == len(NAMES)
+    assert len(set(HOBBIES)) >= 5
+
+
+ANN = Person(name="Ann", age=40, job="nurse", hobby="chess")
+BO = Person(name="Bo", age=9, job="pupil", hobby="football", ties={"Ann": "child"})
+SLOT = DaySlot(time="07:30", person="Ann", room="kitchen_0", activity="making breakfast")
+
+
+@pytest.mark.parametrize(
+    ("values", "sentence"),
+    [
+        ({"people": (ANN, ANN)}, "two people are called 'Ann'"),
+        (
+            {"people": (BO, ANN.model_copy(update={"name": "Cy"}))},
+            "Bo is tied to 'Ann': expected another one of",
+        ),
+        ({"day": (SLOT.model_copy(update={"person": "Zed"}),)}, "'Zed' has something to do at 07:30"),
+        ({"people": (ANN,)}, "at least 2 items"),
+        ({"day": ()}, "at least 1 item"),
+    ],
+)
+def test_a_cast_that_does_not_fit_together_is_refused(values, sentence):
+    whole = {"setting": "a home", "people": (ANN, BO), "day": (SLOT,)}
+    with pytest.raises(ValidationError, match=sentence):
+        Cast(**{**whole, **values})
+
+
+@pytest.mark.parametrize("time", ["7:30", "24:00", "12:60", "noon"])
+def test_a_time_of_day_has_four_digits(time):
+    with pytest.raises(ValidationError, match="time"):
+        DaySlot(time=time, person="Ann", room="kitchen_0", activity="eating")
+
+
+def test_the_robot_is_not_one_of_the_people():
+    assert ROBOT not in NAMES
