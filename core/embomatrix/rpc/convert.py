@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import TYPE_CHECKING, Final, Literal, TypeVar
 
 from embomatrix.proto.v1 import rollout_service_pb2, types_pb2
 from embomatrix.reward.breakdown import AtomResult, RewardBreakdown
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
     from embomatrix.rpc.values import Outcome
 
+ArgField = Literal["object_index", "source_index", "relation", "yaw", "distance", "room_name"]
 WireT = TypeVar("WireT")
 ValueT = TypeVar("ValueT")
 
@@ -52,6 +53,10 @@ SKILL_KINDS: Final[Mapping[Skill, types_pb2.SkillKind.ValueType]] = {
 KNOWN: Final = 65_536
 """Calls and steps that a process remembers by their bytes: plans of one model repeat them, and so do the results."""
 _SKILLS: Final = {kind: skill for skill, kind in SKILL_KINDS.items()}
+_FIELDS: Final[Mapping[Skill, tuple[tuple[ArgField, bool], ...]]] = {
+    skill: tuple((arg.value, arg in taken) for arg in Arg) for skill, taken in SIGNATURES.items()
+}
+"""For each skill the fields of a call, in order, and whether the skill takes them."""
 _INFRA_CODES: Final[Mapping[InfraCode, types_pb2.InfraCode.ValueType]] = {
     code: types_pb2.InfraCode.Value(f"INFRA_CODE_{code.name}") for code in InfraCode
 }
@@ -128,10 +133,10 @@ def _call_of(data: bytes) -> SkillCall:
     if skill is None:
         raise ConvertError("skill", f"{message.skill} is no known skill: is the sender newer than this side?")
     taken = SIGNATURES[skill]
-    for arg in Arg:
-        if message.HasField(arg.value) != (arg in taken):
-            problem = "is missing: {} needs it" if arg in taken else "is set: {} does not take it"
-            raise ConvertError(arg.value, problem.format(skill.value))
+    for field, is_taken in _FIELDS[skill]:
+        if message.HasField(field) != is_taken:
+            problem = "is missing: {} needs it" if is_taken else "is set: {} does not take it"
+            raise ConvertError(field, problem.format(skill.value))
     return SkillCall(
         skill,
         object_index=message.object_index if Arg.OBJECT in taken else None,

@@ -53,11 +53,11 @@ class CachedActor:
 
 def _move(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
     target = target_of(world, call)
-    stands = world.navigator.stands(target, world.robot)
-    if stands:
-        world.robot = stands[0]
-        return None
-    return no_way_to(world, target)
+    stand = world.navigator.nearest_stand(target, world.robot)
+    if stand is None:
+        return no_way_to(world, target)
+    world.robot = stand
+    return None
 
 
 def _turn(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:

@@ -15,6 +15,8 @@ from embomatrix.sim.floor_ways import RecentDistances, cheapest_way
 from embomatrix.skills.limits import ROBOT
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from embomatrix.sim.floor_parts import Window
@@ -44,7 +46,7 @@ class FloorGrid:
         """Rasterise obstacles, shape (n, 6), and inflate them by the robot's radius."""
         self._lay_out(scene)
         covered = (~self._floor_of(scene)).astype(np.int16)
-        for box in boxes:
+        for box in boxes.tolist():
             covered[self._window(box[:2], box[2:4])] += 1
         for edge in (np.s_[0, :], np.s_[-1, :], np.s_[:, 0], np.s_[:, -1]):
             covered[edge] += 1
@@ -75,7 +77,7 @@ class FloorGrid:
         """The same for a window's cells, after changes to the grid that was made first."""
         covered = self._covered[window].copy()
         for boxes, step in changes:
-            for box in boxes:
+            for box in boxes.tolist():
                 here, _ = overlap(window, self._window(box[:2], box[2:4]))
                 covered[here] += step
         return covered
@@ -87,12 +89,14 @@ class FloorGrid:
             return self
         reach = ROBOT.radius_m + CELL_M
         edge = reach + CELL_M
-        window = self._window(boxes[:, :2].min(axis=0) - edge, boxes[:, 2:4].max(axis=0) + edge)
+        low, high = boxes[:, :2].min(axis=0) - edge, boxes[:, 2:4].max(axis=0) + edge
+        window = self._window(low.tolist(), high.tolist())
         free = self.parts.within(window) > 0
         changes = (*self._changes, (gone, -1), (come, 1))
         for box in boxes:
-            here = self._window(box[:2] - reach, box[2:4] + reach)
-            around = self._window(box[:2] - 2 * reach, box[2:4] + 2 * reach)
+            low, high = box[:2], box[2:4]
+            here = self._window((low - reach).tolist(), (high + reach).tolist())
+            around = self._window((low - 2 * reach).tolist(), (high + 2 * reach).tolist())
             _, inner = overlap(here, around)
             free[overlap(window, here)[0]] = _clear(self._covered_in(around, changes))[inner]
         grid = self._with_parts(self.parts.changed(free, window))
@@ -120,7 +124,7 @@ class FloorGrid:
 
     def _blocked_by(self, boxes: FloatArray) -> list[tuple[Window, BoolArray]]:
         """For each lot of cells that boxes cover, the window in which the robot may touch them, and where in it it does."""
-        windows = (self._window(box[:2], box[2:4]) for box in boxes)
+        windows = (self._window(box[:2], box[2:4]) for box in boxes.tolist())
         lots = sorted({(rows.start, rows.stop, cols.start, cols.stop) for rows, cols in windows})
         return [_blocked(slice(*lot[:2]), slice(*lot[2:]), self._shape) for lot in lots]
 
@@ -169,8 +173,8 @@ class FloorGrid:
     def center(self, cell: Cell) -> Vec2:
         """World coordinates of the middle of a cell."""
         return (
-            float(self._origin[0] + (cell[0] + 0.5) * CELL_M),
-            float(self._origin[1] + (cell[1] + 0.5) * CELL_M),
+            self._origin_m[0] + (cell[0] + 0.5) * CELL_M,
+            self._origin_m[1] + (cell[1] + 0.5) * CELL_M,
         )
 
     def is_free(self, x_m: float, y_m: float) -> bool:
@@ -201,14 +205,14 @@ class FloorGrid:
 
     def free_centers(self, low_m: Vec2, high_m: Vec2, label: int) -> FloatArray:
         """Middles of the component's cells in a rectangle, shape (n, 2), in the world."""
-        window = self._window(np.asarray(low_m), np.asarray(high_m))
+        window = self._window(low_m, high_m)
         inside = np.argwhere((self.parts.within(window) == label) & (label > 0))
         corner = np.array([window[0].start, window[1].start])
         return np.asarray(self._origin + (inside + corner + 0.5) * CELL_M, dtype=np.float64)
 
     def all_free_centers(self, low_m: Vec2, high_m: Vec2) -> FloatArray:
         """Middles of the free cells in a rectangle, whatever their component, shape (n, 2), in the world."""
-        window = self._window(np.asarray(low_m), np.asarray(high_m))
+        window = self._window(low_m, high_m)
         corner = np.array([window[0].start, window[1].start])
         inside = np.argwhere(self.parts.within(window) > 0)
         return np.asarray(self._origin + (inside + corner + 0.5) * CELL_M, dtype=np.float64)
@@ -238,7 +242,7 @@ class FloorGrid:
 
         The way leads over ``floor`` only, of the grid's shape. Empty when there is none.
         """
-        free, goal = self.free, self._window(np.asarray(low_m), np.asarray(high_m))
+        free, goal = self.free, self._window(low_m, high_m)
         way = cheapest_way(free, floor, start, goal)
         return np.array([self.center(cell) for cell in way if not free[cell]]).reshape(-1, 2)
 
@@ -267,22 +271,30 @@ class FloorGrid:
     def _floor_of(self, scene: Scene) -> BoolArray:
         floor = np.zeros(self._shape, dtype=np.bool_)
         for room in scene.rooms:
-            floor[self._window(np.asarray(room.low_m), np.asarray(room.high_m))] = True
+            floor[self._window(room.low_m, room.high_m)] = True
         for doorway in scene.doorways:
             half = np.array([doorway.width_m, DOORWAY_DEPTH_M]) / 2
             if doorway.along == "y":
                 half = half[::-1]
             if all(doorway.rooms):
-                floor[self._window(doorway.center_m - half, doorway.center_m + half)] = True
+                floor[
+                    self._window((doorway.center_m - half).tolist(), (doorway.center_m + half).tolist())
+                ] = True
         return floor
 
-    def _window(self, low: FloatArray, high: FloatArray) -> Window:
+    def _window(self, low: Sequence[float], high: Sequence[float]) -> Window:
         """Cells that a rectangle touches with more than its edge."""
-        first = np.floor((low - self._origin) / CELL_M + 1e-9).astype(int)
-        last = np.ceil((high - self._origin) / CELL_M - 1e-9).astype(int)
-        first = np.clip(first, 0, self._shape)
-        last = np.clip(last, first, self._shape)
-        return slice(int(first[0]), int(last[0])), slice(int(first[1]), int(last[1]))
+        rows, columns = (
+            slice(*_cells_between(*ends)) for ends in zip(low, high, self._origin_m, self._shape, strict=True)
+        )
+        return rows, columns
+
+
+def _cells_between(low_m: float, high_m: float, origin_m: float, count: int) -> tuple[int, int]:
+    """First cell of those that a stretch touches along one axis, and the one after the last. Plain: arrays of two are slow."""
+    first = min(max(math.floor((low_m - origin_m) / CELL_M + 1e-9), 0), count)
+    last = min(max(math.ceil((high_m - origin_m) / CELL_M - 1e-9), first), count)
+    return first, last
 
 
 def _clear(covered: NDArray[np.int16]) -> BoolArray:

@@ -61,6 +61,8 @@ class Ground:
         self._kept: OrderedDict[Floor, Laid] = OrderedDict()
         self._moved: set[int] = set()
         self._leaves = OpenLeaves(engine)
+        self._one_open: dict[Ajar, FloorGrid] = {}
+        """Where the robot fits on the floor of the start with the leaves of one more object wide open."""
         self._round, self._read = -1, 0
         self._now: FloorGrid | None = None
         self.refresh()
@@ -110,14 +112,29 @@ class Ground:
     def grid(self) -> FloorGrid:
         """Where the robot fits, made when it is asked for: many doors are shut again before it drives."""
         if self._now is None:
-            kept = self._laid.narrowed
-            if self.ajar not in kept:
-                kept[self.ajar] = self.shut.narrowed(self.leaves.barring)
-                if len(kept) > LEAVES_KEPT:
-                    kept.popitem(last=False)
-            kept.move_to_end(self.ajar)
-            self._now = kept[self.ajar]
+            foreseen = self._one_open.get(self.ajar) if self._laid is self._at_start else None
+            self._now = foreseen or self._narrowed()
         return self._now
+
+    def complete(self) -> Iterator[None]:
+        """Find out where the robot fits with the leaves of each object wide open, one object at a step.
+
+        Work for a process that waits. Changes no answer: most plans open one thing, and most of these are opened again.
+        """
+        for ajar in self._leaves.each_open():
+            leaves = self._leaves.obstacles(ajar)
+            self._one_open[ajar] = self._at_start.grid.narrowed(leaves.barring)
+            yield
+
+    def _narrowed(self) -> FloorGrid:
+        """The floor with the leaves that stand open now."""
+        kept = self._laid.narrowed
+        if self.ajar not in kept:
+            kept[self.ajar] = self.shut.narrowed(self.leaves.barring)
+            if len(kept) > LEAVES_KEPT:
+                kept.popitem(last=False)
+        kept.move_to_end(self.ajar)
+        return kept[self.ajar]
 
     @property
     def at_start(self) -> tuple[Obstacles, FloorGrid]:

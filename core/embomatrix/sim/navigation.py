@@ -143,16 +143,30 @@ class Navigator:
         no wall nor anything much taller than the object stands between; nor, for things in furniture, its sides or back.
         What has doors or roofed cavities is served from its front.
         """
+        return tuple(self._stands_from(name, origin))
+
+    def nearest_stand(self, name: str, origin: StandPose) -> StandPose | None:
+        """The first of ``stands``; None when there is none."""
+        return next(self._stands_from(name, origin), None)
+
+    def _stands_from(self, name: str, origin: StandPose) -> Iterator[StandPose]:
+        """``stands``, one after another: to drive somewhere takes the first only."""
         start = self._cell(origin)
         if start is None or self._engine.is_parked(name):
-            return ()
+            return
         shut = self.stands_past_shut(name, StandPose(*self.ground.grid.center(start), 0.0))
         grid = self.ground.grid
         if grid is self.ground.shut:
-            return shut
+            yield from shut
+            return
         label = grid.label(start)
-        found = tuple(stand for stand in shut if grid.label_at(stand.x_m, stand.y_m) == label)
-        return found or self._stands_on(grid, (self._key(name), self.ground.ajar, label), name)
+        found = False
+        for stand in shut:
+            if grid.label_at(stand.x_m, stand.y_m) == label:
+                found = True
+                yield stand
+        if not found:
+            yield from self._stands_on(grid, (self._key(name), self.ground.ajar, label), name)
 
     def stands_past_shut(self, name: str, origin: StandPose) -> tuple[StandPose, ...]:
         """As ``stands``, as if all doors and drawers of furniture were shut: few leaves stand in any of these places."""
@@ -204,10 +218,14 @@ class Navigator:
         return origin
 
     def complete(self) -> Iterator[None]:
-        """Find out what bars the arm's way to each object, one at a step: work for a process that waits. Changes no answer."""
+        """Find out what bars the arm's way to each object, and the robot's where a door stands open, one object at a step.
+
+        Work for a process that waits. Changes no answer.
+        """
         for item in self._scene.objects:
             self._blockers_of(item.name)
             yield
+        yield from self.ground.complete()
 
     def service(self, name: str) -> Service:
         """What a place must offer from which the robot works on the object."""

@@ -45,6 +45,17 @@ class OpenLeaves:
         joints = ((number, self._engine.joints(self._objects[number].name)) for number in sorted(self._swung))
         return tuple((number, fractions) for number, fractions in joints if max(fractions) > OPEN_FRACTION)
 
+    def each_open(self) -> Iterator[Ajar]:
+        """What stands open at the start, and one object more with all its joints wide open: for each object in turn."""
+        at_start = {number: tuple(self._objects[number].joints) for number in self._at_start}
+        for number in sorted(self._jointed):
+            joints = at_start | {number: (1.0,) * len(self._objects[number].joints)}
+            yield tuple(
+                (other, fractions)
+                for other, fractions in sorted(joints.items())
+                if max(fractions) > OPEN_FRACTION
+            )
+
     def obstacles(self, ajar: Ajar) -> Obstacles:
         """Boxes of the parts of leaves that stand open so."""
         found = [Obstacles.of([], WALLS, [])]

@@ -181,6 +181,30 @@ def test_thing_put_on_the_floor_bars_the_way_until_it_is_taken_up(engine, naviga
     assert navigator.forward(navigator.start, 0.0, 1.0) == before
 
 
+def test_floors_with_one_thing_open_are_the_same_when_they_were_found_ahead(engine, navigator) -> None:
+    jointed = [item for item in engine.scene.objects if item.fixed and item.joints]
+    ahead = Navigator(engine, Relations(engine))
+    assert len(list(ahead.ground.complete())) == len(jointed) > 0
+    for item in jointed:
+        engine.set_joints(item.name, (1.0,) * len(item.joints))
+        for each in (ahead, navigator):
+            each.refresh()
+        assert _parts_are_equal(ahead.ground.grid, navigator.ground.grid), item.name
+        engine.reset()
+
+
+def test_robot_drives_to_the_first_of_the_standing_poses_whatever_stands_open(engine, navigator) -> None:
+    openable = [item for item in engine.scene.objects if item.fixed and item.joints]
+    for opened in (None, *openable):
+        if opened is not None:
+            engine.set_joints(opened.name, (1.0,) * len(opened.joints))
+        navigator.refresh()
+        for item in engine.scene.objects:
+            stands = navigator.stands(item.name, navigator.start)
+            assert navigator.nearest_stand(item.name, navigator.start) == (stands[0] if stands else None)
+        engine.reset()
+
+
 def test_place_off_the_map_is_not_reachable(navigator) -> None:
     for x, y in ((-50.0, 0.0), (math.nan, 1.0), (2.0, 1.3)):
         assert not navigator.reachable(navigator.start, StandPose(x, y, 0.0))

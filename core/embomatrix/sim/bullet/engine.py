@@ -6,6 +6,7 @@ bit-exact, whatever Bullet rounds. The main client is never stepped and no body 
 
 from __future__ import annotations
 
+import math
 import struct
 from typing import TYPE_CHECKING, Final
 
@@ -247,9 +248,15 @@ class BulletEngine:
         return struct.pack(f"<i?{len(values)}d", number, present, *values)
 
     def complete(self) -> Iterator[None]:
-        """Make the bodies that nobody asked for yet, one at a step: work for a process that waits. Changes no answer."""
+        """Make the bodies of objects and walls that nobody asked for yet, one at a step, changing no answer.
+
+        Work for a process that waits.
+        """
         for number in self._bodies.missing():
             self._body(number)
+            yield
+        for chunk in range(math.ceil(len(self._scene.walls) / PART_LIMIT)):
+            self._bodies.wall(chunk)
             yield
 
     def close(self) -> None:
