@@ -1,13 +1,10 @@
 """The status page in a real browser, before a real manager with a real worker: what the cluster does is what the page shows."""
 
 import contextlib
-import os
 import re
-import shutil
-import subprocess
-from html.parser import HTMLParser
 
 import pytest
+from tests.fakes.browser import shown
 from tests.fakes.commands import background
 
 from embomatrix.rpc.client import ClusterClient
@@ -16,46 +13,7 @@ from embomatrix.skills.parse import plan_from_json
 from embomatrix.world.dataset import Dataset
 
 ROLLOUTS = 24
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 pytestmark = pytest.mark.browser
-
-
-@pytest.fixture(scope="module")
-def browser():
-    found = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if found is None and os.environ.get("EMBOMATRIX_CI"):
-        pytest.fail(f"none of {', '.join(BROWSERS)} is installed: CI checks the status page")
-    if found is None:
-        pytest.skip(f"none of {', '.join(BROWSERS)} is installed: install one to check the status page")
-    return found
-
-
-class Page(HTMLParser):
-    """The words of a page by the id of the element that they stand in, and how often each class of element is there."""
-
-    VOID = frozenset(("meta", "link", "input", "br", "line", "polygon", "polyline"))
-
-    def __init__(self, source):
-        super().__init__()
-        self._open = []
-        self.words = {}
-        self.classes = []
-        self.feed(source)
-
-    def handle_starttag(self, tag, attrs):
-        values = dict(attrs)
-        self.classes.append(values.get("class") or "")
-        if tag not in self.VOID:
-            self._open.append((tag, values.get("id")))
-
-    def handle_endtag(self, tag):
-        while self._open and self._open.pop()[0] != tag:
-            pass
-
-    def handle_data(self, data):
-        for _, name in self._open:
-            if name:
-                self.words[name] = " ".join(f"{self.words.get(name, '')} {data}".split())
 
 
 @contextlib.contextmanager
@@ -72,27 +30,6 @@ def cluster(folder, *options):
         with background(folder / "worker.log", *lend, f"--cache-dir={folder / 'cache'}", *token) as worker:
             worker.wait_for("registered with the manager")
             yield found[1], found[2]
-
-
-def shown(browser, url, folder):
-    """The page after its scripts ran for a few seconds."""
-    result = subprocess.run(
-        [
-            browser,
-            "--headless",
-            "--no-sandbox",
-            "--disable-gpu",
-            f"--user-data-dir={folder / 'profile'}",
-            "--virtual-time-budget=5000",
-            "--dump-dom",
-            url,
-        ],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=True,
-    )
-    return Page(result.stdout)
 
 
 async def test_page_shows_workers_slots_warm_scenes_and_throughput(browser, kitchen, tmp_path):

@@ -15,8 +15,8 @@ pytestmark = pytest.mark.timeout(60)
 async def test_every_phase_of_every_rollout_is_timed_and_nothing_is_counted_twice(tmp_path):
     async with manager(tmp_path) as at, open_run(at.address) as client, FakeWorker(at.address, slots=2):
         results = await outcomes(client, batch(40))
-        async with AdminClient(at.address) as admin:
-            summary = await admin.run("r1")
+        async with AdminClient(at.address) as logs:
+            summary = await logs.run("r1")
     timings = [result.outcome.timings for result in results.values()]
     assert all(
         timing.execute_s == 0.001 and timing.deliver_s > 0 and timing.lease_s >= 0 for timing in timings
@@ -33,10 +33,10 @@ async def test_the_log_has_each_lease_and_its_end_in_order(tmp_path):
         async with FakeWorker(at.address, slots=2, poison={"poison"}):
             good, bad = batch(10), batch(1, batch_id="b2", task="poison")
             await outcomes(client, Batch("r1", "mixed", 1, good.rollouts + bad.rollouts))
-        async with AdminClient(at.address) as admin:
-            events = await admin.all_events("r1")
-            summary = await admin.run("r1")
-            fleet = await admin.all_events()
+        async with AdminClient(at.address) as logs:
+            events = await logs.all_events("r1")
+            summary = await logs.run("r1")
+            fleet = await logs.all_events()
     kinds = [event.kind for event in events]
     assert kinds[:2] == [EventKind.RUN_OPENED, EventKind.SUBMITTED]
     assert (kinds.count(EventKind.LEASED), kinds.count(EventKind.COMPLETED)) == (13, 10)
@@ -55,24 +55,24 @@ async def test_the_log_has_each_lease_and_its_end_in_order(tmp_path):
 
 
 async def test_a_closed_run_is_kept_with_its_log_and_its_last_counters(tmp_path):
-    async with manager(tmp_path) as at, open_run(at.address) as client, AdminClient(at.address) as admin:
+    async with manager(tmp_path) as at, open_run(at.address) as client, AdminClient(at.address) as logs:
         async with FakeWorker(at.address) as worker:
             await client.announce_lookahead("r1", 1, [LookaheadEntry(1, KITCHEN, 8)])
             await until(lambda: worker.residents)
             await outcomes(client, batch(8))
             stats = await client.close_run("r1")
-        assert await admin.open_runs() == ()
-        (kept,) = await admin.closed_runs()
+        assert await logs.open_runs() == ()
+        (kept,) = await logs.closed_runs()
         assert (kept.run_id, kept.stats, kept.pending) == ("r1", stats, 0)
         assert kept.closed_s > kept.opened_s > 0
-        summary = await admin.run("r1")
+        summary = await logs.run("r1")
         assert summary.run == kept
         assert summary.prewarm_lead.count == stats.prewarm_hits
         assert sum(summary.series.completed) == 8
-        events = await admin.all_events("r1")
+        events = await logs.all_events("r1")
         assert [event.kind for event in events].count(EventKind.COMPLETED) == 8
         assert events[-1].kind is EventKind.RUN_CLOSED
-    async with manager(tmp_path) as at, AdminClient(at.address) as admin:
-        assert (await admin.run("r1")).run == kept
+    async with manager(tmp_path) as at, AdminClient(at.address) as logs:
+        assert (await logs.run("r1")).run == kept
         with pytest.raises(NotFoundError, match="no run 'r2' is open or kept"):
-            await admin.run("r2")
+            await logs.run("r2")

@@ -39,6 +39,7 @@ COMMANDS: Final[Mapping[str, Command]] = {
     "scene": Command("build, check and draw base scenes", "factory"),
     "play": Command("execute a plan in a task and explain every step and the reward", "factory"),
     "manager": Command("serve the Simulation Manager, or ask it how the cluster does", "manager"),
+    "cluster": Command("look at a cluster and steer it: workers, runs, plan, reports, traces", "report"),
     "worker": Command("lend this machine's cores to a manager", "worker"),
     "train": Command("train a policy with imitation and GRPO on a cluster", "trainer"),
     "eval": Command("measure a trained policy on held-out tasks", "trainer"),

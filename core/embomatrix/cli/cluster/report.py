@@ -1,0 +1,216 @@
+"""The report of a run: one HTML file with everything in it. It loads nothing and runs no script."""
+
+from __future__ import annotations
+
+import html
+import string
+import time
+from collections import Counter
+from importlib.resources import files
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.cli.cluster.charts import busy_chart, phase_chart, throughput_chart
+from embomatrix.cli.cluster.timeline import busy_share, slot_spans
+from embomatrix.rpc.run_log import EventKind, Phase
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+    from embomatrix.rpc.run_log import PhaseSummary, RunEvent, RunSummary
+
+STEPS: Final = 240
+"""Points in time at which the share of slots at work is told."""
+NONE: Final = "–"
+PHASES: Final[Mapping[Phase, str]] = {
+    Phase.QUEUE: "waited for a lease",
+    Phase.LEASE: "network, and wait for a slot behind another rollout",
+    Phase.LOAD: "waited for the scene to be loaded",
+    Phase.EXECUTE: "in the slot",
+    Phase.DELIVER: "from the result's arrival to the trainer's log",
+}
+
+
+def report_page(summary: RunSummary, events: Sequence[RunEvent]) -> str:
+    """The page. ``events`` is the run's log as far as it was kept; counts and quantiles are of the whole run."""
+    template = files("embomatrix.cli.cluster").joinpath("report.html").read_text(encoding="utf-8")
+    run = summary.run
+    return string.Template(template).substitute(
+        title=_text(run.name or run.run_id),
+        about=_text(_about(summary)),
+        tiles=_tiles(summary),
+        throughput=throughput_chart(summary.series),
+        busy=_busy(summary, events),
+        phases=phase_chart(summary.phases),
+        phase_rows=_phase_rows(summary),
+        prewarm_rows=_prewarm_rows(summary),
+        worker_rows=_worker_rows(summary),
+        failures=_failures(summary),
+        kept=_text(_kept(summary, events)),
+    )
+
+
+def seconds_text(seconds: float) -> str:
+    """A duration in the unit that suits it, to three digits."""
+    if seconds >= 120:
+        return f"{seconds / 60:.3g} min"
+    if seconds >= 1:
+        return f"{seconds:.3g} s"
+    if seconds >= 1e-3:
+        return f"{seconds * 1e3:.3g} ms"
+    return f"{seconds * 1e6:.0f} µs" if seconds else "0"
+
+
+def _about(summary: RunSummary) -> str:
+    run = summary.run
+    opened = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(run.opened_s))
+    state = "closed" if run.closed_s else "still open"
+    return f"run {run.run_id} · opened {opened} · {seconds_text(_length_s(summary))} · {state} · EmboMatrix {summary.version}"
+
+
+def _length_s(summary: RunSummary) -> float:
+    """Of the run; of one that is open, up to its last outcome."""
+    if summary.run.closed_s:
+        return summary.run.closed_s - summary.run.opened_s
+    return len(summary.series.completed) * summary.series.step_s
+
+
+def _tiles(summary: RunSummary) -> str:
+    stats, phases = summary.run.stats, summary.phases
+    completed = sum(summary.series.completed)
+    active_s = summary.series.step_s * sum(count > 0 for count in summary.series.completed)
+    execute_s = phases[Phase.EXECUTE].sum_s
+    cpu_s = summary.manager_cpu_s + execute_s
+    asked = stats.prewarm_hits + stats.prewarm_misses
+    tiles = (
+        (
+            "Completed",
+            f"{completed:,}",
+            f"{stats.infra_failures:,} failed, {stats.redispatched:,} leases given again",
+        ),
+        ("Throughput", f"{completed / active_s:,.0f}/s" if active_s else NONE, "while there was work"),
+        (
+            "Execute p50",
+            seconds_text(phases[Phase.EXECUTE].p50_s),
+            f"p99 {seconds_text(phases[Phase.EXECUTE].p99_s)}",
+        ),
+        ("Prewarm hits", _share(stats.prewarm_hits, asked), f"{stats.prewarm_hits:,} of {asked:,} scenes"),
+        (
+            "Prewarm waste",
+            _share(stats.prewarm_wasted, asked + stats.prewarm_wasted),
+            f"{stats.prewarm_wasted:,} loads unused",
+        ),
+        ("Manager overhead", _share(summary.manager_cpu_s, cpu_s), "its CPU time, of its own and the slots'"),
+    )
+    return "".join(
+        f'<section class="tile"><h2>{_text(name)}</h2><b>{_text(value)}</b><span>{_text(note)}</span></section>'
+        for name, value, note in tiles
+    )
+
+
+def _share(part: float, whole: float) -> str:
+    return f"{100 * part / whole:.3g} %" if whole else NONE
+
+
+def _busy(summary: RunSummary, events: Sequence[RunEvent]) -> str:
+    spans = slot_spans(events)
+    if not spans:
+        return '<p class="none">No slot was told of: no rollout has run, or the workers are older than this manager.</p>'
+    length_s = max(_length_s(summary), 1e-3)
+    step_s = length_s / STEPS
+    return busy_chart(busy_share(spans, summary.run.opened_s, step_s, STEPS), step_s)
+
+
+def _phase_rows(summary: RunSummary) -> str:
+    whole_s = sum(found.sum_s for found in summary.phases.values())
+    rows = []
+    for phase in Phase:
+        found = summary.phases[phase]
+        quantiles = (found.p50_s, found.p95_s, found.p99_s)
+        share = found.sum_s / whole_s if whole_s else 0.0
+        cells = [_text(seconds_text(value)) for value in quantiles]
+        name = f"{phase.value}<small>{_text(PHASES[phase])}</small>"
+        rows.append(_row([name, *cells, _bar(share)], figures=3))
+    return "".join(rows)
+
+
+def _prewarm_rows(summary: RunSummary) -> str:
+    stats = summary.run.stats
+    rows = [
+        ("scenes that were warm when their batch came", f"{stats.prewarm_hits:,}"),
+        ("scenes that were not", f"{stats.prewarm_misses:,}"),
+        ("loads ahead of demand that nobody used", f"{stats.prewarm_wasted:,}"),
+        ("rollouts that began warm", f"{stats.warm_starts:,}"),
+        ("rollouts that waited for a scene", f"{stats.cold_starts:,}"),
+        ("lead: warm before it was needed", _quantiles(summary.prewarm_lead)),
+        ("loading a scene, on all workers", _quantiles(summary.scene_load)),
+    ]
+    return "".join(_row([_text(name), _text(value)], figures=1) for name, value in rows)
+
+
+def _quantiles(found: PhaseSummary) -> str:
+    if not found.count:
+        return NONE
+    return f"p50 {seconds_text(found.p50_s)}, p95 {seconds_text(found.p95_s)}"
+
+
+def _worker_rows(summary: RunSummary) -> str:
+    total_s = sum(worker.execute_s for worker in summary.workers)
+    rows = []
+    for worker in sorted(summary.workers, key=lambda worker: -worker.completed):
+        mean = seconds_text(worker.execute_s / worker.completed) if worker.completed else NONE
+        figures = (f"{worker.completed:,}", f"{worker.failed:,}", mean, seconds_text(worker.load_s))
+        share = worker.execute_s / total_s if total_s else 0.0
+        rows.append(_row([_text(worker.worker_id), *map(_text, figures), _bar(share)], figures=4))
+    return "".join(rows) or '<tr><td colspan="6" class="none">No worker has finished anything.</td></tr>'
+
+
+def _failures(summary: RunSummary) -> str:
+    if not summary.failures:
+        return '<p class="none">None. Every lease that was given came back with a result.</p>'
+    codes = Counter(event.code for event in summary.failures)
+    told = ", ".join(f"{count} {code}" for code, count in codes.most_common())
+    rows = "".join(map(_failure_row, reversed(summary.failures)))
+    names = ("time", "what", "reason", "attempt", "rollout", "worker", "scene")
+    head = "".join(f"<th>{name}</th>" for name in names)
+    table = f"<table><tr>{head}</tr>{rows}</table>"
+    return f'<p class="note">The latest {len(summary.failures)}: {_text(told)}.</p><div class="scroll">{table}</div>'
+
+
+def _failure_row(event: RunEvent) -> str:
+    """Two rows: what and where, and below it the words of whoever saw it."""
+    what = "lease failed" if event.kind is EventKind.FAILED else "rollout given up"
+    at = time.strftime("%H:%M:%S", time.gmtime(event.at_s))
+    scene = event.bundle_digest.removeprefix("sha256:")[:8] or NONE
+    words = (at, what, event.code, str(event.attempt), event.rollout_id, event.worker_id or NONE, scene)
+    cells = "".join(f"<td>{_text(word)}</td>" for word in words)
+    message = f'<tr class="words"><td colspan="{len(words)}">{_text(event.message)}</td></tr>'
+    return f'<tr class="failure">{cells}</tr>{message}'
+
+
+def _row(cells: Iterable[str], *, figures: int) -> str:
+    """Cells of markup; those after the first are numbers, as many as ``figures``."""
+    return (
+        "<tr>"
+        + "".join(
+            f'<td class="n">{cell}</td>' if 0 < at <= figures else f"<td>{cell}</td>"
+            for at, cell in enumerate(cells)
+        )
+        + "</tr>"
+    )
+
+
+def _bar(share: float) -> str:
+    return f'<div class="share"><div class="bar"><i style="width:{100 * share:.1f}%"></i></div><span>{share:.0%}</span></div>'
+
+
+def _kept(summary: RunSummary, events: Sequence[RunEvent]) -> str:
+    if not summary.events_dropped:
+        return f"All {len(events):,} events of the run are kept."
+    return (
+        f"The latest {len(events):,} events are kept, {summary.events_dropped:,} earlier ones made room: slots at work are "
+        f"known for the end of the run only; everything else is of the whole run."
+    )
+
+
+def _text(words: str) -> str:
+    return html.escape(words)

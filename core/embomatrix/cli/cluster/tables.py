@@ -1,0 +1,155 @@
+"""What `embomatrix cluster` prints: tables for people, JSON for programs."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+from rich.measure import Measurement
+from rich.table import Table
+from rich.text import Text
+
+from embomatrix.rpc.run_log import EventKind, RunEvent
+from embomatrix.rpc.values import ResidentState, Warmth
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from embomatrix.rpc.values import PlanCell, RunInfo, WorkerInfo
+
+STATE_STYLES: Mapping[str, str] = {"ready": "green", "lost": "red", "quarantined": "red"}
+WARMTH_STYLES: Mapping[Warmth, str] = {
+    Warmth.WARM: "green",
+    Warmth.WARMING: "yellow",
+    Warmth.QUEUED: "dim",
+    Warmth.UNPLACEABLE: "red",
+}
+_BAD = frozenset((EventKind.FAILED, EventKind.WORKER_LOST, EventKind.SCENE_FAILED))
+
+
+def show(table: Table) -> None:
+    """Print a table whole: where the terminal is too narrow for its figures, lines wrap rather than lose them."""
+    console = Console()
+    least = Measurement.get(console, console.options.update(max_width=10_000), table).minimum
+    if least > console.width:
+        console = Console(width=least, soft_wrap=True)
+    console.print(table)
+
+
+def show_json(value: object) -> None:
+    """Print a value as JSON; dataclasses become objects."""
+    print(json.dumps(value, default=plain, ensure_ascii=False))
+
+
+def plain(value: object) -> Any:
+    """What JSON can hold of a value of ours."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    if isinstance(value, frozenset | set):
+        return sorted(value)
+    if hasattr(value, "items"):
+        return dict(value.items())
+    raise TypeError(f"{type(value).__name__} can't be told as JSON")
+
+
+def event_plain(event: RunEvent) -> dict[str, Any]:
+    """An event without what does not apply to it."""
+    return {name: value for name, value in event._asdict().items() if value or name == "sequence"}
+
+
+def worker_table(workers: Sequence[WorkerInfo]) -> Table:
+    table = _table(
+        "worker", "state", slots=1, busy=1, done=1, warm=1, **{"memory MB": 1, "silent s": 1, "why": 0}
+    )
+    for worker in workers:
+        warm = sum(resident.state is ResidentState.WARM for resident in worker.residents)
+        state = Text(worker.state, style=STATE_STYLES.get(worker.state, "yellow"))
+        table.add_row(
+            Text(worker.worker_id),
+            state,
+            str(worker.resources.slots),
+            str(worker.running),
+            str(worker.completed),
+            str(warm),
+            str(worker.resources.memory_mb),
+            f"{worker.last_seen_s:.1f}",
+            Text(worker.reason),
+        )
+    return table
+
+
+def run_table(runs: Sequence[RunInfo]) -> Table:
+    table = _table("run", "name", "state", **dict.fromkeys(("done", "open", "failed", "again", "late"), 1))
+    table.add_column("prewarm hits", justify="right", no_wrap=True)
+    table.add_column("wasted", justify="right", no_wrap=True)
+    for run in runs:
+        stats = run.stats
+        asked = stats.prewarm_hits + stats.prewarm_misses
+        counts = (stats.delivered, run.pending, stats.infra_failures, stats.redispatched, stats.stale_results)
+        table.add_row(
+            Text(run.run_id),
+            Text(run.name),
+            f"closed {_ago(run.closed_s)}" if run.closed_s else "open",
+            *map(str, counts),
+            f"{stats.prewarm_hits}/{asked}" if asked else "-",
+            str(stats.prewarm_wasted),
+        )
+    return table
+
+
+def plan_table(cells: Sequence[PlanCell]) -> Table:
+    """Steps down, the scenes that each needs beside it, coloured by how far they are."""
+    table = Table("run", "step", "scenes: rollouts, and who has them", box=None, padding=(0, 2, 0, 0))
+    rows: dict[tuple[str, int], Text] = {}
+    for cell in cells:
+        row = rows.setdefault((cell.run_id, cell.step), Text())
+        scene = cell.bundle_digest.removeprefix("sha256:")[:8]
+        where = f" on {', '.join(cell.worker_ids)}" if cell.worker_ids else ""
+        row.append(f"{scene}·{cell.count} {cell.warmth.value}{where}  ", style=WARMTH_STYLES[cell.warmth])
+    for (run_id, step), row in sorted(rows.items()):
+        table.add_row(Text(run_id), str(step), row)
+    return table
+
+
+def event_line(event: RunEvent) -> Text:
+    """One event in one line: when, what, and what it is about, as ``name=value``."""
+    at = time.strftime("%H:%M:%S", time.localtime(event.at_s)) + f".{int(event.at_s % 1 * 1000):03d}"
+    named = (
+        ("batch", event.batch_id),
+        ("rollout", event.rollout_id),
+        ("attempt", event.attempt),
+        ("worker", event.worker_id),
+        ("slot", event.slot),
+        ("scene", event.bundle_digest.removeprefix("sha256:")[:8]),
+        ("size", event.size),
+        ("code", event.code),
+    )
+    line = Text(f"{at} ", style="dim", no_wrap=True)
+    line.append(f"{event.kind.value:<14}", style="red" if event.kind in _BAD else "default")
+    line.append("".join(f" {name}={value}" for name, value in named if value), style="default")
+    if event.timings is not None:
+        line.append(f" execute={event.timings.execute_s * 1e3:.1f}ms", style="default")
+    return line.append(f" {event.message}" if event.message else "", style="default")
+
+
+def _table(*names: str, **figures: int) -> Table:
+    """``names`` are words, ``figures`` the further columns: 1 for a number, 0 for sentences, which alone may fold."""
+    table = Table(box=None, padding=(0, 2, 0, 0))
+    for name in names:
+        table.add_column(name, no_wrap=True)
+    for name, is_number in figures.items():
+        table.add_column(
+            name, justify="right" if is_number else "left", no_wrap=bool(is_number), overflow="fold"
+        )
+    return table
+
+
+def _ago(at_s: float) -> str:
+    seconds = max(0.0, time.time() - at_s)
+    for unit, length_s in (("d", 86400.0), ("h", 3600.0), ("min", 60.0)):
+        if seconds >= length_s:
+            return f"{seconds / length_s:.0f} {unit} ago"
+    return f"{seconds:.0f} s ago"

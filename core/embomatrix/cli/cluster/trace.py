@@ -1,0 +1,165 @@
+"""A run as a Chrome trace, for https://ui.perfetto.dev or chrome://tracing.
+
+The format is Google's "Trace Event Format": complete slices (X), flows (s, f), asynchronous slices (b, e), instants (i) and
+names (M); times are microseconds.
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import TYPE_CHECKING, Any, Final
+
+from embomatrix.cli.cluster.timeline import slot_spans
+from embomatrix.rpc.run_log import EventKind
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+    from embomatrix.cli.cluster.timeline import SlotKey, Span
+    from embomatrix.rpc.run_log import RunEvent
+
+MANAGER: Final = 1
+"""Process id of the manager's track; workers come after it."""
+SUBMISSION_US: Final = 1000.0
+"""A submission is a moment; it is drawn this long, so that there is something to click on."""
+
+TraceEvent = dict[str, Any]
+
+
+def chrome_trace(run: Sequence[RunEvent], fleet: Sequence[RunEvent], name: str) -> Mapping[str, Any]:
+    """The trace as a JSON value: one track for each slot, one for submissions, loading scenes beside the slots.
+
+    ``run`` are the events of a run, ``fleet`` those of workers and scenes; both in order.
+    """
+    spans = slot_spans(run)
+    workers = sorted({key.worker_id for key in spans})
+    processes = {worker_id: number for number, worker_id in enumerate(workers, MANAGER + 1)}
+    origin_s = min((event.at_s for event in run), default=0.0)
+    clock = _Clock(min([origin_s, *(track[0].begin_s - track[0].load_s for track in spans.values())]))
+    flows = _flow_ids(run)
+    events = [
+        *_names(name, processes, spans),
+        *_submissions(run, clock, flows),
+        *itertools.chain.from_iterable(
+            _track(processes[key.worker_id], key.slot, track, clock, flows) for key, track in spans.items()
+        ),
+        *_fleet(fleet, processes, clock),
+    ]
+    return {"traceEvents": events, "displayTimeUnit": "ms"}
+
+
+class _Clock:
+    """Microseconds from the first event."""
+
+    def __init__(self, origin_s: float) -> None:
+        self._origin_s = origin_s
+
+    def us(self, at_s: float) -> float:
+        return round((at_s - self._origin_s) * 1e6, 3)
+
+
+def _names(
+    name: str, processes: Mapping[str, int], spans: Mapping[SlotKey, Sequence[Span]]
+) -> Iterator[TraceEvent]:
+    yield _meta("process_name", MANAGER, 0, f"manager: {name}")
+    yield _meta("thread_name", MANAGER, 1, "submissions")
+    for worker_id, process in processes.items():
+        yield _meta("process_name", process, 0, f"worker {worker_id}")
+    for key in spans:
+        yield _meta("thread_name", processes[key.worker_id], key.slot, f"slot {key.slot}")
+
+
+def _meta(kind: str, process: int, thread: int, name: str) -> TraceEvent:
+    return {"ph": "M", "name": kind, "pid": process, "tid": thread, "args": {"name": name}}
+
+
+def _flow_ids(run: Sequence[RunEvent]) -> dict[tuple[str, str], int]:
+    """A number for each rollout that completed, by batch and rollout."""
+    done = [event for event in run if event.kind is EventKind.COMPLETED and event.slot]
+    return {(event.batch_id, event.rollout_id): event.sequence for event in done}
+
+
+def _submissions(
+    run: Sequence[RunEvent], clock: _Clock, flows: Mapping[tuple[str, str], int]
+) -> Iterator[TraceEvent]:
+    submitted = [event for event in run if event.kind is EventKind.SUBMITTED]
+    of_batch: dict[str, list[int]] = {}
+    for (batch_id, _), flow in flows.items():
+        of_batch.setdefault(batch_id, []).append(flow)
+    track = {"pid": MANAGER, "tid": 1}
+    for event, after in itertools.zip_longest(submitted, submitted[1:]):
+        begin = clock.us(event.at_s)
+        length = min(SUBMISSION_US, clock.us(after.at_s) - begin) if after is not None else SUBMISSION_US
+        told = {"batch": event.batch_id, "rollouts": event.size}
+        yield {"ph": "X", "name": f"submit {event.size}", "ts": begin, "dur": length, "args": told, **track}
+        for flow in of_batch.get(event.batch_id, ()):
+            yield {"ph": "s", "name": "rollout", "cat": "rollout", "id": flow, "ts": begin, **track}
+
+
+def _track(
+    process: int, slot: int, spans: Sequence[Span], clock: _Clock, flows: Mapping[tuple[str, str], int]
+) -> Iterator[TraceEvent]:
+    """What one slot did, gaps told apart: the result was on its way, nothing was to be done, the scene was loading."""
+    track = {"pid": process, "tid": slot}
+
+    def part(name: str, begin_s: float, end_s: float, told: TraceEvent) -> Iterator[TraceEvent]:
+        begin, end = clock.us(begin_s), clock.us(end_s)
+        if end > begin:
+            yield {"ph": "X", "name": name, "ts": begin, "dur": round(end - begin, 3), "args": told, **track}
+
+    free_s: float | None = None
+    arrived_s = 0.0
+    for span in spans:
+        begin_s = span.begin_s if free_s is None else max(free_s, span.begin_s)
+        loading_s = begin_s - span.load_s if free_s is None else max(free_s, begin_s - span.load_s)
+        if free_s is not None:
+            on_its_way_s = min(max(arrived_s, free_s), loading_s)
+            yield from part("deliver", free_s, on_its_way_s, {})
+            yield from part("idle", on_its_way_s, loading_s, {})
+        yield from part("load", loading_s, begin_s, {"scene": span.event.bundle_digest})
+        failed = span.event.kind is EventKind.FAILED
+        yield from part("failed" if failed else "execute", begin_s, span.end_s, _told(span.event))
+        flow = None if failed else flows.get((span.event.batch_id, span.event.rollout_id))
+        if flow is not None:
+            at = {"ts": clock.us(begin_s), **track}
+            yield {"ph": "f", "bp": "e", "name": "rollout", "cat": "rollout", "id": flow, **at}
+        free_s, arrived_s = span.end_s, span.event.at_s
+    if free_s is not None:
+        yield from part("deliver", free_s, max(free_s, arrived_s), {})
+
+
+def _told(event: RunEvent) -> TraceEvent:
+    told: TraceEvent = {
+        "rollout": event.rollout_id,
+        "batch": event.batch_id,
+        "attempt": event.attempt,
+        "scene": event.bundle_digest,
+    }
+    if event.timings is not None:
+        told["queue_ms"] = round(event.timings.queued_s * 1e3, 3)
+        told["lease_ms"] = round(event.timings.lease_s * 1e3, 3)
+        told["execute_ms"] = round(event.timings.execute_s * 1e3, 3)
+    return told | ({"code": event.code, "message": event.message} if event.code else {})
+
+
+def _fleet(fleet: Iterable[RunEvent], processes: Mapping[str, int], clock: _Clock) -> Iterator[TraceEvent]:
+    """Scenes that were loaded, and workers that came and went, since the run was opened."""
+    for event in fleet:
+        process = processes.get(event.worker_id)
+        if process is None or clock.us(event.at_s - event.held_s) < 0:
+            continue
+        at = {"pid": process, "tid": 0}
+        if event.kind is EventKind.SCENE_WARM:
+            scene = {"name": f"load {event.bundle_digest[7:15]}", "cat": "scene", "id": event.sequence, **at}
+            yield {"ph": "b", "ts": clock.us(event.at_s - event.held_s), **scene}
+            yield {"ph": "e", "ts": clock.us(event.at_s), **scene}
+        else:
+            told = {"message": event.message, "scene": event.bundle_digest}
+            yield {
+                "ph": "i",
+                "s": "p",
+                "name": event.kind.value,
+                "ts": clock.us(event.at_s),
+                "args": told,
+                **at,
+            }

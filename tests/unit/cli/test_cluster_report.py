@@ -1,0 +1,143 @@
+"""The report of a run as a file: whole, for itself, and the same for any theme."""
+
+import re
+from html.parser import HTMLParser
+
+from embomatrix.cli.cluster.report import report_page, seconds_text
+from embomatrix.rpc.run_log import (
+    EventKind,
+    Phase,
+    PhaseSummary,
+    RunEvent,
+    RunSeries,
+    RunSummary,
+    RunWorker,
+)
+from embomatrix.rpc.values import RunInfo, RunStats, Timings
+
+STATS = RunStats(
+    delivered=3, infra_failures=1, redispatched=2, prewarm_hits=9, prewarm_misses=1, prewarm_wasted=2
+)
+TIMINGS = Timings(queued_s=0.1, load_s=0.0, execute_s=0.5, lease_s=0.01)
+
+
+def summary(**changes):
+    found = PhaseSummary(3, 1.5, 0.5, 0.6, 0.7)
+    values = {
+        "run": RunInfo("r1", "<evening>", STATS, 0, 1_000.0, 1_060.0),
+        "phases": dict.fromkeys(Phase, found),
+        "workers": (RunWorker("office & lab", 3, 1, 1.5, 0.2),),
+        "series": RunSeries(0.25, (1, 2, 0), (0, 0, 1)),
+        "failures": (
+            RunEvent(9, 1_010.0, EventKind.FAILED, "r1", "b", "x9", "office", "sha256:0123456789", 1, 2,
+                     "slot_crashed", "no <mesh> of 3 \u00b5m"),
+        ),
+        "manager_cpu_s": 0.5,
+        "prewarm_lead": found,
+        "scene_load": PhaseSummary(),
+        "events_dropped": 0,
+        "version": "1.2",
+    }  # fmt: skip
+    return RunSummary(**{**values, **changes})
+
+
+EVENTS = tuple(
+    RunEvent(
+        n, 1_000.0 + n, EventKind.COMPLETED, "r1", "b", f"x{n}", "office", "s", 1, 1,
+        timings=TIMINGS, held_s=0.5,
+    )
+    for n in range(1, 4)
+)  # fmt: skip
+
+
+class Outline(HTMLParser):
+    """What a page asks for, and whether its elements are closed in order."""
+
+    VOID = frozenset(("meta", "link", "br"))
+
+    def __init__(self, page):
+        super().__init__()
+        self.open, self.asked, self.ids, self.scripts = [], [], [], 0
+        self.feed(page)
+
+    def handle_starttag(self, tag, attrs):
+        values = dict(attrs)
+        self.asked += [value for name, value in attrs if name in ("src", "href", "xlink:href", "action")]
+        self.ids += [values["id"]] if "id" in values else []
+        self.scripts += tag == "script"
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        self.handle_starttag(tag, attrs)
+        if tag not in self.VOID:
+            self.open.pop()
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def test_the_page_needs_nothing_but_itself():
+    page = report_page(summary(), EVENTS)
+    outline = Outline(page)
+    assert outline.open == []
+    assert outline.scripts == 0
+    assert all(asked.startswith(("#", "data:")) for asked in outline.asked)
+    assert not re.search(r"url\((?!#)|@import", page)
+    assert len(outline.ids) == len(set(outline.ids)), "an id stands twice"
+
+
+def test_what_people_wrote_is_text_and_never_markup():
+    page = report_page(summary(), EVENTS)
+    assert "&lt;evening&gt;" in page
+    assert "no &lt;mesh&gt; of 3 µm" in page
+    assert "office &amp; lab" in page
+    assert "<evening>" not in page
+
+
+def test_every_colour_of_a_chart_is_one_of_the_page():
+    page = report_page(summary(), EVENTS)
+    charts = re.findall(r"<svg.*?</svg>", page, flags=re.DOTALL)
+    assert len(charts) == 3
+    for chart in charts:
+        assert set(re.findall(r"#[0-9a-f]{6}\b", chart)) == set()
+        assert "var(--" in chart
+
+
+def test_figures_stand_on_the_page_as_they_were_counted():
+    words = re.sub(r"<[^>]*>", " ", report_page(summary(), EVENTS))
+    words = " ".join(words.split())
+    assert "Completed 3 1 failed, 2 leases given again" in words
+    assert "Prewarm hits 90 % 9 of 10 scenes" in words
+    assert "Manager overhead 25 %" in words
+    assert "lease failed slot_crashed 2 x9 office 01234567" in words
+    assert "All 3 events of the run are kept." in words
+
+
+def test_a_run_without_anything_has_a_report_all_the_same():
+    nothing = dict.fromkeys(Phase, PhaseSummary())
+    empty = summary(
+        run=RunInfo("r1", "", RunStats(), 0, 1_000.0),
+        phases=nothing,
+        workers=(),
+        failures=(),
+        series=RunSeries(0.25, (), ()),
+    )
+    page = report_page(empty, ())
+    assert Outline(page).open == []
+    assert "No worker has finished anything." in page
+    assert "None. Every lease that was given came back with a result." in page
+
+
+def test_a_log_that_dropped_events_says_so():
+    assert "1,234 earlier ones made room" in report_page(summary(events_dropped=1234), EVENTS)
+
+
+def test_durations_are_told_in_the_unit_that_suits_them():
+    assert [seconds_text(seconds) for seconds in (0.0, 3e-5, 0.0123, 4.2, 600.0)] == [
+        "0",
+        "30 µs",
+        "12.3 ms",
+        "4.2 s",
+        "10 min",
+    ]
