@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import logging
 import time
 from dataclasses import dataclass
@@ -34,6 +35,7 @@ from embomatrix.rpc.convert_run import (
     run_terms_to_proto,
 )
 from embomatrix.rpc.convert_session import run_info_from_proto, worker_info_from_proto
+from embomatrix.rpc.managers import Managers, of_the_leader
 from embomatrix.rpc.status import (
     DeadlineError,
     InternalError,
@@ -75,6 +77,8 @@ class ClientLimits:
     """For every rollout of a batch to have its outcome."""
     retry_first_s: float = 0.1
     retry_longest_s: float = 2.0
+    failover_s: float = 20.0
+    """For another manager to take over, where several were told."""
     """Wait before a broken stream is attached again: doubled from the first to the longest."""
 
 
@@ -84,26 +88,81 @@ _TRANSIENT: Final = (UnavailableError, InternalError, OverloadedError)
 """Errors after which the same batch is attached again rather than given up."""
 
 
+@dataclass(frozen=True)
+class _Link:
+    """A channel to one manager, and its services."""
+
+    channel: grpc.aio.Channel
+
+    @functools.cached_property
+    def rollouts(self) -> rollout_service_pb2_grpc.RolloutServiceAsyncStub:
+        return rollout_service_pb2_grpc.RolloutServiceStub(self.channel)
+
+    @functools.cached_property
+    def scenes(self) -> scene_service_pb2_grpc.SceneServiceAsyncStub:
+        return scene_service_pb2_grpc.SceneServiceStub(self.channel)
+
+    @functools.cached_property
+    def admin(self) -> admin_service_pb2_grpc.AdminServiceAsyncStub:
+        return admin_service_pb2_grpc.AdminServiceStub(self.channel)
+
+
 class ClusterClient:
-    """Async context manager over one channel to the manager. Every failure is a ``ClusterError``."""
+    """Async context manager over channels to the manager, or to several (``A:PORT,B:PORT``) of which one leads.
+
+    Every failure is a ``ClusterError``.
+    """
 
     def __init__(
         self, address: str = DEFAULT_ADDRESS, token: str = "", *, limits: ClientLimits = DEFAULT_LIMITS
     ) -> None:
-        self._address = address
+        self._managers = Managers(address)
         self._token = token
         self._limits = limits
+        self._links: dict[str, _Link] = {}
 
     async def __aenter__(self) -> Self:
-        self._channel = open_channel(self._address, self._token)
-        self._rollouts = rollout_service_pb2_grpc.RolloutServiceStub(self._channel)
-        self._scenes = scene_service_pb2_grpc.SceneServiceStub(self._channel)
-        self._admin = admin_service_pb2_grpc.AdminServiceStub(self._channel)
+        self._link()
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        await self._channel.close()
+        for link in self._links.values():
+            await link.channel.close()
 
+    @property
+    def managers(self) -> Managers:
+        """Whom this client turns to."""
+        return self._managers
+
+    @property
+    def patience_s(self) -> float:
+        """How long a call is tried anew with the other managers."""
+        return self._limits.failover_s
+
+    def _link(self) -> _Link:
+        address = self._managers.current
+        if address not in self._links:
+            # Links of managers that were left stay open: other calls may still be on them.
+            self._links[address] = _Link(open_channel(address, self._token))
+        return self._links[address]
+
+    @property
+    def _address(self) -> str:
+        return self._managers.current
+
+    @property
+    def _rollouts(self) -> rollout_service_pb2_grpc.RolloutServiceAsyncStub:
+        return self._link().rollouts
+
+    @property
+    def _scenes(self) -> scene_service_pb2_grpc.SceneServiceAsyncStub:
+        return self._link().scenes
+
+    @property
+    def _admin(self) -> admin_service_pb2_grpc.AdminServiceAsyncStub:
+        return self._link().admin
+
+    @of_the_leader
     async def open_run(self, name: str, run_id: str = "", terms: RunTerms = DEFAULT_TERMS) -> str:
         """Open a run, or attach to the one of this id, which keeps its terms; returns its id."""
         request = run_terms_to_proto(terms)
@@ -119,6 +178,7 @@ class ClusterClient:
         answers = await self.announce_window(run_id, version, entries)
         return {answer.bundle_digest: answer.warmth for answer in answers}
 
+    @of_the_leader
     async def announce_window(
         self, run_id: str, version: int, entries: Iterable[LookaheadEntry]
     ) -> tuple[LookaheadAnswer, ...]:
@@ -130,6 +190,7 @@ class ClusterClient:
             answer = await self._rollouts.AnnounceLookahead(request, timeout=self._limits.call_s)
             return each("answers", lookahead_answer_from_proto, answer.answers)
 
+    @of_the_leader
     async def put_bundles(self, bundles: Mapping[str, bytes]) -> tuple[str, ...]:
         """Give the manager the bundles (by digest) that it lacks; returns the digests that were sent."""
         request = scene_service_pb2.MissingBundlesRequest(bundle_digests=list(bundles))
@@ -163,7 +224,7 @@ class ClusterClient:
         attached = _AttachedBatch(batch, time.monotonic() + within_s)
         wait_s = self._limits.retry_first_s
         while attached.missing:
-            before = len(attached.missing)
+            before, cursor = len(attached.missing), attached.cursor
             try:
                 async with contextlib.aclosing(self._stream(attached)) as stream:
                     async for results, groups in stream:
@@ -172,8 +233,14 @@ class ClusterClient:
                         for group in attached.ended(groups):
                             yield group
                 attached.submitted = True
+                if attached.cursor == cursor:
+                    # The batch ended without what is missing: a store that lost its last second had delivered other
+                    # rollouts under the cursors that were read.
+                    attached.read_again()
             except _TRANSIENT as error:
                 logger.info("batch %s: attaching again after: %s", batch.batch_id, error)
+                if isinstance(error, UnavailableError):
+                    self._managers.move(error)
             except NotFoundError:
                 # The manager lost the batch, or never got it: the same id and content may be submitted again.
                 if not attached.submitted:
@@ -206,12 +273,14 @@ class ClusterClient:
         finally:
             call.cancel()
 
+    @of_the_leader
     async def cancel(self, run_id: str, batch_id: str) -> None:
         """Call a batch off: its rollouts that have no outcome yet end as ``Cancelled``."""
         request = rollout_service_pb2.CancelBatchRequest(run_id=run_id, batch_id=batch_id)
         with cluster_errors(self._address):
             await self._rollouts.CancelBatch(request, timeout=self._limits.call_s)
 
+    @of_the_leader
     async def close_run(self, run_id: str) -> RunStats:
         """End a run; the manager drops its results and look-ahead."""
         request = rollout_service_pb2.CloseRunRequest(run_id=run_id)
@@ -219,6 +288,7 @@ class ClusterClient:
             answer = await self._rollouts.CloseRun(request, timeout=self._limits.call_s)
             return inside("stats", run_stats_from_proto, answer.stats)
 
+    @of_the_leader
     async def list_workers(self) -> tuple[WorkerInfo, ...]:
         """The workers that the manager knows."""
         with cluster_errors(self._address):
@@ -226,6 +296,7 @@ class ClusterClient:
             answer = await self._admin.ListWorkers(request, timeout=self._limits.call_s)
             return each("workers", worker_info_from_proto, answer.workers)
 
+    @of_the_leader
     async def list_runs(self) -> tuple[RunInfo, ...]:
         """The runs that are open."""
         with cluster_errors(self._address):
@@ -233,6 +304,7 @@ class ClusterClient:
             answer = await self._admin.ListRuns(request, timeout=self._limits.call_s)
             return each("runs", run_info_from_proto, answer.runs)
 
+    @of_the_leader
     async def drain_worker(self, worker_id: str) -> None:
         """Ask a worker to finish what it runs and to leave."""
         request = admin_service_pb2.DrainWorkerRequest(worker_id=worker_id)
@@ -247,14 +319,14 @@ class _AttachedBatch:
         self.batch = batch
         self.missing = {rollout.rollout_id for rollout in batch.rollouts}
         self.submitted = False
-        self._cursor = 0
+        self.cursor = 0
         self._groups: set[str] = set()
         self._ends_s = ends_s
 
     def new(self, results: Sequence[RolloutResult]) -> Iterable[RolloutResult]:
         """Those results that were not seen before; a repeated one is not delivered twice."""
         for result in results:
-            self._cursor = max(self._cursor, result.cursor)
+            self.cursor = max(self.cursor, result.cursor)
             if result.rollout_id in self.missing:
                 self.missing.discard(result.rollout_id)
                 yield result
@@ -266,13 +338,17 @@ class _AttachedBatch:
                 self._groups.add(group.group_id)
                 yield group
 
+    def read_again(self) -> None:
+        """Read the results from the first one on."""
+        self.cursor = 0
+
     def forget_cursor(self) -> None:
         self.submitted = False
-        self._cursor = 0
+        self.cursor = 0
 
     def wait_request(self) -> rollout_service_pb2.WaitExecutionRequest:
         return rollout_service_pb2.WaitExecutionRequest(
-            run_id=self.batch.run_id, batch_id=self.batch.batch_id, after_cursor=self._cursor
+            run_id=self.batch.run_id, batch_id=self.batch.batch_id, after_cursor=self.cursor
         )
 
     def time_left(self, within_s: float) -> float:

@@ -45,7 +45,9 @@ EXPECTED: Final[Mapping[str, str]] = {
 }
 """What to say of a wrong value where the validator only knows a pattern."""
 
-Manager = Annotated[str, typer.Option(help="HOST:PORT of the manager.", envvar="EMBOMATRIX_MANAGER")]
+Manager = Annotated[
+    str, typer.Option(help="HOST:PORT of the manager, or of several: A,B.", envvar="EMBOMATRIX_MANAGER")
+]
 Token = Annotated[
     str, typer.Option(envvar="EMBOMATRIX_TOKEN", help="Join token, if the manager asks for one.")
 ]

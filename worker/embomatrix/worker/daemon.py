@@ -11,6 +11,7 @@ import time
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.rpc.managers import Managers
 from embomatrix.rpc.status import (
     ClusterError,
     DeadlineError,
@@ -62,6 +63,7 @@ class Daemon:
         self._settings = settings
         self._resources = resources
         self._boot_id = secrets.token_hex(8)
+        self._managers = Managers(settings.manager)
         self._backoff = Backoff(rng)
         self._outbox = Outbox()
         folder = settings.cache_dir.expanduser()
@@ -151,6 +153,7 @@ class Daemon:
             except _PASSING as error:
                 if self._settings.once:
                     raise
+                self._managers.move(error)
                 await self._wait_before_next(error)
 
     async def _wait_before_next(self, error: ClusterError) -> None:
@@ -169,21 +172,21 @@ class Daemon:
 
     async def _register(self) -> Registration:
         registration = await register(
-            self._settings.manager,
+            self._managers.current,
             self._settings.token,
             worker_id=self._settings.name,
             boot_id=self._boot_id,
             resources=self._resources,
         )
         logger.info(
-            "registered with the manager at %s session=%s", self._settings.manager, registration.session_id
+            "registered with the manager at %s session=%s", self._managers.current, registration.session_id
         )
         return registration
 
     async def _serve(self, registration: Registration) -> None:
         self._lease_ttl_s = registration.lease_ttl_s
         session = Session(
-            self._settings.manager,
+            self._managers.current,
             self._settings.token,
             registration,
             self._pool,

@@ -8,7 +8,9 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from embomatrix.rpc.channel import DEFAULT_ADDRESS, TOKEN_PATTERN, is_address
+from embomatrix.rpc.channel import DEFAULT_ADDRESS, TOKEN_PATTERN
+from embomatrix.rpc.managers import addresses_of
+from embomatrix.rpc.status import InvalidRequestError
 
 
 class WorkerSettings(BaseModel):
@@ -17,7 +19,7 @@ class WorkerSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     manager: str = DEFAULT_ADDRESS
-    """HOST:PORT of the manager; the worker dials out, nothing needs to reach it."""
+    """HOST:PORT of the manager, or of several with commas between; the worker dials out, nothing needs to reach it."""
     token: str = Field("", repr=False, pattern=TOKEN_PATTERN)
     """Join token; empty where the manager asks for none."""
     name: str = Field(default_factory=lambda: default_name(), pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")
@@ -42,8 +44,10 @@ class WorkerSettings(BaseModel):
     @field_validator("manager")
     @classmethod
     def _check_address(cls, value: str) -> str:
-        if not is_address(value):
-            raise ValueError("not HOST:PORT")
+        try:
+            addresses_of(value)
+        except InvalidRequestError as error:
+            raise ValueError("not HOST:PORT") from error
         return value
 
 

@@ -1,0 +1,87 @@
+"""Several managers of one cluster, of which one leads: where to turn to, and where next."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import time
+from typing import TYPE_CHECKING, Any, Concatenate, Final, ParamSpec, Protocol, TypeVar
+
+from embomatrix.rpc.channel import DEFAULT_ADDRESS, is_address
+from embomatrix.rpc.status import InvalidRequestError, StandbyError, UnavailableError
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Coroutine
+
+    from embomatrix.rpc.status import ClusterError
+
+PAUSE_S: Final = 0.2
+"""Between two calls of different managers."""
+P = ParamSpec("P")
+T = TypeVar("T")
+C = TypeVar("C", bound="Caller")
+
+
+def addresses_of(text: str) -> tuple[str, ...]:
+    """The managers in ``HOST:PORT,HOST:PORT``. Raises InvalidRequestError."""
+    addresses = tuple(dict.fromkeys(part.strip() for part in text.split(",")))
+    for address in addresses:
+        if not is_address(address):
+            raise InvalidRequestError(
+                f"{address!r} is no address of a manager: expected HOST:PORT, as in {DEFAULT_ADDRESS}, or several with "
+                "commas between them"
+            )
+    return addresses
+
+
+class Caller(Protocol):
+    """A client of several managers."""
+
+    @property
+    def managers(self) -> Managers: ...
+
+    @property
+    def patience_s(self) -> float: ...
+
+
+def of_the_leader(
+    method: Callable[Concatenate[C, P], Awaitable[T]],
+) -> Callable[Concatenate[C, P], Coroutine[Any, Any, T]]:
+    """A call that is made anew, of the next manager, while the present one can't serve and there are several."""
+
+    @functools.wraps(method)
+    async def ask(self: C, /, *args: P.args, **options: P.kwargs) -> T:
+        ends_s = time.monotonic() + self.patience_s
+        while True:
+            try:
+                return await method(self, *args, **options)
+            except UnavailableError as error:
+                if not self.managers.several or time.monotonic() >= ends_s:
+                    raise
+                self.managers.move(error)
+            await asyncio.sleep(PAUSE_S)
+
+    return ask
+
+
+class Managers:
+    """The addresses that a worker or trainer was told, one of them the present one."""
+
+    def __init__(self, text: str) -> None:
+        self._addresses = addresses_of(text)
+        self.current = self._addresses[0]
+
+    @property
+    def several(self) -> bool:
+        return len(self._addresses) > 1
+
+    def move(self, error: ClusterError) -> None:
+        """After a failed call: to the leader that the present manager named, else to the next in turn.
+
+        Only addresses that were told from the start count: nobody is led elsewhere with a token in the hand.
+        """
+        if isinstance(error, StandbyError) and error.leader in self._addresses:
+            self.current = error.leader
+            return
+        turn = self._addresses.index(self.current) + 1
+        self.current = self._addresses[turn % len(self._addresses)]
