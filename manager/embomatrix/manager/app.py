@@ -106,14 +106,14 @@ async def running(
             settings = settings.model_copy(update={"port": probe.getsockname()[1]})
         store = open_store(settings.state_url)
         stack.push_async_callback(store.close)
+        leadership = Leadership(store, _candidate(settings))
+        stack.push_async_callback(leadership.resign)
         standby = Standby()
         http = _HttpServer(standby.page(), http_socket)
         group = await stack.enter_async_context(_stopped_at_exit())
         group.create_task(http.serve())
-        leadership = Leadership(store, _candidate(settings))
         epoch = await _win(leadership, standby, settings, on_standby)
-        stack.push_async_callback(leadership.resign)
-        runtime = await _start_runtime(settings, store, bundles, epoch)
+        runtime = await _start_runtime(settings, store, bundles, leadership, epoch)
         server, port = await build_server(
             runtime,
             host=settings.host,
@@ -161,7 +161,7 @@ async def _win(
 
 
 async def _start_runtime(
-    settings: ManagerSettings, store: StateStore, bundles: BundleStore, epoch: int
+    settings: ManagerSettings, store: StateStore, bundles: BundleStore, leadership: Leadership, epoch: int
 ) -> ManagerRuntime:
     dispatch = DispatchLimits(
         lease_ttl_s=settings.lease_ttl_s,
@@ -183,7 +183,15 @@ async def _start_runtime(
     registry = Registry(liveness, first_epoch=first_epoch)
     cluster = ClusterState(dispatch, schedule, boot_id=secrets.token_hex(4), first_epoch=first_epoch)
     archive = RunArchive(settings.data_dir / "runs")
-    runtime = ManagerRuntime(cluster, registry, store, bundles, archive, results_ttl_s=settings.results_ttl_s)
+    runtime = ManagerRuntime(
+        cluster,
+        registry,
+        store,
+        bundles,
+        archive,
+        results_ttl_s=settings.results_ttl_s,
+        lapsed_s=leadership.lapsed_s,
+    )
     await runtime.start()
     return runtime
 

@@ -29,10 +29,9 @@ class Leadership:
         self._candidate = candidate
         self._renewed_s = -float("inf")
 
-    @property
-    def lapsed(self) -> bool:
-        """The lead could not be renewed in time: another manager may have it."""
-        return time.monotonic() - self._renewed_s >= self._candidate.ttl_s
+    def lapsed_s(self) -> float:
+        """For how long another manager may have had the lead, since this one could not renew it; 0 while it leads."""
+        return max(0.0, time.monotonic() - self._renewed_s - self._candidate.ttl_s)
 
     async def win(self, on_standby: Callable[[str], Awaitable[None]]) -> int:
         """Wait until this manager leads; returns its epoch. ``on_standby`` hears the address of whoever leads until then.

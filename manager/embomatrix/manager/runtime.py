@@ -29,10 +29,10 @@ from embomatrix.manager.links import WorkerLink
 from embomatrix.manager.meter import Meter
 from embomatrix.manager.results import ResultLogs
 from embomatrix.manager.runs import RunLimits, Runs
-from embomatrix.rpc.status import SupersededError
+from embomatrix.rpc.status import SupersededError, UnavailableError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from embomatrix.manager.archive import RunArchive
     from embomatrix.manager.bundles import BundleStore
@@ -40,17 +40,25 @@ if TYPE_CHECKING:
     from embomatrix.manager.links import WorkerCommand
     from embomatrix.manager.registry import Registry, Session
     from embomatrix.manager.store.protocol import StateStore
+    from embomatrix.rpc.status import ClusterError
     from embomatrix.rpc.values import LeaseResult, Resources, WorkerState
 
 logger = logging.getLogger(__name__)
 
 CLEANUP_S: Final = 5.0
+LET_GO_S: Final = 30.0
+"""A manager that is cut off from its store for so long has its workers turn to another. As long as a lease lives."""
+STORE_AWAY: Final = (
+    "the manager is cut off from its store, and another one may lead: try again, or try the others"
+)
+_SUSPENSION: Final = {True: ("suspended", "is away"), False: ("goes on", "is back")}
 
 
 class ManagerRuntime:
     """What the services call. ``start`` before the first call, ``serve`` for as long as it shall work.
 
-    Results are kept for ``results_ttl_s`` after their batch ended, and at most ``results_kept`` of them.
+    Results are kept for ``results_ttl_s`` after their batch ended, and at most ``results_kept`` of them. ``lapsed_s`` tells
+    for how long another manager may have had the lead: nothing is dispatched meanwhile.
     """
 
     def __init__(
@@ -64,6 +72,7 @@ class ManagerRuntime:
         limits: RunLimits | None = None,
         results_ttl_s: float = 3600.0,
         results_kept: int = 500_000,
+        lapsed_s: Callable[[], float] = lambda: 0.0,
     ) -> None:
         logs = ResultLogs(ttl_s=results_ttl_s, limit=results_kept)
         self.cluster = cluster
@@ -77,6 +86,9 @@ class ManagerRuntime:
         self._intake = Intake(cluster, registry)
         self._delivery = Delivery(store, logs, self._say, self.chronicle.in_log)
         self._links: dict[str, WorkerLink] = {}
+        self._lapsed_s = lapsed_s
+        self._suspended = False
+        self._paused = False
 
     async def start(self) -> None:
         """Take the state up where a former manager left it."""
@@ -91,6 +103,8 @@ class ManagerRuntime:
 
     def register(self, worker_id: str, boot_id: str, resources: Resources) -> tuple[Session, float]:
         """Open a session for a worker; returns it and the heartbeat's interval in seconds."""
+        if self._lapsed_s() > LET_GO_S:
+            raise UnavailableError(STORE_AWAY)
         session, commands = self._intake.register(worker_id, boot_id, resources, now_s=time.monotonic())
         self._close_link(worker_id)
         self.chronicle.fleet.joined(worker_id, resources, now_s=time.monotonic())
@@ -146,11 +160,17 @@ class ManagerRuntime:
 
     def pause_dispatch(self) -> None:
         """No new leases are given; what runs goes on."""
-        self._carry_out(self._intake.feed(DispatchPaused(), now_s=time.monotonic()))
+        self._paused = True
+        self._dispatch_or_not()
 
     def resume_dispatch(self) -> None:
-        """Leases are given again."""
-        self._carry_out(self._intake.feed(DispatchResumed(), now_s=time.monotonic()))
+        """Leases are given again, unless the store is away."""
+        self._paused = False
+        self._dispatch_or_not()
+
+    def _dispatch_or_not(self) -> None:
+        event = DispatchPaused() if self._paused or self._suspended else DispatchResumed()
+        self._carry_out(self._intake.feed(event, now_s=time.monotonic()))
 
     def _carry_out(self, commands: Sequence[Command]) -> None:
         now_s = time.monotonic()
@@ -176,14 +196,28 @@ class ManagerRuntime:
         if link is not None:
             link.put(command)
 
-    def _close_link(self, worker_id: str) -> None:
+    def _close_link(self, worker_id: str, reason: ClusterError | None = None) -> None:
         link = self._links.pop(worker_id, None)
         if link is not None:
-            link.close(SupersededError(f"another session of worker {worker_id} took over: stop this one"))
+            taken = f"another session of worker {worker_id} took over: stop this one"
+            link.close(reason or SupersededError(taken))
+
+    def _watch_the_lead(self) -> None:
+        """Dispatch nothing while another manager may; after some time leave the workers to it."""
+        lapsed_s = self._lapsed_s()
+        if (lapsed_s > 0.0) != self._suspended:
+            self._suspended = not self._suspended
+            logger.warning("dispatch %s: the store %s", *_SUSPENSION[self._suspended])
+            self._dispatch_or_not()
+        if lapsed_s > LET_GO_S:
+            for worker_id in list(self._links):
+                self.registry.detach(self._links[worker_id].session, now_s=time.monotonic())
+                self._close_link(worker_id, UnavailableError(STORE_AWAY))
 
     async def _keep_time(self) -> None:
         while True:
             await asyncio.sleep(TICK_S)
+            self._watch_the_lead()
             lost, commands = self._intake.tick(now_s=time.monotonic())
             for event in lost:
                 logger.warning("worker lost worker=%s: %s", event.worker_id, event.reason)
