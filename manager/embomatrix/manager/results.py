@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import bisect
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
@@ -16,7 +17,10 @@ LINGER_S: Final = 0.005
 
 
 class BatchLog:
-    """The results of one batch in the order of their cursors, which run from 1 without gaps."""
+    """The results of one batch in the order of their cursors.
+
+    These rise from 1, without gaps unless the store lost its last second: what was lost comes again under later ones.
+    """
 
     def __init__(
         self,
@@ -59,11 +63,24 @@ class BatchLog:
 
         The wait ends with the batch, whose rollouts have deadlines, or with the caller's own.
         """
-        while len(self.rows) <= cursor and not self.ended:
+        while self.last_cursor <= cursor and not self.ended:
             await self._changed.wait()
-        if len(self.rows) - cursor < PER_MESSAGE and not self.ended:
+        if self.last_cursor - cursor < PER_MESSAGE and not self.ended:
             await asyncio.sleep(LINGER_S)
-        return self.rows[cursor : cursor + PER_MESSAGE]
+        start = self._position(cursor)
+        return self.rows[start : start + PER_MESSAGE]
+
+    @property
+    def last_cursor(self) -> int:
+        """Of the newest result; 0 before the first."""
+        return self.rows[-1].cursor if self.rows else 0
+
+    def until(self, cursor: int) -> Sequence[ResultRow]:
+        """The results up to the cursor and with it."""
+        return self.rows[: self._position(cursor)]
+
+    def _position(self, cursor: int) -> int:
+        return bisect.bisect_right(self.rows, cursor, key=lambda row: row.cursor)
 
     def _wake(self) -> None:
         self._changed.set()

@@ -102,7 +102,9 @@ class Runs:
             for row in await self._store.batches(run.run_id):
                 batch = batch_of(row)
                 log = BatchLog(run.run_id, row.batch_id, row.digest, groups=group_sizes(batch))
-                while page := await self._store.results_after(run.run_id, row.batch_id, len(log.rows), PAGE):
+                while page := await self._store.results_after(
+                    run.run_id, row.batch_id, log.last_cursor, PAGE
+                ):
                     log.append(page)
                 self._logs.add(log)
                 delivered = {result.rollout_id: result.cursor for result in log.rows}

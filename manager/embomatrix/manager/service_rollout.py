@@ -83,10 +83,12 @@ async def _results(
     log: BatchLog, cursor: int
 ) -> AsyncIterator[tuple[list[types_pb2.RolloutResult], list[pb.GroupDone]]]:
     """All results beyond the cursor, as they come, to the end of the batch, and the groups that end with each."""
-    if cursor > len(log.rows) and log.ended:
-        raise TrimmedError(f"batch {log.batch_id!r} ends at cursor {len(log.rows)}: {cursor} lies beyond it")
+    if cursor > log.last_cursor and log.ended:
+        raise TrimmedError(
+            f"batch {log.batch_id!r} ends at cursor {log.last_cursor}: {cursor} lies beyond it"
+        )
     ends = GroupEnds(log.groups)
-    ends.take(_messages(log.rows[:cursor]))
+    ends.take(_messages(log.until(cursor)))
     while rows := await log.after(cursor):
         cursor = rows[-1].cursor
         results = _messages(rows)
