@@ -308,7 +308,7 @@ class Assignments:
             run.times.add(self.now_s - lease.started_s)
         run.counters.warm_starts += record.warm
         run.counters.cold_starts += not record.warm
-        self.fleet.workers[lease.worker_id].completed += 1
+        self.fleet.workers[lease.worker_id].note_completed(completed.timings.execute_s)
         timings = lease.timings(completed.timings, self.now_s)
         warm = record.warm and completed.warm
         self.finish(record, completed.noted(timings=timings, warm=warm))

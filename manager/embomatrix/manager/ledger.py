@@ -5,12 +5,20 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from enum import Enum, auto
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from embomatrix.rpc.values import RunStats, Timings
 
 if TYPE_CHECKING:
     from embomatrix.rpc.values import LeaseRef, Rollout
+
+
+AHEAD_S: Final = 0.025
+"""A worker holds leases for this long ahead: its slots go on while results and new leases travel many to a message."""
+BEHIND: Final = 24
+"""Leases that wait behind a slot at most, however fast it is."""
+PACE_WEIGHT: Final = 0.1
+"""Of the latest rollout in what a worker is taken to need for one."""
 
 
 class RolloutKey(NamedTuple):
@@ -99,7 +107,7 @@ class WorkerRecord:
     worker_id: str
     slots: int
     credits: int
-    """Leases it may hold: one per slot and one waiting behind each, so that a freed slot never waits for the network."""
+    """Leases it may hold: one for each slot, and behind it one that waits, or as many as it executes within ``AHEAD_S``."""
     warm: frozenset[str] = frozenset()
     held: dict[str, LeaseRecord] = field(default_factory=dict)
     reported: bool = False
@@ -114,6 +122,8 @@ class WorkerRecord:
     rendering: int = 0
     """Leases among ``held`` that need a slot which renders: no more than there are such slots."""
     completed: int = 0
+    pace_s: float = 0.0
+    """What it needs for one rollout, the latest ones before others."""
 
     @property
     def draining(self) -> bool:
@@ -138,6 +148,14 @@ class WorkerRecord:
     @property
     def busyness(self) -> float:
         return len(self.held) / self.slots
+
+    def note_completed(self, execute_s: float) -> None:
+        """It executed a rollout in so many seconds: how many it may hold follows its pace."""
+        weight = PACE_WEIGHT if self.completed else 1.0
+        self.completed += 1
+        self.pace_s += weight * (execute_s - self.pace_s)
+        behind = math.ceil(AHEAD_S / self.pace_s) if self.pace_s * BEHIND > AHEAD_S else BEHIND
+        self.credits = self.slots * (1 + behind)
 
     def takes(self, record: RolloutRecord, now_s: float) -> bool:
         """Whether this rollout may go here, as far as it is not a question of credits or of the scene."""

@@ -48,6 +48,8 @@ FETCH_S: Final = 30.0
 HEARTBEATS_MISSED: Final = 3
 """So many heartbeats in a row without an answer mean that the connection is dead."""
 RESULTS_PER_MESSAGE: Final = 64
+LINGER_S: Final = 0.01
+"""A message costs more than what it carries: results wait this long for others at most."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,6 +103,7 @@ class Session:
         self._draining = False
         self._state_due = False
         self._news = asyncio.Event()
+        self._lingering: asyncio.TimerHandle | None = None
         self._data_channel: grpc.aio.Channel | None = None
         self.attached = asyncio.Event()
         """Set once the manager was heard on the stream."""
@@ -108,8 +111,11 @@ class Session:
         """When a manager last renewed the leases, in this session or before it."""
 
     def tell(self) -> None:
-        """There are results to send."""
-        self._news.set()
+        """There are results to send: now, or gathered while earlier ones are under way or every slot has enough ahead."""
+        if not self._pool.ahead and not self._outbox.in_flight:
+            self._news.set()
+        elif self._lingering is None:
+            self._lingering = asyncio.get_running_loop().call_later(LINGER_S, self._news.set)
 
     def tell_state(self) -> None:
         """Residents changed: the state is due."""
@@ -137,6 +143,7 @@ class Session:
                     task.result()
             finally:
                 self._data_channel = None
+                self._linger_no_more()
                 for task in (beating, talking):
                     task.cancel()
                     with contextlib.suppress(asyncio.CancelledError, Exception):
@@ -187,12 +194,18 @@ class Session:
         while not self._drained():
             await self._news.wait()
             self._news.clear()
+            self._linger_no_more()
             while self._state_due or self._outbox.has_unsent:
                 results = self._outbox.take_unsent(RESULTS_PER_MESSAGE)
                 message = self._request(state=self._state() if self._state_due else None)
                 message.results.extend(lease_result_to_proto(result) for result in results)
                 self._state_due = False
                 yield message
+
+    def _linger_no_more(self) -> None:
+        if self._lingering is not None:
+            self._lingering.cancel()
+            self._lingering = None
 
     def _state(self) -> WorkerState:
         return WorkerState(self._pool.residents(), self._pool.held(), (), self._draining)
@@ -221,6 +234,8 @@ class Session:
             self._outbox.acknowledge(ref)
         for lease in each("leases", lease_from_proto, response.leases):
             self._pool.submit(lease)
+        if self._outbox.has_unsent:
+            self.tell()
         if self._drained():
             self._news.set()
 

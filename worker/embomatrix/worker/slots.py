@@ -32,6 +32,8 @@ ROLLOUTS_PER_SLOT: Final = 5_000
 GROWTH_MB: Final = 128.0
 """A slot's process is replaced after this many rollouts, or when it has grown by this much."""
 RETRY_CHECK_S: Final = 1.0
+AHEAD: Final = 2
+"""Leases that wait behind each slot while others are asked for."""
 
 
 @dataclass(slots=True, eq=False)
@@ -88,6 +90,11 @@ class SlotPool:
     def load(self) -> float:
         """Share of the slots that execute something, 0 to 1."""
         return 1.0 - len(self._free) / self._limits.slots
+
+    @property
+    def ahead(self) -> bool:
+        """Whether every slot executes something, and enough waits behind it until more can come."""
+        return not self._free and len(self._waiting) >= AHEAD * self._limits.slots
 
     @property
     def memory_used_mb(self) -> float:
