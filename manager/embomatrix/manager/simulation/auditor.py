@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections import Counter
+from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.commands import (
     AcknowledgeLease,
@@ -12,13 +13,17 @@ from embomatrix.manager.commands import (
     FinishBatch,
     GiveLease,
 )
-from embomatrix.rpc.values import Completed, InfraFailure, ResidentState
+from embomatrix.rpc.values import Completed, GroupPolicy, InfraFailure, ResidentState
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from embomatrix.manager.simulation.agenda import Agenda
     from embomatrix.rpc.values import Batch, LeaseRef, RolloutResult, WorkerState
+
+
+HEDGE_SHARE: Final = 0.05
+"""No more rollouts than this may have had two leases at once."""
 
 
 class BrokenInvariantError(Exception):
@@ -43,6 +48,9 @@ class Auditor:
         self._holders: dict[str, list[str]] = {}
         """Who has good leases of a rollout."""
         self.hedges = 0
+        self._policies: dict[str, GroupPolicy] = {}
+        self._lost_in: set[tuple[str, str]] = set()
+        """Groups and batches of which the infrastructure lost a rollout."""
         self._held_by: dict[str, dict[str, LeaseRef]] = {}
         """By worker: the good leases by rollout."""
         self._warm: dict[str, set[str]] = {}
@@ -58,6 +66,17 @@ class Auditor:
     @property
     def open_rollouts(self) -> int:
         return self.submitted - self.delivered
+
+    @property
+    def open_by_run(self) -> Counter[str]:
+        """Rollouts without an outcome."""
+        counts: Counter[str] = Counter()
+        for (run_id, _), left in self._open.items():
+            counts[run_id] += len(left)
+        return counts
+
+    def open_run(self, run_id: str, policy: GroupPolicy) -> None:
+        self._policies[run_id] = policy
 
     def submit(self, batch: Batch) -> None:
         key = batch.run_id, batch.batch_id
@@ -162,9 +181,16 @@ class Auditor:
         elif isinstance(outcome, InfraFailure):
             _check(not hasattr(outcome, "reward"), f"{rollout_id} failed and has a reward")
             self.infra_failures += 1
+            self._lost_in |= {(key[1], result.group_id), (key[1], "")}
+        else:
+            policy = self._policies.get(key[0], GroupPolicy.PARTIAL)
+            whole = "" if policy is GroupPolicy.FAIL_FAST else result.group_id
+            _check(policy is not GroupPolicy.PARTIAL, f"{rollout_id} was called off by nobody")
+            _check((key[1], whole) in self._lost_in, f"{rollout_id} was called off and nothing was lost")
 
     def _finish(self, key: tuple[str, str]) -> None:
         left = self._open.get(key)
+        _check(self.hedges <= HEDGE_SHARE * self.submitted, f"{self.hedges} hedges of {self.submitted}")
         _check(left is not None and not left, f"batch {key[1]} ended with {len(left or ())} rollouts open")
         self._open.pop(key)
 

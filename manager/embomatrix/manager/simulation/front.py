@@ -13,7 +13,7 @@ from embomatrix.manager.commands import (
     GiveLease,
     SetDesired,
 )
-from embomatrix.manager.events import BatchSubmitted, LookaheadAnnounced
+from embomatrix.manager.events import BatchSubmitted, LookaheadAnnounced, RunOpened
 from embomatrix.manager.intake import TICK_S, Heartbeat
 from embomatrix.rpc.values import Lease
 
@@ -28,11 +28,13 @@ if TYPE_CHECKING:
     from embomatrix.manager.simulation.gauge import Gauge
     from embomatrix.rpc.values import (
         Batch,
+        LeaseProgress,
         LeaseRef,
         LeaseResult,
         LookaheadEntry,
         Resources,
         RolloutResult,
+        RunTerms,
         WorkerState,
     )
 
@@ -122,18 +124,25 @@ class Front:
             commands = self._intake.report(session, state, results, resync=resync, now_s=self._agenda.now_s)
         self._carry_out(commands)
 
-    def heartbeat(self, session: Session, held: tuple[LeaseRef, ...]) -> float:
+    def heartbeat(
+        self, session: Session, held: tuple[LeaseRef, ...], progress: tuple[LeaseProgress, ...]
+    ) -> float:
         """Raises SupersededError."""
         with self._gauge.deciding("heartbeat"):
             interval_s, commands = self._intake.heartbeat(
-                session.session_id, session.epoch, Heartbeat(held), now_s=self._agenda.now_s
+                session.session_id,
+                session.epoch,
+                Heartbeat(held, progress=progress),
+                now_s=self._agenda.now_s,
             )
         self._carry_out(commands)
         return interval_s
 
-    def open_run(self, run_id: str, take: Callable[[Sequence[RolloutResult]], None]) -> None:
+    def open_run(self, run_id: str, terms: RunTerms, take: Callable[[Sequence[RolloutResult]], None]) -> None:
         """The run's results are handed to ``take`` as they come."""
         self._trainers[run_id] = take
+        self._auditor.open_run(run_id, terms.group_policy)
+        self._carry_out(self._intake.feed(RunOpened(run_id, terms), now_s=self._agenda.now_s))
 
     def announce(self, run_id: str, version: int, entries: tuple[LookaheadEntry, ...]) -> None:
         with self._gauge.deciding("look-ahead"):

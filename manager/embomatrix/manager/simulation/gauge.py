@@ -45,6 +45,8 @@ class Gauge:
         self.load_s = 0.0
         self.pressed: list[tuple[int, int]] = []
         """Executing and existing slots, while there is work for every slot."""
+        self.shared: Counter[str] = Counter()
+        """Executions of each run, summed over the moments at which every run wanted all slots."""
         self.died_s: dict[str, float] = {}
         """When each worker died last, until the manager knows."""
         self.detected_s: list[float] = []

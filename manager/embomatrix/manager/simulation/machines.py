@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -14,6 +15,9 @@ if TYPE_CHECKING:
 
 DURATIONS = 4096
 """Distinct execution times: rollouts take them in turn, which costs less than drawing one for each."""
+
+RENDER_MB = 2048
+"""Memory of the GPU for each slot that renders."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +49,13 @@ class Setting:
     machines: tuple[Machine, ...]
     scenes: dict[str, SceneSize]
     execute_s: tuple[float, ...]
+    lengths: dict[str, float]
+    """How many times longer the rollouts of each run take."""
+
+    def duration_s(self, rollout_id: str) -> float:
+        """Of this rollout's execution on a machine of speed 1: the same wherever it is executed."""
+        run_id = rollout_id.split(".", 1)[0]
+        return self.lengths[run_id] * self.execute_s[zlib.crc32(rollout_id.encode()) % len(self.execute_s)]
 
     @property
     def slots(self) -> int:
@@ -69,7 +80,8 @@ def setting_of(scenario: Scenario) -> Setting:
     }
     spread = np.exp(rng.normal(0.0, scenario.execute_spread, DURATIONS))
     durations = tuple(float(value) for value in scenario.execute_s * spread)
-    return Setting(_machines(scenario, rng), scenes, durations)
+    lengths = {trainer.name: trainer.length for trainer in scenario.trainers}
+    return Setting(_machines(scenario, rng), scenes, durations, lengths)
 
 
 def _machines(scenario: Scenario, rng: np.random.Generator) -> tuple[Machine, ...]:
@@ -89,7 +101,14 @@ def _machines(scenario: Scenario, rng: np.random.Generator) -> tuple[Machine, ..
             Machine(
                 worker_id=f"w{index:05d}",
                 kind=kind.name,
-                resources=Resources(kind.slots, kind.slots, kind.memory_mb, round(speed, 3)),
+                resources=Resources(
+                    kind.slots,
+                    kind.slots,
+                    kind.memory_mb,
+                    round(speed, 3),
+                    vram_mb=kind.render_slots * RENDER_MB,
+                    render_slots=kind.render_slots,
+                ),
                 speed=speed / scenario.faults.slowness if slow[index] else speed,
                 latency_s=kind.latency_s * float(rng.uniform(0.5, 2.0)),
                 bandwidth_mb_s=kind.bandwidth_mb_s,

@@ -68,6 +68,10 @@ class Report:
     """From a group's submission to the start of its first execution, the mean."""
     first_result_s: float
     """From the first submission of a run to its first result, the longest of all runs."""
+    groups_s: Mapping[str, tuple[float, ...]]
+    """From the submission of each group to its last result, by run."""
+    shares: Mapping[str, float]
+    """What each run had of the slots at work, while every run wanted all of them; empty if that never was."""
     costs: Mapping[str, Cost]
     counts: Mapping[str, int]
 
@@ -152,7 +156,17 @@ class Simulation:
         if warmed_up and self._auditor.open_rollouts >= self._setting.slots:
             at_work = sum(worker.slots.executing for worker in self.workers if worker.slots is not None)
             self._gauge.pressed.append((at_work, self._setting.slots))
+        if len(self._trainers) > 1:
+            self._look_at_shares()
         self.agenda.after(SAMPLE_S, self._look)
+
+    def _look_at_shares(self) -> None:
+        """Note what each run has of the slots while all of them want more than there are."""
+        wanted = self._auditor.open_by_run
+        if all(wanted[trainer.plan.name] >= 2 * self._setting.slots for trainer in self._trainers):
+            for worker in self.workers:
+                if worker.slots is not None:
+                    self._gauge.shared += worker.slots.executing_of()
 
     def _report(self) -> Report:
         for worker in self.workers:
@@ -186,6 +200,8 @@ class Simulation:
             orphaned_s=tuple(self._auditor.orphaned_s),
             start_latency_s=fmean(gauge.first_queued_s) if gauge.first_queued_s else 0.0,
             first_result_s=max(trainer.first_result_s for trainer in self._trainers),
+            groups_s={trainer.plan.name: tuple(trainer.groups_s) for trainer in self._trainers},
+            shares={run: count / gauge.shared.total() for run, count in sorted(gauge.shared.items())},
             costs=gauge.costs,
             counts=gauge.counts,
         )

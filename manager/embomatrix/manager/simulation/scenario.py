@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from embomatrix.manager.assignments import DispatchLimits
 from embomatrix.manager.registry import LivenessLimits
 from embomatrix.manager.scheduler import ScheduleLimits
+from embomatrix.rpc.values import RunTerms
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,6 +23,8 @@ class MachineKind:
     """One way between it and the manager."""
     bandwidth_mb_s: float
     """For bundles."""
+    render_slots: int = 0
+    """Slots of them that render."""
 
 
 LOCAL = MachineKind("server", 1.0, 8, 2048, 1.0, 0.0002, 100.0)
@@ -69,6 +72,11 @@ class Trainer:
     surprises: float = 0.0
     start_s: float = 5.0
     """When its first step begins; workers have joined by then."""
+    terms: RunTerms = field(default_factory=RunTerms)
+    length: float = 1.0
+    """How many times longer its rollouts take than the scenario's."""
+    render: bool = False
+    """Its rollouts need slots that render."""
 
     @property
     def rollouts(self) -> int:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import zlib
-from collections import deque
+from collections import Counter, deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -12,6 +11,7 @@ from embomatrix.rpc.values import (
     Completed,
     InfraCode,
     InfraFailure,
+    LeaseProgress,
     LeaseResult,
     Resident,
     ResidentState,
@@ -32,6 +32,7 @@ RETRY_LOAD_S: Final = 10.0
 """A scene that failed to load is tried again after this long, as the real worker does."""
 RESPAWN_S: Final = 0.02
 """A slot whose process was killed or crashed has a new one after this long."""
+STEP_S: Final = 0.1
 REWARD: Final = RewardBreakdown(0.5, 0.2, 15.0, (), False)
 
 
@@ -70,12 +71,26 @@ class SimulatedSlots:
         self._scenes: dict[str, _Scene] = {}
         self._waiting: deque[Lease] = deque()
         self._running: dict[LeaseRef, tuple[Lease, float]] = {}
+        self._stuck_s: dict[LeaseRef, float] = {}
+        """When executions that never end did their last step."""
         self._free = machine.resources.slots
         self._clock = 0
 
     @property
     def executing(self) -> int:
         return len(self._running)
+
+    def executing_of(self) -> Counter[str]:
+        """How many rollouts of each run it executes."""
+        return Counter(lease.rollout.rollout_id.split(".", 1)[0] for lease, _ in self._running.values())
+
+    def progress(self) -> tuple[LeaseProgress, ...]:
+        """Steps of what runs: one in each ``STEP_S``, until it hangs."""
+        now_s = self._around.agenda.now_s
+        return tuple(
+            LeaseProgress(ref, int((min(now_s, self._stuck_s.get(ref, now_s)) - began_s) / STEP_S))
+            for ref, (_, began_s) in self._running.items()
+        )
 
     def held(self) -> tuple[LeaseRef, ...]:
         """Leases that run or wait."""
@@ -215,14 +230,15 @@ class SimulatedSlots:
         began_s = around.agenda.now_s
         self._running[lease.ref] = lease, began_s
         rollout_id = lease.rollout.rollout_id
-        durations = around.setting.execute_s
-        seconds = durations[zlib.crc32(rollout_id.encode()) % len(durations)] / self._machine.speed
+        seconds = around.setting.duration_s(rollout_id) / self._machine.speed
         fate, crash, hang = around.dice.random(), around.faults.crash, around.faults.hang
         outcome: Completed | InfraFailure
         if fate < crash:
             seconds *= fate / crash
             outcome = InfraFailure(InfraCode.SLOT_CRASHED, "segmentation fault", self._machine.worker_id)
         elif fate < crash + hang or seconds > lease.deadline_s:
+            if fate < crash + hang:
+                self._stuck_s[lease.ref] = began_s + seconds * (fate - crash) / hang
             seconds = lease.deadline_s
             outcome = InfraFailure(InfraCode.SLOT_TIMEOUT, "killed", self._machine.worker_id)
         else:
@@ -243,6 +259,7 @@ class SimulatedSlots:
         self._start()
 
     def _leave(self, lease: Lease, began_s: float) -> None:
+        self._stuck_s.pop(lease.ref, None)
         self._around.gauge.busy_s += self._around.agenda.now_s - began_s
         scene = self._scenes.get(lease.rollout.bundle_digest)
         if scene is not None:

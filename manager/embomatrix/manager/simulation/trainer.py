@@ -37,6 +37,8 @@ class SimulatedTrainer:
         self.ended_s = 0.0
         self.warmed_up_s = plan.start_s
         """When its first step was over, which nobody could announce in time; where there is only one, when it began."""
+        self.groups_s: list[float] = []
+        """From the submission of each group to its last result."""
         self.waited_s = 0.0
         """Since then: from the last submission of each step to its last result."""
         self.first_result_s = math.inf
@@ -51,7 +53,9 @@ class SimulatedTrainer:
         self._warm: dict[str, bool] = {}
         self._began_s = math.inf
         self._sent_s = 0.0
-        front.open_run(plan.name, self._take)
+        self._open: dict[str, tuple[int, float]] = {}
+        """By group: results to come, and when it was sent."""
+        front.open_run(plan.name, plan.terms, self._take)
         agenda.after(plan.start_s, self._begin_step)
 
     @property
@@ -65,7 +69,9 @@ class SimulatedTrainer:
             for later in range(step + 1, min(step + plan.lookahead, plan.steps - 1) + 1)
         ]
         entries = tuple(
-            LookaheadEntry(at + 1, scene, plan.group_size) for at, scenes in window for scene in scenes
+            LookaheadEntry(at + 1, scene, plan.group_size, plan.render)
+            for at, scenes in window
+            for scene in scenes
         )
         self._agenda.after(plan.latency_s, lambda: self._front.announce(plan.name, step + 1, entries))
         self._left = plan.groups * plan.group_size
@@ -79,15 +85,21 @@ class SimulatedTrainer:
         name = f"{plan.name}.{step}.{group}"
         scene = self._actual[step][group]
         rollouts = tuple(
-            Rollout(f"{name}.{index}", name, scene, scene, (), step) for index in range(plan.group_size)
+            Rollout(f"{name}.{index}", name, scene, scene, (), step, plan.render)
+            for index in range(plan.group_size)
         )
         self._sent_s = self._agenda.now_s
+        self._open[name] = plan.group_size, self._sent_s
         self._began_s = min(self._began_s, self._sent_s)
         batch = Batch(plan.name, name, step + 1, rollouts)
         self._agenda.after(plan.latency_s, lambda: self._front.submit(batch))
 
     def _take(self, results: Sequence[RolloutResult]) -> None:
         for result in results:
+            left, sent_s = self._open[result.group_id]
+            self._open[result.group_id] = left - 1, sent_s
+            if left == 1:
+                self.groups_s.append(self._agenda.now_s - sent_s)
             if isinstance(result.outcome, Completed):
                 self._gauge.queued_s.append(result.outcome.timings.queued_s)
                 self._starts_s.setdefault(result.group_id, []).append(result.outcome.timings.queued_s)

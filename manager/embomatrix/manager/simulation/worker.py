@@ -161,7 +161,7 @@ class SimulatedWorker:
         session, slots = self._session, self.slots
         if stream is not self._stream or session is None or slots is None:
             return
-        held = slots.held()
+        held, progress = slots.held(), slots.progress()
 
         def renewed(interval_s: float) -> None:
             self._misses, self._renewed_s = 0, self._agenda.now_s
@@ -174,7 +174,7 @@ class SimulatedWorker:
             else:
                 self._beat(stream)
 
-        self._ask(lambda: self._front.heartbeat(session, held), renewed, ANSWER_S, missed)
+        self._ask(lambda: self._front.heartbeat(session, held, progress), renewed, ANSWER_S, missed)
 
     def _ask(
         self, call: Callable[[], _T], answered: Callable[[_T], None], limit_s: float, late: Callable[[], None]
