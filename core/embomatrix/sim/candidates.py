@@ -7,6 +7,8 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+import numpy as np
+
 from embomatrix.sim.bounds import IDENTITY, bounds_of
 from embomatrix.sim.spots import interior_around, is_under, surface_under
 from embomatrix.world.asset import SupportSurface
@@ -18,7 +20,7 @@ if TYPE_CHECKING:
 
     from embomatrix.sim.bounds import AssetBounds
     from embomatrix.world.asset import Asset
-    from embomatrix.world.geometry import Vec2, Vec3
+    from embomatrix.world.geometry import FloatArray, Vec2, Vec3
 
 GOLDEN: Final = (0.7548776662466927, 0.5698402909980532)
 """Steps of the R2 sequence: its first n points are spread over the square about as well as Poisson discs."""
@@ -101,17 +103,22 @@ def proposals(found: Sequence[Patch], shift: Vec2, tries: int) -> Iterator[tuple
     ``shift`` in the unit square moves the whole pattern: equal shifts give equal poses. Whether the relation holds there is
     not looked at.
     """
-    for patch, (x, y, z) in proposed_places(found, shift, tries):
+    for patch, (x, y, z) in zip(
+        itertools.cycle(found), proposed_places(found, shift, tries).tolist(), strict=False
+    ):
         yield patch, Pose.from_xyz_yaw(x, y, z, patch.yaw)
 
 
-def proposed_places(found: Sequence[Patch], shift: Vec2, tries: int) -> Iterator[tuple[Patch, Vec3]]:
-    """Positions of ``proposals``."""
-    (start_u, start_v), (step_u, step_v) = shift, GOLDEN
-    for number, patch in zip(range(1, tries + 1), itertools.cycle(found), strict=False):
-        u, v = (start_u + number * step_u) % 1.0, (start_v + number * step_v) % 1.0
-        x, y, z = patch.center_m
-        yield patch, (x + (2 * u - 1) * patch.room_m[0], y + (2 * v - 1) * patch.room_m[1], z)
+def proposed_places(found: Sequence[Patch], shift: Vec2, tries: int) -> FloatArray:
+    """Positions of ``proposals``, shape (n, 3): of all tries, unless there is no patch."""
+    if not found:
+        return np.zeros((0, 3))
+    rows = np.arange(tries) % len(found)
+    places = np.array([patch.center_m for patch in found])[rows]  # (n, 3)
+    rooms = np.array([patch.room_m for patch in found])[rows]  # (n, 2)
+    spread = (np.array(shift) + np.arange(1, tries + 1)[:, None] * np.array(GOLDEN)) % 1.0
+    places[:, :2] += (2 * spread - 1) * rooms
+    return places
 
 
 def candidates(held: Asset, support: Asset, relation: Relation, shift: Vec2, tries: int) -> Iterator[Pose]:

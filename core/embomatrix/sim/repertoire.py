@@ -5,8 +5,6 @@ from __future__ import annotations
 from itertools import cycle, islice
 from typing import TYPE_CHECKING, Final
 
-import numpy as np
-
 from embomatrix.sim.bounds import IDENTITY, bounds_of
 from embomatrix.sim.candidates import patches, proposed_places
 from embomatrix.sim.footprints import LEVEL_FLOOR, footprint_of, pose_box_asset
@@ -99,11 +97,14 @@ class Repertoire:
             middles = [Pose.from_xyz_yaw(*patch.center_m, patch.yaw) for patch in found]
             self._patches[key] = (found, PoseSet.of(pose_rows(middles), [patch.link for patch in found]))
         found, middle = self._patches[key]
-        points = [point for _, point in proposed_places(found, shift, tries)]
-        yaws = [patch.yaw for patch in islice(cycle(found), len(points))]
+        points = proposed_places(found, shift, tries)
         links = [patch.link for patch in islice(cycle(found), len(points))]
-        places = middle.repeated_at(np.array(points).reshape(-1, 3))
-        return Spots(lambda number: Pose.from_xyz_yaw(*points[number], yaws[number]), links, places)
+
+        def local(number: int) -> Pose:
+            x, y, z = points[number].tolist()
+            return Pose.from_xyz_yaw(x, y, z, found[number % len(found)].yaw)
+
+        return Spots(local, links, middle.repeated_at(points))
 
     def base(self, asset: Asset) -> Base | None:
         """What the asset stands on when it stands upright, as ``statics`` has it."""
