@@ -18,7 +18,7 @@ from embomatrix.factory.writer.tables import (
 from embomatrix.factory.writer.tasks import Draft, PlainWriter, is_heldout_signature, object_table
 from embomatrix.factory.writer.variant import Variant
 from embomatrix.factory.writer.view import SceneView, is_liftable
-from embomatrix.factory.writer.words import refer, room_words, sentence
+from embomatrix.factory.writer.words import Voice, refer, room_words, sentence
 from embomatrix.world.bddl import ROOM_TYPES, parse_formula
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.evaluate import objects_of
@@ -140,9 +140,9 @@ def test_table_brings_hosts_along_and_its_order_betrays_nothing(view: SceneView)
 
 
 def test_room_is_named_where_the_category_is_not_enough(view: SceneView) -> None:
-    words = {refer(view, "apple_1", np.random.default_rng(seed)) for seed in range(10)}
+    words = {refer(view, "apple_1", Voice(np.random.default_rng(seed))) for seed in range(10)}
     assert words == {"the apple in the kitchen"}
-    assert {refer(view, "bowl_1", np.random.default_rng(seed)) for seed in range(20)} == {
+    assert {refer(view, "bowl_1", Voice(np.random.default_rng(seed))) for seed in range(20)} == {
         "the bowl",
         "the bowl in the kitchen",
     }

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.social.chores import impossible_chore
-from embomatrix.factory.social.phrases import JOINS, MATTERS, QUESTIONS, TURNS, filled, pick
+from embomatrix.factory.social.phrases import JOINS, MATTERS, QUESTIONS, TURNS, filled
 from embomatrix.factory.social.values import ROBOT, Act, Conversation, Turn
 from embomatrix.factory.writer.goals import placed_elsewhere
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     from embomatrix.factory.social.values import Cast, DaySlot
     from embomatrix.factory.writer.goals import Piece, Workshop
+    from embomatrix.factory.writer.words import Voice
 
 REFUSED_SHARE: Final = 0.35
 AMENDED_SHARE: Final = 0.6
@@ -40,10 +41,11 @@ class Scenario:
 class GrammarConversation:
     """One conversation, turn by turn."""
 
-    def __init__(self, scenario: Scenario, shop: Workshop) -> None:
+    def __init__(self, scenario: Scenario, shop: Workshop, voice: Voice) -> None:
         self._scenario = scenario
         self._shop = shop
         self._rng = shop.rng
+        self._voice = voice
         self._turns: list[Turn] = []
 
     def run(self) -> Conversation:
@@ -68,9 +70,9 @@ class GrammarConversation:
         )
 
     def _open(self, first: Piece) -> None:
-        matter = filled(pick(MATTERS[first.kind], self._rng), thing=first.thing)
+        matter = filled(self._voice.choose(MATTERS[first.kind]), thing=first.thing)
         self._say(self._scenario.slot.person, Act.NEED, activity=self._scenario.slot.activity, matter=matter)
-        question = filled(pick(QUESTIONS[first.kind], self._rng), thing=first.thing)
+        question = filled(self._voice.choose(QUESTIONS[first.kind]), thing=first.thing)
         self._say(ROBOT, Act.CLARIFY, question=question)
 
     def _settle(self, first: Piece, earlier: Piece | None) -> str:
@@ -96,11 +98,13 @@ class GrammarConversation:
     def _joined(self, pieces: Sequence[Piece]) -> str:
         text = pieces[0].clause
         for piece in pieces[1:]:
-            text += pick(JOINS, self._rng) + piece.clause
+            text += self._voice.choose(JOINS) + piece.clause
         return text
 
     def _say(self, speaker: str, act: Act, **words: str) -> None:
-        self._turns.append(Turn(speaker=speaker, act=act, text=filled(pick(TURNS[act], self._rng), **words)))
+        self._turns.append(
+            Turn(speaker=speaker, act=act, text=filled(self._voice.choose(TURNS[act]), **words))
+        )
 
 
 def starting_slots(cast: Cast, rooms: Sequence[str], rng: np.random.Generator) -> list[DaySlot]:

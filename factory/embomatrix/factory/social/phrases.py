@@ -9,7 +9,6 @@ from embomatrix.factory.social.values import Act
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    import numpy as np
 
 CLAUSES: Final[Mapping[str, tuple[str, ...]]] = {
     "ontop": (
@@ -200,11 +199,18 @@ INSTRUCTIONS: Final = (
 )
 """The request as a robot is given it; every one names a person."""
 
-JOINS: Final = (", then ", ", and ", ", after that ", "; also ", ", and then ")
+JOINS: Final = (
+    ", then ",
+    ", and ",
+    ", after that ",
+    "; also ",
+    ", and then ",
+    ", and afterwards ",
+    "; when that is done, ",
+)
 
-
-def pick(options: tuple[str, ...], rng: np.random.Generator) -> str:
-    return options[int(rng.integers(len(options)))]
+WHERE: Final = ("in {room}", "over in {room}", "that is in {room}")
+"""Ways to say in which room a thing is."""
 
 
 def filled(template: str, **words: str) -> str:

@@ -4,28 +4,27 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from embomatrix.factory.social.phrases import INSTRUCTIONS, JOINS, filled, pick
+from embomatrix.factory.social.phrases import INSTRUCTIONS, JOINS, filled
 from embomatrix.factory.writer.words import room_words
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from embomatrix.factory.social.values import Cast, Conversation
     from embomatrix.factory.writer.view import SceneView
+    from embomatrix.factory.writer.words import Voice
 
 
-def instruction_of(conversation: Conversation, cast: Cast, view: SceneView, rng: np.random.Generator) -> str:
+def instruction_of(conversation: Conversation, cast: Cast, view: SceneView, voice: Voice) -> str:
     """One or two sentences. What the robot is to do are the conversation's last wishes, in their order."""
     slot = conversation.slot
     who = cast.of(slot.person)
     others = [person.name for person in cast.people if person.name != who.name]
     what = conversation.last_wishes[0]
     for clause in conversation.last_wishes[1:]:
-        what += pick(JOINS, rng) + clause
+        what += voice.choose(JOINS) + clause
     return filled(
-        pick(INSTRUCTIONS, rng),
+        voice.choose(INSTRUCTIONS),
         who=who.name,
-        other=others[int(rng.integers(len(others)))],
+        other=others[int(voice.rng.integers(len(others)))],
         what=what,
         activity=slot.activity,
         time=slot.time,

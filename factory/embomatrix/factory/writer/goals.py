@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.writer.tables import suits
-from embomatrix.factory.writer.words import PHRASES, phrase, refer, spoken
+from embomatrix.factory.writer.words import PHRASES, Voice, phrase, refer, spoken
 from embomatrix.world.goal import And, Atom, Exists, Formula, Not
 
 if TYPE_CHECKING:
@@ -42,7 +42,8 @@ class Piece:
 class Workshop:
     """What the makers of pieces draw from. ``used`` are objects that earlier pieces of the same goal are about.
 
-    ``phrases`` are the ways to ask for an atom, by predicate.
+    ``phrases`` are the ways to ask for an atom, by predicate, ``where`` those to say in which room a thing is; ``voice``
+    chooses among them, equally where none is given.
     """
 
     view: SceneView
@@ -50,10 +51,20 @@ class Workshop:
     rng: np.random.Generator
     used: frozenset[str] = frozenset()
     phrases: Mapping[str, tuple[str, ...]] = field(default_factory=lambda: PHRASES)
+    where: tuple[str, ...] = ("in {room}",)
+    voice: Voice | None = None
 
     def phrase(self, kind: str, *, thing: str, place: str = "") -> str:
         """One imperative clause."""
-        return phrase(self.phrases[kind], self.rng, thing=thing, place=place)
+        return phrase(self.phrases[kind], self._voice, thing=thing, place=place)
+
+    def refer(self, name: str) -> str:
+        """A noun phrase for an object."""
+        return refer(self.view, name, self._voice, self.where)
+
+    @property
+    def _voice(self) -> Voice:
+        return self.voice or Voice(self.rng)
 
     def pick(self, names: list[str]) -> str | None:
         fresh = [name for name in names if name not in self.used]
@@ -79,7 +90,7 @@ def place_piece(shop: Workshop) -> Piece | None:
     thing = shop.pick([name for name in shop.things() if not shop.view.is_basket(name)])
     if thing is None:
         return None
-    return _placed(shop, thing, refer(shop.view, thing, shop.rng))
+    return _placed(shop, thing, shop.refer(thing))
 
 
 def _placed(shop: Workshop, thing: str, called: str) -> Piece | None:
@@ -131,14 +142,14 @@ def _one_of(
     view = shop.view
     alike = view.alike(target)
     if len(alike) == 1:
-        return atom(target), {}, (target,), refer(view, target, shop.rng)
+        return atom(target), {}, (target,), shop.refer(target)
     synset = view.asset(target).synset
     variable = f"?{synset}"
     return (
         Exists(variable, synset, atom(variable)),
         {synset: alike},
         alike,
-        refer(view, target, shop.rng),
+        shop.refer(target),
     )
 
 
@@ -192,11 +203,11 @@ def thermal_piece(shop: Workshop) -> Piece | None:
 
 def _thermal(shop: Workshop, food: str, source: str, predicate: str) -> Piece:
     view, rng = shop.view, shop.rng
-    place = refer(view, source, rng)
+    place = shop.refer(source)
     goal: Formula = Atom(predicate, (food,))
     objects: tuple[str, ...] = (food,)
     signs: tuple[str, ...] = (f"{predicate}({view.category(food)})",)
-    called = refer(view, food, rng)
+    called = shop.refer(food)
     clause = shop.phrase(predicate, thing=called, place=place)
     if view.is_container(source) and len(view.alike(source)) == 1 and rng.random() < 0.35:
         goal = And((goal, Atom("inside", (food, source))))

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.world.bddl import is_room_instance
 
 if TYPE_CHECKING:
+    from collections import Counter
     from collections.abc import Mapping, Sequence
 
     import numpy as np
@@ -57,24 +58,48 @@ def room_words(view: SceneView, room: str) -> str:
     return f"the {spoken(stem)}" if types.count(stem) == 1 else room
 
 
-def refer(view: SceneView, name: str, rng: np.random.Generator) -> str:
+class Voice:
+    """Chooses among ways to say a thing: here, any with equal chance."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self.rng = rng
+
+    def choose(self, options: Sequence[str]) -> str:
+        return options[int(self.rng.integers(len(options)))] if len(options) > 1 else options[0]
+
+
+class FreshVoice(Voice):
+    """Says nothing twice while there is another way to say it."""
+
+    def __init__(self, rng: np.random.Generator, said: Counter[str]) -> None:
+        super().__init__(rng)
+        self._said = said
+
+    def choose(self, options: Sequence[str]) -> str:
+        least = min(self._said[option] for option in options)
+        chosen = super().choose([option for option in options if self._said[option] == least])
+        self._said[chosen] += 1
+        return chosen
+
+
+def refer(view: SceneView, name: str, voice: Voice, where: Sequence[str] = ("in {room}",)) -> str:
     """A noun phrase for an object, or for any of those of its category in its room.
 
-    The room is named where the category does not tell which one is meant.
+    The room is named, in one of the ways of ``where``, if the category does not tell which one is meant.
     """
     noun = spoken(view.category(name))
     article = "the" if len(view.alike(name)) == 1 else "an" if noun[0] in "aeiou" else "a"
     words = f"{article} {noun}"
     ambiguous = len(view.rooms_with(view.category(name))) > 1
-    if ambiguous or rng.random() < 0.35:
-        words += f" in {room_words(view, view.room(name))}"
+    if ambiguous or voice.rng.random() < 0.35:
+        words += " " + voice.choose(where).format(room=room_words(view, view.room(name)))
     return words
 
 
-def phrase(phrases: Sequence[str], rng: np.random.Generator, *, thing: str, place: str = "") -> str:
+def phrase(phrases: Sequence[str], voice: Voice, *, thing: str, place: str = "") -> str:
     """One imperative clause. Without a place, only phrases that name none."""
     options = [text for text in phrases if place or "{place}" not in text]
-    return options[int(rng.integers(len(options)))].format(thing=thing, place=place)
+    return voice.choose(options).format(thing=thing, place=place)
 
 
 def sentence(phrases: Sequence[str], rng: np.random.Generator) -> str:

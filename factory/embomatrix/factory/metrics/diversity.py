@@ -1,0 +1,152 @@
+"""How diverse instructions and goals are, without a judge: n-grams, entropies, near-duplicates, who is named.
+
+Every figure depends on how many instructions it is taken of: self-BLEU grows with them. Compare sets of equal size.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
+
+NEAR: Final = 0.9
+"""Cosine of two instructions above which one counts as a copy of the other."""
+SMOOTHING: Final = 0.1
+"""Stands for a count of 0 among n-grams: method 1 of Chen and Cherry (2014)."""
+_WORD: Final = re.compile(r"[a-z0-9]+(?:'[a-z]+)?")
+
+Words = tuple[str, ...]
+
+
+def words_of(text: str) -> Words:
+    """Lower-case words; an underscore parts them."""
+    return tuple(_WORD.findall(text.lower().replace("_", " ")))
+
+
+def distinct(texts: Sequence[Words], n: int) -> float:
+    """Different n-grams over all n-grams (Li et al. 2016); 0 where there are none."""
+    grams = [gram for words in texts for gram in _grams(words, n)]
+    return len(set(grams)) / len(grams) if grams else 0.0
+
+
+def self_bleu(texts: Sequence[Words], n: int = 4) -> float:
+    """Mean BLEU of each text against all others (Zhu et al. 2018): 1 for copies, towards 0 for texts with nothing in common."""
+    if len(texts) < 2:
+        return 0.0
+    scores = [
+        bleu(words, [other for at, other in enumerate(texts) if at != number], n)
+        for number, words in enumerate(texts)
+    ]
+    return sum(scores) / len(scores)
+
+
+def bleu(words: Words, references: Sequence[Words], n: int = 4) -> float:
+    """Geometric mean of the clipped precisions of 1- to n-grams, with the brevity penalty (Papineni et al. 2002)."""
+    logs = []
+    for size in range(1, n + 1):
+        counts = Counter(_grams(words, size))
+        if not counts:
+            break
+        most: Counter[Words] = Counter()
+        for reference in references:
+            most |= Counter(_grams(reference, size))
+        matched = sum(min(count, most[gram]) for gram, count in counts.items())
+        logs.append(math.log((matched or SMOOTHING) / counts.total()))
+    if not logs:
+        return 0.0
+    nearest = min(
+        (len(reference) for reference in references), key=lambda size: (abs(size - len(words)), size)
+    )
+    penalty = min(0.0, 1.0 - nearest / len(words))
+    return math.exp(penalty + sum(logs) / len(logs))
+
+
+def normalised_entropy(values: Collection[Hashable]) -> float:
+    """Shannon entropy of how often each value comes up, over the largest possible: the logarithm of how many there are."""
+    if len(values) < 2:
+        return 0.0
+    shares = [count / len(values) for count in Counter(values).values()]
+    return -sum(share * math.log(share) for share in shares) / math.log(len(values))
+
+
+def near_duplicates(texts: Sequence[Words], near: float = NEAR) -> float:
+    """Share of texts that an earlier one resembles, by the cosine of TF-IDF weights of words and pairs of words."""
+    vectors = _weighted(texts)
+    copies = sum(
+        any(_cosine(vector, earlier) > near for earlier in vectors[:number])
+        for number, vector in enumerate(vectors)
+    )
+    return copies / len(texts) if texts else 0.0
+
+
+def named_share(texts: Iterable[str], names: Collection[str]) -> float:
+    """Share of texts that name somebody."""
+    known = re.compile(rf"\b(?:{'|'.join(map(re.escape, names))})\b") if names else None
+    found = [bool(known and known.search(text)) for text in texts]
+    return sum(found) / len(found) if found else 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Diversity:
+    """Figures over groups of instructions, a base scene's each; means over the groups but for what concerns all of them.
+
+    ``signature_entropy`` and ``verb_entropy`` are over all tasks; ``group`` is the number of instructions of a group.
+    """
+
+    groups: int
+    group: float
+    self_bleu4: float
+    distinct_1: float
+    distinct_2: float
+    near_duplicate_rate: float
+    named_share: float
+    signature_entropy: float
+    verb_entropy: float
+    words: float
+
+
+def diversity(
+    instructions: Mapping[str, Sequence[str]], signatures: Sequence[str], names: Collection[str]
+) -> Diversity:
+    """Measure instructions by base scene; ``signatures`` are the goals' kinds, ``names`` those of everybody."""
+    groups = [[words_of(text) for text in texts] for texts in instructions.values() if texts]
+    texts = [text for found in instructions.values() for text in found]
+    every = [words for group in groups for words in group]
+    return Diversity(
+        groups=len(groups),
+        group=_mean([len(group) for group in groups]),
+        self_bleu4=_mean([self_bleu(group) for group in groups]),
+        distinct_1=_mean([distinct(group, 1) for group in groups]),
+        distinct_2=_mean([distinct(group, 2) for group in groups]),
+        near_duplicate_rate=_mean([near_duplicates(group) for group in groups]),
+        named_share=named_share(texts, names),
+        signature_entropy=normalised_entropy(signatures),
+        verb_entropy=normalised_entropy([words[0] for words in every if words]),
+        words=_mean([len(words) for words in every]),
+    )
+
+
+def _grams(words: Words, n: int) -> list[Words]:
+    return [words[at : at + n] for at in range(len(words) - n + 1)]
+
+
+def _weighted(texts: Sequence[Words]) -> list[dict[Words, float]]:
+    counts = [Counter([*_grams(words, 1), *_grams(words, 2)]) for words in texts]
+    seen: Counter[Words] = Counter(gram for count in counts for gram in count)
+    rarity = {gram: math.log((1 + len(texts)) / (1 + number)) + 1 for gram, number in seen.items()}
+    return [{gram: number * rarity[gram] for gram, number in count.items()} for count in counts]
+
+
+def _cosine(one: Mapping[Words, float], other: Mapping[Words, float]) -> float:
+    shared = sum(weight * other.get(gram, 0.0) for gram, weight in one.items())
+    length = math.sqrt(sum(w * w for w in one.values()) * sum(w * w for w in other.values()))
+    return shared / length if length else 0.0
+
+
+def _mean(values: Sequence[float]) -> float:
+    return float(sum(values) / len(values)) if values else 0.0
