@@ -347,7 +347,7 @@ async def test_the_status_page_tells_what_happens(tmp_path):
             steps = (await http.get("/api/lookahead")).json()
             assert [step["step"] for step in steps] == [5, 6]
             assert steps[0]["cells"][0]["warmth"] == "warm"
-            assert 'embo_rollouts_total{outcome="completed"} 10' in (await http.get("/metrics")).text
+            assert 'embo_rollouts_total{outcome="completed"} 10.0' in (await http.get("/metrics")).text
             assert "<html" in (await http.get("/")).text
             stranger = await http.get("/api/overview", headers={"host": "evil.example"})
             assert stranger.status_code == 400

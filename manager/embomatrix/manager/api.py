@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 
 from fastapi import APIRouter, Depends, FastAPI, Header, HTTPException
 from fastapi.middleware.trustedhost import TrustedHostMiddleware
-from fastapi.responses import HTMLResponse, JSONResponse, PlainTextResponse
+from fastapi.responses import HTMLResponse, JSONResponse, Response
 
 from embomatrix.manager import views
-from embomatrix.manager.prometheus import metrics_page
+from embomatrix.manager.prometheus import CONTENT_TYPE, metrics_page
 from embomatrix.manager.service_auth import token_fits
 from embomatrix.manager.settings import is_loopback
 
@@ -63,9 +63,9 @@ def _figures(runtime: ManagerRuntime) -> APIRouter:
     async def lookahead() -> JSONResponse:
         return _rows(views.lookahead(runtime))
 
-    @router.get("/metrics", response_class=PlainTextResponse)
-    async def metrics() -> str:
-        return metrics_page(runtime)
+    @router.get("/metrics")
+    async def metrics() -> Response:
+        return Response(metrics_page(runtime), media_type=CONTENT_TYPE)
 
     return router
 

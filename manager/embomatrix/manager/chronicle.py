@@ -55,6 +55,12 @@ class Chronicle:
         self.fleet = FleetLog(self._sequences, epoch_s=epoch_s)
         self.attempts: Counter[int] = Counter()
         """Rollouts by the attempt that brought their outcome."""
+        self.execute_s = 0.0
+        """Seconds that slots worked for results."""
+        self.hedges_won = 0
+        """Results of second leases that came while the first was still good."""
+        self.dropped = 0
+        """Events that logs of runs which are closed by now had dropped."""
         self._runs: dict[str, RunRecord] = {}
         self._closed: dict[Phase, Histogram] = {phase: Histogram() for phase in Phase}
 
@@ -89,6 +95,7 @@ class Chronicle:
         self._note(EventKind.RUN_CLOSED, run_id, now_s=now_s)
         run = self._runs.pop(run_id, None)
         if run is not None:
+            self.dropped += run.ring.dropped
             for phase, histogram in run.figures.phases.items():
                 self._closed[phase].add(histogram)
         return run
@@ -135,6 +142,7 @@ class Chronicle:
         match result.outcome:
             case Completed(timings=timings):
                 self.attempts[result.attempt] += 1
+                self.execute_s += timings.execute_s
                 run.figures.completed(timings, now_s)
             case InfraFailure(code, message, worker_id):
                 self.attempts[result.attempt] += 1
@@ -164,6 +172,7 @@ class Chronicle:
             worker.completed += 1
             worker.execute_s += timings.execute_s
             worker.load_s += timings.load_s
+            self.hedges_won += len(record.leases) > 1 and record.leases[-1] is lease
         else:
             code, message = result.outcome.code.value, result.outcome.message[:MESSAGE_CHARS]
             worker.failed += 1

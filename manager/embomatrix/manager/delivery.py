@@ -30,7 +30,8 @@ class Delivery:
     """Owns the way of results. What a trainer saw, a restarted manager knows, so no cursor is ever given twice.
 
     A worker hears that it may forget a result (``acknowledge``) only after the store has it: until then it is not lost
-    with the manager. ``on_logged`` is told of each run whose results are in their log, and how many seconds each took.
+    with the manager. ``on_logged`` is told of each run whose results are in their log, and how many seconds each of the
+    completed took.
     """
 
     def __init__(
@@ -105,7 +106,8 @@ class Delivery:
                 for row, (result, arrived_s) in zip(rows, results, strict=True)
             ]
         )
-        self._on_logged(log.run_id, [now_s - arrived_s for _, arrived_s in results])
+        completed = (at_s for result, at_s in results if isinstance(result.outcome, Completed))
+        self._on_logged(log.run_id, [now_s - arrived_s for arrived_s in completed])
         if any(isinstance(entry.command, FinishBatch) for entry in ended):
             log.finish(now_s)
 

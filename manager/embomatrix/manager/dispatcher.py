@@ -149,6 +149,11 @@ class Dispatcher:
         return len(self._desk.pending) + self._recovery.waiting
 
     @property
+    def expired(self) -> int:
+        """Leases whose time was up, so far."""
+        return self._desk.leases.expired
+
+    @property
     def live_leases(self) -> Mapping[str, LeaseRecord]:
         return self._desk.leases.live
 

@@ -39,6 +39,8 @@ class LeaseBook:
         first_epoch: int = 1,
     ) -> None:
         self.live: dict[str, LeaseRecord] = {}
+        self.expired = 0
+        """Leases whose time was up, so far."""
         self.in_use: Counter[tuple[str, str]] = Counter()
         """Live leases by (worker, scene)."""
         self._used: set[tuple[str, str]] = set()
@@ -142,6 +144,7 @@ class LeaseBook:
                 heapq.heappush(self._due, (lease.due_s, epoch, lease))
             else:
                 late.append(lease)
+        self.expired += len(late)
         return late
 
     def take_used(self) -> frozenset[tuple[str, str]]:

@@ -22,6 +22,7 @@ from embomatrix.manager.commands import (
     SetDesired,
 )
 from embomatrix.manager.delivery import Delivery
+from embomatrix.manager.effort import Effort
 from embomatrix.manager.events import DispatchPaused, DispatchResumed
 from embomatrix.manager.history import RunHistory
 from embomatrix.manager.intake import TICK_S, Heartbeat, Intake
@@ -29,6 +30,7 @@ from embomatrix.manager.links import WorkerLink
 from embomatrix.manager.meter import Meter
 from embomatrix.manager.results import ResultLogs
 from embomatrix.manager.runs import RunLimits, Runs
+from embomatrix.manager.store.timed import timed_store
 from embomatrix.rpc.status import SupersededError, UnavailableError
 
 if TYPE_CHECKING:
@@ -79,6 +81,8 @@ class ManagerRuntime:
         self.registry = registry
         self.bundles = bundles
         self.meter = Meter()
+        self.effort = Effort()
+        store = timed_store(store, self.effort.operated)
         self.started_s = time.monotonic()
         self.chronicle = Chronicle(epoch_s=time.time() - self.started_s)
         self.history = RunHistory(self.chronicle, archive, cluster)
@@ -216,7 +220,9 @@ class ManagerRuntime:
 
     async def _keep_time(self) -> None:
         while True:
+            due_s = time.monotonic() + TICK_S
             await asyncio.sleep(TICK_S)
+            self.effort.lag.observe(time.monotonic() - due_s)
             self._watch_the_lead()
             lost, commands = self._intake.tick(now_s=time.monotonic())
             for event in lost:
@@ -227,6 +233,7 @@ class ManagerRuntime:
 
     async def _clean_up(self) -> None:
         while True:
+            self.effort.sample(time.monotonic(), time.process_time(), self.chronicle.execute_s)
             await asyncio.sleep(CLEANUP_S)
             await self._delivery.give_up_outdated(time.monotonic())
             await self.runs.close_idle(time.monotonic())

@@ -1,0 +1,64 @@
+"""The table of metrics in the operator's guide is the code's."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from embomatrix.manager.archive import RunArchive
+from embomatrix.manager.bundles import BundleStore
+from embomatrix.manager.cluster_state import ClusterState
+from embomatrix.manager.effort import Effort
+from embomatrix.manager.prometheus import metrics_page
+from embomatrix.manager.registry import LivenessLimits, Registry
+from embomatrix.manager.runtime import ManagerRuntime
+from embomatrix.manager.store.memory import MemoryStore
+from embomatrix.manager.store.timed import timed_store
+
+GUIDE = Path(__file__).parents[3] / "docs" / "operations.md"
+OWN = re.compile(r"# (?:HELP|TYPE) (embo_\w+)")
+
+
+@pytest.fixture
+async def page(tmp_path):
+    bundles = BundleStore(tmp_path / "bundles", limit_bytes=1, total_bytes=1)
+    cluster, registry = ClusterState(boot_id="boot"), Registry(LivenessLimits())
+    runtime = ManagerRuntime(cluster, registry, MemoryStore(), bundles, RunArchive(tmp_path / "runs"))
+    await runtime.start()
+    return metrics_page(runtime)
+
+
+async def test_every_metric_stands_in_the_guide_with_its_labels_and_no_other(page):
+    found = re.findall(
+        r"^\| `(embo_\w+)` \|([^|]*)\| [^|]+\| [^|]+ \|$", GUIDE.read_text(), flags=re.MULTILINE
+    )
+    assert [name for name, _ in found] == list(dict.fromkeys(OWN.findall(page)))
+    for name, labels in found:
+        samples = re.findall(rf"^{name}(?:_bucket|_count|_sum)?\{{([^}}]*)\}}", page, flags=re.MULTILINE)
+        names = {label for sample in samples for label in re.findall(r'(\w+)="', sample)} - {"le"}
+        assert names == set(re.findall(r"`(\w+)`", labels)), name
+
+
+async def test_every_state_and_outcome_is_told_before_it_first_happens(page):
+    assert 'embo_slots{state="quarantined"} 0.0' in page
+    assert 'embo_rollouts_total{outcome="slot_crashed"} 0.0' in page
+    assert 'embo_hedges_total{won="true"} 0.0' in page
+
+
+def test_overhead_is_of_the_last_minute():
+    effort = Effort()
+    effort.sample(0.0, 0.0, 0.0)
+    assert effort.overhead() == 0.0
+    effort.sample(10.0, 9.0, 1.0)
+    assert effort.overhead() == 0.9
+    for second in range(20, 200, 10):
+        effort.sample(second, 9.0 + second / 10, 1.0 + second * 0.9)
+    assert effort.overhead() == pytest.approx(0.1)
+
+
+async def test_a_store_is_timed_by_operation_and_otherwise_the_same():
+    took = []
+    store = timed_store(MemoryStore(), lambda name, seconds: took.append((name, seconds >= 0.0)))
+    assert await store.runs() == []
+    assert await store.credentials() == []
+    assert took == [("runs", True), ("credentials", True)]
