@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -12,6 +13,7 @@ from embomatrix.worker.bench_cluster import ClusterLoad
 from embomatrix.worker.bench_cluster_parts import ClusterJob, ClusterPart, bench_cluster_parts
 from embomatrix.worker.bench_figures import BenchResult, commit_here, describe_machine
 from embomatrix.worker.bench_output import console, errors, hand_in, refusals
+from embomatrix.worker.bench_peers import Peer
 from embomatrix.worker.bench_prewarm import PrewarmSizes
 from embomatrix.worker.bench_simulation import bench_simulation
 from embomatrix.worker.bench_workload import PINNED
@@ -34,6 +36,9 @@ LimitS = Annotated[
 Parts = Annotated[
     list[ClusterPart] | None, typer.Option("--part", help="What to measure; may be repeated. [default: all]")
 ]
+Peers = Annotated[
+    list[Peer] | None, typer.Option("--peer", help="Whom to compare with; may be repeated. [default: all]")
+]
 Naive = Annotated[int, typer.Option(min=1, help="Rollouts of the ablation's first row: seconds each.")]
 
 
@@ -44,6 +49,7 @@ def cluster(
     json_file: Json = None,
     part: Parts = None,
     naive: Naive = NAIVE,
+    peer: Peers = None,
     workers: Annotated[int, typer.Option(min=1, max=64, help="Worker daemons of the phases.")] = 2,
     slots: Annotated[int, typer.Option(min=1, max=64, help="Slots of each of them.")] = 1,
     scenes: Annotated[int, typer.Option(min=1, help="Scenes of each phase, at most.")] = 16,
@@ -59,13 +65,15 @@ def cluster(
     ] = 10_000,
     out: Annotated[Path, typer.Option(help="Folder for the pictures of the simulation.")] = SIMULATION_OUT,
 ) -> None:
-    """Measure a manager and workers on loopback, the paper's ablation and look-ahead. Or simulate thousands of workers."""
+    """Measure a manager and workers on loopback, the paper's ablation, look-ahead, and peers. Or simulate."""
     with refusals():
         if simulate:
             hand_in(_simulation(out, most_workers), json_file)
             return
         load = ClusterLoad(workers=workers, slots=slots, scenes=scenes, limit_s=limit_s)
         job = cluster_job(dataset, engine_dataset, workload, part, naive, load)
+        if peer:
+            job = replace(job, peers=replace(job.peers, peers=tuple(peer)))
         hand_in(measure_cluster(job), json_file)
 
 

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.worker.bench_ablation import AblationSizes, bench_ablation
 from embomatrix.worker.bench_cluster import ClusterLoad, bench_cluster_load
+from embomatrix.worker.bench_peers import PeerSizes, hold_contest
+from embomatrix.worker.bench_peers_page import contest_figures
 from embomatrix.worker.bench_prewarm import PrewarmSizes, bench_prewarm
 from embomatrix.worker.bench_scenes import scenes_of
 from embomatrix.worker.bench_work import main_work, whole_work
@@ -29,6 +31,7 @@ class ClusterPart(StrEnum):
     PHASES = "phases"
     ABLATION = "ablation"
     PREWARM = "prewarm"
+    PEERS = "peers"
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +47,7 @@ class ClusterJob:
     load: ClusterLoad = field(default_factory=ClusterLoad)
     ablation: AblationSizes = field(default_factory=AblationSizes)
     prewarm: PrewarmSizes = field(default_factory=PrewarmSizes)
+    peers: PeerSizes = field(default_factory=PeerSizes)
 
 
 def bench_cluster_parts(job: ClusterJob, on_step: OnStep) -> tuple[Figure, ...]:
@@ -69,8 +73,14 @@ def _prewarm(job: ClusterJob, on_step: OnStep) -> tuple[Figure, ...]:
     return bench_prewarm(work, job.prewarm, on_step)
 
 
+def _peers(job: ClusterJob, on_step: OnStep) -> tuple[Figure, ...]:
+    work = main_work(Dataset.load(job.engine_dataset), read_workload(job.workload))
+    return contest_figures(hold_contest(work, job.peers, on_step))
+
+
 MEASURES: Final[Mapping[ClusterPart, Callable[[ClusterJob, OnStep], tuple[Figure, ...]]]] = {
     ClusterPart.PHASES: _phases,
     ClusterPart.ABLATION: _ablation,
     ClusterPart.PREWARM: _prewarm,
+    ClusterPart.PEERS: _peers,
 }

@@ -8,11 +8,15 @@ from typing import TYPE_CHECKING, Final
 
 import psutil
 
+from embomatrix.worker.bench_figures import BenchError
+
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from embomatrix.worker.bench_processes import BenchCluster
 
+TRIES: Final = 100
+"""Looks for a slot that executes: between two rollouts none does."""
 SLOT_DEPTH: Final = 3
 """A slot is forked by its scene, the scene by the root, and the root is a child of the daemon."""
 
@@ -56,6 +60,17 @@ def cpu_use(cluster: BenchCluster) -> CpuUse:
                 else:
                     daemons_s += _seconds(process)
     return CpuUse(slots_s, _seconds(manager), daemons_s, _seconds(psutil.Process()))
+
+
+def running_slot(cluster: BenchCluster) -> int:
+    """Process id of a slot that executes now. Raises BenchError when there is none."""
+    for _ in range(TRIES):
+        for worker in cluster.processes[1:]:
+            for process, depth in _tree(psutil.Process(worker.child.pid), 0):
+                with contextlib.suppress(psutil.Error):
+                    if depth >= SLOT_DEPTH and process.status() == psutil.STATUS_RUNNING:
+                        return int(process.pid)
+    raise BenchError("no slot is at work that could be killed: expected one that executes")
 
 
 def _tree(process: psutil.Process, depth: int) -> Iterator[tuple[psutil.Process, int]]:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.worker.bench_ablation_page import EXPLANATION, ablation_lines
 from embomatrix.worker.bench_figures import BenchError, is_shared, shown
+from embomatrix.worker.bench_peers_page import CONTEST, contest_lines
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -101,6 +102,9 @@ def _subparts(result: BenchResult) -> Iterator[tuple[str, str, list[str]]]:
     ablation = ablation_lines(result.figures)
     if ablation:
         yield "The paper's ablation", EXPLANATION, ablation
+    contest = contest_lines(result.figures)
+    if contest:
+        yield "Against what one would pick instead", CONTEST, contest
 
 
 def hand_parts(page: str) -> dict[str, str]:

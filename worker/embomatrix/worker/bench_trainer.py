@@ -84,14 +84,18 @@ class BenchTrainer:
             await asyncio.sleep(POLL_S)
         await asyncio.sleep(COMPLETE_S)
 
-    async def push(self, rollouts: Sequence[Rollout]) -> Pushed:
-        """Submit them at once and wait for all."""
+    async def stream(self, rollouts: Sequence[Rollout]) -> AsyncIterator[Arrival]:
+        """Submit them at once; yields each result as it comes."""
         number = next(self._batches)
         batch = Batch(self._run_id, str(number), number, tuple(rollouts))
         started_s = time.perf_counter()
-        arrivals = [
-            Arrival(time.perf_counter() - started_s, result) async for result in self._client.execute(batch)
-        ]
+        async for result in self._client.execute(batch):
+            yield Arrival(time.perf_counter() - started_s, result)
+
+    async def push(self, rollouts: Sequence[Rollout]) -> Pushed:
+        """Submit them at once and wait for all."""
+        started_s = time.perf_counter()
+        arrivals = [arrival async for arrival in self.stream(rollouts)]
         return Pushed(time.perf_counter() - started_s, tuple(arrivals))
 
     async def push_singly(self, rollouts: Sequence[Rollout]) -> Pushed:
