@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from embomatrix.reward.breakdown import AtomResult, RewardBreakdown
-from embomatrix.world.evaluate import evaluate, objects_of, render, scored_atoms
+from embomatrix.world.evaluate import evaluate
 
 if TYPE_CHECKING:
     from embomatrix.world.goal import Facts
@@ -38,11 +38,8 @@ def score(
 
     Raises GoalError when the goal quantifies over a type that the task does not list.
     """
-    relevant = len(objects_of(task.goal, task.types) & touched)
-    atoms = tuple(
-        AtomResult(render(atom), evaluate(atom, facts, task.types))
-        for atom in scored_atoms(task.goal, task.types)
-    )
+    relevant = len(task.goal_objects & touched)
+    atoms = tuple(AtomResult(text, evaluate(atom, facts, task.types)) for atom, text in task.goal_atoms)
     satisfied = sum(atom.holds for atom in atoms)
     return RewardBreakdown(
         format=settings.format,

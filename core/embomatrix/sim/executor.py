@@ -15,7 +15,6 @@ from embomatrix.skills.describe import Sight, done, final_lines, gained
 from embomatrix.skills.syntax import Skill
 from embomatrix.skills.trace import Step, Trace
 from embomatrix.skills.view import source_of, target_of
-from embomatrix.world.evaluate import objects_of
 from embomatrix.world.state import State
 from embomatrix.world.substances import in_words
 
@@ -148,7 +147,7 @@ class Simulator:
 
     def describe(self, task: Task) -> tuple[str, ...]:
         """State of the goal's objects and of those that a call succeeded on, in the table's order, in words."""
-        told = objects_of(task.goal, task.types) | self._touched
+        told = task.goal_objects | self._touched
         names = [name for name in task.table if name in told]
         return final_lines([self._sight(name) for name in names])
 

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from embomatrix.world.geometry import Aabb
 
-CELL_M: Final = 0.5
-WIDE_CELLS: Final = 64
+CELL_M: Final = 1.0
+WIDE_CELLS: Final = 32
 """A box over more cells than this is looked at in every query instead: a carpet, or a thing thrown far away."""
 SPANS_KEPT: Final = 1024
 
@@ -61,7 +61,7 @@ class Neighbourhood:
             for number, (a, b, c, d, e, f) in place.items()
             if c <= high_z and f >= low_z and a <= high_x and d >= low_x and b <= high_y and e >= low_y
         ]
-        return sorted(set(found))
+        return sorted(set(found)) if len(found) > 1 else found
 
     def _places(self, span: tuple[int, int, int, int]) -> list[dict[int, Extent]]:
         """Where the boxes over a span are kept; some may be in several places."""

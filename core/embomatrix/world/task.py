@@ -7,6 +7,8 @@ from enum import StrEnum
 from functools import cached_property
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.world.evaluate import objects_of, render, scored_atoms
+
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
@@ -56,3 +58,13 @@ class Task:
     @cached_property
     def index_of(self) -> Mapping[str, int]:
         return {name: index for index, name in enumerate(self.table)}
+
+    @cached_property
+    def goal_objects(self) -> frozenset[str]:
+        """Objects that the goal is about. Raises GoalError when it quantifies over a type that the task does not list."""
+        return objects_of(self.goal, self.types)
+
+    @cached_property
+    def goal_atoms(self) -> tuple[tuple[Formula, str], ...]:
+        """Sub-goals that are scored, each with its text. Raises GoalError as ``goal_objects`` does."""
+        return tuple((atom, render(atom)) for atom in scored_atoms(self.goal, self.types))
