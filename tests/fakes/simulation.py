@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 import time
+import zlib
 
 from embomatrix.reward.breakdown import AtomResult, RewardBreakdown
 from embomatrix.rpc.values import Completed, Timings
@@ -43,7 +44,14 @@ class FakeScene:
 
     def execute(self, rollout):
         self._executed += 1
+        times = note(rollout.rollout_id)
         match rollout.task_id:
+            case "first slow":
+                time.sleep(3.0 if times == 1 else 0.01)
+            case "first hangs":
+                time.sleep(600 if times == 1 else 0.01)
+            case "brief":
+                time.sleep(0.05)
             case "crash":
                 os.kill(os.getpid(), signal.SIGSEGV)
             case "hang":
@@ -63,7 +71,7 @@ class FakeScene:
                 os.kill(os.getppid(), signal.SIGSTOP)
                 time.sleep(1.0)
         return Completed(
-            reward=RewardBreakdown(0.5, 0.2, 30.0, (AtomResult("done", True),), True),
+            reward=RewardBreakdown(0.5, 0.2, goal(rollout), (AtomResult("done", True),), True),
             steps=(),
             final=(f"executed {self._executed} in {os.getpid()} of {os.getppid()}",),
             trace_digest=f"trace of {rollout.rollout_id}",
@@ -71,6 +79,27 @@ class FakeScene:
             timings=Timings(),
             warm=True,
         )
+
+
+def goal(rollout):
+    """The reward of the goal: 30, or of graded tasks as the rollout's id has it."""
+    return graded(rollout.rollout_id) if rollout.task_id == "graded" else 30.0
+
+
+def graded(rollout_id):
+    return float(zlib.crc32(rollout_id.encode()) % 4) * 10.0
+
+
+def note(rollout_id):
+    """Note that an execution begins, for tests that count them; returns how many of this rollout there were with it."""
+    path = os.environ.get("FAKE_EXECUTIONS")
+    if not path:
+        return 1
+    with open(path, "a+") as file:
+        file.write(f"{rollout_id}\n")
+        file.flush()
+        file.seek(0)
+        return file.read().split().count(rollout_id)
 
 
 if __name__ == "__main__":

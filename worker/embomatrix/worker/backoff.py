@@ -15,7 +15,7 @@ class Backoff:
 
     rng: np.random.Generator
     first_s: float = 0.2
-    longest_s: float = 4.0
+    longest_s: float = 3.0
     """A manager that comes back has its workers within five seconds."""
     _attempts: int = 0
 

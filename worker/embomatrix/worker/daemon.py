@@ -146,6 +146,7 @@ class Daemon:
             except UnknownSessionError as error:
                 # A manager took over. It takes up what is held here once this worker has said what that is.
                 self._registration = None
+                self._backoff.reset()
                 await self._wait_before_next(error)
             except SupersededError as error:
                 self._give_up_leases(str(error))

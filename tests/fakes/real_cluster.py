@@ -1,0 +1,191 @@
+"""A cluster of real processes, started, killed and counted by a test."""
+
+import asyncio
+import collections
+import contextlib
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from embomatrix.cli.local_cluster import free_port
+from embomatrix.rpc.client import ClientLimits, ClusterClient
+from embomatrix.rpc.status import ClusterError
+from embomatrix.rpc.values import Batch, Completed, InfraFailure, Rollout
+from embomatrix.world.bundle import bundle_digest
+
+FAKES = Path(__file__).parent
+LIMITS = ClientLimits(retry_first_s=0.05, retry_longest_s=0.5)
+SCENE = b"ok"
+DIGEST = bundle_digest(SCENE)
+
+
+class RealCluster:
+    """Context manager: whatever still runs at its end is killed. ``settings`` are those of every manager."""
+
+    def __init__(self, folder, **settings):
+        self.folder = folder
+        self.settings = settings
+        self.ports = {}
+        self.processes = {}
+        self.executions = folder / "executions.txt"
+
+    def __enter__(self):
+        self.executions.touch()
+        return self
+
+    def __exit__(self, *_):
+        for process in self.processes.values():
+            process.kill()
+            process.wait()
+
+    @property
+    def address(self):
+        """Of every manager that was started, with commas between."""
+        return ",".join(f"127.0.0.1:{port}" for port in self.ports.values())
+
+    def start_manager(self, name="manager", **settings):
+        port = self.ports.setdefault(name, free_port())
+        chosen = {
+            "port": port,
+            "http_port": 0,
+            "data_dir": str(self.folder / "manager"),
+            "state": f"sqlite:{self.folder / 'state.sqlite'}",
+            **self.settings,
+            **settings,
+        }
+        self._start(name, str(FAKES / "manager_process.py"), json.dumps(chosen))
+
+    def start_worker(self, name, slots=2, manager=""):
+        """A daemon with the simulation that needs no physics, which notes each execution as it begins."""
+        arguments = (manager or self.address, name, str(self.folder / name), str(slots))
+        self._start(name, str(FAKES / "worker_process.py"), *arguments)
+
+    def start_quick_worker(self, name, slots=4, execute_s=0.01):
+        """A worker that only pretends to execute: as many rollouts as the manager can take."""
+        arguments = (self.address, name, str(slots), str(execute_s))
+        self._start(name, str(FAKES / "quick_worker_process.py"), *arguments)
+
+    def start_real_worker(self, name, slots=1):
+        arguments = (f"--manager={self.address}", f"--name={name}", f"--slots={slots}", "--nice=0")
+        cache = f"--cache-dir={self.folder / name}"
+        self._start(name, "-m", "embomatrix.cli", "worker", "run", *arguments, cache)
+
+    def signal(self, name, number=signal.SIGKILL):
+        """Send a signal; a process that is killed is waited for. Returns the wall clock."""
+        process = self.processes[name]
+        process.send_signal(number)
+        at_s = time.time()
+        if number == signal.SIGKILL:
+            del self.processes[name]
+            process.wait()
+        return at_s
+
+    def log(self, name):
+        return (self.folder / f"{name}.log").read_text()
+
+    def logged_s(self, name, pattern, after_s):
+        """Wall clock of the first line of a manager's log after ``after_s`` that has the pattern; None for no such."""
+        for line in self.log(name).splitlines():
+            found = re.match(r"(\d+\.\d+) (.*)", line)
+            if found and float(found[1]) >= after_s and re.search(pattern, found[2]):
+                return float(found[1])
+        return None
+
+    def executed(self):
+        """How often each rollout was begun on a daemon."""
+        return collections.Counter(self.executions.read_text().split())
+
+    def client(self, **options):
+        return ClusterClient(self.address, **{"limits": LIMITS, **options})
+
+    def _start(self, name, *arguments):
+        root = str(Path(__file__).parents[2])
+        paths = os.pathsep.join(filter(None, (os.environ.get("PYTHONPATH"), root)))
+        environment = {**os.environ, "FAKE_EXECUTIONS": str(self.executions), "PYTHONPATH": paths}
+        with (self.folder / f"{name}.log").open("ab") as log:
+            self.processes[name] = subprocess.Popen(
+                [sys.executable, *arguments], stdout=log, stderr=log, env=environment
+            )
+
+
+async def connected(client, *names, limit_s=60.0):
+    """Wait until these workers are ready; returns how many seconds that took."""
+    began_s = time.monotonic()
+    async with asyncio.timeout(limit_s):
+        while True:
+            with contextlib.suppress(ClusterError):
+                workers = await client.list_workers()
+                if {worker.worker_id for worker in workers if worker.state == "ready"} >= set(names):
+                    return time.monotonic() - began_s
+            await asyncio.sleep(0.05)
+
+
+def batch_of(run_id, count, task="ok", batch_id="b1", group=8):
+    rollouts = tuple(
+        Rollout(f"{batch_id}-{number}", f"g{number // group}", DIGEST, task, (), number // group)
+        for number in range(count)
+    )
+    return Batch(run_id, batch_id, 0, rollouts)
+
+
+async def opened(client, run_id="run"):
+    """A run whose only scene the manager has."""
+    await client.put_bundles({DIGEST: SCENE})
+    return await client.open_run("reliability", run_id)
+
+
+async def outcomes(client, batch, *, then=lambda count: None, deadline_s=120.0):
+    """Every result of the batch, in the order in which they came; ``then`` is told how many there are after each."""
+    results = []
+    async for result in client.execute(batch, deadline_s=deadline_s):
+        results.append(result)
+        then(len(results))
+    return results
+
+
+@dataclass(frozen=True)
+class Tally:
+    """What became of a batch, as its trainer saw it."""
+
+    submitted: int
+    delivered: int
+    duplicates: int
+    infra_failures: int
+    fabricated: int
+
+    @property
+    def clean(self):
+        return self == Tally(self.submitted, self.submitted, 0, 0, 0)
+
+
+def tally(batch, results, reward=30.7):
+    """``reward`` is what the simulation gives for every rollout, or a function of the rollout's id: any other is fabricated."""
+    counts = collections.Counter(result.rollout_id for result in results)
+    expected = reward if callable(reward) else lambda _: reward
+    assert set(counts) <= {rollout.rollout_id for rollout in batch.rollouts}
+    return Tally(
+        submitted=len(batch.rollouts),
+        delivered=len(counts),
+        duplicates=sum(count - 1 for count in counts.values()),
+        infra_failures=sum(isinstance(result.outcome, InfraFailure) for result in results),
+        fabricated=sum(
+            isinstance(result.outcome, Completed)
+            and abs(result.outcome.reward.total - expected(result.rollout_id)) > 1e-9
+            for result in results
+        ),
+    )
+
+
+def tell(name, counted, **figures):
+    """Print the figures of a test, for the table in docs/reliability.md."""
+    parts = {**vars(counted), **figures}
+    text = " ".join(
+        f"{key}={value:.2f}" if isinstance(value, float) else f"{key}={value}" for key, value in parts.items()
+    )
+    print(f"\n{name}: {text}")

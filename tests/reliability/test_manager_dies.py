@@ -1,0 +1,76 @@
+"""A4: the manager is killed in the middle of a batch. Nothing is lost, nothing comes twice, nothing alive runs twice."""
+
+import asyncio
+import time
+
+import pytest
+from tests.fakes.real_cluster import RealCluster, batch_of, connected, opened, outcomes, tally, tell
+
+pytestmark = pytest.mark.timeout(240)
+
+
+async def killed_in_the_middle(folder, *, count, task, kill_at, away_s, grace_s):
+    """A manager killed after ``kill_at`` results and started again ``away_s`` later."""
+    with RealCluster(folder, restart_grace_s=grace_s) as cluster:
+        cluster.start_manager()
+        for name in ("w1", "w2"):
+            cluster.start_worker(name)
+        async with cluster.client() as client:
+            await connected(client, "w1", "w2")
+            batch = batch_of(await opened(client), count, task)
+            times = {}
+
+            def kill(seen):
+                times.setdefault(seen, time.monotonic())
+                if seen == kill_at:
+                    cluster.signal("manager")
+
+            running = asyncio.create_task(outcomes(client, batch, then=kill))
+            while "manager" in cluster.processes and not running.done():  # noqa: ASYNC110  # another task kills it
+                await asyncio.sleep(0.01)
+            await asyncio.sleep(away_s)
+            cluster.start_manager()
+            began_s = time.monotonic()
+            joined_s = await connected(client, "w1", "w2")
+            results = await running
+            stats = await client.close_run(batch.run_id)
+        counted = tally(batch, results)
+        again = sum(times - 1 for times in cluster.executed().values())
+        recovery_s = min(at_s for at_s in times.values() if at_s > began_s) - began_s
+        tell(f"A4 away {away_s:g} s", counted, executed_again=again, rejoin_s=joined_s, recovery_s=recovery_s)
+        assert counted.clean
+        assert again == 0
+        assert stats.delivered == count
+
+
+async def test_a_killed_manager_goes_on_and_nothing_alive_is_executed_again(tmp_path):
+    # As many as the two workers hold: nobody has to wait for the grace to end.
+    await killed_in_the_middle(tmp_path, count=10, task="slow", kill_at=2, away_s=0.1, grace_s=15.0)
+
+
+@pytest.mark.slow
+async def test_a_manager_that_was_away_for_five_seconds_finds_what_was_finished_meanwhile(tmp_path):
+    await killed_in_the_middle(tmp_path, count=400, task="brief", kill_at=100, away_s=5.0, grace_s=8.0)
+
+
+async def test_a_batch_goes_on_though_its_trainer_does_not_ask(tmp_path):
+    with RealCluster(tmp_path, restart_grace_s=0.5) as cluster:
+        cluster.start_manager()
+        cluster.start_worker("w1")
+        async with cluster.client() as client:
+            await connected(client, "w1")
+            batch = batch_of(await opened(client), 12, "brief")
+            asking = asyncio.create_task(outcomes(client, batch))
+            while not cluster.executed():  # noqa: ASYNC110  # another process writes the file
+                await asyncio.sleep(0.01)
+            asking.cancel()
+            cluster.signal("manager")
+            cluster.start_manager()
+            await connected(client, "w1")
+            async with asyncio.timeout(30):
+                while (await client.list_runs())[0].stats.delivered < 12:
+                    await asyncio.sleep(0.05)
+            results = await outcomes(client, batch)
+        counted = tally(batch, results)
+        tell("A4 without its trainer", counted, executed=sum(cluster.executed().values()))
+        assert counted.clean
