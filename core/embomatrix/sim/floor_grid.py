@@ -93,10 +93,9 @@ class FloorGrid:
         window = self._window(low.tolist(), high.tolist())
         free = self.parts.within(window) > 0
         changes = (*self._changes, (gone, -1), (come, 1))
-        for box in boxes:
-            low, high = box[:2], box[2:4]
-            here = self._window((low - reach).tolist(), (high + reach).tolist())
-            around = self._window((low - 2 * reach).tolist(), (high + 2 * reach).tolist())
+        for a, b, c, d in _lots(boxes, reach):
+            here = self._window((a - reach, b - reach), (c + reach, d + reach))
+            around = self._window((a - 2 * reach, b - 2 * reach), (c + 2 * reach, d + 2 * reach))
             _, inner = overlap(here, around)
             free[overlap(window, here)[0]] = _clear(self._covered_in(around, changes))[inner]
         grid = self._with_parts(self.parts.changed(free, window))
@@ -288,6 +287,20 @@ class FloorGrid:
             slice(*_cells_between(*ends)) for ends in zip(low, high, self._origin_m, self._shape, strict=True)
         )
         return rows, columns
+
+
+def _lots(boxes: FloatArray, apart_m: float) -> list[list[float]]:
+    """Rectangles that hold all boxes, shape (n, 6), those that are near to one another together: parts of one thing are."""
+    lots: list[list[float]] = []
+    for a, b, c, d in boxes[:, :4].tolist():
+        for lot in lots:
+            e, f, g, h = lot
+            if a <= g + apart_m and e <= c + apart_m and b <= h + apart_m and f <= d + apart_m:
+                lot[:] = min(a, e), min(b, f), max(c, g), max(d, h)
+                break
+        else:
+            lots.append([a, b, c, d])
+    return lots
 
 
 def _cells_between(low_m: float, high_m: float, origin_m: float, count: int) -> tuple[int, int]:

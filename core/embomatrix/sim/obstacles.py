@@ -113,13 +113,19 @@ class Obstacles:
 
 
 def crosses(start: Vec2, end: Vec2, rectangles: FloatArray) -> bool:
-    """Whether the segment between two points of the plane passes through any rectangle, shape (4, n): slab test."""
-    if not rectangles.shape[1]:
-        return False
+    """Whether the segment between two points of the plane passes through any rectangle, shape (4, n): slab test.
+
+    One by one: there are three of them in the median, fewer than comparing whole arrays pays for.
+    """
     (x, y), (to_x, to_y) = start, end
-    near = (rectangles[0] <= max(x, to_x)) & (rectangles[2] >= min(x, to_x))
-    near &= (rectangles[1] <= max(y, to_y)) & (rectangles[3] >= min(y, to_y))
-    return any(_passes(x, y, to_x - x, to_y - y, rectangle) for rectangle in rectangles[:, near].T.tolist())
+    low_x, high_x = min(x, to_x), max(x, to_x)
+    low_y, high_y = min(y, to_y), max(y, to_y)
+    for rectangle in rectangles.T.tolist():
+        a, b, c, d = rectangle
+        near = a <= high_x and c >= low_x and b <= high_y and d >= low_y
+        if near and _passes(x, y, to_x - x, to_y - y, rectangle):
+            return True
+    return False
 
 
 def _passes(x: float, y: float, dx: float, dy: float, rectangle: Sequence[float]) -> bool:
