@@ -76,6 +76,11 @@ class RealCluster:
         cache = f"--cache-dir={self.folder / name}"
         self._start(name, "-m", "embomatrix.cli", "worker", "run", *arguments, cache)
 
+    def start_trainer(self, name, batch, task, out):
+        """A trainer that submits or asks for the batch, and notes in the file ``out`` what it read."""
+        arguments = (self.address, batch.run_id, str(len(batch.rollouts)), task, str(out))
+        self._start(name, str(FAKES / "trainer_process.py"), *arguments)
+
     def signal(self, name, number=signal.SIGKILL):
         """Send a signal; a process that is killed is waited for. Returns the wall clock."""
         process = self.processes[name]
@@ -124,6 +129,13 @@ async def connected(client, *names, limit_s=60.0):
                 if {worker.worker_id for worker in workers if worker.state == "ready"} >= set(names):
                     return time.monotonic() - began_s
             await asyncio.sleep(0.05)
+
+
+async def until(condition, limit_s=60.0):
+    """Wait for what other processes and tasks bring about."""
+    async with asyncio.timeout(limit_s):
+        while not condition():  # noqa: ASYNC110
+            await asyncio.sleep(0.01)
 
 
 def batch_of(run_id, count, task="ok", batch_id="b1", group=8):

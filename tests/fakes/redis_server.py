@@ -1,6 +1,7 @@
 """A real Redis server as a process of its own: it can be killed, and started again on what it wrote down."""
 
 import contextlib
+import os
 import shutil
 import socket
 import subprocess
@@ -54,6 +55,11 @@ class RedisServer:
         """As an operator stops it: what it holds is written down."""
         self.process.terminate()
         self.process.wait()
+
+    def forget(self, size):
+        """Take the last bytes of what it wrote down, as a machine without power would; it must not run."""
+        log = max(self.folder.rglob("*.aof"), key=lambda path: path.stat().st_mtime)
+        os.truncate(log, log.stat().st_size - size)
 
     def __enter__(self):
         self.start()

@@ -90,6 +90,10 @@ def graded(rollout_id):
     return float(zlib.crc32(rollout_id.encode()) % 4) * 10.0
 
 
+def graded_total(rollout_id):
+    return 0.7 + graded(rollout_id)
+
+
 def note(rollout_id):
     """Note that an execution begins, for tests that count them; returns how many of this rollout there were with it."""
     path = os.environ.get("FAKE_EXECUTIONS")

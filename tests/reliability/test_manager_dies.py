@@ -4,7 +4,7 @@ import asyncio
 import time
 
 import pytest
-from tests.fakes.real_cluster import RealCluster, batch_of, connected, opened, outcomes, tally, tell
+from tests.fakes.real_cluster import RealCluster, batch_of, connected, opened, outcomes, tally, tell, until
 
 pytestmark = pytest.mark.timeout(240)
 
@@ -26,8 +26,7 @@ async def killed_in_the_middle(folder, *, count, task, kill_at, away_s, grace_s)
                     cluster.signal("manager")
 
             running = asyncio.create_task(outcomes(client, batch, then=kill))
-            while "manager" in cluster.processes and not running.done():  # noqa: ASYNC110  # another task kills it
-                await asyncio.sleep(0.01)
+            await until(lambda: "manager" not in cluster.processes or running.done())
             await asyncio.sleep(away_s)
             cluster.start_manager()
             began_s = time.monotonic()
@@ -53,6 +52,7 @@ async def test_a_manager_that_was_away_for_five_seconds_finds_what_was_finished_
     await killed_in_the_middle(tmp_path, count=400, task="brief", kill_at=100, away_s=5.0, grace_s=8.0)
 
 
+@pytest.mark.slow
 async def test_a_batch_goes_on_though_its_trainer_does_not_ask(tmp_path):
     with RealCluster(tmp_path, restart_grace_s=0.5) as cluster:
         cluster.start_manager()
@@ -61,14 +61,13 @@ async def test_a_batch_goes_on_though_its_trainer_does_not_ask(tmp_path):
             await connected(client, "w1")
             batch = batch_of(await opened(client), 12, "brief")
             asking = asyncio.create_task(outcomes(client, batch))
-            while not cluster.executed():  # noqa: ASYNC110  # another process writes the file
-                await asyncio.sleep(0.01)
+            await until(lambda: cluster.executed())
             asking.cancel()
             cluster.signal("manager")
             cluster.start_manager()
             await connected(client, "w1")
             async with asyncio.timeout(30):
-                while (await client.list_runs())[0].stats.delivered < 12:
+                while (await client.list_runs())[0].stats.delivered < 12:  # noqa: ASYNC110
                     await asyncio.sleep(0.05)
             results = await outcomes(client, batch)
         counted = tally(batch, results)

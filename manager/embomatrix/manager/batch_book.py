@@ -34,6 +34,10 @@ class BatchBook:
         """The open batch of a rollout without an outcome."""
         return self._batches[record.key[:2]]
 
+    def scenes(self) -> frozenset[str]:
+        """Of rollouts without an outcome."""
+        return frozenset(record.scene for batch in self._batches.values() for record in batch.open.values())
+
     def of_run(self, run_id: str) -> list[BatchRecord]:
         return [batch for key, batch in self._batches.items() if key[0] == run_id]
 

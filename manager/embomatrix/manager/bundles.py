@@ -9,32 +9,64 @@ import logging
 import os
 import re
 import tempfile
+import time
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.rpc.channel import CHUNK_BYTES
 from embomatrix.rpc.status import InvalidRequestError, NotFoundError, OverloadedError
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncIterator, Callable
+    from collections.abc import Set as AbstractSet
     from pathlib import Path
 
 logger = logging.getLogger(__name__)
 
 PREFIX: Final = "sha256:"
+INCOMING: Final = "incoming-"
+"""What the names of files begin with that are not whole yet."""
 _DIGEST: Final = re.compile(r"sha256:[0-9a-f]{64}")
 
 
 class BundleStore:
-    """A folder of bundles. ``limit_bytes`` bounds one bundle, ``total_bytes`` the folder."""
+    """A folder of bundles. ``limit_bytes`` bounds one bundle, ``total_bytes`` the folder.
 
-    def __init__(self, folder: Path, *, limit_bytes: int, total_bytes: int) -> None:
+    When the folder is full, bundles go that nobody needs and that were not used for ``keep_s`` seconds, the longest unused
+    first. A file's time of change is when it was last used; ``clock`` gives seconds of the same clock.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        limit_bytes: int,
+        total_bytes: int,
+        keep_s: float = 600.0,
+        clock: Callable[[], float] = time.time,
+    ) -> None:
         self._folder = folder
         self._limit_bytes = limit_bytes
         self._total_bytes = total_bytes
+        self._keep_s = keep_s
+        self._clock = clock
+        self._needed: Callable[[], AbstractSet[str]] = frozenset
         folder.mkdir(parents=True, exist_ok=True)
+        for left_over in folder.glob(f"{INCOMING}*"):
+            if clock() - left_over.stat().st_mtime > keep_s:
+                left_over.unlink(missing_ok=True)
+
+    def keep(self, needed: Callable[[], AbstractSet[str]]) -> None:
+        """Never delete those that this returns, by digest."""
+        self._needed = needed
 
     def has(self, digest: str) -> bool:
-        return self._path(digest).is_file()
+        """Whether it is here; it counts as used."""
+        now_s = self._clock()
+        try:
+            os.utime(self._path(digest), (now_s, now_s))
+        except FileNotFoundError:
+            return False
+        return True
 
     def missing(self, digests: list[str]) -> list[str]:
         """Those that were never put here, in the same order."""
@@ -59,7 +91,7 @@ class BundleStore:
             ) from error
 
     async def _take(self, digest: str, path: Path, chunks: AsyncIterator[bytes]) -> None:
-        handle, name = tempfile.mkstemp(prefix="incoming-", dir=self._folder)
+        handle, name = tempfile.mkstemp(prefix=INCOMING, dir=self._folder)
         sha, size = hashlib.sha256(), 0
         try:
             with os.fdopen(handle, "wb") as file:
@@ -76,8 +108,9 @@ class BundleStore:
                 raise InvalidRequestError(
                     f"the bundle's content has digest {found}, expected {digest}: it was damaged on its way, or misnamed"
                 )
-            self._check_space(size)
+            await asyncio.to_thread(self._make_room, size, self._needed())
             os.replace(name, path)
+            self.has(digest)
         finally:
             with contextlib.suppress(FileNotFoundError):
                 os.unlink(name)
@@ -85,7 +118,7 @@ class BundleStore:
     async def get(self, digest: str) -> AsyncIterator[bytes]:
         """The bundle in chunks; ``NotFoundError`` when it was never put."""
         path = self._path(digest)
-        if not path.is_file():
+        if not self.has(digest):
             raise NotFoundError(f"the manager has no bundle {digest}: put it first")
         with path.open("rb") as file:
             while chunk := await asyncio.to_thread(file.read, CHUNK_BYTES):
@@ -98,17 +131,30 @@ class BundleStore:
                 found = PREFIX + hashlib.file_digest(file, "sha256").hexdigest()
         except FileNotFoundError:
             return False
+        self.has(digest)
         if found != digest:
             logger.warning("bundle damaged on disk, removed bundle=%s found=%s", digest, found)
             path.unlink(missing_ok=True)
         return found == digest
 
-    def _check_space(self, size: int) -> None:
-        used = sum(entry.stat().st_size for entry in os.scandir(self._folder) if entry.is_file())
+    def _make_room(self, size: int, needed: AbstractSet[str]) -> None:
+        """Have the folder, which holds the incoming bundle already, keep its bound."""
+        files = {entry.name: entry.stat() for entry in os.scandir(self._folder) if entry.is_file()}
+        used = sum(found.st_size for found in files.values())
+        kept = {self._path(digest).name for digest in needed}
+        before_s = self._clock() - self._keep_s
+        for name, found in sorted(files.items(), key=lambda item: item[1].st_mtime):
+            if used <= self._total_bytes or found.st_mtime >= before_s:
+                break
+            if name in kept or name.startswith(INCOMING):
+                continue
+            (self._folder / name).unlink(missing_ok=True)
+            used -= found.st_size
+            logger.info("bundle deleted to make room bundle=%s", name)
         if used > self._total_bytes:
             raise OverloadedError(
-                f"the bundle folder {self._folder} holds {used} of {self._total_bytes} bytes and has no room for "
-                f"{size} more: raise bundle_total_mb or clear the folder"
+                f"the bundle folder {self._folder} holds {used} of {self._total_bytes} bytes and has no room for {size} "
+                "more; all others are needed or were used lately: try again later, raise bundle_total_mb, or close runs"
             )
 
     def _path(self, digest: str) -> Path:

@@ -71,6 +71,12 @@ class ClusterState:
         self.dispatcher.forget_run(run_id)
         return stats, commands
 
+    def needed_scenes(self) -> frozenset[str]:
+        """Scenes of rollouts without an outcome, and of what is announced: their bundles must stay."""
+        windows = self.scheduler.windows.values()
+        announced = frozenset(entry.bundle_digest for window in windows for entry in window.entries)
+        return self.dispatcher.scenes | announced
+
     def stats(self, run_id: str) -> RunStats:
         """The counters of an open run."""
         prewarm = self.scheduler.prewarm.counters(run_id)

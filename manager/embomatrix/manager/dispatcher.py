@@ -154,6 +154,11 @@ class Dispatcher:
         return self._desk.leases.expired
 
     @property
+    def scenes(self) -> frozenset[str]:
+        """Scenes of rollouts without an outcome."""
+        return self._desk.batches.scenes()
+
+    @property
     def live_leases(self) -> Mapping[str, LeaseRecord]:
         return self._desk.leases.live
 

@@ -80,6 +80,7 @@ class ManagerRuntime:
         self.cluster = cluster
         self.registry = registry
         self.bundles = bundles
+        bundles.keep(cluster.needed_scenes)
         self.meter = Meter()
         self.effort = Effort()
         store = timed_store(store, self.effort.operated)

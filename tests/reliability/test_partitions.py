@@ -1,0 +1,96 @@
+"""A6: the line between a worker and the manager is cut, in either direction or in both, for a while or for long."""
+
+import asyncio
+import re
+import time
+
+import pytest
+from tests.fakes.proxy import TO_MANAGER, TO_WORKER, Proxy
+from tests.fakes.real_cluster import RealCluster, batch_of, connected, opened, outcomes, tally, tell, until
+
+pytestmark = pytest.mark.timeout(300)
+
+DIRECTIONS = pytest.mark.parametrize(
+    "directions", [(TO_MANAGER,), (TO_WORKER,), (TO_MANAGER, TO_WORKER)], ids=["to", "from", "both"]
+)
+
+
+async def cut_while_it_runs(cluster, directions, *, count, task, cut_s, other):
+    """One worker's line is cut for ``cut_s`` once it has begun; ``other`` joins directly meanwhile. Returns what came of it."""
+    cluster.start_manager()
+    async with Proxy(cluster.ports["manager"]) as proxy, cluster.client() as client:
+        cluster.start_worker("w1", manager=proxy.address)
+        await connected(client, "w1")
+        batch = batch_of(await opened(client), count, task)
+        running = asyncio.create_task(outcomes(client, batch, deadline_s=200.0))
+        await until(lambda: cluster.executed())
+        cut_at_s = time.time()
+        proxy.cut(*directions)
+        if other:
+            cluster.start_worker(other)
+        await asyncio.sleep(cut_s)
+        proxy.heal()
+        results = await running
+        await connected(client, "w1")
+        await asyncio.sleep(1.0)
+        stats = await client.close_run(batch.run_id)
+        lost_s = cluster.logged_s("manager", "worker lost worker=w1", cut_at_s)
+    return tally(batch, results), stats, None if lost_s is None else lost_s - cut_at_s
+
+
+@DIRECTIONS
+@pytest.mark.slow
+async def test_a_short_cut_costs_time_and_nothing_else(tmp_path, directions):
+    with RealCluster(tmp_path) as cluster:
+        counted, stats, lost_s = await cut_while_it_runs(
+            cluster, directions, count=60, task="slow", cut_s=5.0, other=""
+        )
+    tell(f"A6 5 s, {' and '.join(directions)}", counted, redispatched=stats.redispatched)
+    assert counted.clean
+    assert (stats.redispatched, stats.stale_results, lost_s) == (0, 0, None)
+    assert set(cluster.executed().values()) == {1}
+
+
+async def cut_for_long(folder, directions, *, cut_s, **settings):
+    with RealCluster(folder, **settings) as cluster:
+        counted, stats, lost_s = await cut_while_it_runs(
+            cluster, directions, count=2, task="first slow", cut_s=cut_s, other="w2"
+        )
+        tell(
+            f"A6 {cut_s:g} s, {' and '.join(directions)}",
+            counted,
+            redispatched=stats.redispatched,
+            stale=stats.stale_results,
+            detection_s=lost_s,
+        )
+        assert counted.clean
+        assert stats.redispatched == 2
+        assert set(cluster.executed().values()) == {2}
+        return stats
+
+
+async def test_what_runs_behind_a_long_cut_is_given_to_another_and_comes_once(tmp_path):
+    both = (TO_MANAGER, TO_WORKER)
+    stats = await cut_for_long(tmp_path, both, cut_s=4.0, heartbeat_s=0.2, lost_after_s=1.0)
+    assert stats.stale_results == 2
+
+
+@DIRECTIONS
+@pytest.mark.slow
+async def test_what_runs_behind_a_cut_of_a_minute_is_given_to_another_and_comes_once(tmp_path, directions):
+    stats = await cut_for_long(tmp_path, directions, cut_s=60.0)
+    # Where the worker hears that it was given up it stops; else its results come late and are fenced.
+    assert stats.stale_results in (0, 2)
+
+
+@pytest.mark.slow
+async def test_a_worker_that_cannot_renew_its_leases_stops_what_it_runs(tmp_path):
+    settings = {"heartbeat_s": 0.2, "lost_after_s": 1.5, "lease_ttl_s": 4.0}
+    with RealCluster(tmp_path, **settings) as cluster:
+        counted, stats, _ = await cut_while_it_runs(
+            cluster, (TO_MANAGER, TO_WORKER), count=2, task="first hangs", cut_s=12.0, other="w2"
+        )
+        tell("A6 leases that run out", counted, redispatched=stats.redispatched)
+        assert counted.clean
+        assert stats.stale_results == 0
+        assert re.search(r"2 leases given up: no heartbeat was answered", cluster.log("w1"))

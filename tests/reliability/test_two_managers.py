@@ -1,0 +1,123 @@
+"""A8: two managers on one Redis. One dispatches; the other takes over when it dies, and what it wrote before is all there."""
+
+import asyncio
+import signal
+import time
+
+import grpc
+import pytest
+from grpc_health.v1 import health_pb2, health_pb2_grpc
+from tests.fakes.real_cluster import RealCluster, batch_of, connected, opened, outcomes, tally, tell, until
+from tests.fakes.redis_server import RedisServer
+
+from embomatrix.cli.local_cluster import free_port
+from embomatrix.rpc.client import ClusterClient
+from embomatrix.rpc.status import StandbyError
+
+pytestmark = pytest.mark.timeout(240)
+
+
+async def answers(cluster, name):
+    """What a manager's health check says."""
+    async with grpc.aio.insecure_channel(f"127.0.0.1:{cluster.ports[name]}") as channel:
+        stub = health_pb2_grpc.HealthStub(channel)
+        answer = await stub.Check(health_pb2.HealthCheckRequest(), wait_for_ready=True, timeout=30)
+    return health_pb2.HealthCheckResponse.ServingStatus.Name(answer.status)
+
+
+async def leads(cluster, name):
+    """Wait until this manager leads; returns how many seconds that took."""
+    began_s = time.monotonic()
+    async with asyncio.timeout(60):
+        while await answers(cluster, name) != "SERVING":  # noqa: ASYNC110
+            await asyncio.sleep(0.05)
+    return time.monotonic() - began_s
+
+
+async def both(cluster):
+    """The first manager leads, the second stands by, two workers know both."""
+    cluster.start_manager("first")
+    await leads(cluster, "first")
+    cluster.start_manager("second")
+    for name in ("w1", "w2"):
+        cluster.start_worker(name)
+
+
+async def failed_over(folder, *, count, kill_at, ttl_s, number=signal.SIGKILL):
+    with (
+        RedisServer(folder / "redis", free_port()) as redis,
+        RealCluster(folder, state=redis.url, leader_ttl_s=ttl_s, restart_grace_s=15.0) as cluster,
+    ):
+        await both(cluster)
+        assert await answers(cluster, "second") == "NOT_SERVING"
+        async with cluster.client() as client:
+            await connected(client, "w1", "w2")
+            batch = batch_of(await opened(client), count, "slow")
+            killed = asyncio.Event()
+
+            def kill(seen):
+                if seen == kill_at:
+                    cluster.signal("first", number)
+                    killed.set()
+
+            running = asyncio.create_task(outcomes(client, batch, then=kill))
+            await killed.wait()
+            takeover_s = await leads(cluster, "second")
+            joined_s = await connected(client, "w1", "w2")
+            results = await running
+        counted = tally(batch, results)
+        again = sum(times - 1 for times in cluster.executed().values())
+        tell(f"A8 {number.name}", counted, executed_again=again, takeover_s=takeover_s, rejoin_s=joined_s)
+        assert counted.clean
+        assert again == 0
+
+
+async def test_another_manager_takes_over_when_the_leader_is_killed(tmp_path):
+    await failed_over(tmp_path, count=10, kill_at=2, ttl_s=1.0)
+
+
+@pytest.mark.slow
+async def test_another_manager_takes_over_within_ten_seconds_at_the_default_settings(tmp_path):
+    await failed_over(tmp_path, count=10, kill_at=2, ttl_s=6.0)
+
+
+@pytest.mark.slow
+async def test_a_leader_that_is_stopped_in_order_hands_over_at_once(tmp_path):
+    await failed_over(tmp_path, count=10, kill_at=2, ttl_s=30.0, number=signal.SIGTERM)
+
+
+@pytest.mark.slow
+async def test_a_leader_that_was_frozen_is_refused_by_the_store_and_ends(tmp_path):
+    with (
+        RedisServer(tmp_path / "redis", free_port()) as redis,
+        RealCluster(tmp_path, state=redis.url, leader_ttl_s=1.0) as cluster,
+    ):
+        await both(cluster)
+        async with cluster.client() as client:
+            await connected(client, "w1", "w2")
+            batch = batch_of(await opened(client), 40, "slow")
+            running = asyncio.create_task(outcomes(client, batch))
+            await until(lambda: len(cluster.executed()) >= 8)
+            cluster.signal("first", signal.SIGSTOP)
+            takeover_s = await leads(cluster, "second")
+            cluster.signal("first", signal.SIGCONT)
+            ended = await asyncio.to_thread(cluster.processes["first"].wait, 30)
+            results = await running
+        counted = tally(batch, results)
+        tell("A8 frozen", counted, takeover_s=takeover_s)
+        assert ended != 0
+        assert "another manager took over" in cluster.log("first")
+        assert (counted.delivered, counted.duplicates, counted.fabricated) == (40, 0, 0)
+
+
+@pytest.mark.slow
+async def test_a_manager_that_stands_by_names_the_leader(tmp_path):
+    with RealCluster(tmp_path, leader_ttl_s=60.0) as cluster:
+        cluster.start_manager("first")
+        await leads(cluster, "first")
+        cluster.start_manager("second")
+        await answers(cluster, "second")
+        async with ClusterClient(f"127.0.0.1:{cluster.ports['second']}") as client:
+            with pytest.raises(StandbyError, match="stands by") as caught:
+                await client.open_run("x")
+        assert caught.value.leader == f"127.0.0.1:{cluster.ports['first']}"

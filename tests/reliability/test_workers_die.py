@@ -1,0 +1,103 @@
+"""A1 and A2: a long run without faults, and one whose workers are killed again and again."""
+
+import asyncio
+import contextlib
+import random
+import time
+
+import pytest
+from tests.fakes.real_cluster import RealCluster, batch_of, connected, opened, outcomes, tally, tell
+from tests.fakes.worker import REWARD
+
+from embomatrix.rpc.values import Completed
+
+pytestmark = pytest.mark.timeout(900)
+
+WORKERS = 10
+ROLLOUTS = 20_000
+
+
+async def kill_again_and_again(cluster, rng, kills):
+    """``kill -9`` a random worker every two seconds, and start it anew."""
+    with contextlib.suppress(asyncio.CancelledError):
+        while True:
+            await asyncio.sleep(2.0)
+            name = rng.choice([name for name in cluster.processes if name != "manager"])
+            kills.append((name, cluster.signal(name)))
+            cluster.start_quick_worker(name)
+
+
+async def soak(folder, *, killing):
+    """20,000 rollouts on ten workers, with or without the killing. Returns the tally, the seconds and the detections."""
+    with RealCluster(folder) as cluster:
+        cluster.start_manager()
+        names = [f"w{number}" for number in range(WORKERS)]
+        for name in names:
+            cluster.start_quick_worker(name)
+        async with cluster.client() as client:
+            await connected(client, *names)
+            batch = batch_of(await opened(client), ROLLOUTS)
+            kills = []
+            killer = asyncio.create_task(
+                kill_again_and_again(cluster, random.Random(0), kills) if killing else asyncio.sleep(0)
+            )
+            began_s = time.monotonic()
+            results = await outcomes(client, batch, deadline_s=800.0)
+            took_s = time.monotonic() - began_s
+            killer.cancel()
+            await asyncio.gather(killer, return_exceptions=True)
+            stats = await client.close_run(batch.run_id)
+        found = [
+            at_s - killed_s
+            for name, killed_s in kills
+            if (at_s := cluster.logged_s("manager", f"worker (lost|registered) worker={name}\\b", killed_s))
+        ]
+    return tally(batch, results, REWARD.total), stats, took_s, kills, found
+
+
+@pytest.mark.slow
+async def test_twenty_thousand_rollouts_have_one_outcome_each_also_while_workers_are_killed(tmp_path):
+    (tmp_path / "quiet").mkdir()
+    (tmp_path / "killing").mkdir()
+    counted, _, quiet_s, _, _ = await soak(tmp_path / "quiet", killing=False)
+    tell("A1", counted, seconds=quiet_s, per_second=ROLLOUTS / quiet_s)
+    assert counted.clean
+    counted, stats, took_s, kills, found = await soak(tmp_path / "killing", killing=True)
+    tell(
+        "A2",
+        counted,
+        kills=len(kills),
+        redispatched=stats.redispatched,
+        slowest_detection_s=max(found),
+        seconds=took_s,
+        throughput_ratio=quiet_s / took_s,
+    )
+    assert (counted.delivered, counted.duplicates, counted.fabricated) == (ROLLOUTS, 0, 0)
+    assert len(kills) >= 3
+    assert stats.delivered == ROLLOUTS
+
+
+@pytest.mark.slow
+async def test_daemons_that_are_killed_again_and_again_cost_no_rollout(tmp_path):
+    with RealCluster(tmp_path, max_attempts=10) as cluster:
+        cluster.start_manager()
+        for name in ("w1", "w2", "w3"):
+            cluster.start_worker(name)
+        async with cluster.client() as client:
+            await connected(client, "w1", "w2", "w3")
+            batch = batch_of(await opened(client), 300, "brief")
+            rng = random.Random(1)
+            kills = []
+
+            def kill(seen):
+                if seen % 60 == 0:
+                    name = rng.choice(["w1", "w2", "w3"])
+                    kills.append(cluster.signal(name))
+                    cluster.start_worker(name)
+
+            results = await outcomes(client, batch, then=kill)
+            stats = await client.close_run(batch.run_id)
+        counted = tally(batch, results)
+        tell("A2 daemons", counted, kills=len(kills), redispatched=stats.redispatched)
+        assert counted.clean
+        assert all(isinstance(result.outcome, Completed) for result in results)

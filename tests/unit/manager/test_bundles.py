@@ -1,0 +1,118 @@
+"""The folder of bundles: bounded, and never without what somebody needs."""
+
+import hashlib
+import os
+
+import pytest
+from tests.fakes.manager import chunks_of
+
+from embomatrix.manager.bundles import BundleStore
+from embomatrix.rpc.status import InvalidRequestError, OverloadedError
+
+SIZE = 1000
+
+
+class Folder:
+    """A store with room for three bundles, and its clock. Bundles are named by a letter."""
+
+    def __init__(self, path, keep_s=60.0):
+        self.now_s = 1_000_000.0
+        self.needed = set()
+        self.path = path
+        self.store = BundleStore(
+            path, limit_bytes=SIZE, total_bytes=3 * SIZE, keep_s=keep_s, clock=lambda: self.now_s
+        )
+        self.store.keep(lambda: {digest_of(name) for name in self.needed})
+
+    async def put(self, name, after_s=100.0):
+        self.now_s += after_s
+
+        async def chunks():
+            for chunk in chunks_of(content_of(name)):
+                yield chunk
+
+        await self.store.put(digest_of(name), chunks())
+
+    def there(self):
+        return "".join(name for name in "abcdef" if (self.path / file_of(name)).exists())
+
+
+def content_of(name):
+    return name.encode() * SIZE
+
+
+def digest_of(name):
+    return f"sha256:{hashlib.sha256(content_of(name)).hexdigest()}"
+
+
+def file_of(name):
+    return f"{digest_of(name).removeprefix('sha256:')}.bundle"
+
+
+@pytest.fixture
+async def full(tmp_path):
+    folder = Folder(tmp_path)
+    for name in "abc":
+        await folder.put(name)
+    return folder
+
+
+async def test_a_full_folder_lets_the_longest_unused_go(full):
+    await full.put("d")
+    assert full.there() == "bcd"
+
+
+async def test_what_is_asked_for_counts_as_used(full):
+    full.now_s += 50
+    assert full.store.missing([digest_of("a"), digest_of("f")]) == [digest_of("f")]
+    await full.put("d")
+    assert full.there() == "acd"
+
+
+async def test_what_is_fetched_counts_as_used(full):
+    full.now_s += 50
+    assert b"".join([chunk async for chunk in full.store.get(digest_of("a"))]) == content_of("a")
+    await full.put("d")
+    assert full.there() == "acd"
+
+
+async def test_what_somebody_needs_stays_however_long_it_was_not_used(full):
+    full.needed = {"a", "b"}
+    await full.put("d")
+    await full.put("e")
+    assert full.there() == "abe"
+
+
+async def test_a_folder_full_of_what_is_needed_refuses_and_keeps_everything(full):
+    full.needed = set("abc")
+    with pytest.raises(OverloadedError, match="needed or were used lately"):
+        await full.put("d")
+    assert full.there() == "abc"
+    full.needed = set()
+    await full.put("d")
+    assert full.there() == "bcd"
+
+
+async def test_what_was_used_lately_is_not_deleted(full):
+    await full.put("d", after_s=0.0)
+    await full.put("e", after_s=0.0)
+    with pytest.raises(OverloadedError):
+        await full.put("f", after_s=0.0)
+    assert full.there() == "cde"
+
+
+async def test_what_was_left_half_written_by_a_killed_manager_goes_at_the_next_start(tmp_path):
+    old, young = tmp_path / "incoming-old", tmp_path / "incoming-young"
+    for path, at_s in ((old, 1_000_000.0 - 3600), (young, 1_000_000.0 - 1)):
+        path.write_bytes(b"half")
+        os.utime(path, (at_s, at_s))
+    Folder(tmp_path)
+    assert (old.exists(), young.exists()) == (False, True)
+
+
+async def test_a_bundle_that_is_too_large_is_refused(tmp_path):
+    folder = Folder(tmp_path)
+    folder.store = BundleStore(tmp_path, limit_bytes=SIZE - 1, total_bytes=3 * SIZE)
+    with pytest.raises(InvalidRequestError, match="larger than"):
+        await folder.put("a")
+    assert list(tmp_path.iterdir()) == []
