@@ -35,6 +35,7 @@ class FakeManager(worker_service_pb2_grpc.WorkerServiceServicer):
     states: list = field(default_factory=list)
     results: list = field(default_factory=list)
     renewed: list = field(default_factory=list)
+    steps: dict = field(default_factory=dict)
     fetches: list[str] = field(default_factory=list)
     epoch: int = 0
     outgoing: asyncio.Queue = field(default_factory=asyncio.Queue)
@@ -60,6 +61,9 @@ class FakeManager(worker_service_pb2_grpc.WorkerServiceServicer):
 
     def drain(self):
         self.outgoing.put_nowait(pb.SessionResponse(drain=True))
+
+    def resume(self):
+        self.outgoing.put_nowait(pb.SessionResponse(resume=True))
 
     def break_stream(self):
         self.outgoing.put_nowait(None)
@@ -90,6 +94,8 @@ class FakeManager(worker_service_pb2_grpc.WorkerServiceServicer):
             if not self.answering_heartbeats:
                 await asyncio.sleep(60)
             self.renewed.append([ref.lease_id for ref in request.running])
+            for told in request.progress:
+                self.steps.setdefault(told.ref.lease_id, []).append(told.steps)
             return pb.HeartbeatResponse(next_interval_s=0.1)
 
     async def Session(self, request_iterator, context):

@@ -42,9 +42,10 @@ class FakeScene:
     def complete(self):
         yield from (None,) * 3
 
-    def execute(self, rollout):
+    def execute(self, rollout, on_step):
         self._executed += 1
         times = note(rollout.rollout_id)
+        on_step(1)
         match rollout.task_id:
             case "first slow":
                 time.sleep(3.0 if times == 1 else 0.01)
@@ -55,9 +56,14 @@ class FakeScene:
             case "crash":
                 os.kill(os.getpid(), signal.SIGSEGV)
             case "hang":
+                on_step(2)
                 time.sleep(600)
             case "slow":
                 time.sleep(0.3)
+            case "steps":
+                for number in range(2, 40):
+                    time.sleep(0.05)
+                    on_step(number)
             case "raise":
                 raise ArithmeticError("x" * 600)
             case "grow":

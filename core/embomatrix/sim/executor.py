@@ -19,7 +19,7 @@ from embomatrix.world.state import State
 from embomatrix.world.substances import in_words
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence, Set
+    from collections.abc import Callable, Iterator, Sequence, Set
 
     import numpy as np
 
@@ -129,12 +129,15 @@ class Simulator:
         self._hash.update(world.state_bytes())
         return Step(call, None, self._message(call, held, changes))
 
-    def execute(self, task: Task, plan: Plan, seed: int) -> Trace:
-        """Reset and run the plan up to its end or its first failed step."""
+    def execute(
+        self, task: Task, plan: Plan, seed: int, on_step: Callable[[int], None] = lambda _: None
+    ) -> Trace:
+        """Reset and run the plan up to its end or its first failed step. ``on_step`` is told how many are done."""
         self.reset(task, seed)
         steps: list[Step] = []
         for call in plan:
             steps.append(self.run_step(call))
+            on_step(len(steps))
             if not steps[-1].ok:
                 break
         return Trace(

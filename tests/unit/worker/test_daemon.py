@@ -103,6 +103,31 @@ async def test_a_broken_stream_is_opened_again_and_unacknowledged_results_come_a
     assert _done(manager) == ["l1", "l1", "l2", "l2"]
 
 
+async def test_heartbeats_tell_the_steps_of_what_runs(tmp_path):
+    manager = FakeManager()
+    async with joined(manager, tmp_path):
+        digest = manager.bundle(b"ok")
+        manager.lease("l1", digest, "steps")
+        manager.lease("l2", digest, "hang", deadline_s=600.0)
+        await _until(lambda: manager.steps.get("l1", [0])[-1] > 10)
+        assert manager.steps["l1"] == sorted(manager.steps["l1"])
+        await _until(lambda: manager.steps.get("l2", [])[-2:] == [2, 2])
+
+
+async def test_a_worker_whose_drain_was_taken_back_stays(tmp_path):
+    manager = FakeManager()
+    async with joined(manager, tmp_path):
+        digest = manager.bundle(b"ok")
+        manager.lease("l1", digest, "steps")
+        await _until(lambda: ["l1"] in manager.renewed)
+        manager.drain()
+        await _until(lambda: manager.states[-1].draining)
+        manager.resume()
+        await _until(lambda: not manager.states[-1].draining)
+        manager.lease("l2", digest)
+        await _until(lambda: "l2" in _done(manager))
+
+
 async def test_leases_go_on_while_the_stream_is_broken(tmp_path):
     manager = FakeManager()
     async with joined(manager, tmp_path):

@@ -215,6 +215,7 @@ async def test_a_rollout_that_takes_too_much_memory_fails_alone(tmp_path):
         harness.submit("l2")
         outcomes = await harness.outcomes(2)
     assert outcomes["l1"].message.startswith("MemoryError")
+    assert outcomes["l1"].code is InfraCode.SLOT_OOM
     assert isinstance(outcomes["l2"], Completed)
 
 

@@ -19,7 +19,7 @@ from embomatrix.worker.slot_program import BundleCorruptError, run_program
 from embomatrix.world.bundle import BundleError, bundle_digest, decode_bundle, encode_bundle, read_bundle
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
     from embomatrix.world.bundle import Bundle
@@ -83,14 +83,14 @@ class PhysicsScene:
         """Give the clients back. The scene can't be used afterwards."""
         self._simulator.close()
 
-    def execute(self, rollout: Rollout) -> Completed:
+    def execute(self, rollout: Rollout, on_step: Callable[[int], None] = lambda _: None) -> Completed:
         task = self._tasks.get(rollout.task_id)
         if task is None:
             raise UnknownTaskError(
                 f"bundle {rollout.bundle_digest} has no task {rollout.task_id!r}: "
                 f"it has {len(self._tasks)}; submit the digest of the task's own bundle"
             )
-        trace = self._simulator.execute(task, rollout.plan, rollout.seed)
+        trace = self._simulator.execute(task, rollout.plan, rollout.seed, on_step)
         return Completed(
             reward=score(task, trace.touched, self._simulator.facts),
             steps=trace.steps,

@@ -16,6 +16,8 @@ from embomatrix.sim.zygote import PREFIX_BYTES, Frame, frame_lengths, pack, unpa
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from embomatrix.worker.progress import ProgressBoard
+
 SIMULATOR_PROGRAM: Final = (sys.executable, "-m", "embomatrix.worker.physics")
 START_S: Final = 60.0
 """Limit for a root to import the engine, on a machine that is busy."""
@@ -207,9 +209,12 @@ class Root(Zygote):
         await self._process.wait()
 
 
-async def start_root(log: Path, program: tuple[str, ...] = SIMULATOR_PROGRAM) -> Root:
+async def start_root(
+    log: Path, program: tuple[str, ...] = SIMULATOR_PROGRAM, board: ProgressBoard | None = None
+) -> Root:
     """Spawn the root and wait until it has imported the engine. Raises ProcessGoneError with the reason.
 
+    Its slots tell on the ``board`` how far they are; without one they tell nobody.
     What the engine prints goes to ``log``: Bullet writes warnings to standard output.
     """
     ours, theirs = socket.socketpair()
@@ -220,12 +225,14 @@ async def start_root(log: Path, program: tuple[str, ...] = SIMULATOR_PROGRAM) ->
         "OMP_NUM_THREADS": "1",
         "OPENBLAS_NUM_THREADS": "1",
     }
+    shared = () if board is None else (board.fd,)
     with theirs, log.open("ab") as output:
         process = await asyncio.create_subprocess_exec(
             *program,
             str(theirs.fileno()),
             str(os.getpid()),
-            pass_fds=(theirs.fileno(),),
+            *map(str, shared),
+            pass_fds=(theirs.fileno(), *shared),
             env=environment,
             stdin=asyncio.subprocess.DEVNULL,
             stdout=output,

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from embomatrix.worker.processes import Child, Root
+    from embomatrix.worker.progress import ProgressBoard
 
 logger = logging.getLogger(__name__)
 
@@ -113,8 +114,10 @@ class Residents:
         on_change: Callable[[Scene], None],
         log: Path,
         program: tuple[str, ...] = SIMULATOR_PROGRAM,
+        board: ProgressBoard | None = None,
     ) -> None:
         self._limits = limits
+        self._board = board
         self._bundle_path = bundle_path
         self._on_change = on_change
         self._log = log
@@ -297,7 +300,7 @@ class Residents:
     async def _ready_root(self) -> Root:
         async with self._root_turn:
             if self._root is None:
-                self._root = await start_root(self._log, self._program)
+                self._root = await start_root(self._log, self._program, self._board)
             return self._root
 
     def _evict(self, digest: str) -> None:

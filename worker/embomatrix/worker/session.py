@@ -15,6 +15,7 @@ from embomatrix.rpc.channel import PROTOCOL_VERSION, open_channel
 from embomatrix.rpc.convert import each, resources_to_proto
 from embomatrix.rpc.convert_session import (
     lease_from_proto,
+    lease_progress_to_proto,
     lease_ref_from_proto,
     lease_ref_to_proto,
     lease_result_to_proto,
@@ -100,7 +101,9 @@ class Session:
         self._registration = registration
         self._pool = pool
         self._outbox = outbox
-        self._draining = False
+        self._leaving = False
+        self._told_to_drain = False
+        self._paused = ""
         self._state_due = False
         self._news = asyncio.Event()
         self._lingering: asyncio.TimerHandle | None = None
@@ -124,8 +127,17 @@ class Session:
 
     def drain(self) -> None:
         """Take nothing new; the session ends when everything held is finished and acknowledged."""
-        self._draining = True
+        self._leaving = True
         self.tell_state()
+
+    def pause(self, reason: str) -> None:
+        """Ask for nothing new and keep the scenes, for this reason; an empty one takes that back."""
+        self._paused = reason
+        self.tell_state()
+
+    @property
+    def _draining(self) -> bool:
+        return self._leaving or self._told_to_drain
 
     async def serve(self) -> None:
         """Keep the session until the connection breaks, the manager ends it, or the worker has drained."""
@@ -188,7 +200,12 @@ class Session:
         claims = (*self._pool.claims(), *self._outbox.claims())
         yield self._request(
             state=WorkerState(
-                self._pool.residents(), self._pool.held(), finished, self._draining, claims=claims
+                self._pool.residents(),
+                self._pool.held(),
+                finished,
+                self._draining,
+                self._paused,
+                claims,
             )
         )
         while not self._drained():
@@ -208,7 +225,7 @@ class Session:
             self._lingering = None
 
     def _state(self) -> WorkerState:
-        return WorkerState(self._pool.residents(), self._pool.held(), (), self._draining)
+        return WorkerState(self._pool.residents(), self._pool.held(), (), self._draining, self._paused)
 
     def _request(self, state: WorkerState | None) -> pb.SessionRequest:
         return pb.SessionRequest(
@@ -221,9 +238,12 @@ class Session:
         return self._draining and not self._pool.held() and not len(self._outbox)
 
     def _take(self, response: pb.SessionResponse) -> None:
-        if response.drain and not self._draining:
-            logger.info("the manager asks this worker to drain")
-            self.drain()
+        if response.drain != response.resume and response.drain != self._told_to_drain:
+            logger.info(
+                "the manager %s", "asks this worker to drain" if response.drain else "takes its drain back"
+            )
+            self._told_to_drain = response.drain
+            self.tell_state()
         if response.HasField("desired"):
             self._pool.want(response.desired.bundle_digests)
         for ref in each("acknowledged", lease_ref_from_proto, response.acknowledged):
@@ -251,6 +271,7 @@ class Session:
                 running=[lease_ref_to_proto(ref) for ref in self._pool.held()],
                 load=self._pool.load,
                 memory_used_mb=int(self._pool.memory_used_mb),
+                progress=[lease_progress_to_proto(progress) for progress in self._pool.progress()],
             )
             try:
                 with cluster_errors(self._address):

@@ -7,6 +7,7 @@ threads: a thread does not survive a fork, but the locks that it held do.
 
 from __future__ import annotations
 
+import functools
 import gc
 import itertools
 import select
@@ -32,9 +33,10 @@ from embomatrix.sim.zygote import (
     serve_forks,
     take_small_pages,
 )
+from embomatrix.worker.progress import ProgressBoard
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from embomatrix.rpc.values import Completed, Rollout
 
@@ -49,7 +51,8 @@ COLLECT_EVERY: Final = 32
 class LoadedScene(Protocol):
     """A scene in memory, ready to execute plans. It leaves nothing behind from one rollout to the next."""
 
-    def execute(self, rollout: Rollout) -> Completed: ...
+    def execute(self, rollout: Rollout, on_step: Callable[[int], None]) -> Completed:
+        """Execute the plan; ``on_step`` is told after each step how many are done."""
 
     def complete(self) -> Iterator[None]:
         """Steps of a millisecond or two that make later executions faster and change nothing else."""
@@ -70,11 +73,16 @@ class BundleCorruptError(Exception):
 
 
 def run_program(simulation: Simulation) -> None:
-    """Serve as root until the daemon goes away. Arguments: the control socket's descriptor, the daemon's process id."""
+    """Serve as root until the daemon goes away.
+
+    Arguments: the control socket's descriptor, the daemon's process id, and the descriptor of a board of progress, if
+    anybody reads one.
+    """
     die_with_parent(int(sys.argv[2]))
     # Ctrl-C is for the daemon: it drains first, and ends this process when it is done.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     control = socket.socket(fileno=int(sys.argv[1]))
+    board = ProgressBoard(int(sys.argv[3])) if len(sys.argv) > 3 else ProgressBoard.create(0)
     try:
         simulation.prepare()
     except Exception as error:  # noqa: BLE001  # the daemon tells the person
@@ -82,10 +90,10 @@ def run_program(simulation: Simulation) -> None:
         return
     send(control, Frame({"memory_mb": private_mb()}))
     gc.collect()
-    serve_forks(control, lambda connection: _hold_scene(simulation, connection))
+    serve_forks(control, lambda connection: _hold_scene(simulation, connection, board))
 
 
-def _hold_scene(simulation: Simulation, connection: socket.socket) -> None:
+def _hold_scene(simulation: Simulation, connection: socket.socket, board: ProgressBoard) -> None:
     """Load the scene that the first frame names, then fork slots from it. It executes nothing itself: it stays pristine."""
     request = receive(connection)
     if request is None:
@@ -105,10 +113,10 @@ def _hold_scene(simulation: Simulation, connection: socket.socket) -> None:
     send(connection, Frame({"load_s": load_s, "cpu_s": cpu_s, "memory_mb": private_mb()}))
     memory_mb = int(request.header["slot_memory_mb"])
     gc.enable()
-    serve_forks(connection, lambda slot: _run_slot(scene, slot, memory_mb), scene.complete())
+    serve_forks(connection, lambda slot: _run_slot(scene, slot, memory_mb, board), scene.complete())
 
 
-def _run_slot(scene: LoadedScene, connection: socket.socket, memory_mb: int) -> None:
+def _run_slot(scene: LoadedScene, connection: socket.socket, memory_mb: int, board: ProgressBoard) -> None:
     """Execute rollouts, one after another, until the daemon closes the stream."""
     limit_memory(memory_mb)
     take_small_pages()
@@ -123,14 +131,17 @@ def _run_slot(scene: LoadedScene, connection: socket.socket, memory_mb: int) -> 
         request = receive(connection)
         if request is None:
             return
-        send(connection, _answer(scene, request.body))
+        on_step = functools.partial(board.set, int(request.header.get("slot", 0)))
+        send(connection, _answer(scene, request.body, on_step))
 
 
-def _answer(scene: LoadedScene, body: bytes) -> Frame:
+def _answer(scene: LoadedScene, body: bytes, on_step: Callable[[int], None]) -> Frame:
     started_s, core_s = time.perf_counter(), time.thread_time()
     try:
-        completed = scene.execute(rollout_from_proto(types_pb2.Rollout.FromString(body)))
+        completed = scene.execute(rollout_from_proto(types_pb2.Rollout.FromString(body)), on_step)
         result = completed_to_proto(completed).SerializeToString()
+    except MemoryError as error:
+        return Frame(_failure(InfraCode.SLOT_OOM, error))
     except Exception as error:  # noqa: BLE001  # a defect is a failure of the infrastructure, never a reward
         return Frame(_failure(InfraCode.SLOT_CRASHED, error))
     header = {

@@ -14,9 +14,18 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.proto.v1 import types_pb2
 from embomatrix.rpc.convert import completed_from_proto, rollout_to_proto
-from embomatrix.rpc.values import InfraCode, InfraFailure, LeaseClaim, LeaseResult, ResidentState, Timings
+from embomatrix.rpc.values import (
+    InfraCode,
+    InfraFailure,
+    LeaseClaim,
+    LeaseProgress,
+    LeaseResult,
+    ResidentState,
+    Timings,
+)
 from embomatrix.sim.zygote import Frame
 from embomatrix.worker.processes import SIMULATOR_PROGRAM, ProcessGoneError
+from embomatrix.worker.progress import ProgressBoard
 from embomatrix.worker.residents import Residents
 
 if TYPE_CHECKING:
@@ -75,8 +84,14 @@ class SlotPool:
         self._limits = limits
         self._on_result = on_result
         self._on_change = on_change
+        self._board = ProgressBoard.create(limits.slots)
         self._residents = Residents(
-            limits, bundle_path=bundle_path, on_change=self._scene_changed, log=log, program=program
+            limits,
+            bundle_path=bundle_path,
+            on_change=self._scene_changed,
+            log=log,
+            program=program,
+            board=self._board,
         )
         self._wanted: tuple[str, ...] = ()
         self._waiting: deque[_Ticket] = deque()
@@ -106,6 +121,11 @@ class SlotPool:
     def held(self) -> tuple[LeaseRef, ...]:
         """Leases that wait or run here: those to renew."""
         return tuple(self._tickets)
+
+    def progress(self) -> tuple[LeaseProgress, ...]:
+        """How far the leases are that run."""
+        running = ((ref, ticket.slot) for ref, ticket in self._tickets.items() if ticket.slot)
+        return tuple(LeaseProgress(ref, self._board.steps(slot)) for ref, slot in running)
 
     def claims(self) -> tuple[LeaseClaim, ...]:
         """What these leases are for."""
@@ -186,6 +206,7 @@ class SlotPool:
             scene.last_used = self._clock
             scene.running += 1
             ticket.slot, ticket.began_s = heapq.heappop(self._free), time.monotonic()
+            self._board.set(ticket.slot, 0)
             ticket.task = tasks.create_task(self._run_lease(ticket, scene))
             # A task that is cancelled before its first step runs no `finally` of its own.
             ticket.task.add_done_callback(functools.partial(self._release, scene, ticket.slot))
@@ -214,7 +235,7 @@ class SlotPool:
         body = rollout_to_proto(ticket.lease.rollout).SerializeToString()
         try:
             async with asyncio.timeout(ticket.lease.deadline_s):
-                answer = await slot.child.peer.ask(Frame({"op": "execute"}, body))
+                answer = await slot.child.peer.ask(Frame({"op": "execute", "slot": ticket.slot}, body))
         except TimeoutError:
             self._residents.end_later(slot.child)
             late = f"the rollout took longer than its {ticket.lease.deadline_s:g} s and was killed"
