@@ -6,6 +6,7 @@ height. Room doors have no leaves.
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import TYPE_CHECKING, Final
 
@@ -173,11 +174,11 @@ class Navigator:
         start = self.ground.shut.cell(origin.x_m, origin.y_m)
         if start is None or self._engine.is_parked(name):
             return ()
-        if self.ground.floor == () and self._is_as_loaded(name) and self._serves_start(start):
+        label = self.ground.shut.label(start)
+        if self.ground.floor == () and label == self._part_of_start and self._is_as_loaded(name):
             found = self._found_before.get(name)
             if found is not None:
                 return found
-        label = self.ground.shut.label(start)
         return self._stands_on(self.ground.shut, (self._key(name), (), label), name)
 
     def _stands_on(
@@ -272,10 +273,12 @@ class Navigator:
             for item in (name, *self._relations.hosts_of(name))
         )
 
-    def _serves_start(self, cell: Cell) -> bool:
-        """Whether a path leads from a cell to where the scene has the robot start."""
-        start = self.ground.shut.cell(self.start.x_m, self.start.y_m)
-        return start is not None and self.ground.shut.label(start) == self.ground.shut.label(cell)
+    @functools.cached_property
+    def _part_of_start(self) -> int:
+        """Number of the part of the floor, as it was loaded, where the scene has the robot start; 0 when it is on none."""
+        _, grid = self.ground.at_start
+        start = grid.cell(self.start.x_m, self.start.y_m)
+        return grid.label(start) if start is not None else 0
 
     def _cell(self, pose: StandPose) -> Cell | None:
         return self.ground.grid.cell(pose.x_m, pose.y_m)
