@@ -56,7 +56,7 @@ def of_the_leader(
             try:
                 return await method(self, *args, **options)
             except UnavailableError as error:
-                if not self.managers.several or time.monotonic() >= ends_s:
+                if self.managers.count == 1 or time.monotonic() >= ends_s:
                     raise
                 self.managers.move(error)
             await asyncio.sleep(PAUSE_S)
@@ -72,8 +72,8 @@ class Managers:
         self.current = self._addresses[0]
 
     @property
-    def several(self) -> bool:
-        return len(self._addresses) > 1
+    def count(self) -> int:
+        return len(self._addresses)
 
     def move(self, error: ClusterError) -> None:
         """After a failed call: to the leader that the present manager named, else to the next in turn.

@@ -31,7 +31,7 @@ def test_a_lone_manager_stays_the_one():
     managers = Managers("a:1")
     managers.move(UnavailableError("nobody answers"))
     assert managers.current == "a:1"
-    assert not managers.several
+    assert managers.count == 1
 
 
 @pytest.mark.parametrize("text", ["", "a", "a:1,", "a:1;b:2", "a:0"])

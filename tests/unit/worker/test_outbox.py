@@ -71,7 +71,7 @@ def test_no_result_is_lost_before_it_is_acknowledged(actions):
 
 
 def test_waits_double_up_to_the_longest_and_start_over_after_a_success():
-    backoff = Backoff(default_rng(0))
+    backoff = Backoff(default_rng(0), longest_s=3.0)
     waits = [backoff.next_s() for _ in range(12)]
     assert all(0.8 <= wait / min(3.0, 0.2 * 2**n) <= 1.2 for n, wait in enumerate(waits))
     backoff.reset()

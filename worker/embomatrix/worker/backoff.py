@@ -14,9 +14,8 @@ class Backoff:
     """Doubles from ``first_s`` to ``longest_s`` seconds; each wait is spread by a fifth to both sides."""
 
     rng: np.random.Generator
+    longest_s: float
     first_s: float = 0.2
-    longest_s: float = 3.0
-    """A manager that comes back has its workers within five seconds."""
     _attempts: int = 0
 
     def next_s(self) -> float:

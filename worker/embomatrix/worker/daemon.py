@@ -39,6 +39,8 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+LONGEST_WAIT_S: Final = 3.0
+"""Between two attempts to connect: a manager that comes back has its workers within five seconds."""
 FENCE_CHECK_S: Final = 0.5
 DRAIN_RETRY_S: Final = 1.0
 """While it drains, a worker tries to deliver its last results at least this often."""
@@ -64,7 +66,8 @@ class Daemon:
         self._resources = resources
         self._boot_id = secrets.token_hex(8)
         self._managers = Managers(settings.manager)
-        self._backoff = Backoff(rng)
+        # Each of several managers is asked as often as one would be.
+        self._backoff = Backoff(rng, longest_s=LONGEST_WAIT_S / self._managers.count)
         self._outbox = Outbox()
         folder = settings.cache_dir.expanduser()
         folder.mkdir(parents=True, exist_ok=True)

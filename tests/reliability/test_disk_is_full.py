@@ -1,0 +1,39 @@
+"""The manager's disk runs full in the middle of a batch: nothing is lost, and it goes on when there is room again."""
+
+import asyncio
+import resource
+
+import psutil
+import pytest
+from tests.fakes.real_cluster import RealCluster, batch_of, connected, opened, outcomes, tally, tell, until
+
+from embomatrix.rpc.status import OverloadedError
+
+pytestmark = [pytest.mark.timeout(240), pytest.mark.slow]
+
+
+async def test_results_wait_for_room_on_the_disk_and_new_runs_are_refused_with_the_remedy(tmp_path):
+    with RealCluster(tmp_path) as cluster:
+        cluster.start_manager()
+        cluster.start_worker("w1")
+        async with cluster.client() as client:
+            await connected(client, "w1")
+            batch = batch_of(await opened(client), 400, "brief")
+            seen = []
+            running = asyncio.create_task(outcomes(client, batch, then=seen.append))
+            await until(lambda: len(seen) >= 20)
+            manager = psutil.Process(cluster.processes["manager"].pid)
+            # No file of this process may grow, as on a disk without room.
+            manager.rlimit(resource.RLIMIT_FSIZE, (4096, resource.RLIM_INFINITY))
+            await until(lambda: "make room on its disk" in cluster.log("manager"))
+            with pytest.raises(OverloadedError, match="make room on its disk"):
+                await client.open_run("another")
+            waited_at = len(seen)
+            await asyncio.sleep(2.0)
+            assert len(seen) == waited_at, "a result was shown that is not written down"
+            manager.rlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+            results = await running
+        counted = tally(batch, results)
+        tell("disk full", counted, delivered_before=waited_at)
+        assert counted.clean
+        assert set(cluster.executed().values()) == {1}
