@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.sim.barriers import no_way_into, no_way_to
+from embomatrix.sim.barriers import no_way_for_arm, no_way_into, no_way_to
 from embomatrix.sim.household import clean, cut, soak
 from embomatrix.sim.leaves import Leaves
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.syntax import Skill
 from embomatrix.skills.view import metres, preposition, refuse, target_of
 from embomatrix.world.geometry import Pose
-from embomatrix.world.poses import StandPose
+from embomatrix.world.poses import Handling, StandPose
 from embomatrix.world.state import Relation, State
 
 if TYPE_CHECKING:
@@ -45,7 +45,9 @@ class CachedActor:
 
     def act(self, world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
         """Carry out a call whose preconditions hold. A refusal leaves the world as it was."""
-        return ACTIONS[call.skill](world, call, rng)
+        handling = HANDLINGS.get(call.skill)
+        refusal = no_way_for_arm(world, handling, target_of(world, call)) if handling is not None else None
+        return refusal or ACTIONS[call.skill](world, call, rng)
 
     def close(self) -> None:
         """Nothing to free."""
@@ -186,3 +188,12 @@ ACTIONS: Final[Mapping[Skill, Action]] = {
     Skill.SOAK: soak,
 }
 """One action for each skill."""
+
+HANDLINGS: Final[Mapping[Skill, Handling]] = {
+    Skill.PICK_UP: Handling.TAKE,
+    Skill.OPEN: Handling.OPEN,
+    Skill.CLOSE: Handling.CLOSE,
+    Skill.TOGGLE_ON: Handling.PRESS,
+    Skill.TOGGLE_OFF: Handling.PRESS,
+}
+"""Skills of which the scene's analysis knows where the arm finds no way."""

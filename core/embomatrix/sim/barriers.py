@@ -17,10 +17,21 @@ if TYPE_CHECKING:
     from embomatrix.sim.live_world import LiveWorld
     from embomatrix.skills.view import Refusal
     from embomatrix.world.geometry import FloatArray, Vec2
+    from embomatrix.world.poses import Handling
 
 RASTER_M: Final = 0.1
 """Distance of the points at which the robot might stand."""
 WALL: Final = "a wall"
+
+
+def no_way_for_arm(world: LiveWorld, handling: Handling, target: str) -> Refusal | None:
+    """Refusal when the scene's analysis found no way of the arm to do this; while all stays where it was."""
+    other = world.barred.get(handling, {}).get(target, "")
+    if not other or not all(
+        world.navigator.is_as_loaded(name) for name in (target, other) if name in world.scene.by_name
+    ):
+        return None
+    return refuse(FailureReason.ARM_BLOCKED, target=target, other=other)
 
 
 def no_way_to(world: LiveWorld, target: str) -> Refusal:

@@ -42,6 +42,8 @@ class LiveWorld:
         self.relations = Relations(engine)
         self.navigator = Navigator(engine, self.relations, bundle.poses.stands, Prepared.of(bundle))
         self.placer = Placer(engine, self.relations, bundle.poses)
+        self.barred = bundle.poses.barred
+        """What the arm finds no way to in the scene as it was loaded."""
         self.states: Symbols[State] = Symbols()
         self.substances: Symbols[SubstanceFact] = Symbols()
         self._future = frozenset(item.name for item in self.scene.objects if item.absent)

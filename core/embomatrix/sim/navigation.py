@@ -175,7 +175,7 @@ class Navigator:
         if start is None or self._engine.is_parked(name):
             return ()
         label = self.ground.shut.label(start)
-        if self.ground.floor == () and label == self._part_of_start and self._is_as_loaded(name):
+        if self.ground.floor == () and label == self._part_of_start and self.is_as_loaded(name):
             found = self._found_before.get(name)
             if found is not None:
                 return found
@@ -245,6 +245,13 @@ class Navigator:
         near = math.dist(here, nearest) <= ROBOT.reach_m
         return not crosses(here, nearest, self._blockers_of(name) if near else self._all_blockers_of(name))
 
+    def is_as_loaded(self, name: str) -> bool:
+        """Whether the object and what it stands on or in are where the scene has them."""
+        return all(
+            self._engine.pose(item) == self._scene.by_name[item].pose_world_asset
+            for item in (name, *self._relations.hosts_of(name))
+        )
+
     def _blockers_of(self, name: str) -> FloatArray:
         """Those rectangles within reach of the object that the arm can't pass on its way to it, shape (4, n)."""
         key = self._key(name)
@@ -265,13 +272,6 @@ class Navigator:
         """All that standing poses and lines of approach depend on, but for where the robot is."""
         hosts = tuple(self._relations.hosts_of(name))
         return self.ground.floor, name, self._engine.pose(name), hosts
-
-    def _is_as_loaded(self, name: str) -> bool:
-        """Whether the object and what it stands on or in are where the scene has them."""
-        return all(
-            self._engine.pose(item) == self._scene.by_name[item].pose_world_asset
-            for item in (name, *self._relations.hosts_of(name))
-        )
 
     @functools.cached_property
     def _part_of_start(self) -> int:

@@ -13,6 +13,7 @@ from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.bullet.mini_world import MiniWorld, Still
 from embomatrix.sim.candidates import LIFT_M, candidates, stands_in, surfaces_for
+from embomatrix.sim.contents import Contents
 from embomatrix.sim.engine import TOLERANCE_M
 from embomatrix.sim.footprints import LEVEL_FLOOR, Footprint, box_of, footprint_of
 from embomatrix.sim.navigation import Navigator
@@ -51,14 +52,14 @@ class PlacementLibrary:
         self._mini = MiniWorld(self._pool)
         self._known: dict[tuple[str, str, Relation, int], tuple[Pose, ...]] = {}
         self._standing: dict[str, Pose | None] = {}
-        self._contents: dict[int, tuple[Asset, str]] = {}
+        self._contents = Contents()
 
     def poses(self, held: Asset, support: Asset, relation: Relation, seed: int) -> tuple[Pose, ...]:
         """Poses of ``held`` in the frame of ``support``, each stable and in the relation; empty when none was found.
 
         Depends on nothing but the arguments' content.
         """
-        key = (self._content(held), self._content(support), relation, seed)
+        key = (self._contents.of(held), self._contents.of(support), relation, seed)
         if key not in self._known:
             self._known[key] = tuple(self._verified(held, support, relation, _shift(key), POSES))
         return self._known[key]
@@ -67,7 +68,7 @@ class PlacementLibrary:
         self, footprint: Footprint, support: Asset, relation: Relation, seed: int
     ) -> tuple[Pose, ...]:
         """Poses of a class's box in the frame of ``support``, each stable, in the relation, and level all over."""
-        key = (footprint.name, self._content(support), relation, seed)
+        key = (footprint.name, self._contents.of(support), relation, seed)
         if key not in self._known:
             box, most = box_of(footprint), _wanted(support, relation)
             found = self._verified(box, support, relation, _shift(key), most)
@@ -83,7 +84,7 @@ class PlacementLibrary:
 
     def standing(self, asset: Asset) -> Pose | None:
         """Pose in which the asset stands by itself on a level floor at height 0; None when it does not."""
-        key = self._content(asset)
+        key = self._contents.of(asset)
         if key not in self._standing:
             low = bounds_of(asset).box(IDENTITY).low_m[2]
             pose = Pose((0.0, 0.0, LIFT_M - low))
@@ -122,14 +123,6 @@ class PlacementLibrary:
             if settled.stable and stands_in(held, back @ settled.pose, support, relation):
                 found += 1
                 yield back @ settled.pose
-
-    def _content(self, asset: Asset) -> str:
-        """Digest of everything in the asset. The asset is kept, so that its id can't pass to another one."""
-        known = self._contents.get(id(asset))
-        if known is None:
-            known = (asset, hashlib.sha256(repr(asset).encode()).hexdigest())
-            self._contents[id(asset)] = known
-        return known[1]
 
 
 def build_pose_cache(

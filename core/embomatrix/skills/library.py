@@ -180,6 +180,7 @@ LIBRARY: Final[Mapping[Skill, Entry]] = {
             *_AT_HAND,
             Precondition.BEARS_NOTHING,
         ),
+        (FailureReason.ARM_BLOCKED,),
     ),
     Skill.PLACE: Entry(
         "Put what the hand holds on top of, inside or under the object.",
@@ -212,7 +213,7 @@ LIBRARY: Final[Mapping[Skill, Entry]] = {
             Precondition.IS_CLOSED,
             Precondition.NOT_RUNNING,
         ),
-        (FailureReason.DOOR_BLOCKED,),
+        (FailureReason.DOOR_BLOCKED, FailureReason.ARM_BLOCKED),
     ),
     Skill.CLOSE: Entry(
         "Close every door, drawer or lid of the object with the empty hand.",
@@ -224,7 +225,7 @@ LIBRARY: Final[Mapping[Skill, Entry]] = {
             *_AT_HAND,
             Precondition.IS_OPEN,
         ),
-        (FailureReason.DOOR_BLOCKED,),
+        (FailureReason.DOOR_BLOCKED, FailureReason.ARM_BLOCKED),
     ),
     Skill.TOGGLE_ON: Entry(
         "Switch the object on with the empty hand.",
@@ -237,6 +238,7 @@ LIBRARY: Final[Mapping[Skill, Entry]] = {
             Precondition.IS_OFF,
             Precondition.CLOSED_TO_START,
         ),
+        (FailureReason.ARM_BLOCKED,),
     ),
     Skill.TOGGLE_OFF: Entry(
         "Switch the object off with the empty hand.",
@@ -248,6 +250,7 @@ LIBRARY: Final[Mapping[Skill, Entry]] = {
             *_AT_HAND,
             Precondition.IS_ON,
         ),
+        (FailureReason.ARM_BLOCKED,),
     ),
     Skill.HEAT: Entry(
         "Wait beside a working heat source until the object at it is hot.",
@@ -361,7 +364,7 @@ MISHAPS: Final[Mapping[Skill, tuple[FailureReason, ...]]] = {
     Skill.CLEAN: _AT_WORK,
     Skill.SOAK: _AT_WORK,
 }
-"""What else stops a skill when a robot really carries it out: reasons of the physical mode alone."""
+"""What else stops a skill when a robot really carries it out; cached mode gives what was foreseen of it."""
 
 
 def reasons_of(skill: Skill) -> frozenset[FailureReason]:

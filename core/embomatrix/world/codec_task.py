@@ -9,7 +9,7 @@ from embomatrix.world.codec_asset import pose_from_field, pose_to_json
 from embomatrix.world.evaluate import GoalError, objects_of
 from embomatrix.world.field import Field
 from embomatrix.world.placements import flattened
-from embomatrix.world.poses import PlacementKey, PoseCache, StandPose
+from embomatrix.world.poses import Handling, PlacementKey, PoseCache, StandPose
 from embomatrix.world.state import Relation
 from embomatrix.world.task import MAX_TABLE, Profile, Task, TaskCategory
 
@@ -88,7 +88,7 @@ def poses_to_json(poses: PoseCache, tables: TableWriter | None = None) -> Json:
     if tables is not None:
         names, sets, spots = flattened(poses.placements)
         tables.placements(sets, spots)
-        return {"placements": names, "stands": stands}
+        return {"placements": names, "stands": stands, **_barred_to_json(poses)}
     placements = [
         {
             "asset_id": key.asset_id,
@@ -98,15 +98,16 @@ def poses_to_json(poses: PoseCache, tables: TableWriter | None = None) -> Json:
         }
         for key, found in poses.placements.items()
     ]
-    return {"placements": placements, "stands": stands}
+    return {"placements": placements, "stands": stands, **_barred_to_json(poses)}
 
 
 def poses_from_json(value: object, tables: Tables | None = None) -> PoseCache:
     """A pose cache; ``tables`` hold the rows that it was written with. Raises SceneInvalidError."""
-    fields = Field(value, "poses", tables=tables).record("placements", "stands")
+    fields = Field(value, "poses", tables=tables).record("placements", "stands", optional=("barred",))
+    barred = _barred_from_json(fields["barred"]) if "barred" in fields else {}
     if tables is not None:
         names = [item.name() for item in fields["placements"].items()]
-        return PoseCache(tables.placements(names), tables.stands(fields["stands"]))
+        return PoseCache(tables.placements(names), tables.stands(fields["stands"]), barred)
     stands = {
         name: tuple(StandPose(*stand.vec3()) for stand in found.items())
         for name, found in fields["stands"].entries()
@@ -120,7 +121,21 @@ def poses_from_json(value: object, tables: Tables | None = None) -> PoseCache:
         if key in placements:
             item.fail("the same placement stands in the cache twice")
         placements[key] = tuple(pose_from_field(pose) for pose in entry["poses"].items())
-    return PoseCache(placements, stands)
+    return PoseCache(placements, stands, barred)
+
+
+def _barred_to_json(poses: PoseCache) -> dict[str, Json]:
+    """One entry by handling, none where nothing is barred."""
+    barred: Json = {handling.value: dict(found) for handling, found in poses.barred.items() if found}
+    return {"barred": barred} if barred else {}
+
+
+def _barred_from_json(field: Field) -> dict[Handling, dict[str, str]]:
+    kinds = field.record(optional=tuple(Handling))
+    return {
+        Handling(kind): {name: other.name() for name, other in found.entries()}
+        for kind, found in kinds.items()
+    }
 
 
 def _stands_to_json(stands: tuple[StandPose, ...], tables: TableWriter | None) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from enum import StrEnum
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -30,11 +31,22 @@ class PlacementKey:
     relation: Relation
 
 
+class Handling(StrEnum):
+    """What the hand does to an object where it stands."""
+
+    TAKE = "take"
+    OPEN = "open"
+    CLOSE = "close"
+    PRESS = "press"
+
+
 @dataclass(frozen=True)
 class PoseCache:
     """``placements``: poses of the placed asset in the *support's* asset frame, each verified by settling in physics.
     ``stands``: standing poses per object name, in the world, best first.
+    ``barred``: by object name what bars the arm's way where there is none, in the scene as it was loaded.
     """
 
     placements: Mapping[PlacementKey, tuple[Pose, ...]] = field(default_factory=dict)
     stands: Mapping[str, tuple[StandPose, ...]] = field(default_factory=dict)
+    barred: Mapping[Handling, Mapping[str, str]] = field(default_factory=dict)

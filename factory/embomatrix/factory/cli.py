@@ -32,6 +32,7 @@ from embomatrix.factory.task_import.sources import (
     read_jsonl,
 )
 from embomatrix.sim.engine import EngineMissingError
+from embomatrix.sim.physical.survey import Foresight
 from embomatrix.sim.pose_cache import PlacementLibrary
 from embomatrix.world.bddl import BddlError, parse_problem
 from embomatrix.world.catalog import Catalog, CatalogError
@@ -206,11 +207,12 @@ def _judged(
     outcomes: list[Imported | Verified | Refusal] = []
     with _progress(console) as bars, contextlib.closing(PlacementLibrary()) as library:
         bar = bars.add_task("problems", total=len(sources))
+        foresight = Foresight()
         for source in sources:
             if bind_only:
                 outcomes.append(bind_first(source, bases, seed=seed))
             else:
-                outcomes.append(verify_first(source, bases, library, seed=seed))
+                outcomes.append(verify_first(source, bases, library, foresight, seed=seed))
             bars.advance(bar)
     return outcomes
 

@@ -28,6 +28,7 @@ from embomatrix.factory.task_import.sources import (
 from embomatrix.factory.task_import.task import Imported, category_of, import_problem, instruction_of
 from embomatrix.sim.engine import FLOOR
 from embomatrix.sim.executor import Simulator
+from embomatrix.sim.physical.survey import Foresight
 from embomatrix.sim.pose_cache import PlacementLibrary
 from embomatrix.world.bddl import BddlError, Literal, parse_formula, parse_problem
 from embomatrix.world.bundle import Bundle, bundle_digest, decode_bundle, encode_bundle
@@ -228,7 +229,7 @@ def test_imported_task_is_verified_by_execution(home: Scene) -> None:
     text = text.replace("(ontop apple.n.01_2 breakfast_table.n.01_1)\n", "")
     imported = import_problem(source(text), home)
     assert isinstance(imported, Imported)
-    outcome = verify(imported, PlacementLibrary())
+    outcome = verify(imported, PlacementLibrary(), Foresight())
     assert isinstance(outcome, Verified), outcome
     assert [call["action"] for call in outcome.record.oracle][-1] == "close"
 
@@ -343,7 +344,7 @@ def test_a_floor_that_the_goal_is_about_becomes_an_object_that_can_be_wiped_and_
     task = imported.task
     assert "(not (covered floors_1 dust.n.01)) (ontop plate_1 floors_1)" in task.goal_bddl
     assert imported.scene.by_name["floors_1"].fixed
-    outcome = verify(imported, PlacementLibrary())
+    outcome = verify(imported, PlacementLibrary(), Foresight())
     assert isinstance(outcome, Verified), outcome
     assert {"clean_object_with_tool", "slice_object_with_tool"} <= {
         step["action"] for step in outcome.record.oracle

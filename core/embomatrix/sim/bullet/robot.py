@@ -80,8 +80,12 @@ class RobotBody:
         self._forces += [SHOULDER_EFFORT_NM] * 4 + [WRIST_EFFORT_NM] * 3 + [FINGER_N] * 2
         self._inertial = Pose(tuple(bullet.getDynamicsInfo(self.body, self.hand, physicsClientId=client)[3]))
         self._hold = -1
+        self.appear(posture)
+
+    def appear(self, posture: Posture) -> None:
+        """Be in a posture at once, whatever is there."""
         for joint, value in zip(self._driven, spread(posture), strict=True):
-            bullet.resetJointState(self.body, joint, value, physicsClientId=client)
+            self._bullet.resetJointState(self.body, joint, value, physicsClientId=self._client)
         self.steer(posture)
 
     @property

@@ -149,7 +149,7 @@ def _lead_all(stage: Stage, name: str, goal: float, rng: np.random.Generator) ->
         return refuse(FailureReason.ARM_BLOCKED, target=name, other=name)
     home = stage.told
     refusal = None
-    row = sorted(leaves_of(stage, name), key=lambda leaf: leaf.height_m, reverse=not goal)
+    row = in_turn(stage, name, goal)
     # Who leads a leaf may push one that is done: those have a second turn.
     for leaf in (*row, *row):
         if _is_done(stage.dynamic.bodies.joints(name)[leaf.number], goal):
@@ -164,6 +164,11 @@ def _lead_all(stage: Stage, name: str, goal: float, rng: np.random.Generator) ->
     # Where the robot ends up does not undo what became of the door.
     fold(stage, stage.world.navigator.aside(name, home), rng, name)
     return refusal
+
+
+def in_turn(stage: Stage, name: str, goal: float) -> list[Leaf]:
+    """The leaves of an object in the order in which they are led: to open it the low ones first, to shut it the high ones."""
+    return sorted(leaves_of(stage, name), key=lambda leaf: leaf.height_m, reverse=not goal)
 
 
 def _is_done(reached: float, goal: float) -> bool:
@@ -189,6 +194,17 @@ def _lead(stage: Stage, leaf: Leaf, goal: float, rng: np.random.Generator) -> Re
 
 def _stretch(stage: Stage, leaf: Leaf, start: float, goal: float, rng: np.random.Generator) -> Refusal | None:
     """Take the leaf where it is and lead it to a share of its travel."""
+    reach, ways = leading(stage, leaf, start, goal)
+    for way in itertools.islice(ways, WAYS):
+        _draw_in(stage, way, rng)
+        swing = approach(stage, way, reach, rng, loaded=False)
+        if swing is not None and unfold(stage, swing) is None:
+            return _pull(stage, way, leaf, goal)
+    return refuse(FailureReason.ARM_BLOCKED, target=leaf.name, other=reach.hindrance or SOMETHING)
+
+
+def leading(stage: Stage, leaf: Leaf, start: float, goal: float) -> tuple[Reach, Iterator[Way]]:
+    """Free ways to lead a leaf from one share of its travel to another, and what judges them."""
     boxes = stage.boxes()
     fractions = np.linspace(start, goal, WAYPOINTS)
     moving = [_leaf_boxes(leaf, float(fraction)) for fraction in fractions]
@@ -209,18 +225,12 @@ def _stretch(stage: Stage, leaf: Leaf, start: float, goal: float, rng: np.random
     reach = Reach(boxes, fixed, None, clear)
     tracks = _tracks(leaf, fractions)
     first = next(tracks)
-    point = first.position[2]
-    bases = stage.bases(point, 0.75, walk_m=FAR_M)
+    bases = stage.bases(first.position[2], 0.75, walk_m=FAR_M)
     if goal > start:
         # The others of the object will stand open too.
         ends = [_leaf_boxes(other, goal) for other in leaves_of(stage, leaf.name)]
         bases = stage.floor.cut_off_last(bases, functools.reduce(Boxes.joined, ends))
-    for way in itertools.islice(reach.ways(itertools.chain([first], tracks), bases), WAYS):
-        _draw_in(stage, way, rng)
-        swing = approach(stage, way, reach, rng, loaded=False)
-        if swing is not None and unfold(stage, swing) is None:
-            return _pull(stage, way, leaf, goal)
-    return refuse(FailureReason.ARM_BLOCKED, target=leaf.name, other=reach.hindrance or SOMETHING)
+    return reach, reach.ways(itertools.chain([first], tracks), bases)
 
 
 def _draw_in(stage: Stage, way: Way, rng: np.random.Generator) -> None:

@@ -67,16 +67,21 @@ def _was_pushed(stage: Stage, name: str) -> bool:
 
 
 def _take(stage: Stage, target: str, rng: np.random.Generator) -> Refusal | None:
+    tracks, roofed, bases = ways_to(stage, target)
+    return take_by(stage, target, tracks, roofed, bases, rng)
+
+
+def ways_to(stage: Stage, target: str) -> tuple[list[Track], int, list[FloatArray]]:
+    """Ways of the tool to an object, how many of the first lead in under a roof, and bases, (b, 3), to go them from."""
     world = stage.world
-    pose = world.engine.pose(target)
-    boxes = stage.boxes()
-    course, out_m = way_in(stage, target, world.engine.aabb(target), boxes)
-    tracks = grasp_tracks(world.asset(target), pose, world.engine.joints(target), course, out_m)
+    pose, joints = world.engine.pose(target), world.engine.joints(target)
+    course, out_m = way_in(stage, target, world.engine.aabb(target), stage.boxes())
+    tracks = grasp_tracks(world.asset(target), pose, joints, course, out_m)
     roofed = len(tracks) if out_m is not None else 0
     if roofed:
         # A roof may be high enough to come from above all the same: what is around decides.
-        tracks += grasp_tracks(world.asset(target), pose, world.engine.joints(target), course, None)
-    return take_by(stage, target, tracks, roofed, bases_at(stage, pose, course, out_m), rng)
+        tracks += grasp_tracks(world.asset(target), pose, joints, course, None)
+    return tracks, roofed, bases_at(stage, pose, course, out_m)
 
 
 def take_by(

@@ -20,6 +20,7 @@ from embomatrix.skills.view import refuse
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from embomatrix.sim.physical.reach import Reach, Way
     from embomatrix.sim.physical.stage import Stage
     from embomatrix.skills.view import Refusal
 
@@ -40,11 +41,9 @@ def press(stage: Stage, target: str, rng: np.random.Generator) -> Refusal | None
 
 
 def _press(stage: Stage, target: str, rng: np.random.Generator) -> Refusal | None:
-    tracks = _tracks(stage, target)
-    reach = stage.reach(stage.boxes(), target)
+    reach, ways = pressing(stage, target)
     refusal = None
-    point = np.array(stage.world.relations.body(target).center_m)
-    for way, refusal in arrivals(stage, reach.ways(tracks, stage.bases(point)), reach, rng, loaded=False):
+    for way, refusal in arrivals(stage, ways, reach, rng, loaded=False):
         if refusal is not None:
             continue
         stage.wake_around(target)
@@ -55,6 +54,13 @@ def _press(stage: Stage, target: str, rng: np.random.Generator) -> Refusal | Non
             return None
         refusal = refuse(FailureReason.ARM_BLOCKED, target=target, other=hit or SOMETHING)
     return refusal or refuse(FailureReason.ARM_BLOCKED, target=target, other=reach.hindrance or SOMETHING)
+
+
+def pressing(stage: Stage, target: str) -> tuple[Reach, Iterator[Way]]:
+    """Free ways to touch a thing, and what judges them."""
+    reach = stage.reach(stage.boxes(), target)
+    point = np.array(stage.world.relations.body(target).center_m)
+    return reach, reach.ways(_tracks(stage, target), stage.bases(point))
 
 
 def _tracks(stage: Stage, target: str) -> Iterator[Track]:

@@ -268,10 +268,6 @@ def stacked(base: Member, piece: Piece, index: int) -> Member:
     return Member(piece, base.x, base.y, base.bottom + top_of(base.piece) + REST_GAP_M, base.turns, on=index)
 
 
-def relation_of(member: Member) -> Relation | None:
-    return Relation.ONTOP if member.on >= 0 else None
-
-
 def around_table(table: Piece, chairs: Sequence[Piece], gap_m: float = 0.04) -> tuple[Member, ...]:
     """A table with chairs facing it: along the long sides first, then at the ends."""
     side, end = _places(table, max((c.size_m[1] for c in chairs), default=0.5))

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 
     FloatArray = NDArray[np.float64]
 
-TOP_ROOM_M: Final = 1.0
-"""Clearance at least assumed over a surface in the open; what stands above it is tested as a solid."""
 _EDGE_M: Final = 0.01
 _SAMPLES: Final = 60
 _SPACING_M: Final = np.array([0.01, 0.01, 0.0])

@@ -21,6 +21,7 @@ from embomatrix.factory.writer.tasks import PlainWriter, is_heldout_signature
 from embomatrix.factory.writer.variant import Variant, build_variant
 from embomatrix.factory.writer.view import SceneView
 from embomatrix.sim.executor import Simulator
+from embomatrix.sim.physical.survey import Foresight
 from embomatrix.sim.planner.oracle import find_plan
 from embomatrix.sim.pose_cache import PlacementLibrary
 from embomatrix.sim.prepared import prepare
@@ -128,7 +129,7 @@ def build_dataset(
     rooms = split_rooms(bases, settings.seed)
     writer = SocialWriter(settings.seed) if settings.writer is WriterKind.SOCIAL else PlainWriter()
     with contextlib.closing(PlacementLibrary()) as library:
-        bench = _Workbench(settings, writer, library, progress)
+        bench = _Workbench(settings, writer, library, Foresight(), progress)
         for split, target in (("heldout", settings.heldout), ("train", settings.train)):
             _fill_split(store, bases, rooms[split], split, target, bench)
     records = [record for result in store.results for record in result.records]
@@ -204,6 +205,7 @@ class _Workbench:
     settings: BuildSettings
     writer: TaskWriter
     library: PlacementLibrary
+    foresight: Foresight
     progress: Callable[[str, int], None]
 
 
@@ -224,6 +226,7 @@ class _VariantJob:
         self._seed = bench.settings.seed
         self._writer = bench.writer
         self._library = bench.library
+        self._foresight = bench.foresight
         self._known = set(known)
         self._view = SceneView(variant.scene)
         self._admitted: list[tuple[Draft, Plan]] = []
@@ -235,7 +238,7 @@ class _VariantJob:
         """The variant's records with their bundle, the missing categories in turns."""
         drafts = self._write(missing, rng)
         needs = [Needs(draft.about, draft.task.table) for draft in drafts]
-        poses = cache_poses(self._view, needs, self._library, self._seed)
+        poses = cache_poses(self._view, needs, self._library, self._foresight, self._seed)
         left = dict(missing)
         with contextlib.closing(Simulator(Bundle(self._variant.scene, {}, poses))) as stage:
             for draft in drafts:

@@ -1,14 +1,18 @@
-"""The pose cache of a task's scene: verified poses for what the goals bring together, standing poses for all rows.
+"""The pose cache of a task's scene: verified poses for what the goals bring together, standing poses that reach for all rows.
 
 Other pairs are left to the executor's live search: a plan that goes its own way costs milliseconds, not minutes here.
 """
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from embomatrix.sim.pose_cache import build_pose_cache, footprint_placements
+from embomatrix.sim.bullet.engine import BulletEngine
+from embomatrix.sim.live_world import LiveWorld
+from embomatrix.sim.pose_cache import footprint_placements, standing_poses
+from embomatrix.world.bundle import Bundle
 from embomatrix.world.poses import PlacementKey, PoseCache
 from embomatrix.world.state import Relation
 
@@ -16,6 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     from embomatrix.factory.writer.view import SceneView
+    from embomatrix.sim.physical.survey import Foresight
     from embomatrix.sim.pose_cache import PlacementLibrary
     from embomatrix.world.geometry import Pose
 
@@ -28,8 +33,10 @@ class Needs:
     table: tuple[str, ...]
 
 
-def cache_poses(view: SceneView, tasks: Iterable[Needs], library: PlacementLibrary, seed: int) -> PoseCache:
-    """Poses for every thing of a task on, or in, whatever of the same task can hold it.
+def cache_poses(
+    view: SceneView, tasks: Iterable[Needs], library: PlacementLibrary, foresight: Foresight, seed: int
+) -> PoseCache:
+    """Poses for every thing of a task on, or in, whatever of the same task can hold it, and what the arm can do to all rows.
 
     What a goal brings together has poses of its own; for all other rows of a task's table there are those of their
     footprints.
@@ -50,8 +57,10 @@ def cache_poses(view: SceneView, tasks: Iterable[Needs], library: PlacementLibra
             if view.is_surface(name) or view.is_container(name) or view.is_basket(name)
         ]
         placements.update(footprint_placements(scene, portable, holders, library, seed))
-    stands = build_pose_cache(scene, list(rows), [], seed=seed, library=library).stands
-    return PoseCache({key: poses for key, poses in placements.items() if poses}, stands)
+    kept = {key: poses for key, poses in placements.items() if poses}
+    with contextlib.closing(BulletEngine(scene)) as engine:
+        poses = PoseCache(kept, standing_poses(engine, list(rows)))
+        return foresight.survey(LiveWorld(Bundle(scene, {}, poses), engine), poses, rows, seed=seed)
 
 
 def _pairs(view: SceneView, about: tuple[str, ...]) -> Iterator[tuple[str, str, Relation]]:

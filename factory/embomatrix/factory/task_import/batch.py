@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from embomatrix.factory.task_import.sources import SourceText
+    from embomatrix.sim.physical.survey import Foresight
     from embomatrix.sim.pose_cache import PlacementLibrary
     from embomatrix.world.scene import Scene
 
@@ -40,13 +41,18 @@ def bind_first(source: SourceText, bases: Sequence[Scene], *, seed: int = 0) -> 
 
 
 def verify_first(
-    source: SourceText, bases: Sequence[Scene], library: PlacementLibrary, *, seed: int = 0
+    source: SourceText,
+    bases: Sequence[Scene],
+    library: PlacementLibrary,
+    foresight: Foresight,
+    *,
+    seed: int = 0,
 ) -> Verified | Refusal:
     """The problem in the first scene in which it is admitted, else the refusal that came furthest. Raises BddlError."""
 
     def judged(base: Scene) -> Verified | Refusal:
         imported = import_problem(source, base, seed=seed)
-        return imported if isinstance(imported, Refusal) else verify(imported, library, seed=seed)
+        return imported if isinstance(imported, Refusal) else verify(imported, library, foresight, seed=seed)
 
     return _first(judged(base) for base in bases)
 
@@ -66,10 +72,12 @@ def _first(outcomes: Iterable[T | Refusal]) -> T | Refusal:
     return max(refusals, key=lambda refusal: order.index(refusal.reason))
 
 
-def verify(imported: Imported, library: PlacementLibrary, *, seed: int = 0) -> Verified | Refusal:
+def verify(
+    imported: Imported, library: PlacementLibrary, foresight: Foresight, *, seed: int = 0
+) -> Verified | Refusal:
     """Judge an imported task by execution, and pack it when it is admitted."""
     needs = Needs(imported.about, imported.task.table)
-    poses = cache_poses(SceneView(imported.scene), [needs], library, seed)
+    poses = cache_poses(SceneView(imported.scene), [needs], library, foresight, seed)
     with contextlib.closing(Simulator(Bundle(imported.scene, {}, poses))) as stage:
         verdict = admit(stage, imported.task, find_plan, imported.init)
         if not isinstance(verdict, Admitted):

@@ -54,8 +54,6 @@ MEMBERS: Final[Mapping[Group, tuple[str, ...]]] = {
 }  # fmt: skip
 """Categories of each group. All of them can be carried; the food can be heated, cooked and frozen."""
 
-COOKABLE_GROUPS: Final = frozenset({Group.FOOD, Group.FRUIT})
-
 _KITCHEN: Final = (Group.FOOD, Group.FOOD, Group.FRUIT, Group.TABLEWARE, Group.PACKAGES)
 _DINING: Final = (Group.FRUIT, Group.TABLEWARE, Group.PACKAGES, Group.FOOD, Group.DECORATION)
 _LIVING: Final = (Group.BOOKS, Group.TOYS, Group.DEVICES, Group.DECORATION, Group.TABLEWARE)

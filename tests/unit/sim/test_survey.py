@@ -1,0 +1,113 @@
+"""What is found out offline about the arm: in the flat, and in the flat with something in the way."""
+
+import contextlib
+from dataclasses import replace
+
+import pytest
+from tests.fakes import furniture as make
+from tests.fakes.plans import executed, with_objects
+from tests.fakes.scenes import kitchen_scene, placed, upright
+
+from embomatrix.sim.bullet.engine import BulletEngine
+from embomatrix.sim.executor import Simulator
+from embomatrix.sim.live_world import LiveWorld
+from embomatrix.sim.physical.survey import Foresight
+from embomatrix.sim.pose_cache import standing_poses
+from embomatrix.skills.failure import FailureReason
+from embomatrix.world.bundle import Bundle, decode_bundle, encode_bundle
+from embomatrix.world.poses import Handling, PoseCache
+
+BOX_M = 0.14
+"""Inner width of what the apple is walled in by."""
+TALL_M = 0.12
+"""Not much taller than the apple: the line of approach is clear."""
+NAMES = ("apple_1", "chicken_leg_1", "microwave_1", "table_lamp_1")
+
+
+def walled_in():
+    """The flat with ``apple_1`` on its table between four boards and under a fifth."""
+    x, y, top = 1.9, 1.6, 0.75
+    side, lid = (
+        make.block("board", "board.n.01", (0.02, 0.2, TALL_M), {}),
+        make.block("lid", "board.n.01", (0.2, 0.2, 0.02), {}),
+    )
+    away, turn = BOX_M / 2 + 0.01, 1.5707963267948966
+    at = ((away, 0.0, 0.0), (-away, 0.0, 0.0), (0.0, away, turn), (0.0, -away, turn))
+    boards = [
+        (placed(f"board_{n}", side, "kitchen_0", upright(x + dx, y + dy, top, side, yaw), fixed=True), side)
+        for n, (dx, dy, yaw) in enumerate(at, start=1)
+    ]
+    roof = placed("lid_1", lid, "kitchen_0", upright(x, y, top + TALL_M, lid), fixed=True)
+    return with_objects(kitchen_scene(), [*boards, (roof, lid)])
+
+
+def surveyed(scene, names, foresight=None):
+    """The cache of a scene with standing poses for these objects, after a look ahead; the world's state before and after."""
+    with contextlib.closing(BulletEngine(scene)) as engine:
+        poses = PoseCache({}, standing_poses(engine, names))
+        world = LiveWorld(Bundle(scene, {}, poses), engine)
+        before = world.state_bytes()
+        found = (foresight or Foresight()).survey(world, poses, names, seed=0)
+        assert world.state_bytes() == before
+        assert {name: set(stands) for name, stands in found.stands.items()} == {
+            name: set(stands) for name, stands in poses.stands.items()
+        }
+        return found
+
+
+def executed_with(scene, poses, text):
+    simulator = Simulator(Bundle(scene, {}, poses))
+    try:
+        return executed(simulator, text)
+    finally:
+        simulator.close()
+
+
+@pytest.fixture(scope="module")
+def flat():
+    return surveyed(kitchen_scene(), NAMES)
+
+
+def test_nothing_is_barred_where_the_arm_gets_at_everything(flat):
+    assert flat.barred == {}
+
+
+def test_what_is_walled_in_is_barred_and_cached_mode_says_who_bars_it():
+    scene = walled_in()
+    poses = surveyed(scene, ("apple_1",))
+    other = poses.barred[Handling.TAKE]["apple_1"]
+    assert other.startswith(("board", "lid"))
+    trace = executed_with(scene, poses, "move apple_1; pick_up apple_1")
+    assert trace.failure is FailureReason.ARM_BLOCKED
+    assert trace.steps[-1].message == f"the arm finds no free way to apple_1: {other} bars it"
+
+
+def test_a_thing_is_free_again_when_what_barred_it_is_taken_away():
+    poses = PoseCache(barred={Handling.TAKE: {"apple_1": "bowl_1"}})
+    scene = kitchen_scene()
+    barred = executed_with(scene, poses, "move apple_1; pick_up apple_1")
+    assert barred.failure is FailureReason.ARM_BLOCKED
+    taken = "move bowl_1; pick_up bowl_1; move countertop_1; place countertop_1 ontop; move apple_1; pick_up apple_1"
+    assert executed_with(scene, poses, taken).failure is None
+
+
+def test_a_thing_that_was_put_elsewhere_is_not_barred_there():
+    poses = PoseCache(barred={Handling.PRESS: {"table_lamp_1": "wall"}})
+    barred = executed_with(kitchen_scene(), poses, "move table_lamp_1; toggle_on table_lamp_1")
+    assert barred.failure is FailureReason.ARM_BLOCKED
+    moved = "move table_lamp_1; pick_up table_lamp_1; move coffee_table_1; place coffee_table_1 ontop; toggle_on table_lamp_1"
+    assert executed_with(kitchen_scene(), poses, moved).failure is None
+
+
+def test_what_a_look_ahead_knows_of_other_scenes_changes_no_answer(flat):
+    foresight = Foresight()
+    surveyed(walled_in(), ("microwave_1",), foresight)
+    assert surveyed(kitchen_scene(), NAMES, foresight) == flat
+
+
+def test_what_is_barred_travels_in_the_bundle():
+    poses = PoseCache(barred={Handling.OPEN: {"fridge_1": "wall"}, Handling.TAKE: {"apple_1": "bowl_1"}})
+    bundle = Bundle(kitchen_scene(), {}, poses)
+    assert decode_bundle(encode_bundle(bundle)).poses.barred == poses.barred
+    none = replace(bundle, poses=PoseCache())
+    assert decode_bundle(encode_bundle(none)).poses.barred == {}
