@@ -20,8 +20,8 @@ from embomatrix.sim.contents import Contents
 from embomatrix.sim.leaves import Leaves
 from embomatrix.sim.physical.doors import STRETCHES, close_all, in_turn, leading, open_all
 from embomatrix.sim.physical.fold import WAYS, approach
-from embomatrix.sim.physical.hands import pick_up, ways_to
-from embomatrix.sim.physical.press import press, pressing
+from embomatrix.sim.physical.hands import ways_to
+from embomatrix.sim.physical.press import pressing
 from embomatrix.sim.physical.stage import AROUND_M, Stage, tucked
 from embomatrix.sim.physical.travel import SOMETHING
 from embomatrix.skills.limits import ROBOT
@@ -41,15 +41,13 @@ if TYPE_CHECKING:
     Look = tuple[int | None, str]
     """Number of the first standing pose that will do, and what bars the way where none does."""
 
-STANDS: Final = 3
-"""Standing poses that are looked at: the robot steps aside to work, so that those after them add little."""
+STANDS: Final = 2
+"""Standing poses that are looked at: the robot steps aside to work, so that the others add little."""
 TRIALS: Final[Mapping[Handling, Callable[[Stage, str, np.random.Generator], Refusal | None]]] = {
-    Handling.TAKE: pick_up,
     Handling.OPEN: open_all,
     Handling.CLOSE: close_all,
-    Handling.PRESS: press,
 }
-DOORS: Final = frozenset({Handling.OPEN, Handling.CLOSE})
+"""Handlings of doors."""
 SEEN_M: Final = ROBOT.reach_m + AROUND_M
 """What is farther from a door has no part in whether the robot, within reach of it, can lead it."""
 
@@ -124,7 +122,7 @@ class _Surveyor:
         """The first standing pose from which it can be done; None, and what bars the way, when there is none such."""
         self._make_ready(name, handling)
         stands = self._world.navigator.stands(name, self._world.navigator.start)[:STANDS]
-        if handling not in DOORS:
+        if handling not in TRIALS:
             number, other = self._look_from(stands, name, handling)
         else:
             key = self._surroundings(name, handling, stands)
@@ -144,8 +142,8 @@ class _Surveyor:
             other = self._bars(name, handling)
             if not other:
                 return number, ""
-        # Where no way is seen ahead, one may open up while the robot works: what can't be done is tried.
-        if stands and self._does(stands[0], name, handling):
+        # Leaves give way to one another as they are led: of doors it is tried what seems not to go.
+        if stands and handling in TRIALS and self._does(stands[0], name, handling):
             return 0, ""
         return None, other
 

@@ -15,7 +15,6 @@ import numpy as np
 
 from embomatrix.factory.furnish.roles import Role
 from embomatrix.world.geometry import Pose
-from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -23,6 +22,7 @@ if TYPE_CHECKING:
     from embomatrix.factory.furnish.boxes import Box
     from embomatrix.world.asset import Asset, Joint, Link
     from embomatrix.world.geometry import Part, Vec3
+    from embomatrix.world.state import Relation
 
 CORNER_SOFA_M: Final = 1.4
 """A sofa that exceeds this along both sides goes round a corner, its second arm on its right: the nook is open floor."""
