@@ -61,7 +61,7 @@ def test_work_is_spread_over_the_scenes_and_names_every_plan_once(work, dataset,
 
 def test_every_row_executes_the_work_that_it_says(figures):
     counts = {name: figure.n for name, figure in figures.items()}
-    assert counts["ablation_naive_ms"] == 1
+    assert counts["ablation_naive_ms"] == counts["ablation_user_ms"] == 1
     assert counts["ablation_cached_ms"] == counts["ablation_scheduler_ms"] == 3
     assert counts["ablation_dispatcher_ms"] == counts["rollouts_per_s"] == SCENES * PER_SCENE
     assert counts["ablation_scheduler_slow_ms"] == SCENES * PER_SCENE

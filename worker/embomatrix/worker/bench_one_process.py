@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import time
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from embomatrix.reward.hierarchy import score
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.executor import Simulator
-from embomatrix.sim.physical.actor import physical_simulator
+from embomatrix.sim.physical.actor import PhysicalActor
 from embomatrix.sim.prepared import Prepared
 from embomatrix.worker.bench_subject import frozen_heap
 from embomatrix.worker.physics import CLIENTS_PER_SCENE
@@ -25,9 +26,30 @@ if TYPE_CHECKING:
     MakeSimulator = Callable[[Bundle], Simulator]
 
 
-def naive_s(rollouts: Sequence[Rollout], bundles: Mapping[str, bytes]) -> list[float]:
-    """Seconds of each rollout, loaded and executed in physical mode: our loader, and what rests sleeps."""
-    return [_seconds(rollout, bundles[rollout.bundle_digest], physical_simulator) for rollout in rollouts]
+@dataclass(frozen=True, slots=True)
+class NaiveRollout:
+    """What a rollout in physical mode took."""
+
+    rollout: Rollout
+    seconds: float
+    """From the bundle's bytes to the reward, on the clock."""
+    steps: int
+    """Of 1/240 s, that went by in its world."""
+
+
+def naive(rollouts: Sequence[Rollout], bundles: Mapping[str, bytes]) -> list[NaiveRollout]:
+    """Each rollout loaded and executed in physical mode: our loader, and what rests sleeps."""
+    taken = []
+    for rollout in rollouts:
+        actors: list[PhysicalActor] = []
+
+        def make(bundle: Bundle, actors: list[PhysicalActor] = actors) -> Simulator:
+            actors.append(PhysicalActor(bundle))
+            return Simulator(bundle, actor=actors[0])
+
+        seconds = _seconds(rollout, bundles[rollout.bundle_digest], make)
+        taken.append(NaiveRollout(rollout, seconds, actors[0].dynamic.steps))
+    return taken
 
 
 def cached_s(rollouts: Sequence[Rollout], bundles: Mapping[str, bytes]) -> list[float]:
