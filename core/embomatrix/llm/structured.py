@@ -82,27 +82,33 @@ def read_json(text: str, shape: type[T]) -> T:
     answer = text.rpartition("</think>")[2]
     answer = answer if answer.strip() else text
     first_problem = ""
-    for value in _json_values(answer):
+    for value, damaged in _json_values(answer):
         try:
             return shape.model_validate(value)
         except ValidationError as error:
-            first_problem = first_problem or _problems(error)
+            # Of half an answer, the parts that are whole are not what was asked for.
+            first_problem = first_problem or (
+                "its JSON is damaged, or breaks off" if damaged else _problems(error)
+            )
     raise ValueError(first_problem or "it holds no complete JSON value")
 
 
-def _json_values(text: str) -> Iterator[Any]:
-    """JSON objects and arrays in the text: fenced ones first; a value inside another that was read is not given."""
+def _json_values(text: str) -> Iterator[tuple[Any, bool]]:
+    """JSON objects and arrays in the text, and whether brackets before them could not be read.
+
+    Fenced ones come first; a value inside another that was read is not given.
+    """
     decoder = json.JSONDecoder()
     for part in (*(match[1] for match in _FENCE.finditer(text)), text):
-        at, starts = 0, 0
+        at, starts, damaged = 0, 0, False
         while starts < MAX_STARTS and (bracket := _BRACKET.search(part, at)) is not None:
             starts += 1
             try:
                 value, at = decoder.raw_decode(part, bracket.start())
             except (ValueError, RecursionError):
-                at = bracket.end()
+                at, damaged = bracket.end(), True
                 continue
-            yield value
+            yield value, damaged
 
 
 def _problems(error: ValidationError) -> str:

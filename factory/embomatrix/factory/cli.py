@@ -22,6 +22,7 @@ from embomatrix.factory.pipeline.build import (
 )
 from embomatrix.factory.refusal import Refusal
 from embomatrix.factory.scenes.build import build_base_scene
+from embomatrix.factory.social.asking import Asked, asked_writer
 from embomatrix.factory.task_import.batch import Verified, bind_first, verify_first
 from embomatrix.factory.task_import.sources import (
     SourceError,
@@ -31,6 +32,7 @@ from embomatrix.factory.task_import.sources import (
     read_file,
     read_jsonl,
 )
+from embomatrix.llm.ledger import Price
 from embomatrix.sim.engine import EngineMissingError
 from embomatrix.sim.physical.survey import Foresight
 from embomatrix.sim.pose_cache import PlacementLibrary
@@ -43,6 +45,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from embomatrix.factory.task_import.task import Imported
+    from embomatrix.factory.writer.tasks import TaskWriter
+    from embomatrix.llm.ledger import Ledger
     from embomatrix.world.scene import Scene
 
 app = typer.Typer(
@@ -79,12 +83,48 @@ def generate(
     heldout: Annotated[int, typer.Option(min=0, help="Tasks to evaluate on, in other rooms.")] = 0,
     seed: Seed = 0,
     scenes: Scenes = None,
+    llm: Annotated[
+        str, typer.Option(help="Base URL of an OpenAI-compatible endpoint, such as http://127.0.0.1:8000/v1.")
+    ] = "",
+    model: Annotated[str, typer.Option(help="Name of the model there.")] = "",
+    key: Annotated[str, typer.Option("--llm-key", envvar="EMBOMATRIX_LLM_KEY", help="Its key.")] = "",
+    cassette: Annotated[
+        Path | None,
+        typer.Option(help="File of recorded answers: read where it has them, added to where not."),
+    ] = None,
+    price: Annotated[
+        tuple[float, float], typer.Option(help="Of a million tokens, in and out, for the account.")
+    ] = (0.0, 0.0),
 ) -> None:
     """Play the people of each scene, and make tasks of what they come to ask the robot for; keep what they said."""
-    _make(out, BuildSettings(tasks, heldout, seed, _scene_ids(scenes), WriterKind.SOCIAL))
+    names = _scene_ids(scenes)
+    if not llm and cassette is None:
+        _make(out, BuildSettings(tasks, heldout, seed, names, WriterKind.SOCIAL))
+        return
+    if llm and not model:
+        _fail("--llm needs the name of a model there: give --model")
+    asked = Asked(llm, model, key, cassette, Price(*price), out / "ledger.jsonl")
+    with _mended(out), asked_writer(asked) as (writer, ledger):
+        _make(out, BuildSettings(tasks, heldout, seed, names, WriterKind.MODEL), writer)
+        _print_account(ledger)
 
 
-def _make(out: Path, settings: BuildSettings) -> None:
+def _print_account(ledger: Ledger) -> None:
+    """What the model was asked, by agent."""
+    table = Table("agent", "calls", "failed", "retries", "tokens in", "tokens out", "seconds", "cost")
+    for purpose, account in (*ledger.accounts.items(), ("all", ledger.total())):
+        counts = (
+            account.calls,
+            account.failed,
+            account.retries,
+            account.prompt_tokens,
+            account.completion_tokens,
+        )
+        table.add_row(purpose, *map(str, counts), f"{account.seconds:.1f}", f"{account.cost:.4f}")
+    Console().print(table)
+
+
+def _make(out: Path, settings: BuildSettings, writer: TaskWriter | None = None) -> None:
     """A data set in the folder, with progress and a summary."""
     console = Console()
     kept = f": what was built is kept in {out}, and the same command goes on from there"
@@ -94,7 +134,7 @@ def _make(out: Path, settings: BuildSettings) -> None:
             "train": bars.add_task("training tasks", total=settings.train),
         }
         summary = build_dataset(
-            out, settings, lambda split, admitted: bars.update(tasks[split], completed=admitted)
+            out, settings, lambda split, admitted: bars.update(tasks[split], completed=admitted), writer
         )
         for split, bar in tasks.items():
             bars.update(bar, completed=summary.total(split))
@@ -278,7 +318,7 @@ def _mended(out: Path | None = None, kept: str = "") -> Iterator[None]:
     """
     try:
         yield
-    except (CatalogError, DatasetError, EngineMissingError, SourceError) as error:
+    except (CatalogError, DatasetError, EngineMissingError, LlmError, SourceError) as error:
         _fail(str(error))
     except OSError as error:
         if out is None:

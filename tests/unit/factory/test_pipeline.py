@@ -177,6 +177,8 @@ def test_bad_bddl_is_one_sentence_and_exit_2(tmp_path: Path, old: str, new: str,
         (["import"], "exactly one of"),
         (["import", "--bddl", "OUT/none.bddl"], "can't be read"),
         (["list", "OUT/none"], "no dataset"),
+        (["generate", "--out", "OUT/a", "--llm", "http://127.0.0.1:9/v1"], "needs the name of a model"),
+        (["generate", "--out", "OUT/a", "--cassette", "OUT/none.jsonl"], "record one first"),
     ],
 )
 def test_unknown_names_are_one_sentence_and_exit_2(

@@ -57,6 +57,7 @@ class WriterKind(StrEnum):
 
     PLAIN = "plain"  # what a goal says, in a bounded vocabulary: small policies learn from it
     SOCIAL = "social"  # what people come to ask for in conversations, each with its transcript
+    MODEL = "model"  # the same with a language model in the place of the grammar
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,8 +118,11 @@ def build_dataset(
     folder: Path,
     settings: BuildSettings,
     progress: Callable[[str, int], None] = lambda _split, _admitted: None,
+    writer: TaskWriter | None = None,
 ) -> Summary:
     """Write a data set, or go on with one that was cut short. ``progress`` hears of each split's admitted tasks.
+
+    ``writer`` stands in for the one that the settings name; with a language model only it can be given.
 
     Raises CatalogError for an unknown scene, DatasetError when the folder holds a build of other settings.
     """
@@ -127,7 +131,8 @@ def build_dataset(
     store = BuildStore.open(folder, dataclasses.asdict(settings))
     bases = [build_base_scene(scene_id, seed=settings.seed) for scene_id in settings.scenes]
     rooms = split_rooms(bases, settings.seed)
-    writer = SocialWriter(settings.seed) if settings.writer is WriterKind.SOCIAL else PlainWriter()
+    if writer is None:
+        writer = SocialWriter(settings.seed) if settings.writer is WriterKind.SOCIAL else PlainWriter()
     with contextlib.closing(PlacementLibrary()) as library:
         bench = _Workbench(settings, writer, library, Foresight(), progress)
         for split, target in (("heldout", settings.heldout), ("train", settings.train)):

@@ -1,0 +1,99 @@
+"""Scene information extraction: what a language model is told of a scene, from its inventory."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.factory.writer.words import spoken
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from embomatrix.factory.writer.view import SceneView
+
+MOST_IN_ROOM: Final = 40
+"""Things that are told of a room; those that a task can be about come first."""
+
+
+@dataclass(frozen=True, slots=True)
+class Thing:
+    """One object: what a person calls it, what it rests on or in, and what can be done with it."""
+
+    name: str
+    category: str
+    room: str
+    rests: str
+    abilities: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class RoomFacts:
+    """A room with its floor's area in m² and what it holds. ``left_out`` things are not listed."""
+
+    name: str
+    type: str
+    area_m2: float
+    things: tuple[Thing, ...]
+    left_out: int
+
+
+@dataclass(frozen=True, slots=True)
+class SceneFacts:
+    """All that is told. Objects are known by their names in the scene."""
+
+    base: str
+    rooms: tuple[RoomFacts, ...]
+
+    @property
+    def things(self) -> dict[str, Thing]:
+        """By name."""
+        return {thing.name: thing for room in self.rooms for thing in room.things}
+
+    def described(self) -> str:
+        """Rooms as a list, things one a line: name, place, what can be done."""
+        return "\n".join(_room_lines(room) for room in self.rooms)
+
+
+def facts_of(view: SceneView, rooms: Sequence[str]) -> SceneFacts:
+    """What the given rooms of a scene hold."""
+    found = []
+    for room in view.scene.rooms:
+        if room.name not in rooms:
+            continue
+        names = sorted(view.in_room[room.name], key=lambda name: not _abilities(view, name))
+        kept = tuple(_thing(view, name) for name in names[:MOST_IN_ROOM])
+        area_m2 = room.size_m[0] * room.size_m[1]
+        found.append(RoomFacts(room.name, room.type, area_m2, kept, len(names) - len(kept)))
+    return SceneFacts(view.scene.base, tuple(found))
+
+
+def _thing(view: SceneView, name: str) -> Thing:
+    item = view.item(name)
+    rests = (
+        f"{item.relation.value} {item.host}" if item.host and item.relation is not None else "on the floor"
+    )
+    return Thing(name, view.category(name), item.room, rests, _abilities(view, name))
+
+
+def _abilities(view: SceneView, name: str) -> tuple[str, ...]:
+    """What a task may do with it, in the words of the goal's predicates."""
+    tests = (
+        ("can be carried", view.is_portable(name)),
+        ("things can be put on it", view.is_surface(name)),
+        ("things can be put in it", view.is_container(name) or view.is_basket(name)),
+        ("open" if view.is_open(name) else "closed", view.is_openable(name)),
+        ("on" if view.is_on(name) else "off", view.is_toggleable(name)),
+        ("can be cooked", view.asset(name).can("cookable")),
+        ("heats or freezes food", view.is_source(name)),
+    )
+    return tuple(words for words, holds in tests if holds)
+
+
+def _room_lines(room: RoomFacts) -> str:
+    lines = [f"[{room.name}] {spoken(room.type)}, {room.area_m2:.0f} m²"]
+    lines += [
+        f"- {thing.name} ({spoken(thing.category)}, {thing.rests}): {', '.join(thing.abilities) or 'decoration'}"
+        for thing in room.things
+    ]
+    return "\n".join(lines + ([f"- and {room.left_out} things more"] if room.left_out else []))

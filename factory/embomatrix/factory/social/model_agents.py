@@ -1,0 +1,129 @@
+"""Role-Playing, Social Simulation and Summarization Agent behind a language model.
+
+Each asks for a typed answer and has it checked against the scene; what is wrong goes back to the model as a sentence. What
+stands between the marks of a scene's description is data: a name in it that reads like an order is a name.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from embomatrix.factory.social.prompts import (
+    CAST_SYSTEM,
+    CAST_USER,
+    CATEGORY_HINTS,
+    ROBOT_LIMITS,
+    SUMMARY_SYSTEM,
+    SUMMARY_USER,
+    TALK_SYSTEM,
+    TALK_USER,
+)
+from embomatrix.factory.social.requests import TaskRequest, check_request
+from embomatrix.factory.social.values import ROBOT, Act, Cast, Conversation, Turn
+from embomatrix.llm.structured import ask
+from embomatrix.llm.values import ChatRequest, Message, Speaker
+
+if TYPE_CHECKING:
+    from embomatrix.factory.social.facts import SceneFacts
+    from embomatrix.factory.social.values import DaySlot
+    from embomatrix.factory.writer.view import SceneView
+    from embomatrix.llm.values import ChatModel
+    from embomatrix.world.task import TaskCategory
+
+CAST: Final = "role-playing agent"
+TALK: Final = "social simulation agent"
+SUMMARY: Final = "summarization agent"
+"""Who asks, for ledgers and errors."""
+
+
+class Talk(BaseModel):
+    """What the model writes of a conversation."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    turns: tuple[Turn, ...] = Field(min_length=4, max_length=14)
+    first_wish: str = Field(min_length=3, max_length=200)
+    last_wishes: tuple[str, ...] = Field(min_length=1, max_length=6)
+
+
+class ModelAgents:
+    """All three agents on one model; ``temperature`` is that of what is made up."""
+
+    def __init__(self, model: ChatModel, *, temperature: float = 0.9, attempts: int = 3) -> None:
+        self._model = model
+        self._temperature = temperature
+        self._attempts = attempts
+
+    async def cast(self, facts: SceneFacts, seed: int) -> Cast:
+        """People who fit the scene and are found in every room of it. Raises LlmError."""
+        rooms = tuple(room.name for room in facts.rooms)
+
+        def check(cast: Cast) -> None:
+            named = {room for person in cast.people for room in person.rooms} | {
+                slot.room for slot in cast.day
+            }
+            if unknown := sorted(named - set(rooms)):
+                raise ValueError(f"there is no room {unknown[0]!r}: the rooms are {', '.join(rooms)}")
+            if empty := cast.rooms_without_anyone(rooms):
+                raise ValueError(f"nobody is ever in {', '.join(empty)}: give each of these rooms somebody")
+
+        request = self._request(CAST, CAST_SYSTEM.format(), CAST_USER.format(scene=facts.described()), seed)
+        return (await ask(self._model, request, Cast, check=check, attempts=self._attempts)).value
+
+    async def converse(
+        self, facts: SceneFacts, cast: Cast, slot: DaySlot, category: TaskCategory, seed: int
+    ) -> Conversation:
+        """Several rounds between people and the robot, in which a request takes shape. Raises LlmError."""
+
+        def check(talk: Talk) -> None:
+            speakers = {turn.speaker for turn in talk.turns}
+            if unknown := sorted(speakers - {ROBOT, *cast.names}):
+                raise ValueError(
+                    f"nobody is called {unknown[0]!r}: speakers are {ROBOT}, {', '.join(cast.names)}"
+                )
+            if (
+                ROBOT not in speakers
+                or talk.turns[-1].act is not Act.CONFIRM
+                or talk.turns[-1].speaker != ROBOT
+            ):
+                raise ValueError("the robot must take part, and confirm the whole request in the last turn")
+
+        user = TALK_USER.format(
+            scene=facts.described(),
+            people="\n".join(
+                f"{each.name}, {each.age}, {each.job}, likes {each.hobby}" for each in cast.people
+            ),
+            time=slot.time,
+            room=slot.room,
+            person=slot.person,
+            activity=slot.activity,
+            hint=CATEGORY_HINTS[category.value],
+        )
+        request = self._request(TALK, TALK_SYSTEM.format(limits=ROBOT_LIMITS), user, seed)
+        talk = (await ask(self._model, request, Talk, check=check, attempts=self._attempts)).value
+        return Conversation(
+            slot=slot, turns=talk.turns, first_wish=talk.first_wish, last_wishes=talk.last_wishes
+        )
+
+    async def summarise(
+        self, facts: SceneFacts, view: SceneView, conversation: Conversation, seed: int
+    ) -> TaskRequest:
+        """The conversation's outcome over things that are there. Raises LlmError."""
+        known = frozenset(facts.things)
+        said = "\n".join(f"{turn.speaker}: {turn.text}" for turn in conversation.turns)
+        user = SUMMARY_USER.format(scene=facts.described(), conversation=said)
+        request = self._request(SUMMARY, SUMMARY_SYSTEM, user, seed)
+        answer = await ask(
+            self._model,
+            request,
+            TaskRequest,
+            check=lambda value: check_request(value, view, known),
+            attempts=self._attempts,
+        )
+        return answer.value
+
+    def _request(self, purpose: str, system: str, user: str, seed: int) -> ChatRequest:
+        messages = (Message(Speaker.SYSTEM, system), Message(Speaker.USER, user))
+        return ChatRequest(purpose, messages, temperature=self._temperature, seed=seed)

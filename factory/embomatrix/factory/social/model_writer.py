@@ -1,0 +1,93 @@
+"""Tasks by social simulation with a language model: its agents make up people, talk and request; the scene decides."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import TYPE_CHECKING, Self
+
+from embomatrix.factory.social.conversing import starting_slots
+from embomatrix.factory.social.facts import facts_of
+from embomatrix.factory.social.requests import piece_of
+from embomatrix.factory.social.transcript import transcript_of
+from embomatrix.factory.writer.goals import Workshop
+from embomatrix.factory.writer.tasks import Draft, draft_of
+from embomatrix.llm.values import UnusableReplyError
+
+if TYPE_CHECKING:
+    from contextlib import AbstractAsyncContextManager
+
+    import numpy as np
+
+    from embomatrix.factory.social.model_agents import ModelAgents
+    from embomatrix.factory.social.values import Cast
+    from embomatrix.factory.writer.variant import Variant
+    from embomatrix.factory.writer.view import SceneView
+    from embomatrix.world.task import TaskCategory
+
+logger = logging.getLogger(__name__)
+SEEDS = 2**31
+
+
+class ModelWriter:
+    """Context manager over one event loop, which closes the ``endpoint`` at its end.
+
+    An answer that stays unusable costs its draft and no more.
+    """
+
+    def __init__(
+        self, agents: ModelAgents, endpoint: AbstractAsyncContextManager[object] | None = None
+    ) -> None:
+        self._agents = agents
+        self._endpoint = endpoint
+        self._casts: dict[str, Cast] = {}
+        self._runner = asyncio.Runner()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._endpoint is not None:
+            self._runner.run(self._closed(self._endpoint))
+        self._runner.close()
+
+    @staticmethod
+    async def _closed(endpoint: AbstractAsyncContextManager[object]) -> None:
+        await endpoint.__aexit__(None, None, None)
+
+    def write(
+        self,
+        variant: Variant,
+        view: SceneView,
+        category: TaskCategory,
+        task_id: str,
+        rng: np.random.Generator,
+    ) -> Draft | None:
+        """A draft, None where the model gave nothing usable. Raises EndpointError where nobody answers."""
+        try:
+            return self._runner.run(self._write(variant, view, category, task_id, rng))
+        except UnusableReplyError as error:
+            logger.warning("no draft %s: %s", task_id, error)
+            return None
+
+    async def _write(
+        self,
+        variant: Variant,
+        view: SceneView,
+        category: TaskCategory,
+        task_id: str,
+        rng: np.random.Generator,
+    ) -> Draft:
+        base, seed = variant.scene.base, int(rng.integers(SEEDS))
+        if base not in self._casts:
+            everywhere = facts_of(view, [room.name for room in variant.scene.rooms])
+            self._casts[base] = await self._agents.cast(everywhere, seed)
+        cast = self._casts[base]
+        facts = facts_of(view, variant.rooms)
+        slot = starting_slots(cast, variant.rooms, rng)[0]
+        conversation = await self._agents.converse(facts, cast, slot, category, seed)
+        request = await self._agents.summarise(facts, view, conversation, seed)
+        pieces = [piece_of(wish, view) for wish in request.wishes]
+        transcript = transcript_of(cast, conversation, request.instruction, pieces)
+        shop = Workshop(view, variant, rng)
+        return draft_of(shop, category, task_id, pieces, request.instruction, transcript)

@@ -1,0 +1,115 @@
+"""What a conversation came to, typed: an instruction and the atoms that are to hold, over things that are there."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import TYPE_CHECKING, Final
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from embomatrix.factory.writer.goals import Piece
+from embomatrix.world.goal import Atom, Formula, Not
+
+if TYPE_CHECKING:
+    from embomatrix.factory.writer.view import SceneView
+
+
+class Wanted(StrEnum):
+    """Predicates that a request may use; the robot's skills bring all of them about."""
+
+    ONTOP = "ontop"
+    INSIDE = "inside"
+    OPEN = "open"
+    TOGGLED_ON = "toggled_on"
+    COOKED = "cooked"
+    HOT = "hot"
+    FROZEN = "frozen"
+
+
+PLACED: Final = frozenset({Wanted.ONTOP, Wanted.INSIDE})
+THERMAL: Final = frozenset({Wanted.COOKED, Wanted.HOT, Wanted.FROZEN})
+
+
+class Wish(BaseModel):
+    """One atom. ``place`` is the host of a relation; ``holds`` false asks for the contrary: closed, switched off."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    predicate: Wanted
+    thing: str
+    place: str = ""
+    holds: bool = True
+
+
+class TaskRequest(BaseModel):
+    """A concrete request."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    instruction: str = Field(min_length=10, max_length=400)
+    wishes: tuple[Wish, ...] = Field(min_length=1, max_length=6)
+
+
+def check_request(request: TaskRequest, view: SceneView, known: frozenset[str]) -> None:
+    """Raise ValueError, with a sentence for whoever made the request, where a wish is not about what is there."""
+    for number, wish in enumerate(request.wishes, start=1):
+        problem = _problem(wish, view, known)
+        if problem:
+            raise ValueError(f"wish {number}, {wish.predicate.value}: {problem}")
+    if len(set(request.wishes)) < len(request.wishes):
+        raise ValueError("the same wish stands there twice")
+
+
+def _problem(wish: Wish, view: SceneView, known: frozenset[str]) -> str:
+    for name in (wish.thing, *([wish.place] if wish.place else [])):
+        if name not in known:
+            return f"there is no {name!r}: use a name from the list, such as {min(known)!r}"
+    if wish.predicate in PLACED:
+        return _placing_problem(wish, view)
+    if wish.place:
+        return f"it takes no place, found {wish.place!r}"
+    if wish.predicate in THERMAL:
+        if not wish.holds:
+            return "only what is to be cooked, hot or frozen can be asked for, not the contrary"
+        return (
+            ""
+            if view.asset(wish.thing).can("cookable")
+            else f"{wish.thing} is nothing to cook, heat or freeze"
+        )
+    if wish.predicate is Wanted.OPEN:
+        if not view.is_openable(wish.thing):
+            return f"{wish.thing} has no door or drawer"
+        done = view.is_open(wish.thing)
+    else:
+        if not view.is_toggleable(wish.thing):
+            return f"{wish.thing} can't be switched"
+        done = view.is_on(wish.thing)
+    return f"{wish.thing} is so already" if done is wish.holds else ""
+
+
+def _placing_problem(wish: Wish, view: SceneView) -> str:
+    if not wish.holds:
+        return "say where the thing is to be, not where it is not to be"
+    if not wish.place:
+        return "it takes a place"
+    inside = wish.predicate is Wanted.INSIDE
+    hosts = (
+        view.is_container(wish.place) or view.is_basket(wish.place) if inside else view.is_surface(wish.place)
+    )
+    if not view.is_portable(wish.thing):
+        return f"{wish.thing} can't be carried"
+    if not hosts or not view.takes(wish.place, wish.thing, inside=inside):
+        return f"{wish.thing} does not go {'into' if inside else 'onto'} {wish.place}"
+    if view.item(wish.thing).host == wish.place:
+        return f"{wish.thing} is there already"
+    return ""
+
+
+def piece_of(wish: Wish, view: SceneView) -> Piece:
+    """The wish as a piece of a goal. Its words stand in the request's instruction."""
+    names = (wish.thing, wish.place) if wish.place else (wish.thing,)
+    atom: Formula = Atom(wish.predicate.value, names)
+    categories = ",".join(view.category(name) for name in names)
+    kind = "place" if wish.predicate in PLACED else "thermal" if wish.predicate in THERMAL else "switch"
+    sign = f"{'' if wish.holds else 'not '}{wish.predicate.value}({categories})"
+    return Piece(atom if wish.holds else Not(atom), "", names, (sign,), kind, wish.thing)

@@ -1,0 +1,169 @@
+"""A language model plays the people; whatever it answers, only what the scene holds becomes a task."""
+
+import json
+
+import numpy as np
+import pytest
+from tests.fakes.chat_server import ChatServer
+
+from embomatrix.factory.scenes.build import build_base_scene
+from embomatrix.factory.social.facts import MOST_IN_ROOM, facts_of
+from embomatrix.factory.social.model_agents import ModelAgents
+from embomatrix.factory.social.model_writer import ModelWriter
+from embomatrix.factory.social.requests import TaskRequest, Wanted, Wish, check_request, piece_of
+from embomatrix.factory.social.values import DaySlot
+from embomatrix.factory.writer.variant import build_variant
+from embomatrix.factory.writer.view import SceneView
+from embomatrix.llm.endpoint import Endpoint, EndpointLimits
+from embomatrix.llm.values import EndpointError, UnusableReplyError
+from embomatrix.world.goal import Atom, Not
+from embomatrix.world.task import TaskCategory
+
+SCENE = build_base_scene("Rs_int", seed=0)
+ROOMS = tuple(room.name for room in SCENE.rooms)
+VARIANT = build_variant(SCENE, ROOMS[:4], "Rs_int-model", np.random.default_rng(5))
+VIEW = SceneView(VARIANT.scene)
+FACTS = facts_of(VIEW, VARIANT.rooms)
+THING = next(name for name in VARIANT.added if VIEW.is_portable(name) and not VIEW.is_basket(name))
+HOST = next(
+    name
+    for room in VARIANT.rooms
+    for name in VIEW.in_room[room]
+    if VIEW.is_surface(name) and VIEW.takes(name, THING, inside=False) and VIEW.item(THING).host != name
+)
+KNOWN = frozenset(FACTS.things)
+
+CAST = json.dumps(
+    {
+        "setting": "a small flat",
+        "people": [
+            {"name": "Ann", "age": 40, "job": "nurse", "hobby": "chess", "rooms": list(ROOMS)},
+            {"name": "Bo", "age": 9, "job": "pupil", "hobby": "football", "ties": {"Ann": "child"}},
+        ],
+        "day": [{"time": "07:30", "person": "Ann", "room": ROOMS[0], "activity": "making breakfast"}],
+    }
+)
+TALK = json.dumps(
+    {
+        "turns": [
+            {"speaker": "Ann", "act": "need", "text": "It is in the way."},
+            {"speaker": "robot", "act": "clarify", "text": "Where shall it go?"},
+            {"speaker": "Bo", "act": "answer", "text": "Over there."},
+            {"speaker": "robot", "act": "confirm", "text": "I will put it over there."},
+        ],
+        "first_wish": "away with it",
+        "last_wishes": ["put it over there"],
+    }
+)
+GOOD = json.dumps(
+    {
+        "instruction": "Ann wants it out of the way: put it over there.",
+        "wishes": [{"predicate": "ontop", "thing": THING, "place": HOST}],
+    }
+)
+
+
+def written(*script, category=TaskCategory.PICK_AND_PLACE):
+    server = ChatServer(*script)
+    limits = EndpointLimits(attempts=2, first_wait_s=0.01, timeout_s=5.0)
+    with server.serving() as url:
+        endpoint = Endpoint(url, "small-1", limits=limits)
+        with ModelWriter(ModelAgents(endpoint)) as writer:
+            draft = writer.write(VARIANT, VIEW, category, "t", np.random.default_rng(0))
+    return draft, server
+
+
+def test_three_agents_make_a_task_with_its_transcript():
+    draft, server = written(CAST, TALK, GOOD)
+    assert len(server.requests) == 3
+    assert draft.task.instruction == "Ann wants it out of the way: put it over there."
+    assert draft.task.goal == Atom("ontop", (THING, HOST))
+    assert {THING, HOST} <= set(draft.task.table)
+    assert "**Bo** (answer): Over there." in draft.transcript
+    assert THING in server.requests[1]["messages"][1]["content"]
+
+
+def test_nonsense_half_a_json_a_wrong_schema_and_a_thing_that_is_not_there_are_answered_with_what_is_wrong():
+    wrong = GOOD.replace(THING, "unicorn_1")
+    draft, server = written("Sure!", CAST[: len(CAST) // 2], CAST, '{"turns": 3}', TALK, wrong, GOOD)
+    objections = [request["messages"][-1]["content"] for request in server.requests]
+    assert draft is not None
+    assert "no complete JSON value" in objections[1]
+    assert "its JSON is damaged, or breaks off" in objections[2]
+    assert "turns: input should be a valid tuple" in objections[4]
+    assert "wish 1, ontop: there is no 'unicorn_1': use a name from the list" in objections[6]
+
+
+def test_a_model_that_stays_wrong_costs_its_draft_and_no_more():
+    draft, server = written(CAST, TALK, "no")
+    assert draft is None
+    assert len(server.requests) == 5
+
+
+def test_an_endpoint_that_is_gone_ends_the_writing():
+    with pytest.raises(EndpointError, match=r"role-playing agent: the endpoint .* answered 500"):
+        written((500, {}, "broken", 0.0))
+
+
+async def test_a_cast_that_leaves_a_room_empty_is_sent_back():
+    lonely = json.loads(CAST)
+    lonely["people"][0]["rooms"] = []
+    server = ChatServer(json.dumps(lonely))
+    everywhere = facts_of(VIEW, ROOMS)
+    with server.serving() as url:
+        async with Endpoint(url, "small-1") as endpoint:
+            with pytest.raises(UnusableReplyError, match="nobody is ever in"):
+                await ModelAgents(endpoint).cast(everywhere, 0)
+
+
+def test_what_a_model_is_told_names_every_thing_that_it_may_use():
+    text = FACTS.described()
+    assert all(f"- {name} (" in text for name in KNOWN)
+    assert all(f"[{room}]" in text for room in VARIANT.rooms)
+    assert all(len(room.things) <= MOST_IN_ROOM for room in FACTS.rooms)
+
+
+def a_door():
+    return next(name for name in KNOWN if VIEW.is_openable(name) and not VIEW.is_open(name))
+
+
+@pytest.mark.parametrize(
+    ("wish", "sentence"),
+    [
+        (lambda: Wish(predicate=Wanted.ONTOP, thing=THING), "it takes a place"),
+        (lambda: Wish(predicate=Wanted.ONTOP, thing=HOST, place=HOST), "can't be carried"),
+        (
+            lambda: Wish(predicate=Wanted.ONTOP, thing=THING, place=VIEW.item(THING).host),
+            "is there already|does not go",
+        ),
+        (lambda: Wish(predicate=Wanted.INSIDE, thing=THING, place=THING), "does not go into"),
+        (
+            lambda: Wish(predicate=Wanted.ONTOP, thing=THING, place=HOST, holds=False),
+            "not where it is not to be",
+        ),
+        (lambda: Wish(predicate=Wanted.OPEN, thing=a_door(), place=HOST), "it takes no place"),
+        (lambda: Wish(predicate=Wanted.OPEN, thing=a_door(), holds=False), "is so already"),
+        (lambda: Wish(predicate=Wanted.TOGGLED_ON, thing=HOST), "can't be switched"),
+        (lambda: Wish(predicate=Wanted.COOKED, thing=HOST), "nothing to cook"),
+        (lambda: Wish(predicate=Wanted.HOT, thing=HOST, holds=False), "not the contrary"),
+    ],
+)
+def test_wishes_that_the_scene_does_not_allow_are_told_apart(wish, sentence):
+    request = TaskRequest(instruction="Ann asks for it, please.", wishes=(wish(),))
+    with pytest.raises(ValueError, match=sentence):
+        check_request(request, VIEW, KNOWN)
+
+
+def test_a_wish_becomes_a_piece_of_a_goal():
+    piece = piece_of(Wish(predicate=Wanted.OPEN, thing=a_door(), holds=False), VIEW)
+    assert piece.goal == Not(Atom("open", (a_door(),)))
+    assert piece.signs == (f"not open({VIEW.category(a_door())})",)
+
+
+def test_a_slot_of_the_day_is_where_the_talk_is(tmp_path):
+    _, server = written(CAST, TALK, GOOD)
+    slot = DaySlot(**json.loads(CAST)["day"][0])
+    assert (
+        f"It is {slot.time} in {slot.room}; Ann is making breakfast."
+        in server.requests[1]["messages"][1]["content"]
+    )
