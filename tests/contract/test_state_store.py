@@ -12,6 +12,7 @@ from tests.fakes.redis_server import RedisServer
 from embomatrix.cli.local_cluster import free_port
 from embomatrix.manager.store.memory import MemoryState, MemoryStore
 from embomatrix.manager.store.protocol import (
+    BatchResults,
     BatchRow,
     Candidate,
     CredentialRow,
@@ -105,8 +106,8 @@ async def test_batches_come_back_in_the_order_they_were_put(store):
 async def test_results_are_read_from_a_cursor_in_order(store):
     await store.open_run(RunRow("r1", ""))
     await store.put_batch(BATCH)
-    assert await store.append_results("r1", "b1", rows(1, 2)) == 2
-    assert await store.append_results("r1", "b1", rows(3, 4, 5)) == 3
+    assert await store.append_results([BatchResults("r1", "b1", rows(1, 2))]) == 2
+    assert await store.append_results([BatchResults("r1", "b1", rows(3, 4, 5))]) == 3
     assert await store.results_after("r1", "b1", 0, 100) == rows(1, 2, 3, 4, 5)
     assert await store.results_after("r1", "b1", 2, 2) == rows(3, 4)
     assert await store.results_after("r1", "b1", 5, 100) == []
@@ -115,21 +116,38 @@ async def test_results_are_read_from_a_cursor_in_order(store):
 async def test_of_each_rollout_only_the_first_result_counts(store):
     await store.open_run(RunRow("r1", ""))
     await store.put_batch(BATCH)
-    await store.append_results("r1", "b1", rows(1))
-    assert await store.append_results("r1", "b1", [ResultRow(2, "rollout:1", b"late"), *rows(3)]) == 1
+    await store.append_results([BatchResults("r1", "b1", rows(1))])
+    assert (
+        await store.append_results([BatchResults("r1", "b1", [ResultRow(2, "rollout:1", b"late"), *rows(3)])])
+        == 1
+    )
     assert await store.results_after("r1", "b1", 0, 100) == rows(1, 3)
+
+
+async def test_results_of_several_batches_are_written_at_once(store):
+    await store.open_run(RunRow("r1", ""))
+    await store.put_batch(BATCH)
+    await store.put_batch(BatchRow("r1", "b2", "d", b""))
+    parts = [
+        BatchResults("r1", "b1", rows(1, 2)),
+        BatchResults("r1", "unknown", rows(1)),
+        BatchResults("r1", "b2", rows(1, 2, 3)),
+    ]
+    assert await store.append_results(parts) == 5
+    assert await store.results_after("r1", "b1", 0, 100) == rows(1, 2)
+    assert await store.results_after("r1", "b2", 0, 100) == rows(1, 2, 3)
 
 
 async def test_results_of_an_unknown_batch_are_not_kept(store):
     await store.open_run(RunRow("r1", ""))
-    assert await store.append_results("r1", "b1", rows(1)) == 0
+    assert await store.append_results([BatchResults("r1", "b1", rows(1))]) == 0
     assert await store.results_after("r1", "b1", 0, 100) == []
 
 
 async def test_a_closed_run_takes_its_batches_and_results_along(store):
     await store.open_run(RunRow("r1", ""))
     await store.put_batch(BATCH)
-    await store.append_results("r1", "b1", rows(1))
+    await store.append_results([BatchResults("r1", "b1", rows(1))])
     await store.close_run("r1")
     await store.open_run(RunRow("r1", ""))
     assert await store.batches("r1") == []
@@ -141,7 +159,7 @@ async def test_a_dropped_batch_leaves_the_others(store):
     await store.open_run(RunRow("r1", ""))
     await store.put_batch(BATCH)
     await store.put_batch(BatchRow("r1", "b2", "d", b""))
-    await store.append_results("r1", "b2", rows(1))
+    await store.append_results([BatchResults("r1", "b2", rows(1))])
     await store.drop_batch("r1", "b1")
     assert [batch.batch_id for batch in await store.batches("r1")] == ["b2"]
     assert await store.results_after("r1", "b2", 0, 100) == rows(1)
@@ -150,7 +168,7 @@ async def test_a_dropped_batch_leaves_the_others(store):
 async def test_another_process_finds_everything_again(store, openings):
     await store.open_run(RunRow("r1", "name"))
     await store.put_batch(BATCH)
-    await store.append_results("r1", "b1", rows(1, 2))
+    await store.append_results([BatchResults("r1", "b1", rows(1, 2))])
     again = openings()
     await again.claim(FIRST)
     assert await again.runs() == [RunRow("r1", "name")]
@@ -224,14 +242,14 @@ async def test_the_manager_that_claimed_last_is_the_only_one_that_writes(store, 
     for write in (
         store.open_run(RunRow("r2", "")),
         store.put_batch(BatchRow("r1", "b2", "d", b"")),
-        store.append_results("r1", "b1", rows(1)),
+        store.append_results([BatchResults("r1", "b1", rows(1))]),
         store.drop_batch("r1", "b1"),
         store.close_run("r1"),
         store.put_credentials([CredentialRow("a", b"")]),
     ):
         with pytest.raises(FencedError, match="another manager"):
             await write
-    assert await newer.append_results("r1", "b1", rows(1)) == 1
+    assert await newer.append_results([BatchResults("r1", "b1", rows(1))]) == 1
 
 
 async def test_a_store_that_cannot_be_used_says_what_to_do(tmp_path):
@@ -264,11 +282,11 @@ async def test_a_full_disk_is_told_and_what_was_written_before_is_still_there(tm
     await store.put_batch(BATCH)
     large = [ResultRow(2, "large", bytes(500_000))]
     with no_file_grows():
-        await store.append_results("r1", "b1", rows(1))
+        await store.append_results([BatchResults("r1", "b1", rows(1))])
         with pytest.raises(StateFullError, match="make room on its disk"):
-            await store.append_results("r1", "b1", large)
+            await store.append_results([BatchResults("r1", "b1", large)])
     assert await store.results_after("r1", "b1", 0, 10) == rows(1)
-    assert await store.append_results("r1", "b1", large) == 1
+    assert await store.append_results([BatchResults("r1", "b1", large)]) == 1
     await store.close()
 
 

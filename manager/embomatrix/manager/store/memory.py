@@ -6,6 +6,7 @@ import time
 from typing import TYPE_CHECKING
 
 from embomatrix.manager.store.protocol import (
+    BatchResults,
     BatchRow,
     Candidate,
     CredentialRow,
@@ -79,11 +80,14 @@ class MemoryStore:
             return PutOutcome.CREATED
         return PutOutcome.SAME if self._state.batches[key].digest == batch.digest else PutOutcome.CONFLICT
 
-    async def append_results(self, run_id: str, batch_id: str, rows: Sequence[ResultRow]) -> int:
+    async def append_results(self, parts: Sequence[BatchResults]) -> int:
         self._check()
-        if (run_id, batch_id) not in self._state.batches:
+        return sum(self._append((part.run_id, part.batch_id), part.rows) for part in parts)
+
+    def _append(self, key: tuple[str, str], rows: Sequence[ResultRow]) -> int:
+        if key not in self._state.batches:
             return 0
-        results = self._state.results.setdefault((run_id, batch_id), {})
+        results = self._state.results.setdefault(key, {})
         before = len(results)
         for row in rows:
             results.setdefault(row.rollout_id, row)

@@ -86,6 +86,15 @@ class ResultRow:
 
 
 @dataclass(frozen=True, slots=True)
+class BatchResults:
+    """Results of one batch that are written together."""
+
+    run_id: str
+    batch_id: str
+    rows: Sequence[ResultRow]
+
+
+@dataclass(frozen=True, slots=True)
 class CredentialRow:
     """Who may call: ``payload`` is opaque to the store and holds no secret, only its hash."""
 
@@ -117,8 +126,11 @@ class StateStore(Protocol):
     async def put_batch(self, batch: BatchRow) -> PutOutcome:
         """Note a batch, if its run is open and its id is free."""
 
-    async def append_results(self, run_id: str, batch_id: str, rows: Sequence[ResultRow]) -> int:
-        """Add results; of each rollout only the first counts. Returns how many were new. Of an unknown batch: none."""
+    async def append_results(self, parts: Sequence[BatchResults]) -> int:
+        """Add results of several batches, all or none, in one write; of each rollout only the first counts.
+
+        Returns how many were new. Of an unknown batch: none.
+        """
 
     async def results_after(self, run_id: str, batch_id: str, cursor: int, limit: int) -> list[ResultRow]:
         """Results with a higher cursor, in order."""

@@ -15,6 +15,7 @@ import redis.asyncio
 from redis.exceptions import OutOfMemoryError, RedisError, ResponseError
 
 from embomatrix.manager.store.protocol import (
+    BatchResults,
     BatchRow,
     Candidate,
     CredentialRow,
@@ -89,12 +90,17 @@ return 'created'
 _APPEND: Final = (
     _GUARD
     + """
-if redis.call('EXISTS', KEYS[2]) == 0 then return 0 end
-local added = 0
-for index = 2, #ARGV, 3 do
-    if redis.call('SADD', KEYS[3], ARGV[index + 1]) == 1 then
-        redis.call('ZADD', KEYS[4], ARGV[index], #ARGV[index + 1] .. ':' .. ARGV[index + 1] .. ARGV[index + 2])
-        added = added + 1
+local added, index = 0, 2
+for key = 2, #KEYS, 3 do
+    local known = redis.call('EXISTS', KEYS[key]) == 1
+    local rows = tonumber(ARGV[index])
+    index = index + 1
+    for _ = 1, rows do
+        if known and redis.call('SADD', KEYS[key + 1], ARGV[index + 1]) == 1 then
+            redis.call('ZADD', KEYS[key + 2], ARGV[index], #ARGV[index + 1] .. ':' .. ARGV[index + 1] .. ARGV[index + 2])
+            added = added + 1
+        end
+        index = index + 3
     end
 end
 return added
@@ -178,9 +184,14 @@ class RedisStore:
         answer = await self._script(_PUT_BATCH, keys, *arguments)
         return PutOutcome(answer.decode())
 
-    async def append_results(self, run_id: str, batch_id: str, rows: Sequence[ResultRow]) -> int:
-        flat = [value for row in rows for value in (row.cursor, row.rollout_id, row.payload)]
-        return int(await self._script(_APPEND, self._batch_keys(run_id, batch_id), *flat))
+    async def append_results(self, parts: Sequence[BatchResults]) -> int:
+        keys = [key for part in parts for key in self._batch_keys(part.run_id, part.batch_id)]
+        values: list[str | bytes | int] = []
+        for part in parts:
+            values.append(len(part.rows))
+            for row in part.rows:
+                values += (row.cursor, row.rollout_id, row.payload)
+        return int(await self._script(_APPEND, keys, *values))
 
     async def results_after(self, run_id: str, batch_id: str, cursor: int, limit: int) -> list[ResultRow]:
         key = self._key(f"results:{run_id}:{batch_id}")

@@ -8,6 +8,7 @@ import time
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from embomatrix.manager.store.protocol import (
+    BatchResults,
     BatchRow,
     Candidate,
     CredentialRow,
@@ -118,18 +119,16 @@ class SqliteStore:
 
         return await self._run(put)
 
-    async def append_results(self, run_id: str, batch_id: str, rows: Sequence[ResultRow]) -> int:
-        def append() -> int:
-            key = (run_id, batch_id)
-            batch = self._db.execute("SELECT 1 FROM batch WHERE run_id = ? AND batch_id = ?", key)
-            if batch.fetchone() is None:
-                return 0
-            values = [(*key, row.rollout_id, row.cursor, row.payload) for row in rows]
-            return self._db.executemany(
-                "INSERT OR IGNORE INTO result VALUES (?, ?, ?, ?, ?)", values
-            ).rowcount
+    async def append_results(self, parts: Sequence[BatchResults]) -> int:
+        return await self._run(lambda: sum(self._append(part) for part in parts))
 
-        return await self._run(append)
+    def _append(self, part: BatchResults) -> int:
+        key = (part.run_id, part.batch_id)
+        batch = self._db.execute("SELECT 1 FROM batch WHERE run_id = ? AND batch_id = ?", key)
+        if batch.fetchone() is None:
+            return 0
+        values = [(*key, row.rollout_id, row.cursor, row.payload) for row in part.rows]
+        return self._db.executemany("INSERT OR IGNORE INTO result VALUES (?, ?, ?, ?, ?)", values).rowcount
 
     async def results_after(self, run_id: str, batch_id: str, cursor: int, limit: int) -> list[ResultRow]:
         query = (
