@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,7 +22,7 @@ from embomatrix.world.bundle import bundle_digest
 
 FAKES = Path(__file__).parent
 LIMITS = ClientLimits(retry_first_s=0.05, retry_longest_s=0.5)
-SCENE = b"ok"
+SCENE = zlib.compress(b"ok")
 DIGEST = bundle_digest(SCENE)
 
 

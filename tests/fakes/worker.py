@@ -9,7 +9,7 @@ import grpc
 from embomatrix.proto.v1 import worker_service_pb2 as pb
 from embomatrix.proto.v1 import worker_service_pb2_grpc
 from embomatrix.reward.breakdown import RewardBreakdown
-from embomatrix.rpc.channel import PROTOCOL_VERSION, open_channel
+from embomatrix.rpc.channel import open_channel
 from embomatrix.rpc.convert import resources_to_proto
 from embomatrix.rpc.convert_session import (
     lease_from_proto,
@@ -29,6 +29,7 @@ from embomatrix.rpc.values import (
     Timings,
     WorkerState,
 )
+from embomatrix.rpc.versions import PROTOCOL_VERSION
 
 REWARD = RewardBreakdown(format=0.5, relevance=0.2, goal=15.0, atoms=(), success=False)
 
@@ -49,6 +50,8 @@ class FakeWorker:
     load_s: float = 0.0
     execute_s: float = 0.0
     token: str = ""
+    join_token: str = ""
+    ca: bytes = b""
     boot_id: str = ""
     poison: set = field(default_factory=set)
     stuck: set = field(default_factory=set)
@@ -64,7 +67,7 @@ class FakeWorker:
     resumed: bool = False
 
     async def __aenter__(self):
-        self._channel = open_channel(self.address, self.token)
+        self._channel = open_channel(self.address, self.token, self.ca)
         self._stub = worker_service_pb2_grpc.WorkerServiceStub(self._channel)
         self._outgoing = asyncio.Queue()
         self._permits = asyncio.Semaphore(self.slots)
@@ -74,11 +77,17 @@ class FakeWorker:
                 worker_id=self.worker_id,
                 boot_id=self.boot_id,
                 protocol_version=PROTOCOL_VERSION,
+                join_token=self.join_token,
                 resources=resources_to_proto(Resources(self.slots, self.slots, self.memory_mb)),
             ),
             timeout=5,
         )
         self.session = (answer.session_id, answer.session_epoch)
+        if answer.credential:
+            await self._channel.close()
+            self.token = answer.credential
+            self._channel = open_channel(self.address, self.token, self.ca)
+            self._stub = worker_service_pb2_grpc.WorkerServiceStub(self._channel)
         self._send(state=self._state())
         self._start(self._talk())
         self._start(self._beat(answer.heartbeat_interval_s))

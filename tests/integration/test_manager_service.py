@@ -5,6 +5,7 @@ import contextlib
 import hashlib
 import socket
 import time
+import zlib
 
 import grpc
 import httpx
@@ -44,7 +45,7 @@ pytestmark = pytest.mark.timeout(60)
 
 
 def bundle_of(text):
-    data = text.encode()
+    data = zlib.compress(text.encode(), level=0)
     return f"sha256:{hashlib.sha256(data).hexdigest()}", data
 
 
@@ -259,7 +260,7 @@ async def test_a_manager_whose_state_was_taken_over_stops(tmp_path):
 async def test_a_bundle_with_a_wrong_digest_is_refused(tmp_path):
     async with manager(tmp_path) as at, ClusterClient(at.address) as client:
         with pytest.raises(InvalidRequestError, match="damaged"):
-            await client.put_bundles({KITCHEN: b"something else"})
+            await client.put_bundles({KITCHEN: BEDROOM_DATA})
         with pytest.raises(InvalidRequestError, match="is no digest"):
             await client.put_bundles({"../../etc/passwd": b"x"})
         assert await client.put_bundles({KITCHEN: KITCHEN_DATA}) == (KITCHEN,)

@@ -2,9 +2,9 @@
 
 import asyncio
 import contextlib
-import hashlib
 
 import pytest
+from tests.fakes.guarded import packed
 from tests.fakes.worker import FakeWorker
 
 from embomatrix.manager.app import running
@@ -29,8 +29,7 @@ from embomatrix.rpc.values import (
 )
 
 pytestmark = pytest.mark.timeout(60)
-DATA = b"a kitchen"
-KITCHEN = f"sha256:{hashlib.sha256(DATA).hexdigest()}"
+KITCHEN, DATA = packed("a kitchen")
 
 
 @contextlib.asynccontextmanager

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+import zlib
 from collections import Counter
 from pathlib import Path
 
@@ -116,7 +117,8 @@ def _batch(run_id, digests, count, task="ok", batch_id="b1"):
 
 
 async def _put(client, *contents):
-    bundles = {bundle_digest(content): content for content in contents}
+    packed = [zlib.compress(content) for content in contents]
+    bundles = {bundle_digest(content): content for content in packed}
     await client.put_bundles(bundles)
     return list(bundles)
 

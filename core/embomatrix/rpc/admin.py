@@ -23,13 +23,16 @@ CALL_S: Final = 10.0
 class AdminClient:
     """Async context manager over one channel to the manager at HOST:PORT. Every failure is a ``ClusterError``."""
 
-    def __init__(self, address: str = DEFAULT_ADDRESS, token: str = "", *, call_s: float = CALL_S) -> None:
+    def __init__(
+        self, address: str = DEFAULT_ADDRESS, token: str = "", *, ca: bytes = b"", call_s: float = CALL_S
+    ) -> None:
         self._address = address
         self._token = token
+        self._ca = ca
         self._call_s = call_s
 
     async def __aenter__(self) -> Self:
-        self._channel = open_channel(self._address, self._token)
+        self._channel = open_channel(self._address, self._token, self._ca)
         self._stub = admin_service_pb2_grpc.AdminServiceStub(self._channel)
         return self
 

@@ -1,4 +1,4 @@
-"""Channels to the manager: one set of options, and the token on every call."""
+"""Channels to the manager: one set of options, TLS where there is an authority to trust, and the token on every call."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
 
 DEFAULT_ADDRESS: Final = "127.0.0.1:50070"
-PROTOCOL_VERSION: Final = 1
 MAX_MESSAGE_BYTES: Final = 32 * 1024 * 1024
 CHUNK_BYTES: Final = 1024 * 1024
 """Bundles travel in chunks of this size."""
@@ -54,9 +53,10 @@ SERVER_OPTIONS: Final[tuple[tuple[str, int], ...]] = (
 )
 
 
-def open_channel(address: str, token: str = "") -> grpc.aio.Channel:
+def open_channel(address: str, token: str = "", ca: bytes = b"") -> grpc.aio.Channel:
     """A channel to HOST:PORT that sends the token with every call; it connects when it is first used.
 
+    ``ca`` is the certificate (PEM) of the authority that the manager's must be signed by; without it there is no TLS.
     Raises InvalidRequestError for an address or a token that can't be one.
     """
     if not is_address(address):
@@ -66,7 +66,10 @@ def open_channel(address: str, token: str = "") -> grpc.aio.Channel:
     if not re.fullmatch(TOKEN_PATTERN, token):
         raise InvalidRequestError("the token can't be sent: expected visible ASCII characters without spaces")
     interceptors = [interceptor(token) for interceptor in _INTERCEPTORS] if token else None
-    return grpc.aio.insecure_channel(address, options=CHANNEL_OPTIONS, interceptors=interceptors)
+    if not ca:
+        return grpc.aio.insecure_channel(address, options=CHANNEL_OPTIONS, interceptors=interceptors)
+    trusted = grpc.ssl_channel_credentials(ca)
+    return grpc.aio.secure_channel(address, trusted, options=CHANNEL_OPTIONS, interceptors=interceptors)
 
 
 def is_address(text: str) -> bool:
@@ -78,6 +81,11 @@ def is_address(text: str) -> bool:
 def bearer(token: str) -> str:
     """The value of the ``authorization`` key for a token."""
     return f"Bearer {token}"
+
+
+def token_of(header: str | None) -> str:
+    """The token in the value of an ``authorization`` key; empty when there is none."""
+    return (header or "").removeprefix("Bearer ")
 
 
 def chunks_of(data: bytes) -> list[bytes]:

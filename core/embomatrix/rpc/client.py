@@ -20,6 +20,7 @@ from embomatrix.proto.v1 import (
     scene_service_pb2,
     scene_service_pb2_grpc,
 )
+from embomatrix.rpc.capabilities import version_with
 from embomatrix.rpc.channel import DEFAULT_ADDRESS, chunks_of, open_channel
 from embomatrix.rpc.convert import (
     batch_to_proto,
@@ -108,16 +109,23 @@ class _Link:
 
 
 class ClusterClient:
-    """Async context manager over channels to the manager, or to several (``A:PORT,B:PORT``) of which one leads.
+    """Async context manager over channels to the manager, or to several (``A:PORT,B:PORT``) of which one leads; by TLS if
+    ``ca`` (PEM) names whom to trust.
 
     Every failure is a ``ClusterError``.
     """
 
     def __init__(
-        self, address: str = DEFAULT_ADDRESS, token: str = "", *, limits: ClientLimits = DEFAULT_LIMITS
+        self,
+        address: str = DEFAULT_ADDRESS,
+        token: str = "",
+        *,
+        ca: bytes = b"",
+        limits: ClientLimits = DEFAULT_LIMITS,
     ) -> None:
         self._managers = Managers(address)
         self._token = token
+        self._ca = ca
         self._limits = limits
         self._links: dict[str, _Link] = {}
 
@@ -143,7 +151,7 @@ class ClusterClient:
         address = self._managers.current
         if address not in self._links:
             # Links of managers that were left stay open: other calls may still be on them.
-            self._links[address] = _Link(open_channel(address, self._token))
+            self._links[address] = _Link(open_channel(address, self._token, self._ca))
         return self._links[address]
 
     @property
@@ -167,6 +175,9 @@ class ClusterClient:
         """Open a run, or attach to the one of this id, which keeps its terms; returns its id."""
         request = run_terms_to_proto(terms)
         request.name, request.run_id = name, run_id
+        request.protocol_version = await version_with(
+            self._rollouts, self._address, timeout_s=self._limits.call_s
+        )
         with cluster_errors(self._address):
             answer = await self._rollouts.OpenRun(request, timeout=self._limits.call_s)
         return str(answer.run_id)

@@ -20,7 +20,17 @@ from embomatrix.rpc.values import (
     Timings,
 )
 from embomatrix.skills.failure import FailureReason
-from embomatrix.skills.syntax import MAX_STEPS, SIGNATURES, Arg, PlaceRelation, Plan, Skill, SkillCall
+from embomatrix.skills.syntax import (
+    MAX_PLAN_BYTES,
+    MAX_ROOM_NAME,
+    MAX_STEPS,
+    SIGNATURES,
+    Arg,
+    PlaceRelation,
+    Plan,
+    Skill,
+    SkillCall,
+)
 from embomatrix.skills.trace import Step
 
 if TYPE_CHECKING:
@@ -50,6 +60,8 @@ SKILL_KINDS: Final[Mapping[Skill, types_pb2.SkillKind.ValueType]] = {
     Skill.CLEAN: types_pb2.SKILL_KIND_CLEAN,
     Skill.SOAK: types_pb2.SKILL_KIND_SOAK,
 }
+MAX_ROLLOUT_BYTES: Final = MAX_PLAN_BYTES + 4096
+"""On the wire: the largest plan, and its names."""
 KNOWN: Final = 65_536
 """Calls and steps that a process remembers by their bytes: plans of one model repeat them, and so do the results."""
 _SKILLS: Final = {kind: skill for skill, kind in SKILL_KINDS.items()}
@@ -144,8 +156,14 @@ def _call_of(data: bytes) -> SkillCall:
         relation=_relation(message.relation) if Arg.RELATION in taken else None,
         yaw=finite("yaw", message.yaw) if Arg.YAW in taken else None,
         distance=finite("distance", message.distance) if Arg.DISTANCE in taken else None,
-        room_name=message.room_name if Arg.ROOM in taken else None,
+        room_name=_room_name(message.room_name) if Arg.ROOM in taken else None,
     )
+
+
+def _room_name(text: str) -> str:
+    if len(text) > MAX_ROOM_NAME:
+        raise ConvertError("room_name", f"has {len(text)} characters: at most {MAX_ROOM_NAME} name a room")
+    return text
 
 
 def _relation(text: str) -> PlaceRelation:
@@ -181,6 +199,12 @@ def rollout_to_proto(rollout: Rollout) -> types_pb2.Rollout:
 
 
 def rollout_from_proto(message: types_pb2.Rollout) -> Rollout:
+    """The rollout, which keeps its bytes; more of them than the largest plan takes are refused before they are looked at."""
+    wire = message.SerializeToString()
+    if len(wire) > MAX_ROLLOUT_BYTES:
+        raise ConvertError(
+            "plan", f"makes a rollout of {len(wire)} bytes: at most {MAX_ROLLOUT_BYTES} are taken"
+        )
     rollout = Rollout(
         rollout_id=required("rollout_id", message.rollout_id),
         group_id=required("group_id", message.group_id),
@@ -190,7 +214,7 @@ def rollout_from_proto(message: types_pb2.Rollout) -> Rollout:
         seed=message.seed,
         render=message.render,
     )
-    object.__setattr__(rollout, "wire", message.SerializeToString())
+    object.__setattr__(rollout, "wire", wire)
     return rollout
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import re
 from typing import TYPE_CHECKING, Final
 
 import grpc
@@ -109,6 +110,24 @@ _NAMED: Final[Mapping[str, type[ClusterError]]] = {"unknown-session": UnknownSes
 """Errors that share a status with others, by the value of ``ERROR_KEY`` that tells them apart."""
 _NAMES: Final = {error: name for name, error in _NAMED.items()}
 
+_TLS_TROUBLES: Final[Mapping[str, str]] = {
+    "WRONG_VERSION_NUMBER": "what answers at {address} does not speak TLS: leave --ca out, or check the port",
+    "[Hh]andshake failed": (
+        "the certificate at {address} is not signed by the authority in --ca, or has expired: pass the ca.pem of that manager, "
+        "or renew it with `embomatrix manager init`"
+    ),
+    "Hostname Verification": (
+        "the certificate at {address} is for other names: call the manager by one of them, or add this one with "
+        "`embomatrix manager init --san NAME`"
+    ),
+    # Only of an attempt to connect: a manager that dies closes its connections too.
+    "failed to connect .*Socket closed": (
+        "what answers at {address} closed the connection: if it speaks TLS, pass --ca, or set EMBOMATRIX_CA, to the ca.pem "
+        "of that manager"
+    ),
+}
+"""What gRPC says of a handshake, as a pattern, and what it means; the first that fits counts."""
+
 
 @contextlib.asynccontextmanager
 async def translate(context: grpc.aio.ServicerContext) -> AsyncIterator[None]:
@@ -159,6 +178,8 @@ def cluster_error(error: grpc.aio.AioRpcError, address: str) -> ClusterError:
     if ERROR_KEY in told:
         return (_NAMED.get(told[ERROR_KEY]) or _ERRORS.get(code, InternalError))(details)
     match code:
+        case grpc.StatusCode.UNAVAILABLE if trouble := _tls_trouble(details):
+            return ManagerUnreachableError(trouble.format(address=address))
         case grpc.StatusCode.UNAVAILABLE:
             return ManagerUnreachableError(
                 f"no manager answers at {address}: start one with `embomatrix manager serve`, "
@@ -177,6 +198,11 @@ def cluster_error(error: grpc.aio.AioRpcError, address: str) -> ClusterError:
             return _ERRORS.get(code, InternalError)(
                 f"the call to {address} failed with {code.name}: {details}"
             )
+
+
+def _tls_trouble(details: str) -> str:
+    """What gRPC's words of a failed handshake mean; empty when it did not come to one."""
+    return next((sentence for sign, sentence in _TLS_TROUBLES.items() if re.search(sign, details)), "")
 
 
 @contextlib.contextmanager

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 from embomatrix.skills.syntax import (
     ALIASES,
     MAX_PLAN_BYTES,
+    MAX_ROOM_NAME,
     MAX_STEPS,
     PROFILES,
     SIGNATURES,
@@ -54,7 +55,6 @@ class PlanError(ValueError):
 PLAN_KEYS: Final = ("action_sequence", "plan")
 MAX_INDEX: Final = 2**63 - 1
 """Indices beyond the wire's 64 bits name nothing."""
-MAX_ROOM_NAME: Final = 64
 _MAX_STARTS: Final = 256
 """Brackets at which a JSON plan is looked for: bounds the work on adversarial text."""
 _JSON_START: Final = re.compile(r"\[\s*\{|\{\s*\"")

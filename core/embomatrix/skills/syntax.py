@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 MAX_STEPS: Final = 64
 MAX_PLAN_BYTES: Final = 64 * 1024
 """A longer plan, or a longer text, can't be parsed: it is no plan."""
+MAX_ROOM_NAME: Final = 64
+"""Characters."""
 
 
 class Skill(StrEnum):

@@ -24,7 +24,7 @@ from embomatrix.world.poses import PoseCache
 from embomatrix.world.tables import Tables, TableWriter
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -42,6 +42,8 @@ _ALIGNMENT: Final = 8
 _DTYPES: Final[Mapping[str, np.dtype[Any]]] = {name: np.dtype(name) for name in ("<f8", "<i4", "|u1")}
 _PREPARED: Final = "prepared."
 _CHUNK: Final = 1 << 20
+"""What a bundle may grow by beyond its ratio: the smallest ones compress best."""
+_PIECE: Final = 1 << 16
 
 
 class BundleError(ValueError):
@@ -110,9 +112,7 @@ def read_bundle(path: Path, *, digest: str = "", limits: BundleLimits = DEFAULT_
 def decode_bundle(data: bytes, *, digest: str = "", limits: BundleLimits = DEFAULT_LIMITS) -> Bundle:
     """The bundle, checked in every part. ``digest`` is compared first unless it is empty. Raises BundleError."""
     if len(data) > limits.compressed_bytes:
-        raise BundleError(
-            f"the bundle has over {limits.compressed_bytes:,} bytes: expected at most {limits.compressed_bytes:,}"
-        )
+        raise _too_large(limits)
     found = bundle_digest(data)
     if digest and found != digest:
         raise BundleError(f"the bundle's digest is {found}, expected {digest}")
@@ -201,20 +201,57 @@ def _check_tasks(bundle: Bundle) -> None:
             )
 
 
+class Inflation:
+    """Decompresses a bundle while it comes, and refuses it at the first piece that breaks a limit.
+
+    Whoever takes bundles in uses this: what one side accepts, every other accepts.
+    """
+
+    def __init__(self, limits: BundleLimits = DEFAULT_LIMITS) -> None:
+        self._limits = limits
+        self._decoder = zlib.decompressobj()
+        self._taken = 0
+        self._grown = 0
+
+    def feed(self, data: bytes) -> Iterator[bytes]:
+        """What the next bytes of the bundle hold, in pieces that fit in memory. Raises BundleError."""
+        for start in range(0, len(data), _PIECE):
+            yield self._inflate(data[start : start + _PIECE])
+
+    def finish(self) -> None:
+        """Raises BundleError unless the bundle ended where its bytes ended."""
+        if not self._decoder.eof or self._decoder.unused_data:
+            raise BundleError("the bundle is cut short, or bytes follow its end: fetch it again")
+
+    def _inflate(self, piece: bytes) -> bytes:
+        self._taken += len(piece)
+        if self._taken > self._limits.compressed_bytes:
+            raise _too_large(self._limits)
+        bound = int(self._taken * self._limits.ratio) + _CHUNK
+        try:
+            content = self._decoder.decompress(piece, bound - self._grown + 1)
+        except zlib.error as error:
+            raise BundleError(f"the bundle is no zlib stream: {error}") from error
+        self._grown += len(content)
+        if self._grown > bound or self._decoder.unconsumed_tail:
+            raise BundleError(
+                f"the bundle grows beyond {bound:,} bytes in its first {self._taken:,}: expected at most "
+                f"{self._limits.ratio:g} to 1"
+            )
+        return content
+
+
+def _too_large(limits: BundleLimits) -> BundleError:
+    return BundleError(
+        f"the bundle has over {limits.compressed_bytes:,} bytes: expected at most {limits.compressed_bytes:,}"
+    )
+
+
 def _decompress(data: bytes, limits: BundleLimits) -> bytes:
-    bound = int(len(data) * limits.ratio) + _CHUNK
-    decoder = zlib.decompressobj()
-    try:
-        text = decoder.decompress(data, bound)
-    except zlib.error as error:
-        raise BundleError(f"the bundle is no zlib stream: {error}") from error
-    if decoder.unconsumed_tail:
-        raise BundleError(
-            f"the bundle of {len(data)} bytes grows beyond {bound} bytes: expected at most {limits.ratio:g} to 1"
-        )
-    if not decoder.eof or decoder.unused_data:
-        raise BundleError("the bundle is cut short, or bytes follow its end: fetch it again")
-    return text
+    inflation = Inflation(limits)
+    content = b"".join(inflation.feed(data))
+    inflation.finish()
+    return content
 
 
 def _refuse_constant(name: str) -> float:

@@ -13,11 +13,14 @@ from typing import TYPE_CHECKING, Final
 
 import uvicorn
 
+from embomatrix.manager.access.gate import Gate
+from embomatrix.manager.access.protection import protection_of
 from embomatrix.manager.api import build_api
 from embomatrix.manager.archive import RunArchive
 from embomatrix.manager.assignments import DispatchLimits
 from embomatrix.manager.bundles import BundleStore
 from embomatrix.manager.cluster_state import ClusterState
+from embomatrix.manager.http_rules import HttpRules, allowed_hosts
 from embomatrix.manager.leadership import Leadership
 from embomatrix.manager.listen import bound_socket
 from embomatrix.manager.registry import LivenessLimits, Registry
@@ -35,6 +38,7 @@ if TYPE_CHECKING:
     from fastapi import FastAPI
     from starlette.types import Receive, Scope, Send
 
+    from embomatrix.manager.access.protection import Tls
     from embomatrix.manager.settings import ManagerSettings
     from embomatrix.manager.store.protocol import StateStore
 
@@ -59,7 +63,7 @@ async def serve(
     on_ready: Callable[[Endpoints], None],
     on_standby: Callable[[str], None] = lambda leader: None,
 ) -> None:
-    """Serve until SIGINT or SIGTERM. ``StateError`` and ``PortInUseError`` tell a person what to mend.
+    """Serve until SIGINT or SIGTERM. ``AccessError``, ``StateError`` and ``PortInUseError`` tell a person what to mend.
 
     ``on_standby`` hears the leader's address while another manager leads.
     """
@@ -90,10 +94,10 @@ async def running(
     settings: ManagerSettings, on_standby: Callable[[str], None] = lambda leader: None
 ) -> AsyncIterator[Endpoints]:
     """A manager that leads for as long as this is held. While another one leads, it stands by before it is entered."""
+    protection = protection_of(settings)
     with _folder_errors(settings):
         bundles = BundleStore(
             settings.data_dir / "bundles",
-            limit_bytes=settings.bundle_mb * MEGABYTE,
             total_bytes=settings.bundle_total_mb * MEGABYTE,
         )
     async with contextlib.AsyncExitStack() as stack:
@@ -108,26 +112,31 @@ async def running(
         stack.push_async_callback(store.close)
         leadership = Leadership(store, _candidate(settings))
         stack.push_async_callback(leadership.resign)
-        standby = Standby()
-        http = _HttpServer(standby.page(), http_socket)
+        standby = Standby(protection.tls)
+        http = _HttpServer(standby.page(), http_socket, protection.tls)
         group = await stack.enter_async_context(_stopped_at_exit())
         group.create_task(http.serve())
         epoch = await _win(leadership, standby, settings, on_standby)
         runtime = await _start_runtime(settings, store, bundles, leadership, epoch)
+        gate = Gate(store, guarded=protection.guarded, shared_token=settings.token)
+        await gate.open(protection.first)
         server, port = await build_server(
             runtime,
+            gate,
+            protection.tls,
             host=settings.host,
             port=settings.port,
-            token=settings.token,
             lease_ttl_s=settings.lease_ttl_s,
         )
-        http.show(build_api(runtime, settings))
+        rules = HttpRules(gate, hosts=allowed_hosts(settings.http_host, protection.tls))
+        http.show(build_api(runtime, rules))
         group.create_task(leadership.keep())
         group.create_task(runtime.serve())
         await server.start()
         stack.push_async_callback(server.stop, STOP_GRACE_S)
         http_port = http_socket.getsockname()[1]
-        yield Endpoints(f"{settings.host}:{port}", f"http://{settings.http_host}:{http_port}/")
+        scheme = "http" if protection.tls is None else "https"
+        yield Endpoints(f"{settings.host}:{port}", f"{scheme}://{settings.http_host}:{http_port}/")
 
 
 def _candidate(settings: ManagerSettings) -> Candidate:
@@ -199,7 +208,7 @@ async def _start_runtime(
 class _HttpServer:
     """Uvicorn on a socket that is bound already, without its signal handlers: the manager has its own."""
 
-    def __init__(self, app: FastAPI, bound: socket.socket) -> None:
+    def __init__(self, app: FastAPI, bound: socket.socket, tls: Tls | None) -> None:
         self._socket = bound
         self._app = app
         config = uvicorn.Config(
@@ -209,6 +218,8 @@ class _HttpServer:
             access_log=False,
             lifespan="off",
             timeout_graceful_shutdown=1,
+            ssl_certfile=None if tls is None else tls.chain_file,
+            ssl_keyfile=None if tls is None else tls.key_file,
         )
         self._server = uvicorn.Server(config)
         self._server.capture_signals = contextlib.nullcontext  # type: ignore[method-assign,assignment]

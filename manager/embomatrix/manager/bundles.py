@@ -14,11 +14,13 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.rpc.channel import CHUNK_BYTES
 from embomatrix.rpc.status import InvalidRequestError, NotFoundError, OverloadedError
+from embomatrix.world.bundle import BundleError, Inflation
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
     from collections.abc import Set as AbstractSet
     from pathlib import Path
+    from typing import IO
 
 logger = logging.getLogger(__name__)
 
@@ -29,7 +31,7 @@ _DIGEST: Final = re.compile(r"sha256:[0-9a-f]{64}")
 
 
 class BundleStore:
-    """A folder of bundles. ``limit_bytes`` bounds one bundle, ``total_bytes`` the folder.
+    """A folder of bundles, each within the limits that workers keep to; ``total_bytes`` bounds the folder.
 
     When the folder is full, bundles go that nobody needs and that were not used for ``keep_s`` seconds, the longest unused
     first. A file's time of change is when it was last used; ``clock`` gives seconds of the same clock.
@@ -39,13 +41,11 @@ class BundleStore:
         self,
         folder: Path,
         *,
-        limit_bytes: int,
         total_bytes: int,
         keep_s: float = 600.0,
         clock: Callable[[], float] = time.time,
     ) -> None:
         self._folder = folder
-        self._limit_bytes = limit_bytes
         self._total_bytes = total_bytes
         self._keep_s = keep_s
         self._clock = clock
@@ -81,10 +81,15 @@ class BundleStore:
         return await asyncio.to_thread(check)
 
     async def put(self, digest: str, chunks: AsyncIterator[bytes]) -> None:
-        """Take a bundle in. It appears under its name only when all of it is there and its digest is right."""
+        """Take a bundle in. It appears under its name only when all of it is there and its digest is right.
+
+        Raises InvalidRequestError at the first piece that no worker would take.
+        """
         path = self._path(digest)
         try:
             await self._take(digest, path, chunks)
+        except BundleError as error:
+            raise InvalidRequestError(f"bundle {digest} is refused: {error}") from error
         except OSError as error:
             raise OverloadedError(
                 f"the bundle folder {self._folder} can't be written ({error.strerror}): make room on the manager's disk"
@@ -92,22 +97,19 @@ class BundleStore:
 
     async def _take(self, digest: str, path: Path, chunks: AsyncIterator[bytes]) -> None:
         handle, name = tempfile.mkstemp(prefix=INCOMING, dir=self._folder)
-        sha, size = hashlib.sha256(), 0
+        sha, size, inflation = hashlib.sha256(), 0, Inflation()
         try:
             with os.fdopen(handle, "wb") as file:
                 async for chunk in chunks:
                     size += len(chunk)
-                    if size > self._limit_bytes:
-                        raise InvalidRequestError(
-                            f"bundle {digest} is larger than {self._limit_bytes} bytes: split its scene"
-                        )
                     sha.update(chunk)
-                    await asyncio.to_thread(file.write, chunk)
+                    await asyncio.to_thread(_check_and_write, inflation, chunk, file)
             found = PREFIX + sha.hexdigest()
             if found != digest:
                 raise InvalidRequestError(
                     f"the bundle's content has digest {found}, expected {digest}: it was damaged on its way, or misnamed"
                 )
+            inflation.finish()
             await asyncio.to_thread(self._make_room, size, self._needed())
             os.replace(name, path)
             self.has(digest)
@@ -163,3 +165,10 @@ class BundleStore:
                 f"{digest[:100]!r} is no digest: expected sha256: and 64 hexadecimal digits"
             )
         return self._folder / f"{digest.removeprefix(PREFIX)}.bundle"
+
+
+def _check_and_write(inflation: Inflation, chunk: bytes, file: IO[bytes]) -> None:
+    """Looks into the chunk before it reaches the disk; what it holds is dropped, piece by piece."""
+    for _ in inflation.feed(chunk):
+        pass
+    file.write(chunk)

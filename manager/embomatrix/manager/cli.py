@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from pathlib import Path  # noqa: TC003  # typer reads the annotation when the command runs
+from pathlib import Path  # typer reads the annotation when the command runs
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
+
+from embomatrix.manager.token_cli import app as token_app
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from embomatrix.manager.settings import ManagerSettings
+    from embomatrix.rpc.roles import Role
 
 app = typer.Typer(
     help="Serve a Simulation Manager, or ask one how the cluster does.",
@@ -19,9 +22,22 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
+app.add_typer(token_app, name="token")
+
 Token = Annotated[
-    str, typer.Option(envvar="EMBOMATRIX_TOKEN", help="Shared secret of the cluster.", show_default=False)
+    str, typer.Option(envvar="EMBOMATRIX_TOKEN", help="A token, or @FILE that holds it.", show_default=False)
 ]
+Manager = Annotated[
+    str,
+    typer.Option("--manager", "--address", help="HOST:PORT of the manager.", envvar="EMBOMATRIX_MANAGER"),
+]
+Ca = Annotated[
+    Path | None,
+    typer.Option(
+        envvar="EMBOMATRIX_CA", help="The ca.pem of a manager that serves by TLS.", show_default=False
+    ),
+]
+DataDir = Annotated[Path | None, typer.Option(help="Folder of bundles and state.", show_default=False)]
 
 
 @app.command()
@@ -39,12 +55,24 @@ def serve(
     advertise: Annotated[
         str, typer.Option(help="HOST:PORT under which others reach this manager, if not where it serves.")
     ] = "",
-    data_dir: Annotated[
-        Path | None, typer.Option(help="Folder of bundles and state.", show_default=False)
+    data_dir: DataDir = None,
+    token: Annotated[
+        str,
+        typer.Option(
+            envvar="EMBOMATRIX_TOKEN",
+            help="One secret that is an admin's for everybody, beside the tokens of roles; or @FILE that holds it.",
+            show_default=False,
+        ),
+    ] = "",
+    tls_cert: Annotated[
+        Path | None, typer.Option(help="Certificate (PEM), else that of `init`.", show_default=False)
     ] = None,
-    token: Token = "",
+    tls_key: Annotated[Path | None, typer.Option(help="Its private key.", show_default=False)] = None,
+    tls_ca: Annotated[
+        Path | None, typer.Option(help="Certificate of who signed it.", show_default=False)
+    ] = None,
     insecure_bind: Annotated[
-        bool, typer.Option("--insecure-bind", help="Serve outside this machine without a token.")
+        bool, typer.Option("--insecure-bind", help="Serve outside this machine without TLS or tokens.")
     ] = False,
     log_level: Annotated[str, typer.Option(help="debug, info, warning or error.")] = "info",
 ) -> None:
@@ -56,7 +84,10 @@ def serve(
         "http_port": http_port,
         "state": state,
         "advertise": advertise,
-        "token": token,
+        "token": _token(token),
+        "tls_cert": tls_cert,
+        "tls_key": tls_key,
+        "tls_ca": tls_ca,
         "insecure_bind": insecure_bind,
         **({"data_dir": data_dir} if data_dir is not None else {}),
     }
@@ -65,22 +96,71 @@ def serve(
 
 
 @app.command()
-def status(
-    manager: Annotated[
-        str,
-        typer.Option("--manager", "--address", help="HOST:PORT of the manager.", envvar="EMBOMATRIX_MANAGER"),
-    ] = "127.0.0.1:50070",
-    token: Token = "",
-) -> None:
+def status(manager: Manager = "127.0.0.1:50070", token: Token = "", ca: Ca = None) -> None:
     """Show workers and runs of a manager."""
     import asyncio
 
     from embomatrix.manager.status_table import show_status
     from embomatrix.rpc.status import ClusterError
+    from embomatrix.rpc.trust import read_ca
 
     try:
-        asyncio.run(show_status(manager, token))
+        asyncio.run(show_status(manager, _token(token), read_ca(ca)))
     except ClusterError as error:
+        _refuse(str(error))
+
+
+@app.command()
+def init(
+    data_dir: DataDir = None,
+    san: Annotated[
+        list[str] | None,
+        typer.Option(help="A further name or address that clients call this machine by.", show_default=False),
+    ] = None,
+    hand_out: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="ROLE:FOLDER", help="Put ca.pem and a token of the role there too.", show_default=False
+        ),
+    ] = None,
+) -> None:
+    """Make certificates and first tokens for a manager that is served beyond this machine. What is there stays as it is."""
+    from embomatrix.manager.access.folder import FIRST_ROLES, AccessError, hand_out_to, prepare
+
+    folder = _settings({} if data_dir is None else {"data_dir": data_dir}).data_dir
+    parcels = [_parcel(text) for text in hand_out or ()]
+    roles = tuple(dict.fromkeys((*FIRST_ROLES, *(role for role, _ in parcels))))
+    try:
+        done = prepare(folder, sans=san or (), roles=roles)
+        for role, target in parcels:
+            hand_out_to(folder, role, target)
+    except AccessError as error:
+        _refuse(str(error))
+    for sentence in done.made:
+        print(f"made   {sentence}")
+    for sentence in done.found:
+        print(f"there  {sentence}")
+
+
+def _parcel(text: str) -> tuple[Role, Path]:
+    """What ``ROLE:FOLDER`` asks for."""
+    from pathlib import Path
+
+    from embomatrix.rpc.roles import Role
+
+    name, _, target = text.partition(":")
+    if name not in (Role.WORKER, Role.TRAINER, Role.VIEWER, Role.ADMIN) or not target:
+        _refuse(f"--hand-out {text!r}: expected worker:FOLDER, trainer:FOLDER, viewer:FOLDER or admin:FOLDER")
+    return Role(name), Path(target)
+
+
+def _token(text: str) -> str:
+    from embomatrix.rpc.status import InvalidRequestError
+    from embomatrix.rpc.trust import read_token
+
+    try:
+        return read_token(text)
+    except InvalidRequestError as error:
         _refuse(str(error))
 
 
@@ -106,6 +186,7 @@ def _settings(options: Mapping[str, object]) -> ManagerSettings:
 def _serve(settings: ManagerSettings) -> None:
     import asyncio
 
+    from embomatrix.manager.access.folder import AccessError
     from embomatrix.manager.app import Endpoints, serve
     from embomatrix.manager.listen import PortInUseError
     from embomatrix.manager.store.protocol import StateError
@@ -128,7 +209,7 @@ def _serve(settings: ManagerSettings) -> None:
     problem = ""
     try:
         asyncio.run(serve(settings, on_ready, on_standby))
-    except* (PortInUseError, StateError) as group:
+    except* (AccessError, PortInUseError, StateError) as group:
         problem = str(_first_of(group))
     if problem:
         _refuse(problem)

@@ -7,8 +7,12 @@ import errno
 import socket
 from typing import TYPE_CHECKING, Final
 
+import grpc
+
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
+
+    from embomatrix.manager.access.protection import Tls
 
 
 class PortInUseError(Exception):
@@ -39,3 +43,14 @@ def bound_socket(host: str, port: int, *, option: str = "") -> Iterator[socket.s
                 f"{host}:{port} can't be bound ({error.strerror}): {remedy.format(option=option)}"
             ) from error
         yield bound
+
+
+def bind_server(server: grpc.aio.Server, host: str, port: int, tls: Tls | None) -> int:
+    """Have a gRPC server listen there, by TLS if there is a certificate; returns its port. Raises PortInUseError."""
+    address = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+    try:
+        if tls is None:
+            return int(server.add_insecure_port(address))
+        return int(server.add_secure_port(address, grpc.ssl_server_credentials([(tls.key, tls.chain)])))
+    except RuntimeError as error:
+        raise PortInUseError(f"{address} can't be bound ({error}): pass another --port") from error

@@ -6,7 +6,7 @@ import functools
 import itertools
 import secrets
 from collections import OrderedDict
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING
 
@@ -20,6 +20,7 @@ from embomatrix.manager.events import (
     WorkerSuspected,
 )
 from embomatrix.rpc.status import NotFoundError, SupersededError, UnknownSessionError
+from embomatrix.rpc.versions import PROTOCOL_VERSION
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -75,6 +76,12 @@ class Session:
     """An operator takes it out."""
     load: float = 0.0
     memory_used_mb: int = 0
+    protocol: int = PROTOCOL_VERSION
+    """The version that both sides speak."""
+    credential_id: str = ""
+    """The token that opened it: no other speaks for it."""
+    asked: set[str] = field(default_factory=set)
+    """Bundles that the worker was asked to hold, or to execute in: it may fetch these."""
 
 
 class Registry:
@@ -159,6 +166,17 @@ class Registry:
         if session.standing is Standing.LOST:
             raise SupersededError(f"worker {worker_id} was given up ({session.reason}): register again")
         return session
+
+    def holder(self, session_id: str) -> Session:
+        """The live session of that name, for calls that carry no epoch."""
+        session = self._sessions.get(self._worker_of.get(session_id, ""))
+        return self.find(session_id, session.epoch if session is not None else 0)
+
+    def end(self, session: Session, reason: str) -> list[Event]:
+        """The session is over at once, whatever its worker does; what it held goes to others."""
+        if session.standing is Standing.LOST or self._sessions.get(session.worker_id) is not session:
+            return []
+        return [self._lose(session, reason)]
 
     def attach(self, session: Session, *, now_s: float) -> None:
         """The worker's stream is open. A suspect gets nothing before its first state was heard on it."""

@@ -82,7 +82,7 @@ class Runs:
         self._bundles = bundles
         self._logs = logs
         self._carry_out = carry_out
-        self._limits = limits
+        self.limits = limits
         self._history = history
         self._runs: dict[str, RunRow] = {}
         self._heard_s: dict[str, float] = {}
@@ -121,7 +121,7 @@ class Runs:
                 f"run id {run_id[:140]!r}: use up to 128 letters, digits, '.', '_' and '-'"
             )
         if run_id not in self._runs:
-            if len(self._runs) >= self._limits.runs:
+            if len(self._runs) >= self.limits.runs:
                 raise OverloadedError(f"{len(self._runs)} runs are open: close some with CloseRun")
             run = RunRow(run_id, name[:200], terms_payload(terms))
             with _store_errors():
@@ -138,9 +138,9 @@ class Runs:
     ) -> list[LookaheadAnswer]:
         """Replace the run's window; answers how far each scene is."""
         self._check_run(run_id)
-        if len(entries) > self._limits.lookahead_entries:
+        if len(entries) > self.limits.lookahead_entries:
             raise InvalidRequestError(
-                f"{len(entries)} look-ahead entries: at most {self._limits.lookahead_entries}, announce fewer steps"
+                f"{len(entries)} look-ahead entries: at most {self.limits.lookahead_entries}, announce fewer steps"
             )
         self._feed(LookaheadAnnounced(run_id, version, entries))
         scenes = dict.fromkeys(entry.bundle_digest for entry in entries)
@@ -206,7 +206,7 @@ class Runs:
     async def close_idle(self, now_s: float) -> None:
         """Close runs whose trainers went away without a word."""
         for run_id, heard_s in list(self._heard_s.items()):
-            if now_s - heard_s > self._limits.idle_s and not self._cluster.dispatcher.pending_of(run_id):
+            if now_s - heard_s > self.limits.idle_s and not self._cluster.dispatcher.pending_of(run_id):
                 logger.info("closing idle run run=%s", run_id)
                 with contextlib.suppress(UnavailableError):
                     await self.close_run(run_id)
@@ -217,7 +217,7 @@ class Runs:
         self._heard_s[run_id] = time.monotonic()
 
     def _check_batch(self, batch: Batch) -> None:
-        count, limit = len(batch.rollouts), self._limits.batch_rollouts
+        count, limit = len(batch.rollouts), self.limits.batch_rollouts
         if not 0 < count <= limit:
             raise InvalidRequestError(f"batch {batch.batch_id!r} has {count} rollouts: expected 1 to {limit}")
         if len({rollout.rollout_id for rollout in batch.rollouts}) < count:
@@ -225,7 +225,7 @@ class Runs:
                 f"batch {batch.batch_id!r} has a rollout id twice: every id must be unique"
             )
         queued = self._cluster.dispatcher.queued
-        if queued + count > self._limits.queued_rollouts:
+        if queued + count > self.limits.queued_rollouts:
             raise OverloadedError(f"{queued} rollouts wait already: submit again when some have come back")
         missing = self._bundles.missing([rollout.bundle_digest for rollout in batch.rollouts])
         if missing:

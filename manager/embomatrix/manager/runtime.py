@@ -32,6 +32,7 @@ from embomatrix.manager.results import ResultLogs
 from embomatrix.manager.runs import RunLimits, Runs
 from embomatrix.manager.store.timed import timed_store
 from embomatrix.rpc.status import SupersededError, UnavailableError
+from embomatrix.rpc.versions import PROTOCOL_VERSION
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -106,11 +107,20 @@ class ManagerRuntime:
             group.create_task(self._clean_up())
             group.create_task(self._delivery.serve())
 
-    def register(self, worker_id: str, boot_id: str, resources: Resources) -> tuple[Session, float]:
+    def register(
+        self,
+        worker_id: str,
+        boot_id: str,
+        resources: Resources,
+        *,
+        credential_id: str = "",
+        protocol: int = PROTOCOL_VERSION,
+    ) -> tuple[Session, float]:
         """Open a session for a worker; returns it and the heartbeat's interval in seconds."""
         if self._lapsed_s() > LET_GO_S:
             raise UnavailableError(STORE_AWAY)
         session, commands = self._intake.register(worker_id, boot_id, resources, now_s=time.monotonic())
+        session.credential_id, session.protocol = credential_id, protocol
         self._close_link(worker_id)
         self.chronicle.fleet.joined(worker_id, resources, now_s=time.monotonic())
         self._carry_out(commands)
@@ -150,6 +160,14 @@ class ManagerRuntime:
         interval_s, commands = self._intake.heartbeat(session_id, epoch, beat, now_s=time.monotonic())
         self._carry_out(commands)
         return interval_s
+
+    def end_session(self, session: Session, reason: str, error: ClusterError) -> None:
+        """The session is over at once: its stream ends with the error, and what it held goes to others."""
+        events = self.registry.end(session, reason)
+        if events:
+            logger.info("session ended worker=%s: %s", session.worker_id, reason)
+            self._carry_out(self._intake.feed(*events, now_s=time.monotonic()))
+            self._close_link(session.worker_id, error)
 
     def drain_worker(self, worker_id: str) -> None:
         """The worker gets nothing new, and leaves when it has finished what it holds."""

@@ -8,9 +8,9 @@ import grpc
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
-from embomatrix.manager.listen import PortInUseError
+from embomatrix.manager.listen import bind_server
 from embomatrix.manager.service_admin import AdminServicer
-from embomatrix.manager.service_auth import TokenInterceptor
+from embomatrix.manager.service_auth import RoleInterceptor
 from embomatrix.manager.service_rollout import RolloutServicer
 from embomatrix.manager.service_scene import SceneServicer
 from embomatrix.manager.service_worker import WorkerServicer
@@ -27,6 +27,8 @@ from embomatrix.proto.v1 import (
 from embomatrix.rpc.channel import SERVER_OPTIONS
 
 if TYPE_CHECKING:
+    from embomatrix.manager.access.gate import Gate
+    from embomatrix.manager.access.protection import Tls
     from embomatrix.manager.runtime import ManagerRuntime
 
 SERVICES: Final = tuple(
@@ -41,25 +43,24 @@ SERVICES: Final = tuple(
 
 
 async def build_server(
-    runtime: ManagerRuntime, *, host: str, port: int, token: str, lease_ttl_s: float
+    runtime: ManagerRuntime, gate: Gate, tls: Tls | None, *, host: str, port: int, lease_ttl_s: float
 ) -> tuple[grpc.aio.Server, int]:
-    """A server that is bound but not started, and its port (``port`` 0 takes a free one). Raises PortInUseError."""
-    interceptors = [TokenInterceptor(token)] if token else []
-    server = grpc.aio.server(options=SERVER_OPTIONS, interceptors=interceptors)
+    """A server that is bound but not started, and its port (``port`` 0 takes a free one).
+
+    Raises PortInUseError, and AccessError for a certificate that does not fit its key.
+    """
+    server = grpc.aio.server(options=SERVER_OPTIONS, interceptors=[RoleInterceptor(gate)])
     worker_service_pb2_grpc.add_WorkerServiceServicer_to_server(
-        WorkerServicer(runtime, lease_ttl_s=lease_ttl_s), server
+        WorkerServicer(runtime, gate, lease_ttl_s=lease_ttl_s), server
     )
-    rollout_service_pb2_grpc.add_RolloutServiceServicer_to_server(RolloutServicer(runtime.runs), server)
+    rollout_service_pb2_grpc.add_RolloutServiceServicer_to_server(
+        RolloutServicer(runtime.runs, authority=tls.authority if tls else b""), server
+    )
     scene_service_pb2_grpc.add_SceneServiceServicer_to_server(SceneServicer(runtime.bundles), server)
-    admin_service_pb2_grpc.add_AdminServiceServicer_to_server(AdminServicer(runtime), server)
+    admin_service_pb2_grpc.add_AdminServiceServicer_to_server(AdminServicer(runtime, gate), server)
     await _add_health(server)
     reflection.enable_server_reflection((*SERVICES, health.SERVICE_NAME, reflection.SERVICE_NAME), server)
-    address = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
-    try:
-        bound = server.add_insecure_port(address)
-    except RuntimeError as error:
-        raise PortInUseError(f"{address} can't be bound ({error}): pass another --port") from error
-    return server, bound
+    return server, bind_server(server, host, port, tls)
 
 
 async def _add_health(server: grpc.aio.Server) -> None:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from embomatrix.manager.service_tokens import TokenMethods
 from embomatrix.manager.views import plan, run_infos, worker_infos
 from embomatrix.proto.v1 import admin_service_pb2 as pb
-from embomatrix.proto.v1 import admin_service_pb2_grpc
 from embomatrix.rpc.convert_log import event_page_to_proto, run_summary_to_proto
 from embomatrix.rpc.convert_session import plan_cell_to_proto, run_info_to_proto, worker_info_to_proto
 from embomatrix.rpc.status import translate
@@ -14,11 +14,13 @@ from embomatrix.rpc.status import translate
 if TYPE_CHECKING:
     import grpc
 
+    from embomatrix.manager.access.gate import Gate
     from embomatrix.manager.runtime import ManagerRuntime
 
 
-class AdminServicer(admin_service_pb2_grpc.AdminServiceServicer):
-    def __init__(self, runtime: ManagerRuntime) -> None:
+class AdminServicer(TokenMethods):
+    def __init__(self, runtime: ManagerRuntime, gate: Gate) -> None:
+        super().__init__(runtime, gate)
         self._runtime = runtime
 
     async def ListWorkers(

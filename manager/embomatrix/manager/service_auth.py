@@ -1,34 +1,26 @@
-"""One shared token, checked on every call but the health check."""
+"""The door of every call: refuses, with a sentence, whoever has no token for it."""
 
 from __future__ import annotations
 
-import hmac
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import grpc
 
-from embomatrix.rpc.channel import TOKEN_KEY, bearer
-from embomatrix.rpc.status import ERROR_KEY
+from embomatrix.rpc.channel import TOKEN_KEY
+from embomatrix.rpc.status import translate
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
-_OPEN: Final = "/grpc.health.v1.Health/"
-_REFUSAL: Final = (
-    "no token, or a wrong one: pass --token, or set EMBOMATRIX_TOKEN to the token of this manager"
-)
+    from embomatrix.manager.access.gate import Gate
+    from embomatrix.rpc.status import ClusterError
 
 
-def token_fits(header: str | None, token: str) -> bool:
-    """Whether an ``authorization`` header carries the token; takes the same time whatever is wrong with it."""
-    return hmac.compare_digest((header or "").encode(), bearer(token).encode())
+class RoleInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[misc]  # grpc is untyped
+    """Lets a call through if the gate has nothing against it; what it carries is not parsed before that."""
 
-
-class TokenInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[misc]  # grpc is untyped
-    """Refuses calls without the token as ``UNAUTHENTICATED``."""
-
-    def __init__(self, token: str) -> None:
-        self._token = token
+    def __init__(self, gate: Gate) -> None:
+        self._gate = gate
 
     async def intercept_service(
         self,
@@ -36,19 +28,22 @@ class TokenInterceptor(grpc.aio.ServerInterceptor):  # type: ignore[misc]  # grp
         handler_call_details: grpc.HandlerCallDetails,
     ) -> grpc.RpcMethodHandler:
         handler = await continuation(handler_call_details)
-        if handler is None or handler_call_details.method.startswith(_OPEN):
+        if handler is None:
             return handler
         metadata = dict(handler_call_details.invocation_metadata or ())
-        if token_fits(metadata.get(TOKEN_KEY), self._token):
-            return handler
-        return _refusing(handler)
+        refusal = self._gate.refusal(handler_call_details.method, metadata.get(TOKEN_KEY))
+        return handler if refusal is None else _refusing(handler, refusal)
 
 
-def _refusing(handler: grpc.RpcMethodHandler) -> grpc.RpcMethodHandler:
-    """A handler of the same kind that refuses: gRPC answers a unary method's caller only through a unary handler."""
+def _refusing(handler: grpc.RpcMethodHandler, refusal: ClusterError) -> grpc.RpcMethodHandler:
+    """A handler of the same kind that refuses: gRPC answers a unary method's caller only through a unary handler.
+
+    It has no deserializer: the message of a stranger stays bytes.
+    """
 
     async def refuse(_: Any, context: grpc.aio.ServicerContext) -> None:
-        await context.abort(grpc.StatusCode.UNAUTHENTICATED, _REFUSAL, trailing_metadata=((ERROR_KEY, "1"),))
+        async with translate(context):
+            raise refusal
 
     makers = {
         (False, False): grpc.unary_unary_rpc_method_handler,
@@ -57,4 +52,4 @@ def _refusing(handler: grpc.RpcMethodHandler) -> grpc.RpcMethodHandler:
         (True, True): grpc.stream_stream_rpc_method_handler,
     }
     make = makers[handler.request_streaming, handler.response_streaming]
-    return make(refuse, handler.request_deserializer, handler.response_serializer)
+    return make(refuse, None, handler.response_serializer)

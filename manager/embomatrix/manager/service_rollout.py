@@ -18,6 +18,8 @@ from embomatrix.rpc.convert_run import (
     run_terms_from_proto,
 )
 from embomatrix.rpc.status import NotFoundError, TrimmedError, translate
+from embomatrix.rpc.versions import PROTOCOL_OLDEST, SPOKEN, VersionRange, agree, software_version
+from embomatrix.world.bundle import DEFAULT_LIMITS
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Sequence
@@ -30,13 +32,31 @@ if TYPE_CHECKING:
 
 
 class RolloutServicer(rollout_service_pb2_grpc.RolloutServiceServicer):
-    def __init__(self, runs: Runs) -> None:
+    """``authority`` is the certificate (PEM) of who signed the manager's; empty without TLS."""
+
+    def __init__(self, runs: Runs, *, authority: bytes = b"") -> None:
         self._runs = runs
+        self._authority = authority.decode("ascii")
+
+    async def GetCapabilities(
+        self, request: pb.GetCapabilitiesRequest, context: grpc.aio.ServicerContext
+    ) -> pb.GetCapabilitiesResponse:
+        return pb.GetCapabilitiesResponse(
+            protocol_low=SPOKEN.oldest,
+            protocol_high=SPOKEN.newest,
+            version=software_version(),
+            batch_rollouts=self._runs.limits.batch_rollouts,
+            bundle_bytes=DEFAULT_LIMITS.compressed_bytes,
+            ca_certificate=self._authority,
+        )
 
     async def OpenRun(
         self, request: pb.OpenRunRequest, context: grpc.aio.ServicerContext
     ) -> pb.OpenRunResponse:
         async with translate(context):
+            # A trainer of version 1 does not say which it speaks.
+            spoken = request.protocol_version or PROTOCOL_OLDEST
+            agree(SPOKEN, VersionRange(spoken, spoken), us="this manager", them="the trainer")
             run_id = await self._runs.open_run(request.name, request.run_id, run_terms_from_proto(request))
         return pb.OpenRunResponse(run_id=run_id)
 

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.manager.intake import Heartbeat
 from embomatrix.proto.v1 import worker_service_pb2 as pb
 from embomatrix.proto.v1 import worker_service_pb2_grpc
-from embomatrix.rpc.channel import PROTOCOL_VERSION
 from embomatrix.rpc.convert import each, inside, resources_from_proto
 from embomatrix.rpc.convert_session import (
     lease_progress_from_proto,
@@ -19,13 +18,21 @@ from embomatrix.rpc.convert_session import (
     lease_to_proto,
     worker_state_from_proto,
 )
-from embomatrix.rpc.status import DeadlineError, InvalidRequestError, PreconditionError, translate
+from embomatrix.rpc.status import (
+    DeadlineError,
+    InvalidRequestError,
+    NotAllowedError,
+    SupersededError,
+    translate,
+)
+from embomatrix.rpc.versions import SPOKEN, VersionRange, agree
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Coroutine
 
     import grpc
 
+    from embomatrix.manager.access.gate import Gate
     from embomatrix.manager.links import Outbox, WorkerLink
     from embomatrix.manager.runtime import ManagerRuntime
 
@@ -36,24 +43,38 @@ _WORKER_ID: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._:@-]{0,127}")
 
 
 class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
-    """``lease_ttl_s`` is told to workers: whoever can't renew within it must stop."""
+    """``lease_ttl_s`` is told to workers: whoever can't renew within it must stop. ``gate`` knows who may speak for whom."""
 
-    def __init__(self, runtime: ManagerRuntime, *, lease_ttl_s: float) -> None:
+    def __init__(self, runtime: ManagerRuntime, gate: Gate, *, lease_ttl_s: float) -> None:
         self._runtime = runtime
+        self._gate = gate
         self._lease_ttl_s = lease_ttl_s
 
     async def Register(
         self, request: pb.RegisterRequest, context: grpc.aio.ServicerContext
     ) -> pb.RegisterResponse:
         async with translate(context):
-            _check_registration(request)
+            _check_name(request.worker_id)
+            # First of all: a version that is refused may mean other things by its fields, and must not use up a token to join.
+            protocol = _agreed(request)
             resources = inside("resources", resources_from_proto, request.resources)
-            session, interval_s = self._runtime.register(request.worker_id, request.boot_id, resources)
+            admission = await self._gate.admit(
+                context, request.join_token, request.worker_id, request.boot_id
+            )
+            session, interval_s = self._runtime.register(
+                request.worker_id,
+                request.boot_id,
+                resources,
+                credential_id=admission.token_id,
+                protocol=protocol,
+            )
         return pb.RegisterResponse(
             session_id=session.session_id,
             session_epoch=session.epoch,
             heartbeat_interval_s=interval_s,
             lease_ttl_s=self._lease_ttl_s,
+            protocol_version=session.protocol,
+            credential=admission.credential,
         )
 
     async def Session(  # type: ignore[override]  # gRPC also takes a coroutine that writes by the context
@@ -62,6 +83,7 @@ class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
         async with translate(context):
             first = await _first_state(request_iterator)
             session = self._runtime.registry.find(first.session_id, first.session_epoch)
+            self._gate.check_session(context, session)
             with self._runtime.attached(session) as link:
                 self._take(link, first, resync=True)
                 await _until_one_ends(self._listen(link, request_iterator), _speak(link, context))
@@ -70,6 +92,7 @@ class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
         self, request: pb.HeartbeatRequest, context: grpc.aio.ServicerContext
     ) -> pb.HeartbeatResponse:
         async with translate(context):
+            self._gate.check_session(context, self._runtime.registry.holder(request.session_id))
             interval_s = self._runtime.take_heartbeat(
                 request.session_id,
                 request.session_epoch,
@@ -86,8 +109,24 @@ class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
         self, request: pb.FetchBundleRequest, context: grpc.aio.ServicerContext
     ) -> AsyncIterator[pb.FetchBundleResponse]:
         async with translate(context):
+            session = self._runtime.registry.holder(request.session_id)
+            self._gate.check_session(context, session)
+            if request.bundle_digest not in session.asked:
+                raise NotAllowedError(
+                    f"worker {session.worker_id} was not asked to hold bundle {request.bundle_digest[:80]!r}"
+                )
             async for chunk in self._runtime.bundles.get(request.bundle_digest):
                 yield pb.FetchBundleResponse(chunk=chunk)
+
+    async def Deregister(
+        self, request: pb.DeregisterRequest, context: grpc.aio.ServicerContext
+    ) -> pb.DeregisterResponse:
+        async with translate(context):
+            session = self._runtime.registry.find(request.session_id, request.session_epoch)
+            self._gate.check_session(context, session)
+            left = SupersededError(f"worker {session.worker_id} said that it leaves: its session is over")
+            self._runtime.end_session(session, "it left", left)
+        return pb.DeregisterResponse()
 
     async def _listen(self, link: WorkerLink, requests: AsyncIterator[pb.SessionRequest]) -> None:
         async for request in requests:
@@ -155,13 +194,15 @@ async def _until_one_ends(*parts: Coroutine[None, None, None]) -> None:
         task.result()
 
 
-def _check_registration(request: pb.RegisterRequest) -> None:
-    if not _WORKER_ID.fullmatch(request.worker_id):
+def _check_name(worker_id: str) -> None:
+    if not _WORKER_ID.fullmatch(worker_id):
         raise InvalidRequestError(
-            f"worker id {request.worker_id[:140]!r}: use up to 128 letters, digits, '.', '_', ':', '@' and '-'"
+            f"worker id {worker_id[:140]!r}: use up to 128 letters, digits, '.', '_', ':', '@' and '-'"
         )
-    if request.protocol_version != PROTOCOL_VERSION:
-        raise PreconditionError(
-            f"worker {request.worker_id} speaks protocol {request.protocol_version}, this manager {PROTOCOL_VERSION}: "
-            f"install the same release of embomatrix on both"
-        )
+
+
+def _agreed(request: pb.RegisterRequest) -> int:
+    """The version that both sides will speak. Raises PreconditionError."""
+    newest = request.protocol_version
+    theirs = VersionRange(request.protocol_low or newest, newest)
+    return agree(SPOKEN, theirs, us="this manager", them=f"worker {request.worker_id}")

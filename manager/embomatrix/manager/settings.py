@@ -15,7 +15,7 @@ DEFAULT_HTTP_PORT = 8070
 
 
 class ManagerSettings(BaseModel):
-    """How a manager serves. Outside loopback it needs a token."""
+    """How a manager serves. Outside loopback it needs certificates and tokens: see ``access.protection``."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -36,11 +36,15 @@ class ManagerSettings(BaseModel):
     state: str = ""
     """``memory:``, ``sqlite:PATH`` or ``redis://HOST:PORT/DB``. Empty: a file in the data folder."""
     token: str = Field("", repr=False, pattern=TOKEN_PATTERN)
-    """Shared secret of workers, trainers and viewers; empty: none is asked for."""
+    """One secret that is an admin's for everybody, beside the tokens of roles; empty: there is none."""
+    tls_cert: Path | None = None
+    """Certificate of the manager (PEM), the authority's after it. None: that of ``manager init``, if it is there."""
+    tls_key: Path | None = None
+    """Its private key."""
+    tls_ca: Path | None = None
+    """Certificate of the authority that signed it; what invitations of workers are pinned to."""
     insecure_bind: bool = False
-    """Serve outside loopback without a token."""
-    bundle_mb: int = Field(256, ge=1)
-    """Largest size of one bundle, in MB."""
+    """Serve outside loopback without certificates and tokens."""
     bundle_total_mb: int = Field(16_384, ge=1)
     """Largest size of all bundles, in MB."""
     heartbeat_s: float = Field(1.0, gt=0)
@@ -88,13 +92,9 @@ class ManagerSettings(BaseModel):
         return value
 
     @model_validator(mode="after")
-    def _guard_bind(self) -> Self:
-        for host in (self.host, self.http_host):
-            if not (is_loopback(host) or self.token or self.insecure_bind):
-                raise ValueError(
-                    f"refusing to serve on {host} without a token, where anyone could use the cluster: set --token (or "
-                    f"EMBOMATRIX_TOKEN), or pass --insecure-bind if the network is trusted"
-                )
+    def _pair_files(self) -> Self:
+        if (self.tls_cert is None) != (self.tls_key is None):
+            raise ValueError("--tls-cert and --tls-key belong together: pass both, or none")
         return self
 
 

@@ -8,18 +8,21 @@ import grpc
 from fastapi import FastAPI
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 
-from embomatrix.manager.listen import PortInUseError
+from embomatrix.manager.listen import bind_server
 from embomatrix.rpc.channel import SERVER_OPTIONS
 from embomatrix.rpc.status import StandbyError, translate
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
+    from embomatrix.manager.access.protection import Tls
+
 
 class Standby:
     """``leader`` is the address of the manager that leads; set it whenever that changes."""
 
-    def __init__(self) -> None:
+    def __init__(self, tls: Tls | None = None) -> None:
+        self._tls = tls
         self.leader = ""
 
     @property
@@ -33,11 +36,7 @@ class Standby:
         health_pb2_grpc.add_HealthServicer_to_server(servicer, server)
         await servicer.set("", health_pb2.HealthCheckResponse.NOT_SERVING)
         server.add_generic_rpc_handlers((_Refusal(self),))
-        address = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
-        try:
-            server.add_insecure_port(address)
-        except RuntimeError as error:
-            raise PortInUseError(f"{address} can't be bound ({error}): pass another --port") from error
+        bind_server(server, host, port, self._tls)
         await server.start()
         return server
 

@@ -14,9 +14,9 @@ if TYPE_CHECKING:
     from embomatrix.rpc.values import RunInfo, WorkerInfo
 
 
-async def show_status(address: str, token: str) -> None:
+async def show_status(address: str, token: str, ca: bytes = b"") -> None:
     """Print the workers and runs of the manager at HOST:PORT; raises ``ClusterError`` when it can't be asked."""
-    async with ClusterClient(address, token) as client:
+    async with ClusterClient(address, token, ca=ca) as client:
         workers, runs = await client.list_workers(), await client.list_runs()
     console = Console()
     console.print(_worker_table(workers) if workers else "no workers: start one with `embomatrix worker run`")

@@ -2,6 +2,8 @@
 
 import asyncio
 import hashlib
+import os
+import zlib
 from pathlib import Path
 
 import pytest
@@ -17,6 +19,9 @@ from embomatrix.manager.settings import ManagerSettings
 from embomatrix.manager.store.protocol import ResultRow
 from embomatrix.rpc.status import InvalidRequestError, NotFoundError, OverloadedError
 from embomatrix.rpc.values import Cancelled, InfraCode, InfraFailure, RolloutResult
+from embomatrix.world.bundle import BundleError, decode_bundle
+
+MIB = 1024 * 1024
 
 
 def rows(first, last):
@@ -70,48 +75,77 @@ def digest_of(data):
     return f"sha256:{hashlib.sha256(data).hexdigest()}"
 
 
+def packed(content):
+    """As a bundle is: a whole zlib stream, here of the size of its content and 11 bytes."""
+    return zlib.compress(content, level=0)
+
+
 async def test_a_bundle_appears_only_when_its_digest_is_right(tmp_path):
-    store = BundleStore(tmp_path, limit_bytes=100, total_bytes=1000)
+    store = BundleStore(tmp_path, total_bytes=1000)
+    data = packed(b"something")
     with pytest.raises(InvalidRequestError, match="expected sha256:"):
-        await store.put(digest_of(b"other"), pieces(b"some", b"thing"))
+        await store.put(digest_of(b"other"), pieces(data[:5], data[5:]))
     assert list(tmp_path.iterdir()) == []
-    await store.put(digest_of(b"something"), pieces(b"some", b"thing"))
-    assert b"".join([part async for part in store.get(digest_of(b"something"))]) == b"something"
+    await store.put(digest_of(data), pieces(data[:5], data[5:]))
+    assert b"".join([part async for part in store.get(digest_of(data))]) == data
 
 
 async def test_a_bundle_damaged_on_disk_is_asked_for_again(tmp_path):
-    store = BundleStore(tmp_path, limit_bytes=100, total_bytes=1000)
-    digest = digest_of(b"content")
-    await store.put(digest, pieces(b"content"))
+    store = BundleStore(tmp_path, total_bytes=1000)
+    data = packed(b"content")
+    digest = digest_of(data)
+    await store.put(digest, pieces(data))
     assert await store.lacking([digest, digest]) == []
     next(tmp_path.iterdir()).write_bytes(b"contemt")
     assert await store.lacking([digest, digest]) == [digest]
     assert list(tmp_path.iterdir()) == []
 
 
-async def test_a_bundle_that_is_too_large_is_refused_before_it_is_whole(tmp_path):
-    store = BundleStore(tmp_path, limit_bytes=10, total_bytes=1000)
-    with pytest.raises(InvalidRequestError, match="larger than 10 bytes"):
-        await store.put(digest_of(b"x" * 40), pieces(*[b"x" * 8] * 5))
+async def counted(data, size, taken):
+    for start in range(0, len(data), size):
+        taken.append(start)
+        yield data[start : start + size]
+
+
+@pytest.mark.parametrize(
+    ("data", "sentence", "pieces_taken"),
+    [
+        (os.urandom(9 * MIB), "no zlib stream", 1),
+        (packed(os.urandom(9 * MIB)), "over 8,388,608 bytes", 9),
+        (zlib.compress(bytes(40 * MIB)), "expected at most 100 to 1", 1),
+        (packed(b"content")[:-3], "cut short", 1),
+        (packed(b"content") + b"more", "bytes follow its end", 1),
+    ],
+    ids=["noise", "too large", "bomb", "cut short", "too long"],
+)
+async def test_what_no_worker_would_take_is_refused_before_it_is_whole(
+    tmp_path, data, sentence, pieces_taken
+):
+    store, taken = BundleStore(tmp_path, total_bytes=100 * MIB), []
+    with pytest.raises(InvalidRequestError, match=sentence):
+        await store.put(digest_of(data), counted(data, MIB, taken))
     assert list(tmp_path.iterdir()) == []
+    assert len(taken) == pieces_taken
+    with pytest.raises(BundleError, match=sentence if len(data) <= 8 * MIB else "over 8,388,608 bytes"):
+        decode_bundle(data)
 
 
 async def test_a_full_folder_takes_no_more(tmp_path):
-    store = BundleStore(tmp_path, limit_bytes=100, total_bytes=50)
-    await store.put(digest_of(b"a" * 40), pieces(b"a" * 40))
+    store = BundleStore(tmp_path, total_bytes=70)
+    await store.put(digest_of(packed(b"a" * 40)), pieces(packed(b"a" * 40)))
     with pytest.raises(OverloadedError, match="no room"):
-        await store.put(digest_of(b"b" * 40), pieces(b"b" * 40))
+        await store.put(digest_of(packed(b"b" * 40)), pieces(packed(b"b" * 40)))
 
 
 async def test_a_folder_that_is_gone_is_named(tmp_path):
-    store = BundleStore(tmp_path / "bundles", limit_bytes=100, total_bytes=50)
+    store = BundleStore(tmp_path / "bundles", total_bytes=50)
     (tmp_path / "bundles").rmdir()
     with pytest.raises(OverloadedError, match=r"bundles can't be written \(No such file or directory\)"):
         await store.put(digest_of(b"a"), pieces(b"a"))
 
 
 async def test_a_bundle_that_was_never_put_is_not_found(tmp_path):
-    store = BundleStore(tmp_path, limit_bytes=100, total_bytes=1000)
+    store = BundleStore(tmp_path, total_bytes=1000)
     with pytest.raises(NotFoundError, match="put it first"):
         await anext(store.get(digest_of(b"nothing")))
 
@@ -133,14 +167,6 @@ def test_quantiles_of_few_values():
     assert [quantile([1.0, 2.0, 3.0], share) for share in (0.0, 0.5, 0.95, 1.0)] == [1.0, 2.0, 3.0, 3.0]
 
 
-@pytest.mark.parametrize("host", ["0.0.0.0", "192.168.1.5", "manager", "::"])
-def test_outside_loopback_a_token_is_needed(host):
-    with pytest.raises(ValidationError, match="--insecure-bind"):
-        ManagerSettings(host=host)
-    assert ManagerSettings(host=host, token="secret").host == host
-    assert ManagerSettings(host=host, insecure_bind=True).host == host
-
-
 def test_unknown_settings_are_refused_and_the_token_is_never_shown():
     with pytest.raises(ValidationError, match="Extra inputs"):
         ManagerSettings(prot=1)
@@ -155,7 +181,8 @@ def test_the_state_lies_in_the_data_folder_unless_told_otherwise():
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["--host", "0.0.0.0"], "without a token"),
+        (["--host", "0.0.0.0"], "without TLS and tokens"),
+        (["--tls-cert", "x"], "belong together"),
         (["--port", "70000"], "--port"),
         (["--state", "mysql://x"], "expected memory:, sqlite:PATH or redis://"),
         (["--state", "redis://127.0.0.1:1/0"], "can't be reached"),

@@ -21,7 +21,7 @@ OWN = re.compile(r"# (?:HELP|TYPE) (embo_\w+)")
 
 @pytest.fixture
 async def page(tmp_path):
-    bundles = BundleStore(tmp_path / "bundles", limit_bytes=1, total_bytes=1)
+    bundles = BundleStore(tmp_path / "bundles", total_bytes=1)
     cluster, registry = ClusterState(boot_id="boot"), Registry(LivenessLimits())
     runtime = ManagerRuntime(cluster, registry, MemoryStore(), bundles, RunArchive(tmp_path / "runs"))
     await runtime.start()

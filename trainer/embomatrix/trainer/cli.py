@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import logging
 import os
@@ -18,8 +19,9 @@ from embomatrix.trainer.errors import TrainerError, reason_of
 from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
+    from embomatrix.rpc.client import ClusterClient
     from embomatrix.trainer.data import TaskSet
     from embomatrix.trainer.evaluate import Evaluation
     from embomatrix.trainer.policy.protocol import Policy
@@ -28,11 +30,19 @@ if TYPE_CHECKING:
     from embomatrix.trainer.settings import TrainSettings
     from embomatrix.trainer.telling import Teller
 
+    Connect = Callable[[], ClusterClient]
+
 _DATASET = Annotated[Path, typer.Option(help="Folder that `embomatrix factory build` wrote.")]
 _MANAGER = Annotated[
     str, typer.Option(help="HOST:PORT of the Simulation Manager.", envvar="EMBOMATRIX_MANAGER")
 ]
-_TOKEN = Annotated[str, typer.Option(help="Token of the trainer role.", envvar="EMBOMATRIX_TOKEN")]
+_TOKEN = Annotated[
+    str,
+    typer.Option(help="Token of the trainer role, or @FILE that holds it.", envvar="EMBOMATRIX_TOKEN"),
+]
+_CA = Annotated[
+    Path | None, typer.Option(help="The ca.pem of a manager that serves by TLS.", envvar="EMBOMATRIX_CA")
+]
 _THREADS = Annotated[int | None, typer.Option(min=1, help="Threads of torch; default: half of the cores.")]
 
 
@@ -56,9 +66,11 @@ def train(
     threads: _THREADS = None,
     device: Annotated[str | None, typer.Option(help="torch device: cpu, cuda.")] = None,
     token: _TOKEN = "",
+    ca: _CA = None,
 ) -> None:
     """Train a policy: imitation of the oracle, then GRPO on the cluster, measured on held-out tasks."""
     with _problems_shown("train", out):
+        connect = _connector(manager, token, ca)
         changes = {
             "seed": seed,
             "device": device,
@@ -68,9 +80,9 @@ def train(
             "imitation.seconds": imitate_seconds,
         }
         if resume:
-            summary = _resumed(dataset, manager, token, out, changes)
+            summary = _resumed(dataset, connect, out, changes)
         else:
-            summary = _started(dataset, manager, token, out, model, settings_file, changes)
+            summary = _started(dataset, connect, out, model, settings_file, changes)
         _show_summary(summary)
 
 
@@ -87,9 +99,11 @@ def evaluate(
     seed: Annotated[int | None, typer.Option(help="Seed of sampling.")] = None,
     threads: _THREADS = None,
     token: _TOKEN = "",
+    ca: _CA = None,
 ) -> None:
     """Measure a trained policy: success per category with 95 % intervals."""
     with _problems_shown("eval"):
+        connect = _connector(manager, token, ca)
         from embomatrix.trainer.checkpoint import read_state
         from embomatrix.trainer.policy.choice import saved_policy
 
@@ -106,7 +120,7 @@ def evaluate(
         if not chosen:
             raise TrainerError(f"the dataset has no tasks of split {split!r}: expected `heldout` or `train`")
         policy = saved_policy(checkpoint / "policy", settings)
-        result = _evaluated(policy, chosen, tasks, manager, token, settings)
+        result = _evaluated(policy, chosen, tasks, connect, settings)
         _show_evaluation(result)
         if json_file is not None:
             _write(json_file, json.dumps(result.as_json(), indent=1))
@@ -141,8 +155,7 @@ def _leave(command: str, sentence: str, status: int) -> NoReturn:
 
 def _started(
     dataset: Path,
-    manager: str,
-    token: str,
+    connect: Connect,
     out: Path,
     model: str,
     settings_file: Path | None,
@@ -158,10 +171,10 @@ def _started(
         raise TrainerError(f"{out} holds another run: pass --resume to go on with it, or another --out")
     tasks = _loaded(dataset, settings)
     policy = new_policy(settings, tasks)
-    return _run(policy, tasks, manager, token, settings, out)
+    return _run(policy, tasks, connect, settings, out)
 
 
-def _resumed(dataset: Path, manager: str, token: str, out: Path, changes: dict[str, Any]) -> Summary:
+def _resumed(dataset: Path, connect: Connect, out: Path, changes: dict[str, Any]) -> Summary:
     from embomatrix.trainer.checkpoint import CheckpointStore, read_state
     from embomatrix.trainer.loop import CHECKPOINTS, REFERENCE
     from embomatrix.trainer.policy.choice import saved_policy
@@ -176,7 +189,7 @@ def _resumed(dataset: Path, manager: str, token: str, out: Path, changes: dict[s
     tasks = _loaded(dataset, settings)
     policy = saved_policy(newest / "policy", settings)
     reference = saved_policy(out / REFERENCE, settings).frozen_copy()
-    return _run(policy, tasks, manager, token, settings, out, progress=progress, reference=reference)
+    return _run(policy, tasks, connect, settings, out, progress=progress, reference=reference)
 
 
 def _changed(settings: TrainSettings, changes: dict[str, Any]) -> TrainSettings:
@@ -215,18 +228,24 @@ def _teller(policy: Policy, tasks: TaskSet, settings: TrainSettings) -> Teller:
     return Teller(policy, told.rows, Variation(tasks.kinds, told.rename_share, told.drop_share))
 
 
-def _gateway(tasks: TaskSet, manager: str, token: str, name: str, seed: int) -> Gateway:
+def _connector(manager: str, token: str, ca: Path | None) -> Connect:
+    """How to reach the manager: what the options name is read once. Raises ClusterError."""
     from embomatrix.rpc.client import ClusterClient
+    from embomatrix.rpc.trust import read_ca, read_token
+
+    return functools.partial(ClusterClient, manager, read_token(token), ca=read_ca(ca))
+
+
+def _gateway(tasks: TaskSet, connect: Connect, name: str, seed: int) -> Gateway:
     from embomatrix.trainer.rollout import Gateway
 
-    return Gateway(lambda: ClusterClient(manager, token), tasks.bundle_bytes, run_name=name, run_seed=seed)
+    return Gateway(connect, tasks.bundle_bytes, run_name=name, run_seed=seed)
 
 
 def _run(
     policy: Policy,
     tasks: TaskSet,
-    manager: str,
-    token: str,
+    connect: Connect,
     settings: TrainSettings,
     out: Path,
     **resumed: Any,
@@ -243,7 +262,7 @@ def _run(
         ) from error
     reference = resumed.pop("reference", None)
     with (
-        _gateway(tasks, manager, token, out.name, settings.seed) as gateway,
+        _gateway(tasks, connect, out.name, settings.seed) as gateway,
         display_for(console) as display,
     ):
         parts = Parts(policy, _teller(policy, tasks, settings), tasks, gateway, display, reference)
@@ -251,13 +270,13 @@ def _run(
 
 
 def _evaluated(
-    policy: Policy, chosen: Sequence[Any], tasks: TaskSet, manager: str, token: str, settings: TrainSettings
+    policy: Policy, chosen: Sequence[Any], tasks: TaskSet, connect: Connect, settings: TrainSettings
 ) -> Evaluation:
     from embomatrix.trainer.evaluate import evaluate_policy
     from embomatrix.trainer.progress import display_for
 
     with (
-        _gateway(tasks, manager, token, "eval", settings.seed) as gateway,
+        _gateway(tasks, connect, "eval", settings.seed) as gateway,
         display_for(Console()) as display,
     ):
         return evaluate_policy(

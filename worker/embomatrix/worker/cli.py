@@ -24,6 +24,7 @@ from embomatrix.rpc.channel import DEFAULT_ADDRESS
 from embomatrix.rpc.client import ClientLimits, ClusterClient
 from embomatrix.rpc.status import ClusterError, ManagerUnreachableError
 from embomatrix.worker.daemon import Daemon, serve
+from embomatrix.worker.membership import membership_of
 from embomatrix.worker.processes import ProcessGoneError, start_root
 from embomatrix.worker.resources import measure
 from embomatrix.worker.settings import WorkerSettings
@@ -49,7 +50,16 @@ Manager = Annotated[
     str, typer.Option(help="HOST:PORT of the manager, or of several: A,B.", envvar="EMBOMATRIX_MANAGER")
 ]
 Token = Annotated[
-    str, typer.Option(envvar="EMBOMATRIX_TOKEN", help="Join token, if the manager asks for one.")
+    str,
+    typer.Option(
+        envvar="EMBOMATRIX_TOKEN", help="Token of a worker, or @FILE that holds it.", show_default=False
+    ),
+]
+Ca = Annotated[
+    Path | None,
+    typer.Option(
+        envvar="EMBOMATRIX_CA", help="The ca.pem of a manager that serves by TLS.", show_default=False
+    ),
 ]
 
 
@@ -58,12 +68,24 @@ def run(
     manager: Manager = DEFAULT_ADDRESS,
     slots: Annotated[int, typer.Option(help="Rollouts at the same time; 0: one for each core.")] = 0,
     token: Token = "",
+    join: Annotated[
+        str,
+        typer.Option(
+            envvar="EMBOMATRIX_JOIN",
+            help="TOKEN@HOST:PORT as the operator got it: all that joining takes.",
+            show_default=False,
+        ),
+    ] = "",
+    ca: Ca = None,
     name: Annotated[str, typer.Option(help="Worker id; by default the host's name and a random part.")] = "",
     cache_dir: Annotated[
         Path | None, typer.Option(help="Folder for bundles and the simulator's log.")
     ] = None,
     memory_mb: Annotated[int, typer.Option(help="Memory for scenes; 0: four tenths of what is free.")] = 0,
     nice: Annotated[int, typer.Option(help="Politeness, 0 to 19.")] = 10,
+    state_dir: Annotated[
+        Path | None, typer.Option(help="Folder of this machine's credentials.", show_default=False)
+    ] = None,
     once: Annotated[bool, typer.Option(help="End when the manager can't be reached.")] = False,
     verbose: Annotated[bool, typer.Option(help="Log every rollout.")] = False,
 ) -> None:
@@ -73,12 +95,16 @@ def run(
         "manager": manager,
         "slots": slots,
         "token": token,
+        "join": join,
+        "ca": ca,
         "memory_mb": memory_mb,
         "nice": nice,
         "once": once,
     }
     if name:
         values["name"] = name
+    if state_dir is not None:
+        values["state_dir"] = state_dir
     if cache_dir is not None:
         values["cache_dir"] = cache_dir
     settings = _settings(values)
@@ -98,15 +124,16 @@ def run(
 
 
 async def _serve(settings: WorkerSettings) -> None:
-    daemon = Daemon(settings, measure(settings), np.random.default_rng())
+    membership = await membership_of(settings)
+    daemon = Daemon(settings, measure(settings), np.random.default_rng(), membership=membership)
     await serve(daemon, (signal.SIGINT, signal.SIGTERM))
 
 
 @app.command()
-def doctor(manager: Manager = DEFAULT_ADDRESS, token: Token = "") -> None:
+def doctor(manager: Manager = DEFAULT_ADDRESS, token: Token = "", ca: Ca = None) -> None:
     """Check what a worker needs: the engine, its processes, memory, and a manager that answers."""
     _check_engine()
-    settings = _settings({"manager": manager, "token": token})
+    settings = _settings({"manager": manager, "token": token, "ca": ca})
     resources = measure(settings)
     table = Table(box=None, show_header=False, padding=(0, 2))
     table.add_row("python", f"{platform.python_version()} on {platform.machine()}")
@@ -146,9 +173,11 @@ async def _try_simulator() -> tuple[float, float]:
 
 
 async def _ask_manager(settings: WorkerSettings) -> str:
-    async with ClusterClient(settings.manager, settings.token, limits=ClientLimits(call_s=5.0)) as client:
+    member = await membership_of(settings)
+    limits = ClientLimits(call_s=5.0)
+    async with ClusterClient(member.manager, member.token, ca=member.ca, limits=limits) as client:
         workers = await client.list_workers()
-    return f"answers at {settings.manager}, {len(workers)} workers"
+    return f"answers at {member.manager}, {len(workers)} workers"
 
 
 def _check_engine() -> None:

@@ -24,6 +24,7 @@ from embomatrix.rpc.status import (
 from embomatrix.rpc.values import Completed, InfraCode
 from embomatrix.worker.backoff import Backoff
 from embomatrix.worker.cache import BundleCache
+from embomatrix.worker.membership import Membership, MembershipFile
 from embomatrix.worker.outbox import Outbox
 from embomatrix.worker.processes import SIMULATOR_PROGRAM
 from embomatrix.worker.residents import LoadError, SlotLimits
@@ -61,11 +62,13 @@ class Daemon:
         rng: np.random.Generator,
         *,
         program: tuple[str, ...] = SIMULATOR_PROGRAM,
+        membership: Membership | None = None,
     ) -> None:
         self._settings = settings
+        self._membership = membership or Membership(settings.manager, settings.name, settings.token)
         self._resources = resources
         self._boot_id = secrets.token_hex(8)
-        self._managers = Managers(settings.manager)
+        self._managers = Managers(self._membership.manager)
         # Each of several managers is asked as often as one would be.
         self._backoff = Backoff(rng, longest_s=LONGEST_WAIT_S / self._managers.count)
         self._outbox = Outbox()
@@ -112,7 +115,7 @@ class Daemon:
         await self._pool.start()
         logger.info(
             "worker %s: %d slots, %d MB for scenes, score %.2f",
-            self._settings.name,
+            self._membership.name,
             self._resources.slots,
             self._resources.memory_mb,
             self._resources.score,
@@ -145,6 +148,7 @@ class Daemon:
                 if self._registration is None:
                     self._registration = await self._register()
                 await self._serve(self._registration)
+                await self._say_goodbye()
                 return
             except UnknownSessionError as error:
                 # A manager took over. It takes up what is held here once this worker has said what that is.
@@ -159,6 +163,10 @@ class Daemon:
                     raise
                 self._managers.move(error)
                 await self._wait_before_next(error)
+
+    async def _say_goodbye(self) -> None:
+        if self._session is not None:
+            await self._session.leave()
 
     async def _wait_before_next(self, error: ClusterError) -> None:
         """Wait, longer each time; a drain ends the wait."""
@@ -176,22 +184,30 @@ class Daemon:
 
     async def _register(self) -> Registration:
         registration = await register(
-            self._managers.current,
-            self._settings.token,
-            worker_id=self._settings.name,
-            boot_id=self._boot_id,
-            resources=self._resources,
+            self._present_membership(), boot_id=self._boot_id, resources=self._resources
         )
+        if registration.credential:
+            self._join(registration.credential)
         logger.info(
             "registered with the manager at %s session=%s", self._managers.current, registration.session_id
         )
         return registration
 
+    def _present_membership(self) -> Membership:
+        """The membership with the manager that this worker turns to at present, where there are several."""
+        return replace(self._membership, manager=self._managers.current)
+
+    def _join(self, credential: str) -> None:
+        """From here on this worker shows the credential, in this process and in those after it."""
+        before = self._membership
+        self._membership = replace(before, token=credential, joining=False)
+        MembershipFile(self._settings.state_dir, before.token).keep(self._membership)
+        logger.info("joined the manager at %s as worker %s", before.manager, before.name)
+
     async def _serve(self, registration: Registration) -> None:
         self._lease_ttl_s = registration.lease_ttl_s
         session = Session(
-            self._managers.current,
-            self._settings.token,
+            self._present_membership(),
             registration,
             self._pool,
             self._outbox,
@@ -237,7 +253,7 @@ class Daemon:
         self._takeovers = [at_s for at_s in self._takeovers if now_s - at_s < TAKEOVER_WINDOW_S] + [now_s]
         if len(self._takeovers) > TAKEOVERS_ALLOWED:
             raise SupersededError(
-                f"the session of worker {self._settings.name!r} is taken over again and again: another worker of "
+                f"the session of worker {self._membership.name!r} is taken over again and again: another worker of "
                 "that name is running; stop it, or give one of them another --name"
             ) from error
         logger.info("registering again: %s", error)
@@ -260,10 +276,10 @@ class Daemon:
         """Keep a result for the manager, signed with this worker's name."""
         outcome: Completed | InfraFailure
         if isinstance(result.outcome, Completed):
-            outcome = result.outcome.noted(worker_id=self._settings.name)
+            outcome = result.outcome.noted(worker_id=self._membership.name)
             logger.debug("rollout completed lease=%s reward=%.1f", result.ref.lease_id, outcome.reward.total)
         else:
-            outcome = replace(result.outcome, worker_id=self._settings.name)
+            outcome = replace(result.outcome, worker_id=self._membership.name)
             logger.warning(
                 "rollout failed lease=%s %s: %s", result.ref.lease_id, outcome.code, outcome.message
             )

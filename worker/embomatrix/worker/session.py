@@ -6,12 +6,12 @@ import asyncio
 import contextlib
 import logging
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.proto.v1 import worker_service_pb2 as pb
 from embomatrix.proto.v1 import worker_service_pb2_grpc
-from embomatrix.rpc.channel import PROTOCOL_VERSION, open_channel
+from embomatrix.rpc.channel import open_channel
 from embomatrix.rpc.convert import each, resources_to_proto
 from embomatrix.rpc.convert_session import (
     lease_from_proto,
@@ -22,12 +22,15 @@ from embomatrix.rpc.convert_session import (
     worker_state_to_proto,
 )
 from embomatrix.rpc.status import (
+    ClusterError,
     DeadlineError,
     NotFoundError,
+    PreconditionError,
     UnavailableError,
     cluster_errors,
 )
 from embomatrix.rpc.values import InfraCode, WorkerState
+from embomatrix.rpc.versions import PROTOCOL_OLDEST, PROTOCOL_VERSION
 from embomatrix.worker.residents import LoadError
 from embomatrix.world.bundle import DEFAULT_LIMITS
 
@@ -37,6 +40,7 @@ if TYPE_CHECKING:
     import grpc
 
     from embomatrix.rpc.values import Resources
+    from embomatrix.worker.membership import Membership
     from embomatrix.worker.outbox import Outbox
     from embomatrix.worker.slots import SlotPool
 
@@ -61,26 +65,50 @@ class Registration:
     epoch: int
     heartbeat_s: float
     lease_ttl_s: float
+    protocol: int
+    """The version that both sides speak."""
+    credential: str = field(default="", repr=False)
+    """What this worker shows from here on; empty when that does not change."""
 
 
-async def register(
-    address: str, token: str, *, worker_id: str, boot_id: str, resources: Resources
-) -> Registration:
+async def register(membership: Membership, *, boot_id: str, resources: Resources) -> Registration:
     """Announce this worker; an older session of the same worker id ends. Raises ClusterError."""
     request = pb.RegisterRequest(
-        worker_id=worker_id,
+        worker_id=membership.name,
         boot_id=boot_id,
         protocol_version=PROTOCOL_VERSION,
+        protocol_low=PROTOCOL_OLDEST,
         resources=resources_to_proto(resources),
-        join_token=token,
+        join_token=membership.token if membership.joining else "",
     )
-    async with open_channel(address, token) as channel:
-        with cluster_errors(address):
-            stub = worker_service_pb2_grpc.WorkerServiceStub(channel)
-            answer = await stub.Register(request, timeout=REGISTER_S)
+    shown = "" if membership.joining else membership.token
+    async with open_channel(membership.manager, shown, membership.ca) as channel:
+        stub = worker_service_pb2_grpc.WorkerServiceStub(channel)
+        try:
+            answer = await _announce(stub, request, membership.manager)
+        except PreconditionError as error:
+            # A manager of the version before takes no range, only a version that is exactly its own.
+            request.protocol_version, request.protocol_low = PROTOCOL_OLDEST, 0
+            try:
+                answer = await _announce(stub, request, membership.manager)
+            except PreconditionError:
+                raise error from None
     return Registration(
-        answer.session_id, answer.session_epoch, answer.heartbeat_interval_s, answer.lease_ttl_s
+        answer.session_id,
+        answer.session_epoch,
+        answer.heartbeat_interval_s,
+        answer.lease_ttl_s,
+        answer.protocol_version or PROTOCOL_OLDEST,
+        answer.credential,
     )
+
+
+async def _announce(
+    stub: worker_service_pb2_grpc.WorkerServiceAsyncStub, request: pb.RegisterRequest, address: str
+) -> pb.RegisterResponse:
+    with cluster_errors(address):
+        answer: pb.RegisterResponse = await stub.Register(request, timeout=REGISTER_S)
+    return answer
 
 
 class Session:
@@ -88,16 +116,15 @@ class Session:
 
     def __init__(
         self,
-        address: str,
-        token: str,
+        membership: Membership,
         registration: Registration,
         pool: SlotPool,
         outbox: Outbox,
         *,
         renewed_s: float,
     ) -> None:
-        self._address = address
-        self._token = token
+        self._membership = membership
+        self._address = membership.manager
         self._registration = registration
         self._pool = pool
         self._outbox = outbox
@@ -142,9 +169,9 @@ class Session:
     async def serve(self) -> None:
         """Keep the session until the connection breaks, the manager ends it, or the worker has drained."""
         async with (
-            open_channel(self._address, self._token) as channel,
+            self._open_channel() as channel,
             # Its own connection: no bundle on its way delays a heartbeat.
-            open_channel(self._address, self._token) as heartbeat_channel,
+            self._open_channel() as heartbeat_channel,
         ):
             self._data_channel = channel
             beating = asyncio.create_task(self._beat(heartbeat_channel))
@@ -160,6 +187,21 @@ class Session:
                     task.cancel()
                     with contextlib.suppress(asyncio.CancelledError, Exception):
                         await task
+
+    async def leave(self) -> None:
+        """Say that this worker is gone for good, so that nobody waits for it; a manager that can't hear it will find out."""
+        if self._registration.protocol <= PROTOCOL_OLDEST:
+            return
+        request = pb.DeregisterRequest(
+            session_id=self._registration.session_id, session_epoch=self._registration.epoch
+        )
+        async with self._open_channel() as channel:
+            stub = worker_service_pb2_grpc.WorkerServiceStub(channel)
+            with contextlib.suppress(ClusterError), cluster_errors(self._address):
+                await stub.Deregister(request, timeout=HEARTBEAT_S)
+
+    def _open_channel(self) -> grpc.aio.Channel:
+        return open_channel(self._address, self._membership.token, self._membership.ca)
 
     async def fetch(self, digest: str) -> bytes:
         """The bundle's bytes as the manager sends them. Raises LoadError."""

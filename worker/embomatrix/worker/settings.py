@@ -21,7 +21,13 @@ class WorkerSettings(BaseModel):
     manager: str = DEFAULT_ADDRESS
     """HOST:PORT of the manager, or of several with commas between; the worker dials out, nothing needs to reach it."""
     token: str = Field("", repr=False, pattern=TOKEN_PATTERN)
-    """Join token; empty where the manager asks for none."""
+    """Token of the worker role, or ``@FILE`` that holds it; empty where the manager asks for none."""
+    join: str = Field("", repr=False)
+    """TOKEN@HOST:PORT, all that joining takes; it stands in for manager, token and ca."""
+    ca: Path | None = None
+    """Certificate of the authority that signed the manager's; None: no TLS."""
+    state_dir: Path = Path("~/.local/share/embomatrix/worker")
+    """Folder of the credentials that managers gave this machine."""
     name: str = Field(default_factory=lambda: default_name(), pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")
     """Worker id. Two daemons of one name take the session from each other, so the default is never the same twice."""
     slots: int = Field(0, ge=0, le=1024)

@@ -67,6 +67,7 @@ class GetCapabilitiesResponse(google.protobuf.message.Message):
     VERSION_FIELD_NUMBER: builtins.int
     BATCH_ROLLOUTS_FIELD_NUMBER: builtins.int
     BUNDLE_BYTES_FIELD_NUMBER: builtins.int
+    CA_CERTIFICATE_FIELD_NUMBER: builtins.int
     protocol_low: builtins.int
     """The versions of the protocol that the manager speaks, both ends included."""
     protocol_high: builtins.int
@@ -74,6 +75,8 @@ class GetCapabilitiesResponse(google.protobuf.message.Message):
     """Of the software."""
     batch_rollouts: builtins.int
     bundle_bytes: builtins.int
+    ca_certificate: builtins.str
+    """PEM of the authority that signed the manager's certificate; empty without TLS. Who joins compares its fingerprint."""
     def __init__(
         self,
         *,
@@ -82,8 +85,9 @@ class GetCapabilitiesResponse(google.protobuf.message.Message):
         version: builtins.str = ...,
         batch_rollouts: builtins.int = ...,
         bundle_bytes: builtins.int = ...,
+        ca_certificate: builtins.str = ...,
     ) -> None: ...
-    def ClearField(self, field_name: typing.Literal["batch_rollouts", b"batch_rollouts", "bundle_bytes", b"bundle_bytes", "protocol_high", b"protocol_high", "protocol_low", b"protocol_low", "version", b"version"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["batch_rollouts", b"batch_rollouts", "bundle_bytes", b"bundle_bytes", "ca_certificate", b"ca_certificate", "protocol_high", b"protocol_high", "protocol_low", b"protocol_low", "version", b"version"]) -> None: ...
 
 Global___GetCapabilitiesResponse: typing_extensions.TypeAlias = GetCapabilitiesResponse
 

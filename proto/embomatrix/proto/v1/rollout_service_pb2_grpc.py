@@ -77,7 +77,7 @@ class RolloutServiceServicer(object):
     """
 
     def GetCapabilities(self, request, context):
-        """Which protocol versions and limits this manager has.
+        """Which protocol versions and limits this manager has. Answered to anyone, before a token is shown.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

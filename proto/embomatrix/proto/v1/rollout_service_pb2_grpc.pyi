@@ -205,7 +205,7 @@ class RolloutServiceStub(typing.Generic[_RolloutServiceGetCapabilitiesType, _Rol
     ], channel: grpc.aio.Channel) -> None: ...
 
     GetCapabilities: _RolloutServiceGetCapabilitiesType
-    """Which protocol versions and limits this manager has."""
+    """Which protocol versions and limits this manager has. Answered to anyone, before a token is shown."""
 
     OpenRun: _RolloutServiceOpenRunType
 
@@ -262,7 +262,7 @@ class RolloutServiceServicer(metaclass=abc.ABCMeta):
         request: embomatrix.proto.v1.rollout_service_pb2.GetCapabilitiesRequest,
         context: _ServicerContext,
     ) -> typing.Union[embomatrix.proto.v1.rollout_service_pb2.GetCapabilitiesResponse, collections.abc.Awaitable[embomatrix.proto.v1.rollout_service_pb2.GetCapabilitiesResponse]]:
-        """Which protocol versions and limits this manager has."""
+        """Which protocol versions and limits this manager has. Answered to anyone, before a token is shown."""
 
     @abc.abstractmethod
     def OpenRun(

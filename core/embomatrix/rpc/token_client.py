@@ -1,0 +1,102 @@
+"""The operator's side of tokens: hand out, look over, take back."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final, Self
+
+from embomatrix.proto.v1 import admin_service_pb2 as pb
+from embomatrix.proto.v1 import admin_service_pb2_grpc
+from embomatrix.rpc.channel import DEFAULT_ADDRESS, open_channel
+from embomatrix.rpc.client import DEFAULT_LIMITS, ClientLimits
+from embomatrix.rpc.convert import ConvertError, each, finite, required
+from embomatrix.rpc.roles import Role, TokenInfo
+from embomatrix.rpc.status import cluster_errors
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+_ROLES: Final[Mapping[Role, pb.Role.ValueType]] = {role: pb.Role.Value(f"ROLE_{role.name}") for role in Role}
+_ROLE_VALUES: Final = {number: role for role, number in _ROLES.items()}
+
+
+def role_to_proto(role: Role) -> pb.Role.ValueType:
+    return _ROLES[role]
+
+
+def role_from_proto(number: pb.Role.ValueType) -> Role:
+    role = _ROLE_VALUES.get(number)
+    if role is None:
+        raise ConvertError("role", f"{number} is none of {', '.join(Role)}")
+    return role
+
+
+def token_info_to_proto(info: TokenInfo) -> pb.TokenInfo:
+    return pb.TokenInfo(
+        token_id=info.token_id,
+        role=_ROLES[info.role],
+        label=info.label,
+        left_s=info.left_s,
+        worker_id=info.worker_id,
+    )
+
+
+def token_info_from_proto(message: pb.TokenInfo) -> TokenInfo:
+    return TokenInfo(
+        required("token_id", message.token_id),
+        role_from_proto(message.role),
+        message.label,
+        finite("left_s", message.left_s),
+        message.worker_id,
+    )
+
+
+class TokenClient:
+    """Async context manager over one channel to the manager. Every failure is a ``ClusterError``."""
+
+    def __init__(
+        self,
+        address: str = DEFAULT_ADDRESS,
+        token: str = "",
+        *,
+        ca: bytes = b"",
+        limits: ClientLimits = DEFAULT_LIMITS,
+    ) -> None:
+        self._address = address
+        self._token = token
+        self._ca = ca
+        self._limits = limits
+
+    async def __aenter__(self) -> Self:
+        self._channel = open_channel(self._address, self._token, self._ca)
+        self._admin = admin_service_pb2_grpc.AdminServiceStub(self._channel)
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self._channel.close()
+
+    async def issue(self, role: Role, *, valid_s: float = 0.0, label: str = "") -> tuple[str, str]:
+        """A new token and its id; the manager keeps only its hash. ``valid_s`` 0: until revoked."""
+        request = pb.IssueTokenRequest(role=_ROLES[role], valid_s=valid_s, label=label)
+        with cluster_errors(self._address):
+            answer = await self._admin.IssueToken(request, timeout=self._limits.call_s)
+        return answer.token, answer.token_id
+
+    async def listed(self) -> tuple[TokenInfo, ...]:
+        """The tokens that are valid."""
+        with cluster_errors(self._address):
+            answer = await self._admin.ListTokens(pb.ListTokensRequest(), timeout=self._limits.call_s)
+            return each("tokens", token_info_from_proto, answer.tokens)
+
+    async def revoke(self, token_id: str) -> None:
+        """Make a token void; sessions that it opened end at once."""
+        with cluster_errors(self._address):
+            await self._admin.RevokeToken(
+                pb.RevokeTokenRequest(token_id=token_id), timeout=self._limits.call_s
+            )
+
+    async def revoke_worker(self, worker_id: str, reason: str = "") -> None:
+        """Make a worker's credential void: its session ends, and what it held goes to others."""
+        with cluster_errors(self._address):
+            await self._admin.RevokeWorker(
+                pb.RevokeWorkerRequest(worker_id=worker_id, reason=reason), timeout=self._limits.call_s
+            )

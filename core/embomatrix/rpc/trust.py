@@ -1,0 +1,150 @@
+"""Whom a client trusts: the authority that signed the manager's certificate, and how one string carries it to a new worker."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hashlib
+import re
+import socket
+import ssl
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final, Self
+
+from embomatrix.proto.v1 import rollout_service_pb2, rollout_service_pb2_grpc
+from embomatrix.rpc.channel import is_address, open_channel
+from embomatrix.rpc.status import (
+    InvalidRequestError,
+    ManagerUnreachableError,
+    NotAllowedError,
+    UnavailableError,
+    cluster_errors,
+)
+
+FIRST_CONTACT_S: Final = 10.0
+"""Limit for the handshake and the answer of a manager whose certificate is not known yet."""
+_TOKEN: Final = re.compile(r"([0-9A-Za-z_-]+\.[0-9A-Za-z_-]+)(?:\.([0-9a-f]{64}))?")
+_CERTIFICATE: Final = re.compile(
+    r"-----BEGIN CERTIFICATE-----\s.+?\s-----END CERTIFICATE-----", re.DOTALL | re.ASCII
+)
+
+
+def read_token(text: str) -> str:
+    """The token itself, or what the file holds that ``@FILE`` names. Raises InvalidRequestError."""
+    if not text.startswith("@"):
+        return text
+    try:
+        return Path(text[1:]).expanduser().read_text(encoding="ascii").strip()
+    except (OSError, UnicodeDecodeError) as error:
+        problem = error.strerror if isinstance(error, OSError) else "it holds no token"
+        raise InvalidRequestError(f"--token {text}: the file can't be read ({problem})") from error
+
+
+def read_ca(path: Path | None) -> bytes:
+    """The authority's certificate (PEM) in a file; nothing for no file. Raises InvalidRequestError."""
+    if path is None:
+        return b""
+    try:
+        text = path.expanduser().read_text(encoding="ascii")
+        fingerprint_of(text)
+    except OSError as error:
+        raise InvalidRequestError(f"--ca {path}: the file can't be read ({error.strerror})") from error
+    except ValueError as error:
+        raise InvalidRequestError(
+            f"--ca {path}: it holds no certificate: pass the ca.pem that `embomatrix manager init` wrote"
+        ) from error
+    return text.encode("ascii")
+
+
+def fingerprint_of(pem: str) -> str:
+    """SHA-256 of the first certificate in the text, in hexadecimal digits. ValueError for text without one."""
+    found = _CERTIFICATE.search(pem)
+    if found is None:
+        raise ValueError("there is no certificate in it")
+    return hashlib.sha256(ssl.PEM_cert_to_DER_cert(found[0])).hexdigest()
+
+
+@dataclass(frozen=True, slots=True)
+class Invitation:
+    """All that a spare PC needs to join: ``TOKEN@HOST:PORT``; with TLS, TOKEN ends in the authority's fingerprint."""
+
+    address: str
+    """HOST:PORT, or several with commas between them."""
+    token: str = field(repr=False)
+    fingerprint: str = ""
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """Raises InvalidRequestError, which shows nothing of the token."""
+        token, _, address = text.partition("@")
+        found = _TOKEN.fullmatch(token)
+        if found is None or not all(is_address(part) for part in address.split(",")):
+            raise InvalidRequestError(
+                "--join: expected TOKEN@HOST:PORT as `embomatrix manager token issue --role join` printed it"
+            )
+        return cls(address, found[1], found[2] or "")
+
+    def __str__(self) -> str:
+        return f"{'.'.join(filter(None, (self.token, self.fingerprint)))}@{self.address}"
+
+    @property
+    def token_id(self) -> str:
+        """Names the token without betraying it."""
+        return self.token.partition(".")[0]
+
+
+async def fetch_ca(invitation: Invitation) -> bytes:
+    """The authority's certificate (PEM) from the manager itself; nothing for an invitation without a fingerprint.
+
+    The first connection trusts whatever certificate it meets; nothing secret is said on it, and what it answers must have the
+    invitation's fingerprint. Raises NotAllowedError when it has another.
+    """
+    if not invitation.fingerprint:
+        return b""
+    *first, last = invitation.address.split(",")
+    for address in first:
+        # One that stands by, or is away, can't tell.
+        with contextlib.suppress(UnavailableError):
+            return await _fetch_from(address, invitation.fingerprint)
+    return await _fetch_from(last, invitation.fingerprint)
+
+
+async def _fetch_from(address: str, fingerprint: str) -> bytes:
+    met = await asyncio.to_thread(_certificate_at, address)
+    async with open_channel(address, ca=met) as channel:
+        stub = rollout_service_pb2_grpc.RolloutServiceStub(channel)
+        with cluster_errors(address):
+            request = rollout_service_pb2.GetCapabilitiesRequest()
+            answer = await stub.GetCapabilities(request, timeout=FIRST_CONTACT_S)
+    with contextlib.suppress(ValueError):
+        if fingerprint_of(answer.ca_certificate) == fingerprint:
+            return str(answer.ca_certificate).encode("ascii")
+    raise NotAllowedError(
+        f"who answers at {address} is not the manager that this invitation is from: its authority has another "
+        "fingerprint. Ask the operator for a new invitation, and how the network lets another machine answer"
+    )
+
+
+def _certificate_at(address: str) -> bytes:
+    """The certificate (PEM) that is shown at HOST:PORT, whoever signed it."""
+    host, _, port = address.rpartition(":")
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.check_hostname = False
+    context.verify_mode = ssl.CERT_NONE
+    context.set_alpn_protocols(["h2"])
+    try:
+        with (
+            socket.create_connection((host.strip("[]"), int(port)), FIRST_CONTACT_S) as plain,
+            context.wrap_socket(plain) as tls,
+        ):
+            shown = tls.getpeercert(binary_form=True)
+    except ssl.SSLError as error:
+        raise ManagerUnreachableError(
+            f"what answers at {address} does not speak TLS, and the invitation says that the manager does: check its port"
+        ) from error
+    except OSError as error:
+        raise ManagerUnreachableError(
+            f"no manager answers at {address} ({error.strerror or error}): is the address right, and the port open?"
+        ) from error
+    return ssl.DER_cert_to_PEM_cert(shown or b"").encode("ascii")

@@ -1,0 +1,243 @@
+"""Tokens as the manager knows them: hashes, roles, ends. Decisions only; the clock and the randomness are arguments.
+
+A token is ``ID.SECRET``. The id is no secret: it finds the credential. The secret has 256 random bits, so one plain hash keeps
+it safe where a password would need a slow one.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import json
+import secrets
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.manager.store.protocol import CredentialRow
+from embomatrix.rpc.roles import Role, TokenInfo
+from embomatrix.rpc.status import (
+    InvalidRequestError,
+    NotAllowedError,
+    NotFoundError,
+    NotSignedInError,
+    OverloadedError,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+LONGEST_JOIN_S: Final = 86_400.0
+"""A token to join is valid for a day at most: it is meant to be used at once."""
+REMEMBERED_S: Final = 30 * 86_400.0
+"""Expired credentials are remembered for so long, to say that they expired."""
+LIMIT: Final = 100_000
+LABEL_LENGTH: Final = 200
+NO_TOKEN: Final = (
+    "no token, or a wrong one: pass --token, or set EMBOMATRIX_TOKEN to the token of this manager"
+)
+_REPLACED: Final = "its worker asked for another before it had shown it"
+_NOTHING: Final = hashlib.sha256(b"").hexdigest()
+
+
+@dataclass(frozen=True, slots=True)
+class Credential:
+    """A token without its secret. Times are seconds since 1970, by the manager's clock."""
+
+    token_id: str
+    role: Role
+    secret_hash: str
+    label: str = ""
+    expires_s: float = 0.0
+    """0: never."""
+    worker_id: str = ""
+    """The worker that a credential belongs to, or that a token to join was used by."""
+    boot_id: str = ""
+    """The process that a token to join was used by."""
+    joined_by: str = ""
+    """Id of the token to join that a worker's credential was given for."""
+    revoked: str = ""
+    """Why it is void; empty while it is not."""
+
+    @classmethod
+    def from_row(cls, row: CredentialRow) -> Credential:
+        fields = json.loads(row.payload)
+        return cls(**{**fields, "role": Role(fields["role"])})
+
+    def row(self) -> CredentialRow:
+        return CredentialRow(self.token_id, json.dumps(asdict(self), separators=(",", ":")).encode())
+
+    def named(self) -> str:
+        """How a sentence calls it."""
+        return f"the token {self.token_id}" + (f" ({self.label})" if self.label else "")
+
+
+def new_secret() -> str:
+    return secrets.token_urlsafe(32)
+
+
+def new_id() -> str:
+    return secrets.token_hex(6)
+
+
+class CredentialBook:
+    """Every credential of a cluster. Methods that change something return what is to be written, and ``keep`` takes it in."""
+
+    def __init__(
+        self,
+        credentials: Iterable[Credential] = (),
+        *,
+        make_secret: Callable[[], str] = new_secret,
+        make_id: Callable[[], str] = new_id,
+    ) -> None:
+        self._make_secret = make_secret
+        self._make_id = make_id
+        self._by_id: dict[str, Credential] = {}
+        self._of_worker: dict[str, dict[str, Credential]] = {}
+        """Credentials of role worker by the name that they belong to, then by id."""
+        self._seen: set[str] = set()
+        """Credentials that were shown since this process started."""
+        self.keep(*credentials)
+
+    def __contains__(self, token_id: str) -> bool:
+        return token_id in self._by_id
+
+    def keep(self, *credentials: Credential) -> None:
+        for credential in credentials:
+            self._by_id[credential.token_id] = credential
+            if credential.role is Role.WORKER and credential.worker_id:
+                self._of_worker.setdefault(credential.worker_id, {})[credential.token_id] = credential
+
+    def find(self, token: str, *, now_s: float) -> Credential:
+        """The valid credential of a token. Raises NotSignedInError, which says why it is void."""
+        token_id, _, secret = token.partition(".")
+        credential = self._by_id.get(token_id)
+        # Compared even if there is nothing to compare with: the answer takes as long whatever is wrong.
+        known = credential.secret_hash if credential is not None else _NOTHING
+        fits = hmac.compare_digest(hash_of(secret), known)
+        if credential is None or not fits or not secret:
+            raise NotSignedInError(NO_TOKEN)
+        if credential.revoked:
+            raise NotSignedInError(
+                f"{credential.named()} was revoked ({credential.revoked}): ask the operator for another"
+            )
+        if credential.expires_s and now_s >= credential.expires_s:
+            raise NotSignedInError(
+                f"{credential.named()} expired: ask the operator for another (`embomatrix manager token issue`)"
+            )
+        self._seen.add(token_id)
+        return credential
+
+    def issue(
+        self, role: Role, *, valid_s: float, label: str, now_s: float, worker_id: str = ""
+    ) -> tuple[Credential, str]:
+        """A new credential, and the token that is told once. ``valid_s`` 0: until revoked, or a day for one to join."""
+        if not 0.0 <= valid_s < float("inf"):
+            raise InvalidRequestError(f"a token's validity is {valid_s} s: expected 0 or more")
+        if role is Role.JOIN:
+            valid_s = valid_s or LONGEST_JOIN_S
+            if valid_s > LONGEST_JOIN_S:
+                raise InvalidRequestError(
+                    f"a token to join is asked to be valid for {valid_s:.0f} s: at most {LONGEST_JOIN_S:.0f} s"
+                )
+        if len(self._by_id) >= LIMIT:
+            raise OverloadedError(f"{len(self._by_id)} tokens are known, which is the most: revoke some")
+        secret = self._make_secret()
+        credential = Credential(
+            token_id=self._make_id(),
+            role=role,
+            secret_hash=hash_of(secret),
+            label=label[:LABEL_LENGTH],
+            expires_s=now_s + valid_s if valid_s else 0.0,
+            worker_id=worker_id,
+        )
+        return credential, f"{credential.token_id}.{secret}"
+
+    def redeem(
+        self, join: Credential, worker_id: str, boot_id: str, *, now_s: float
+    ) -> tuple[tuple[Credential, ...], str]:
+        """What a token to join becomes: the changed credentials, the worker's own first, and its token.
+
+        It is good for one worker. The same process may show it again as long as the credential that it got was never shown:
+        the answer may have been lost on its way. Raises NotSignedInError or NotAllowedError.
+        """
+        changed: tuple[Credential, ...] = ()
+        if join.worker_id:
+            given = [
+                c
+                for c in self._of_worker.get(join.worker_id, {}).values()
+                if c.joined_by == join.token_id and c.revoked != _REPLACED
+            ]
+            again = (join.worker_id, join.boot_id) == (worker_id, boot_id) and bool(boot_id)
+            if not again or any(c.revoked or c.token_id in self._seen for c in given):
+                raise NotSignedInError(
+                    f"this token to join was used already, by worker {join.worker_id}: ask the operator for another "
+                    "(`embomatrix manager token issue --role join`)"
+                )
+            changed = tuple(replace(c, revoked=_REPLACED) for c in given)
+        holder = self._holder(worker_id)
+        if holder is not None and holder not in changed and holder.joined_by != join.token_id:
+            raise NotAllowedError(
+                f"another machine joined as worker {worker_id}: pass another --name, or have its credential revoked first"
+            )
+        own, token = self.issue(Role.WORKER, valid_s=0.0, label=join.label, now_s=now_s, worker_id=worker_id)
+        own = replace(own, joined_by=join.token_id)
+        used = replace(join, worker_id=worker_id, boot_id=boot_id)
+        return (own, used, *changed), token
+
+    def check_name(self, credential_id: str, bound_to: str, worker_id: str) -> None:
+        """Raises NotAllowedError when a worker's token is not good for registering under this name."""
+        if bound_to and bound_to != worker_id:
+            raise NotAllowedError(
+                f"this credential belongs to worker {bound_to}: it can't register as {worker_id}"
+            )
+        holder = self._holder(worker_id)
+        if not bound_to and holder is not None and holder.token_id != credential_id:
+            raise NotAllowedError(
+                f"the name {worker_id} belongs to a machine that joined with a credential of its own: pass another --name"
+            )
+        if not bound_to and any(c.revoked for c in self._of_worker.get(worker_id, {}).values()):
+            raise NotAllowedError(
+                f"worker {worker_id} was revoked: let it join anew (`embomatrix manager token issue --role join`)"
+            )
+
+    def revoke(self, token_id: str, reason: str) -> Credential:
+        """The credential, void. Raises NotFoundError."""
+        credential = self._by_id.get(token_id)
+        if credential is None:
+            raise NotFoundError(
+                f"there is no token {token_id[:40]!r}: `embomatrix manager token list` shows them"
+            )
+        return replace(credential, revoked=credential.revoked or reason)
+
+    def revoke_worker(self, worker_id: str, reason: str) -> tuple[Credential, ...]:
+        """The worker's credentials, void. A worker of a shared token has none: its name alone is barred."""
+        own = self._credentials_of(worker_id)
+        if own:
+            return tuple(replace(c, revoked=reason) for c in own)
+        return (Credential(self._make_id(), Role.WORKER, _NOTHING, worker_id=worker_id, revoked=reason),)
+
+    def infos(self, *, now_s: float) -> tuple[TokenInfo, ...]:
+        """The tokens that are valid: not expired, not revoked, and not used up."""
+        return tuple(
+            TokenInfo(c.token_id, c.role, c.label, c.expires_s - now_s if c.expires_s else 0.0, c.worker_id)
+            for c in self._by_id.values()
+            if not c.revoked
+            and not (c.expires_s and now_s >= c.expires_s)
+            and not (c.role is Role.JOIN and c.worker_id)
+        )
+
+    def _credentials_of(self, worker_id: str) -> list[Credential]:
+        """The valid credentials that belong to this name: one, or none."""
+        return [c for c in self._of_worker.get(worker_id, {}).values() if not c.revoked]
+
+    def _holder(self, worker_id: str) -> Credential | None:
+        return next(iter(self._credentials_of(worker_id)), None)
+
+
+def hash_of(secret: str) -> str:
+    return hashlib.sha256(secret.encode()).hexdigest()
+
+
+def is_remembered(credential: Credential, *, now_s: float) -> bool:
+    """Whether it is still worth keeping: what never expires must be kept even when revoked, or it would be valid again."""
+    return not credential.expires_s or now_s < credential.expires_s + REMEMBERED_S

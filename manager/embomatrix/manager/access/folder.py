@@ -1,0 +1,207 @@
+"""The folder ``access`` in a manager's data folder: authority, certificate and first tokens, made once by ``manager init``."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.manager.access.certificates import (
+    RENEWAL,
+    KeyPair,
+    life_left,
+    make_authority,
+    make_server_certificate,
+    names_in,
+)
+from embomatrix.manager.access.credentials import LONGEST_JOIN_S, Credential, CredentialBook
+from embomatrix.manager.store.protocol import CredentialRow
+from embomatrix.rpc.roles import Role
+from embomatrix.rpc.trust import fingerprint_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+    from pathlib import Path
+
+FIRST_ROLES: Final = (Role.ADMIN, Role.TRAINER, Role.VIEWER, Role.JOIN)
+LOCAL_NAMES: Final = ("localhost", "127.0.0.1", "::1")
+_PRIVATE: Final = 0o600
+
+
+class AccessError(Exception):
+    """Certificates or tokens that can't be used, or are missing where they must be; the sentence names the remedy."""
+
+
+@dataclass(frozen=True, slots=True)
+class Prepared:
+    """What ``prepare`` did: sentences for a person, in order."""
+
+    made: tuple[str, ...]
+    found: tuple[str, ...]
+
+
+class AccessFolder:
+    """Paths, and what is in them. Nothing here is read before it is asked for."""
+
+    def __init__(self, data_dir: Path) -> None:
+        self.path = data_dir / "access"
+        self.ca = self.path / "ca.pem"
+        self.ca_key = self.path / "ca.key"
+        self.server = self.path / "server.pem"
+        self.server_key = self.path / "server.key"
+        self.hashes = self.path / "tokens.json"
+        """First tokens as the manager reads them: hashed."""
+
+    def token(self, role: Role) -> Path:
+        """The file with the first token of a role, for whom it is meant."""
+        return self.path / "tokens" / role.value
+
+    def first_credentials(self) -> tuple[Credential, ...]:
+        """Raises AccessError."""
+        try:
+            rows = json.loads(self.hashes.read_bytes())
+            return tuple(
+                Credential.from_row(CredentialRow(row["token_id"], json.dumps(row).encode())) for row in rows
+            )
+        except (FileNotFoundError, NotADirectoryError):
+            return ()
+        except OSError as error:
+            raise AccessError(
+                f"{self.hashes} can't be read ({error.strerror}): check its permissions"
+            ) from error
+        except (ValueError, TypeError, KeyError) as error:
+            raise AccessError(
+                f"{self.hashes} can't be read ({error}): remove it and run `embomatrix manager init` again"
+            ) from error
+
+
+def prepare(
+    data_dir: Path, *, sans: Iterable[str], roles: Sequence[Role] = FIRST_ROLES, now: datetime | None = None
+) -> Prepared:
+    """Make what is missing, and leave alone what is there: an authority is never overwritten.
+
+    The server's certificate is made anew when it lacks one of ``sans`` or will expire soon. Raises AccessError.
+    """
+    folder = AccessFolder(data_dir)
+    moment = now or datetime.now(UTC)
+    made: list[str] = []
+    found: list[str] = []
+    try:
+        folder.path.mkdir(parents=True, exist_ok=True, mode=0o700)
+        authority = _authority(folder, moment, made, found)
+        _certify(folder, authority, tuple(sans), moment, made, found)
+        _first_tokens(folder, roles, moment, made, found)
+    except OSError as error:
+        raise AccessError(
+            f"{error.filename or folder.path} can't be written ({error.strerror}): pass another --data-dir"
+        ) from error
+    return Prepared(tuple(made), tuple(found))
+
+
+def hand_out_to(data_dir: Path, role: Role, target: Path) -> None:
+    """Put what a client of this role needs into a folder of its own: the authority's certificate and the role's token."""
+    folder = AccessFolder(data_dir)
+    try:
+        target.mkdir(parents=True, exist_ok=True)
+        write_public(target / "ca.pem", folder.ca.read_bytes())
+        write_private(target / "token", folder.token(role).read_bytes())
+    except FileNotFoundError as error:
+        raise AccessError(
+            f"{error.filename} is not there any more: issue a token with `embomatrix manager token issue --role {role}`"
+        ) from error
+    except OSError as error:
+        raise AccessError(f"{error.filename or target} can't be written ({error.strerror})") from error
+
+
+def write_private(path: Path, content: bytes) -> None:
+    """Written beside and renamed, for the owner's eyes only from its first byte on."""
+    _write(path, content, _PRIVATE)
+
+
+def write_public(path: Path, content: bytes) -> None:
+    _write(path, content, 0o644)
+
+
+def _write(path: Path, content: bytes, mode: int) -> None:
+    part = path.with_name(f"{path.name}.part")
+    part.unlink(missing_ok=True)
+    with open(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
+        file.write(content)
+    part.replace(path)
+
+
+def _authority(folder: AccessFolder, now: datetime, made: list[str], found: list[str]) -> KeyPair:
+    if folder.ca.exists():
+        found.append(f"the authority {folder.ca}")
+        if not folder.ca_key.exists():
+            return KeyPair(folder.ca.read_bytes(), b"")
+        return KeyPair(folder.ca.read_bytes(), folder.ca_key.read_bytes())
+    authority = make_authority(f"EmboMatrix authority of {socket.gethostname()}", now)
+    # The key first: a certificate without its key would be taken for an authority that is kept elsewhere.
+    write_private(folder.ca_key, authority.key)
+    write_public(folder.ca, authority.certificate)
+    made.append(f"the authority {folder.ca}: clients pass it as --ca")
+    return authority
+
+
+def _certify(
+    folder: AccessFolder,
+    authority: KeyPair,
+    sans: tuple[str, ...],
+    now: datetime,
+    made: list[str],
+    found: list[str],
+) -> None:
+    before: tuple[str, ...] = ()
+    if folder.server.exists():
+        certificate = folder.server.read_bytes()
+        before = names_in(certificate)
+        if set(sans) <= set(before) and life_left(certificate, now) > RENEWAL:
+            found.append(f"the certificate {folder.server}, for {', '.join(before)}")
+            return
+    if not authority.key:
+        raise AccessError(
+            f"{folder.ca_key} is missing, so no certificate can be signed: bring it back for as long as this takes"
+        )
+    names = tuple(dict.fromkeys((*before, *sans, *LOCAL_NAMES, *_own_names())))
+    try:
+        pair = make_server_certificate(authority, names, now)
+    except ValueError as error:
+        raise AccessError(f"--san: {error}") from error
+    write_private(folder.server_key, pair.key)
+    write_public(folder.server, pair.certificate)
+    made.append(f"the certificate {folder.server}, for {', '.join(names)}")
+
+
+def _own_names() -> tuple[str, ...]:
+    return tuple(dict.fromkeys(name for name in (socket.gethostname(), socket.getfqdn()) if name.isascii()))
+
+
+def _first_tokens(
+    folder: AccessFolder, roles: Sequence[Role], now: datetime, made: list[str], found: list[str]
+) -> None:
+    credentials = list(folder.first_credentials())
+    known = {credential.role for credential in credentials}
+    book = CredentialBook()
+    for role in roles:
+        if role in known:
+            found.append(f"a first token of the role {role}")
+            continue
+        path = folder.token(role)
+        path.parent.mkdir(exist_ok=True, mode=0o700)
+        valid_s = LONGEST_JOIN_S if role is Role.JOIN else 0.0
+        credential, token = book.issue(
+            role, valid_s=valid_s, label="made by manager init", now_s=now.timestamp()
+        )
+        pinned = f".{fingerprint_of(folder.ca.read_text())}" if role is Role.JOIN else ""
+        write_private(path, f"{token}{pinned}\n".encode())
+        credentials.append(credential)
+        made.append(
+            f"a token of the role {role}: {path}" + (", good for one worker and a day" if valid_s else "")
+        )
+    if len(credentials) > len(known):
+        rows = [asdict(credential) for credential in credentials]
+        write_private(folder.hashes, json.dumps(rows, indent=1).encode())

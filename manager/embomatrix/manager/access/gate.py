@@ -1,0 +1,198 @@
+"""Who may call what: the book of credentials with its store, and the answer to every call that comes in."""
+
+from __future__ import annotations
+
+import asyncio
+import hmac
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.manager.access.credentials import (
+    NO_TOKEN,
+    Credential,
+    CredentialBook,
+    is_remembered,
+)
+from embomatrix.manager.access.roles import OPEN, may_call, who_may
+from embomatrix.manager.store.protocol import StateError
+from embomatrix.rpc.channel import TOKEN_KEY, token_of
+from embomatrix.rpc.roles import Role
+from embomatrix.rpc.status import (
+    ClusterError,
+    NotAllowedError,
+    NotSignedInError,
+    PreconditionError,
+    UnavailableError,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+    import grpc
+
+    from embomatrix.manager.registry import Session
+    from embomatrix.manager.store.protocol import StateStore
+    from embomatrix.rpc.roles import TokenInfo
+
+SHARED_ID: Final = "shared"
+"""What the token of ``--token`` is called; no issued token has an id like it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Caller:
+    """Who calls, as far as the token tells. Sessions remember ``token_id``, and only it may speak for them."""
+
+    role: Role
+    token_id: str = ""
+    worker_id: str = ""
+    """The worker that the credential belongs to; empty for tokens of several."""
+
+
+ANYONE: Final = Caller(Role.ADMIN)
+"""The caller where no token is asked for."""
+
+
+@dataclass(frozen=True, slots=True)
+class Admission:
+    """How a worker was let in: the id of what it shows from here on, and the token of a new credential, if it got one."""
+
+    token_id: str
+    credential: str = ""
+
+
+class Gate:
+    """Tokens of one cluster. ``shared_token`` is an admin's for everybody; with ``guarded`` false nobody is asked for one."""
+
+    def __init__(
+        self,
+        store: StateStore,
+        *,
+        guarded: bool,
+        shared_token: str = "",
+        clock: Callable[[], float] = time.time,
+    ) -> None:
+        self._store = store
+        self._guarded = guarded
+        self._shared = shared_token
+        self._clock = clock
+        self._book = CredentialBook()
+        self._lock = asyncio.Lock()
+
+    async def open(self, first: Iterable[Credential] = ()) -> None:
+        """Read what former managers knew, and take in first tokens that the store never saw. Raises StateError."""
+        now_s = self._clock()
+        known = [Credential.from_row(row) for row in await self._store.credentials()]
+        self._book.keep(*(credential for credential in known if is_remembered(credential, now_s=now_s)))
+        fresh = [credential for credential in first if credential.token_id not in self._book]
+        if fresh:
+            await self._store.put_credentials([credential.row() for credential in fresh])
+            self._book.keep(*fresh)
+
+    def caller(self, token: str) -> Caller:
+        """Raises NotSignedInError."""
+        if not self._guarded:
+            return ANYONE
+        if self._shared and hmac.compare_digest(token.encode(), self._shared.encode()):
+            return Caller(Role.ADMIN, SHARED_ID)
+        if not token:
+            raise NotSignedInError(NO_TOKEN)
+        found = self._book.find(token, now_s=self._clock())
+        return Caller(found.role, found.token_id, found.worker_id if found.role is Role.WORKER else "")
+
+    def refusal(self, method: str, header: str | None) -> ClusterError | None:
+        """Why ``/package.Service/Method`` may not be called with this ``authorization`` header; None if it may."""
+        if method in OPEN and not header:
+            return None
+        try:
+            caller = self.caller(token_of(header))
+        except NotSignedInError as error:
+            return error
+        if method in OPEN or may_call(caller.role, method):
+            return None
+        return NotAllowedError(
+            f"a token of the role {caller.role} may not call {method.rpartition('/')[2]}: it takes {who_may(method)}"
+        )
+
+    def caller_of(self, context: grpc.aio.ServicerContext) -> Caller:
+        """Who made this call, as its metadata tell. Raises NotSignedInError."""
+        return self.caller(token_of(_header(context)))
+
+    async def admit(
+        self, context: grpc.aio.ServicerContext, join_token: str, worker_id: str, boot_id: str
+    ) -> Admission:
+        """Let a worker register under this name: by the token of its call, or by the one to join in its request."""
+        caller = self.caller(token_of(_header(context)) or join_token)
+        if not may_call(caller.role, _REGISTER):
+            raise NotAllowedError(
+                f"a token of the role {caller.role} may not register workers: it takes {who_may(_REGISTER)}"
+            )
+        if caller.role is Role.JOIN:
+            return await self._join(token_of(_header(context)) or join_token, worker_id, boot_id)
+        if self._guarded:
+            self._book.check_name(caller.token_id, caller.worker_id, worker_id)
+        return Admission(caller.token_id)
+
+    def check_session(self, context: grpc.aio.ServicerContext, session: Session) -> None:
+        """Raises NotAllowedError unless the caller's credential is the one that opened the session."""
+        if self.caller_of(context).token_id != session.credential_id:
+            raise NotAllowedError(
+                f"the session of worker {session.worker_id} was opened with another credential: register with this one"
+            )
+
+    async def issue(self, role: Role, *, valid_s: float, label: str) -> tuple[str, str]:
+        """A new token and its id."""
+        self._need_guard()
+        async with self._lock:
+            credential, token = self._book.issue(role, valid_s=valid_s, label=label, now_s=self._clock())
+            await self._keep(credential)
+        return token, credential.token_id
+
+    async def revoke(self, token_id: str) -> None:
+        self._need_guard()
+        if token_id == SHARED_ID:
+            raise PreconditionError(
+                "the shared token of --token can't be revoked: start the manager with another"
+            )
+        async with self._lock:
+            await self._keep(self._book.revoke(token_id, "by the operator"))
+
+    async def revoke_worker(self, worker_id: str, reason: str) -> None:
+        self._need_guard()
+        async with self._lock:
+            await self._keep(*self._book.revoke_worker(worker_id, reason))
+
+    def infos(self) -> tuple[TokenInfo, ...]:
+        return self._book.infos(now_s=self._clock())
+
+    async def _join(self, token: str, worker_id: str, boot_id: str) -> Admission:
+        async with self._lock:
+            now_s = self._clock()
+            # Looked up again: another process may have used it while this one waited.
+            changed, own = self._book.redeem(
+                self._book.find(token, now_s=now_s), worker_id, boot_id, now_s=now_s
+            )
+            await self._keep(*changed)
+        return Admission(changed[0].token_id, own)
+
+    async def _keep(self, *credentials: Credential) -> None:
+        """Written first: what the store does not hold was never granted, and never taken back."""
+        try:
+            await self._store.put_credentials([credential.row() for credential in credentials])
+        except StateError as error:
+            raise UnavailableError(str(error)) from error
+        self._book.keep(*credentials)
+
+    def _need_guard(self) -> None:
+        if not self._guarded:
+            raise PreconditionError(
+                "this manager asks nobody for a token, so there are none to hand out or take back: run "
+                "`embomatrix manager init` for its data folder and start it again"
+            )
+
+
+_REGISTER: Final = "/embomatrix.proto.v1.WorkerService/Register"
+
+
+def _header(context: grpc.aio.ServicerContext) -> str | None:
+    return next((value for key, value in context.invocation_metadata() or () if key == TOKEN_KEY), None)

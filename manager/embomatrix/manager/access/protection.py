@@ -1,0 +1,84 @@
+"""What a manager is protected by: certificates, tokens, both, or on loopback nothing. Anything less is refused at start."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING
+
+from embomatrix.manager.access.certificates import RENEWAL, life_left, names_in
+from embomatrix.manager.access.folder import AccessError, AccessFolder
+from embomatrix.manager.settings import is_loopback
+from embomatrix.rpc.trust import fingerprint_of
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from embomatrix.manager.access.credentials import Credential
+    from embomatrix.manager.settings import ManagerSettings
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Tls:
+    """A certificate to serve with. ``chain``, ``key`` and ``authority`` are PEM; the last is empty where it isn't known."""
+
+    chain_file: Path
+    key_file: Path
+    chain: bytes
+    key: bytes = field(repr=False)
+    authority: bytes
+    names: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Protection:
+    """``first`` are the tokens that ``manager init`` made; ``guarded`` says whether tokens are asked for."""
+
+    tls: Tls | None
+    first: tuple[Credential, ...]
+    guarded: bool
+
+
+def protection_of(settings: ManagerSettings) -> Protection:
+    """What the settings and the data folder give. Raises AccessError if it is too little for the addresses that are served."""
+    folder = AccessFolder(settings.data_dir)
+    tls = _tls(settings, folder)
+    first = folder.first_credentials()
+    guarded = bool(first or settings.token)
+    lacking = [name for name, there in (("TLS", tls is not None), ("tokens", guarded)) if not there]
+    for host in (settings.host, settings.http_host):
+        if lacking and not is_loopback(host) and not settings.insecure_bind:
+            raise AccessError(
+                f"refusing to serve on {host} without {' and '.join(lacking)}, where anyone could use the cluster or listen: "
+                f"run `embomatrix manager init --data-dir {settings.data_dir} --san HOST` first, or pass --insecure-bind if "
+                "the network is trusted"
+            )
+    return Protection(tls, first, guarded)
+
+
+def _tls(settings: ManagerSettings, folder: AccessFolder) -> Tls | None:
+    chain_file = settings.tls_cert or folder.server
+    key_file = settings.tls_key or folder.server_key
+    if settings.tls_cert is None and not folder.server.exists():
+        return None
+    ca_file = settings.tls_ca or (folder.ca if settings.tls_cert is None else None)
+    try:
+        chain, key = chain_file.read_bytes(), key_file.read_bytes()
+        authority = b"" if ca_file is None else ca_file.read_bytes()
+        names = names_in(chain)
+        left = life_left(chain, datetime.now(UTC))
+        if authority:
+            fingerprint_of(authority.decode("ascii"))
+    except OSError as error:
+        raise AccessError(
+            f"{error.filename} can't be read ({error.strerror}): check --tls-cert, --tls-key and --tls-ca, or run "
+            "`embomatrix manager init` for the data folder"
+        ) from error
+    except ValueError as error:
+        raise AccessError(f"{chain_file} or {ca_file} holds no certificate (PEM): {error}") from error
+    if left < RENEWAL:
+        logger.warning("the certificate %s expires in %d days: renew it", chain_file, left.days)
+    return Tls(chain_file, key_file, chain, key, authority, names)

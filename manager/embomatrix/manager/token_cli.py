@@ -1,0 +1,120 @@
+"""`embomatrix manager token`: hand out tokens of a role, look them over, take them back."""
+
+from __future__ import annotations
+
+from pathlib import Path  # typer reads the annotation when the command runs
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar
+
+import typer
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Coroutine
+
+    from embomatrix.rpc.roles import TokenInfo
+    from embomatrix.rpc.token_client import TokenClient
+
+app = typer.Typer(
+    help="Hand out tokens, look them over, take them back.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+)
+T = TypeVar("T")
+
+Manager = Annotated[
+    str,
+    typer.Option("--manager", "--address", help="HOST:PORT of the manager.", envvar="EMBOMATRIX_MANAGER"),
+]
+Token = Annotated[
+    str,
+    typer.Option(
+        envvar="EMBOMATRIX_TOKEN", help="An admin's token, or @FILE that holds it.", show_default=False
+    ),
+]
+Ca = Annotated[
+    Path | None,
+    typer.Option(
+        envvar="EMBOMATRIX_CA", help="The ca.pem of a manager that serves by TLS.", show_default=False
+    ),
+]
+
+
+@app.command()
+def issue(
+    role: Annotated[str, typer.Option(help="join, worker, trainer, viewer or admin.")],
+    label: Annotated[str, typer.Option(help="For people: whom it is for.")] = "",
+    hours: Annotated[
+        float, typer.Option(min=0.0, help="How long it is valid; 0: until revoked, or a day for one to join.")
+    ] = 0.0,
+    manager: Manager = "127.0.0.1:50070",
+    token: Token = "",
+    ca: Ca = None,
+) -> None:
+    """Hand out a token. It is told once: the manager keeps only its hash."""
+    from embomatrix.rpc.roles import Role
+    from embomatrix.rpc.trust import Invitation, fingerprint_of, read_ca
+
+    if role not in list(Role):
+        _refuse(f"--role {role!r}: expected {', '.join(Role)}")
+    wanted = Role(role)
+    new, token_id = _ask(
+        manager, token, ca, lambda client: client.issue(wanted, valid_s=hours * 3600.0, label=label)
+    )
+    if wanted is not Role.JOIN:
+        print(new)
+        typer.echo(f"id {token_id}; it is not told again", err=True)
+        return
+    pem = read_ca(ca).decode("ascii")
+    print(Invitation(manager, new, fingerprint_of(pem) if pem else ""))
+    typer.echo("on the machine that joins: embomatrix worker run --join with the line above", err=True)
+
+
+@app.command(name="list")
+def list_(manager: Manager = "127.0.0.1:50070", token: Token = "", ca: Ca = None) -> None:
+    """Show the tokens that are valid, by id."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table("id", "role", "label", "valid for", "worker")
+    for info in _ask(manager, token, ca, lambda client: client.listed()):
+        table.add_row(info.token_id, info.role, info.label, _left(info), info.worker_id)
+    Console().print(table)
+
+
+@app.command()
+def revoke(
+    token_id: Annotated[str, typer.Argument(help="The id that `list` shows.")],
+    manager: Manager = "127.0.0.1:50070",
+    token: Token = "",
+    ca: Ca = None,
+) -> None:
+    """Make a token void. Sessions of workers that it opened end at once."""
+    _ask(manager, token, ca, lambda client: client.revoke(token_id))
+    print(f"revoked {token_id}")
+
+
+def _left(info: TokenInfo) -> str:
+    return f"{info.left_s / 3600:.1f} h" if info.left_s else "until revoked"
+
+
+def _ask(manager: str, token: str, ca: Path | None, question: Callable[[TokenClient], Awaitable[T]]) -> T:
+    """One call to the manager; whatever is wrong ends as a sentence."""
+    import asyncio
+
+    from embomatrix.rpc.status import ClusterError
+    from embomatrix.rpc.token_client import TokenClient
+    from embomatrix.rpc.trust import read_ca, read_token
+
+    async def ask() -> T:
+        async with TokenClient(manager, read_token(token), ca=read_ca(ca)) as client:
+            return await question(client)
+
+    call: Coroutine[Any, Any, T] = ask()
+    try:
+        return asyncio.run(call)
+    except ClusterError as error:
+        _refuse(str(error))
+
+
+def _refuse(sentence: str) -> NoReturn:
+    typer.echo(f"embomatrix manager token: {sentence}", err=True)
+    raise typer.Exit(2)

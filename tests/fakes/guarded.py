@@ -1,0 +1,56 @@
+"""A manager that asks for tokens and speaks TLS, as `embomatrix manager init` prepares it, in this process."""
+
+import contextlib
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+from embomatrix.manager.access.folder import AccessFolder, prepare
+from embomatrix.manager.app import running
+from embomatrix.manager.settings import ManagerSettings
+from embomatrix.rpc.roles import Role
+from embomatrix.rpc.token_client import TokenClient
+from embomatrix.world.bundle import bundle_digest
+
+
+@dataclass
+class Guarded:
+    """Where the manager answers, and what opens it."""
+
+    address: str
+    page: str
+    ca: bytes
+    folder: AccessFolder
+
+    def token(self, role):
+        return self.folder.token(role).read_text().strip()
+
+    def operator(self):
+        return TokenClient(self.address, self.token(Role.ADMIN), ca=self.ca)
+
+    async def issue(self, role, **options):
+        async with self.operator() as operator:
+            return (await operator.issue(role, **options))[0]
+
+
+@contextlib.asynccontextmanager
+async def guarded(data_dir: Path, **changes):
+    """Prepared once for the folder, and served as often as one likes; other options are those of the manager."""
+    prepare(data_dir, sans=("127.0.0.1",), roles=tuple(Role))
+    folder = AccessFolder(data_dir)
+    options = {
+        "port": 0,
+        "http_port": 0,
+        "heartbeat_s": 0.1,
+        "stream_grace_s": 0.2,
+        "data_dir": data_dir,
+        **changes,
+    }
+    async with running(ManagerSettings(**options)) as at:
+        yield Guarded(at.address, at.status_url, folder.ca.read_bytes(), folder)
+
+
+def packed(content):
+    """A bundle that nothing but its limits says anything about, and its digest."""
+    data = zlib.compress(content.encode())
+    return bundle_digest(data), data
