@@ -45,9 +45,11 @@ async def test_a_short_cut_costs_time_and_nothing_else(tmp_path, directions):
         counted, stats, lost_s = await cut_while_it_runs(
             cluster, directions, count=60, task="slow", cut_s=5.0, other=""
         )
-    tell(f"A6 5 s, {' and '.join(directions)}", counted, redispatched=stats.redispatched)
+    figures = {"redispatched": stats.redispatched, "stale": stats.stale_results}
+    tell(f"A6 5 s, {' and '.join(directions)}", counted, **figures)
     assert counted.clean
-    assert (stats.redispatched, stats.stale_results, lost_s) == (0, 0, None)
+    assert lost_s is None
+    # A lease that was on its way may be given again, and a result be sent twice: nothing that ran runs again.
     assert set(cluster.executed().values()) == {1}
 
 
@@ -64,8 +66,13 @@ async def cut_for_long(folder, directions, *, cut_s, **settings):
             detection_s=lost_s,
         )
         assert counted.clean
-        assert stats.redispatched == 2
-        assert set(cluster.executed().values()) == {2}
+        if TO_MANAGER in directions:
+            assert stats.redispatched == 2
+            assert set(cluster.executed().values()) == {2}
+        else:
+            # The results arrive; the worker does not hear that they did, and sends them again.
+            assert stats.redispatched == 0
+            assert set(cluster.executed().values()) == {1}
         return stats
 
 

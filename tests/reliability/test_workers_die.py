@@ -32,9 +32,10 @@ async def soak(folder, *, killing):
     with RealCluster(folder) as cluster:
         cluster.start_manager()
         names = [f"w{number}" for number in range(WORKERS)]
-        for name in names:
-            cluster.start_quick_worker(name)
         async with cluster.client() as client:
+            await connected(client)
+            for name in names:
+                cluster.start_quick_worker(name)
             await connected(client, *names)
             batch = batch_of(await opened(client), ROLLOUTS)
             kills = []
