@@ -217,8 +217,8 @@ class Residents:
             self.end_later(slot.child)
             return
         scene.idle.append(slot)
-        idle = [other for other in self._scenes.values() if other.idle]
-        if sum(len(other.idle) for other in idle) > self._limits.idle_slots:
+        if sum(len(other.idle) for other in self._scenes.values()) > self._limits.idle_slots:
+            idle = (other for other in self._scenes.values() if other.idle)
             oldest = min(idle, key=lambda other: other.last_used)
             self.end_later(oldest.idle.pop(0).child)
 

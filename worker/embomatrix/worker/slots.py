@@ -98,8 +98,13 @@ class SlotPool:
         self._tickets: dict[LeaseRef, _Ticket] = {}
         self._free = list(range(1, limits.slots + 1))
         """Permits that nobody has, as a heap: the lowest is given first, so that a little work stays on few."""
+        self._at_work: dict[int, Scene] = {}
+        """The scene that each occupied permit executes in."""
+        self._tasks: asyncio.TaskGroup | None = None
         self._clock = 0
         self._wake = asyncio.Event()
+        self._unsettled = False
+        """A wanted scene is not warm, or too much is held: when a scene falls idle, more can be done about it."""
 
     @property
     def load(self) -> float:
@@ -142,11 +147,15 @@ class SlotPool:
         if lease.ref in self._tickets:
             return
         digest = lease.rollout.bundle_digest
-        ticket = _Ticket(lease, time.monotonic(), self._residents.warm(digest) is not None)
+        warm = self._residents.warm(digest) is not None
+        ticket = _Ticket(lease, time.monotonic(), warm)
         self._residents.retry(digest)
         self._tickets[lease.ref] = ticket
         self._waiting.append(ticket)
-        self._wake.set()
+        if warm:
+            self._start_leases()
+        else:
+            self._wake.set()
 
     def cancel(self, refs: Iterable[LeaseRef]) -> None:
         """Forget these leases; what runs is killed, and none of them gives a result."""
@@ -170,14 +179,13 @@ class SlotPool:
     async def run(self) -> None:
         """Load, evict and execute until cancelled; then every process is ended."""
         try:
-            async with asyncio.TaskGroup() as tasks:
+            async with asyncio.TaskGroup() as self._tasks:
                 while True:
                     await self._wait_for_work()
-                    leased = (ticket.digest for ticket in self._waiting)
-                    # Scenes of leases that wait come before those that are only announced.
-                    self._residents.settle(tuple(dict.fromkeys((*leased, *self._wanted))), tasks)
-                    self._start_leases(tasks)
+                    self._settle(self._tasks)
+                    self._start_leases()
         finally:
+            self._tasks = None
             await self._residents.close()
 
     async def _wait_for_work(self) -> None:
@@ -185,6 +193,14 @@ class SlotPool:
             async with asyncio.timeout(RETRY_CHECK_S if self._residents.failed() else None):
                 await self._wake.wait()
         self._wake.clear()
+
+    def _settle(self, tasks: asyncio.TaskGroup) -> None:
+        leased = (ticket.digest for ticket in self._waiting)
+        # Scenes of leases that wait come before those that are only announced.
+        wanted = tuple(dict.fromkeys((*leased, *self._wanted)))
+        self._residents.settle(wanted, tasks)
+        over = self._residents.memory_used_mb > self._limits.memory_mb
+        self._unsettled = over or any(self._residents.warm(digest) is None for digest in wanted)
 
     def _scene_changed(self, scene: Scene) -> None:
         if scene.state is ResidentState.FAILED:
@@ -194,27 +210,56 @@ class SlotPool:
         self._on_change()
         self._wake.set()
 
-    def _start_leases(self, tasks: asyncio.TaskGroup) -> None:
-        for ticket in list(self._waiting):
-            if not self._free:
-                return
-            scene = self._residents.warm(ticket.digest)
-            if scene is None:
-                continue
-            self._waiting.remove(ticket)
-            self._clock += 1
-            scene.last_used = self._clock
-            scene.running += 1
-            ticket.slot, ticket.began_s = heapq.heappop(self._free), time.monotonic()
-            self._board.set(ticket.slot, 0)
-            ticket.task = tasks.create_task(self._run_lease(ticket, scene))
+    def _start_leases(self) -> None:
+        """Occupy free permits as long as a lease waits whose scene is warm."""
+        while self._tasks is not None and self._free and (found := self._next_lease()) is not None:
+            ticket, scene = found
+            slot = heapq.heappop(self._free)
+            self._occupy(slot, ticket, scene)
+            ticket.task = self._tasks.create_task(self._serve(slot, ticket, scene))
             # A task that is cancelled before its first step runs no `finally` of its own.
-            ticket.task.add_done_callback(functools.partial(self._release, scene, ticket.slot))
+            ticket.task.add_done_callback(functools.partial(self._vacate, slot))
 
-    def _release(self, scene: Scene, slot: int, _: asyncio.Task[None]) -> None:
+    def _next_lease(self) -> tuple[_Ticket, Scene] | None:
+        for ticket in self._waiting:
+            scene = self._residents.warm(ticket.digest)
+            if scene is not None:
+                self._waiting.remove(ticket)
+                return ticket, scene
+        return None
+
+    def _occupy(self, slot: int, ticket: _Ticket, scene: Scene) -> None:
+        self._clock += 1
+        scene.last_used = self._clock
+        scene.running += 1
+        ticket.slot, ticket.began_s = slot, time.monotonic()
+        self._board.set(slot, 0)
+        self._at_work[slot] = scene
+
+    def _leave(self, slot: int) -> None:
+        scene = self._at_work.pop(slot)
         self._residents.release(scene)
+        if self._unsettled and not scene.running:
+            self._wake.set()
+
+    def _vacate(self, slot: int, _: asyncio.Task[None]) -> None:
+        if slot in self._at_work:
+            self._leave(slot)
         heapq.heappush(self._free, slot)
-        self._wake.set()
+        self._start_leases()
+
+    async def _serve(self, slot: int, ticket: _Ticket, scene: Scene) -> None:
+        """Execute this lease, and under the same permit those that wait behind it."""
+        task = ticket.task
+        while True:
+            await self._run_lease(ticket, scene)
+            self._leave(slot)
+            found = self._next_lease()
+            if found is None:
+                return
+            ticket, scene = found
+            self._occupy(slot, ticket, scene)
+            ticket.task = task
 
     async def _run_lease(self, ticket: _Ticket, scene: Scene) -> None:
         outcome: Completed | InfraFailure | None
