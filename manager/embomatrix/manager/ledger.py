@@ -13,9 +13,9 @@ if TYPE_CHECKING:
     from embomatrix.rpc.values import LeaseRef, Rollout
 
 
-AHEAD_S: Final = 0.025
+AHEAD_S: Final = 0.05
 """A worker holds leases for this long ahead: its slots go on while results and new leases travel many to a message."""
-BEHIND: Final = 24
+BEHIND: Final = 32
 """Leases that wait behind a slot at most, however fast it is."""
 PACE_WEIGHT: Final = 0.1
 """Of the latest rollout in what a worker is taken to need for one."""

@@ -53,7 +53,7 @@ FETCH_S: Final = 30.0
 HEARTBEATS_MISSED: Final = 3
 """So many heartbeats in a row without an answer mean that the connection is dead."""
 RESULTS_PER_MESSAGE: Final = 64
-LINGER_S: Final = 0.01
+LINGER_S: Final = 0.025
 """A message costs more than what it carries: results wait this long for others at most."""
 
 
