@@ -23,7 +23,10 @@ from embomatrix.world.bundle import bundle_digest
 
 @dataclass
 class FakeManager(worker_service_pb2_grpc.WorkerServiceServicer):
-    """One worker's manager. ``results`` keeps every result that ever arrived, ``states`` every full state."""
+    """One worker's manager. ``results`` keeps every result that ever arrived, ``states`` every full state.
+
+    ``deliveries`` counts the messages that brought results.
+    """
 
     acknowledging: bool = True
     answering_heartbeats: bool = True
@@ -34,6 +37,7 @@ class FakeManager(worker_service_pb2_grpc.WorkerServiceServicer):
     resources: object = None
     states: list = field(default_factory=list)
     results: list = field(default_factory=list)
+    deliveries: int = 0
     renewed: list = field(default_factory=list)
     steps: dict = field(default_factory=dict)
     fetches: list[str] = field(default_factory=list)
@@ -125,6 +129,7 @@ class FakeManager(worker_service_pb2_grpc.WorkerServiceServicer):
 
     def _take(self, request):
         found = list(request.results)
+        self.deliveries += bool(found)
         if request.HasField("state"):
             self.states.append(worker_state_from_proto(request.state))
             found += request.state.finished

@@ -1,7 +1,7 @@
 """Workers in a large cluster: found by scene, by free slots and by backlog, without looking at all of them."""
 
 from embomatrix.manager.fleet import CANDIDATES, THIEVES, Fleet
-from embomatrix.manager.ledger import LeaseRecord, RolloutKey, RolloutRecord
+from embomatrix.manager.ledger import AHEAD_S, BEHIND, LeaseRecord, RolloutKey, RolloutRecord
 from embomatrix.rpc.values import LeaseRef, Rollout
 
 MANY = 3 * CANDIDATES
@@ -73,3 +73,17 @@ def test_a_worker_that_drains_or_is_suspected_is_neither_live_nor_idle():
     assert fleet.idle == {"w0002"}
     fleet.leave("w0002")
     assert (fleet.live, fleet.idle) == (0, frozenset())
+
+
+def test_a_worker_holds_as_many_leases_ahead_as_it_executes_until_others_come():
+    fleet = fleet_of(1)
+    worker = fleet.workers["w0000"]
+    assert worker.credits == 2
+    worker.note_completed(AHEAD_S / 10)
+    assert worker.credits == 11
+    for _ in range(200):
+        worker.note_completed(1e-6)
+    assert worker.credits == 1 + BEHIND
+    for _ in range(200):
+        worker.note_completed(10 * AHEAD_S)
+    assert worker.credits == 2

@@ -85,6 +85,17 @@ async def test_many_leases_are_executed_once_each(tmp_path):
     assert sorted(_done(manager)) == sorted(f"l{number}" for number in range(200))
 
 
+async def test_results_travel_together_while_enough_waits_behind_the_slots(tmp_path):
+    manager = FakeManager()
+    digest = manager.bundle(b"ok")
+    async with joined(manager, tmp_path):
+        manager.want(digest)
+        for number in range(200):
+            manager.lease(f"l{number}", digest)
+        await _until(lambda: len(manager.results) >= 200)
+    assert manager.deliveries < 100
+
+
 async def test_a_broken_stream_is_opened_again_and_unacknowledged_results_come_again(tmp_path):
     manager = FakeManager(acknowledging=False)
     digest = manager.bundle(b"ok")

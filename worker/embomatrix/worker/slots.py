@@ -9,11 +9,8 @@ import heapq
 import logging
 import time
 from collections import deque
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.proto.v1 import types_pb2
-from embomatrix.rpc.convert import completed_from_proto, rollout_to_proto
 from embomatrix.rpc.values import (
     InfraCode,
     InfraFailure,
@@ -21,9 +18,8 @@ from embomatrix.rpc.values import (
     LeaseProgress,
     LeaseResult,
     ResidentState,
-    Timings,
 )
-from embomatrix.sim.zygote import Frame
+from embomatrix.worker.execution import Ticket, execute
 from embomatrix.worker.processes import SIMULATOR_PROGRAM, ProcessGoneError
 from embomatrix.worker.progress import ProgressBoard
 from embomatrix.worker.residents import Residents
@@ -33,35 +29,13 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from embomatrix.rpc.values import Completed, Lease, LeaseRef, Resident
-    from embomatrix.worker.residents import Scene, Slot, SlotLimits
+    from embomatrix.worker.residents import Scene, SlotLimits
 
 logger = logging.getLogger(__name__)
 
-ROLLOUTS_PER_SLOT: Final = 5_000
-GROWTH_MB: Final = 128.0
-"""A slot's process is replaced after this many rollouts, or when it has grown by this much."""
 RETRY_CHECK_S: Final = 1.0
 AHEAD: Final = 2
 """Leases that wait behind each slot while others are asked for."""
-
-
-@dataclass(slots=True, eq=False)
-class _Ticket:
-    """A lease that waits or runs here."""
-
-    lease: Lease
-    taken_s: float
-    found_warm: bool
-    requeued: bool = False
-    slot: int = 0
-    """The permit that it has, from 1; 0 before."""
-    began_s: float = 0.0
-    """When it got the permit, on the monotonic clock."""
-    task: asyncio.Task[None] | None = None
-
-    @property
-    def digest(self) -> str:
-        return self.lease.rollout.bundle_digest
 
 
 class SlotPool:
@@ -94,8 +68,8 @@ class SlotPool:
             board=self._board,
         )
         self._wanted: tuple[str, ...] = ()
-        self._waiting: deque[_Ticket] = deque()
-        self._tickets: dict[LeaseRef, _Ticket] = {}
+        self._waiting: deque[Ticket] = deque()
+        self._tickets: dict[LeaseRef, Ticket] = {}
         self._free = list(range(1, limits.slots + 1))
         """Permits that nobody has, as a heap: the lowest is given first, so that a little work stays on few."""
         self._at_work: dict[int, Scene] = {}
@@ -148,7 +122,7 @@ class SlotPool:
             return
         digest = lease.rollout.bundle_digest
         warm = self._residents.warm(digest) is not None
-        ticket = _Ticket(lease, time.monotonic(), warm)
+        ticket = Ticket(lease, time.monotonic(), warm)
         self._residents.retry(digest)
         self._tickets[lease.ref] = ticket
         self._waiting.append(ticket)
@@ -180,13 +154,18 @@ class SlotPool:
         """Load, evict and execute until cancelled; then every process is ended."""
         try:
             async with asyncio.TaskGroup() as self._tasks:
-                while True:
-                    await self._wait_for_work()
-                    self._settle(self._tasks)
-                    self._start_leases()
+                await self._work(self._tasks)
+        finally:
+            await self._residents.close()
+
+    async def _work(self, tasks: asyncio.TaskGroup) -> None:
+        try:
+            while True:
+                await self._wait_for_work()
+                self._settle(tasks)
+                self._start_leases()
         finally:
             self._tasks = None
-            await self._residents.close()
 
     async def _wait_for_work(self) -> None:
         with contextlib.suppress(TimeoutError):
@@ -195,9 +174,8 @@ class SlotPool:
         self._wake.clear()
 
     def _settle(self, tasks: asyncio.TaskGroup) -> None:
-        leased = (ticket.digest for ticket in self._waiting)
         # Scenes of leases that wait come before those that are only announced.
-        wanted = tuple(dict.fromkeys((*leased, *self._wanted)))
+        wanted = tuple(dict.fromkeys((*(ticket.digest for ticket in self._waiting), *self._wanted)))
         self._residents.settle(wanted, tasks)
         over = self._residents.memory_used_mb > self._limits.memory_mb
         self._unsettled = over or any(self._residents.warm(digest) is None for digest in wanted)
@@ -220,7 +198,7 @@ class SlotPool:
             # A task that is cancelled before its first step runs no `finally` of its own.
             ticket.task.add_done_callback(functools.partial(self._vacate, slot))
 
-    def _next_lease(self) -> tuple[_Ticket, Scene] | None:
+    def _next_lease(self) -> tuple[Ticket, Scene] | None:
         for ticket in self._waiting:
             scene = self._residents.warm(ticket.digest)
             if scene is not None:
@@ -228,7 +206,7 @@ class SlotPool:
                 return ticket, scene
         return None
 
-    def _occupy(self, slot: int, ticket: _Ticket, scene: Scene) -> None:
+    def _occupy(self, slot: int, ticket: Ticket, scene: Scene) -> None:
         self._clock += 1
         scene.last_used = self._clock
         scene.running += 1
@@ -248,7 +226,7 @@ class SlotPool:
         heapq.heappush(self._free, slot)
         self._start_leases()
 
-    async def _serve(self, slot: int, ticket: _Ticket, scene: Scene) -> None:
+    async def _serve(self, slot: int, ticket: Ticket, scene: Scene) -> None:
         """Execute this lease, and under the same permit those that wait behind it."""
         task = ticket.task
         while True:
@@ -261,7 +239,7 @@ class SlotPool:
             self._occupy(slot, ticket, scene)
             ticket.task = task
 
-    async def _run_lease(self, ticket: _Ticket, scene: Scene) -> None:
+    async def _run_lease(self, ticket: Ticket, scene: Scene) -> None:
         outcome: Completed | InfraFailure | None
         try:
             outcome = await self._execute(ticket, scene)
@@ -271,47 +249,15 @@ class SlotPool:
         if outcome is not None:
             self._finish(ticket, outcome)
 
-    async def _execute(self, ticket: _Ticket, scene: Scene) -> Completed | InfraFailure | None:
+    async def _execute(self, ticket: Ticket, scene: Scene) -> Completed | InfraFailure | None:
         """Run the rollout in a slot of its scene; None when the scene had died and the lease waits again."""
         try:
             slot = await scene.take_slot(self._limits.fork_s)
         except ProcessGoneError as error:
             return self._scene_died(ticket, scene, str(error))
-        body = rollout_to_proto(ticket.lease.rollout).SerializeToString()
-        try:
-            async with asyncio.timeout(ticket.lease.deadline_s):
-                answer = await slot.child.peer.ask(Frame({"op": "execute", "slot": ticket.slot}, body))
-        except TimeoutError:
-            self._residents.end_later(slot.child)
-            late = f"the rollout took longer than its {ticket.lease.deadline_s:g} s and was killed"
-            return InfraFailure(InfraCode.SLOT_TIMEOUT, late)
-        except ProcessGoneError:
-            how = await slot.child.end()
-            return InfraFailure(InfraCode.SLOT_CRASHED, f"the simulator ended during the rollout: {how}")
-        except asyncio.CancelledError:
-            self._residents.end_later(slot.child)
-            raise
-        return self._outcome(ticket, scene, slot, answer)
+        return await execute(ticket, scene, slot, self._residents)
 
-    def _outcome(self, ticket: _Ticket, scene: Scene, slot: Slot, answer: Frame) -> Completed | InfraFailure:
-        header = answer.header
-        if "error" in header:
-            # What an exception left behind in the process is unknown.
-            self._residents.end_later(slot.child)
-            return InfraFailure(InfraCode(header["code"]), header["error"])
-        if _worn(slot, float(header["resident_mb"])):
-            self._residents.end_later(slot.child)
-        else:
-            self._residents.keep_slot(scene, slot)
-        timings = Timings(
-            # Loading may have begun before the lease came.
-            load_s=0.0 if ticket.found_warm else min(scene.load_s, ticket.began_s - ticket.taken_s),
-            execute_s=float(header["execute_s"]),
-        )
-        completed = completed_from_proto(types_pb2.Completed.FromString(answer.body))
-        return completed.noted(timings=timings, warm=ticket.found_warm)
-
-    def _scene_died(self, ticket: _Ticket, scene: Scene, reason: str) -> InfraFailure | None:
+    def _scene_died(self, ticket: Ticket, scene: Scene, reason: str) -> InfraFailure | None:
         """Have the scene loaded anew for this lease, once."""
         self._residents.lost(scene, reason)
         if ticket.requeued:
@@ -322,15 +268,7 @@ class SlotPool:
         self._waiting.appendleft(ticket)
         return None
 
-    def _finish(self, ticket: _Ticket, outcome: Completed | InfraFailure) -> None:
+    def _finish(self, ticket: Ticket, outcome: Completed | InfraFailure) -> None:
         if self._tickets.pop(ticket.lease.ref, None) is not None:
             held_s = time.monotonic() - ticket.began_s if ticket.slot else 0.0
-            result = LeaseResult(ticket.lease.ref, outcome, ticket.lease.origin, ticket.slot, held_s)
-            self._on_result(result)
-
-
-def _worn(slot: Slot, resident_mb: float) -> bool:
-    """Count a rollout, and tell whether the slot has done enough."""
-    slot.rollouts += 1
-    slot.first_mb = slot.first_mb or resident_mb
-    return slot.rollouts >= ROLLOUTS_PER_SLOT or resident_mb > slot.first_mb + GROWTH_MB
+            self._on_result(LeaseResult(ticket.lease.ref, outcome, ticket.lease.origin, ticket.slot, held_s))
