@@ -18,10 +18,13 @@ pytestmark = pytest.mark.timeout(240)
 
 
 async def answers(cluster, name):
-    """What a manager's health check says."""
+    """What a manager's health check says; nothing while it ceases to stand by and has not begun to lead."""
     async with grpc.aio.insecure_channel(f"127.0.0.1:{cluster.ports[name]}") as channel:
         stub = health_pb2_grpc.HealthStub(channel)
-        answer = await stub.Check(health_pb2.HealthCheckRequest(), wait_for_ready=True, timeout=30)
+        try:
+            answer = await stub.Check(health_pb2.HealthCheckRequest(), wait_for_ready=True, timeout=30)
+        except grpc.aio.AioRpcError:
+            return ""
     return health_pb2.HealthCheckResponse.ServingStatus.Name(answer.status)
 
 
