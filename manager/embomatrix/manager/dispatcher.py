@@ -129,6 +129,7 @@ class Dispatcher:
             in_use=frozenset(desk.leases.in_use),
             used=desk.leases.take_used(),
             idle=desk.fleet.idle if pending else frozenset(),
+            lags=dict(desk.fleet.lags),
             runs={heads[0].scene: heads[0].key.run_id for heads in lanes},
             rendering=frozenset(h.scene for heads in lanes for h in heads if h.rollout.render),
         )
@@ -276,7 +277,9 @@ class Dispatcher:
         for scene in self._desk.failures.scenes():
             self._desk.judge(scene)
         self._give_up_without_capacity()
-        self._desk.fill(self._desk.fleet.thieves())
+        if self._desk.fleet.live <= 1:
+            self._desk.fleet.forgive()
+        self._desk.fill([*self._desk.fleet.thieves(), *self._desk.fleet.lags])
         self._hedger.look()
 
     def _expire(self, lease: LeaseRecord) -> None:

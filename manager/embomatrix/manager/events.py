@@ -169,6 +169,8 @@ class DemandObserved:
     idle: frozenset[str] = frozenset()
     runs: Mapping[str, str] = field(default_factory=dict)
     rendering: frozenset[str] = frozenset()
+    lags: Mapping[str, float] = field(default_factory=dict)
+    """How many times slower than others those workers are that plainly are."""
 
 
 @dataclass(frozen=True, slots=True)

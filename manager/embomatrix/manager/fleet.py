@@ -16,6 +16,8 @@ CANDIDATES: Final = 64
 """Busy workers, idle workers and holders of a scene looked at in one go, each time others: bounds, so that a large cluster
 costs no more than a small one."""
 
+LONGEST_RELUCTANCE_S: Final = 10.0
+
 
 def has_credit(worker: WorkerRecord) -> bool:
     """Whether it may be given a lease at all."""
@@ -31,6 +33,8 @@ class Fleet:
         self._backlogged: dict[str, None] = {}
         self._idle: dict[str, None] = {}
         self._live: set[str] = set()
+        self.lags: dict[str, float] = {}
+        """How many times slower those workers are that plainly are."""
 
     def join(self, worker_id: str, slots: int, render_slots: int = 0) -> None:
         """A new worker, which can take nothing until it has reported."""
@@ -49,7 +53,18 @@ class Fleet:
             self._backlogged.pop(worker_id, None)
             self._idle.pop(worker_id, None)
             self._live.discard(worker_id)
+            self.lags.pop(worker_id, None)
         return worker
+
+    def note_lag(self, worker: WorkerRecord, took_s: float, usual_s: float) -> None:
+        """One of the worker's leases took so long, where those of its run take so long as a rule."""
+        worker.note_lag(took_s / usual_s)
+        worker.reluctance_s = min((worker.lag - 1.0) * usual_s, LONGEST_RELUCTANCE_S)
+        if worker.lag > 1.0:
+            self.lags[worker.worker_id] = worker.lag
+        else:
+            self.lags.pop(worker.worker_id, None)
+        self._weigh(worker)
 
     def stand(self, worker: WorkerRecord) -> None:
         """The worker drains, paused, reported, fell silent or was heard again: it may take leases, or no longer."""
@@ -72,6 +87,14 @@ class Fleet:
 
     def has_warm(self, scene: str) -> bool:
         return scene in self._warm_on
+
+    def forgive(self) -> None:
+        """Take nobody for slow any more: there is nobody to be slower than."""
+        for worker_id in list(self.lags):
+            worker = self.workers[worker_id]
+            worker.log_lag = worker.reluctance_s = 0.0
+            del self.lags[worker_id]
+            self._weigh(worker)
 
     def hold(self, worker: WorkerRecord, lease: LeaseRecord) -> None:
         worker.held[lease.ref.lease_id] = lease

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bisect
+import math
 from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
@@ -34,6 +35,7 @@ class Holder:
     leaving: bool = False
     paused: bool = False
     """It said so itself. While it is paused, what it holds stays."""
+    score_limit: float = math.inf
     loading_since_s: dict[str, float] = field(default_factory=dict)
 
     @property
@@ -50,9 +52,19 @@ class Holder:
         return max(self.resources.slots, 1)
 
     @property
+    def score(self) -> float:
+        """Its speed: what it claims, or less where it was found to be slow."""
+        return max(min(self.resources.score, self.score_limit), 1e-3)
+
+    @property
+    def is_slow(self) -> bool:
+        """Plainly slower than others, whatever it claims."""
+        return self.score_limit < math.inf
+
+    @property
     def capacity(self) -> float:
         """How many slots of speed 1 it is worth."""
-        return self.slots * max(self.resources.score, 1e-3)
+        return self.slots * self.score
 
     def standing(self) -> tuple[str, ...]:
         """Scenes that it has or was told to have, by last use. What it was told counts: its reports lag behind."""
@@ -89,6 +101,7 @@ class Holders:
         self._warm: dict[str, frozenset[str]] = {}
         self._warm_on: dict[str, set[str]] = {}
         self._memory_mb: Counter[int] = Counter()
+        self._slow: set[str] = set()
 
     def join(self, worker_id: str, resources: Resources) -> None:
         self.leave(worker_id)
@@ -113,6 +126,22 @@ class Holders:
         (self.failing.add if holder.failed_s else self.failing.discard)(holder.worker_id)
         if holder.usable:
             self.fresh.add(holder.worker_id)
+
+    def limit_scores(self, lags: Mapping[str, float]) -> None:
+        """These workers are so many times slower than others, whatever they claim; the rest are what they claim."""
+        usual = sum(holder.resources.score for holder in self.by_id.values()) / max(len(self.by_id), 1)
+        for worker_id in lags.keys() | self._slow:
+            holder = self.by_id.get(worker_id)
+            if holder is None:
+                self._slow.discard(worker_id)
+                continue
+            # In halves: a capacity that moves with every result would move scenes.
+            limit = usual / 2.0 ** round(math.log2(lags[worker_id])) if worker_id in lags else math.inf
+            if limit != holder.score_limit:
+                self._use(holder, usable=False)
+                holder.score_limit = limit
+                (self._slow.discard if limit == math.inf else self._slow.add)(worker_id)
+                self.changed(holder)
 
     def standing_on(self, scene: str) -> AbstractSet[str]:
         """Who has the scene or was told to have it, usable or not."""
@@ -204,7 +233,7 @@ class Places:
         return Site(
             worker_id=worker_id,
             slots=holder.slots,
-            score=holder.resources.score,
+            score=holder.score,
             memory_mb=memory_mb,
             residents=held,
             pinned=frozenset(scene for scene in held if (worker_id, scene) in self._in_use),

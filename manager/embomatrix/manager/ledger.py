@@ -21,6 +21,12 @@ PACE_WEIGHT: Final = 0.1
 """Of the latest rollout in what a worker is taken to need for one."""
 
 
+LAG_WEIGHT: Final = 0.2
+"""Weight of the latest of a worker's leases, in the mean of the logarithms: one odd lease makes nobody slow."""
+LAG_PLAIN: Final = math.log(2.5)
+"""Workers that are slower than others by less than this are left alone: their claims and luck explain it."""
+
+
 class RolloutKey(NamedTuple):
     """Names a rollout in the whole cluster."""
 
@@ -118,6 +124,9 @@ class WorkerRecord:
     """It said so itself."""
     paused: str = ""
     """Why it takes nothing new for now, in its own words."""
+    log_lag: float = 0.0
+    reluctance_s: float = 0.0
+    """It takes only rollouts that have waited for so long: the time that it needs longer than others."""
     render_slots: int = 0
     rendering: int = 0
     """Leases among ``held`` that need a slot which renders: no more than there are such slots."""
@@ -139,7 +148,8 @@ class WorkerRecord:
 
     @property
     def open_credits(self) -> int:
-        return self.credits - len(self.held) if self.usable else 0
+        most = self.credits if self.lag == 1.0 else self.slots  # nobody shall wait behind a slow slot
+        return most - len(self.held) if self.usable else 0
 
     @property
     def free_slots(self) -> int:
@@ -147,7 +157,17 @@ class WorkerRecord:
 
     @property
     def busyness(self) -> float:
-        return len(self.held) / self.slots
+        """Shares of its slots that are taken; whoever lags comes after all others."""
+        return len(self.held) / self.slots + self.lag - 1.0
+
+    def note_lag(self, ratio: float) -> None:
+        """One of its leases took ``ratio`` times as long as those of its run as a rule."""
+        self.log_lag += LAG_WEIGHT * (math.log(max(ratio, 1e-3)) - self.log_lag)
+
+    @property
+    def lag(self) -> float:
+        """How many times slower it is than others, by its latest leases; 1 unless that is plain."""
+        return math.exp(self.log_lag) if self.log_lag >= LAG_PLAIN else 1.0
 
     def note_completed(self, execute_s: float) -> None:
         """It executed a rollout in so many seconds: how many it may hold follows its pace."""
@@ -160,6 +180,8 @@ class WorkerRecord:
     def takes(self, record: RolloutRecord, now_s: float) -> bool:
         """Whether this rollout may go here, as far as it is not a question of credits or of the scene."""
         if record.failed_on == self.worker_id and now_s < record.avoid_until_s:
+            return False
+        if now_s - record.submitted_s < self.reluctance_s:
             return False
         if record.rollout.render and self.rendering >= self.render_slots:
             return False

@@ -46,6 +46,8 @@ if TYPE_CHECKING:
 DEFAULT_TERMS: Final = RunTerms()
 LEARNING: Final = 0.05
 """Weight of the latest of a row of measurements."""
+OVERDUE: Final = 3.0
+"""A load that takes so many times longer than usual is not waited for."""
 LEASES_AT_A_TIME: Final = 64
 """So many leases are told of at the price of looking at one worker."""
 
@@ -184,6 +186,7 @@ class Scheduler:
 
     def _on_demand(self, event: DemandObserved) -> None:
         self._demand = event
+        self._holders.limit_scores(event.lags)
         self.prewarm.used(event.used)
         self._touch(event.used)
         # By its peak and not by what is left: a scene's copies shall not come and go while a batch runs down.
@@ -297,9 +300,11 @@ class Scheduler:
         """One worker more for a scene whose rollouts wait while others are idle, unless one is loading it already."""
         scene = need.bundle_digest
         waited_s = self._demand.waited_s.get(scene, 0.0)
-        if waited_s >= (self.load_s(scene) or self._limits.affinity_wait_s):
-            told = [holder for holder in self._holders.having(scene) if scene in (holder.desired or ())]
-            loading = any(scene not in holder.warm_since_s for holder in told)
+        told = [holder for holder in self._holders.having(scene) if scene in (holder.desired or ())]
+        # What a slow worker needed to load it says nothing of the others.
+        load_s = self._typical_load_s if all(h.is_slow for h in told) else self.load_s(scene)
+        if waited_s >= (load_s or self._limits.affinity_wait_s):
+            loading = any(self._will_have(holder, scene) for holder in told)
             if not loading and not self._demand.idle <= {holder.worker_id for holder in told}:
                 self._copies[scene] = len(told) + 1
         return dataclasses.replace(
@@ -311,6 +316,13 @@ class Scheduler:
             share=share,
             render=need.render or scene in self._demand.rendering,
         )
+
+    def _will_have(self, holder: Holder, scene: str) -> bool:
+        """Whether it is worth waiting for this load: it is neither on a slow worker nor overdue."""
+        if scene in holder.warm_since_s or holder.is_slow:
+            return False
+        since_s = self._now_s - holder.loading_since_s.get(scene, self._now_s)
+        return since_s <= max(OVERDUE * self.usual_load_s(scene), self._limits.affinity_wait_s)
 
     def _estimate(self, scene: str) -> float:
         return self._size_mb.get(scene, self._limits.scene_mb)
