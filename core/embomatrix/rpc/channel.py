@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import grpc
 
+from embomatrix.rpc.logs import hide
 from embomatrix.rpc.status import InvalidRequestError
 
 if TYPE_CHECKING:
@@ -54,7 +55,7 @@ SERVER_OPTIONS: Final[tuple[tuple[str, int], ...]] = (
 
 
 def open_channel(address: str, token: str = "", ca: bytes = b"") -> grpc.aio.Channel:
-    """A channel to HOST:PORT that sends the token with every call; it connects when it is first used.
+    """A channel to HOST:PORT that sends the token with every call, and no log line shows; it connects when it is first used.
 
     ``ca`` is the certificate (PEM) of the authority that the manager's must be signed by; without it there is no TLS.
     Raises InvalidRequestError for an address or a token that can't be one.
@@ -65,6 +66,7 @@ def open_channel(address: str, token: str = "", ca: bytes = b"") -> grpc.aio.Cha
         )
     if not re.fullmatch(TOKEN_PATTERN, token):
         raise InvalidRequestError("the token can't be sent: expected visible ASCII characters without spaces")
+    hide(token)
     interceptors = [interceptor(token) for interceptor in _INTERCEPTORS] if token else None
     if not ca:
         return grpc.aio.insecure_channel(address, options=CHANNEL_OPTIONS, interceptors=interceptors)

@@ -214,6 +214,8 @@ class _HttpServer:
         config = uvicorn.Config(
             self._answer,
             interface="asgi3",
+            # Its lines go where ours go, in the same form.
+            log_config=None,
             log_level="warning",
             access_log=False,
             lifespan="off",

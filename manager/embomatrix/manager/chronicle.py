@@ -7,6 +7,7 @@ events, and of a rollout a handful of counts.
 from __future__ import annotations
 
 import itertools
+import logging
 from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
     from embomatrix.manager.ledger import LeaseRecord
     from embomatrix.rpc.run_log import EventPage
     from embomatrix.rpc.values import Batch, LeaseResult
+
+logger = logging.getLogger(__name__)
 
 EVENTS_KEPT: Final = 32_768
 """Events of all open runs together, at about 250 bytes each; every run may keep at least ``LEAST_KEPT`` of its own."""
@@ -193,6 +196,7 @@ class Chronicle:
         run.ring.append(event)
         if code:
             run.figures.failures.append(event)
+            _say_failed(event)
 
     def _end(self, command: DeliverResult, now_s: float, code: str, message: str, worker_id: str) -> RunEvent:
         return self._note(
@@ -238,3 +242,18 @@ class Chronicle:
         if run_id in self._runs:
             self._runs[run_id].ring.append(event)
         return event
+
+
+def _say_failed(event: RunEvent) -> None:
+    logger.warning(
+        "lease failed run=%s batch=%s rollout=%s attempt=%d worker=%s slot=%d scene=%s code=%s: %s",
+        event.run_id,
+        event.batch_id,
+        event.rollout_id,
+        event.attempt,
+        event.worker_id,
+        event.slot,
+        event.bundle_digest,
+        event.code,
+        event.message,
+    )

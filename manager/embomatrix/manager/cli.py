@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 import typer
 
 from embomatrix.manager.token_cli import app as token_app
+from embomatrix.rpc.logs import LogFormat, hide, log_to_stderr
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -38,6 +39,10 @@ Ca = Annotated[
     ),
 ]
 DataDir = Annotated[Path | None, typer.Option(help="Folder of bundles and state.", show_default=False)]
+
+LogLines = Annotated[
+    LogFormat, typer.Option(help="Log lines for people, or as JSON.", envvar="EMBOMATRIX_LOG_FORMAT")
+]
 
 
 @app.command()
@@ -75,6 +80,7 @@ def serve(
         bool, typer.Option("--insecure-bind", help="Serve outside this machine without TLS or tokens.")
     ] = False,
     log_level: Annotated[str, typer.Option(help="debug, info, warning or error.")] = "info",
+    log_format: LogLines = LogFormat.HUMAN,
 ) -> None:
     """Serve until interrupted."""
     options = {
@@ -91,8 +97,10 @@ def serve(
         "insecure_bind": insecure_bind,
         **({"data_dir": data_dir} if data_dir is not None else {}),
     }
-    _log_to_stderr(log_level)
-    _serve(_settings(options))
+    _log_to_stderr(log_level, log_format)
+    settings = _settings(options)
+    hide(settings.token)
+    _serve(settings)
 
 
 @app.command()
@@ -221,12 +229,11 @@ def _first_of(group: BaseExceptionGroup[BaseException]) -> BaseException:
     return _first_of(first) if isinstance(first, BaseExceptionGroup) else first
 
 
-def _log_to_stderr(level: str) -> None:
-    import logging
-
-    if level.upper() not in logging.getLevelNamesMapping():
-        _refuse(f"--log-level {level!r}: expected debug, info, warning or error")
-    logging.basicConfig(level=level.upper(), format="%(asctime)s %(levelname)s %(name)s %(message)s")
+def _log_to_stderr(level: str, log_format: LogFormat) -> None:
+    try:
+        log_to_stderr(level, log_format)
+    except ValueError as error:
+        _refuse(f"--log-level {level!r}: {error}")
 
 
 def _refuse(sentence: str) -> NoReturn:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
     from embomatrix.rpc.run_log import PhaseSummary
     from embomatrix.rpc.values import Batch, RunStats
 
+logger = logging.getLogger(__name__)
+
 
 class RunHistory:
     """Reads the process's own clocks: it is told of runs by their door, not by a state machine."""
@@ -29,6 +32,7 @@ class RunHistory:
         self._cluster = cluster
 
     def opened(self, run_id: str, name: str) -> None:
+        logger.info("run opened run=%s: %s", run_id, name or "no name")
         self._chronicle.open_run(run_id, name, now_s=time.monotonic(), cpu_s=time.process_time())
 
     def submitted(self, batch: Batch) -> None:
@@ -41,6 +45,9 @@ class RunHistory:
     async def closed(self, run_id: str, stats: RunStats, leads: PhaseSummary) -> None:
         """The run is over, with these counters: it goes to the archive."""
         record = self._chronicle.close_run(run_id, now_s=time.monotonic())
+        logger.info(
+            "run closed run=%s: %d outcomes, %d failures", run_id, stats.delivered, stats.infra_failures
+        )
         if record is not None:
             info = self._info(record, stats, pending=0, closed_s=time.time())
             await self._archive.keep(self._summed(record, info, leads), tuple(record.ring.events))

@@ -17,6 +17,7 @@ from embomatrix.rpc.convert_run import (
     run_stats_to_proto,
     run_terms_from_proto,
 )
+from embomatrix.rpc.logs import bind
 from embomatrix.rpc.status import NotFoundError, TrimmedError, translate
 from embomatrix.rpc.versions import PROTOCOL_OLDEST, SPOKEN, VersionRange, agree, software_version
 from embomatrix.world.bundle import DEFAULT_LIMITS
@@ -64,6 +65,7 @@ class RolloutServicer(rollout_service_pb2_grpc.RolloutServiceServicer):
         self, request: pb.AnnounceLookaheadRequest, context: grpc.aio.ServicerContext
     ) -> pb.AnnounceLookaheadResponse:
         async with translate(context):
+            bind("run", request.run_id)
             entries = each("entries", lookahead_entry_from_proto, request.entries)
             answers = self._runs.announce(request.run_id, request.version, entries)
         return pb.AnnounceLookaheadResponse(answers=[lookahead_answer_to_proto(one) for one in answers])
@@ -72,6 +74,8 @@ class RolloutServicer(rollout_service_pb2_grpc.RolloutServiceServicer):
         self, request: pb.ExecuteRequest, context: grpc.aio.ServicerContext
     ) -> AsyncIterator[pb.ExecuteResponse]:
         async with translate(context):
+            bind("run", request.run_id)
+            bind("batch", request.batch_id)
             log = await self._runs.submit(batch_from_proto(request))
             async for results, groups in _results(log, 0):
                 yield pb.ExecuteResponse(results=results, groups=groups)
@@ -80,6 +84,8 @@ class RolloutServicer(rollout_service_pb2_grpc.RolloutServiceServicer):
         self, request: pb.WaitExecutionRequest, context: grpc.aio.ServicerContext
     ) -> AsyncIterator[pb.WaitExecutionResponse]:
         async with translate(context):
+            bind("run", request.run_id)
+            bind("batch", request.batch_id)
             log = self._runs.log_of(request.run_id, request.batch_id)
             async for results, groups in _results(log, request.after_cursor):
                 yield pb.WaitExecutionResponse(results=results, groups=groups)
@@ -88,6 +94,8 @@ class RolloutServicer(rollout_service_pb2_grpc.RolloutServiceServicer):
         self, request: pb.CancelBatchRequest, context: grpc.aio.ServicerContext
     ) -> pb.CancelBatchResponse:
         async with translate(context):
+            bind("run", request.run_id)
+            bind("batch", request.batch_id)
             self._runs.cancel(request.run_id, request.batch_id)
         return pb.CancelBatchResponse()
 
@@ -95,6 +103,7 @@ class RolloutServicer(rollout_service_pb2_grpc.RolloutServiceServicer):
         self, request: pb.CloseRunRequest, context: grpc.aio.ServicerContext
     ) -> pb.CloseRunResponse:
         async with translate(context):
+            bind("run", request.run_id)
             stats = await self._runs.close_run(request.run_id)
         return pb.CloseRunResponse(stats=run_stats_to_proto(stats))
 

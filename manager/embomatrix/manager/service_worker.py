@@ -18,6 +18,7 @@ from embomatrix.rpc.convert_session import (
     lease_to_proto,
     worker_state_from_proto,
 )
+from embomatrix.rpc.logs import bind
 from embomatrix.rpc.status import (
     DeadlineError,
     InvalidRequestError,
@@ -38,6 +39,8 @@ if TYPE_CHECKING:
 
 FIRST_STATE_S: Final = 10.0
 """A session stream must begin with the worker's state within this time."""
+SESSION_SHOWN: Final = 6
+"""Letters of an id in log lines: whoever knows all of a session's could speak for its worker."""
 LEASES_PER_MESSAGE: Final = 64
 _WORKER_ID: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._:@-]{0,127}")
 
@@ -55,6 +58,7 @@ class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
     ) -> pb.RegisterResponse:
         async with translate(context):
             _check_name(request.worker_id)
+            bind("worker", request.worker_id)
             # First of all: a version that is refused may mean other things by its fields, and must not use up a token to join.
             protocol = _agreed(request)
             resources = inside("resources", resources_from_proto, request.resources)
@@ -84,6 +88,8 @@ class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
             first = await _first_state(request_iterator)
             session = self._runtime.registry.find(first.session_id, first.session_epoch)
             self._gate.check_session(context, session)
+            bind("worker", session.worker_id)
+            bind("session", session.session_id[:SESSION_SHOWN])
             with self._runtime.attached(session) as link:
                 self._take(link, first, resync=True)
                 await _until_one_ends(self._listen(link, request_iterator), _speak(link, context))

@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from embomatrix.rpc.channel import DEFAULT_ADDRESS
+from embomatrix.rpc.logs import LogFormat, log_to_stderr
 from embomatrix.trainer.errors import TrainerError, reason_of
 from embomatrix.world.whole_file import write_whole
 
@@ -43,6 +44,14 @@ _TOKEN = Annotated[
 _CA = Annotated[
     Path | None, typer.Option(help="The ca.pem of a manager that serves by TLS.", envvar="EMBOMATRIX_CA")
 ]
+_LOG_FORMAT = Annotated[
+    LogFormat | None,
+    typer.Option(
+        help="`json`: tell the log as JSON lines on standard error, beside the progress.",
+        envvar="EMBOMATRIX_LOG_FORMAT",
+        show_default=False,
+    ),
+]
 _THREADS = Annotated[int | None, typer.Option(min=1, help="Threads of torch; default: half of the cores.")]
 
 
@@ -67,9 +76,12 @@ def train(
     device: Annotated[str | None, typer.Option(help="torch device: cpu, cuda.")] = None,
     token: _TOKEN = "",
     ca: _CA = None,
+    log_format: _LOG_FORMAT = None,
 ) -> None:
     """Train a policy: imitation of the oracle, then GRPO on the cluster, measured on held-out tasks."""
     with _problems_shown("train", out):
+        if log_format is LogFormat.JSON:
+            log_to_stderr("info", log_format)
         connect = _connector(manager, token, ca)
         changes = {
             "seed": seed,

@@ -181,6 +181,15 @@ class TrainingRun:
         self._recorder.step(record, seconds)
         if record.step % self._settings.samples_every == 1 or self._settings.samples_every == 1:
             self._recorder.samples(record.step, logs[0])
+        logger.info(
+            "step done step=%d rollouts=%d lost=%d reward=%.3f success=%.3f seconds=%.2f",
+            record.step,
+            record.rollouts,
+            record.lost,
+            record.reward,
+            record.success,
+            seconds,
+        )
         self._parts.display.stepped(record, self._share(), record.rollouts / max(seconds, 1e-9))
 
     def _save(self, updater: Updater) -> Path:

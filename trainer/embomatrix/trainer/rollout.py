@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol, Self, TypeVar
 
 from embomatrix.reward.hierarchy import unparsable
+from embomatrix.rpc.logs import bind
 from embomatrix.rpc.status import ClusterError
 from embomatrix.rpc.values import Batch, Completed, LookaheadEntry, Rollout, RunStats
 from embomatrix.skills.parse import PlanError, parse_plan
@@ -109,6 +110,7 @@ class Gateway:
         except BaseException:
             self._stop_thread()
             raise
+        bind("run", self.run_id)
         return self
 
     async def _open(self) -> None:

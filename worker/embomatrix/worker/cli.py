@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import importlib.util
-import logging
 import os
 import platform
 import signal
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -22,6 +20,7 @@ from rich.table import Table
 
 from embomatrix.rpc.channel import DEFAULT_ADDRESS
 from embomatrix.rpc.client import ClientLimits, ClusterClient
+from embomatrix.rpc.logs import LogFormat, bind, hide, log_to_stderr
 from embomatrix.rpc.status import ClusterError, ManagerUnreachableError
 from embomatrix.worker.daemon import Daemon, serve
 from embomatrix.worker.membership import membership_of
@@ -88,6 +87,9 @@ def run(
     ] = None,
     once: Annotated[bool, typer.Option(help="End when the manager can't be reached.")] = False,
     verbose: Annotated[bool, typer.Option(help="Log every rollout.")] = False,
+    log_format: Annotated[
+        LogFormat, typer.Option(help="Log lines for people, or as JSON.", envvar="EMBOMATRIX_LOG_FORMAT")
+    ] = LogFormat.HUMAN,
 ) -> None:
     """Join the manager and execute rollouts until stopped: Ctrl-C drains, a second one leaves at once."""
     _check_engine()
@@ -108,11 +110,10 @@ def run(
     if cache_dir is not None:
         values["cache_dir"] = cache_dir
     settings = _settings(values)
-    level = logging.DEBUG if verbose else logging.INFO
-    logging.basicConfig(
-        level=logging.WARNING, format="%(asctime)s %(levelname)-7s %(message)s", stream=sys.stderr
-    )
-    logging.getLogger("embomatrix").setLevel(level)
+    level = "debug" if verbose else "info"
+    log_to_stderr(level, log_format)
+    for secret in (settings.token, settings.join):
+        hide(secret)
     os.nice(settings.nice)
     try:
         asyncio.run(_serve(settings))
@@ -125,6 +126,7 @@ def run(
 
 async def _serve(settings: WorkerSettings) -> None:
     membership = await membership_of(settings)
+    bind("worker", membership.name)
     daemon = Daemon(settings, measure(settings), np.random.default_rng(), membership=membership)
     await serve(daemon, (signal.SIGINT, signal.SIGTERM))
 

@@ -11,6 +11,7 @@ import time
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.rpc.logs import bind, hide
 from embomatrix.rpc.managers import Managers
 from embomatrix.rpc.status import (
     ClusterError,
@@ -42,6 +43,8 @@ logger = logging.getLogger(__name__)
 
 LONGEST_WAIT_S: Final = 3.0
 """Between two attempts to connect: a manager that comes back has its workers within five seconds."""
+SESSION_SHOWN: Final = 6
+"""Letters of a session's id in log lines: whoever knows all of them could speak for this worker."""
 FENCE_CHECK_S: Final = 0.5
 DRAIN_RETRY_S: Final = 1.0
 """While it drains, a worker tries to deliver its last results at least this often."""
@@ -189,7 +192,9 @@ class Daemon:
         if registration.credential:
             self._join(registration.credential)
         logger.info(
-            "registered with the manager at %s session=%s", self._managers.current, registration.session_id
+            "registered with the manager at %s session=%s",
+            self._managers.current,
+            registration.session_id[:SESSION_SHOWN],
         )
         return registration
 
@@ -199,12 +204,14 @@ class Daemon:
 
     def _join(self, credential: str) -> None:
         """From here on this worker shows the credential, in this process and in those after it."""
+        hide(credential)
         before = self._membership
         self._membership = replace(before, token=credential, joining=False)
         MembershipFile(self._settings.state_dir, before.token).keep(self._membership)
         logger.info("joined the manager at %s as worker %s", before.manager, before.name)
 
     async def _serve(self, registration: Registration) -> None:
+        bind("session", registration.session_id[:SESSION_SHOWN])
         self._lease_ttl_s = registration.lease_ttl_s
         session = Session(
             self._present_membership(),

@@ -1,0 +1,110 @@
+"""Log lines: sentences for people, objects for programs, ids on both, and no secret on any."""
+
+import asyncio
+import contextvars
+import json
+import logging
+import subprocess
+import sys
+
+import pytest
+
+from embomatrix.rpc.logs import HumanFormatter, JsonFormatter, bind, hide, log_to_stderr
+
+MANAGER_LINE = "lease expired rollout=%s worker=%s after=%.1f s (%d %% of its life)"
+
+
+def record(message, *args, error=None):
+    info = (type(error), error, error.__traceback__) if error else None
+    return logging.LogRecord("embomatrix.test", logging.WARNING, __file__, 1, message, args, info)
+
+
+def as_json(*args, **kwargs):
+    return json.loads(JsonFormatter().format(record(*args, **kwargs)))
+
+
+def alone(function):
+    """Bind ids without a trace in other tests."""
+    return contextvars.copy_context().run(function)
+
+
+def test_what_a_message_names_is_a_field():
+    line = as_json(MANAGER_LINE, "x1", "w1", 2.5, 80)
+    assert line["message"] == "lease expired rollout=x1 worker=w1 after=2.5 s (80 % of its life)"
+    assert (line["rollout"], line["worker"], line["after"]) == ("x1", "w1", 2.5)
+    assert (line["level"], line["logger"]) == ("warning", "embomatrix.test")
+    assert line["time"].endswith("Z")
+
+
+def test_bound_ids_are_on_every_line_and_the_message_says_more():
+    def told():
+        bind("worker", "w1")
+        bind("session", "abc")
+        bind("session", "")
+        return as_json("scene warm scene=%s", "s1"), HumanFormatter().format(
+            record("scene warm scene=%s", "s1")
+        )
+
+    line, sentence = alone(told)
+    assert (line["worker"], line["scene"], "session" in line) == ("w1", "s1", False)
+    assert sentence.endswith("WARNING scene warm scene=s1 worker=w1")
+    assert "worker" not in as_json("nothing is bound here")
+
+
+async def test_tasks_have_ids_of_their_own():
+    async def serve(run):
+        bind("run", run)
+        await asyncio.sleep(0)
+        return as_json("served")["run"]
+
+    assert await asyncio.gather(serve("r1"), serve("r2")) == ["r1", "r2"]
+    assert "run" not in as_json("served")
+
+
+def test_an_exception_is_part_of_its_line():
+    try:
+        raise ValueError("two\nlines")
+    except ValueError as error:
+        text = JsonFormatter().format(record("it failed", error=error))
+    assert "\n" not in text
+    assert "ValueError: two\nlines" in json.loads(text)["exception"]
+
+
+@pytest.mark.parametrize("formatter", [HumanFormatter(), JsonFormatter()])
+def test_secrets_are_never_written(formatter):
+    hide("s3cret-token")
+    hide("ab")
+    try:
+        raise ValueError("refused s3cret-token")
+    except ValueError as error:
+        text = formatter.format(
+            record("key=%s at %s", "s3cret-token", "redis://me:pw123@host/0", error=error)
+        )
+    text += formatter.format(record("header %s", "Bearer xyz.987"))
+    assert not any(word in text for word in ("s3cret", "pw123", "xyz.987"))
+    assert "me:***@host" in text
+    assert "about" in formatter.format(record("about")), "a short word is left alone"
+
+
+def test_a_message_without_arguments_is_told_as_it_is():
+    assert as_json("plain id=%s without arguments")["message"] == "plain id=%s without arguments"
+
+
+def test_no_message_can_pass_for_another_time_or_level():
+    line = as_json("level=%s message=%s", "info", "all is well")
+    assert (line["level"], line["message"]) == ("warning", "level=info message=all is well")
+
+
+def test_an_unknown_level_is_refused():
+    with pytest.raises(ValueError, match="expected debug, info, warning or error"):
+        log_to_stderr("loud", None)
+
+
+def test_libraries_are_heard_only_when_something_is_wrong():
+    program = (
+        "import logging; from embomatrix.rpc.logs import *; log_to_stderr('debug', LogFormat.JSON)\n"
+        "logging.getLogger('asyncio').info('chatter'); logging.getLogger('asyncio').error('trouble')\n"
+        "logging.getLogger('embomatrix.x').debug('detail')"
+    )
+    told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stderr
+    assert [json.loads(line)["message"] for line in told.splitlines()] == ["trouble", "detail"]
