@@ -5,11 +5,12 @@ A parked object stands in no relation.
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.sim.bounds import bounds_of
 from embomatrix.sim.footing import Footings
-from embomatrix.sim.spots import REST_M, is_under
+from embomatrix.sim.spots import REST_M, heights_over, is_under
 from embomatrix.world.state import OPEN_FRACTION, Relation
 
 if TYPE_CHECKING:
@@ -73,11 +74,23 @@ class Relations:
     def under(self, a: str, b: str) -> bool:
         """Some part of ``b`` lies over the centre of ``a``, and all that do begin above its top, 1 cm deeper allowed.
 
-        Centre and top are those of ``a`` with its joints shut: a door that is ajar moves nothing out from under a shelf.
+        Centre and top are those of ``a`` with its joints shut: a door that is ajar moves nothing out from under a shelf. What
+        lies in a cavity is under nothing beyond that cavity's roof: what is in the oven is not under the worktop.
         """
         if not self._apart(a, b):
             return False
-        return is_under(self.body(a), self._scene.asset_of(b), self._engine.pose(b))
+        box, asset, pose = self.body(a), self._scene.asset_of(b), self._engine.pose(b)
+        if not is_under(box, asset, pose):
+            return False
+        height_m = min(heights_over(box, asset, pose))
+        return not any(
+            self._roof_m(box, item.name) < height_m for item in self.enclosing(a) if item.name != b
+        )
+
+    def _roof_m(self, box: Aabb, name: str) -> float:
+        """Height at which what an object has over a box begins; infinite without anything."""
+        heights = heights_over(box, self._scene.asset_of(name), self._engine.pose(name))
+        return min((height for height in heights if height >= box.high_m[2] - REST_M), default=math.inf)
 
     def nextto(self, a: str, b: str) -> bool:
         """Side by side: their heights overlap, neither's centre is over the other, and the gap between them is small.

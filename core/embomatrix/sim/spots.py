@@ -139,12 +139,17 @@ def is_under(box: Aabb, asset: Asset, pose: Pose) -> bool:
     Some part of the asset's base lies over the box's centre, and every part that does so begins above the box's top, 1 cm
     deeper allowed.
     """
+    over = heights_over(box, asset, pose)
+    return bool(over) and all(bottom >= box.high_m[2] - REST_M for bottom in over)
+
+
+def heights_over(box: Aabb, asset: Asset, pose: Pose) -> list[float]:
+    """Heights in the world at which parts of an asset's base begin that lie over, or below, the centre of a box."""
     if not is_upright(pose):
-        return False
+        return []
     cx, cy, _ = box.center_m
-    over = [
+    return [
         part_box.low_m[2]
         for part_box in parts_of(asset).base_boxes(pose)
         if part_box.low_m[0] <= cx <= part_box.high_m[0] and part_box.low_m[1] <= cy <= part_box.high_m[1]
     ]
-    return bool(over) and all(bottom >= box.high_m[2] - REST_M for bottom in over)

@@ -93,6 +93,14 @@ def test_opening_a_thing_does_not_move_it_out_from_under_another(engine, relatio
     assert relations.under("microwave_1", "breakfast_table_1")
 
 
+def test_what_lies_in_a_cavity_is_under_nothing_beyond_its_roof(engine, relations) -> None:
+    x, y, top = 0.6, 3.6, 1.7 + APPLE_M
+    assert relations.inside("chicken_leg_1", "fridge_1")
+    engine.set_pose("apple_1", Pose((x, y, top)))
+    assert relations.ontop("apple_1", "fridge_1")
+    assert not relations.under("chicken_leg_1", "apple_1")
+
+
 def test_thing_on_a_shelf_board_is_not_under_the_shelf(relations) -> None:
     assert not relations.under("mug_1", "shelf_1")
 
