@@ -18,7 +18,7 @@ from embomatrix.skills.parse import plan_from_json
 from embomatrix.world.dataset import Dataset, DatasetError
 from embomatrix.world.task import TaskCategory
 
-SETTINGS = BuildSettings(train=8, heldout=4, seed=0, scenes=("Rs_int", "Wainscott_0_int"))
+SETTINGS = BuildSettings(train=8, heldout=4, seed=0, scenes=("Rs_int", "Wainscott_0_int"), look_ahead=False)
 
 BDDL = """(define (problem Put_the_apple_in_the_fridge)
     (:domain omnigibson)
@@ -191,7 +191,9 @@ def test_unknown_names_are_one_sentence_and_exit_2(
 
 
 def test_tasks_of_conversations_are_verified_and_their_transcripts_kept(tmp_path):
-    settings = BuildSettings(train=4, heldout=0, seed=1, scenes=("Rs_int",), writer=WriterKind.SOCIAL)
+    settings = BuildSettings(
+        train=4, heldout=0, seed=1, scenes=("Rs_int",), writer=WriterKind.SOCIAL, look_ahead=False
+    )
     summary = build_dataset(tmp_path, settings)
     dataset = Dataset.load(tmp_path)
     assert summary.total("train") == len(dataset.train) == 4

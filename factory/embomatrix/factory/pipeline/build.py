@@ -69,6 +69,8 @@ class BuildSettings:
     seed: int = 0
     scenes: tuple[str, ...] = DEFAULT_SCENES
     writer: WriterKind = WriterKind.PLAIN
+    look_ahead: bool = True
+    """Whether to find out what the arm can do in each variant: about 8 s of CPU for one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,7 +136,8 @@ def build_dataset(
     if writer is None:
         writer = SocialWriter(settings.seed) if settings.writer is WriterKind.SOCIAL else PlainWriter()
     with contextlib.closing(PlacementLibrary()) as library:
-        bench = _Workbench(settings, writer, library, Foresight(), progress)
+        foresight = Foresight() if settings.look_ahead else None
+        bench = _Workbench(settings, writer, library, foresight, progress)
         for split, target in (("heldout", settings.heldout), ("train", settings.train)):
             _fill_split(store, bases, rooms[split], split, target, bench)
     records = [record for result in store.results for record in result.records]
@@ -210,7 +213,7 @@ class _Workbench:
     settings: BuildSettings
     writer: TaskWriter
     library: PlacementLibrary
-    foresight: Foresight
+    foresight: Foresight | None
     progress: Callable[[str, int], None]
 
 

@@ -34,12 +34,12 @@ class Needs:
 
 
 def cache_poses(
-    view: SceneView, tasks: Iterable[Needs], library: PlacementLibrary, foresight: Foresight, seed: int
+    view: SceneView, tasks: Iterable[Needs], library: PlacementLibrary, foresight: Foresight | None, seed: int
 ) -> PoseCache:
     """Poses for every thing of a task on, or in, whatever of the same task can hold it, and what the arm can do to all rows.
 
     What a goal brings together has poses of its own; for all other rows of a task's table there are those of their
-    footprints.
+    footprints. Without ``foresight`` nothing is looked up about the arm.
     """
     scene = view.scene
     placements: dict[PlacementKey, tuple[Pose, ...]] = {}
@@ -60,6 +60,8 @@ def cache_poses(
     kept = {key: poses for key, poses in placements.items() if poses}
     with contextlib.closing(BulletEngine(scene)) as engine:
         poses = PoseCache(kept, standing_poses(engine, list(rows)))
+        if foresight is None:
+            return poses
         return foresight.survey(LiveWorld(Bundle(scene, {}, poses), engine), poses, rows, seed=seed)
 
 
