@@ -33,6 +33,7 @@ from embomatrix.factory.task_import.sources import (
     read_jsonl,
 )
 from embomatrix.llm.ledger import Price
+from embomatrix.llm.values import LlmError
 from embomatrix.sim.engine import EngineMissingError
 from embomatrix.sim.physical.survey import Foresight
 from embomatrix.sim.pose_cache import PlacementLibrary
