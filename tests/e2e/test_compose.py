@@ -1,8 +1,8 @@
 """The real compose file on a real Docker engine: redis, manager and workers come up, and a batch runs through them."""
 
 import json
-import os
 import shutil
+import ssl
 import subprocess
 import time
 import urllib.request
@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-TOKEN = "a-secret-for-this-test"
 
 pytestmark = [pytest.mark.docker, pytest.mark.timeout(1800)]
 
@@ -21,7 +20,6 @@ def _compose(*arguments, check=True):
     return subprocess.run(
         [*program, "-p", "embomatrix-check", "-f", str(ROOT / "docker-compose.yml"), *arguments],
         cwd=ROOT,
-        env={**os.environ, "EMBOMATRIX_TOKEN": TOKEN},
         capture_output=True,
         text=True,
         check=check,
@@ -44,7 +42,12 @@ def _engine_answers():
 def cluster():
     if not _engine_answers():
         pytest.skip("no Docker engine answers: start one to check the compose file")
-    for service, target in (("manager", "manager"), ("worker", "worker"), ("trainer", "trainer")):
+    for service, target in (
+        ("init", "manager"),
+        ("manager", "manager"),
+        ("worker", "worker"),
+        ("trainer", "trainer"),
+    ):
         subprocess.run(
             [
                 "docker",
@@ -65,20 +68,29 @@ def cluster():
             timeout=1500,
         )
     _compose("up", "-d", "--no-build")
-    yield
+    yield Door()
     _compose("down", "--volumes", "--timeout", "20", check=False)
 
 
-def _status(path):
-    request = urllib.request.Request(
-        f"http://127.0.0.1:8070{path}", headers={"Authorization": f"Bearer {TOKEN}"}
-    )
-    with urllib.request.urlopen(request, timeout=5) as answer:
-        return json.load(answer)
+class Door:
+    """The published page, opened with what the init service made."""
 
+    def __init__(self):
+        def read(name):
+            return _compose("exec", "-T", "manager", "cat", f"/data/access/{name}").stdout
 
-def _ready_workers():
-    return sum(worker["state"] == "ready" for worker in _status("/api/workers"))
+        self._trusted = ssl.create_default_context(cadata=read("ca.pem"))
+        self._token = read("tokens/viewer").strip()
+
+    def status(self, path):
+        request = urllib.request.Request(
+            f"https://127.0.0.1:8070{path}", headers={"Authorization": f"Bearer {self._token}"}
+        )
+        with urllib.request.urlopen(request, timeout=5, context=self._trusted) as answer:
+            return json.load(answer)
+
+    def ready_workers(self):
+        return sum(worker["state"] == "ready" for worker in self.status("/api/workers"))
 
 
 def _until(condition, limit_s=90.0):
@@ -94,11 +106,11 @@ def _until(condition, limit_s=90.0):
 
 
 def test_two_workers_register_with_the_manager(cluster):
-    _until(lambda: _ready_workers() == 2)
+    _until(lambda: cluster.ready_workers() == 2)
 
 
 def test_a_trainer_in_a_container_trains_on_tasks_made_in_a_container(cluster):
-    _until(lambda: _ready_workers() == 2)
+    _until(lambda: cluster.ready_workers() == 2)
     _compose(
         "run",
         "--rm",
@@ -124,6 +136,6 @@ def test_a_trainer_in_a_container_trains_on_tasks_made_in_a_container(cluster):
     )
     assert "success" in result.stdout
     assert "0 lost and masked" in " ".join(result.stdout.split())
-    assert sum(worker["completed"] for worker in _status("/api/workers")) > 0, (
+    assert sum(worker["completed"] for worker in cluster.status("/api/workers")) > 0, (
         "no container executed anything"
     )

@@ -25,6 +25,7 @@ from embomatrix.cli.failure import fail
 from embomatrix.rpc.admin import AdminClient
 from embomatrix.rpc.channel import DEFAULT_ADDRESS
 from embomatrix.rpc.status import ClusterError
+from embomatrix.rpc.trust import read_ca, read_token
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine
@@ -45,7 +46,13 @@ app = typer.Typer(
 
 Manager = Annotated[str, typer.Option(help="HOST:PORT of the manager.", envvar="EMBOMATRIX_MANAGER")]
 Token = Annotated[
-    str, typer.Option(envvar="EMBOMATRIX_TOKEN", help="Token of the cluster.", show_default=False)
+    str, typer.Option(envvar="EMBOMATRIX_TOKEN", help="A token, or @FILE that holds it.", show_default=False)
+]
+Ca = Annotated[
+    Path | None,
+    typer.Option(
+        envvar="EMBOMATRIX_CA", help="The ca.pem of a manager that serves by TLS.", show_default=False
+    ),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 Worker = Annotated[str, typer.Argument(help="Id of the worker, as `embomatrix cluster workers` shows it.")]
@@ -53,11 +60,13 @@ Run = Annotated[str, typer.Argument(help="Id of the run, as `embomatrix cluster 
 
 
 @app.command()
-def workers(manager: Manager = DEFAULT_ADDRESS, token: Token = "", as_json: AsJson = False) -> None:
+def workers(
+    manager: Manager = DEFAULT_ADDRESS, token: Token = "", ca: Ca = None, as_json: AsJson = False
+) -> None:
     """List the workers: state, slots, scenes, and why one does not work."""
 
     async def ask() -> None:
-        async with AdminClient(manager, token) as client:
+        async with _client(manager, token, ca) as client:
             found = await client.workers()
         if as_json:
             show_json(found)
@@ -74,12 +83,13 @@ def runs(
     closed: Annotated[bool, typer.Option("--closed", help="Those that are over and still kept.")] = False,
     manager: Manager = DEFAULT_ADDRESS,
     token: Token = "",
+    ca: Ca = None,
     as_json: AsJson = False,
 ) -> None:
     """List the runs that are open, or those that were closed."""
 
     async def ask() -> None:
-        async with AdminClient(manager, token) as client:
+        async with _client(manager, token, ca) as client:
             found = await (client.closed_runs() if closed else client.open_runs())
         if as_json:
             show_json(found)
@@ -96,12 +106,13 @@ def plan(
     run: Annotated[str, typer.Argument(help="Of this run only.")] = "",
     manager: Manager = DEFAULT_ADDRESS,
     token: Token = "",
+    ca: Ca = None,
     as_json: AsJson = False,
 ) -> None:
     """Show the look-ahead grid: which scenes each coming step needs, how warm each is, and where."""
 
     async def ask() -> None:
-        async with AdminClient(manager, token) as client:
+        async with _client(manager, token, ca) as client:
             cells = await client.plan(run)
         if as_json:
             show_json(cells)
@@ -115,12 +126,16 @@ def plan(
 
 @app.command()
 def drain(
-    name: Worker, manager: Manager = DEFAULT_ADDRESS, token: Token = "", as_json: AsJson = False
+    name: Worker,
+    manager: Manager = DEFAULT_ADDRESS,
+    token: Token = "",
+    ca: Ca = None,
+    as_json: AsJson = False,
 ) -> None:
     """Take a worker out: it finishes what it holds and gets nothing new."""
 
     async def ask() -> None:
-        async with AdminClient(manager, token) as client:
+        async with _client(manager, token, ca) as client:
             await client.drain(name)
         _done(as_json, worker=name, state="draining")
 
@@ -129,12 +144,16 @@ def drain(
 
 @app.command()
 def resume(
-    name: Worker, manager: Manager = DEFAULT_ADDRESS, token: Token = "", as_json: AsJson = False
+    name: Worker,
+    manager: Manager = DEFAULT_ADDRESS,
+    token: Token = "",
+    ca: Ca = None,
+    as_json: AsJson = False,
 ) -> None:
     """Take a drain back, as long as the worker has not left."""
 
     async def ask() -> None:
-        async with AdminClient(manager, token) as client:
+        async with _client(manager, token, ca) as client:
             await client.resume(name)
         _done(as_json, worker=name, state="ready")
 
@@ -142,11 +161,13 @@ def resume(
 
 
 @app.command()
-def pause(manager: Manager = DEFAULT_ADDRESS, token: Token = "", as_json: AsJson = False) -> None:
+def pause(
+    manager: Manager = DEFAULT_ADDRESS, token: Token = "", ca: Ca = None, as_json: AsJson = False
+) -> None:
     """Give no new leases, to any worker; what runs goes on."""
 
     async def ask() -> None:
-        async with AdminClient(manager, token) as client:
+        async with _client(manager, token, ca) as client:
             await client.pause_dispatch()
         _done(as_json, dispatch="paused")
 
@@ -154,11 +175,13 @@ def pause(manager: Manager = DEFAULT_ADDRESS, token: Token = "", as_json: AsJson
 
 
 @app.command("resume-dispatch")
-def resume_dispatch(manager: Manager = DEFAULT_ADDRESS, token: Token = "", as_json: AsJson = False) -> None:
+def resume_dispatch(
+    manager: Manager = DEFAULT_ADDRESS, token: Token = "", ca: Ca = None, as_json: AsJson = False
+) -> None:
     """Give leases again."""
 
     async def ask() -> None:
-        async with AdminClient(manager, token) as client:
+        async with _client(manager, token, ca) as client:
             await client.resume_dispatch()
         _done(as_json, dispatch="running")
 
@@ -173,10 +196,11 @@ def report(
     ] = None,
     manager: Manager = DEFAULT_ADDRESS,
     token: Token = "",
+    ca: Ca = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures instead.")] = False,
 ) -> None:
     """Write what a run came to as one HTML file that needs nothing else; also after it was closed."""
-    summary, events, _ = _ask(_read(manager, token, run))
+    summary, events, _ = _ask(_read(manager, token, ca, run))
     if as_json:
         show_json(summary)
         return
@@ -193,9 +217,10 @@ def trace(
     ] = None,
     manager: Manager = DEFAULT_ADDRESS,
     token: Token = "",
+    ca: Ca = None,
 ) -> None:
     """Write a run as a Chrome trace: open it in https://ui.perfetto.dev."""
-    summary, events, fleet = _ask(_read(manager, token, run))
+    summary, events, fleet = _ask(_read(manager, token, ca, run))
     text = json.dumps(chrome_trace(events, fleet, summary.run.name or run), separators=(",", ":"))
     _write(out or Path(f"{run}.trace.json"), text)
 
@@ -206,13 +231,14 @@ def events(
     follow: Annotated[bool, typer.Option("--follow", help="Go on until interrupted.")] = False,
     manager: Manager = DEFAULT_ADDRESS,
     token: Token = "",
+    ca: Ca = None,
     as_json: AsJson = False,
 ) -> None:
     """Print the log of a run, or of the fleet, one event a line."""
 
     async def ask() -> None:
         console, after = Console(soft_wrap=True, highlight=False), 0
-        async with AdminClient(manager, token) as client:
+        async with _client(manager, token, ca) as client:
             while True:
                 page = await client.events(run, after=after)
                 for event in page.events:
@@ -232,10 +258,14 @@ def events(
 
 
 async def _read(
-    manager: str, token: str, run: str
+    manager: str, token: str, ca: Path | None, run: str
 ) -> tuple[RunSummary, tuple[RunEvent, ...], tuple[RunEvent, ...]]:
-    async with AdminClient(manager, token) as client:
+    async with _client(manager, token, ca) as client:
         return await client.run(run), await client.all_events(run), await client.all_events()
+
+
+def _client(manager: str, token: str, ca: Path | None) -> AdminClient:
+    return AdminClient(manager, read_token(token), ca=read_ca(ca))
 
 
 def _ask(question: Coroutine[None, None, T]) -> T:

@@ -102,12 +102,16 @@ def prepare(
 
 
 def hand_out_to(data_dir: Path, role: Role, target: Path) -> None:
-    """Put what a client of this role needs into a folder of its own: the authority's certificate and the role's token."""
+    """Put what a client of this role needs into a folder of its own: the authority's certificate and the role's token.
+
+    A token that was handed out there before stays. Raises AccessError.
+    """
     folder = AccessFolder(data_dir)
     try:
         target.mkdir(parents=True, exist_ok=True)
         write_public(target / "ca.pem", folder.ca.read_bytes())
-        write_private(target / "token", folder.token(role).read_bytes())
+        if not (target / "token").exists():
+            write_private(target / "token", folder.token(role).read_bytes())
     except FileNotFoundError as error:
         raise AccessError(
             f"{error.filename} is not there any more: issue a token with `embomatrix manager token issue --role {role}`"
