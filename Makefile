@@ -8,7 +8,7 @@ PIP_FLAGS := $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX),)
 BIN := $(VENV)/bin
 ARGS ?=
 
-.PHONY: run test test-slow lint types contracts proto check compose-check pictures clean
+.PHONY: run test test-slow lint types contracts proto proto-check check compose-check pictures clean
 
 run: $(VENV)/.runtime
 	$(BIN)/embomatrix demo $(ARGS)
@@ -32,7 +32,10 @@ contracts: $(VENV)/.dev
 proto: $(VENV)/.dev
 	PYTHON=$(BIN)/python proto/generate.sh
 
-check: lint types contracts
+proto-check: $(VENV)/.dev
+	proto/check.sh $(BIN)/buf
+
+check: lint types contracts proto-check
 
 compose-check: $(VENV)/.dev
 	$(BIN)/python -m pytest -m docker $(ARGS)

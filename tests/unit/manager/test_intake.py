@@ -51,7 +51,10 @@ def test_what_is_leased_for_the_results_of_a_first_state_is_not_taken_for_lost()
     # The result took a millisecond: more may wait behind the slot from here on.
     assert [lease.rollout.rollout_id for lease in more] == ["x2", "x3"]
     assert not [command for command in commands if isinstance(command, CancelLease)]
-    assert set(manager.intake.cluster.dispatcher.live_leases) == {second.lease_id, *(lease.ref.lease_id for lease in more)}
+    assert set(manager.intake.cluster.dispatcher.live_leases) == {
+        second.lease_id,
+        *(lease.ref.lease_id for lease in more),
+    }
 
 
 def test_a_suspect_that_comes_back_holds_each_rollout_once():

@@ -1,0 +1,82 @@
+"""`proto/check.sh` as CI runs it: it finds what would break older sides, and works in whatever clone it is given."""
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[3]
+BUF = Path(sys.executable).with_name("buf")
+FIELD = "  string release = 1;\n"
+PROTO = """syntax = "proto3";
+
+package embomatrix.proto.v1;
+
+service NoteService {
+  rpc Note(NoteRequest) returns (NoteResponse);
+}
+
+message NoteRequest {
+  string release = 1;
+}
+
+message NoteResponse {}
+"""
+
+
+def git(folder, *arguments):
+    identity = ("-c", "user.name=Ann", "-c", "user.email=ann@lab.example", "-c", "init.defaultBranch=main")
+    subprocess.run(["git", *identity, *arguments], cwd=folder, check=True, capture_output=True)
+
+
+def commit(folder, proto):
+    (folder / "proto/embomatrix/proto/v1/note_service.proto").write_text(proto)
+    git(folder, "add", "-A")
+    git(folder, "commit", "-m", "change")
+
+
+@pytest.fixture
+def repository(tmp_path):
+    """A repository of one commit with a protocol of its own and our rules."""
+    if not BUF.exists():
+        pytest.fail(f"{BUF} is missing: install the extra dev, whose wheel buf-bin brings it")
+    folder = tmp_path / "repository"
+    (folder / "proto/embomatrix/proto/v1").mkdir(parents=True)
+    for name in ("check.sh", "buf.yaml"):
+        shutil.copy(ROOT / "proto" / name, folder / "proto" / name)
+    git(tmp_path, "init", str(folder))
+    commit(folder, PROTO)
+    return folder
+
+
+def checked(folder):
+    return subprocess.run(
+        [str(folder / "proto/check.sh"), str(BUF)], cwd=folder, capture_output=True, text=True, check=False
+    )
+
+
+def test_a_first_commit_has_nothing_to_compare_with_and_says_so(repository):
+    told = checked(repository)
+    assert told.returncode == 0, told.stderr
+    assert "skipped, this checkout has one commit only" in told.stdout
+
+
+def test_a_field_that_is_added_breaks_nothing_and_one_that_is_gone_does(repository):
+    commit(repository, PROTO.replace(FIELD, f"{FIELD}  string more = 2;\n"))
+    assert "nothing broken since" in checked(repository).stdout
+    git(repository, "checkout", "-b", "work")
+    commit(repository, PROTO.replace(FIELD, "  string more = 2;\n"))
+    told = checked(repository)
+    assert told.returncode != 0
+    assert 'field "1" with name "release"' in told.stdout
+
+
+def test_a_clone_of_one_commit_is_linted_all_the_same(repository, tmp_path):
+    commit(repository, PROTO.replace("NoteService", "Notes"))
+    git(tmp_path, "clone", "--depth=1", f"file://{repository}", "shallow")
+    told = checked(tmp_path / "shallow")
+    assert told.returncode != 0
+    assert "Notes" in told.stdout
+    assert "breaking" not in told.stdout
