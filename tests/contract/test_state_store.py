@@ -165,6 +165,15 @@ async def test_a_dropped_batch_leaves_the_others(store):
     assert await store.results_after("r1", "b2", 0, 100) == rows(1)
 
 
+async def test_the_list_of_workers_is_replaced_as_a_whole(store, openings):
+    assert await store.workers() == frozenset()
+    await store.put_workers(["w1", "w2"])
+    await store.put_workers(["w2", "w3"])
+    assert await openings().workers() == {"w2", "w3"}
+    await store.put_workers([])
+    assert await store.workers() == frozenset()
+
+
 async def test_another_process_finds_everything_again(store, openings):
     await store.open_run(RunRow("r1", "name"))
     await store.put_batch(BATCH)
@@ -246,6 +255,7 @@ async def test_the_manager_that_claimed_last_is_the_only_one_that_writes(store, 
         store.drop_batch("r1", "b1"),
         store.close_run("r1"),
         store.put_credentials([CredentialRow("a", b"")]),
+        store.put_workers(["w1"]),
     ):
         with pytest.raises(FencedError, match="another manager"):
             await write

@@ -39,6 +39,7 @@ from embomatrix.manager.events import (
     WorkerRecovered,
     WorkerReported,
     WorkerResumed,
+    WorkersExpected,
     WorkerSuspected,
 )
 from embomatrix.manager.hedging import Hedger
@@ -86,6 +87,8 @@ class Dispatcher:
                 self._desk.submit(event)
             case BatchRestored():
                 self._recovery.restore(event)
+            case WorkersExpected(worker_ids):
+                self._recovery.expect(worker_ids)
             case BatchCancelled(run_id, batch_id):
                 self._desk.cancel((run_id, batch_id))
             case RunClosed(run_id):
@@ -155,6 +158,11 @@ class Dispatcher:
         return self._desk.leases.expired
 
     @property
+    def expected(self) -> frozenset[str]:
+        """Workers of a former manager that were not heard yet, while they are waited for."""
+        return self._recovery.expected
+
+    @property
     def scenes(self) -> frozenset[str]:
         """Scenes of rollouts without an outcome."""
         return self._desk.batches.scenes()
@@ -220,6 +228,7 @@ class Dispatcher:
         for lease in [lease for lease in worker.held.values() if lease.ref not in held]:
             self._desk.give_back(lease, failure, counted=False)
             self._desk.offer(lease.record.scene)
+        self._recovery.heard(worker.worker_id)
         origins = {claim.ref: claim.origin for claim in event.claims}
         for ref in event.held:
             if self._desk.leases.find(worker.worker_id, ref) is not None:

@@ -130,6 +130,13 @@ class BatchRestored:
 
 
 @dataclass(frozen=True, slots=True)
+class WorkersExpected:
+    """These were there under the former manager: once all of them have reported, nobody else can hold a lease of it."""
+
+    worker_ids: frozenset[str]
+
+
+@dataclass(frozen=True, slots=True)
 class BatchCancelled:
     run_id: str
     batch_id: str
@@ -208,6 +215,7 @@ Event = (
     | RunOpened
     | BatchSubmitted
     | BatchRestored
+    | WorkersExpected
     | BatchCancelled
     | RunClosed
     | LookaheadAnnounced

@@ -21,7 +21,10 @@ if TYPE_CHECKING:
 
 
 class Recovery:
-    """Rollouts of restored batches wait here for ``grace_s``: queued earlier, those that run would run a second time."""
+    """Rollouts of restored batches wait here: queued earlier, those that run would run a second time.
+
+    The wait ends when all workers that were there before have said what they hold, or after ``grace_s``.
+    """
 
     def __init__(self, desk: Assignments, *, grace_s: float) -> None:
         self._desk = desk
@@ -29,6 +32,7 @@ class Recovery:
         self._until_s = 0.0
         self._awaited: dict[RolloutKey, RolloutRecord] = {}
         self._scenes: Counter[str] = Counter()
+        self._expected: set[str] | None = None
 
     @property
     def waiting(self) -> int:
@@ -38,6 +42,20 @@ class Recovery:
     def awaited(self) -> Mapping[str, int]:
         """Rollouts that somebody may hold, by scene."""
         return self._scenes
+
+    @property
+    def expected(self) -> frozenset[str]:
+        """Workers that were there before and are still waited for."""
+        return frozenset(self._expected or ()) if self._awaited else frozenset()
+
+    def expect(self, worker_ids: frozenset[str]) -> None:
+        """These were there under the former manager, and no others."""
+        self._expected = set(worker_ids)
+
+    def heard(self, worker_id: str) -> None:
+        """The worker has said what it holds."""
+        if self._expected is not None:
+            self._expected.discard(worker_id)
 
     def restore(self, event: BatchRestored) -> None:
         """Take over a batch. Its counters and cursors go on where they were."""
@@ -72,8 +90,9 @@ class Recovery:
         return True
 
     def tick(self) -> None:
-        """Once the workers had their time, what nobody holds is queued."""
-        if not self._awaited or self._desk.now_s < self._until_s:
+        """Once the workers are back or had their time, what nobody holds is queued."""
+        all_are_back = self._expected is not None and not self._expected
+        if not self._awaited or not (all_are_back or self._desk.now_s >= self._until_s):
             return
         left = [record for record in self._awaited.values() if record.phase is not Phase.DONE]
         self._awaited.clear()

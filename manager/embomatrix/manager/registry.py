@@ -119,6 +119,11 @@ class Registry:
         fair_s = len(self._by_silence) / self._limits.heartbeats_per_s
         return max(self._limits.heartbeat_s, min(fair_s, self._limits.longest_heartbeat_s))
 
+    @property
+    def present(self) -> frozenset[str]:
+        """Ids of the workers that are not lost."""
+        return frozenset(self._by_silence)
+
     def register(
         self, worker_id: str, boot_id: str, resources: Resources, *, now_s: float
     ) -> tuple[Session, list[Event]]:

@@ -16,6 +16,7 @@ from embomatrix.manager.events import (
     BatchSubmitted,
     LookaheadAnnounced,
     RunOpened,
+    WorkersExpected,
 )
 from embomatrix.manager.group_ends import group_sizes
 from embomatrix.manager.records import batch_of, batch_row, failed_rows, terms_of, terms_payload
@@ -110,6 +111,7 @@ class Runs:
                 delivered = {result.rollout_id: result.cursor for result in log.rows}
                 self._history.submitted(batch)
                 self._feed(BatchRestored(batch, delivered, failed_rows(log.rows)))
+        self._feed(WorkersExpected(await self._store.workers()))
         if self._runs:
             logger.info("took up %d runs of a former manager", len(self._runs))
 

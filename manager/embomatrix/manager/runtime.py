@@ -30,6 +30,7 @@ from embomatrix.manager.links import WorkerLink
 from embomatrix.manager.meter import Meter
 from embomatrix.manager.results import ResultLogs
 from embomatrix.manager.runs import RunLimits, Runs
+from embomatrix.manager.store.protocol import StateError
 from embomatrix.manager.store.timed import timed_store
 from embomatrix.rpc.status import SupersededError, UnavailableError
 from embomatrix.rpc.versions import PROTOCOL_VERSION
@@ -49,6 +50,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 CLEANUP_S: Final = 5.0
+ROSTER_S: Final = 0.5
 LET_GO_S: Final = 30.0
 """A manager that is cut off from its store for so long has its workers turn to another. As long as a lease lives."""
 STORE_AWAY: Final = (
@@ -84,7 +86,7 @@ class ManagerRuntime:
         bundles.keep(cluster.needed_scenes)
         self.meter = Meter()
         self.effort = Effort()
-        store = timed_store(store, self.effort.operated)
+        self._store = store = timed_store(store, self.effort.operated)
         self.started_s = time.monotonic()
         self.chronicle = Chronicle(epoch_s=time.time() - self.started_s)
         self.history = RunHistory(self.chronicle, archive, cluster)
@@ -105,6 +107,7 @@ class ManagerRuntime:
         async with asyncio.TaskGroup() as group:
             group.create_task(self._keep_time())
             group.create_task(self._clean_up())
+            group.create_task(self._keep_roster())
             group.create_task(self._delivery.serve())
 
     def register(
@@ -249,6 +252,17 @@ class ManagerRuntime:
                 self.chronicle.fleet.lost(event.worker_id, event.reason, now_s=time.monotonic())
                 self._close_link(event.worker_id)
             self._carry_out(commands)
+
+    async def _keep_roster(self) -> None:
+        """Note who is there, for the manager that comes after this one: it is a hint, and may be a second old."""
+        noted: frozenset[str] | None = None
+        while True:
+            await asyncio.sleep(ROSTER_S)
+            present = self.registry.present | self.cluster.dispatcher.expected
+            if present != noted:
+                with contextlib.suppress(StateError):
+                    await self._store.put_workers(present)
+                    noted = present
 
     async def _clean_up(self) -> None:
         while True:

@@ -17,6 +17,7 @@ from embomatrix.manager.events import (
     WorkerJoined,
     WorkerLost,
     WorkerReported,
+    WorkersExpected,
 )
 from embomatrix.rpc.values import (
     Batch,
@@ -98,6 +99,31 @@ def test_what_nobody_holds_is_given_out_only_after_the_grace():
     assert given_to(successor.worker("w1", slots=4)) == []
     assert given_to(successor.tell(Tick(), after_s=GRACE_S - 0.1)) == []
     assert given_to(successor.tell(Tick(), after_s=0.2)) == [("w1", "x0"), ("w1", "x1")]
+
+
+def test_once_all_workers_of_before_have_said_what_they_hold_nobody_waits_longer():
+    successor = Successor(2)
+    successor.tell(WorkersExpected(frozenset({"w1", "w2"})))
+    successor.worker("w1", claim("x0"), slots=4)
+    assert given_to(successor.tell(Tick(), after_s=0.1)) == []
+    successor.worker("w2")
+    assert [rollout for _, rollout in given_to(successor.tell(Tick(), after_s=0.1))] == ["x1"]
+
+
+def test_where_nobody_was_before_nobody_is_waited_for():
+    successor = Successor(1)
+    successor.tell(WorkersExpected(frozenset()))
+    successor.worker("w1")
+    assert given_to(successor.tell(Tick(), after_s=0.1)) == [("w1", "x0")]
+
+
+def test_a_worker_that_does_not_come_back_is_waited_for_no_longer_than_the_grace():
+    successor = Successor(1)
+    successor.tell(WorkersExpected(frozenset({"w1", "gone"})))
+    successor.worker("w1")
+    assert given_to(successor.tell(Tick(), after_s=GRACE_S - 0.1)) == []
+    assert successor.dispatcher.expected == {"gone"}
+    assert given_to(successor.tell(Tick(), after_s=0.2)) == [("w1", "x0")]
 
 
 def test_a_batch_that_comes_meanwhile_does_not_wait():

@@ -18,7 +18,7 @@ from embomatrix.manager.store.protocol import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Collection, Sequence
 
 
 class MemoryState:
@@ -28,6 +28,7 @@ class MemoryState:
         self.epoch = 0
         self.leader: Candidate | None = None
         self.leads_until_s = 0.0
+        self.workers: frozenset[str] = frozenset()
         self.runs: dict[str, RunRow] = {}
         self.batches: dict[tuple[str, str], BatchRow] = {}
         self.results: dict[tuple[str, str], dict[str, ResultRow]] = {}
@@ -107,6 +108,13 @@ class MemoryStore:
 
     async def batches(self, run_id: str) -> list[BatchRow]:
         return [batch for key, batch in self._state.batches.items() if key[0] == run_id]
+
+    async def put_workers(self, worker_ids: Collection[str]) -> None:
+        self._check()
+        self._state.workers = frozenset(worker_ids)
+
+    async def workers(self) -> frozenset[str]:
+        return self._state.workers
 
     async def put_credentials(self, rows: Sequence[CredentialRow]) -> None:
         self._check()

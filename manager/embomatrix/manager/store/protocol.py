@@ -10,7 +10,7 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Collection, Sequence
 
 
 class StateError(Exception):
@@ -143,6 +143,12 @@ class StateStore(Protocol):
 
     async def batches(self, run_id: str) -> list[BatchRow]:
         """Batches of a run, oldest first."""
+
+    async def put_workers(self, worker_ids: Collection[str]) -> None:
+        """Replace the list of workers that are there: whom the next manager waits for."""
+
+    async def workers(self) -> frozenset[str]:
+        """The workers of that list."""
 
     async def put_credentials(self, rows: Sequence[CredentialRow]) -> None:
         """Note these, all or none; one of a known id replaces it."""

@@ -1,9 +1,10 @@
 """State in Redis (6.2 command set, also Valkey): for clusters, and for another manager to take over.
 
-Keys, all below one prefix: ``epoch``; ``leader`` (hash holder, address; it lapses); ``credentials`` (hash token id -> payload);
-``runs`` (hash id -> name), ``run_terms`` (hash id -> terms) and ``run_order`` (list); of a run ``batches:RUN`` (list of ids);
-of a batch ``batch:RUN:BATCH`` (hash digest, payload), ``done:RUN:BATCH`` (set of rollouts), ``results:RUN:BATCH`` (sorted set
-of "rollout id length:rollout id payload" by cursor). Every conditional write is one Lua script that checks the epoch first.
+Keys, all below one prefix: ``epoch``; ``leader`` (hash holder, address; it lapses); ``workers`` (set); ``credentials`` (hash
+token id -> payload); ``runs`` (hash id -> name), ``run_terms`` (hash id -> terms) and ``run_order`` (list); of a run
+``batches:RUN`` (list of ids); of a batch ``batch:RUN:BATCH`` (hash digest, payload), ``done:RUN:BATCH`` (set of rollouts),
+``results:RUN:BATCH`` (sorted set of "rollout id length:rollout id payload" by cursor).
+Every conditional write is one Lua script that checks the epoch first.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from embomatrix.manager.store.protocol import (
 from embomatrix.manager.store.url import without_password
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Sequence
+    from collections.abc import Awaitable, Collection, Sequence
 
 logger = logging.getLogger(__name__)
 
@@ -60,6 +61,14 @@ _RESIGN: Final = (
     _GUARD
     + """
 redis.call('DEL', KEYS[2])
+return 1
+"""
+)
+_PUT_WORKERS: Final = (
+    _GUARD
+    + """
+redis.call('DEL', KEYS[2])
+for index = 2, #ARGV do redis.call('SADD', KEYS[2], ARGV[index]) end
 return 1
 """
 )
@@ -216,6 +225,13 @@ class RedisStore:
             if fields:
                 rows.append(BatchRow(run_id, batch_id, fields[b"digest"].decode(), fields[b"payload"]))
         return rows
+
+    async def put_workers(self, worker_ids: Collection[str]) -> None:
+        await self._script(_PUT_WORKERS, ("workers",), *worker_ids)
+
+    async def workers(self) -> frozenset[str]:
+        found = await self._call(cast("Awaitable[Any]", self._redis.smembers(self._key("workers"))))
+        return frozenset(worker_id.decode() for worker_id in found)
 
     async def put_credentials(self, rows: Sequence[CredentialRow]) -> None:
         flat = [value for row in rows for value in (row.token_id, row.payload)]

@@ -22,7 +22,7 @@ from embomatrix.manager.store.protocol import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Collection, Sequence
     from pathlib import Path
 
 T = TypeVar("T")
@@ -47,6 +47,7 @@ CREATE TABLE IF NOT EXISTS result (
     run_id TEXT NOT NULL, batch_id TEXT NOT NULL, rollout_id TEXT NOT NULL, cursor INTEGER NOT NULL,
     payload BLOB NOT NULL, PRIMARY KEY (run_id, batch_id, rollout_id)
 ) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS worker (worker_id TEXT PRIMARY KEY) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS credential (token_id TEXT PRIMARY KEY, payload BLOB NOT NULL);
 CREATE INDEX IF NOT EXISTS result_order ON result (run_id, batch_id, cursor);
 """
@@ -153,6 +154,17 @@ class SqliteStore:
     async def batches(self, run_id: str) -> list[BatchRow]:
         query = "SELECT run_id, batch_id, digest, payload FROM batch WHERE run_id = ? ORDER BY rowid"
         return [BatchRow(*row) for row in await self._read(query, run_id)]
+
+    async def put_workers(self, worker_ids: Collection[str]) -> None:
+        def put() -> None:
+            self._db.execute("DELETE FROM worker")
+            rows = [(worker_id,) for worker_id in worker_ids]
+            self._db.executemany("INSERT INTO worker VALUES (?)", rows)
+
+        await self._run(put)
+
+    async def workers(self) -> frozenset[str]:
+        return frozenset(row[0] for row in await self._read("SELECT worker_id FROM worker"))
 
     async def put_credentials(self, rows: Sequence[CredentialRow]) -> None:
         values = [(row.token_id, row.payload) for row in rows]
