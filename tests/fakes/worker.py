@@ -52,6 +52,9 @@ class FakeWorker:
     token: str = ""
     join_token: str = ""
     ca: bytes = b""
+    through: type = lambda channel: channel
+    """What its channel is wrapped in, such as one that lets through an older protocol alone."""
+    protocol: int = PROTOCOL_VERSION
     boot_id: str = ""
     poison: set = field(default_factory=set)
     stuck: set = field(default_factory=set)
@@ -67,7 +70,7 @@ class FakeWorker:
     resumed: bool = False
 
     async def __aenter__(self):
-        self._channel = open_channel(self.address, self.token, self.ca)
+        self._channel = self.through(open_channel(self.address, self.token, self.ca))
         self._stub = worker_service_pb2_grpc.WorkerServiceStub(self._channel)
         self._outgoing = asyncio.Queue()
         self._permits = asyncio.Semaphore(self.slots)
@@ -76,7 +79,7 @@ class FakeWorker:
             pb.RegisterRequest(
                 worker_id=self.worker_id,
                 boot_id=self.boot_id,
-                protocol_version=PROTOCOL_VERSION,
+                protocol_version=self.protocol,
                 join_token=self.join_token,
                 resources=resources_to_proto(Resources(self.slots, self.slots, self.memory_mb)),
             ),
