@@ -125,7 +125,10 @@ class Pass:
 
     @property
     def rate(self) -> float:
-        """Results per second."""
+        """Results per second. Raises BenchError when there are none."""
+        if not self.latency_s:
+            told = "; ".join(self.reasons) or f"{self.hung} were never heard of"
+            raise BenchError(f"not one rollout of the contest had a result: {told}")
         return len(self.latency_s) / self.wall_s
 
 

@@ -62,6 +62,15 @@ def cpu_use(cluster: BenchCluster) -> CpuUse:
     return CpuUse(slots_s, _seconds(manager), daemons_s, _seconds(psutil.Process()))
 
 
+def family_cpu_s() -> float:
+    """Processor time of this process and of all that descend from it and live, in seconds."""
+    used_s = 0.0
+    for process, _ in _tree(psutil.Process(), 0):
+        with contextlib.suppress(psutil.Error):
+            used_s += _seconds(process)
+    return used_s
+
+
 def running_slot(cluster: BenchCluster) -> int:
     """Process id of a slot that executes now. Raises BenchError when there is none."""
     for _ in range(TRIES):

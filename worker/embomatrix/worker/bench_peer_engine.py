@@ -43,6 +43,11 @@ def write_bundles(folder: Path, bundles: Mapping[str, bytes]) -> None:
         (folder / _file(digest)).write_bytes(data)
 
 
+def forget_executions(folder: Path) -> None:
+    """Count anew."""
+    (folder / EXECUTED).unlink(missing_ok=True)
+
+
 def executed_twice(folder: Path) -> int:
     """How many executions began for rollouts that had been begun before."""
     path = folder / EXECUTED

@@ -20,7 +20,8 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.worker.bench_apart import apart
 from embomatrix.worker.bench_contender import Chunk, Mode, Pass, Setup, execute, greet
-from embomatrix.worker.bench_peer_engine import executed_twice, write_bundles
+from embomatrix.worker.bench_cpu import family_cpu_s
+from embomatrix.worker.bench_peer_engine import executed_twice, forget_executions, write_bundles
 from embomatrix.worker.bench_peer_own import own_cluster
 
 if TYPE_CHECKING:
@@ -74,8 +75,10 @@ class PeerSizes:
     """So many times so many rollouts are submitted at once, each for itself: latency under load."""
     kill_at: float = 0.25
     """Share of the results after which a process is killed."""
-    limit_s: float = 30.0
+    limit_s: float = 45.0
     """For each measurement: what was not heard of by then is counted as hung."""
+    start_s: float = 60.0
+    """For processes to start and to load their scenes."""
     peer_s: float = 180.0
     """For all of one peer, which is given up then."""
 
@@ -85,6 +88,8 @@ class Tuned:
     """What was measured of one contender that holds its scenes."""
 
     all_at_once: Pass
+    cpu_s: float
+    """Processor time of all its processes meanwhile, and of the one that submits."""
     alone: Pass
     waves: tuple[Pass, ...]
     killed: Pass
@@ -155,10 +160,10 @@ def measure_peer(peer: Peer, work: Work, sizes: PeerSizes) -> PeerOutcome:
         execute(contender, singles(work.sample(2 * sizes.slots)), sizes.limit_s)
         plain = execute(contender, singles(work.sample(sizes.plain)), sizes.limit_s)
     with _brought(bring, Mode.SHARED, work, sizes, preload=tuple(work.bundles)) as (contender, setup):
-        greet(contender, setup, sizes.limit_s)
+        greet(contender, setup, sizes.start_s)
         shared = _tuned(contender, setup, work, sizes)
     with _brought(bring, Mode.AFFINE, work, sizes) as (contender, setup):
-        greet(contender, setup, sizes.limit_s)
+        greet(contender, setup, sizes.start_s)
         first, second = (
             chunks_of(part, sizes.chunk, setup.lanes) for part in (work.rollouts[0::2], work.rollouts[1::2])
         )
@@ -169,18 +174,18 @@ def measure_peer(peer: Peer, work: Work, sizes: PeerSizes) -> PeerOutcome:
 
 def _tuned(contender: Contender, setup: Setup, work: Work, sizes: PeerSizes) -> Tuned:
     chunks = chunks_of(work.rollouts, sizes.chunk, setup.lanes)
+    before_s = family_cpu_s()
     all_at_once = execute(contender, chunks, sizes.limit_s)
+    cpu_s = family_cpu_s() - before_s
     alone = Pass()
     for rollout in work.sample(sizes.alone):
         alone.latency_s += execute(contender, singles((rollout,)), sizes.limit_s).latency_s
     sample = work.sample(sizes.wave)
     waves = tuple(execute(contender, singles(sample), sizes.limit_s) for _ in range(sizes.waves))
-    before = executed_twice(setup.folder)
+    forget_executions(setup.folder)
     killed = _killed(contender, chunks, sizes)
-    # The whole work was submitted once more: that many executions are wanted.
-    wanted = sum(len(chunk.rollouts) for chunk in chunks)
-    repeated = max(killed.repeated, executed_twice(setup.folder) - before - wanted)
-    return Tuned(all_at_once, alone, waves, killed, max(0, repeated))
+    repeated = max(killed.repeated, executed_twice(setup.folder))
+    return Tuned(all_at_once, cpu_s, alone, waves, killed, repeated)
 
 
 def _killed(contender: Contender, chunks: Sequence[Chunk], sizes: PeerSizes) -> Pass:

@@ -65,6 +65,8 @@ def _peer(who: str, found: PeerOutcome) -> Iterator[Figure]:
 def _tuned(who: str, found: Tuned) -> Iterator[Figure]:
     waves_s = [seconds for wave in found.waves for seconds in wave.latency_s]
     killed = found.killed
+    count = len(found.all_at_once.latency_s)
+    yield Figure(_name(who, "CPU of a rollout"), found.cpu_s / count * 1e3, "ms", Better.LOWER, count)
     alone_ms = quantile(found.alone.latency_s, 0.5) * 1e3
     yield Figure(_name(who, "alone, p50"), alone_ms, "ms", Better.LOWER, len(found.alone.latency_s))
     yield Figure(
@@ -100,6 +102,7 @@ COLUMNS: Final[Mapping[str, str]] = {
     "shared, 1/s": "rollouts, shared",
     "affine, 1/s": "rollouts, affine",
     "new scenes, 1/s": "rollouts, affine, new scenes",
+    "CPU, ms": "CPU of a rollout",
     "scenes waited for": "scenes that rollouts waited for",
     "alone, ms": "alone, p50",
     "under load, ms": "under load, mean",
