@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ipaddress
+import socket
 from pathlib import Path
 from typing import Self
 
@@ -81,8 +82,9 @@ class ManagerSettings(BaseModel):
     @property
     def address(self) -> str:
         """HOST:PORT as others should use it."""
-        host = f"[{self.host}]" if ":" in self.host else self.host
-        return self.advertise or f"{host}:{self.port}"
+        everywhere = self.host in ("0.0.0.0", "::")  # it is asked for, not chosen
+        host = socket.gethostname() if everywhere else self.host
+        return self.advertise or f"{f'[{host}]' if ':' in host else host}:{self.port}"
 
     @field_validator("advertise")
     @classmethod
