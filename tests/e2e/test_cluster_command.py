@@ -1,15 +1,20 @@
 """`embomatrix cluster` before a real manager: it shows what the cluster does, and what a person gets wrong in a sentence."""
 
 import asyncio
+import itertools
 import json
 
 import pytest
+from tests.e2e.test_dashboard import cluster
 from tests.fakes.browser import shown
 from tests.fakes.commands import run
 from tests.fakes.worker import FakeWorker
-from tests.integration.test_manager_service import KITCHEN, batch, manager, open_run, outcomes
+from tests.integration.test_manager_service import batch, manager, open_run, outcomes
 
-from embomatrix.rpc.values import Batch, LookaheadEntry
+from embomatrix.rpc.client import ClusterClient
+from embomatrix.rpc.values import Batch, Completed, LookaheadEntry, Rollout
+from embomatrix.skills.parse import plan_from_json
+from embomatrix.world.dataset import Dataset
 
 NOWHERE = "127.0.0.1:1"
 UNREACHABLE = f"no manager answers at {NOWHERE}"
@@ -19,56 +24,67 @@ async def told(*arguments):
     return await asyncio.to_thread(run, "cluster", *arguments)
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    return tmp_path_factory.mktemp("cluster")
-
-
-async def closed_run(folder, address):
-    """A run of 41 rollouts on two slots, of which one crashes each time; closed when this ends."""
-    async with (
-        open_run(address) as client,
-        FakeWorker(address, worker_id="lab-pc", slots=2, poison={"poison"}),
-    ):
-        good, bad = batch(40), batch(1, batch_id="b2", task="poison")
-        await client.announce_lookahead("r1", 1, [LookaheadEntry(7, KITCHEN, 40)])
-        await outcomes(client, Batch("r1", "mixed", 1, good.rollouts + bad.rollouts))
-        (cell,) = json.loads((await told("plan", "r1", f"--manager={address}", "--json")).text)
-        assert (cell["step"], cell["count"], cell["warmth"], cell["worker_ids"]) == (
-            7,
-            40,
-            "warm",
-            ["lab-pc"],
-        )
-        workers = await told("workers", f"--manager={address}")
-        assert "lab-pc ready 2 0 40 1 1024" in workers.text
-        open_runs = await told("runs", f"--manager={address}", "--json")
+async def lived_run(kitchen, address):
+    """A run of 40 rollouts on two slots and one more that crashes each time; closed when this ends."""
+    dataset = Dataset.load(kitchen)
+    record = dataset.train[0]
+    digest, task, plan = record.bundle_digest, record.task.task_id, plan_from_json(list(record.oracle))
+    rollouts = [Rollout(f"x{number}", f"g{number // 8}", digest, task, plan, 0) for number in range(40)]
+    rollouts.append(Rollout("bad", "alone", digest, "no-such-task", plan, 0))
+    there = f"--manager={address}"
+    async with ClusterClient(address) as client:
+        await client.open_run("evening", "r1")
+        await client.put_bundles({digest: dataset.bundle_bytes(digest)})
+        await client.announce_lookahead("r1", 1, [LookaheadEntry(7, digest, 40)])
+        batch = Batch("r1", "b", 6, tuple(rollouts))
+        results = [result async for result in client.execute(batch, deadline_s=60)]
+        (cell,) = json.loads((await told("plan", "r1", there, "--json")).text)
+        assert (cell["step"], cell["count"], cell["worker_ids"]) == (7, 40, ["kitchen-worker"])
+        workers = await told("workers", there)
+        assert "kitchen-worker ready 2 0 40 1 " in workers.text
+        open_runs = await told("runs", there, "--json")
         assert [(run["run_id"], run["closed_s"]) for run in json.loads(open_runs.text)] == [("r1", 0.0)]
         await client.close_run("r1")
+    return results
+
+
+def assert_a_trace_of(events, rollouts):
+    """No two spans of a slot overlap, and every rollout was executed once, after it was submitted."""
+    tracks, executed = {}, []
+    for event in events:
+        if event["ph"] == "X":
+            tracks.setdefault((event["pid"], event["tid"]), []).append(event)
+        if event["name"] == "execute":
+            executed.append(event["args"]["rollout"])
+    assert sorted(executed) == sorted(rollouts)
+    assert len(tracks) == 3, "submissions and two slots"
+    for track in tracks.values():
+        assert all(one["ts"] + one["dur"] <= two["ts"] + 0.01 for one, two in itertools.pairwise(track))
+    (submitted,) = [event["ts"] for event in events if event["name"] == "submit 41"]
+    assert all(event["ts"] >= submitted for event in events if event["name"] == "execute")
 
 
 @pytest.mark.browser
-async def test_report_and_trace_of_a_run_that_is_over_show_what_it_did(browser, folder):
-    async with manager(folder / "data") as at:
-        await closed_run(folder, at.address)
-        there = f"--manager={at.address}"
-        runs = await told("runs", "--closed", there)
-        assert "r1 test closed" in runs.text
-        report, trace = folder / "report.html", folder / "trace.json"
+async def test_report_and_trace_of_a_run_that_is_over_show_what_it_did(browser, kitchen, tmp_path):
+    report, trace = tmp_path / "report.html", tmp_path / "trace.json"
+    with cluster(tmp_path / "cluster") as (address, _):
+        results = await lived_run(kitchen, address)
+        there = f"--manager={address}"
+        assert "r1 evening closed" in (await told("runs", "--closed", there)).text
         assert (await told("report", "r1", f"--out={report}", there)).status == 0
         assert (await told("trace", "r1", f"--out={trace}", there)).status == 0
         lines = (await told("events", "r1", "--json", there)).text
         fleet = await told("events", there)
-    page = shown(browser, report.as_uri(), folder)
+    page = shown(browser, report.as_uri(), tmp_path)
     assert page.words["about"].startswith("run r1 · opened 20")
     assert "slot_crashed" in page.words["failures"]
-    assert page.words["workers"].split("share of the work ")[1].startswith("lab-pc 40 3 ")
+    assert page.words["workers"].split("share of the work ")[1].startswith("kitchen-worker 40 3 ")
     assert page.words["kept"].startswith("All ")
-    names = [event["name"] for event in json.loads(trace.read_text())["traceEvents"]]
-    assert names.count("submit 41") == 1
+    done = [result.rollout_id for result in results if isinstance(result.outcome, Completed)]
+    assert_a_trace_of(json.loads(trace.read_text())["traceEvents"], done)
     kinds = [event["kind"] for event in map(json.loads, lines.replace("} {", "}\n{").splitlines())]
     assert (kinds[0], kinds[-1], kinds.count("completed")) == ("run_opened", "run_closed", 40)
-    assert "worker_joined worker=lab-pc size=2" in fleet.text
+    assert "worker_joined worker=kitchen-worker size=2" in fleet.text
 
 
 @pytest.mark.parametrize("command", ["workers", "runs", "plan", "pause", "resume-dispatch", "events"])
@@ -82,6 +98,8 @@ async def test_what_is_not_there_is_named_with_what_to_do(tmp_path):
         there = f"--manager={at.address}"
         report = await told("report", "r9", there)
         assert (report.status, "no run 'r9' is open or kept" in report.text) == (2, True)
+        revoke = await told("revoke", "w9", "--reason=a test", there)
+        assert (revoke.status, "token" in revoke.text, "Traceback" in revoke.text) == (2, True, False)
         drain = await told("drain", "w9", there)
         assert (drain.status, "there is no worker 'w9'" in drain.text) == (2, True)
         assert (await told("workers", there)).text.startswith("no workers: start one")

@@ -25,6 +25,7 @@ from embomatrix.cli.failure import fail
 from embomatrix.rpc.admin import AdminClient
 from embomatrix.rpc.channel import DEFAULT_ADDRESS
 from embomatrix.rpc.status import ClusterError
+from embomatrix.rpc.token_client import TokenClient
 from embomatrix.rpc.trust import read_ca, read_token
 
 if TYPE_CHECKING:
@@ -156,6 +157,25 @@ def resume(
         async with _client(manager, token, ca) as client:
             await client.resume(name)
         _done(as_json, worker=name, state="ready")
+
+    _ask(ask())
+
+
+@app.command()
+def revoke(
+    name: Worker,
+    reason: Annotated[str, typer.Option(help="Why: its owner reads it.")],
+    manager: Manager = DEFAULT_ADDRESS,
+    token: Token = "",
+    ca: Ca = None,
+    as_json: AsJson = False,
+) -> None:
+    """Send a worker away for good: its credential is void, and what it held goes to others."""
+
+    async def ask() -> None:
+        async with TokenClient(manager, read_token(token), ca=read_ca(ca)) as client:
+            await client.revoke_worker(name, reason)
+        _done(as_json, worker=name, state="revoked")
 
     _ask(ask())
 

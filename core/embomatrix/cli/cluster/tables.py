@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from rich.console import Console
 from rich.measure import Measurement
@@ -20,23 +20,27 @@ if TYPE_CHECKING:
 
     from embomatrix.rpc.values import PlanCell, RunInfo, WorkerInfo
 
-STATE_STYLES: Mapping[str, str] = {"ready": "green", "lost": "red", "quarantined": "red"}
-WARMTH_STYLES: Mapping[Warmth, str] = {
+STATE_STYLES: Final[Mapping[str, str]] = {"ready": "green", "lost": "red", "quarantined": "red"}
+WARMTH_STYLES: Final[Mapping[Warmth, str]] = {
     Warmth.WARM: "green",
     Warmth.WARMING: "yellow",
     Warmth.QUEUED: "dim",
     Warmth.UNPLACEABLE: "red",
 }
-_BAD = frozenset((EventKind.FAILED, EventKind.WORKER_LOST, EventKind.SCENE_FAILED))
+WIDEST: Final = 1000
+SENTENCE: Final = 60
+GRID: Final = 100
+"""Letters of a line that may be as wide as it needs, of a column of sentences, and of the scenes of a step."""
+NAMED: Final = 3
+"""Workers that a cell of the grid names."""
+_BAD: Final = frozenset((EventKind.FAILED, EventKind.WORKER_LOST, EventKind.SCENE_FAILED))
 
 
 def show(table: Table) -> None:
     """Print a table whole: where the terminal is too narrow for its figures, lines wrap rather than lose them."""
     console = Console()
-    least = Measurement.get(console, console.options.update(max_width=10_000), table).minimum
-    if least > console.width:
-        console = Console(width=least, soft_wrap=True)
-    console.print(table)
+    whole = Measurement.get(console, console.options.update(max_width=WIDEST), table).maximum
+    Console(width=max(whole, console.width)).print(table)
 
 
 def show_json(value: object) -> None:
@@ -101,16 +105,18 @@ def run_table(runs: Sequence[RunInfo]) -> Table:
 
 
 def plan_table(cells: Sequence[PlanCell]) -> Table:
-    """Steps down, the scenes that each needs beside it, coloured by how far they are."""
-    table = Table("run", "step", "scenes: rollouts, and who has them", box=None, padding=(0, 2, 0, 0))
-    rows: dict[tuple[str, int], Text] = {}
+    """Steps down; beside each the scenes that it needs, coloured by how far they are: ``scene·rollouts·warmth@workers``."""
+    table = _table("run", "step")
+    table.add_column("scenes", overflow="fold", max_width=GRID)
+    rows: dict[tuple[str, int], list[Text]] = {}
     for cell in cells:
-        row = rows.setdefault((cell.run_id, cell.step), Text())
         scene = cell.bundle_digest.removeprefix("sha256:")[:8]
-        where = f" on {', '.join(cell.worker_ids)}" if cell.worker_ids else ""
-        row.append(f"{scene}·{cell.count} {cell.warmth.value}{where}  ", style=WARMTH_STYLES[cell.warmth])
-    for (run_id, step), row in sorted(rows.items()):
-        table.add_row(Text(run_id), str(step), row)
+        more = len(cell.worker_ids) - NAMED
+        names = (*cell.worker_ids[:NAMED], *([f"{more}_more"] if more > 0 else []))
+        told = f"{scene}·{cell.count}·{cell.warmth.value}" + (f"@{','.join(names)}" if names else "")
+        rows.setdefault((cell.run_id, cell.step), []).append(Text(told, style=WARMTH_STYLES[cell.warmth]))
+    for (run_id, step), told_cells in sorted(rows.items()):
+        table.add_row(Text(run_id), str(step), Text("  ").join(told_cells))
     return table
 
 
@@ -141,9 +147,10 @@ def _table(*names: str, **figures: int) -> Table:
     for name in names:
         table.add_column(name, no_wrap=True)
     for name, is_number in figures.items():
-        table.add_column(
-            name, justify="right" if is_number else "left", no_wrap=bool(is_number), overflow="fold"
-        )
+        if is_number:
+            table.add_column(name, justify="right", no_wrap=True)
+        else:
+            table.add_column(name, overflow="fold", max_width=SENTENCE)
     return table
 
 
