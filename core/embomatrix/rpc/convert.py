@@ -6,10 +6,9 @@ import functools
 import math
 from typing import TYPE_CHECKING, Final, Literal, TypeVar
 
-from embomatrix.proto.v1 import rollout_service_pb2, types_pb2
+from embomatrix.proto.v1 import types_pb2
 from embomatrix.reward.breakdown import AtomResult, RewardBreakdown
 from embomatrix.rpc.values import (
-    Batch,
     Cancelled,
     Completed,
     InfraCode,
@@ -88,10 +87,12 @@ class ConvertError(ValueError):
         return ConvertError(f"{parent}.{self.field}", self.problem)
 
 
-def each(field: str, convert: Callable[[WireT], ValueT], messages: Iterable[WireT]) -> tuple[ValueT, ...]:
-    """Convert a repeated field; an error tells which element it stands in."""
+def each(
+    field: str, convert: Callable[[WireT], ValueT], messages: Iterable[WireT], *, first: int = 0
+) -> tuple[ValueT, ...]:
+    """Convert a repeated field, or its part from the element ``first`` on; an error tells which element it stands in."""
     values: list[ValueT] = []
-    for index, message in enumerate(messages):
+    for index, message in enumerate(messages, start=first):
         try:
             values.append(convert(message))
         except ConvertError as error:
@@ -216,30 +217,6 @@ def rollout_from_proto(message: types_pb2.Rollout) -> Rollout:
     )
     object.__setattr__(rollout, "wire", wire)
     return rollout
-
-
-def batch_to_proto(batch: Batch) -> rollout_service_pb2.ExecuteRequest:
-    return rollout_service_pb2.ExecuteRequest(
-        run_id=batch.run_id,
-        batch_id=batch.batch_id,
-        step=batch.step,
-        rollouts=[rollout_to_proto(rollout) for rollout in batch.rollouts],
-    )
-
-
-def batch_from_proto(message: rollout_service_pb2.ExecuteRequest) -> Batch:
-    """The batch; two rollouts of one id are a ``ConvertError``, since each gets exactly one outcome."""
-    rollouts = each("rollouts", rollout_from_proto, message.rollouts)
-    seen: set[str] = set()
-    for index, rollout in enumerate(rollouts):
-        if rollout.rollout_id in seen:
-            raise ConvertError(
-                f"rollouts[{index}].rollout_id", f"{rollout.rollout_id!r} stands twice in the batch"
-            )
-        seen.add(rollout.rollout_id)
-    return Batch(
-        required("run_id", message.run_id), required("batch_id", message.batch_id), message.step, rollouts
-    )
 
 
 def reward_to_proto(reward: RewardBreakdown) -> types_pb2.Reward:

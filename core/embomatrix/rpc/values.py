@@ -41,6 +41,8 @@ class Batch:
     batch_id: str
     step: int
     rollouts: tuple[Rollout, ...]
+    wire: bytes = field(default=b"", init=False, compare=False, repr=False)
+    """The message that it came in, as for a rollout."""
 
 
 @dataclass(frozen=True, slots=True)

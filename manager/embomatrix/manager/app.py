@@ -20,6 +20,7 @@ from embomatrix.manager.archive import RunArchive
 from embomatrix.manager.assignments import DispatchLimits
 from embomatrix.manager.bundles import BundleStore
 from embomatrix.manager.cluster_state import ClusterState
+from embomatrix.manager.garbage import only_young
 from embomatrix.manager.http_rules import HttpRules, allowed_hosts
 from embomatrix.manager.leadership import Leadership
 from embomatrix.manager.listen import bound_socket
@@ -76,6 +77,7 @@ async def serve(
     async def lead() -> None:
         async with running(settings, on_standby) as endpoints:
             leads.set()
+            only_young()
             on_ready(endpoints)
             await stop.wait()
 

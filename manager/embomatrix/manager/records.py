@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 from embomatrix.manager.store.protocol import BatchRow, ResultRow
 from embomatrix.proto.v1 import rollout_service_pb2, types_pb2
-from embomatrix.rpc.convert import batch_from_proto, batch_to_proto, rollout_result_to_proto
+from embomatrix.rpc.convert import rollout_result_to_proto
+from embomatrix.rpc.convert_batch import batch_from_proto, batch_to_proto
 from embomatrix.rpc.convert_run import run_terms_from_proto, run_terms_to_proto
 
 if TYPE_CHECKING:
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
 def batch_row(batch: Batch) -> BatchRow:
     """Equal batches give equal digests."""
-    payload = batch_to_proto(batch).SerializeToString(deterministic=True)
+    payload = batch.wire or batch_to_proto(batch).SerializeToString(deterministic=True)
     return BatchRow(batch.run_id, batch.batch_id, hashlib.sha256(payload).hexdigest(), payload)
 
 

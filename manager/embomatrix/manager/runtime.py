@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import gc
 import logging
 import time
 from typing import TYPE_CHECKING, Final
@@ -24,6 +25,7 @@ from embomatrix.manager.commands import (
 from embomatrix.manager.delivery import Delivery
 from embomatrix.manager.effort import Effort
 from embomatrix.manager.events import DispatchPaused, DispatchResumed
+from embomatrix.manager.garbage import Collector
 from embomatrix.manager.history import RunHistory
 from embomatrix.manager.intake import TICK_S, Heartbeat, Intake
 from embomatrix.manager.links import WorkerLink
@@ -88,6 +90,7 @@ class ManagerRuntime:
         self.effort = Effort()
         self._store = store = timed_store(store, self.effort.operated)
         self.started_s = time.monotonic()
+        self._collector = Collector(self.started_s)
         self.chronicle = Chronicle(epoch_s=time.time() - self.started_s)
         self.history = RunHistory(self.chronicle, archive, cluster)
         self.runs = Runs(cluster, store, bundles, logs, self._carry_out, limits or RunLimits(), self.history)
@@ -270,3 +273,6 @@ class ManagerRuntime:
             await asyncio.sleep(CLEANUP_S)
             await self._delivery.give_up_outdated(time.monotonic())
             await self.runs.close_idle(time.monotonic())
+            dispatcher = self.cluster.dispatcher
+            if self._collector.note(dispatcher.queued + len(dispatcher.live_leases), time.monotonic()):
+                gc.collect()

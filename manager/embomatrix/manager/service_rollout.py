@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import asyncio
+from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.group_ends import GroupEnds
 from embomatrix.proto.v1 import rollout_service_pb2 as pb
 from embomatrix.proto.v1 import rollout_service_pb2_grpc, types_pb2
-from embomatrix.rpc.convert import (
-    batch_from_proto,
-    each,
-)
+from embomatrix.rpc.convert import each, rollout_from_proto
+from embomatrix.rpc.convert_batch import batch_with
 from embomatrix.rpc.convert_run import (
     lookahead_answer_to_proto,
     lookahead_entry_from_proto,
@@ -30,6 +29,10 @@ if TYPE_CHECKING:
     from embomatrix.manager.results import BatchLog
     from embomatrix.manager.runs import Runs
     from embomatrix.manager.store.protocol import ResultRow
+    from embomatrix.rpc.values import Batch, Rollout
+
+SLICE: Final = 128
+"""Rollouts of a batch that are converted in one go: about two milliseconds."""
 
 
 class RolloutServicer(rollout_service_pb2_grpc.RolloutServiceServicer):
@@ -76,7 +79,7 @@ class RolloutServicer(rollout_service_pb2_grpc.RolloutServiceServicer):
         async with translate(context):
             bind("run", request.run_id)
             bind("batch", request.batch_id)
-            log = await self._runs.submit(batch_from_proto(request))
+            log = await self._runs.submit(await _batch(request))
             async for results, groups in _results(log, 0):
                 yield pb.ExecuteResponse(results=results, groups=groups)
 
@@ -106,6 +109,16 @@ class RolloutServicer(rollout_service_pb2_grpc.RolloutServiceServicer):
             bind("run", request.run_id)
             stats = await self._runs.close_run(request.run_id)
         return pb.CloseRunResponse(stats=run_stats_to_proto(stats))
+
+
+async def _batch(request: pb.ExecuteRequest) -> Batch:
+    """The batch of a request. A large one takes longer than workers may wait: others have their turn meanwhile."""
+    rollouts: list[Rollout] = []
+    for start in range(0, len(request.rollouts), SLICE):
+        part = request.rollouts[start : start + SLICE]
+        rollouts += each("rollouts", rollout_from_proto, part, first=start)
+        await asyncio.sleep(0)
+    return batch_with(request, tuple(rollouts))
 
 
 async def _results(

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from embomatrix.proto.v1 import rollout_service_pb2, types_pb2
 from embomatrix.reward.breakdown import AtomResult, RewardBreakdown
-from embomatrix.rpc import convert, convert_run
+from embomatrix.rpc import convert, convert_batch, convert_run
 from embomatrix.rpc.convert import ConvertError
 from embomatrix.rpc.values import (
     Batch,
@@ -114,7 +114,7 @@ def test_every_skill_call_comes_back_equal(call):
 @given(st.lists(ROLLOUTS, max_size=4, unique_by=lambda rollout: rollout.rollout_id).map(tuple), NAMES, UINT64)
 def test_a_batch_comes_back_equal(rollouts, name, step):
     batch = Batch("run-1", name, step, rollouts)
-    assert convert.batch_from_proto(_over_the_wire(convert.batch_to_proto(batch))) == batch
+    assert convert_batch.batch_from_proto(_over_the_wire(convert_batch.batch_to_proto(batch))) == batch
 
 
 @given(RESULTS)
@@ -236,7 +236,7 @@ def test_a_malformed_plan_names_the_field(calls, field):
     rollout = types_pb2.Rollout(rollout_id="r", group_id="g", bundle_digest="d", task_id="t", plan=calls)
     request = rollout_service_pb2.ExecuteRequest(run_id="run", batch_id="b", rollouts=[rollout])
     with pytest.raises(ConvertError) as caught:
-        convert.batch_from_proto(request)
+        convert_batch.batch_from_proto(request)
     assert caught.value.field == field
     assert str(caught.value).startswith(f"{field}: ")
 
@@ -245,7 +245,7 @@ def test_two_rollouts_of_one_id_are_refused():
     rollout = types_pb2.Rollout(rollout_id="r", group_id="g", bundle_digest="d", task_id="t")
     request = rollout_service_pb2.ExecuteRequest(run_id="run", batch_id="b", rollouts=[rollout, rollout])
     with pytest.raises(ConvertError, match=r"rollouts\[1\].rollout_id: 'r' stands twice"):
-        convert.batch_from_proto(request)
+        convert_batch.batch_from_proto(request)
 
 
 def test_a_result_without_an_outcome_is_refused():

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.worker.bench_ablation import AblationSizes, bench_ablation
 from embomatrix.worker.bench_cluster import ClusterLoad, bench_cluster_load
+from embomatrix.worker.bench_flow import FlowSizes, bench_flow
 from embomatrix.worker.bench_peers import PeerSizes, hold_contest
 from embomatrix.worker.bench_peers_page import contest_figures
 from embomatrix.worker.bench_prewarm import PrewarmSizes, bench_prewarm
@@ -30,6 +31,7 @@ class ClusterPart(StrEnum):
 
     PHASES = "phases"
     ABLATION = "ablation"
+    FLOW = "flow"
     PREWARM = "prewarm"
     PEERS = "peers"
 
@@ -48,6 +50,7 @@ class ClusterJob:
     ablation: AblationSizes = field(default_factory=AblationSizes)
     prewarm: PrewarmSizes = field(default_factory=PrewarmSizes)
     peers: PeerSizes = field(default_factory=PeerSizes)
+    flow: FlowSizes = field(default_factory=FlowSizes)
 
 
 def bench_cluster_parts(job: ClusterJob, on_step: OnStep) -> tuple[Figure, ...]:
@@ -68,6 +71,11 @@ def _ablation(job: ClusterJob, on_step: OnStep) -> tuple[Figure, ...]:
     return bench_ablation(work, job.ablation, on_step)
 
 
+def _flow(job: ClusterJob, on_step: OnStep) -> tuple[Figure, ...]:
+    work = main_work(Dataset.load(job.engine_dataset), read_workload(job.workload))
+    return bench_flow(work, job.flow, on_step)
+
+
 def _prewarm(job: ClusterJob, on_step: OnStep) -> tuple[Figure, ...]:
     work = whole_work(Dataset.load(job.engine_dataset), read_workload(job.workload))
     return bench_prewarm(work, job.prewarm, on_step)
@@ -81,6 +89,7 @@ def _peers(job: ClusterJob, on_step: OnStep) -> tuple[Figure, ...]:
 MEASURES: Final[Mapping[ClusterPart, Callable[[ClusterJob, OnStep], tuple[Figure, ...]]]] = {
     ClusterPart.PHASES: _phases,
     ClusterPart.ABLATION: _ablation,
+    ClusterPart.FLOW: _flow,
     ClusterPart.PREWARM: _prewarm,
     ClusterPart.PEERS: _peers,
 }

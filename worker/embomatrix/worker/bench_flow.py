@@ -1,0 +1,171 @@
+"""`bench cluster`, part flow: what the manager costs while thousands of rollouts are in flight.
+
+A real manager with its embedded store, this process as the trainer, and a worker that executes nothing: so nothing but the
+manager limits the flow, and a rollout costs it what it costs with real slots.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import tempfile
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import psutil
+
+from embomatrix.rpc.client import ClusterClient
+from embomatrix.rpc.convert import rollout_from_proto, rollout_to_proto
+from embomatrix.worker.bench_cpu import cpu_use
+from embomatrix.worker.bench_figures import Better, Figure, quantile
+from embomatrix.worker.bench_hollow import hollow_worker
+from embomatrix.worker.bench_processes import bench_cluster
+from embomatrix.worker.bench_trainer import trainer_on
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from embomatrix.rpc.values import Rollout
+    from embomatrix.worker.bench_processes import BenchCluster
+    from embomatrix.worker.bench_trainer import BenchTrainer, Pushed
+    from embomatrix.worker.bench_work import Work
+
+MANAGER_GOAL_US: Final = 150.0
+DISPATCH_GOAL_MS: Final = 10.0
+POLL_S: Final = 0.05
+MB: Final = 1e6
+
+
+@dataclass(frozen=True, slots=True)
+class FlowSizes:
+    """Batches of ``in_flight`` rollouts, the next submitted before the last is done; ``most`` to learn the manager's memory."""
+
+    slots: int = 2
+    in_flight: int = 4_096
+    batches: int = 4
+    most: int = 16_000
+    limit_s: float = 120.0
+
+
+@dataclass(frozen=True, slots=True)
+class Flow:
+    """``waits_s``: from a message with results to the next leases. ``rss_mb`` by the rollouts in flight."""
+
+    rollouts: int
+    wall_s: float
+    manager_s: float
+    """Processor time."""
+    waits_s: tuple[float, ...]
+    rss_mb: dict[int, float]
+
+
+def bench_flow(work: Work, sizes: FlowSizes, on_step: Callable[[str], None]) -> tuple[Figure, ...]:
+    """Raises BenchError when the manager dies or the time is up; ClusterError for a call refused."""
+    deadline_s = time.monotonic() + sizes.limit_s
+    with (
+        tempfile.TemporaryDirectory(prefix="embomatrix-bench-") as name,
+        bench_cluster(Path(name), workers=0, slots=sizes.slots, deadline_s=deadline_s) as cluster,
+    ):
+        flow = asyncio.run(_measure(cluster, work, sizes, on_step, deadline_s))
+    return _figures(flow)
+
+
+async def _measure(
+    cluster: BenchCluster, work: Work, sizes: FlowSizes, on_step: Callable[[str], None], deadline_s: float
+) -> Flow:
+    plan = work.rollouts[0].plan
+    async with (
+        trainer_on(cluster, work.bundles, deadline_s - time.monotonic()) as trainer,
+        hollow_worker(cluster.address, plan, sizes.slots) as worker,
+    ):
+        on_step("executing nothing, to learn how fast")
+        await trainer.warm_up(work.rollouts)
+        await trainer.push(_repeated(work, sizes.in_flight // 4))
+        on_step(f"{sizes.in_flight} rollouts in flight")
+        before, first = cpu_use(cluster), len(worker.waits_s)
+        started_s = time.perf_counter()
+        count = await _flow(trainer, [_repeated(work, sizes.in_flight)] * sizes.batches)
+        wall_s, used = time.perf_counter() - started_s, cpu_use(cluster).since(before)
+        waits_s = tuple(worker.waits_s[first:])
+        worker.answering.clear()
+        rss_mb = await _memory(cluster, trainer, work, sizes, on_step)
+    return Flow(count, wall_s, used.manager_s, waits_s, rss_mb)
+
+
+async def _flow(trainer: BenchTrainer, batches: Sequence[Sequence[Rollout]]) -> int:
+    """Two batches at a time, so that about one of them is in flight at any moment; tells how many rollouts came back."""
+    turns = asyncio.Semaphore(2)
+
+    async def push(rollouts: Sequence[Rollout]) -> int:
+        async with turns:
+            pushed = await trainer.push(rollouts)
+            return len([arrival.completed for arrival in pushed.arrivals])
+
+    return sum(await asyncio.gather(*map(push, batches)))
+
+
+async def _memory(
+    cluster: BenchCluster,
+    trainer: BenchTrainer,
+    work: Work,
+    sizes: FlowSizes,
+    on_step: Callable[[str], None],
+) -> dict[int, float]:
+    """The manager's memory with a quarter of the rollouts in flight, and with all: nobody answers."""
+    manager = psutil.Process(cluster.processes[0].child.pid)
+    rss_mb: dict[int, float] = {}
+    pushes: list[asyncio.Task[Pushed]] = []
+    parts = (sizes.most // 4, sizes.most - sizes.most // 4)
+    async with ClusterClient(cluster.address) as viewer:
+        for count, total in zip(parts, itertools.accumulate(parts), strict=True):
+            on_step(f"{total} rollouts in flight that nobody executes")
+            pushes.append(asyncio.create_task(trainer.push(_repeated(work, count))))
+            await _pending(viewer, total)
+            rss_mb[total] = manager.memory_info().rss / MB
+    for push in pushes:
+        push.cancel()
+    await asyncio.gather(*pushes, return_exceptions=True)
+    return rss_mb
+
+
+async def _pending(viewer: ClusterClient, count: int) -> None:
+    """Wait until so many rollouts have no outcome."""
+    while True:
+        if sum(run.pending for run in await viewer.list_runs()) >= count:
+            return
+        await asyncio.sleep(POLL_S)
+
+
+def _repeated(work: Work, count: int) -> tuple[Rollout, ...]:
+    """So many of the workload's rollouts, over and over, each with an id of its own.
+
+    They are written as messages here: doing it when they are submitted would hold up the worker, which shares this process.
+    """
+    plans = itertools.islice(itertools.cycle(work.sample(len(work.rollouts))), count)
+    named = (replace(rollout, rollout_id=f"{n}", group_id=f"{n}") for n, rollout in enumerate(plans))
+    return tuple(rollout_from_proto(rollout_to_proto(rollout)) for rollout in named)
+
+
+def _figures(flow: Flow) -> tuple[Figure, ...]:
+    count = flow.rollouts
+    (few, few_mb), (most, most_mb) = sorted(flow.rss_mb.items())
+    each_kb = (most_mb - few_mb) / (most - few) * 1e3
+    return (
+        Figure(
+            "manager_cpu_us", flow.manager_s / count * 1e6, "µs", Better.LOWER, count, goal=MANAGER_GOAL_US
+        ),
+        Figure(
+            "dispatch_p99_ms",
+            quantile(flow.waits_s, 0.99) * 1e3,
+            "ms",
+            Better.LOWER,
+            len(flow.waits_s),
+            goal=DISPATCH_GOAL_MS,
+        ),
+        Figure("rollouts that the manager lets through", count / flow.wall_s, "1/s", Better.HIGHER, count),
+        Figure("manager_rss_mb_16k", most_mb, "MB", Better.LOWER, most),
+        Figure(f"manager's memory, {few} rollouts in flight", few_mb, "MB", Better.LOWER, few),
+        Figure("manager's memory for each more in flight", each_kb, "kB", Better.LOWER, most - few),
+    )
