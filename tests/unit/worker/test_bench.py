@@ -21,6 +21,7 @@ from embomatrix.worker.bench_figures import (
     Figure,
     figure_in,
     is_shared,
+    put_together,
     quantile_figure,
     result_to_json,
     shown,
@@ -380,6 +381,18 @@ def test_the_page_is_made_of_figures_that_were_measured_before(tmp_path):
     assert "| skill_speedup_min | 250 × | ≥ 100 | reached | 7 |" in engine
     assert "| step_outcomes_equal | 0.99 share | ≥ 0.98 | reached | 5,000 |" in fidelity
     assert "commit `def`" in fidelity
+
+
+def test_parts_of_a_bench_make_one_result_when_they_are_of_one_commit():
+    old, new, other = (
+        Figure(name, value, "ms", Better.LOWER, 1) for name, value in (("x", 1.0), ("x", 2.0), ("y", 3.0))
+    )
+    busy = replace(_result(new, other), machine=MACHINE | {"load_before": 3.0})
+    [whole] = put_together([_result(old), busy])
+    assert whole.figures == (new, other)
+    assert is_shared(whole.machine)
+    with pytest.raises(BenchError, match="commits abc and def"):
+        put_together([_result(old), replace(busy, commit="def")])
 
 
 def test_a_file_that_holds_no_figures_is_named(tmp_path):

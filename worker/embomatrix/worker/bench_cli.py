@@ -40,7 +40,14 @@ from embomatrix.worker.bench_fidelity import (
 from embomatrix.worker.bench_fidelity_page import figures_of, read_disagreement, skill_table
 from embomatrix.worker.bench_fidelity_page import replay as replayed
 from embomatrix.worker.bench_fidelity_pool import Modes
-from embomatrix.worker.bench_figures import BenchResult, commit_here, describe_machine, figure_in, read_result
+from embomatrix.worker.bench_figures import (
+    BenchResult,
+    commit_here,
+    describe_machine,
+    figure_in,
+    put_together,
+    read_result,
+)
 from embomatrix.worker.bench_output import console, errors, hand_in, refusals, write
 from embomatrix.worker.bench_page import hand_parts, render_page
 from embomatrix.worker.bench_rollout import bench_rollout
@@ -192,7 +199,7 @@ def page(
 ) -> None:
     """Render the page of figures that were measured before."""
     with refusals():
-        results = _with_speedup([read_result(file) for file in files])
+        results = _with_speedup(put_together([read_result(file) for file in files]))
         write(out, render_page(results, _present(out)))
         console.print(f"wrote {out}", highlight=False)
 

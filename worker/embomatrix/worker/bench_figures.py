@@ -106,6 +106,25 @@ def read_result(path: Path) -> BenchResult:
         ) from error
 
 
+def put_together(results: Sequence[BenchResult]) -> list[BenchResult]:
+    """Results of one bench, measured in parts, as one; the later figure of a name counts.
+
+    Raises BenchError when parts of a bench were measured at different commits.
+    """
+    whole: dict[str, BenchResult] = {}
+    for result in results:
+        before = whole.get(result.bench, result)
+        if before.commit != result.commit:
+            raise BenchError(
+                f"files of bench {result.bench!r} are of the commits {before.commit} and {result.commit}: "
+                "expected parts of one commit; measure again"
+            )
+        figures = {figure.name: figure for figure in (*before.figures, *result.figures)}
+        busiest = max((before.machine, result.machine), key=lambda machine: float(machine["load_before"]))
+        whole[result.bench] = BenchResult(result.bench, result.commit, busiest, tuple(figures.values()))
+    return list(whole.values())
+
+
 def _figure_from(item: Mapping[str, Any]) -> Figure:
     goal = None if item["goal"] is None else float(item["goal"])
     return Figure(

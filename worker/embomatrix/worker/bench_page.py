@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.worker.bench_ablation_page import EXPLANATION, ablation_lines
 from embomatrix.worker.bench_figures import BenchError, is_shared, shown
-from embomatrix.worker.bench_peers_page import CONTEST, contest_lines
+from embomatrix.worker.bench_peers_page import CONTEST, PREFIX, contest_lines
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -63,7 +63,11 @@ TITLES: Final[Mapping[str, tuple[str, str]]] = {
         "and loaded before their batches came, *repeated* ones were executed in before. *Steady* is one large group for each "
         "slot, *alone* one rollout with nothing else under way. Latency is from submission to result, so it includes waiting "
         "for the group's other rollouts. Overhead is the share of the slots' time in which they executed nothing. The manager "
-        "holds every bundle before the clock starts.",
+        "holds every bundle before the clock starts. *rollouts_per_s* and *overhead_ratio* are of the ablation's last row, a "
+        "worker with two slots: the ratio is the processor time of manager, worker beside its slots and trainer, over all. "
+        "*prewarm_hit_rate*, *prewarm_waste* and *start_latency_ratio* are of steps of two scenes with loading slowed by 2 s, "
+        "two steps announced ahead and 2.5 s of generation a step; a scene starts when its first rollout begins, and the ratio "
+        "is to scenes that come unannounced. `--part` measures one part alone; `bench page` puts files of parts together.",
     ),
 }
 """Heading and explanation of each bench, in the order of the page."""
@@ -89,7 +93,8 @@ def render_page(results: Sequence[BenchResult], before: str) -> str:
             lines += [_paragraph(f"Measured at commit `{result.commit}`, {load}."), ""]
         for subheading, words, rows in _subparts(result):
             lines += [f"### {subheading}", "", _paragraph(words), "", *rows, ""]
-        lines += _table(result.figures)
+        # What the contest's own table shows is not told twice.
+        lines += _table([figure for figure in result.figures if not figure.name.startswith(PREFIX)])
     headings = dict(HAND_PARTS)
     for name in dict.fromkeys([*headings, *parts]):
         lines += [""] + ([f"## {headings[name]}", ""] if name in headings else [])

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from embomatrix.worker.bench_peers import Contest, PeerOutcome, Tuned
 
 OURS: Final = "ours"
+PREFIX: Final = "contest, "
+"""How the names begin of figures that the contest's table shows."""
 LEAD_GOAL: Final = 1.0
 CONTEST: Final = (
     "Ours, a manager and a worker with two slots, driven over gRPC, against libraries that execute the same plans of "
@@ -94,7 +96,7 @@ def _count(name: str, value: int, measured: Pass) -> Figure:
 
 
 def _name(who: str, what: str) -> str:
-    return f"contest, {who}: {what}"
+    return f"{PREFIX}{who}: {what}"
 
 
 COLUMNS: Final[Mapping[str, str]] = {
