@@ -414,6 +414,21 @@ async def test_a_worker_whose_token_is_revoked_ends_as_well(tmp_path):
             await until(lambda: not pod._tasks)
 
 
+async def test_a_trainer_whose_token_is_revoked_reads_no_further(tmp_path):
+    async with guarded(tmp_path) as at, trainer(at) as client, await joined(at, "w1", execute_s=0.05):
+        token = await at.issue(Role.TRAINER)
+        async with ClusterClient(at.address, token, ca=at.ca) as revoked:
+            stream = revoked.execute(Batch("r1", "b1", 1, rollouts(40)), deadline_s=30)
+            await anext(stream)
+            async with at.operator() as operator:
+                await operator.revoke(token.partition(".")[0])
+            with pytest.raises(NotSignedInError, match="revoked"):
+                async for _ in stream:
+                    pass
+        # Nothing of the batch is lost: who may read it attaches.
+        assert len(await collect(client, 40)) == 40
+
+
 async def test_tokens_and_credentials_outlive_the_manager_and_what_was_revoked_stays_so(tmp_path):
     async with guarded(tmp_path) as at:
         first = await joined(at, "w1")

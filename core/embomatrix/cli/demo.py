@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.logging import RichHandler
 
 from embomatrix.cli.failure import INTERRUPTED, fail
-from embomatrix.cli.local_cluster import LocalCluster, local_cluster
+from embomatrix.cli.local_cluster import LocalCluster, local_cluster, without_membership
 from embomatrix.cli.supervisor import DIE_WITH_PARENT, embomatrix_command
 
 if TYPE_CHECKING:
@@ -130,7 +130,10 @@ def _run(problem: Callable[[], str], *arguments: str) -> None:
     write what it keeps.
     """
     with subprocess.Popen(
-        embomatrix_command(*arguments), start_new_session=True, preexec_fn=DIE_WITH_PARENT
+        embomatrix_command(*arguments),
+        start_new_session=True,
+        preexec_fn=DIE_WITH_PARENT,
+        env=without_membership(os.environ),
     ) as child:
         try:
             while (status := _status_of(child)) is None:

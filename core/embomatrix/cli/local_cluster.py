@@ -5,12 +5,15 @@ from __future__ import annotations
 import os
 import socket
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from embomatrix.cli.supervisor import ChildSpec, Supervisor, embomatrix_command
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
+
+MEMBERSHIP: Final = frozenset({"EMBOMATRIX_MANAGER", "EMBOMATRIX_TOKEN", "EMBOMATRIX_CA", "EMBOMATRIX_JOIN"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +34,7 @@ def local_cluster(folder: Path, *, workers: int, slots: int) -> LocalCluster:
     port, http_port = free_port(), free_port()
     address = f"127.0.0.1:{port}"
     # One thread per process: BLAS and OpenMP pools of idle daemons would only take the trainer's cores.
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
+    environment = {**without_membership(os.environ), "OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
     manager = ChildSpec(
         "manager",
         embomatrix_command(
@@ -62,6 +65,11 @@ def local_cluster(folder: Path, *, workers: int, slots: int) -> LocalCluster:
     )
     supervisor = Supervisor((manager, *daemons), folder / "logs")
     return LocalCluster(address, f"http://127.0.0.1:{http_port}", supervisor, names)
+
+
+def without_membership(environment: Mapping[str, str]) -> dict[str, str]:
+    """The environment without what a person set for another cluster: this one is open, and speaks no TLS."""
+    return {name: value for name, value in environment.items() if name not in MEMBERSHIP}
 
 
 def free_port() -> int:

@@ -54,7 +54,7 @@ async def build_server(
         WorkerServicer(runtime, gate, lease_ttl_s=lease_ttl_s), server
     )
     rollout_service_pb2_grpc.add_RolloutServiceServicer_to_server(
-        RolloutServicer(runtime.runs, authority=tls.authority if tls else b""), server
+        RolloutServicer(runtime.runs, gate, authority=tls.authority if tls else b""), server
     )
     scene_service_pb2_grpc.add_SceneServiceServicer_to_server(SceneServicer(runtime.bundles), server)
     admin_service_pb2_grpc.add_AdminServiceServicer_to_server(AdminServicer(runtime, gate), server)

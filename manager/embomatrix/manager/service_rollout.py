@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
     import grpc
 
+    from embomatrix.manager.access.gate import Gate
     from embomatrix.manager.results import BatchLog
     from embomatrix.manager.runs import Runs
     from embomatrix.manager.store.protocol import ResultRow
@@ -36,10 +37,11 @@ SLICE: Final = 128
 
 
 class RolloutServicer(rollout_service_pb2_grpc.RolloutServiceServicer):
-    """``authority`` is the certificate (PEM) of who signed the manager's; empty without TLS."""
+    """``gate`` knows who calls; ``authority`` is the certificate (PEM) of who signed the manager's, empty without TLS."""
 
-    def __init__(self, runs: Runs, *, authority: bytes = b"") -> None:
+    def __init__(self, runs: Runs, gate: Gate, *, authority: bytes = b"") -> None:
         self._runs = runs
+        self._gate = gate
         self._authority = authority.decode("ascii")
 
     async def GetCapabilities(
@@ -81,6 +83,7 @@ class RolloutServicer(rollout_service_pb2_grpc.RolloutServiceServicer):
             bind("batch", request.batch_id)
             log = await self._runs.submit(await _batch(request))
             async for results, groups in _results(log, 0):
+                self._gate.caller_of(context)  # a token that was revoked meanwhile reads nothing more
                 yield pb.ExecuteResponse(results=results, groups=groups)
 
     async def WaitExecution(
@@ -91,6 +94,7 @@ class RolloutServicer(rollout_service_pb2_grpc.RolloutServiceServicer):
             bind("batch", request.batch_id)
             log = self._runs.log_of(request.run_id, request.batch_id)
             async for results, groups in _results(log, request.after_cursor):
+                self._gate.caller_of(context)
                 yield pb.WaitExecutionResponse(results=results, groups=groups)
 
     async def CancelBatch(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import hmac
+import logging
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
@@ -34,6 +35,8 @@ if TYPE_CHECKING:
     from embomatrix.manager.registry import Session
     from embomatrix.manager.store.protocol import StateStore
     from embomatrix.rpc.roles import TokenInfo
+
+logger = logging.getLogger(__name__)
 
 SHARED_ID: Final = "shared"
 """What the token of ``--token`` is called; no issued token has an id like it."""
@@ -146,6 +149,7 @@ class Gate:
         async with self._lock:
             credential, token = self._book.issue(role, valid_s=valid_s, label=label, now_s=self._clock())
             await self._keep(credential)
+        logger.info("token issued token=%s role=%s label=%s", credential.token_id, role, credential.label)
         return token, credential.token_id
 
     async def revoke(self, token_id: str) -> None:
@@ -156,11 +160,13 @@ class Gate:
             )
         async with self._lock:
             await self._keep(self._book.revoke(token_id, "by the operator"))
+        logger.info("token revoked token=%s", token_id)
 
     async def revoke_worker(self, worker_id: str, reason: str) -> None:
         self._need_guard()
         async with self._lock:
             await self._keep(*self._book.revoke_worker(worker_id, reason))
+        logger.info("worker revoked worker=%s: %s", worker_id, reason)
 
     def infos(self) -> tuple[TokenInfo, ...]:
         return self._book.infos(now_s=self._clock())
@@ -173,6 +179,9 @@ class Gate:
                 self._book.find(token, now_s=now_s), worker_id, boot_id, now_s=now_s
             )
             await self._keep(*changed)
+        logger.info(
+            "worker joined worker=%s token=%s by=%s", worker_id, changed[0].token_id, changed[0].joined_by
+        )
         return Admission(changed[0].token_id, own)
 
     async def _keep(self, *credentials: Credential) -> None:
