@@ -92,21 +92,6 @@ def revoke(
     print(f"revoked {token_id}")
 
 
-@app.command()
-def revoke_worker(
-    worker: Annotated[
-        str, typer.Argument(help="Id of the worker, as `embomatrix cluster workers` shows it.")
-    ],
-    reason: Annotated[str, typer.Option(help="What its owner is told.")] = "",
-    manager: Manager = "127.0.0.1:50070",
-    token: Token = "",
-    ca: Ca = None,
-) -> None:
-    """Put a worker out: its session ends, what it held goes to others, and it must join anew to come back."""
-    _ask(manager, token, ca, lambda client: client.revoke_worker(worker, reason))
-    print(f"revoked {worker}")
-
-
 def _left(info: TokenInfo) -> str:
     return f"{info.left_s / 3600:.1f} h" if info.left_s else "until revoked"
 
