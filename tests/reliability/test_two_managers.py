@@ -11,6 +11,7 @@ from tests.fakes.real_cluster import RealCluster, batch_of, connected, opened, o
 from tests.fakes.redis_server import RedisServer
 
 from embomatrix.cli.local_cluster import free_port
+from embomatrix.rpc.admin import AdminClient
 from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.status import StandbyError
 
@@ -124,3 +125,7 @@ async def test_a_manager_that_stands_by_names_the_leader(tmp_path):
             with pytest.raises(StandbyError, match="stands by") as caught:
                 await client.open_run("x")
         assert caught.value.leader == f"127.0.0.1:{cluster.ports['first']}"
+        both_of_them = f"127.0.0.1:{cluster.ports['second']},127.0.0.1:{cluster.ports['first']}"
+        async with ClusterClient(both_of_them) as client, AdminClient(both_of_them) as admin:
+            assert await client.open_run("x", "x") == "x"
+            assert [run.run_id for run in await admin.open_runs()] == ["x"]

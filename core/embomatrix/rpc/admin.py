@@ -10,6 +10,7 @@ from embomatrix.rpc.channel import DEFAULT_ADDRESS, open_channel
 from embomatrix.rpc.convert import each, inside
 from embomatrix.rpc.convert_log import event_page_from_proto, run_summary_from_proto
 from embomatrix.rpc.convert_session import plan_cell_from_proto, run_info_from_proto, worker_info_from_proto
+from embomatrix.rpc.managers import PATIENCE_S, Channels, Managers, of_the_leader
 from embomatrix.rpc.status import cluster_errors
 
 if TYPE_CHECKING:
@@ -21,24 +22,48 @@ CALL_S: Final = 10.0
 
 
 class AdminClient:
-    """Async context manager over one channel to the manager at HOST:PORT. Every failure is a ``ClusterError``."""
+    """Async context manager over channels to the manager at HOST:PORT, or to several of which one leads.
+
+    Every failure is a ``ClusterError``.
+    """
 
     def __init__(
         self, address: str = DEFAULT_ADDRESS, token: str = "", *, ca: bytes = b"", call_s: float = CALL_S
     ) -> None:
-        self._address = address
+        self._managers = Managers(address)
         self._token = token
         self._ca = ca
         self._call_s = call_s
 
     async def __aenter__(self) -> Self:
-        self._channel = open_channel(self._address, self._token, self._ca)
-        self._stub = admin_service_pb2_grpc.AdminServiceStub(self._channel)
+        self._channels = Channels(
+            self._managers, lambda address: open_channel(address, self._token, self._ca)
+        )
+        self._channels.present()
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        await self._channel.close()
+        await self._channels.close()
 
+    @property
+    def managers(self) -> Managers:
+        """Whom this client turns to."""
+        return self._managers
+
+    @property
+    def patience_s(self) -> float:
+        """How long a call is tried anew with the other managers."""
+        return PATIENCE_S
+
+    @property
+    def _address(self) -> str:
+        return self._managers.current
+
+    @property
+    def _stub(self) -> admin_service_pb2_grpc.AdminServiceAsyncStub:
+        return admin_service_pb2_grpc.AdminServiceStub(self._channels.present())
+
+    @of_the_leader
     async def workers(self) -> tuple[WorkerInfo, ...]:
         """The workers that the manager knows, also those that it lost a moment ago."""
         with cluster_errors(self._address):
@@ -53,12 +78,14 @@ class AdminClient:
         """Those that the manager still keeps, the one that was closed last first."""
         return await self._runs(pb.ListRunsRequest(closed=True))
 
+    @of_the_leader
     async def run(self, run_id: str) -> RunSummary:
         """What a run came to, so far or in the end. Raises NotFoundError."""
         with cluster_errors(self._address):
             answer = await self._stub.GetRun(pb.GetRunRequest(run_id=run_id), timeout=self._call_s)
             return inside("summary", run_summary_from_proto, answer)
 
+    @of_the_leader
     async def events(self, run_id: str = "", *, after: int = 0) -> EventPage:
         """One page of a run's log, or of the fleet's, of what came after that sequence. Raises NotFoundError."""
         request = pb.ReadEventsRequest(run_id=run_id, after=after)
@@ -73,33 +100,39 @@ class AdminClient:
             found += page
         return tuple(found)
 
+    @of_the_leader
     async def drain(self, worker_id: str) -> None:
         """The worker gets nothing new and leaves when it has finished what it holds. Raises NotFoundError."""
         with cluster_errors(self._address):
             await self._stub.DrainWorker(pb.DrainWorkerRequest(worker_id=worker_id), timeout=self._call_s)
 
+    @of_the_leader
     async def resume(self, worker_id: str) -> None:
         """Take a drain back, as long as the worker has not left. Raises NotFoundError."""
         request = pb.ResumeWorkerRequest(worker_id=worker_id)
         with cluster_errors(self._address):
             await self._stub.ResumeWorker(request, timeout=self._call_s)
 
+    @of_the_leader
     async def plan(self, run_id: str = "") -> tuple[PlanCell, ...]:
         """The look-ahead grid of one run, or of all: what each coming step needs, and who has it."""
         with cluster_errors(self._address):
             answer = await self._stub.GetPlan(pb.GetPlanRequest(run_id=run_id), timeout=self._call_s)
             return each("cells", plan_cell_from_proto, answer.cells)
 
+    @of_the_leader
     async def pause_dispatch(self) -> None:
         """Have no new leases given; what runs goes on."""
         with cluster_errors(self._address):
             await self._stub.PauseDispatch(pb.PauseDispatchRequest(), timeout=self._call_s)
 
+    @of_the_leader
     async def resume_dispatch(self) -> None:
         """Have leases given again."""
         with cluster_errors(self._address):
             await self._stub.ResumeDispatch(pb.ResumeDispatchRequest(), timeout=self._call_s)
 
+    @of_the_leader
     async def _runs(self, request: pb.ListRunsRequest) -> tuple[RunInfo, ...]:
         with cluster_errors(self._address):
             answer = await self._stub.ListRuns(request, timeout=self._call_s)

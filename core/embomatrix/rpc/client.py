@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import functools
 import logging
 import time
 from dataclasses import dataclass
@@ -36,7 +35,7 @@ from embomatrix.rpc.convert_run import (
     run_terms_to_proto,
 )
 from embomatrix.rpc.convert_session import run_info_from_proto, worker_info_from_proto
-from embomatrix.rpc.managers import Managers, of_the_leader
+from embomatrix.rpc.managers import PATIENCE_S, Channels, Managers, of_the_leader
 from embomatrix.rpc.status import (
     DeadlineError,
     InternalError,
@@ -78,7 +77,7 @@ class ClientLimits:
     """For every rollout of a batch to have its outcome."""
     retry_first_s: float = 0.1
     retry_longest_s: float = 2.0
-    failover_s: float = 20.0
+    failover_s: float = PATIENCE_S
     """For another manager to take over, where several were told."""
     """Wait before a broken stream is attached again: doubled from the first to the longest."""
 
@@ -87,25 +86,6 @@ DEFAULT_LIMITS: Final = ClientLimits()
 DEFAULT_TERMS: Final = RunTerms()
 _TRANSIENT: Final = (UnavailableError, InternalError, OverloadedError)
 """Errors after which the same batch is attached again rather than given up."""
-
-
-@dataclass(frozen=True)
-class _Link:
-    """A channel to one manager, and its services."""
-
-    channel: grpc.aio.Channel
-
-    @functools.cached_property
-    def rollouts(self) -> rollout_service_pb2_grpc.RolloutServiceAsyncStub:
-        return rollout_service_pb2_grpc.RolloutServiceStub(self.channel)
-
-    @functools.cached_property
-    def scenes(self) -> scene_service_pb2_grpc.SceneServiceAsyncStub:
-        return scene_service_pb2_grpc.SceneServiceStub(self.channel)
-
-    @functools.cached_property
-    def admin(self) -> admin_service_pb2_grpc.AdminServiceAsyncStub:
-        return admin_service_pb2_grpc.AdminServiceStub(self.channel)
 
 
 class ClusterClient:
@@ -127,15 +107,16 @@ class ClusterClient:
         self._token = token
         self._ca = ca
         self._limits = limits
-        self._links: dict[str, _Link] = {}
 
     async def __aenter__(self) -> Self:
-        self._link()
+        self._channels = Channels(
+            self._managers, lambda address: open_channel(address, self._token, self._ca)
+        )
+        self._channels.present()
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        for link in self._links.values():
-            await link.channel.close()
+        await self._channels.close()
 
     @property
     def managers(self) -> Managers:
@@ -147,28 +128,21 @@ class ClusterClient:
         """How long a call is tried anew with the other managers."""
         return self._limits.failover_s
 
-    def _link(self) -> _Link:
-        address = self._managers.current
-        if address not in self._links:
-            # Links of managers that were left stay open: other calls may still be on them.
-            self._links[address] = _Link(open_channel(address, self._token, self._ca))
-        return self._links[address]
-
     @property
     def _address(self) -> str:
         return self._managers.current
 
     @property
     def _rollouts(self) -> rollout_service_pb2_grpc.RolloutServiceAsyncStub:
-        return self._link().rollouts
+        return rollout_service_pb2_grpc.RolloutServiceStub(self._channels.present())
 
     @property
     def _scenes(self) -> scene_service_pb2_grpc.SceneServiceAsyncStub:
-        return self._link().scenes
+        return scene_service_pb2_grpc.SceneServiceStub(self._channels.present())
 
     @property
     def _admin(self) -> admin_service_pb2_grpc.AdminServiceAsyncStub:
-        return self._link().admin
+        return admin_service_pb2_grpc.AdminServiceStub(self._channels.present())
 
     @of_the_leader
     async def open_run(self, name: str, run_id: str = "", terms: RunTerms = DEFAULT_TERMS) -> str:

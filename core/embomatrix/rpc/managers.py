@@ -13,10 +13,14 @@ from embomatrix.rpc.status import InvalidRequestError, StandbyError, Unavailable
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Coroutine
 
+    import grpc
+
     from embomatrix.rpc.status import ClusterError
 
 PAUSE_S: Final = 0.2
 """Between two calls of different managers."""
+PATIENCE_S: Final = 20.0
+"""For another manager to take over, where several were told."""
 P = ParamSpec("P")
 T = TypeVar("T")
 C = TypeVar("C", bound="Caller")
@@ -32,6 +36,26 @@ def addresses_of(text: str) -> tuple[str, ...]:
                 "commas between them"
             )
     return addresses
+
+
+class Channels:
+    """A channel to each manager that was turned to. Those that were left stay open: other calls may still be on them."""
+
+    def __init__(self, managers: Managers, open_to: Callable[[str], grpc.aio.Channel]) -> None:
+        self._managers = managers
+        self._open_to = open_to
+        self._open: dict[str, grpc.aio.Channel] = {}
+
+    def present(self) -> grpc.aio.Channel:
+        """That to the present manager."""
+        address = self._managers.current
+        if address not in self._open:
+            self._open[address] = self._open_to(address)
+        return self._open[address]
+
+    async def close(self) -> None:
+        for channel in self._open.values():
+            await channel.close()
 
 
 class Caller(Protocol):

@@ -9,6 +9,7 @@ from embomatrix.proto.v1 import admin_service_pb2_grpc
 from embomatrix.rpc.channel import DEFAULT_ADDRESS, open_channel
 from embomatrix.rpc.client import DEFAULT_LIMITS, ClientLimits
 from embomatrix.rpc.convert import ConvertError, each, finite, required
+from embomatrix.rpc.managers import PATIENCE_S, Channels, Managers, of_the_leader
 from embomatrix.rpc.roles import Role, TokenInfo
 from embomatrix.rpc.status import cluster_errors
 
@@ -51,7 +52,10 @@ def token_info_from_proto(message: pb.TokenInfo) -> TokenInfo:
 
 
 class TokenClient:
-    """Async context manager over one channel to the manager. Every failure is a ``ClusterError``."""
+    """Async context manager over channels to the manager, or to several of which one leads.
+
+    Every failure is a ``ClusterError``.
+    """
 
     def __init__(
         self,
@@ -61,19 +65,40 @@ class TokenClient:
         ca: bytes = b"",
         limits: ClientLimits = DEFAULT_LIMITS,
     ) -> None:
-        self._address = address
+        self._managers = Managers(address)
         self._token = token
         self._ca = ca
         self._limits = limits
 
     async def __aenter__(self) -> Self:
-        self._channel = open_channel(self._address, self._token, self._ca)
-        self._admin = admin_service_pb2_grpc.AdminServiceStub(self._channel)
+        self._channels = Channels(
+            self._managers, lambda address: open_channel(address, self._token, self._ca)
+        )
+        self._channels.present()
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        await self._channel.close()
+        await self._channels.close()
 
+    @property
+    def managers(self) -> Managers:
+        """Whom this client turns to."""
+        return self._managers
+
+    @property
+    def patience_s(self) -> float:
+        """How long a call is tried anew with the other managers."""
+        return PATIENCE_S
+
+    @property
+    def _address(self) -> str:
+        return self._managers.current
+
+    @property
+    def _admin(self) -> admin_service_pb2_grpc.AdminServiceAsyncStub:
+        return admin_service_pb2_grpc.AdminServiceStub(self._channels.present())
+
+    @of_the_leader
     async def issue(self, role: Role, *, valid_s: float = 0.0, label: str = "") -> tuple[str, str]:
         """A new token and its id; the manager keeps only its hash. ``valid_s`` 0: until revoked."""
         request = pb.IssueTokenRequest(role=_ROLES[role], valid_s=valid_s, label=label)
@@ -81,12 +106,14 @@ class TokenClient:
             answer = await self._admin.IssueToken(request, timeout=self._limits.call_s)
         return answer.token, answer.token_id
 
+    @of_the_leader
     async def listed(self) -> tuple[TokenInfo, ...]:
         """The tokens that are valid."""
         with cluster_errors(self._address):
             answer = await self._admin.ListTokens(pb.ListTokensRequest(), timeout=self._limits.call_s)
             return each("tokens", token_info_from_proto, answer.tokens)
 
+    @of_the_leader
     async def revoke(self, token_id: str) -> None:
         """Make a token void; sessions that it opened end at once."""
         with cluster_errors(self._address):
@@ -94,6 +121,7 @@ class TokenClient:
                 pb.RevokeTokenRequest(token_id=token_id), timeout=self._limits.call_s
             )
 
+    @of_the_leader
     async def revoke_worker(self, worker_id: str, reason: str = "") -> None:
         """Make a worker's credential void: its session ends, and what it held goes to others."""
         with cluster_errors(self._address):
