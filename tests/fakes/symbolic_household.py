@@ -12,7 +12,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from embomatrix.reward.hierarchy import score
-from embomatrix.rpc.values import Completed, InfraCode, InfraFailure, RolloutResult, RunStats, Timings
+from embomatrix.rpc.values import (
+    Completed,
+    InfraCode,
+    InfraFailure,
+    RolloutResult,
+    RunStats,
+    RunTerms,
+    Timings,
+)
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.prompt import Row, Situation
 from embomatrix.skills.syntax import PlaceRelation, Skill, SkillCall
@@ -283,7 +291,7 @@ class SymbolicCluster:
 
     async def __aexit__(self, *_: object) -> None: ...
 
-    async def open_run(self, name: str, run_id: str = "") -> str:
+    async def open_run(self, name: str, run_id: str = "", terms: RunTerms | None = None) -> str:
         return run_id or f"run-{name}"
 
     async def announce_lookahead(self, run_id, version, entries):

@@ -76,7 +76,7 @@ def test_leaving_closes_the_run_with_work_under_way():
 
 
 class Unreachable(SymbolicCluster):
-    async def open_run(self, name, run_id=""):
+    async def open_run(self, name, run_id="", terms=None):
         raise ManagerUnreachableError("no manager answers at nowhere:1: start one, or pass --manager")
 
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from embomatrix.trainer.policy.protocol import Policy
     from embomatrix.trainer.report import Summary
     from embomatrix.trainer.rollout import Gateway
-    from embomatrix.trainer.settings import TrainSettings
+    from embomatrix.trainer.settings import OnLost, TrainSettings
     from embomatrix.trainer.telling import Teller
 
     Connect = Callable[[], ClusterClient]
@@ -248,10 +248,14 @@ def _connector(manager: str, token: str, ca: Path | None) -> Connect:
     return functools.partial(ClusterClient, manager, read_token(token), ca=read_ca(ca))
 
 
-def _gateway(tasks: TaskSet, connect: Connect, name: str, seed: int) -> Gateway:
+def _gateway(tasks: TaskSet, connect: Connect, name: str, seed: int, on_lost: OnLost) -> Gateway:
+    from embomatrix.rpc.values import GroupPolicy
     from embomatrix.trainer.rollout import Gateway
+    from embomatrix.trainer.settings import OnLost
 
-    return Gateway(connect, tasks.bundle_bytes, run_name=name, run_seed=seed)
+    whole = on_lost is OnLost.GROUP
+    policy = GroupPolicy.RETRY_THEN_FAIL_GROUP if whole else GroupPolicy.PARTIAL
+    return Gateway(connect, tasks.bundle_bytes, run_name=name, run_seed=seed, policy=policy)
 
 
 def _run(
@@ -274,7 +278,7 @@ def _run(
         ) from error
     reference = resumed.pop("reference", None)
     with (
-        _gateway(tasks, connect, out.name, settings.seed) as gateway,
+        _gateway(tasks, connect, out.name, settings.seed, settings.grpo.on_lost) as gateway,
         display_for(console) as display,
     ):
         parts = Parts(policy, _teller(policy, tasks, settings), tasks, gateway, display, reference)
@@ -286,9 +290,10 @@ def _evaluated(
 ) -> Evaluation:
     from embomatrix.trainer.evaluate import evaluate_policy
     from embomatrix.trainer.progress import display_for
+    from embomatrix.trainer.settings import OnLost
 
     with (
-        _gateway(tasks, connect, "eval", settings.seed) as gateway,
+        _gateway(tasks, connect, "eval", settings.seed, OnLost.PARTIAL) as gateway,
         display_for(Console()) as display,
     ):
         return evaluate_policy(

@@ -11,12 +11,12 @@ import logging
 import math
 import threading
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol, Self, TypeVar
+from typing import TYPE_CHECKING, Final, Protocol, Self, TypeVar
 
 from embomatrix.reward.hierarchy import unparsable
 from embomatrix.rpc.logs import bind
 from embomatrix.rpc.status import ClusterError
-from embomatrix.rpc.values import Batch, Completed, LookaheadEntry, Rollout, RunStats
+from embomatrix.rpc.values import Batch, Completed, GroupPolicy, LookaheadEntry, Rollout, RunStats, RunTerms
 from embomatrix.skills.parse import PlanError, parse_plan
 from embomatrix.skills.prompt import Codec, with_indices
 from embomatrix.trainer.data import group_seed
@@ -36,12 +36,13 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 T = TypeVar("T")
+DEFAULT_TERMS: Final = RunTerms()
 
 
 class Cluster(Protocol):
     """What the gateway needs of ``rpc.client.ClusterClient``."""
 
-    async def open_run(self, name: str, run_id: str = "") -> str: ...
+    async def open_run(self, name: str, run_id: str = "", terms: RunTerms = DEFAULT_TERMS) -> str: ...
 
     async def announce_lookahead(
         self, run_id: str, version: int, entries: Iterable[LookaheadEntry]
@@ -83,7 +84,10 @@ def parsed(text: str, situation: Situation, codec: Codec) -> Plan:
 
 
 class Gateway:
-    """Context manager over one run of the cluster. Methods are called from the trainer's thread."""
+    """Context manager over one run of the cluster. Methods are called from the trainer's thread.
+
+    ``policy`` says what the cluster does with the rest of a group that lost a rollout: nobody executes what is left out anyway.
+    """
 
     def __init__(
         self,
@@ -92,11 +96,13 @@ class Gateway:
         *,
         run_name: str,
         run_seed: int,
+        policy: GroupPolicy = GroupPolicy.RETRY_THEN_FAIL_GROUP,
     ) -> None:
         self._open_cluster = open_cluster
         self._bundle_bytes = bundle_bytes
         self._run_name = run_name
         self._run_seed = run_seed
+        self._terms = RunTerms(policy)
         self._announced = 0
         self._sent: dict[str, asyncio.Task[None]] = {}
         self._loop = asyncio.new_event_loop()
@@ -117,7 +123,7 @@ class Gateway:
         self._context = self._open_cluster()
         self._cluster = await self._context.__aenter__()
         try:
-            self.run_id = await self._cluster.open_run(self._run_name)
+            self.run_id = await self._cluster.open_run(self._run_name, terms=self._terms)
         except BaseException:
             await self._context.__aexit__(None, None, None)
             raise

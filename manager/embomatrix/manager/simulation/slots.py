@@ -229,6 +229,10 @@ class SimulatedSlots:
         self._free -= 1
         began_s = around.agenda.now_s
         self._running[lease.ref] = lease, began_s
+        rendering = sum(running.rollout.render for running, _ in self._running.values())
+        around.gauge.counts["rendered without a slot for it"] += (
+            rendering > self._machine.resources.render_slots
+        )
         rollout_id = lease.rollout.rollout_id
         seconds = around.setting.duration_s(rollout_id) / self._machine.speed
         fate, crash, hang = around.dice.random(), around.faults.crash, around.faults.hang

@@ -1,0 +1,370 @@
+"""What the Task-Dispatcher does about lost members, stragglers, stuck slots, pauses, and runs beside one another."""
+
+import hypothesis.strategies as st
+import pytest
+from hypothesis import given
+from tests.fakes.worker import completed
+
+from embomatrix.manager.assignments import DispatchLimits
+from embomatrix.manager.commands import CancelLease, DeliverResult, FinishBatch, GiveLease
+from embomatrix.manager.dispatcher import Dispatcher
+from embomatrix.manager.events import (
+    BatchSubmitted,
+    DispatchPaused,
+    DispatchResumed,
+    LeaseFinished,
+    LeasesRenewed,
+    RunOpened,
+    Tick,
+    WorkerDrained,
+    WorkerJoined,
+    WorkerReported,
+    WorkerResumed,
+)
+from embomatrix.manager.shares import Share, in_turns, quotas
+from embomatrix.rpc.values import (
+    Batch,
+    Cancelled,
+    Completed,
+    GroupPolicy,
+    InfraCode,
+    InfraFailure,
+    LeaseProgress,
+    Resident,
+    ResidentState,
+    Resources,
+    Rollout,
+    RunTerms,
+)
+
+LIMITS = DispatchLimits(known_after=4, hedge_share=0.1)
+CRASH = InfraFailure(InfraCode.SLOT_CRASHED, "signal 11")
+
+
+class Desk:
+    """A dispatcher, its clock, and the leases that its workers hold."""
+
+    def __init__(self, limits=LIMITS):
+        self.dispatcher = Dispatcher(limits, boot_id="boot")
+        self.now_s = 0.0
+        self.results = {}
+        self.held = {}
+        self.hedges = []
+
+    def tell(self, event, after_s=0.0):
+        self.now_s += after_s
+        commands = self.dispatcher.handle(event, now_s=self.now_s)
+        for command in commands:
+            match command:
+                case DeliverResult(result=result):
+                    self.results[result.rollout_id] = result.outcome
+                case GiveLease():
+                    self.held.setdefault(command.rollout.rollout_id, {})[command.worker_id] = command.ref
+                    self.hedges += [command] if command.hedge else []
+                case CancelLease(worker_id, ref):
+                    for leases in self.held.values():
+                        if leases.get(worker_id) == ref:
+                            del leases[worker_id]
+        return commands
+
+    def worker(self, worker_id, slots=1, warm=("kitchen",), render_slots=0):
+        self.tell(WorkerJoined(worker_id, Resources(slots, slots, 1024, render_slots=render_slots)))
+        self.report(worker_id, warm, resync=True)
+
+    def report(self, worker_id, warm=("kitchen",), **changes):
+        residents = tuple(Resident(scene, ResidentState.WARM) for scene in warm)
+        return self.tell(WorkerReported(worker_id, residents, **changes))
+
+    def submit(self, *groups, run_id="r1", batch_id="b1", scene="kitchen", render=False):
+        """So many rollouts in each group, named "group.index"."""
+        rollouts = tuple(
+            Rollout(f"{batch_id}.{group}.{index}", f"{batch_id}.{group}", scene, "t", (), 0, render)
+            for group, size in enumerate(groups)
+            for index in range(size)
+        )
+        return self.tell(BatchSubmitted(Batch(run_id, batch_id, 1, rollouts)))
+
+    def finish(self, rollout_id, outcome=None, worker_id=None, after_s=0.0):
+        leases = self.held[rollout_id]
+        worker_id = worker_id or next(iter(leases))
+        ref = leases.pop(worker_id)
+        return self.tell(LeaseFinished(worker_id, ref, outcome or completed(worker_id)), after_s)
+
+
+@pytest.fixture
+def desk():
+    return Desk()
+
+
+def policy(desk, group_policy, **terms):
+    desk.tell(RunOpened("r1", RunTerms(group_policy, **terms)))
+
+
+# Group policies
+
+
+def test_the_default_cancels_what_is_left_of_a_group_that_lost_a_member_and_nothing_else(desk):
+    desk.worker("w1", slots=8)
+    desk.submit(3, 2)
+    desk.finish("b1.0.0")
+    for _ in range(3):
+        commands = desk.finish("b1.0.1", CRASH)
+    assert isinstance(desk.results["b1.0.0"], Completed)
+    assert isinstance(desk.results["b1.0.1"], InfraFailure)
+    assert desk.results["b1.0.2"] == Cancelled("rollout b1.0.1 was lost: slot_crashed")
+    assert [command for command in commands if isinstance(command, CancelLease)]
+    assert not {"b1.1.0", "b1.1.1"} & set(desk.results)
+    assert desk.dispatcher.counters("r1").groups_failed == 1
+
+
+def test_partial_groups_go_on_without_the_lost_member(desk):
+    policy(desk, GroupPolicy.PARTIAL)
+    desk.worker("w1", slots=8)
+    desk.submit(2)
+    for _ in range(3):
+        desk.finish("b1.0.0", CRASH)
+    desk.finish("b1.0.1")
+    assert isinstance(desk.results["b1.0.1"], Completed)
+
+
+def test_fail_fast_tries_nothing_twice_and_cancels_the_batch(desk):
+    policy(desk, GroupPolicy.FAIL_FAST)
+    desk.worker("w1", slots=8)
+    desk.submit(2, 2, 2)
+    commands = desk.finish("b1.1.0", CRASH)
+    assert commands.count(FinishBatch("r1", "b1")) == 1
+    assert isinstance(desk.results["b1.1.0"], InfraFailure)
+    assert sum(isinstance(outcome, Cancelled) for outcome in desk.results.values()) == 5
+    assert desk.dispatcher.counters("r1").groups_failed == 3
+
+
+def test_what_a_failed_group_frees_is_used_in_the_same_step(desk):
+    desk.worker("w1", slots=1)
+    desk.submit(2, 2)
+    desk.tell(Tick(), after_s=601.0)
+    desk.submit(1, batch_id="b2")
+    assert "b2.0.0" in desk.held
+
+
+def test_the_deadline_of_a_run_goes_before_the_manager_s(desk):
+    policy(desk, GroupPolicy.PARTIAL, rollout_deadline_s=5.0)
+    desk.submit(1)
+    desk.tell(Tick(), after_s=5.0)
+    assert desk.results["b1.0.0"].code is InfraCode.DEADLINE
+    assert "within 5 s" in desk.results["b1.0.0"].message
+
+
+# Hedging
+
+
+def known(desk, count=20):
+    """A run of which the manager knows that its rollouts take a second; one is left that runs on w1."""
+    desk.worker("w1", slots=count)
+    desk.submit(count)
+    for index in range(count - 1):
+        desk.finish(f"b1.0.{index}", after_s=1.0 if not index else 0.0)
+
+
+def test_a_straggler_at_the_end_of_its_group_gets_a_second_lease_and_the_first_result_counts(desk):
+    known(desk)
+    desk.worker("w2")
+    desk.tell(Tick(), after_s=0.5)
+    assert desk.hedges == []
+    desk.tell(Tick(), after_s=2.0)
+    (hedge,) = desk.hedges
+    assert (hedge.worker_id, hedge.rollout.rollout_id) == ("w2", "b1.0.19")
+    first = desk.held["b1.0.19"]["w1"]
+    commands = desk.finish("b1.0.19", worker_id="w2")
+    assert CancelLease("w1", first) in commands
+    assert desk.results["b1.0.19"].worker_id == "w2"
+    desk.tell(LeaseFinished("w1", first, completed("w1")))
+    assert desk.results["b1.0.19"].worker_id == "w2"
+    counters = desk.dispatcher.counters("r1")
+    assert (counters.hedged, counters.stale_results, counters.delivered) == (1, 1, 20)
+    assert not desk.dispatcher.live_leases
+
+
+def test_a_second_lease_that_fails_leaves_the_first_alone(desk):
+    known(desk)
+    desk.worker("w2")
+    desk.tell(Tick(), after_s=3.0)
+    desk.finish("b1.0.19", CRASH, worker_id="w2")
+    assert desk.dispatcher.counters("r1").redispatched == 0
+    desk.finish("b1.0.19", worker_id="w1")
+    assert isinstance(desk.results["b1.0.19"], Completed)
+
+
+def test_a_rollout_is_hedged_once_and_a_run_within_its_budget():
+    desk = Desk(DispatchLimits(known_after=4, hedge_share=0.05))
+    desk.worker("w1", slots=40)
+    desk.submit(40)
+    for index in range(36):
+        desk.finish(f"b1.0.{index}", after_s=1.0 if not index else 0.0)
+    desk.worker("w2", slots=8)
+    for _ in range(20):
+        desk.tell(Tick(), after_s=1.0)
+    assert len(desk.hedges) == 2
+
+
+def test_what_ran_out_of_memory_is_not_started_twice_at_once(desk):
+    desk.worker("w1", slots=20)
+    desk.submit(20)
+    desk.finish("b1.0.19", InfraFailure(InfraCode.SLOT_OOM, "MemoryError"))
+    for index in range(19):
+        desk.finish(f"b1.0.{index}", after_s=1.0 if not index else 0.0)
+    desk.worker("w2")
+    desk.tell(Tick(), after_s=30.0)
+    assert desk.hedges == []
+
+
+def test_a_straggler_whose_scene_is_nowhere_else_has_it_loaded(desk):
+    known(desk)
+    desk.worker("w2", warm=())
+    desk.tell(Tick(), after_s=3.0)
+    demand = desk.dispatcher.demand()
+    assert demand.pending == {"kitchen": 1}
+    assert demand.waited_s["kitchen"] >= 3.0
+    desk.report("w2")
+    desk.tell(Tick())
+    assert [hedge.worker_id for hedge in desk.hedges] == ["w2"]
+
+
+# Progress
+
+
+def beat(desk, worker_id, rollout_id, steps, after_s):
+    ref = desk.held[rollout_id][worker_id]
+    return desk.tell(LeasesRenewed(worker_id, (ref,), (LeaseProgress(ref, steps),)), after_s)
+
+
+def test_a_slot_that_does_no_step_any_more_loses_its_lease_to_another_worker(desk):
+    known(desk)
+    desk.submit(1, batch_id="b2")
+    (worker_id,) = desk.held["b2.0.0"]
+    desk.worker("w2")
+    for steps in range(8):
+        beat(desk, worker_id, "b2.0.0", steps, after_s=3.0)
+    beat(desk, worker_id, "b2.0.0", 7, after_s=9.0)
+    assert list(desk.held["b2.0.0"]) == [worker_id]
+    beat(desk, worker_id, "b2.0.0", 7, after_s=1.0)
+    assert list(desk.held["b2.0.0"]) == ["w2"]
+    assert desk.dispatcher.counters("r1").redispatched == 1
+
+
+def test_a_worker_that_tells_no_progress_is_not_judged_by_it(desk):
+    known(desk)
+    ref = desk.held["b1.0.19"]["w1"]
+    for _ in range(20):
+        desk.tell(LeasesRenewed("w1", (ref,)), after_s=5.0)
+    assert desk.held["b1.0.19"] == {"w1": ref}
+
+
+def test_three_stalls_end_a_rollout_as_stalled(desk):
+    known(desk)
+    for _ in range(3):
+        beat(desk, "w1", "b1.0.19", 3, after_s=1.0)
+        beat(desk, "w1", "b1.0.19", 3, after_s=20.0)
+    assert desk.results["b1.0.19"].code is InfraCode.STALLED
+    assert "did no step for 20 s, after 3" in desk.results["b1.0.19"].message
+
+
+# Pauses
+
+
+def test_nothing_is_leased_while_dispatch_is_paused_and_everything_after(desk):
+    desk.worker("w1", slots=2)
+    desk.tell(DispatchPaused())
+    desk.submit(2)
+    desk.tell(Tick(), after_s=100.0)
+    assert desk.held == {}
+    assert desk.results == {}
+    desk.tell(DispatchResumed())
+    assert set(desk.held) == {"b1.0.0", "b1.0.1"}
+
+
+def test_a_paused_worker_finishes_what_it_holds_and_gets_nothing_new(desk):
+    desk.worker("w1")
+    desk.submit(3)
+    desk.report("w1", paused="the owner is back")
+    desk.finish("b1.0.0")
+    assert "b1.0.2" not in desk.held
+    desk.report("w1")
+    assert "b1.0.2" in desk.held
+
+
+def test_a_drain_that_is_taken_back_gives_work_again_unless_the_worker_itself_leaves(desk):
+    desk.worker("w1")
+    desk.tell(WorkerDrained("w1"))
+    desk.submit(1)
+    assert desk.held == {}
+    desk.report("w1", draining=True)
+    desk.tell(WorkerResumed("w1"))
+    assert desk.held == {}
+    desk.report("w1", draining=False)
+    assert "b1.0.0" in desk.held
+
+
+# Rendering
+
+
+def test_rollouts_that_render_go_to_slots_that_render_and_no_more_than_there_are(desk):
+    desk.worker("w1", slots=4)
+    desk.worker("w2", slots=4, render_slots=1)
+    desk.submit(3, render=True)
+    assert [list(leases) for leases in desk.held.values()] == [["w2"]]
+    desk.submit(2, batch_id="b2")
+    assert "b2.0.1" in desk.held
+    desk.finish("b1.0.0")
+    assert list(desk.held["b1.0.1"]) == ["w2"]
+
+
+# Runs beside one another
+
+
+def test_a_late_run_gets_the_next_free_slot_beside_a_large_batch(desk):
+    desk.worker("w1", slots=2)
+    desk.submit(200, run_id="large", batch_id="large")
+    desk.submit(1, run_id="small", batch_id="small")
+    desk.finish("large.0.0", after_s=1.0)
+    assert "small.0.0" in desk.held
+
+
+@given(
+    st.lists(st.tuples(st.sampled_from("abc"), st.integers(0, 2), st.floats(1.0, 9.0)), max_size=30),
+    st.fixed_dictionaries({run: st.sampled_from([0.5, 1.0, 4.0]) for run in "abc"}),
+)
+def test_claims_keep_their_order_in_each_run_and_no_run_is_ahead_of_its_weight(entries, weights):
+    class Claim:
+        def __init__(self, run, rank, cost):
+            self.rank, self.cost, self.share = rank, cost, Share(run, weights[run])
+
+    claims = [Claim(*entry) for entry in sorted(entries, key=lambda entry: entry[1])]
+    ordered = in_turns(claims, lambda claim: claim.cost)
+    assert sorted(map(id, ordered)) == sorted(map(id, claims))
+    assert [claim.rank for claim in ordered] == sorted(claim.rank for claim in claims)
+    for run in "abc":
+        mine = [claim for claim in claims if claim.share.run_id == run]
+        assert [claim for claim in ordered if claim.share.run_id == run] == mine
+    if {claim.rank for claim in claims} <= {0}:
+        spent = dict.fromkeys("abc", 0.0)
+        for index, claim in enumerate(ordered):
+            spent[claim.share.run_id] += claim.cost / claim.share.weight
+            behind = {later.share.run_id for later in ordered[index + 1 :]} - {claim.share.run_id}
+            assert all(spent[claim.share.run_id] <= spent[run] + 9.0 / weights[run] + 1e-9 for run in behind)
+
+
+@given(
+    st.dictionaries(
+        st.builds(Share, st.text("abcdef", min_size=1), st.sampled_from([0.5, 1.0, 3.0]), st.integers(0, 1)),
+        st.integers(0, 100),
+        min_size=1,
+    ),
+    st.integers(0, 200),
+)
+def test_quotas_use_all_slots_that_anybody_wants_and_give_nobody_more(wanted, slots):
+    given_slots = quotas(wanted, slots)
+    assert all(given_slots[share] <= wanted[share] + 1e-9 for share in wanted)
+    assert sum(given_slots.values()) == pytest.approx(min(slots, sum(wanted.values())))
+    top = max(share.priority for share in wanted)
+    urgent = {share: count for share, count in wanted.items() if share.priority == top}
+    assert sum(given_slots[share] for share in urgent) == pytest.approx(min(slots, sum(urgent.values())))
