@@ -6,6 +6,7 @@ import asyncio
 import gzip
 import logging
 import os
+import re
 import zlib
 from typing import TYPE_CHECKING, Final
 
@@ -30,6 +31,7 @@ logger = logging.getLogger(__name__)
 
 RUNS_KEPT: Final = 50
 SUFFIX: Final = ".run.gz"
+_RUN_ID: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
 
 
 class RunArchive:
@@ -52,6 +54,9 @@ class RunArchive:
 
     async def load(self, run_id: str) -> tuple[RunSummary, tuple[RunEvent, ...]] | None:
         """A run that is kept; None when there is none of that id."""
+        # What callers send becomes a file's name: only what can be a run's id does.
+        if not _RUN_ID.fullmatch(run_id):
+            return None
         return await asyncio.to_thread(self._read, self._path(run_id))
 
     def _path(self, run_id: str) -> Path:

@@ -89,5 +89,7 @@ async def test_the_archive_keeps_the_latest_and_passes_over_what_is_damaged(tmp_
     assert [kept.run.run_id for kept in await archive.summaries()] == ["r4", "r2"]
     assert await archive.load("r3") is None
     assert await archive.load("r0") is None
+    assert await archive.load("../runs/r4") is None
+    assert await archive.load("r4\0") is None
     _, events = await archive.load("r4")
     assert [event.kind for event in events] == [EventKind.RUN_OPENED]
