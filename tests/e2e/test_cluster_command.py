@@ -7,7 +7,7 @@ import json
 import pytest
 from tests.e2e.test_dashboard import cluster
 from tests.fakes.browser import shown
-from tests.fakes.commands import run
+from tests.fakes.commands import background, run
 from tests.fakes.worker import FakeWorker
 from tests.integration.test_manager_service import batch, manager, open_run, outcomes
 
@@ -119,6 +119,11 @@ async def test_a_worker_is_drained_and_taken_back_and_dispatch_is_paused(tmp_pat
         (row,) = json.loads((await told("workers", there, "--json")).text)
         assert row["state"] == "draining"
         assert (await told("resume", "lab-pc", there)).text == "worker lab-pc, state ready"
+        with background(tmp_path / "log", "cluster", "events", "--follow", there) as following:
+            await asyncio.to_thread(following.wait_for, "worker_joined worker=lab-pc")
+            async with FakeWorker(at.address, worker_id="late-pc"):
+                await asyncio.to_thread(following.wait_for, "worker_joined worker=late-pc")
+            assert (await asyncio.to_thread(following.interrupt)).status == 0
         assert json.loads((await told("pause", there, "--json")).text) == {"dispatch": "paused"}
         waiting = asyncio.create_task(outcomes(client, batch(4)))
         await asyncio.sleep(0.3)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import logging
-from collections import Counter
+from collections import Counter, OrderedDict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -32,6 +32,7 @@ logger = logging.getLogger(__name__)
 EVENTS_KEPT: Final = 32_768
 """Events of all open runs together, at about 250 bytes each; every run may keep at least ``LEAST_KEPT`` of its own."""
 LEAST_KEPT: Final = 256
+HEDGES_KEPT: Final = 4096
 PAGE: Final = 4096
 """Events that a message carries at most."""
 MESSAGE_CHARS: Final = 500
@@ -61,7 +62,9 @@ class Chronicle:
         self.execute_s = 0.0
         """Seconds that slots worked for results."""
         self.hedges_won = 0
-        """Results of second leases that came while the first was still good."""
+        """Results of second leases, given while the first was late and still good."""
+        self._hedges: OrderedDict[str, None] = OrderedDict()
+        """Second leases that may still bring one."""
         self.dropped = 0
         """Events that logs of runs which are closed by now had dropped."""
         self._runs: dict[str, RunRecord] = {}
@@ -110,6 +113,10 @@ class Chronicle:
 
     def leased(self, command: GiveLease, *, now_s: float) -> None:
         origin = command.origin
+        if command.hedge:
+            self._hedges[command.ref.lease_id] = None
+            while len(self._hedges) > HEDGES_KEPT:
+                self._hedges.popitem(last=False)
         run = self._runs.get(origin.run_id)
         if run is not None:
             run.ring.append(
@@ -175,10 +182,11 @@ class Chronicle:
             worker.completed += 1
             worker.execute_s += timings.execute_s
             worker.load_s += timings.load_s
-            self.hedges_won += len(record.leases) > 1 and record.leases[-1] is lease
+            self.hedges_won += result.ref.lease_id in self._hedges
         else:
             code, message = result.outcome.code.value, result.outcome.message[:MESSAGE_CHARS]
             worker.failed += 1
+        self._hedges.pop(result.ref.lease_id, None)
         event = RunEvent(
             next(self._sequences),
             self.epoch_s + now_s,

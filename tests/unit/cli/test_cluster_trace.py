@@ -98,6 +98,12 @@ def test_a_failed_lease_takes_its_slot_and_has_no_flow():
     assert not [event for event in trace if event["ph"] in "sf"]
 
 
+def test_a_rollout_whose_submission_was_dropped_from_the_log_has_no_flow():
+    trace = chrome_trace([completed(2, 12.0, 1.0)], (), "a run")["traceEvents"]
+    assert [event["name"] for event in trace if event["ph"] == "X"] == ["execute"]
+    assert not [event for event in trace if event["ph"] in "sf"]
+
+
 def test_scenes_and_losses_stand_beside_the_slots_of_their_worker():
     run = [submitted(1, 10.0, 1), completed(3, 12.0, 1.0)]
     warm = RunEvent(2, 11.0, EventKind.SCENE_WARM, worker_id="w1", bundle_digest="sha256:kitchen", held_s=0.5)

@@ -1,10 +1,27 @@
 """The log of runs: bounded, whole where it can be, and honest about what it dropped."""
 
+from dataclasses import replace
+
+from tests.fakes.worker import completed
+
 from embomatrix.manager.archive import RunArchive
 from embomatrix.manager.chronicle import EVENTS_KEPT, LEAST_KEPT, Chronicle
 from embomatrix.manager.commands import GiveLease
+from embomatrix.manager.ledger import LeaseRecord, RolloutKey, RolloutRecord
 from embomatrix.rpc.run_log import EventKind, PhaseSummary, RunSeries, RunSummary
-from embomatrix.rpc.values import LeaseOrigin, LeaseRef, Resident, ResidentState, Rollout, RunInfo, RunStats
+from embomatrix.rpc.values import (
+    InfraCode,
+    InfraFailure,
+    LeaseOrigin,
+    LeaseRef,
+    LeaseResult,
+    Resident,
+    ResidentState,
+    Rollout,
+    RunInfo,
+    RunStats,
+    Timings,
+)
 
 EPOCH_S = 1_000.0
 
@@ -56,6 +73,41 @@ def test_a_lease_of_a_run_that_was_closed_is_left_out():
     told.close_run("r1", now_s=2.0)
     told.leased(lease(1), now_s=3.0)
     assert told.page("r1", 0) is None
+
+
+def live(command):
+    record = RolloutRecord(
+        RolloutKey("r1", "b", command.rollout.rollout_id), command.rollout, 1, submitted_s=1.0, warm=True
+    )
+    return {command.ref.lease_id: LeaseRecord(command.ref, "w1", record, 2.0, 30.0, 60.0)}
+
+
+def test_a_hedge_is_won_when_its_own_result_comes():
+    told = chronicle("r1")
+    first, second = lease(1), replace(lease(2), hedge=True)
+    for command in (first, second):
+        told.leased(command, now_s=2.0)
+    crashed = InfraFailure(InfraCode.SLOT_CRASHED, "died")
+    told.reported("w1", [LeaseResult(first.ref, crashed)], live(first), now_s=3.0)
+    assert told.hedges_won == 0
+    told.reported("w1", [LeaseResult(second.ref, completed())], live(second), now_s=3.0)
+    assert told.hedges_won == 1
+
+
+def test_results_of_leases_that_are_not_live_are_nobodys():
+    told = chronicle("r1")
+    told.reported("w1", [LeaseResult(LeaseRef("l1", 1), completed())], {}, now_s=3.0)
+    told.reported("w2", [LeaseResult(lease(1).ref, completed())], live(lease(1)), now_s=3.0)
+    assert [event.kind for event in told.page("r1", 0).events] == [EventKind.RUN_OPENED]
+
+
+def test_phases_of_a_lease_add_up_to_its_life():
+    told = chronicle("r1")
+    done = replace(completed(), timings=Timings(load_s=0.5, execute_s=1.0))
+    told.reported("w1", [LeaseResult(lease(1).ref, done, slot=3, held_s=1.2)], live(lease(1)), now_s=4.0)
+    (event,) = [event for event in told.page("r1", 0).events if event.kind is EventKind.COMPLETED]
+    assert event.timings == Timings(queued_s=1.0, load_s=0.5, execute_s=1.0, lease_s=0.5)
+    assert (event.slot, event.held_s, event.attempt) == (3, 1.2, 1)
 
 
 def test_scenes_are_told_when_they_change_and_not_before():

@@ -74,8 +74,13 @@ def _meta(kind: str, process: int, thread: int, name: str) -> TraceEvent:
 
 
 def _flow_ids(run: Sequence[RunEvent]) -> dict[tuple[str, str], int]:
-    """A number for each rollout that completed, by batch and rollout."""
-    done = [event for event in run if event.kind is EventKind.COMPLETED and event.slot]
+    """A number for each rollout that completed, by batch and rollout, where its submission is still in the log."""
+    submitted = {event.batch_id for event in run if event.kind is EventKind.SUBMITTED}
+    done = [
+        event
+        for event in run
+        if event.kind is EventKind.COMPLETED and event.slot and event.batch_id in submitted
+    ]
     return {(event.batch_id, event.rollout_id): event.sequence for event in done}
 
 
