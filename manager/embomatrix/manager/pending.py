@@ -94,13 +94,18 @@ class PendingQueues:
             else (self._counts, worker.warm)
         )
         best: RolloutRecord | None = None
+        least: Turn | None = None
         for scene in few:
             if scene not in many:
                 continue
             for heap in self._heaps[scene].values():
+                head = _head(heap)
+                # Nobody in a lane comes before its head: most lanes are told by it alone.
+                if head is None or (least is not None and self._turn(head) > least):
+                    continue
                 record = _first_taken(heap, worker, now_s)
-                if record is not None and (best is None or self._turn(record) < self._turn(best)):
-                    best = record
+                if record is not None and (least is None or self._turn(record) < least):
+                    best, least = record, self._turn(record)
         return best
 
     def take(self, record: RolloutRecord) -> None:
