@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import json
 import os
+import socket
 import ssl
 import stat
 import sys
@@ -18,8 +19,10 @@ import pytest
 from tests.fakes import simulation
 from tests.fakes.commands import background, run
 from tests.fakes.guarded import guarded, packed
+from tests.fakes.redis_server import RedisServer
 from tests.fakes.worker import FakeWorker, completed
 
+from embomatrix.cli.local_cluster import free_port
 from embomatrix.manager.app import running
 from embomatrix.manager.settings import ManagerSettings
 from embomatrix.proto.v1 import admin_service_pb2, rollout_service_pb2, types_pb2, worker_service_pb2
@@ -33,6 +36,7 @@ from embomatrix.rpc.status import (
     NotAllowedError,
     NotSignedInError,
     PreconditionError,
+    StandbyError,
 )
 from embomatrix.rpc.token_client import TokenClient
 from embomatrix.rpc.trust import Invitation, fetch_ca, fingerprint_of
@@ -448,6 +452,44 @@ async def test_tokens_and_credentials_outlive_the_manager_and_what_was_revoked_s
                 await client.list_workers()
     stored = b"".join(path.read_bytes() for path in tmp_path.glob("state.sqlite*"))
     assert first.token.partition(".")[2].encode() not in stored
+
+
+async def test_who_takes_a_cluster_over_knows_its_tokens(tmp_path):
+    """Two managers on one Redis: what the first handed out and took back holds at the second, which stood by with TLS too."""
+    with RedisServer(tmp_path / "redis", free_port()) as redis:
+        options = {"state": redis.url, "leader_ttl_s": 1.0}
+        standby = free_port()
+        over = asyncio.Event()
+
+        async def take_over():
+            async with guarded(tmp_path / "data", port=standby, **options) as at:
+                for token, outcome in ((given, None), (taken, NotSignedInError)):
+                    async with ClusterClient(at.address, token, ca=at.ca) as client:
+                        with contextlib.nullcontext() if outcome is None else pytest.raises(outcome):
+                            await client.open_run("test", "r1")
+                async with worker(at, "w1", token=first.token) as again:
+                    assert again.session
+                    await asyncio.sleep(0.05)
+                over.set()
+
+        async with guarded(tmp_path / "data", **options) as at:
+            given, taken = await at.issue(Role.TRAINER), await at.issue(Role.TRAINER)
+            async with at.operator() as operator:
+                await operator.revoke(taken.partition(".")[0])
+            async with await joined(at, "w1") as first:
+                await asyncio.sleep(0.05)
+            waiting = asyncio.create_task(take_over())
+            await until(lambda: stands_by(standby))
+            async with ClusterClient(f"127.0.0.1:{standby}", given, ca=at.ca) as client:
+                with pytest.raises(StandbyError):
+                    await client.list_workers()
+        await waiting
+        assert over.is_set()
+
+
+def stands_by(port):
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
 
 
 async def test_one_shared_token_is_an_admins_for_everybody_beside_the_others(tmp_path):
