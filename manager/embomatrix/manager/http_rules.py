@@ -71,6 +71,7 @@ class Guard:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
+            await send({"type": "websocket.close", "code": 1008})
             return
         refusal = self._rules.refusal(scope["method"], scope["path"], Headers(scope=scope))
         if refusal is None:

@@ -47,7 +47,7 @@ async def build_server(
 ) -> tuple[grpc.aio.Server, int]:
     """A server that is bound but not started, and its port (``port`` 0 takes a free one).
 
-    Raises PortInUseError, and AccessError for a certificate that does not fit its key.
+    Raises PortInUseError.
     """
     server = grpc.aio.server(options=SERVER_OPTIONS, interceptors=[RoleInterceptor(gate)])
     worker_service_pb2_grpc.add_WorkerServiceServicer_to_server(

@@ -15,6 +15,7 @@ from embomatrix.manager.access.credentials import (
     CredentialBook,
     is_remembered,
 )
+from embomatrix.manager.access.folder import AccessError
 from embomatrix.manager.access.roles import OPEN, may_call, who_may
 from embomatrix.manager.store.protocol import StateError
 from embomatrix.rpc.channel import TOKEN_KEY, token_of
@@ -83,7 +84,10 @@ class Gate:
         self._lock = asyncio.Lock()
 
     async def open(self, first: Iterable[Credential] = ()) -> None:
-        """Read what former managers knew, and take in first tokens that the store never saw. Raises StateError."""
+        """Read what former managers knew, and take in first tokens that the store never saw. Raises StateError.
+
+        Raises AccessError for a shared token that was issued for a role: whoever holds it would become an admin.
+        """
         now_s = self._clock()
         known = [Credential.from_row(row) for row in await self._store.credentials()]
         self._book.keep(*(credential for credential in known if is_remembered(credential, now_s=now_s)))
@@ -91,6 +95,11 @@ class Gate:
         if fresh:
             await self._store.put_credentials([credential.row() for credential in fresh])
             self._book.keep(*fresh)
+        if self._shared.partition(".")[0] in self._book:
+            raise AccessError(
+                "--token, or EMBOMATRIX_TOKEN, holds a token that this cluster issued for a role, and would make it an "
+                "admin's: leave it out, or pass another secret"
+            )
 
     def caller(self, token: str) -> Caller:
         """Raises NotSignedInError."""

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
+import ssl
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING
 
 from embomatrix.manager.access.certificates import RENEWAL, life_left, names_in
@@ -68,10 +69,15 @@ def _tls(settings: ManagerSettings, folder: AccessFolder) -> Tls | None:
     try:
         chain, key = chain_file.read_bytes(), key_file.read_bytes()
         authority = b"" if ca_file is None else ca_file.read_bytes()
+        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(chain_file, key_file)
         names = names_in(chain)
         left = life_left(chain, datetime.now(UTC))
         if authority:
             fingerprint_of(authority.decode("ascii"))
+    except ssl.SSLError as error:
+        raise AccessError(
+            f"{key_file} is not the key of the certificate {chain_file} ({error.reason}): pass two that belong together"
+        ) from error
     except OSError as error:
         raise AccessError(
             f"{error.filename} can't be read ({error.strerror}): check --tls-cert, --tls-key and --tls-ca, or run "
@@ -79,6 +85,11 @@ def _tls(settings: ManagerSettings, folder: AccessFolder) -> Tls | None:
         ) from error
     except ValueError as error:
         raise AccessError(f"{chain_file} or {ca_file} holds no certificate (PEM): {error}") from error
+    if left < timedelta(0):
+        raise AccessError(
+            f"the certificate {chain_file} expired {-left.days} days ago: `embomatrix manager init` makes that of the data "
+            "folder anew"
+        )
     if left < RENEWAL:
         logger.warning("the certificate %s expires in %d days: renew it", chain_file, left.days)
     return Tls(chain_file, key_file, chain, key, authority, names)
