@@ -59,12 +59,14 @@ class Fleet:
     def note_lag(self, worker: WorkerRecord, took_s: float, usual_s: float) -> None:
         """One of the worker's leases took so long, where those of its run take so long as a rule."""
         worker.note_lag(took_s / usual_s)
-        worker.reluctance_s = min((worker.lag - 1.0) * usual_s, LONGEST_RELUCTANCE_S)
         if worker.lag > 1.0:
+            worker.reluctance_s = min((worker.lag - 1.0) * usual_s, LONGEST_RELUCTANCE_S)
             self.lags[worker.worker_id] = worker.lag
-        else:
-            self.lags.pop(worker.worker_id, None)
-        self._weigh(worker)
+            self._weigh(worker)
+        elif worker.worker_id in self.lags:
+            worker.reluctance_s = 0.0
+            del self.lags[worker.worker_id]
+            self._weigh(worker)
 
     def stand(self, worker: WorkerRecord) -> None:
         """The worker drains, paused, reported, fell silent or was heard again: it may take leases, or no longer."""

@@ -185,7 +185,7 @@ class WorkerRecord:
             return False
         if record.rollout.render and self.rendering >= self.render_slots:
             return False
-        return not any(lease.worker_id == self.worker_id for lease in record.leases)
+        return not record.leases or all(lease.worker_id != self.worker_id for lease in record.leases)
 
 
 @dataclass(slots=True, eq=False)
