@@ -98,10 +98,8 @@ async def running(
     """A manager that leads for as long as this is held. While another one leads, it stands by before it is entered."""
     protection = protection_of(settings)
     with _folder_errors(settings):
-        bundles = BundleStore(
-            settings.data_dir / "bundles",
-            total_bytes=settings.bundle_total_mb * MEGABYTE,
-        )
+        total_bytes = settings.bundle_total_mb * MEGABYTE
+        bundles = BundleStore(settings.data_dir / "bundles", total_bytes=total_bytes)
     async with contextlib.AsyncExitStack() as stack:
         # Ports first: a manager that can't serve must not take the state from one that does.
         http_socket = stack.enter_context(
@@ -122,23 +120,16 @@ async def running(
         runtime = await _start_runtime(settings, store, bundles, leadership, epoch)
         gate = Gate(store, guarded=protection.guarded, shared_token=settings.token)
         await gate.open(protection.first)
-        server, port = await build_server(
-            runtime,
-            gate,
-            protection.tls,
-            host=settings.host,
-            port=settings.port,
-            lease_ttl_s=settings.lease_ttl_s,
-        )
+        server, port = await build_server(runtime, gate, protection.tls, settings)
         rules = HttpRules(gate, hosts=allowed_hosts(settings.http_host, protection.tls))
         http.show(build_api(runtime, rules))
         group.create_task(leadership.keep())
         group.create_task(runtime.serve())
         await server.start()
         stack.push_async_callback(server.stop, STOP_GRACE_S)
-        http_port = http_socket.getsockname()[1]
+        page = f"{settings.http_host}:{http_socket.getsockname()[1]}"
         scheme = "http" if protection.tls is None else "https"
-        yield Endpoints(f"{settings.host}:{port}", f"{scheme}://{settings.http_host}:{http_port}/")
+        yield Endpoints(f"{settings.host}:{port}", f"{scheme}://{page}/")
 
 
 def _candidate(settings: ManagerSettings) -> Candidate:

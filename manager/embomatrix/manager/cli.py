@@ -39,7 +39,29 @@ Ca = Annotated[
     ),
 ]
 DataDir = Annotated[Path | None, typer.Option(help="Folder of bundles and state.", show_default=False)]
-
+State = Annotated[
+    str,
+    typer.Option(help="memory: | sqlite:PATH | redis://HOST:PORT/DB. Default: a file in the data folder."),
+]
+Advertise = Annotated[
+    str, typer.Option(help="HOST:PORT under which others reach this manager, if not where it serves.")
+]
+SharedToken = Annotated[
+    str,
+    typer.Option(
+        envvar="EMBOMATRIX_TOKEN",
+        help="One secret that is an admin's for everybody, beside the tokens of roles; or @FILE that holds it.",
+        show_default=False,
+    ),
+]
+TlsCert = Annotated[
+    Path | None, typer.Option(help="Certificate (PEM), else that of `init`.", show_default=False)
+]
+TlsKey = Annotated[Path | None, typer.Option(help="Its private key.", show_default=False)]
+TlsCa = Annotated[Path | None, typer.Option(help="Certificate of who signed it.", show_default=False)]
+InsecureBind = Annotated[
+    bool, typer.Option("--insecure-bind", help="Serve outside this machine without TLS or tokens.")
+]
 LogLines = Annotated[
     LogFormat, typer.Option(help="Log lines for people, or as JSON.", envvar="EMBOMATRIX_LOG_FORMAT")
 ]
@@ -51,34 +73,14 @@ def serve(
     port: Annotated[int, typer.Option(help="gRPC port; 0 takes a free one.")] = 50070,
     http_host: Annotated[str, typer.Option(help="Address of the status page.")] = "127.0.0.1",
     http_port: Annotated[int, typer.Option(help="Port of the status page; 0 takes a free one.")] = 8070,
-    state: Annotated[
-        str,
-        typer.Option(
-            help="memory: | sqlite:PATH | redis://HOST:PORT/DB. Default: a file in the data folder."
-        ),
-    ] = "",
-    advertise: Annotated[
-        str, typer.Option(help="HOST:PORT under which others reach this manager, if not where it serves.")
-    ] = "",
+    state: State = "",
+    advertise: Advertise = "",
     data_dir: DataDir = None,
-    token: Annotated[
-        str,
-        typer.Option(
-            envvar="EMBOMATRIX_TOKEN",
-            help="One secret that is an admin's for everybody, beside the tokens of roles; or @FILE that holds it.",
-            show_default=False,
-        ),
-    ] = "",
-    tls_cert: Annotated[
-        Path | None, typer.Option(help="Certificate (PEM), else that of `init`.", show_default=False)
-    ] = None,
-    tls_key: Annotated[Path | None, typer.Option(help="Its private key.", show_default=False)] = None,
-    tls_ca: Annotated[
-        Path | None, typer.Option(help="Certificate of who signed it.", show_default=False)
-    ] = None,
-    insecure_bind: Annotated[
-        bool, typer.Option("--insecure-bind", help="Serve outside this machine without TLS or tokens.")
-    ] = False,
+    token: SharedToken = "",
+    tls_cert: TlsCert = None,
+    tls_key: TlsKey = None,
+    tls_ca: TlsCa = None,
+    insecure_bind: InsecureBind = False,
     log_level: Annotated[str, typer.Option(help="debug, info, warning or error.")] = "info",
     log_format: LogLines = LogFormat.HUMAN,
 ) -> None:

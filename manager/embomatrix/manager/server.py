@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from embomatrix.manager.access.gate import Gate
     from embomatrix.manager.access.protection import Tls
     from embomatrix.manager.runtime import ManagerRuntime
+    from embomatrix.manager.settings import ManagerSettings
 
 SERVICES: Final = tuple(
     module.DESCRIPTOR.services_by_name[name].full_name
@@ -43,7 +44,7 @@ SERVICES: Final = tuple(
 
 
 async def build_server(
-    runtime: ManagerRuntime, gate: Gate, tls: Tls | None, *, host: str, port: int, lease_ttl_s: float
+    runtime: ManagerRuntime, gate: Gate, tls: Tls | None, settings: ManagerSettings
 ) -> tuple[grpc.aio.Server, int]:
     """A server that is bound but not started, and its port (``port`` 0 takes a free one).
 
@@ -51,7 +52,7 @@ async def build_server(
     """
     server = grpc.aio.server(options=SERVER_OPTIONS, interceptors=[RoleInterceptor(gate)])
     worker_service_pb2_grpc.add_WorkerServiceServicer_to_server(
-        WorkerServicer(runtime, gate, lease_ttl_s=lease_ttl_s), server
+        WorkerServicer(runtime, gate, lease_ttl_s=settings.lease_ttl_s), server
     )
     rollout_service_pb2_grpc.add_RolloutServiceServicer_to_server(
         RolloutServicer(runtime.runs, gate, authority=tls.authority if tls else b""), server
@@ -60,7 +61,7 @@ async def build_server(
     admin_service_pb2_grpc.add_AdminServiceServicer_to_server(AdminServicer(runtime, gate), server)
     await _add_health(server)
     reflection.enable_server_reflection((*SERVICES, health.SERVICE_NAME, reflection.SERVICE_NAME), server)
-    return server, bind_server(server, host, port, tls)
+    return server, bind_server(server, settings.host, settings.port, tls)
 
 
 async def _add_health(server: grpc.aio.Server) -> None:

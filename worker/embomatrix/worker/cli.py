@@ -61,35 +61,38 @@ Ca = Annotated[
     ),
 ]
 
+Join = Annotated[
+    str,
+    typer.Option(
+        envvar="EMBOMATRIX_JOIN",
+        help="TOKEN@HOST:PORT as the operator got it: all that joining takes.",
+        show_default=False,
+    ),
+]
+CacheDir = Annotated[Path | None, typer.Option(help="Folder for bundles and the simulator's log.")]
+StateDir = Annotated[
+    Path | None, typer.Option(help="Folder of this machine's credentials.", show_default=False)
+]
+LogLines = Annotated[
+    LogFormat, typer.Option(help="Log lines for people, or as JSON.", envvar="EMBOMATRIX_LOG_FORMAT")
+]
+
 
 @app.command()
 def run(
     manager: Manager = DEFAULT_ADDRESS,
     slots: Annotated[int, typer.Option(help="Rollouts at the same time; 0: one for each core.")] = 0,
     token: Token = "",
-    join: Annotated[
-        str,
-        typer.Option(
-            envvar="EMBOMATRIX_JOIN",
-            help="TOKEN@HOST:PORT as the operator got it: all that joining takes.",
-            show_default=False,
-        ),
-    ] = "",
+    join: Join = "",
     ca: Ca = None,
     name: Annotated[str, typer.Option(help="Worker id; by default the host's name and a random part.")] = "",
-    cache_dir: Annotated[
-        Path | None, typer.Option(help="Folder for bundles and the simulator's log.")
-    ] = None,
+    cache_dir: CacheDir = None,
     memory_mb: Annotated[int, typer.Option(help="Memory for scenes; 0: four tenths of what is free.")] = 0,
     nice: Annotated[int, typer.Option(help="Politeness, 0 to 19.")] = 10,
-    state_dir: Annotated[
-        Path | None, typer.Option(help="Folder of this machine's credentials.", show_default=False)
-    ] = None,
+    state_dir: StateDir = None,
     once: Annotated[bool, typer.Option(help="End when the manager can't be reached.")] = False,
     verbose: Annotated[bool, typer.Option(help="Log every rollout.")] = False,
-    log_format: Annotated[
-        LogFormat, typer.Option(help="Log lines for people, or as JSON.", envvar="EMBOMATRIX_LOG_FORMAT")
-    ] = LogFormat.HUMAN,
+    log_format: LogLines = LogFormat.HUMAN,
 ) -> None:
     """Join the manager and execute rollouts until stopped: Ctrl-C drains, a second one leaves at once."""
     _check_engine()
@@ -103,17 +106,12 @@ def run(
         "nice": nice,
         "once": once,
     }
-    if name:
-        values["name"] = name
-    if state_dir is not None:
-        values["state_dir"] = state_dir
-    if cache_dir is not None:
-        values["cache_dir"] = cache_dir
-    settings = _settings(values)
-    level = "debug" if verbose else "info"
-    log_to_stderr(level, log_format)
-    for secret in (settings.token, settings.join):
-        hide(secret)
+    # Left out, these have defaults that are not one value for all.
+    chosen = {"name": name or None, "state_dir": state_dir, "cache_dir": cache_dir}
+    settings = _settings({**values, **{key: value for key, value in chosen.items() if value is not None}})
+    log_to_stderr("debug" if verbose else "info", log_format)
+    hide(settings.token)
+    hide(settings.join)
     os.nice(settings.nice)
     try:
         asyncio.run(_serve(settings))
