@@ -32,7 +32,8 @@ CONTEST: Final = (
     "are submitted at once, each for itself. *Killed*: everything at once, and a process that executes gets SIGKILL "
     "after a quarter of the results. Ours keeps every rollout and its lease in SQLite and checks what comes over the "
     "wire. The pool does neither, and when one of its processes dies, it gives up all that it has and must be made "
-    "anew. *Ours over it* is against the faster of shared and affine."
+    "anew. `pip install 'embomatrix[bench]'` brings the libraries. *Ours over it* is against the faster of shared and "
+    "affine."
 )
 
 

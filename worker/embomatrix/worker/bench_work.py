@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import zip_longest
 from typing import TYPE_CHECKING
 
@@ -27,6 +27,11 @@ class Work:
     def rollouts(self) -> tuple[Rollout, ...]:
         """Every plan once, scene by scene."""
         return tuple(rollout for scene in self.scenes for rollout in rollouts_of(scene))
+
+    def first(self, plans: int) -> Work:
+        """The same scenes with so many plans each, at most."""
+        scenes = tuple(replace(scene, executions=scene.executions[:plans]) for scene in self.scenes)
+        return Work(scenes, self.bundles)
 
     def sample(self, count: int) -> tuple[Rollout, ...]:
         """Up to ``count`` of them, spread over the scenes: the first plan of each, then the second of each."""
