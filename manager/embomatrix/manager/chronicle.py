@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 EVENTS_KEPT: Final = 32_768
-"""Events of all open runs together, at about 250 bytes each; every run may keep at least ``LEAST_KEPT`` of its own."""
+"""Events of all open runs together, at about 350 bytes each; every run may keep at least ``LEAST_KEPT`` of its own."""
 LEAST_KEPT: Final = 256
 HEDGES_KEPT: Final = 4096
 PAGE: Final = 4096
