@@ -37,7 +37,7 @@ class Recovery:
     @property
     def waiting(self) -> int:
         """Rollouts that somebody may hold."""
-        return len(self._awaited)
+        return sum(record.phase is not Phase.DONE for record in self._awaited.values())
 
     def awaited(self) -> Mapping[str, int]:
         """Rollouts that somebody may hold, by scene."""
