@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
     from embomatrix.manager.store.protocol import ResultRow
 
-PER_MESSAGE: Final = 64
+PER_MESSAGE: Final = 256
 LINGER_S: Final = 0.02
 """Results are sent at once when a message is full, else after this: a batch that trickles shall not send one by one."""
 

@@ -41,7 +41,7 @@ FIRST_STATE_S: Final = 10.0
 """A session stream must begin with the worker's state within this time."""
 SESSION_SHOWN: Final = 6
 """Letters of an id in log lines: whoever knows all of a session's could speak for its worker."""
-LEASES_PER_MESSAGE: Final = 64
+LEASES_PER_MESSAGE: Final = 256
 _WORKER_ID: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._:@-]{0,127}")
 
 

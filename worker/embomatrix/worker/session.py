@@ -52,7 +52,7 @@ FETCH_S: Final = 30.0
 """Limits for the answers to a registration, a heartbeat and a request for a bundle."""
 HEARTBEATS_MISSED: Final = 3
 """So many heartbeats in a row without an answer mean that the connection is dead."""
-RESULTS_PER_MESSAGE: Final = 64
+RESULTS_PER_MESSAGE: Final = 256
 LINGER_S: Final = 0.025
 """A message costs more than what it carries: results wait this long for others at most."""
 
