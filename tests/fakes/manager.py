@@ -9,11 +9,11 @@ import grpc
 from embomatrix.proto.v1 import worker_service_pb2 as pb
 from embomatrix.proto.v1 import worker_service_pb2_grpc
 from embomatrix.rpc.channel import SERVER_OPTIONS, chunks_of
-from embomatrix.rpc.convert import resources_from_proto
 from embomatrix.rpc.convert_session import (
     lease_ref_to_proto,
     lease_result_from_proto,
     lease_to_proto,
+    resources_from_proto,
     worker_state_from_proto,
 )
 from embomatrix.rpc.status import NotFoundError, SupersededError, translate

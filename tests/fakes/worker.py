@@ -10,12 +10,12 @@ from embomatrix.proto.v1 import worker_service_pb2 as pb
 from embomatrix.proto.v1 import worker_service_pb2_grpc
 from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.rpc.channel import open_channel
-from embomatrix.rpc.convert import resources_to_proto
 from embomatrix.rpc.convert_session import (
     lease_from_proto,
     lease_ref_from_proto,
     lease_ref_to_proto,
     lease_result_to_proto,
+    resources_to_proto,
     worker_state_to_proto,
 )
 from embomatrix.rpc.values import (

@@ -13,7 +13,6 @@ from embomatrix.rpc.values import (
     Completed,
     InfraCode,
     InfraFailure,
-    Resources,
     Rollout,
     RolloutResult,
     Timings,
@@ -356,31 +355,3 @@ def _outcome(message: types_pb2.RolloutResult) -> Outcome:
             return Cancelled(message.cancelled.reason)
         case None:
             raise ConvertError("outcome", "is missing: a result has exactly one")
-
-
-def resources_to_proto(resources: Resources) -> types_pb2.Resources:
-    return types_pb2.Resources(
-        slots=resources.slots,
-        cores=resources.cores,
-        memory_mb=resources.memory_mb,
-        score=resources.score,
-        gpu=resources.gpu,
-        vram_mb=resources.vram_mb,
-        versions=dict(resources.versions),
-        render_slots=resources.render_slots,
-    )
-
-
-def resources_from_proto(message: types_pb2.Resources) -> Resources:
-    if message.slots == 0:
-        raise ConvertError("slots", "is 0: a worker offers at least one slot")
-    return Resources(
-        slots=message.slots,
-        cores=message.cores,
-        memory_mb=message.memory_mb,
-        score=finite("score", message.score),
-        gpu=message.gpu,
-        vram_mb=message.vram_mb,
-        versions=dict(message.versions),
-        render_slots=message.render_slots,
-    )

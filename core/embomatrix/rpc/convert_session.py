@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.proto.v1 import admin_service_pb2, worker_service_pb2
+from embomatrix.proto.v1 import admin_service_pb2, types_pb2, worker_service_pb2
 from embomatrix.rpc.convert import (
     ConvertError,
     completed_from_proto,
@@ -14,8 +14,6 @@ from embomatrix.rpc.convert import (
     infra_failure_to_proto,
     inside,
     required,
-    resources_from_proto,
-    resources_to_proto,
     rollout_from_proto,
     rollout_to_proto,
     write_completed,
@@ -38,6 +36,7 @@ from embomatrix.rpc.values import (
     PlanCell,
     Resident,
     ResidentState,
+    Resources,
     RunInfo,
     WorkerInfo,
     WorkerState,
@@ -50,6 +49,42 @@ _STATES: Final[Mapping[ResidentState, worker_service_pb2.ResidentState.ValueType
     state: worker_service_pb2.ResidentState.Value(f"RESIDENT_STATE_{state.name}") for state in ResidentState
 }
 _STATE_VALUES: Final = {number: state for state, number in _STATES.items()}
+MAX_LABELS: Final = 32
+"""Labels of one worker: more are a mistake, and every listing would carry them."""
+
+
+def resources_to_proto(resources: Resources) -> types_pb2.Resources:
+    return types_pb2.Resources(
+        slots=resources.slots,
+        cores=resources.cores,
+        memory_mb=resources.memory_mb,
+        score=resources.score,
+        gpu=resources.gpu,
+        vram_mb=resources.vram_mb,
+        versions=dict(resources.versions),
+        render_slots=resources.render_slots,
+        disk_mb=resources.disk_mb,
+        labels=dict(resources.labels),
+    )
+
+
+def resources_from_proto(message: types_pb2.Resources) -> Resources:
+    if message.slots == 0:
+        raise ConvertError("slots", "is 0: a worker offers at least one slot")
+    if len(message.labels) > MAX_LABELS:
+        raise ConvertError("labels", f"are {len(message.labels)}: a worker has at most {MAX_LABELS}")
+    return Resources(
+        slots=message.slots,
+        cores=message.cores,
+        memory_mb=message.memory_mb,
+        score=finite("score", message.score),
+        gpu=message.gpu,
+        vram_mb=message.vram_mb,
+        versions=dict(message.versions),
+        render_slots=message.render_slots,
+        disk_mb=message.disk_mb,
+        labels=dict(message.labels),
+    )
 
 
 def resident_to_proto(resident: Resident) -> worker_service_pb2.Resident:

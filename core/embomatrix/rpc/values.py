@@ -230,6 +230,10 @@ class Resources:
     """Of the package, Python, the engine's wheel, and the platform fingerprint."""
     render_slots: int = 0
     """Slots of them that render on the GPU."""
+    disk_mb: int = 0
+    """Free space for bundles."""
+    labels: Mapping[str, str] = field(default_factory=dict)
+    """What the operator calls this machine by: room=lab, owner=ann."""
 
 
 @dataclass(frozen=True, slots=True)

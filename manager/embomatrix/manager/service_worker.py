@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.manager.intake import Heartbeat
 from embomatrix.proto.v1 import worker_service_pb2 as pb
 from embomatrix.proto.v1 import worker_service_pb2_grpc
-from embomatrix.rpc.convert import each, inside, resources_from_proto
+from embomatrix.rpc.convert import each, inside
 from embomatrix.rpc.convert_session import (
     lease_progress_from_proto,
     lease_ref_from_proto,
     lease_ref_to_proto,
     lease_result_from_proto,
     lease_to_proto,
+    resources_from_proto,
     worker_state_from_proto,
 )
 from embomatrix.rpc.logs import bind

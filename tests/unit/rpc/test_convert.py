@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from embomatrix.proto.v1 import rollout_service_pb2, types_pb2
 from embomatrix.reward.breakdown import AtomResult, RewardBreakdown
-from embomatrix.rpc import convert, convert_batch, convert_run
+from embomatrix.rpc import convert, convert_batch, convert_run, convert_session
 from embomatrix.rpc.convert import ConvertError
 from embomatrix.rpc.values import (
     Batch,
@@ -99,6 +99,8 @@ RESOURCES = st.builds(
     vram_mb=UINT64,
     versions=st.dictionaries(NAMES, TEXTS, max_size=3),
     render_slots=UINT32,
+    disk_mb=UINT64,
+    labels=st.dictionaries(NAMES, TEXTS, max_size=3),
 )
 
 
@@ -148,7 +150,10 @@ def test_a_rollout_that_is_changed_is_not_passed_on_as_it_came():
 
 @given(RESOURCES)
 def test_resources_come_back_equal(resources):
-    assert convert.resources_from_proto(_over_the_wire(convert.resources_to_proto(resources))) == resources
+    assert (
+        convert_session.resources_from_proto(_over_the_wire(convert_session.resources_to_proto(resources)))
+        == resources
+    )
 
 
 @given(st.builds(RunStats, *[UINT64] * len(RunStats.__slots__)))
@@ -267,4 +272,4 @@ def test_an_unknown_failure_reason_is_refused():
 
 def test_a_worker_without_slots_is_refused():
     with pytest.raises(ConvertError, match="slots: is 0"):
-        convert.resources_from_proto(types_pb2.Resources(cores=4))
+        convert_session.resources_from_proto(types_pb2.Resources(cores=4))

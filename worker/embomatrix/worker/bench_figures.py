@@ -15,7 +15,8 @@ import numpy as np
 import psutil
 
 from embomatrix.sim.zygote import MIB
-from embomatrix.worker.resources import find_gpu, measure_score, versions
+from embomatrix.worker.gpu import find_gpu
+from embomatrix.worker.resources import measure_score, versions
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -169,7 +170,7 @@ def shown(value: float) -> str:
 
 def describe_machine() -> dict[str, Any]:
     """Where the bench runs, and how busy that machine is before it begins."""
-    gpu, _ = find_gpu()
+    gpu = find_gpu().name
     return {
         "cpu": _cpu_model(),
         "cores": _cores(),

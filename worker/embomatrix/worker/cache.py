@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import errno
 import logging
 import os
 import re
+import secrets
+import time
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.rpc.values import InfraCode
@@ -20,10 +24,18 @@ logger = logging.getLogger(__name__)
 
 _DIGEST: Final = re.compile(r"sha256:[0-9a-f]{64}")
 SUFFIX: Final = ".bundle"
+PART: Final = ".part-"
+ABANDONED_S: Final = 3600.0
+"""A part of a bundle that nobody has written to for so long was left by a daemon that was killed."""
+MIB: Final = 1024 * 1024
+FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
 
 
 class BundleCache:
-    """Brings bundles to disk. ``fetch`` gets a bundle's bytes from the manager and raises LoadError when it can't."""
+    """Brings bundles to disk; several daemons may share the folder, and what is there outlives them.
+
+    ``fetch`` gets a bundle's bytes from the manager and raises LoadError when it can't.
+    """
 
     def __init__(self, folder: Path, *, limit_bytes: int, fetch: Callable[[str], Awaitable[bytes]]) -> None:
         self._folder = folder
@@ -69,19 +81,46 @@ class BundleCache:
         path = self._path(digest)
         self._folder.mkdir(parents=True, exist_ok=True)
         # Written aside and renamed: a daemon killed in between leaves no half bundle under the digest's name.
-        part = path.with_suffix(f".part-{os.getpid()}")
-        part.write_bytes(data)
-        part.replace(path)
-        self._evict(keep=path)
+        part = path.with_suffix(f"{PART}{os.getpid()}-{secrets.token_hex(4)}")
+        try:
+            self._write(part, data)
+            part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)
+        self._evict(keep=path, limit_bytes=self._limit_bytes)
         return path
 
-    def _evict(self, *, keep: Path) -> None:
-        files = [(file, file.stat()) for file in self._folder.glob(f"*{SUFFIX}")]
-        files.sort(key=lambda item: item[1].st_mtime_ns)
-        total = sum(stat.st_size for _, stat in files)
-        for file, stat in files:
-            if total <= self._limit_bytes:
-                break
-            if file != keep:
-                file.unlink(missing_ok=True)
-                total -= stat.st_size
+    def _write(self, part: Path, data: bytes) -> None:
+        """On a full disk everything else in the cache makes way, once."""
+        try:
+            part.write_bytes(data)
+        except OSError as error:
+            if error.errno not in FULL:
+                raise
+            logger.warning("the disk is full: all other bundles leave %s", self._folder)
+            self._evict(keep=part, limit_bytes=0)
+            part.write_bytes(data)
+
+    def used_mb(self) -> float:
+        """What the bundles take on disk."""
+        return round(sum(size for _, size, _ in self._files()) / MIB, 1)
+
+    def _evict(self, *, keep: Path, limit_bytes: int) -> None:
+        files = sorted(self._files(), key=lambda file: file[2])
+        total = sum(size for _, size, _ in files)
+        for path, size, used_s in files:
+            abandoned = PART in path.name and time.time() - used_s > ABANDONED_S
+            if abandoned or (total > limit_bytes and path != keep and PART not in path.name):
+                path.unlink(missing_ok=True)
+                total -= size
+
+    def _files(self) -> list[tuple[Path, int, float]]:
+        """Bundles and parts of bundles, each with its bytes and the wall time of its last use."""
+        files = []
+        for path in self._folder.glob("*"):
+            if path.suffix == SUFFIX or PART in path.name:
+                # Another daemon that shares the folder may have removed it meanwhile.
+                with contextlib.suppress(FileNotFoundError):
+                    stat = path.stat()
+                    files.append((path, stat.st_size, stat.st_mtime))
+        return files

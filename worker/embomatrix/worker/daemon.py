@@ -24,18 +24,25 @@ from embomatrix.rpc.status import (
 )
 from embomatrix.rpc.values import Completed, InfraCode
 from embomatrix.worker.backoff import Backoff
-from embomatrix.worker.cache import BundleCache
+from embomatrix.worker.cache import MIB, BundleCache
+from embomatrix.worker.courtesy import Courtesy
+from embomatrix.worker.machine import Machine
 from embomatrix.worker.membership import Membership, MembershipFile
 from embomatrix.worker.outbox import Outbox
 from embomatrix.worker.processes import SIMULATOR_PROGRAM
 from embomatrix.worker.residents import LoadError, SlotLimits
 from embomatrix.worker.session import Session, register
 from embomatrix.worker.slots import SlotPool
+from embomatrix.worker.status import StatusFile, StatusReport, daemon_pids
+from embomatrix.worker.takeovers import Takeovers
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     import numpy as np
 
     from embomatrix.rpc.values import InfraFailure, LeaseResult, Resources
+    from embomatrix.worker.machine import Probe
     from embomatrix.worker.session import Registration
     from embomatrix.worker.settings import WorkerSettings
 
@@ -46,11 +53,10 @@ LONGEST_WAIT_S: Final = 3.0
 SESSION_SHOWN: Final = 6
 """Letters of a session's id in log lines: whoever knows all of them could speak for this worker."""
 FENCE_CHECK_S: Final = 0.5
+FETCH_AGAIN_S: Final = 0.25
+"""Before a bundle is asked for a second time: the connection broke, and a next one may be there by then."""
 DRAIN_RETRY_S: Final = 1.0
 """While it drains, a worker tries to deliver its last results at least this often."""
-TAKEOVERS_ALLOWED: Final = 3
-"""After so many takeovers within a minute, another daemon evidently bears the same name."""
-TAKEOVER_WINDOW_S: Final = 60.0
 _PASSING: Final = (UnavailableError, DeadlineError, OverloadedError, InternalError)
 """Errors after which the daemon connects again. Others need a person."""
 
@@ -66,6 +72,7 @@ class Daemon:
         *,
         program: tuple[str, ...] = SIMULATOR_PROGRAM,
         membership: Membership | None = None,
+        probe: Probe | None = None,
     ) -> None:
         self._settings = settings
         self._membership = membership or Membership(settings.manager, settings.name, settings.token)
@@ -78,7 +85,9 @@ class Daemon:
         folder = settings.cache_dir.expanduser()
         folder.mkdir(parents=True, exist_ok=True)
         self._cache = BundleCache(
-            folder / "bundles", limit_bytes=settings.cache_mb * 1024 * 1024, fetch=self._fetch
+            folder / "bundles",
+            limit_bytes=settings.cache_mb * MIB,
+            fetch=lambda digest: fetch(lambda: self._session, digest),
         )
         limits = SlotLimits(resources.slots, resources.memory_mb, settings.slot_memory_mb)
         self._pool = SlotPool(
@@ -89,11 +98,20 @@ class Daemon:
             log=folder / "simulator.log",
             program=program,
         )
+        self._courtesy = Courtesy(
+            settings.preferences,
+            probe or Machine(lambda: daemon_pids(settings.state_dir)),
+            self._pool,
+            on_pause=self._pause,
+            on_hand_back=self._hand_back,
+        )
+        file = StatusFile(settings.state_dir, self._membership.name)
+        self._report = StatusReport(file, settings, resources, self._pool, self._cache, self._outbox)
         self._session: Session | None = None
         self._renewed_s = time.monotonic()
         self._lease_ttl_s = math.inf
         self._registration: Registration | None = None
-        self._takeovers: list[float] = []
+        self._takeovers = Takeovers()
         self._draining = asyncio.Event()
         self._forced = asyncio.Event()
 
@@ -110,6 +128,7 @@ class Daemon:
             return
         logger.info("draining: %d leases are held", self.held)
         self._draining.set()
+        self._report.draining()
         if self._session is not None:
             self._session.drain()
 
@@ -123,10 +142,15 @@ class Daemon:
             self._resources.memory_mb,
             self._resources.score,
         )
-        tasks = [
-            asyncio.create_task(work)
-            for work in (self._pool.run(), self._stay_connected(), self._fence(), self._until_left())
-        ]
+        works = (
+            self._pool.run(),
+            self._stay_connected(),
+            self._fence(),
+            self._courtesy.run(),
+            self._report.run(),
+            self._until_left(),
+        )
+        tasks = [asyncio.create_task(work) for work in works]
         try:
             done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
             for task in done:
@@ -151,7 +175,8 @@ class Daemon:
                 if self._registration is None:
                     self._registration = await self._register()
                 await self._serve(self._registration)
-                await self._say_goodbye()
+                if self._session is not None:
+                    await self._session.leave()
                 return
             except UnknownSessionError as error:
                 # A manager took over. It takes up what is held here once this worker has said what that is.
@@ -166,10 +191,6 @@ class Daemon:
                     raise
                 self._managers.move(error)
                 await self._wait_before_next(error)
-
-    async def _say_goodbye(self) -> None:
-        if self._session is not None:
-            await self._session.leave()
 
     async def _wait_before_next(self, error: ClusterError) -> None:
         """Wait, longer each time; a drain ends the wait."""
@@ -222,15 +243,19 @@ class Daemon:
         )
         if self._draining.is_set():
             session.drain()
+        if self._courtesy.reason:
+            session.pause(self._courtesy.reason)
         self._session = session
         attached = asyncio.create_task(self._note_attached(session))
         try:
             await session.serve()
         finally:
             attached.cancel()
+            self._report.disconnected()
 
     async def _note_attached(self, session: Session) -> None:
         await session.attached.wait()
+        self._report.connected(self._managers.current)
         self._backoff.reset()
 
     async def _fence(self) -> None:
@@ -251,52 +276,64 @@ class Daemon:
         held = self._pool.held()
         if held:
             logger.warning("%d leases given up: %s", len(held), reason)
-        self._pool.cancel_all()
+        self._pool.cancel(held)
 
     def _count_takeover(self, error: SupersededError) -> None:
         """Register again, unless another daemon of this name would do the same, for ever."""
         self._registration = None
-        now_s = time.monotonic()
-        self._takeovers = [at_s for at_s in self._takeovers if now_s - at_s < TAKEOVER_WINDOW_S] + [now_s]
-        if len(self._takeovers) > TAKEOVERS_ALLOWED:
+        if self._takeovers.add(time.monotonic()):
             raise SupersededError(
                 f"the session of worker {self._membership.name!r} is taken over again and again: another worker of "
                 "that name is running; stop it, or give one of them another --name"
             ) from error
         logger.info("registering again: %s", error)
 
-    async def _fetch(self, digest: str) -> bytes:
-        """Fetch a bundle over the present session; a broken connection is tried once more on the next."""
-        for last in (False, True):
-            session = self._session
-            if session is None:
-                break
-            try:
-                return await session.fetch(digest)
-            except (ClusterError, TimeoutError) as error:
-                if last:
-                    raise LoadError(InfraCode.SCENE_LOAD_FAILED, f"not fetched: {error}") from error
-                await asyncio.sleep(self._backoff.first_s * 5)
-        raise LoadError(InfraCode.SCENE_LOAD_FAILED, "there is no connection to the manager")
-
     def _take_result(self, result: LeaseResult) -> None:
         """Keep a result for the manager, signed with this worker's name."""
-        outcome: Completed | InfraFailure
-        if isinstance(result.outcome, Completed):
-            outcome = result.outcome.noted(worker_id=self._membership.name)
-            logger.debug("rollout completed lease=%s reward=%.1f", result.ref.lease_id, outcome.reward.total)
-        else:
-            outcome = replace(result.outcome, worker_id=self._membership.name)
-            logger.warning(
-                "rollout failed lease=%s %s: %s", result.ref.lease_id, outcome.code, outcome.message
-            )
-        self._outbox.put(replace(result, outcome=outcome))
+        self._report.finished(result)
+        self._outbox.put(signed(result, self._membership.name))
         if self._session is not None:
             self._session.tell()
+
+    def _pause(self, reason: str) -> None:
+        self._report.paused(reason)
+        if self._session is not None:
+            self._session.pause(reason)
+
+    def _hand_back(self) -> None:
+        if self._session is not None:
+            self._session.resync()
 
     def _residents_changed(self) -> None:
         if self._session is not None:
             self._session.tell_state()
+
+
+def signed(result: LeaseResult, name: str) -> LeaseResult:
+    """The result with the name of the worker that it is from."""
+    outcome: Completed | InfraFailure
+    if isinstance(result.outcome, Completed):
+        outcome = result.outcome.noted(worker_id=name)
+        logger.debug("rollout completed lease=%s reward=%.1f", result.ref.lease_id, outcome.reward.total)
+    else:
+        outcome = replace(result.outcome, worker_id=name)
+        logger.warning("rollout failed lease=%s %s: %s", result.ref.lease_id, outcome.code, outcome.message)
+    return replace(result, outcome=outcome)
+
+
+async def fetch(session_now: Callable[[], Session | None], digest: str) -> bytes:
+    """Fetch a bundle over the present session; a broken connection is tried once more on the next. Raises LoadError."""
+    for last in (False, True):
+        session = session_now()
+        if session is None:
+            break
+        try:
+            return await session.fetch(digest)
+        except (ClusterError, TimeoutError) as error:
+            if last:
+                raise LoadError(InfraCode.SCENE_LOAD_FAILED, f"not fetched: {error}") from error
+            await asyncio.sleep(FETCH_AGAIN_S)
+    raise LoadError(InfraCode.SCENE_LOAD_FAILED, "there is no connection to the manager")
 
 
 async def serve(daemon: Daemon, signals: tuple[int, ...]) -> None:

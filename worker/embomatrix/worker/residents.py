@@ -188,6 +188,12 @@ class Residents:
             self._on_change(scene)
             tasks.create_task(self._load(scene))
 
+    def shed(self) -> None:
+        """Evict every scene in which nothing runs."""
+        for digest, held in self._held().items():
+            if not held.busy:
+                self._evict(digest)
+
     def lost(self, scene: Scene, reason: str) -> None:
         """The scene's process forks no more: forget the scene, so that it is loaded anew when it is wanted.
 

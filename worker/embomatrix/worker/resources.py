@@ -7,7 +7,6 @@ import math
 import os
 import platform
 import shutil
-import subprocess
 import time
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Final
@@ -17,31 +16,50 @@ import psutil
 
 from embomatrix.rpc.values import Resources
 from embomatrix.sim.zygote import MIB
+from embomatrix.worker.cgroup import find_limits
+from embomatrix.worker.gpu import find_gpu
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
+    from embomatrix.worker.cgroup import Limits
     from embomatrix.worker.settings import WorkerSettings
 
-MEMORY_SHARE: Final = 0.4
-"""Share of the free memory that residents may use when nothing else is said."""
 REFERENCE_S: Final = 0.0065
 """Seconds that the probe takes on a machine of score 1: a core of a cloud machine of 2026."""
-GPU_QUERY_S: Final = 5.0
 
 
 def measure(settings: WorkerSettings) -> Resources:
     """Resources of this machine; what the settings name is taken from there."""
-    gpu, vram_mb = find_gpu()
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    free_mb = psutil.virtual_memory().available // MIB
+    limits = find_limits()
+    cores = usable_cores(limits)
+    slots = settings.slots or cores
+    gpu = find_gpu()
+    free_mb = min(psutil.virtual_memory().available / MIB, limits.memory_mb)
     return Resources(
-        slots=settings.slots or cores,
+        slots=slots,
         cores=cores,
-        memory_mb=settings.memory_mb or max(1, int(free_mb * MEMORY_SHARE)),
+        memory_mb=settings.memory_mb or max(1, int(free_mb * settings.memory_share)),
         score=measure_score(),
-        gpu=gpu,
-        vram_mb=vram_mb,
+        gpu=gpu.name,
+        vram_mb=gpu.vram_mb,
         versions=versions(),
+        render_slots=gpu.render_slots(slots),
+        disk_mb=free_disk_mb(settings.cache_dir.expanduser()),
+        labels=settings.labels,
     )
+
+
+def usable_cores(limits: Limits) -> int:
+    """Cores that this process may keep busy: by its affinity, and by the quota of its control groups, rounded down."""
+    allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, int(min(allowed, limits.cores)))
+
+
+def free_disk_mb(folder: Path) -> int:
+    """Free space where this folder is, or will be."""
+    existing = next(parent for parent in (folder.absolute(), *folder.absolute().parents) if parent.exists())
+    return shutil.disk_usage(existing).free // MIB
 
 
 def measure_score() -> float:
@@ -54,20 +72,6 @@ def measure_score() -> float:
             total += number * 0.5
         seconds.append(time.perf_counter() - started_s)
     return round(REFERENCE_S / min(seconds), 2)
-
-
-def find_gpu() -> tuple[str, int]:
-    """Name and memory (MiB) of the first NVIDIA GPU, or an empty name."""
-    program = shutil.which("nvidia-smi")
-    if program is None:
-        return "", 0
-    query = [program, "--query-gpu=name,memory.total", "--format=csv,noheader,nounits"]
-    try:
-        answer = subprocess.run(query, capture_output=True, text=True, timeout=GPU_QUERY_S, check=True)
-        name, memory_mb = answer.stdout.splitlines()[0].rsplit(",", 1)
-        return name.strip(), int(memory_mb)
-    except (OSError, subprocess.SubprocessError, ValueError, IndexError):
-        return "", 0
 
 
 def versions() -> dict[str, str]:

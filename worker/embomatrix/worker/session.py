@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.proto.v1 import worker_service_pb2 as pb
 from embomatrix.proto.v1 import worker_service_pb2_grpc
 from embomatrix.rpc.channel import open_channel
-from embomatrix.rpc.convert import each, resources_to_proto
+from embomatrix.rpc.convert import each
 from embomatrix.rpc.convert_session import (
     lease_from_proto,
     lease_progress_to_proto,
     lease_ref_from_proto,
     lease_ref_to_proto,
     lease_result_to_proto,
+    resources_to_proto,
     worker_state_to_proto,
 )
 from embomatrix.rpc.status import (
@@ -132,6 +133,7 @@ class Session:
         self._told_to_drain = False
         self._paused = ""
         self._state_due = False
+        self._resync_due = False
         self._news = asyncio.Event()
         self._lingering: asyncio.TimerHandle | None = None
         self._data_channel: grpc.aio.Channel | None = None
@@ -161,6 +163,11 @@ class Session:
         """Ask for nothing new and keep the scenes, for this reason; an empty one takes that back."""
         self._paused = reason
         self.tell_state()
+
+    def resync(self) -> None:
+        """Open the stream anew: its first message tells which leases are held here no longer, so that others get them."""
+        self._resync_due = True
+        self._news.set()
 
     @property
     def _draining(self) -> bool:
@@ -225,13 +232,16 @@ class Session:
 
     async def _talk(self, channel: grpc.aio.Channel) -> None:
         stub = worker_service_pb2_grpc.WorkerServiceStub(channel)
+        self._resync_due = True
         with cluster_errors(self._address):
-            async for response in stub.Session(self._requests()):
-                if not self.attached.is_set():
-                    # The manager answers once it has heard the full state, which renews what it names.
-                    self.renewed_s = time.monotonic()
-                    self.attached.set()
-                self._take(response)
+            while self._resync_due:
+                self._resync_due = False
+                async for response in stub.Session(self._requests()):
+                    if not self.attached.is_set():
+                        # The manager answers once it has heard the full state, which renews what it names.
+                        self.renewed_s = time.monotonic()
+                        self.attached.set()
+                    self._take(response)
         if not self._drained():
             raise UnavailableError(f"the manager at {self._address} ended the session")
 
@@ -250,11 +260,11 @@ class Session:
                 claims,
             )
         )
-        while not self._drained():
+        while not self._drained() and not self._resync_due:
             await self._news.wait()
             self._news.clear()
             self._linger_no_more()
-            while self._state_due or self._outbox.has_unsent:
+            while not self._resync_due and (self._state_due or self._outbox.has_unsent):
                 results = self._outbox.take_unsent(RESULTS_PER_MESSAGE)
                 message = self._request(state=self._state() if self._state_due else None)
                 message.results.extend(lease_result_to_proto(result) for result in results)

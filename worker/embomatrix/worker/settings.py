@@ -9,8 +9,10 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from embomatrix.rpc.channel import DEFAULT_ADDRESS, TOKEN_PATTERN
+from embomatrix.rpc.convert_session import MAX_LABELS
 from embomatrix.rpc.managers import addresses_of
 from embomatrix.rpc.status import InvalidRequestError
+from embomatrix.worker.preferences import Preferences
 
 
 class WorkerSettings(BaseModel):
@@ -33,7 +35,9 @@ class WorkerSettings(BaseModel):
     slots: int = Field(0, ge=0, le=1024)
     """Rollouts that may run at the same time. 0: as many as there are cores."""
     memory_mb: int = Field(0, ge=0)
-    """Memory for all resident scenes together. 0: four tenths of what is free."""
+    """Memory for all resident scenes together. 0: ``memory_share`` of what is free."""
+    memory_share: float = Field(0.4, gt=0, le=1)
+    """Of the memory that is free when the worker starts, and that its control group leaves it."""
     slot_memory_mb: int = Field(2048, ge=64)
     """Memory that one rollout may allocate beyond what its scene holds."""
     cache_dir: Path = Path("~/.cache/embomatrix/worker")
@@ -41,7 +45,11 @@ class WorkerSettings(BaseModel):
     cache_mb: int = Field(1024, ge=1)
     """Disk space for bundles; the longest unused go first."""
     nice: int = Field(10, ge=0, le=19)
-    """Politeness towards the machine's owner: higher leaves more to others."""
+    """Politeness towards the machine's owner: higher leaves more to others. Above 0 the disk is left to others too."""
+    labels: dict[str, str] = Field(default_factory=dict, max_length=MAX_LABELS)
+    """What the operator calls this machine by."""
+    preferences: Preferences = Field(default_factory=lambda: Preferences.model_validate({}))
+    """When this machine works."""
     drain_s: float = Field(60.0, gt=0)
     """How long running rollouts may take to end after a signal."""
     once: bool = False

@@ -76,6 +76,7 @@ class SlotPool:
         """The scene that each occupied permit executes in."""
         self._tasks: asyncio.TaskGroup | None = None
         self._clock = 0
+        self._resting = False
         self._wake = asyncio.Event()
         self._unsettled = False
         """A wanted scene is not warm, or too much is held: when a scene falls idle, more can be done about it."""
@@ -143,8 +144,19 @@ class SlotPool:
                 ticket.task.cancel()
         self._wake.set()
 
-    def cancel_all(self) -> None:
-        self.cancel(self.held())
+    def rest(self) -> None:
+        """Begin nothing from now on, neither leases nor loading; what runs goes on, and scenes stay."""
+        self._resting = True
+
+    def go_on(self) -> None:
+        """Take a rest back."""
+        self._resting = False
+        self._start_leases()
+        self._wake.set()
+
+    def shed(self) -> None:
+        """Give up the scenes in which nothing runs, for the memory that they hold."""
+        self._residents.shed()
 
     async def start(self) -> None:
         """Start the simulator. Raises ProcessGoneError with the reason when that can't be."""
@@ -174,6 +186,8 @@ class SlotPool:
         self._wake.clear()
 
     def _settle(self, tasks: asyncio.TaskGroup) -> None:
+        if self._resting:
+            return
         # Scenes of leases that wait come before those that are only announced.
         wanted = tuple(dict.fromkeys((*(ticket.digest for ticket in self._waiting), *self._wanted)))
         self._residents.settle(wanted, tasks)
@@ -199,6 +213,8 @@ class SlotPool:
             ticket.task.add_done_callback(functools.partial(self._vacate, slot))
 
     def _next_lease(self) -> tuple[Ticket, Scene] | None:
+        if self._resting:
+            return None
         for ticket in self._waiting:
             scene = self._residents.warm(ticket.digest)
             if scene is not None:
