@@ -18,7 +18,7 @@ SIMULATION = Path(__file__).with_name("simulation.py")
 def main():
     manager, name, folder, slots = sys.argv[1:]
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
-    settings = WorkerSettings(manager=manager, name=name, cache_dir=Path(folder))
+    settings = WorkerSettings(manager=manager, name=name, cache_dir=Path(folder), state_dir=Path(folder))
     resources = Resources(int(slots), int(slots), 500)
     daemon = Daemon(settings, resources, np.random.default_rng(), program=(sys.executable, str(SIMULATION)))
     asyncio.run(serve(daemon, (signal.SIGTERM, signal.SIGINT)))

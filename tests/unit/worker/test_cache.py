@@ -1,6 +1,9 @@
 """Bundles on disk: what is there is not fetched, what is damaged is fetched again, what is old goes."""
 
+import asyncio
 import os
+import resource
+import signal
 
 import pytest
 
@@ -76,3 +79,60 @@ async def test_the_longest_unused_bundles_go_when_the_disk_is_full(tmp_path):
     await cache.path_of(newest)
     names = {path.name for path in (tmp_path / "bundles").iterdir()}
     assert names == {digest.removeprefix("sha256:") + ".bundle" for digest in (oldest, newest)}
+
+
+async def test_a_cache_that_is_opened_again_fetches_nothing_it_has(tmp_path):
+    source = Source(b"scene", b"other")
+    for digest in source.bundles:
+        await _cache(tmp_path, source).path_of(digest)
+    later = Source()
+    for digest in source.bundles:
+        assert (await _cache(tmp_path, later).path_of(digest)).read_bytes() == source.bundles[digest]
+    assert later.asked == []
+
+
+async def test_two_daemons_share_a_folder_without_harm(tmp_path):
+    contents = [bytes([number]) * 400 for number in range(8)]
+    sources = [Source(*contents), Source(*contents)]
+    caches = [_cache(tmp_path, source, limit_bytes=1300) for source in sources]
+
+    async def bring(cache, digests):
+        for digest in digests:
+            assert (await cache.path_of(digest)).suffix == ".bundle"
+
+    digests = list(sources[0].bundles)
+    await asyncio.gather(bring(caches[0], digests * 3), bring(caches[1], digests[::-1] * 3))
+    left = list((tmp_path / "bundles").iterdir())
+    assert all(bundle_digest(path.read_bytes()).endswith(path.stem) for path in left)
+    assert sum(path.stat().st_size for path in left) <= 1300
+
+
+async def test_what_a_killed_daemon_left_half_written_goes_in_time(tmp_path):
+    source = Source(b"scene")
+    cache = _cache(tmp_path, source)
+    (tmp_path / "bundles").mkdir()
+    old, young = tmp_path / "bundles" / "a.part-1-x", tmp_path / "bundles" / "b.part-2-y"
+    old.write_bytes(b"half")
+    young.write_bytes(b"half")
+    os.utime(old, (0, 0))
+    await cache.path_of(next(iter(source.bundles)))
+    assert (old.exists(), young.exists()) == (False, True)
+
+
+async def test_a_bundle_that_cannot_be_written_leaves_nothing_behind(tmp_path):
+    # The limit is the system's own, and lifted again.
+    source = Source(b"a" * 400, b"b" * 4000)
+    cache = _cache(tmp_path, source)
+    small, large = source.bundles
+    kept = await cache.path_of(small)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
+    try:
+        with pytest.raises(OSError, match="File too large"):
+            await cache.path_of(large)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        signal.signal(signal.SIGXFSZ, before)
+    assert [path.name for path in (tmp_path / "bundles").iterdir()] == [kept.name]
+    assert (await cache.path_of(large)).read_bytes() == b"b" * 4000

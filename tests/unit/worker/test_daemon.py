@@ -16,7 +16,7 @@ from embomatrix.worker.settings import WorkerSettings
 
 
 def _daemon(address, folder, **options):
-    settings = WorkerSettings(manager=address, name="w1", cache_dir=folder, **options)
+    settings = WorkerSettings(manager=address, name="w1", cache_dir=folder, state_dir=folder, **options)
     return Daemon(settings, Resources(2, 2, 500), np.random.default_rng(0), program=PROGRAM)
 
 

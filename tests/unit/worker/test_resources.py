@@ -5,7 +5,8 @@ import os
 import pytest
 from pydantic import ValidationError
 
-from embomatrix.worker.resources import find_gpu, fingerprint, measure
+from embomatrix.worker.gpu import Gpu, ask_program
+from embomatrix.worker.resources import fingerprint, measure
 from embomatrix.worker.settings import WorkerSettings
 
 
@@ -32,7 +33,7 @@ def test_a_gpu_is_found_by_nvidia_smi(tmp_path, monkeypatch):
     program.write_text("#!/bin/sh\necho 'NVIDIA H200, 143771'\n")
     program.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
-    assert find_gpu() == ("NVIDIA H200", 143771)
+    assert ask_program() == Gpu("NVIDIA H200", 143771)
 
 
 def test_a_gpu_program_that_fails_means_no_gpu(tmp_path, monkeypatch):
@@ -40,7 +41,7 @@ def test_a_gpu_program_that_fails_means_no_gpu(tmp_path, monkeypatch):
     program.write_text("#!/bin/sh\necho 'driver mismatch'\nexit 9\n")
     program.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
-    assert find_gpu() == ("", 0)
+    assert ask_program() is None
 
 
 def test_two_workers_of_one_host_get_different_names():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import logging
 import math
 import secrets
@@ -87,7 +88,7 @@ class Daemon:
         self._cache = BundleCache(
             folder / "bundles",
             limit_bytes=settings.cache_mb * MIB,
-            fetch=lambda digest: fetch(lambda: self._session, digest),
+            fetch=functools.partial(fetch, lambda: self._session),
         )
         limits = SlotLimits(resources.slots, resources.memory_mb, settings.slot_memory_mb)
         self._pool = SlotPool(

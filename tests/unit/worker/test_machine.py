@@ -1,0 +1,146 @@
+"""What a machine shows, read from real files, real processes and what loginctl prints."""
+
+import os
+import subprocess
+import sys
+import time
+
+import psutil
+import pytest
+
+from embomatrix.worker.cgroup import Limits, find_limits
+from embomatrix.worker.machine import (
+    NEVER_S,
+    CpuTimes,
+    Machine,
+    Owner,
+    desktop_active_s,
+    family_cpu_s,
+    terminal_active_s,
+)
+from embomatrix.worker.pausing import Observation
+from embomatrix.worker.preferences import Preferences
+from embomatrix.worker.resources import free_disk_mb, usable_cores
+
+BUSY = "import time\nend = time.process_time() + 0.4\nwhile time.process_time() < end: pass\n"
+
+
+def test_the_last_key_in_any_terminal_is_a_sign_of_the_owner(tmp_path):
+    for name, typed_s in (
+        ("pts/0", 1000),
+        ("pts/7", 3000),
+        ("tty1", 2000),
+        ("pts/ptmx", 9000),
+        ("tty", 9000),
+    ):
+        path = tmp_path / name
+        path.parent.mkdir(exist_ok=True)
+        path.touch()
+        os.utime(path, (typed_s, 9000))
+    assert terminal_active_s(tmp_path) == 3000
+
+
+def test_a_machine_without_terminals_and_desktops_has_been_left_alone_for_ever(tmp_path):
+    assert Owner(tmp_path).idle_s(time.time()) == NEVER_S
+
+
+DESKTOP = "Type=wayland\nClass=user\nState=active\nIdleHint={}\nIdleSinceHint={}\n"
+TERMINAL = "Type=tty\nClass=user\nState=active\nIdleHint=no\nIdleSinceHint=0\n"
+GREETER = "Type=x11\nClass=greeter\nState=active\nIdleHint=no\nIdleSinceHint=0\n"
+CLOSING = "Type=x11\nClass=user\nState=closing\nIdleHint=no\nIdleSinceHint=0\n"
+
+
+@pytest.mark.parametrize(
+    ("sessions", "active_s"),
+    [
+        ("", None),
+        (DESKTOP.format("no", 0), 5000.0),
+        (DESKTOP.format("yes", 4_000_000_000), 4000.0),
+        (DESKTOP.format("yes", "n/a"), 5000.0),
+        (DESKTOP.format("yes", 4_000_000_000) + "\n" + DESKTOP.format("yes", 4_500_000_000), 4500.0),
+        (f"{TERMINAL}\n{GREETER}\n{CLOSING}", None),
+        (TERMINAL + "\n" + DESKTOP.format("no", 0), 5000.0),
+    ],
+)
+def test_a_desktop_is_used_until_it_says_that_it_is_idle(sessions, active_s):
+    assert desktop_active_s(sessions, 5000.0) == active_s
+
+
+def test_what_others_use_is_what_is_busy_and_not_ours():
+    before = CpuTimes(total_s=100, busy_s=50, ours_s=40)
+    assert CpuTimes(200, 90, 60).others_share_since(before) == pytest.approx(0.2)
+    assert CpuTimes(200, 90, 10).others_share_since(before) == pytest.approx(0.4)
+    assert before.others_share_since(before) == 0.0
+
+
+def test_processes_below_ours_count_as_ours_also_after_their_end():
+    before_s = family_cpu_s(os.getpid())
+    subprocess.run([sys.executable, "-c", BUSY], check=True)
+    assert family_cpu_s(os.getpid()) - before_s >= 0.4
+
+
+def test_a_process_that_is_gone_used_nothing():
+    process = subprocess.Popen([sys.executable, "-c", ""])
+    process.wait()
+    assert family_cpu_s(process.pid) == 0.0
+
+
+def test_our_own_work_is_no_load_of_others_and_theirs_is():
+    ours, nobody = Machine(lambda: [os.getpid()]), Machine(list)
+    subprocess.run([sys.executable, "-c", BUSY], check=True)
+    # Whatever else this machine does, both saw it; between them lies what was ours.
+    share, whole = ours.observe().others_load, nobody.observe().others_load
+    assert whole > share
+
+
+def test_this_machine_can_be_observed():
+    seen = Machine(lambda: [os.getpid()]).observe()
+    assert 0 <= seen.minute < 24 * 60
+    assert 0 <= seen.others_load <= 1
+    assert 0 < seen.free_memory < 1
+    assert seen.owner_idle_s >= 0
+
+
+def test_a_wish_that_this_machine_cannot_heed_is_told():
+    machine = Machine(list)
+    wishes = Preferences(idle_s=60, mains_only=True)
+    assert len(machine.blind_to(wishes, Observation(0))) == 2
+    assert machine.blind_to(wishes, Observation(0, owner_idle_s=5.0, on_mains=True)) == []
+    assert machine.blind_to(Preferences(), Observation(0)) == []
+
+
+def _group(mount, name, **files):
+    folder = mount / name
+    folder.mkdir(parents=True, exist_ok=True)
+    for file, text in files.items():
+        (folder / file.replace("__", ".")).write_text(text + "\n")
+
+
+def test_the_tightest_group_around_this_process_counts(tmp_path):
+    mount, membership = tmp_path / "cgroup", tmp_path / "membership"
+    membership.write_text("0::/user.slice/worker.service\n")
+    _group(mount, "user.slice/worker.service", cpu__max="max 100000", memory__max="max", memory__current="5")
+    _group(
+        mount, "user.slice", cpu__max="250000 100000", memory__max=str(3 << 30), memory__current=str(1 << 30)
+    )
+    assert find_limits(mount, membership) == Limits(2.5, 2048.0)
+    assert usable_cores(Limits(cores=0.5)) == 1
+    assert usable_cores(Limits()) == len(psutil.Process().cpu_affinity())
+
+
+def test_groups_of_the_first_version_count_too(tmp_path):
+    mount, membership = tmp_path / "cgroup", tmp_path / "membership"
+    membership.write_text("5:memory:/docker/1\n4:cpu,cpuacct:/docker/1\n")
+    _group(mount, "cpu,cpuacct/docker/1", cpu__cfs_quota_us="150000", cpu__cfs_period_us="100000")
+    _group(mount, "cpu,cpuacct", cpu__cfs_quota_us="-1", cpu__cfs_period_us="100000")
+    _group(mount, "memory", memory__limit_in_bytes=str(1 << 30), memory__usage_in_bytes="0")
+    assert find_limits(mount, membership) == Limits(1.5, 1024.0)
+
+
+def test_without_groups_nothing_is_limited(tmp_path):
+    assert find_limits(tmp_path, tmp_path / "none") == Limits()
+
+
+def test_free_space_is_that_of_the_folder_or_of_what_is_there_of_it(tmp_path):
+    assert free_disk_mb(tmp_path / "not" / "yet") == pytest.approx(free_disk_mb(tmp_path), rel=0.5)
+    assert free_disk_mb(tmp_path) > 0
