@@ -42,35 +42,43 @@ def terms(new=NEW, **changes):
     return Terms(**{**values, **changes})
 
 
+LONGEST = 5
+SCALE = Scale(4, 7, LONGEST)
+
+
 def by_hand(kind, ratio, low, high, kl_coef):
     """The objective as a person would compute it, plan by plan and token by token."""
     plans = []
     for new, old, reference, mask, advantage in zip(NEW, OLD, REFERENCE, MASK, ADVANTAGES, strict=True):
         own = [at for at, present in enumerate(mask) if present]
         whole = math.exp(sum(new[at] - old[at] for at in own))
+        mean = math.exp(sum(new[at] - old[at] for at in own) / len(own))
         tokens = []
         for at in own:
-            rho = whole if ratio is RatioLevel.SEQUENCE else math.exp(new[at] - old[at])
+            rho = {
+                RatioLevel.TOKEN: math.exp(new[at] - old[at]),
+                RatioLevel.SEQUENCE: whole,
+                RatioLevel.MEAN: mean,
+            }[RatioLevel.MEAN if kind is LossKind.GSPO else ratio]
             gain = min(rho * advantage, min(max(rho, 1 - low), 1 + high) * advantage)
             gap = reference[at] - new[at]
             tokens.append((gain, kl_coef * (math.exp(gap) - gap - 1)))
         plans.append(tokens)
-    count = sum(map(len, plans))
-    if kind is LossKind.DAPO:
-        return sum(cost - gain for plan in plans for gain, cost in plan) / count
-    share = [1.0 if kind is LossKind.PAPER else 1 / len(plan) for plan in plans]
-    costs = [sum(cost for _, cost in plan) * part for plan, part in zip(plans, share, strict=True)]
-    if ratio is RatioLevel.SEQUENCE:
-        gains = [plan[0][0] for plan in plans]
-    else:
-        gains = [sum(gain for gain, _ in plan) * part for plan, part in zip(plans, share, strict=True)]
-    return (sum(costs) - sum(gains)) / len(plans)
+    if kind is LossKind.PAPER:
+        gains = [
+            plan[0][0] if ratio is not RatioLevel.TOKEN else sum(gain for gain, _ in plan) for plan in plans
+        ]
+        return (sum(cost for plan in plans for _, cost in plan) - sum(gains)) / len(plans)
+    if kind in (LossKind.GRPO, LossKind.GSPO):
+        return sum(sum(cost - gain for gain, cost in plan) / len(plan) for plan in plans) / len(plans)
+    total = sum(cost - gain for plan in plans for gain, cost in plan)
+    return total / (len(plans) * LONGEST if kind is LossKind.DR_GRPO else sum(map(len, plans)))
 
 
 @pytest.mark.parametrize(("kind", "ratio"), list(itertools.product(LossKind, RatioLevel)))
 def test_loss_is_the_formula_written_out(kind, ratio):
     objective = Objective(kind, ratio, clip_low=0.2, clip_high=0.28, kl_coef=0.1)
-    loss, _ = surrogate_loss(terms(), objective, Scale(4, 7))
+    loss, _ = surrogate_loss(terms(), objective, SCALE)
     assert loss.item() == pytest.approx(by_hand(kind, ratio, 0.2, 0.28, 0.1), abs=1e-12)
 
 
@@ -78,7 +86,7 @@ def test_paper_objective_keeps_its_golden_value():
     objective = Objective(LossKind.PAPER, RatioLevel.SEQUENCE, clip_low=0.2, clip_high=0.2, kl_coef=0.1)
     # ratios exp(0.5), exp(-0.5), exp(-0.5), exp(0.5); clipped at 1.2 and 0.8 where that lowers the gain
     gain = (1.2 - 0.8 + 0.5 * math.exp(-0.5) - 0.5 * math.exp(0.5)) / 4
-    loss, _ = surrogate_loss(terms(reference=None), objective, Scale(4, 7))
+    loss, _ = surrogate_loss(terms(reference=None), objective, SCALE)
     assert loss.item() == pytest.approx(-gain, abs=1e-12)
 
 
@@ -87,7 +95,7 @@ def test_parts_of_a_step_add_up_to_the_whole(kind, ratio):
     objective = Objective(kind, ratio, kl_coef=0.05, entropy_coef=0.01)
     entropy = torch.full((4, 2), 0.3, dtype=torch.float64)
     whole = terms(entropy=entropy)
-    loss, _ = surrogate_loss(whole, objective, Scale(4, 7))
+    loss, _ = surrogate_loss(whole, objective, SCALE)
     loss.backward()
     pieces = terms(entropy=entropy)
     for rows in (slice(0, 2), slice(2, 4)):
@@ -99,14 +107,14 @@ def test_parts_of_a_step_add_up_to_the_whole(kind, ratio):
             pieces.reference[rows],
             entropy[rows],
         )
-        surrogate_loss(part, objective, Scale(4, 7))[0].backward()
+        surrogate_loss(part, objective, SCALE)[0].backward()
     assert torch.allclose(whole.logprobs.grad, pieces.logprobs.grad)
 
 
 @pytest.mark.parametrize(("kind", "ratio"), list(itertools.product(LossKind, RatioLevel)))
 def test_gradient_raises_good_plans_and_lowers_bad_ones(kind, ratio):
     start = terms(new=OLD, reference=None)
-    loss, metrics = surrogate_loss(start, Objective(kind, ratio), Scale(4, 7))
+    loss, metrics = surrogate_loss(start, Objective(kind, ratio), SCALE)
     loss.backward()
     for row, advantage in enumerate(ADVANTAGES):
         for at, own in enumerate(MASK[row]):
@@ -118,7 +126,7 @@ def test_gradient_raises_good_plans_and_lowers_bad_ones(kind, ratio):
 
 def test_ratio_beyond_the_clip_gives_no_more_gradient():
     far = terms(new=[[0.9, 0.9]] * 4, reference=None, advantages=torch.ones(4, dtype=torch.float64))
-    loss, metrics = surrogate_loss(far, Objective(), Scale(4, 7))
+    loss, metrics = surrogate_loss(far, Objective(), SCALE)
     loss.backward()
     assert far.logprobs.grad.abs().max() == 0
     assert metrics.clip_fraction == 1
@@ -128,14 +136,14 @@ def test_lost_rows_move_nothing():
     mask = torch.tensor(MASK)
     mask[2] = False
     part = terms(mask=mask)
-    loss, _ = surrogate_loss(part, Objective(LossKind.PAPER, RatioLevel.SEQUENCE, kl_coef=0.1), Scale(4, 7))
+    loss, _ = surrogate_loss(part, Objective(LossKind.PAPER, RatioLevel.SEQUENCE, kl_coef=0.1), SCALE)
     loss.backward()
     assert part.logprobs.grad[2].abs().max() == 0
 
 
 def test_kl_pulls_towards_the_reference():
     part = terms(new=OLD, advantages=torch.zeros(4, dtype=torch.float64))
-    loss, metrics = surrogate_loss(part, Objective(kl_coef=1.0), Scale(4, 7))
+    loss, metrics = surrogate_loss(part, Objective(kl_coef=1.0), SCALE)
     loss.backward()
     own = torch.tensor(MASK)
     wanted = torch.sign(torch.tensor(REFERENCE) - torch.tensor(OLD))[own]

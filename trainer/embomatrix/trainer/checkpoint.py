@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from embomatrix.trainer.policy.protocol import Policy
 
-SCHEMA = 1
+SCHEMA = 2
 _STATE = "state.json"
 _TENSORS = "training.pt"
 _PREFIX = "step-"
@@ -30,10 +30,14 @@ FULL_BYTES = 8 * 1024 * 1024
 
 @dataclass
 class Progress:
-    """Where a run stands. ``cursor`` is the schedule's; seconds are of GRPO and, by activity, of the whole run."""
+    """Where a run stands. ``cursor`` is the schedule's, ``reserve_cursor`` that of the reserve.
+
+    Seconds are of GRPO and, by activity, of the whole run.
+    """
 
     step: int = 0
     cursor: int = 0
+    reserve_cursor: int = 0
     rollouts: int = 0
     lost: int = 0
     imitation_steps: int = 0

@@ -126,12 +126,45 @@ def group_seed(run_seed: int, task_id: str) -> int:
     return int.from_bytes(digest[:4], "big") >> 1
 
 
-class Schedule:
-    """Endless order of tasks. ``cursor`` is the whole state: the same seed and cursor give the same future."""
+LONGEST_PLAN: Final = 10_000
+"""Stands for the length of a plan that nobody knows: such tasks come last."""
 
-    def __init__(self, tasks: Sequence[TrainingTask], *, seed: int, cursor: int = 0) -> None:
+
+@dataclass(frozen=True, slots=True)
+class Curriculum:
+    """A pool that grows linearly from its ``start`` share of the tasks to all of them over the first ``tasks`` draws."""
+
+    tasks: int = 0
+    start: float = 1.0
+
+    def pool(self, position: int, count: int) -> int:
+        """How many of ``count`` tasks are in the pool at this draw."""
+        share = self.start + (1.0 - self.start) * min(1.0, position / self.tasks)
+        return max(1, min(count, round(share * count)))
+
+
+class Schedule:
+    """Endless order of tasks. ``cursor`` is the whole state: the same seed and cursor give the same future.
+
+    Each epoch is a permutation of all tasks. With a ``curriculum``, the first positions draw from a pool that begins with the
+    tasks of the shortest oracle plans. ``stream`` tells schedules of one seed apart.
+    """
+
+    def __init__(
+        self,
+        tasks: Sequence[TrainingTask],
+        *,
+        seed: int,
+        cursor: int = 0,
+        stream: int = 0,
+        curriculum: Curriculum | None = None,
+    ) -> None:
         self._tasks = tuple(tasks)
-        self._seed = seed
+        self._seed = (seed, stream)
+        self._curriculum = curriculum or Curriculum()
+        self._by_length = sorted(
+            self._tasks, key=lambda task: (len(task.oracle) or LONGEST_PLAN, task.task.task_id)
+        )
         self.cursor = cursor
 
     def take(self, count: int) -> tuple[TrainingTask, ...]:
@@ -146,8 +179,12 @@ class Schedule:
         return tuple(self._at(position) for position in range(begin, begin + count))
 
     def _at(self, position: int) -> TrainingTask:
+        if position < self._curriculum.tasks:
+            pool = self._curriculum.pool(position, len(self._tasks))
+            draw = np.random.default_rng(np.random.SeedSequence((*self._seed, 1, position)))
+            return self._by_length[int(draw.integers(pool))]
         epoch, offset = divmod(position, len(self._tasks))
-        order = np.random.default_rng(np.random.SeedSequence((self._seed, epoch))).permutation(
+        order = np.random.default_rng(np.random.SeedSequence((*self._seed, 0, epoch))).permutation(
             len(self._tasks)
         )
         return self._tasks[int(order[offset])]

@@ -6,6 +6,9 @@ The paper's objective (section "Learning algorithms") is, for B tasks with G pla
 
 with one ratio rho per *plan*: ``LossKind.PAPER`` with ``RatioLevel.SEQUENCE``. Sums over a step are linear in its groups,
 so a step may be back-propagated group by group, as results arrive: ``Scale`` carries the totals of the whole step.
+
+Sources of the other kinds: GRPO, Shao et al. 2024 (DeepSeekMath); DAPO, Yu et al. 2025; Dr. GRPO, Liu et al. 2025; GSPO,
+Zheng et al. 2025; BNPO as TRL names it. All of them equal TRL's in value and gradient.
 """
 
 from __future__ import annotations
@@ -25,14 +28,18 @@ class LossKind(StrEnum):
 
     PAPER = "paper"  # summed over a plan's tokens, averaged over plans: as the paper prints it
     GRPO = "grpo"  # averaged over a plan's tokens, then over plans: DeepSeekMath
+    BNPO = "bnpo"  # averaged over the tokens of each part of the step, then over parts
     DAPO = "dapo"  # averaged over all tokens of the step: long plans weigh by their length
+    DR_GRPO = "dr_grpo"  # summed over tokens, divided by plans times the longest plan allowed: length weighs nothing
+    GSPO = "gspo"  # as GRPO, with the geometric mean of a plan's token ratios in place of each
 
 
 class RatioLevel(StrEnum):
-    """Whether the ratio of new to old probability is taken per token or per plan (the product of its tokens)."""
+    """Whether the ratio of new to old probability is taken per token or per plan."""
 
     TOKEN = "token"
-    SEQUENCE = "sequence"
+    SEQUENCE = "sequence"  # the product over a plan's tokens, as the paper prints it
+    MEAN = "mean"  # its root of the plan's length: GSPO
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,13 +53,24 @@ class Objective:
     kl_coef: float = 0.0
     entropy_coef: float = 0.0
 
+    @property
+    def level(self) -> RatioLevel:
+        """The ratio's level: GSPO brings its own."""
+        return RatioLevel.MEAN if self.kind is LossKind.GSPO else self.ratio
+
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """Totals over the whole step, by which every part of it is divided: plans that have a result, and their tokens."""
+    """Totals over the whole step, by which every part of it is divided.
+
+    ``plans`` counts the plans and ``tokens`` theirs; for BNPO ``tokens`` are those of this part times ``parts``, the number of
+    parts. ``longest`` is the number of tokens that a plan may have at most; Dr. GRPO alone divides by it.
+    """
 
     plans: int
     tokens: int
+    longest: int = 1
+    parts: int = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,8 +129,10 @@ def surrogate_loss(terms: Terms, objective: Objective, scale: Scale) -> tuple[Te
     """This part's share of the step's loss, to be minimised: shares of all parts add up to the whole."""
     mask = terms.mask.to(terms.logprobs.dtype)  # (plans, tokens)
     log_ratio = (terms.logprobs - terms.old_logprobs) * mask
-    if objective.ratio is RatioLevel.SEQUENCE:
+    if objective.level is not RatioLevel.TOKEN:
         log_ratio = log_ratio.sum(dim=1, keepdim=True)  # (plans, 1)
+    if objective.level is RatioLevel.MEAN:
+        log_ratio = log_ratio / mask.sum(dim=1, keepdim=True).clamp(min=1)
     ratio = log_ratio.exp()
     advantages = terms.advantages[:, None]  # (plans, 1)
     clipped = ratio.clamp(1 - objective.clip_low, 1 + objective.clip_high)
@@ -133,8 +153,8 @@ def kl_estimate(logprobs: Tensor, reference: Tensor) -> Tensor:
 
 
 def _averaged_gain(gain: Tensor, mask: Tensor, objective: Objective, scale: Scale) -> Tensor:
-    """A ratio per plan is one term per plan where the paper averages over plans, else it stands for every token."""
-    if objective.ratio is RatioLevel.SEQUENCE and objective.kind is not LossKind.DAPO:
+    """A ratio per plan is one term per plan in the paper's objective, else it stands for every token."""
+    if objective.kind is LossKind.PAPER and objective.level is not RatioLevel.TOKEN:
         present = mask.amax(dim=1)  # (plans,): 0 where the rollout was lost
         return (gain[:, 0] * present).sum() / max(scale.plans, 1)
     return _averaged(gain.expand_as(mask), mask, objective.kind, scale)
@@ -142,11 +162,16 @@ def _averaged_gain(gain: Tensor, mask: Tensor, objective: Objective, scale: Scal
 
 def _averaged(values: Tensor, mask: Tensor, kind: LossKind, scale: Scale) -> Tensor:
     summed = (values * mask).sum(dim=1)  # (plans,)
-    if kind is LossKind.PAPER:
-        return summed.sum() / max(scale.plans, 1)
-    if kind is LossKind.GRPO:
-        return (summed / mask.sum(dim=1).clamp(min=1)).sum() / max(scale.plans, 1)
-    return summed.sum() / max(scale.tokens, 1)
+    if kind in (LossKind.GRPO, LossKind.GSPO):
+        summed = summed / mask.sum(dim=1).clamp(min=1)
+    return summed.sum() / divisor(kind, scale)
+
+
+def divisor(kind: LossKind, scale: Scale) -> int:
+    """What the sum of a step's terms is divided by."""
+    if kind in (LossKind.BNPO, LossKind.DAPO):
+        return max(scale.tokens, 1)
+    return max(scale.plans, 1) * (scale.longest if kind is LossKind.DR_GRPO else 1)
 
 
 @torch.no_grad()

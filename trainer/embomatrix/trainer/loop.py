@@ -13,13 +13,13 @@ import numpy as np
 import torch
 
 from embomatrix.trainer.checkpoint import CheckpointStore, Progress, restore, whole_folder
-from embomatrix.trainer.data import Schedule
+from embomatrix.trainer.data import Curriculum, Schedule
 from embomatrix.trainer.evaluate import Evaluation, evaluate_policy
 from embomatrix.trainer.imitate import imitate
 from embomatrix.trainer.recorder import Recorder, read_metrics
 from embomatrix.trainer.report import REPORT, Summary, write_report
 from embomatrix.trainer.stopwatch import Activity, Stopwatch
-from embomatrix.trainer.update import Updater
+from embomatrix.trainer.update import StepPlan, Updater
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -27,14 +27,15 @@ if TYPE_CHECKING:
     from embomatrix.trainer.data import TaskSet
     from embomatrix.trainer.policy.protocol import Policy
     from embomatrix.trainer.progress import Display
+    from embomatrix.trainer.records import GroupLog, StepRecord
     from embomatrix.trainer.rollout import Gateway
     from embomatrix.trainer.settings import TrainSettings
     from embomatrix.trainer.telling import Teller
-    from embomatrix.trainer.update import GroupLog, StepRecord
 
 logger = logging.getLogger(__name__)
 REFERENCE = "reference"
 CHECKPOINTS = "checkpoints"
+RESERVE_STREAM = 1
 
 
 @dataclass(frozen=True)
@@ -134,24 +135,38 @@ class TrainingRun:
     def _optimise(self, updater: Updater) -> None:
         settings = self._settings.grpo
         progress = self._progress
-        schedule = Schedule(self._parts.tasks.train, seed=self._settings.seed, cursor=progress.cursor)
+        tasks, seed = self._parts.tasks.train, self._settings.seed
+        curriculum = Curriculum(settings.curriculum_tasks, settings.curriculum_start)
+        schedule = Schedule(tasks, seed=seed, cursor=progress.cursor, curriculum=curriculum)
+        reserve = Schedule(tasks, seed=seed, cursor=progress.reserve_cursor, stream=RESERVE_STREAM)
         while (share := self._share()) < 1.0:
             began_s = time.monotonic()
-            self._announce(schedule, progress.step)
+            self._announce(schedule, reserve, progress.step)
             progress.step += 1
-            record, logs = updater.take_step(
-                progress.step,
-                schedule.take(settings.tasks_per_step),
-                np.random.default_rng(np.random.SeedSequence((self._settings.seed, 2, progress.step))),
-                self._generator,
-                self._rate_factor(share),
-            )
+            record, logs = updater.take_step(self._plan(schedule, reserve, share))
             seconds = time.monotonic() - began_s
-            progress.cursor = schedule.cursor
+            progress.cursor, progress.reserve_cursor = schedule.cursor, reserve.cursor
             progress.grpo_s += seconds
             self._note(record, logs, seconds)
             if progress.step % self._settings.checkpoint_every == 0:
                 self._save(updater)
+
+    def _plan(self, schedule: Schedule, reserve: Schedule, share: float) -> StepPlan:
+        settings = self._settings.grpo
+        end = settings.relevance if settings.relevance_final is None else settings.relevance_final
+        return StepPlan(
+            step=self._progress.step,
+            tasks=schedule.take(settings.tasks_per_step),
+            upcoming=schedule.peek(settings.tasks_per_step),
+            reserve=reserve.take(settings.reserve),
+            rng=self._rng,
+            generator=self._generator,
+            rate_factor=self._rate_factor(share),
+            relevance=settings.relevance + (end - settings.relevance) * share,
+        )
+
+    def _rng(self, step: int) -> np.random.Generator:
+        return np.random.default_rng(np.random.SeedSequence((self._settings.seed, 2, step)))
 
     def _share(self) -> float:
         """Share of the GRPO budget that is spent."""
@@ -166,14 +181,18 @@ class TrainingRun:
         rise = min(1.0, self._progress.step / (settings.warmup_steps + 1))
         return rise * (1.0 - (1.0 - settings.final_learning_rate_share) * share)
 
-    def _announce(self, schedule: Schedule, step: int) -> None:
-        """This step's tasks and those of the steps ahead: the whole window, every time."""
-        size = self._settings.grpo.tasks_per_step
+    def _announce(self, schedule: Schedule, reserve: Schedule, step: int) -> None:
+        """This step's tasks and those of the steps ahead, then what may replace some: the whole window, every time."""
+        settings = self._settings.grpo
+        size = settings.tasks_per_step
         window = {
             step + 1 + ahead: schedule.peek(size, skip=ahead * size)
-            for ahead in range(self._settings.grpo.lookahead + 1)
+            for ahead in range(settings.lookahead + 1)
         }
-        self._parts.gateway.announce(window, self._settings.grpo.group)
+        if settings.reserve and settings.lookahead:
+            # Needed in this step, if at all: behind what is certain.
+            window[step + 1 + settings.lookahead] += reserve.peek(settings.reserve)
+        self._parts.gateway.announce(window, settings.group)
 
     def _note(self, record: StepRecord, logs: list[GroupLog], seconds: float) -> None:
         self._progress.rollouts += record.rollouts

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from embomatrix.trainer.evaluate import Evaluation
     from embomatrix.trainer.imitate import ImitationProgress
-    from embomatrix.trainer.update import StepRecord
+    from embomatrix.trainer.records import StepRecord
 
 _SMOOTHING = 0.9
 _LINE_EVERY_S = 10.0

@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
+    from embomatrix.trainer.records import GroupLog, StepRecord
     from embomatrix.trainer.rollout import PlanOutcome
-    from embomatrix.trainer.update import GroupLog, StepRecord
 
 METRICS = "metrics.jsonl"
 SAMPLES = "samples.jsonl"

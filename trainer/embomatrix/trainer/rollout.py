@@ -73,6 +73,11 @@ class PlanOutcome:
         """The reward's total; NaN where there is none."""
         return math.nan if self.reward is None else self.reward.total
 
+    def valued(self, relevance: float) -> float:
+        """The reward with its second tier weighted; NaN where there is none."""
+        reward = self.reward
+        return math.nan if reward is None else reward.format + relevance * reward.relevance + reward.goal
+
     @property
     def success(self) -> bool:
         return self.reward is not None and self.reward.success

@@ -17,6 +17,14 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
+class Overlap(StrEnum):
+    """What is computed while the cluster simulates."""
+
+    NONE = "none"  # nothing: every reward of a step is waited for, then the policy learns
+    STREAM = "stream"  # groups are sampled and learnt while others are simulated
+    AHEAD = "ahead"  # so is the next step's batch sampled, with weights that are one step old
+
+
 class OnLost(StrEnum):
     """What becomes of a group of which the infrastructure lost a rollout."""
 
@@ -91,6 +99,17 @@ class GrpoSettings(_Frozen):
     lookahead: int = Field(default=3, ge=0)
     """Steps announced ahead."""
     on_lost: OnLost = OnLost.GROUP
+    overlap: Overlap = Overlap.STREAM
+    reserve: int = Field(default=0, ge=0)
+    """Dynamic sampling: tasks of a step, at most, that take the place of groups without signal."""
+    curriculum_tasks: int = Field(default=0, ge=0)
+    """While so many tasks are drawn, they come from a pool that grows from the shortest plans to all; 0: from all at once."""
+    curriculum_start: float = Field(default=0.25, gt=0, le=1)
+    """The pool's share of all tasks at the start."""
+    relevance: float = Field(default=1.0, ge=0)
+    """Weight of the reward's second tier in what is learnt; 0 leaves it out."""
+    relevance_final: float | None = Field(default=None, ge=0)
+    """Its weight at the end of the budget, reached linearly; None: it stays."""
 
     def objective(self) -> Objective:
         return Objective(

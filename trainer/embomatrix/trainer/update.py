@@ -1,8 +1,9 @@
 """One optimiser step of GRPO, with simulation hidden behind sampling and back-propagation.
 
-Chunks of tasks are sampled one after the other; each chunk's plans go to the cluster at once. Chunks are back-propagated in
-the order of sampling as soon as their rewards are there, with one optimiser step at the end: the gradient is that of the
-whole batch, on-policy, and does not depend on which worker was faster.
+Chunks of tasks are sampled one after the other; each chunk's plans go to the cluster at once. With ``Overlap.STREAM`` chunks
+are back-propagated as their rewards arrive, with one optimiser step at the end: the gradient is that of the whole batch,
+on-policy, summed in the order of sampling, so that it does not depend on which worker was faster. ``Overlap.AHEAD`` also
+samples the next step's plans before this step's rewards are needed, from weights that are one step old.
 """
 
 from __future__ import annotations
@@ -13,62 +14,57 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from embomatrix.rpc.values import Completed
-from embomatrix.trainer.grpo import LossMetrics, Scale, Terms, group_advantages, surrogate_loss
-from embomatrix.trainer.rollout import waited
-from embomatrix.trainer.settings import OnLost
+from embomatrix.trainer.errors import TrainerError
+from embomatrix.trainer.gradients import GradientSum
+from embomatrix.trainer.grpo import (
+    LossKind,
+    LossMetrics,
+    Scale,
+    Terms,
+    divisor,
+    group_advantages,
+    surrogate_loss,
+)
+from embomatrix.trainer.records import GroupLog, StepRecord, record_of
+from embomatrix.trainer.sampling import Sampler, next_back
+from embomatrix.trainer.settings import OnLost, Overlap
 from embomatrix.trainer.stopwatch import Activity
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from concurrent.futures import Future
+    from collections.abc import Callable, Sequence
 
     import numpy as np
 
     from embomatrix.trainer.data import TrainingTask
-    from embomatrix.trainer.policy.protocol import Policy, Samples
+    from embomatrix.trainer.policy.protocol import Policy
     from embomatrix.trainer.rollout import Gateway, PlanOutcome
+    from embomatrix.trainer.sampling import Chunk
     from embomatrix.trainer.settings import GrpoSettings
     from embomatrix.trainer.stopwatch import Stopwatch
-    from embomatrix.trainer.telling import Teller, Told
+    from embomatrix.trainer.telling import Teller
+
+GRADIENTS_ASIDE = 2
+"""Chunks back-propagated before their turn, at most: each keeps a gradient of the policy's size."""
+BAD_GRADIENTS = 5
+"""Steps in a row whose gradient is not finite: the run has gone astray."""
 
 
 @dataclass(frozen=True, slots=True)
-class StepRecord:
-    """What one step did. Rates are over rollouts that have a result; token means over the plans that moved the policy."""
+class StepPlan:
+    """What one step works on. ``rng`` gives a step's generator for tellings; ``generator`` draws the tokens.
+
+    ``upcoming`` are the next step's tasks, sampled now with ``Overlap.AHEAD``; ``reserve`` may replace groups that carry no
+    signal, in this order. ``rate_factor`` scales the learning rate, ``relevance`` the reward's second tier.
+    """
 
     step: int
-    reward: float
-    success: float
-    well_formed: float
-    plan_steps: float
-    dead_groups: float
-    entropy: float
-    kl: float
-    clipped: float
-    gradient_norm: float
-    learning_rate: float
-    rollouts: int
-    lost: int
-    warm: float
-
-
-@dataclass(frozen=True, slots=True)
-class GroupLog:
-    """One task's plans of a step, for the sample log."""
-
-    task: TrainingTask
-    outcomes: tuple[PlanOutcome, ...]
-    advantages: tuple[float, ...]
-
-
-@dataclass(slots=True)
-class _Chunk:
     tasks: Sequence[TrainingTask]
-    told: Sequence[Told]
-    samples: Samples
-    futures: list[Future[tuple[PlanOutcome, ...]]]
-    reference: torch.Tensor | None = None
+    upcoming: Sequence[TrainingTask]
+    reserve: Sequence[TrainingTask]
+    rng: Callable[[int], np.random.Generator]
+    generator: torch.Generator
+    rate_factor: float
+    relevance: float = 1.0
 
 
 class Updater:
@@ -84,169 +80,189 @@ class Updater:
         stopwatch: Stopwatch,
     ) -> None:
         self._policy = policy
-        self._reference = reference
-        self._teller = teller
-        self._gateway = gateway
         self._settings = settings
         self._stopwatch = stopwatch
+        self._sampler = Sampler(policy, reference, teller, gateway, settings)
+        self._ahead: tuple[int, list[Chunk]] | None = None
+        self._bad_gradients = 0
         self.optimiser = torch.optim.AdamW(
             policy.parameters(), lr=settings.learning_rate, betas=(0.9, 0.95), weight_decay=0.0
         )
 
-    def take_step(
-        self,
-        step: int,
-        tasks: Sequence[TrainingTask],
-        rng: np.random.Generator,
-        generator: torch.Generator,
-        rate_factor: float,
-    ) -> tuple[StepRecord, list[GroupLog]]:
-        """Sample, execute and learn from one batch of tasks; ``rate_factor`` scales the learning rate."""
-        settings = self._settings
+    def take_step(self, plan: StepPlan) -> tuple[StepRecord, list[GroupLog]]:
+        """Sample, execute and learn from one batch of tasks. Raises TrainerError where it can't go on."""
         with self._stopwatch.spending(Activity.SAMPLING):
-            chunks = [
-                self._sample(f"{step}-{number}", step, tasks[at : at + settings.chunk], rng, generator)
-                for number, at in enumerate(range(0, len(tasks), settings.chunk))
-            ]
+            chunks = self._chunks(plan)
+        work = _Work(plan, self._scale(chunks), GradientSum(self._policy.parameters()))
+        self._learn_all(chunks, work)
+        self._replace_dead(len(chunks), work)
         with self._stopwatch.spending(Activity.UPDATE):
-            for chunk in chunks:
-                chunk.reference = self._reference_logprobs(chunk)
-        scale = Scale(
-            plans=sum(chunk.samples.mask.shape[0] for chunk in chunks),
-            tokens=sum(int(chunk.samples.mask.sum()) for chunk in chunks),
-        )
-        rate = settings.learning_rate * rate_factor
-        for group in self.optimiser.param_groups:
-            group["lr"] = rate
-        self.optimiser.zero_grad(set_to_none=True)
-        logs: list[GroupLog] = []
-        metrics: list[LossMetrics] = []
-        for chunk in chunks:
-            with self._stopwatch.spending(Activity.WAITING):
-                outcomes = [waited(future) for future in chunk.futures]
-            with self._stopwatch.spending(Activity.UPDATE):
-                logs += self._learn(chunk, outcomes, scale, metrics)
-        with self._stopwatch.spending(Activity.UPDATE):
-            norm = self._apply(metrics)
-        return _record(step, logs, metrics, norm, rate), logs
+            norm, rate = self._apply(work)
+        return record_of(plan.step, work.logs, work.metrics, norm, rate), work.logs
 
-    def _sample(
-        self,
-        label: str,
-        step: int,
-        tasks: Sequence[TrainingTask],
-        rng: np.random.Generator,
-        generator: torch.Generator,
-    ) -> _Chunk:
-        settings = self._settings
-        told = [self._teller.anew(task, rng) for task in tasks]
-        samples = self._policy.sample(
-            [each.prompt for each in told], settings.group, settings.temperature, settings.max_new, generator
-        )
-        futures = [
-            self._gateway.submit(
-                f"step-{label}-{row}",
-                step,
-                task,
-                each.situation,
-                samples.texts[row * settings.group : (row + 1) * settings.group],
-                self._policy.codec,
+    def _chunks(self, plan: StepPlan) -> list[Chunk]:
+        """This step's chunks, sampled now or a step ago; those of the next step are sent on their way too."""
+        ready, self._ahead = self._ahead, None
+        if ready is not None and ready[0] == plan.step:
+            chunks = ready[1]
+        else:
+            chunks = self._sampler.sample(plan.step, plan.tasks, plan.rng(plan.step), plan.generator)
+        if self._settings.overlap is Overlap.AHEAD and plan.upcoming:
+            coming = plan.step + 1
+            self._ahead = (
+                coming,
+                self._sampler.sample(coming, plan.upcoming, plan.rng(coming), plan.generator),
             )
-            for row, (task, each) in enumerate(zip(tasks, told, strict=True))
-        ]
-        return _Chunk(tasks, told, samples, futures)
+        return chunks
 
-    @torch.no_grad()
-    def _reference_logprobs(self, chunk: _Chunk) -> torch.Tensor | None:
-        """Computed while the cluster works: it needs no reward."""
-        if self._settings.kl_coef == 0:
-            return None
-        return self._reference.logprobs(
-            [each.prompt for each in chunk.told],
-            chunk.samples.tokens,
-            chunk.samples.mask,
-            self._settings.group,
-            self._settings.temperature,
-        ).logprobs
+    def _scale(self, chunks: Sequence[Chunk]) -> Scale:
+        return Scale(
+            plans=sum(chunk.plans for chunk in chunks),
+            tokens=sum(chunk.tokens for chunk in chunks),
+            longest=self._settings.max_new,
+            parts=len(chunks),
+        )
+
+    def _learn_all(self, chunks: Sequence[Chunk], work: _Work) -> None:
+        """Back-propagate every chunk, as its rewards arrive where that is wanted."""
+        waiting = list(chunks)
+        if self._settings.overlap is Overlap.NONE:
+            with self._stopwatch.spending(Activity.WAITING):
+                for chunk in waiting:
+                    chunk.outcomes()
+        logs: dict[int, list[GroupLog]] = {}
+        while waiting:
+            # The first in line waits alone once enough gradients are kept for later.
+            open_ones = waiting[:1] if work.gradients.aside >= GRADIENTS_ASIDE else waiting
+            with self._stopwatch.spending(Activity.WAITING):
+                chunk = next_back(open_ones)
+                outcomes = chunk.outcomes()
+            waiting.remove(chunk)
+            with self._stopwatch.spending(Activity.UPDATE):
+                logs[chunk.part] = self._learn(chunk, outcomes, work)
+        for part in sorted(logs):
+            work.logs += logs[part]
+
+    def _replace_dead(self, part: int, work: _Work) -> None:
+        """Groups without signal are replaced from the reserve, round by round, and the sum is scaled to what carries one."""
+        plan, reserve = work.plan, list(work.plan.reserve)
+        if not reserve:
+            return
+        replaced = 0
+        while reserve and (missing := sum(log.dead for log in work.logs) - replaced) > 0:
+            tasks, reserve = reserve[:missing], reserve[missing:]
+            replaced += len(tasks)
+            with self._stopwatch.spending(Activity.SAMPLING):
+                chunks = self._sampler.sample(
+                    plan.step, tasks, plan.rng(plan.step), plan.generator, first_part=part
+                )
+            part += len(chunks)
+            self._learn_all(chunks, work)
+        if work.live_plans:
+            kind = self._settings.loss
+            final = Scale(work.live_plans, work.live_tokens, self._settings.max_new, work.live_parts)
+            if kind is LossKind.BNPO:
+                work.gradients.scale(work.scale.parts / final.parts)
+            else:
+                work.gradients.scale(divisor(kind, work.scale) / divisor(kind, final))
 
     def _learn(
-        self,
-        chunk: _Chunk,
-        outcomes: list[tuple[PlanOutcome, ...]],
-        scale: Scale,
-        metrics: list[LossMetrics],
+        self, chunk: Chunk, outcomes: Sequence[tuple[PlanOutcome, ...]], work: _Work
     ) -> list[GroupLog]:
         """Back-propagate the groups of a chunk that carry a signal."""
-        group = self._settings.group
-        rewards = torch.tensor([[outcome.value for outcome in each] for each in outcomes])  # (tasks, G)
+        rewards = torch.tensor(
+            [[outcome.valued(work.plan.relevance) for outcome in each] for each in outcomes]
+        )  # (tasks, G)
         if self._settings.on_lost is OnLost.GROUP:
             rewards[torch.isnan(rewards).any(dim=1)] = math.nan
         advantages = group_advantages(rewards)
         live = [row for row, dead in enumerate(advantages.dead.tolist()) if not dead]
-        if live:
-            rows = torch.tensor([row * group + sample for row in live for sample in range(group)])
-            known = ~torch.isnan(rewards[live].view(-1))
-            samples = chunk.samples
-            rows = rows.to(samples.tokens.device)
-            length = int(samples.mask[rows].sum(dim=1).max())
-            mask = samples.mask[rows, :length] & known.to(rows.device)[:, None]
-            tokens = samples.tokens[rows, :length]
-            prompts = [chunk.told[row].prompt for row in live]
-            scored = self._policy.logprobs(prompts, tokens, mask, group, self._settings.temperature)
-            terms = Terms(
-                logprobs=scored.logprobs,
-                old_logprobs=samples.logprobs[rows, :length],
-                mask=mask,
-                advantages=advantages.values[live].view(-1).to(rows.device),
-                reference=None if chunk.reference is None else chunk.reference[rows, :length],
-                entropy=scored.entropy,
-            )
-            loss, parts = surrogate_loss(terms, self._settings.objective(), scale)
-            loss.backward()  # type: ignore[no-untyped-call]
-            metrics.append(parts)
+        work.gradients.add(chunk.part, lambda: self._backward(chunk, live, rewards, advantages.values, work))
         return [
-            GroupLog(task, each, tuple(values))
-            for task, each, values in zip(chunk.tasks, outcomes, advantages.values.tolist(), strict=True)
+            GroupLog(task, each, tuple(values), dead)
+            for task, each, values, dead in zip(
+                chunk.tasks, outcomes, advantages.values.tolist(), advantages.dead.tolist(), strict=True
+            )
         ]
 
-    def _apply(self, metrics: list[LossMetrics]) -> float:
-        """Move the policy, unless nothing was learnt or the gradient is not finite."""
-        if not metrics:
-            return 0.0
+    def _backward(
+        self,
+        chunk: Chunk,
+        live: Sequence[int],
+        rewards: torch.Tensor,
+        advantages: torch.Tensor,
+        work: _Work,
+    ) -> None:
+        if not live:
+            return
+        group, samples = self._settings.group, chunk.samples
+        device = samples.tokens.device
+        rows = torch.tensor([row * group + sample for row in live for sample in range(group)], device=device)
+        known = ~torch.isnan(rewards[live].view(-1)).to(device)
+        length = int(samples.mask[rows].sum(dim=1).max())
+        mask = samples.mask[rows, :length] & known[:, None]
+        scored = self._policy.logprobs(
+            [chunk.told[row].prompt for row in live],
+            samples.tokens[rows, :length],
+            mask,
+            group,
+            self._settings.temperature,
+        )
+        terms = Terms(
+            logprobs=scored.logprobs,
+            old_logprobs=samples.logprobs[rows, :length],
+            mask=mask,
+            advantages=advantages[live].view(-1).to(device),
+            reference=None if chunk.reference is None else chunk.reference[rows, :length],
+            entropy=scored.entropy,
+        )
+        loss, parts = surrogate_loss(terms, self._settings.objective(), self._scale_of(chunk, work.scale))
+        loss.backward()  # type: ignore[no-untyped-call]
+        work.count(parts, len(rows))
+
+    def _scale_of(self, chunk: Chunk, scale: Scale) -> Scale:
+        """BNPO divides by the part's own tokens, and averages over parts."""
+        if self._settings.loss is not LossKind.BNPO:
+            return scale
+        return Scale(scale.plans, chunk.tokens * scale.parts, scale.longest, scale.parts)
+
+    def _apply(self, work: _Work) -> tuple[float, float]:
+        """Move the policy, unless nothing was learnt or the gradient is not finite; returns its norm and the rate."""
+        rate = self._settings.learning_rate * work.plan.rate_factor
+        if not work.metrics:
+            return 0.0, rate
+        for group in self.optimiser.param_groups:
+            group["lr"] = rate
         norm = float(torch.nn.utils.clip_grad_norm_(self._policy.parameters(), self._settings.max_grad_norm))
         if math.isfinite(norm):
+            self._bad_gradients = 0
             self.optimiser.step()
-        return norm
+            return norm, rate
+        self._bad_gradients += 1
+        if self._bad_gradients >= BAD_GRADIENTS:
+            raise TrainerError(
+                f"the gradient of step {work.plan.step} is not finite (found {norm}), the {BAD_GRADIENTS}th time in a row: the "
+                "policy was left as it is; lower grpo.learning_rate and go on with --resume"
+            )
+        return norm, rate
 
 
-def _record(
-    step: int, logs: list[GroupLog], metrics: list[LossMetrics], norm: float, rate: float
-) -> StepRecord:
-    outcomes = [outcome for log in logs for outcome in log.outcomes]
-    known = [outcome for outcome in outcomes if outcome.reward is not None]
-    executed = [outcome.outcome for outcome in known if isinstance(outcome.outcome, Completed)]
-    weight = sum(part.weight for part in metrics) or 1
+class _Work:
+    """What a step has gathered so far."""
 
-    def over_tokens(name: str) -> float:
-        return float(sum(getattr(part, name) * part.weight for part in metrics) / weight)
+    def __init__(self, plan: StepPlan, scale: Scale, gradients: GradientSum) -> None:
+        self.plan = plan
+        self.scale = scale
+        self.gradients = gradients
+        self.logs: list[GroupLog] = []
+        self.metrics: list[LossMetrics] = []
+        self.live_plans = 0
+        self.live_tokens = 0
+        self.live_parts = 0
 
-    return StepRecord(
-        step=step,
-        reward=_mean([outcome.value for outcome in known]),
-        success=_mean([outcome.success for outcome in known]),
-        well_formed=_mean([not outcome.problem for outcome in known]),
-        plan_steps=_mean([len(outcome.steps) for outcome in executed]),
-        dead_groups=_mean([not any(log.advantages) for log in logs]),
-        entropy=over_tokens("entropy"),
-        kl=over_tokens("kl_to_reference"),
-        clipped=over_tokens("clip_fraction"),
-        gradient_norm=norm,
-        learning_rate=rate,
-        rollouts=len(outcomes),
-        lost=len(outcomes) - len(known),
-        warm=_mean([outcome.warm for outcome in executed]),
-    )
-
-
-def _mean(values: Sequence[float]) -> float:
-    return float(sum(values) / len(values)) if values else 0.0
+    def count(self, metrics: LossMetrics, plans: int) -> None:
+        """One more part with a signal."""
+        self.metrics.append(metrics)
+        self.live_plans += plans
+        self.live_tokens += metrics.weight
+        self.live_parts += 1

@@ -1,0 +1,42 @@
+"""Gradients of parts add up in one order, to the bit, whatever order the parts come in."""
+
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import nn
+
+from embomatrix.trainer.gradients import GradientSum
+
+PARTS = [torch.tensor([scale, 1 / scale, 0.1]) for scale in (1e7, 3.0, 1e-7, 0.3, 1e3)]
+
+
+def summed(order, tensors=PARTS):
+    weights, idle = nn.Parameter(torch.zeros(3)), nn.Parameter(torch.zeros(2))
+    gradients = GradientSum([weights, idle])
+    most = 0
+    for part in order:
+        gradients.add(part, lambda part=part: (weights * tensors[part]).sum().backward())
+        most = max(most, gradients.aside)
+    assert gradients.aside == 0
+    assert idle.grad is None
+    return weights.grad, most
+
+
+@given(st.permutations(range(len(PARTS))))
+def test_any_order_gives_the_sum_of_the_order_of_parts(order):
+    assert torch.equal(summed(order)[0], summed(range(len(PARTS)))[0])
+
+
+def test_a_part_before_its_turn_waits_beside_the_sum():
+    assert summed([0, 1, 2, 3, 4])[1] == 0
+    assert summed([4, 3, 2, 1, 0])[1] == 4
+
+
+def test_a_part_without_a_gradient_takes_its_turn():
+    weights = nn.Parameter(torch.zeros(3))
+    gradients = GradientSum([weights])
+    gradients.add(1, lambda: weights.sum().backward())
+    gradients.add(0, lambda: None)
+    assert gradients.due == 2
+    gradients.scale(0.5)
+    assert weights.grad.tolist() == [0.5, 0.5, 0.5]

@@ -1,0 +1,42 @@
+"""The order of tasks is known arbitrarily far ahead, with and without a curriculum."""
+
+from collections import Counter
+
+from hypothesis import given
+from hypothesis import strategies as st
+from tests.fakes.symbolic_household import make_tasks
+
+from embomatrix.trainer.data import Curriculum, Schedule
+
+TASKS = make_tasks(12, 0, objects=10).train
+
+
+def ids(tasks):
+    return [task.task.task_id for task in tasks]
+
+
+@given(st.integers(0, 60), st.integers(0, 20), st.integers(0, 30))
+def test_what_is_peeked_is_what_is_taken(cursor, count, curriculum_tasks):
+    curriculum = Curriculum(curriculum_tasks, 0.25)
+    schedule = Schedule(TASKS, seed=3, cursor=cursor, curriculum=curriculum)
+    ahead = ids(schedule.peek(count, skip=5))
+    schedule.take(5)
+    assert ids(schedule.take(count)) == ahead
+    again = Schedule(TASKS, seed=3, cursor=schedule.cursor, curriculum=curriculum)
+    assert ids(again.peek(7)) == ids(schedule.peek(7))
+
+
+def test_an_epoch_holds_every_task_once():
+    assert Counter(ids(Schedule(TASKS, seed=1).take(len(TASKS)))) == Counter(ids(TASKS))
+
+
+def test_streams_of_one_seed_differ():
+    assert ids(Schedule(TASKS, seed=1).peek(12)) != ids(Schedule(TASKS, seed=1, stream=1).peek(12))
+
+
+def test_a_curriculum_begins_with_the_shortest_plans_and_ends_with_all():
+    schedule = Schedule(TASKS, seed=1, curriculum=Curriculum(400, 0.25))
+    by_length = sorted(TASKS, key=lambda task: (len(task.oracle), task.task.task_id))
+    first, last = set(ids(schedule.peek(40))), set(ids(schedule.peek(200, skip=300)))
+    assert first <= set(ids(by_length[:4]))
+    assert last == set(ids(TASKS))

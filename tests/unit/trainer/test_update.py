@@ -1,0 +1,81 @@
+"""Steps of GRPO: what is overlapped, replaced and weighted changes nothing that it should not."""
+
+import math
+
+import pytest
+import torch
+from tests.fakes.symbolic_household import SymbolicCluster, make_tasks
+from tests.unit.trainer.test_loop import run, weights
+
+from embomatrix.trainer.errors import TrainerError
+from embomatrix.trainer.grpo import LossKind
+from embomatrix.trainer.recorder import read_metrics
+from embomatrix.trainer.settings import Overlap
+
+TASKS = make_tasks(10, 0, objects=10)
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    torch.set_num_threads(1)
+
+
+def trained(out, **changes):
+    return run(out, changes.pop("cluster", SymbolicCluster(TASKS)), TASKS, **{"grpo__steps": 4, **changes})
+
+
+def test_streaming_learns_the_same_to_the_bit_as_waiting_for_everything(tmp_path):
+    _, waited = trained(tmp_path / "none", grpo__overlap=Overlap.NONE, grpo__chunk=1)
+    _, streamed = trained(tmp_path / "stream", grpo__chunk=1, cluster=SymbolicCluster(TASKS, delay_s=0.01))
+    assert torch.equal(weights(waited), weights(streamed))
+
+
+def test_a_step_ahead_is_sampled_by_weights_one_step_old(tmp_path):
+    summary, policy = trained(tmp_path / "ahead", grpo__overlap=Overlap.AHEAD, grpo__learning_rate=1e-2)
+    _, streamed = trained(tmp_path / "stream", grpo__learning_rate=1e-2)
+    rows = read_metrics(tmp_path / "ahead")
+    assert summary.steps == 4
+    assert not torch.equal(weights(policy), weights(streamed))
+    assert rows[0]["kl_to_old"] == pytest.approx(0, abs=1e-6)
+    assert max(row["kl_to_old"] for row in rows[1:]) > 1e-6
+
+
+def test_groups_without_signal_are_replaced_from_the_reserve(tmp_path):
+    cluster = SymbolicCluster(TASKS)
+    trained(tmp_path / "a", cluster=cluster, grpo__reserve=6, imitation__steps=0)
+    without = trained(tmp_path / "b", imitation__steps=0)[0]
+    rows = read_metrics(tmp_path / "a")
+    assert all(4 <= row["groups"] <= 10 for row in rows)
+    assert any(row["groups"] > 4 for row in rows)
+    assert sum(row["rollouts"] for row in rows) > without.rollouts
+
+
+@pytest.mark.parametrize("kind", [LossKind.DAPO, LossKind.BNPO, LossKind.GRPO])
+def test_a_reserve_that_is_not_needed_changes_nothing(tmp_path, kind):
+    changes = {
+        "grpo__loss": kind,
+        "grpo__tasks_per_step": 2,
+        "grpo__chunk": 1,
+        "grpo__steps": 2,
+        "grpo__temperature": 1.5,
+        "seed": 1,
+    }
+    _, plain = trained(tmp_path / "plain", **changes)
+    _, reserved = trained(tmp_path / "reserved", grpo__reserve=1, **changes)
+    assert [row["dead_groups"] for row in read_metrics(tmp_path / "plain")] == [0, 0]
+    assert torch.equal(weights(plain), weights(reserved))
+
+
+def test_without_the_relevance_tier_the_update_differs_and_the_log_keeps_it(tmp_path):
+    _, whole = trained(tmp_path / "whole")
+    _, without = trained(tmp_path / "without", grpo__relevance=0.0)
+    assert not torch.equal(weights(whole), weights(without))
+    row = read_metrics(tmp_path / "without")[0]
+    tiers = row["reward_format"] + row["reward_relevance"] + row["reward_goal"]
+    assert row["reward"] == pytest.approx(tiers)
+    assert row["reward_relevance"] > 0
+
+
+def test_a_gradient_that_is_never_finite_ends_the_run_with_the_policy_as_it_was(tmp_path):
+    with pytest.raises(TrainerError, match=r"not finite .* lower grpo.learning_rate"):
+        trained(tmp_path, grpo__kl_coef=math.inf, grpo__steps=30)
