@@ -87,7 +87,7 @@ async def test_report_and_trace_of_a_run_that_is_over_show_what_it_did(browser, 
     assert "worker_joined worker=kitchen-worker size=2" in fleet.text
 
 
-@pytest.mark.parametrize("command", ["workers", "runs", "plan", "pause", "resume-dispatch", "events"])
+@pytest.mark.parametrize("command", ["workers", "plan", "events"])
 def test_a_manager_that_can_not_be_reached_is_named(command):
     answer = run("cluster", command, f"--manager={NOWHERE}")
     assert (answer.status, UNREACHABLE in answer.text, "Traceback" in answer.text) == (2, True, False)
