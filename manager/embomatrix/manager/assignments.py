@@ -28,7 +28,7 @@ from embomatrix.manager.ledger import (
 )
 from embomatrix.manager.load_failures import LoadFailures
 from embomatrix.manager.pending import PendingQueues
-from embomatrix.manager.run_book import RunBook, RunRecord
+from embomatrix.manager.run_book import RunBook
 from embomatrix.rpc.values import (
     Cancelled,
     Completed,
@@ -145,10 +145,6 @@ class Assignments:
         batch = self.batches.get(key)
         for record in list(batch.open.values()) if batch is not None else ():
             self._conclude(record, CALLED_OFF)
-
-    def cancel_run(self, run_id: str) -> None:
-        for batch in self.batches.of_run(run_id):
-            self.cancel((run_id, batch.batch_id))
 
     def finish(self, record: RolloutRecord, outcome: Outcome) -> None:
         """The one place where a rollout gets its outcome, and its group or batch what follows from it."""
@@ -304,30 +300,15 @@ class Assignments:
         self._end(lease)
         record.attempts += 1
         run = self.runs.of(record.key.run_id)
-        self._time(lease, run, lost=False)
+        self.fleet.time(lease, run.times, self.now_s, lost=False)
         for other in record.leases:
-            self._time(other, run, lost=True)
+            self.fleet.time(other, run.times, self.now_s, lost=True)
         run.counters.warm_starts += record.warm
         run.counters.cold_starts += not record.warm
         self.fleet.workers[lease.worker_id].note_completed(completed.timings.execute_s)
         timings = lease.timings(completed.timings, self.now_s)
         warm = record.warm and completed.warm
         self.finish(record, completed.noted(timings=timings, warm=warm))
-
-    def _time(self, lease: LeaseRecord, run: RunRecord, *, lost: bool) -> None:
-        """What a lease took tells how fast its worker is, and how long others may take.
-
-        One that ``lost`` against a second one would have taken longer still.
-        """
-        if lease.started_s is None:
-            return
-        took_s, worker = self.now_s - lease.started_s, self.fleet.workers[lease.worker_id]
-        usual_s = run.times.quantile_s(0.5)
-        if usual_s and (not lost or took_s > worker.lag * usual_s):
-            self.fleet.note_lag(worker, took_s, usual_s)
-        if not lost:
-            # As it would have been on a worker that is not slow.
-            run.times.add(took_s / worker.lag)
 
     def _take_failure(self, lease: LeaseRecord, failure: InfraFailure) -> None:
         worker = self.fleet.workers[lease.worker_id]

@@ -43,6 +43,7 @@ from embomatrix.manager.events import (
     WorkerSuspected,
 )
 from embomatrix.manager.hedging import Hedger
+from embomatrix.manager.patience import Patience
 from embomatrix.manager.recovery import Recovery
 from embomatrix.rpc.values import InfraCode, InfraFailure, ResidentState
 
@@ -67,8 +68,7 @@ class Dispatcher:
         self._desk = Assignments(limits, boot_id=boot_id, first_epoch=first_epoch)
         self._recovery = Recovery(self._desk, grace_s=limits.restart_grace_s)
         self._hedger = Hedger(self._desk, limits)
-        self._unplaceable: dict[str, tuple[float, str]] = {}
-        self._alone_since_s = 0.0
+        self._patience = Patience(self._desk, limits.no_capacity_s)
 
     def handle(self, event: Event, *, now_s: float) -> list[Command]:
         """Take in one fact; returns what shall be done about it, in order."""
@@ -92,7 +92,8 @@ class Dispatcher:
             case BatchCancelled(run_id, batch_id):
                 self._desk.cancel((run_id, batch_id))
             case RunClosed(run_id):
-                self._desk.cancel_run(run_id)
+                for batch in self._desk.batches.of_run(run_id):
+                    self._desk.cancel((run_id, batch.batch_id))
             case WorkerJoined(worker_id, resources):
                 self._on_lost(WorkerLost(worker_id, "a newer session of the same worker took over"))
                 self._desk.fleet.join(worker_id, resources.slots, resources.render_slots)
@@ -103,11 +104,7 @@ class Dispatcher:
             case WorkerSuspected() | WorkerRecovered() | WorkerDrained() | WorkerResumed():
                 self._on_standing(event)
             case ScenesUnplaceable(reasons):
-                known = self._unplaceable
-                self._unplaceable = {
-                    scene: (known[scene][0] if scene in known else now_s, text)
-                    for scene, text in reasons.items()
-                }
+                self._patience.note_unplaceable(reasons)
             case Tick():
                 self._on_tick()
             case _:
@@ -285,7 +282,7 @@ class Dispatcher:
             self._desk.finish(record, InfraFailure(InfraCode.DEADLINE, message))
         for scene in self._desk.failures.scenes():
             self._desk.judge(scene)
-        self._give_up_without_capacity()
+        self._patience.give_up()
         if self._desk.fleet.live <= 1:
             self._desk.fleet.forgive()
         self._desk.fill([*self._desk.fleet.thieves(), *self._desk.fleet.lags])
@@ -305,31 +302,3 @@ class Dispatcher:
         self._desk.commands.append(CancelLease(lease.worker_id, lease.ref))
         self._desk.give_back(lease, failure, counted=lease.started_s is not None)
         self._desk.offer(lease.record.scene)
-
-    def _give_up_without_capacity(self) -> None:
-        """End rollouts that waited long enough while no worker was there, or none that could hold their scene."""
-        limit_s, fleet = self._limits.no_capacity_s, self._desk.fleet
-        if fleet.live or self._desk.paused:
-            self._alone_since_s = self._desk.now_s
-            hopeless = [
-                (scene, text)
-                for scene, (since_s, text) in self._unplaceable.items()
-                if self._desk.now_s - since_s >= limit_s and self._desk.pending.count(scene)
-            ]
-        elif self._desk.now_s - self._alone_since_s >= limit_s:
-            there = (
-                f"{len(fleet.workers)} are paused, draining or silent" if fleet.workers else "none is there"
-            )
-            text = f"no worker took work for {limit_s:g} s, {there}: start one with `embomatrix worker run`"
-            hopeless = [(scene, text) for scene in self._desk.pending.counts()]
-        else:
-            return
-        for scene, text in hopeless:
-            self._end_waiting(scene, InfraFailure(InfraCode.NO_CAPACITY, text))
-
-    def _end_waiting(self, scene: str, failure: InfraFailure) -> None:
-        """End those rollouts of the scene that waited for the bounded time; later ones keep their own wait."""
-        while (record := self._desk.pending.oldest(scene)) is not None:
-            if self._desk.now_s - record.submitted_s < self._limits.no_capacity_s:
-                return
-            self._desk.finish(record, failure)

@@ -10,6 +10,8 @@ from embomatrix.manager.ledger import LeaseRecord, WorkerRecord
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
+    from embomatrix.manager.run_book import SlotTimes
+
 VICTIMS: Final = 8
 THIEVES: Final = 64
 CANDIDATES: Final = 64
@@ -56,7 +58,22 @@ class Fleet:
             self.lags.pop(worker_id, None)
         return worker
 
-    def note_lag(self, worker: WorkerRecord, took_s: float, usual_s: float) -> None:
+    def time(self, lease: LeaseRecord, times: SlotTimes, now_s: float, *, lost: bool) -> None:
+        """What a lease took tells how fast its worker is, and how long others of its run may take.
+
+        One that ``lost`` against a second one would have taken longer still.
+        """
+        if lease.started_s is None:
+            return
+        took_s, worker = now_s - lease.started_s, self.workers[lease.worker_id]
+        usual_s = times.quantile_s(0.5)
+        if usual_s and (not lost or took_s > worker.lag * usual_s):
+            self._note_lag(worker, took_s, usual_s)
+        if not lost:
+            # As it would have been on a worker that is not slow.
+            times.add(took_s / worker.lag)
+
+    def _note_lag(self, worker: WorkerRecord, took_s: float, usual_s: float) -> None:
         """One of the worker's leases took so long, where those of its run take so long as a rule."""
         worker.note_lag(took_s / usual_s)
         if worker.lag > 1.0:

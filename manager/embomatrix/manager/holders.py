@@ -66,6 +66,29 @@ class Holder:
         """How many slots of speed 1 it is worth."""
         return self.slots * self.score
 
+    def note(self, resident: Resident, now_s: float) -> None:
+        """How far it is with a scene, by its own report."""
+        scene = resident.bundle_digest
+        if resident.state is not ResidentState.WARM:
+            self.warm_since_s.pop(scene, None)
+        if resident.state is not ResidentState.LOADING:
+            self.loading_since_s.pop(scene, None)
+        match resident.state:
+            case ResidentState.WARM:
+                self.warm_since_s.setdefault(scene, now_s)
+                self.failed_s.pop(scene, None)
+            case ResidentState.FAILED:
+                self.failed_s.setdefault(scene, now_s)
+            case ResidentState.LOADING:
+                self.loading_since_s.setdefault(scene, now_s)
+                self.failed_s.pop(scene, None)
+
+    def will_have(self, scene: str, now_s: float, overdue_s: float) -> bool:
+        """Whether it is worth waiting for this load: the worker is not plainly slow, and the load not overdue."""
+        if scene in self.warm_since_s or self.is_slow:
+            return False
+        return now_s - self.loading_since_s.get(scene, now_s) <= overdue_s
+
     def standing(self) -> tuple[str, ...]:
         """Scenes that it has or was told to have, by last use. What it was told counts: its reports lag behind."""
         scenes = [

@@ -68,3 +68,17 @@ class Outlook:
             return max(0.0, load_s - (self._now_s - since_s))
         ahead = holder.to_load(holder.desired or ()).index(scene)
         return load_s * (1 + ahead // holder.slots)
+
+
+def why_not(holders: Holders, scene: str, size_mb: float, *, renders: bool) -> str:
+    """Why no worker takes the scene, in words."""
+    failing = (holders.by_id[name] for name in sorted(holders.failing))
+    errors = [holder.residents[scene].error for holder in failing if scene in holder.residents]
+    if any(errors):
+        return f"scene {scene} fails to load: {next(filter(None, errors))}"
+    if renders and not any(holder.renders for holder in holders.by_id.values()):
+        return f"scene {scene} needs slots that render on a GPU, and no worker has any"
+    return (
+        f"scene {scene} needs {size_mb:.0f} MB and the largest worker gives {holders.most_memory_mb} MB: "
+        f"raise a worker's memory limit"
+    )

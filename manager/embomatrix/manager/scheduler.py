@@ -32,11 +32,11 @@ from embomatrix.manager.events import (
     WorkerSuspected,
 )
 from embomatrix.manager.holders import Holder, Holders, Places
-from embomatrix.manager.outlook import Outlook
+from embomatrix.manager.outlook import Outlook, why_not
 from embomatrix.manager.placement import Need, needs_of, place
 from embomatrix.manager.prewarm import PrewarmLedger
 from embomatrix.manager.shares import Share
-from embomatrix.manager.window import Window
+from embomatrix.manager.window import Window, announcers
 from embomatrix.rpc.values import Completed, Resident, ResidentState, RunTerms
 
 if TYPE_CHECKING:
@@ -142,7 +142,7 @@ class Scheduler:
         """Decide where every scene should be; returns the desired sets that changed."""
         self._now_s = now_s
         needs = needs_of(self._peaks, [window.entries for window in self.windows.values()])
-        owners = {**self._announcers(), **self._demand.runs}
+        owners = {**announcers(self.windows), **self._demand.runs}
         turns = {scene: turn for turn, scene in enumerate(self._demand.waited_s)}
         needs = [
             self._spread(
@@ -166,10 +166,6 @@ class Scheduler:
     def outlook(self) -> Outlook:
         """How far scenes are, at this moment."""
         return Outlook(self._holders, self.unplaceable, self.usual_load_s, self._now_s)
-
-    def load_s(self, scene: str) -> float:
-        """Measured seconds to load the scene; 0 when nobody has."""
-        return self._load_s.get(scene, 0.0)
 
     def usual_load_s(self, scene: str) -> float:
         """What loading the scene takes, or a scene as a rule while nobody knows; 0 before the first."""
@@ -254,23 +250,11 @@ class Scheduler:
         scene = resident.bundle_digest
         if resident.memory_mb > 0:
             self._size_mb[scene] = max(self._size_mb.get(scene, 0.0), resident.memory_mb)
-        if resident.state is not ResidentState.LOADING:
-            holder.loading_since_s.pop(scene, None)
-        match resident.state:
-            case ResidentState.WARM:
-                holder.warm_since_s.setdefault(scene, self._now_s)
-                holder.failed_s.pop(scene, None)
-                if resident.load_s > 0:
-                    before_s = self._load_s.get(scene, resident.load_s)
-                    self._load_s[scene] = 0.5 * (before_s + resident.load_s)
-                    self._typical_load_s = _learned(self._typical_load_s, resident.load_s)
-            case ResidentState.FAILED:
-                holder.failed_s.setdefault(scene, self._now_s)
-                holder.warm_since_s.pop(scene, None)
-            case ResidentState.LOADING:
-                holder.loading_since_s.setdefault(scene, self._now_s)
-                holder.warm_since_s.pop(scene, None)
-                holder.failed_s.pop(scene, None)
+        holder.note(resident, self._now_s)
+        if resident.state is ResidentState.WARM and resident.load_s > 0:
+            before_s = self._load_s.get(scene, resident.load_s)
+            self._load_s[scene] = 0.5 * (before_s + resident.load_s)
+            self._typical_load_s = _learned(self._typical_load_s, resident.load_s)
 
     def _touch(self, used: Iterable[tuple[str, str]]) -> None:
         """Scenes that were just used move to the front, so that among the needless the oldest goes first."""
@@ -288,23 +272,16 @@ class Scheduler:
         terms = self._terms.get(run_id, DEFAULT_TERMS)
         return Share(run_id, terms.weight, terms.priority)
 
-    def _announcers(self) -> dict[str, str]:
-        """Whose look-ahead a scene is in; the run that was there first where it is in several."""
-        found: dict[str, str] = {}
-        for run_id, window in self.windows.items():
-            for scene in window.scenes:
-                found.setdefault(scene, run_id)
-        return found
-
     def _spread(self, need: Need, turn: int, share: Share) -> Need:
         """One worker more for a scene whose rollouts wait while others are idle, unless one is loading it already."""
         scene = need.bundle_digest
         waited_s = self._demand.waited_s.get(scene, 0.0)
         told = [holder for holder in self._holders.having(scene) if scene in (holder.desired or ())]
         # What a slow worker needed to load it says nothing of the others.
-        load_s = self._typical_load_s if all(h.is_slow for h in told) else self.load_s(scene)
+        load_s = self._typical_load_s if all(h.is_slow for h in told) else self._load_s.get(scene, 0.0)
         if waited_s >= (load_s or self._limits.affinity_wait_s):
-            loading = any(self._will_have(holder, scene) for holder in told)
+            overdue_s = max(OVERDUE * self.usual_load_s(scene), self._limits.affinity_wait_s)
+            loading = any(holder.will_have(scene, self._now_s, overdue_s) for holder in told)
             if not loading and not self._demand.idle <= {holder.worker_id for holder in told}:
                 self._copies[scene] = len(told) + 1
         return dataclasses.replace(
@@ -317,30 +294,13 @@ class Scheduler:
             render=need.render or scene in self._demand.rendering,
         )
 
-    def _will_have(self, holder: Holder, scene: str) -> bool:
-        """Whether it is worth waiting for this load: it is neither on a slow worker nor overdue."""
-        if scene in holder.warm_since_s or holder.is_slow:
-            return False
-        since_s = self._now_s - holder.loading_since_s.get(scene, self._now_s)
-        return since_s <= max(OVERDUE * self.usual_load_s(scene), self._limits.affinity_wait_s)
-
     def _estimate(self, scene: str) -> float:
         return self._size_mb.get(scene, self._limits.scene_mb)
 
     def _why_not(self, scene: str) -> str:
-        holders = (self._holders.by_id[name] for name in sorted(self._holders.failing))
-        errors = [holder.residents[scene].error for holder in holders if scene in holder.residents]
-        if any(errors):
-            return f"scene {scene} fails to load: {next(filter(None, errors))}"
-        if not any(holder.renders for holder in self._holders.by_id.values()):
-            rendering = {e.bundle_digest for w in self.windows.values() for e in w.entries if e.render}
-            if scene in rendering | self._demand.rendering:
-                return f"scene {scene} needs slots that render on a GPU, and no worker has any"
-        largest_mb = self._holders.most_memory_mb
-        return (
-            f"scene {scene} needs {self._estimate(scene):.0f} MB and the largest worker gives {largest_mb} MB: "
-            f"raise a worker's memory limit"
-        )
+        announced = {e.bundle_digest for w in self.windows.values() for e in w.entries if e.render}
+        renders = scene in announced or scene in self._demand.rendering
+        return why_not(self._holders, scene, self._estimate(scene), renders=renders)
 
     def _order(self, name: str, scenes: tuple[str, ...]) -> SetDesired | None:
         """Tell the worker, if the set or the order of what it still has to load is another than it was told."""
@@ -356,16 +316,13 @@ class Scheduler:
             if scene not in scenes and scene not in holder.residents:
                 self.prewarm.withdrawn(name, scene)
         for scene in holder.to_load(scenes):
-            run_id = self._announcer(scene)
+            run_id = next((run for run, window in self.windows.items() if window.announces(scene)), None)
             if run_id is not None and not self._demand.pending.get(scene):
                 self.prewarm.ordered(name, scene, run_id)
         holder.desired = scenes
         self._holders.changed(holder)
         self._holders.fresh.discard(name)
         return SetDesired(name, scenes)
-
-    def _announcer(self, scene: str) -> str | None:
-        return next((run_id for run_id, window in self.windows.items() if window.announces(scene)), None)
 
 
 def _learned(before: float, measured: float) -> float:

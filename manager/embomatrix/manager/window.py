@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from embomatrix.rpc.values import Batch, LookaheadEntry
 
 
@@ -34,3 +36,12 @@ class Window:
             del self._steps[step]
         for scene in {rollout.bundle_digest for rollout in batch.rollouts}:
             self._steps.get(batch.step, {}).pop(scene, None)
+
+
+def announcers(windows: Mapping[str, Window]) -> dict[str, str]:
+    """Whose look-ahead each scene is in; the run that was there first where it is in several."""
+    found: dict[str, str] = {}
+    for run_id, window in windows.items():
+        for scene in window.scenes:
+            found.setdefault(scene, run_id)
+    return found

@@ -21,6 +21,12 @@ if TYPE_CHECKING:
 SIMULATOR_PROGRAM: Final = (sys.executable, "-m", "embomatrix.worker.physics")
 START_S: Final = 60.0
 """Limit for a root to import the engine, on a machine that is busy."""
+ENVIRONMENT: Final = {
+    "GLIBC_TUNABLES": "glibc.malloc.hugetlb=1",
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+}
+"""Huge pages halve the time of a fork; the C library reads this before the first line of Python runs."""
 FORK_S: Final = 10.0
 REAP_S: Final = 5.0
 READ_BYTES: Final = 64 * 1024
@@ -218,13 +224,6 @@ async def start_root(
     What the engine prints goes to ``log``: Bullet writes warnings to standard output.
     """
     ours, theirs = socket.socketpair()
-    # Huge pages halve the time of a fork; the C library reads this before the first line of Python runs.
-    environment = {
-        **os.environ,
-        "GLIBC_TUNABLES": "glibc.malloc.hugetlb=1",
-        "OMP_NUM_THREADS": "1",
-        "OPENBLAS_NUM_THREADS": "1",
-    }
     shared = () if board is None else (board.fd,)
     with theirs, log.open("ab") as output:
         process = await asyncio.create_subprocess_exec(
@@ -233,7 +232,7 @@ async def start_root(
             str(os.getpid()),
             *map(str, shared),
             pass_fds=(theirs.fileno(), *shared),
-            env=environment,
+            env={**os.environ, **ENVIRONMENT},
             stdin=asyncio.subprocess.DEVNULL,
             stdout=output,
             stderr=output,
