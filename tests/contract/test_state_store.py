@@ -207,11 +207,16 @@ async def test_only_one_of_two_managers_leads_and_the_other_learns_its_address(s
 
 
 async def test_a_lead_that_was_given_up_goes_to_the_next(store, openings):
-    await store.resign()
     other = openings()
+    await store.close()
     assert await other.claim(SECOND) == Lead(2, "host:2", mine=True)
-    with pytest.raises(FencedError):
-        await store.renew()
+
+
+async def test_who_was_overtaken_takes_no_lead_away_when_it_ends(store, openings):
+    newer, third = openings(), openings()
+    await newer.claim(FIRST)
+    await store.close()
+    assert not (await third.claim(SECOND)).mine
 
 
 async def test_a_lead_lapses_unless_it_is_renewed(openings):

@@ -111,7 +111,6 @@ async def running(
         store = open_store(settings.state_url)
         stack.push_async_callback(store.close)
         leadership = Leadership(store, _candidate(settings))
-        stack.push_async_callback(leadership.resign)
         standby = Standby(protection.tls)
         http = _HttpServer(standby.page(), http_socket, protection.tls)
         group = await stack.enter_async_context(_stopped_at_exit())

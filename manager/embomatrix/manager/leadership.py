@@ -70,10 +70,3 @@ class Leadership:
                 logger.warning("the lead could not be renewed: %s", error)
             else:
                 self._renewed_s = asked_s
-
-    async def resign(self) -> None:
-        """Leave the lead to whoever stands by, at once."""
-        try:
-            await self._store.resign()
-        except StateError as error:
-            logger.info("the lead lapses by itself: %s", error)

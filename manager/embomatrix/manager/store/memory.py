@@ -57,10 +57,6 @@ class MemoryStore:
         self._state.leader = self._candidate
         self._state.leads_until_s = time.monotonic() + (self._candidate.ttl_s if self._candidate else 0.0)
 
-    async def resign(self) -> None:
-        self._check()
-        self._state.leader = None
-
     async def open_run(self, run: RunRow) -> None:
         self._check()
         self._state.runs.setdefault(run.run_id, run)
@@ -124,7 +120,8 @@ class MemoryStore:
         return list(self._state.credentials.values())
 
     async def close(self) -> None:
-        """Nothing is held."""
+        if self._epoch == self._state.epoch:
+            self._state.leader = None
 
     def _check(self) -> None:
         if self._epoch != self._state.epoch:

@@ -114,9 +114,6 @@ class StateStore(Protocol):
     async def renew(self) -> None:
         """The lead goes on. ``FencedError`` when another manager took it; that it lapsed meanwhile does no harm."""
 
-    async def resign(self) -> None:
-        """Leave the lead to whoever claims it next."""
-
     async def open_run(self, run: RunRow) -> None:
         """Note a run; the same id again keeps the first name and terms."""
 
@@ -157,4 +154,4 @@ class StateStore(Protocol):
         """Every credential that was ever put, in no order."""
 
     async def close(self) -> None:
-        """Let go of connections and files."""
+        """Leave the lead to whoever claims it next, and let go of connections and files."""

@@ -9,6 +9,7 @@ Every conditional write is one Lua script that checks the epoch first.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from typing import TYPE_CHECKING, Any, Final, cast
 
@@ -176,9 +177,6 @@ class RedisStore:
             ttl_ms = int(candidate.ttl_s * 1000)
             await self._script(_RENEW, ("leader",), candidate.holder, candidate.address, ttl_ms)
 
-    async def resign(self) -> None:
-        await self._script(_RESIGN, ("leader",))
-
     async def open_run(self, run: RunRow) -> None:
         await self._script(_OPEN_RUN, ("runs", "run_order", "run_terms"), run.run_id, run.name, run.terms)
 
@@ -242,6 +240,8 @@ class RedisStore:
         return [CredentialRow(token_id.decode(), payload) for token_id, payload in found.items()]
 
     async def close(self) -> None:
+        with contextlib.suppress(StateError):
+            await self._script(_RESIGN, ("leader",))
         await self._redis.aclose()
 
     async def _check_server(self) -> None:

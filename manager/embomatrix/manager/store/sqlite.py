@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import sqlite3
 import time
 from typing import TYPE_CHECKING, Any, Final, TypeVar
@@ -95,9 +96,6 @@ class SqliteStore:
         if (candidate := self._candidate) is not None:
             await self._run(lambda: self._lead(candidate))
 
-    async def resign(self) -> None:
-        await self._write("DELETE FROM leader")
-
     async def open_run(self, run: RunRow) -> None:
         await self._write("INSERT OR IGNORE INTO run VALUES (?, ?, ?)", run.run_id, run.name, run.terms)
 
@@ -176,6 +174,8 @@ class SqliteStore:
         return [CredentialRow(*row) for row in await self._read("SELECT token_id, payload FROM credential")]
 
     async def close(self) -> None:
+        with contextlib.suppress(StateError):
+            await self._write("DELETE FROM leader")
         async with self._lock:
             self._db.close()
 
@@ -203,7 +203,7 @@ class SqliteStore:
                 await asyncio.wait([thread])
                 raise
             except sqlite3.Error as error:
-                if error.sqlite_errorcode in _FULL:
+                if getattr(error, "sqlite_errorcode", None) in _FULL:
                     raise StateFullError(
                         f"the state file {self._path} can't be written ({error}): make room on its disk"
                     ) from error
