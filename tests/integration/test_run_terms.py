@@ -211,3 +211,23 @@ async def test_the_plan_shows_what_comes_and_who_has_it(tmp_path):
         assert await admin.plan() == cells
         with pytest.raises(NotFoundError, match="run 'other' is not open"):
             await admin.plan("other")
+
+
+async def test_a_straggler_is_started_once_more_and_its_group_comes_back(tmp_path):
+    async with (
+        manager(tmp_path, hedge_after_s=0.3) as address,
+        open_run(address) as client,
+        FakeWorker(address, worker_id="quick", slots=2, execute_s=0.01),
+        FakeWorker(address, worker_id="stuck", slots=2, execute_s=0.01, stuck={"late"}) as stuck,
+    ):
+        await events(client, batch_of(*["t"] * 40, size=20))
+        await until(lambda: KITCHEN in stuck.residents)
+        await asyncio.sleep(0.1)
+        before = len(stuck.executed)
+        batch = Batch("r1", "b2", 2, tuple(Rollout(f"y{i}", "g", KITCHEN, "late", (), i) for i in range(24)))
+        results, (group,) = await events(client, batch)
+        assert group == GroupDone("g", completed=24)
+        assert {outcome.worker_id for outcome in results.values()} == {"quick"}
+        stats = await client.close_run("r1")
+        assert 1 <= stats.hedged <= 3
+        assert len(stuck.executed) > before

@@ -171,6 +171,9 @@ async def _start_runtime(
         rollout_deadline_s=settings.rollout_deadline_s,
         no_capacity_s=settings.no_capacity_s,
         max_attempts=settings.max_attempts,
+        hedge_after_s=settings.hedge_after_s,
+        hedge_share=settings.hedge_share,
+        stall_after_s=settings.stall_after_s,
         restart_grace_s=settings.restart_grace_s,
     )
     schedule = ScheduleLimits(affinity_wait_s=settings.affinity_wait_s)

@@ -66,6 +66,12 @@ class ManagerSettings(BaseModel):
     """How long rollouts wait while no worker could take them."""
     affinity_wait_s: float = Field(0.5, ge=0)
     """How long rollouts wait for workers that have their scene before idle ones load it, while its load time isn't known."""
+    hedge_after_s: float = Field(1.0, gt=0)
+    """No rollout is late, and started a second time elsewhere, before it has run for this long."""
+    hedge_share: float = Field(0.05, ge=0, le=1)
+    """Largest share of a run's rollouts that are started a second time; 0: none."""
+    stall_after_s: float = Field(10.0, gt=0)
+    """No lease has stalled before it has done no step for this long."""
     max_attempts: int = Field(3, ge=1)
     """Started leases of one rollout before it ends as an infrastructure failure."""
     restart_grace_s: float = Field(5.0, ge=0)
