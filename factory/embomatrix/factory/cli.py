@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
@@ -13,13 +14,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from embomatrix.factory.assets_cli import app as assets_app
-from embomatrix.factory.pipeline.build import (
-    DEFAULT_SCENES,
-    BuildSettings,
-    Summary,
-    WriterKind,
-    build_dataset,
-)
+from embomatrix.factory.pipeline.build import Summary, build_dataset
+from embomatrix.factory.pipeline.settings import DEFAULT_SCENES, BuildSettings, WriterKind
 from embomatrix.factory.refusal import Refusal
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.social.asking import Asked, asked_writer
@@ -55,6 +51,8 @@ app = typer.Typer(
 )
 app.add_typer(assets_app, name="assets")
 EVERY_ACTIVITY = "all"
+MOST_JOBS = 8
+"""Each holds some scenes: a few hundred MB."""
 EVERY_SCENE = "all"
 
 Out = Annotated[Path, typer.Option(help="Folder for the dataset.")]
@@ -62,6 +60,13 @@ Seed = Annotated[int, typer.Option(min=0, help="Equal seeds give equal datasets.
 Scenes = Annotated[
     list[str] | None,
     typer.Option("--scenes", "--scene", help="Base scene, or 'all'; give it again for more."),
+]
+Jobs = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        help="Processes; the dataset is the same for any number. Default: one for each core, at most 8.",
+    ),
 ]
 
 
@@ -72,9 +77,10 @@ def build(
     heldout: Annotated[int, typer.Option(min=0, help="Tasks to evaluate on, in other rooms.")] = 40,
     seed: Seed = 0,
     scenes: Scenes = None,
+    jobs: Jobs = None,
 ) -> None:
     """Write tasks over base scenes, keep those that the oracle solves, and save them with their scenes."""
-    _make(out, BuildSettings(train, heldout, seed, _scene_ids(scenes)))
+    _make(out, BuildSettings(train, heldout, seed, _scene_ids(scenes)), jobs=jobs)
 
 
 @app.command()
@@ -84,6 +90,7 @@ def generate(
     heldout: Annotated[int, typer.Option(min=0, help="Tasks to evaluate on, in other rooms.")] = 0,
     seed: Seed = 0,
     scenes: Scenes = None,
+    jobs: Jobs = None,
     llm: Annotated[
         str, typer.Option(help="Base URL of an OpenAI-compatible endpoint, such as http://127.0.0.1:8000/v1.")
     ] = "",
@@ -100,7 +107,7 @@ def generate(
     """Play the people of each scene, and make tasks of what they come to ask the robot for; keep what they said."""
     names = _scene_ids(scenes)
     if not llm and cassette is None:
-        _make(out, BuildSettings(tasks, heldout, seed, names, WriterKind.SOCIAL))
+        _make(out, BuildSettings(tasks, heldout, seed, names, WriterKind.SOCIAL), jobs=jobs)
         return
     if llm and not model:
         _fail("--llm needs the name of a model there: give --model")
@@ -125,7 +132,9 @@ def _print_account(ledger: Ledger) -> None:
     Console().print(table)
 
 
-def _make(out: Path, settings: BuildSettings, writer: TaskWriter | None = None) -> None:
+def _make(
+    out: Path, settings: BuildSettings, writer: TaskWriter | None = None, jobs: int | None = None
+) -> None:
     """A data set in the folder, with progress and a summary."""
     console = Console()
     kept = f": what was built is kept in {out}, and the same command goes on from there"
@@ -135,7 +144,11 @@ def _make(out: Path, settings: BuildSettings, writer: TaskWriter | None = None) 
             "train": bars.add_task("training tasks", total=settings.train),
         }
         summary = build_dataset(
-            out, settings, lambda split, admitted: bars.update(tasks[split], completed=admitted), writer
+            out,
+            settings,
+            lambda split, admitted: bars.update(tasks[split], completed=admitted),
+            writer,
+            jobs or min(MOST_JOBS, len(os.sched_getaffinity(0))),
         )
         for split, bar in tasks.items():
             bars.update(bar, completed=summary.total(split))

@@ -8,7 +8,8 @@ import pytest
 from typer.testing import CliRunner
 
 from embomatrix.factory.cli import app
-from embomatrix.factory.pipeline.build import BuildSettings, Summary, WriterKind, build_dataset, split_rooms
+from embomatrix.factory.pipeline.build import Summary, build_dataset, split_rooms
+from embomatrix.factory.pipeline.settings import BuildSettings, WriterKind
 from embomatrix.factory.pipeline.store import BuildStore
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.writer.tasks import is_heldout_signature
@@ -201,3 +202,13 @@ def test_tasks_of_conversations_are_verified_and_their_transcripts_kept(tmp_path
         transcript = (tmp_path / "transcripts" / f"{record.task.task_id}.md").read_text(encoding="utf-8")
         assert transcript.startswith(f"# {record.task.instruction}\n")
         assert record.oracle
+
+
+def test_several_processes_make_the_same_data_set_as_one(tmp_path):
+    settings = BuildSettings(
+        train=20, heldout=0, seed=2, scenes=("Rs_int", "Wainscott_0_int"), look_ahead=False
+    )
+    for name, jobs in (("one", 1), ("two", 2)):
+        build_dataset(tmp_path / name, settings, jobs=jobs)
+    for file in ("tasks.jsonl", "build.jsonl", "rejections.jsonl"):
+        assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "two" / file).read_bytes()

@@ -1,0 +1,62 @@
+"""Who makes the variants of a round: this process, or several."""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import signal
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from typing import TYPE_CHECKING
+
+from embomatrix.factory.pipeline.variants import VariantMaker, VariantOrder, VariantYield
+from embomatrix.world.dataset import DatasetError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+    from embomatrix.factory.pipeline.settings import BuildSettings
+    from embomatrix.factory.writer.tasks import TaskWriter
+
+    Make = Callable[[Sequence[VariantOrder]], Iterator[VariantYield]]
+    """Makes variants; what comes of them comes in the order of the orders."""
+
+
+@contextlib.contextmanager
+def makers(settings: BuildSettings, writer: TaskWriter | None, jobs: int) -> Iterator[Make]:
+    """For as long as this is held. A ``writer`` works in this process alone: it may hold a connection."""
+    if writer is not None or jobs == 1:
+        with contextlib.closing(VariantMaker(settings, writer)) as maker:
+            yield lambda orders: map(maker.make, orders)
+        return
+    pool = ProcessPoolExecutor(
+        jobs, multiprocessing.get_context("spawn"), initializer=_begin, initargs=(settings,)
+    )
+    try:
+        yield lambda orders: _made(pool, orders)
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _made(pool: ProcessPoolExecutor, orders: Sequence[VariantOrder]) -> Iterator[VariantYield]:
+    try:
+        yield from pool.map(_make, orders)
+    except BrokenProcessPool as error:
+        raise DatasetError(
+            "a process that makes scene variants died, perhaps for want of memory: what was built is kept; call the same "
+            "command again, with fewer --jobs"
+        ) from error
+
+
+_maker: VariantMaker
+"""Of this process, when it is one of several."""
+
+
+def _begin(settings: BuildSettings) -> None:
+    global _maker
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt is the parent's to answer
+    _maker = VariantMaker(settings)
+
+
+def _make(order: VariantOrder) -> VariantYield:
+    return _maker.make(order)

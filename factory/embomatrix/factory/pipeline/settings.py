@@ -1,0 +1,30 @@
+"""What decides a build of a data set."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+DEFAULT_SCENES: Final = ("Rs_int", "Wainscott_0_int", "restaurant_diner")
+
+
+class WriterKind(StrEnum):
+    """Where tasks come from."""
+
+    PLAIN = "plain"  # what a goal says, in a bounded vocabulary: small policies learn from it
+    SOCIAL = "social"  # what people come to ask for in conversations, each with its transcript
+    MODEL = "model"  # the same with a language model in the place of the grammar
+
+
+@dataclass(frozen=True, slots=True)
+class BuildSettings:
+    """What decides a build: equal settings give equal data sets."""
+
+    train: int = 480
+    heldout: int = 40
+    seed: int = 0
+    scenes: tuple[str, ...] = DEFAULT_SCENES
+    writer: WriterKind = WriterKind.PLAIN
+    look_ahead: bool = True
+    """Whether to find out what the arm can do in each variant: about 8 s of CPU for one."""

@@ -1,0 +1,208 @@
+"""One variant of a base scene at a time: furnished with small things, written about, judged, and bundled."""
+
+from __future__ import annotations
+
+import contextlib
+import zlib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from embomatrix.factory.admission import Admitted, admit
+from embomatrix.factory.pipeline.poses import Needs, cache_poses
+from embomatrix.factory.pipeline.settings import WriterKind
+from embomatrix.factory.pipeline.store import Rejection, VariantResult
+from embomatrix.factory.scenes.build import build_base_scene
+from embomatrix.factory.social.writer import SocialWriter
+from embomatrix.factory.writer.tasks import PlainWriter, is_heldout_signature
+from embomatrix.factory.writer.variant import Variant, build_variant
+from embomatrix.factory.writer.view import SceneView
+from embomatrix.sim.executor import Simulator
+from embomatrix.sim.physical.survey import Foresight
+from embomatrix.sim.planner.oracle import find_plan
+from embomatrix.sim.pose_cache import PlacementLibrary
+from embomatrix.sim.prepared import prepare
+from embomatrix.skills.parse import plan_to_json
+from embomatrix.world.bundle import Bundle, bundle_digest, encode_bundle
+from embomatrix.world.dataset import TaskRecord
+from embomatrix.world.task import TaskCategory
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from embomatrix.factory.pipeline.settings import BuildSettings
+    from embomatrix.factory.writer.tasks import Draft, TaskWriter
+    from embomatrix.skills.syntax import Plan
+    from embomatrix.world.scene import Scene
+
+TASKS_EACH: Final = 8
+"""Tasks that one variant is to yield."""
+DRAFTS: Final = 14
+"""Drafts that are written for a variant: some are not admitted."""
+WRITE_TRIES: Final = 120
+"""Tasks that are written for the drafts: those of the other split's kinds are thrown away."""
+FOCUS_ROOMS: Final = 3
+"""Rooms that a variant furnishes with small things, and whose things its tasks are about."""
+
+
+@dataclass(frozen=True, slots=True)
+class VariantOrder:
+    """One variant to make, of a base scene. ``rooms`` are those of its split; ``known`` are tasks that exist already."""
+
+    split: str
+    number: int
+    base: str
+    rooms: tuple[str, ...]
+    missing: Mapping[TaskCategory, int]
+    known: frozenset[str]
+
+
+@dataclass(frozen=True, slots=True)
+class VariantYield:
+    """What came of it: records, the bundle that they run in, and transcripts by task id."""
+
+    result: VariantResult
+    bundle: bytes
+    transcripts: Mapping[str, str]
+
+
+class VariantMaker:
+    """Makes variants in this process; what one finds out about furniture and places serves the next ones.
+
+    ``writer`` stands in for the one that the settings name; with a language model only it can be given. Each answer follows
+    from settings and order alone. Close it after use.
+    """
+
+    def __init__(self, settings: BuildSettings, writer: TaskWriter | None = None) -> None:
+        if writer is None:
+            writer = SocialWriter(settings.seed) if settings.writer is WriterKind.SOCIAL else PlainWriter()
+        foresight = Foresight() if settings.look_ahead else None
+        self._bench = _Workbench(settings, writer, PlacementLibrary(), foresight)
+        self._bases: dict[str, Scene] = {}
+
+    def make(self, order: VariantOrder) -> VariantYield:
+        """Write and judge the tasks of one variant."""
+        seed = self._bench.settings.seed
+        if order.base not in self._bases:
+            self._bases[order.base] = build_base_scene(order.base, seed=seed)
+        base = self._bases[order.base]
+        rng = np.random.default_rng(
+            np.random.SeedSequence((seed, zlib.crc32(order.split.encode()), order.number))
+        )
+        focus = _focus(base, order.rooms, order.missing, rng)
+        variant = build_variant(base, focus, f"{base.base}-{order.split}-{order.number:03d}", rng)
+        return _VariantJob(variant, order, self._bench).run(rng)
+
+    def close(self) -> None:
+        self._bench.library.close()
+
+
+def key_of(signature: str, instruction: str) -> str:
+    """What two tasks of a data set must not have in common."""
+    return f"{signature}|{instruction}"
+
+
+@dataclass(frozen=True)
+class _Workbench:
+    """What all variants of a build share."""
+
+    settings: BuildSettings
+    writer: TaskWriter
+    library: PlacementLibrary
+    foresight: Foresight | None
+
+
+def _focus(
+    base: Scene, rooms: Sequence[str], missing: Mapping[TaskCategory, int], rng: np.random.Generator
+) -> tuple[str, ...]:
+    """Rooms of a variant: a kitchen while kitchen tasks are wanted, and others at random."""
+    types = {room.name: room.type for room in base.rooms}
+    order = [str(name) for name in rng.permutation(list(rooms))]
+    wants_kitchen = missing[TaskCategory.KITCHEN_OPERATION] > 0
+    order.sort(key=lambda name: not (wants_kitchen and types[name] in {"kitchen", "bar"}))
+    return tuple(order[:FOCUS_ROOMS])
+
+
+class _VariantJob:
+    """Writes and judges the tasks of one variant."""
+
+    def __init__(self, variant: Variant, order: VariantOrder, bench: _Workbench) -> None:
+        self._variant = variant
+        self._order = order
+        self._seed = bench.settings.seed
+        self._writer = bench.writer
+        self._library = bench.library
+        self._foresight = bench.foresight
+        self._known = set(order.known)
+        self._view = SceneView(variant.scene)
+        self._admitted: list[tuple[Draft, Plan]] = []
+        self._rejections: list[Rejection] = []
+
+    def run(self, rng: np.random.Generator) -> VariantYield:
+        """The variant's records with their bundle, the missing categories in turns."""
+        missing = self._order.missing
+        drafts = self._write(missing, rng)
+        needs = [Needs(draft.about, draft.task.table) for draft in drafts]
+        poses = cache_poses(self._view, needs, self._library, self._foresight, self._seed)
+        left = dict(missing)
+        with contextlib.closing(Simulator(Bundle(self._variant.scene, {}, poses))) as stage:
+            for draft in drafts:
+                if len(self._admitted) == TASKS_EACH:
+                    break
+                if left[draft.task.category] > 0 and self._judge(stage, draft):
+                    left[draft.task.category] -= 1
+            tasks = {draft.task.task_id: draft.task for draft, _ in self._admitted}
+            data = encode_bundle(prepare(Bundle(self._variant.scene, tasks, poses), stage.world))
+        return VariantYield(self._result(bundle_digest(data)), data, self._transcripts())
+
+    def _write(self, missing: Mapping[TaskCategory, int], rng: np.random.Generator) -> list[Draft]:
+        """Drafts whose kinds of goal belong to this split, all different, the missing categories in turns."""
+        wanted = [category for category, count in missing.items() if count > 0]
+        drafts: list[Draft] = []
+        for attempt in range(WRITE_TRIES):
+            if len(drafts) == DRAFTS:
+                break
+            task_id = f"{self._variant.scene.scene_id}-{len(drafts):02d}"
+            category = wanted[attempt % len(wanted)]
+            draft = self._writer.write(self._variant, self._view, category, task_id, rng)
+            if draft is not None and self._is_new(draft):
+                drafts.append(draft)
+                self._known.add(key_of(draft.signature, draft.task.instruction))
+        return drafts
+
+    def _transcripts(self) -> dict[str, str]:
+        """Of the admitted tasks that somebody talked about, by task id."""
+        return {draft.task.task_id: draft.transcript for draft, _ in self._admitted if draft.transcript}
+
+    def _is_new(self, draft: Draft) -> bool:
+        """Whether the goal's kind belongs to this split, and nothing like it was asked for in these words."""
+        key = key_of(draft.signature, draft.task.instruction)
+        mine = is_heldout_signature(draft.signature, self._seed) is (self._order.split == "heldout")
+        return mine and key not in self._known
+
+    def _judge(self, stage: Simulator, draft: Draft) -> bool:
+        verdict = admit(stage, draft.task, find_plan)
+        if isinstance(verdict, Admitted):
+            self._admitted.append((draft, verdict.plan))
+            return True
+        self._rejections.append(
+            Rejection(
+                scene=self._variant.scene.scene_id,
+                category=draft.task.category.value,
+                instruction=draft.task.instruction,
+                goal=draft.task.goal_bddl,
+                reason=verdict.reason,
+                sentence=verdict.sentence,
+            )
+        )
+        return False
+
+    def _result(self, digest: str) -> VariantResult:
+        records = tuple(
+            TaskRecord(
+                draft.task, digest, self._order.split, tuple(plan_to_json(plan)), draft.rooms, draft.signature
+            )
+            for draft, plan in self._admitted
+        )
+        return VariantResult(self._order.split, self._order.number, records, tuple(self._rejections))
