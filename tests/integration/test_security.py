@@ -568,7 +568,7 @@ async def test_a_daemon_joins_once_and_shows_its_credential_from_then_on(tmp_pat
             await serving
             # It said that it leaves: nobody had to wait until it was missed.
             assert [found.state for found in await viewer.list_workers()] == ["lost"]
-    [kept] = (tmp_path / "pc" / "state").iterdir()
+    [kept] = (tmp_path / "pc" / "state").glob("member-*.json")
     assert stat.S_IMODE(kept.stat().st_mode) == 0o600
     assert str(invitation).partition(".")[2][:20] not in kept.read_text()
 
@@ -591,7 +591,7 @@ async def test_a_spare_pc_joins_with_one_string_and_is_known_from_then_on(tmp_pa
                 await asyncio.to_thread(command.wait_for, "registered with the manager")
                 text = command.text
             assert ("joined the manager" in text) == (start == "first")
-        [kept] = (home / "state").iterdir()
+        [kept] = (home / "state").glob("member-*.json")
         assert stat.S_IMODE(kept.stat().st_mode) == 0o600
         assert invitation.partition("@")[0] not in kept.read_text()
         assert json.loads(kept.read_text())["name"] == "spare"
