@@ -67,6 +67,8 @@ class PeerSizes:
     slots: int = 2
     chunk: int = 10
     """Rollouts of one scene that are sent together when a peer is tuned: some 25 ms of work."""
+    warm: int = 10
+    """Plans of each scene that the tuned processes execute before the others are measured: they have worked before."""
     plain: int = 40
     alone: int = 40
     """Rollouts with nothing else under way."""
@@ -173,7 +175,8 @@ def measure_peer(peer: Peer, work: Work, sizes: PeerSizes) -> PeerOutcome:
 
 
 def _tuned(contender: Contender, setup: Setup, work: Work, sizes: PeerSizes) -> Tuned:
-    chunks = chunks_of(work.rollouts, sizes.chunk, setup.lanes)
+    execute(contender, chunks_of(work.first(sizes.warm).rollouts, sizes.chunk, setup.lanes), sizes.limit_s)
+    chunks = chunks_of(work.after(sizes.warm).rollouts, sizes.chunk, setup.lanes)
     before_s = family_cpu_s()
     all_at_once = execute(contender, chunks, sizes.limit_s)
     cpu_s = family_cpu_s() - before_s

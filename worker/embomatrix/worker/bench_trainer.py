@@ -41,6 +41,10 @@ class Arrival:
             return outcome
         raise BenchError(f"rollout {self.result.rollout_id} had no result: {outcome}")
 
+    def check(self) -> None:
+        """Raises BenchError when the rollout has no result."""
+        _ = self.completed
+
     @property
     def start_s(self) -> float:
         """Seconds until its execution began, with what the result's way back took."""
@@ -93,10 +97,13 @@ class BenchTrainer:
             yield Arrival(time.perf_counter() - started_s, result)
 
     async def push(self, rollouts: Sequence[Rollout]) -> Pushed:
-        """Submit them at once and wait for all."""
+        """Submit them at once and wait for all. Raises BenchError when one has no result."""
         started_s = time.perf_counter()
         arrivals = [arrival async for arrival in self.stream(rollouts)]
-        return Pushed(time.perf_counter() - started_s, tuple(arrivals))
+        wall_s = time.perf_counter() - started_s
+        for arrival in arrivals:
+            arrival.check()
+        return Pushed(wall_s, tuple(arrivals))
 
     async def push_singly(self, rollouts: Sequence[Rollout]) -> Pushed:
         """Submit each when the one before it has its result."""

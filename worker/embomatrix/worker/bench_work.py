@@ -33,6 +33,11 @@ class Work:
         scenes = tuple(replace(scene, executions=scene.executions[:plans]) for scene in self.scenes)
         return Work(scenes, self.bundles)
 
+    def after(self, plans: int) -> Work:
+        """The same scenes without so many plans, the first of each."""
+        scenes = tuple(replace(scene, executions=scene.executions[plans:]) for scene in self.scenes)
+        return Work(scenes, self.bundles)
+
     def sample(self, count: int) -> tuple[Rollout, ...]:
         """Up to ``count`` of them, spread over the scenes: the first plan of each, then the second of each."""
         turns = zip_longest(*(rollouts_of(scene) for scene in self.scenes))
