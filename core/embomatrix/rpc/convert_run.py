@@ -74,6 +74,7 @@ def run_terms_to_proto(terms: RunTerms) -> rollout_service_pb2.OpenRunRequest:
         weight=terms.weight,
         priority=terms.priority,
         rollout_deadline_s=terms.rollout_deadline_s,
+        verified=terms.verified,
     )
 
 
@@ -85,7 +86,9 @@ def run_terms_from_proto(message: rollout_service_pb2.OpenRunRequest) -> RunTerm
         if finite(field, getattr(message, field)) < 0:
             raise ConvertError(field, f"is {getattr(message, field)}: it can't be below 0")
     # A message without a weight has 0 there.
-    return RunTerms(policy, message.weight or 1.0, message.priority, message.rollout_deadline_s)
+    return RunTerms(
+        policy, message.weight or 1.0, message.priority, message.rollout_deadline_s, message.verified
+    )
 
 
 def warmth_to_proto(warmth: Warmth) -> types_pb2.Warmth.ValueType:

@@ -230,6 +230,8 @@ def worker_info_to_proto(info: WorkerInfo) -> admin_service_pb2.WorkerInfo:
         completed=info.completed,
         last_seen_s=info.last_seen_s,
         reason=info.reason,
+        audited=info.audited,
+        audit_mismatches=info.audit_mismatches,
     )
 
 
@@ -243,6 +245,8 @@ def worker_info_from_proto(message: admin_service_pb2.WorkerInfo) -> WorkerInfo:
         completed=message.completed,
         last_seen_s=finite("last_seen_s", message.last_seen_s),
         reason=message.reason,
+        audited=message.audited,
+        audit_mismatches=message.audit_mismatches,
     )
 
 

@@ -171,6 +171,8 @@ class RunTerms:
     priority: int = 0
     rollout_deadline_s: float = 0.0
     """From submission to outcome; 0 for the manager's default."""
+    verified: bool = False
+    """Results of workers on probation, and some of the others, are delivered when a second worker came to the same."""
 
 
 class Warmth(StrEnum):
@@ -251,6 +253,10 @@ class RunStats:
     prewarm_wasted: int = 0
     hedged: int = 0
     groups_failed: int = 0
+    audited: int = 0
+    """Results that were compared with those of another worker."""
+    audit_mismatches: int = 0
+    """Of these: where the two were not the same."""
 
 
 class ResidentState(StrEnum):
@@ -349,7 +355,7 @@ class WorkerState:
 
 @dataclass(frozen=True, slots=True)
 class WorkerInfo:
-    """A worker as the manager sees it. ``state`` is "ready", "paused", "suspect", "lost" or "draining"."""
+    """A worker as the manager sees it. ``state`` is "ready", "paused", "suspect", "lost", "draining" or "quarantined"."""
 
     worker_id: str
     state: str
@@ -359,7 +365,11 @@ class WorkerInfo:
     completed: int
     last_seen_s: float
     reason: str = ""
-    """Why it is paused, draining or lost."""
+    """Why it is paused, draining, lost or in quarantine."""
+    audited: int = 0
+    """Executions that were compared with others'."""
+    audit_mismatches: int = 0
+    """Of these: in which a majority contradicted it."""
 
 
 @dataclass(frozen=True, slots=True)

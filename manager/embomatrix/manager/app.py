@@ -18,6 +18,7 @@ from embomatrix.manager.access.protection import protection_of
 from embomatrix.manager.api import build_api
 from embomatrix.manager.archive import RunArchive
 from embomatrix.manager.assignments import DispatchLimits
+from embomatrix.manager.auditor import AuditRules
 from embomatrix.manager.bundles import BundleStore
 from embomatrix.manager.cluster_state import ClusterState
 from embomatrix.manager.garbage import only_young
@@ -175,6 +176,7 @@ async def _start_runtime(
         hedge_share=settings.hedge_share,
         stall_after_s=settings.stall_after_s,
         restart_grace_s=settings.restart_grace_s,
+        audit=AuditRules(settings.audit_probation, settings.audit_share, settings.audits_all_runs),
     )
     schedule = ScheduleLimits(affinity_wait_s=settings.affinity_wait_s)
     liveness = LivenessLimits(
@@ -185,7 +187,13 @@ async def _start_runtime(
     # Epochs of this manager's sessions and leases lie above those of every manager before it.
     first_epoch = (epoch << 32) + 1
     registry = Registry(liveness, first_epoch=first_epoch)
-    cluster = ClusterState(dispatch, schedule, boot_id=secrets.token_hex(4), first_epoch=first_epoch)
+    cluster = ClusterState(
+        dispatch,
+        schedule,
+        boot_id=secrets.token_hex(4),
+        first_epoch=first_epoch,
+        audit_key=secrets.token_bytes(32),
+    )
     archive = RunArchive(settings.data_dir / "runs")
     runtime = ManagerRuntime(
         cluster,

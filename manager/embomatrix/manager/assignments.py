@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from embomatrix.manager.auditor import AuditRules
+from embomatrix.manager.audits import Audits
 from embomatrix.manager.batch_book import BatchBook
 from embomatrix.manager.commands import (
     AcknowledgeLease,
@@ -79,6 +81,8 @@ class DispatchLimits:
     """A lease that runs and does no step for longer than this, and than five times the 99th percentile of its run, is void."""
     restart_grace_s: float = 5.0
     """How long a manager that took over waits for workers to say what they hold, before it gives the same to others."""
+    audit: AuditRules = field(default_factory=AuditRules)
+    """Which results are executed a second time."""
 
 
 class Assignments:
@@ -87,7 +91,9 @@ class Assignments:
     ``now_s`` is set before each change; what shall be done is collected in ``commands``. ``settled`` ends a change.
     """
 
-    def __init__(self, limits: DispatchLimits, *, boot_id: str, first_epoch: int = 1) -> None:
+    def __init__(
+        self, limits: DispatchLimits, *, boot_id: str, first_epoch: int = 1, audit_key: bytes = b""
+    ) -> None:
         self.now_s = 0.0
         self.paused = False
         """No leases are given."""
@@ -105,6 +111,7 @@ class Assignments:
         self.pending = PendingQueues(self.runs.turn)
         self.failures = LoadFailures()
         self.batches = BatchBook()
+        self.audits = Audits(self, limits.audit, audit_key)
         self._limits = limits
         self._freed: dict[str, None] = {}
 
@@ -147,7 +154,13 @@ class Assignments:
             self._conclude(record, CALLED_OFF)
 
     def finish(self, record: RolloutRecord, outcome: Outcome) -> None:
-        """The one place where a rollout gets its outcome, and its group or batch what follows from it."""
+        """The one place where a rollout gets its outcome, and its group or batch what follows from it.
+
+        The end of an execution that checks another's result says something of that one.
+        """
+        if record.check:
+            self.audits.checked(record, outcome)
+            return
         batch = self.batches.of(record)
         group = batch.groups[record.rollout.group_id]
         self._conclude(record, outcome)
@@ -169,6 +182,8 @@ class Assignments:
             self.pending.remove(record)
         for lease in list(record.leases):
             self.void(lease)
+        if record.held:
+            self.audits.forget(record)
         batch = self.batches.of(record)
         cursor = self.batches.conclude(record)
         counters = self.runs.of(record.key.run_id).counters
@@ -196,13 +211,15 @@ class Assignments:
         self._end(lease)
         if counted:
             self._blame(record, lease.worker_id, failure)
-        if record.leases:
+        if record.leases or record.held:
             return
         run = self.runs.of(record.key.run_id)
         most = attempts_allowed(run.terms.group_policy, self._limits.max_attempts)
         if record.attempts >= most:
             message = f"{failure.message} (attempt {record.attempts} of {most})"
             self.finish(record, dataclasses.replace(failure, message=message))
+        elif record.check:
+            self.audits.returned(record)
         else:
             run.counters.redispatched += 1
             self._queue(record)
@@ -226,7 +243,7 @@ class Assignments:
                 worker = self.fleet.best_for(scene, self._free_for(record))
                 if worker is not None:
                     self.pending.take(record)
-                    self._give(record, worker)
+                    self.give(record, worker)
                     break
             else:
                 return
@@ -244,20 +261,21 @@ class Assignments:
                     self._steal_for(worker)
                     break
                 self.pending.take(record)
-                self._give(record, worker)
+                self.give(record, worker)
 
     def hedge(self, record: RolloutRecord, worker: WorkerRecord) -> None:
         """Lease a rollout that runs elsewhere a second time; whoever is first counts."""
         record.hedged = True
         self.runs.of(record.key.run_id).counters.hedged += 1
-        self._give(record, worker, hedge=True)
+        self.give(record, worker, hedge=True)
 
-    def _give(self, record: RolloutRecord, worker: WorkerRecord, *, hedge: bool = False) -> None:
+    def give(self, record: RolloutRecord, worker: WorkerRecord, *, hedge: bool = False) -> None:
+        """Lease the rollout to the worker, which can take it."""
         lease = self.leases.give(record, worker, self.now_s)
         deadline_s = self._limits.execute_deadline_s
         origin = LeaseOrigin(*record.key, attempt=record.attempts + 1)
         self.commands.append(
-            GiveLease(worker.worker_id, lease.ref, record.rollout, deadline_s, origin, hedge)
+            GiveLease(worker.worker_id, lease.ref, record.rollout, deadline_s, origin, hedge, record.check)
         )
 
     def _end(self, lease: LeaseRecord) -> None:
@@ -277,7 +295,7 @@ class Assignments:
             if lease is None:
                 return
             self.void(lease)
-            self._give(lease.record, worker)
+            self.give(lease.record, worker)
 
     def settle(self, event: LeaseFinished) -> None:
         self.commands.append(AcknowledgeLease(event.worker_id, event.ref))
@@ -303,12 +321,16 @@ class Assignments:
         self.fleet.time(lease, run.times, self.now_s, lost=False)
         for other in record.leases:
             self.fleet.time(other, run.times, self.now_s, lost=True)
-        run.counters.warm_starts += record.warm
-        run.counters.cold_starts += not record.warm
         self.fleet.workers[lease.worker_id].note_completed(completed.timings.execute_s)
         timings = lease.timings(completed.timings, self.now_s)
         warm = record.warm and completed.warm
-        self.finish(record, completed.noted(timings=timings, warm=warm))
+        noted = completed.noted(timings=timings, warm=warm, worker_id=lease.worker_id)
+        if not record.check:
+            run.counters.warm_starts += record.warm
+            run.counters.cold_starts += not record.warm
+            if self.audits.hold(lease, noted):
+                return
+        self.finish(record, noted)
 
     def _take_failure(self, lease: LeaseRecord, failure: InfraFailure) -> None:
         worker = self.fleet.workers[lease.worker_id]

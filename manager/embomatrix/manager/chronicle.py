@@ -140,7 +140,9 @@ class Chronicle:
         """A worker tells how leases ended; to be called before the state machines hear of it and end them."""
         for result in results:
             lease = live.get(result.ref.lease_id)
-            if lease is not None and lease.ref == result.ref and lease.worker_id == worker_id:
+            if lease is None or lease.record.check:
+                continue
+            if lease.ref == result.ref and lease.worker_id == worker_id:
                 self._ended_lease(result, lease, now_s)
 
     def delivered(self, command: DeliverResult, *, now_s: float) -> None:

@@ -7,8 +7,9 @@ import math
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.assignments import DispatchLimits
+from embomatrix.manager.commands import QuarantineWorker
 from embomatrix.manager.dispatcher import Dispatcher
-from embomatrix.manager.events import RunClosed, ScenesUnplaceable
+from embomatrix.manager.events import RunClosed, ScenesUnplaceable, WorkerJoined, WorkerQuarantined
 from embomatrix.manager.scheduler import ScheduleLimits, Scheduler, Urgency
 from embomatrix.rpc.values import RunStats
 
@@ -31,6 +32,7 @@ class ClusterState:
     """Everything that the manager decides. Events in, commands out, the clock an argument, no I/O.
 
     ``boot_id`` is new for every process of the manager; the epochs of its leases begin with ``first_epoch``.
+    ``audit_key`` is a secret of it.
     """
 
     def __init__(
@@ -40,8 +42,11 @@ class ClusterState:
         *,
         boot_id: str,
         first_epoch: int = 1,
+        audit_key: bytes = b"",
     ) -> None:
-        self.dispatcher = Dispatcher(dispatch or DispatchLimits(), boot_id=boot_id, first_epoch=first_epoch)
+        self.dispatcher = Dispatcher(
+            dispatch or DispatchLimits(), boot_id=boot_id, first_epoch=first_epoch, audit_key=audit_key
+        )
         self.scheduler = Scheduler(schedule or ScheduleLimits())
         self._waiting = 0
         self._placed_s = -math.inf
@@ -53,6 +58,11 @@ class ClusterState:
         """Take in one fact; returns what shall be done about it, in order."""
         commands = self.dispatcher.handle(event, now_s=now_s)
         urgency = self.scheduler.note(event, now_s=now_s)
+        barred = [command.worker_id for command in commands if isinstance(command, QuarantineWorker)]
+        if isinstance(event, WorkerJoined) and self.dispatcher.auditor.quarantined(event.worker_id):
+            barred.append(event.worker_id)
+        for worker_id in barred:
+            urgency = max(urgency, self.scheduler.note(WorkerQuarantined(worker_id), now_s=now_s))
         if self.dispatcher.waiting_scenes != self._waiting:
             # A scene got its first waiting rollout, or lost its last.
             urgency = max(urgency, Urgency.LATER)

@@ -31,6 +31,8 @@ class GiveLease:
     origin: LeaseOrigin
     """Comes back in the worker's claims when another manager asks."""
     hedge: bool = False
+    audit: bool = False
+    """The result is compared with another's: a worker is not told."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,4 +68,16 @@ class FinishBatch:
     batch_id: str
 
 
-Command = SetDesired | GiveLease | CancelLease | AcknowledgeLease | DeliverResult | FinishBatch
+@dataclass(frozen=True, slots=True)
+class QuarantineWorker:
+    """The worker's results are wrong: it gets nothing more. Told to people, not to the worker."""
+
+    worker_id: str
+    reason: str
+    audited: int
+    """Executions of it that had been compared, with the one that was wrong."""
+
+
+Command = (
+    SetDesired | GiveLease | CancelLease | AcknowledgeLease | DeliverResult | FinishBatch | QuarantineWorker
+)

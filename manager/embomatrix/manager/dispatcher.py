@@ -10,6 +10,7 @@ as commands. The rules it keeps:
 * Only leases that were started cost an attempt. After ``max_attempts`` the rollout ends as an infrastructure failure, and
   what becomes of its group is the run's policy.
 * A rollout has one live lease, or two on different workers when the first is late; the first good result counts.
+* A result that is audited is compared with what a second worker comes to: see ``audits``.
 * Runs take turns by weight; the slot time that they had decides, not how many leases.
 """
 
@@ -50,6 +51,7 @@ from embomatrix.rpc.values import InfraCode, InfraFailure, ResidentState
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from embomatrix.manager.auditor import Auditor
     from embomatrix.manager.ledger import LeaseRecord, RunCounters, WorkerRecord
 
 
@@ -60,12 +62,15 @@ STALL_TIMES: Final = 5.0
 class Dispatcher:
     """Batches in, leases and results out. ``boot_id`` keeps lease ids of different manager processes apart.
 
-    ``first_epoch`` lies above the epochs of every lease that a former manager gave.
+    ``first_epoch`` lies above the epochs of every lease that a former manager gave. Whoever knows ``audit_key`` can tell
+    which results will be audited.
     """
 
-    def __init__(self, limits: DispatchLimits, *, boot_id: str, first_epoch: int = 1) -> None:
+    def __init__(
+        self, limits: DispatchLimits, *, boot_id: str, first_epoch: int = 1, audit_key: bytes = b""
+    ) -> None:
         self._limits = limits
-        self._desk = Assignments(limits, boot_id=boot_id, first_epoch=first_epoch)
+        self._desk = Assignments(limits, boot_id=boot_id, first_epoch=first_epoch, audit_key=audit_key)
         self._recovery = Recovery(self._desk, grace_s=limits.restart_grace_s)
         self._hedger = Hedger(self._desk, limits)
         self._patience = Patience(self._desk, limits.no_capacity_s)
@@ -94,9 +99,13 @@ class Dispatcher:
             case RunClosed(run_id):
                 for batch in self._desk.batches.of_run(run_id):
                     self._desk.cancel((run_id, batch.batch_id))
+                self._desk.audits.drop_run(run_id)
             case WorkerJoined(worker_id, resources):
                 self._on_lost(WorkerLost(worker_id, "a newer session of the same worker took over"))
-                self._desk.fleet.join(worker_id, resources.slots, resources.render_slots)
+                joined = self._desk.fleet.join(
+                    worker_id, resources.slots, resources.render_slots, resources.versions
+                )
+                self._desk.audits.joined(joined)
             case WorkerReported():
                 self._on_reported(event)
             case WorkerLost():
@@ -158,6 +167,11 @@ class Dispatcher:
     def expected(self) -> frozenset[str]:
         """Workers of a former manager that were not heard yet, while they are waited for."""
         return self._recovery.expected
+
+    @property
+    def auditor(self) -> Auditor:
+        """What is known of workers' honesty; for reading."""
+        return self._desk.audits.auditor
 
     @property
     def scenes(self) -> frozenset[str]:
@@ -252,6 +266,8 @@ class Dispatcher:
         match event:
             case WorkerDrained() | WorkerResumed():
                 worker.drained = isinstance(event, WorkerDrained)
+                if isinstance(event, WorkerResumed):
+                    self._desk.audits.pardon(worker)
             case WorkerSuspected() | WorkerRecovered():
                 worker.suspect = isinstance(event, WorkerSuspected)
         self._desk.fleet.stand(worker)
@@ -287,6 +303,7 @@ class Dispatcher:
             self._desk.fleet.forgive()
         self._desk.fill([*self._desk.fleet.thieves(), *self._desk.fleet.lags])
         self._hedger.look()
+        self._desk.audits.look()
 
     def _expire(self, lease: LeaseRecord) -> None:
         if lease.expires_s <= self._desk.now_s:

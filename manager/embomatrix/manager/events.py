@@ -84,6 +84,13 @@ class WorkerResumed:
 
 
 @dataclass(frozen=True, slots=True)
+class WorkerQuarantined:
+    """Its results were found to be wrong: it gets nothing more until an operator resumes it."""
+
+    worker_id: str
+
+
+@dataclass(frozen=True, slots=True)
 class LeasesRenewed:
     """A heartbeat named the leases that the worker still holds, and how far those have come that run."""
 
@@ -210,6 +217,7 @@ Event = (
     | WorkerLost
     | WorkerDrained
     | WorkerResumed
+    | WorkerQuarantined
     | LeasesRenewed
     | LeaseFinished
     | RunOpened

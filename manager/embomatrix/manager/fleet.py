@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.manager.ledger import LeaseRecord, WorkerRecord
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Iterable, Mapping
 
     from embomatrix.manager.run_book import SlotTimes
 
@@ -38,14 +38,21 @@ class Fleet:
         self.lags: dict[str, float] = {}
         """How many times slower those workers are that plainly are."""
 
-    def join(self, worker_id: str, slots: int, render_slots: int = 0) -> None:
+    def join(
+        self, worker_id: str, slots: int, render_slots: int = 0, versions: Mapping[str, str] | None = None
+    ) -> WorkerRecord:
         """A new worker, which can take nothing until it has reported."""
         slots = max(slots, 1)
         record = WorkerRecord(
-            worker_id, slots=slots, credits=2 * slots, render_slots=min(render_slots, slots)
+            worker_id,
+            slots=slots,
+            credits=2 * slots,
+            render_slots=min(render_slots, slots),
+            versions=versions or {},
         )
         self.workers[worker_id] = record
         self._live.add(worker_id)
+        return record
 
     def leave(self, worker_id: str) -> WorkerRecord | None:
         worker = self.workers.get(worker_id)
@@ -87,7 +94,7 @@ class Fleet:
 
     def stand(self, worker: WorkerRecord) -> None:
         """The worker drains, paused, reported, fell silent or was heard again: it may take leases, or no longer."""
-        if worker.draining or worker.suspect or worker.paused:
+        if worker.draining or worker.suspect or worker.paused or worker.quarantined:
             self._live.discard(worker.worker_id)
         else:
             self._live.add(worker.worker_id)

@@ -35,12 +35,16 @@ class Holder:
     leaving: bool = False
     paused: bool = False
     """It said so itself. While it is paused, what it holds stays."""
+    quarantined: bool = False
+    """Its results were found to be wrong."""
     score_limit: float = math.inf
     loading_since_s: dict[str, float] = field(default_factory=dict)
 
     @property
     def usable(self) -> bool:
-        return self.reported and not (self.suspect or self.drained or self.leaving or self.paused)
+        return self.reported and not (
+            self.suspect or self.drained or self.leaving or self.paused or self.quarantined
+        )
 
     @property
     def renders(self) -> bool:

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from embomatrix.rpc.values import RunStats, Timings
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from embomatrix.rpc.values import LeaseRef, Rollout
 
 
@@ -66,6 +68,12 @@ class RolloutRecord:
     failed_on: str = ""
     avoid_until_s: float = -math.inf
     """The worker that it failed on last gets it again only from then on, while there are others."""
+    held: bool = False
+    """It was executed, and the result waits until another worker has come to the same."""
+    check: bool = False
+    """It is a further execution of a rollout, to compare: no batch has it."""
+    barred: frozenset[str] = frozenset()
+    """Workers that executed it before, and whose results it is to be compared with."""
 
     @property
     def scene(self) -> str:
@@ -124,6 +132,10 @@ class WorkerRecord:
     """It said so itself."""
     paused: str = ""
     """Why it takes nothing new for now, in its own words."""
+    quarantined: bool = False
+    """It was found to give wrong results."""
+    versions: Mapping[str, str] = field(default_factory=dict)
+    """Of what its results depend on."""
     log_lag: float = 0.0
     reluctance_s: float = 0.0
     """It takes only rollouts that have waited for so long: the time that it needs longer than others."""
@@ -140,7 +152,9 @@ class WorkerRecord:
 
     @property
     def usable(self) -> bool:
-        return self.reported and not (self.suspect or self.drained or self.leaving or self.paused)
+        return self.reported and not (
+            self.suspect or self.drained or self.leaving or self.paused or self.quarantined
+        )
 
     @property
     def free_render_slots(self) -> int:
@@ -184,6 +198,8 @@ class WorkerRecord:
         if now_s - record.submitted_s < self.reluctance_s:
             return False
         if record.rollout.render and self.rendering >= self.render_slots:
+            return False
+        if self.worker_id in record.barred:
             return False
         return not record.leases or all(lease.worker_id != self.worker_id for lease in record.leases)
 
@@ -230,6 +246,8 @@ class RunCounters:
     cold_starts: int = 0
     hedged: int = 0
     groups_failed: int = 0
+    audited: int = 0
+    audit_mismatches: int = 0
 
     def stats(self) -> RunStats:
         return RunStats(
@@ -241,4 +259,6 @@ class RunCounters:
             cold_starts=self.cold_starts,
             hedged=self.hedged,
             groups_failed=self.groups_failed,
+            audited=self.audited,
+            audit_mismatches=self.audit_mismatches,
         )

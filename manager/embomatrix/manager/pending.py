@@ -21,10 +21,11 @@ Turn = tuple[float, float, int]
 
 
 class Lane(NamedTuple):
-    """Rollouts of one run that go to the same kind of slots."""
+    """Rollouts of one run that go to the same kind of slots, and are barred from the same workers."""
 
     run_id: str
     render: bool
+    barred: frozenset[str]
 
 
 _Heap = list[tuple[int, RolloutRecord]]
@@ -65,8 +66,7 @@ class PendingQueues:
     def push(self, record: RolloutRecord) -> None:
         """Queue a rollout that no one holds."""
         record.phase = Phase.PENDING
-        lane = Lane(record.key.run_id, record.rollout.render)
-        heap = self._heaps.setdefault(record.scene, {}).setdefault(lane, [])
+        heap = self._heaps.setdefault(record.scene, {}).setdefault(_lane(record), [])
         heapq.heappush(heap, (record.sequence, record))
         self._counts[record.scene] += 1
         self._by_run[record.key.run_id] += 1
@@ -110,7 +110,7 @@ class PendingQueues:
 
     def take(self, record: RolloutRecord) -> None:
         """The record gets a lease."""
-        heap = self._heaps[record.scene][Lane(record.key.run_id, record.rollout.render)]
+        heap = self._heaps[record.scene][_lane(record)]
         if heap[0][1] is record:
             heapq.heappop(heap)
         else:
@@ -129,6 +129,10 @@ class PendingQueues:
             # What is left in the heaps are records that reached their outcome while they waited.
             del self._counts[scene]
             self._heaps.pop(scene, None)
+
+
+def _lane(record: RolloutRecord) -> Lane:
+    return Lane(record.key.run_id, record.rollout.render, record.barred)
 
 
 def _head(heap: _Heap) -> RolloutRecord | None:

@@ -15,6 +15,7 @@ from prometheus_client.registry import Collector
 from embomatrix.manager.histogram import BOUNDS_S
 from embomatrix.manager.history import manager_version
 from embomatrix.manager.registry import Standing
+from embomatrix.manager.views import standing_counts
 from embomatrix.rpc.values import InfraCode, ResidentState
 
 if TYPE_CHECKING:
@@ -54,7 +55,7 @@ class _Cluster(Collector):
 
     def _fleet(self) -> Iterator[Metric]:
         sessions = self._runtime.registry.sessions
-        standings = Counter(session.standing.value for session in sessions.values())
+        standings = standing_counts(self._runtime)
         states = {standing.value: standings[standing.value] for standing in Standing}
         yield _gauges("embo_workers", "Workers by state.", "state", states)
         yield _gauges("embo_slots", "Slots of connected workers by state.", "state", self._slot_states())
@@ -124,8 +125,7 @@ class _Cluster(Collector):
 
     def _state_of_free(self, worker: WorkerRecord) -> str:
         """What a slot without a rollout could do: start one at once, soon, or not."""
-        session = self._runtime.registry.sessions.get(worker.worker_id)
-        if session is not None and session.standing.value == "quarantined":
+        if worker.quarantined:
             return "quarantined"
         states = {resident.state for resident in self._runtime.cluster.scheduler.residents(worker.worker_id)}
         if ResidentState.WARM in states:

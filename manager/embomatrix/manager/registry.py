@@ -36,6 +36,7 @@ class Standing(StrEnum):
     LOST = "lost"
     DRAINING = "draining"
     PAUSED = "paused"
+    QUARANTINED = "quarantined"
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,6 +20,7 @@ from embomatrix.manager.commands import (
     DeliverResult,
     FinishBatch,
     GiveLease,
+    QuarantineWorker,
     SetDesired,
 )
 from embomatrix.manager.delivery import Delivery
@@ -34,6 +35,7 @@ from embomatrix.manager.results import ResultLogs
 from embomatrix.manager.runs import RunLimits, Runs
 from embomatrix.manager.store.protocol import StateError
 from embomatrix.manager.store.timed import timed_store
+from embomatrix.manager.views import UNAUDITED
 from embomatrix.rpc.status import SupersededError, UnavailableError
 from embomatrix.rpc.versions import PROTOCOL_VERSION
 
@@ -100,6 +102,7 @@ class ManagerRuntime:
         self._lapsed_s = lapsed_s
         self._suspended = False
         self._paused = False
+        self._said_unaudited = False
 
     async def start(self) -> None:
         """Take the state up where a former manager left it."""
@@ -209,7 +212,8 @@ class ManagerRuntime:
                     self._say(command)
                 case GiveLease():
                     self._say(command)
-                    self.chronicle.leased(command, now_s=now_s)
+                    if not command.audit:
+                        self.chronicle.leased(command, now_s=now_s)
                 case AcknowledgeLease():
                     self._delivery.put_acknowledgement(command)
                 case DeliverResult():
@@ -218,6 +222,8 @@ class ManagerRuntime:
                     self._delivery.put(command)
                 case FinishBatch():
                     self._delivery.put(command)
+                case QuarantineWorker():
+                    logger.error("worker quarantined worker=%s: %s", command.worker_id, command.reason)
 
     def _say(self, command: WorkerCommand) -> None:
         """Without a stream the command is lost; the worker's next full state shows that, and it is given again."""
@@ -243,12 +249,18 @@ class ManagerRuntime:
                 self.registry.detach(self._links[worker_id].session, now_s=time.monotonic())
                 self._close_link(worker_id, UnavailableError(STORE_AWAY))
 
+    def _say_what_is_not_audited(self) -> None:
+        if self.cluster.dispatcher.auditor.lone and not self._said_unaudited:
+            self._said_unaudited = True
+            logger.warning(UNAUDITED)
+
     async def _keep_time(self) -> None:
         while True:
             due_s = time.monotonic() + TICK_S
             await asyncio.sleep(TICK_S)
             self.effort.lag.observe(time.monotonic() - due_s)
             self._watch_the_lead()
+            self._say_what_is_not_audited()
             lost, commands = self._intake.tick(now_s=time.monotonic())
             for event in lost:
                 logger.warning("worker lost worker=%s: %s", event.worker_id, event.reason)

@@ -26,6 +26,7 @@ from embomatrix.manager.events import (
     WorkerDrained,
     WorkerJoined,
     WorkerLost,
+    WorkerQuarantined,
     WorkerRecovered,
     WorkerReported,
     WorkerResumed,
@@ -130,7 +131,13 @@ class Scheduler:
                 return Urgency.NONE
             case WorkerJoined() | WorkerLost():
                 return self._on_presence(event)
-            case WorkerDrained() | WorkerResumed() | WorkerSuspected() | WorkerRecovered():
+            case (
+                WorkerDrained()
+                | WorkerResumed()
+                | WorkerSuspected()
+                | WorkerRecovered()
+                | WorkerQuarantined()
+            ):
                 return self._on_standing(event)
             case Tick():
                 return Urgency.LATER if self._demand.pending or self._holders.failing else Urgency.NONE
@@ -211,7 +218,8 @@ class Scheduler:
                 return Urgency.NOW
 
     def _on_standing(
-        self, event: WorkerDrained | WorkerResumed | WorkerSuspected | WorkerRecovered
+        self,
+        event: WorkerDrained | WorkerResumed | WorkerSuspected | WorkerRecovered | WorkerQuarantined,
     ) -> Urgency:
         holder = self._holders.by_id.get(event.worker_id)
         if holder is None:
@@ -219,6 +227,9 @@ class Scheduler:
         match event:
             case WorkerDrained() | WorkerResumed():
                 holder.drained = isinstance(event, WorkerDrained)
+                holder.quarantined = holder.quarantined and isinstance(event, WorkerDrained)
+            case WorkerQuarantined():
+                holder.quarantined = True
             case WorkerSuspected() | WorkerRecovered():
                 holder.suspect = isinstance(event, WorkerSuspected)
         self._holders.changed(holder)

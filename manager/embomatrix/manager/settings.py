@@ -78,6 +78,13 @@ class ManagerSettings(BaseModel):
     """How long a manager that took over waits for workers to say what they run, before it gives the same to others."""
     leader_ttl_s: float = Field(6.0, gt=0)
     """A manager that did not renew its lead for this long may be replaced by one that stands by."""
+    audit: bool | None = None
+    """Have other workers execute a part of the results once more, and compare. None: unless all workers are on this
+    machine. Runs that ask for verified results have it done in any case."""
+    audit_probation: int = Field(50, ge=0)
+    """So many executions of a new worker are compared, all of them."""
+    audit_share: float = Field(0.05, ge=0, le=1)
+    """Of its later results."""
     results_ttl_s: float = Field(3600.0, gt=0)
     """How long results are kept after their batch ended."""
 
@@ -91,6 +98,11 @@ class ManagerSettings(BaseModel):
         everywhere = self.host in ("0.0.0.0", "::")  # it is asked for, not chosen
         host = socket.gethostname() if everywhere else self.host
         return self.advertise or f"{f'[{host}]' if ':' in host else host}:{self.port}"
+
+    @property
+    def audits_all_runs(self) -> bool:
+        """Whether results of runs that did not ask for it are audited as well."""
+        return not is_loopback(self.host) if self.audit is None else self.audit
 
     @field_validator("advertise")
     @classmethod

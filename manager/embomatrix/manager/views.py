@@ -14,10 +14,12 @@ from embomatrix.rpc.values import Resident, ResidentState, RunInfo, RunStats, Wo
 
 if TYPE_CHECKING:
     from embomatrix.manager.meter import FailureNote
+    from embomatrix.manager.registry import Session
     from embomatrix.manager.runtime import ManagerRuntime
     from embomatrix.rpc.values import PlanCell
 
 NOTHING: Final = Window(0, ())
+UNAUDITED: Final = "results are not audited: that takes a second worker"
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +45,8 @@ class Overview:
     redispatched: int
     stale_results: int
     failures: list[FailureNote]
+    notice: str = ""
+    """What an operator should know."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +69,8 @@ class WorkerView:
     silent_s: float
     residents: list[Resident]
     loads: list[str]
+    audited: int = 0
+    audit_mismatches: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +105,7 @@ def overview(runtime: ManagerRuntime) -> Overview:
     workers = list(cluster.dispatcher.workers.values())
     return Overview(
         uptime_s=now_s - runtime.started_s,
-        workers=dict(Counter(session.standing.value for session in runtime.registry.sessions.values())),
+        workers=dict(standing_counts(runtime)),
         slots=sum(worker.slots for worker in workers),
         slots_busy=sum(min(len(worker.held), worker.slots) for worker in workers),
         queued=cluster.dispatcher.queued,
@@ -116,6 +122,7 @@ def overview(runtime: ManagerRuntime) -> Overview:
         redispatched=totals.redispatched,
         stale_results=totals.stale_results,
         failures=list(meter.failures),
+        notice=UNAUDITED if cluster.dispatcher.auditor.lone else "",
     )
 
 
@@ -162,6 +169,8 @@ def worker_infos(runtime: ManagerRuntime) -> list[WorkerInfo]:
                 completed=view.completed,
                 last_seen_s=view.silent_s,
                 reason=view.reason,
+                audited=view.audited,
+                audit_mismatches=view.audit_mismatches,
             )
         )
     return infos
@@ -172,18 +181,35 @@ def run_infos(runtime: ManagerRuntime) -> list[RunInfo]:
     return [runtime.history.info(record) for record in runtime.chronicle.runs.values()]
 
 
+def standing_counts(runtime: ManagerRuntime) -> Counter[str]:
+    """How many workers are in each state."""
+    return Counter(_standing(runtime, session).value for session in runtime.registry.sessions.values())
+
+
+def _standing(runtime: ManagerRuntime, session: Session) -> Standing:
+    """As people shall see it: what was decided about a worker comes before what it says itself."""
+    if session.standing is Standing.LOST:
+        return Standing.LOST
+    if runtime.cluster.dispatcher.auditor.quarantined(session.worker_id):
+        return Standing.QUARANTINED
+    record = runtime.cluster.dispatcher.workers.get(session.worker_id)
+    return Standing.DRAINING if record is not None and record.draining else session.standing
+
+
 def _worker(runtime: ManagerRuntime, worker_id: str) -> WorkerView:
     session = runtime.registry.sessions[worker_id]
     record = runtime.cluster.dispatcher.workers.get(worker_id)
     scheduler = runtime.cluster.scheduler
     held = len(record.held) if record else 0
     residents = scheduler.residents(worker_id)
+    repute = runtime.cluster.dispatcher.auditor.of(worker_id)
     here = {r.bundle_digest for r in residents if r.state is not ResidentState.FAILED}
-    draining = record is not None and record.draining and session.standing is not Standing.LOST
     return WorkerView(
         worker_id=worker_id,
-        state=Standing.DRAINING.value if draining else session.standing.value,
-        reason=session.reason,
+        state=_standing(runtime, session).value,
+        reason=repute.quarantine or session.reason,
+        audited=repute.audited,
+        audit_mismatches=repute.mismatches,
         slots=session.resources.slots,
         busy=min(held, record.slots) if record else 0,
         waiting=max(0, held - record.slots) if record else 0,

@@ -11,6 +11,7 @@ from embomatrix.manager.commands import (
     DeliverResult,
     FinishBatch,
     GiveLease,
+    QuarantineWorker,
     SetDesired,
 )
 from embomatrix.manager.events import BatchSubmitted, LookaheadAnnounced, RunOpened
@@ -171,6 +172,8 @@ class Front:
                     results.setdefault(run_id, []).append(result)
                 case FinishBatch():
                     pass
+                case QuarantineWorker():
+                    self._gauge.caught[command.worker_id] = command.audited
                 case _:
                     _write(letters.setdefault(command.worker_id, Letter()), command)
         for worker_id, letter in letters.items():

@@ -52,6 +52,8 @@ class Gauge:
         self.detected_s: list[float] = []
         """From each death of a worker to the manager's knowing of it."""
         self.counts: Counter[str] = Counter()
+        self.caught: dict[str, int] = {}
+        """Workers in quarantine, and how many executions of each had been compared by then."""
 
     @property
     def cpu_s(self) -> float:

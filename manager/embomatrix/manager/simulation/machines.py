@@ -30,6 +30,8 @@ class Machine:
     speed: float
     latency_s: float
     bandwidth_mb_s: float
+    lies: float = 0.0
+    """Share of its executions whose result it makes up."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,12 +108,14 @@ def _machines(scenario: Scenario, rng: np.random.Generator) -> tuple[Machine, ..
                     kind.slots,
                     kind.memory_mb,
                     round(speed, 3),
+                    versions={"platform": kind.name},
                     vram_mb=kind.render_slots * RENDER_MB,
                     render_slots=kind.render_slots,
                 ),
                 speed=speed / scenario.faults.slowness if slow[index] else speed,
                 latency_s=kind.latency_s * float(rng.uniform(0.5, 2.0)),
                 bandwidth_mb_s=kind.bandwidth_mb_s,
+                lies=scenario.faults.lies if index < scenario.faults.liars else 0.0,
             )
         )
     return tuple(machines)

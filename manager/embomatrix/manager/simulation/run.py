@@ -74,6 +74,8 @@ class Report:
     """What each run had of the slots at work, while every run wanted all of them; empty if that never was."""
     costs: Mapping[str, Cost]
     counts: Mapping[str, int]
+    caught: Mapping[str, int]
+    """Workers that were put in quarantine, and how many of their executions had been compared by then."""
 
     @property
     def waste(self) -> float:
@@ -123,10 +125,13 @@ class Simulation:
         self.agenda.after(0.0, self._look)
         with _without_collector():
             in_time = self.agenda.run(until=self._ended, limit_s=self._scenario.limit_s)
-        if not in_time or not self._auditor.complete or self._cluster.dispatcher.live_leases:
+        # Audits of what was delivered end with their run.
+        leases = self._cluster.dispatcher.live_leases.values()
+        live = [lease for lease in leases if not lease.record.check]
+        if not in_time or not self._auditor.complete or live:
             raise BrokenInvariantError(
                 f"after {self.agenda.now_s:.0f} s {self._auditor.delivered} of {self._scenario.rollouts} rollouts have "
-                f"an outcome, {len(self._cluster.dispatcher.live_leases)} leases live"
+                f"an outcome, {len(live)} leases live"
             )
         return self._report()
 
@@ -204,6 +209,7 @@ class Simulation:
             shares={run: count / gauge.shared.total() for run, count in sorted(gauge.shared.items())},
             costs=gauge.costs,
             counts=gauge.counts,
+            caught=gauge.caught,
         )
 
 

@@ -103,6 +103,10 @@ class Faults:
     slow_workers: float = 0.0
     """Share of workers that are slower than they say."""
     slowness: float = 10.0
+    liars: int = 0
+    """So many workers make results up …"""
+    lies: float = 0.1
+    """… for this share of their rollouts, each time another one."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,6 +34,7 @@ RESPAWN_S: Final = 0.02
 """A slot whose process was killed or crashed has a new one after this long."""
 STEP_S: Final = 0.1
 REWARD: Final = RewardBreakdown(0.5, 0.2, 15.0, (), False)
+INVENTED: Final = RewardBreakdown(0.5, 0.2, 30.0, (), True)
 
 
 @dataclass(slots=True, eq=False)
@@ -247,8 +248,17 @@ class SimulatedSlots:
             outcome = InfraFailure(InfraCode.SLOT_TIMEOUT, "killed", self._machine.worker_id)
         else:
             timings = Timings(execute_s=seconds)
-            outcome = Completed(REWARD, (), (), rollout_id, self._machine.worker_id, timings, warm=True)
+            outcome = self._result(rollout_id, timings)
         around.agenda.after(seconds, lambda: self._finished(lease, outcome))
+
+    def _result(self, rollout_id: str, timings: Timings) -> Completed:
+        """The trace names its rollout, unless the machine lies."""
+        lies, worker_id = self._machine.lies, self._machine.worker_id
+        if lies and self._around.dice.random() < lies:
+            return Completed(
+                INVENTED, (), (), f"{rollout_id} as {worker_id} has it", worker_id, timings, warm=True
+            )
+        return Completed(REWARD, (), (), rollout_id, worker_id, timings, warm=True)
 
     def _finished(self, lease: Lease, outcome: Completed | InfraFailure) -> None:
         entry = self._running.pop(lease.ref, None)
