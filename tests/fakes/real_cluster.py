@@ -62,10 +62,16 @@ class RealCluster:
         }
         self._start(name, str(FAKES / "manager_process.py"), json.dumps(chosen))
 
-    def start_worker(self, name, slots=2, manager=""):
+    def start_worker(self, name, slots=2, manager="", **wishes):
         """A daemon with the simulation that needs no physics, which notes each execution as it begins."""
         arguments = (manager or self.address, name, str(self.folder / name), str(slots))
-        self._start(name, str(FAKES / "worker_process.py"), *arguments)
+        self._start(name, str(FAKES / "worker_process.py"), *arguments, json.dumps(wishes))
+
+    def type_at(self, name):
+        """The owner of this worker's machine types something, now."""
+        terminal = self.folder / name / "devices" / "pts" / "0"
+        terminal.parent.mkdir(parents=True, exist_ok=True)
+        terminal.touch()
 
     def start_quick_worker(self, name, slots=4, execute_s=0.01):
         """A worker that only pretends to execute: as many rollouts as the manager can take."""

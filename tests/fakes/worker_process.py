@@ -1,7 +1,12 @@
-"""A worker daemon with the simulation that needs no physics: ``python worker_process.py MANAGER NAME FOLDER SLOTS``."""
+"""A worker daemon with the simulation that needs no physics: ``python worker_process.py MANAGER NAME FOLDER SLOTS [WISHES]``.
+
+WISHES are preferences as JSON. Its owner sits at the terminals in FOLDER/devices.
+"""
 
 import asyncio
+import json
 import logging
+import os
 import signal
 import sys
 from pathlib import Path
@@ -10,17 +15,24 @@ import numpy as np
 
 from embomatrix.rpc.values import Resources
 from embomatrix.worker.daemon import Daemon, serve
+from embomatrix.worker.machine import Machine, Owner
+from embomatrix.worker.preferences import Preferences
 from embomatrix.worker.settings import WorkerSettings
 
 SIMULATION = Path(__file__).with_name("simulation.py")
 
 
 def main():
-    manager, name, folder, slots = sys.argv[1:]
+    manager, name, folder, slots = sys.argv[1:5]
+    wishes = Preferences(**json.loads(sys.argv[5])) if len(sys.argv) > 5 else Preferences()
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
-    settings = WorkerSettings(manager=manager, name=name, cache_dir=Path(folder), state_dir=Path(folder))
+    settings = WorkerSettings(
+        manager=manager, name=name, cache_dir=Path(folder), state_dir=Path(folder), preferences=wishes
+    )
     resources = Resources(int(slots), int(slots), 500)
-    daemon = Daemon(settings, resources, np.random.default_rng(), program=(sys.executable, str(SIMULATION)))
+    machine = Machine(lambda: [os.getpid()], Owner(Path(folder) / "devices", sessions=str))
+    program = (sys.executable, str(SIMULATION))
+    daemon = Daemon(settings, resources, np.random.default_rng(), program=program, probe=machine)
     asyncio.run(serve(daemon, (signal.SIGTERM, signal.SIGINT)))
 
 

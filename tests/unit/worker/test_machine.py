@@ -41,7 +41,7 @@ def test_the_last_key_in_any_terminal_is_a_sign_of_the_owner(tmp_path):
 
 
 def test_a_machine_without_terminals_and_desktops_has_been_left_alone_for_ever(tmp_path):
-    assert Owner(tmp_path).idle_s(time.time()) == NEVER_S
+    assert Owner(tmp_path, sessions=str).idle_s(time.time()) == NEVER_S
 
 
 DESKTOP = "Type=wayland\nClass=user\nState=active\nIdleHint={}\nIdleSinceHint={}\n"

@@ -37,8 +37,8 @@ class Probe(Protocol):
 class Machine:
     """The machine that this runs on. ``ours`` gives the process ids of all worker daemons here: theirs is no load of others."""
 
-    def __init__(self, ours: Callable[[], Iterable[int]], *, devices: Path = DEVICES) -> None:
-        self._owner = Owner(devices) if sys.platform == "linux" else None
+    def __init__(self, ours: Callable[[], Iterable[int]], owner: Owner | None = None) -> None:
+        self._owner = owner or (Owner() if sys.platform == "linux" else None)
         self._load = OthersLoad(ours)
 
     def observe(self) -> Observation:
@@ -74,8 +74,9 @@ def on_mains() -> bool | None:
 class Owner:
     """The last sign of a person: what was typed in a terminal, and what the desktop tells logind."""
 
-    def __init__(self, devices: Path = DEVICES) -> None:
+    def __init__(self, devices: Path = DEVICES, sessions: Callable[[], str] | None = None) -> None:
         self._devices = devices
+        self._sessions = sessions or ask_sessions
         self._desktop_active_s: float | None = None
         self._asked_s = float("-inf")
 
@@ -83,7 +84,7 @@ class Owner:
         """Seconds since the last sign; ``now_s`` is wall time. Where nobody is logged in, very many."""
         if now_s - self._asked_s >= SESSIONS_ASKED_S:
             self._asked_s = now_s
-            self._desktop_active_s = desktop_active_s(ask_sessions(), now_s)
+            self._desktop_active_s = desktop_active_s(self._sessions(), now_s)
         signs = [terminal_active_s(self._devices), self._desktop_active_s]
         return max(0.0, now_s - max((sign for sign in signs if sign is not None), default=now_s - NEVER_S))
 
