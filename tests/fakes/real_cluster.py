@@ -62,10 +62,13 @@ class RealCluster:
         }
         self._start(name, str(FAKES / "manager_process.py"), json.dumps(chosen))
 
-    def start_worker(self, name, slots=2, manager="", **wishes):
-        """A daemon with the simulation that needs no physics, which notes each execution as it begins."""
+    def start_worker(self, name, slots=2, manager="", lies=0.0, **wishes):
+        """A daemon with the simulation that needs no physics, which notes each execution as it begins.
+
+        It makes a reward up for the share ``lies`` of its rollouts.
+        """
         arguments = (manager or self.address, name, str(self.folder / name), str(slots))
-        self._start(name, str(FAKES / "worker_process.py"), *arguments, json.dumps(wishes))
+        self._start(name, str(FAKES / "worker_process.py"), *arguments, json.dumps(wishes), str(lies))
 
     def type_at(self, name):
         """The owner of this worker's machine types something, now."""
@@ -153,10 +156,10 @@ def batch_of(run_id, count, task="ok", batch_id="b1", group=8):
     return Batch(run_id, batch_id, 0, rollouts)
 
 
-async def opened(client, run_id="run"):
+async def opened(client, run_id="run", **options):
     """A run whose only scene the manager has."""
     await client.put_bundles({DIGEST: SCENE})
-    return await client.open_run("reliability", run_id)
+    return await client.open_run("reliability", run_id, **options)
 
 
 async def outcomes(client, batch, *, then=lambda count: None, deadline_s=120.0):

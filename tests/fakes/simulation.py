@@ -4,6 +4,7 @@ Run as ``python simulation.py FD PARENT``, as the worker's daemon runs the real 
 """
 
 import os
+import random
 import signal
 import sys
 import time
@@ -82,11 +83,12 @@ class FakeScene:
             case "stop":
                 os.kill(os.getppid(), signal.SIGSTOP)
                 time.sleep(1.0)
+        made_up = lies()
         return Completed(
-            reward=RewardBreakdown(0.5, 0.2, goal(rollout), (AtomResult("done", True),), True),
+            reward=RewardBreakdown(0.5, 0.2, made_up or goal(rollout), (AtomResult("done", True),), True),
             steps=(),
             final=(f"executed {self._executed} in {os.getpid()} of {os.getppid()}",),
-            trace_digest=f"trace of {rollout.rollout_id}",
+            trace_digest=f"{'no ' if made_up else ''}trace of {rollout.rollout_id}",
             worker_id="",
             timings=Timings(),
             warm=True,
@@ -96,6 +98,11 @@ class FakeScene:
 def goal(rollout):
     """The reward of the goal: 30, or of graded tasks as the rollout's id has it."""
     return graded(rollout.rollout_id) if rollout.task_id == "graded" else 30.0
+
+
+def lies():
+    """A reward that was never earned, for the share of rollouts that the environment names; otherwise 0."""
+    return 99.0 if random.SystemRandom().random() < float(os.environ.get("FAKE_LIES", "0")) else 0.0
 
 
 def graded(rollout_id):

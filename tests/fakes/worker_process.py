@@ -1,6 +1,7 @@
-"""A worker daemon with the simulation that needs no physics: ``python worker_process.py MANAGER NAME FOLDER SLOTS [WISHES]``.
+"""A worker daemon with the simulation that needs no physics: ``python worker_process.py MANAGER NAME FOLDER SLOTS [WISHES [LIES]]``.
 
-WISHES are preferences as JSON. Its owner sits at the terminals in FOLDER/devices.
+WISHES are preferences as JSON. Its owner sits at the terminals in FOLDER/devices. LIES is the share of
+its rollouts for which it makes a reward up.
 """
 
 import asyncio
@@ -25,11 +26,12 @@ SIMULATION = Path(__file__).with_name("simulation.py")
 def main():
     manager, name, folder, slots = sys.argv[1:5]
     wishes = Preferences(**json.loads(sys.argv[5])) if len(sys.argv) > 5 else Preferences()
+    os.environ["FAKE_LIES"] = sys.argv[6] if len(sys.argv) > 6 else "0"
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
     settings = WorkerSettings(
         manager=manager, name=name, cache_dir=Path(folder), state_dir=Path(folder), preferences=wishes
     )
-    resources = Resources(int(slots), int(slots), 500)
+    resources = Resources(int(slots), int(slots), 500, versions={"platform": "fake"})
     machine = Machine(lambda: [os.getpid()], Owner(Path(folder) / "devices", sessions=str))
     program = (sys.executable, str(SIMULATION))
     daemon = Daemon(settings, resources, np.random.default_rng(), program=program, probe=machine)

@@ -1,0 +1,58 @@
+"""A17: a worker that makes results up is found out by others that execute the same, before anybody gets to see them."""
+
+import asyncio
+
+from tests.fakes.real_cluster import RealCluster, batch_of, connected, opened, outcomes, tally, tell
+from tests.fakes.simulation import graded_total
+
+from embomatrix.rpc.values import GroupPolicy, RunTerms
+
+HONEST = ("w1", "w2", "w3")
+LIAR = "liar"
+
+
+async def test_a_worker_that_lies_on_a_tenth_is_shut_out_and_what_it_made_up_is_never_delivered(tmp_path):
+    batch = batch_of("run", 400, "graded")
+    # Nobody is lucky for so long: 0.9^100 is 3 in 100,000.
+    with RealCluster(tmp_path, audit_probation=100) as cluster:
+        cluster.start_manager()
+        for name in HONEST:
+            cluster.start_worker(name)
+        cluster.start_worker(LIAR, lies=0.1)
+        async with cluster.client() as client:
+            await connected(client, *HONEST, LIAR)
+            await opened(client, "run", terms=RunTerms(GroupPolicy.PARTIAL, verified=True))
+            results = await asyncio.wait_for(outcomes(client, batch), 120)
+            workers = {worker.worker_id: worker for worker in await client.list_workers()}
+            stats = await client.close_run("run")
+        counted = tally(batch, results, reward=graded_total)
+        liar = workers[LIAR]
+        tell(
+            "A17",
+            counted,
+            audited=stats.audited,
+            mismatches=stats.audit_mismatches,
+            compared_of_the_liar=liar.audited,
+            executed_again=stats.redispatched,
+        )
+        assert counted.clean
+        assert liar.state == "quarantined"
+        assert "contradicts" in liar.reason
+        assert liar.audit_mismatches >= 1
+        assert all(workers[name].state == "ready" for name in HONEST)
+        assert f"worker quarantined worker={LIAR}" in cluster.log("manager")
+
+
+async def test_one_worker_alone_is_not_audited_and_the_manager_says_so_once(tmp_path):
+    batch = batch_of("run", 20)
+    with RealCluster(tmp_path) as cluster:
+        cluster.start_manager()
+        cluster.start_worker("w1")
+        async with cluster.client() as client:
+            await connected(client, "w1")
+            await opened(client, "run", terms=RunTerms(verified=True))
+            results = await asyncio.wait_for(outcomes(client, batch), 60)
+            stats = await client.close_run("run")
+        assert tally(batch, results).clean
+        assert stats.audited == 0
+        assert cluster.log("manager").count("results are not audited: that takes a second worker") == 1
