@@ -3,7 +3,10 @@
 import asyncio
 import os
 import resource
+import shutil
 import signal
+import subprocess
+import sys
 
 import pytest
 
@@ -117,6 +120,50 @@ async def test_what_a_killed_daemon_left_half_written_goes_in_time(tmp_path):
     os.utime(old, (0, 0))
     await cache.path_of(next(iter(source.bundles)))
     assert (old.exists(), young.exists()) == (False, True)
+
+
+SMALL_DISK = """
+import asyncio, sys
+from pathlib import Path
+from embomatrix.worker.cache import BundleCache
+from embomatrix.world.bundle import bundle_digest
+
+bundles = {bundle_digest(content): content for content in (b"a" * 30_000, b"b" * 30_000, b"c" * 30_000)}
+
+async def fetch(digest):
+    return bundles[digest]
+
+async def main():
+    cache = BundleCache(Path(sys.argv[1]), limit_bytes=10**9, fetch=fetch)
+    paths = [await cache.path_of(digest) for digest in bundles]
+    print(*(path.exists() for path in paths), len(list(Path(sys.argv[1]).iterdir())))
+
+asyncio.run(main())
+"""
+ON_SMALL_DISK = ("unshare", "--user", "--map-root-user", "--mount", "sh", "-c")
+MOUNT = 'mount -t tmpfs -o size=72k none "$0"'
+
+
+def _small_disks():
+    """Whether this system lets a person mount a disk of their own."""
+    command = (*ON_SMALL_DISK, MOUNT, "/mnt")
+    return (
+        shutil.which("unshare") is not None
+        and not subprocess.run(command, capture_output=True, check=False).returncode
+    )
+
+
+@pytest.mark.skipif(not _small_disks(), reason="needs a user namespace")
+def test_on_a_full_disk_other_bundles_make_way(tmp_path):
+    command = (
+        *ON_SMALL_DISK,
+        f'{MOUNT} && exec "$1" -c "$2" "$0"',
+        str(tmp_path),
+        sys.executable,
+        SMALL_DISK,
+    )
+    result = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+    assert result.stdout == "False False True 1\n", result.stderr
 
 
 async def test_a_bundle_that_cannot_be_written_leaves_nothing_behind(tmp_path):

@@ -34,7 +34,7 @@ from embomatrix.worker.processes import SIMULATOR_PROGRAM
 from embomatrix.worker.residents import LoadError, SlotLimits
 from embomatrix.worker.session import Session, register
 from embomatrix.worker.slots import SlotPool
-from embomatrix.worker.status import StatusFile, StatusReport, daemon_pids
+from embomatrix.worker.status import StatusReport, daemon_pids
 from embomatrix.worker.takeovers import Takeovers
 
 if TYPE_CHECKING:
@@ -106,8 +106,9 @@ class Daemon:
             on_pause=self._pause,
             on_hand_back=self._hand_back,
         )
-        file = StatusFile(settings.state_dir, self._membership.name)
-        self._report = StatusReport(file, settings, resources, self._pool, self._cache, self._outbox)
+        self._report = StatusReport(
+            self._membership, settings, resources, self._pool, self._cache, self._outbox
+        )
         self._session: Session | None = None
         self._renewed_s = time.monotonic()
         self._lease_ttl_s = math.inf

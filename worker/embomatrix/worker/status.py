@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
     from embomatrix.rpc.values import LeaseResult, Resources
     from embomatrix.worker.cache import BundleCache
+    from embomatrix.worker.membership import Membership
     from embomatrix.worker.outbox import Outbox
     from embomatrix.worker.settings import WorkerSettings
     from embomatrix.worker.slots import SlotPool
@@ -61,7 +62,6 @@ class StatusFile:
     """One daemon's file. A full disk costs the status and nothing else."""
 
     def __init__(self, state_dir: Path, name: str) -> None:
-        self.name = name
         self._path = state_dir.expanduser() / FOLDER / f"{name}.json"
         self._last: WorkerStatus | None = None
 
@@ -92,18 +92,19 @@ class StatusReport:
 
     def __init__(
         self,
-        file: StatusFile,
+        membership: Membership,
         settings: WorkerSettings,
         resources: Resources,
         pool: SlotPool,
         cache: BundleCache,
         outbox: Outbox,
     ) -> None:
-        self._file = file
+        self._file = StatusFile(settings.state_dir, membership.name)
         self._status = WorkerStatus(
-            file.name,
+            membership.name,
             os.getpid(),
             time.time(),
+            membership.manager,
             slots=resources.slots,
             memory_mb=resources.memory_mb,
             cache_mb=settings.cache_mb,
