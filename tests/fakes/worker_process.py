@@ -1,4 +1,6 @@
-"""A worker daemon with the simulation that needs no physics: ``python worker_process.py MANAGER NAME FOLDER SLOTS [WISHES [LIES]]``.
+"""A worker daemon with the simulation that needs no physics.
+
+``python worker_process.py MANAGER NAME FOLDER SLOTS [WISHES [LIES]]``.
 
 WISHES are preferences as JSON. Its owner sits at the terminals in FOLDER/devices. LIES is the share of
 its rollouts for which it makes a reward up.

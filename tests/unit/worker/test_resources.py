@@ -5,7 +5,7 @@ import os
 import pytest
 from pydantic import ValidationError
 
-from embomatrix.worker.gpu import Gpu, ask_program
+from embomatrix.worker.gpu import Gpu, ask_nvml, ask_program, find_gpu
 from embomatrix.worker.resources import fingerprint, measure
 from embomatrix.worker.settings import WorkerSettings
 
@@ -42,6 +42,24 @@ def test_a_gpu_program_that_fails_means_no_gpu(tmp_path, monkeypatch):
     program.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
     assert ask_program() is None
+
+
+def test_slots_render_only_where_a_gpu_has_memory_for_them():
+    assert Gpu().render_slots(8) == 0
+    assert Gpu("A", 1024).render_slots(8) == 0
+    assert Gpu("A", 8192).render_slots(8) == 4
+    assert Gpu("A", 80_000).render_slots(8) == 8
+
+
+def test_a_machine_without_the_driver_of_a_gpu_has_none_and_says_nothing(monkeypatch):
+    monkeypatch.setenv("PATH", "")
+    assert find_gpu() == (ask_nvml() or Gpu())
+
+
+def test_a_machine_tells_its_labels_and_its_free_disk(tmp_path):
+    resources = measure(WorkerSettings(cache_dir=tmp_path / "cache", labels={"room": "attic"}))
+    assert resources.labels == {"room": "attic"}
+    assert resources.disk_mb > 0
 
 
 def test_two_workers_of_one_host_get_different_names():

@@ -51,6 +51,7 @@ def doctor(manager: Manager = DEFAULT_ADDRESS, token: Token = "", ca: Ca = None)
     table.add_row("engine", f"pybullet {resources.versions['pybullet']}")
     table.add_row("platform", resources.versions["platform"])
     table.add_row("slots", f"{resources.slots} (cores)")
+    table.add_row("free for bundles", f"{resources.disk_mb} MB")
     table.add_row("memory for scenes", f"{resources.memory_mb} MB")
     table.add_row("speed", f"{resources.score:.2f} of the reference")
     table.add_row(
