@@ -33,6 +33,7 @@ async def test_a_worker_whose_owner_comes_back_pauses_and_goes_on_later_and_noth
             cluster.type_at("spare")
             await _until_standing(client, "spare", ("paused", "its owner is active"))
             assert not running.done()
+            await until(lambda: [status.paused for status in running_daemons(tmp_path / "spare")] != [""])
             [status] = running_daemons(tmp_path / "spare")
             await _until_standing(client, "spare", ("ready", ""))
             results = await running
@@ -40,4 +41,5 @@ async def test_a_worker_whose_owner_comes_back_pauses_and_goes_on_later_and_noth
         counted = tally(batch, results)
         tell("owner", counted, redispatched=stats.redispatched, told=status.paused)
         assert counted.clean
+        assert status.paused == "its owner is active"
         assert {result.attempt for result in results} == {1}
