@@ -62,6 +62,14 @@ TlsCa = Annotated[Path | None, typer.Option(help="Certificate of who signed it."
 InsecureBind = Annotated[
     bool, typer.Option("--insecure-bind", help="Serve outside this machine without TLS or tokens.")
 ]
+Audit = Annotated[
+    bool | None,
+    typer.Option(
+        "--audit/--no-audit",
+        help="Compare results of every run between workers; by default where others may join.",
+        show_default=False,
+    ),
+]
 LogLines = Annotated[
     LogFormat, typer.Option(help="Log lines for people, or as JSON.", envvar="EMBOMATRIX_LOG_FORMAT")
 ]
@@ -81,6 +89,7 @@ def serve(
     tls_key: TlsKey = None,
     tls_ca: TlsCa = None,
     insecure_bind: InsecureBind = False,
+    audit: Audit = None,
     log_level: Annotated[str, typer.Option(help="debug, info, warning or error.")] = "info",
     log_format: LogLines = LogFormat.HUMAN,
 ) -> None:
@@ -97,6 +106,7 @@ def serve(
         "tls_key": tls_key,
         "tls_ca": tls_ca,
         "insecure_bind": insecure_bind,
+        "audit": audit,
         **({"data_dir": data_dir} if data_dir is not None else {}),
     }
     _log_to_stderr(log_level, log_format)

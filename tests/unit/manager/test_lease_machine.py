@@ -70,6 +70,7 @@ TERMS = st.builds(
     st.sampled_from([0.5, 1.0, 4.0]),
     st.integers(0, 1),
     st.sampled_from([0.0, 30.0]),
+    st.booleans(),
 )
 STANDINGS = (WorkerSuspected, WorkerRecovered, WorkerRecovered, WorkerDrained, WorkerResumed, WorkerResumed)
 workers = st.sampled_from(WORKERS)
