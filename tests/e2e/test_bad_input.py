@@ -269,11 +269,15 @@ def test_what_is_no_checkpoint_can_not_be_evaluated(kitchen, tmp_path):
 
 def test_interrupted_build_leaves_no_dataset_and_can_be_gone_on_with(tmp_path):
     out = tmp_path / "out"
-    arguments = ("factory", "build", f"--out={out}", "--scene=Rs_int", "--train=8", "--heldout=0")
+    arguments = (
+        "factory", "build", f"--out={out}", "--scene=Rs_int", "--train=8", "--heldout=0", "--no-look-ahead"
+    )  # fmt: skip
     with background(tmp_path / "log", *arguments) as building:
         building.wait_for((out / "build.jsonl").exists)
         told = building.interrupt()
     assert_told(told, 130, "interrupted: what was built is kept in", "the same command goes on from there")
     assert not (out / "tasks.jsonl").exists()
-    other = run("factory", "build", f"--out={out}", "--scene=Rs_int", "--train=9", "--heldout=0")
+    other = run(
+        "factory", "build", f"--out={out}", "--scene=Rs_int", "--train=9", "--heldout=0", "--no-look-ahead"
+    )
     assert_told(other, 2, "holds a build of other settings (train 8, now 9): give the same again")

@@ -52,7 +52,8 @@ def demo(
     started_s = time.monotonic()
     if not (dataset / "tasks.jsonl").exists():
         console.rule("tasks")
-        _run(_no_problem, "factory", "build", f"--out={dataset}", f"--seed={seed}")
+        # A run to look at: what the arm of physical mode could not do after all is not looked for.
+        _run(_no_problem, "factory", "build", f"--out={dataset}", f"--seed={seed}", "--no-look-ahead")
     built_s = time.monotonic()
     cluster = local_cluster(folder / "cluster", workers=workers, slots=slots)
     with cluster.supervisor:

@@ -27,4 +27,4 @@ class BuildSettings:
     scenes: tuple[str, ...] = DEFAULT_SCENES
     writer: WriterKind = WriterKind.PLAIN
     look_ahead: bool = True
-    """Whether to find out what the arm can do in each variant: about 8 s of CPU for one."""
+    """Whether to find out what the arm can do in each variant: about 12 s of CPU for one."""
