@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, Self
+from typing import TYPE_CHECKING, Final
 
 from embomatrix.proto.v1 import admin_service_pb2 as pb
 from embomatrix.proto.v1 import admin_service_pb2_grpc
-from embomatrix.rpc.channel import DEFAULT_ADDRESS, open_channel
+from embomatrix.rpc.channel import DEFAULT_ADDRESS
 from embomatrix.rpc.convert import each, inside
 from embomatrix.rpc.convert_log import event_page_from_proto, run_summary_from_proto
 from embomatrix.rpc.convert_session import plan_cell_from_proto, run_info_from_proto, worker_info_from_proto
-from embomatrix.rpc.managers import PATIENCE_S, Channels, Managers, of_the_leader
+from embomatrix.rpc.leader_client import LeaderClient
+from embomatrix.rpc.managers import of_the_leader
 from embomatrix.rpc.status import cluster_errors
 
 if TYPE_CHECKING:
@@ -21,7 +22,7 @@ CALL_S: Final = 10.0
 """For the answer to one call."""
 
 
-class AdminClient:
+class AdminClient(LeaderClient):
     """Async context manager over channels to the manager at HOST:PORT, or to several of which one leads.
 
     Every failure is a ``ClusterError``.
@@ -30,38 +31,12 @@ class AdminClient:
     def __init__(
         self, address: str = DEFAULT_ADDRESS, token: str = "", *, ca: bytes = b"", call_s: float = CALL_S
     ) -> None:
-        self._managers = Managers(address)
-        self._token = token
-        self._ca = ca
+        super().__init__(address, token, ca=ca)
         self._call_s = call_s
-
-    async def __aenter__(self) -> Self:
-        self._channels = Channels(
-            self._managers, lambda address: open_channel(address, self._token, self._ca)
-        )
-        self._channels.present()
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        await self._channels.close()
-
-    @property
-    def managers(self) -> Managers:
-        """Whom this client turns to."""
-        return self._managers
-
-    @property
-    def patience_s(self) -> float:
-        """How long a call is tried anew with the other managers."""
-        return PATIENCE_S
-
-    @property
-    def _address(self) -> str:
-        return self._managers.current
 
     @property
     def _stub(self) -> admin_service_pb2_grpc.AdminServiceAsyncStub:
-        return admin_service_pb2_grpc.AdminServiceStub(self._channels.present())
+        return admin_service_pb2_grpc.AdminServiceStub(self._channel)
 
     @of_the_leader
     async def workers(self) -> tuple[WorkerInfo, ...]:

@@ -7,7 +7,7 @@ import contextlib
 import logging
 import time
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Self
+from typing import TYPE_CHECKING, Final
 
 import grpc
 
@@ -20,7 +20,7 @@ from embomatrix.proto.v1 import (
     scene_service_pb2_grpc,
 )
 from embomatrix.rpc.capabilities import version_with
-from embomatrix.rpc.channel import DEFAULT_ADDRESS, chunks_of, open_channel
+from embomatrix.rpc.channel import DEFAULT_ADDRESS, chunks_of
 from embomatrix.rpc.convert import (
     each,
     inside,
@@ -35,7 +35,8 @@ from embomatrix.rpc.convert_run import (
     run_terms_to_proto,
 )
 from embomatrix.rpc.convert_session import run_info_from_proto, worker_info_from_proto
-from embomatrix.rpc.managers import PATIENCE_S, Channels, Managers, of_the_leader
+from embomatrix.rpc.leader_client import LeaderClient
+from embomatrix.rpc.managers import PATIENCE_S, of_the_leader
 from embomatrix.rpc.status import (
     DeadlineError,
     InternalError,
@@ -88,7 +89,7 @@ _TRANSIENT: Final = (UnavailableError, InternalError, OverloadedError)
 """Errors after which the same batch is attached again rather than given up."""
 
 
-class ClusterClient:
+class ClusterClient(LeaderClient):
     """Async context manager over channels to the manager, or to several (``A:PORT,B:PORT``) of which one leads; by TLS if
     ``ca`` (PEM) names whom to trust.
 
@@ -103,46 +104,20 @@ class ClusterClient:
         ca: bytes = b"",
         limits: ClientLimits = DEFAULT_LIMITS,
     ) -> None:
-        self._managers = Managers(address)
-        self._token = token
-        self._ca = ca
+        super().__init__(address, token, ca=ca, patience_s=limits.failover_s)
         self._limits = limits
-
-    async def __aenter__(self) -> Self:
-        self._channels = Channels(
-            self._managers, lambda address: open_channel(address, self._token, self._ca)
-        )
-        self._channels.present()
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        await self._channels.close()
-
-    @property
-    def managers(self) -> Managers:
-        """Whom this client turns to."""
-        return self._managers
-
-    @property
-    def patience_s(self) -> float:
-        """How long a call is tried anew with the other managers."""
-        return self._limits.failover_s
-
-    @property
-    def _address(self) -> str:
-        return self._managers.current
 
     @property
     def _rollouts(self) -> rollout_service_pb2_grpc.RolloutServiceAsyncStub:
-        return rollout_service_pb2_grpc.RolloutServiceStub(self._channels.present())
+        return rollout_service_pb2_grpc.RolloutServiceStub(self._channel)
 
     @property
     def _scenes(self) -> scene_service_pb2_grpc.SceneServiceAsyncStub:
-        return scene_service_pb2_grpc.SceneServiceStub(self._channels.present())
+        return scene_service_pb2_grpc.SceneServiceStub(self._channel)
 
     @property
     def _admin(self) -> admin_service_pb2_grpc.AdminServiceAsyncStub:
-        return admin_service_pb2_grpc.AdminServiceStub(self._channels.present())
+        return admin_service_pb2_grpc.AdminServiceStub(self._channel)
 
     @of_the_leader
     async def open_run(self, name: str, run_id: str = "", terms: RunTerms = DEFAULT_TERMS) -> str:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, Self
+from typing import TYPE_CHECKING, Final
 
 from embomatrix.proto.v1 import admin_service_pb2 as pb
 from embomatrix.proto.v1 import admin_service_pb2_grpc
-from embomatrix.rpc.channel import DEFAULT_ADDRESS, open_channel
+from embomatrix.rpc.channel import DEFAULT_ADDRESS
 from embomatrix.rpc.client import DEFAULT_LIMITS, ClientLimits
 from embomatrix.rpc.convert import ConvertError, each, finite, required
-from embomatrix.rpc.managers import PATIENCE_S, Channels, Managers, of_the_leader
+from embomatrix.rpc.leader_client import LeaderClient
+from embomatrix.rpc.managers import of_the_leader
 from embomatrix.rpc.roles import Role, TokenInfo
 from embomatrix.rpc.status import cluster_errors
 
@@ -51,7 +52,7 @@ def token_info_from_proto(message: pb.TokenInfo) -> TokenInfo:
     )
 
 
-class TokenClient:
+class TokenClient(LeaderClient):
     """Async context manager over channels to the manager, or to several of which one leads.
 
     Every failure is a ``ClusterError``.
@@ -65,38 +66,12 @@ class TokenClient:
         ca: bytes = b"",
         limits: ClientLimits = DEFAULT_LIMITS,
     ) -> None:
-        self._managers = Managers(address)
-        self._token = token
-        self._ca = ca
+        super().__init__(address, token, ca=ca, patience_s=limits.failover_s)
         self._limits = limits
-
-    async def __aenter__(self) -> Self:
-        self._channels = Channels(
-            self._managers, lambda address: open_channel(address, self._token, self._ca)
-        )
-        self._channels.present()
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        await self._channels.close()
-
-    @property
-    def managers(self) -> Managers:
-        """Whom this client turns to."""
-        return self._managers
-
-    @property
-    def patience_s(self) -> float:
-        """How long a call is tried anew with the other managers."""
-        return PATIENCE_S
-
-    @property
-    def _address(self) -> str:
-        return self._managers.current
 
     @property
     def _admin(self) -> admin_service_pb2_grpc.AdminServiceAsyncStub:
-        return admin_service_pb2_grpc.AdminServiceStub(self._channels.present())
+        return admin_service_pb2_grpc.AdminServiceStub(self._channel)
 
     @of_the_leader
     async def issue(self, role: Role, *, valid_s: float = 0.0, label: str = "") -> tuple[str, str]:
