@@ -5,6 +5,7 @@ import asyncio
 from tests.fakes.real_cluster import RealCluster, batch_of, connected, opened, outcomes, tally, tell
 from tests.fakes.simulation import graded_total
 
+from embomatrix.manager.intake import TICK_S
 from embomatrix.rpc.values import GroupPolicy, RunTerms
 
 HONEST = ("w1", "w2", "w3")
@@ -55,4 +56,9 @@ async def test_one_worker_alone_is_not_audited_and_the_manager_says_so_once(tmp_
             stats = await client.close_run("run")
         assert tally(batch, results).clean
         assert stats.audited == 0
-        assert cluster.log("manager").count("results are not audited: that takes a second worker") == 1
+        said = "results are not audited: that takes a second worker"
+        async with asyncio.timeout(20):
+            while said not in cluster.log("manager"):  # noqa: ASYNC110  # a file tells nobody
+                await asyncio.sleep(0.05)
+        await asyncio.sleep(4 * TICK_S)
+        assert cluster.log("manager").count(said) == 1

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from embomatrix.manager.bundles import BundleStore
 from embomatrix.manager.cli import app
 from embomatrix.manager.meter import Meter, quantile
-from embomatrix.manager.results import BatchLog, ResultLogs
+from embomatrix.manager.results import PER_MESSAGE, BatchLog, ResultLogs
 from embomatrix.manager.settings import ManagerSettings
 from embomatrix.manager.store.protocol import ResultRow
 from embomatrix.rpc.status import InvalidRequestError, NotFoundError, OverloadedError
@@ -42,9 +42,9 @@ async def test_a_message_takes_what_came_while_it_lingered_and_no_more_than_it_c
     log = BatchLog("r1", "b1", "d", rows(1, 1))
     reader = asyncio.create_task(log.after(0))
     await asyncio.sleep(0)
-    log.append(rows(2, 200))
-    assert [row.cursor for row in await reader] == list(range(1, 65))
-    assert len(await log.after(190)) == 10
+    log.append(rows(2, PER_MESSAGE + 100))
+    assert [row.cursor for row in await reader] == list(range(1, PER_MESSAGE + 1))
+    assert len(await log.after(PER_MESSAGE + 90)) == 10
 
 
 async def test_a_dropped_log_lets_its_readers_go():
