@@ -15,6 +15,8 @@ from embomatrix.cli.local_cluster import local_cluster
 from embomatrix.cli.supervisor import embomatrix_command
 
 STEPS = 12
+HOLD_S = 2.5
+"""Longer than a step takes to reach the workers, shorter than the silence after which the manager gives a worker nothing."""
 pytestmark = pytest.mark.timeout(420)
 
 
@@ -39,6 +41,9 @@ def run(tmp_path_factory):
             _training(dataset, cluster.address, out), text=True, stdout=subprocess.PIPE
         )
         _until(lambda: len(_metrics(out)) >= 2, trainer)
+        # Rollouts take milliseconds: stopped, the worker holds what it is given until it dies.
+        os.kill(children.pid("worker-1"), signal.SIGSTOP)
+        time.sleep(HOLD_S)
         os.kill(children.pid("worker-1"), signal.SIGKILL)
         told, _ = trainer.communicate(timeout=240)
         assert trainer.returncode == 0, told
