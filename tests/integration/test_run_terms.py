@@ -164,7 +164,7 @@ async def test_a_paused_worker_keeps_its_scenes_and_gets_nothing_new(tmp_path):
         worker.pause("the owner is back")
         await until(lambda: worker.residents)
         await asyncio.sleep(0.1)
-        (found,) = await admin.workers()
+        (found,) = await admin.list_workers()
         assert found.state == "paused"
         assert found.reason == "the owner is back"
         batch = Batch("r1", "b2", 2, (Rollout("y0", "g", KITCHEN, "t", (), 0),))
@@ -183,10 +183,10 @@ async def test_a_drain_is_taken_back(tmp_path):
         FakeWorker(address) as worker,
         AdminClient(address) as admin,
     ):
-        await admin.drain("w1")
-        assert (await admin.workers())[0].state == "draining"
+        await admin.drain_worker("w1")
+        assert (await admin.list_workers())[0].state == "draining"
         await admin.resume("w1")
-        assert (await admin.workers())[0].state == "ready"
+        assert (await admin.list_workers())[0].state == "ready"
         await until(lambda: worker.resumed)
         results, _ = await events(client, batch_of("t"))
         assert isinstance(results["x0"], Completed)

@@ -128,4 +128,4 @@ async def test_a_manager_that_stands_by_names_the_leader(tmp_path):
         both_of_them = f"127.0.0.1:{cluster.ports['second']},127.0.0.1:{cluster.ports['first']}"
         async with ClusterClient(both_of_them) as client, AdminClient(both_of_them) as admin:
             assert await client.open_run("x", "x") == "x"
-            assert [run.run_id for run in await admin.open_runs()] == ["x"]
+            assert [run.run_id for run in await admin.list_runs()] == ["x"]

@@ -12,8 +12,6 @@ from typing import TYPE_CHECKING, Final
 import grpc
 
 from embomatrix.proto.v1 import (
-    admin_service_pb2,
-    admin_service_pb2_grpc,
     rollout_service_pb2,
     rollout_service_pb2_grpc,
     scene_service_pb2,
@@ -34,8 +32,7 @@ from embomatrix.rpc.convert_run import (
     run_stats_from_proto,
     run_terms_to_proto,
 )
-from embomatrix.rpc.convert_session import run_info_from_proto, worker_info_from_proto
-from embomatrix.rpc.leader_client import LeaderClient
+from embomatrix.rpc.fleet_client import FleetClient
 from embomatrix.rpc.managers import PATIENCE_S, of_the_leader
 from embomatrix.rpc.status import (
     DeadlineError,
@@ -57,10 +54,8 @@ if TYPE_CHECKING:
         GroupDone,
         LookaheadAnswer,
         LookaheadEntry,
-        RunInfo,
         RunStats,
         Warmth,
-        WorkerInfo,
     )
 
 logger = logging.getLogger(__name__)
@@ -89,7 +84,7 @@ _TRANSIENT: Final = (UnavailableError, InternalError, OverloadedError)
 """Errors after which the same batch is attached again rather than given up."""
 
 
-class ClusterClient(LeaderClient):
+class ClusterClient(FleetClient):
     """Async context manager over channels to the manager, or to several (``A:PORT,B:PORT``) of which one leads; by TLS if
     ``ca`` (PEM) names whom to trust.
 
@@ -104,7 +99,7 @@ class ClusterClient(LeaderClient):
         ca: bytes = b"",
         limits: ClientLimits = DEFAULT_LIMITS,
     ) -> None:
-        super().__init__(address, token, ca=ca, patience_s=limits.failover_s)
+        super().__init__(address, token, ca=ca, call_s=limits.call_s, patience_s=limits.failover_s)
         self._limits = limits
 
     @property
@@ -114,10 +109,6 @@ class ClusterClient(LeaderClient):
     @property
     def _scenes(self) -> scene_service_pb2_grpc.SceneServiceAsyncStub:
         return scene_service_pb2_grpc.SceneServiceStub(self._channel)
-
-    @property
-    def _admin(self) -> admin_service_pb2_grpc.AdminServiceAsyncStub:
-        return admin_service_pb2_grpc.AdminServiceStub(self._channel)
 
     @of_the_leader
     async def open_run(self, name: str, run_id: str = "", terms: RunTerms = DEFAULT_TERMS) -> str:
@@ -247,29 +238,6 @@ class ClusterClient(LeaderClient):
         with cluster_errors(self._address):
             answer = await self._rollouts.CloseRun(request, timeout=self._limits.call_s)
             return inside("stats", run_stats_from_proto, answer.stats)
-
-    @of_the_leader
-    async def list_workers(self) -> tuple[WorkerInfo, ...]:
-        """The workers that the manager knows."""
-        with cluster_errors(self._address):
-            request = admin_service_pb2.ListWorkersRequest()
-            answer = await self._admin.ListWorkers(request, timeout=self._limits.call_s)
-            return each("workers", worker_info_from_proto, answer.workers)
-
-    @of_the_leader
-    async def list_runs(self) -> tuple[RunInfo, ...]:
-        """The runs that are open."""
-        with cluster_errors(self._address):
-            request = admin_service_pb2.ListRunsRequest()
-            answer = await self._admin.ListRuns(request, timeout=self._limits.call_s)
-            return each("runs", run_info_from_proto, answer.runs)
-
-    @of_the_leader
-    async def drain_worker(self, worker_id: str) -> None:
-        """Ask a worker to finish what it runs and to leave."""
-        request = admin_service_pb2.DrainWorkerRequest(worker_id=worker_id)
-        with cluster_errors(self._address):
-            await self._admin.DrainWorker(request, timeout=self._limits.call_s)
 
 
 class _AttachedBatch:

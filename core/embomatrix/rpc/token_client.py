@@ -5,11 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.proto.v1 import admin_service_pb2 as pb
-from embomatrix.proto.v1 import admin_service_pb2_grpc
-from embomatrix.rpc.channel import DEFAULT_ADDRESS
-from embomatrix.rpc.client import DEFAULT_LIMITS, ClientLimits
 from embomatrix.rpc.convert import ConvertError, each, finite, required
-from embomatrix.rpc.leader_client import LeaderClient
+from embomatrix.rpc.fleet_client import FleetClient
 from embomatrix.rpc.managers import of_the_leader
 from embomatrix.rpc.roles import Role, TokenInfo
 from embomatrix.rpc.status import cluster_errors
@@ -52,54 +49,34 @@ def token_info_from_proto(message: pb.TokenInfo) -> TokenInfo:
     )
 
 
-class TokenClient(LeaderClient):
-    """Async context manager over channels to the manager, or to several of which one leads.
-
-    Every failure is a ``ClusterError``.
-    """
-
-    def __init__(
-        self,
-        address: str = DEFAULT_ADDRESS,
-        token: str = "",
-        *,
-        ca: bytes = b"",
-        limits: ClientLimits = DEFAULT_LIMITS,
-    ) -> None:
-        super().__init__(address, token, ca=ca, patience_s=limits.failover_s)
-        self._limits = limits
-
-    @property
-    def _admin(self) -> admin_service_pb2_grpc.AdminServiceAsyncStub:
-        return admin_service_pb2_grpc.AdminServiceStub(self._channel)
+class TokenClient(FleetClient):
+    """Async context manager over channels to a cluster. Every failure is a ``ClusterError``."""
 
     @of_the_leader
     async def issue(self, role: Role, *, valid_s: float = 0.0, label: str = "") -> tuple[str, str]:
         """A new token and its id; the manager keeps only its hash. ``valid_s`` 0: until revoked."""
         request = pb.IssueTokenRequest(role=_ROLES[role], valid_s=valid_s, label=label)
         with cluster_errors(self._address):
-            answer = await self._admin.IssueToken(request, timeout=self._limits.call_s)
+            answer = await self._admin.IssueToken(request, timeout=self._call_s)
         return answer.token, answer.token_id
 
     @of_the_leader
     async def listed(self) -> tuple[TokenInfo, ...]:
         """The tokens that are valid."""
         with cluster_errors(self._address):
-            answer = await self._admin.ListTokens(pb.ListTokensRequest(), timeout=self._limits.call_s)
+            answer = await self._admin.ListTokens(pb.ListTokensRequest(), timeout=self._call_s)
             return each("tokens", token_info_from_proto, answer.tokens)
 
     @of_the_leader
     async def revoke(self, token_id: str) -> None:
         """Make a token void; sessions that it opened end at once."""
         with cluster_errors(self._address):
-            await self._admin.RevokeToken(
-                pb.RevokeTokenRequest(token_id=token_id), timeout=self._limits.call_s
-            )
+            await self._admin.RevokeToken(pb.RevokeTokenRequest(token_id=token_id), timeout=self._call_s)
 
     @of_the_leader
     async def revoke_worker(self, worker_id: str, reason: str = "") -> None:
         """Make a worker's credential void: its session ends, and what it held goes to others."""
         with cluster_errors(self._address):
             await self._admin.RevokeWorker(
-                pb.RevokeWorkerRequest(worker_id=worker_id, reason=reason), timeout=self._limits.call_s
+                pb.RevokeWorkerRequest(worker_id=worker_id, reason=reason), timeout=self._call_s
             )

@@ -29,7 +29,7 @@ from embomatrix.rpc.token_client import TokenClient
 from embomatrix.rpc.trust import read_ca, read_token
 
 if TYPE_CHECKING:
-    from collections.abc import Coroutine
+    from collections.abc import Callable, Coroutine
 
     from embomatrix.rpc.run_log import RunEvent, RunSummary
 
@@ -66,17 +66,13 @@ def workers(
 ) -> None:
     """List the workers: state, slots, scenes, and why one does not work."""
 
-    async def ask() -> None:
-        async with _client(manager, token, ca) as client:
-            found = await client.workers()
-        if as_json:
-            show_json(found)
-        elif found:
-            show(worker_table(found))
-        else:
-            print("no workers: start one with `embomatrix worker run`")
-
-    _ask(ask())
+    found = _asked(manager, token, ca, lambda client: client.list_workers())
+    if as_json:
+        show_json(found)
+    elif found:
+        show(worker_table(found))
+    else:
+        print("no workers: start one with `embomatrix worker run`")
 
 
 @app.command()
@@ -89,17 +85,13 @@ def runs(
 ) -> None:
     """List the runs that are open, or those that were closed."""
 
-    async def ask() -> None:
-        async with _client(manager, token, ca) as client:
-            found = await (client.closed_runs() if closed else client.open_runs())
-        if as_json:
-            show_json(found)
-        elif found:
-            show(run_table(found))
-        else:
-            print("no closed runs are kept" if closed else "no open runs; closed ones: --closed")
-
-    _ask(ask())
+    found = _asked(manager, token, ca, lambda client: client.list_runs(closed=closed))
+    if as_json:
+        show_json(found)
+    elif found:
+        show(run_table(found))
+    else:
+        print("no closed runs are kept" if closed else "no open runs; closed ones: --closed")
 
 
 @app.command()
@@ -112,17 +104,13 @@ def plan(
 ) -> None:
     """Show the look-ahead grid: which scenes each coming step needs, how warm each is, and where."""
 
-    async def ask() -> None:
-        async with _client(manager, token, ca) as client:
-            cells = await client.plan(run)
-        if as_json:
-            show_json(cells)
-        elif cells:
-            show(plan_table(cells))
-        else:
-            print("nothing is announced: trainers tell the scenes of coming steps with AnnounceLookahead")
-
-    _ask(ask())
+    cells = _asked(manager, token, ca, lambda client: client.plan(run))
+    if as_json:
+        show_json(cells)
+    elif cells:
+        show(plan_table(cells))
+    else:
+        print("nothing is announced: trainers tell the scenes of coming steps with AnnounceLookahead")
 
 
 @app.command()
@@ -135,12 +123,8 @@ def drain(
 ) -> None:
     """Take a worker out: it finishes what it holds and gets nothing new."""
 
-    async def ask() -> None:
-        async with _client(manager, token, ca) as client:
-            await client.drain(name)
-        _done(as_json, worker=name, state="draining")
-
-    _ask(ask())
+    _asked(manager, token, ca, lambda client: client.drain_worker(name))
+    _done(as_json, worker=name, state="draining")
 
 
 @app.command()
@@ -153,12 +137,8 @@ def resume(
 ) -> None:
     """Take a drain back, as long as the worker has not left."""
 
-    async def ask() -> None:
-        async with _client(manager, token, ca) as client:
-            await client.resume(name)
-        _done(as_json, worker=name, state="ready")
-
-    _ask(ask())
+    _asked(manager, token, ca, lambda client: client.resume(name))
+    _done(as_json, worker=name, state="ready")
 
 
 @app.command()
@@ -186,12 +166,8 @@ def pause(
 ) -> None:
     """Give no new leases, to any worker; what runs goes on."""
 
-    async def ask() -> None:
-        async with _client(manager, token, ca) as client:
-            await client.pause_dispatch()
-        _done(as_json, dispatch="paused")
-
-    _ask(ask())
+    _asked(manager, token, ca, lambda client: client.pause_dispatch())
+    _done(as_json, dispatch="paused")
 
 
 @app.command("resume-dispatch")
@@ -200,12 +176,8 @@ def resume_dispatch(
 ) -> None:
     """Give leases again."""
 
-    async def ask() -> None:
-        async with _client(manager, token, ca) as client:
-            await client.resume_dispatch()
-        _done(as_json, dispatch="running")
-
-    _ask(ask())
+    _asked(manager, token, ca, lambda client: client.resume_dispatch())
+    _done(as_json, dispatch="running")
 
 
 @app.command()
@@ -286,6 +258,18 @@ async def _read(
 
 def _client(manager: str, token: str, ca: Path | None) -> AdminClient:
     return AdminClient(manager, read_token(token), ca=read_ca(ca))
+
+
+def _asked(
+    manager: str, token: str, ca: Path | None, question: Callable[[AdminClient], Coroutine[None, None, T]]
+) -> T:
+    """The answer to one question to the manager."""
+
+    async def ask() -> T:
+        async with _client(manager, token, ca) as client:
+            return await question(client)
+
+    return _ask(ask())
 
 
 def _ask(question: Coroutine[None, None, T]) -> T:
