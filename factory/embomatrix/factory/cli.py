@@ -14,6 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from embomatrix.factory.assets_cli import app as assets_app
+from embomatrix.factory.evaluate.cli import app as evaluate_app
 from embomatrix.factory.pipeline.build import Summary, build_dataset
 from embomatrix.factory.pipeline.settings import DEFAULT_SCENES, BuildSettings, WriterKind
 from embomatrix.factory.refusal import Refusal
@@ -50,6 +51,7 @@ app = typer.Typer(
     help="Make verified tasks.", no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False
 )
 app.add_typer(assets_app, name="assets")
+app.add_typer(evaluate_app, name="evaluate")
 EVERY_ACTIVITY = "all"
 MOST_JOBS = 8
 """Each holds some scenes: a few hundred MB."""

@@ -1,0 +1,200 @@
+"""``embomatrix factory evaluate``: measure tasks and scenes, write figures, put them on the page of benchmarks."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NoReturn
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from embomatrix.factory.evaluate.drafts import asked_of
+from embomatrix.factory.evaluate.figures import (
+    Evaluation,
+    EvaluationError,
+    Figure,
+    evaluation_to_json,
+    read_evaluation,
+)
+from embomatrix.factory.evaluate.judge import judged
+from embomatrix.factory.evaluate.measure import evaluate_aesthetics, evaluate_tasks, written_for
+from embomatrix.factory.evaluate.page import with_factory
+from embomatrix.factory.evaluate.tasks import panel, people_of
+from embomatrix.factory.pipeline.corpus import training_scenes
+from embomatrix.factory.pipeline.store import TRANSCRIPTS_FOLDER
+from embomatrix.llm.cassette import Cassette, CassetteMode
+from embomatrix.llm.endpoint import Endpoint
+from embomatrix.llm.values import LlmError
+from embomatrix.world.catalog import CatalogError
+from embomatrix.world.dataset import Dataset, DatasetError
+from embomatrix.world.whole_file import write_whole
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping, Sequence
+
+    from embomatrix.factory.evaluate.drafts import Asked
+    from embomatrix.llm.values import ChatModel
+
+app = typer.Typer(
+    help="Measure tasks and scenes; figures go to JSON and to the page of benchmarks.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+PAGE = Path("docs/benchmarks.md")
+JsonFile = Annotated[Path | None, typer.Option("--json", help="File for the figures.")]
+Seed = Annotated[int, typer.Option(min=0, help="Equal seeds give equal figures.")]
+
+
+@app.command()
+def tasks(
+    dataset: Annotated[
+        Path | None,
+        typer.Option(help="Measure the tasks of this dataset; without it both writers draft some."),
+    ] = None,
+    scenes: Annotated[
+        list[str] | None,
+        typer.Option(help="Base scene; give it again for more. Default: the 45 to train on."),
+    ] = None,
+    each: Annotated[int, typer.Option(min=2, help="Tasks of a scene; the paper takes 10.")] = 10,
+    seed: Seed = 0,
+    json_file: JsonFile = None,
+    llm: Annotated[str, typer.Option(help="Endpoint whose model scores each scene's tasks as well.")] = "",
+    model: Annotated[str, typer.Option(help="Name of the model there.")] = "",
+    key: Annotated[str, typer.Option("--llm-key", envvar="EMBOMATRIX_LLM_KEY", help="Its key.")] = "",
+    cassette: Annotated[
+        Path | None, typer.Option(help="Recorded answers: read where it has them, added to where not.")
+    ] = None,
+) -> None:
+    """Diversity of instructions and goals, with and without social simulation."""
+    with _mended():
+        if llm and not model:
+            raise EvaluationError("--llm needs the name of a model there: give --model")
+        if dataset is not None:
+            groups, evaluation = _of_dataset(dataset, each)
+        else:
+            chosen = tuple(dict.fromkeys(scenes or training_scenes()))
+            with _progress("scenes", len(chosen)) as advance:
+                written = written_for(chosen, each, seed, advance)
+            groups, evaluation = written.social, evaluate_tasks(written, each, seed)
+        if llm or cassette is not None:
+            verdicts = asyncio.run(_judged(groups, llm, model, key, cassette, seed))
+            evaluation = replace(evaluation, figures=(*evaluation.figures, *verdicts))
+        _hand_in(evaluation, json_file)
+
+
+@app.command()
+def aesthetics(
+    rooms: Annotated[Path, typer.Option(help="Table of hand-made rooms, gzipped JSON.")],
+    seed: Seed = 0,
+    json_file: JsonFile = None,
+    calibration: Annotated[
+        Path | None, typer.Option(help="File for weights that are fitted to all of the rooms.")
+    ] = None,
+) -> None:
+    """How well the geometric score tells hand-made rooms from spoilt ones that its fit did not see."""
+    with _mended():
+        evaluation, fitted = evaluate_aesthetics(rooms, seed)
+        if calibration is not None:
+            write_whole(calibration, (json.dumps(asdict(fitted), indent=1) + "\n").encode("ascii"))
+        _hand_in(evaluation, json_file)
+
+
+@app.command()
+def page(
+    files: Annotated[list[Path], typer.Argument(help="Files that `evaluate PART --json` wrote.")],
+    out: Annotated[Path, typer.Option(help="Page whose part on the factory is replaced.")] = PAGE,
+) -> None:
+    """Write the factory's part of the page of benchmarks."""
+    with _mended(out):
+        evaluations = [read_evaluation(file) for file in files]
+        before = out.read_text(encoding="utf-8") if out.exists() else ""
+        write_whole(out, with_factory(before, evaluations).encode("utf-8"))
+    Console().print(f"page: {out}", highlight=False)
+
+
+def _of_dataset(folder: Path, each: int) -> tuple[Mapping[str, Sequence[Asked]], Evaluation]:
+    groups = asked_of(Dataset.load(folder).records, each)
+    if not groups:
+        raise EvaluationError(f"no base scene of {folder} has {each} tasks: ask for fewer with --each")
+    figures = panel(groups, people_of(folder / TRANSCRIPTS_FOLDER))
+    conditions = {"dataset": folder.name, "scenes": len(groups), "tasks a scene": each}
+    return groups, Evaluation("tasks", conditions, figures)
+
+
+async def _judged(
+    groups: Mapping[str, Sequence[Asked]], url: str, model: str, key: str, cassette: Path | None, seed: int
+) -> tuple[Figure, ...]:
+    """Mean scores of a language model over the scenes."""
+    async with contextlib.AsyncExitStack() as stack:
+        judge: ChatModel | None = None
+        if url:
+            judge = await stack.enter_async_context(Endpoint(url, model, api_key=key))
+        if cassette is not None:
+            judge = Cassette(cassette, CassetteMode.AUTO if judge else CassetteMode.REPLAY, judge)
+        assert judge is not None  # the caller gave a URL or a cassette
+        verdicts = [
+            await judged(judge, [asked.instruction for asked in group], seed) for group in groups.values()
+        ]
+    return tuple(
+        Figure(
+            f"judge {name}",
+            float(np.mean([getattr(each, name) for each in verdicts])),
+            "of 10",
+            len(verdicts),
+        )
+        for name in ("variety", "characters", "overall")
+    )
+
+
+def _hand_in(evaluation: Evaluation, json_file: Path | None) -> None:
+    table = Table("figure", "value", "goal", "", "n")
+    for figure in evaluation.figures:
+        goal = "" if figure.goal is None else f"{'≤' if figure.better == 'lower' else '≥'} {figure.goal:.3g}"
+        verdict = "" if figure.goal is None else "reached" if figure.is_reached else "short"
+        table.add_row(figure.name, f"{figure.value:.3g} {figure.unit}".strip(), goal, verdict, str(figure.n))
+    Console().print(table)
+    for note in evaluation.notes:
+        Console().print(note, highlight=False, markup=False)
+    if json_file is not None:
+        with _mended(json_file):
+            write_whole(
+                json_file, (json.dumps(evaluation_to_json(evaluation), indent=1) + "\n").encode("ascii")
+            )
+
+
+@contextlib.contextmanager
+def _progress(what: str, total: int) -> Iterator[Callable[[int], None]]:
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True)) as bars:
+        bar = bars.add_task(what, total=total)
+        yield lambda done: bars.update(bar, completed=done)
+
+
+@contextlib.contextmanager
+def _mended(out: Path | None = None) -> Iterator[None]:
+    """What a person can mend is one sentence and exit status 2, an interrupt one and 130."""
+    try:
+        yield
+    except (CatalogError, DatasetError, EvaluationError, LlmError) as error:
+        _fail(str(error), 2)
+    except OSError as error:
+        if out is None:
+            raise
+        _fail(f"{out} can't be written ({error.strerror}): make room, or name another file", 2)
+    except KeyboardInterrupt:
+        _fail("interrupted: nothing was written", 130)
+
+
+def _fail(sentence: str, status: int) -> NoReturn:
+    Console(stderr=True).print(
+        f"embomatrix factory evaluate: {sentence}", highlight=False, markup=False, soft_wrap=True
+    )
+    raise typer.Exit(status) from None

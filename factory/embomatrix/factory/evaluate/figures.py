@@ -1,0 +1,100 @@
+"""What an evaluation hands in: figures with their goals, in the form of the benches' files, and how they were measured."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+
+class EvaluationError(Exception):
+    """An evaluation can't be made or read. One sentence that names the remedy."""
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """One number of ``n`` measurements. ``goal`` is in the same unit, None where none is set.
+
+    ``better`` is "higher", "lower", or empty for what is neither.
+    """
+
+    name: str
+    value: float
+    unit: str
+    n: int
+    better: str = ""
+    goal: float | None = None
+
+    @property
+    def is_reached(self) -> bool:
+        """Whether the value is at least as good as its goal; true without one."""
+        if self.goal is None:
+            return True
+        return self.value <= self.goal if self.better == "lower" else self.value >= self.goal
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """Figures of one part. ``conditions`` say what was measured, as plain JSON values; ``notes`` are sentences for the page."""
+
+    part: str
+    conditions: Mapping[str, Any]
+    figures: tuple[Figure, ...]
+    notes: tuple[str, ...] = ()
+
+    def figure(self, name: str) -> Figure:
+        """The figure of that name. Raises KeyError."""
+        return {figure.name: figure for figure in self.figures}[name]
+
+
+def evaluation_to_json(evaluation: Evaluation) -> dict[str, Any]:
+    """Plain JSON values; numbers with six digits."""
+    return {
+        "part": evaluation.part,
+        "conditions": dict(evaluation.conditions),
+        "figures": [
+            {
+                "name": figure.name,
+                "value": float(f"{figure.value:.6g}"),
+                "unit": figure.unit,
+                "n": figure.n,
+                "better": figure.better,
+                "goal": figure.goal,
+            }
+            for figure in evaluation.figures
+        ],
+        "notes": list(evaluation.notes),
+    }
+
+
+def read_evaluation(path: Path) -> Evaluation:
+    """What `evaluation_to_json` made, from a file. Raises EvaluationError when it is none."""
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+        return Evaluation(
+            str(value["part"]),
+            dict(value["conditions"]),
+            tuple(_figure_from(item) for item in value["figures"]),
+            tuple(map(str, value["notes"])),
+        )
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise EvaluationError(
+            f"{path} holds no figures of an evaluation ({error}): expected a file that 'embomatrix factory evaluate' "
+            "wrote with --json"
+        ) from error
+
+
+def _figure_from(item: Mapping[str, Any]) -> Figure:
+    goal = None if item["goal"] is None else float(item["goal"])
+    return Figure(
+        str(item["name"]),
+        float(item["value"]),
+        str(item["unit"]),
+        int(item["n"]),
+        str(item["better"]),
+        goal,
+    )

@@ -1,0 +1,239 @@
+"""Evaluations: diversity of tasks, a score of layouts that tells good rooms from spoilt ones, and the page of figures."""
+
+import dataclasses
+import gzip
+import json
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from embomatrix.factory.cli import app
+from embomatrix.factory.evaluate.aesthetics import Calibration, auc, features_of, fit, score_room
+from embomatrix.factory.evaluate.drafts import Asked, asked_in
+from embomatrix.factory.evaluate.figures import (
+    Evaluation,
+    EvaluationError,
+    Figure,
+    evaluation_to_json,
+    read_evaluation,
+)
+from embomatrix.factory.evaluate.judge import Verdict
+from embomatrix.factory.evaluate.page import BEGIN, END, with_factory
+from embomatrix.factory.evaluate.rooms import FLOOR, Item, RoomPlan, plan_of, read_rooms
+from embomatrix.factory.evaluate.spoiling import SPOILERS
+from embomatrix.factory.evaluate.tasks import evenness, panel, people_of
+from embomatrix.factory.pipeline.corpus import HELDOUT_SCENES, training_scenes
+from embomatrix.factory.social.milieus import NAMES
+from embomatrix.factory.social.writer import SocialWriter
+from embomatrix.world.catalog import Catalog
+
+BED = Item("bed", (1.0, 0.8), (1.0, 0.8), 0.0, 0.0, 0.6, FLOOR)
+DESK = Item("desk", (3.7, 3.0), (0.3, 0.7), 0.0, 0.0, 0.75, FLOOR)
+CHAIR = Item("chair", (3.2, 3.0), (0.25, 0.25), 0.0, 0.0, 0.9, FLOOR)
+BOOK = Item("book", (3.7, 3.2), (0.1, 0.1), 0.0, 0.75, 0.8, "desk")
+PILLOW = Item("pillow", (0.4, 0.8), (0.2, 0.3), 0.0, 0.6, 0.7, "bed")
+ROOM = RoomPlan("bedroom_0", (0.0, 0.0), (4.0, 4.0), (BED, DESK, CHAIR), (BOOK, PILLOW), (1, 0))
+HOSTS = {"book": {"desk": 1.0, "bed": 0.2}, "pillow": {"bed": 1.0}}
+
+
+def test_a_room_as_people_have_it_has_every_feature_but_the_free_floor_at_its_best():
+    features = features_of(ROOM, HOSTS)
+    assert {name for name, value in features.items() if value < 1} == {"walkable"}
+    assert features["walkable"] > 0.7
+
+
+@pytest.mark.parametrize(
+    ("feature", "change"),
+    [
+        ("apart", {"pieces": (BED, DESK, CHAIR, dataclasses.replace(BED, center_m=(1.5, 1.2)))}),
+        ("straight", {"pieces": (dataclasses.replace(BED, tilt_rad=0.3), DESK, CHAIR)}),
+        ("at_wall", {"pieces": (dataclasses.replace(BED, center_m=(2.0, 1.5)), DESK, CHAIR)}),
+        ("within", {"pieces": (dataclasses.replace(BED, center_m=(0.5, 0.8)), DESK, CHAIR)}),
+        ("seated", {"pieces": (BED, DESK, dataclasses.replace(CHAIR, center_m=(0.5, 3.5)))}),
+        ("hosted", {"things": (dataclasses.replace(PILLOW, host="desk"),), "carried": (1,)}),
+        ("things_apart", {"things": (BOOK, dataclasses.replace(BOOK, center_m=(3.75, 3.2))), "carried": (1, 1)}),
+        ("in_reach", {"things": (dataclasses.replace(BOOK, low_m=1.9, high_m=2.0),), "carried": (1,)}),
+    ],
+)  # fmt: skip
+def test_each_feature_falls_with_what_it_is_about(feature, change):
+    spoilt = dataclasses.replace(ROOM, **change)
+    assert features_of(spoilt, HOSTS)[feature] < features_of(ROOM, HOSTS)[feature]
+
+
+def test_a_feature_that_a_room_has_nothing_for_does_not_count():
+    empty = RoomPlan("hall_0", (0.0, 0.0), (3.0, 3.0), (), (), ())
+    assert features_of(empty, HOSTS) == {"walkable": 1.0}
+    assert score_room(empty, Calibration.load()).total == pytest.approx(10)
+
+
+@given(st.floats(0, 1), st.integers(0, 1000))
+def test_scores_lie_between_0_and_10_and_rise_with_what_is_there(share, seed):
+    spoilt = SPOILERS["dropped"](ROOM, np.random.default_rng(seed))
+    score = score_room(spoilt, Calibration.load(), share)
+    assert 0 <= score.total <= 10
+    assert score.total == pytest.approx(2 * share + score.clutter + score.placement)
+
+
+@given(st.sampled_from(sorted(SPOILERS)), st.integers(0, 1000))
+def test_a_spoilt_room_has_the_same_things_elsewhere(name, seed):
+    spoilt = SPOILERS[name](ROOM, np.random.default_rng(seed))
+    assert [item.kind for item in (*spoilt.pieces, *spoilt.things)] == [
+        "bed",
+        "desk",
+        "chair",
+        "book",
+        "pillow",
+    ]
+    if name != "swapped":
+        for thing, before, bearer in zip(spoilt.things, ROOM.things, ROOM.carried, strict=True):
+            moved = np.subtract(spoilt.pieces[bearer].center_m, ROOM.pieces[bearer].center_m)
+            assert np.allclose(np.subtract(thing.center_m, before.center_m), moved)
+
+
+def test_auc_counts_pairs_in_the_right_order_and_draws_by_half():
+    assert auc(np.array([3.0, 2.0]), np.array([1.0, 2.0])) == pytest.approx((2 + 1 + 0.5) / 4)
+
+
+def test_a_fit_tells_rooms_from_spoilt_ones_and_uses_no_weight_below_0():
+    rng = np.random.default_rng(0)
+    spoilt = [spoil(ROOM, rng) for spoil in SPOILERS.values() for _ in range(4)]
+    calibration = fit([ROOM] * 4, spoilt, steps=400)
+    assert min(calibration.weights.values()) >= 0
+    worst = [score_room(room, calibration).total for room in spoilt]
+    assert score_room(ROOM, calibration).total > np.mean(worst)
+
+
+def test_a_room_of_a_scene_stands_within_its_walls_and_scores_like_a_hand_made_one(flat):
+    plans = [plan_of(flat, room.name) for room in flat.rooms]
+    assert sum(len(plan.pieces) for plan in plans) > 20
+    calibration = Calibration.load()
+    scores = [score_room(plan, calibration) for plan in plans if len(plan.pieces) >= 3]
+    assert all(score.features["within"] == 1 for score in scores)
+    assert np.mean([score.total for score in scores]) > 8
+
+
+def _rooms_file(path, rooms):
+    path.write_bytes(gzip.compress(json.dumps({"rooms": rooms}).encode()))
+    return path
+
+
+def test_hand_made_rooms_are_read_with_their_furniture_and_what_it_bears(tmp_path):
+    objects = [
+        ["Floor", "", [0, 0, 0], 0.0, [0, -0.2, 0], [9, 0.4, 9], [], 1.0],
+        ["TVStand", "a", [1, 0, 0], 91.0, [1, 0.3, 0], [0.4, 0.6, 1.2], ["Floor"], 9.0],
+        ["Vase", "b", [1, 0.6, 0.2], 33.0, [1, 0.7, 0.2], [0.1, 0.2, 0.1], ["TVStand"], 1.0],
+        ["Painting", "", [0, 1.5, 2], 0.0, [0, 1.5, 2], [1, 1, 0.1], [], 0],
+    ]
+    (room,) = read_rooms(_rooms_file(tmp_path / "rooms.json.gz", [{"kind": "bedrooms", "objects": objects}]))
+    assert [(item.kind, item.host) for item in (*room.pieces, *room.things)] == [
+        ("tv_stand", FLOOR),
+        ("vase", "tv_stand"),
+    ]
+    assert room.carried == (0,)
+    assert room.pieces[0].tilt_rad == pytest.approx(math.radians(1))
+    assert room.high_m == (1.2, 2.05)
+
+
+def test_a_file_that_holds_no_rooms_is_told_in_a_sentence(tmp_path):
+    with pytest.raises(EvaluationError, match="no table of hand-made rooms"):
+        read_rooms(_rooms_file(tmp_path / "rooms.json.gz", [{"kind": "bedrooms", "objects": [["Bed"]]}]))
+
+
+@given(st.lists(st.sampled_from("abc"), min_size=1, max_size=12))
+def test_evenness_is_1_where_all_kinds_come_up_equally_often(values):
+    assert 0 <= evenness(values) <= 1 + 1e-9
+    assert evenness(list("abc") * 4) == pytest.approx(1)
+
+
+def test_the_panel_measures_each_writer_and_sets_goals_for_one():
+    tasks = [
+        Asked("Mia is cooking: put the mug in the oven.", "inside(mug,oven)", ("kitchen_0",), False),
+        Asked("For Hugo, open a fridge.", "open(fridge)", ("kitchen_0", "bar_0"), True),
+    ]
+    figures = {figure.name: figure for figure in panel({"Rs_int": tasks}, NAMES)}
+    assert figures["named_share"].value == 1
+    assert figures["several_rooms_share"].value == figures["quantified_share"].value == 0.5
+    assert figures["predicate_entropy"].value == 1
+    assert figures["destination_entropy"].value == 0
+    assert {name for name, figure in figures.items() if figure.goal is not None} == {
+        "self_bleu4", "near_duplicate_rate", "named_share", "signature_entropy",
+    }  # fmt: skip
+    assert all(figure.goal is None for figure in panel({"Rs_int": tasks}, NAMES, "plain"))
+
+
+def test_people_are_read_from_transcripts(tmp_path):
+    (tmp_path / "t.md").write_text(
+        "# x\n\n* **Mia**, 40, nurse, likes chess\n* **Hugo**, 9, pupil\n\n**Mia** (need): x\n"
+    )
+    assert people_of(tmp_path) == {"Mia", "Hugo"}
+
+
+def test_drafts_of_a_scene_are_different_and_the_same_for_a_seed(flat):
+    first = asked_in(flat, SocialWriter(0), 6, 0)
+    assert len({asked.instruction for asked in first}) == 6
+    assert first == asked_in(flat, SocialWriter(0), 6, 0)
+
+
+def test_scenes_to_train_in_and_held_out_ones_are_all_scenes_and_share_none():
+    assert len(training_scenes()) == 45
+    assert {*training_scenes(), *HELDOUT_SCENES} == {*Catalog.load().scene_ids}
+    stems = {scene.rsplit("_", 1)[0] for scene in training_scenes()}
+    assert not {
+        scene for scene in HELDOUT_SCENES if scene.endswith("_int") and scene.rsplit("_", 1)[0] in stems
+    }
+
+
+EVALUATION = Evaluation(
+    "tasks",
+    {"scenes": 45, "seed": 0},
+    (Figure("self_bleu4", 0.3, "", 450, "lower", 0.35), Figure("words", 20.0, "words", 450)),
+    ("A note.",),
+)
+
+
+def test_figures_survive_their_file(tmp_path):
+    path = tmp_path / "tasks.json"
+    path.write_text(json.dumps(evaluation_to_json(EVALUATION)))
+    assert read_evaluation(path) == EVALUATION
+    path.write_text('{"part": "tasks"}')
+    with pytest.raises(EvaluationError, match="holds no figures"):
+        read_evaluation(path)
+
+
+def test_the_page_keeps_all_but_the_factorys_part():
+    page = with_factory("# Benchmarks\n\nBy others.\n", [EVALUATION])
+    assert page.startswith("# Benchmarks\n\nBy others.\n")
+    assert "| self_bleu4 | 0.3 | ≤ 0.35 | reached | 450 |" in page
+    worse = dataclasses.replace(EVALUATION.figures[0], value=0.4)
+    again = with_factory(f"{page}\nAfter.\n", [dataclasses.replace(EVALUATION, figures=(worse,), notes=())])
+    assert "| self_bleu4 | 0.4 | ≤ 0.35 | short | 450 |" in again
+    assert "reached" not in again
+    assert again.endswith("\nAfter.\n")
+    assert again.count(BEGIN) == again.count(END) == 1
+
+
+def test_a_page_with_half_a_part_is_left_alone():
+    with pytest.raises(EvaluationError, match="put it back"):
+        with_factory(f"# Benchmarks\n{BEGIN}\ntext\n", [EVALUATION])
+    with pytest.raises(EvaluationError, match="given twice"):
+        with_factory("", [EVALUATION, EVALUATION])
+    with pytest.raises(EvaluationError, match="there is no part 'x'"):
+        with_factory("", [dataclasses.replace(EVALUATION, part="x")])
+
+
+def test_a_judge_gives_points_of_ten():
+    with pytest.raises(ValueError, match="less than or equal to 10"):
+        Verdict.model_validate({"variety": 8, "characters": 9, "overall": 11, "explanation": "x"})
+
+
+def test_the_command_tells_in_a_sentence_what_is_wrong(tmp_path):
+    found = CliRunner().invoke(app, ["evaluate", "tasks", "--dataset", str(tmp_path / "none")])
+    assert found.exit_code == 2
+    assert "none" in found.output
+    found = CliRunner().invoke(app, ["evaluate", "aesthetics", "--rooms", str(tmp_path)])
+    assert found.exit_code == 2
+    assert "no table of hand-made rooms" in found.output.replace("\n", " ")
