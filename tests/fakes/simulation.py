@@ -49,7 +49,7 @@ class FakeScene:
     def complete(self):
         yield from (None,) * 3
 
-    def execute(self, rollout, on_step):
+    def execute(self, rollout, on_step, reward):
         self._executed += 1
         times = note(rollout.rollout_id)
         on_step(1)
@@ -85,7 +85,9 @@ class FakeScene:
                 time.sleep(1.0)
         made_up = lies()
         return Completed(
-            reward=RewardBreakdown(0.5, 0.2, made_up or goal(rollout), (AtomResult("done", True),), True),
+            reward=RewardBreakdown(
+                reward.format, 0.2, made_up or goal(rollout), (AtomResult("done", True),), True
+            ),
             steps=(),
             final=(f"executed {self._executed} in {os.getpid()} of {os.getppid()}",),
             trace_digest=f"{'no ' if made_up else ''}trace of {rollout.rollout_id}",

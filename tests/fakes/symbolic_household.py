@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from embomatrix.reward.hierarchy import score
+from embomatrix.reward.settings import PAPER, RewardSettings
 from embomatrix.rpc.values import (
     Completed,
     InfraCode,
@@ -159,8 +160,10 @@ class House:
         return None
 
 
-def run_plan(task: TrainingTask, plan: tuple[SkillCall, ...]) -> tuple[RewardBreakdown, tuple[Step, ...]]:
-    """Execute until the first failure and score with the paper's constants."""
+def run_plan(
+    task: TrainingTask, plan: tuple[SkillCall, ...], reward: RewardSettings = PAPER
+) -> tuple[RewardBreakdown, tuple[Step, ...]]:
+    """Execute until the first failure and score it."""
     house = House(task.situation)
     steps = []
     for call in plan:
@@ -169,7 +172,7 @@ def run_plan(task: TrainingTask, plan: tuple[SkillCall, ...]) -> tuple[RewardBre
         if failure:
             break
     touched = frozenset(house.by_index[index].name for index in house.touched)
-    return score(task.task, touched, house), tuple(steps)
+    return score(task.task, touched, house, reward), tuple(steps)
 
 
 def make_task(task_id: str, rng: np.random.Generator, objects: int = 16) -> TrainingTask:
@@ -284,6 +287,7 @@ class SymbolicCluster:
     sent: set[str] = field(default_factory=set)
     executed: int = 0
     closed: bool = False
+    terms: RunTerms = field(default_factory=RunTerms)
 
     async def __aenter__(self) -> SymbolicCluster:
         self._by_id = {task.task.task_id: task for task in (*self.tasks.train, *self.tasks.heldout)}
@@ -292,6 +296,7 @@ class SymbolicCluster:
     async def __aexit__(self, *_: object) -> None: ...
 
     async def open_run(self, name: str, run_id: str = "", terms: RunTerms | None = None) -> str:
+        self.terms = terms or self.terms
         return run_id or f"run-{name}"
 
     async def announce_lookahead(self, run_id, version, entries):
@@ -315,7 +320,7 @@ class SymbolicCluster:
         if (self.lose_first and cursor == 1) or any(mark in rollout.rollout_id for mark in self.lost):
             return InfraFailure(InfraCode.WORKER_LOST, "the worker was lost")
         self.executed += 1
-        reward, steps = run_plan(self._by_id[rollout.task_id], rollout.plan)
+        reward, steps = run_plan(self._by_id[rollout.task_id], rollout.plan, self.terms.reward)
         return Completed(reward, steps, (), "digest", "worker-0", Timings(), warm=True)
 
     async def close_run(self, run_id: str) -> RunStats:

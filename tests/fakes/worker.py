@@ -9,6 +9,7 @@ import grpc
 from embomatrix.proto.v1 import worker_service_pb2 as pb
 from embomatrix.proto.v1 import worker_service_pb2_grpc
 from embomatrix.reward.breakdown import RewardBreakdown
+from embomatrix.reward.settings import PAPER
 from embomatrix.rpc.channel import open_channel
 from embomatrix.rpc.convert_session import (
     lease_from_proto,
@@ -31,11 +32,11 @@ from embomatrix.rpc.values import (
 )
 from embomatrix.rpc.versions import PROTOCOL_VERSION
 
-REWARD = RewardBreakdown(format=0.5, relevance=0.2, goal=15.0, atoms=(), success=False)
 
-
-def completed(worker_id="w1"):
-    return Completed(REWARD, (), (), "sha256:trace", worker_id, Timings(execute_s=0.001), warm=True)
+def completed(worker_id="w1", reward=PAPER):
+    """A plan that reached half of its goal."""
+    scored = RewardBreakdown(reward.format, reward.relevance_per_object, reward.goal / 2, (), success=False)
+    return Completed(scored, (), (), "sha256:trace", worker_id, Timings(execute_s=0.001), warm=True)
 
 
 @dataclass
@@ -191,7 +192,7 @@ class FakeWorker:
             if lease.rollout.task_id in self.poison:
                 self.report(lease.ref, InfraFailure(InfraCode.SLOT_CRASHED, "signal 11", self.worker_id))
             else:
-                self.report(lease.ref, completed(self.worker_id))
+                self.report(lease.ref, completed(self.worker_id, lease.reward))
 
     async def _beat(self, interval_s):
         while True:

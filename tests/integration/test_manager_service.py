@@ -69,9 +69,9 @@ async def open_run(address, run_id="r1", token=""):
         yield client
 
 
-def batch(count, *, batch_id="b1", scene=KITCHEN, task="t", step=1):
+def batch(count, *, batch_id="b1", scene=KITCHEN, task="t", step=1, run_id="r1"):
     rollouts = tuple(Rollout(f"{batch_id}-{i}", f"g{i // 4}", scene, task, (), i) for i in range(count))
-    return Batch("r1", batch_id, step, rollouts)
+    return Batch(run_id, batch_id, step, rollouts)
 
 
 async def outcomes(client, submitted):

@@ -14,6 +14,7 @@ import pytest
 from tests.fakes.plans import plan_of
 from tests.fakes.scenes import kitchen_scene, kitchen_tasks
 
+from embomatrix.reward.settings import PAPER, RewardSettings
 from embomatrix.rpc.values import Completed, InfraCode, Lease, LeaseRef, ResidentState, Rollout
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.pose_cache import build_pose_cache
@@ -72,10 +73,10 @@ class Harness:
     def _take(self, result):
         self.results[result.ref.lease_id] = result.outcome
 
-    def submit(self, lease_id, plan=(), *, seed=1, digest="", deadline_s=30.0):
+    def submit(self, lease_id, plan=(), *, seed=1, digest="", deadline_s=30.0, reward=PAPER):
         task = next(iter(self.bundle.tasks))
         rollout = Rollout(lease_id, "g", digest or self.digest, task, plan, seed)
-        self.pool.submit(Lease(LeaseRef(lease_id, 1), rollout, deadline_s))
+        self.pool.submit(Lease(LeaseRef(lease_id, 1), rollout, deadline_s, reward=reward))
 
     def plan(self, text):
         return plan_of(next(iter(self.bundle.tasks.values())), text)
@@ -155,6 +156,20 @@ async def test_equal_plans_have_equal_digests_in_every_slot_in_a_fresh_process_a
 def _words(call):
     values = (call.object_index, call.relation.value if call.relation else None)
     return [call.skill.value, *(str(value) for value in values if value is not None)]
+
+
+async def test_a_plan_is_scored_with_the_coefficients_of_its_run_and_does_the_same(tmp_path, kitchen):
+    own = RewardSettings(format=2.0, relevance_per_object=1.0, relevance_limit=9.0, goal=3.0)
+    async with running(tmp_path, kitchen) as harness:
+        harness.submit("own", harness.plan(PLANS[0]), reward=own)
+        harness.submit("paper's", harness.plan(PLANS[0]))
+        mine, usual = await harness.outcome("own"), await harness.outcome("paper's")
+    assert mine.trace_digest == usual.trace_digest
+    assert mine.reward.atoms == usual.reward.atoms
+    assert (usual.reward.format, mine.reward.format) == (0.5, 2.0)
+    assert usual.reward.relevance > 0
+    assert mine.reward.relevance == pytest.approx(5 * usual.reward.relevance)
+    assert mine.reward.goal == pytest.approx(usual.reward.goal / 10)
 
 
 async def test_a_slot_that_was_stopped_is_killed_at_the_deadline_and_the_next_rollout_is_executed(

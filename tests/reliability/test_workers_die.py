@@ -7,7 +7,7 @@ import time
 
 import pytest
 from tests.fakes.real_cluster import RealCluster, batch_of, connected, opened, outcomes, tally, tell
-from tests.fakes.worker import REWARD
+from tests.fakes.worker import completed
 
 from embomatrix.rpc.values import Completed
 
@@ -53,7 +53,7 @@ async def soak(folder, *, killing):
             for name, killed_s in kills
             if (at_s := cluster.logged_s("manager", f"worker (lost|registered) worker={name}\\b", killed_s))
         ]
-    return tally(batch, results, REWARD.total), stats, took_s, kills, found
+    return tally(batch, results, completed().reward.total), stats, took_s, kills, found
 
 
 @pytest.mark.slow

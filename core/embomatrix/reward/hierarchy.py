@@ -2,33 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from embomatrix.reward.breakdown import AtomResult, RewardBreakdown
+from embomatrix.reward.settings import PAPER, RewardSettings
 from embomatrix.world.evaluate import evaluate
 
 if TYPE_CHECKING:
     from embomatrix.world.goal import Facts
     from embomatrix.world.task import Task
-
-
-@dataclass(frozen=True, slots=True)
-class RewardSettings:
-    """Constants of the three tiers. The defaults are the paper's."""
-
-    unparsable: float = -1.0
-    """Whole reward of a text that is no plan."""
-    format: float = 0.5
-    """For a text that is a plan, whatever it does."""
-    relevance_per_object: float = 0.2
-    """For each object of the goal on which a skill call succeeded."""
-    relevance_limit: float = 1.0
-    goal: float = 30.0
-    """For a goal whose atoms all hold; each atom earns its equal share."""
-
-
-PAPER = RewardSettings()
 
 
 def score(

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.proto.v1 import rollout_service_pb2, types_pb2
+from embomatrix.reward.settings import PAPER, RewardSettings, RewardSettingsError
 from embomatrix.rpc.convert import ConvertError, finite, required
 from embomatrix.rpc.values import (
     GroupDone,
@@ -18,6 +20,10 @@ from embomatrix.rpc.values import (
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
+    from embomatrix.proto.v1 import admin_service_pb2, worker_service_pb2
+
+    _Scored = rollout_service_pb2.OpenRunRequest | worker_service_pb2.Lease | admin_service_pb2.RunInfo
 
 _WARMTHS: Final[Mapping[Warmth, types_pb2.Warmth.ValueType]] = {
     warmth: types_pb2.Warmth.Value(f"WARMTH_{warmth.name}") for warmth in Warmth
@@ -75,6 +81,7 @@ def run_terms_to_proto(terms: RunTerms) -> rollout_service_pb2.OpenRunRequest:
         priority=terms.priority,
         rollout_deadline_s=terms.rollout_deadline_s,
         verified=terms.verified,
+        reward=reward_settings_to_proto(terms.reward),
     )
 
 
@@ -87,8 +94,33 @@ def run_terms_from_proto(message: rollout_service_pb2.OpenRunRequest) -> RunTerm
             raise ConvertError(field, f"is {getattr(message, field)}: it can't be below 0")
     # A message without a weight has 0 there.
     return RunTerms(
-        policy, message.weight or 1.0, message.priority, message.rollout_deadline_s, message.verified
+        policy,
+        message.weight or 1.0,
+        message.priority,
+        message.rollout_deadline_s,
+        message.verified,
+        reward_settings_of(message),
     )
+
+
+def reward_settings_to_proto(reward: RewardSettings) -> types_pb2.RewardSettings | None:
+    """None for the paper's, which are every worker's defaults: the field stays away."""
+    return (
+        None if reward is PAPER or reward == PAPER else types_pb2.RewardSettings(**dataclasses.asdict(reward))
+    )
+
+
+def reward_settings_of(message: _Scored) -> RewardSettings:
+    """What the message's field ``reward`` asks for; the paper's where it is absent. ConvertError for what is no reward."""
+    if not message.HasField("reward"):
+        return PAPER
+    told = message.reward
+    try:
+        return RewardSettings(
+            told.unparsable, told.format, told.relevance_per_object, told.relevance_limit, told.goal
+        )
+    except RewardSettingsError as error:
+        raise ConvertError(f"reward.{error.field}", error.problem) from error
 
 
 def warmth_to_proto(warmth: Warmth) -> types_pb2.Warmth.ValueType:

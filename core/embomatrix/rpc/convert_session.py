@@ -19,6 +19,8 @@ from embomatrix.rpc.convert import (
     write_completed,
 )
 from embomatrix.rpc.convert_run import (
+    reward_settings_of,
+    reward_settings_to_proto,
     run_stats_from_proto,
     run_stats_to_proto,
     warmth_from_proto,
@@ -160,6 +162,7 @@ def lease_to_proto(lease: Lease) -> worker_service_pb2.Lease:
         rollout=rollout_to_proto(lease.rollout),
         deadline_s=lease.deadline_s,
         origin=None if lease.origin is None else lease_origin_to_proto(lease.origin),
+        reward=reward_settings_to_proto(lease.reward),
     )
 
 
@@ -170,7 +173,13 @@ def lease_from_proto(message: worker_service_pb2.Lease) -> Lease:
     origin = None
     if message.HasField("origin"):
         origin = inside("origin", lease_origin_from_proto, message.origin)
-    return Lease(ref, inside("rollout", rollout_from_proto, message.rollout), message.deadline_s, origin)
+    return Lease(
+        ref,
+        inside("rollout", rollout_from_proto, message.rollout),
+        message.deadline_s,
+        origin,
+        reward_settings_of(message),
+    )
 
 
 def lease_result_to_proto(result: LeaseResult) -> worker_service_pb2.LeaseResult:
@@ -258,6 +267,8 @@ def run_info_to_proto(info: RunInfo) -> admin_service_pb2.RunInfo:
         pending=info.pending,
         opened_s=info.opened_s,
         closed_s=info.closed_s,
+        reward=reward_settings_to_proto(info.reward),
+        waits_for=info.waits_for,
     )
 
 
@@ -269,6 +280,8 @@ def run_info_from_proto(message: admin_service_pb2.RunInfo) -> RunInfo:
         message.pending,
         finite("opened_s", message.opened_s),
         finite("closed_s", message.closed_s),
+        reward_settings_of(message),
+        message.waits_for,
     )
 
 

@@ -9,6 +9,8 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING
 
+from embomatrix.reward.settings import PAPER, RewardSettings
+
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
@@ -173,6 +175,8 @@ class RunTerms:
     """From submission to outcome; 0 for the manager's default."""
     verified: bool = False
     """Results of workers on probation, and some of the others, are delivered when a second worker came to the same."""
+    reward: RewardSettings = PAPER
+    """Coefficients of the reward's tiers, for all rollouts of the run."""
 
 
 class Warmth(StrEnum):
@@ -313,6 +317,8 @@ class Lease:
     deadline_s: float
     origin: LeaseOrigin | None = None
     """None from a manager that does not take leases up."""
+    reward: RewardSettings = PAPER
+    """How the run wants it scored."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -385,3 +391,6 @@ class RunInfo:
     pending: int
     opened_s: float = 0.0
     closed_s: float = 0.0
+    reward: RewardSettings = PAPER
+    waits_for: str = ""
+    """Why rollouts of it can't be executed by any worker that is there; empty while they can."""

@@ -15,6 +15,8 @@ from embomatrix.rpc.status import PreconditionError
 PROTOCOL_VERSION: Final = 2
 """1: sessions, leases, batches. 2: credentials, leaving, progress of leases, coefficients of a run, policies of groups."""
 PROTOCOL_OLDEST: Final = 1
+SCORES_SINCE: Final = 2
+"""Workers of an older version score with the paper's coefficients, whatever a lease asks for."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -142,7 +142,9 @@ class Assignments:
         run = self.runs.of(batch.run_id)
         due_s = self.now_s + (run.terms.rollout_deadline_s or self._limits.rollout_deadline_s)
         warm = {scene: self.fleet.has_warm(scene) for scene in scenes}
-        noted = self.batches.open(batch, delivered, now_s=self.now_s, due_s=due_s, warm=warm)
+        noted = self.batches.open(
+            batch, delivered, now_s=self.now_s, due_s=due_s, warm=warm, reward=run.terms.reward
+        )
         run.submitted += len(noted.open)
         if not noted.open:
             self._close(noted)
@@ -275,7 +277,16 @@ class Assignments:
         deadline_s = self._limits.execute_deadline_s
         origin = LeaseOrigin(*record.key, attempt=record.attempts + 1)
         self.commands.append(
-            GiveLease(worker.worker_id, lease.ref, record.rollout, deadline_s, origin, hedge, record.check)
+            GiveLease(
+                worker.worker_id,
+                lease.ref,
+                record.rollout,
+                deadline_s,
+                origin,
+                hedge,
+                record.check,
+                record.reward,
+            )
         )
 
     def _end(self, lease: LeaseRecord) -> None:

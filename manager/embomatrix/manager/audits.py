@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.manager.auditor import Auditor, AuditRules, Opinion, Ruling, judge, opinion_of
 from embomatrix.manager.commands import CancelLease, QuarantineWorker
 from embomatrix.manager.ledger import Phase, RolloutKey, RolloutRecord
+from embomatrix.reward.settings import PAPER
 from embomatrix.rpc.values import Completed, InfraCode, InfraFailure
 
 if TYPE_CHECKING:
@@ -256,6 +257,7 @@ class Audits:
             warm=record.warm,
             check=True,
             barred=barred,
+            reward=record.reward,
         )
 
     def _somebody_for(self, check: RolloutRecord) -> bool:
@@ -264,6 +266,7 @@ class Audits:
             name not in check.barred
             and not (worker.quarantined or worker.draining)
             and (worker.render_slots > 0 or not check.rollout.render)
+            and (worker.scores or check.reward == PAPER)
             for name, worker in self._desk.fleet.workers.items()
         )
 

@@ -11,6 +11,7 @@ from embomatrix.manager.ledger import BatchRecord, GroupRecord, Phase, RolloutKe
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
+    from embomatrix.reward.settings import RewardSettings
     from embomatrix.rpc.values import Batch
 
 
@@ -49,6 +50,7 @@ class BatchBook:
         now_s: float,
         due_s: float,
         warm: Mapping[str, bool],
+        reward: RewardSettings,
     ) -> BatchRecord:
         """Note a batch; its open rollouts are those that were not delivered before. ``warm`` tells it of each scene."""
         key = (batch.run_id, batch.batch_id)
@@ -67,6 +69,7 @@ class BatchBook:
                 sequence=next(self._sequences),
                 submitted_s=now_s,
                 warm=warm[rollout.bundle_digest],
+                reward=reward,
             )
             noted.open[rollout.rollout_id] = group.open[rollout.rollout_id] = record
             heapq.heappush(self._due, (due_s, record.sequence, record))

@@ -16,6 +16,7 @@ from embomatrix.manager.event_ring import EventRing
 from embomatrix.manager.fleet_log import FleetLog
 from embomatrix.manager.histogram import Histogram, merged
 from embomatrix.manager.run_figures import RunFigures
+from embomatrix.reward.settings import PAPER, RewardSettings
 from embomatrix.rpc.run_log import EventKind, Phase, RunEvent
 from embomatrix.rpc.values import Cancelled, Completed, InfraFailure
 
@@ -48,6 +49,7 @@ class RunRecord:
     cpu_s: float
     ring: EventRing
     figures: RunFigures
+    reward: RewardSettings = PAPER
 
 
 class Chronicle:
@@ -86,14 +88,18 @@ class Chronicle:
             return self.fleet.ring.after(after, limit)
         return self._runs[run_id].ring.after(after, limit) if run_id in self._runs else None
 
-    def open_run(self, run_id: str, name: str, *, now_s: float, cpu_s: float) -> None:
+    def open_run(
+        self, run_id: str, name: str, *, now_s: float, cpu_s: float, reward: RewardSettings = PAPER
+    ) -> None:
         """Begin a log; one that was begun goes on."""
         if run_id in self._runs:
             return
         limit = max(LEAST_KEPT, EVENTS_KEPT // (len(self._runs) + 1))
         for run in self._runs.values():
             run.ring.limit = limit
-        self._runs[run_id] = RunRecord(run_id, name, now_s, cpu_s, EventRing(limit), RunFigures(now_s))
+        self._runs[run_id] = RunRecord(
+            run_id, name, now_s, cpu_s, EventRing(limit), RunFigures(now_s), reward
+        )
         self._note(EventKind.RUN_OPENED, run_id, now_s=now_s, message=name)
 
     def close_run(self, run_id: str, *, now_s: float) -> RunRecord | None:

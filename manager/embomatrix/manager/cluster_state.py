@@ -97,6 +97,12 @@ class ClusterState:
             prewarm_wasted=prewarm.wasted,
         )
 
+    def waits_for(self, run_id: str) -> str:
+        """Why rollouts of the run can't be executed by any worker that is there; empty while they can."""
+        reasons = self.scheduler.unplaceable
+        scenes = self.dispatcher.waiting_scenes_of(run_id) if reasons else ()
+        return next((reasons[scene] for scene in sorted(scenes) if scene in reasons), "")
+
     def totals(self) -> RunStats:
         """The counters of all runs, also of those that were closed."""
         open_runs = [self.stats(run_id) for run_id in self.dispatcher.runs]

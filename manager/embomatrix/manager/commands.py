@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from embomatrix.reward.settings import PAPER, RewardSettings
+
 if TYPE_CHECKING:
     from embomatrix.rpc.values import LeaseOrigin, LeaseRef, Rollout, RolloutResult
 
@@ -33,6 +35,8 @@ class GiveLease:
     hedge: bool = False
     audit: bool = False
     """The result is compared with another's: a worker is not told."""
+    reward: RewardSettings = PAPER
+    """How the run wants it scored."""
 
 
 @dataclass(frozen=True, slots=True)

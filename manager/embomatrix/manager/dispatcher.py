@@ -46,7 +46,9 @@ from embomatrix.manager.events import (
 from embomatrix.manager.hedging import Hedger
 from embomatrix.manager.patience import Patience
 from embomatrix.manager.recovery import Recovery
+from embomatrix.reward.settings import PAPER
 from embomatrix.rpc.values import InfraCode, InfraFailure, ResidentState
+from embomatrix.rpc.versions import SCORES_SINCE
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -100,12 +102,8 @@ class Dispatcher:
                 for batch in self._desk.batches.of_run(run_id):
                     self._desk.cancel((run_id, batch.batch_id))
                 self._desk.audits.drop_run(run_id)
-            case WorkerJoined(worker_id, resources):
-                self._on_lost(WorkerLost(worker_id, "a newer session of the same worker took over"))
-                joined = self._desk.fleet.join(
-                    worker_id, resources.slots, resources.render_slots, resources.versions
-                )
-                self._desk.audits.joined(joined)
+            case WorkerJoined():
+                self._on_joined(event)
             case WorkerReported():
                 self._on_reported(event)
             case WorkerLost():
@@ -141,6 +139,7 @@ class Dispatcher:
             lags=dict(desk.fleet.lags),
             runs={heads[0].scene: heads[0].key.run_id for heads in lanes},
             rendering=frozenset(h.scene for heads in lanes for h in heads if h.rollout.render),
+            scored=frozenset(heads[0].scene for heads in lanes if all(h.reward != PAPER for h in heads)),
         )
 
     @property
@@ -202,7 +201,24 @@ class Dispatcher:
         """Rollouts of the run without an outcome."""
         return sum(len(batch.open) for batch in self._desk.batches.of_run(run_id))
 
+    def waiting_scenes_of(self, run_id: str) -> frozenset[str]:
+        """Scenes of the run's rollouts without an outcome."""
+        batches = self._desk.batches.of_run(run_id)
+        return frozenset(record.scene for batch in batches for record in batch.open.values())
+
     # Workers and time
+
+    def _on_joined(self, event: WorkerJoined) -> None:
+        self._on_lost(WorkerLost(event.worker_id, "a newer session of the same worker took over"))
+        resources = event.resources
+        joined = self._desk.fleet.join(
+            event.worker_id,
+            resources.slots,
+            resources.render_slots,
+            resources.versions,
+            scores=event.protocol >= SCORES_SINCE,
+        )
+        self._desk.audits.joined(joined)
 
     def _on_reported(self, event: WorkerReported) -> None:
         worker = self._desk.fleet.workers.get(event.worker_id)

@@ -39,7 +39,13 @@ class Fleet:
         """How many times slower those workers are that plainly are."""
 
     def join(
-        self, worker_id: str, slots: int, render_slots: int = 0, versions: Mapping[str, str] | None = None
+        self,
+        worker_id: str,
+        slots: int,
+        render_slots: int = 0,
+        versions: Mapping[str, str] | None = None,
+        *,
+        scores: bool = True,
     ) -> WorkerRecord:
         """A new worker, which can take nothing until it has reported."""
         slots = max(slots, 1)
@@ -49,6 +55,7 @@ class Fleet:
             credits=2 * slots,
             render_slots=min(render_slots, slots),
             versions=versions or {},
+            scores=scores,
         )
         self.workers[worker_id] = record
         self._live.add(worker_id)

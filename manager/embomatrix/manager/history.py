@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from embomatrix.manager.archive import RunArchive
     from embomatrix.manager.chronicle import Chronicle, RunRecord
     from embomatrix.manager.cluster_state import ClusterState
+    from embomatrix.reward.settings import RewardSettings
     from embomatrix.rpc.run_log import PhaseSummary
     from embomatrix.rpc.values import Batch, RunStats
 
@@ -31,9 +32,11 @@ class RunHistory:
         self._archive = archive
         self._cluster = cluster
 
-    def opened(self, run_id: str, name: str) -> None:
+    def opened(self, run_id: str, name: str, reward: RewardSettings) -> None:
         logger.info("run opened run=%s: %s", run_id, name or "no name")
-        self._chronicle.open_run(run_id, name, now_s=time.monotonic(), cpu_s=time.process_time())
+        self._chronicle.open_run(
+            run_id, name, now_s=time.monotonic(), cpu_s=time.process_time(), reward=reward
+        )
 
     def submitted(self, batch: Batch) -> None:
         self._chronicle.submitted(batch, now_s=time.monotonic())
@@ -101,7 +104,16 @@ class RunHistory:
 
     def _info(self, record: RunRecord, stats: RunStats, *, pending: int, closed_s: float = 0.0) -> RunInfo:
         opened_s = self._chronicle.epoch_s + record.opened_s
-        return RunInfo(record.run_id, record.name, stats, pending, opened_s, closed_s)
+        return RunInfo(
+            record.run_id,
+            record.name,
+            stats,
+            pending,
+            opened_s,
+            closed_s,
+            record.reward,
+            self._cluster.waits_for(record.run_id),
+        )
 
 
 def manager_version() -> str:

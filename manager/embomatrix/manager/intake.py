@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.events import Event, LeaseFinished, LeasesRenewed, Tick, WorkerLost, WorkerReported
+from embomatrix.rpc.versions import PROTOCOL_VERSION
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -45,10 +46,18 @@ class Intake:
         return [command for event in events for command in self.cluster.handle(event, now_s=now_s)]
 
     def register(
-        self, worker_id: str, boot_id: str, resources: Resources, *, now_s: float
+        self,
+        worker_id: str,
+        boot_id: str,
+        resources: Resources,
+        *,
+        now_s: float,
+        protocol: int = PROTOCOL_VERSION,
     ) -> tuple[Session, list[Command]]:
-        """Open a session for a worker."""
-        session, events = self.registry.register(worker_id, boot_id, resources, now_s=now_s)
+        """Open a session for a worker, which speaks this version."""
+        session, events = self.registry.register(
+            worker_id, boot_id, resources, now_s=now_s, protocol=protocol
+        )
         return session, self.feed(*events, now_s=now_s)
 
     def report(

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from enum import Enum, auto
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from embomatrix.reward.settings import PAPER, RewardSettings
 from embomatrix.rpc.values import RunStats, Timings
 
 if TYPE_CHECKING:
@@ -74,6 +75,8 @@ class RolloutRecord:
     """It is a further execution of a rollout, to compare: no batch has it."""
     barred: frozenset[str] = frozenset()
     """Workers that executed it before, and whose results it is to be compared with."""
+    reward: RewardSettings = PAPER
+    """How its run wants it scored."""
 
     @property
     def scene(self) -> str:
@@ -136,6 +139,8 @@ class WorkerRecord:
     """It was found to give wrong results."""
     versions: Mapping[str, str] = field(default_factory=dict)
     """Of what its results depend on."""
+    scores: bool = True
+    """It scores with the coefficients that a lease asks for; workers of protocol 1 know only the paper's."""
     log_lag: float = 0.0
     reluctance_s: float = 0.0
     """It takes only rollouts that have waited for so long: the time that it needs longer than others."""
@@ -196,6 +201,8 @@ class WorkerRecord:
         if record.failed_on == self.worker_id and now_s < record.avoid_until_s:
             return False
         if now_s - record.submitted_s < self.reluctance_s:
+            return False
+        if not self.scores and record.reward != PAPER:
             return False
         if record.rollout.render and self.rendering >= self.render_slots:
             return False

@@ -46,7 +46,7 @@ class WorkerLink:
             case GiveLease():
                 self.session.asked.add(command.rollout.bundle_digest)
                 self._outbox.leases.append(
-                    Lease(command.ref, command.rollout, command.deadline_s, command.origin)
+                    Lease(command.ref, command.rollout, command.deadline_s, command.origin, command.reward)
                 )
             case CancelLease():
                 self._outbox.cancelled.append(command.ref)

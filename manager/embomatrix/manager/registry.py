@@ -126,7 +126,13 @@ class Registry:
         return frozenset(self._by_silence)
 
     def register(
-        self, worker_id: str, boot_id: str, resources: Resources, *, now_s: float
+        self,
+        worker_id: str,
+        boot_id: str,
+        resources: Resources,
+        *,
+        now_s: float,
+        protocol: int = PROTOCOL_VERSION,
     ) -> tuple[Session, list[Event]]:
         """Open a session; an older one of the same worker ends. The same process keeps its leases, another one loses them."""
         before = self._sessions.get(worker_id)
@@ -139,6 +145,7 @@ class Registry:
             epoch=self._epoch,
             resources=resources,
             last_seen_s=now_s,
+            protocol=protocol,
         )
         self._sessions[worker_id] = self._by_silence[worker_id] = session
         self._by_silence.move_to_end(worker_id)
@@ -152,7 +159,7 @@ class Registry:
                 session.standing = before.standing
                 return session, []
         lost = [WorkerLost(worker_id, "a newer session of the same worker took over")] if alive else []
-        return session, [*lost, WorkerJoined(worker_id, resources)]
+        return session, [*lost, WorkerJoined(worker_id, resources, protocol)]
 
     def find(self, session_id: str, epoch: int) -> Session:
         """The live session of that name; raises ``SupersededError`` for one that ended, so that its worker stops.

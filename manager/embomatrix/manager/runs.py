@@ -22,6 +22,7 @@ from embomatrix.manager.group_ends import group_sizes
 from embomatrix.manager.records import batch_of, batch_row, failed_rows, terms_of, terms_payload
 from embomatrix.manager.results import BatchLog
 from embomatrix.manager.store.protocol import PutOutcome, RunRow, StateError, StateFullError
+from embomatrix.reward.settings import PAPER
 from embomatrix.rpc.status import (
     ConflictError,
     InvalidRequestError,
@@ -97,8 +98,9 @@ class Runs:
         """Take up what a former manager left. Its open batches go on at once, whether their trainer asks for them or not."""
         for run in await self._store.runs():
             self._runs[run.run_id] = run
-            self._feed(RunOpened(run.run_id, terms_of(run)))
-            self._history.opened(run.run_id, run.name)
+            terms = terms_of(run)
+            self._feed(RunOpened(run.run_id, terms))
+            self._history.opened(run.run_id, run.name, terms.reward)
             self._heard_s[run.run_id] = time.monotonic()
             for row in await self._store.batches(run.run_id):
                 batch = batch_of(row)
@@ -116,7 +118,10 @@ class Runs:
             logger.info("took up %d runs of a former manager", len(self._runs))
 
     async def open_run(self, name: str, run_id: str, terms: RunTerms = DEFAULT_TERMS) -> str:
-        """Open a run, or attach to the one of that id, which keeps its terms; an empty id gets a new one."""
+        """Open a run, or attach to the one of that id, which keeps its terms; an empty id gets a new one.
+
+        ConflictError for coefficients of the reward that are not those of the run that is there.
+        """
         run_id = run_id or f"run-{secrets.token_hex(6)}"
         if not _RUN_ID.fullmatch(run_id):
             raise InvalidRequestError(
@@ -131,7 +136,11 @@ class Runs:
             if run_id not in self._runs:
                 self._runs[run_id] = run
                 self._feed(RunOpened(run_id, terms))
-            self._history.opened(run_id, run.name)
+            self._history.opened(run_id, run.name, terms.reward)
+        elif terms.reward not in (PAPER, terms_of(self._runs[run_id]).reward):
+            raise ConflictError(
+                f"run {run_id!r} was opened with other reward coefficients: keep those, or open another run"
+            )
         self._heard_s[run_id] = time.monotonic()
         return run_id
 

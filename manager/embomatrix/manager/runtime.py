@@ -128,8 +128,10 @@ class ManagerRuntime:
         """Open a session for a worker; returns it and the heartbeat's interval in seconds."""
         if self._lapsed_s() > LET_GO_S:
             raise UnavailableError(STORE_AWAY)
-        session, commands = self._intake.register(worker_id, boot_id, resources, now_s=time.monotonic())
-        session.credential_id, session.protocol = credential_id, protocol
+        session, commands = self._intake.register(
+            worker_id, boot_id, resources, now_s=time.monotonic(), protocol=protocol
+        )
+        session.credential_id = credential_id
         self._close_link(worker_id)
         self.chronicle.fleet.joined(worker_id, resources, now_s=time.monotonic())
         self._carry_out(commands)

@@ -2,11 +2,13 @@
 
 import dataclasses
 import re
+import tomllib
 from pathlib import Path
 
 import pytest
 
-from embomatrix.reward.hierarchy import PAPER, score
+from embomatrix.reward.hierarchy import score
+from embomatrix.reward.settings import PAPER, RewardSettings
 from embomatrix.world.bddl import parse_problem
 from embomatrix.world.evaluate import evaluate
 from embomatrix.world.task import Task, TaskCategory
@@ -61,3 +63,9 @@ def test_task_of_the_example_could_be_admitted():
     assert not evaluate(task.goal, Holding([]), task.types)
     atoms = score(task, frozenset(), Holding([])).atoms
     assert 2 * sum(atom.holds for atom in atoms) <= len(atoms)
+
+
+def test_the_example_of_a_settings_file_is_a_reward():
+    table = re.search(r"```toml\n(.*?)```", PAGE, re.DOTALL)
+    assert table
+    assert RewardSettings(**tomllib.loads(table[1])["reward"]).goal == 10.0

@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from embomatrix.reward.hierarchy import RewardSettings, score, unparsable
+from embomatrix.reward.hierarchy import score, unparsable
+from embomatrix.reward.settings import RewardSettings, RewardSettingsError
 from embomatrix.world.bddl import parse_formula
 from embomatrix.world.task import Task, TaskCategory
 
@@ -82,6 +83,20 @@ def test_constants_are_settings() -> None:
     assert score(TWO, frozenset({"box_1"}), Inside("apple_0"), settings).total == pytest.approx(
         1.0 + 0.5 + 5.0
     )
+
+
+@pytest.mark.parametrize(
+    ("coefficients", "sentence"),
+    [
+        ({"goal": -3.0}, r"goal is -3: a tier pays 0 or more, and 0 leaves it out"),
+        ({"relevance_limit": float("nan")}, r"relevance_limit is nan: expected a number between"),
+        ({"format": 1e9}, r"format is 1e\+09: expected a number between -1e6 and 1e6"),
+        ({"unparsable": 1.0}, r"unparsable is 1 and format 0\.5: .* lower it"),
+    ],
+)
+def test_coefficients_that_make_no_reward_are_named(coefficients: dict[str, float], sentence: str) -> None:
+    with pytest.raises(RewardSettingsError, match=sentence):
+        RewardSettings(**coefficients)
 
 
 @given(st.frozensets(st.sampled_from([*NAMES, "box_1"])), st.frozensets(st.sampled_from(NAMES)))

@@ -6,7 +6,9 @@ import time
 import pytest
 from tests.fakes.symbolic_household import SymbolicCluster, make_tasks
 
+from embomatrix.reward.settings import RewardSettings
 from embomatrix.rpc.status import ManagerUnreachableError
+from embomatrix.rpc.values import RunTerms
 from embomatrix.skills.prompt import Codec, plan_in_names
 from embomatrix.trainer.data import Schedule, group_seed
 from embomatrix.trainer.errors import TrainerError
@@ -17,12 +19,12 @@ TASK = TASKS.train[0]
 ORACLE = plan_in_names(TASK.oracle, TASK.situation)
 
 
-def gateway(cluster):
-    return Gateway(lambda: cluster, TASKS.bundle_bytes, run_name="test", run_seed=7)
+def gateway(cluster, **options):
+    return Gateway(lambda: cluster, TASKS.bundle_bytes, run_name="test", run_seed=7, **options)
 
 
-def outcomes(cluster, *texts):
-    with gateway(cluster) as gate:
+def outcomes(cluster, *texts, **options):
+    with gateway(cluster, **options) as gate:
         return waited(gate.submit("b", 1, TASK, TASK.situation, texts, Codec.NAMES))
 
 
@@ -48,6 +50,14 @@ def test_text_that_is_no_plan_is_scored_here_and_never_executed():
     assert verdict.problem
     assert cluster.executed == 0
     assert cluster.batches == []
+
+
+def test_a_run_s_coefficients_score_what_is_executed_and_what_never_is():
+    terms = RunTerms(reward=RewardSettings(unparsable=-7.0, format=2.0))
+    cluster = SymbolicCluster(TASKS)
+    none, failed = outcomes(cluster, "no idea", "toggle_on countertop", terms=terms)
+    assert cluster.terms == terms
+    assert (none.value, failed.value) == (-7.0, 2.0)
 
 
 def test_a_lost_rollout_has_no_reward_rather_than_a_zero():

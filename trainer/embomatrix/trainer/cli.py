@@ -72,6 +72,12 @@ def train(
     settings_file: Annotated[
         Path | None, typer.Option("--settings", help="TOML file with any setting.")
     ] = None,
+    reward: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=VALUE", help="A coefficient of the reward, as docs/rewards.md names it; repeatable."
+        ),
+    ] = None,
     threads: _THREADS = None,
     device: Annotated[str | None, typer.Option(help="torch device: cpu, cuda.")] = None,
     token: _TOKEN = "",
@@ -90,6 +96,7 @@ def train(
             "grpo.minutes": minutes,
             "grpo.steps": steps,
             "imitation.seconds": imitate_seconds,
+            **_coefficients(reward or ()),
         }
         if resume:
             summary = _resumed(dataset, connect, out, changes)
@@ -163,6 +170,17 @@ def _leave(command: str, sentence: str, status: int) -> NoReturn:
         f"embomatrix {command}: {sentence}", highlight=False, markup=False
     )
     raise typer.Exit(status) from None
+
+
+def _coefficients(told: Sequence[str]) -> dict[str, str]:
+    """Settings by dotted key, from ``NAME=VALUE``; whether there is such a one and what it may be, the settings know."""
+    pairs = [text.partition("=") for text in told]
+    for name, equals, value in pairs:
+        if not (name and equals and value):
+            raise TrainerError(
+                f"--reward {name + equals + value!r}: expected NAME=VALUE, for example goal=10"
+            )
+    return {f"reward.{name}": value for name, _, value in pairs}
 
 
 def _started(
@@ -248,14 +266,17 @@ def _connector(manager: str, token: str, ca: Path | None) -> Connect:
     return functools.partial(ClusterClient, manager, read_token(token), ca=read_ca(ca))
 
 
-def _gateway(tasks: TaskSet, connect: Connect, name: str, seed: int, on_lost: OnLost) -> Gateway:
-    from embomatrix.rpc.values import GroupPolicy
+def _gateway(
+    tasks: TaskSet, connect: Connect, name: str, settings: TrainSettings, on_lost: OnLost
+) -> Gateway:
+    from embomatrix.rpc.values import GroupPolicy, RunTerms
     from embomatrix.trainer.rollout import Gateway
     from embomatrix.trainer.settings import OnLost
 
     whole = on_lost is OnLost.GROUP
     policy = GroupPolicy.RETRY_THEN_FAIL_GROUP if whole else GroupPolicy.PARTIAL
-    return Gateway(connect, tasks.bundle_bytes, run_name=name, run_seed=seed, policy=policy)
+    terms = RunTerms(policy, reward=settings.reward.settings())
+    return Gateway(connect, tasks.bundle_bytes, run_name=name, run_seed=settings.seed, terms=terms)
 
 
 def _run(
@@ -278,7 +299,7 @@ def _run(
         ) from error
     reference = resumed.pop("reference", None)
     with (
-        _gateway(tasks, connect, out.name, settings.seed, settings.grpo.on_lost) as gateway,
+        _gateway(tasks, connect, out.name, settings, settings.grpo.on_lost) as gateway,
         display_for(console) as display,
     ):
         parts = Parts(policy, _teller(policy, tasks, settings), tasks, gateway, display, reference)
@@ -293,7 +314,7 @@ def _evaluated(
     from embomatrix.trainer.settings import OnLost
 
     with (
-        _gateway(tasks, connect, "eval", settings.seed, OnLost.PARTIAL) as gateway,
+        _gateway(tasks, connect, "eval", settings, OnLost.PARTIAL) as gateway,
         display_for(Console()) as display,
     ):
         return evaluate_policy(

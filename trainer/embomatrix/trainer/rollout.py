@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final, Protocol, Self, TypeVar
 from embomatrix.reward.hierarchy import unparsable
 from embomatrix.rpc.logs import bind
 from embomatrix.rpc.status import ClusterError
-from embomatrix.rpc.values import Batch, Completed, GroupPolicy, LookaheadEntry, Rollout, RunStats, RunTerms
+from embomatrix.rpc.values import Batch, Completed, LookaheadEntry, Rollout, RunStats, RunTerms
 from embomatrix.skills.parse import PlanError, parse_plan
 from embomatrix.skills.prompt import Codec, with_indices
 from embomatrix.trainer.data import group_seed
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from typing import Any
 
     from embomatrix.reward.breakdown import RewardBreakdown
+    from embomatrix.reward.settings import RewardSettings
     from embomatrix.rpc.values import Outcome, RolloutResult, Warmth
     from embomatrix.skills.prompt import Situation
     from embomatrix.skills.syntax import Plan
@@ -91,7 +92,8 @@ def parsed(text: str, situation: Situation, codec: Codec) -> Plan:
 class Gateway:
     """Context manager over one run of the cluster. Methods are called from the trainer's thread.
 
-    ``policy`` says what the cluster does with the rest of a group that lost a rollout: nobody executes what is left out anyway.
+    ``terms`` say what becomes of the rest of a group that lost a rollout, for nobody executes what is left out anyway, and
+    how plans are scored: by the worker, and here where a text is none.
     """
 
     def __init__(
@@ -101,13 +103,13 @@ class Gateway:
         *,
         run_name: str,
         run_seed: int,
-        policy: GroupPolicy = GroupPolicy.RETRY_THEN_FAIL_GROUP,
+        terms: RunTerms = DEFAULT_TERMS,
     ) -> None:
         self._open_cluster = open_cluster
         self._bundle_bytes = bundle_bytes
         self._run_name = run_name
         self._run_seed = run_seed
-        self._terms = RunTerms(policy)
+        self._terms = terms
         self._announced = 0
         self._sent: dict[str, asyncio.Task[None]] = {}
         self._loop = asyncio.new_event_loop()
@@ -207,7 +209,9 @@ class Gateway:
 
         ``situation`` is the telling that the texts answer: it knows what their names mean.
         """
-        plans: list[Plan | PlanOutcome] = [_plan_or_verdict(text, situation, codec) for text in texts]
+        plans: list[Plan | PlanOutcome] = [
+            _plan_or_verdict(text, situation, codec, self._terms.reward) for text in texts
+        ]
         rollouts = tuple(
             Rollout(
                 rollout_id=f"{self.run_id}/{batch_id}/{index}",
@@ -240,11 +244,13 @@ class Gateway:
         )
 
 
-def _plan_or_verdict(text: str, situation: Situation, codec: Codec) -> Plan | PlanOutcome:
+def _plan_or_verdict(
+    text: str, situation: Situation, codec: Codec, reward: RewardSettings
+) -> Plan | PlanOutcome:
     try:
         return parsed(text, situation, codec)
     except PlanError as error:
-        return PlanOutcome(text, unparsable(), problem=str(error))
+        return PlanOutcome(text, unparsable(reward), problem=str(error))
 
 
 def _plan_outcome(text: str, outcome: Outcome | None) -> PlanOutcome:

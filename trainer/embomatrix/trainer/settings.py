@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import tomllib
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from embomatrix.reward.settings import PAPER, RewardSettings
 from embomatrix.skills.prompt import Codec
 from embomatrix.trainer.errors import TrainerError
 from embomatrix.trainer.grpo import LossKind, Objective, RatioLevel
@@ -117,6 +118,24 @@ class GrpoSettings(_Frozen):
         )
 
 
+class RewardTable(_Frozen):
+    """Coefficients of the reward's tiers: what the cluster scores this run's plans with. 0 leaves a tier out."""
+
+    unparsable: float = PAPER.unparsable
+    format: float = PAPER.format
+    relevance_per_object: float = PAPER.relevance_per_object
+    relevance_limit: float = PAPER.relevance_limit
+    goal: float = PAPER.goal
+
+    @model_validator(mode="after")
+    def _pays(self) -> Self:
+        self.settings()
+        return self
+
+    def settings(self) -> RewardSettings:
+        return RewardSettings(**self.model_dump())
+
+
 class EvaluationSettings(_Frozen):
     """Success on held-out tasks."""
 
@@ -144,6 +163,7 @@ class TrainSettings(_Frozen):
     prompt: PromptSettings = PromptSettings()
     imitation: ImitationSettings = ImitationSettings()
     grpo: GrpoSettings = GrpoSettings()
+    reward: RewardTable = RewardTable()
     evaluation: EvaluationSettings = EvaluationSettings()
 
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from embomatrix.proto.v1 import types_pb2
+from embomatrix.reward.settings import PAPER
 from embomatrix.rpc.convert import completed_from_proto, rollout_to_proto
 from embomatrix.rpc.values import InfraCode, InfraFailure, Timings
 from embomatrix.sim.zygote import Frame
@@ -45,7 +47,7 @@ async def execute(ticket: Ticket, scene: Scene, slot: Slot, residents: Residents
     body = ticket.lease.rollout.wire or rollout_to_proto(ticket.lease.rollout).SerializeToString()
     try:
         async with asyncio.timeout(ticket.lease.deadline_s):
-            answer = await slot.child.peer.ask(Frame({"op": "execute", "slot": ticket.slot}, body))
+            answer = await slot.child.peer.ask(Frame(_order(ticket), body))
     except TimeoutError:
         residents.end_later(slot.child)
         late = f"the rollout took longer than its {ticket.lease.deadline_s:g} s and was killed"
@@ -57,6 +59,12 @@ async def execute(ticket: Ticket, scene: Scene, slot: Slot, residents: Residents
         residents.end_later(slot.child)
         raise
     return _outcome(ticket, scene, slot, answer, residents)
+
+
+def _order(ticket: Ticket) -> dict[str, Any]:
+    reward = ticket.lease.reward
+    own = {} if reward is PAPER else {"reward": dataclasses.asdict(reward)}
+    return {"op": "execute", "slot": ticket.slot, **own}
 
 
 def _outcome(

@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.reward.hierarchy import score
+from embomatrix.reward.settings import PAPER, RewardSettings
 from embomatrix.rpc.convert import completed_to_proto, rollout_from_proto, rollout_to_proto
 from embomatrix.rpc.values import Completed, Rollout, Timings
 from embomatrix.sim.bullet.client import ClientPool
@@ -83,7 +84,12 @@ class PhysicsScene:
         """Give the clients back. The scene can't be used afterwards."""
         self._simulator.close()
 
-    def execute(self, rollout: Rollout, on_step: Callable[[int], None] = lambda _: None) -> Completed:
+    def execute(
+        self,
+        rollout: Rollout,
+        on_step: Callable[[int], None] = lambda _: None,
+        reward: RewardSettings = PAPER,
+    ) -> Completed:
         task = self._tasks.get(rollout.task_id)
         if task is None:
             raise UnknownTaskError(
@@ -92,7 +98,7 @@ class PhysicsScene:
             )
         trace = self._simulator.execute(task, rollout.plan, rollout.seed, on_step)
         return Completed(
-            reward=score(task, trace.touched, self._simulator.facts),
+            reward=score(task, trace.touched, self._simulator.facts, reward),
             steps=trace.steps,
             final=trace.final,
             trace_digest=trace.digest,

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from embomatrix.proto.v1 import types_pb2
+from embomatrix.reward.settings import PAPER, RewardSettings
 from embomatrix.rpc.convert import completed_to_proto, rollout_from_proto
 from embomatrix.rpc.values import InfraCode
 from embomatrix.sim.zygote import (
@@ -51,8 +52,8 @@ COLLECT_EVERY: Final = 32
 class LoadedScene(Protocol):
     """A scene in memory, ready to execute plans. It leaves nothing behind from one rollout to the next."""
 
-    def execute(self, rollout: Rollout, on_step: Callable[[int], None]) -> Completed:
-        """Execute the plan; ``on_step`` is told after each step how many are done."""
+    def execute(self, rollout: Rollout, on_step: Callable[[int], None], reward: RewardSettings) -> Completed:
+        """Execute the plan and score it; ``on_step`` is told after each step how many are done."""
 
     def complete(self) -> Iterator[None]:
         """Steps of a millisecond or two that make later executions faster and change nothing else."""
@@ -132,13 +133,16 @@ def _run_slot(scene: LoadedScene, connection: socket.socket, memory_mb: int, boa
         if request is None:
             return
         on_step = functools.partial(board.set, int(request.header.get("slot", 0)))
-        send(connection, _answer(scene, request.body, on_step))
+        send(connection, _answer(scene, request, on_step))
 
 
-def _answer(scene: LoadedScene, body: bytes, on_step: Callable[[int], None]) -> Frame:
+def _answer(scene: LoadedScene, request: Frame, on_step: Callable[[int], None]) -> Frame:
     started_s, core_s = time.perf_counter(), time.thread_time()
     try:
-        completed = scene.execute(rollout_from_proto(types_pb2.Rollout.FromString(body)), on_step)
+        own = request.header.get("reward")
+        reward = PAPER if own is None else RewardSettings(**own)
+        rollout = rollout_from_proto(types_pb2.Rollout.FromString(request.body))
+        completed = scene.execute(rollout, on_step, reward)
         result = completed_to_proto(completed).SerializeToString()
     except MemoryError as error:
         return Frame(_failure(InfraCode.SLOT_OOM, error))

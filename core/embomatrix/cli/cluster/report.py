@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import html
 import string
 import time
@@ -11,11 +12,13 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.cli.cluster.charts import busy_chart, phase_chart, throughput_chart
 from embomatrix.cli.cluster.timeline import busy_share, slot_spans
+from embomatrix.reward.settings import PAPER
 from embomatrix.rpc.run_log import EventKind, Phase
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
+    from embomatrix.reward.settings import RewardSettings
     from embomatrix.rpc.run_log import PhaseSummary, RunEvent, RunSummary
 
 STEPS: Final = 240
@@ -64,7 +67,20 @@ def _about(summary: RunSummary) -> str:
     run = summary.run
     opened = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(run.opened_s))
     state = "closed" if run.closed_s else "still open"
-    return f"run {run.run_id} · opened {opened} · {seconds_text(_length_s(summary))} · {state} · EmboMatrix {summary.version}"
+    length = seconds_text(_length_s(summary))
+    return (
+        f"run {run.run_id} · opened {opened} · {length} · {state} · {_reward_text(run.reward)} · "
+        f"EmboMatrix {summary.version}"
+    )
+
+
+def _reward_text(reward: RewardSettings) -> str:
+    """The coefficients that are not the paper's."""
+    told = dataclasses.asdict(reward)
+    own = [
+        f"{name} {told[name]:g}" for name, usual in dataclasses.asdict(PAPER).items() if told[name] != usual
+    ]
+    return f"reward: {', '.join(own)}, else the paper's" if own else "reward: the paper's"
 
 
 def _length_s(summary: RunSummary) -> float:

@@ -89,6 +89,7 @@ def run_table(runs: Sequence[RunInfo]) -> Table:
     table = _table("run", "name", "state", **dict.fromkeys(("done", "open", "failed", "again", "late"), 1))
     table.add_column("prewarm hits", justify="right", no_wrap=True)
     table.add_column("wasted", justify="right", no_wrap=True)
+    table.add_column("waits for", overflow="fold", max_width=SENTENCE)
     for run in runs:
         stats = run.stats
         asked = stats.prewarm_hits + stats.prewarm_misses
@@ -100,6 +101,7 @@ def run_table(runs: Sequence[RunInfo]) -> Table:
             *map(str, counts),
             f"{stats.prewarm_hits}/{asked}" if asked else "-",
             str(stats.prewarm_wasted),
+            Text(run.waits_for),
         )
     return table
 

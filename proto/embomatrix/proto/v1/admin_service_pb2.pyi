@@ -470,14 +470,22 @@ class RunInfo(google.protobuf.message.Message):
     PENDING_FIELD_NUMBER: builtins.int
     OPENED_S_FIELD_NUMBER: builtins.int
     CLOSED_S_FIELD_NUMBER: builtins.int
+    REWARD_FIELD_NUMBER: builtins.int
+    WAITS_FOR_FIELD_NUMBER: builtins.int
     run_id: builtins.str
     name: builtins.str
     pending: builtins.int
     opened_s: builtins.float
     """Seconds since the epoch on the manager's clock; closed_s is 0 while it is open."""
     closed_s: builtins.float
+    waits_for: builtins.str
+    """Why rollouts of it can't be executed by any worker that is there; empty while they can."""
     @property
     def stats(self) -> embomatrix.proto.v1.rollout_service_pb2.RunStats: ...
+    @property
+    def reward(self) -> embomatrix.proto.v1.types_pb2.RewardSettings:
+        """Its coefficients; absent for the workers' defaults."""
+
     def __init__(
         self,
         *,
@@ -487,9 +495,11 @@ class RunInfo(google.protobuf.message.Message):
         pending: builtins.int = ...,
         opened_s: builtins.float = ...,
         closed_s: builtins.float = ...,
+        reward: embomatrix.proto.v1.types_pb2.RewardSettings | None = ...,
+        waits_for: builtins.str = ...,
     ) -> None: ...
-    def HasField(self, field_name: typing.Literal["stats", b"stats"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["closed_s", b"closed_s", "name", b"name", "opened_s", b"opened_s", "pending", b"pending", "run_id", b"run_id", "stats", b"stats"]) -> None: ...
+    def HasField(self, field_name: typing.Literal["reward", b"reward", "stats", b"stats"]) -> builtins.bool: ...
+    def ClearField(self, field_name: typing.Literal["closed_s", b"closed_s", "name", b"name", "opened_s", b"opened_s", "pending", b"pending", "reward", b"reward", "run_id", b"run_id", "stats", b"stats", "waits_for", b"waits_for"]) -> None: ...
 
 Global___RunInfo: typing_extensions.TypeAlias = RunInfo
 
