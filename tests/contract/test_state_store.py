@@ -5,6 +5,7 @@ import contextlib
 import dataclasses
 import itertools
 import resource
+import sqlite3
 
 import pytest
 from tests.fakes.redis_server import RedisServer
@@ -15,12 +16,13 @@ from embomatrix.manager.store.protocol import (
     BatchResults,
     BatchRow,
     Candidate,
-    CredentialRow,
     FencedError,
     Lead,
     PutOutcome,
     ResultRow,
     RunRow,
+    Shelf,
+    ShelfRow,
     StateError,
     StateFullError,
 )
@@ -185,17 +187,26 @@ async def test_another_process_finds_everything_again(store, openings):
     assert await again.results_after("r1", "b1", 1, 100) == rows(2)
 
 
-async def test_credentials_are_known_to_whoever_opens_the_state_and_the_last_word_on_one_counts(openings):
-    store = openings()
-    await store.claim(FIRST)
-    await store.put_credentials([CredentialRow("a", b"\x00first"), CredentialRow("b", b"of b")])
-    await store.put_credentials([CredentialRow("a", b"second\xff")])
+@pytest.mark.parametrize("shelf", Shelf)
+async def test_what_is_kept_by_name_is_known_to_whoever_opens_the_state_and_the_last_word_counts(
+    store, openings, shelf
+):
+    await store.put_rows(shelf, [ShelfRow("a", b"\x00first"), ShelfRow("b", b"of b")])
+    await store.put_rows(shelf, [ShelfRow("a", b"second\xff")])
     again = openings()
-    found = await again.credentials()
-    assert sorted(found, key=lambda row: row.token_id) == [
-        CredentialRow("a", b"second\xff"),
-        CredentialRow("b", b"of b"),
-    ]
+    found = await again.rows(shelf)
+    assert sorted(found, key=lambda row: row.key) == [ShelfRow("a", b"second\xff"), ShelfRow("b", b"of b")]
+    assert [await again.rows(other) for other in Shelf if other is not shelf] == [[], []]
+
+
+async def test_credentials_in_the_file_of_an_older_manager_are_taken_up(tmp_path):
+    with contextlib.closing(sqlite3.connect(tmp_path / "state.sqlite")) as older:
+        older.execute("CREATE TABLE credential (token_id TEXT PRIMARY KEY, payload BLOB NOT NULL)")
+        older.execute("INSERT INTO credential VALUES ('a', x'00ff')")
+        older.commit()
+    store = SqliteStore(tmp_path / "state.sqlite")
+    assert await store.rows(Shelf.CREDENTIALS) == [ShelfRow("a", b"\x00\xff")]
+    await store.close()
 
 
 async def test_only_one_of_two_managers_leads_and_the_other_learns_its_address(store, openings):
@@ -259,7 +270,7 @@ async def test_the_manager_that_claimed_last_is_the_only_one_that_writes(store, 
         store.append_results([BatchResults("r1", "b1", rows(1))]),
         store.drop_batch("r1", "b1"),
         store.close_run("r1"),
-        store.put_credentials([CredentialRow("a", b"")]),
+        store.put_rows(Shelf.CREDENTIALS, [ShelfRow("a", b"")]),
         store.put_workers(["w1"]),
     ):
         with pytest.raises(FencedError, match="another manager"):

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import dataclasses
 from dataclasses import dataclass, field
 
 import grpc
@@ -68,6 +69,8 @@ class FakeWorker:
     cancelled: list = field(default_factory=list)
     residents: dict = field(default_factory=dict)
     paused: str = ""
+    lies: bool = False
+    """It says that plans reached nothing of their goal."""
     resumed: bool = False
 
     async def __aenter__(self):
@@ -192,7 +195,8 @@ class FakeWorker:
             if lease.rollout.task_id in self.poison:
                 self.report(lease.ref, InfraFailure(InfraCode.SLOT_CRASHED, "signal 11", self.worker_id))
             else:
-                self.report(lease.ref, completed(self.worker_id, lease.reward))
+                reward = dataclasses.replace(lease.reward, goal=0.0) if self.lies else lease.reward
+                self.report(lease.ref, completed(self.worker_id, reward))
 
     async def _beat(self, interval_s):
         while True:

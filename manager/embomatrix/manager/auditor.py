@@ -116,7 +116,7 @@ class Repute:
     """Executions of it with which another agreed, since it was put on probation."""
     audited: int = 0
     disputed: int = 0
-    """Results of it that another contradicts and that a third has to tell about."""
+    """Results of it that another contradicts and that a third has to tell about; what a former manager left open is not."""
     mismatches: int = 0
     """Of those audited: in which it was found to be wrong."""
     quarantine: str = ""
@@ -132,6 +132,20 @@ class Auditor:
         """A result was not audited because there was no second worker."""
         self._key = key
         self._reputes: dict[str, Repute] = {}
+        self._changed: dict[str, None] = {}
+
+    def know(self, reputes: Mapping[str, Repute]) -> None:
+        """What former managers found out."""
+        self._reputes.update(reputes)
+
+    def note(self, *worker_ids: str) -> None:
+        """There is more to be noted of these workers."""
+        self._changed.update(dict.fromkeys(worker_ids))
+
+    def take_changed(self) -> list[str]:
+        """Workers whose repute changed since this was last asked."""
+        changed, self._changed = self._changed, {}
+        return list(changed)
 
     def of(self, worker_id: str) -> Repute:
         return self._reputes.setdefault(worker_id, Repute())
@@ -151,14 +165,21 @@ class Auditor:
         known = repute.agreed if verified else repute.taken
         return known < self.rules.probation or self._drawn(lease_id)
 
+    def took(self, worker_id: str) -> None:
+        """A result of it is to be compared."""
+        self.of(worker_id).taken += 1
+        self.note(worker_id)
+
     def agreed(self, worker_id: str) -> None:
         """Others came to what it came to."""
+        self.note(worker_id)
         repute = self.of(worker_id)
         repute.agreed += 1
         repute.audited += 1
 
     def convict(self, worker_id: str, reason: str) -> None:
         """A majority contradicts it."""
+        self.note(worker_id)
         repute = self.of(worker_id)
         repute.audited += 1
         repute.mismatches += 1
@@ -168,6 +189,7 @@ class Auditor:
         """An operator takes it back: it is on probation again."""
         repute = self._reputes.get(worker_id)
         if repute is not None and repute.quarantine:
+            self.note(worker_id)
             repute.taken = repute.agreed = 0
             repute.quarantine = ""
 

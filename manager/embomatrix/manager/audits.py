@@ -65,7 +65,7 @@ class Audits:
             self.auditor.lone = True
             return False
         self.auditor.lone = False
-        self.auditor.of(worker_id).taken += 1
+        self.auditor.took(worker_id)
         opinion = opinion_of(worker_id, self._desk.fleet.workers[worker_id].versions, completed)
         case = Case(
             record.key, record if verified else None, check, [opinion], [completed] if verified else []

@@ -30,6 +30,7 @@ from embomatrix.manager.events import (
     Event,
     LeaseFinished,
     LeasesRenewed,
+    ReputesKnown,
     RunClosed,
     RunOpened,
     ScenesUnplaceable,
@@ -96,6 +97,8 @@ class Dispatcher:
                 self._recovery.restore(event)
             case WorkersExpected(worker_ids):
                 self._recovery.expect(worker_ids)
+            case ReputesKnown(reputes):
+                self._desk.audits.auditor.know(reputes)
             case BatchCancelled(run_id, batch_id):
                 self._desk.cancel((run_id, batch_id))
             case RunClosed(run_id):

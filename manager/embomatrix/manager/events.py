@@ -10,6 +10,7 @@ from embomatrix.rpc.versions import PROTOCOL_VERSION
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from embomatrix.manager.auditor import Repute
     from embomatrix.rpc.values import (
         Batch,
         Completed,
@@ -148,6 +149,13 @@ class WorkersExpected:
 
 
 @dataclass(frozen=True, slots=True)
+class ReputesKnown:
+    """What former managers found out about workers, by their ids."""
+
+    reputes: Mapping[str, Repute]
+
+
+@dataclass(frozen=True, slots=True)
 class BatchCancelled:
     run_id: str
     batch_id: str
@@ -230,6 +238,7 @@ Event = (
     | BatchSubmitted
     | BatchRestored
     | WorkersExpected
+    | ReputesKnown
     | BatchCancelled
     | RunClosed
     | LookaheadAnnounced

@@ -1,11 +1,14 @@
-"""Batches and results as bytes: what the store keeps, and what a result's stream sends without converting it again."""
+"""Batches, results and reputes as bytes: what the store keeps, and what a result's stream sends without converting it again."""
 
 from __future__ import annotations
 
 import hashlib
+import json
+from dataclasses import asdict
 from typing import TYPE_CHECKING
 
-from embomatrix.manager.store.protocol import BatchRow, ResultRow
+from embomatrix.manager.auditor import Repute
+from embomatrix.manager.store.protocol import BatchRow, ResultRow, ShelfRow
 from embomatrix.proto.v1 import rollout_service_pb2, types_pb2
 from embomatrix.rpc.convert import rollout_result_to_proto
 from embomatrix.rpc.convert_batch import batch_from_proto, batch_to_proto
@@ -47,6 +50,16 @@ def timed_row(row: ResultRow, deliver_s: float) -> ResultRow:
     timed = types_pb2.Completed(timings=types_pb2.Timings(deliver_s=deliver_s))
     told = types_pb2.RolloutResult(completed=timed).SerializeToString()
     return ResultRow(row.cursor, row.rollout_id, row.payload + told)
+
+
+def repute_row(worker_id: str, repute: Repute) -> ShelfRow:
+    """Disputes end with the manager in which they are open: what they are about is executed again."""
+    kept = {name: value for name, value in asdict(repute).items() if name != "disputed"}
+    return ShelfRow(worker_id, json.dumps(kept, separators=(",", ":")).encode())
+
+
+def repute_of(row: ShelfRow) -> Repute:
+    return Repute(**json.loads(row.payload))
 
 
 def terms_payload(terms: RunTerms) -> bytes:

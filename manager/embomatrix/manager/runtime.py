@@ -29,11 +29,11 @@ from embomatrix.manager.events import DispatchPaused, DispatchResumed
 from embomatrix.manager.garbage import Collector
 from embomatrix.manager.history import RunHistory
 from embomatrix.manager.intake import TICK_S, Heartbeat, Intake
+from embomatrix.manager.keeper import Keeper
 from embomatrix.manager.links import WorkerLink
 from embomatrix.manager.meter import Meter
 from embomatrix.manager.results import ResultLogs
 from embomatrix.manager.runs import RunLimits, Runs
-from embomatrix.manager.store.protocol import StateError
 from embomatrix.manager.store.timed import timed_store
 from embomatrix.manager.views import UNAUDITED
 from embomatrix.rpc.status import SupersededError, UnavailableError
@@ -54,7 +54,6 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 CLEANUP_S: Final = 5.0
-ROSTER_S: Final = 0.5
 LET_GO_S: Final = 30.0
 """A manager that is cut off from its store for so long has its workers turn to another. As long as a lease lives."""
 STORE_AWAY: Final = (
@@ -90,13 +89,14 @@ class ManagerRuntime:
         bundles.keep(cluster.needed_scenes)
         self.meter = Meter()
         self.effort = Effort()
-        self._store = store = timed_store(store, self.effort.operated)
+        store = timed_store(store, self.effort.operated)
         self.started_s = time.monotonic()
         self._collector = Collector(self.started_s)
         self.chronicle = Chronicle(epoch_s=time.time() - self.started_s)
         self.history = RunHistory(self.chronicle, archive, cluster)
         self.runs = Runs(cluster, store, bundles, logs, self._carry_out, limits or RunLimits(), self.history)
         self._intake = Intake(cluster, registry)
+        self._keeper = Keeper(store, registry, cluster.dispatcher)
         self._delivery = Delivery(store, logs, self._say, self.chronicle.in_log)
         self._links: dict[str, WorkerLink] = {}
         self._lapsed_s = lapsed_s
@@ -106,6 +106,9 @@ class ManagerRuntime:
 
     async def start(self) -> None:
         """Take the state up where a former manager left it."""
+        self._carry_out(self._intake.feed(await self._keeper.reputes(), now_s=time.monotonic()))
+        self._paused = await self._keeper.paused()
+        self._dispatch_or_not()
         await self.runs.restore()
 
     async def serve(self) -> None:
@@ -113,7 +116,7 @@ class ManagerRuntime:
         async with asyncio.TaskGroup() as group:
             group.create_task(self._keep_time())
             group.create_task(self._clean_up())
-            group.create_task(self._keep_roster())
+            group.create_task(self._keeper.serve())
             group.create_task(self._delivery.serve())
 
     def register(
@@ -191,16 +194,22 @@ class ManagerRuntime:
         self._carry_out(self._intake.feed(*self.registry.resume(worker_id), now_s=time.monotonic()))
         if worker_id in self._links:
             self._links[worker_id].resume()
+        self._keeper.hurry()
 
-    def pause_dispatch(self) -> None:
-        """No new leases are given; what runs goes on."""
+    async def pause_dispatch(self) -> None:
+        """No new leases are given, also by the managers that come after this one; what runs goes on.
+
+        UnavailableError where those could not be told.
+        """
         self._paused = True
         self._dispatch_or_not()
+        await self._keeper.note_pause(True)
 
-    def resume_dispatch(self) -> None:
-        """Leases are given again, unless the store is away."""
+    async def resume_dispatch(self) -> None:
+        """Leases are given again, unless the store is away. UnavailableError as above."""
         self._paused = False
         self._dispatch_or_not()
+        await self._keeper.note_pause(False)
 
     def _dispatch_or_not(self) -> None:
         event = DispatchPaused() if self._paused or self._suspended else DispatchResumed()
@@ -226,6 +235,7 @@ class ManagerRuntime:
                     self._delivery.put(command)
                 case QuarantineWorker():
                     logger.error("worker quarantined worker=%s: %s", command.worker_id, command.reason)
+                    self._keeper.hurry()
 
     def _say(self, command: WorkerCommand) -> None:
         """Without a stream the command is lost; the worker's next full state shows that, and it is given again."""
@@ -269,17 +279,6 @@ class ManagerRuntime:
                 self.chronicle.fleet.lost(event.worker_id, event.reason, now_s=time.monotonic())
                 self._close_link(event.worker_id)
             self._carry_out(commands)
-
-    async def _keep_roster(self) -> None:
-        """Note who is there, for the manager that comes after this one: it is a hint, and may be a second old."""
-        noted: frozenset[str] | None = None
-        while True:
-            await asyncio.sleep(ROSTER_S)
-            present = self.registry.present | self.cluster.dispatcher.expected
-            if present != noted:
-                with contextlib.suppress(StateError):
-                    await self._store.put_workers(present)
-                    noted = present
 
     async def _clean_up(self) -> None:
         while True:

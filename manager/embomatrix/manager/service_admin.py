@@ -75,12 +75,12 @@ class AdminServicer(TokenMethods):
         self, request: pb.PauseDispatchRequest, context: grpc.aio.ServicerContext
     ) -> pb.PauseDispatchResponse:
         async with translate(context):
-            self._runtime.pause_dispatch()
+            await self._runtime.pause_dispatch()
         return pb.PauseDispatchResponse()
 
     async def ResumeDispatch(
         self, request: pb.ResumeDispatchRequest, context: grpc.aio.ServicerContext
     ) -> pb.ResumeDispatchResponse:
         async with translate(context):
-            self._runtime.resume_dispatch()
+            await self._runtime.resume_dispatch()
         return pb.ResumeDispatchResponse()

@@ -10,7 +10,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 
 from embomatrix.manager.access.credentials import LONGEST_JOIN_S, CredentialBook, hash_of
 from embomatrix.manager.access.roles import OPEN, ROLES, may_call, who_may
-from embomatrix.manager.store.protocol import CredentialRow
+from embomatrix.manager.store.protocol import ShelfRow
 from embomatrix.proto.v1 import (
     admin_service_pb2,
     rollout_service_pb2,
@@ -76,7 +76,7 @@ def test_a_token_is_known_by_its_hash_alone_and_survives_being_written_down():
     credential, token = issued(book, Role.TRAINER, label="ann")
     row = credential.row()
     assert token.encode().partition(b".")[2] not in row.payload
-    again = CredentialBook([type(credential).from_row(CredentialRow(row.token_id, row.payload))])
+    again = CredentialBook([type(credential).from_row(ShelfRow(row.key, row.payload))])
     assert again.find(token, now_s=1.0) == credential
 
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from tests.fakes.worker import completed
 
 from embomatrix.manager.assignments import DispatchLimits
-from embomatrix.manager.auditor import Auditor, AuditRules, Ruling, judge, opinion_of
+from embomatrix.manager.auditor import Auditor, AuditRules, Repute, Ruling, judge, opinion_of
 from embomatrix.manager.cluster_state import ClusterState
 from embomatrix.manager.commands import CancelLease, DeliverResult, GiveLease, QuarantineWorker
 from embomatrix.manager.events import (
@@ -24,6 +24,7 @@ from embomatrix.manager.events import (
     WorkerReported,
     WorkerResumed,
 )
+from embomatrix.manager.records import repute_of, repute_row
 from embomatrix.manager.simulation.run import simulate
 from embomatrix.manager.simulation.scenario import LOCAL, Faults, Scenario, Trainer
 from embomatrix.reward.breakdown import AtomResult
@@ -310,6 +311,21 @@ def test_audits_of_plain_runs_are_off_unless_they_are_asked_for():
     bench.tell(Tick())
     assert not bench.live
     assert bench.stats().audited == 0
+
+
+def test_a_repute_is_written_when_it_changed_and_read_without_the_disputes_that_were_open():
+    auditor = Auditor(AuditRules(probation=2), b"key")
+    auditor.took("w1")
+    auditor.agreed("w1")
+    auditor.of("w1").disputed += 1
+    auditor.convict("w2", "it contradicts w1 and w3")
+    written = [repute_row(worker_id, auditor.of(worker_id)) for worker_id in auditor.take_changed()]
+    assert auditor.take_changed() == []
+    successor = Auditor(AuditRules(probation=2), b"key")
+    successor.know({row.key: repute_of(row) for row in written})
+    assert successor.of("w1") == Repute(taken=1, agreed=1, audited=1)
+    assert successor.quarantined("w2") == "it contradicts w1 and w3"
+    assert successor.take_changed() == []
 
 
 def test_after_probation_a_share_is_drawn_by_a_key_that_no_worker_has():

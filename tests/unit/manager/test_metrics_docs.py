@@ -13,6 +13,7 @@ from embomatrix.manager.prometheus import metrics_page
 from embomatrix.manager.registry import LivenessLimits, Registry
 from embomatrix.manager.runtime import ManagerRuntime
 from embomatrix.manager.store.memory import MemoryStore
+from embomatrix.manager.store.protocol import Shelf
 from embomatrix.manager.store.timed import timed_store
 
 GUIDE = Path(__file__).parents[3] / "docs" / "operations.md"
@@ -60,5 +61,5 @@ async def test_a_store_is_timed_by_operation_and_otherwise_the_same():
     took = []
     store = timed_store(MemoryStore(), lambda name, seconds: took.append((name, seconds >= 0.0)))
     assert await store.runs() == []
-    assert await store.credentials() == []
-    assert took == [("runs", True), ("credentials", True)]
+    assert await store.rows(Shelf.CREDENTIALS) == []
+    assert took == [("runs", True), ("rows", True)]

@@ -13,7 +13,7 @@ import secrets
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.manager.store.protocol import CredentialRow
+from embomatrix.manager.store.protocol import ShelfRow
 from embomatrix.rpc.roles import Role, TokenInfo
 from embomatrix.rpc.status import (
     InvalidRequestError,
@@ -59,12 +59,12 @@ class Credential:
     """Why it is void; empty while it is not."""
 
     @classmethod
-    def from_row(cls, row: CredentialRow) -> Credential:
+    def from_row(cls, row: ShelfRow) -> Credential:
         fields = json.loads(row.payload)
         return cls(**{**fields, "role": Role(fields["role"])})
 
-    def row(self) -> CredentialRow:
-        return CredentialRow(self.token_id, json.dumps(asdict(self), separators=(",", ":")).encode())
+    def row(self) -> ShelfRow:
+        return ShelfRow(self.token_id, json.dumps(asdict(self), separators=(",", ":")).encode())
 
     def named(self) -> str:
         """How a sentence calls it."""

@@ -18,7 +18,7 @@ from embomatrix.manager.access.certificates import (
     names_in,
 )
 from embomatrix.manager.access.credentials import LONGEST_JOIN_S, Credential, CredentialBook
-from embomatrix.manager.store.protocol import CredentialRow
+from embomatrix.manager.store.protocol import ShelfRow
 from embomatrix.rpc.roles import Role
 from embomatrix.rpc.trust import fingerprint_of
 
@@ -64,7 +64,7 @@ class AccessFolder:
         try:
             rows = json.loads(self.hashes.read_bytes())
             return tuple(
-                Credential.from_row(CredentialRow(row["token_id"], json.dumps(row).encode())) for row in rows
+                Credential.from_row(ShelfRow(row["token_id"], json.dumps(row).encode())) for row in rows
             )
         except (FileNotFoundError, NotADirectoryError):
             return ()

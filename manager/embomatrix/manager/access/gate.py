@@ -17,7 +17,7 @@ from embomatrix.manager.access.credentials import (
 )
 from embomatrix.manager.access.folder import AccessError
 from embomatrix.manager.access.roles import OPEN, may_call, who_may
-from embomatrix.manager.store.protocol import StateError
+from embomatrix.manager.store.protocol import Shelf, StateError
 from embomatrix.rpc.channel import TOKEN_KEY, token_of
 from embomatrix.rpc.roles import Role
 from embomatrix.rpc.status import (
@@ -89,11 +89,11 @@ class Gate:
         Raises AccessError for a shared token that was issued for a role: whoever holds it would become an admin.
         """
         now_s = self._clock()
-        known = [Credential.from_row(row) for row in await self._store.credentials()]
+        known = [Credential.from_row(row) for row in await self._store.rows(Shelf.CREDENTIALS)]
         self._book.keep(*(credential for credential in known if is_remembered(credential, now_s=now_s)))
         fresh = [credential for credential in first if credential.token_id not in self._book]
         if fresh:
-            await self._store.put_credentials([credential.row() for credential in fresh])
+            await self._store.put_rows(Shelf.CREDENTIALS, [credential.row() for credential in fresh])
             self._book.keep(*fresh)
         if self._shared.partition(".")[0] in self._book:
             raise AccessError(
@@ -196,7 +196,7 @@ class Gate:
     async def _keep(self, *credentials: Credential) -> None:
         """Written first: what the store does not hold was never granted, and never taken back."""
         try:
-            await self._store.put_credentials([credential.row() for credential in credentials])
+            await self._store.put_rows(Shelf.CREDENTIALS, [credential.row() for credential in credentials])
         except StateError as error:
             raise UnavailableError(str(error)) from error
         self._book.keep(*credentials)

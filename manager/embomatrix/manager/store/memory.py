@@ -9,12 +9,13 @@ from embomatrix.manager.store.protocol import (
     BatchResults,
     BatchRow,
     Candidate,
-    CredentialRow,
     FencedError,
     Lead,
     PutOutcome,
     ResultRow,
     RunRow,
+    Shelf,
+    ShelfRow,
 )
 
 if TYPE_CHECKING:
@@ -32,7 +33,7 @@ class MemoryState:
         self.runs: dict[str, RunRow] = {}
         self.batches: dict[tuple[str, str], BatchRow] = {}
         self.results: dict[tuple[str, str], dict[str, ResultRow]] = {}
-        self.credentials: dict[str, CredentialRow] = {}
+        self.shelves: dict[Shelf, dict[str, ShelfRow]] = {shelf: {} for shelf in Shelf}
 
 
 class MemoryStore:
@@ -112,12 +113,12 @@ class MemoryStore:
     async def workers(self) -> frozenset[str]:
         return self._state.workers
 
-    async def put_credentials(self, rows: Sequence[CredentialRow]) -> None:
+    async def put_rows(self, shelf: Shelf, rows: Sequence[ShelfRow]) -> None:
         self._check()
-        self._state.credentials.update((row.token_id, row) for row in rows)
+        self._state.shelves[shelf].update((row.key, row) for row in rows)
 
-    async def credentials(self) -> list[CredentialRow]:
-        return list(self._state.credentials.values())
+    async def rows(self, shelf: Shelf) -> list[ShelfRow]:
+        return list(self._state.shelves[shelf].values())
 
     async def close(self) -> None:
         if self._epoch == self._state.epoch:

@@ -1,4 +1,5 @@
-"""What the manager writes down, so that another process of it can go on: runs, batches, and delivered results.
+"""What the manager writes down, so that another process of it can go on: runs, batches, delivered results, and what is known
+of tokens and workers.
 
 Leases are not among it: the workers that hold them say so when they come back.
 """
@@ -94,11 +95,22 @@ class BatchResults:
     rows: Sequence[ResultRow]
 
 
-@dataclass(frozen=True, slots=True)
-class CredentialRow:
-    """Who may call: ``payload`` is opaque to the store and holds no secret, only its hash."""
+class Shelf(StrEnum):
+    """What is kept by name beside the runs, for every manager that comes."""
 
-    token_id: str
+    CREDENTIALS = "credentials"
+    """Who may call, by the token's id. They hold no secret, only its hash."""
+    REPUTES = "reputes"
+    """What is known of workers' honesty, by their ids."""
+    SWITCHES = "switches"
+    """What operators turned on or off."""
+
+
+@dataclass(frozen=True, slots=True)
+class ShelfRow:
+    """One thing that is kept by name; ``payload`` is opaque to the store."""
+
+    key: str
     payload: bytes
 
 
@@ -147,11 +159,11 @@ class StateStore(Protocol):
     async def workers(self) -> frozenset[str]:
         """The workers of that list."""
 
-    async def put_credentials(self, rows: Sequence[CredentialRow]) -> None:
-        """Note these, all or none; one of a known id replaces it."""
+    async def put_rows(self, shelf: Shelf, rows: Sequence[ShelfRow]) -> None:
+        """Note these, all or none; one of a known key replaces it."""
 
-    async def credentials(self) -> list[CredentialRow]:
-        """Every credential that was ever put, in no order."""
+    async def rows(self, shelf: Shelf) -> list[ShelfRow]:
+        """The last of every key that was ever put there, in no order."""
 
     async def close(self) -> None:
         """Leave the lead to whoever claims it next, and let go of connections and files."""

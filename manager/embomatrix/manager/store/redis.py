@@ -1,9 +1,9 @@
 """State in Redis (6.2 command set, also Valkey): for clusters, and for another manager to take over.
 
-Keys, all below one prefix: ``epoch``; ``leader`` (hash holder, address; it lapses); ``workers`` (set); ``credentials`` (hash
-token id -> payload); ``runs`` (hash id -> name), ``run_terms`` (hash id -> terms) and ``run_order`` (list); of a run
-``batches:RUN`` (list of ids); of a batch ``batch:RUN:BATCH`` (hash digest, payload), ``done:RUN:BATCH`` (set of rollouts),
-``results:RUN:BATCH`` (sorted set of "rollout id length:rollout id payload" by cursor).
+Keys, all below one prefix: ``epoch``; ``leader`` (hash holder, address; it lapses); ``workers`` (set); ``credentials``,
+``reputes`` and ``switches`` (hashes name -> payload); ``runs`` (hash id -> name), ``run_terms`` (hash id -> terms) and
+``run_order`` (list); of a run ``batches:RUN`` (list of ids); of a batch ``batch:RUN:BATCH`` (hash digest, payload),
+``done:RUN:BATCH`` (set of rollouts), ``results:RUN:BATCH`` (sorted set of "rollout id length:rollout id payload" by cursor).
 Every conditional write is one Lua script that checks the epoch first.
 """
 
@@ -20,12 +20,13 @@ from embomatrix.manager.store.protocol import (
     BatchResults,
     BatchRow,
     Candidate,
-    CredentialRow,
     FencedError,
     Lead,
     PutOutcome,
     ResultRow,
     RunRow,
+    Shelf,
+    ShelfRow,
     StateError,
     StateFullError,
 )
@@ -134,7 +135,7 @@ redis.call('HDEL', KEYS[5], ARGV[2])
 return 1
 """
 )
-_PUT_CREDENTIALS: Final = (
+_PUT_ROWS: Final = (
     _GUARD
     + """
 for index = 2, #ARGV, 2 do redis.call('HSET', KEYS[2], ARGV[index], ARGV[index + 1]) end
@@ -231,13 +232,13 @@ class RedisStore:
         found = await self._call(cast("Awaitable[Any]", self._redis.smembers(self._key("workers"))))
         return frozenset(worker_id.decode() for worker_id in found)
 
-    async def put_credentials(self, rows: Sequence[CredentialRow]) -> None:
-        flat = [value for row in rows for value in (row.token_id, row.payload)]
-        await self._script(_PUT_CREDENTIALS, ("credentials",), *flat)
+    async def put_rows(self, shelf: Shelf, rows: Sequence[ShelfRow]) -> None:
+        flat = [value for row in rows for value in (row.key, row.payload)]
+        await self._script(_PUT_ROWS, (shelf.value,), *flat)
 
-    async def credentials(self) -> list[CredentialRow]:
-        found = await self._call(self._redis.hgetall(self._key("credentials")))
-        return [CredentialRow(token_id.decode(), payload) for token_id, payload in found.items()]
+    async def rows(self, shelf: Shelf) -> list[ShelfRow]:
+        found = await self._call(self._redis.hgetall(self._key(shelf.value)))
+        return [ShelfRow(key.decode(), payload) for key, payload in found.items()]
 
     async def close(self) -> None:
         with contextlib.suppress(StateError):

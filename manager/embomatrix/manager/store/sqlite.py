@@ -12,12 +12,13 @@ from embomatrix.manager.store.protocol import (
     BatchResults,
     BatchRow,
     Candidate,
-    CredentialRow,
     FencedError,
     Lead,
     PutOutcome,
     ResultRow,
     RunRow,
+    Shelf,
+    ShelfRow,
     StateError,
     StateFullError,
 )
@@ -49,7 +50,9 @@ CREATE TABLE IF NOT EXISTS result (
     payload BLOB NOT NULL, PRIMARY KEY (run_id, batch_id, rollout_id)
 ) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS worker (worker_id TEXT PRIMARY KEY) WITHOUT ROWID;
-CREATE TABLE IF NOT EXISTS credential (token_id TEXT PRIMARY KEY, payload BLOB NOT NULL);
+CREATE TABLE IF NOT EXISTS shelf (
+    shelf TEXT NOT NULL, key TEXT NOT NULL, payload BLOB NOT NULL, PRIMARY KEY (shelf, key)
+) WITHOUT ROWID;
 CREATE INDEX IF NOT EXISTS result_order ON result (run_id, batch_id, cursor);
 """
 
@@ -70,9 +73,7 @@ class SqliteStore:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._db = sqlite3.connect(path, timeout=5.0, check_same_thread=False, isolation_level=None)
             self._db.executescript(_SCHEMA)
-            if all(column[1] != "terms" for column in self._db.execute("PRAGMA table_info(run)")):
-                # The file of an older manager.
-                self._db.execute("ALTER TABLE run ADD COLUMN terms BLOB NOT NULL DEFAULT x''")
+            self._take_up_older()
         except (sqlite3.Error, OSError) as error:
             raise StateError(
                 f"the state file {path} can't be used ({error}): check its folder's permissions, or pass --state"
@@ -164,20 +165,29 @@ class SqliteStore:
     async def workers(self) -> frozenset[str]:
         return frozenset(row[0] for row in await self._read("SELECT worker_id FROM worker"))
 
-    async def put_credentials(self, rows: Sequence[CredentialRow]) -> None:
-        values = [(row.token_id, row.payload) for row in rows]
-        await self._run(
-            lambda: self._db.executemany("INSERT OR REPLACE INTO credential VALUES (?, ?)", values)
-        )
+    async def put_rows(self, shelf: Shelf, rows: Sequence[ShelfRow]) -> None:
+        values = [(shelf.value, row.key, row.payload) for row in rows]
+        await self._run(lambda: self._db.executemany("INSERT OR REPLACE INTO shelf VALUES (?, ?, ?)", values))
 
-    async def credentials(self) -> list[CredentialRow]:
-        return [CredentialRow(*row) for row in await self._read("SELECT token_id, payload FROM credential")]
+    async def rows(self, shelf: Shelf) -> list[ShelfRow]:
+        query = "SELECT key, payload FROM shelf WHERE shelf = ?"
+        return [ShelfRow(*row) for row in await self._read(query, shelf.value)]
 
     async def close(self) -> None:
         with contextlib.suppress(StateError):
             await self._write("DELETE FROM leader")
         async with self._lock:
             self._db.close()
+
+    def _take_up_older(self) -> None:
+        """Read on in the file of an older manager, which kept no terms, and credentials in a table of their own."""
+        if all(column[1] != "terms" for column in self._db.execute("PRAGMA table_info(run)")):
+            self._db.execute("ALTER TABLE run ADD COLUMN terms BLOB NOT NULL DEFAULT x''")
+        if self._db.execute("SELECT 1 FROM sqlite_master WHERE name = 'credential'").fetchone():
+            self._db.execute(
+                "INSERT OR IGNORE INTO shelf SELECT ?, token_id, payload FROM credential",
+                (Shelf.CREDENTIALS.value,),
+            )
 
     def _lead(self, candidate: Candidate) -> None:
         row = (candidate.holder, candidate.address, self._clock() + candidate.ttl_s)

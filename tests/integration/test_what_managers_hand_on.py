@@ -1,0 +1,104 @@
+"""What operators and audits decided outlives the manager that it was told: the next one on the same state knows it."""
+
+import asyncio
+import contextlib
+
+import pytest
+from tests.fakes.redis_server import RedisServer
+from tests.fakes.worker import FakeWorker
+from tests.integration.test_manager_service import BUNDLES, batch, manager, outcomes, until
+
+from embomatrix.cli.local_cluster import free_port
+from embomatrix.rpc.admin import AdminClient
+from embomatrix.rpc.client import ClusterClient
+from embomatrix.rpc.status import UnavailableError
+from embomatrix.rpc.values import Completed, GroupPolicy, RunTerms
+
+pytestmark = pytest.mark.timeout(60)
+VERIFIED = RunTerms(GroupPolicy.PARTIAL, verified=True)
+
+
+@pytest.fixture(scope="module")
+def redis_url(tmp_path_factory):
+    with RedisServer(tmp_path_factory.mktemp("redis"), free_port()) as server:
+        yield server.url
+
+
+@pytest.fixture(params=["sqlite", "redis"])
+def state(request, tmp_path):
+    if request.param == "sqlite":
+        return f"sqlite:{tmp_path / 'state.sqlite'}"
+    return request.getfixturevalue("redis_url")
+
+
+@contextlib.asynccontextmanager
+async def people(address):
+    async with ClusterClient(address) as client, AdminClient(address) as admin:
+        await client.put_bundles(BUNDLES)
+        yield client, admin
+
+
+async def states(admin):
+    return {info.worker_id: info.state for info in await admin.list_workers()}
+
+
+async def test_a_worker_in_quarantine_stays_there_under_the_next_manager_until_an_operator_trusts_it(
+    tmp_path, state
+):
+    async with manager(tmp_path, state=state) as at, people(at.address) as (client, admin):
+        await client.open_run("verified", "r1", VERIFIED)
+        async with (
+            FakeWorker(at.address, "liar", lies=True),
+            FakeWorker(at.address, "w2"),
+            FakeWorker(at.address, "w3"),
+        ):
+            results = await outcomes(client, batch(8))
+            assert {result.outcome.reward.goal for result in results.values()} == {15.0}
+            assert (await states(admin))["liar"] == "quarantined"
+        await client.close_run("r1")
+    async with manager(tmp_path / "second", state=state) as at, people(at.address) as (client, admin):
+        await client.open_run("plain", "r1")
+        async with FakeWorker(at.address, "liar", lies=True) as liar:
+            assert await states(admin) == {"liar": "quarantined"}
+            reason = (await admin.list_workers())[0].reason
+            assert "contradicts w2 and w3" in reason or "contradicts w3 and w2" in reason
+            running = asyncio.create_task(outcomes(client, batch(2)))
+            async with FakeWorker(at.address, "w2") as honest:
+                assert all(isinstance(r.outcome, Completed) for r in (await running).values())
+                assert (len(liar.executed), len(honest.executed)) == (0, 2)
+            await admin.resume("liar")
+            assert (await states(admin))["liar"] == "ready"
+    third = manager(tmp_path / "third", state=state)
+    async with third as at, people(at.address) as (_, admin), FakeWorker(at.address, "liar"):
+        assert await states(admin) == {"liar": "ready"}
+
+
+async def test_dispatch_that_was_paused_stays_paused_under_the_next_manager_until_it_is_resumed(
+    tmp_path, state
+):
+    async with manager(tmp_path, state=state) as at, people(at.address) as (client, admin):
+        await client.open_run("test", "r2")
+        await admin.pause_dispatch()
+    second = manager(tmp_path / "second", state=state)
+    async with second as at, people(at.address) as (client, admin), FakeWorker(at.address) as worker:
+        running = asyncio.create_task(outcomes(client, batch(2, run_id="r2")))
+        await until(lambda: worker.residents)
+        await asyncio.sleep(0.3)
+        assert worker.executed == []
+        await admin.resume_dispatch()
+        assert len(await running) == 2
+    third = manager(tmp_path / "third", state=state)
+    async with third as at, people(at.address) as (client, _), FakeWorker(at.address):
+        assert len(await outcomes(client, batch(2, batch_id="b2", run_id="r2"))) == 2
+
+
+async def test_a_pause_that_can_not_be_noted_holds_and_says_so(tmp_path):
+    server = RedisServer(tmp_path, free_port())
+    with server:
+        async with manager(tmp_path, state=server.url) as at, people(at.address) as (client, admin):
+            await client.open_run("test", "r1")
+            server.kill()
+            with pytest.raises(
+                UnavailableError, match=r"dispatch is paused, but another manager would not know"
+            ):
+                await admin.pause_dispatch()
