@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.sim.barriers import no_way_for_arm, no_way_into, no_way_to
 from embomatrix.sim.household import clean, cut, soak
 from embomatrix.sim.leaves import Leaves
+from embomatrix.sim.swings import SWING
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.syntax import Skill
 from embomatrix.skills.view import metres, preposition, refuse, target_of
@@ -26,13 +28,9 @@ if TYPE_CHECKING:
 
     Action = Callable[[LiveWorld, SkillCall, np.random.Generator], Refusal | None]
 
-SWING: Final = (0.25, 0.5, 0.75, 1.0)
-"""Shares of its travel at which a door is checked for things in its way."""
 OTHER_STANDS: Final = 2
 APART_M: Final = 0.4
 """A crowded support is served from up to two other standing poses, this far or further from the first."""
-LEAST_OPEN: Final = 0.5
-"""A door that something stops before this share of its travel does not open."""
 
 
 class CachedActor:
@@ -104,7 +102,7 @@ def _place(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refus
     target, held = target_of(world, call), world.carried[0]
     fails = FailureReason.NO_FREE_POSE
     tried: tuple[StandPose, ...] = ()
-    for stand in (world.robot, *other_stands(world, target)):
+    for stand in itertools.chain((world.robot,), other_stands(world, target)):
         found = world.placer.find(held, target, Relation(call.relation.value), stand, rng, tried)
         if isinstance(found, Pose) and world.hand.let_go(found):
             world.robot = stand
@@ -127,18 +125,12 @@ def other_stands(world: LiveWorld, target: str) -> Iterator[StandPose]:
 
 def _open(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
     target = target_of(world, call)
-    before = world.engine.joints(target)
-    leaves = Leaves(world.engine, world.relations, target)
-    course = [[max(share, fraction) for fraction in before] for share in SWING]
-    reached, other = leaves.swing(course)
-    if reached and SWING[reached - 1] >= LEAST_OPEN:
-        if other:
-            leaves.go_on(course[reached - 1], course[reached])
-        world.navigator.refresh()
-        world.robot = world.navigator.aside(target, world.robot)
-        return None
-    leaves.put_back()
-    return refuse(FailureReason.DOOR_BLOCKED, target=target, other=other)
+    other = world.swings.open(target)
+    if other:
+        return refuse(FailureReason.DOOR_BLOCKED, target=target, other=other)
+    world.navigator.refresh()
+    world.robot = world.navigator.aside(target, world.robot)
+    return None
 
 
 def _close(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:

@@ -5,10 +5,9 @@ from __future__ import annotations
 import hashlib
 from typing import TYPE_CHECKING, Protocol
 
-from embomatrix.sim.actions import SWING, CachedActor
+from embomatrix.sim.actions import CachedActor
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.draws import Draws
-from embomatrix.sim.leaves import measure_swing
 from embomatrix.sim.live_world import LiveWorld
 from embomatrix.skills.check import check
 from embomatrix.skills.describe import Sight, done, final_lines, gained
@@ -163,10 +162,7 @@ class Simulator:
         yield from world.relations.footings.complete()
         yield from world.placer.complete()
         yield from world.navigator.complete()
-        for item in world.scene.objects:
-            if item.joints:
-                measure_swing(world.engine, item.name, (0.0, *SWING))
-                yield
+        yield from world.swings.complete()
 
     def close(self) -> None:
         """Free the engine and the actor. The simulator can't be used afterwards."""

@@ -11,14 +11,31 @@ from embomatrix.sim.spots import REST_M, interior_around, is_shut, is_upright, l
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from embomatrix.sim.engine import PhysicsEngine
     from embomatrix.world.asset import Asset, Interior
-    from embomatrix.world.geometry import Aabb, Pose
+    from embomatrix.world.geometry import Aabb, Pose, Vec3
 
 
 SLACK_M: Final = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Hollows:
+    """The cavities of an asset by the links that they ride on, and a width that nothing has which lies in one of them."""
+
+    by_link: tuple[tuple[str, tuple[Interior, ...]], ...]
+    too_wide_m: float
+
+    @staticmethod
+    def of(asset: Asset) -> Hollows:
+        """The cavities of an asset that has some."""
+        links = dict.fromkeys(item.link for item in asset.interiors)
+        by_link = [(link, tuple(item for item in asset.interiors if item.link == link)) for link in links]
+        return Hollows(
+            tuple(by_link), max(math.hypot(*item.size_m[:2]) for item in asset.interiors) + SLACK_M
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +81,9 @@ class Footings:
         self._scene = engine.scene
         self._at_start: dict[str, Footing] = {}
         self._now: dict[str, Footing] = {}
+        self._middles_m: dict[str, float] = {}
+        """Of an asset's three extents the middle one: however it lies, it is nowhere narrower along both axes of the plane."""
+        self._hollows: dict[str, Hollows] = {}
         self._stale: set[str] = set()
         """Objects near to which something has changed, so that they may stand otherwise since."""
         self._round = engine.journal.rounds
@@ -71,7 +91,9 @@ class Footings:
 
     def of(self, name: str) -> Footing:
         """How the object stands: its host, the containers around it, what it is on top of."""
-        self._read_journal()
+        journal = self._engine.journal
+        if len(journal.entries) != self._read or journal.rounds != self._round:
+            self._read_journal()
         known = self._now if name in self._stale else self._at_start
         footing = known.get(name)
         if footing is None:
@@ -91,8 +113,6 @@ class Footings:
             self._round, self._read = journal.rounds, 0
             self._now.clear()
             self._stale.clear()
-        if len(journal.entries) == self._read:
-            return
         before: dict[str, Aabb | None] = {}
         for name, box in journal.entries[self._read :]:
             before.setdefault(name, box)
@@ -102,25 +122,28 @@ class Footings:
             if not self._engine.is_parked(name):
                 places.append(self._engine.aabb(name))
             self._forget(name)
+            hollow = bool(self._scene.asset_of(name).interiors)
             for place in places:
                 for other in self._engine.near(place.grown(REST_M)):
-                    if self._concerns(other, name, place):
+                    # A table neither rests on nor lies in a mug that stands on it.
+                    if _is_over(self._engine.aabb(other), place) or (hollow and self._fits(other, place)):
                         self._forget(other)
 
     def _forget(self, name: str) -> None:
         self._stale.add(name)
         self._now.pop(name, None)
 
-    def _concerns(self, other: str, name: str, place: Aabb) -> bool:
-        """Whether an object may rest on or lie in a thing at a place: a table does neither in a mug that stands on it."""
-        if _is_over(self._engine.aabb(other), place):
-            return True
-        if not self._scene.asset_of(name).interiors:
-            return False
-        # However it lies, a thing is nowhere narrower than its middle extent along both axes of the plane.
-        _, middle, _ = sorted(self._scene.asset_of(other).size_m)
+    def _fits(self, name: str, place: Aabb) -> bool:
+        """Whether an object may lie in something that takes a place."""
         width, depth, _ = place.size_m
-        return middle <= math.hypot(width, depth) + SLACK_M
+        return self._middle_m(self._scene.asset_of(name)) <= math.hypot(width, depth) + SLACK_M
+
+    def _middle_m(self, asset: Asset) -> float:
+        known = self._middles_m.get(asset.asset_id)
+        if known is None:
+            _, known, _ = sorted(asset.size_m)
+            self._middles_m[asset.asset_id] = known
+        return known
 
     def _find(self, name: str) -> Footing:
         engine, scene = self._engine, self._scene
@@ -131,16 +154,21 @@ class Footings:
         around: list[tuple[float, str, Enclosure]] = []
         on: list[str] = []
         for other in engine.near(box.grown(REST_M), frozenset((name,))):
-            interior, surface = self._spots_of(name, other)
-            if surface and self._is_open_to(name, other):
+            asset = scene.asset_of(other)
+            over = _is_over(box, engine.aabb(other))
+            if not (over or asset.interiors):
+                continue
+            pose, fractions = engine.pose(other), engine.joints(other)
+            interior = self._interior(name, asset, pose, fractions) if asset.interiors else None
+            surface = surface_under(box, asset, pose, fractions, doored=True) if over else ""
+            if surface and _is_open(box, asset, pose, fractions):
                 on.append(other)
             if interior is None and not surface:
                 continue
-            asset = scene.asset_of(other)
             volume = math.prod(asset.size_m)
             if interior is not None:
                 hosts.append((volume, other, Host(other, Relation.INSIDE, interior.name)))
-                enclosure = Enclosure(other, interior.name, is_shut(asset, interior, engine.joints(other)))
+                enclosure = Enclosure(other, interior.name, is_shut(asset, interior, fractions))
                 around.append((math.prod(interior.size_m), other, enclosure))
             else:
                 hosts.append((volume, other, Host(other, Relation.ONTOP, surface)))
@@ -179,53 +207,31 @@ class Footings:
         return self._interior(name, asset, engine.pose(other), engine.joints(other)) is not None
 
     def _known(self, name: str) -> Footing | None:
-        self._read_journal()
+        journal = self._engine.journal
+        if len(journal.entries) != self._read or journal.rounds != self._round:
+            self._read_journal()
         return (self._now if name in self._stale else self._at_start).get(name)
-
-    def _spots_of(self, name: str, other: str) -> tuple[Interior | None, str]:
-        """The cavity of another object that this one is in, and the surface of it that it rests on, doored or not."""
-        engine, asset = self._engine, self._scene.asset_of(other)
-        box = engine.aabb(name)
-        over = _is_over(box, engine.aabb(other))
-        if not (over or asset.interiors):
-            return None, ""
-        pose, fractions = engine.pose(other), engine.joints(other)
-        interior = self._interior(name, asset, pose, fractions) if asset.interiors else None
-        return interior, surface_under(box, asset, pose, fractions, doored=True) if over else ""
-
-    def _is_open_to(self, name: str, other: str) -> bool:
-        """Whether the surface that the object rests on is one that no door shuts off, of an asset that may have such."""
-        asset = self._scene.asset_of(other)
-        if not any(interior.closed_by for interior in asset.interiors):
-            return True
-        pose, fractions = self._engine.pose(other), self._engine.joints(other)
-        return bool(surface_under(self._engine.aabb(name), asset, pose, fractions, doored=False))
 
     def _interior(self, name: str, asset: Asset, pose: Pose, fractions: tuple[float, ...]) -> Interior | None:
         """The smallest cavity of an asset at a pose that the object is in."""
-        engine = self._engine
-        _, middle, _ = sorted(self._scene.asset_of(name).size_m)
-        if all(middle > math.hypot(*item.size_m[:2]) + SLACK_M for item in asset.interiors):
-            return None  # It is too wide for any of them, however it lies.
+        engine, own = self._engine, self._scene.asset_of(name)
+        hollows = self._hollows.get(asset.asset_id)
+        if hollows is None:
+            hollows = self._hollows[asset.asset_id] = Hollows.of(asset)
+        if self._middle_m(own) > hollows.too_wide_m:
+            return None
         box = engine.aabb(name)
         # However the object turns, the centre of its box moves less than this.
         slack = math.dist(box.low_m, box.high_m) / 2
         found: list[Interior] = []
-        for link in dict.fromkeys(item.link for item in asset.interiors):
+        for link, interiors in hollows.by_link:
             frame = link_frame(asset, pose, fractions, link)
             if not is_upright(frame):
                 continue
             inverse = frame.inverse()
-            x, y, z = inverse.apply(box.center_m)
-            if not any(
-                abs(z - item.center_m[2]) <= item.size_m[2] / 2 + slack
-                and abs(x - item.center_m[0]) <= item.size_m[0] / 2 + slack
-                and abs(y - item.center_m[1]) <= item.size_m[1] / 2 + slack
-                for item in asset.interiors
-                if item.link == link
-            ):
+            if not _may_be_in(inverse.apply(box.center_m), interiors, slack):
                 continue
-            placed = square_box(box, inverse) or bounds_of(self._scene.asset_of(name)).box(
+            placed = square_box(box, inverse) or bounds_of(own).box(
                 inverse @ engine.pose(name), engine.joints(name)
             )
             interior = interior_around(placed, asset, link)
@@ -239,6 +245,27 @@ def _is_over(box: Aabb, other: Aabb) -> bool:
     x, y, _ = box.center_m
     (low_x, low_y, _), (high_x, high_y, _) = other.low_m, other.high_m
     return low_x - SLACK_M <= x <= high_x + SLACK_M and low_y - SLACK_M <= y <= high_y + SLACK_M
+
+
+def _may_be_in(center: Vec3, interiors: Sequence[Interior], slack: float) -> bool:
+    """Whether a point lies in any of some cavities that are grown by a length on all sides."""
+    x, y, z = center
+    for item in interiors:
+        (cx, cy, cz), (width, depth, height) = item.center_m, item.size_m
+        if (
+            abs(z - cz) <= height / 2 + slack
+            and abs(x - cx) <= width / 2 + slack
+            and abs(y - cy) <= depth / 2 + slack
+        ):
+            return True
+    return False
+
+
+def _is_open(box: Aabb, asset: Asset, pose: Pose, fractions: tuple[float, ...]) -> bool:
+    """Whether a box that rests on a surface of an asset rests on one that no door shuts off."""
+    if not any(interior.closed_by for interior in asset.interiors):
+        return True
+    return bool(surface_under(box, asset, pose, fractions, doored=False))
 
 
 def _first_two(item: tuple[float, str, object]) -> tuple[float, str]:

@@ -16,12 +16,9 @@ class Hand:
 
     def __init__(self, engine: PhysicsEngine) -> None:
         self._engine = engine
-        self._pose_held_item: dict[str, Pose] = {}
-
-    @property
-    def carried(self) -> tuple[str, ...]:
+        self._pose_held_item: Mapping[str, Pose] = {}
+        self.carried: tuple[str, ...] = ()
         """What the hand holds, then what lies in it; empty for an empty hand."""
-        return tuple(self._pose_held_item)
 
     @property
     def offsets(self) -> Mapping[str, Pose]:
@@ -30,12 +27,12 @@ class Hand:
 
     def forget(self) -> None:
         """Be empty again, without putting anything anywhere: for a world that was reset."""
-        self._pose_held_item.clear()
+        self._hold({})
 
     def take(self, group: Sequence[str]) -> None:
         """Take the first object of the group, with the others in it."""
         back = self._engine.pose(group[0]).inverse()
-        self._pose_held_item = {item: back @ self._engine.pose(item) for item in group}
+        self._hold({item: back @ self._engine.pose(item) for item in group})
         for item in group:
             self._engine.park(item)
 
@@ -51,5 +48,8 @@ class Hand:
             for item in group:
                 self._engine.park(item)
             return False
-        self._pose_held_item.clear()
+        self._hold({})
         return True
+
+    def _hold(self, offsets: Mapping[str, Pose]) -> None:
+        self._pose_held_item, self.carried = offsets, tuple(offsets)

@@ -52,6 +52,10 @@ class Leaves:
         """Names of the objects that move along."""
         return tuple(rider.name for rider in self._riders)
 
+    def carried(self, fractions: Sequence[float]) -> tuple[tuple[str, Pose], ...]:
+        """Where the riders are when the leaves are at these shares of their travel."""
+        return tuple((rider.name, self._carried(rider, fractions)) for rider in self._riders)
+
     def swing(self, course: Iterable[Sequence[float]]) -> tuple[int, str]:
         """Go through joint positions until something is in the way.
 
@@ -92,9 +96,11 @@ class Leaves:
 
     def _put(self, fractions: Sequence[float]) -> None:
         self._engine.set_joints(self._name, fractions)
-        for rider in self._riders:
-            frame = link_frame(self._asset, self._base, fractions, rider.link)
-            self._engine.set_pose(rider.name, frame @ rider.pose_link_object)
+        for name, pose in self.carried(fractions):
+            self._engine.set_pose(name, pose)
+
+    def _carried(self, rider: Rider, fractions: Sequence[float]) -> Pose:
+        return link_frame(self._asset, self._base, fractions, rider.link) @ rider.pose_link_object
 
     def _stopped_by(self, near: frozenset[str]) -> str:
         """A body that the leaves or their riders run into where they are; "" when there is none."""

@@ -15,7 +15,7 @@ from embomatrix.skills.limits import ROBOT
 from embomatrix.world.geometry import Aabb
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -59,6 +59,17 @@ class Lineup:
     lows_m: FloatArray
     highs_m: FloatArray
 
+    def around(self) -> Aabb:
+        """Smallest box that holds all of them; there must be one."""
+        (a, b, c), (d, e, f) = self.lows_m.min(axis=0).tolist(), self.highs_m.max(axis=0).tolist()
+        return Aabb((a, b, c), (d, e, f))
+
+    def crowded(self, others: Sequence[Aabb], margin_m: float) -> Iterator[bool]:
+        """Whether each box, grown by a margin, overlaps any of some others, one by one: most askers take the first few."""
+        for (a, b, c), (d, e, f) in zip(self.lows_m.tolist(), self.highs_m.tolist(), strict=True):
+            box = Aabb((a, b, c), (d, e, f)).grown(margin_m)
+            yield any(box.overlaps(other) for other in others)
+
     def at(self, rows: Sequence[int]) -> Lineup:
         """Some of the poses, in the order of ``rows``."""
         return Lineup(self.lows_m[rows], self.highs_m[rows])
@@ -68,11 +79,6 @@ class Lineup:
         rise = np.zeros_like(self.lows_m)
         rise[:, 2] = np.maximum(height_m - self.lows_m[:, 2], 0.0)
         return Lineup(self.lows_m + rise, self.highs_m + rise)
-
-    def around(self) -> Aabb:
-        """Smallest box that holds all of them; there must be one."""
-        (a, b, c), (d, e, f) = self.lows_m.min(axis=0).tolist(), self.highs_m.max(axis=0).tolist()
-        return Aabb((a, b, c), (d, e, f))
 
     def reached_from(self, stand: StandPose) -> BoolArray:
         """Whether the arm reaches the nearest point of each box in the plane, and its middle's height; shape (n,)."""
@@ -90,12 +96,6 @@ class Lineup:
         # Of lowest and highest: twice the height of the middle.
         sums = self.lows_m[:, 2] + self.highs_m[:, 2]
         return np.asarray(reached & (sums >= 2 * low_m) & (sums <= 2 * high_m))
-
-    def crowded(self, others: Neighbours, margin_m: float) -> BoolArray:
-        """Whether each box, grown by a margin, overlaps that of any neighbour; shape (n,)."""
-        low = self.lows_m[:, None] - margin_m <= others.highs_m  # (n, k, 3)
-        high = self.highs_m[:, None] + margin_m >= others.lows_m
-        return np.asarray(np.asarray((low & high).all(axis=2)).any(axis=1))
 
     def overlaps(self, others: Neighbours) -> tuple[BoolArray, IntArray]:
         """Whether the thing would surely meet a neighbour at each pose, and the one whose box it shares the most with.

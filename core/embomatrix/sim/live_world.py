@@ -11,6 +11,7 @@ from embomatrix.sim.navigation import Navigator
 from embomatrix.sim.placement import Placer
 from embomatrix.sim.prepared import Prepared
 from embomatrix.sim.relations import Relations
+from embomatrix.sim.swings import Swings
 from embomatrix.sim.symbols import Symbols
 from embomatrix.sim.thermal import Thermal
 from embomatrix.sim.water import Water
@@ -41,6 +42,7 @@ class LiveWorld:
         self.engine = engine
         self.relations = Relations(engine)
         self.navigator = Navigator(engine, self.relations, bundle.poses.stands, Prepared.of(bundle))
+        self.swings = Swings(engine, self.relations)
         self.placer = Placer(engine, self.relations, bundle.poses)
         self.barred = bundle.poses.barred
         """What the arm finds no way to in the scene as it was loaded."""
@@ -149,15 +151,15 @@ class LiveWorld:
 
     def state_bytes(self) -> bytes:
         """All in which the engine's state and the symbolic states differ from the scene's start, the robot and the hand."""
-        robot = f"{self.robot.x_m.hex()} {self.robot.y_m.hex()} {self.robot.yaw.hex()}"
-        symbolic = [f"{name}:{','.join(sorted(states))}" for name, states in self.states.changed()]
-        symbolic += [
-            f"{name}:{','.join(f'{fact.relation} {fact.substance}' for fact in sorted(facts))}"
-            for name, facts in self.substances.changed()
-        ]
-        symbolic += sorted(self.absent)
-        text = "\n".join([robot, " ".join(self.carried), *symbolic])
-        return self.engine.state_bytes() + text.encode()
+        robot, carried = self.robot, " ".join(self.hand.carried)
+        lines = [f"{robot.x_m.hex()} {robot.y_m.hex()} {robot.yaw.hex()}\n{carried}"]
+        for name, states in self.states.changed():
+            lines.append(f"{name}:{','.join(sorted(states))}")
+        for name, facts in self.substances.changed():
+            lines.append(f"{name}:{','.join(f'{fact.relation} {fact.substance}' for fact in sorted(facts))}")
+        if self.absent:
+            lines += sorted(self.absent)
+        return self.engine.state_bytes() + "\n".join(lines).encode()
 
     def _take_states_from_scene(self) -> None:
         for item in self.scene.objects:

@@ -17,6 +17,8 @@ WIDE_CELLS: Final = 32
 SPANS_KEPT: Final = 1024
 
 Cell = tuple[int, int]
+Span = tuple[int, int, int, int]
+"""First and last cell along x and y: i first, j first, i last, j last."""
 Extent = tuple[float, float, float, float, float, float]
 
 
@@ -27,15 +29,21 @@ class Neighbourhood:
         self._cells: dict[Cell, dict[int, Extent]] = {}
         """The boxes over each cell. Those over very many are in one place of their own."""
         self._wide: dict[int, Extent] = {}
-        self._seen: dict[tuple[int, int, int, int], list[dict[int, Extent]]] = {}
+        self._seen: dict[Span, list[dict[int, Extent]]] = {}
         """Places over spans that were asked for, good until there is another cell."""
         self._homes: dict[int, list[dict[int, Extent]]] = {}
-        self._spans: dict[int, tuple[int, int, int, int]] = {}
+        self._spans: dict[int, Span] = {}
 
     def put(self, number: int, box: Aabb) -> None:
         """Add a box, or move it."""
         extent = (*box.low_m, *box.high_m)
-        span = _span(extent[0], extent[1], extent[3], extent[4])
+        floor = math.floor
+        span = (
+            floor(extent[0] / CELL_M),
+            floor(extent[1] / CELL_M),
+            floor(extent[3] / CELL_M),
+            floor(extent[4] / CELL_M),
+        )
         if self._spans.get(number) != span:
             self.take_out(number)
             self._spans[number] = span
@@ -54,7 +62,11 @@ class Neighbourhood:
         (low_x, low_y, low_z), (high_x, high_y, high_z) = box.low_m, box.high_m
         low_x, low_y, low_z = low_x - reach_m, low_y - reach_m, low_z - reach_m
         high_x, high_y, high_z = high_x + reach_m, high_y + reach_m, high_z + reach_m
-        places = self._places(_span(low_x, low_y, high_x, high_y))
+        floor = math.floor
+        span = floor(low_x / CELL_M), floor(low_y / CELL_M), floor(high_x / CELL_M), floor(high_y / CELL_M)
+        places = self._seen.get(span)
+        if places is None:
+            places = self._find_places(span)
         found = [
             number
             for place in places
@@ -63,16 +75,14 @@ class Neighbourhood:
         ]
         return sorted(set(found)) if len(found) > 1 else found
 
-    def _places(self, span: tuple[int, int, int, int]) -> list[dict[int, Extent]]:
+    def _find_places(self, span: Span) -> list[dict[int, Extent]]:
         """Where the boxes over a span are kept; some may be in several places."""
-        known = self._seen.get(span)
-        if known is None:
-            if len(self._seen) >= SPANS_KEPT:
-                self._seen.clear()
-            known = self._seen[span] = [self._wide, *self._cells_of(span)]
-        return known
+        if len(self._seen) >= SPANS_KEPT:
+            self._seen.clear()
+        self._seen[span] = [self._wide, *self._cells_of(span)]
+        return self._seen[span]
 
-    def _cells_of(self, span: tuple[int, int, int, int]) -> list[dict[int, Extent]]:
+    def _cells_of(self, span: Span) -> list[dict[int, Extent]]:
         first_i, first_j, last_i, last_j = span
         if (last_i - first_i + 1) * (last_j - first_j + 1) > WIDE_CELLS:
             return list(self._cells.values())
@@ -80,7 +90,7 @@ class Neighbourhood:
         places = (cells.get((i, j)) for i in range(first_i, last_i + 1) for j in range(first_j, last_j + 1))
         return [place for place in places if place is not None]
 
-    def _homes_of(self, span: tuple[int, int, int, int]) -> list[dict[int, Extent]]:
+    def _homes_of(self, span: Span) -> list[dict[int, Extent]]:
         first_i, first_j, last_i, last_j = span
         if (last_i - first_i + 1) * (last_j - first_j + 1) > WIDE_CELLS:
             return [self._wide]
@@ -93,9 +103,3 @@ class Neighbourhood:
         if len(self._cells) != count:
             self._seen.clear()
         return homes
-
-
-def _span(low_x: float, low_y: float, high_x: float, high_y: float) -> tuple[int, int, int, int]:
-    """First and last cell along x and y: i first, j first, i last, j last."""
-    floor = math.floor
-    return floor(low_x / CELL_M), floor(low_y / CELL_M), floor(high_x / CELL_M), floor(high_y / CELL_M)

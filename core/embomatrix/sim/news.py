@@ -16,7 +16,8 @@ class News:
         self._engine = engine
         self._round = engine.journal.rounds
         self._read = 0
-        self._places: dict[str, list[Aabb]] = {}
+        self._names: set[str] = set()
+        self._places: list[Aabb] = []
 
     def read(self) -> bool:
         """Go on to what changed since the last call. Whether the engine was reset in between."""
@@ -24,19 +25,17 @@ class News:
         again = journal.rounds != self._round
         if again:
             self._round, self._read = journal.rounds, 0
+        names = self._names = set[str]()
         self._places.clear()
         for name, box in journal.entries[self._read :]:
-            if name not in self._places:
-                self._places[name] = [box] if box is not None else []
+            if name not in names:
+                names.add(name)
+                if box is not None:
+                    self._places.append(box)
         self._read = len(journal.entries)
-        for name, boxes in self._places.items():
-            if not self._engine.is_parked(name):
-                boxes.append(self._engine.aabb(name))
+        self._places += [self._engine.aabb(name) for name in names if not self._engine.is_parked(name)]
         return again
 
     def concerns(self, name: str, area: Aabb) -> bool:
         """Whether the object is among what changed, or anything in an area before or after it changed."""
-        places = self._places
-        return bool(places) and (
-            name in places or any(area.overlaps(box) for boxes in places.values() for box in boxes)
-        )
+        return name in self._names or any(area.overlaps(box) for box in self._places)

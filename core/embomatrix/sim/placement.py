@@ -200,7 +200,7 @@ class Placer:
         """
         if not order:
             return
-        held, margin_m = errand.held, NEAR_M
+        held = errand.held
         boxes = spots.lineup(bounds_of(self._scene.asset_of(held)), self._engine.joints(held), frames)
         reached = self._served(errand, boxes, errand.robot)
         for stand in errand.passed_over:
@@ -212,18 +212,20 @@ class Placer:
         handy = boxes.handy_from(errand.robot).tolist()
         rows.sort(key=lambda number: not handy[number])
         boxes = boxes.at(rows)
-        near = self._engine.near(boxes.around().grown(margin_m), frozenset((held, errand.target)))
-        if not near:
-            yield from ((number, "") for number in rows)
+        near = self._engine.near(boxes.around().grown(NEAR_M), frozenset((held, errand.target)))
+        others = [self._engine.aabb(name) for name in near]
+        crowded: list[int] = []
+        for place, is_crowded in enumerate(boxes.crowded(others, NEAR_M)):
+            if is_crowded:
+                crowded.append(place)
+            else:
+                yield rows[place], ""
+        if not crowded:
             return
-        others = self._neighbours(near)
-        crowded = boxes.crowded(others, margin_m).tolist()
-        yield from ((number, "") for number, close in zip(rows, crowded, strict=True) if not close)
-        if not any(crowded):
-            return
-        taken, most = (answers.tolist() for answers in boxes.overlaps(others))
-        for number, close, full, nearest in zip(rows, crowded, taken, most, strict=True):
-            if close and not full:
+        boxes, rows = boxes.at(crowded), [rows[place] for place in crowded]
+        taken, most = (answers.tolist() for answers in boxes.overlaps(self._neighbours(near)))
+        for number, full, nearest in zip(rows, taken, most, strict=True):
+            if not full:
                 yield number, near[nearest]
 
     def _served(self, errand: Errand, boxes: Lineup, stand: StandPose) -> BoolArray:

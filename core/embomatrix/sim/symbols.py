@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, TypeVar
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Sequence
 
 T = TypeVar("T")
 
@@ -34,15 +34,15 @@ class Symbols(dict[str, set[T]]):
         self._kept = {name: frozenset(members) for name, members in self.items()}
         self._asked.clear()
 
-    def changed(self) -> Iterator[tuple[str, set[T]]]:
+    def changed(self) -> Sequence[tuple[str, set[T]]]:
         """Names and sets that are not as kept, by name."""
-        for name in sorted(self._asked):
-            members = super().__getitem__(name)
-            if members != self._kept[name]:
-                yield name, members
+        if not self._asked:
+            return ()
+        asked = [(name, super(Symbols, self).__getitem__(name)) for name in sorted(self._asked)]
+        return [(name, members) for name, members in asked if members != self._kept[name]]
 
     def restore(self) -> None:
         """Make every set equal to the one that was kept."""
-        for name, _ in list(self.changed()):
+        for name, _ in self.changed():
             super().__setitem__(name, set(self._kept[name]))
         self._asked.clear()

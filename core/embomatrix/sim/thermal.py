@@ -57,9 +57,9 @@ class Thermal:
         first, self._acted = not self._acted, True
         for name, source in self._sources:
             # One that acts by itself has acted on all that is there, unless something has changed there since.
-            if not first and not source.requires_on and not self._news.concerns(name, self._area(name)):
+            if not self.works(name, source):
                 continue
-            if self.works(name, source):
+            if first or source.requires_on or self._news.concerns(name, self._area(name)):
                 for item in self._acted_on(name, source):
                     changes += self._expose(item, source)
         return tuple(changes)

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
     from embomatrix.sim.engine import PhysicsEngine
     from embomatrix.sim.relations import Relations
+    from embomatrix.skills.household import Washing
 
 
 class Water:
@@ -40,39 +41,37 @@ class Water:
         self._news = News(engine)
         self._acting: set[str] = set()
         self._acting_at_start: frozenset[str] | None = None
-        self._sources = [
-            item.name
-            for item in self._scene.objects
-            if washing(asset := self._scene.assets[item.asset_id]) is not None or flows_from(asset.synset)
-        ]
+        self._sources: list[tuple[str, Washing | None]] = []
+        for item in self._scene.objects:
+            asset = self._scene.assets[item.asset_id]
+            machine = washing(asset)
+            if machine is not None or flows_from(asset.synset):
+                self._sources.append((item.name, machine))
 
     def apply(self) -> tuple[Change, ...]:
         """Let every source that runs act on what lies in it. Returns what changed since the last time, by hand or by itself."""
         if self._news.read() and self._acting_at_start is not None:
             self._acting = set(self._acting_at_start)
-        for name in self._sources:
-            if not self._runs(name):
+        for name, machine in self._sources:
+            if not self._runs(name, machine):
                 self._acting.discard(name)
             # What a source did to a thing nothing undoes: it acts again when it was started, or something came.
             elif name not in self._acting or self._news.concerns(name, self._engine.aabb(name)):
                 self._acting.add(name)
-                self._act(name)
+                self._act(name, machine)
         if self._acting_at_start is None:
             self._acting_at_start = frozenset(self._acting)
         changes = tuple(self._changes)
         self._changes.clear()
         return changes
 
-    def _runs(self, name: str) -> bool:
+    def _runs(self, name: str, machine: Washing | None) -> bool:
         if State.TOGGLED_ON not in self._states.get(name, ()) or self._engine.is_parked(name):
             return False
-        machine = washing(self._scene.asset_of(name))
         return machine is None or not machine.requires_closed or not self._relations.open(name)
 
-    def _act(self, name: str) -> None:
-        asset = self._scene.asset_of(name)
-        machine = washing(asset)
-        liquids = liquids_given(asset, (), on=True)
+    def _act(self, name: str, machine: Washing | None) -> None:
+        liquids = liquids_given(self._scene.asset_of(name), (), on=True)
         for item in self._engine.near(self._engine.aabb(name), frozenset((name,))):
             if self._scene.by_name[item].fixed or not self._relations.inside(item, name):
                 continue

@@ -93,16 +93,14 @@ def refuse(reason: FailureReason, **values: str) -> Refusal:
 
 def target_of(world: WorldView, call: SkillCall) -> str:
     """Name of the call's object, "" for calls without one or with an index outside the table."""
-    return _row(world, call.object_index)
+    index, table = call.object_index, world.table
+    return table[index] if index is not None and 0 <= index < len(table) else ""
 
 
 def source_of(world: WorldView, call: SkillCall) -> str:
     """Name of the call's source, "" for calls without one or with an index outside the table."""
-    return _row(world, call.source_index)
-
-
-def _row(world: WorldView, index: int | None) -> str:
-    return world.table[index] if index is not None and 0 <= index < len(world.table) else ""
+    index, table = call.source_index, world.table
+    return table[index] if index is not None and 0 <= index < len(table) else ""
 
 
 def metres(value: float) -> str:

@@ -99,11 +99,12 @@ class Asset:
     interiors: tuple[Interior, ...] = ()
     abilities: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     credit: Credit | None = None
+    joints: tuple[tuple[str, Joint], ...] = field(init=False, repr=False, compare=False)
+    """(link name, joint) of every moving link, in link order: the order of an object's joint positions."""
+
+    def __post_init__(self) -> None:
+        joints = tuple((link.name, link.joint) for link in self.links if link.joint is not None)
+        object.__setattr__(self, "joints", joints)
 
     def can(self, ability: str) -> bool:
         return ability in self.abilities
-
-    @property
-    def joints(self) -> tuple[tuple[str, Joint], ...]:
-        """(link name, joint) of every moving link, in link order: the order of an object's joint positions."""
-        return tuple((link.name, link.joint) for link in self.links if link.joint is not None)

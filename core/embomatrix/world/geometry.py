@@ -183,12 +183,9 @@ class Aabb:
         items = list(boxes)
         if not items:
             raise ValueError("no boxes to enclose: expected at least one")
-        lows, highs = zip(*((box.low_m, box.high_m) for box in items), strict=True)
-        (a, b, c), (d, e, f) = (
-            (min(axis) for axis in zip(*lows, strict=True)),
-            (max(axis) for axis in zip(*highs, strict=True)),
-        )
-        return Aabb((a, b, c), (d, e, f))
+        lows = zip(*[box.low_m for box in items], strict=True)
+        highs = zip(*[box.high_m for box in items], strict=True)
+        return Aabb(tuple(map(min, lows)), tuple(map(max, highs)))
 
 
 _set_low: Final = _writer(Aabb, "low_m")

@@ -72,13 +72,6 @@ def test_a_place_is_handy_that_is_near_and_neither_low_nor_overhead(away_m, heig
     assert lineup_of([cube]).handy_from(StandPose(0.0, 0.0, 0.0)).tolist() == [handy]
 
 
-@given(st.lists(BOX, min_size=1, max_size=5), st.lists(BOX, min_size=1, max_size=5))
-def test_a_box_is_crowded_when_any_neighbour_overlaps_it_grown(boxes, near) -> None:
-    others = Neighbours.of(near, [True] * len(near), [True] * len(near))
-    expected = [any(box.grown(0.006).overlaps(other) for other in near) for box in boxes]
-    assert lineup_of(boxes).crowded(others, 0.006).tolist() == expected
-
-
 def test_a_thing_in_the_middle_of_a_solid_one_is_taken_and_beside_it_not() -> None:
     boxes = [Aabb((0.0, 0.0, 0.0), (0.1, 0.1, 0.1)), Aabb((0.19, 0.0, 0.0), (0.29, 0.1, 0.1))]
     near = [Aabb((9.0, 9.0, 9.0), (9.1, 9.1, 9.1)), Aabb((0.0, 0.0, 0.0), (0.2, 0.2, 0.2))]

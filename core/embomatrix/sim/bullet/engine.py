@@ -84,6 +84,8 @@ class BulletEngine:
         self._changed: set[int] = set()
         self._chunks: dict[int, bytes] = {}
         """What ``state_bytes`` says of objects that changed, for as long as it is so."""
+        self._all_chunks: bytes | None = b""
+        """These together, for as long as nothing changes: half of the calls only move the robot."""
         self._bodies = SceneBodies(self._client, scene)
 
     @property
@@ -109,6 +111,7 @@ class BulletEngine:
             self._bound(number, self._boxes_at_start[number])
         self._changed.clear()
         self._chunks.clear()
+        self._all_chunks = b""
         self._journal.begin_round()
 
     def pose(self, name: str) -> Pose:
@@ -233,10 +236,12 @@ class BulletEngine:
 
     def state_bytes(self) -> bytes:
         """Poses, joints and parking of all objects in which they differ from the scene's, for the digest of a trace."""
-        chunks = self._chunks
-        for number in self._changed - chunks.keys():
-            chunks[number] = self._chunk(number)
-        return b"".join([chunks[number] for number in sorted(chunks)])
+        if self._all_chunks is None:
+            chunks = self._chunks
+            for number in self._changed - chunks.keys():
+                chunks[number] = self._chunk(number)
+            self._all_chunks = b"".join([chunks[number] for number in sorted(chunks)])
+        return self._all_chunks
 
     def _chunk(self, number: int) -> bytes:
         """What ``state_bytes`` says of an object: nothing when it is as the scene has it."""
@@ -271,6 +276,7 @@ class BulletEngine:
         """Enter a change that is about to be made into the journal and the list of what a reset undoes."""
         self._changed.add(number)
         self._chunks.pop(number, None)
+        self._all_chunks = None
         box = self._boxes[number] if self._present[number] else None
         self._journal.entries.append((self._names[number], box))
 

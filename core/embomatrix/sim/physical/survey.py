@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.sim.actions import SWING
 from embomatrix.sim.bounds import IDENTITY
 from embomatrix.sim.bullet.dynamic import DynamicWorld
 from embomatrix.sim.contents import Contents
@@ -24,6 +23,7 @@ from embomatrix.sim.physical.hands import ways_to
 from embomatrix.sim.physical.press import pressing
 from embomatrix.sim.physical.stage import AROUND_M, Stage, tucked
 from embomatrix.sim.physical.travel import SOMETHING
+from embomatrix.sim.swings import SWING
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.poses import Handling, PoseCache
 

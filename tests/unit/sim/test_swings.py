@@ -1,0 +1,72 @@
+"""How leaves open that nothing was moved near to is found out ahead: the answers are those of looking at it then."""
+
+import pytest
+from tests.fakes.plans import plan_of, task_over
+from tests.fakes.scenes import upright
+from tests.unit.sim.test_leaves import drawer_scene
+
+from embomatrix.sim.executor import Simulator
+from embomatrix.world.bundle import Bundle
+
+DRAWERS = "bottom_cabinet_1"
+PLANS = (
+    f"move {DRAWERS}; open {DRAWERS}",
+    f"move {DRAWERS}; open {DRAWERS}; close {DRAWERS}; open {DRAWERS}",
+    f"move apple_1; pick_up apple_1; move {DRAWERS}; place {DRAWERS} ontop; open {DRAWERS}",
+    f"move {DRAWERS}; open {DRAWERS}; pick_up mug_2; move coffee_table_1; place coffee_table_1 ontop; "
+    f"move {DRAWERS}; close {DRAWERS}; open {DRAWERS}",
+    "move fridge_1; open fridge_1; move microwave_1; open microwave_1",
+)
+
+
+@pytest.fixture(scope="module")
+def both():
+    """One simulator that found out ahead, and one that did not."""
+    ahead, then = Simulator(Bundle(drawer_scene(), {})), Simulator(Bundle(drawer_scene(), {}))
+    for _ in ahead.complete():
+        pass
+    yield ahead, then
+    ahead.close()
+    then.close()
+
+
+def in_the_way(simulator: Simulator, y_m: float) -> None:
+    """Stand the bowl before the drawers, by hand."""
+    simulator.world.engine.set_pose("bowl_1", upright(4.0, y_m, 0.0, simulator.world.asset("bowl_1")))
+
+
+@pytest.mark.parametrize("plan", PLANS)
+def test_plans_go_the_same_whether_doors_were_looked_at_ahead_or_not(both, plan) -> None:
+    task = task_over(both[0].world.scene)
+    first, second = (simulator.execute(task, plan_of(task, plan), 3) for simulator in both)
+    assert first.failure is None
+    assert first == second
+
+
+@pytest.mark.parametrize("y_m", [0.6, 0.64, 0.75, 0.9, 1.2, 3.0])
+def test_what_came_before_a_drawer_stops_it_as_if_nothing_had_been_foreseen(both, y_m) -> None:
+    task = task_over(both[0].world.scene)
+    outcomes = []
+    for simulator in both:
+        simulator.reset(task, 0)
+        in_the_way(simulator, y_m)
+        outcomes.append((simulator.world.swings.open(DRAWERS), simulator.world.engine.state_bytes()))
+    assert outcomes[0] == outcomes[1]
+
+
+def test_looking_ahead_leaves_the_scene_as_it_was(both) -> None:
+    ahead, then = both
+    task = task_over(ahead.world.scene)
+    for simulator in both:
+        simulator.reset(task, 0)
+    for _ in ahead.world.swings.complete():
+        assert ahead.world.engine.state_bytes() == then.world.engine.state_bytes()
+
+
+def test_what_was_foreseen_is_not_measured_again(both) -> None:
+    ahead, _ = both
+    ahead.reset(task_over(ahead.world.scene), 0)
+    assert not ahead.world.swings.open(DRAWERS)
+    changed = [name for name, _ in ahead.world.engine.journal.entries]
+    assert sorted(changed) == sorted(set(changed)), "every stop on the way would be a change of its own"
+    assert {DRAWERS, "mug_2", "book_1"} == set(changed)
