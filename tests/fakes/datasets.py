@@ -8,8 +8,9 @@ from tests.fakes.scenes import kitchen_scene, kitchen_tasks
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.planner.oracle import find_plan
 from embomatrix.skills.parse import plan_to_json
-from embomatrix.world.bundle import Bundle, bundle_digest, encode_bundle
+from embomatrix.world.bundle import Bundle, encode_bundle
 from embomatrix.world.dataset import TaskRecord, write_dataset
+from embomatrix.world.inflation import bundle_digest
 
 HELD_OUT = "tidy_up"
 

@@ -10,7 +10,7 @@ from embomatrix.manager.app import running
 from embomatrix.manager.settings import ManagerSettings
 from embomatrix.rpc.roles import Role
 from embomatrix.rpc.token_client import TokenClient
-from embomatrix.world.bundle import bundle_digest
+from embomatrix.world.inflation import bundle_digest
 
 
 @dataclass

@@ -18,7 +18,7 @@ from embomatrix.rpc.convert_session import (
 )
 from embomatrix.rpc.status import NotFoundError, SupersededError, translate
 from embomatrix.rpc.values import Lease, LeaseRef, Rollout
-from embomatrix.world.bundle import bundle_digest
+from embomatrix.world.inflation import bundle_digest
 
 
 @dataclass

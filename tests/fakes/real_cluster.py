@@ -18,7 +18,7 @@ from embomatrix.cli.local_cluster import free_port
 from embomatrix.rpc.client import ClientLimits, ClusterClient
 from embomatrix.rpc.status import ClusterError
 from embomatrix.rpc.values import Batch, Completed, InfraFailure, Rollout
-from embomatrix.world.bundle import bundle_digest
+from embomatrix.world.inflation import bundle_digest
 
 FAKES = Path(__file__).parent
 LIMITS = ClientLimits(retry_first_s=0.05, retry_longest_s=0.5)

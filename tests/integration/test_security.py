@@ -44,7 +44,7 @@ from embomatrix.rpc.values import Batch, Completed, LeaseRef, LeaseResult, Resou
 from embomatrix.worker.daemon import Daemon
 from embomatrix.worker.membership import membership_of
 from embomatrix.worker.settings import WorkerSettings
-from embomatrix.world.bundle import bundle_digest
+from embomatrix.world.inflation import bundle_digest
 
 pytestmark = pytest.mark.timeout(120)
 

@@ -23,7 +23,8 @@ from embomatrix.sim.zygote import private_mb
 from embomatrix.skills.syntax import MAX_STEPS
 from embomatrix.worker.residents import SlotLimits
 from embomatrix.worker.slots import SlotPool
-from embomatrix.world.bundle import Bundle, bundle_digest, encode_bundle
+from embomatrix.world.bundle import Bundle, encode_bundle
+from embomatrix.world.inflation import bundle_digest
 
 PLANS = (
     "move apple_1; pick_up apple_1; move countertop_1; place countertop_1 ontop",

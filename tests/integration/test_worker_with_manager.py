@@ -20,7 +20,8 @@ from embomatrix.rpc.values import Batch, Completed, LookaheadEntry, Rollout, War
 from embomatrix.sim.pose_cache import build_pose_cache
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.syntax import PlaceRelation, Skill, SkillCall
-from embomatrix.world.bundle import Bundle, bundle_digest, encode_bundle
+from embomatrix.world.bundle import Bundle, encode_bundle
+from embomatrix.world.inflation import bundle_digest
 
 FAKES = Path(__file__).parents[1] / "fakes"
 LIMITS = ClientLimits(retry_first_s=0.05, retry_longest_s=0.5)

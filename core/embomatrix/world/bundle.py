@@ -7,7 +7,6 @@ how everything hangs together, and arrays that hold the numbers: see ``tables``.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import struct
@@ -20,11 +19,19 @@ import numpy as np
 from embomatrix.world.codec import scene_from_json, scene_to_json
 from embomatrix.world.codec_task import poses_from_json, poses_to_json, task_from_json, task_to_json
 from embomatrix.world.field import Field, SceneInvalidError
+from embomatrix.world.inflation import (
+    DEFAULT_LIMITS,
+    BundleError,
+    BundleLimits,
+    bundle_digest,
+    decompress,
+    too_large,
+)
 from embomatrix.world.poses import PoseCache
 from embomatrix.world.tables import Tables, TableWriter
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Mapping
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -41,22 +48,6 @@ _HEAD: Final = struct.Struct("<4sII")
 _ALIGNMENT: Final = 8
 _DTYPES: Final[Mapping[str, np.dtype[Any]]] = {name: np.dtype(name) for name in ("<f8", "<i4", "|u1")}
 _PREPARED: Final = "prepared."
-_CHUNK: Final = 1 << 20
-"""What a bundle may grow by beyond its ratio: the smallest ones compress best."""
-_PIECE: Final = 1 << 16
-
-
-class BundleError(ValueError):
-    """A bundle can't be accepted. The message tells what was found and what was expected."""
-
-
-@dataclass(frozen=True, slots=True)
-class BundleLimits:
-    """What a bundle may cost before it is known to be sound."""
-
-    compressed_bytes: int = 8 * 1024 * 1024
-    ratio: float = 100.0
-    """Decompressed bytes for each compressed byte; scenes need about ten."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,9 +62,6 @@ class Bundle:
     tasks: Mapping[str, Task]
     poses: PoseCache = field(default_factory=PoseCache)
     prepared: Arrays = field(default_factory=dict, compare=False)
-
-
-DEFAULT_LIMITS: Final = BundleLimits()
 
 
 def encode_bundle(bundle: Bundle) -> bytes:
@@ -97,11 +85,6 @@ def encode_bundle(bundle: Bundle) -> bytes:
     return zlib.compress(b"".join(parts), level=6)
 
 
-def bundle_digest(data: bytes) -> str:
-    """Content address of a bundle: ``sha256:`` and the hash of its compressed bytes in hexadecimal digits."""
-    return f"sha256:{hashlib.sha256(data).hexdigest()}"
-
-
 def read_bundle(path: Path, *, digest: str = "", limits: BundleLimits = DEFAULT_LIMITS) -> Bundle:
     """The bundle in a file, whose size is looked at before it is read. Raises BundleError, or OSError."""
     with path.open("rb") as file:
@@ -112,12 +95,12 @@ def read_bundle(path: Path, *, digest: str = "", limits: BundleLimits = DEFAULT_
 def decode_bundle(data: bytes, *, digest: str = "", limits: BundleLimits = DEFAULT_LIMITS) -> Bundle:
     """The bundle, checked in every part. ``digest`` is compared first unless it is empty. Raises BundleError."""
     if len(data) > limits.compressed_bytes:
-        raise _too_large(limits)
+        raise too_large(limits)
     found = bundle_digest(data)
     if digest and found != digest:
         raise BundleError(f"the bundle's digest is {found}, expected {digest}")
     try:
-        bundle = _from_content(_decompress(data, limits))
+        bundle = _from_content(decompress(data, limits))
     except SceneInvalidError as error:
         raise BundleError(f"bundle {found}: {error}") from error
     except (ValueError, RecursionError) as error:
@@ -199,59 +182,6 @@ def _check_tasks(bundle: Bundle) -> None:
             raise BundleError(
                 f"the table of task {task.task_id!r} names {min(unknown)!r}: the scene has no such object"
             )
-
-
-class Inflation:
-    """Decompresses a bundle while it comes, and refuses it at the first piece that breaks a limit.
-
-    Whoever takes bundles in uses this: what one side accepts, every other accepts.
-    """
-
-    def __init__(self, limits: BundleLimits = DEFAULT_LIMITS) -> None:
-        self._limits = limits
-        self._decoder = zlib.decompressobj()
-        self._taken = 0
-        self._grown = 0
-
-    def feed(self, data: bytes) -> Iterator[bytes]:
-        """What the next bytes of the bundle hold, in pieces that fit in memory. Raises BundleError."""
-        for start in range(0, len(data), _PIECE):
-            yield self._inflate(data[start : start + _PIECE])
-
-    def finish(self) -> None:
-        """Raises BundleError unless the bundle ended where its bytes ended."""
-        if not self._decoder.eof or self._decoder.unused_data:
-            raise BundleError("the bundle is cut short, or bytes follow its end: fetch it again")
-
-    def _inflate(self, piece: bytes) -> bytes:
-        self._taken += len(piece)
-        if self._taken > self._limits.compressed_bytes:
-            raise _too_large(self._limits)
-        bound = int(self._taken * self._limits.ratio) + _CHUNK
-        try:
-            content = self._decoder.decompress(piece, bound - self._grown + 1)
-        except zlib.error as error:
-            raise BundleError(f"the bundle is no zlib stream: {error}") from error
-        self._grown += len(content)
-        if self._grown > bound or self._decoder.unconsumed_tail:
-            raise BundleError(
-                f"the bundle grows beyond {bound:,} bytes in its first {self._taken:,}: expected at most "
-                f"{self._limits.ratio:g} to 1"
-            )
-        return content
-
-
-def _too_large(limits: BundleLimits) -> BundleError:
-    return BundleError(
-        f"the bundle has over {limits.compressed_bytes:,} bytes: expected at most {limits.compressed_bytes:,}"
-    )
-
-
-def _decompress(data: bytes, limits: BundleLimits) -> bytes:
-    inflation = Inflation(limits)
-    content = b"".join(inflation.feed(data))
-    inflation.finish()
-    return content
 
 
 def _refuse_constant(name: str) -> float:

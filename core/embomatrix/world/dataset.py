@@ -12,9 +12,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from embomatrix.world.bundle import BundleError, decode_bundle
+from embomatrix.world.bundle import decode_bundle
 from embomatrix.world.codec_task import task_from_json, task_to_json
 from embomatrix.world.field import Field, SceneInvalidError
+from embomatrix.world.inflation import BundleError
 from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:

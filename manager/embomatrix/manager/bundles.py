@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.rpc.channel import CHUNK_BYTES
 from embomatrix.rpc.status import InvalidRequestError, NotFoundError, OverloadedError
-from embomatrix.world.bundle import BundleError, Inflation
+from embomatrix.world.inflation import BundleError, Inflation
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable

@@ -19,7 +19,7 @@ from embomatrix.rpc.convert_run import (
 from embomatrix.rpc.logs import bind
 from embomatrix.rpc.status import NotFoundError, TrimmedError, translate
 from embomatrix.rpc.versions import PROTOCOL_OLDEST, SPOKEN, VersionRange, agree, software_version
-from embomatrix.world.bundle import DEFAULT_LIMITS
+from embomatrix.world.inflation import DEFAULT_LIMITS
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Sequence

@@ -31,9 +31,10 @@ from embomatrix.sim.executor import Simulator
 from embomatrix.sim.physical.survey import Foresight
 from embomatrix.sim.pose_cache import PlacementLibrary
 from embomatrix.world.bddl import BddlError, Literal, parse_formula, parse_problem
-from embomatrix.world.bundle import Bundle, bundle_digest, decode_bundle, encode_bundle
+from embomatrix.world.bundle import Bundle, decode_bundle, encode_bundle
 from embomatrix.world.evaluate import evaluate
 from embomatrix.world.goal import Atom
+from embomatrix.world.inflation import bundle_digest
 from embomatrix.world.scene import Scene
 from embomatrix.world.state import State, SubstanceFact, SubstanceRelation
 from embomatrix.world.task import Profile, TaskCategory

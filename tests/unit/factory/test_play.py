@@ -9,8 +9,9 @@ from tests.fakes.scenes import kitchen_scene, kitchen_tasks
 from typer.testing import CliRunner
 
 from embomatrix.factory.play_cli import play
-from embomatrix.world.bundle import Bundle, bundle_digest, encode_bundle
+from embomatrix.world.bundle import Bundle, encode_bundle
 from embomatrix.world.dataset import TaskRecord, write_dataset
+from embomatrix.world.inflation import bundle_digest
 
 GOOD = [
     {"action": "move", "object_index": 10},

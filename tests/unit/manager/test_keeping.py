@@ -19,7 +19,8 @@ from embomatrix.manager.settings import ManagerSettings
 from embomatrix.manager.store.protocol import ResultRow
 from embomatrix.rpc.status import InvalidRequestError, NotFoundError, OverloadedError
 from embomatrix.rpc.values import Cancelled, InfraCode, InfraFailure, RolloutResult
-from embomatrix.world.bundle import BundleError, decode_bundle
+from embomatrix.world.bundle import decode_bundle
+from embomatrix.world.inflation import BundleError
 
 MIB = 1024 * 1024
 

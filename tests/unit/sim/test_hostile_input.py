@@ -17,10 +17,11 @@ from tests.fakes.scenes import kitchen_scene
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.engine import FLOOR, WALL, EngineError
 from embomatrix.world.asset import Joint, JointKind, Link
-from embomatrix.world.bundle import Bundle, BundleError, decode_bundle, encode_bundle, read_bundle
+from embomatrix.world.bundle import Bundle, decode_bundle, encode_bundle, read_bundle
 from embomatrix.world.codec import RESERVED_NAMES, check_scene, scene_from_json, scene_to_json
 from embomatrix.world.field import SceneInvalidError
 from embomatrix.world.geometry import Part, Pose, Shape
+from embomatrix.world.inflation import BundleError
 
 NAN, INF = math.nan, math.inf
 ORIGIN = (0.0, 0.0, 0.0)

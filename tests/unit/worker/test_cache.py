@@ -13,7 +13,7 @@ import pytest
 from embomatrix.rpc.values import InfraCode
 from embomatrix.worker.cache import BundleCache
 from embomatrix.worker.residents import LoadError
-from embomatrix.world.bundle import bundle_digest
+from embomatrix.world.inflation import bundle_digest
 
 
 class Source:
@@ -126,7 +126,7 @@ SMALL_DISK = """
 import asyncio, sys
 from pathlib import Path
 from embomatrix.worker.cache import BundleCache
-from embomatrix.world.bundle import bundle_digest
+from embomatrix.world.inflation import bundle_digest
 
 bundles = {bundle_digest(content): content for content in (b"a" * 30_000, b"b" * 30_000, b"c" * 30_000)}
 

@@ -5,8 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from embomatrix.world.bundle import Bundle, bundle_digest, encode_bundle
+from embomatrix.world.bundle import Bundle, encode_bundle
 from embomatrix.world.dataset import Dataset, DatasetError, TaskRecord, record_to_json, write_dataset
+from embomatrix.world.inflation import bundle_digest
 from embomatrix.world.task import Task
 
 PLAN = ({"action": "move", "object_index": 1}, {"action": "open", "object_index": 1})

@@ -13,8 +13,8 @@ from rich.table import Table
 from embomatrix.rpc.status import ClusterError
 from embomatrix.sim.engine import EngineError
 from embomatrix.worker.bench_figures import BenchError, is_shared, result_to_json, shown
-from embomatrix.world.bundle import BundleError
 from embomatrix.world.dataset import DatasetError
+from embomatrix.world.inflation import BundleError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

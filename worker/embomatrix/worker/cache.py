@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.rpc.values import InfraCode
 from embomatrix.worker.residents import LoadError
-from embomatrix.world.bundle import bundle_digest
+from embomatrix.world.inflation import bundle_digest
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable

@@ -17,7 +17,8 @@ from embomatrix.sim.executor import Simulator
 from embomatrix.sim.prepared import Prepared
 from embomatrix.worker.rehearsal import PLANS, REHEARSAL, TIMES, rehearsal_bundle
 from embomatrix.worker.slot_program import BundleCorruptError, run_program
-from embomatrix.world.bundle import BundleError, bundle_digest, decode_bundle, encode_bundle, read_bundle
+from embomatrix.world.bundle import decode_bundle, encode_bundle, read_bundle
+from embomatrix.world.inflation import BundleError, bundle_digest
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -33,7 +33,7 @@ from embomatrix.rpc.status import (
 from embomatrix.rpc.values import InfraCode, WorkerState
 from embomatrix.rpc.versions import PROTOCOL_OLDEST, PROTOCOL_VERSION
 from embomatrix.worker.residents import LoadError
-from embomatrix.world.bundle import DEFAULT_LIMITS
+from embomatrix.world.inflation import DEFAULT_LIMITS
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator

@@ -24,8 +24,9 @@ from embomatrix.sim.planner.oracle import find_plan
 from embomatrix.sim.pose_cache import PlacementLibrary
 from embomatrix.sim.prepared import prepare
 from embomatrix.skills.parse import plan_to_json
-from embomatrix.world.bundle import Bundle, bundle_digest, encode_bundle
+from embomatrix.world.bundle import Bundle, encode_bundle
 from embomatrix.world.dataset import TaskRecord
+from embomatrix.world.inflation import bundle_digest
 from embomatrix.world.task import TaskCategory
 
 if TYPE_CHECKING:

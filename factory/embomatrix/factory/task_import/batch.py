@@ -15,8 +15,9 @@ from embomatrix.sim.executor import Simulator
 from embomatrix.sim.planner.oracle import find_plan
 from embomatrix.sim.prepared import prepare
 from embomatrix.skills.parse import plan_to_json
-from embomatrix.world.bundle import Bundle, bundle_digest, encode_bundle
+from embomatrix.world.bundle import Bundle, encode_bundle
 from embomatrix.world.dataset import TaskRecord
+from embomatrix.world.inflation import bundle_digest
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

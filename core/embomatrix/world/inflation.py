@@ -1,0 +1,94 @@
+"""What a bundle may cost before it is known to be sound: its address, its size, and how far it may grow.
+
+Whoever passes bundles on needs no more than this, and no numpy.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import zlib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+_CHUNK: Final = 1 << 20
+"""What a bundle may grow by beyond its ratio: the smallest ones compress best."""
+_PIECE: Final = 1 << 16
+
+
+class BundleError(ValueError):
+    """A bundle can't be accepted. The message tells what was found and what was expected."""
+
+
+@dataclass(frozen=True, slots=True)
+class BundleLimits:
+    """What a bundle may cost before it is known to be sound."""
+
+    compressed_bytes: int = 8 * 1024 * 1024
+    ratio: float = 100.0
+    """Decompressed bytes for each compressed byte; scenes need about ten."""
+
+
+DEFAULT_LIMITS: Final = BundleLimits()
+
+
+def bundle_digest(data: bytes) -> str:
+    """Content address of a bundle: ``sha256:`` and the hash of its compressed bytes in hexadecimal digits."""
+    return f"sha256:{hashlib.sha256(data).hexdigest()}"
+
+
+class Inflation:
+    """Decompresses a bundle while it comes, and refuses it at the first piece that breaks a limit.
+
+    Whoever takes bundles in uses this: what one side accepts, every other accepts.
+    """
+
+    def __init__(self, limits: BundleLimits = DEFAULT_LIMITS) -> None:
+        self._limits = limits
+        self._decoder = zlib.decompressobj()
+        self._taken = 0
+        self._grown = 0
+
+    def feed(self, data: bytes) -> Iterator[bytes]:
+        """What the next bytes of the bundle hold, in pieces that fit in memory. Raises BundleError."""
+        for start in range(0, len(data), _PIECE):
+            yield self._inflate(data[start : start + _PIECE])
+
+    def finish(self) -> None:
+        """Raises BundleError unless the bundle ended where its bytes ended."""
+        if not self._decoder.eof or self._decoder.unused_data:
+            raise BundleError("the bundle is cut short, or bytes follow its end: fetch it again")
+
+    def _inflate(self, piece: bytes) -> bytes:
+        self._taken += len(piece)
+        if self._taken > self._limits.compressed_bytes:
+            raise too_large(self._limits)
+        bound = int(self._taken * self._limits.ratio) + _CHUNK
+        try:
+            content = self._decoder.decompress(piece, bound - self._grown + 1)
+        except zlib.error as error:
+            raise BundleError(f"the bundle is no zlib stream: {error}") from error
+        self._grown += len(content)
+        if self._grown > bound or self._decoder.unconsumed_tail:
+            raise BundleError(
+                f"the bundle grows beyond {bound:,} bytes in its first {self._taken:,}: expected at most "
+                f"{self._limits.ratio:g} to 1"
+            )
+        return content
+
+
+def too_large(limits: BundleLimits) -> BundleError:
+    """The error about a bundle with more bytes than the limits allow."""
+    return BundleError(
+        f"the bundle has over {limits.compressed_bytes:,} bytes: expected at most {limits.compressed_bytes:,}"
+    )
+
+
+def decompress(data: bytes, limits: BundleLimits) -> bytes:
+    """What a whole bundle holds. Raises BundleError."""
+    inflation = Inflation(limits)
+    content = b"".join(inflation.feed(data))
+    inflation.finish()
+    return content
