@@ -38,6 +38,7 @@ proto-check: $(VENV)/.dev
 check: lint types contracts proto-check
 
 compose-check: $(VENV)/.dev
+	deploy/docker/local_bases.sh
 	$(BIN)/python -m pytest -m docker $(ARGS)
 
 pictures: $(VENV)/.dev

@@ -48,6 +48,7 @@ from embomatrix.worker.bench_figures import (
     put_together,
     read_result,
 )
+from embomatrix.worker.bench_operations_cli import operations
 from embomatrix.worker.bench_output import console, errors, hand_in, refusals, write
 from embomatrix.worker.bench_page import hand_parts, render_page
 from embomatrix.worker.bench_rollout import bench_rollout
@@ -76,6 +77,7 @@ SPEEDUP = "skill_speedup_min"
 MODES = Modes(cached=Simulator, physical=physical_simulator)
 
 app.command()(cluster)
+app.command()(operations)
 
 
 @app.command()

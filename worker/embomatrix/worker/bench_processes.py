@@ -71,7 +71,7 @@ def bench_cluster(
     """
     with contextlib.ExitStack() as started:
         manager = started.enter_context(
-            _running(
+            running_process(
                 folder,
                 "manager",
                 *("embomatrix.cli", "manager", "serve", "--port=0", "--http-port=0"),
@@ -81,7 +81,7 @@ def bench_cluster(
         address = _address_of(manager, deadline_s)
         daemons = tuple(
             started.enter_context(
-                _running(folder, name, *_worker_command(folder, address, name, slots, load_delay_s))
+                running_process(folder, name, *_worker_command(folder, address, name, slots, load_delay_s))
             )
             for name in (f"worker-{number}" for number in range(1, workers + 1))
         )
@@ -101,7 +101,7 @@ def _worker_command(
 
 
 @contextlib.contextmanager
-def _running(folder: Path, name: str, *arguments: str) -> Iterator[Process]:
+def running_process(folder: Path, name: str, *arguments: str) -> Iterator[Process]:
     """A module of this interpreter with its arguments, in the background."""
     log = folder / f"{name}.log"
     with log.open("wb") as file:
