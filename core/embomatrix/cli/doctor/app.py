@@ -1,0 +1,95 @@
+"""`embomatrix doctor`: is this machine fit for its part in a cluster, and can it reach the manager?"""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from embomatrix.cli.cluster.tables import show_json
+from embomatrix.cli.doctor.findings import Level, verdict
+from embomatrix.cli.doctor.machine import machine
+from embomatrix.cli.doctor.manager import Visit, manager
+from embomatrix.cli.failure import MENDABLE, fail
+from embomatrix.rpc.channel import DEFAULT_ADDRESS
+from embomatrix.rpc.managers import addresses_of
+from embomatrix.rpc.status import ClusterError
+from embomatrix.rpc.trust import read_ca, read_token
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from embomatrix.cli.doctor.findings import Finding
+
+STYLES: Final[Mapping[Level, str]] = {Level.FINE: "green", Level.NOTE: "yellow", Level.WRONG: "red"}
+
+Manager = Annotated[
+    str,
+    typer.Option(
+        "--manager",
+        help="HOST:PORT of the manager to visit.",
+        envvar="EMBOMATRIX_MANAGER",
+        show_default=False,
+    ),
+]
+Token = Annotated[
+    str, typer.Option(envvar="EMBOMATRIX_TOKEN", help="A token, or @FILE that holds it.", show_default=False)
+]
+Ca = Annotated[
+    Path | None,
+    typer.Option(
+        envvar="EMBOMATRIX_CA", help="The ca.pem of a manager that serves by TLS.", show_default=False
+    ),
+]
+PagePort = Annotated[
+    int, typer.Option(help="Port of its status page, which tells the time.", min=1, max=65535)
+]
+
+
+def doctor(
+    manager: Manager = "",
+    token: Token = "",
+    ca: Ca = None,
+    page_port: PagePort = 8070,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Check Python, packages, ports, memory, disk and the way to the manager, and say what to do. Status 2: all is not well."""
+    try:
+        addresses = addresses_of(manager or DEFAULT_ADDRESS)
+        secret, trusted = read_token(token), read_ca(ca)
+    except ClusterError as error:
+        fail("doctor", str(error))
+    visits = [Visit(address, secret, trusted, page_port, expected=bool(manager)) for address in addresses]
+    findings = [*machine(), *asyncio.run(_visit(visits))]
+    if as_json:
+        show_json(findings)
+    else:
+        _show(findings)
+    if any(finding.level is Level.WRONG for finding in findings):
+        raise SystemExit(MENDABLE)
+
+
+async def _visit(visits: Sequence[Visit]) -> list[Finding]:
+    """All managers at the same time."""
+    found = await asyncio.gather(*(manager(visit) for visit in visits))
+    return [finding for findings in found for finding in findings]
+
+
+def _show(findings: Sequence[Finding]) -> None:
+    table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
+    table.add_column(no_wrap=True)
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
+    for finding in findings:
+        told = Text(finding.found)
+        if finding.remedy:
+            told.append(f"\n{finding.remedy}", style="dim")
+        table.add_row(Text(finding.level.value, style=STYLES[finding.level]), finding.thing, told)
+    console = Console(highlight=False)
+    console.print(table)
+    console.print(f"\n{verdict(findings)}", markup=False)

@@ -1,0 +1,120 @@
+"""What a machine brings: Python, packages, ports, memory, disk. Each is judged by a function of what was measured."""
+
+from __future__ import annotations
+
+import errno
+import importlib.util
+import os
+import platform
+import shutil
+import socket
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.cli.doctor.findings import Finding, Level
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Mapping
+
+NEEDED: Final[Mapping[str, tuple[str, ...]]] = {
+    "worker": ("pybullet", "scipy", "psutil"),
+    "manager": ("fastapi", "uvicorn", "redis", "prometheus_client", "cryptography", "grpc_health"),
+    "factory": ("pybullet", "scipy", "trimesh", "PIL", "httpx"),
+    "trainer": ("torch", "httpx"),
+}
+"""Packages that a part imports beyond those of the command itself, by the extra that brings them."""
+PORTS: Final[Mapping[str, int]] = {"port of workers and trainers": 50070, "port of the status page": 8070}
+MEMORY_LEAST_MB: Final = 512
+"""A simulator with its engine takes 100 MB, a scene 20 to 80, an empty manager 90."""
+MEMORY_GOOD_MB: Final = 2048
+DISK_LEAST_MB: Final = 200
+DISK_GOOD_MB: Final = 2048
+"""A worker's cache of bundles may take 1 GiB, a manager's bundles more."""
+MEGABYTE: Final = 1_000_000
+
+
+def machine() -> list[Finding]:
+    """Look at this machine."""
+    installed = {name for names in NEEDED.values() for name in names if importlib.util.find_spec(name)}
+    free = {name: _is_free(port) for name, port in PORTS.items()}
+    return [
+        python(sys.version_info[:2], platform.system(), platform.machine()),
+        *parts(installed),
+        *(port(name, PORTS[name], free=is_free) for name, is_free in free.items()),
+        memory(_free_memory_mb()),
+        disk(Path.home(), shutil.disk_usage(Path.home()).free / MEGABYTE),
+    ]
+
+
+def python(version: tuple[int, int], system: str, processor: str) -> Finding:
+    """The interpreter, on which everything depends."""
+    found = f"{version[0]}.{version[1]} on {system}, {processor}"
+    if version < (3, 11):
+        return Finding("Python", Level.WRONG, found, "install Python 3.11")
+    if version >= (3, 12) or system != "Linux" or processor not in ("x86_64", "AMD64"):
+        advice = "a manager and a trainer run here; the physics engine of workers and of the factory has wheels for Python "
+        return Finding("Python", Level.NOTE, found, f"{advice}3.11 on x86-64 Linux alone")
+    return Finding("Python", Level.FINE, found)
+
+
+def parts(installed: Collection[str]) -> list[Finding]:
+    """Which parts of the project can run, by the packages that are there."""
+    findings: list[Finding] = []
+    for extra, names in NEEDED.items():
+        missing = [name for name in names if name not in installed]
+        if missing:
+            remedy = f"to run it here: pip install 'embomatrix[{extra}]'"
+            findings.append(Finding(extra, Level.NOTE, f"lacks {', '.join(missing)}", remedy))
+        else:
+            findings.append(Finding(extra, Level.FINE, "installed"))
+    return findings
+
+
+def port(name: str, number: int, *, free: bool) -> Finding:
+    """A port of loopback that a manager takes by default."""
+    if free:
+        return Finding(name, Level.FINE, f"{number} is free")
+    remedy = "it is a manager's, or another program's: a second manager takes --port and --http-port"
+    return Finding(name, Level.NOTE, f"{number} is taken", remedy)
+
+
+def memory(free_mb: float) -> Finding:
+    """What new processes may take."""
+    return _amount(
+        "memory", free_mb, MEMORY_LEAST_MB, MEMORY_GOOD_MB, "close programs, or give it fewer --slots"
+    )
+
+
+def disk(folder: Path, free_mb: float) -> Finding:
+    """Where caches and state lie by default."""
+    remedy = "make room, or pass --cache-dir and --data-dir of another disk"
+    return _amount(f"disk of {folder}", free_mb, DISK_LEAST_MB, DISK_GOOD_MB, remedy)
+
+
+def _amount(thing: str, free_mb: float, least_mb: float, good_mb: float, remedy: str) -> Finding:
+    found = f"{free_mb:,.0f} MB are free"
+    if free_mb >= good_mb:
+        return Finding(thing, Level.FINE, found)
+    level = Level.NOTE if free_mb >= least_mb else Level.WRONG
+    return Finding(thing, level, f"{found}, {good_mb:,.0f} would do", remedy)
+
+
+def _is_free(number: int) -> bool:
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("127.0.0.1", number))
+        except OSError as error:
+            return error.errno != errno.EADDRINUSE
+    return True
+
+
+def _free_memory_mb() -> float:
+    """What the kernel would give without swapping; where it doesn't tell, what nobody uses at all."""
+    table = Path("/proc/meminfo")
+    if table.exists():
+        for line in table.read_text(encoding="ascii").splitlines():
+            if line.startswith("MemAvailable:"):
+                return int(line.split()[1]) * 1024 / MEGABYTE
+    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / MEGABYTE

@@ -1,0 +1,186 @@
+"""Whether a manager can be reached from here: by the network, by TLS, in a version that both speak, with the token in hand."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import http.client
+import socket
+import ssl
+import time
+from dataclasses import dataclass, field
+from email.utils import parsedate_to_datetime
+from typing import Final
+
+from embomatrix.cli.doctor.findings import Finding, Level
+from embomatrix.proto.v1 import rollout_service_pb2_grpc
+from embomatrix.rpc.admin import AdminClient
+from embomatrix.rpc.capabilities import Capabilities, capabilities_of
+from embomatrix.rpc.channel import open_channel
+from embomatrix.rpc.status import ClusterError, NotAllowedError, PreconditionError
+from embomatrix.rpc.versions import SPOKEN, agree, software_version
+
+KNOCK_S: Final = 1.0
+"""Limit for each of the questions, of which there are four: a doctor is quick."""
+CERTIFICATE_DAYS: Final = 30
+"""`manager init` renews a certificate with less than this left."""
+CLOCK_S: Final = 60.0
+DAY_S: Final = 86400.0
+
+
+@dataclass(frozen=True, slots=True)
+class Visit:
+    """Whom to visit, and what to show there. ``ca`` is PEM; ``page_port`` is that of the status page."""
+
+    address: str
+    token: str = field(default="", repr=False)
+    ca: bytes = b""
+    page_port: int = 8070
+    expected: bool = True
+    """Whether somebody named this manager, or it is only where one would be by default."""
+
+    @property
+    def host(self) -> str:
+        return self.address.rpartition(":")[0].strip("[]")
+
+    @property
+    def port(self) -> int:
+        return int(self.address.rpartition(":")[2])
+
+
+async def manager(visit: Visit) -> list[Finding]:
+    """Knock, and go on for as long as there is an answer."""
+    reached = await asyncio.to_thread(_reach, visit)
+    findings = [reached]
+    if reached.level is not Level.FINE:
+        return findings
+    findings.append(await asyncio.to_thread(_tls, visit))
+    if findings[-1].level is Level.WRONG:
+        return findings
+    findings.append(await _versions(visit))
+    findings.append(await _token(visit))
+    offset_s = await asyncio.to_thread(_clock_offset_s, visit)
+    if offset_s is not None:
+        findings.append(clock(offset_s))
+    return findings
+
+
+def certificate(days_left: float) -> Finding:
+    """How long the manager's certificate still holds."""
+    found = f"by TLS, its certificate holds {days_left:.0f} days more"
+    if days_left < CERTIFICATE_DAYS:
+        return Finding(
+            "TLS", Level.NOTE, found, "run `embomatrix manager init` there again: it makes a new one"
+        )
+    return Finding("TLS", Level.FINE, found)
+
+
+def versions(found: Capabilities) -> Finding:
+    """Whether both sides speak one protocol; other releases than our own are told."""
+    try:
+        spoken = agree(
+            SPOKEN, found.protocol, us="this trainer", them="that manager", their_release=found.release
+        )
+    except PreconditionError as error:
+        return Finding("versions", Level.WRONG, f"protocol {found.protocol} there, {SPOKEN} here", str(error))
+    told = f"protocol {spoken}, release {found.release or 'unknown'}"
+    if found.release and software_version() and found.release != software_version():
+        return Finding(
+            "versions", Level.NOTE, f"{told} there, {software_version()} here", "they work together"
+        )
+    return Finding("versions", Level.FINE, told)
+
+
+def clock(offset_s: float) -> Finding:
+    """This machine's clock less the manager's."""
+    found = f"{abs(offset_s):.0f} s {'ahead of' if offset_s > 0 else 'behind'} the manager's"
+    if abs(offset_s) < CLOCK_S:
+        return Finding("clock", Level.FINE, found)
+    remedy = (
+        "let NTP set it: leases don't mind, but certificates may seem expired and logs don't fit together"
+    )
+    return Finding("clock", Level.NOTE, found, remedy)
+
+
+def _reach(visit: Visit) -> Finding:
+    try:
+        socket.create_connection((visit.host, visit.port), KNOCK_S).close()
+    except OSError as error:
+        if not visit.expected:
+            return Finding(
+                "manager", Level.NOTE, f"none at {visit.address}", "name yours with --manager HOST:PORT"
+            )
+        remedy = "is it running, is the address right, does a firewall let its port through?"
+        return Finding("manager", Level.WRONG, f"{visit.address}: {error.strerror or error}", remedy)
+    return Finding("manager", Level.FINE, f"{visit.address} answers")
+
+
+def _tls(visit: Visit) -> Finding:
+    context = ssl.create_default_context(cadata=visit.ca.decode("ascii")) if visit.ca else _trusting()
+    context.set_alpn_protocols(["h2"])
+    try:
+        with (
+            socket.create_connection((visit.host, visit.port), KNOCK_S) as plain,
+            context.wrap_socket(plain, server_hostname=visit.host) as tls,
+        ):
+            shown = tls.getpeercert()
+    except ssl.SSLCertVerificationError as error:
+        remedy = "pass the ca.pem of this manager with --ca; a name that it lacks is added by `manager init --san NAME`"
+        return Finding("TLS", Level.WRONG, error.verify_message, remedy)
+    except OSError:
+        if visit.ca:
+            return Finding("TLS", Level.WRONG, "it does not speak TLS", "leave --ca and EMBOMATRIX_CA out")
+        return Finding("TLS", Level.FINE, "none: it serves in the clear, as on loopback")
+    if not visit.ca:
+        remedy = "pass its ca.pem with --ca, or EMBOMATRIX_CA"
+        return Finding("TLS", Level.WRONG, "it serves by TLS, and no authority to trust was named", remedy)
+    ends_s = ssl.cert_time_to_seconds(str((shown or {}).get("notAfter")))
+    return certificate((ends_s - time.time()) / DAY_S)
+
+
+def _trusting() -> ssl.SSLContext:
+    """Only asks whether there is TLS at all."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.check_hostname = False
+    context.verify_mode = ssl.CERT_NONE
+    return context
+
+
+async def _versions(visit: Visit) -> Finding:
+    try:
+        async with open_channel(visit.address, ca=visit.ca) as channel:
+            stub = rollout_service_pb2_grpc.RolloutServiceStub(channel)
+            return versions(await capabilities_of(stub, visit.address, timeout_s=KNOCK_S))
+    except ClusterError as error:
+        return Finding("versions", Level.WRONG, str(error), "is this the port of a manager's gRPC services?")
+
+
+async def _token(visit: Visit) -> Finding:
+    try:
+        async with AdminClient(
+            visit.address, visit.token, ca=visit.ca, call_s=KNOCK_S, patience_s=0
+        ) as client:
+            ready = sum(worker.state == "ready" for worker in await client.list_workers())
+    except NotAllowedError as error:
+        return Finding("token", Level.FINE, f"is known; {error}")
+    except ClusterError as error:
+        return Finding(
+            "token", Level.WRONG, str(error), "tokens are made by `embomatrix manager token issue`"
+        )
+    found = "is known" if visit.token else "none is asked for"
+    return Finding("token", Level.FINE, f"{found}; {ready} workers are ready")
+
+
+def _clock_offset_s(visit: Visit) -> float | None:
+    """By the date in the status page's answer; None where no page answers. Right to a second."""
+    if visit.ca:
+        context = ssl.create_default_context(cadata=visit.ca.decode("ascii"))
+        page: http.client.HTTPConnection = http.client.HTTPSConnection(
+            visit.host, visit.page_port, timeout=KNOCK_S, context=context
+        )
+    else:
+        page = http.client.HTTPConnection(visit.host, visit.page_port, timeout=KNOCK_S)
+    with contextlib.closing(page), contextlib.suppress(OSError, http.client.HTTPException, ValueError):
+        page.request("GET", "/healthz")
+        return time.time() - parsedate_to_datetime(page.getresponse().headers["date"] or "").timestamp()
+    return None

@@ -1,0 +1,117 @@
+"""`embomatrix doctor`: what it makes of what it measured, and of managers that are there, elsewhere, or of another kind."""
+
+import asyncio
+
+import pytest
+from tests.integration.test_manager_service import manager as a_manager
+
+from embomatrix.cli.doctor.findings import Finding, Level, verdict
+from embomatrix.cli.doctor.machine import NEEDED, disk, machine, memory, parts, port, python
+from embomatrix.cli.doctor.manager import Visit, certificate, clock, manager, versions
+from embomatrix.manager.access.folder import prepare
+from embomatrix.rpc.capabilities import Capabilities
+from embomatrix.rpc.versions import PROTOCOL_VERSION, VersionRange
+
+
+def levels(findings):
+    return {finding.thing: finding.level for finding in findings}
+
+
+@pytest.mark.parametrize(
+    ("version", "system", "processor", "level"),
+    [
+        ((3, 11), "Linux", "x86_64", Level.FINE),
+        ((3, 12), "Linux", "x86_64", Level.NOTE),
+        ((3, 11), "Linux", "aarch64", Level.NOTE),
+        ((3, 11), "Darwin", "x86_64", Level.NOTE),
+        ((3, 10), "Linux", "x86_64", Level.WRONG),
+    ],
+)
+def test_python_is_judged_by_what_the_engine_has_wheels_for(version, system, processor, level):
+    assert python(version, system, processor).level is level
+
+
+def test_a_part_without_its_packages_is_named_with_the_extra_that_brings_them():
+    found = parts({"pybullet", "scipy", *NEEDED["manager"]})
+    assert levels(found) == {
+        "worker": Level.NOTE,
+        "manager": Level.FINE,
+        "factory": Level.NOTE,
+        "trainer": Level.NOTE,
+    }
+    assert (found[0].found, found[0].remedy) == (
+        "lacks psutil",
+        "to run it here: pip install 'embomatrix[worker]'",
+    )
+
+
+def test_little_memory_is_told_and_less_is_wrong(tmp_path):
+    assert [memory(free_mb).level for free_mb in (4096, 1024, 100)] == [Level.FINE, Level.NOTE, Level.WRONG]
+    assert "100 MB are free" in disk(tmp_path, 100.0).found
+    assert port("port of the status page", 8070, free=False).level is Level.NOTE
+
+
+def test_a_certificate_near_its_end_and_a_clock_an_hour_off_are_told():
+    assert [certificate(days).level for days in (300, 29, -1)] == [Level.FINE, Level.NOTE, Level.NOTE]
+    assert [clock(offset_s).level for offset_s in (0.7, 3600.0, -3600.0)] == [
+        Level.FINE,
+        Level.NOTE,
+        Level.NOTE,
+    ]
+    assert "behind" in clock(-3600.0).found
+
+
+def test_a_manager_that_speaks_no_common_version_is_wrong_and_another_release_is_not():
+    newer = versions(Capabilities(VersionRange(PROTOCOL_VERSION + 5, PROTOCOL_VERSION + 6), "9.0.0"))
+    assert newer.level is Level.WRONG
+    assert "pip install --upgrade" in newer.remedy
+    other = versions(Capabilities(VersionRange(1, PROTOCOL_VERSION), "0.0.9"))
+    assert other.level is Level.NOTE
+
+
+def test_the_verdict_names_what_is_wrong():
+    fine, note, wrong = (Finding(level.value, level, "") for level in Level)
+    assert verdict([fine]) == "all is well"
+    assert verdict([fine, note]) == "nothing is wrong; 1 of 2 things are worth a look"
+    assert verdict([fine, wrong, note]) == "1 of 3 things are wrong: wrong"
+
+
+def test_this_machine_can_run_its_own_tests():
+    found = levels(machine())
+    assert found["Python"] is not Level.WRONG
+    assert found["memory"] is not Level.WRONG
+
+
+async def test_a_manager_that_is_not_there_is_wrong_only_for_who_named_it():
+    (named,) = await manager(Visit("127.0.0.1:1"))
+    (default,) = await manager(Visit("127.0.0.1:1", expected=False))
+    assert (named.level, default.level) == (Level.WRONG, Level.NOTE)
+
+
+async def test_a_manager_in_the_clear_is_fine(tmp_path):
+    async with a_manager(tmp_path) as endpoints:
+        page_port = int(endpoints.status_url.rstrip("/").rpartition(":")[2])
+        found = await manager(Visit(endpoints.address, page_port=page_port))
+    assert [finding.thing for finding in found] == ["manager", "TLS", "versions", "token", "clock"]
+    assert {finding.level for finding in found} == {Level.FINE}
+
+
+async def test_a_guarded_manager_says_what_is_missing_step_by_step(tmp_path):
+    await asyncio.to_thread(prepare, tmp_path, sans=())
+    access = tmp_path / "access"
+    ca, viewer = (access / "ca.pem").read_bytes(), (access / "tokens" / "viewer").read_text().strip()
+    async with a_manager(tmp_path) as endpoints:
+        nobody = await manager(Visit(endpoints.address))
+        trusting = await manager(Visit(endpoints.address, ca=ca, page_port=1))
+        signed_in = await manager(Visit(endpoints.address, viewer, ca, page_port=1))
+        elsewhere = await manager(Visit(endpoints.address.replace("127.0.0.1", "127.0.0.2"), ca=ca))
+    assert levels(nobody)["TLS"] is Level.WRONG
+    assert "--ca" in nobody[-1].remedy
+    assert levels(trusting) == {
+        "manager": Level.FINE,
+        "TLS": Level.FINE,
+        "versions": Level.FINE,
+        "token": Level.WRONG,
+    }
+    assert levels(signed_in)["token"] is Level.FINE
+    assert elsewhere[0].level is Level.WRONG

@@ -1,0 +1,101 @@
+"""`embomatrix status` and `top`: what they say of a cluster, and that they show it of a real manager."""
+
+import asyncio
+import io
+
+import pytest
+from rich.console import Console
+from tests.fakes.worker import FakeWorker
+from tests.integration.test_manager_service import manager
+
+from embomatrix.cli.status.app import status, top
+from embomatrix.cli.status.live import Glance, earliest, rate, screen
+from embomatrix.cli.status.words import sentences
+from embomatrix.rpc.values import (
+    PlanCell,
+    Resident,
+    ResidentState,
+    Resources,
+    RunInfo,
+    RunStats,
+    Warmth,
+    WorkerInfo,
+)
+
+
+def worker(name="w1", state="ready", *, running=0, completed=0, reason="", residents=()):
+    return WorkerInfo(name, state, Resources(2, 4, 1024), residents, running, completed, 0.5, reason)
+
+
+def test_words_begin_with_the_verdict():
+    run_info = RunInfo("r1", "evening", RunStats(), pending=3)
+    assert sentences((), (), ())[0].startswith("No workers: start one")
+    assert sentences((worker(),), (), ())[0] == "The cluster is ready, and no run is open."
+    assert sentences((worker(),), (run_info,), ())[0] == "The cluster works."
+    assert sentences((worker(state="paused"),), (run_info,), ())[0].startswith(
+        "No worker works, and 3 rollouts wait"
+    )
+
+
+def test_words_tell_what_runs_what_is_warm_and_who_does_not_work():
+    warm = Resident("sha256:aa", ResidentState.WARM)
+    stats = RunStats(delivered=40, warm_starts=30, cold_starts=10, infra_failures=2, redispatched=5)
+    plan = [
+        PlanCell("r1", 7, "sha256:aa", 8, Warmth.WARM),
+        PlanCell("r1", 7, "sha256:bb", 8, Warmth.UNPLACEABLE),
+    ]
+    told = sentences(
+        (worker(running=1, residents=(warm,)), worker("w2", "paused", reason="somebody uses it")),
+        (RunInfo("r1", "evening", stats, pending=3),),
+        plan,
+    )
+    assert told[1:] == [
+        "Workers: 1 ready, 1 paused; 1 of 2 slots run a rollout; 1 scenes are in memory.",
+        "Run evening: 40 rollouts done, 75% of them in warm scenes; 2 lost by the infrastructure, 5 given again; 3 under way.",
+        "Look-ahead: 1 of 2 scenes of the next 1 steps are warm; 1 find no room: give workers memory, or start more.",
+        "w2 is paused: somebody uses it.",
+    ]
+
+
+def test_words_of_a_thousand_workers_fit_on_a_screen():
+    assert len(sentences([worker(f"w{n}", "lost") for n in range(1000)], (), ())) < 16
+
+
+def drawn(now, lines):
+    console = Console(file=io.StringIO(), width=120)
+    console.print(screen(now, now, lines=lines))
+    return console.file.getvalue().splitlines()
+
+
+def test_the_screen_shows_those_that_do_not_work_first_and_no_more_than_fits():
+    crowd = (*(worker(f"w{n:04}", running=n % 3) for n in range(1000)), worker("broken", "lost"))
+    lines = drawn(Glance(0.0, crowd, ()), 24)
+    assert len(lines) <= 24
+    (first,) = [line for line in lines if line.startswith("broken")]
+    assert lines.index(first) < min(n for n, line in enumerate(lines) if line.startswith("w0"))
+    assert lines[-1].startswith("and 9")
+
+
+def test_throughput_is_that_of_the_last_seconds_and_never_negative():
+    glances = [Glance(float(at_s), (worker(completed=100 * at_s),), ()) for at_s in range(10)]
+    assert rate(earliest(glances, 5.0), glances[-1]) == 100.0
+    assert rate(glances[-1], Glance(10.0, (), ())) == 0.0
+    assert rate(glances[-1], glances[-1]) == 0.0
+
+
+async def test_both_commands_show_a_real_manager(tmp_path, capsys):
+    async with manager(tmp_path) as endpoints, FakeWorker(endpoints.address, "w1"):
+        await asyncio.to_thread(status, endpoints.address)
+        words = capsys.readouterr().out
+        await asyncio.to_thread(top, endpoints.address, rounds=1)
+        live = capsys.readouterr().out
+    assert "Workers: 1 ready" in words
+    assert "0 rollouts/s" in live
+    assert "w1" in live
+
+
+def test_a_manager_that_is_not_there_is_told_in_a_sentence(capsys):
+    for command, name in ((status, "status"), (top, "top")):
+        with pytest.raises(SystemExit, match="2"):
+            command("127.0.0.1:1")
+        assert capsys.readouterr().err.startswith(f"embomatrix {name}: no manager answers")
