@@ -74,7 +74,7 @@ def checkpoint(kitchen, tmp_path_factory):
     "arguments",
     [
         ("train", "--dataset=DATASET", "--out=OUT"),
-        ("eval", "CHECKPOINT", "--dataset=DATASET"),
+        ("eval", "--baseline=oracle", "--bench=DATASET", "--out=OUT"),
         ("worker", "run", "--once", "--cache-dir=OUT"),
         ("worker", "doctor"),
         ("manager", "status"),

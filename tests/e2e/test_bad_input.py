@@ -5,6 +5,7 @@ import resource
 import shutil
 
 import pytest
+from tests.fakes.chat_server import ChatServer, completion
 from tests.fakes.commands import background, run, without
 
 TASK = "apple_to_counter"
@@ -262,9 +263,22 @@ def test_folder_of_another_run_is_left_alone(kitchen, tmp_path):
     )
 
 
-def test_what_is_no_checkpoint_can_not_be_evaluated(kitchen, tmp_path):
-    told = run("eval", tmp_path, f"--dataset={kitchen}")
-    assert_told(told, 2, f"{tmp_path} is no readable checkpoint (state.json: No such file or directory)")
+def test_interrupted_evaluation_keeps_its_answers_and_goes_on_from_them(kitchen, tmp_path):
+    out = tmp_path / "out"
+    arguments = ("eval", f"--bench={kitchen}", "--split=all", "--model-name=m", "--samples=3", f"--out={out}")
+    late = (200, {}, json.dumps(completion("move 10")), 6.0)
+    server = ChatServer("move 10", "move 10", late)
+    with server.serving() as url:
+        with background(tmp_path / "log", *arguments, f"--endpoint={url}") as asking:
+            asking.wait_for(lambda: (out / "answers.jsonl").exists() and len(_lines(out)) == 3)
+            assert_told(asking.interrupt(), 130, "the same command goes on from there")
+        server.script = ["move 10"]
+        told = run(*arguments, f"--endpoint={url}")
+    assert_told(told, 0, "2 answers are there already", "12 answers in", "goal_not_met 12 100.0%")
+
+
+def _lines(out):
+    return (out / "answers.jsonl").read_bytes().splitlines()
 
 
 def test_interrupted_build_leaves_no_dataset_and_can_be_gone_on_with(tmp_path):

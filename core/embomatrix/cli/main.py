@@ -45,7 +45,7 @@ COMMANDS: Final[Mapping[str, Command]] = {
     "doctor": Command("check this machine and the way to a manager, and say what to do", "manager"),
     "worker": Command("lend this machine's cores to a manager", "worker"),
     "train": Command("train a policy with imitation and GRPO on a cluster", "trainer"),
-    "eval": Command("measure a trained policy on held-out tasks", "trainer"),
+    "eval": Command("measure a model, an endpoint or a baseline on a benchmark", "trainer"),
     "model": Command("bring a packaged language model into a folder to train", "hf"),
     "bench": Command("measure rollouts and the cluster on this machine", "worker"),
 }

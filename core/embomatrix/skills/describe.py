@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.skills.syntax import Skill
+from embomatrix.skills.syntax import SIGNATURES, Arg, Skill
 from embomatrix.skills.view import preposition
 from embomatrix.world.state import Relation
 
@@ -100,6 +100,18 @@ def final_lines(sights: Sequence[Sight]) -> tuple[str, ...]:
     lines = tuple(line(sight) for sight in sights[:MAX_FINAL_LINES])
     left = len(sights) - len(lines)
     return (*lines, f"and {left} more objects") if left > 0 else lines
+
+
+def call_in_words(call: SkillCall, table: Sequence[str]) -> str:
+    """The call with the objects' names in place of their indices; indices outside the table stay numbers."""
+    words = [call.skill.value]
+    for arg in SIGNATURES[call.skill]:
+        value = getattr(call, arg.value)
+        if arg in (Arg.OBJECT, Arg.SOURCE) and isinstance(value, int) and 0 <= value < len(table):
+            words.append(table[value])
+        else:
+            words.append(f"{value:g}" if isinstance(value, float) else str(value))
+    return " ".join(words)
 
 
 def listed(words: Sequence[str]) -> str:

@@ -57,7 +57,12 @@ class Dataset:
     @staticmethod
     def load(folder: Path | str) -> Dataset:
         """Read the records. Raises DatasetError when the folder holds no dataset, or a record is wrong."""
-        path = Path(folder) / TASKS_FILE
+        return Dataset.load_file(Path(folder) / TASKS_FILE)
+
+    @staticmethod
+    def load_file(path: Path) -> Dataset:
+        """Read the records of a file of any name, with its bundles beside it. Raises DatasetError as ``load``."""
+        folder = path.parent
         try:
             lines = path.read_text(encoding="utf-8").splitlines()
         except OSError as error:
@@ -72,7 +77,7 @@ class Dataset:
         records = tuple(
             _record(line, f"{path}:{number}") for number, line in enumerate(lines, start=1) if line.strip()
         )
-        return Dataset(Path(folder), records)
+        return Dataset(folder, records)
 
     @property
     def train(self) -> tuple[TaskRecord, ...]:
@@ -91,6 +96,10 @@ class Dataset:
             raise DatasetError(
                 f"the bundle {path} of the dataset can't be read ({error.strerror}): {_REMEDY}"
             ) from error
+
+    def has_bundle(self, digest: str) -> bool:
+        """Whether the folder holds the bundle. Raises DatasetError for anything but a digest."""
+        return (self.folder / BUNDLES_FOLDER / bundle_file(digest)).is_file()
 
     def bundle(self, digest: str) -> Bundle:
         """Decoded bundle, kept for the next call. Raises DatasetError."""

@@ -6,6 +6,10 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from embomatrix.world.geometry import Aabb
+
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
@@ -131,6 +135,14 @@ class Scene:
     def asset_of(self, name: str) -> Asset:
         """Asset of the object with this name; KeyError when there is none."""
         return self.assets[self.by_name[name].asset_id]
+
+    def box_of(self, name: str) -> Aabb:
+        """World box around the object as it is placed, with its doors shut; KeyError when there is none of this name."""
+        pose = self.by_name[name].pose_world_asset
+        reach = np.abs(pose.rotation) @ (np.asarray(self.asset_of(name).size_m) / 2)  # (3,)
+        center = np.asarray(pose.position_m)
+        low, high = (center - reach).tolist(), (center + reach).tolist()
+        return Aabb((low[0], low[1], low[2]), (high[0], high[1], high[2]))
 
     def room_at(self, point: Vec3 | Vec2) -> str:
         """Name of the room under a point; in a wall, of the first room within 15 cm; empty when outside all rooms."""

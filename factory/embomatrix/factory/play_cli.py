@@ -24,8 +24,9 @@ from embomatrix.sim.film import film_cached
 from embomatrix.sim.physical.actor import PhysicalActor
 from embomatrix.sim.physical.film import film_physical
 from embomatrix.sim.planner.oracle import PlanNotFound, find_plan
-from embomatrix.skills.parse import PlanError, argument, parse_plan
-from embomatrix.skills.syntax import MAX_PLAN_BYTES, SIGNATURES, Arg
+from embomatrix.skills.describe import call_in_words
+from embomatrix.skills.parse import PlanError, parse_plan
+from embomatrix.skills.syntax import MAX_PLAN_BYTES
 from embomatrix.world.dataset import Dataset, DatasetError
 from embomatrix.world.evaluate import GoalError
 from embomatrix.world.whole_file import check_writable
@@ -33,7 +34,7 @@ from embomatrix.world.whole_file import check_writable
 if TYPE_CHECKING:
     from embomatrix.reward.breakdown import RewardBreakdown
     from embomatrix.sim.film import Film
-    from embomatrix.skills.syntax import Plan, SkillCall
+    from embomatrix.skills.syntax import Plan
     from embomatrix.skills.trace import Trace
     from embomatrix.world.bundle import Bundle
     from embomatrix.world.task import Task
@@ -159,7 +160,7 @@ def _draw(film: Film, path: Path) -> None:
     """Draw the film, with a bar that tells how far it is, and write it."""
     done = [step.ok for step in film.steps]
     captions = [
-        Caption(call_in_words(call, film.task), done[number] if number < len(done) else None)
+        Caption(call_in_words(call, film.task.table), done[number] if number < len(done) else None)
         for number, call in enumerate(film.plan)
     ]
     with Progress(console=console, transient=True) as progress:
@@ -202,7 +203,7 @@ def _show_steps(task: Task, trace: Trace) -> None:
     table.add_column()
     table.add_column(overflow="fold")
     for number, call in enumerate(trace.plan, start=1):
-        words = escape(call_in_words(call, task))
+        words = escape(call_in_words(call, task.table))
         if number > len(trace.steps):
             table.add_row(str(number), "[dim]·[/dim]", f"[dim]{words}[/dim]", "[dim]not executed[/dim]")
             continue
@@ -213,18 +214,6 @@ def _show_steps(task: Task, trace: Trace) -> None:
             reason = f"[red]{step.failure.value}[/red]: {escape(step.message)}"
             table.add_row(str(number), "[red]✗[/red]", words, reason)
     console.print(table)
-
-
-def call_in_words(call: SkillCall, task: Task) -> str:
-    """The call with the objects' names in place of their indices; indices outside the table stay numbers."""
-    words = [call.skill.value]
-    for arg in SIGNATURES[call.skill]:
-        value = argument(call, arg)
-        if arg in (Arg.OBJECT, Arg.SOURCE) and isinstance(value, int) and 0 <= value < len(task.table):
-            words.append(task.table[value])
-        else:
-            words.append(f"{value:g}" if isinstance(value, float) else str(value))
-    return " ".join(words)
 
 
 def _show_unparsable(error: PlanError) -> None:

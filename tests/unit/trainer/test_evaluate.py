@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from embomatrix.trainer.evaluate import Evaluation, TaskScore, bootstrap, improvement
+from embomatrix.trainer.evaluate import Evaluation, TaskScore, improvement
+from embomatrix.trainer.evaluation.intervals import bootstrap
 
 
 def scored(successes, samples=10, prefix="t", category="pick_and_place"):

@@ -1,10 +1,9 @@
-"""`embomatrix train` and `embomatrix eval`. torch is imported after the arguments are read."""
+"""`embomatrix train`. torch is imported after the arguments are read."""
 
 from __future__ import annotations
 
 import contextlib
 import functools
-import json
 import logging
 import os
 from pathlib import Path
@@ -17,14 +16,12 @@ from rich.table import Table
 from embomatrix.rpc.channel import DEFAULT_ADDRESS
 from embomatrix.rpc.logs import LogFormat, log_to_stderr
 from embomatrix.trainer.errors import TrainerError, reason_of
-from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from embomatrix.rpc.client import ClusterClient
     from embomatrix.trainer.data import TaskSet
-    from embomatrix.trainer.evaluate import Evaluation
     from embomatrix.trainer.policy.protocol import Policy
     from embomatrix.trainer.report import Summary
     from embomatrix.trainer.rollout import Gateway
@@ -103,46 +100,6 @@ def train(
         else:
             summary = _started(dataset, connect, out, model, settings_file, changes)
         _show_summary(summary)
-
-
-def evaluate(
-    checkpoint: Annotated[
-        Path, typer.Argument(help="A checkpoint folder: runs/NAME/checkpoints/step-000050.")
-    ],
-    dataset: _DATASET = Path("build/dataset"),
-    manager: _MANAGER = DEFAULT_ADDRESS,
-    split: Annotated[str, typer.Option(help="`heldout` or `train`.")] = "heldout",
-    samples: Annotated[int | None, typer.Option(min=1, help="Plans per task; default 10.")] = None,
-    temperature: Annotated[float | None, typer.Option(min=0, help="0 takes the likeliest plan.")] = None,
-    json_file: Annotated[Path | None, typer.Option("--json", help="Write every task's score here.")] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of sampling.")] = None,
-    threads: _THREADS = None,
-    token: _TOKEN = "",
-    ca: _CA = None,
-) -> None:
-    """Measure a trained policy: success per category with 95 % intervals."""
-    with _problems_shown("eval"):
-        connect = _connector(manager, token, ca)
-        from embomatrix.trainer.checkpoint import read_state
-        from embomatrix.trainer.policy.choice import saved_policy
-
-        _, settings = read_state(checkpoint)
-        changes = {
-            "seed": seed,
-            "threads": threads,
-            "evaluation.samples": samples,
-            "evaluation.temperature": temperature,
-        }
-        settings = _changed(settings, changes)
-        tasks = _loaded(dataset, settings)
-        chosen = {"heldout": tasks.heldout, "train": tasks.train}.get(split)
-        if not chosen:
-            raise TrainerError(f"the dataset has no tasks of split {split!r}: expected `heldout` or `train`")
-        policy = saved_policy(checkpoint / "policy", settings)
-        result = _evaluated(policy, chosen, tasks, connect, settings)
-        _show_evaluation(result)
-        if json_file is not None:
-            _write(json_file, json.dumps(result.as_json(), indent=1))
 
 
 @contextlib.contextmanager
@@ -243,13 +200,6 @@ def _loaded(dataset: Path, settings: TrainSettings) -> TaskSet:
     return load_tasks(dataset)
 
 
-def _write(path: Path, text: str) -> None:
-    try:
-        write_whole(path, text.encode("utf-8"))
-    except OSError as error:
-        raise TrainerError(f"{path} can't be written ({error.strerror}): name another file") from error
-
-
 def _teller(policy: Policy, tasks: TaskSet, settings: TrainSettings) -> Teller:
     from embomatrix.trainer.augment import Variation
     from embomatrix.trainer.telling import Teller
@@ -306,30 +256,6 @@ def _run(
         return TrainingRun(parts, settings, out, **resumed).run()
 
 
-def _evaluated(
-    policy: Policy, chosen: Sequence[Any], tasks: TaskSet, connect: Connect, settings: TrainSettings
-) -> Evaluation:
-    from embomatrix.trainer.evaluate import evaluate_policy
-    from embomatrix.trainer.progress import display_for
-    from embomatrix.trainer.settings import OnLost
-
-    with (
-        _gateway(tasks, connect, "eval", settings, OnLost.PARTIAL) as gateway,
-        display_for(Console()) as display,
-    ):
-        return evaluate_policy(
-            policy,
-            _teller(policy, tasks, settings),
-            chosen,
-            gateway,
-            settings.evaluation,
-            max_new=settings.grpo.max_new,
-            seed=settings.seed,
-            label="eval",
-            report=lambda done, total: display.evaluating("", done, total),
-        )
-
-
 def _show_summary(summary: Summary) -> None:
     from embomatrix.trainer.report import prewarm_share, success_rows, time_rows
 
@@ -349,14 +275,6 @@ def _show_summary(summary: Summary) -> None:
         highlight=False,
     )
     console.print(f"report      {summary.report}\ncheckpoint  {summary.checkpoint}", highlight=False)
-
-
-def _show_evaluation(result: Evaluation) -> None:
-    rows = [("all tasks", str(len(result.scores)), result.success().as_percent())]
-    for category in result.categories:
-        count = sum(score.category == category for score in result.scores)
-        rows.append((category, str(count), result.success(category).as_percent()))
-    _table(Console(), "success, 95 % intervals", ("category", "tasks", "success"), rows)
 
 
 def _table(console: Console, title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:

@@ -65,7 +65,7 @@ def load_tasks(folder: Path) -> TaskSet:
             # One scene at a time: all of them decoded would fill the memory that simulators need.
             bundle = dataset.read_bundle(digest)
             kinds.add(bundle.scene)
-            tasks |= {record.task.task_id: _training_task(bundle, record) for record in records}
+            tasks |= {record.task.task_id: training_task(bundle, record) for record in records}
     except DatasetError as error:
         raise TrainerError(str(error)) from error
     train = tuple(tasks[record.task.task_id] for record in dataset.train)
@@ -104,7 +104,8 @@ def _kind(asset: Asset, *, fixed: bool) -> tuple[object, ...]:
     return (fixed, bool(asset.joints), bool(asset.interiors), bool(asset.supports), abilities)
 
 
-def _training_task(bundle: Bundle, record: TaskRecord) -> TrainingTask:
+def training_task(bundle: Bundle, record: TaskRecord) -> TrainingTask:
+    """The task of a record with what a prompt tells of it. Raises TrainerError where record and bundle disagree."""
     task = record.task
     if bundle.tasks.get(task.task_id) != task:
         raise TrainerError(

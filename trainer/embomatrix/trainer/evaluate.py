@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from embomatrix.trainer.evaluation.intervals import bootstrap
 from embomatrix.trainer.rollout import waited
 
 if TYPE_CHECKING:
@@ -18,13 +19,11 @@ if TYPE_CHECKING:
     from concurrent.futures import Future
 
     from embomatrix.trainer.data import TrainingTask
+    from embomatrix.trainer.evaluation.intervals import Interval
     from embomatrix.trainer.policy.protocol import Policy
     from embomatrix.trainer.rollout import Gateway, PlanOutcome
     from embomatrix.trainer.settings import EvaluationSettings
     from embomatrix.trainer.telling import Teller
-
-RESAMPLES = 4000
-LEVEL = 0.95
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,18 +41,6 @@ class TaskScore:
     @property
     def rate(self) -> float:
         return self.successes / self.samples if self.samples else float("nan")
-
-
-@dataclass(frozen=True, slots=True)
-class Interval:
-    """An estimate with its 95 % bootstrap interval."""
-
-    value: float
-    low: float
-    high: float
-
-    def as_percent(self) -> str:
-        return f"{self.value:.1%} [{self.low:.1%}, {self.high:.1%}]"
 
 
 @dataclass(frozen=True)
@@ -95,17 +82,6 @@ def improvement(before: Evaluation, after: Evaluation) -> Interval:
     earlier = {score.task_id: score.rate for score in before.scores}
     pairs = [score.rate - earlier[score.task_id] for score in after.scores if score.task_id in earlier]
     return bootstrap(pairs)
-
-
-def bootstrap(values: Sequence[float], seed: int = 0) -> Interval:
-    """Mean and percentile interval over resampled values; NaN values (nothing known of a task) are left out."""
-    known = np.array([value for value in values if value == value])
-    if not known.size:
-        return Interval(float("nan"), float("nan"), float("nan"))
-    draws = np.random.default_rng(seed).integers(known.size, size=(RESAMPLES, known.size))
-    means = known[draws].mean(axis=1)  # (resamples,)
-    low, high = np.quantile(means, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
-    return Interval(float(known.mean()), float(low), float(high))
 
 
 def evaluate_policy(

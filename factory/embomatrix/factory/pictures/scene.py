@@ -59,14 +59,7 @@ def draw_plan(scene: Scene) -> Image.Image:
 
 def footprint(scene: Scene, item: SceneObject) -> Aabb:
     """Bounding box of an object in the world, closed."""
-    asset = scene.assets[item.asset_id]
-    half = np.asarray(asset.size_m) / 2
-    reach = np.abs(item.pose_world_asset.rotation) @ half
-    center = np.asarray(item.pose_world_asset.position_m)
-    low, high = center - reach, center + reach
-    return Aabb(
-        (float(low[0]), float(low[1]), float(low[2])), (float(high[0]), float(high[1]), float(high[2]))
-    )
+    return scene.box_of(item.name)
 
 
 def is_overhead(box: Aabb) -> bool:

@@ -1,0 +1,106 @@
+"""`embomatrix eval` in this process: what it refuses, and that its files come out the same again."""
+
+import json
+
+import pytest
+import typer
+from tests.fakes.datasets import write_kitchen_dataset
+from typer.testing import CliRunner
+
+from embomatrix.cli.evaluate import evaluate
+
+
+@pytest.fixture(scope="module")
+def kitchen(tmp_path_factory):
+    return write_kitchen_dataset(tmp_path_factory.mktemp("kitchen"))
+
+
+@pytest.fixture(scope="module")
+def measured(kitchen, tmp_path_factory):
+    """The folder of an evaluation of random plans."""
+    out = tmp_path_factory.mktemp("measured")
+    arguments = (f"--bench={kitchen}", "--split=all", "--baseline=random", "--samples=3", "--jobs=1")
+    assert told(*arguments, f"--out={out}")[0] == 0
+    return out
+
+
+def told(*arguments):
+    """Exit status and all that a person reads."""
+    app = typer.Typer()
+    app.command()(evaluate)
+    result = CliRunner().invoke(app, [str(item) for item in arguments])
+    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+    return result.exit_code, " ".join(result.output.split())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--model=OUT", "--bench=DATASET"), "OUT is no model: expected runs/NAME/checkpoints/step-000050"),
+        (("--bench=DATASET",), "expected one of --model, --endpoint, --baseline and --answers"),
+        (
+            ("--baseline=oracle", "--model=tiny"),
+            "expected one of --model, --endpoint, --baseline and --answers",
+        ),
+        (("--baseline=oracle", "--bench=nowhere"), "there is no benchmark at nowhere: pass a dataset folder"),
+        (("--baseline=oracle", "--bench=eai"), "make it with `embomatrix factory import`"),
+        (
+            ("--endpoint=http://127.0.0.1:1/v1", "--bench=DATASET"),
+            "pass --model-name as the endpoint calls it",
+        ),
+        (("--answers=OUT/none",), "none can't be read (No such file or directory)"),
+    ],
+)
+def test_evaluation_that_can_not_be_made_is_told_why(kitchen, tmp_path, arguments, words):
+    filled = [item.replace("DATASET", str(kitchen)).replace("OUT", str(tmp_path)) for item in arguments]
+    status, text = told(*filled, f"--out={tmp_path / 'out'}")
+    assert status == 2
+    assert words.replace("OUT", str(tmp_path)) in text
+    assert not (tmp_path / "out").exists()
+
+
+def test_endpoint_that_can_not_be_reached_is_named(kitchen, tmp_path):
+    asked = ("--endpoint=http://127.0.0.1:1/v1", "--model-name=m", "--attempts=1", f"--bench={kitchen}")
+    status, text = told(*asked, "--samples=2", f"--out={tmp_path}")
+    assert status == 2
+    assert "can't be reached" in text
+    assert "0 of 2 answers are kept in" in text
+
+
+def test_stored_answers_give_the_same_files_again(measured, tmp_path):
+    status, text = told(f"--answers={measured / 'answers.jsonl'}", f"--out={tmp_path}", "--jobs=2")
+    assert status == 0, text
+    for name in ("report.json", "report.html", "report.txt"):
+        assert (tmp_path / name).read_bytes() == (measured / name).read_bytes()
+
+
+def test_answers_that_are_missing_are_told(measured, tmp_path):
+    lines = (measured / "answers.jsonl").read_text().splitlines(keepends=True)
+    (tmp_path / "answers.jsonl").write_text("".join(lines[:5]))
+    status, text = told(f"--answers={tmp_path / 'answers.jsonl'}", "--jobs=1")
+    assert status == 0
+    assert "8 of 12 answers are missing: figures are over the others" in text
+    assert json.loads((tmp_path / "report.json").read_text())["samples"] == 4
+
+
+def test_answers_to_other_tasks_are_refused(measured, kitchen):
+    status, text = told(f"--answers={measured / 'answers.jsonl'}", f"--bench={write_other(measured)}")
+    assert status == 2
+    assert "answers other tasks than" in text
+
+
+def write_other(folder):
+    """The same dataset with another oracle's plan: other records."""
+    other = write_kitchen_dataset(folder / "other")
+    lines = [json.loads(line) for line in (other / "tasks.jsonl").read_text().splitlines()]
+    lines[0]["task"]["instruction"] = "Do something else."
+    (other / "tasks.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    return other
+
+
+def test_another_report_stands_as_a_row_beside(measured, kitchen, tmp_path):
+    arguments = (f"--bench={kitchen}", "--split=all", "--baseline=oracle", "--samples=1", "--jobs=1")
+    status, text = told(*arguments, f"--beside={measured / 'report.json'}", f"--out={tmp_path}")
+    assert status == 0
+    assert "oracle 100.0" in text
+    assert "random " in text

@@ -1,0 +1,272 @@
+"""From answers to a table: kept, resumed, judged by the engine, and the same again from what was kept."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.fakes.chat_server import ChatServer, completion
+from tests.fakes.datasets import write_kitchen_dataset
+from tests.fakes.executors import HereExecutor
+
+from embomatrix.llm.endpoint import Endpoint, EndpointLimits
+from embomatrix.skills.parse import plan_to_json
+from embomatrix.skills.prompt import Codec
+from embomatrix.trainer.errors import TrainerError
+from embomatrix.trainer.evaluation.answers import Answer, AnswerSheet, Setup, read_answers
+from embomatrix.trainer.evaluation.asking import BaselineAsker, EndpointAsker, questions_digest
+from embomatrix.trainer.evaluation.baselines import BaselineName, baseline_for
+from embomatrix.trainer.evaluation.benchmark import find_benchmark
+from embomatrix.trainer.evaluation.judging import Judge
+from embomatrix.trainer.evaluation.page import evaluation_page
+from embomatrix.trainer.evaluation.pictures import chosen_pictures
+from embomatrix.trainer.evaluation.scoreboard import Scoreboard
+from embomatrix.trainer.evaluation.table import read_row, report_of, text_report
+from embomatrix.worker.rollout_pool import RolloutPool
+
+APPLE = "apple_to_counter"
+SOLVED = "move 10; pick_up 10; move 0; place 0 ontop"
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory):
+    return find_benchmark(str(write_kitchen_dataset(tmp_path_factory.mktemp("kitchen"))), "all")
+
+
+def setup_of(bench, samples=2, codec="lines", **changes):
+    setup = Setup(
+        bench.name, bench.digest, bench.split, len(bench.records), "me", codec, 60, samples, 1.0, 64, 0
+    )
+    return replace(setup, **changes)
+
+
+def judged(bench, answers, setup=None):
+    executor = HereExecutor(bench.folder)
+    found = Judge(bench, setup or setup_of(bench), executor).judge(answers)
+    return found, executor
+
+
+def report(bench, answers, setup=None):
+    setup = setup or setup_of(bench)
+    found, _ = judged(bench, answers, setup)
+    board = Scoreboard.of([record.task for record in bench.records], found.verdicts)
+    value = report_of(setup, board)
+    return value, evaluation_page(value, chosen_pictures(bench, board, found.plans))
+
+
+def asked(bench, name, samples=1):
+    return [
+        Answer(
+            task_id,
+            sample,
+            json.dumps(plan_to_json(baseline_for(name)(task, np.random.default_rng((sample, 7))))),
+        )
+        for task_id, task in bench.tasks.items()
+        for sample in range(samples)
+    ]
+
+
+def test_oracle_succeeds_everywhere_and_random_plans_parse(bench):
+    oracle, _ = judged(bench, asked(bench, BaselineName.ORACLE))
+    assert all(verdict.success and verdict.partial == 1.0 for verdict in oracle.verdicts)
+    drawn, _ = judged(bench, asked(bench, BaselineName.RANDOM, 5))
+    assert len(drawn.plans) == 5 * len(bench.records)
+    assert not all(verdict.success for verdict in drawn.verdicts)
+
+
+def test_greedy_script_solves_what_takes_no_foresight(bench):
+    found, _ = judged(bench, asked(bench, BaselineName.GREEDY))
+    assert {verdict.task_id: verdict.success for verdict in found.verdicts}[APPLE]
+
+
+def test_each_kind_of_answer_gets_its_verdict(bench):
+    texts = [SOLVED.replace("; ", "\n"), "I would rather not.", "dance 3", "pick_up 10", "move 99", "move 10"]
+    found, _ = judged(bench, [Answer(APPLE, at, text) for at, text in enumerate(texts)])
+    assert [verdict.success for verdict in found.verdicts] == [True, *[False] * 5]
+    assert [str(verdict.cause or "") for verdict in found.verdicts] == [
+        "",
+        "unparsable",
+        "hallucinated_skill",
+        "missing_step",
+        "hallucinated_object",
+        "goal_not_met",
+    ]
+
+
+def test_equal_plans_of_a_task_are_executed_once(bench):
+    answers = [
+        Answer(APPLE, at, text)
+        for at, text in enumerate(
+            ["move 10", "move 10\n", '[{"action": "move", "object_index": 10}]', "move 0"]
+        )
+    ]
+    found, executor = judged(bench, answers)
+    assert executor.executed == 2
+    assert len(found.verdicts) == 4
+
+
+def test_processes_of_this_machine_give_what_this_process_gives(bench):
+    answers = asked(bench, BaselineName.RANDOM, 2)
+    here, _ = judged(bench, answers)
+    assert Judge(bench, setup_of(bench), RolloutPool(bench.folder, 2)).judge(answers) == here
+
+
+def test_report_is_made_again_from_the_kept_answers_bit_for_bit(bench, tmp_path):
+    setup = setup_of(bench, codec="json")
+    with AnswerSheet(tmp_path / "answers.jsonl", setup) as sheet:
+        BaselineAsker(baseline_for(BaselineName.RANDOM)).ask(
+            list(bench.tasks.values()), sheet, lambda *_: None
+        )
+        first = report(bench, sheet.ordered(bench.tasks), setup)
+    kept, answers = read_answers(tmp_path / "answers.jsonl")
+    again = report(
+        bench,
+        [answers[key] for key in sorted(answers, key=lambda key: (list(bench.tasks).index(key[0]), key[1]))],
+        kept,
+    )
+    assert json.dumps(again[0]) == json.dumps(first[0])
+    assert again[1] == first[1]
+    assert text_report(again[0]) == text_report(first[0])
+
+
+def test_order_in_which_answers_came_leaves_no_trace(bench):
+    answers = asked(bench, BaselineName.RANDOM, 2)
+    assert report(bench, answers[::-1]) == report(bench, answers)
+
+
+def test_report_of_other_tasks_does_not_stand_in_the_same_table(bench, tmp_path):
+    value, _ = report(bench, asked(bench, BaselineName.ORACLE))
+    path = tmp_path / "report.json"
+    path.write_text(json.dumps(value))
+    row = read_row(path, bench.digest)
+    assert "me" in text_report(value, [replace(row, label="another")])
+    with pytest.raises(TrainerError, match="reports on other tasks"):
+        read_row(path, "sha256:0")
+
+
+def test_lost_plans_count_in_no_figure(bench):
+    found, _ = judged(bench, asked(bench, BaselineName.ORACLE))
+    lost = [replace(found.verdicts[0], sample=7, success=False, lost=True), *found.verdicts]
+    board = Scoreboard.of([record.task for record in bench.records], lost)
+    assert board.lost == 1
+    assert board.success().interval.value == 1.0
+
+
+def test_tasks_that_can_not_be_expressed_count_as_failed_in_the_success_over_all(bench):
+    found, _ = judged(bench, asked(bench, BaselineName.ORACLE))
+    board = Scoreboard.of([record.task for record in bench.records], found.verdicts, by_rule=4)
+    assert board.success().interval.value == 1.0
+    assert board.success_over_all().interval.value == 0.5
+
+
+def test_page_escapes_what_models_and_tasks_say(bench):
+    setup = setup_of(bench, model="<script>alert(1)</script>")
+    _, page = report(bench, asked(bench, BaselineName.ORACLE), setup)
+    assert "<script" not in page
+    assert "<svg" in page
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (lambda text: text.replace('"answers": 1', '"answers": 99'), "is of another version"),
+        (lambda text: text.replace('"sample": 0', '"sample": "x"'), "line 2, is damaged: 'sample'"),
+        (lambda text: "", "holds no answers"),
+        (lambda text: "{}\n" + text, "is of another version"),
+        (lambda text: text + "nonsense\n", "is damaged"),
+    ],
+)
+def test_answers_that_can_not_be_used_are_named(bench, tmp_path, damage, words):
+    path = tmp_path / "answers.jsonl"
+    with AnswerSheet(path, setup_of(bench)) as sheet:
+        sheet.add([Answer(APPLE, 0, "move 1")])
+    path.write_text(damage(path.read_text()))
+    with pytest.raises(TrainerError, match=words):
+        read_answers(path)
+
+
+def test_answers_to_other_questions_are_not_added_to(bench, tmp_path):
+    path = tmp_path / "answers.jsonl"
+    with AnswerSheet(path, setup_of(bench)) as sheet:
+        sheet.add([Answer(APPLE, 0, "move 1")])
+    with (
+        pytest.raises(TrainerError, match=r"temperature 1\.0, now 0\.5"),
+        AnswerSheet(path, setup_of(bench, temperature=0.5)),
+    ):
+        pass
+
+
+def test_line_cut_short_by_a_kill_is_asked_again(bench, tmp_path):
+    path = tmp_path / "answers.jsonl"
+    with AnswerSheet(path, setup_of(bench)) as sheet:
+        sheet.add([Answer(APPLE, 0, "move 1"), Answer(APPLE, 1, "móve \ud800 2")])
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-5])
+    with AnswerSheet(path, setup_of(bench)) as sheet:
+        assert (APPLE, 0) in sheet
+        assert (APPLE, 1) not in sheet
+        sheet.add([Answer(APPLE, 1, "móve \ud800 2")])
+    assert path.read_bytes() == whole
+
+
+def endpoint_asker(url, tmp_path, attempts=1):
+    limits = EndpointLimits(attempts=attempts, first_wait_s=0.01, concurrent=3)
+    return EndpointAsker(
+        lambda: Endpoint(url, "scripted", limits=limits), Codec.LINES, tmp_path / "ledger.jsonl"
+    )
+
+
+def test_endpoint_is_asked_once_for_each_sample_and_what_it_cost_is_written(bench, tmp_path):
+    server = ChatServer("move 10")
+    with server.serving() as url, AnswerSheet(tmp_path / "answers.jsonl", setup_of(bench)) as sheet:
+        endpoint_asker(url, tmp_path).ask(list(bench.tasks.values()), sheet, lambda *_: None)
+        endpoint_asker(url, tmp_path).ask(list(bench.tasks.values()), sheet, lambda *_: None)
+        assert len(sheet) == len(server.requests) == 2 * len(bench.records)
+    assert server.most_at_once <= 3
+    assert len({request["seed"] for request in server.requests}) == len(server.requests)
+    assert len((tmp_path / "ledger.jsonl").read_text().splitlines()) == len(server.requests)
+
+
+def test_endpoint_that_breaks_off_costs_no_answer_that_came(bench, tmp_path):
+    good = (200, {}, json.dumps(completion("move 10")), 0.0)
+    server = ChatServer(good, good, good, (500, {}, "out of order", 0.0))
+    path = tmp_path / "answers.jsonl"
+    with server.serving() as url, AnswerSheet(path, setup_of(bench)) as sheet:
+        with pytest.raises(TrainerError, match=r"answered 500.*; [123] of 8 answers are kept in"):
+            endpoint_asker(url, tmp_path).ask(list(bench.tasks.values()), sheet, lambda *_: None)
+        kept = len(sheet)
+    again = ChatServer("move 10")
+    with again.serving() as url, AnswerSheet(path, setup_of(bench)) as sheet:
+        endpoint_asker(url, tmp_path).ask(list(bench.tasks.values()), sheet, lambda *_: None)
+        assert len(sheet) == 8
+    assert len(again.requests) == 8 - kept
+
+
+def test_other_prompts_are_other_questions(bench):
+    tasks = list(bench.tasks.values())
+    digests = {questions_digest(tasks, codec, rows) for codec in Codec for rows in (5, 60)}
+    assert len(digests) == 6
+
+
+def test_task_in_a_scene_without_a_bundle_is_named(bench, tmp_path):
+    path = tmp_path / "tasks.json"
+    path.write_bytes((bench.folder / "tasks.jsonl").read_bytes())
+    with pytest.raises(TrainerError, match="is in the unknown scene 'flat_kitchen'"):
+        find_benchmark(str(path))
+
+
+@pytest.mark.parametrize(
+    ("named", "split", "words"),
+    [
+        ("nowhere", "", "there is no benchmark at nowhere: pass a dataset folder"),
+        ("KITCHEN", "test", "no tasks of the split 'test': it has those of heldout, train"),
+    ],
+)
+def test_benchmark_that_is_not_there_is_named(bench, named, split, words):
+    with pytest.raises(TrainerError, match=words):
+        find_benchmark(named.replace("KITCHEN", str(bench.folder)), split)
+
+
+def test_held_out_tasks_are_measured_unless_told_otherwise(bench):
+    assert find_benchmark(str(bench.folder)).split == "heldout"
+    assert find_benchmark(str(bench.folder), "all", 2).digest != bench.digest

@@ -1,0 +1,134 @@
+"""Intervals over tasks, pass@k, and the one cause of each failure."""
+
+import math
+
+import numpy as np
+import pytest
+
+from embomatrix.skills.failure import SENTENCES, FailureReason
+from embomatrix.skills.parse import PlanReason, parse_plan
+from embomatrix.skills.trace import Step
+from embomatrix.trainer.evaluation.intervals import Method, mean_over_tasks, pass_at, wilson
+from embomatrix.trainer.evaluation.taxonomy import (
+    MEANINGS,
+    REMEDIES,
+    STEP_CAUSES,
+    Cause,
+    cause_of_text,
+    cause_of_trace,
+)
+
+TABLE = ("fridge_1", "apple_1", "table_1", "microwave_1", "bowl_1")
+
+
+def failed(plan, at, reason, **words):
+    """The steps of a plan whose step ``at``, from 1, fails with the reason's own sentence."""
+    steps = [Step(call, None, "") for call in plan[: at - 1]]
+    return (*steps, Step(plan[at - 1], reason, SENTENCES[reason].format(**words)))
+
+
+def test_wilson_gives_the_textbook_interval():
+    interval = wilson(0.1, 20)  # Newcombe 1998, table I: 2 of 20
+    assert (interval.low, interval.high) == pytest.approx((0.0279, 0.3010), abs=1e-3)
+
+
+def test_tasks_that_are_all_alike_leave_no_false_certainty():
+    nothing = mean_over_tasks([0.0] * 20)
+    assert nothing.method is Method.WILSON
+    assert nothing.interval.low == pytest.approx(0.0)
+    assert 0.1 < nothing.interval.high < 0.2
+
+
+def test_tasks_are_resampled_with_all_their_samples():
+    """Ten samples of each of ten tasks that either always or never succeed are ten observations, not a hundred."""
+    estimate = mean_over_tasks([0.0, 1.0] * 5)
+    assert estimate.method is Method.BOOTSTRAP
+    assert estimate.interval.high - estimate.interval.low > 0.5
+
+
+def test_a_task_of_which_nothing_is_known_is_left_out():
+    estimate = mean_over_tasks([1.0, math.nan, 0.5])
+    assert (estimate.tasks, estimate.interval.value) == (2, 0.75)
+    assert mean_over_tasks([math.nan]).method is Method.NONE
+
+
+def test_pass_at_k_is_the_share_of_draws_with_a_success():
+    rng = np.random.default_rng(0)
+    draws = [rng.permutation(10)[:3].min() < 2 for _ in range(20_000)]  # samples 0 and 1 succeed
+    assert pass_at(3, 10, 2) == pytest.approx(np.mean(draws), abs=0.01)
+    assert pass_at(1, 10, 2) == pytest.approx(0.2)
+    assert pass_at(10, 10, 1) == 1.0
+    assert math.isnan(pass_at(11, 10, 2))
+
+
+def test_every_reason_of_a_step_has_one_cause():
+    assert set(STEP_CAUSES) | set(REMEDIES) == set(FailureReason)
+    assert not set(STEP_CAUSES) & set(REMEDIES)
+
+
+def test_every_reason_of_a_text_has_a_cause_and_every_cause_a_meaning():
+    assert {cause_of_text(reason) for reason in PlanReason} <= set(Cause)
+    assert set(MEANINGS) == set(Cause)
+
+
+@pytest.mark.parametrize(
+    ("plan", "at", "reason", "words", "cause"),
+    [
+        (
+            "move 1; pick_up 1; place 0 inside",
+            3,
+            "container_closed",
+            {"container": "fridge_1"},
+            "missing_step",
+        ),
+        (
+            "move 1; pick_up 1; place 0 inside; open 0",
+            3,
+            "container_closed",
+            {"container": "fridge_1"},
+            "wrong_order",
+        ),
+        (
+            "move 1; pick_up 1; place 0 inside; open 3",
+            3,
+            "container_closed",
+            {"container": "fridge_1"},
+            "missing_step",
+        ),
+        (
+            "open 0; close 0; pick_up 1",
+            3,
+            "out_of_reach",
+            {"target": "apple_1", "distance": "2.1", "limit": "0.9"},
+            "missing_step",
+        ),
+        (
+            "pick_up 1; move 1",
+            1,
+            "out_of_reach",
+            {"target": "apple_1", "distance": "2.1", "limit": "0.9"},
+            "wrong_order",
+        ),
+        ("pick_up 1; pick_up 4; place 2 ontop", 2, "hand_full", {"held": "apple_1"}, "wrong_order"),
+        ("pick_up 1; pick_up 4", 2, "hand_full", {"held": "apple_1"}, "missing_step"),
+        (
+            "pick_up 4; pick_up 1",
+            1,
+            "supports_others",
+            {"target": "bowl_1", "other": "apple_1"},
+            "wrong_order",
+        ),
+        ("move 99", 1, "unknown_index", {"index": 99, "last": 4}, "hallucinated_object"),
+        ("pick_up 0", 1, "not_portable", {"target": "fridge_1"}, "affordance"),
+        ("open 0; open 0", 2, "already_open", {"target": "fridge_1"}, "additional_step"),
+        ("move 1", 1, "no_path", {"target": "apple_1", "other": "table_1"}, "unreachable"),
+    ],
+)
+def test_first_failed_step_gives_the_cause(plan, at, reason, words, cause):
+    calls = parse_plan(plan)
+    assert cause_of_trace(calls, failed(calls, at, FailureReason(reason), **words), TABLE) == cause
+
+
+def test_a_plan_that_ran_to_its_end_missed_its_goal():
+    plan = parse_plan("move 1")
+    assert cause_of_trace(plan, [Step(plan[0], None, "")], TABLE) is Cause.GOAL_NOT_MET

@@ -1,0 +1,78 @@
+"""Executes an evaluation's plans on a cluster."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Final
+
+from embomatrix.rpc.values import Batch, GroupPolicy, RunTerms
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Coroutine, Sequence
+
+    from embomatrix.rpc.client import ClusterClient
+    from embomatrix.rpc.values import Rollout
+    from embomatrix.trainer.evaluation.judging import OnResult
+
+AT_ONCE: Final = 4
+"""Batches under way: the manager loads the scenes of the others while one is executed, so that no look-ahead is needed."""
+RUN_NAME: Final = "eval"
+
+
+class ClusterExecutor:
+    """One run of a cluster, one batch a scene. A manager that goes away is waited for as long as a batch may take."""
+
+    def __init__(self, connect: Callable[[], ClusterClient], bundle_bytes: Callable[[str], bytes]) -> None:
+        self._connect = connect
+        self._bundle_bytes = bundle_bytes
+
+    def execute(self, rollouts: Sequence[Rollout], on_result: OnResult) -> None:
+        """Execute each once. Raises ClusterError."""
+        asyncio.run(self._run(rollouts, on_result))
+
+    async def _run(self, rollouts: Sequence[Rollout], on_result: OnResult) -> None:
+        by_bundle: dict[str, list[Rollout]] = {}
+        for rollout in rollouts:
+            by_bundle.setdefault(rollout.bundle_digest, []).append(rollout)
+        async with self._connect() as client:
+            run_id = await client.open_run(RUN_NAME, terms=RunTerms(GroupPolicy.PARTIAL))
+            try:
+                work = iter(list(enumerate(by_bundle.items())))
+
+                async def take_scenes() -> None:
+                    for step, (digest, members) in work:
+                        await client.put_bundles({digest: self._bundle_bytes(digest)})
+                        await _batch(client, run_id, step, members, on_result)
+
+                await _several(take_scenes)
+            finally:
+                await client.close_run(run_id)
+
+
+async def _several(work: Callable[[], Coroutine[Any, Any, None]]) -> None:
+    """The same work a few times at once; the first error ends the others and is raised as it is."""
+    try:
+        async with asyncio.TaskGroup() as tasks:
+            for _ in range(AT_ONCE):
+                tasks.create_task(work())
+    except ExceptionGroup as errors:
+        raise errors.exceptions[0] from errors
+
+
+async def _batch(
+    client: ClusterClient, run_id: str, step: int, group: Sequence[Rollout], on_result: OnResult
+) -> None:
+    # The ids of a manager's rollouts are its own: those of two evaluations must differ.
+    sent = {f"{run_id}/{rollout.rollout_id}": rollout.rollout_id for rollout in group}
+    batch = Batch(
+        run_id,
+        f"{RUN_NAME}-{step}",
+        step,
+        tuple(
+            replace(rollout, rollout_id=name, group_id=f"{run_id}/{rollout.group_id}")
+            for name, rollout in zip(sent, group, strict=True)
+        ),
+    )
+    async for result in client.execute(batch):
+        on_result(sent[result.rollout_id], result.outcome)

@@ -1,0 +1,93 @@
+"""Numbers with their uncertainty. Tasks are the unit of chance: samples of one task are not independent."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+RESAMPLES: Final = 4000
+LEVEL: Final = 0.95
+_Z: Final = 1.959963984540054
+"""Quantile of the standard normal distribution at (1 + LEVEL) / 2."""
+
+
+@dataclass(frozen=True, slots=True)
+class Interval:
+    """An estimate with its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+
+    def as_percent(self) -> str:
+        return f"{self.value:.1%} [{self.low:.1%}, {self.high:.1%}]"
+
+
+class Method(StrEnum):
+    """How an interval was made."""
+
+    BOOTSTRAP = "bootstrap"
+    WILSON = "wilson"
+    NONE = "none"
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """A mean over tasks. ``tasks`` are those of which something is known."""
+
+    interval: Interval
+    method: Method
+    tasks: int
+
+
+NOTHING: Final = Interval(math.nan, math.nan, math.nan)
+
+
+def bootstrap(values: Sequence[float], seed: int = 0) -> Interval:
+    """Mean and percentile interval over resampled values; NaN values (nothing known of a task) are left out."""
+    known = np.array([value for value in values if value == value])
+    if not known.size:
+        return NOTHING
+    draws = np.random.default_rng(seed).integers(known.size, size=(RESAMPLES, known.size))
+    means = known[draws].mean(axis=1)  # (resamples,)
+    low, high = np.quantile(means, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+    return Interval(float(known.mean()), float(low), float(high))
+
+
+def wilson(share: float, count: int) -> Interval:
+    """Wilson's score interval (1927) of a share of ``count`` independent trials, at least one."""
+    middle = share + _Z**2 / (2 * count)
+    spread = _Z * math.sqrt(share * (1 - share) / count + _Z**2 / (4 * count**2))
+    scale = 1 + _Z**2 / count
+    return Interval(share, max(0.0, (middle - spread) / scale), min(1.0, (middle + spread) / scale))
+
+
+def mean_over_tasks(shares: Sequence[float]) -> Estimate:
+    """The mean of each task's share, all in [0, 1]; NaN where nothing is known of a task.
+
+    Tasks are resampled, each with all its samples. Where all tasks are alike there is nothing to resample, and a bootstrap
+    would claim certainty: there it is Wilson's interval with the tasks as trials, whatever the samples of each.
+    """
+    known = [share for share in shares if share == share]
+    if not known:
+        return Estimate(NOTHING, Method.NONE, 0)
+    if min(known) == max(known):
+        return Estimate(wilson(known[0], len(known)), Method.WILSON, len(known))
+    return Estimate(bootstrap(known), Method.BOOTSTRAP, len(known))
+
+
+def pass_at(k: int, samples: int, successes: int) -> float:
+    """Chance that at least one of ``k`` samples succeeds, drawn from these without replacement: Chen et al. 2021, eq. 1.
+
+    NaN where there are fewer than ``k`` samples.
+    """
+    if k > samples:
+        return math.nan
+    return 1.0 - math.comb(samples - successes, k) / math.comb(samples, k)

@@ -1,0 +1,62 @@
+"""A model to measure by its folder or name: a checkpoint of a run, a policy's own folder, or any Hugging Face model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+
+from embomatrix.trainer.checkpoint import read_state
+from embomatrix.trainer.errors import TrainerError, reason_of
+from embomatrix.trainer.policy.choice import saved_policy
+from embomatrix.trainer.policy.hf import HfPolicy
+from embomatrix.trainer.policy.tiny import TinyPolicy
+from embomatrix.trainer.settings import LANGUAGE_MODEL_DEFAULTS, read_settings
+
+if TYPE_CHECKING:
+    from embomatrix.skills.prompt import Codec
+    from embomatrix.trainer.policy.protocol import Policy
+
+
+@dataclass(frozen=True, slots=True)
+class LoadedModel:
+    """A policy, the rows of a table that it is told, and the tokens that it writes at most."""
+
+    policy: Policy
+    rows: int
+    max_tokens: int
+
+
+def load_model(named: str, codec: Codec, *, threads: int | None, device: str) -> LoadedModel:
+    """A checkpoint speaks the codec that it was trained in, any other model ``codec``. Raises TrainerError."""
+    folder = Path(named)
+    if folder.is_dir() and (folder / "policy").is_dir():
+        _, settings = read_state(folder)
+        settings = settings.model_copy(update={"device": device})
+        _prepare(threads or settings.threads, device)
+        policy: Policy = saved_policy(folder / "policy", settings)
+        return LoadedModel(policy, settings.prompt.rows, settings.grpo.max_new)
+    _prepare(threads or torch.get_num_threads(), device)
+    if folder.is_dir() and TinyPolicy.is_saved_in(folder):
+        settings = read_settings(None, {"device": device})
+        return LoadedModel(saved_policy(folder, settings), settings.prompt.rows, settings.grpo.max_new)
+    if folder.is_dir() and not HfPolicy.is_saved_in(folder):
+        raise TrainerError(
+            f"{folder} is no model: expected runs/NAME/checkpoints/step-000050, or a folder with config.json"
+        )
+    settings = read_settings(None, {"device": device}, LANGUAGE_MODEL_DEFAULTS)
+    return LoadedModel(
+        HfPolicy.load(named, codec, device=device), settings.prompt.rows, settings.grpo.max_new
+    )
+
+
+def _prepare(threads: int, device: str) -> None:
+    torch.set_num_threads(threads)
+    try:
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise TrainerError(
+            f"the device {device!r} can't be used ({reason_of(error)}): expected cpu, or cuda where torch finds a GPU"
+        ) from error

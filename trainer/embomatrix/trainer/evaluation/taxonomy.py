@@ -1,0 +1,198 @@
+"""Why a plan does not reach its goal: one cause for each plan, by rules that look at the plan and its trace alone.
+
+The first thing that went wrong decides. `docs/evaluation.md` tells the rules in words; a test holds the table complete.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.skills.failure import SENTENCES, FailureReason
+from embomatrix.skills.parse import PlanReason
+from embomatrix.skills.syntax import Skill
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from embomatrix.skills.syntax import Plan, SkillCall
+    from embomatrix.skills.trace import Step
+
+
+class Cause(StrEnum):
+    """The kinds of failure, in the order in which a table lists them."""
+
+    UNPARSABLE = "unparsable"
+    HALLUCINATED_SKILL = "hallucinated_skill"
+    WRONG_ARGUMENT = "wrong_argument"
+    HALLUCINATED_OBJECT = "hallucinated_object"
+    AFFORDANCE = "affordance"
+    MISSING_STEP = "missing_step"
+    WRONG_ORDER = "wrong_order"
+    ADDITIONAL_STEP = "additional_step"
+    UNREACHABLE = "unreachable"
+    NO_ROOM = "no_room"
+    MISHAP = "mishap"
+    GOAL_NOT_MET = "goal_not_met"
+
+
+MEANINGS: Final[Mapping[Cause, str]] = {
+    Cause.UNPARSABLE: "the text holds no plan, or one that is too long",
+    Cause.HALLUCINATED_SKILL: "the plan calls a skill that does not exist",
+    Cause.WRONG_ARGUMENT: "an argument of a call is missing or of the wrong kind",
+    Cause.HALLUCINATED_OBJECT: "a step names an object or a room that does not exist",
+    Cause.AFFORDANCE: "a step asks of an object what it can never do",
+    Cause.MISSING_STEP: "a step lacks another one before it, which the plan holds nowhere after it either",
+    Cause.WRONG_ORDER: "a step lacks another one before it, which the plan holds only after it",
+    Cause.ADDITIONAL_STEP: "a step asks for what is so already",
+    Cause.UNREACHABLE: "the robot or its arm can't get there",
+    Cause.NO_ROOM: "there is no free place for the thing",
+    Cause.MISHAP: "physical mode: the robot collided, or the thing slipped or fell",
+    Cause.GOAL_NOT_MET: "every step succeeded, and the goal does not hold",
+}
+"""Each cause in words."""
+
+
+class Role(StrEnum):
+    """Which object another step would have had to be about, by its place in the failed step's sentence."""
+
+    TARGET = "target"
+    SOURCE = "source"
+    OTHER = "other"
+    CONTAINER = "container"
+    ANY = "any"
+
+
+@dataclass(frozen=True, slots=True)
+class Remedy:
+    """The call that makes a precondition true: a skill, and which object it is about."""
+
+    skill: Skill
+    about: Role
+
+
+_PLAN_CAUSES: Final[Mapping[PlanReason, Cause]] = {
+    PlanReason.TOO_LONG: Cause.UNPARSABLE,
+    PlanReason.NO_PLAN: Cause.UNPARSABLE,
+    PlanReason.TOO_MANY_STEPS: Cause.UNPARSABLE,
+    PlanReason.UNKNOWN_SKILL: Cause.HALLUCINATED_SKILL,
+    PlanReason.MISSING_ARGUMENT: Cause.WRONG_ARGUMENT,
+    PlanReason.WRONG_ARGUMENT: Cause.WRONG_ARGUMENT,
+}
+
+REMEDIES: Final[Mapping[FailureReason, Remedy]] = {
+    FailureReason.NOT_THERE: Remedy(Skill.SLICE, Role.ANY),
+    FailureReason.OUT_OF_REACH: Remedy(Skill.MOVE, Role.TARGET),
+    FailureReason.NO_LINE_OF_APPROACH: Remedy(Skill.MOVE, Role.TARGET),
+    FailureReason.HAND_FULL: Remedy(Skill.PLACE, Role.ANY),
+    FailureReason.HAND_EMPTY: Remedy(Skill.PICK_UP, Role.ANY),
+    FailureReason.SUPPORTS_OTHERS: Remedy(Skill.PICK_UP, Role.OTHER),
+    FailureReason.CONTAINER_CLOSED: Remedy(Skill.OPEN, Role.CONTAINER),
+    FailureReason.OPENED_WHILE_ON: Remedy(Skill.TOGGLE_OFF, Role.TARGET),
+    FailureReason.MUST_BE_CLOSED: Remedy(Skill.CLOSE, Role.TARGET),
+    FailureReason.SOURCE_OFF: Remedy(Skill.TOGGLE_ON, Role.SOURCE),
+    FailureReason.SOURCE_OPEN: Remedy(Skill.CLOSE, Role.SOURCE),
+    FailureReason.NOT_AT_SOURCE: Remedy(Skill.PLACE, Role.SOURCE),
+    FailureReason.TOOL_NOT_HELD: Remedy(Skill.PICK_UP, Role.SOURCE),
+    FailureReason.NEEDS_SOAKING: Remedy(Skill.SOAK, Role.SOURCE),
+}
+"""Preconditions that another call makes true. Whether the plan holds that call later tells wrong order from missing step."""
+
+STEP_CAUSES: Final[Mapping[FailureReason, Cause]] = {
+    FailureReason.UNKNOWN_INDEX: Cause.HALLUCINATED_OBJECT,
+    FailureReason.UNKNOWN_ROOM: Cause.HALLUCINATED_OBJECT,
+    FailureReason.NO_PATH: Cause.UNREACHABLE,
+    FailureReason.NO_STANDING_POSE: Cause.UNREACHABLE,
+    FailureReason.BLOCKED: Cause.UNREACHABLE,
+    FailureReason.STEP_TOO_LONG: Cause.UNREACHABLE,
+    FailureReason.TOO_HIGH: Cause.UNREACHABLE,
+    FailureReason.ARM_BLOCKED: Cause.UNREACHABLE,
+    FailureReason.DOOR_BLOCKED: Cause.UNREACHABLE,
+    FailureReason.NO_FREE_POSE: Cause.NO_ROOM,
+    FailureReason.ALREADY_OPEN: Cause.ADDITIONAL_STEP,
+    FailureReason.ALREADY_CLOSED: Cause.ADDITIONAL_STEP,
+    FailureReason.ALREADY_ON: Cause.ADDITIONAL_STEP,
+    FailureReason.ALREADY_OFF: Cause.ADDITIONAL_STEP,
+    FailureReason.ALREADY_SLICED: Cause.ADDITIONAL_STEP,
+    FailureReason.COLLIDED: Cause.MISHAP,
+    FailureReason.SLIPPED: Cause.MISHAP,
+    FailureReason.FELL: Cause.MISHAP,
+    **dict.fromkeys(
+        (
+            FailureReason.NOT_PORTABLE,
+            FailureReason.TOO_HEAVY,
+            FailureReason.TOO_LARGE,
+            FailureReason.NOT_OPENABLE,
+            FailureReason.NOT_TOGGLEABLE,
+            FailureReason.NO_SURFACE,
+            FailureReason.NO_CAVITY,
+            FailureReason.PLACE_ON_ITSELF,
+            FailureReason.NOT_A_HEAT_SOURCE,
+            FailureReason.NOT_A_COLD_SOURCE,
+            FailureReason.NOT_HEATABLE,
+            FailureReason.NOT_COOKABLE,
+            FailureReason.NOT_FREEZABLE,
+            FailureReason.NOT_HOT_ENOUGH,
+            FailureReason.NOT_COLD_ENOUGH,
+            FailureReason.NOT_A_SLICER,
+            FailureReason.NOT_SLICEABLE,
+            FailureReason.NOT_A_CLEANER,
+            FailureReason.STAYS_ON,
+            FailureReason.GIVES_NO_LIQUID,
+            FailureReason.NOT_SOAKABLE,
+        ),
+        Cause.AFFORDANCE,
+    ),
+}
+"""What a failed step is by its reason alone."""
+
+
+def cause_of_text(reason: PlanReason) -> Cause:
+    """Why a text is no plan, as a cause."""
+    return _PLAN_CAUSES[reason]
+
+
+def cause_of_trace(plan: Plan, steps: Sequence[Step], table: Sequence[str]) -> Cause:
+    """Why an executed plan did not reach its goal. ``table`` is the task's object table, ``steps`` end with the failure."""
+    last = steps[-1] if steps else None
+    if last is None or last.failure is None:
+        return Cause.GOAL_NOT_MET
+    remedy = REMEDIES.get(last.failure)
+    if remedy is None:
+        return STEP_CAUSES[last.failure]
+    later = plan[len(steps) :]
+    if any(call.skill is remedy.skill and _is_about(call, remedy, last, table) for call in later):
+        return Cause.WRONG_ORDER
+    return Cause.MISSING_STEP
+
+
+def _is_about(call: SkillCall, remedy: Remedy, failed: Step, table: Sequence[str]) -> bool:
+    """Whether the call is about the object that the failed step lacked something of."""
+    if remedy.about is Role.ANY:
+        return True
+    assert failed.failure is not None
+    found = _PATTERNS[failed.failure].fullmatch(failed.message)
+    index = call.object_index
+    if found is None or index is None or not 0 <= index < len(table):
+        return False
+    return table[index] == found.group(remedy.about.value)
+
+
+def _pattern(sentence: str) -> re.Pattern[str]:
+    """Reads a failure's sentence back: each placeholder is a group."""
+    seen: set[str] = set()
+
+    def group(match: re.Match[str]) -> str:
+        name = match.group(1)
+        again = name in seen
+        seen.add(name)
+        return f"(?P={name})" if again else f"(?P<{name}>.+?)"
+
+    return re.compile(re.sub(r"\\\{(\w+)\\\}", group, re.escape(sentence)))
+
+
+_PATTERNS: Final = {
+    reason: _pattern(SENTENCES[reason]) for reason, remedy in REMEDIES.items() if remedy.about is not Role.ANY
+}

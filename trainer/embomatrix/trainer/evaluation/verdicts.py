@@ -1,0 +1,76 @@
+"""From what became of a plan to a verdict: success, partial credit, and the cause where it failed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from embomatrix.rpc.values import Completed
+from embomatrix.trainer.evaluation.taxonomy import Cause, cause_of_text, cause_of_trace
+
+if TYPE_CHECKING:
+    from embomatrix.rpc.values import Outcome
+    from embomatrix.skills.parse import PlanError
+    from embomatrix.skills.syntax import Plan
+    from embomatrix.trainer.evaluation.answers import Answer
+    from embomatrix.world.task import Task
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What became of one answer.
+
+    ``partial`` is the share of the goal's atoms that hold at the end, 0 for a text that is no plan. ``cause`` says why the goal
+    was not reached, None for a success. ``step``, from 1, is the step that failed, 0 where none did: a goal may be reached
+    before it. ``reason`` (a ``PlanReason`` or ``FailureReason``) and ``sentence`` are the step's or the parser's own. ``done``
+    are the steps that succeeded of the plan's ``steps``. ``lost``: the infrastructure has no result, which says nothing
+    about the plan.
+    """
+
+    task_id: str
+    sample: int
+    success: bool
+    partial: float
+    cause: Cause | None = None
+    reason: str = ""
+    step: int = 0
+    sentence: str = ""
+    steps: int = 0
+    done: int = 0
+    lost: bool = False
+
+
+def of_text(answer: Answer, error: PlanError) -> Verdict:
+    """The verdict on a text that is no plan: it is not executed."""
+    return Verdict(
+        answer.task_id,
+        answer.sample,
+        success=False,
+        partial=0.0,
+        cause=cause_of_text(error.reason),
+        reason=error.reason.value,
+        sentence=str(error),
+    )
+
+
+def of_plan(answer: Answer, task: Task, plan: Plan, outcome: Outcome | None) -> Verdict:
+    """The verdict on a plan that was executed, or that the infrastructure lost."""
+    if not isinstance(outcome, Completed):
+        return Verdict(answer.task_id, answer.sample, success=False, partial=0.0, steps=len(plan), lost=True)
+    reward, steps = outcome.reward, outcome.steps
+    partial = sum(atom.holds for atom in reward.atoms) / len(reward.atoms) if reward.atoms else 0.0
+    done = sum(step.ok for step in steps)
+    last = steps[-1] if steps else None
+    failure = last.failure if last is not None else None
+    return Verdict(
+        answer.task_id,
+        answer.sample,
+        success=reward.success,
+        partial=partial,
+        cause=None if reward.success else cause_of_trace(plan, steps, task.table),
+        reason=failure.value if failure is not None else "",
+        step=len(steps) if failure is not None else 0,
+        sentence=last.message if last is not None and failure is not None else "",
+        steps=len(plan),
+        done=done,
+    )
