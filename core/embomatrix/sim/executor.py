@@ -170,12 +170,14 @@ class Simulator:
         self._world.engine.close()
 
     def _message(self, call: SkillCall, held: Sequence[str], changes: Sequence[Change]) -> str:
+        cargo = self._world.carried[1:] if call.skill is Skill.PICK_UP else ()
+        sentence = done(call, target=target_of(self._world, call), held=held[0] if held else "", cargo=cargo)
+        if not changes:
+            return sentence
         by_object: dict[str, list[str]] = {}
         for change in changes:
             by_object.setdefault(change.name, []).append(change.words)
-        cargo = self._world.carried[1:] if call.skill is Skill.PICK_UP else ()
-        sentence = done(call, target=target_of(self._world, call), held=held[0] if held else "", cargo=cargo)
-        return "; ".join(filter(None, (sentence, gained(by_object))))
+        return f"{sentence}; {gained(by_object)}"
 
     def _sight(self, name: str) -> Sight:
         world = self._world
@@ -186,8 +188,10 @@ class Simulator:
             states.append("open" if world.is_open(name) else "closed")
         if asset.can("toggleable"):
             states.append("on" if world.is_on(name) else "off")
-        states += sorted(state.value for state in world.states.get(name, set()) - {State.TOGGLED_ON})
-        states += [in_words(fact) for fact in sorted(world.substances.get(name, ()))]
+        if symbols := world.states.get(name):
+            states += sorted(state.value for state in symbols if state is not State.TOGGLED_ON)
+        if facts := world.substances.get(name):
+            states += [in_words(fact) for fact in sorted(facts)]
         return Sight(
             name=name,
             room=world.room_of(name),

@@ -197,6 +197,12 @@ class FloorGrid:
         label = self.label_at(x_m, y_m)
         return renumbered or not label or label != wider.label_at(x_m, y_m)
 
+    def is_like(self, other: FloorGrid, low_m: Vec2, high_m: Vec2) -> bool:
+        """Whether this grid and the one that it came from have the same components in a rectangle, by the same numbers."""
+        here, _ = overlap(self._window(low_m, high_m), self.parts.window)
+        untouched = any(side.start == side.stop for side in here)
+        return self.parts.whole is other.parts.whole and other.parts.inner is None and untouched
+
     def main_part_of(self, wider: FloorGrid, x_m: float, y_m: float) -> int:
         """The largest component of this grid in the one that a point belongs to on the grid that it was narrowed from."""
         cell = wider.cell(x_m, y_m)

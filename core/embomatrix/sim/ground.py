@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 ON_FLOOR_M: Final = 0.05
 """A movable object whose underside is lower than this stands on the floor."""
-GRIDS_KEPT: Final = 3
-"""Floors in memory: a plan comes back to few of them, and each takes a megabyte in a house with a garden."""
+GRIDS_KEPT: Final = 2
+"""Floors in memory besides that of the start: a plan comes back to few, and each takes a megabyte in a house with a garden."""
 LEAVES_KEPT: Final = 12
 """Floors with doors and drawers open in memory, for each of these: they share most with one another."""
 
@@ -74,7 +74,7 @@ class Ground:
             self._moved.clear()
             self._leaves.forget()
             self._round, self._read = journal.rounds, 0
-        for name, _ in journal.entries[self._read :]:
+        for name in dict.fromkeys([name for name, _ in journal.entries[self._read :]]):
             number = self.numbers[name]
             if self._scene.objects[number].fixed:
                 self._leaves.note(number)
@@ -85,12 +85,7 @@ class Ground:
         """What stands on the floor otherwise than at the start."""
         self.ajar: Ajar = self._leaves.ajar()
         """Whose leaves stand open."""
-        if self.floor not in self._kept:
-            self._kept[self.floor] = self._lay(self.floor)
-            if len(self._kept) > GRIDS_KEPT:
-                self._kept.popitem(last=False)
-        self._kept.move_to_end(self.floor)
-        self._laid = self._kept[self.floor]
+        self._laid = self._lay_or_recall(self.floor) if self.floor else self._at_start
         self._now = None if self.ajar else self._laid.grid
 
     @property
@@ -150,12 +145,19 @@ class Ground:
         for number in sorted(self._moved):
             item = self._scene.objects[number]
             pose = self._engine.pose(item.name) if self._on_floor(item.name) else None
-            if pose != (item.pose_world_asset if number in self._on_floor_at_start else None):
+            before = item.pose_world_asset if number in self._on_floor_at_start else None
+            if pose is not before and pose != before:
                 yield number, pose
 
+    def _lay_or_recall(self, floor: Floor) -> Laid:
+        if floor not in self._kept:
+            self._kept[floor] = self._lay(floor)
+            if len(self._kept) > GRIDS_KEPT:
+                self._kept.popitem(last=False)
+        self._kept.move_to_end(floor)
+        return self._kept[floor]
+
     def _lay(self, floor: Floor) -> Laid:
-        if not floor:
-            return self._at_start
         moved = [number for number, _ in floor]
         names = [self._scene.objects[number].name for number, pose in floor if pose is not None]
         come = Obstacles.joined([Obstacles.of([], WALLS, []), *map(self._parts_of, names)])

@@ -133,11 +133,18 @@ class PoseSet:
 
         ``rows``, shape (n, 7), are positions and quaternions.
         """
-        rotations = _rotations(rows[:, 3:])
-        positions = rows[:, :3] + rotations @ np.array(then.position_m)
+        positions, rotations = np.ascontiguousarray(rows[:, :3]), _rotations(rows[:, 3:])
+        if then is not IDENTITY:
+            positions, rotations = (
+                positions + rotations @ np.array(then.position_m),
+                rotations @ then.rotation,
+            )
         names = tuple(dict.fromkeys(links))
-        link_of = np.array([names.index(link) for link in links], dtype=np.int64)
-        return PoseSet(positions, rotations @ then.rotation, np.arange(len(rows)), names, link_of)
+        if len(names) > 1:
+            link_of = np.array([names.index(link) for link in links], dtype=np.int64)
+        else:
+            link_of = np.zeros(len(links), dtype=np.int64)
+        return PoseSet(positions, rotations, np.arange(len(rows)), names, link_of)
 
     def repeated_at(self, positions_m: FloatArray) -> PoseSet:
         """The poses in turn, again and again, moved to positions on their links, shape (m, 3)."""
@@ -148,19 +155,24 @@ class PoseSet:
         """Boxes of a thing with these bounds and joint positions, where the links are; at infinity on links without frame."""
         if not self.links:
             return Lineup(np.zeros((0, 3)), np.zeros((0, 3)))
-        lows, highs = np.empty_like(self.positions_m), np.empty_like(self.positions_m)
+        if len(self.links) == 1 and self.links[0] in frames:
+            return Lineup(*self._extents(bounds, fractions, frames[self.links[0]], np.s_[:]))
+        lows, highs = np.full_like(self.positions_m, np.inf), np.full_like(self.positions_m, np.inf)
         for number, link in enumerate(self.links):
-            rows = np.s_[:] if len(self.links) == 1 else self.link_of == number
-            frame = frames.get(link)
-            if frame is None:
-                lows[rows] = highs[rows] = np.inf
-                continue
-            turn = frame.rotation
-            below, above = bounds.extents(turn @ self.rotations, fractions)  # (k, 3) each
-            origins = self.positions_m[rows] @ turn.T + frame.position_m
-            lows[rows] = origins + below[self.turn_of[rows]]
-            highs[rows] = origins + above[self.turn_of[rows]]
+            if link in frames:
+                rows = self.link_of == number
+                lows[rows], highs[rows] = self._extents(bounds, fractions, frames[link], rows)
         return Lineup(lows, highs)
+
+    def _extents(
+        self, bounds: AssetBounds, fractions: Sequence[float], frame: Pose, rows: slice | BoolArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Corners of the boxes at some of the poses, shape (m, 3) each, where the link that they ride on is at ``frame``."""
+        turn = frame.rotation
+        below, above = bounds.extents(turn @ self.rotations, fractions)  # (k, 3) each
+        origins = self.positions_m[rows] @ turn.T + frame.position_m
+        turns = self.turn_of[rows]
+        return origins + below[turns], origins + above[turns]
 
 
 def _rotations(quats_xyzw: FloatArray) -> FloatArray:

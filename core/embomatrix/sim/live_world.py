@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from embomatrix.sim.facts import SceneFacts
 from embomatrix.sim.hand import Hand
 from embomatrix.sim.navigation import Navigator
+from embomatrix.sim.news import News
 from embomatrix.sim.placement import Placer
 from embomatrix.sim.prepared import Prepared
 from embomatrix.sim.relations import Relations
@@ -50,6 +51,7 @@ class LiveWorld:
         self.substances: Symbols[SubstanceFact] = Symbols()
         self._future = frozenset(item.name for item in self.scene.objects if item.absent)
         self.absent: set[str] = set()
+        self._news = News(engine)
         self.thermal = Thermal(engine, self.relations, self.states)
         self.water = Water(engine, self.relations, self.states, self.substances)
         self.facts = SceneFacts(self.relations, self.states, self.substances, self.absent, self._future)
@@ -77,7 +79,8 @@ class LiveWorld:
 
     def let_sources_act(self) -> tuple[Change, ...]:
         """Let heat, cold and water act on what lies at their sources. Returns what changed."""
-        return (*self.thermal.apply(), *self.water.apply())
+        self._news.read()
+        return (*self.thermal.apply(self._news), *self.water.apply(self._news))
 
     @property
     def carried(self) -> tuple[str, ...]:

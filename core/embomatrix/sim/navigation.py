@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from embomatrix.sim.prepared import Prepared
     from embomatrix.sim.relations import Relations
     from embomatrix.world.asset import Asset
-    from embomatrix.world.geometry import FloatArray, Vec2
+    from embomatrix.world.geometry import Aabb, FloatArray, Vec2
     from embomatrix.world.scene import Room
 
 ROOFED_M: Final = 1.5
@@ -175,11 +175,21 @@ class Navigator:
         if start is None or self._engine.is_parked(name):
             return ()
         label = self.ground.shut.label(start)
-        if self.ground.floor == () and label == self._part_of_start and self.is_as_loaded(name):
-            found = self._found_before.get(name)
-            if found is not None:
-                return found
+        found = self._found_before.get(name) if label == self._part_of_start else None
+        if found is not None and self.is_as_loaded(name) and self._is_untouched(name):
+            return found
         return self._stands_on(self.ground.shut, (self._key(name), (), label), name)
+
+    def _is_untouched(self, name: str) -> bool:
+        """Whether what changed on the floor left the places from which an object is served, and the arm's way, as they were."""
+        if self.ground.floor == ():
+            return True
+        before, grid = self.ground.at_start
+        service = self.service(name)
+        if not self.ground.shut.is_like(grid, *service.window):
+            return False
+        own = [self.ground.numbers[item] for item in (name, *self._relations.hosts_of(name))]
+        return np.array_equal(_within_reach(before.blockers(service.box, own), service.box), service.blockers)
 
     def _stands_on(
         self, grid: FloorGrid, key: tuple[tuple[object, ...], Ajar, int], name: str
@@ -258,10 +268,7 @@ class Navigator:
         if key not in self._blockers:
             if len(self._blockers) == ANSWERS_KEPT:
                 self._blockers.clear()
-            found, box = self._all_blockers_of(name), self._relations.body(name).grown(ROBOT.reach_m)
-            near = (found[0] <= box.high_m[0]) & (found[2] >= box.low_m[0])
-            near &= (found[1] <= box.high_m[1]) & (found[3] >= box.low_m[1])
-            self._blockers[key] = np.ascontiguousarray(found[:, near])
+            self._blockers[key] = _within_reach(self._all_blockers_of(name), self._relations.body(name))
         return self._blockers[key]
 
     def _all_blockers_of(self, name: str) -> FloatArray:
@@ -288,6 +295,14 @@ class Navigator:
             item.center_m for item in self._scene.doorways if room.name in item.rooms and all(item.rooms)
         ]
         return doors or [room.center_m]
+
+
+def _within_reach(rectangles: FloatArray, box: Aabb) -> FloatArray:
+    """Those of some rectangles, shape (4, n), that come within the arm's reach of a box."""
+    around = box.grown(ROBOT.reach_m)
+    near = (rectangles[0] <= around.high_m[0]) & (rectangles[2] >= around.low_m[0])
+    near &= (rectangles[1] <= around.high_m[1]) & (rectangles[3] >= around.low_m[1])
+    return np.ascontiguousarray(rectangles[:, near])
 
 
 def has_front(asset: Asset) -> bool:

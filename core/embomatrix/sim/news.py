@@ -13,17 +13,19 @@ class News:
     """Reads an engine's journal. A reset is no news: what follows it is."""
 
     def __init__(self, engine: PhysicsEngine) -> None:
+        self.again = False
+        """Whether the engine was reset between the last two looks."""
         self._engine = engine
         self._round = engine.journal.rounds
         self._read = 0
         self._names: set[str] = set()
         self._places: list[Aabb] = []
 
-    def read(self) -> bool:
-        """Go on to what changed since the last call. Whether the engine was reset in between."""
+    def read(self) -> None:
+        """Go on to what changed since the last call."""
         journal = self._engine.journal
-        again = journal.rounds != self._round
-        if again:
+        self.again = journal.rounds != self._round
+        if self.again:
             self._round, self._read = journal.rounds, 0
         names = self._names = set[str]()
         self._places.clear()
@@ -34,7 +36,6 @@ class News:
                     self._places.append(box)
         self._read = len(journal.entries)
         self._places += [self._engine.aabb(name) for name in names if not self._engine.is_parked(name)]
-        return again
 
     def concerns(self, name: str, area: Aabb) -> bool:
         """Whether the object is among what changed, or anything in an area before or after it changed."""

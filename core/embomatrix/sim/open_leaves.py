@@ -42,7 +42,9 @@ class OpenLeaves:
 
     def ajar(self) -> Ajar:
         """What stands open now, in scene order."""
-        joints = ((number, self._engine.joints(self._objects[number].name)) for number in sorted(self._swung))
+        if not self._swung:
+            return ()
+        joints = [(number, self._engine.joints(self._objects[number].name)) for number in sorted(self._swung)]
         return tuple((number, fractions) for number, fractions in joints if max(fractions) > OPEN_FRACTION)
 
     def each_open(self) -> Iterator[Ajar]:

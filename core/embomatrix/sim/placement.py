@@ -141,6 +141,8 @@ class Placer:
         """Good poses: of those verified for the pair, then for the footprint's class, then of fresh ones."""
         frames = self._frames(errand)
         for spots in self._repertoire.verified(errand.held, errand.target, errand.relation):
+            if not len(spots):
+                continue
             order = range(len(spots)) if rng is None else rng.permutation(len(spots)).tolist()
             for number, nearest in self._roomy_first(errand, spots, frames, order):
                 found = self._accept_verified(errand, spots.pose(number, frames), nearest)

@@ -118,7 +118,7 @@ class Relations:
 
     def open(self, a: str) -> bool:
         """Any joint of ``a`` is past 5 % of its travel."""
-        return any(fraction > OPEN_FRACTION for fraction in self._engine.joints(a))
+        return max(self._engine.joints(a), default=0.0) > OPEN_FRACTION
 
     def body(self, name: str) -> Aabb:
         """Box of the object with its joints shut: an open door neither brings it nearer nor pushes the robot away."""

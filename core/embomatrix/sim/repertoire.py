@@ -17,7 +17,7 @@ from embomatrix.world.poses import PlacementKey
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from embomatrix.sim.bounds import AssetBounds
     from embomatrix.sim.candidates import Patch
@@ -69,24 +69,24 @@ class Repertoire:
     def __init__(self, scene: Scene, cache: PoseCache) -> None:
         self._scene = scene
         self._cache = cache
-        self._verified: dict[PlacementKey, tuple[Spots, Spots]] = {}
+        self._exact: dict[PlacementKey, Spots] = {}
+        self._by_class: dict[PlacementKey, Spots] = {}
         self._footprints: dict[str, tuple[str, Pose]] = {}
         self._bases: dict[str, Base | None] = {}
         self._patches: dict[PlacementKey, tuple[tuple[Patch, ...], PoseSet]] = {}
 
-    def verified(self, held: str, target: str, relation: Relation) -> tuple[Spots, Spots]:
-        """Spots verified for this pair of assets, and those verified for the footprint of what is held."""
+    def verified(self, held: str, target: str, relation: Relation) -> Iterator[Spots]:
+        """Spots verified for this pair of assets, then those verified for the footprint of what is held."""
         one, other = self._scene.asset_of(held), self._scene.asset_of(target)
         key = PlacementKey(one.asset_id, other.asset_id, relation)
-        known = self._verified.get(key)
-        if known is None:
-            exact = rows_of(self._cache.placements, key)
-            boxes, pose_box_held = self._by_class(one, other.asset_id, relation)
-            known = self._verified[key] = (
-                _spots(exact, IDENTITY, one, other, relation),
-                _spots(boxes, pose_box_held, one, other, relation),
-            )
-        return known
+        if key not in self._exact:
+            self._exact[key] = _spots(rows_of(self._cache.placements, key), IDENTITY, one, other, relation)
+        yield self._exact[key]
+        if key not in self._by_class:
+            name, pose_box_held = self.footprint(one)
+            boxes = rows_of(self._cache.placements, PlacementKey(name, other.asset_id, relation))
+            self._by_class[key] = _spots(boxes, pose_box_held, one, other, relation)
+        yield self._by_class[key]
 
     def fresh(self, held: str, target: str, relation: Relation, shift: Vec2, tries: int) -> Spots:
         """At most so many poses by geometry alone, spread over the surfaces; ``shift`` moves the whole pattern."""
@@ -111,11 +111,6 @@ class Repertoire:
         if asset.asset_id not in self._bases:
             self._bases[asset.asset_id] = base_of(asset)
         return self._bases[asset.asset_id]
-
-    def _by_class(self, asset: Asset, support_id: str, relation: Relation) -> tuple[FloatArray, Pose]:
-        """Poses of the box of the asset's footprint, shape (n, 7), and the asset's pose in the frame of that box."""
-        name, pose_box_held = self.footprint(asset)
-        return rows_of(self._cache.placements, PlacementKey(name, support_id, relation)), pose_box_held
 
     def footprint(self, asset: Asset) -> tuple[str, Pose]:
         """Name of the footprint class of an asset, "" without one, and the asset's pose in the frame of the class's box."""

@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from embomatrix.sim.news import News
 from embomatrix.skills.appliance import cold_source, cooks, freezes, heat_source, heats
 from embomatrix.world.geometry import Aabb
 from embomatrix.world.state import Relation, State
@@ -19,6 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, MutableMapping
 
     from embomatrix.sim.engine import PhysicsEngine
+    from embomatrix.sim.news import News
     from embomatrix.sim.relations import Relations
     from embomatrix.skills.appliance import Source
     from embomatrix.world.asset import Asset
@@ -43,26 +43,24 @@ class Thermal:
         self._scene = engine.scene
         self._states = states
         self._sources: list[tuple[str, Source]] = []
-        self._news = News(engine)
         self._acted = False
         for item in self._scene.objects:
             asset = self._scene.assets[item.asset_id]
             found = (heat_source(asset), cold_source(asset))
             self._sources += [(item.name, source) for source in found if source is not None]
 
-    def apply(self) -> tuple[Change, ...]:
+    def apply(self, news: News) -> list[Change]:
         """Let every working source act. Returns what changed, in scene order of the sources."""
         changes: list[Change] = []
-        self._news.read()
         first, self._acted = not self._acted, True
         for name, source in self._sources:
             # One that acts by itself has acted on all that is there, unless something has changed there since.
             if not self.works(name, source):
                 continue
-            if first or source.requires_on or self._news.concerns(name, self._area(name)):
+            if first or source.requires_on or news.concerns(name, self._area(name)):
                 for item in self._acted_on(name, source):
                     changes += self._expose(item, source)
-        return tuple(changes)
+        return changes
 
     def works(self, name: str, source: Source) -> bool:
         """Whether the source is on and closed, as far as it must be."""

@@ -63,7 +63,9 @@ def check_asset(asset: Asset) -> None:
 
 def check_pose(pose: Pose, what: str) -> None:
     """Raise EngineError unless the position is finite and within the world, and the quaternion a rotation."""
-    if not all(abs(value) <= WORLD_LIMIT_M for value in pose.position_m):
+    x, y, z = pose.position_m
+    limit = WORLD_LIMIT_M
+    if not (-limit <= x <= limit and -limit <= y <= limit and -limit <= z <= limit):
         raise EngineError(
             f"{what!r} is at {pose.position_m} m: expected finite coordinates within {WORLD_LIMIT_M:.0f} m"
         )

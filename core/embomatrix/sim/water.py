@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from embomatrix.sim.news import News
 from embomatrix.sim.thermal import Change
 from embomatrix.skills.household import coverings, liquids_given, soaked_with, washed_away, washing
 from embomatrix.world.state import State, SubstanceFact, SubstanceRelation
@@ -18,6 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, MutableMapping, Set
 
     from embomatrix.sim.engine import PhysicsEngine
+    from embomatrix.sim.news import News
     from embomatrix.sim.relations import Relations
     from embomatrix.skills.household import Washing
 
@@ -38,7 +38,6 @@ class Water:
         self._states = states
         self._substances = substances
         self._changes: list[Change] = []
-        self._news = News(engine)
         self._acting: set[str] = set()
         self._acting_at_start: frozenset[str] | None = None
         self._sources: list[tuple[str, Washing | None]] = []
@@ -48,21 +47,20 @@ class Water:
             if machine is not None or flows_from(asset.synset):
                 self._sources.append((item.name, machine))
 
-    def apply(self) -> tuple[Change, ...]:
+    def apply(self, news: News) -> list[Change]:
         """Let every source that runs act on what lies in it. Returns what changed since the last time, by hand or by itself."""
-        if self._news.read() and self._acting_at_start is not None:
+        if news.again and self._acting_at_start is not None:
             self._acting = set(self._acting_at_start)
         for name, machine in self._sources:
             if not self._runs(name, machine):
                 self._acting.discard(name)
             # What a source did to a thing nothing undoes: it acts again when it was started, or something came.
-            elif name not in self._acting or self._news.concerns(name, self._engine.aabb(name)):
+            elif name not in self._acting or news.concerns(name, self._engine.aabb(name)):
                 self._acting.add(name)
                 self._act(name, machine)
         if self._acting_at_start is None:
             self._acting_at_start = frozenset(self._acting)
-        changes = tuple(self._changes)
-        self._changes.clear()
+        changes, self._changes = self._changes, []
         return changes
 
     def _runs(self, name: str, machine: Washing | None) -> bool:

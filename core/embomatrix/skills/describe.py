@@ -12,17 +12,17 @@ from embomatrix.world.state import Relation
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from embomatrix.skills.syntax import PlaceRelation, SkillCall
+    from embomatrix.skills.syntax import SkillCall
 
 MAX_FINAL_LINES: Final = 24
 """Objects of the final description at most: more do not fit a prompt."""
 
 DONE: Final[Mapping[Skill, str]] = {
     Skill.MOVE: "stands at {target}",
-    Skill.TURN: "turned by {yaw} rad",
+    Skill.TURN: "turned by {yaw:.2f} rad",
     Skill.PICK_UP: "holds {target}{cargo}",
     Skill.PLACE: "put {held} {relation} {target}",
-    Skill.MOVE_FORWARD: "drove {distance} m",
+    Skill.MOVE_FORWARD: "drove {distance:.2f} m",
     Skill.OPEN: "opened {target}",
     Skill.CLOSE: "closed {target}",
     Skill.TOGGLE_ON: "switched {target} on",
@@ -70,9 +70,9 @@ def done(call: SkillCall, *, target: str = "", held: str = "", cargo: Sequence[s
         target=target,
         held=held,
         cargo=f" with {listed(cargo)} in it" if cargo else "",
-        relation=_relation(call.relation),
-        yaw=f"{call.yaw or 0.0:.2f}",
-        distance=f"{call.distance or 0.0:.2f}",
+        relation=preposition(call.relation) if call.relation is not None else "",
+        yaw=call.yaw or 0.0,
+        distance=call.distance or 0.0,
         room=call.room_name,
     )
 
@@ -117,7 +117,3 @@ def call_in_words(call: SkillCall, table: Sequence[str]) -> str:
 def listed(words: Sequence[str]) -> str:
     """Words as a list in a sentence: ``a, b and c``."""
     return " and ".join(filter(None, [", ".join(words[:-1]), words[-1]])) if words else "nothing"
-
-
-def _relation(relation: PlaceRelation | None) -> str:
-    return "" if relation is None else preposition(relation)

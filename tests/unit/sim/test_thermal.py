@@ -116,5 +116,5 @@ def test_a_reset_undoes_what_temperature_did(flat):
 
 def test_a_change_is_told_once(flat):
     after(flat, HEAT_ON_STOVE)
-    assert flat.world.thermal.apply() == ()
+    assert flat.world.let_sources_act() == ()
     assert flat.world.states["apple_1"] == {State.HOT, State.COOKED}

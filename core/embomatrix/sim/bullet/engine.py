@@ -178,15 +178,16 @@ class BulletEngine:
         if FLOOR not in ignore and box.low_m[2] < limit:
             return FLOOR
         reach = max(limit, 0.0) + BOX_SLACK_M
-        if WALL not in ignore:
-            for body in sorted({wall // PART_LIMIT for wall in self._walls_around.near(box, reach)}):
+        if WALL not in ignore and (walls := self._walls_around.near(box, reach)):
+            for body in sorted({wall // PART_LIMIT for wall in walls}):
                 if self._closest(self._body(number), self._bodies.wall(body), limit) < limit:
                     return WALL
+        names = self._names
         for other in self._around.near(box, reach):
-            if other == number or self._names[other] in ignore:
+            if other == number or names[other] in ignore:
                 continue
             if self._closest(self._body(number), self._body(other), limit) < limit:
-                return self._names[other]
+                return names[other]
         return ""
 
     def near(self, box: Aabb, ignore: frozenset[str] = NOTHING) -> tuple[str, ...]:
@@ -324,4 +325,4 @@ class BulletEngine:
     def _closest(self, body: int, other: int, limit_m: float) -> float:
         """Smallest signed distance between two bodies, infinity when it is more than ``limit_m`` (at least 0)."""
         contacts = self._bullet.getClosestPoints(body, other, max(limit_m, 0.0), physicsClientId=self._client)
-        return min([contact[8] for contact in contacts], default=float("inf"))
+        return min([contact[8] for contact in contacts]) if contacts else math.inf
