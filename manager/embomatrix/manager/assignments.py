@@ -44,7 +44,7 @@ from embomatrix.rpc.values import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from embomatrix.manager.events import BatchSubmitted, LeaseFinished
+    from embomatrix.manager.events import LeaseFinished
     from embomatrix.rpc.values import Batch
 
 CALLED_OFF = Cancelled("the trainer called it off")
@@ -123,9 +123,6 @@ class Assignments:
         commands, self.commands = self.commands, []
         return commands
 
-    def submit(self, event: BatchSubmitted) -> None:
-        self.queue(self.take_in(event.batch, {}))
-
     def queue(self, records: Sequence[RolloutRecord]) -> None:
         """Give these to whoever has their scenes warm; the others wait."""
         for record in records:
@@ -133,11 +130,11 @@ class Assignments:
         for scene in dict.fromkeys(record.scene for record in records):
             self.offer(scene)
 
-    def take_in(self, batch: Batch, delivered: Mapping[str, int]) -> list[RolloutRecord]:
-        """Note a batch; returns its rollouts without an outcome, which nobody holds. None of a batch that is known."""
+    def open(self, batch: Batch, delivered: Mapping[str, int]) -> BatchRecord | None:
+        """Note a batch, whose rollouts without an outcome are coming; None for one that is known."""
         key = (batch.run_id, batch.batch_id)
         if key in self.batches:
-            return []
+            return None
         scenes = dict.fromkeys(rollout.bundle_digest for rollout in batch.rollouts)
         run = self.runs.of(batch.run_id)
         due_s = self.now_s + (run.terms.rollout_deadline_s or self._limits.rollout_deadline_s)
@@ -145,15 +142,22 @@ class Assignments:
         noted = self.batches.open(
             batch, delivered, now_s=self.now_s, due_s=due_s, warm=warm, reward=run.terms.reward
         )
-        run.submitted += len(noted.open)
-        if not noted.open:
+        run.submitted += noted.whole.left
+        if not noted.whole.left:
             self._close(noted)
-        return list(noted.open.values())
+        return noted
+
+    def queue_coming(self, batch: BatchRecord | None, count: int | None) -> None:
+        """Queue the next so many of those that are coming, or all; none of a batch that is over."""
+        if batch is not None:
+            self.queue(self.batches.admit(batch, count))
 
     def cancel(self, key: tuple[str, str]) -> None:
         batch = self.batches.get(key)
-        for record in list(batch.open.values()) if batch is not None else ():
-            self._conclude(record, CALLED_OFF)
+        if batch is not None:
+            self.batches.admit(batch)
+            for record in list(batch.open.values()):
+                self._conclude(record, CALLED_OFF)
 
     def finish(self, record: RolloutRecord, outcome: Outcome) -> None:
         """The one place where a rollout gets its outcome, and its group or batch what follows from it.
@@ -172,12 +176,14 @@ class Assignments:
     def _fail(self, batch: BatchRecord, group: GroupRecord, why: str) -> None:
         """A member was lost: what becomes of the others is the run's policy."""
         run = self.runs.of(batch.run_id)
+        late = self.batches.admit(batch)
         failed, lost = failed_with(run.terms.group_policy, batch, group)
         for one in failed:
             run.counters.groups_failed += not one.failed
             one.failed = True
         for record in lost:
             self._conclude(record, Cancelled(why))
+        self.queue([record for record in late if record.phase is not Phase.DONE])
 
     def _conclude(self, record: RolloutRecord, outcome: Outcome) -> None:
         if record.phase is Phase.PENDING:
@@ -195,7 +201,7 @@ class Assignments:
             record.key.rollout_id, record.rollout.group_id, cursor, max(record.attempts, 1), outcome
         )
         self.commands.append(DeliverResult(batch.run_id, batch.batch_id, result))
-        if not batch.open:
+        if not batch.whole.left:
             self._close(batch)
 
     def _close(self, batch: BatchRecord) -> None:
@@ -257,13 +263,13 @@ class Assignments:
         """Give freed workers the waiting rollouts of their warm scenes, by turns; the idle take from behind the busy."""
         for worker_id in worker_ids:
             worker = self.fleet.workers.get(worker_id)
-            while worker is not None and worker.open_credits > 0 and not self.paused:
-                record = self.pending.next_for(worker, self.now_s)
-                if record is None:
-                    self._steal_for(worker)
-                    break
+            if worker is None or worker.open_credits <= 0 or self.paused:
+                continue
+            choice = self.pending.choice(worker, self.now_s)
+            while worker.open_credits > 0 and (record := choice.next()) is not None:
                 self.pending.take(record)
                 self.give(record, worker)
+            self._steal_for(worker)
 
     def hedge(self, record: RolloutRecord, worker: WorkerRecord) -> None:
         """Lease a rollout that runs elsewhere a second time; whoever is first counts."""

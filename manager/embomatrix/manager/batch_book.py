@@ -22,8 +22,10 @@ class BatchBook:
         self.tails: dict[GroupRecord, None] = {}
         """Groups and batches of which three quarters are done."""
         self._batches: dict[tuple[str, str], BatchRecord] = {}
-        self._sequences = itertools.count(1)
-        self._due: list[tuple[float, int, RolloutRecord]] = []
+        self._sequence = 0
+        """The last place in the queue that was given."""
+        self._order = itertools.count()
+        self._due: list[tuple[float, int, float, BatchRecord]] = []
 
     def __contains__(self, key: tuple[str, str]) -> bool:
         return key in self._batches
@@ -35,9 +37,14 @@ class BatchBook:
         """The open batch of a rollout without an outcome."""
         return self._batches[record.key[:2]]
 
+    @property
+    def coming(self) -> int:
+        """Rollouts of open batches that have no record yet."""
+        return sum(batch.whole.coming for batch in self._batches.values())
+
     def scenes(self) -> frozenset[str]:
         """Of rollouts without an outcome."""
-        return frozenset(record.scene for batch in self._batches.values() for record in batch.open.values())
+        return frozenset().union(*(batch.open_scenes for batch in self._batches.values()))
 
     def of_run(self, run_id: str) -> list[BatchRecord]:
         return [batch for key, batch in self._batches.items() if key[0] == run_id]
@@ -52,28 +59,31 @@ class BatchBook:
         warm: Mapping[str, bool],
         reward: RewardSettings,
     ) -> BatchRecord:
-        """Note a batch; its open rollouts are those that were not delivered before. ``warm`` tells it of each scene."""
+        """Note a batch, of which those come that were not delivered before. ``warm`` tells it of each of its scenes."""
         key = (batch.run_id, batch.batch_id)
-        noted = BatchRecord(*key, GroupRecord(len(batch.rollouts)), cursor=max(delivered.values(), default=0))
-        self._batches[key] = noted
+        noted = BatchRecord(*key, frozenset(warm), cursor=max(delivered.values(), default=0))
         for rollout in batch.rollouts:
             group = noted.groups.get(rollout.group_id)
             if group is None:
-                group = noted.groups[rollout.group_id] = GroupRecord(0)
+                group = noted.groups[rollout.group_id] = GroupRecord()
             group.size += 1
-            if rollout.rollout_id in delivered:
-                continue
-            record = RolloutRecord(
-                key=RolloutKey(*key, rollout.rollout_id),
-                rollout=rollout,
-                sequence=next(self._sequences),
-                submitted_s=now_s,
-                warm=warm[rollout.bundle_digest],
-                reward=reward,
-            )
-            noted.open[rollout.rollout_id] = group.open[rollout.rollout_id] = record
-            heapq.heappush(self._due, (due_s, record.sequence, record))
+            group.coming += rollout.rollout_id not in delivered
+        noted.whole.size = len(batch.rollouts)
+        noted.whole.coming = sum(group.coming for group in noted.groups.values())
+        noted.rest = _records(batch, delivered, self._sequence, now_s, warm, reward)
+        self._sequence += len(batch.rollouts)
+        self._batches[key] = noted
+        heapq.heappush(self._due, (due_s, next(self._order), now_s, noted))
         return noted
+
+    def admit(self, batch: BatchRecord, count: int | None = None) -> list[RolloutRecord]:
+        """The next so many of those that are coming, or all: nobody holds them, and they are in no queue."""
+        records = list(itertools.islice(batch.rest, count))
+        for record in records:
+            for group in (batch.whole, batch.groups[record.rollout.group_id]):
+                group.open[record.key.rollout_id] = record
+                group.coming -= 1
+        return records
 
     def conclude(self, record: RolloutRecord) -> int:
         """The rollout has its outcome; returns the cursor of it."""
@@ -92,9 +102,32 @@ class BatchBook:
         del self._batches[batch.run_id, batch.batch_id]
 
     def overdue(self, now_s: float) -> Iterator[tuple[RolloutRecord, float]]:
-        """Rollouts whose deadline has passed without an outcome, and the time that they had."""
+        """Rollouts whose deadline has passed without an outcome, and the time that they had: that of their batch."""
         # Deadlines come in order of submission: what is done leaves at the head and doesn't pile up until its deadline.
-        while self._due and (self._due[0][2].phase is Phase.DONE or self._due[0][0] <= now_s):
-            due_s, _, record = heapq.heappop(self._due)
-            if record.phase is not Phase.DONE:
-                yield record, due_s - record.submitted_s
+        while self._due and (not self._due[0][3].whole.left or self._due[0][0] <= now_s):
+            due_s, _, submitted_s, batch = heapq.heappop(self._due)
+            self.admit(batch)
+            for record in list(batch.open.values()):
+                if record.phase is not Phase.DONE:
+                    yield record, due_s - submitted_s
+
+
+def _records(
+    batch: Batch,
+    delivered: Mapping[str, int],
+    after: int,
+    now_s: float,
+    warm: Mapping[str, bool],
+    reward: RewardSettings,
+) -> Iterator[RolloutRecord]:
+    """Records of what was not delivered before, each made when it is asked for. Their places in the queue follow ``after``."""
+    for sequence, rollout in enumerate(batch.rollouts, start=after + 1):
+        if rollout.rollout_id not in delivered:
+            yield RolloutRecord(
+                key=RolloutKey(batch.run_id, batch.batch_id, rollout.rollout_id),
+                rollout=rollout,
+                sequence=sequence,
+                submitted_s=now_s,
+                warm=warm[rollout.bundle_digest],
+                reward=reward,
+            )

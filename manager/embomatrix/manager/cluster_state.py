@@ -54,13 +54,13 @@ class ClusterState:
         self._closed = RunStats()
         self._unplaceable: dict[str, str] = {}
 
-    def handle(self, event: Event, *, now_s: float) -> list[Command]:
-        """Take in one fact; returns what shall be done about it, in order."""
-        commands = self.dispatcher.handle(event, now_s=now_s)
-        urgency = self.scheduler.note(event, now_s=now_s)
+    def handle(self, *events: Event, now_s: float) -> list[Command]:
+        """Take in facts of one moment; returns what shall be done about them, in order."""
+        commands = self.dispatcher.handle(*events, now_s=now_s)
+        urgency = max((self.scheduler.note(event, now_s=now_s) for event in events), default=Urgency.NONE)
         barred = [command.worker_id for command in commands if isinstance(command, QuarantineWorker)]
-        if isinstance(event, WorkerJoined) and self.dispatcher.auditor.quarantined(event.worker_id):
-            barred.append(event.worker_id)
+        joined = (event.worker_id for event in events if isinstance(event, WorkerJoined))
+        barred += filter(self.dispatcher.auditor.quarantined, joined)
         for worker_id in barred:
             urgency = max(urgency, self.scheduler.note(WorkerQuarantined(worker_id), now_s=now_s))
         if self.dispatcher.waiting_scenes != self._waiting:

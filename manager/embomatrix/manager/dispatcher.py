@@ -22,6 +22,7 @@ from embomatrix.manager.assignments import Assignments, DispatchLimits
 from embomatrix.manager.commands import CancelLease, Command
 from embomatrix.manager.events import (
     BatchCancelled,
+    BatchContinued,
     BatchRestored,
     BatchSubmitted,
     DemandObserved,
@@ -78,9 +79,14 @@ class Dispatcher:
         self._hedger = Hedger(self._desk, limits)
         self._patience = Patience(self._desk, limits.no_capacity_s)
 
-    def handle(self, event: Event, *, now_s: float) -> list[Command]:
-        """Take in one fact; returns what shall be done about it, in order."""
+    def handle(self, *events: Event, now_s: float) -> list[Command]:
+        """Take in facts of one moment; returns what shall be done about them, in order. Leases are given after all of them."""
         self._desk.now_s = now_s
+        for event in events:
+            self._take(event)
+        return self._desk.settled()
+
+    def _take(self, event: Event) -> None:
         match event:
             case LeaseFinished():
                 self._desk.settle(event)
@@ -91,8 +97,10 @@ class Dispatcher:
             case DispatchPaused() | DispatchResumed():
                 self._desk.paused = isinstance(event, DispatchPaused)
                 self._desk.fill(list(self._desk.fleet.workers))
-            case BatchSubmitted():
-                self._desk.submit(event)
+            case BatchSubmitted(submitted, count):
+                self._desk.queue_coming(self._desk.open(submitted, {}), count)
+            case BatchContinued(run_id, batch_id, count):
+                self._desk.queue_coming(self._desk.batches.get((run_id, batch_id)), count)
             case BatchRestored():
                 self._recovery.restore(event)
             case WorkersExpected(worker_ids):
@@ -119,7 +127,6 @@ class Dispatcher:
                 self._on_tick()
             case _:
                 pass
-        return self._desk.settled()
 
     def demand(self) -> DemandObserved:
         """What the Resource-Scheduler should know now. Forgets which leases were given since the last call."""
@@ -158,7 +165,7 @@ class Dispatcher:
     @property
     def queued(self) -> int:
         """Rollouts that wait for a lease."""
-        return len(self._desk.pending) + self._recovery.waiting
+        return len(self._desk.pending) + self._desk.batches.coming + self._recovery.waiting
 
     @property
     def expired(self) -> int:
@@ -202,12 +209,11 @@ class Dispatcher:
 
     def pending_of(self, run_id: str) -> int:
         """Rollouts of the run without an outcome."""
-        return sum(len(batch.open) for batch in self._desk.batches.of_run(run_id))
+        return sum(batch.whole.left for batch in self._desk.batches.of_run(run_id))
 
     def waiting_scenes_of(self, run_id: str) -> frozenset[str]:
         """Scenes of the run's rollouts without an outcome."""
-        batches = self._desk.batches.of_run(run_id)
-        return frozenset(record.scene for batch in batches for record in batch.open.values())
+        return frozenset().union(*(batch.open_scenes for batch in self._desk.batches.of_run(run_id)))
 
     # Workers and time
 

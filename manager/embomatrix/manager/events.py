@@ -123,9 +123,20 @@ class RunOpened:
 
 @dataclass(frozen=True, slots=True)
 class BatchSubmitted:
-    """A trainer wants these plans executed."""
+    """A trainer wants these plans executed. The first ``count`` are queued now, the others as ``BatchContinued`` says."""
 
     batch: Batch
+    count: int | None = None
+    """None for all."""
+
+
+@dataclass(frozen=True, slots=True)
+class BatchContinued:
+    """The next ``count`` rollouts of a batch are queued: a large one is taken in pieces, with other events between them."""
+
+    run_id: str
+    batch_id: str
+    count: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,6 +247,7 @@ Event = (
     | LeaseFinished
     | RunOpened
     | BatchSubmitted
+    | BatchContinued
     | BatchRestored
     | WorkersExpected
     | ReputesKnown

@@ -42,8 +42,8 @@ class Intake:
         self.registry = registry
 
     def feed(self, *events: Event, now_s: float) -> list[Command]:
-        """Tell the state machines of these, in order."""
-        return [command for event in events for command in self.cluster.handle(event, now_s=now_s)]
+        """Tell the state machines of these, in order; what became free is given away after the last of them."""
+        return self.cluster.handle(*events, now_s=now_s)
 
     def register(
         self,

@@ -11,7 +11,7 @@ from embomatrix.reward.settings import PAPER, RewardSettings
 from embomatrix.rpc.values import RunStats, Timings
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
 
     from embomatrix.rpc.values import LeaseRef, Rollout
 
@@ -213,17 +213,26 @@ class WorkerRecord:
 
 @dataclass(slots=True, eq=False)
 class GroupRecord:
-    """A group, or a whole batch as far as its tail goes: ``size`` rollouts, of which ``open`` have no outcome."""
+    """A group, or a whole batch as far as its tail goes: ``size`` rollouts, of which ``open`` have no outcome.
 
-    size: int
+    Of a large batch some are still ``coming``: they have neither a record nor an outcome.
+    """
+
+    size: int = 0
+    coming: int = 0
     open: dict[str, RolloutRecord] = field(default_factory=dict)
     failed: bool = False
     """The infrastructure lost a member."""
 
     @property
+    def left(self) -> int:
+        """Rollouts without an outcome."""
+        return len(self.open) + self.coming
+
+    @property
     def in_tail(self) -> bool:
         """Three quarters are done, and something is left."""
-        return 0 < 4 * len(self.open) <= self.size
+        return 0 < 4 * self.left <= self.size
 
 
 @dataclass(slots=True, eq=False)
@@ -232,13 +241,21 @@ class BatchRecord:
 
     run_id: str
     batch_id: str
-    whole: GroupRecord
+    scenes: frozenset[str]
+    whole: GroupRecord = field(default_factory=GroupRecord)
     groups: dict[str, GroupRecord] = field(default_factory=dict)
     cursor: int = 0
+    rest: Iterator[RolloutRecord] = field(default_factory=lambda: iter(()))
+    """Makes the records of those that are still coming, in order."""
 
     @property
     def open(self) -> dict[str, RolloutRecord]:
         return self.whole.open
+
+    @property
+    def open_scenes(self) -> frozenset[str]:
+        """Of rollouts without an outcome; while some are coming, of all."""
+        return self.scenes if self.whole.coming else frozenset(record.scene for record in self.open.values())
 
 
 @dataclass(slots=True)

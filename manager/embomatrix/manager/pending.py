@@ -85,28 +85,14 @@ class PendingQueues:
         """The one that was submitted first, whosever turn it is."""
         return min(self.heads(scene), key=lambda record: record.sequence, default=None)
 
-    def next_for(self, worker: WorkerRecord, now_s: float) -> RolloutRecord | None:
-        """What the worker should take next: of those whose scene it holds warm, whose turn it is."""
+    def choice(self, worker: WorkerRecord, now_s: float) -> Choice:
+        """What the worker should take next, and after that, of the scenes that it holds warm."""
         few: Iterable[str]
         few, many = (
-            (worker.warm, self._counts)
-            if len(worker.warm) < len(self._counts)
-            else (self._counts, worker.warm)
+            (worker.warm, self._heaps) if len(worker.warm) < len(self._heaps) else (self._heaps, worker.warm)
         )
-        best: RolloutRecord | None = None
-        least: Turn | None = None
-        for scene in few:
-            if scene not in many:
-                continue
-            for heap in self._heaps[scene].values():
-                head = _head(heap)
-                # Nobody in a lane comes before its head: most lanes are told by it alone.
-                if head is None or (least is not None and self._turn(head) > least):
-                    continue
-                record = _first_taken(heap, worker, now_s)
-                if record is not None and (least is None or self._turn(record) < least):
-                    best, least = record, self._turn(record)
-        return best
+        lanes = (lane for scene in few if scene in many for lane in self._heaps[scene].items())
+        return Choice(lanes, self._turn, worker, now_s)
 
     def take(self, record: RolloutRecord) -> None:
         """The record gets a lease."""
@@ -129,6 +115,52 @@ class PendingQueues:
             # What is left in the heaps are records that reached their outcome while they waited.
             del self._counts[scene]
             self._heaps.pop(scene, None)
+
+
+class Choice:
+    """Rollouts for one worker, by turns. Valid while each is taken as it is told, and nothing else comes or goes."""
+
+    def __init__(
+        self,
+        lanes: Iterable[tuple[Lane, _Heap]],
+        turn: Callable[[RolloutRecord], Turn],
+        worker: WorkerRecord,
+        now_s: float,
+    ) -> None:
+        self._turn = turn
+        self._worker = worker
+        self._now_s = now_s
+        by_run: dict[str, list[tuple[int, int, _Heap]]] = {}
+        for number, (lane, heap) in enumerate(lanes):
+            if heap:
+                by_run.setdefault(lane.run_id, []).append((heap[0][0], number, heap))
+        self._runs = list(by_run.values())
+        """Of each run a heap of its lanes, by the least place that what the worker takes of the lane may have."""
+        for run in self._runs:
+            heapq.heapify(run)
+
+    def next(self) -> RolloutRecord | None:
+        """Whose turn it is; None when there is nothing that the worker may take."""
+        best: RolloutRecord | None = None
+        least: Turn | None = None
+        for run in self._runs:
+            record = self._first_of(run)
+            # Within a run whoever was first goes first; between runs their turns decide.
+            if record is not None and (least is None or self._turn(record) < least):
+                best, least = record, self._turn(record)
+        return best
+
+    def _first_of(self, run: list[tuple[int, int, _Heap]]) -> RolloutRecord | None:
+        while run:
+            place, number, heap = run[0]
+            record = _first_taken(heap, self._worker, self._now_s)
+            if record is None:
+                heapq.heappop(run)
+            elif record.sequence == place:
+                return record
+            else:
+                heapq.heapreplace(run, (record.sequence, number, heap))
+        return None
 
 
 def _lane(record: RolloutRecord) -> Lane:

@@ -62,7 +62,8 @@ class Recovery:
         counters = self._desk.runs.of(event.batch.run_id).counters
         counters.delivered += len(event.delivered)
         counters.infra_failures += event.infra_failures
-        for record in self._desk.take_in(event.batch, event.delivered):
+        batch = self._desk.open(event.batch, event.delivered)
+        for record in self._desk.batches.admit(batch) if batch is not None else ():
             self._awaited[record.key] = record
             self._scenes[record.scene] += 1
         self._until_s = self._desk.now_s + self._grace_s

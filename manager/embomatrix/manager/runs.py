@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.manager.events import (
     BatchCancelled,
     BatchRestored,
-    BatchSubmitted,
     LookaheadAnnounced,
     RunOpened,
     WorkersExpected,
@@ -22,6 +21,7 @@ from embomatrix.manager.group_ends import group_sizes
 from embomatrix.manager.records import batch_of, batch_row, failed_rows, terms_of, terms_payload
 from embomatrix.manager.results import BatchLog
 from embomatrix.manager.store.protocol import PutOutcome, RunRow, StateError, StateFullError
+from embomatrix.manager.submissions import Submissions
 from embomatrix.reward.settings import PAPER
 from embomatrix.rpc.status import (
     ConflictError,
@@ -88,6 +88,7 @@ class Runs:
         self._history = history
         self._runs: dict[str, RunRow] = {}
         self._heard_s: dict[str, float] = {}
+        self._submissions = Submissions(self._feed)
 
     @property
     def open(self) -> Mapping[str, RunRow]:
@@ -116,6 +117,10 @@ class Runs:
         self._feed(WorkersExpected(await self._store.workers()))
         if self._runs:
             logger.info("took up %d runs of a former manager", len(self._runs))
+
+    async def serve(self) -> None:
+        """Take large batches in, until cancelled."""
+        await self._submissions.serve()
 
     async def open_run(self, name: str, run_id: str, terms: RunTerms = DEFAULT_TERMS) -> str:
         """Open a run, or attach to the one of that id, which keeps its terms; an empty id gets a new one.
@@ -183,7 +188,7 @@ class Runs:
             self._logs.remove(log)
             raise
         self._history.submitted(batch)
-        self._feed(BatchSubmitted(batch))
+        self._submissions.enter(batch)
         return log
 
     def log_of(self, run_id: str, batch_id: str) -> BatchLog:

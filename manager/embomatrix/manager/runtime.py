@@ -118,6 +118,7 @@ class ManagerRuntime:
             group.create_task(self._clean_up())
             group.create_task(self._keeper.serve())
             group.create_task(self._delivery.serve())
+            group.create_task(self.runs.serve())
 
     def register(
         self,

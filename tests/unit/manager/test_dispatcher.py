@@ -1,5 +1,7 @@
 """The Task-Dispatcher, driven by hand: each test tells what happened and what should be done about it."""
 
+from dataclasses import replace
+
 import pytest
 from tests.fakes.worker import completed
 
@@ -8,6 +10,7 @@ from embomatrix.manager.commands import AcknowledgeLease, CancelLease, DeliverRe
 from embomatrix.manager.dispatcher import Dispatcher
 from embomatrix.manager.events import (
     BatchCancelled,
+    BatchContinued,
     BatchSubmitted,
     LeaseFinished,
     LeasesRenewed,
@@ -71,6 +74,12 @@ class Table:
             for i in range(count)
         )
         return self.tell(BatchSubmitted(Batch(run_id, batch_id, 1, rollouts)))
+
+    def submit_in_pieces(self, count, piece, group_size=1):
+        rollouts = tuple(
+            Rollout(f"b1-{i}", f"g{i // group_size}", "kitchen", "t", (), 0) for i in range(count)
+        )
+        return self.tell(BatchSubmitted(Batch("r1", "b1", 1, rollouts), piece))
 
     def finish(self, lease, outcome=None):
         return self.tell(LeaseFinished(lease.worker_id, lease.ref, outcome or completed(lease.worker_id)))
@@ -383,3 +392,54 @@ def test_warm_and_cold_starts_are_told_apart(table):
     assert table.results["b2-0"].outcome.warm
     counters = table.dispatcher.counters("r1")
     assert (counters.cold_starts, counters.warm_starts) == (1, 1)
+
+
+def test_a_large_batch_is_taken_in_pieces_and_ends_when_all_of_them_are_done(table):
+    table.worker(slots=1)
+    first = leases(table.submit_in_pieces(5, 2))
+    assert [lease.rollout.rollout_id for lease in first] == ["b1-0", "b1-1"]
+    assert (table.dispatcher.queued, table.dispatcher.pending_of("r1")) == (3, 5)
+    for lease in first:
+        assert not [command for command in table.finish(lease) if isinstance(command, FinishBatch)]
+    rest = leases(table.tell(BatchContinued("r1", "b1", 2)))
+    assert [lease.rollout.rollout_id for lease in rest] == ["b1-2", "b1-3"]
+    table.finish(rest[0])
+    (last,) = leases(table.tell(BatchContinued("r1", "b1", 2)))
+    table.finish(rest[1])
+    assert table.finish(last)[-1] == FinishBatch("r1", "b1")
+    assert sorted(table.results) == [f"b1-{i}" for i in range(5)]
+
+
+def test_what_is_still_coming_is_cancelled_with_its_batch(table):
+    table.worker(slots=1)
+    table.submit_in_pieces(5, 2)
+    commands = table.tell(BatchCancelled("r1", "b1"))
+    assert commands.count(FinishBatch("r1", "b1")) == 1
+    assert {type(result.outcome) for result in table.results.values()} == {Cancelled}
+    assert len(table.results) == 5
+    assert table.tell(BatchContinued("r1", "b1", 2)) == []
+
+
+def test_members_that_are_still_coming_fail_with_their_group_and_the_others_are_queued():
+    table = Table(replace(LIMITS, max_attempts=1))
+    table.worker(slots=1)
+    (lease, *_) = leases(table.submit_in_pieces(6, 2, group_size=3))
+    given = leases(table.finish(lease, crash()))
+    assert sorted(table.results) == ["b1-0", "b1-1", "b1-2"]
+    assert [lease.rollout.rollout_id for lease in given] == ["b1-3", "b1-4"]
+    assert table.tell(BatchContinued("r1", "b1", 4)) == []
+
+
+def test_the_deadline_of_a_batch_ends_what_is_still_coming(table):
+    table.submit_in_pieces(3, 1)
+    table.tell(Tick(), after_s=601.0)
+    assert {result.outcome.code for result in table.results.values()} == {InfraCode.DEADLINE}
+    assert len(table.results) == 3
+
+
+def test_a_batch_that_comes_while_another_one_is_taken_goes_behind_all_of_it(table):
+    table.submit_in_pieces(3, 1)
+    table.submit(1, batch_id="b2")
+    table.tell(BatchContinued("r1", "b1", 2))
+    (lease, second) = leases(table.worker(slots=1))
+    assert [lease.rollout.rollout_id, second.rollout.rollout_id] == ["b1-0", "b1-1"]

@@ -18,6 +18,7 @@ from embomatrix.manager.cluster_state import ClusterState
 from embomatrix.manager.commands import AcknowledgeLease, CancelLease, DeliverResult, GiveLease, SetDesired
 from embomatrix.manager.events import (
     BatchCancelled,
+    BatchContinued,
     BatchSubmitted,
     DispatchPaused,
     DispatchResumed,
@@ -176,16 +177,23 @@ class LeaseMachine(RuleBasedStateMachine):
         size=st.integers(1, 8),
         scene=st.sampled_from(SCENES),
         render=st.sampled_from([False, False, True]),
+        piece=st.sampled_from([None, None, 1, 3]),
     )
-    def a_batch_comes(self, run, count, size, scene, render):
+    def a_batch_comes(self, run, count, size, scene, render, piece):
         name = f"b{len(self.batches)}"
         rollouts = tuple(
             Rollout(f"{name}-{i}", f"{name}.{i // size}", scene, "t", (), 0, render) for i in range(count)
         )
         self.submitted.update({rollout.rollout_id: rollout for rollout in rollouts})
         self.batches[name] = batch = Batch(run, name, len(self.batches) + 1, rollouts)
-        self.tell(BatchSubmitted(batch))
-        self.tell(BatchSubmitted(batch))
+        self.tell(BatchSubmitted(batch, piece))
+        self.tell(BatchSubmitted(batch, piece))
+
+    @precondition(lambda self: self.batches)
+    @rule(data=st.data(), piece=st.integers(1, 4))
+    def more_of_a_batch_is_taken(self, data, piece):
+        batch = data.draw(st.sampled_from(list(self.batches.values())))
+        self.tell(BatchContinued(batch.run_id, batch.batch_id, piece))
 
     @rule(scenes=st.lists(st.sampled_from(SCENES), max_size=4))
     def a_window_comes(self, scenes):
