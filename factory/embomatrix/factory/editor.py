@@ -1,117 +1,163 @@
-"""Adding a task's objects to a base scene: seeded rest poses that are free, in reach and collide with nothing."""
+"""A base scene that is being changed: what stands in it, what is still free, what the robot would still reach.
+
+The editor decides nothing about where things go; ``layout`` does. It keeps the objects, and tells whether one more may be where
+somebody wants it.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, replace
-from enum import StrEnum
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.assets.library import build_asset
 from embomatrix.factory.furnish.roles import is_portable
+from embomatrix.factory.layout.values import LayoutReason
 from embomatrix.factory.scenes.check import reach_problems
 from embomatrix.factory.scenes.clearance import Clearance
-from embomatrix.factory.scenes.floor import ReachableFloor, box_of
+from embomatrix.factory.scenes.floor import ReachableFloor
 from embomatrix.factory.scenes.joints import with_joints
 from embomatrix.factory.scenes.solids import Solids, placed_parts
-from embomatrix.sim.candidates import candidates
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.asset import Asset, Link, SupportSurface
-from embomatrix.world.catalog import Catalog, CatalogError
 from embomatrix.world.geometry import Aabb, Part, Pose, Shape
 from embomatrix.world.scene import SceneObject
-from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-
-    import numpy as np
+    from collections.abc import Mapping, Sequence
 
     from embomatrix.world.scene import Room, Scene
-    from embomatrix.world.state import State
+    from embomatrix.world.state import Relation, State
 
-TRIES: Final = 64
-_FLOOR_TRIES: Final = 200
-_REST_GAP_M: Final = 0.0005
 _ON_FLOOR_M: Final = 0.05
 _FLAT_M: Final = 0.03
-
-
 _SUNK_M: Final = 0.008
 """How deep the plate of a floor lies: near enough for things to be on it, too deep for them to touch it (5 mm)."""
 _PLATE_M: Final = 0.01
 
 
-class PlacementReason(StrEnum):
-    """Why an object found no place."""
-
-    UNKNOWN_HOST = "unknown_host"
-    UNKNOWN_MODEL = "unknown_model"
-    NO_SURFACE = "no_surface"
-    TOO_LARGE = "too_large"
-    NO_FREE_SPOT = "no_free_spot"
-    OUT_OF_REACH = "out_of_reach"
-
-
 class PlacementError(ValueError):
     """An object can't be placed; ``reason`` says which rule stood against it."""
 
-    def __init__(self, reason: PlacementReason, message: str) -> None:
+    def __init__(self, reason: LayoutReason, message: str) -> None:
         super().__init__(message)
         self.reason = reason
-
-
-@dataclass(slots=True)
-class _Tally:
-    """How many candidate poses there were, and how many of them collided with nothing."""
-
-    seen: int = 0
-    free: int = 0
 
 
 class SceneEditor:
     """Collects changes to a base scene; ``freeze`` makes the new scene. The base scene itself is never changed."""
 
-    def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
-        self._scene = scene
-        self._rng = rng
+    def __init__(self, scene: Scene) -> None:
+        self.base = scene
+        self.rooms: Mapping[str, Room] = {room.name: room for room in scene.rooms}
+        self.clearance = Clearance(scene)
         self._objects: dict[str, SceneObject] = {item.name: item for item in scene.objects}
         self._assets: dict[str, Asset] = dict(scene.assets)
-        self._rooms = {room.name: room for room in scene.rooms}
+        self._boxes: dict[str, Aabb] = {}
         self._solids = Solids.of_scene(scene)
         self._floor = ReachableFloor(scene)
-        self._clearance = Clearance(scene)
         self._unreached = {problem.names for problem in reach_problems(scene)}
         self._counts = Counter(self._assets[item.asset_id].category for item in scene.objects)
 
     @property
     def objects(self) -> Mapping[str, SceneObject]:
-        """The objects so far, by name."""
+        """The objects so far, by name, in the order of the scene."""
         return self._objects
 
-    def add(
-        self, category: str, model: str | None, relation: Relation | None, host: str, *, room: str = ""
-    ) -> str:
-        """Place a new object and return its name, ``category_N``.
+    @property
+    def floor(self) -> ReachableFloor:
+        """Where the robot gets to, as things stand."""
+        return self._floor
 
-        ``host`` is an object that it goes on, in, under or next to, or a room when ``relation`` is None or INROOM: then it
-        stands on that room's floor. Without a model one of the category is drawn, any that fits. Raises PlacementError.
+    def known(self, name: str) -> SceneObject:
+        """An object. Raises PlacementError for an unknown name."""
+        if name not in self._objects:
+            raise PlacementError(
+                LayoutReason.UNKNOWN_HOST,
+                f"no object {name!r} in {self.base.scene_id}: expected one of its {len(self._objects)} objects",
+            )
+        return self._objects[name]
+
+    def asset_of(self, name: str) -> Asset:
+        """An object's asset. Raises PlacementError for an unknown name."""
+        return self._assets[self.known(name).asset_id]
+
+    def box_of(self, name: str) -> Aabb:
+        """An object's box in the world, joints shut. Raises PlacementError for an unknown name."""
+        box = self._boxes.get(name)
+        if box is None:
+            item = self.known(name)
+            box = self._boxes[name] = _box(self._assets[item.asset_id], item.pose_world_asset)
+        return box
+
+    def is_unserved(self, name: str) -> bool:
+        """Whether the robot could not get at an object of the base scene to begin with."""
+        return any(name in names for names in self._unreached)
+
+    def is_free(self, asset: Asset, pose: Pose) -> bool:
+        """Whether an asset would overlap nothing at a pose."""
+        return not self._solids.overlaps(placed_parts(asset, pose))
+
+    def objection(self, asset: Asset, pose: Pose, target: str = "") -> LayoutReason | None:
+        """What stands against an asset at a pose: it meets something, is out of reach, or bars the robot's way. None: nothing.
+
+        ``target`` is what it would be on or in: furniture with doors is served from its front.
         """
-        assets = self._choices(category, model)
-        errors: list[PlacementError] = []
-        for asset in assets:
-            try:
-                pose, where = self._find(asset, relation, host)
-            except PlacementError as error:
-                errors.append(error)
-                continue
-            return self._insert(asset, pose, room or where, relation, host)
-        raise errors[-1]
+        if not self.is_free(asset, pose):
+            return LayoutReason.NO_FREE_SPOT
+        box = _box(asset, pose)
+        room = self.base.room_at(box.center_m)
+        if not room:
+            return LayoutReason.NO_FREE_SPOT
+        if not self._in_reach(box, target):
+            return LayoutReason.OUT_OF_REACH
+        return None if self._leaves_ways(asset, pose, box, room) else LayoutReason.BARS_THE_WAY
 
-    def add_pieces(self, whole: str, category: str, model: str, count: int) -> tuple[str, ...]:
+    def insert(self, asset: Asset, pose: Pose, relation: Relation | None, host: str, room: str = "") -> str:
+        """Add an object at a pose, looked at or not, and return its name, ``category_N``.
+
+        ``host`` is what it rests on or in by ``relation``; empty: the floor. Without a room it is where its middle is.
+        """
+        self._counts[asset.category] += 1
+        name = f"{asset.category}_{self._counts[asset.category]}"
+        box = _box(asset, pose)
+        self._objects[name] = SceneObject(
+            name=name,
+            asset_id=asset.asset_id,
+            room=room or self.base.room_at(box.center_m),
+            pose_world_asset=pose,
+            fixed=not is_portable(asset),
+            joints=(0.0,) * len(asset.joints),
+            host=host,
+            relation=relation if host else None,
+        )
+        self._assets[asset.asset_id] = asset
+        self._solids.add(name, placed_parts(asset, pose))
+        if box.low_m[2] < _ON_FLOOR_M:
+            self._floor = ReachableFloor(self._as_scene())
+        return name
+
+    def remove(self, name: str) -> tuple[str, ...]:
+        """Take an object out again, with all that rests on or in it; their names. Raises PlacementError for an unknown name."""
+        self.known(name)
+        gone = {name: None}
+        for item in self._objects.values():  # hosts stand before their guests
+            if item.host in gone:
+                gone[item.name] = None
+        for each in gone:
+            del self._objects[each]
+        self._look_again(gone)
+        return tuple(gone)
+
+    def move(self, poses: Mapping[str, Pose]) -> None:
+        """Give objects other poses, such as those at which they came to rest. Raises PlacementError for an unknown name."""
+        for name, pose in poses.items():
+            self._objects[name] = replace(self.known(name), pose_world_asset=pose)
+        if poses:
+            self._look_again(poses)
+
+    def add_pieces(self, whole: str, asset: Asset, count: int) -> tuple[str, ...]:
         """Add absent objects that come in when ``whole`` is sliced, and return their names. Raises PlacementError."""
-        (asset,) = self._choices(category, model)
-        origin = self._known(whole)
+        origin = self.known(whole)
         names: list[str] = []
         for _ in range(count):
             self._counts[asset.category] += 1
@@ -131,23 +177,22 @@ class SceneEditor:
 
     def add_floor(self, room: str) -> str:
         """Make the floor of a room an object that plans and goals can name, and return its name."""
-        area = self._rooms[room]
-        asset = floor_asset(area)
+        area = self.rooms[room]
         x, y = area.center_m
-        name = self._insert(asset, Pose((x, y, -_SUNK_M - _PLATE_M / 2)), room, None, "")
+        name = self.insert(floor_asset(area), Pose((x, y, -_SUNK_M - _PLATE_M / 2)), None, "", room)
         self._objects[name] = replace(self._objects[name], fixed=True)
         return name
 
     def set_states(self, name: str, states: frozenset[State]) -> None:
         """Give an object these symbolic states. Raises PlacementError for an unknown name."""
-        self._objects[name] = replace(self._known(name), states=frozenset(states))
+        self._objects[name] = replace(self.known(name), states=frozenset(states))
 
     def set_joints(self, name: str, fractions: Sequence[float]) -> None:
         """Open or shut an object's joints, one share of the travel for each, with all that lies in its drawers.
 
         Raises PlacementError, ValueError.
         """
-        item = self._known(name)
+        item = self.known(name)
         joints = self._assets[item.asset_id].joints
         if len(fractions) != len(joints) or not all(0.0 <= f <= 1.0 for f in fractions):
             raise ValueError(
@@ -159,164 +204,38 @@ class SceneEditor:
         """The scene as it is now, with the assets that it uses."""
         objects = tuple(self._objects.values())
         used = {item.asset_id: self._assets[item.asset_id] for item in objects}
-        return replace(self._scene, scene_id=scene_id, objects=objects, assets=used)
+        return replace(self.base, scene_id=scene_id, objects=objects, assets=used)
 
-    def _known(self, name: str) -> SceneObject:
-        if name not in self._objects:
-            raise PlacementError(
-                PlacementReason.UNKNOWN_HOST,
-                f"no object {name!r} in {self._scene.scene_id}: expected one of its {len(self._objects)} objects",
-            )
-        return self._objects[name]
+    def _as_scene(self) -> Scene:
+        return replace(self.base, objects=tuple(self._objects.values()), assets=self._assets)
 
-    def _choices(self, category: str, model: str | None) -> list[Asset]:
-        """The model's asset, or those of the category in random order."""
-        catalog = Catalog.load()
-        try:
-            if model is not None:
-                return [build_asset(catalog, category, model)]
-            models = catalog.models_of(category)
-        except CatalogError as error:
-            raise PlacementError(PlacementReason.UNKNOWN_MODEL, str(error)) from error
-        order = self._rng.permutation(len(models))[:8]
-        return [build_asset(catalog, category, models[i].model_id) for i in order]
+    def _look_again(self, changed: Mapping[str, object]) -> None:
+        for name in changed:
+            self._boxes.pop(name, None)
+        scene = self._as_scene()
+        self._solids = Solids.of_scene(scene)
+        self._floor = ReachableFloor(scene)
 
-    def _find(self, asset: Asset, relation: Relation | None, host: str) -> tuple[Pose, str]:
-        """A free pose and its room."""
-        if relation is None or relation is Relation.INROOM:
-            if host not in self._rooms:
-                raise PlacementError(
-                    PlacementReason.UNKNOWN_HOST,
-                    f"no room {host!r} in {self._scene.scene_id}: expected one of {', '.join(self._rooms)}",
-                )
-            return self._choose(asset, self._on_floor(asset, self._rooms[host]), None, host)
-        target = self._known(host)
-        if relation is Relation.NEXTTO:
-            return self._choose(asset, self._beside(asset, target), None, host)
-        poses = [
-            target.pose_world_asset @ local
-            for local in candidates(asset, self._assets[target.asset_id], relation, self._shift(), TRIES)
-        ]
-        if not poses:
-            carrier = self._assets[target.asset_id]
-            reason = PlacementReason.TOO_LARGE if carrier.supports else PlacementReason.NO_SURFACE
-            raise PlacementError(
-                reason,
-                f"{asset.asset_id}, {_metres(asset)}, fits nowhere {relation.value} {host} ({_metres(carrier)}): "
-                "try a smaller model or another host",
-            )
-        order = self._rng.permutation(len(poses))
-        return self._choose(asset, iter([poses[i] for i in order]), target, host)
-
-    def _choose(
-        self, asset: Asset, poses: Iterator[Pose], target: SceneObject | None, host: str
-    ) -> tuple[Pose, str]:
-        """The first pose that collides with nothing and is in reach; raises with the rule that failed the most."""
-        tally = _Tally()
-        for pose in poses:
-            tally.seen += 1
-            if self._solids.overlaps(placed_parts(asset, pose)):
-                continue
-            tally.free += 1
-            box = Aabb.around(part.aabb(pose) for link in asset.links for part in link.parts)
-            room = self._scene.room_at(box.center_m)
-            if room and self._in_reach(box, target) and self._leaves_ways(asset, pose, box, room):
-                return pose, room
-        reason = PlacementReason.OUT_OF_REACH if tally.free else PlacementReason.NO_FREE_SPOT
-        raise PlacementError(
-            reason,
-            f"no place for {asset.asset_id}, {_metres(asset)}, at {host}: of {tally.seen} poses {tally.free} were free, "
-            "none of them in the robot's reach without barring its way: try another host",
-        )
-
-    def _in_reach(self, box: Aabb, target: SceneObject | None) -> bool:
+    def _in_reach(self, box: Aabb, target: str) -> bool:
         if not ROBOT.reach_low_m <= box.center_m[2] <= ROBOT.reach_high_m:
             return False
-        front = target.pose_world_asset if target and self._assets[target.asset_id].joints else None
+        front = self.known(target).pose_world_asset if target and self.asset_of(target).joints else None
         return len(self._floor.spots(box, front_of=front)) > 0
 
     def _leaves_ways(self, asset: Asset, pose: Pose, box: Aabb, room: str) -> bool:
         """Whether, with the object on the floor, doorways stay clear and the robot gets to all that it got to before."""
         if box.low_m[2] > _ON_FLOOR_M or box.high_m[2] < _FLAT_M:
             return True
-        if self._clearance.bars_a_doorway(box):
+        if self.clearance.bars_a_doorway(box):
             return False
         item = SceneObject("candidate", asset.asset_id, room, pose, fixed=False)
         assets = {**self._assets, asset.asset_id: asset}
-        trial = replace(self._scene, objects=(*self._objects.values(), item), assets=assets)
-        return {p.names for p in reach_problems(trial)} <= self._unreached
-
-    def _on_floor(self, asset: Asset, room: Room) -> Iterator[Pose]:
-        (x0, y0), (x1, y1) = room.low_m, room.high_m
-        for _ in range(_FLOOR_TRIES):
-            x, y = self._rng.uniform(x0, x1), self._rng.uniform(y0, y1)
-            yield self._standing(asset, float(x), float(y))
-
-    def _beside(self, asset: Asset, target: SceneObject) -> Iterator[Pose]:
-        """Poses at the height of what the target stands on, a few centimetres from its sides."""
-        box = box_of(self._scene, target) if target.name in self._scene.by_name else self._box(target)
-        gap = 0.03 + max(asset.size_m[:2]) / 2
-        support = self._objects.get(target.host)
-        for _ in range(_FLOOR_TRIES):
-            along = float(self._rng.uniform(-0.5, 0.5))
-            side = int(self._rng.integers(4))
-            cx, cy, _ = box.center_m
-            sx, sy, _ = box.size_m
-            x = cx + (sx / 2 + gap) * (1, -1, 0, 0)[side] + along * sx * (side >= 2)
-            y = cy + (sy / 2 + gap) * (0, 0, 1, -1)[side] + along * sy * (side < 2)
-            if support is None:
-                yield self._standing(asset, x, y)
-            elif self._carries(support, x, y, box.low_m[2]):
-                yield Pose.from_xyz_yaw(x, y, box.low_m[2] + asset.size_m[2] / 2, self._yaw())
-
-    def _carries(self, support: SceneObject, x: float, y: float, z: float) -> bool:
-        """Whether a surface of the object lies under the point, at its height."""
-        px, py, pz = support.pose_world_asset.inverse().apply((x, y, z))
-        return any(
-            abs(px - s.center_m[0]) < s.size_m[0] / 2
-            and abs(py - s.center_m[1]) < s.size_m[1] / 2
-            and abs(pz - s.center_m[2]) < 0.005
-            for s in self._assets[support.asset_id].supports
-        )
-
-    def _standing(self, asset: Asset, x: float, y: float) -> Pose:
-        return Pose.from_xyz_yaw(x, y, asset.size_m[2] / 2 + _REST_GAP_M, self._yaw())
-
-    def _yaw(self) -> float:
-        return float(self._rng.integers(4)) * 1.5707963267948966
-
-    def _shift(self) -> tuple[float, float]:
-        return (float(self._rng.random()), float(self._rng.random()))
-
-    def _box(self, item: SceneObject) -> Aabb:
-        asset = self._assets[item.asset_id]
-        return Aabb.around(part.aabb(item.pose_world_asset) for link in asset.links for part in link.parts)
-
-    def _insert(self, asset: Asset, pose: Pose, room: str, relation: Relation | None, host: str) -> str:
-        self._counts[asset.category] += 1
-        name = f"{asset.category}_{self._counts[asset.category]}"
-        rests = relation in (Relation.ONTOP, Relation.INSIDE)
-        carrier = host if rests else self._objects[host].host if relation is Relation.NEXTTO else ""
-        self._objects[name] = SceneObject(
-            name=name,
-            asset_id=asset.asset_id,
-            room=room,
-            pose_world_asset=pose,
-            fixed=not is_portable(asset),
-            joints=(0.0,) * len(asset.joints),
-            host=carrier,
-            relation=relation if rests else Relation.ONTOP if carrier else None,
-        )
-        self._assets[asset.asset_id] = asset
-        self._solids.add(name, placed_parts(asset, pose))
-        if pose.position_m[2] - asset.size_m[2] / 2 < _ON_FLOOR_M:
-            objects = tuple(self._objects.values())
-            self._floor = ReachableFloor(replace(self._scene, objects=objects, assets=self._assets))
-        return name
+        trial = replace(self.base, objects=(*self._objects.values(), item), assets=assets)
+        return {problem.names for problem in reach_problems(trial)} <= self._unreached
 
 
-def _metres(asset: Asset) -> str:
-    return " x ".join(f"{extent:.2f}" for extent in asset.size_m) + " m"
+def _box(asset: Asset, pose: Pose) -> Aabb:
+    return Aabb.around(part.aabb(pose) for link in asset.links for part in link.parts)
 
 
 def floor_asset(room: Room) -> Asset:

@@ -5,7 +5,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from embomatrix.factory.editor import PlacementError, PlacementReason, SceneEditor
+from embomatrix.factory.editor import PlacementError, SceneEditor
+from embomatrix.factory.layout.sampling import ObjectSampler
+from embomatrix.factory.layout.values import LayoutReason
 from embomatrix.factory.scenes.check import check_scene
 from embomatrix.factory.scenes.floor import ReachableFloor, box_of
 from embomatrix.world.state import Relation, State
@@ -14,8 +16,8 @@ if TYPE_CHECKING:
     from embomatrix.world.scene import Scene
 
 
-def editor(scene: Scene, seed: int = 0) -> SceneEditor:
-    return SceneEditor(scene, np.random.default_rng(seed))
+def sampler(edit: SceneEditor, seed: int = 0) -> ObjectSampler:
+    return ObjectSampler(edit, np.random.default_rng(seed))
 
 
 def a_host(scene: Scene, prefix: str) -> str:
@@ -27,8 +29,8 @@ def a_host(scene: Scene, prefix: str) -> str:
     [(Relation.ONTOP, "breakfast_table"), (Relation.INSIDE, "fridge"), (Relation.INSIDE, "bottom_cabinet")],
 )
 def test_added_things_rest_where_they_were_asked_for(flat: Scene, relation: Relation, host: str) -> None:
-    edit = editor(flat)
-    names = [edit.add("apple", None, relation, a_host(flat, host)) for _ in range(2)]
+    edit = SceneEditor(flat)
+    names = [sampler(edit, n).add("apple", None, relation, a_host(flat, host)) for n in range(2)]
     scene = edit.freeze("task-scene")
     assert check_scene(scene) == ()
     assert names == ["apple_1", "apple_2"]
@@ -39,8 +41,8 @@ def test_added_things_rest_where_they_were_asked_for(flat: Scene, relation: Rela
 
 
 def test_a_thing_on_the_floor_of_a_room_is_in_that_room_and_in_reach(flat: Scene) -> None:
-    edit = editor(flat)
-    name = edit.add("bucket", None, None, "living_room_0")
+    edit = SceneEditor(flat)
+    name = sampler(edit).add("bucket", None, None, "living_room_0")
     scene = edit.freeze("task-scene")
     assert scene.by_name[name].room == "living_room_0"
     assert box_of(scene, scene.by_name[name]).low_m[2] == pytest.approx(0.0, abs=0.005)
@@ -49,18 +51,18 @@ def test_a_thing_on_the_floor_of_a_room_is_in_that_room_and_in_reach(flat: Scene
 
 
 def test_next_to_means_on_the_same_surface(flat: Scene) -> None:
-    edit = editor(flat)
+    edit = SceneEditor(flat)
     table = a_host(flat, "breakfast_table")
-    first = edit.add("bowl", None, Relation.ONTOP, table)
-    second = edit.add("apple", None, Relation.NEXTTO, first)
+    first = sampler(edit).add("bowl", None, Relation.ONTOP, table)
+    second = sampler(edit).add("apple", None, Relation.NEXTTO, first)
     assert edit.objects[second].host == table
     assert check_scene(edit.freeze("task-scene")) == ()
 
 
 def test_the_base_scene_is_left_alone_and_assets_in_use_travel(flat: Scene) -> None:
     before = flat.objects
-    edit = editor(flat)
-    name = edit.add("apple", None, Relation.ONTOP, a_host(flat, "breakfast_table"))
+    edit = SceneEditor(flat)
+    name = sampler(edit).add("apple", None, Relation.ONTOP, a_host(flat, "breakfast_table"))
     scene = edit.freeze("task-scene")
     assert flat.objects == before
     assert scene.scene_id == "task-scene"
@@ -71,9 +73,9 @@ def test_the_base_scene_is_left_alone_and_assets_in_use_travel(flat: Scene) -> N
 
 def test_the_same_seed_puts_a_thing_in_the_same_place(flat: Scene) -> None:
     def pose(seed: int) -> object:
-        edit = editor(flat, seed)
+        edit = SceneEditor(flat)
         return edit.objects[
-            edit.add("apple", None, Relation.ONTOP, a_host(flat, "breakfast_table"))
+            sampler(edit, seed).add("apple", None, Relation.ONTOP, a_host(flat, "breakfast_table"))
         ].pose_world_asset
 
     assert pose(5) == pose(5)
@@ -81,7 +83,7 @@ def test_the_same_seed_puts_a_thing_in_the_same_place(flat: Scene) -> None:
 
 
 def test_states_and_joints_are_set_by_name(flat: Scene) -> None:
-    edit = editor(flat)
+    edit = SceneEditor(flat)
     fridge = a_host(flat, "fridge")
     edit.set_states(fridge, frozenset({State.DUSTY}))
     edit.set_joints(fridge, (1.0,) * len(edit.objects[fridge].joints))
@@ -95,27 +97,27 @@ def test_states_and_joints_are_set_by_name(flat: Scene) -> None:
 @pytest.mark.parametrize(
     ("category", "relation", "host", "reason"),
     [
-        ("apple", Relation.ONTOP, "throne_1", PlacementReason.UNKNOWN_HOST),
-        ("apple", None, "ballroom_0", PlacementReason.UNKNOWN_HOST),
-        ("aple", Relation.ONTOP, "bed_1", PlacementReason.UNKNOWN_MODEL),
-        ("sofa", Relation.INSIDE, "fridge_1", PlacementReason.TOO_LARGE),
+        ("apple", Relation.ONTOP, "throne_1", LayoutReason.UNKNOWN_HOST),
+        ("apple", None, "ballroom_0", LayoutReason.UNKNOWN_HOST),
+        ("aple", Relation.ONTOP, "bed_1", LayoutReason.UNKNOWN_MODEL),
+        ("sofa", Relation.INSIDE, "fridge_1", LayoutReason.TOO_LARGE),
     ],
 )
 def test_what_can_not_be_placed_says_why(
-    flat: Scene, category: str, relation: Relation | None, host: str, reason: PlacementReason
+    flat: Scene, category: str, relation: Relation | None, host: str, reason: LayoutReason
 ) -> None:
     with pytest.raises(PlacementError) as caught:
-        editor(flat).add(category, None, relation, host)
+        sampler(SceneEditor(flat)).add(category, None, relation, host)
     assert caught.value.reason is reason
 
 
 def test_a_full_shelf_says_so(flat: Scene) -> None:
-    edit = editor(flat)
+    edit = SceneEditor(flat)
 
     def fill() -> None:
         for _ in range(9):
-            edit.add("tray", "txcjux", Relation.ONTOP, a_host(flat, "breakfast_table"))
+            sampler(edit).add("tray", "txcjux", Relation.ONTOP, a_host(flat, "breakfast_table"))
 
     with pytest.raises(PlacementError) as caught:
         fill()
-    assert caught.value.reason in (PlacementReason.NO_FREE_SPOT, PlacementReason.OUT_OF_REACH)
+    assert caught.value.reason in (LayoutReason.NO_FREE_SPOT, LayoutReason.OUT_OF_REACH)

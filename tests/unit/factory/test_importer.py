@@ -25,7 +25,7 @@ from embomatrix.factory.task_import.sources import (
     read_file,
     read_jsonl,
 )
-from embomatrix.factory.task_import.task import Imported, category_of, import_problem, instruction_of
+from embomatrix.factory.task_import.task import Imported, Manner, category_of, import_problem, instruction_of
 from embomatrix.sim.engine import FLOOR
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.physical.survey import Foresight
@@ -79,7 +79,7 @@ def home() -> Scene:
 
 
 def refusal(text: str, scene: Scene) -> Refusal:
-    outcome = import_problem(source(text), scene)
+    outcome = import_problem(source(text), scene, manner=Manner(furnishing=False))
     assert isinstance(outcome, Refusal)
     return outcome
 
@@ -124,7 +124,10 @@ REFUSALS: dict[RefusalReason, tuple[str, str]] = {
     RefusalReason.ROOM_AS_OBJECT: ("(not (open ?electric_refrigerator.n.01_1))", "(not (open closet_0))"),
     RefusalReason.AGENT_IN_GOAL: ("(not (open ?electric", "(nextto agent.n.01_1 electric"),
     RefusalReason.NO_SCENE_OBJECT: ("breakfast_table.n.01", "bed.n.01"),
-    RefusalReason.NO_PLACE_GIVEN: ("(ontop apple.n.01_2 breakfast_table.n.01_1)\n", "\n"),
+    RefusalReason.NO_PLACE_GIVEN: (
+        "(ontop apple.n.01_2 breakfast_table.n.01_1)",
+        "(ontop apple.n.01_2 apple.n.01_2)",
+    ),
     RefusalReason.DOES_NOT_FIT: ("apple.n.01", "sofa.n.01"),
 }
 
@@ -163,10 +166,10 @@ def test_binding_is_by_ability_as_well_as_by_type(home: Scene) -> None:
     on = "(toggled_on electric_refrigerator.n.01_1)"
     problem = parse_problem(PROBLEM.replace("(not (open ?electric_refrigerator.n.01_1))", on))
     with pytest.raises(RefusedError, match="electric_refrigerator"):
-        bind(problem, home, np.random.default_rng(0))
+        bind(problem, home, np.random.default_rng(0), furnishing=False)
 
 
-def test_small_thing_of_the_room_that_the_scene_lacks_is_added_on_its_floor(home: Scene) -> None:
+def test_small_thing_of_the_room_that_the_scene_lacks_is_put_on_furniture_there(home: Scene) -> None:
     text = PROBLEM.replace("(ontop apple.n.01_2 breakfast_table.n.01_1)", "(inroom apple.n.01_2 living_room)")
     text = text.replace("apple.n.01_2", "tennis_ball.n.01_1").replace(
         "tennis_ball.n.01_1 - apple.n.01", "- apple.n.01\n        tennis_ball.n.01_1 - tennis_ball.n.01"
@@ -174,7 +177,27 @@ def test_small_thing_of_the_room_that_the_scene_lacks_is_added_on_its_floor(home
     imported = import_problem(source(text), home)
     assert isinstance(imported, Imported)
     ball = imported.scene.by_name["tennis_ball_1"]
-    assert (ball.room, ball.host) == ("living_room_0", "")
+    assert ball.room == "living_room_0"
+    assert ball.host in imported.scene.by_name
+
+
+def test_what_the_start_places_nowhere_is_put_where_such_things_are(home: Scene) -> None:
+    imported = import_problem(
+        source(PROBLEM.replace("(ontop apple.n.01_2 breakfast_table.n.01_1)\n", "\n")), home
+    )
+    assert isinstance(imported, Imported)
+    assert imported.scene.by_name["apple_4"].room == "kitchen_0"
+    assert imported.scene.by_name["apple_4"].host
+
+
+def test_furniture_that_the_room_lacks_is_brought_in_where_that_is_allowed(home: Scene) -> None:
+    text = PROBLEM.replace("breakfast_table.n.01", "armchair.n.01")
+    imported = import_problem(source(text), home)
+    assert isinstance(imported, Imported)
+    chair = imported.scene.by_name["armchair_1"]
+    assert (chair.room, chair.fixed) == ("kitchen_0", True)
+    assert imported.scene.by_name["apple_3"].host == "armchair_1"
+    assert isinstance(import_problem(source(text), home, manner=Manner(furnishing=False)), Refusal)
 
 
 def test_states_of_the_start_are_set_and_taken_away(home: Scene) -> None:

@@ -58,6 +58,13 @@ class Clearance:
         corners = np.array((*box.low_m, *box.high_m))
         return any(_overlap(corners[None], zone)[0] for _, _, zone in self._door_zones)
 
+    def doorway_floor(self, room: str) -> Iterator[tuple[float, float, float, float]]:
+        """Rectangles (x0, y0, x1, y1) of a room's floor that stay clear before its doorways."""
+        for _, side, zone in self._door_zones:
+            if side == room:
+                x0, y0, _, x1, y1, _ = zone.tolist()
+                yield (x0, y0, x1, y1)
+
     def before_windows(self) -> Iterator[tuple[Window, str, tuple[str, ...]]]:
         """Every side of every window, and what takes its light."""
         for window in self._scene.windows:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, TypeVar
 
 from embomatrix.factory.admission import Admitted, admit
 from embomatrix.factory.pipeline.poses import Needs, cache_poses
 from embomatrix.factory.refusal import Refusal, RefusalReason
-from embomatrix.factory.task_import.task import Imported, import_problem
+from embomatrix.factory.task_import.task import Imported, Manner, import_problem
 from embomatrix.factory.writer.view import SceneView
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.planner.oracle import find_plan
@@ -20,7 +20,7 @@ from embomatrix.world.dataset import TaskRecord
 from embomatrix.world.inflation import bundle_digest
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from embomatrix.factory.task_import.sources import SourceText
     from embomatrix.sim.physical.survey import Foresight
@@ -36,9 +36,23 @@ class Verified:
     bundle: bytes
 
 
-def bind_first(source: SourceText, bases: Sequence[Scene], *, seed: int = 0) -> Imported | Refusal:
-    """The problem in the first scene that it can be bound to, else the refusal that came furthest. Raises BddlError."""
-    return _first(import_problem(source, base, seed=seed) for base in bases)
+def bind_first(
+    source: SourceText, bases: Sequence[Scene], *, seed: int = 0, manner: Manner | None = None
+) -> Imported | Refusal:
+    """The problem in the first scene that it can be bound to, else the refusal that came furthest. Raises BddlError.
+
+    Scenes that have all furniture come before those that lack some.
+    """
+    return _first(imports(source, bases, seed=seed, manner=manner or Manner()))
+
+
+def imports(
+    source: SourceText, bases: Sequence[Scene], *, seed: int, manner: Manner
+) -> Iterator[Imported | Refusal]:
+    """The problem in each scene as it is, then, where the manner says so, in each with the furniture that it lacks."""
+    for furnishing in (False, True) if manner.furnishing else (False,):
+        for base in bases:
+            yield import_problem(source, base, seed=seed, manner=replace(manner, furnishing=furnishing))
 
 
 def verify_first(
@@ -48,14 +62,16 @@ def verify_first(
     foresight: Foresight,
     *,
     seed: int = 0,
+    manner: Manner | None = None,
 ) -> Verified | Refusal:
-    """The problem in the first scene in which it is admitted, else the refusal that came furthest. Raises BddlError."""
+    """The problem in the first scene in which it is admitted, else the refusal that came furthest. Raises BddlError.
 
-    def judged(base: Scene) -> Verified | Refusal:
-        imported = import_problem(source, base, seed=seed)
-        return imported if isinstance(imported, Refusal) else verify(imported, library, foresight, seed=seed)
-
-    return _first(judged(base) for base in bases)
+    Scenes that have all furniture come before those that lack some.
+    """
+    return _first(
+        imported if isinstance(imported, Refusal) else verify(imported, library, foresight, seed=seed)
+        for imported in imports(source, bases, seed=seed, manner=manner or Manner())
+    )
 
 
 T = TypeVar("T", Imported, Verified)

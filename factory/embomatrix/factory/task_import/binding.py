@@ -8,21 +8,21 @@ are covered, filled or soaked with. Objects that are still to come are the halve
 from __future__ import annotations
 
 import difflib
-from collections import defaultdict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.refusal import RefusalReason, RefusedError
 from embomatrix.factory.task_import.reach import FUTURE, HELD, INSOURCE, Horizon, pieces_of
-from embomatrix.factory.writer.view import SceneView, is_liftable
+from embomatrix.factory.task_import.search import needs_of, search
+from embomatrix.factory.writer.view import SceneView
 from embomatrix.world.bddl import is_room_instance
-from embomatrix.world.catalog import Catalog, CatalogError
+from embomatrix.world.catalog import Catalog
 from embomatrix.world.evaluate import atoms_of, render
-from embomatrix.world.state import Relation, State
+from embomatrix.world.state import Relation
 from embomatrix.world.substances import is_substance
 
 if TYPE_CHECKING:
-    from collections.abc import Container, Iterable, Iterator, Mapping
+    from collections.abc import Container, Mapping
 
     import numpy as np
 
@@ -34,19 +34,24 @@ FLOORS: Final = frozenset({"floor.n.01"})
 AGENT: Final = "agent.n.01"
 PLACING: Final = (Relation.INSIDE, Relation.ONTOP, Relation.UNDER, Relation.NEXTTO)
 """Relations by which ``:init`` places an object, the most telling first."""
-MAX_STEPS: Final = 20_000
-"""Assignments that are looked at before a scene counts as lacking the objects."""
 
 
 @dataclass(frozen=True, slots=True)
 class Addition:
-    """An object that the editor must add. ``host`` is another object of the problem, or empty: the floor of ``room``."""
+    """An object that must be added.
+
+    ``host`` is another object of the problem; on top of none is on the floor of ``room``. Without a relation it may be anywhere
+    in ``room``, without a room anywhere in the problem's rooms. ``beside`` are objects that it is next to, besides; ``needs``
+    are what it must be able to do.
+    """
 
     name: str
     type: str
     relation: Relation | None
     host: str
     room: str
+    beside: tuple[str, ...] = ()
+    needs: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,8 +70,11 @@ class Binding:
     robot_room: str
 
 
-def bind(problem: Problem, scene: Scene, rng: np.random.Generator) -> Binding:
-    """Find the problem's objects in the scene. Raises RefusedError with the first thing that can't be bound."""
+def bind(problem: Problem, scene: Scene, rng: np.random.Generator, *, furnishing: bool = True) -> Binding:
+    """Find the problem's objects in the scene. Raises RefusedError with the first thing that can't be bound.
+
+    Furniture that its rooms lack is to be added when ``furnishing``, as the paper's factory does; else that is a refusal.
+    """
     check_expressible(problem)
     inroom = {
         item.atom.args[0]: item.atom.args[1]
@@ -83,7 +91,7 @@ def bind(problem: Problem, scene: Scene, rng: np.random.Generator) -> Binding:
         and name not in placed
         and name not in problem.wildcards
     ]
-    rooms, found = _search(problem, view, inroom, fixtures, rng)
+    rooms, found = search(problem, view, inroom, fixtures, rng, furnishing=furnishing)
     problem = _spelt_out(problem, view, rooms, found)
     floors = {name: rooms[room] for name, room in inroom.items() if problem.objects.get(name) in FLOORS}
     loose = {name: rooms[inroom[name]] for name in fixtures if name not in found}
@@ -206,129 +214,6 @@ def _placements(problem: Problem) -> dict[str, tuple[Relation, str]]:
     return placed
 
 
-def _search(
-    problem: Problem,
-    view: SceneView,
-    inroom: Mapping[str, str],
-    fixtures: list[str],
-    rng: np.random.Generator,
-) -> tuple[dict[str, str], dict[str, str]]:
-    """Rooms for the problem's rooms, and scene objects for its fixtures. All objects of one word are in one room."""
-    words = sorted(set(inroom.values()))
-    options = {word: _rooms_for(view.scene, word, rng) for word in words}
-    needs = _needs(problem)
-    lacking = ""
-    for rooms in _room_choices(words, options):
-        found, missing = _assign(problem, view, {name: rooms[inroom[name]] for name in fixtures}, needs, rng)
-        if not missing:
-            return rooms, found
-        lacking = lacking or f"{missing} of type {problem.objects[missing]!r} in {rooms[inroom[missing]]}"
-    raise RefusedError(
-        RefusalReason.NO_SCENE_OBJECT, f"{view.scene.base} has no free object for {lacking or 'the rooms'}"
-    )
-
-
-def _rooms_for(scene: Scene, word: str, rng: np.random.Generator) -> list[str]:
-    if is_room_instance(word):
-        names = [room.name for room in scene.rooms if room.name == word]
-    else:
-        names = [room.name for room in scene.rooms if room.type == word]
-    if not names:
-        raise RefusedError(
-            RefusalReason.ROOM_MISSING,
-            f"{scene.base} has no {word!r}: its rooms are {', '.join(room.name for room in scene.rooms)}",
-        )
-    return [str(name) for name in rng.permutation(names)]
-
-
-def _room_choices(words: list[str], options: Mapping[str, list[str]]) -> Iterator[dict[str, str]]:
-    if not words:
-        yield {}
-        return
-    for room in options[words[0]]:
-        for rest in _room_choices(words[1:], options):
-            if room not in rest.values():
-                yield {words[0]: room, **rest}
-
-
-def _needs(problem: Problem) -> Mapping[str, frozenset[str]]:
-    """What an object, or a whole type, must be able to do for start and goal to make sense."""
-    needs: defaultdict[str, set[str]] = defaultdict(set)
-    for atom in (*atoms_of(problem.goal), *(item.atom for item in problem.init if item.positive)):
-        if atom.predicate == State.OPEN:
-            needs[atom.args[0]].add("openable")
-        elif atom.predicate == State.TOGGLED_ON:
-            needs[atom.args[0]].add("toggleable")
-        elif atom.predicate == Relation.INSIDE:
-            needs[atom.args[1]].add("container")
-    return {name: frozenset(values) for name, values in needs.items()}
-
-
-def _assign(
-    problem: Problem,
-    view: SceneView,
-    wanted: Mapping[str, str],
-    needs: Mapping[str, frozenset[str]],
-    rng: np.random.Generator,
-) -> tuple[dict[str, str], str]:
-    """A scene object of its own for each name; the second value is a name for which none is left.
-
-    Small things that the scene lacks are left for the editor to add.
-    """
-    catalog = Catalog.load()
-    domains: dict[str, list[str]] = {}
-    for name, room in wanted.items():
-        categories = set(catalog.categories_of(problem.objects[name]))
-        fits = [
-            other
-            for other in view.in_room.get(room, ())
-            if view.category(other) in categories and _serves(view, other, needs.get(name, frozenset()))
-        ]
-        if fits:
-            domains[name] = [str(other) for other in rng.permutation(fits)]
-        elif not any(_liftable(category) for category in categories):
-            return {}, name
-    order = sorted(domains, key=lambda name: len(domains[name]))
-    found: dict[str, str] = {}
-    failed = _backtrack(order, domains, found, [0])
-    return found, failed
-
-
-def _backtrack(
-    order: list[str], domains: Mapping[str, list[str]], found: dict[str, str], steps: list[int]
-) -> str:
-    """Fill ``found``; returns the name that could not be served, or empty."""
-    if len(found) == len(order):
-        return ""
-    name = order[len(found)]
-    failed = name
-    for other in domains[name]:
-        steps[0] += 1
-        if other in found.values() or steps[0] > MAX_STEPS:
-            continue
-        found[name] = other
-        deeper = _backtrack(order, domains, found, steps)
-        if not deeper:
-            return ""
-        failed = deeper
-        del found[name]
-    return failed
-
-
-def _serves(view: SceneView, name: str, needs: Iterable[str]) -> bool:
-    asset = view.asset(name)
-    return all(bool(asset.interiors) if need == "container" else asset.can(need) for need in needs)
-
-
-def _liftable(category: str) -> bool:
-    catalog = Catalog.load()
-    try:
-        mass = catalog.category(category).mass_kg
-    except CatalogError:
-        return False
-    return any(is_liftable(model.size_m, mass) for model in catalog.models_of(category))
-
-
 def _in_order(
     problem: Problem,
     placed: Mapping[str, tuple[Relation, str]],
@@ -336,24 +221,37 @@ def _in_order(
     floors: Mapping[str, str],
     loose: Mapping[str, str],
 ) -> tuple[Addition, ...]:
-    """Additions such that each host is there before its guest."""
+    """Additions such that each host is there before its guest. What the start places nowhere may be anywhere."""
+    needs = needs_of(problem)
     additions: list[Addition] = []
     ready = {*found, *floors}
     waiting = _to_add(problem, ready)
     while waiting:
         name = next(
-            (name for name in waiting if name in loose or placed.get(name, (None, ""))[1] in ready), None
+            (name for name in waiting if name not in placed or placed[name][1] in ready or name in loose),
+            None,
         )
         if name is None:
             raise RefusedError(
                 RefusalReason.NO_PLACE_GIVEN,
-                f"the start does not say where {waiting[0]!r} is, in a room or at an object",
+                f"the start puts {waiting[0]!r} at {placed[waiting[0]][1]!r}, and says of neither where it is",
             )
         waiting.remove(name)
         ready.add(name)
-        where = (None, "", loose[name]) if name in loose else _place_of(placed[name], floors)
-        additions.append(Addition(name, problem.objects[name], *where))
+        at = placed.get(name) if name not in loose else None
+        where = _place_of(at, floors) if at else (None, "", loose.get(name, ""))
+        beside = _neighbours(problem, name, ready)
+        additions.append(Addition(name, problem.objects[name], *where, beside, needs.get(name, frozenset())))
     return tuple(additions)
+
+
+def _neighbours(problem: Problem, name: str, ready: Container[str]) -> tuple[str, ...]:
+    """Objects that are there before and that the start puts next to one, in either order."""
+    pairs = (
+        item.atom.args for item in problem.init if item.positive and item.atom.predicate == Relation.NEXTTO
+    )
+    others = (b if a == name else a for a, b in pairs if name in (a, b))
+    return tuple(dict.fromkeys(other for other in others if other in ready))
 
 
 def _to_add(problem: Problem, ready: Container[str]) -> list[str]:
@@ -371,9 +269,11 @@ def _to_add(problem: Problem, ready: Container[str]) -> list[str]:
 
 
 def _place_of(at: tuple[Relation, str], floors: Mapping[str, str]) -> tuple[Relation | None, str, str]:
-    """Relation, host and room of an addition; what the start puts on a floor only has a room."""
+    """Relation, host and room of an addition; what the start puts on a floor is on top of no object."""
     relation, host = at
-    return (None, "", floors[host]) if host in floors else (relation, host, "")
+    if host in floors:
+        return Relation.ONTOP, "", floors[host]
+    return (None, "", "") if relation is Relation.NEXTTO else (relation, host, "")
 
 
 def _robot_room(

@@ -6,15 +6,20 @@ import hashlib
 import math
 import re
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Protocol
 
 import numpy as np
 
-from embomatrix.factory.editor import PlacementError, SceneEditor
+from embomatrix.factory.assets.library import build_asset
+from embomatrix.factory.editor import SceneEditor
+from embomatrix.factory.layout.generator import lay
+from embomatrix.factory.layout.jobs import Item
+from embomatrix.factory.layout.values import LayoutRelation
 from embomatrix.factory.refusal import Refusal, RefusalReason, RefusedError
 from embomatrix.factory.task_import.binding import AGENT, FLOORS, bind
 from embomatrix.factory.task_import.reach import FUTURE, INSOURCE, REAL, pieces_of, profile_for
 from embomatrix.factory.task_import.scene import with_robot_in, with_states
+from embomatrix.factory.task_import.search import serves
 from embomatrix.factory.writer.tasks import object_table
 from embomatrix.factory.writer.view import SceneView, is_liftable
 from embomatrix.world.bddl import ROOM_TYPES, Literal, is_room_instance, parse_problem
@@ -26,6 +31,9 @@ from embomatrix.world.substances import MEANINGS, flows_from, is_substance
 from embomatrix.world.task import MAX_TABLE, Task, TaskCategory
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from embomatrix.factory.layout.jobs import Layout
     from embomatrix.factory.task_import.binding import Addition, Binding
     from embomatrix.factory.task_import.sources import SourceText
     from embomatrix.world.bddl import Problem
@@ -38,6 +46,14 @@ _ROOM_OR_TEXT: Final = re.compile(
     rf"(?:{'|'.join(sorted(ROOM_TYPES, key=len, reverse=True))})_\d+|.+?(?=(?:{'|'.join(sorted(ROOM_TYPES))})_\d|$)",
     re.IGNORECASE,
 )
+
+
+class Lay(Protocol):
+    """What puts a task's objects into a scene: ``layout.generator.lay``, or another method that it is compared with."""
+
+    def __call__(self, editor: SceneEditor, items: Sequence[Item], seed: int) -> Layout: ...
+
+
 MODEL_TRIES: Final = 5
 """Models of a type that are tried before it counts as not fitting its place."""
 KITCHEN: Final = frozenset({State.COOKED, State.FROZEN, State.HOT, State.SLICED, REAL})
@@ -58,13 +74,23 @@ class Imported:
     signature: str
 
 
-def import_problem(source: SourceText, base: Scene, *, seed: int = 0) -> Imported | Refusal:
-    """Bind a problem to a base scene. Raises BddlError when the text can't be read."""
+@dataclass(frozen=True, slots=True)
+class Manner:
+    """How problems are given scenes: by which method, and whether rooms get the furniture that they lack."""
+
+    lay: Lay = lay
+    furnishing: bool = True
+
+
+def import_problem(
+    source: SourceText, base: Scene, *, seed: int = 0, manner: Manner | None = None
+) -> Imported | Refusal:
+    """Bind a problem to a base scene and lay out what the scene lacks. Raises BddlError when the text can't be read."""
     problem = parse_problem(source.text)
     digest = hashlib.sha256(f"{seed} {base.scene_id} {source.text}".encode()).digest()
     rng = np.random.default_rng(np.random.SeedSequence(list(digest[:8])))
     try:
-        return _Binder(source, problem, base, rng, digest.hex()[:6]).imported()
+        return _Binder(source, problem, base, rng, digest.hex()[:6], manner or Manner()).imported()
     except RefusedError as error:
         return error.refusal
 
@@ -73,13 +99,20 @@ class _Binder:
     """One import. ``names`` grows from the found objects to all of the problem's."""
 
     def __init__(
-        self, source: SourceText, problem: Problem, base: Scene, rng: np.random.Generator, key: str
+        self,
+        source: SourceText,
+        problem: Problem,
+        base: Scene,
+        rng: np.random.Generator,
+        key: str,
+        manner: Manner,
     ) -> None:
         self._source = source
         self._problem = problem
         self._substances = {name: synset for name, synset in problem.objects.items() if is_substance(synset)}
         self._base = base
         self._rng = rng
+        self._manner = manner
         self._scene_id = f"{base.base}-{_slug(source.name)}-{key}"
         self._hosts = {
             atom.args[1].lstrip("?")
@@ -89,12 +122,10 @@ class _Binder:
         """Objects, and types that variables range over, on or in which something is or is to be."""
 
     def imported(self) -> Imported:
-        binding = bind(self._problem, self._base, self._rng)
+        binding = bind(self._problem, self._base, self._rng, furnishing=self._manner.furnishing)
         self._problem = binding.problem
-        editor = SceneEditor(self._base, self._rng)
-        names = dict(binding.found)
-        for addition in binding.additions:
-            names[addition.name] = self._add(editor, addition, names)
+        editor = SceneEditor(self._base)
+        names = {**binding.found, **self._laid(editor, binding)}
         for whole, halves in pieces_of(self._problem).items():
             names |= zip(halves, self._add_pieces(editor, names[whole], halves), strict=True)
         for floor in self._floors_asked_for():
@@ -121,17 +152,34 @@ class _Binder:
             if type_name in FLOORS and {name, type_name} & about
         )
 
-    def _add(self, editor: SceneEditor, addition: Addition, names: dict[str, str]) -> str:
-        host = names[addition.host] if addition.host else addition.room
-        reason = "its type has no model"
-        for model in self._models(addition)[:MODEL_TRIES]:
-            try:
-                return editor.add(model.category, model.model_id, addition.relation, host, room=addition.room)
-            except PlacementError as error:
-                reason = str(error)
-        raise RefusedError(
-            RefusalReason.DOES_NOT_FIT,
-            f"{addition.name!r} has no place {addition.relation or 'on the floor of'} {host}: {reason}",
+    def _laid(self, editor: SceneEditor, binding: Binding) -> dict[str, str]:
+        """Put all that the scene lacks into it; names in the scene."""
+        items = [self._item(addition, binding) for addition in binding.additions]
+        layout = self._manner.lay(editor, items, int(self._rng.integers(2**31)))
+        if layout.failures:
+            failure = layout.failures[0]
+            raise RefusedError(
+                RefusalReason.DOES_NOT_FIT,
+                f"{failure.thing!r} has no place {failure.relation} {failure.host}: {failure.detail}",
+            )
+        return dict(layout.names)
+
+    def _item(self, addition: Addition, binding: Binding) -> Item:
+        models = self._models(addition)[:MODEL_TRIES]
+        if not models:
+            raise RefusedError(
+                RefusalReason.DOES_NOT_FIT, f"{addition.name!r} has no place: its type has no model"
+            )
+        rooms = (addition.room,) if addition.room else tuple(dict.fromkeys(binding.rooms.values()))
+        demanded = addition.relation is not None
+        host = binding.found.get(addition.host, addition.host) or (addition.room if demanded else "")
+        return Item(
+            name=addition.name,
+            models=tuple((model.category, model.model_id) for model in models),
+            relation=LayoutRelation(addition.relation.value) if addition.relation else None,
+            host=host,
+            rooms=() if host or addition.beside else rooms,
+            beside=tuple(binding.found.get(other, other) for other in addition.beside),
         )
 
     def _add_pieces(self, editor: SceneEditor, whole: str, halves: tuple[str, ...]) -> tuple[str, ...]:
@@ -144,23 +192,38 @@ class _Binder:
             for model in catalog.models_of(category)
         ]
         model = min(models, key=lambda model: abs(math.prod(model.size_m) - half_m3))
-        return editor.add_pieces(whole, model.category, model.model_id, len(halves))
+        return editor.add_pieces(whole, build_asset(catalog, model.category, model.model_id), len(halves))
 
     def _size_of(self, editor: SceneEditor, name: str) -> Vec3:
         category, _, model = editor.objects[name].asset_id.rpartition("-")
         return Catalog.load().model(category, model).size_m
 
     def _models(self, addition: Addition) -> list[Model]:
-        """Models of the type: liftable ones first; large ones for what must hold others, else small ones."""
+        """Models of the type that can do what is asked: liftable ones first, then furniture of a middling size.
+
+        Of what can be lifted large ones come first where it must hold others, else small ones.
+        """
         catalog = Catalog.load()
+        models = [
+            (model, catalog.category(category).mass_kg)
+            for category in catalog.categories_of(addition.type)
+            for model in catalog.models_of(category)
+        ]
+        if not models:
+            return []
+        holds = addition.name in self._hosts or addition.type in self._hosts
+        middling = float(np.median([math.prod(model.size_m) for model, _ in models]))
         ranked: list[tuple[bool, float, Model]] = []
-        for category in catalog.categories_of(addition.type):
-            mass = catalog.category(category).mass_kg
-            for model in catalog.models_of(category):
-                volume = math.prod(model.size_m) * float(self._rng.uniform(0.7, 1.4))
-                holds = addition.name in self._hosts or addition.type in self._hosts
-                ranked.append((not is_liftable(model.size_m, mass), -volume if holds else volume, model))
-        return [model for _, _, model in sorted(ranked, key=lambda item: item[:2])]
+        for model, mass in models:
+            volume = math.prod(model.size_m) * float(self._rng.uniform(0.7, 1.4))
+            stays = not is_liftable(model.size_m, mass)
+            worth = abs(math.log(volume / middling)) if stays else -volume if holds else volume
+            ranked.append((stays, worth, model))
+        order = [model for _, _, model in sorted(ranked, key=lambda item: item[:2])]
+        return [model for model in order[: 4 * MODEL_TRIES] if self._serves(model, addition)]
+
+    def _serves(self, model: Model, addition: Addition) -> bool:
+        return serves(build_asset(Catalog.load(), model.category, model.model_id), addition.needs)
 
     def _task(
         self, scene: Scene, names: dict[str, str], binding: Binding, start: tuple[Literal, ...]

@@ -2,29 +2,32 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.editor import PlacementError, SceneEditor
+from embomatrix.factory.editor import SceneEditor
+from embomatrix.factory.layout.generator import lay
+from embomatrix.factory.layout.jobs import Item
 from embomatrix.factory.scenes.joints import bumped_into
 from embomatrix.factory.scenes.solids import Solids, placed_parts
-from embomatrix.factory.writer.tables import BASKETS, MEMBERS, Group, groups_for, suits
+from embomatrix.factory.writer.tables import BASKETS, MEMBERS, Group, groups_for
 from embomatrix.factory.writer.view import SceneView, is_liftable
 from embomatrix.world.catalog import Catalog
-from embomatrix.world.state import Relation, State
+from embomatrix.world.state import State
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     import numpy as np
 
-    from embomatrix.world.scene import Room, Scene
+    from embomatrix.factory.layout.jobs import LayoutAgents
+    from embomatrix.world.scene import Scene
 
 THINGS: Final = 12
 """Small things that a variant adds, over all its rooms."""
 TRIES: Final = 3
-"""Hosts that are tried for one thing before it is left out."""
-INSIDE_SHARE: Final = 0.3
+"""Models that are tried for one thing before it is left out."""
 BASKET_SHARE: Final = 0.5
 OPEN_SHARE: Final = 0.2
 ON_SHARE: Final = 0.3
@@ -39,64 +42,38 @@ class Variant:
     added: tuple[str, ...]
 
 
-def build_variant(base: Scene, rooms: Sequence[str], scene_id: str, rng: np.random.Generator) -> Variant:
+def build_variant(
+    base: Scene,
+    rooms: Sequence[str],
+    scene_id: str,
+    rng: np.random.Generator,
+    agents: LayoutAgents | None = None,
+) -> Variant:
     """Put small things about in these rooms of a base scene. The same generator state gives the same variant."""
-    editor = SceneEditor(base, rng)
+    editor = SceneEditor(base)
     view = SceneView(base)
-    added: list[str] = []
-    by_name = {room.name: room for room in base.rooms}
-    for name in rooms:
-        added += _add_basket(editor, view, by_name[name], rng)
-        share = max(4, round(THINGS / len(rooms)))
-        added += _add_things(editor, view, by_name[name], share, rng)
+    items = _things(view, rooms, rng)
+    layout = lay(editor, items, int(rng.integers(2**31)), agents)
     _set_doors_and_lights(editor, view, rooms, rng)
-    return Variant(editor.freeze(scene_id), tuple(rooms), tuple(added))
+    added = tuple(layout.names[item.name] for item in items if item.name in layout.names)
+    return Variant(editor.freeze(scene_id), tuple(rooms), added)
 
 
-def _add_basket(editor: SceneEditor, view: SceneView, room: Room, rng: np.random.Generator) -> list[str]:
-    if rng.random() >= BASKET_SHARE:
-        return []
-    category = BASKETS[int(rng.integers(len(BASKETS)))]
-    surfaces = [name for name in view.in_room[room.name] if view.is_surface(name)]
-    hosts: list[str] = [str(host) for host in rng.permutation(surfaces)[:1]] if surfaces else []
-    for host in (*hosts, room.name):
-        relation = None if host == room.name else Relation.ONTOP
-        try:
-            return [editor.add(category, _model(category, rng), relation, host, room=room.name)]
-        except PlacementError:
-            continue
-    return []
+def _things(view: SceneView, rooms: Sequence[str], rng: np.random.Generator) -> list[Item]:
+    """What goes into the rooms: a basket now and then, and things that suit them, each of another category than what is there.
 
-
-def _add_things(
-    editor: SceneEditor, view: SceneView, room: Room, count: int, rng: np.random.Generator
-) -> list[str]:
-    """Things that suit the room, each of another category than what is there, so that words can tell them apart."""
-    names = view.in_room[room.name]
-    surfaces = [name for name in names if view.is_surface(name)]
-    containers = [name for name in names if view.is_container(name)]
-    present = {view.category(name) for name in names}
-    added: list[str] = []
-    for category in _categories(room.type, rng):
-        if len(added) >= count or not (surfaces or containers):
-            break
-        if category in present:
-            continue
-        fit_surfaces, fit_containers = (
-            [host for host in hosts if suits(category, view.category(host))]
-            for hosts in (surfaces, containers)
-        )
-        for _ in range(TRIES if fit_surfaces or fit_containers else 0):
-            inside = bool(fit_containers) and (not fit_surfaces or rng.random() < INSIDE_SHARE)
-            pool = fit_containers if inside else fit_surfaces
-            host = pool[int(rng.integers(len(pool)))]
-            relation = Relation.INSIDE if inside else Relation.ONTOP
-            try:
-                added.append(editor.add(category, _model(category, rng), relation, host, room=room.name))
-            except PlacementError:
-                continue
-            break
-    return added
+    So words can tell them apart. Which of the rooms a thing goes to is not decided here.
+    """
+    types = {room.name: room.type for room in view.scene.rooms}
+    present = {view.category(name) for room in rooms for name in view.in_room[room]}
+    chosen: dict[str, tuple[str, ...]] = {}
+    for room in rooms:
+        if rng.random() < BASKET_SHARE:
+            chosen.setdefault(BASKETS[int(rng.integers(len(BASKETS)))], (room,))
+        share = max(4, round(THINGS / len(rooms)))
+        fresh = (name for name in _categories(types[room], rng) if name not in present | chosen.keys())
+        chosen |= dict.fromkeys(itertools.islice(fresh, share), tuple(rooms))
+    return [Item(name, _models(name, rng), rooms=where) for name, where in chosen.items()]
 
 
 def _categories(room_type: str, rng: np.random.Generator) -> list[str]:
@@ -113,12 +90,12 @@ def _categories(room_type: str, rng: np.random.Generator) -> list[str]:
     return order
 
 
-def _model(category: str, rng: np.random.Generator) -> str:
-    """A model that the robot can carry."""
+def _models(category: str, rng: np.random.Generator) -> tuple[tuple[str, str], ...]:
+    """Models that the robot can carry, in random order."""
     catalog = Catalog.load()
     mass = catalog.category(category).mass_kg
     models = [model for model in catalog.models_of(category) if is_liftable(model.size_m, mass)]
-    return models[int(rng.integers(len(models)))].model_id
+    return tuple((category, models[index].model_id) for index in rng.permutation(len(models))[:TRIES])
 
 
 def _set_doors_and_lights(

@@ -1,0 +1,193 @@
+"""What each constraint on a plane means, over whole arrays of candidate spots.
+
+All is in the plane's frame: origin in its middle, x and y along its sides. A thing's front looks along its own +x.
+Weights are those of the paper's released planar level, which gets three of the meanings wrong. Here a thing faces another
+when its front looks at it, near and far are told by gaps that suit the plane, and the middle counts.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from embomatrix.factory.layout.values import Arrangement
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from embomatrix.factory.layout.values import Footprint, Size2, Size3, Wish
+
+    FloatArray = NDArray[np.float64]
+    BoolArray = NDArray[np.bool_]
+
+WEIGHTS: Final[Mapping[Arrangement, float]] = {
+    Arrangement.EDGE: 2.0,
+    Arrangement.MIDDLE: 1.0,
+    Arrangement.NEAR: 0.5,
+    Arrangement.FAR: 0.5,
+    Arrangement.IN_FRONT_OF: 0.5,
+    Arrangement.SIDE_OF: 0.5,
+    Arrangement.CENTER_ALIGNED: 1.5,
+    Arrangement.FACE_TO: 1.5,
+    Arrangement.NEXT_TO: 1.5,
+}
+EDGE_M: Final = 0.10
+EDGE_SHARE: Final = 0.15
+"""At the edge is within 10 cm of a side, on small planes within this share of the shorter side."""
+MIDDLE_SHARE: Final = 0.15
+"""In the middle is within this share of each side from the plane's middle."""
+NEAR_M: Final = 1.0
+NEAR_SHARE: Final = 0.25
+"""Near is a gap of a metre at most, on small planes of this share of the diagonal; far is anything more."""
+FACE_RAD: Final = math.radians(5.0)
+ALIGNED_RAD: Final = math.radians(5.0)
+FRONT_RAD: Final = math.radians(45.0)
+NEXT_SHARE: Final = 1 / 6
+NEXT_M: Final = (0.05, 0.5)
+"""The engine's rule for ``nextto``: a sixth of the mean of the six extents, within these bounds."""
+NEXT_SLACK: Final = 0.8
+"""Round things are farther apart than their boxes: only this much of what the engine allows is used."""
+SHADE: Final = 0.3
+"""How much of a weight is given by degrees, so that what is nearly so counts for more than what is not at all."""
+
+
+@dataclass(frozen=True, slots=True)
+class Candidates:
+    """n spots of one thing: middles (n, 2), yaws (n,), and half extents (n, 2) of the box around the turned footprint."""
+
+    center: FloatArray
+    yaw: FloatArray
+    half: FloatArray
+
+    @staticmethod
+    def of(center: FloatArray, yaw: FloatArray, size_m: Size3) -> Candidates:
+        """Spots of a thing of this size."""
+        return Candidates(center, yaw, half_extents(yaw, (size_m[0], size_m[1])))
+
+    def at(self, rows: FloatArray | BoolArray | NDArray[np.int64]) -> Candidates:
+        return Candidates(self.center[rows], self.yaw[rows], self.half[rows])
+
+    def __len__(self) -> int:
+        return len(self.yaw)
+
+
+def half_extents(yaw: FloatArray, size_m: Size2) -> FloatArray:
+    """Half extents, shape (n, 2), of the upright boxes around a rectangle turned by each of n yaws."""
+    cosine, sine = np.abs(np.cos(yaw)), np.abs(np.sin(yaw))
+    x, y = size_m[0] / 2, size_m[1] / 2
+    return np.stack([cosine * x + sine * y, sine * x + cosine * y], axis=-1)
+
+
+def margins(spots: Candidates, plane_m: Size2) -> FloatArray:
+    """Free strip between each spot and the nearest side of the plane, shape (n,); negative where it juts out."""
+    return np.asarray((np.asarray(plane_m) / 2 - np.abs(spots.center) - spots.half).min(axis=1))
+
+
+def gaps(spots: Candidates, other: Footprint) -> FloatArray:
+    """Distance between the boxes around each spot and around another footprint, shape (n,); 0 where they overlap."""
+    apart = np.abs(spots.center - np.asarray(other.center_m)) - spots.half - _half(other)
+    return np.asarray(np.hypot(*np.maximum(apart, 0.0).T))
+
+
+def near_m(plane_m: Size2) -> float:
+    return min(NEAR_M, NEAR_SHARE * math.hypot(*plane_m))
+
+
+def holds(wish: Wish, spots: Candidates, plane_m: Size2, size_m: Size3, other: Footprint | None) -> BoolArray:
+    """At which spots a wish holds, shape (n,). A wish about an object that is not on the plane holds nowhere."""
+    if wish.kind is Arrangement.EDGE:
+        return margins(spots, plane_m) <= min(EDGE_M, EDGE_SHARE * min(plane_m))
+    if wish.kind is Arrangement.MIDDLE:
+        return np.asarray((np.abs(spots.center) <= MIDDLE_SHARE * np.asarray(plane_m)).all(axis=1))
+    if other is None:
+        return np.zeros(len(spots), dtype=bool)
+    match wish.kind:
+        case Arrangement.NEAR:
+            return np.asarray(gaps(spots, other) <= near_m(plane_m))
+        case Arrangement.FAR:
+            return np.asarray(gaps(spots, other) > near_m(plane_m))
+        case Arrangement.NEXT_TO:
+            return _beside(spots, size_m, other)
+        case Arrangement.IN_FRONT_OF:
+            return np.asarray(_off_front(spots, other) <= FRONT_RAD)
+        case Arrangement.SIDE_OF:
+            angle = _off_front(spots, other)
+            return np.asarray((angle > FRONT_RAD) & (angle < math.pi - FRONT_RAD))
+        case Arrangement.FACE_TO:
+            return np.asarray(_off_gaze(spots, other) <= FACE_RAD)
+        case _:
+            return np.asarray(_off_axis(spots, other) <= ALIGNED_RAD)
+
+
+def degrees(
+    wish: Wish, spots: Candidates, plane_m: Size2, size_m: Size3, other: Footprint | None
+) -> FloatArray:
+    """How far a wish is met, from 0 to 1, shape (n,): falls off gently where it does not hold."""
+    if wish.kind is Arrangement.EDGE:
+        return np.asarray(np.exp(-np.maximum(margins(spots, plane_m), 0.0) / (0.25 * max(plane_m))))
+    if wish.kind is Arrangement.MIDDLE:
+        return np.asarray(1.0 - np.hypot(*(spots.center / np.asarray(plane_m)).T) * math.sqrt(2))
+    if other is None:
+        return np.zeros(len(spots))
+    match wish.kind:
+        case Arrangement.NEAR | Arrangement.NEXT_TO:
+            return np.asarray(np.exp(-gaps(spots, other) / near_m(plane_m)))
+        case Arrangement.FAR:
+            return np.asarray(1.0 - np.exp(-gaps(spots, other) / near_m(plane_m)))
+        case Arrangement.IN_FRONT_OF:
+            return np.asarray((1.0 + np.cos(_off_front(spots, other))) / 2)
+        case Arrangement.SIDE_OF:
+            return np.asarray(np.abs(np.sin(_off_front(spots, other))))
+        case Arrangement.FACE_TO:
+            return np.asarray((1.0 + np.cos(_off_gaze(spots, other))) / 2)
+        case _:
+            return np.asarray(np.cos(_off_axis(spots, other)) ** 8)
+
+
+def next_to_m(size_m: Size3, other: Footprint) -> float:
+    """The largest gap at which the engine calls two boxes next to each other."""
+    mean = (sum(size_m) + sum(other.size_m) + other.high_m - other.low_m) / 6
+    return min(max(NEXT_SHARE * mean, NEXT_M[0]), NEXT_M[1])
+
+
+def _beside(spots: Candidates, size_m: Size3, other: Footprint) -> BoolArray:
+    """Side by side: their heights overlap, they face each other along one axis, and the gap is small."""
+    if other.low_m >= size_m[2] or other.high_m <= 0.0:
+        return np.zeros(len(spots), dtype=bool)
+    apart = np.abs(spots.center - np.asarray(other.center_m)) - spots.half - _half(other)  # (n, 2)
+    across = np.abs(spots.center - np.asarray(other.center_m)) <= np.maximum(spots.half, _half(other))
+    faces = (across[:, 0] & (apart[:, 1] >= 0)) | (across[:, 1] & (apart[:, 0] >= 0))
+    return np.asarray(faces & (gaps(spots, other) <= NEXT_SLACK * next_to_m(size_m, other)))
+
+
+def _off_front(spots: Candidates, other: Footprint) -> FloatArray:
+    """Angle, 0 to pi, between where another's front looks and the way from it to each spot."""
+    way = spots.center - np.asarray(other.center_m)
+    return _turn(np.arctan2(way[:, 1], way[:, 0]) - other.yaw)
+
+
+def _off_gaze(spots: Candidates, other: Footprint) -> FloatArray:
+    """Angle, 0 to pi, between where the thing's own front looks and the way to another's middle."""
+    way = np.asarray(other.center_m) - spots.center
+    return _turn(np.arctan2(way[:, 1], way[:, 0]) - spots.yaw)
+
+
+def _off_axis(spots: Candidates, other: Footprint) -> FloatArray:
+    """Angle, 0 to pi/4, between the way from another to each spot and the nearest of the other's four axes."""
+    way = spots.center - np.asarray(other.center_m)
+    angle = np.arctan2(way[:, 1], way[:, 0]) - other.yaw
+    quarter = math.pi / 2
+    return np.asarray(np.abs((angle + quarter / 2) % quarter - quarter / 2))
+
+
+def _turn(angle: FloatArray) -> FloatArray:
+    return np.asarray(np.abs((angle + math.pi) % (2 * math.pi) - math.pi))
+
+
+def _half(other: Footprint) -> FloatArray:
+    return half_extents(np.asarray(other.yaw), other.size_m)

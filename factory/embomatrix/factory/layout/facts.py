@@ -1,0 +1,115 @@
+"""What agents are told of a scene: its rooms, and what furniture can hold, where and how much."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.factory.layout.organization import HIGHEST_M, LOWEST_M
+from embomatrix.factory.layout.values import HostFacts, HostOffer, LayoutRelation, RoomFacts
+from embomatrix.factory.writer.tables import HOST_GROUPS
+from embomatrix.sim.candidates import EDGE_M, surfaces_for
+from embomatrix.world.state import Relation
+
+if TYPE_CHECKING:
+    from collections.abc import Container, Iterator
+
+    from embomatrix.factory.editor import SceneEditor
+    from embomatrix.world.asset import Asset
+
+OFFERED: Final = (LayoutRelation.ONTOP, LayoutRelation.INSIDE, LayoutRelation.UNDER)
+LEAST_M: Final = 0.08
+"""Spaces that are narrower hold nothing that is worth telling."""
+LOW_SKIRT_M: Final = 0.05
+"""Things go under what leaves this much over the floor."""
+
+
+def rooms_of(editor: SceneEditor) -> tuple[RoomFacts, ...]:
+    """All rooms of the scene, with the categories of what stands in them."""
+    furniture: dict[str, list[str]] = {name: [] for name in editor.rooms}
+    for item in editor.objects.values():
+        if item.fixed:
+            furniture.setdefault(item.room, []).append(editor.asset_of(item.name).category)
+    return tuple(
+        RoomFacts(name, room.type, room.size_m, tuple(sorted(furniture[name])))
+        for name, room in editor.rooms.items()
+    )
+
+
+def hosts_in(editor: SceneEditor, room: str, named: Container[str] = ()) -> tuple[HostFacts, ...]:
+    """What could hold things in a room: furniture that people put things on or in, and objects that the task names.
+
+    Left out is what the robot can't get at.
+    """
+    guests: dict[str, list[str]] = {}
+    for item in editor.objects.values():
+        if item.host:
+            guests.setdefault(item.host, []).append(editor.asset_of(item.name).category)
+    return tuple(_hosts(editor, room, named, guests))
+
+
+def _hosts(
+    editor: SceneEditor, room: str, named: Container[str], guests: dict[str, list[str]]
+) -> Iterator[HostFacts]:
+    for item in editor.objects.values():
+        asset = editor.asset_of(item.name)
+        if item.name not in named:
+            nobody = HOST_GROUPS.get(asset.category) == frozenset()
+            if item.room != room or not item.fixed or nobody or editor.is_unserved(item.name):
+                continue
+        offers = _offers(asset, round(item.pose_world_asset.position_m[2], 3), asked=item.name in named)
+        if offers:
+            shut = any(interior.closed_by for interior in asset.interiors)
+            yield HostFacts(item.name, asset.category, offers, tuple(guests.get(item.name, ())), shut)
+
+
+def _offers(asset: Asset, base_m: float, *, asked: bool) -> tuple[HostOffer, ...]:
+    found = (_offer(asset, relation, base_m) for relation in OFFERED)
+    return tuple(
+        offer
+        for offer in found
+        if offer is not None and (asked or (bool(asset.supports) and LOWEST_M <= offer.height_m <= HIGHEST_M))
+    )
+
+
+def _spaces(asset: Asset, relation: LayoutRelation) -> tuple[tuple[float, float, float, float], ...]:
+    """Extents along x and y, free height, and height in the asset's frame, of each space that a relation offers."""
+    return tuple(
+        (
+            surface.size_m[0] - 2 * EDGE_M,
+            surface.size_m[1] - 2 * EDGE_M,
+            surface.clearance_m - EDGE_M if math.isfinite(surface.clearance_m) else 9.0,
+            surface.center_m[2],
+        )
+        for surface in surfaces_for(asset, Relation(relation.value))
+        if min(surface.size_m) >= LEAST_M
+    )
+
+
+def _offer(asset: Asset, relation: LayoutRelation, base_m: float) -> HostOffer | None:
+    spaces = _spaces(asset, relation)
+    if relation is LayoutRelation.UNDER and _skirt_m(asset) < LOW_SKIRT_M:
+        return None
+    reachable = [
+        space for space in spaces if relation is LayoutRelation.UNDER or base_m + space[3] <= HIGHEST_M
+    ]
+    if not reachable:
+        return None
+    # Low shelves of tall furniture are no reason to leave out the higher ones.
+    heights = [base_m + space[3] for space in reachable]
+    height = min((h for h in heights if h >= LOWEST_M), default=min(heights))
+    return HostOffer(relation, tuple((x, y, high) for x, y, high, _ in reachable), round(height, 3))
+
+
+def _skirt_m(asset: Asset) -> float:
+    """Free height in the middle below an asset's base."""
+    low = -asset.size_m[2] / 2
+    over = [
+        part.pose.position_m[2] - part.size_m[2] / 2 - low
+        for part in asset.links[0].parts
+        if all(
+            abs(middle) <= extent / 2
+            for middle, extent in zip(part.pose.position_m[:2], part.size_m[:2], strict=True)
+        )
+    ]
+    return min(over, default=0.0)

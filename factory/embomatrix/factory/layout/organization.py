@@ -1,0 +1,160 @@
+"""Room-level Organization Agent, by rules: what each thing of a room stands on, in or under, as a layout tree.
+
+Hosts are filtered by footprint, height and free height, as in the paper; what is left is ranked by where people keep such
+things, by how much stands there already, and by what has failed before.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from embomatrix.factory.furnish.hosts import NO_HOSTS, kept_behind_doors
+from embomatrix.factory.layout.customs import likes, on_appliance
+from embomatrix.factory.layout.tree import LayoutTree
+from embomatrix.factory.layout.values import MEANS, Branch, Kind, LayoutRelation, Means
+from embomatrix.factory.writer.tables import suits
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+    from embomatrix.factory.layout.values import Failure, HostFacts, HostOffer, RoomBrief, Size3, Thing
+
+HIGHEST_M: Final = 1.5
+"""Nothing is put higher than this: the paper's bound."""
+LOWEST_M: Final = 0.15
+"""Furniture surfaces lower than this are floor."""
+LIKED: Final = 1.2
+LIKED_STEP: Final = 0.12
+"""What a thing's favourite furniture is worth, and how much less each next one."""
+STRANGE: Final = 0.2
+"""Of furniture that nothing is known about."""
+UNLIKED: Final = -0.6
+"""Of furniture that people put nothing down on unless they must."""
+UNSUITED: Final = -2.0
+FLOOR: Final = -2.5
+"""Of the floor, for what does not belong there."""
+_FLOOR_GOODS: Final = (
+    "wicker_basket storage_box bucket hamper shopping_basket carton toolbox toy_box suitcase backpack duffel_bag "
+    "tote_bag ashcan recycling_bin trash_can plastic_bin broom mop vacuum watering_can basketball soccer_ball cage "
+    "cooler crate"
+)
+FLOOR_GOODS: Final = frozenset(_FLOOR_GOODS.split())
+"""What people put on the floor."""
+SHUT: Final = -0.5
+"""Things lie in the open rather than behind doors, unless that is where they are kept."""
+CROWD: Final = 0.12
+COMPANY: Final = 0.35
+"""Equal things stand together."""
+CHANCE: Final = 0.45
+
+
+def organize(brief: RoomBrief) -> LayoutTree:
+    """A layout tree that holds every thing of the brief for which any host is left; hosts hang on the floor, the root."""
+    rng = np.random.default_rng((brief.seed, len(brief.failures), 7))
+    guests = {host.name: Counter(host.guests) for host in brief.hosts}
+    hung: dict[str, Branch] = {
+        host.name: Branch(brief.room.name, LayoutRelation.ONTOP, host.name) for host in brief.hosts
+    }
+    for thing in in_order(brief.things):
+        options = list(choices(brief, thing, hung))
+        if not options:
+            continue
+        worths = [_worth(brief, thing, branch, guests) for branch in options]
+        best = options[int(np.argmax(np.asarray(worths) + CHANCE * rng.random(len(options))))]
+        hung[thing.name] = best
+        guests.setdefault(best.parent, Counter())[thing.category] += 1
+    return LayoutTree.of(brief.room.name, hung.values())
+
+
+def in_order(things: Sequence[Thing]) -> list[Thing]:
+    """Things such that each comes after what the task puts it at, as far as that is one of them; the given order else."""
+    order: list[Thing] = []
+    waiting = list(things)
+    while waiting:
+        names = {thing.name for thing in waiting}
+        ready = next((thing for thing in waiting if not names & {thing.host, *thing.beside}), waiting[0])
+        waiting.remove(ready)
+        order.append(ready)
+    return order
+
+
+def choices(brief: RoomBrief, thing: Thing, hung: Mapping[str, Branch]) -> Iterator[Branch]:
+    """Branches that a thing may hang on: what the task demands, else every host that has room for it; none that failed.
+
+    ``hung`` are the branches of the tree so far, by child.
+    """
+    failed = {(item.host, item.relation) for item in brief.failures if item.thing == thing.name}
+    for branch in _open_choices(brief, thing, hung):
+        here = branch.parent == brief.room.name or branch.parent in hung
+        if here and (branch.parent, branch.relation) not in failed:
+            yield branch
+
+
+def _open_choices(brief: RoomBrief, thing: Thing, hung: Mapping[str, Branch]) -> Iterator[Branch]:
+    floor = Branch(brief.room.name, LayoutRelation.ONTOP, thing.name)
+    if thing.relation is not None:
+        if MEANS[thing.relation] is not Means.NONE:
+            yield Branch(thing.host or brief.room.name, thing.relation, thing.name)
+        return
+    beside = next((hung[other] for other in thing.beside if other in hung), None)
+    if beside is not None:
+        yield replace(beside, child=thing.name)
+        return
+    if thing.kind in (Kind.HUNG, Kind.OVERHEAD):
+        yield replace(floor, relation=LayoutRelation.ATTACHED)
+        return
+    if thing.kind is Kind.GOODS:
+        for host in brief.hosts:
+            for offer in host.offers:
+                if offer.relation is not LayoutRelation.UNDER and takes(offer, thing.size_m):
+                    yield Branch(host.name, offer.relation, thing.name)
+    yield floor
+
+
+def takes(offer: HostOffer, size_m: Size3) -> bool:
+    """Whether any space of an offer is larger than a thing, turned either way, and no higher than things are put."""
+    if not LOWEST_M <= offer.height_m <= HIGHEST_M:
+        return False
+    short, long = sorted(size_m[:2])
+    return any(
+        short <= min(space[:2]) and long <= max(space[:2]) and size_m[2] <= space[2]
+        for space in offer.spaces_m
+    )
+
+
+def _worth(brief: RoomBrief, thing: Thing, branch: Branch, guests: Mapping[str, Counter[str]]) -> float:
+    host = next((item for item in brief.hosts if item.name == branch.parent), None)
+    if host is None:
+        return LIKED if thing.kind is not Kind.GOODS or thing.category in FLOOR_GOODS else FLOOR
+    there = guests[host.name]
+    crowd = CROWD * sum(there.values()) - COMPANY * (there[thing.category] > 0)
+    tired = sum(item.host == host.name for item in brief.failures)
+    return liking(thing.category, host, branch.relation) - crowd - 0.5 * tired
+
+
+def liking(category: str, host: HostFacts, relation: LayoutRelation) -> float:
+    """How much people would have such a thing there."""
+    if category in FLOOR_GOODS or not suits(category, host.category):
+        return UNSUITED
+    wanted = likes(category)
+    if relation is LayoutRelation.ONTOP and on_appliance(host.category):
+        worth = UNLIKED
+    elif host.category in wanted:
+        worth = LIKED - LIKED_STEP * wanted.index(host.category)
+    else:
+        worth = UNLIKED if host.category in NO_HOSTS else STRANGE
+    if relation is LayoutRelation.INSIDE and not kept_behind_doors(category, host.category):
+        worth += UNLIKED if on_appliance(host.category) and host.category not in wanted else SHUT
+    return worth
+
+
+def described(failures: Sequence[Failure]) -> str:
+    """What has failed, a line each, for people and models."""
+    return "\n".join(
+        f"- {item.thing} {item.relation.value} {item.host}: {item.reason.value}, {item.detail}"
+        for item in failures
+    )

@@ -1,0 +1,278 @@
+"""Planar-Level Placement Generator: several things on one plane, by a grid of spots and a beam search.
+
+Two constraints are hard, as in the paper: a thing meets nothing, and the robot can stand where it reaches it. Required wishes
+are hard as well; the others add their weights to a score. Boxes around turned footprints stand for the things: what is found
+free is free, what is found taken may not be.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from embomatrix.factory.layout.arrangement import (
+    SHADE,
+    WEIGHTS,
+    Candidates,
+    degrees,
+    gaps,
+    half_extents,
+    holds,
+    margins,
+)
+from embomatrix.factory.layout.values import (
+    ABOUT_THE_PLANE,
+    Arranged,
+    Arrangement,
+    Footprint,
+    LayoutReason,
+    PlaneBrief,
+    PlaneThing,
+    Spot,
+)
+from embomatrix.skills.limits import ROBOT
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from embomatrix.factory.layout.arrangement import BoolArray, FloatArray
+    from embomatrix.factory.layout.values import Size2
+
+BEAMS: Final = 3
+BRANCHES: Final = 6
+RESULTS: Final = 8
+SURFACE_CELLS: Final = 900
+FLOOR_CELLS: Final = 1800
+STEP_M: Final = (0.01, 0.05)
+"""Finest step of the grid on furniture and on floors; large planes take coarser ones, of at most these many cells."""
+GAP_M: Final = 0.01
+"""Free strip around a thing."""
+COMFORT_M: Final = 0.06
+COMFORT: Final = 0.3
+"""Things that are this far from one another and from the rim are worth this much more than those that touch."""
+FRONT: Final = 0.4
+"""What it is worth that a thing looks where its furniture looks, or lies along it."""
+BACK: Final = 1.5
+"""What it is worth that furniture has its back to the nearest wall."""
+CHANCE: Final = 0.25
+"""Scores vary by this much, so that not every table looks the same."""
+LEFT_OUT: Final = 6.0
+"""A thing without a spot costs more than any wish."""
+BATCH: Final = 96
+"""Spots whose reach is looked at together, the best first."""
+SCANNED: Final = 12 * BATCH
+TURNS: Final = (0.0, math.pi / 2, math.pi, -math.pi / 2)
+REACH_M: Final = ROBOT.reach_m - 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class _Beam:
+    spots: tuple[Spot, ...] = ()
+    footprints: tuple[Footprint, ...] = ()
+    score: float = 0.0
+    left_out: tuple[tuple[str, LayoutReason], ...] = ()
+
+
+def arrange(brief: PlaneBrief) -> tuple[Arranged, ...]:
+    """Joint arrangements of the brief's things, the best first; each says what it left out. At least one."""
+    grown = [_Beam()]
+    for thing in _in_order(brief.things):
+        grown = sorted(
+            (child for beam in grown[:BEAMS] for child in _grown(brief, thing, beam)),
+            key=lambda beam: -beam.score,
+        )
+    return tuple(Arranged(beam.spots, beam.score, dict(beam.left_out)) for beam in grown[:RESULTS])
+
+
+def _in_order(things: Sequence[PlaneThing]) -> list[PlaneThing]:
+    """The largest first, but none before what its wishes are about."""
+    waiting = sorted(things, key=lambda thing: -thing.size_m[0] * thing.size_m[1])
+    order: list[PlaneThing] = []
+    while waiting:
+        left = {thing.name for thing in waiting}
+        ready = next(
+            (
+                thing
+                for thing in waiting
+                if not any(wish.other in left - {thing.name} for wish in thing.wishes)
+            ),
+            waiting[0],
+        )
+        waiting.remove(ready)
+        order.append(ready)
+    return order
+
+
+def _grown(brief: PlaneBrief, thing: PlaneThing, beam: _Beam) -> list[_Beam]:
+    """The beam with the thing at each of its best spots, or without it."""
+    search = _Search(brief, thing, beam.footprints)
+    found = search.best()
+    if isinstance(found, LayoutReason):
+        return [replace(beam, score=beam.score - LEFT_OUT, left_out=(*beam.left_out, (thing.name, found)))]
+    return [
+        _Beam(
+            (*beam.spots, spot),
+            (*beam.footprints, search.footprint(spot)),
+            beam.score + score,
+            beam.left_out,
+        )
+        for spot, score in found
+    ]
+
+
+class _Search:
+    """The spots of one thing, given where the others are."""
+
+    def __init__(self, brief: PlaneBrief, thing: PlaneThing, placed: tuple[Footprint, ...]) -> None:
+        self._brief = brief
+        self._thing = thing
+        self._others = {item.name: item for item in (*brief.obstacles, *placed)}
+        self._rng = np.random.default_rng((brief.seed, len(placed), 11))
+
+    def footprint(self, spot: Spot) -> Footprint:
+        x, y, height = self._thing.size_m
+        return Footprint(self._thing.name, spot.center_m, spot.yaw, (x, y), 0.0, height)
+
+    def best(self) -> list[tuple[Spot, float]] | LayoutReason:
+        """The best spots with their scores, apart from one another; the reason where there is none."""
+        spots = self._candidates()
+        spots = spots.at(margins(spots, self._brief.size_m) >= self._brief.rim_m - 1e-9)
+        if not len(spots):
+            return LayoutReason.TOO_LARGE
+        spots = spots.at(~self._taken(spots))
+        if not len(spots):
+            return LayoutReason.NO_FREE_SPOT
+        held = [self._holds(number, spots) for number in range(len(self._thing.wishes))]
+        needed = [row for row, wish in zip(held, self._thing.wishes, strict=True) if wish.required]
+        if needed:
+            fits = np.logical_and.reduce(needed)
+            spots, held = spots.at(fits), [row[fits] for row in held]
+        if not len(spots):
+            return LayoutReason.RELATION_NOT_HELD
+        return self._chosen(spots, held, self._scores(spots, held))
+
+    def _candidates(self) -> Candidates:
+        """Grid points, with lines through the middles of what wishes are about, at all turns; gazes at what is to be faced."""
+        brief = self._brief
+        width, depth = brief.size_m
+        most = FLOOR_CELLS if brief.on_floor else SURFACE_CELLS
+        step = max(STEP_M[brief.on_floor], math.sqrt(width * depth / most))
+        about = [self._others[w.other] for w in self._thing.wishes if w.other in self._others]
+        xs, ys = (
+            np.unique(np.concatenate([_line(extent, step), [item.center_m[axis] for item in about]]))
+            for axis, extent in enumerate((width, depth))
+        )
+        points = np.stack(np.meshgrid(xs, ys, indexing="ij"), axis=-1).reshape(-1, 2)  # (k, 2)
+        gazes = [
+            np.arctan2(*(np.asarray(self._others[wish.other].center_m) - points).T[::-1])
+            for wish in self._thing.wishes
+            if wish.kind is Arrangement.FACE_TO and wish.other in self._others
+        ]
+        turns = TURNS if self._thing.has_front else TURNS[:2]
+        yaws = np.concatenate([*(np.full(len(points), turn) for turn in turns), *gazes])
+        return Candidates.of(np.tile(points, (len(turns) + len(gazes), 1)), yaws, self._thing.size_m)
+
+    def _taken(self, spots: Candidates) -> BoolArray:
+        """Which spots meet something, or a zone that stays clear."""
+        height = self._thing.size_m[2]
+        rows = [
+            (*item.center_m, *(half_extents(np.asarray(item.yaw), item.size_m) + GAP_M).tolist())
+            for item in self._others.values()
+            if item.low_m < height and item.high_m > 0.0
+        ]
+        rows += [((a + c) / 2, (b + d) / 2, (c - a) / 2, (d - b) / 2) for a, b, c, d in self._brief.zones]
+        table = np.asarray(rows, dtype=np.float64).reshape(-1, 4)
+        meets = np.ones((len(spots), len(table)), dtype=bool)
+        for axis in (0, 1):
+            apart = np.abs(spots.center[:, axis, None] - table[None, :, axis])
+            meets &= apart < spots.half[:, axis, None] + table[None, :, axis + 2]
+        return np.asarray(meets.any(axis=1))
+
+    def _holds(self, number: int, spots: Candidates) -> BoolArray:
+        wish = self._thing.wishes[number]
+        other = self._others.get(wish.other)
+        return holds(wish, spots, self._brief.size_m, self._thing.size_m, other)
+
+    def _scores(self, spots: Candidates, held: Sequence[BoolArray]) -> FloatArray:
+        brief, thing = self._brief, self._thing
+        score = CHANCE * self._rng.random(len(spots))
+        kinds = {wish.kind for wish in thing.wishes}
+        for wish, row in zip(thing.wishes, held, strict=True):
+            shade = degrees(wish, spots, brief.size_m, thing.size_m, self._others.get(wish.other))
+            score += WEIGHTS[wish.kind] * ((1 - SHADE) * row + SHADE * shade)
+        if Arrangement.EDGE not in kinds:
+            score += COMFORT * np.minimum(margins(spots, brief.size_m) / COMFORT_M, 1.0)
+        nearest = [gaps(spots, item) for item in self._others.values()]
+        if nearest:
+            score += COMFORT * np.minimum(np.min(nearest, axis=0) / COMFORT_M, 1.0)
+        if thing.has_front and Arrangement.FACE_TO not in kinds:
+            looks = _inwards(spots, brief.size_m) if brief.on_floor else np.cos(spots.yaw)
+            score += (BACK if brief.on_floor else FRONT) * (looks > 0.9)
+        elif not thing.has_front and not brief.on_floor:
+            score += FRONT / 2 * (spots.half[:, 1] >= spots.half[:, 0])
+        return np.asarray(score)
+
+    def _chosen(
+        self, spots: Candidates, held: Sequence[BoolArray], scores: FloatArray
+    ) -> list[tuple[Spot, float]] | LayoutReason:
+        """The best spots in reach, none within a quarter of the plane's shorter side of a better one."""
+        apart = 0.25 * min(self._brief.size_m)
+        chosen: list[tuple[Spot, float]] = []
+        order = np.argsort(-scores, kind="stable")[:SCANNED]
+        for start in range(0, len(order), BATCH):
+            rows = order[start : start + BATCH]
+            for row in rows[self._reached(spots.at(rows))].tolist():
+                x, y = spots.center[row].tolist()
+                if any(math.hypot(x - s.center_m[0], y - s.center_m[1]) < apart for s, _ in chosen):
+                    continue
+                kept = tuple(w for w, h in zip(self._thing.wishes, held, strict=True) if h[row])
+                chosen.append(
+                    (Spot(self._thing.name, (x, y), float(spots.yaw[row]), kept), float(scores[row]))
+                )
+                if len(chosen) == BRANCHES:
+                    return chosen
+            if chosen and start >= 2 * BATCH:
+                break
+        return chosen or LayoutReason.OUT_OF_REACH
+
+    def _reached(self, spots: Candidates) -> BoolArray:
+        """Which spots the arm reaches from some place where the robot can stand, shape (n,)."""
+        if not self._brief.stands:
+            return np.ones(len(spots), dtype=bool)
+        stands = np.asarray(self._brief.stands)  # (k, 2)
+        off = np.abs(stands[None] - spots.center[:, None]) - spots.half[:, None]  # (n, k, 2)
+        away = np.hypot(*np.moveaxis(np.maximum(off, 0.0), -1, 0))
+        return np.asarray(((away >= ROBOT.shoulder_m) & (away <= REACH_M)).any(axis=1))
+
+
+def _inwards(spots: Candidates, plane_m: Size2) -> FloatArray:
+    """Cosine between where each spot's front looks and the way inwards from the nearest side, shape (n,)."""
+    strips = np.asarray(plane_m) / 2 - np.abs(spots.center) - spots.half  # (n, 2)
+    axis = np.argmin(strips, axis=1)
+    inward = -np.sign(spots.center[np.arange(len(spots)), axis])
+    front = np.stack([np.cos(spots.yaw), np.sin(spots.yaw)], axis=1)
+    return np.asarray(inward * front[np.arange(len(spots)), axis])
+
+
+def _line(extent: float, step: float) -> NDArray[np.float64]:
+    """Grid points along one side, the middle among them."""
+    count = int(extent / 2 / step)
+    return np.asarray(np.arange(-count, count + 1) * step, dtype=np.float64)
+
+
+def unknown_names(brief: PlaneBrief) -> tuple[str, ...]:
+    """Objects that wishes name and that are not on the plane."""
+    known = {item.name for item in brief.obstacles} | {thing.name for thing in brief.things}
+    return tuple(
+        dict.fromkeys(
+            wish.other
+            for thing in brief.things
+            for wish in thing.wishes
+            if wish.kind not in ABOUT_THE_PLANE and wish.other not in known
+        )
+    )

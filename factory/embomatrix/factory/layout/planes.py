@@ -1,0 +1,183 @@
+"""Planes of a scene that is being edited: the surfaces of furniture and the floors of rooms, as planar briefs see them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from embomatrix.factory.layout.arrangement import half_extents
+from embomatrix.factory.layout.sampling import LIFT_M
+from embomatrix.factory.layout.values import Footprint, PlaneBrief, PlaneThing, Wish
+from embomatrix.sim.bounds import bounds_of
+from embomatrix.sim.candidates import surfaces_for
+from embomatrix.skills.limits import ROBOT
+from embomatrix.world.geometry import Pose
+from embomatrix.world.state import Relation
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+    from embomatrix.factory.editor import SceneEditor
+    from embomatrix.factory.layout.values import Size2, Spot, Thing
+    from embomatrix.world.asset import Asset
+    from embomatrix.world.geometry import Aabb
+
+STANDS: Final = 72
+"""Spots for the robot that a brief holds at most: more add nothing but time."""
+LOWEST_M: Final = 0.05
+HIGHEST_M: Final = 1.75
+"""Surfaces between these heights over the floor are used before others."""
+RIM_M: Final = 0.01
+FLOOR_RIM_M: Final = 0.02
+"""Free strip at the edge of a surface, and at walls."""
+_IDENTITY: Final = Pose((0.0, 0.0, 0.0))
+
+
+@dataclass(frozen=True, slots=True)
+class Plane:
+    """A rectangle that things can stand on; ``pose`` is its middle's, in the world, x and y along its sides.
+
+    ``host`` is the object whose surface it is, empty for the floor of ``room``.
+    """
+
+    name: str
+    host: str
+    room: str
+    pose: Pose
+    size_m: Size2
+    clearance_m: float
+
+    @property
+    def on_floor(self) -> bool:
+        return not self.host
+
+
+def planes_of(editor: SceneEditor, host: str) -> list[Plane]:
+    """Open surfaces of an object, the largest at a good height first; or the floor of a room. Raises PlacementError."""
+    if host in editor.rooms:
+        room = editor.rooms[host]
+        return [Plane(host, "", host, Pose((*room.center_m, 0.0)), room.size_m, math.inf)]
+    item, asset = editor.known(host), editor.asset_of(host)
+    found = []
+    for surface in surfaces_for(asset, Relation.ONTOP):
+        if surface.link:
+            continue  # what rides on a drawer is the sampler's
+        pose = item.pose_world_asset @ Pose(surface.center_m)
+        found.append(
+            Plane(f"{host}:{surface.name}", host, item.room, pose, surface.size_m, surface.clearance_m)
+        )
+    return sorted(
+        found,
+        key=lambda plane: (
+            not LOWEST_M <= plane.pose.position_m[2] <= HIGHEST_M,
+            -plane.size_m[0] * plane.size_m[1],
+        ),
+    )
+
+
+def brief_for(
+    editor: SceneEditor,
+    plane: Plane,
+    things: Sequence[tuple[Thing, Asset]],
+    wishes: Mapping[str, tuple[Wish, ...]],
+    seed: int,
+) -> PlaneBrief:
+    """What the planar generator is told of a plane, as things stand. Wishes name objects as the scene does."""
+    width, depth = plane.size_m
+    return PlaneBrief(
+        plane=plane.name,
+        size_m=(width, depth),
+        things=tuple(
+            PlaneThing(thing.name, _extent(asset), wishes.get(thing.name, ()), thing.has_front)
+            for thing, asset in things
+        ),
+        obstacles=tuple(_obstacles(editor, plane, max((a.size_m[2] for _, a in things), default=0.0))),
+        zones=tuple(_zones(editor, plane)) if plane.on_floor else (),
+        stands=() if plane.on_floor else _stands(editor, plane),
+        rim_m=min(FLOOR_RIM_M if plane.on_floor else RIM_M, min(width, depth) / 20),
+        on_floor=plane.on_floor,
+        seed=seed,
+    )
+
+
+def pose_at(plane: Plane, asset: Asset, spot: Spot, shift_m: Size2 = (0.0, 0.0), turn: float = 0.0) -> Pose:
+    """Pose in the world of an asset whose box's middle is at a spot, moved and turned a little, its underside on the plane."""
+    box = bounds_of(asset).box(_IDENTITY)
+    yaw = spot.yaw + turn
+    cosine, sine = math.cos(yaw), math.sin(yaw)
+    x, y, _ = box.center_m
+    local = Pose.from_xyz_yaw(
+        spot.center_m[0] + shift_m[0] - (cosine * x - sine * y),
+        spot.center_m[1] + shift_m[1] - (sine * x + cosine * y),
+        LIFT_M - box.low_m[2],
+        yaw,
+    )
+    return plane.pose @ local
+
+
+def company_on(editor: SceneEditor, plane: Plane) -> tuple[tuple[str, str], ...]:
+    """Names and categories of the objects that stand on a plane already."""
+    if plane.on_floor:
+        names = [n for n, item in editor.objects.items() if item.room == plane.room and not item.host]
+    else:
+        names = [n for n, item in editor.objects.items() if item.host == plane.host]
+    return tuple((name, editor.asset_of(name).category) for name in names)
+
+
+def _extent(asset: Asset) -> tuple[float, float, float]:
+    return bounds_of(asset).box(_IDENTITY).size_m
+
+
+def _obstacles(editor: SceneEditor, plane: Plane, height_m: float) -> Iterator[Footprint]:
+    """Whatever reaches into the space over the plane: objects by their turned boxes, the host by its parts."""
+    ground = plane.pose.position_m[2]
+    inverse = plane.pose.inverse()
+    half = half_extents(np.asarray(plane.pose.yaw), plane.size_m)  # (2,)
+    x, y, _ = plane.pose.position_m
+    low, high = (x - half[0], y - half[1]), (x + half[0], y + half[1])
+    for name, item in editor.objects.items():
+        if item.absent:
+            continue
+        box = editor.box_of(name)
+        if box.high_m[2] <= ground + 0.001 or box.low_m[2] >= ground + height_m:
+            continue
+        if any(box.high_m[i] <= low[i] or box.low_m[i] >= high[i] for i in (0, 1)):
+            continue
+        asset = editor.asset_of(name)
+        pose = inverse @ item.pose_world_asset
+        if name != plane.host:
+            yield _footprint(name, pose, bounds_of(asset).box(_IDENTITY))
+            continue
+        for number, part in enumerate(part for link in asset.links for part in link.parts):
+            part_box = part.aabb(_IDENTITY)
+            if pose.position_m[2] + part_box.high_m[2] > 0.001:
+                yield _footprint(f"{name}#{number}", pose, part_box)
+
+
+def _footprint(name: str, pose: Pose, box: Aabb) -> Footprint:
+    x, y, _ = pose.apply(box.center_m)
+    z = pose.position_m[2]
+    return Footprint(name, (x, y), pose.yaw, box.size_m[:2], z + box.low_m[2], z + box.high_m[2])
+
+
+def _zones(editor: SceneEditor, plane: Plane) -> Iterator[tuple[float, float, float, float]]:
+    x, y, _ = plane.pose.position_m
+    for x0, y0, x1, y1 in editor.clearance.doorway_floor(plane.room):
+        yield (x0 - x, y0 - y, x1 - x, y1 - y)
+
+
+def _stands(editor: SceneEditor, plane: Plane) -> tuple[Size2, ...]:
+    """Spots from which the robot may reach the plane, in its frame: evenly thinned, of furniture with doors those before it."""
+    x, y, _ = plane.pose.position_m
+    away = math.hypot(*plane.size_m) / 2 + ROBOT.reach_m
+    cells = editor.floor.cells((x - away, y - away), (x + away, y + away))  # (n, 2)
+    yaw = plane.pose.yaw
+    turn = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
+    local = (cells - (x, y)) @ turn  # rows times the rotation are its inverse applied to columns
+    if editor.asset_of(plane.host).joints:
+        local = local[local[:, 0] > 0.0]
+    step = max(1, len(local) // STANDS)
+    return tuple((float(a), float(b)) for a, b in local[step // 2 :: step][:STANDS])

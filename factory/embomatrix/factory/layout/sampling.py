@@ -1,0 +1,196 @@
+"""Object-level Sampling Agent: continuous poses on, in, under and beside things, each free, in reach and barring nothing."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.factory.assets.library import build_asset
+from embomatrix.factory.editor import PlacementError
+from embomatrix.factory.layout.values import LayoutReason
+from embomatrix.sim.candidates import candidates
+from embomatrix.world.catalog import Catalog, CatalogError
+from embomatrix.world.geometry import Pose
+from embomatrix.world.state import Relation
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+    import numpy as np
+
+    from embomatrix.factory.editor import SceneEditor
+    from embomatrix.world.asset import Asset
+    from embomatrix.world.scene import Room, SceneObject
+
+TRIES: Final = 64
+FLOOR_TRIES: Final = 200
+BARRED: Final = 16
+"""Poses that would bar the robot's way after which a search ends: each costs a look at all ways."""
+MODELS: Final = 8
+"""Models of a category that are looked at where none is given."""
+LIFT_M: Final = 0.0005
+"""Things start this high over what they stand on, so that none begins in contact."""
+
+
+@dataclass(slots=True)
+class _Tally:
+    """How many candidate poses there were, how many of them collided with nothing, and how many of these were in reach."""
+
+    seen: int = 0
+    free: int = 0
+    reached: int = 0
+
+
+class ObjectSampler:
+    """Samples poses for single things in a scene that is being edited. The generator's state decides all."""
+
+    def __init__(self, editor: SceneEditor, rng: np.random.Generator) -> None:
+        self._editor = editor
+        self._rng = rng
+
+    def add(
+        self, category: str, model: str | None, relation: Relation | None, host: str, *, room: str = ""
+    ) -> str:
+        """Place a new object and return its name, ``category_N``.
+
+        ``host`` is an object that it goes on, in, under or next to, or a room when ``relation`` is None or INROOM: then it
+        stands on that room's floor. Without a model one of the category is drawn, any that fits. Raises PlacementError.
+        """
+        errors: list[PlacementError] = []
+        for asset in assets_of(category, model, self._rng):
+            try:
+                pose = self.find(asset, relation, host)
+            except PlacementError as error:
+                errors.append(error)
+                continue
+            return self._editor.insert(asset, pose, *self.rests(relation, host), room)
+        raise errors[-1]
+
+    def find(self, asset: Asset, relation: Relation | None, host: str) -> Pose:
+        """A pose at which nothing stands against the thing. Raises PlacementError with the rule that did the most."""
+        target = host if relation in (Relation.ONTOP, Relation.INSIDE, Relation.UNDER) else ""
+        return self.first_free(asset, self.poses(asset, relation, host), target)
+
+    def poses(self, asset: Asset, relation: Relation | None, host: str) -> Iterator[Pose]:
+        """Poses in the relation to a host, in random order, looked at by nobody. Raises PlacementError where there is none."""
+        editor = self._editor
+        if relation is None or relation is Relation.INROOM:
+            if host not in editor.rooms:
+                raise PlacementError(
+                    LayoutReason.UNKNOWN_HOST,
+                    f"no room {host!r} in {editor.base.scene_id}: expected one of {', '.join(editor.rooms)}",
+                )
+            yield from self._on_floor(asset, editor.rooms[host])
+            return
+        target = editor.known(host)
+        if relation is Relation.NEXTTO:
+            yield from self._beside(asset, target)
+            return
+        carrier = editor.asset_of(host)
+        found = [
+            target.pose_world_asset @ local
+            for local in candidates(asset, carrier, relation, self._shift(), TRIES)
+        ]
+        if not found:
+            reason = LayoutReason.TOO_LARGE if carrier.supports else LayoutReason.NO_SURFACE
+            raise PlacementError(
+                reason,
+                f"{asset.asset_id}, {_metres(asset)}, fits nowhere {relation.value} {host} ({_metres(carrier)}): "
+                "try a smaller model or another host",
+            )
+        for index in self._rng.permutation(len(found)):
+            yield found[index]
+
+    def rests(self, relation: Relation | None, host: str) -> tuple[Relation | None, str]:
+        """What a thing in this relation to a host rests on or in: relation and object, or nothing: the floor."""
+        if relation in (Relation.ONTOP, Relation.INSIDE):
+            return relation, host
+        if relation is Relation.NEXTTO:
+            carrier = self._editor.known(host).host
+            return (Relation.ONTOP, carrier) if carrier else (None, "")
+        return None, ""
+
+    def first_free(self, asset: Asset, poses: Iterable[Pose], target: str) -> Pose:
+        """The first of some poses at which nothing stands against a thing. Raises PlacementError."""
+        tally = _Tally()
+        for pose in poses:
+            tally.seen += 1
+            objection = self._editor.objection(asset, pose, target)
+            if objection is None:
+                return pose
+            tally.free += objection is not LayoutReason.NO_FREE_SPOT
+            tally.reached += objection is LayoutReason.BARS_THE_WAY
+            if tally.reached == BARRED:
+                break
+        raise _none_of(tally, asset, target or "the floor")
+
+    def _on_floor(self, asset: Asset, room: Room) -> Iterator[Pose]:
+        (x0, y0), (x1, y1) = room.low_m, room.high_m
+        for _ in range(FLOOR_TRIES):
+            x, y = self._rng.uniform(x0, x1), self._rng.uniform(y0, y1)
+            yield self._standing(asset, float(x), float(y))
+
+    def _beside(self, asset: Asset, target: SceneObject) -> Iterator[Pose]:
+        """Poses at the height of what the target stands on, a few centimetres from its sides."""
+        box = self._editor.box_of(target.name)
+        gap = 0.03 + max(asset.size_m[:2]) / 2
+        support = self._editor.objects.get(target.host)
+        for _ in range(FLOOR_TRIES):
+            along = float(self._rng.uniform(-0.5, 0.5))
+            side = int(self._rng.integers(4))
+            cx, cy, _ = box.center_m
+            sx, sy, _ = box.size_m
+            x = cx + (sx / 2 + gap) * (1, -1, 0, 0)[side] + along * sx * (side >= 2)
+            y = cy + (sy / 2 + gap) * (0, 0, 1, -1)[side] + along * sy * (side < 2)
+            if support is None:
+                yield self._standing(asset, x, y)
+            elif self._carries(support, x, y, box.low_m[2]):
+                yield Pose.from_xyz_yaw(x, y, box.low_m[2] + asset.size_m[2] / 2, self._yaw())
+
+    def _carries(self, support: SceneObject, x: float, y: float, z: float) -> bool:
+        """Whether a surface of the object lies under the point, at its height."""
+        px, py, pz = support.pose_world_asset.inverse().apply((x, y, z))
+        return any(
+            abs(px - s.center_m[0]) < s.size_m[0] / 2
+            and abs(py - s.center_m[1]) < s.size_m[1] / 2
+            and abs(pz - s.center_m[2]) < 0.005
+            for s in self._editor.asset_of(support.name).supports
+        )
+
+    def _standing(self, asset: Asset, x: float, y: float) -> Pose:
+        return Pose.from_xyz_yaw(x, y, asset.size_m[2] / 2 + LIFT_M, self._yaw())
+
+    def _yaw(self) -> float:
+        return float(self._rng.integers(4)) * math.pi / 2
+
+    def _shift(self) -> tuple[float, float]:
+        return (float(self._rng.random()), float(self._rng.random()))
+
+
+def assets_of(category: str, model: str | None, rng: np.random.Generator) -> list[Asset]:
+    """The model's asset, or some of the category in random order. Raises PlacementError for what is in no catalog."""
+    catalog = Catalog.load()
+    try:
+        if model is not None:
+            return [build_asset(catalog, category, model)]
+        models = catalog.models_of(category)
+    except CatalogError as error:
+        raise PlacementError(LayoutReason.UNKNOWN_MODEL, str(error)) from error
+    return [build_asset(catalog, category, models[i].model_id) for i in rng.permutation(len(models))[:MODELS]]
+
+
+def _none_of(tally: _Tally, asset: Asset, host: str) -> PlacementError:
+    if tally.reached:
+        reason = LayoutReason.BARS_THE_WAY
+    else:
+        reason = LayoutReason.OUT_OF_REACH if tally.free else LayoutReason.NO_FREE_SPOT
+    return PlacementError(
+        reason,
+        f"no place for {asset.asset_id}, {_metres(asset)}, at {host}: of {tally.seen} poses {tally.free} were free, "
+        f"{tally.reached} of them in the robot's reach, none without barring its way: try another host",
+    )
+
+
+def _metres(asset: Asset) -> str:
+    return " x ".join(f"{extent:.2f}" for extent in asset.size_m) + " m"

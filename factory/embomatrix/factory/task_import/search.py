@@ -1,0 +1,168 @@
+"""Finding a problem's furniture in a scene: by backtracking over room instances, and over objects of the right category."""
+
+from __future__ import annotations
+
+import itertools
+from collections import defaultdict
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.factory.refusal import RefusalReason, RefusedError
+from embomatrix.factory.writer.view import is_liftable
+from embomatrix.world.bddl import is_room_instance
+from embomatrix.world.catalog import Catalog, CatalogError
+from embomatrix.world.evaluate import atoms_of
+from embomatrix.world.state import Relation, State
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping
+
+    import numpy as np
+
+    from embomatrix.factory.writer.view import SceneView
+    from embomatrix.world.asset import Asset
+    from embomatrix.world.bddl import Problem
+    from embomatrix.world.scene import Scene
+
+MAX_STEPS: Final = 20_000
+"""Assignments that are looked at before a scene counts as lacking the objects."""
+MAX_CHOICES: Final = 200
+"""Ways to tell the problem's rooms among the scene's that are looked at."""
+
+
+def search(
+    problem: Problem,
+    view: SceneView,
+    inroom: Mapping[str, str],
+    fixtures: list[str],
+    rng: np.random.Generator,
+    *,
+    furnishing: bool,
+) -> tuple[dict[str, str], dict[str, str]]:
+    """Rooms for the problem's rooms, and scene objects for its fixtures. All objects of one word are in one room.
+
+    Of the rooms that lack furniture those are taken that lack least.
+    """
+    words = sorted(set(inroom.values()))
+    options = {word: _rooms_for(view.scene, word, rng) for word in words}
+    needs = needs_of(problem)
+    best: tuple[int, dict[str, str], dict[str, str]] | None = None
+    lacking = ""
+    for rooms in itertools.islice(_room_choices(words, options), MAX_CHOICES):
+        found, missing = _assign(problem, view, {name: rooms[inroom[name]] for name in fixtures}, needs, rng)
+        if not missing:
+            return rooms, found
+        first = missing[0]
+        lacking = lacking or f"{first} of type {problem.objects[first]!r} in {rooms[inroom[first]]}"
+        if best is None or len(missing) < best[0]:
+            best = (len(missing), rooms, found)
+    if best is None or not furnishing:
+        raise RefusedError(
+            RefusalReason.NO_SCENE_OBJECT,
+            f"{view.scene.base} has no free object for {lacking or 'the rooms'}",
+        )
+    return best[1], best[2]
+
+
+def _rooms_for(scene: Scene, word: str, rng: np.random.Generator) -> list[str]:
+    if is_room_instance(word):
+        names = [room.name for room in scene.rooms if room.name == word]
+    else:
+        names = [room.name for room in scene.rooms if room.type == word]
+    if not names:
+        raise RefusedError(
+            RefusalReason.ROOM_MISSING,
+            f"{scene.base} has no {word!r}: its rooms are {', '.join(room.name for room in scene.rooms)}",
+        )
+    return [str(name) for name in rng.permutation(names)]
+
+
+def _room_choices(words: list[str], options: Mapping[str, list[str]]) -> Iterator[dict[str, str]]:
+    if not words:
+        yield {}
+        return
+    for room in options[words[0]]:
+        for rest in _room_choices(words[1:], options):
+            if room not in rest.values():
+                yield {words[0]: room, **rest}
+
+
+def needs_of(problem: Problem) -> Mapping[str, frozenset[str]]:
+    """What an object, or a whole type, must be able to do for start and goal to make sense."""
+    needs: defaultdict[str, set[str]] = defaultdict(set)
+    for atom in (*atoms_of(problem.goal), *(item.atom for item in problem.init if item.positive)):
+        if atom.predicate == State.OPEN:
+            needs[atom.args[0]].add("openable")
+        elif atom.predicate == State.TOGGLED_ON:
+            needs[atom.args[0]].add("toggleable")
+        elif atom.predicate == Relation.INSIDE:
+            needs[atom.args[1]].add("container")
+    return {name: frozenset(values) for name, values in needs.items()}
+
+
+def _assign(
+    problem: Problem,
+    view: SceneView,
+    wanted: Mapping[str, str],
+    needs: Mapping[str, frozenset[str]],
+    rng: np.random.Generator,
+) -> tuple[dict[str, str], list[str]]:
+    """A scene object of its own for as many names as there is one for, and the names of furniture for which none is left.
+
+    Small things that the scene lacks are in neither.
+    """
+    catalog = Catalog.load()
+    domains: dict[str, list[str]] = {}
+    missing: list[str] = []
+    for name, room in wanted.items():
+        categories = set(catalog.categories_of(problem.objects[name]))
+        fits = [
+            other
+            for other in view.in_room.get(room, ())
+            if view.category(other) in categories and serves(view.asset(other), needs.get(name, frozenset()))
+        ]
+        if fits:
+            domains[name] = [str(other) for other in rng.permutation(fits)]
+        elif not any(_liftable(category) for category in categories):
+            missing.append(name)
+    while True:
+        found: dict[str, str] = {}
+        failed = _backtrack(sorted(domains, key=lambda name: len(domains[name])), domains, found, [0])
+        if not failed:
+            return found, missing
+        missing.append(failed)
+        del domains[failed]
+
+
+def _backtrack(
+    order: list[str], domains: Mapping[str, list[str]], found: dict[str, str], steps: list[int]
+) -> str:
+    """Fill ``found``; returns the name that could not be served, or empty."""
+    if len(found) == len(order):
+        return ""
+    name = order[len(found)]
+    failed = name
+    for other in domains[name]:
+        steps[0] += 1
+        if other in found.values() or steps[0] > MAX_STEPS:
+            continue
+        found[name] = other
+        deeper = _backtrack(order, domains, found, steps)
+        if not deeper:
+            return ""
+        failed = deeper
+        del found[name]
+    return failed
+
+
+def serves(asset: Asset, needs: Iterable[str]) -> bool:
+    """Whether an asset can do all that is asked of it; a container has a cavity."""
+    return all(bool(asset.interiors) if need == "container" else asset.can(need) for need in needs)
+
+
+def _liftable(category: str) -> bool:
+    catalog = Catalog.load()
+    try:
+        mass = catalog.category(category).mass_kg
+    except CatalogError:
+        return False
+    return any(is_liftable(model.size_m, mass) for model in catalog.models_of(category))
