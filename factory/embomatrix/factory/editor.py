@@ -17,6 +17,7 @@ from embomatrix.factory.scenes.clearance import Clearance
 from embomatrix.factory.scenes.floor import ReachableFloor
 from embomatrix.factory.scenes.joints import with_joints
 from embomatrix.factory.scenes.solids import Solids, placed_parts
+from embomatrix.factory.writer.view import SceneView
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.asset import Asset, Link, SupportSurface
 from embomatrix.world.geometry import Aabb, Part, Pose, Shape
@@ -54,6 +55,7 @@ class SceneEditor:
         self._assets: dict[str, Asset] = dict(scene.assets)
         self._boxes: dict[str, Aabb] = {}
         self._solids = Solids.of_scene(scene)
+        self._view = SceneView(scene)
         self._floor = ReachableFloor(scene)
         self._unreached = {problem.names for problem in reach_problems(scene)}
         self._counts = Counter(self._assets[item.asset_id].category for item in scene.objects)
@@ -92,6 +94,10 @@ class SceneEditor:
     def is_unserved(self, name: str) -> bool:
         """Whether the robot could not get at an object of the base scene to begin with."""
         return any(name in names for names in self._unreached)
+
+    def opens(self, name: str) -> bool:
+        """Whether an object of the base scene has doors and drawers that open wide and meet nothing, or none at all."""
+        return self._view.opens(name)
 
     def is_free(self, asset: Asset, pose: Pose) -> bool:
         """Whether an asset would overlap nothing at a pose."""

@@ -25,11 +25,12 @@ LOW_SKIRT_M: Final = 0.05
 
 
 def rooms_of(editor: SceneEditor) -> tuple[RoomFacts, ...]:
-    """All rooms of the scene, with the categories of what stands in them."""
+    """All rooms of the scene, with the categories of what could hold things there."""
     furniture: dict[str, list[str]] = {name: [] for name in editor.rooms}
     for item in editor.objects.values():
-        if item.fixed:
-            furniture.setdefault(item.room, []).append(editor.asset_of(item.name).category)
+        asset = editor.asset_of(item.name)
+        if item.fixed and (asset.supports or asset.interiors):
+            furniture.setdefault(item.room, []).append(asset.category)
     return tuple(
         RoomFacts(name, room.type, room.size_m, tuple(sorted(furniture[name])))
         for name, room in editor.rooms.items()
@@ -58,8 +59,10 @@ def _hosts(
             if item.room != room or not item.fixed or nobody or editor.is_unserved(item.name):
                 continue
         offers = _offers(asset, round(item.pose_world_asset.position_m[2], 3), asked=item.name in named)
+        shut = any(interior.closed_by for interior in asset.interiors)
+        if shut and item.name in editor.base.by_name and not editor.opens(item.name):
+            offers = tuple(offer for offer in offers if offer.relation is not LayoutRelation.INSIDE)
         if offers:
-            shut = any(interior.closed_by for interior in asset.interiors)
             yield HostFacts(item.name, asset.category, offers, tuple(guests.get(item.name, ())), shut)
 
 

@@ -343,14 +343,12 @@ class _RoomJob:
         outcome = settle(self._editor, [self.names[name] for name in fresh])
         self._record.settled += outcome.dropped
         owners = {scene_name: name for name, scene_name in self.names.items()}
-        for scene_name, detail in outcome.unstable.items():
+        for scene_name, (reason, detail) in outcome.wrong.items():
             if scene_name not in self._editor.objects:
                 continue  # it went with what it stood on
             item = self._editor.objects[scene_name]
             relation = LayoutRelation(item.relation.value) if item.relation else LayoutRelation.ONTOP
             self._take_out(scene_name)
-            failure = Failure(
-                owners[scene_name], relation, item.host or self._room.name, LayoutReason.UNSTABLE, detail
-            )
+            failure = Failure(owners[scene_name], relation, item.host or self._room.name, reason, detail)
             self._waiting[owners[scene_name]].last = failure
             self._failures.append(failure)

@@ -148,7 +148,7 @@ def liking(category: str, host: HostFacts, relation: LayoutRelation) -> float:
     else:
         worth = UNLIKED if host.category in NO_HOSTS else STRANGE
     if relation is LayoutRelation.INSIDE and not kept_behind_doors(category, host.category):
-        worth += UNLIKED if on_appliance(host.category) and host.category not in wanted else SHUT
+        worth += UNSUITED if on_appliance(host.category) and host.category not in wanted else SHUT
     return worth
 
 

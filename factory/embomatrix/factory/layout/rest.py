@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import contextlib
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
+from embomatrix.factory.layout.values import LayoutReason
 from embomatrix.sim.bullet.engine import BulletEngine
+from embomatrix.sim.pose_cache import standing_poses
 from embomatrix.sim.statics import base_of, is_level, rest_pose
 
 if TYPE_CHECKING:
@@ -16,34 +18,47 @@ if TYPE_CHECKING:
     from embomatrix.world.geometry import Pose
 
 
+HIGH_M: Final = 2.0
+"""Nobody asks the robot to get at what hangs higher."""
+
+
 @dataclass(frozen=True, slots=True)
 class Settling:
-    """How many things had to be let go, and those that did not stay, each with how far it moved, in words."""
+    """How many things had to be let go, and what is wrong with those that can't be where they are: a reason, and words."""
 
     dropped: int
-    unstable: Mapping[str, str]
+    wrong: Mapping[str, tuple[LayoutReason, str]]
 
 
 def settle(editor: SceneEditor, names: Sequence[str]) -> Settling:
-    """Find where objects come to rest, and move them there; what does not stay within 1 cm and 10 degrees is told.
+    """Find where objects come to rest, and move them there; tell which don't stay, and which no standing robot gets at.
 
-    Hosts stand before what rests on them. Raises EngineError where the engine is missing.
+    What moves less than 1 cm and tilts less than 10 degrees stays. Hosts stand before what rests on them. Raises EngineError
+    where the engine is missing.
     """
-    loose = [name for name in names if not editor.known(name).fixed and not is_proved(editor, name)]
-    if not loose:
+    if not names:
         return Settling(0, {})
+    loose = [name for name in names if not editor.known(name).fixed and not is_proved(editor, name)]
     rested: dict[str, Pose] = {}
-    unstable: dict[str, str] = {}
+    wrong: dict[str, tuple[LayoutReason, str]] = {}
     with contextlib.closing(BulletEngine(editor.freeze(editor.base.scene_id))) as engine:
+        stands = standing_poses(engine, [name for name in names if editor.box_of(name).low_m[2] < HIGH_M])
+        for name, poses in stands.items():
+            if not poses:
+                wrong[name] = (
+                    LayoutReason.OUT_OF_REACH,
+                    "the robot can stand nowhere with a clear way for its arm",
+                )
         for name in loose:
             settled = engine.settle(name)
             if settled.stable:
                 engine.set_pose(name, settled.pose)
                 rested[name] = settled.pose
             else:
-                unstable[name] = f"let go, it moves by {settled.moved_m:.3f} m: try a flatter place"
-    editor.move(rested)
-    return Settling(len(loose), unstable)
+                moved = f"let go, it moves by {settled.moved_m:.3f} m: try a flatter place"
+                wrong[name] = (LayoutReason.UNSTABLE, moved)
+    editor.move({name: pose for name, pose in rested.items() if name not in wrong})
+    return Settling(len(loose), wrong)
 
 
 def is_proved(editor: SceneEditor, name: str) -> bool:

@@ -88,7 +88,7 @@ class Failure:
 
 @dataclass(frozen=True, slots=True)
 class RoomFacts:
-    """A room, its floor in metres along the world's x and y, and the categories of the furniture in it, with repetitions."""
+    """A room, its floor in metres along the world's x and y, and the categories of what can hold things there, one by one."""
 
     name: str
     type: str

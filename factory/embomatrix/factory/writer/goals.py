@@ -71,12 +71,12 @@ class Workshop:
         return fresh[int(self.rng.integers(len(fresh)))] if fresh else None
 
     def fixtures(self, wanted: Callable[[str], bool]) -> list[str]:
-        """Objects of the variant's rooms that are wanted and that words can name, alone or as one of a few alike."""
+        """Objects of the variant's rooms that are wanted, that open, and that words can name, alone or as one of a few."""
         return [
             name
             for room in self.variant.rooms
             for name in self.view.in_room[room]
-            if wanted(name) and len(self.view.alike(name)) <= MAX_ALIKE
+            if wanted(name) and len(self.view.alike(name)) <= MAX_ALIKE and self.view.opens(name)
         ]
 
     def things(self) -> list[str]:

@@ -54,9 +54,17 @@ def build_variant(
     view = SceneView(base)
     items = _things(view, rooms, rng)
     layout = lay(editor, items, int(rng.integers(2**31)), agents)
+    for name in [*layout.names.values()]:
+        if name in editor.objects and not _is_in_its_place(editor, name):
+            editor.remove(name)
     _set_doors_and_lights(editor, view, rooms, rng)
-    added = tuple(layout.names[item.name] for item in items if item.name in layout.names)
+    added = tuple(layout.names[item.name] for item in items if layout.names.get(item.name) in editor.objects)
     return Variant(editor.freeze(scene_id), tuple(rooms), added)
+
+
+def _is_in_its_place(editor: SceneEditor, name: str) -> bool:
+    """Whether an added thing stands on or in something, or is one that people put on the floor."""
+    return bool(editor.objects[name].host) or editor.asset_of(name).category in BASKETS
 
 
 def _things(view: SceneView, rooms: Sequence[str], rng: np.random.Generator) -> list[Item]:

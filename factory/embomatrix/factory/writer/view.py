@@ -6,7 +6,10 @@ from collections import Counter
 from functools import cached_property
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.factory.scenes.joints import bumped_into
+from embomatrix.factory.scenes.solids import Solids
 from embomatrix.factory.writer.tables import NEVER_SWITCHED
+from embomatrix.sim.swings import SWING
 from embomatrix.skills.appliance import cold_source, cooks, freezes, heat_source, heats
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.state import OPEN_FRACTION, Relation, State
@@ -30,6 +33,7 @@ class SceneView:
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
+        self._opens: dict[str, bool] = {}
 
     @cached_property
     def in_room(self) -> Mapping[str, tuple[str, ...]]:
@@ -124,6 +128,19 @@ class SceneView:
 
     def is_open(self, name: str) -> bool:
         return any(share > OPEN_FRACTION for share in self.item(name).joints)
+
+    def opens(self, name: str) -> bool:
+        """Whether its doors and drawers meet nothing on their way, where it has any."""
+        if name not in self._opens:
+            joints = len(self.asset(name).joints)
+            self._opens[name] = not joints or not any(
+                bumped_into(self.scene, self._solids, name, (share,) * joints) for share in SWING
+            )
+        return self._opens[name]
+
+    @cached_property
+    def _solids(self) -> Solids:
+        return Solids.of_scene(self.scene)
 
     def is_toggleable(self, name: str) -> bool:
         return self.asset(name).can("toggleable")
