@@ -44,6 +44,7 @@ COMMANDS: Final[Mapping[str, Command]] = {
     "top": Command("watch a cluster live in the terminal", "manager"),
     "doctor": Command("check this machine and the way to a manager, and say what to do", "manager"),
     "worker": Command("lend this machine's cores to a manager", "worker"),
+    "imitate": Command("warm a policy up on the oracle's plans, without a cluster", "trainer"),
     "train": Command("train a policy with imitation and GRPO on a cluster", "trainer"),
     "eval": Command("measure a model, an endpoint or a baseline on a benchmark", "trainer"),
     "model": Command("bring a packaged language model into a folder to train", "hf"),

@@ -9,9 +9,9 @@ from rich.console import Console
 from tests.fakes.symbolic_household import SymbolicCluster, make_tasks
 
 from embomatrix.trainer.augment import Variation
-from embomatrix.trainer.checkpoint import CheckpointStore, read_state
+from embomatrix.trainer.checkpoint import CHECKPOINTS, CheckpointStore, read_state
 from embomatrix.trainer.errors import TrainerError
-from embomatrix.trainer.loop import CHECKPOINTS, REFERENCE, Parts, TrainingRun
+from embomatrix.trainer.loop import REFERENCE, Parts, TrainingRun
 from embomatrix.trainer.policy.choice import new_policy, saved_policy
 from embomatrix.trainer.progress import LineDisplay, LiveDisplay
 from embomatrix.trainer.recorder import read_metrics

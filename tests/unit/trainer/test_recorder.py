@@ -13,7 +13,7 @@ def test_steps_after_the_checkpoint_and_half_lines_are_forgotten(tmp_path):
     lines = [json.dumps({"step": step}) for step in (1, 2, 3)]
     for name in (METRICS, SAMPLES):
         (tmp_path / name).write_text("\n".join([*lines, '{"step": 1, "rew']))
-    Recorder(tmp_path).forget_after(2)
+    Recorder(tmp_path).forget_after(2, METRICS, SAMPLES)
     assert read_metrics(tmp_path) == [{"step": 1}, {"step": 2}]
     assert (tmp_path / SAMPLES).read_text() == (tmp_path / METRICS).read_text()
 

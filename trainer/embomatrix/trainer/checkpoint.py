@@ -12,18 +12,22 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from embomatrix.trainer.errors import DAMAGE, TrainerError, reason_of
+from embomatrix.trainer.imitate import ImitationState
 from embomatrix.trainer.settings import TrainSettings
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator, Mapping
     from pathlib import Path
 
     from embomatrix.trainer.policy.protocol import Policy
 
-SCHEMA = 2
+SCHEMA = 3
+CHECKPOINTS = "checkpoints"
+"""Their folder in a run's."""
 _STATE = "state.json"
 _TENSORS = "training.pt"
-_PREFIX = "step-"
+_PREFIXES = ("imitation-", "step-")
+"""Of the two phases of a run, in their order, which is also that of their names."""
 FULL_BYTES = 8 * 1024 * 1024
 """With less than this left, a disk counts as full: torch does not tell why a file can't be written."""
 
@@ -32,7 +36,8 @@ FULL_BYTES = 8 * 1024 * 1024
 class Progress:
     """Where a run stands. ``cursor`` is the schedule's, ``reserve_cursor`` that of the reserve.
 
-    Seconds are of GRPO and, by activity, of the whole run.
+    ``prepared``: imitation and the evaluation after it are done, and the reference is kept. Seconds are of GRPO and, by
+    activity, of the whole run.
     """
 
     step: int = 0
@@ -40,34 +45,29 @@ class Progress:
     reserve_cursor: int = 0
     rollouts: int = 0
     lost: int = 0
-    imitation_steps: int = 0
+    imitation: ImitationState = field(default_factory=ImitationState)
+    prepared: bool = False
     grpo_s: float = 0.0
     spent_s: dict[str, float] = field(default_factory=dict)
     before: list[dict[str, Any]] = field(default_factory=list)
 
 
 class CheckpointStore:
-    """Checkpoints of one run, a folder each: ``step-000050``. The newest ``keep`` stay."""
+    """Checkpoints of one run, a folder each: ``imitation-000800``, ``step-000050``. The newest ``keep`` stay."""
 
     def __init__(self, folder: Path, *, keep: int) -> None:
         self._folder = folder
         self._keep = keep
 
     def save(
-        self,
-        policy: Policy,
-        optimiser: torch.optim.Optimizer,
-        generator: torch.Generator,
-        progress: Progress,
-        settings: TrainSettings,
+        self, policy: Policy, tensors: Mapping[str, Any], progress: Progress, settings: TrainSettings
     ) -> Path:
         """Write beside, sync, then rename: a crash leaves the last checkpoint as it was. Raises TrainerError."""
-        final = self._folder / f"{_PREFIX}{progress.step:06d}"
+        number = progress.step if progress.prepared else progress.imitation.step
+        final = self._folder / f"{_PREFIXES[progress.prepared]}{number:06d}"
         with whole_folder(final) as partial:
             policy.save(partial / "policy")
-            torch.save(
-                {"optimiser": optimiser.state_dict(), "generator": generator.get_state()}, partial / _TENSORS
-            )
+            torch.save(dict(tensors), partial / _TENSORS)
             state = {
                 "schema": SCHEMA,
                 "progress": asdict(progress),
@@ -87,7 +87,12 @@ class CheckpointStore:
     def _all(self) -> list[Path]:
         if not self._folder.is_dir():
             return []
-        return sorted(path for path in self._folder.glob(f"{_PREFIX}*") if (path / _STATE).is_file())
+        return sorted(
+            path
+            for prefix in _PREFIXES
+            for path in self._folder.glob(f"{prefix}*")
+            if (path / _STATE).is_file()
+        )
 
 
 @contextlib.contextmanager
@@ -125,7 +130,9 @@ def read_state(folder: Path) -> tuple[Progress, TrainSettings]:
             raise TrainerError(
                 f"the checkpoint {folder} has schema {state['schema']}, this version reads {SCHEMA}: start a new run"
             )
-        return Progress(**state["progress"]), TrainSettings.model_validate(state["settings"])
+        progress = Progress(**state["progress"])
+        progress.imitation = ImitationState(**state["progress"]["imitation"])
+        return progress, TrainSettings.model_validate(state["settings"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise TrainerError(
             f"{folder} is no readable checkpoint ({_STATE}: {reason_of(error)}): pass a folder such as "
@@ -133,12 +140,10 @@ def read_state(folder: Path) -> tuple[Progress, TrainSettings]:
         ) from error
 
 
-def restore(folder: Path, optimiser: torch.optim.Optimizer, generator: torch.Generator) -> None:
-    """Put the optimiser and the sampler's generator back as they were. Raises TrainerError where the file is damaged."""
+def restore(folder: Path, put_back: Callable[[dict[str, Any]], object]) -> None:
+    """Give ``put_back`` what was saved besides the policy. Raises TrainerError where that is damaged."""
     try:
-        tensors = torch.load(folder / _TENSORS, map_location="cpu", weights_only=True)
-        optimiser.load_state_dict(tensors["optimiser"])
-        generator.set_state(tensors["generator"])
+        put_back(torch.load(folder / _TENSORS, map_location="cpu", weights_only=True))
     except DAMAGE as error:
         raise TrainerError(
             f"{folder / _TENSORS} is damaged ({reason_of(error)}): remove {folder}, and --resume goes on from the "

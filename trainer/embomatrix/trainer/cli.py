@@ -1,13 +1,12 @@
-"""`embomatrix train`. torch is imported after the arguments are read."""
+"""`embomatrix train` and `embomatrix imitate`. torch is imported after the arguments are read."""
 
 from __future__ import annotations
 
 import contextlib
 import functools
 import logging
-import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 from rich.console import Console
@@ -15,18 +14,18 @@ from rich.table import Table
 
 from embomatrix.rpc.channel import DEFAULT_ADDRESS
 from embomatrix.rpc.logs import LogFormat, log_to_stderr
-from embomatrix.trainer.errors import TrainerError, reason_of
+from embomatrix.trainer.errors import TrainerError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from embomatrix.rpc.client import ClusterClient
     from embomatrix.trainer.data import TaskSet
-    from embomatrix.trainer.policy.protocol import Policy
+    from embomatrix.trainer.imitate import ImitationState
     from embomatrix.trainer.report import Summary
     from embomatrix.trainer.rollout import Gateway
     from embomatrix.trainer.settings import OnLost, TrainSettings
-    from embomatrix.trainer.telling import Teller
+    from embomatrix.trainer.starting import Start
 
     Connect = Callable[[], ClusterClient]
 
@@ -49,26 +48,37 @@ _LOG_FORMAT = Annotated[
         show_default=False,
     ),
 ]
+_MODEL = Annotated[
+    str,
+    typer.Option(
+        help="`tiny`, a Hugging Face model by name or folder, or a policy that was trained: runs/NAME/reference."
+    ),
+]
+_OUT = Annotated[Path, typer.Option(help="Folder for checkpoints, logs and report.")]
+_RESUME = Annotated[bool, typer.Option("--resume", help="Go on from the newest checkpoint in --out.")]
+_SEED = Annotated[int | None, typer.Option(help="Seed of policy, task order and sampling.")]
+_SETTINGS = Annotated[Path | None, typer.Option("--settings", help="TOML file with any setting.")]
+_DEVICE = Annotated[str | None, typer.Option(help="torch device: cpu, cuda.")]
+_TRACK = Annotated[
+    list[str] | None,
+    typer.Option(help="Send metrics to `tensorboard`, `wandb` or `trackio` as well; repeatable."),
+]
 _THREADS = Annotated[int | None, typer.Option(min=1, help="Threads of torch; default: half of the cores.")]
 
 
 def train(
     dataset: _DATASET = Path("build/dataset"),
     manager: _MANAGER = DEFAULT_ADDRESS,
-    model: Annotated[str, typer.Option(help="`tiny`, or a Hugging Face model by name or folder.")] = "tiny",
-    out: Annotated[Path, typer.Option(help="Folder for checkpoints, logs and report.")] = Path("runs/train"),
+    model: _MODEL = "tiny",
+    out: _OUT = Path("runs/train"),
     minutes: Annotated[float | None, typer.Option(min=0, help="Minutes of GRPO; default 5.")] = None,
     steps: Annotated[int | None, typer.Option(min=0, help="Steps of GRPO, in place of minutes.")] = None,
     imitate_seconds: Annotated[
         float | None, typer.Option(min=0, help="Seconds of imitation; default 150.")
     ] = None,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on from the newest checkpoint in --out.")
-    ] = False,
-    seed: Annotated[int | None, typer.Option(help="Seed of policy, task order and sampling.")] = None,
-    settings_file: Annotated[
-        Path | None, typer.Option("--settings", help="TOML file with any setting.")
-    ] = None,
+    resume: _RESUME = False,
+    seed: _SEED = None,
+    settings_file: _SETTINGS = None,
     reward: Annotated[
         list[str] | None,
         typer.Option(
@@ -76,7 +86,8 @@ def train(
         ),
     ] = None,
     threads: _THREADS = None,
-    device: Annotated[str | None, typer.Option(help="torch device: cpu, cuda.")] = None,
+    device: _DEVICE = None,
+    track: _TRACK = None,
     token: _TOKEN = "",
     ca: _CA = None,
     log_format: _LOG_FORMAT = None,
@@ -93,13 +104,52 @@ def train(
             "grpo.minutes": minutes,
             "grpo.steps": steps,
             "imitation.seconds": imitate_seconds,
+            "track": track,
             **_coefficients(reward or ()),
         }
-        if resume:
-            summary = _resumed(dataset, connect, out, changes)
-        else:
-            summary = _started(dataset, connect, out, model, settings_file, changes)
-        _show_summary(summary)
+        from embomatrix.trainer.starting import resumed, started
+
+        new = functools.partial(started, dataset, out, model, settings_file, changes)
+        start = resumed(dataset, out, changes) if resume else new()
+        _show_summary(_run(start, connect, out))
+
+
+def imitate(
+    dataset: _DATASET = Path("build/dataset"),
+    model: _MODEL = "tiny",
+    out: _OUT = Path("runs/imitate"),
+    seconds: Annotated[float | None, typer.Option(min=0, help="Seconds of it; default 150.")] = None,
+    steps: Annotated[int | None, typer.Option(min=0, help="Steps, in place of seconds.")] = None,
+    patience: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            help="Set tasks aside, and stop after so many measurements in a row without a lower loss on them.",
+        ),
+    ] = None,
+    resume: _RESUME = False,
+    seed: _SEED = None,
+    settings_file: _SETTINGS = None,
+    threads: _THREADS = None,
+    device: _DEVICE = None,
+    track: _TRACK = None,
+) -> None:
+    """Warm a policy up on the oracle's plans; no cluster is needed. `train --resume` with the same --out goes on with GRPO."""
+    with _problems_shown("imitate", out):
+        changes = {
+            "seed": seed,
+            "device": device,
+            "threads": threads,
+            "imitation.seconds": seconds,
+            "imitation.steps": steps,
+            "imitation.patience": patience,
+            "track": track,
+        }
+        from embomatrix.trainer.starting import resumed, started
+
+        new = functools.partial(started, dataset, out, model, settings_file, changes)
+        start = resumed(dataset, out, changes) if resume else new()
+        _show_imitation(_imitated(start, out), out)
 
 
 @contextlib.contextmanager
@@ -113,13 +163,10 @@ def _problems_shown(command: str, out: Path | None = None) -> Iterator[None]:
     except (TrainerError, ClusterError) as error:
         _leave(command, str(error), 2)
     except KeyboardInterrupt:
-        saved = out is not None and _saved(out)
+        from embomatrix.trainer.starting import has_checkpoint
+
+        saved = out is not None and has_checkpoint(out)
         _leave(command, f"interrupted: go on with `--resume --out={out}`" if saved else "interrupted", 130)
-
-
-def _saved(out: Path) -> bool:
-    """Whether the folder holds a checkpoint to go on from."""
-    return any((out / "checkpoints").glob("step-*"))
 
 
 def _leave(command: str, sentence: str, status: int) -> NoReturn:
@@ -138,74 +185,6 @@ def _coefficients(told: Sequence[str]) -> dict[str, str]:
                 f"--reward {name + equals + value!r}: expected NAME=VALUE, for example goal=10"
             )
     return {f"reward.{name}": value for name, _, value in pairs}
-
-
-def _started(
-    dataset: Path,
-    connect: Connect,
-    out: Path,
-    model: str,
-    settings_file: Path | None,
-    changes: dict[str, Any],
-) -> Summary:
-    from embomatrix.trainer.policy.choice import TINY, new_policy
-    from embomatrix.trainer.settings import LANGUAGE_MODEL_DEFAULTS, read_settings
-
-    threads = changes["threads"] or max(1, (os.cpu_count() or 2) // 2)
-    defaults = {} if model == TINY else LANGUAGE_MODEL_DEFAULTS
-    settings = read_settings(settings_file, {**changes, "model": model, "threads": threads}, defaults)
-    if _saved(out):
-        raise TrainerError(f"{out} holds another run: pass --resume to go on with it, or another --out")
-    tasks = _loaded(dataset, settings)
-    policy = new_policy(settings, tasks)
-    return _run(policy, tasks, connect, settings, out)
-
-
-def _resumed(dataset: Path, connect: Connect, out: Path, changes: dict[str, Any]) -> Summary:
-    from embomatrix.trainer.checkpoint import CheckpointStore, read_state
-    from embomatrix.trainer.loop import CHECKPOINTS, REFERENCE
-    from embomatrix.trainer.policy.choice import saved_policy
-
-    newest = CheckpointStore(out / CHECKPOINTS, keep=1).latest()
-    if newest is None:
-        raise TrainerError(
-            f"there is no checkpoint in {out} to resume from: leave out --resume, or pass its --out"
-        )
-    progress, settings = read_state(newest)
-    settings = _changed(settings, changes)
-    tasks = _loaded(dataset, settings)
-    policy = saved_policy(newest / "policy", settings)
-    reference = saved_policy(out / REFERENCE, settings).frozen_copy()
-    return _run(policy, tasks, connect, settings, out, progress=progress, reference=reference)
-
-
-def _changed(settings: TrainSettings, changes: dict[str, Any]) -> TrainSettings:
-    from embomatrix.trainer.settings import with_changes
-
-    return with_changes(settings.model_dump(), changes)
-
-
-def _loaded(dataset: Path, settings: TrainSettings) -> TaskSet:
-    import torch
-
-    from embomatrix.trainer.data import load_tasks
-
-    torch.set_num_threads(settings.threads)
-    try:
-        torch.empty(0, device=settings.device)
-    except (RuntimeError, AssertionError) as error:
-        raise TrainerError(
-            f"the device {settings.device!r} can't be used ({reason_of(error)}): expected cpu, or cuda where torch finds a GPU"
-        ) from error
-    return load_tasks(dataset)
-
-
-def _teller(policy: Policy, tasks: TaskSet, settings: TrainSettings) -> Teller:
-    from embomatrix.trainer.augment import Variation
-    from embomatrix.trainer.telling import Teller
-
-    told = settings.prompt
-    return Teller(policy, told.rows, Variation(tasks.kinds, told.rename_share, told.drop_share))
 
 
 def _connector(manager: str, token: str, ca: Path | None) -> Connect:
@@ -229,31 +208,65 @@ def _gateway(
     return Gateway(connect, tasks.bundle_bytes, run_name=name, run_seed=settings.seed, terms=terms)
 
 
-def _run(
-    policy: Policy,
-    tasks: TaskSet,
-    connect: Connect,
-    settings: TrainSettings,
-    out: Path,
-    **resumed: Any,
-) -> Summary:
-    from embomatrix.trainer.loop import Parts, TrainingRun
+def _run(start: Start, connect: Connect, out: Path) -> Summary:
+    from embomatrix.trainer.loop import REFERENCE, Parts, TrainingRun
+    from embomatrix.trainer.policy.choice import saved_policy
     from embomatrix.trainer.progress import display_for
+    from embomatrix.trainer.trackers import trackers_of
 
-    console = Console()
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise TrainerError(
-            f"the folder {out} can't be made ({error.strerror}): pass another --out"
-        ) from error
-    reference = resumed.pop("reference", None)
+    settings, tasks, policy = start.settings, start.tasks, start.policy
+    prepared = start.progress is not None and start.progress.prepared
+    reference = saved_policy(out / REFERENCE, settings).frozen_copy() if prepared else None
     with (
         _gateway(tasks, connect, out.name, settings, settings.grpo.on_lost) as gateway,
-        display_for(console) as display,
+        trackers_of(settings, out) as trackers,
+        display_for(Console()) as display,
     ):
-        parts = Parts(policy, _teller(policy, tasks, settings), tasks, gateway, display, reference)
-        return TrainingRun(parts, settings, out, **resumed).run()
+        parts = Parts(policy, start.teller, tasks, gateway, display, reference)
+        return TrainingRun(parts, settings, out, start.progress, trackers).run()
+
+
+def _imitated(start: Start, out: Path) -> ImitationState:
+    from embomatrix.trainer.checkpoint import Progress, whole_folder
+    from embomatrix.trainer.loop import REFERENCE
+    from embomatrix.trainer.progress import display_for
+    from embomatrix.trainer.recorder import Recorder
+    from embomatrix.trainer.trackers import trackers_of
+    from embomatrix.trainer.warm_up import warm_up
+
+    progress = start.progress or Progress()
+    if progress.prepared:
+        raise TrainerError(
+            f"{out} holds a run that is past its imitation: go on with `embomatrix train --resume`"
+        )
+    with trackers_of(start.settings, out) as trackers, display_for(Console()) as display:
+        recorder = Recorder(out, trackers)
+        warm_up(
+            start.policy,
+            start.teller,
+            start.tasks.train,
+            start.settings,
+            out,
+            progress,
+            recorder,
+            display.imitation,
+        )
+    with whole_folder(out / REFERENCE) as folder:
+        start.policy.save(folder)
+    return progress.imitation
+
+
+def _show_imitation(state: ImitationState, out: Path) -> None:
+    best = (
+        f", loss {state.best_loss:.3f} on tasks set aside, lowest at step {state.best_step}"
+        if state.best_loss is not None
+        else ""
+    )
+    Console(soft_wrap=True).print(
+        f"{state.step} imitation steps in {state.seconds:.0f} s{best}\npolicy      {out / 'reference'}\n"
+        f"go on       embomatrix train --resume --out={out}",
+        highlight=False,
+    )
 
 
 def _show_summary(summary: Summary) -> None:

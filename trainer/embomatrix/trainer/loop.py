@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import os
 import platform
@@ -12,17 +13,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from embomatrix.trainer.checkpoint import CheckpointStore, Progress, restore, whole_folder
+from embomatrix.trainer.checkpoint import CHECKPOINTS, CheckpointStore, Progress, restore, whole_folder
 from embomatrix.trainer.data import Curriculum, Schedule
 from embomatrix.trainer.evaluate import Evaluation, evaluate_policy
-from embomatrix.trainer.imitate import imitate
-from embomatrix.trainer.recorder import Recorder, read_metrics
+from embomatrix.trainer.recorder import METRICS, SAMPLES, Recorder, read_metrics
 from embomatrix.trainer.report import REPORT, Summary, write_report
 from embomatrix.trainer.stopwatch import Activity, Stopwatch
 from embomatrix.trainer.update import StepPlan, Updater
+from embomatrix.trainer.warm_up import warm_up
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
+    from typing import Any
 
     from embomatrix.trainer.data import TaskSet
     from embomatrix.trainer.policy.protocol import Policy
@@ -31,10 +34,10 @@ if TYPE_CHECKING:
     from embomatrix.trainer.rollout import Gateway
     from embomatrix.trainer.settings import TrainSettings
     from embomatrix.trainer.telling import Teller
+    from embomatrix.trainer.trackers import Tracker
 
 logger = logging.getLogger(__name__)
 REFERENCE = "reference"
-CHECKPOINTS = "checkpoints"
 RESERVE_STREAM = 1
 
 
@@ -54,17 +57,22 @@ class TrainingRun:
     """One run in one folder. ``progress`` is a checkpoint's when the run is resumed."""
 
     def __init__(
-        self, parts: Parts, settings: TrainSettings, out: Path, progress: Progress | None = None
+        self,
+        parts: Parts,
+        settings: TrainSettings,
+        out: Path,
+        progress: Progress | None = None,
+        trackers: Sequence[Tracker] = (),
     ) -> None:
         self._parts = parts
         self._settings = settings
         self._out = out
         self._progress = progress or Progress()
-        self._resumed = progress is not None
+        self._restores = self._progress.prepared
         self._stopwatch = Stopwatch()
         self._stopwatch.spent_s.update(self._progress.spent_s)
         self._store = CheckpointStore(out / CHECKPOINTS, keep=settings.keep_checkpoints)
-        self._recorder = Recorder(out)
+        self._recorder = Recorder(out, trackers)
         device = next(iter(parts.policy.parameters())).device
         self._generator = torch.Generator(device).manual_seed(settings.seed)
 
@@ -81,11 +89,11 @@ class TrainingRun:
             self._settings.grpo,
             self._stopwatch,
         )
-        if self._resumed:
+        if self._restores:
             newest = self._store.latest()
             if newest is not None:
-                restore(newest, updater.optimiser, self._generator)
-        self._recorder.forget_after(self._progress.step)
+                restore(newest, functools.partial(self._put_back, updater))
+        self._recorder.forget_after(self._progress.step, METRICS, SAMPLES)
         try:
             self._optimise(updater)
         finally:
@@ -95,22 +103,29 @@ class TrainingRun:
         write_report(summary, read_metrics(self._out), machine())
         return summary
 
+    def _put_back(self, updater: Updater, tensors: Mapping[str, Any]) -> None:
+        updater.optimiser.load_state_dict(tensors["optimiser"])
+        self._generator.set_state(tensors["generator"])
+
     def _prepare(self) -> Policy:
         """Imitation and the first evaluation; the policy as it then is becomes the reference."""
-        parts, settings = self._parts, self._settings
+        parts, progress = self._parts, self._progress
         with self._stopwatch.spending(Activity.IMITATION):
-            self._progress.imitation_steps = imitate(
+            warm_up(
                 parts.policy,
                 parts.teller,
                 parts.tasks.train,
-                settings.imitation,
-                seed=settings.seed,
-                report=parts.display.imitation,
+                self._settings,
+                self._out,
+                progress,
+                self._recorder,
+                parts.display.imitation,
             )
         before = self._evaluate("before GRPO")
-        self._progress.before = before.as_json() if before else []
+        progress.before = before.as_json() if before else []
         with whole_folder(self._out / REFERENCE) as folder:
             parts.policy.save(folder)
+        progress.prepared = True
         return parts.policy.frozen_copy()
 
     def _evaluate(self, label: str) -> Evaluation | None:
@@ -130,6 +145,7 @@ class TrainingRun:
                 report=lambda done, total: parts.display.evaluating(label, done, total),
             )
         parts.display.evaluated(label, result)
+        self._recorder.evaluation(label, result)
         return result
 
     def _optimise(self, updater: Updater) -> None:
@@ -214,9 +230,11 @@ class TrainingRun:
     def _save(self, updater: Updater) -> Path:
         with self._stopwatch.spending(Activity.SAVING):
             self._progress.spent_s = dict(self._stopwatch.spent_s)
-            return self._store.save(
-                self._parts.policy, updater.optimiser, self._generator, self._progress, self._settings
-            )
+            tensors = {
+                "optimiser": updater.optimiser.state_dict(),
+                "generator": self._generator.get_state(),
+            }
+            return self._store.save(self._parts.policy, tensors, self._progress, self._settings)
 
     def _summary(self, checkpoint: Path, after: Evaluation | None, wall_s: float) -> Summary:
         progress = self._progress
@@ -225,7 +243,7 @@ class TrainingRun:
             steps=progress.step,
             rollouts=progress.rollouts,
             lost=progress.lost,
-            imitation_steps=progress.imitation_steps,
+            imitation_steps=progress.imitation.step,
             wall_s=wall_s,
             spent_s=dict(self._stopwatch.spent_s),
             before=Evaluation.from_json(progress.before) if progress.before else None,

@@ -57,7 +57,8 @@ class LineDisplay:
             self._console.print(text, highlight=False, markup=False)
 
     def imitation(self, progress: ImitationProgress) -> None:
-        self._say(f"imitation {progress.share:.0%}: step {progress.step}, loss {progress.loss:.3f}")
+        measured = "" if progress.validation is None else f", {progress.validation:.3f} on tasks set aside"
+        self._say(f"imitation {progress.share:.0%}: step {progress.step}, loss {progress.loss:.3f}{measured}")
 
     def evaluating(self, label: str, done: int, total: int) -> None:
         self._say(f"evaluation {label}: {done} of {total} tasks")
@@ -81,6 +82,7 @@ class LiveDisplay:
         self._console = console
         self._began_s = 0.0
         self._smooth: dict[str, float] = {}
+        self._validation = ""
 
     def __enter__(self) -> Self:
         self._live.__enter__()
@@ -91,9 +93,12 @@ class LiveDisplay:
 
     def imitation(self, progress: ImitationProgress) -> None:
         loss = self._smoothed("loss", progress.loss)
-        self._draw(
-            "imitation of the oracle", progress.share, {"step": f"{progress.step}", "loss": f"{loss:.3f}"}
-        )
+        figures = {"step": f"{progress.step}", "loss": f"{loss:.3f}"}
+        if progress.validation is not None:
+            self._validation = f"{progress.validation:.3f}"
+        if self._validation:
+            figures["on tasks set aside"] = self._validation
+        self._draw("imitation of the oracle", progress.share, figures)
 
     def evaluating(self, label: str, done: int, total: int) -> None:
         self._draw(f"held-out evaluation {label}", done / total, {"tasks": f"{done} of {total}"})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
@@ -11,26 +12,33 @@ from embomatrix.rpc.values import Cancelled, Completed, InfraFailure
 from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
+    from embomatrix.trainer.evaluate import Evaluation
+    from embomatrix.trainer.imitate import ImitationProgress
     from embomatrix.trainer.records import GroupLog, StepRecord
     from embomatrix.trainer.rollout import PlanOutcome
+    from embomatrix.trainer.trackers import Tracker
 
 METRICS = "metrics.jsonl"
 SAMPLES = "samples.jsonl"
+IMITATION = "imitation.jsonl"
 
 
 class Recorder:
-    """Appends to the files of one run's folder. Raises OSError where that can't be written."""
+    """Appends to the files of one run's folder, and tells ``trackers``. Raises OSError where that can't be written."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, trackers: Sequence[Tracker] = ()) -> None:
         self._folder = folder
+        self._trackers = tuple(trackers)
         folder.mkdir(parents=True, exist_ok=True)
 
     def step(self, record: StepRecord, seconds: float) -> None:
         """``seconds`` is the wall clock of the step."""
-        self._append(METRICS, {**asdict(record), "seconds": round(seconds, 4)})
+        row = {**asdict(record), "seconds": round(seconds, 4)}
+        self._append(METRICS, row)
+        self._track("grpo", row)
 
     def samples(self, step: int, log: GroupLog) -> None:
         """One task's plans: text, verdict, reward by tier, what each step did."""
@@ -42,9 +50,20 @@ class Recorder:
             }
             self._append(SAMPLES, {**described, "advantage": round(advantage, 4), **_described(outcome)})
 
-    def forget_after(self, step: int) -> None:
-        """Drop what was written of steps that a run will take again: it is resumed, or had no checkpoint yet."""
-        for name in (METRICS, SAMPLES):
+    def imitation(self, progress: ImitationProgress) -> None:
+        """One step of imitation."""
+        row = asdict(progress)
+        self._append(IMITATION, row)
+        self._track("imitation", row)
+
+    def evaluation(self, label: str, result: Evaluation) -> None:
+        """Held-out success, which the run's own files keep in checkpoints and report."""
+        rates = {category: result.success(category).value for category in result.categories}
+        self._track(f"success {label}", {"step": 0, "all": result.success().value, **rates})
+
+    def forget_after(self, step: int, *names: str) -> None:
+        """Drop what those files hold of steps that a run will take again: it is resumed, or had no checkpoint yet."""
+        for name in names:
             path = self._folder / name
             if path.exists():
                 kept = [
@@ -52,9 +71,24 @@ class Recorder:
                 ]
                 write_whole(path, "".join(f"{line}\n" for line in kept).encode("utf-8"))
 
+    def _track(self, phase: str, row: Mapping[str, Any]) -> None:
+        values = dict(numbers_of(row))
+        step = int(values.pop("step"))
+        for tracker in self._trackers:
+            tracker.log(phase, step, values)
+
     def _append(self, name: str, value: Mapping[str, Any]) -> None:
         with (self._folder / name).open("a", encoding="utf-8") as file:
             file.write(json.dumps(value) + "\n")
+
+
+def numbers_of(row: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
+    """The numbers of a row by name; those of a table in it by ``table/name``."""
+    for name, value in row.items():
+        if isinstance(value, Mapping):
+            yield from ((f"{name}/{inner}", number) for inner, number in numbers_of(value))
+        elif value is not None:
+            yield name, float(value)
 
 
 def _step_of(line: str) -> float:

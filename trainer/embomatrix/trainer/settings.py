@@ -26,6 +26,14 @@ class Overlap(StrEnum):
     AHEAD = "ahead"  # so is the next step's batch sampled, with weights that are one step old
 
 
+class TrackerKind(StrEnum):
+    """Programs that draw metrics."""
+
+    TENSORBOARD = "tensorboard"
+    WANDB = "wandb"
+    TRACKIO = "trackio"
+
+
 class OnLost(StrEnum):
     """What becomes of a group of which the infrastructure lost a rollout."""
 
@@ -67,6 +75,15 @@ class ImitationSettings(_Frozen):
     learning_rate: float = Field(default=2e-3, gt=0)
     warmup_steps: int = Field(default=20, ge=0)
     weight_decay: float = Field(default=0.01, ge=0)
+    patience: int = Field(default=0, ge=0)
+    """Early stopping: so many measurements in a row without a lower loss on tasks set aside end imitation, and the policy is
+    put back to where that loss was lowest. 0: every task is taught, for the whole budget."""
+    validation_share: float = Field(default=0.05, gt=0, lt=1)
+    """Share of the training tasks that are set aside for it."""
+    validate_every: int = Field(default=100, ge=1)
+    """Steps between two measurements."""
+    checkpoint_seconds: float = Field(default=60.0, gt=0)
+    """Seconds of imitation between two checkpoints."""
 
 
 class GrpoSettings(_Frozen):
@@ -157,6 +174,8 @@ class TrainSettings(_Frozen):
     device: str = "cpu"
     checkpoint_every: int = Field(default=50, ge=1)
     keep_checkpoints: int = Field(default=2, ge=1)
+    track: tuple[TrackerKind, ...] = ()
+    """Where metrics go besides the run's own files."""
     samples_every: int = Field(default=10, ge=1)
     """Steps between two groups that are written to the sample log."""
     tiny: TinySettings = TinySettings()

@@ -45,12 +45,23 @@ class Teller:
 
     def lesson(self, task: TrainingTask, rng: np.random.Generator) -> tuple[Tokens, Tokens]:
         """Prompt and oracle's plan of one telling: imitation."""
-        needed = used_rows(task.oracle)
-        told = {row.index for row in limited(task.situation, self.rows).rows} | needed
-        situation = with_fewer_bystanders(subset(task.situation, told), needed, self.variation.drop, rng)
-        varied_situation = varied(situation, self.variation, rng)
-        text = plan_text(task.oracle, varied_situation, self.policy.codec)
-        return self._told(varied_situation).prompt, self.policy.encode_plan(text)
+        situation = with_fewer_bystanders(
+            self._with_needed(task), used_rows(task.oracle), self.variation.drop, rng
+        )
+        return self._lesson(task, varied(situation, self.variation, rng))
+
+    def plain_lesson(self, task: TrainingTask) -> tuple[Tokens, Tokens]:
+        """The same, of the task as it is: what imitation is measured by."""
+        return self._lesson(task, self._with_needed(task))
+
+    def _with_needed(self, task: TrainingTask) -> Situation:
+        """What is told of a task, and what its oracle uses besides."""
+        told = {row.index for row in limited(task.situation, self.rows).rows}
+        return subset(task.situation, told | used_rows(task.oracle))
+
+    def _lesson(self, task: TrainingTask, situation: Situation) -> tuple[Tokens, Tokens]:
+        text = plan_text(task.oracle, situation, self.policy.codec)
+        return self._told(situation).prompt, self.policy.encode_plan(text)
 
     def _told(self, situation: Situation) -> Told:
         return Told(situation, self.policy.encode(prompt_for(situation, self.policy.codec)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.trainer.errors import DAMAGE, TrainerError, reason_of
@@ -11,8 +12,6 @@ from embomatrix.trainer.policy.tiny import TinyPolicy
 from embomatrix.trainer.policy.words import build_vocabulary
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from embomatrix.trainer.data import TaskSet
     from embomatrix.trainer.policy.protocol import Policy
     from embomatrix.trainer.settings import TrainSettings
@@ -20,10 +19,17 @@ if TYPE_CHECKING:
 TINY: Final = "tiny"
 
 
+def is_tiny(model: str) -> bool:
+    """Whether a model by name or folder is the from-scratch policy, new or saved."""
+    return model == TINY or TinyPolicy.is_saved_in(Path(model))
+
+
 def new_policy(settings: TrainSettings, tasks: TaskSet) -> Policy:
     """The policy that a run starts from. Raises TrainerError where the model is unknown or can't be loaded."""
-    if settings.model != TINY:
+    if not is_tiny(settings.model):
         return HfPolicy.load(settings.model, settings.codec, device=settings.device)
+    if settings.model != TINY:
+        return saved_policy(Path(settings.model), settings)
     situations = [task.situation for task in (*tasks.train, *tasks.heldout)]
     vocabulary = build_vocabulary(situations, [task.task.instruction for task in tasks.train])
     shape = DecoderShape(len(vocabulary), **settings.tiny.model_dump())

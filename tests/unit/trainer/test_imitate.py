@@ -1,0 +1,125 @@
+"""Imitation stops when it no longer helps, goes on where it was cut short, and leaves a policy to train."""
+
+import json
+
+import pytest
+import torch
+from rich.console import Console
+from tests.fakes.symbolic_household import make_tasks
+
+from embomatrix.trainer.augment import Variation
+from embomatrix.trainer.checkpoint import CHECKPOINTS, CheckpointStore, Progress, read_state
+from embomatrix.trainer.errors import TrainerError
+from embomatrix.trainer.policy.choice import new_policy, saved_policy
+from embomatrix.trainer.progress import LineDisplay, LiveDisplay
+from embomatrix.trainer.recorder import IMITATION, Recorder
+from embomatrix.trainer.settings import read_settings
+from embomatrix.trainer.telling import Teller
+from embomatrix.trainer.warm_up import warm_up
+
+TINY = {"tiny.layers": 1, "tiny.width": 32, "tiny.heads": 2, "tiny.inner": 64}
+SHORT = {"imitation.steps": 12, "imitation.batch": 4, "imitation.learning_rate": 8e-3}
+STOPPING = {"imitation.patience": 2, "imitation.validate_every": 4, "imitation.validation_share": 0.2}
+TASKS = make_tasks(20, 0, objects=7)
+
+
+class CutError(Exception):
+    """Ends a run in its midst."""
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    torch.set_num_threads(1)
+
+
+def settings_of(**changes):
+    return read_settings(None, {**TINY, **SHORT, **{k.replace("__", "."): v for k, v in changes.items()}})
+
+
+def imitate(out, settings, cut_after=None, tasks=TASKS, display=None):
+    store = CheckpointStore(out / CHECKPOINTS, keep=9)
+    newest = store.latest()
+    progress = read_state(newest)[0] if newest else Progress()
+    policy = saved_policy(newest / "policy", settings) if newest else new_policy(settings, tasks)
+    teller = Teller(policy, 16, Variation(tasks.kinds, 0.5, 0.5))
+    steps = []
+
+    def report(step):
+        steps.append(step)
+        if display:
+            display.imitation(step)
+        if cut_after == step.step:
+            raise CutError
+
+    warm_up(policy, teller, tasks.train, settings, out, progress, Recorder(out), report)
+    return policy, progress.imitation, steps
+
+
+def weights(policy):
+    return torch.cat([parameter.detach().flatten() for parameter in policy.parameters()])
+
+
+@pytest.mark.parametrize("stopping", [{}, STOPPING])
+def test_twelve_steps_are_seven_and_five_after_a_resume(tmp_path, stopping):
+    settings = settings_of(**{key.replace(".", "__"): value for key, value in stopping.items()})
+    whole, state, _ = imitate(tmp_path / "whole", settings)
+    with pytest.raises(CutError):
+        imitate(tmp_path / "halves", settings, cut_after=7)
+    resumed, again, _ = imitate(tmp_path / "halves", settings)
+    assert torch.equal(weights(whole), weights(resumed))
+    assert (state.step, state.best_loss, state.best_step) == (again.step, again.best_loss, again.best_step)
+    assert (tmp_path / "whole" / IMITATION).read_text() == (tmp_path / "halves" / IMITATION).read_text()
+
+
+def test_policy_is_put_back_to_where_it_was_best_on_tasks_set_aside(tmp_path):
+    ruin = settings_of(
+        imitation__steps=400,
+        imitation__learning_rate=2.0,  # after the first measurement nothing gets better
+        imitation__patience=3,
+        imitation__validate_every=2,
+        imitation__warmup_steps=0,
+    )
+    policy, state, _ = imitate(tmp_path, ruin)
+    rows = [json.loads(line) for line in (tmp_path / IMITATION).read_text().splitlines()]
+    measured = {row["step"]: row["validation"] for row in rows if row["validation"] is not None}
+    assert state.done
+    assert state.step < 400
+    assert state.best_loss == min(measured.values()) == measured[state.best_step]
+    assert state.step == state.best_step + 3 * 2
+    newest = CheckpointStore(tmp_path / CHECKPOINTS, keep=9).latest()
+    assert torch.equal(weights(saved_policy(newest / "policy", ruin)), weights(policy))
+
+
+def test_finished_imitation_is_not_repeated(tmp_path):
+    first, _, _ = imitate(tmp_path, settings_of())
+    again, state, steps = imitate(tmp_path, settings_of())
+    assert steps == []
+    assert state.done
+    assert torch.equal(weights(first), weights(again))
+
+
+def test_checkpoints_come_by_the_clock(tmp_path):
+    imitate(tmp_path, settings_of(imitation__checkpoint_seconds=1e-9, keep_checkpoints=3))
+    names = sorted(path.name for path in (tmp_path / CHECKPOINTS).iterdir())
+    assert names == ["imitation-000010", "imitation-000011", "imitation-000012"]
+
+
+def test_too_few_tasks_to_set_aside_are_told(tmp_path):
+    with pytest.raises(TrainerError, match="which leaves none to learn from"):
+        imitate(tmp_path, settings_of(imitation__patience=1), tasks=make_tasks(1, 0, objects=7))
+
+
+def test_policy_in_a_folder_is_a_model_to_start_from(tmp_path):
+    policy, _, _ = imitate(tmp_path, settings_of())
+    policy.save(tmp_path / "reference")
+    begun = new_policy(settings_of(model=str(tmp_path / "reference")), TASKS)
+    assert torch.equal(weights(begun), weights(policy))
+
+
+@pytest.mark.parametrize("live", [False, True])
+def test_displays_tell_the_loss_on_tasks_set_aside(tmp_path, live):
+    console = Console(force_terminal=live, width=120, record=True)
+    display = LiveDisplay(console) if live else LineDisplay(console)
+    with display:
+        imitate(tmp_path, settings_of(imitation__patience=20, imitation__validate_every=1), display=display)
+    assert "on tasks set aside" in console.export_text()

@@ -1,0 +1,41 @@
+"""Metrics reach the programs that draw them, under one name a phase."""
+
+import importlib.util
+
+import pytest
+
+from embomatrix.trainer.errors import TrainerError
+from embomatrix.trainer.imitate import ImitationProgress
+from embomatrix.trainer.recorder import Recorder, numbers_of
+from embomatrix.trainer.settings import read_settings
+from embomatrix.trainer.trackers import trackers_of
+
+
+def test_tensorboard_draws_what_a_run_records(tmp_path):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    settings = read_settings(None, {"track": ["tensorboard"]})
+    with trackers_of(settings, tmp_path) as trackers:
+        recorder = Recorder(tmp_path, trackers)
+        recorder.imitation(ImitationProgress(1, 0.1, 3.0))
+        recorder.imitation(ImitationProgress(2, 0.2, 2.5, validation=2.75))
+    drawn = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
+    assert [(event.step, event.value) for event in drawn.Scalars("imitation/loss")] == [(1, 3.0), (2, 2.5)]
+    assert [(event.step, event.value) for event in drawn.Scalars("imitation/validation")] == [(2, 2.75)]
+
+
+def test_tables_in_a_row_are_named_by_their_path():
+    row = {"step": 1, "reward": 2.5, "success_by_category": {"compound": 0.5}, "validation": None}
+    assert dict(numbers_of(row)) == {"step": 1, "reward": 2.5, "success_by_category/compound": 0.5}
+
+
+@pytest.mark.skipif(importlib.util.find_spec("trackio") is not None, reason="trackio is installed")
+def test_tracker_that_is_not_installed_is_named(tmp_path):
+    told = pytest.raises(TrainerError, match="pip install trackio")
+    with told, trackers_of(read_settings(None, {"track": ["trackio"]}), tmp_path):
+        pass
+
+
+def test_unknown_tracker_is_a_setting_that_is_refused():
+    with pytest.raises(TrainerError, match="track"):
+        read_settings(None, {"track": ["paper"]})

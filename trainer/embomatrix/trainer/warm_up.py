@@ -1,0 +1,68 @@
+"""Imitation in a run's folder: with a log, checkpoints to go on from, and the policy that it ends with."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.trainer.checkpoint import CHECKPOINTS, CheckpointStore, restore
+from embomatrix.trainer.imitate import Imitation
+from embomatrix.trainer.recorder import IMITATION
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from pathlib import Path
+
+    from embomatrix.trainer.checkpoint import Progress
+    from embomatrix.trainer.data import TrainingTask
+    from embomatrix.trainer.imitate import ImitationProgress
+    from embomatrix.trainer.policy.protocol import Policy
+    from embomatrix.trainer.recorder import Recorder
+    from embomatrix.trainer.settings import TrainSettings
+    from embomatrix.trainer.telling import Teller
+
+LOG_EVERY: Final = 10
+"""Steps between two lines of the log, besides those with a measurement."""
+
+
+def warm_up(
+    policy: Policy,
+    teller: Teller,
+    tasks: Sequence[TrainingTask],
+    settings: TrainSettings,
+    out: Path,
+    progress: Progress,
+    recorder: Recorder,
+    report: Callable[[ImitationProgress], None],
+) -> None:
+    """Imitate for the budget, or what is left of it, and keep ``progress.imitation`` true.
+
+    The policy is that of the newest checkpoint in ``out``, where ``progress`` comes from one. However it ends, a checkpoint
+    is left to go on from. Raises TrainerError.
+    """
+    store = CheckpointStore(out / CHECKPOINTS, keep=settings.keep_checkpoints)
+    imitation = Imitation(
+        policy, teller, tasks, settings.imitation, seed=settings.seed, state=progress.imitation
+    )
+    if progress.imitation.done:
+        return
+    newest = store.latest() if progress.imitation.step else None
+    if newest is not None:
+        restore(newest, imitation.restore)
+    recorder.forget_after(progress.imitation.step, IMITATION)
+    saved_s = time.monotonic()
+
+    def told(step: ImitationProgress) -> None:
+        nonlocal saved_s
+        if step.validation is not None or step.step % LOG_EVERY == 1:
+            recorder.imitation(step)
+        report(step)
+        if time.monotonic() - saved_s >= settings.imitation.checkpoint_seconds:
+            store.save(policy, imitation.tensors(), progress, settings)
+            saved_s = time.monotonic()
+
+    try:
+        imitation.run(told)
+    finally:
+        if progress.imitation.step:
+            store.save(policy, imitation.tensors(), progress, settings)
