@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from tests.fakes.commands import background, run
+from tests.fakes.commands import background, run, run_anew
 
 from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.status import InvalidRequestError
@@ -205,7 +205,7 @@ def test_training_tells_how_it_was_interrupted_and_what_could_not_be_written(kit
             )
         [saved] = (tmp_path / "late" / "checkpoints").iterdir()
         assert saved.name.startswith("step-")
-        full = run(*common, f"--out={tmp_path / 'full'}", "--imitate-seconds=0.5", before=_small_files)
+        full = run_anew(*common, f"--out={tmp_path / 'full'}", "--imitate-seconds=0.5", before=_small_files)
         assert_told(full, 2, "can't be written", "make room there, or give rights")
         assert not list((tmp_path / "full").glob("reference*"))
 

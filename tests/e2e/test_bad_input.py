@@ -6,7 +6,7 @@ import shutil
 
 import pytest
 from tests.fakes.chat_server import ChatServer, completion
-from tests.fakes.commands import background, run, without
+from tests.fakes.commands import background, run, run_anew, without
 
 TASK = "apple_to_counter"
 NOWHERE = "127.0.0.1:1"
@@ -185,7 +185,7 @@ def test_trainer_tells_the_same_of_a_dataset(kitchen, tmp_path, damage):
 def test_missing_package_is_named_with_what_brings_it(kitchen, tmp_path, package, arguments, words):
     out = tmp_path / "out"
     filled = [item.replace("DATASET", str(kitchen)).replace("OUT", str(out)) for item in arguments]
-    assert_told(run(*filled, **without(tmp_path, package)), 2, words)
+    assert_told(run_anew(*filled, **without(tmp_path, package)), 2, words)
 
 
 @pytest.mark.parametrize(
@@ -196,7 +196,10 @@ def test_missing_package_is_named_with_what_brings_it(kitchen, tmp_path, package
         (("train", "--minutes=-1"), "Invalid value for '--minutes'"),
         (("demo", "--workers=0"), "Invalid value for '--workers'"),
         (("manager", "serve", "--port=99999"), "--port 99999: input should be less than or equal to 65535"),
-        (("manager", "serve", "--state=foo:bar"), "expected memory:, sqlite:PATH or redis://HOST:PORT/DB"),
+        (
+            ("manager", "serve", "--port=0", "--http-port=0", "--state=foo:bar"),
+            "expected memory:, sqlite:PATH or redis://HOST:PORT/DB",
+        ),
         (
             ("manager", "status", "--manager=nowhere"),
             "'nowhere' is no address of a manager: expected HOST:PORT",
@@ -244,7 +247,7 @@ def _small_files():
 
 
 def test_full_disk_leaves_no_half_scene(tmp_path):
-    told = run("scene", "build", "Rs_int", f"--out={tmp_path}", before=_small_files)
+    told = run_anew("scene", "build", "Rs_int", f"--out={tmp_path}", before=_small_files)
     assert_told(told, 2, "Rs_int.json can't be written (File too large): make room")
     assert list(tmp_path.iterdir()) == []
 

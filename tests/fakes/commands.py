@@ -1,12 +1,19 @@
 """The real `embomatrix` command as a person runs it: to its end, or in the background until it is stopped."""
 
 import contextlib
+import functools
 import os
+import select
 import signal
+import socket
 import subprocess
+import sys
+import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
+
+from tests.fakes.command_server import STATUS, ask
 
 from embomatrix.cli.supervisor import embomatrix_command
 
@@ -43,11 +50,26 @@ def environment(**changes):
     return {**plain, "OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1", **changes}
 
 
-def run(*arguments, text="", before=None, **changes):
-    """Run the command to its end. ``before`` runs in the child first, ``changes`` are of its environment."""
+def run(*arguments, text="", **changes):
+    """Run the command to its end; ``changes`` are of its environment. What it imports was imported before."""
+    with tempfile.TemporaryFile() as said, tempfile.TemporaryFile() as given:
+        given.write(_bytes(text))
+        given.seek(0)
+        streams = (given.fileno(), said.fileno(), said.fileno())
+        ended = ask(_server(), map(str, arguments), environment(**changes), streams)
+        with contextlib.closing(ended):
+            if not select.select([ended], [], [], LIMIT_S)[0]:
+                raise TimeoutError(f"embomatrix {' '.join(map(str, arguments))}: no end after {LIMIT_S:g} s")
+            (status,) = STATUS.unpack(ended.read(STATUS.size))
+        said.seek(0)
+        return Told(status, _words(said.read()))
+
+
+def run_anew(*arguments, text="", before=None, **changes):
+    """The same in a process that starts from nothing. ``before`` runs in it first."""
     result = subprocess.run(
         embomatrix_command(*map(str, arguments)),
-        input=text.encode() if isinstance(text, str) else text,
+        input=_bytes(text),
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         env=environment(**changes),
@@ -55,7 +77,30 @@ def run(*arguments, text="", before=None, **changes):
         check=False,
         preexec_fn=before,
     )
-    return Told(result.returncode, " ".join(result.stdout.decode(errors="replace").split()))
+    return Told(result.returncode, _words(result.stdout))
+
+
+def _bytes(text):
+    return text.encode() if isinstance(text, str) else text
+
+
+def _words(said):
+    return " ".join(said.decode(errors="replace").split())
+
+
+@functools.cache
+def _server():
+    """Started with the first command of this process, and ended by the end of it."""
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with theirs:
+        # The verbosity is read when grpc is imported, and the command sets it only then.
+        subprocess.Popen(
+            [sys.executable, "-m", "tests.fakes.command_server", str(theirs.fileno())],
+            cwd=Path(__file__).parents[2],
+            env=environment(GRPC_VERBOSITY="ERROR"),
+            pass_fds=[theirs.fileno()],
+        )
+    return ours
 
 
 def without(folder, *packages):
@@ -77,6 +122,8 @@ class Background:
                 stderr=subprocess.STDOUT,
                 env=environment(**changes),
                 start_new_session=True,
+                # A shell has what it runs in the background ignore Ctrl-C, and that is inherited.
+                preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
             )
 
     @property

@@ -1,6 +1,7 @@
 """What Prometheus scrapes from a manager that is at work."""
 
 import asyncio
+import itertools
 
 import httpx
 import pytest
@@ -9,7 +10,7 @@ from tests.fakes.worker import FakeWorker
 from tests.integration.test_manager_service import KITCHEN, batch, manager, open_run, outcomes, until
 
 from embomatrix.rpc.run_log import Phase
-from embomatrix.rpc.values import Batch, LookaheadEntry
+from embomatrix.rpc.values import Batch, LookaheadEntry, Warmth
 
 pytestmark = pytest.mark.timeout(60)
 
@@ -23,6 +24,15 @@ async def scraped(http):
     }
 
 
+async def warmed(client, entries):
+    """Announce these until the manager says that all of them are warm: what comes then is a hit."""
+    async with asyncio.timeout(10):
+        for version in itertools.count(1):
+            if set((await client.announce_lookahead("r1", version, entries)).values()) == {Warmth.WARM}:
+                return
+            await asyncio.sleep(0.02)
+
+
 async def test_metrics_of_a_manager_under_load_add_up(tmp_path):
     async with (
         manager(tmp_path) as at,
@@ -30,8 +40,7 @@ async def test_metrics_of_a_manager_under_load_add_up(tmp_path):
         FakeWorker(at.address, slots=4, execute_s=0.01, poison={"poison"}) as worker,
         httpx.AsyncClient(base_url=at.status_url, trust_env=False) as http,
     ):
-        await client.announce_lookahead("r1", 1, [LookaheadEntry(1, KITCHEN, 200)])
-        await until(lambda: worker.residents)
+        await warmed(client, [LookaheadEntry(1, KITCHEN, 200)])
         good, bad = batch(200), batch(1, batch_id="b2", task="poison")
         running = asyncio.create_task(outcomes(client, Batch("r1", "mixed", 1, good.rollouts + bad.rollouts)))
         await until(lambda: len(worker.executed) > 20)
