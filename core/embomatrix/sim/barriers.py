@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from embomatrix.sim.obstacles import WALLS
+from embomatrix.sim.spots import link_frame
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.view import refuse
 
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
     from embomatrix.world.geometry import FloatArray, Vec2
     from embomatrix.world.poses import Handling
 
+SAME_M: Final = 1e-6
 RASTER_M: Final = 0.1
 """Distance of the points at which the robot might stand."""
 WALL: Final = "a wall"
@@ -28,10 +31,27 @@ def no_way_for_arm(world: LiveWorld, handling: Handling, target: str) -> Refusal
     """Refusal when the scene's analysis found no way of the arm to do this; while all stays where it was."""
     other = world.barred.get(handling, {}).get(target, "")
     if not other or not all(
-        world.navigator.is_as_loaded(name) for name in (target, other) if name in world.scene.by_name
+        world.navigator.is_as_loaded(name) or _is_led_out(world, name)
+        for name in (target, other)
+        if name in world.scene.by_name
     ):
         return None
     return refuse(FailureReason.ARM_BLOCKED, target=target, other=other)
+
+
+def _is_led_out(world: LiveWorld, name: str) -> bool:
+    """Whether an object moved only as the drawer did that it lies in: the arm was looked for with that led out."""
+    if world.engine.is_parked(name):
+        return False
+    for enclosure in world.relations.enclosing(name)[:1]:
+        asset, host = world.asset(enclosure.name), world.scene.by_name[enclosure.name]
+        link = next(interior.link for interior in asset.interiors if interior.name == enclosure.interior)
+        if link and world.navigator.is_as_loaded(enclosure.name):
+            before = link_frame(asset, host.pose_world_asset, host.joints, link)
+            now = link_frame(asset, host.pose_world_asset, world.engine.joints(host.name), link)
+            led = now @ before.inverse() @ world.scene.by_name[name].pose_world_asset
+            return math.dist(led.position_m, world.engine.pose(name).position_m) < SAME_M
+    return False
 
 
 def no_way_to(world: LiveWorld, target: str) -> Refusal:

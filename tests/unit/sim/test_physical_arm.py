@@ -1,11 +1,14 @@
 """The arm's kinematics: what is solved in closed form is where the chain of joints leads."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
-from tests.fakes.scenes import kitchen_scene
+from tests.fakes import furniture as make
+from tests.fakes.scenes import kitchen_scene, placed, scene_of, upright
 
 from embomatrix.sim.bullet.dynamic import DynamicWorld
 from embomatrix.sim.bullet.engine import BulletEngine
@@ -17,7 +20,8 @@ from embomatrix.sim.physical.motion import Mover
 from embomatrix.sim.physical.space import boxes_of, clearance, strikes
 from embomatrix.sim.physical.stage import tucked
 from embomatrix.sim.relations import Relations
-from embomatrix.world.geometry import Pose
+from embomatrix.world.asset import Joint, JointKind, Link
+from embomatrix.world.geometry import Part, Pose, Shape
 from embomatrix.world.poses import StandPose
 
 SHARES = arrays.arrays(np.float64, (5, arm.JOINTS), elements=st.floats(0.02, 0.98))
@@ -135,4 +139,25 @@ def test_the_arm_bears_its_own_weight_stretched_out_in_coarse_steps_too():
     stretched[body.LIFT], stretched[body.ARM] = 0.5, (0.0, 1.5, 0.0, -0.2, 0.0, 1.8, 0.785)
     assert mover.sweep(stretched[None]) is None
     assert np.abs(mover.posture - stretched).max() < 0.02
+    world.close()
+
+
+def test_the_lift_bears_its_load_beside_a_leaf_that_fits_closely_between_its_neighbours():
+    """A contact that can move nothing is one by whose effect Bullet divides: it once ended the solving for the robot too."""
+    front, tall = Part(Shape.BOX, Pose((0.31, 0.0, 0.0)), (0.02, 0.6, 1.0)), (0.6, 0.6, 1.0)
+    door = Link("door", (front,), Joint(JointKind.REVOLUTE, (0.31, 0.0, -0.5), (0.0, 1.0, 0.0), 1.5))
+    oven = make.asset("oven", "oven.n.01", tall, [make.box((0.0, 0.0, 0.0), tall)], links=[door])
+    side = make.block("countertop", "countertop.n.01", (0.7, 0.6, 1.0), {})
+    row = [
+        (placed(name, kind, "kitchen_0", upright(1.5, 2.0 + y, 0.01, kind), fixed=True), kind)
+        for name, kind, y in (("oven_1", oven, 0.0), ("side_1", side, 0.59995), ("side_2", side, -0.59995))
+    ]
+    row[0] = replace(row[0][0], joints=(0.0,)), oven
+    scene = scene_of("flush", row)
+    world = DynamicWorld(scene)
+    poses = {item.name: item.pose_world_asset for item in scene.objects}
+    world.build(poses, {item.name: item.joints for item in scene.objects}, tucked(StandPose(2.16, 1.6, 0.0)))
+    mover = Mover(world, lambda: None)
+    assert mover.drive(mover.posture + np.eye(body.NUMBERS)[1:2] * 0.8) is None
+    assert mover.posture[body.LIFT] > -0.005
     world.close()

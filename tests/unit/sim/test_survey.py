@@ -15,6 +15,7 @@ from embomatrix.sim.physical.survey import Foresight
 from embomatrix.sim.pose_cache import standing_poses
 from embomatrix.skills.failure import FailureReason
 from embomatrix.world.bundle import Bundle, decode_bundle, encode_bundle
+from embomatrix.world.geometry import Pose
 from embomatrix.world.poses import Handling, PoseCache
 
 BOX_M = 0.14
@@ -47,7 +48,7 @@ def surveyed(scene, names, foresight=None):
         poses = PoseCache({}, standing_poses(engine, names))
         world = LiveWorld(Bundle(scene, {}, poses), engine)
         before = world.state_bytes()
-        found = (foresight or Foresight()).survey(world, poses, names, seed=0)
+        found = (foresight or Foresight()).survey(world, poses, names)
         assert world.state_bytes() == before
         assert {name: set(stands) for name, stands in found.stands.items()} == {
             name: set(stands) for name, stands in poses.stands.items()
@@ -97,6 +98,27 @@ def test_a_thing_that_was_put_elsewhere_is_not_barred_there():
     assert barred.failure is FailureReason.ARM_BLOCKED
     moved = "move table_lamp_1; pick_up table_lamp_1; move coffee_table_1; place coffee_table_1 ontop; toggle_on table_lamp_1"
     assert executed_with(kitchen_scene(), poses, moved).failure is None
+
+
+def test_a_thing_stays_barred_in_the_drawer_that_was_led_out_with_it():
+    cabinet, apple = make.drawer_cabinet(), make.apple()
+    at = upright(3.0, 2.4, 0.0, cabinet, -1.5707963267948966)
+    drawers = replace(placed("bottom_cabinet_1", cabinet, "kitchen_0", at, fixed=True), joints=(0.0, 0.0))
+    inside = at @ Pose((0.1, 0.0, 0.012 + apple.size_m[2] / 2))
+    scene = with_objects(
+        kitchen_scene(), [(drawers, cabinet), (placed("apple_9", apple, "kitchen_0", inside), apple)]
+    )
+    text = "move bottom_cabinet_1; open bottom_cabinet_1; pick_up apple_9"
+    assert executed_with(scene, PoseCache(), text).failure is None
+    barred = PoseCache(barred={Handling.TAKE: {"apple_9": "bottom_cabinet_1"}})
+    assert executed_with(scene, barred, text).failure is FailureReason.ARM_BLOCKED
+
+
+def test_the_lid_of_what_can_be_carried_is_barred():
+    scene = kitchen_scene()
+    objects = tuple(replace(item, fixed=item.fixed and item.name != "microwave_1") for item in scene.objects)
+    found = surveyed(replace(scene, objects=objects), ("microwave_1",))
+    assert found.barred[Handling.OPEN] == {"microwave_1": "microwave_1"}
 
 
 def test_what_a_look_ahead_knows_of_other_scenes_changes_no_answer(flat):

@@ -61,6 +61,7 @@ class DynamicWorld:
         self.rest()
         self.step(1)
         self.rest()
+        self.bodies.spare_idle_contacts()
         self.bodies.still_sleep()
         self._known = {name: self.bodies.state(name) for name in self.bodies.moving}
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.sim.bullet.bodies import BodyFactory
 from embomatrix.sim.bullet.client import pybullet
 from embomatrix.sim.engine import FLOOR, WALL
+from embomatrix.world.asset import JointKind
 from embomatrix.world.geometry import Pose
 
 if TYPE_CHECKING:
@@ -31,6 +32,8 @@ SLOW_RAD_S: Final = 0.1
 MOVED_M: Final = 5e-4
 TURNED: Final = 2e-3
 """Less than this is the solver's sagging, not motion."""
+ALONG: Final = 0.999
+"""Cosine from which on two directions are one."""
 AWAY_M: Final = -50.0
 """Depth at which things that are not in the world are kept."""
 
@@ -147,6 +150,33 @@ class DynamicBodies:
         asleep = bullet.ACTIVATION_STATE_ENABLE_SLEEPING | bullet.ACTIVATION_STATE_SLEEP
         for body in self._still:
             bullet.changeDynamics(body, -1, activationState=asleep, physicsClientId=self._client)
+
+    def spare_idle_contacts(self) -> None:
+        """Let leaves pass what they lie against where neither can ever push the other: what stands beside a leaf's way.
+
+        A force along its hinge, or across its runners, moves no leaf. Bullet divides by how much a force moves: one such
+        contact makes it stop solving after an iteration, for the robot too once that comes near, and its lift sinks.
+        """
+        bullet, client = self._bullet, self._client
+        for name in self._joints:
+            body = self._bodies[name]
+            for contact in bullet.getContactPoints(bodyA=body, physicsClientId=client):
+                _, _, other, link, other_link, *_ = contact
+                if not self._gives(body, link, contact[7]) and not self._gives(other, other_link, contact[7]):
+                    bullet.setCollisionFilterPair(body, other, link, other_link, 0, physicsClientId=client)
+
+    def _gives(self, body: int, link: int, normal: Vec3) -> bool:
+        """Whether a force along a normal moves a link of a body."""
+        name = self.name(body)
+        if name not in self._joints:
+            return name in self.movable
+        while link >= 0 and link not in self._joints[name]:
+            link = int(self._bullet.getJointInfo(body, link, physicsClientId=self._client)[16])
+        if link < 0:
+            return False
+        _, joint = self._scene.asset_of(name).joints[self._joints[name].index(link)]
+        along = abs(float(self.pose(name).rotation @ joint.axis @ normal))
+        return along < ALONG if joint.kind is JointKind.REVOLUTE else along > 1.0 - ALONG
 
     def sleep(self, name: str) -> None:
         """Put an object to sleep where it is."""

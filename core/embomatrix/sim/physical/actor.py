@@ -125,7 +125,7 @@ def _go_to_room(stage: Stage, call: SkillCall, rng: np.random.Generator) -> Refu
 
 
 def _pick_up(stage: Stage, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
-    return pick_up(stage, target_of(stage.world, call), rng)
+    return pick_up(stage, target_of(stage.world, call))
 
 
 def _place(stage: Stage, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
@@ -134,16 +134,16 @@ def _place(stage: Stage, call: SkillCall, rng: np.random.Generator) -> Refusal |
 
 
 def _open(stage: Stage, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
-    return open_all(stage, target_of(stage.world, call), rng)
+    return open_all(stage, target_of(stage.world, call))
 
 
 def _close(stage: Stage, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
-    return close_all(stage, target_of(stage.world, call), rng)
+    return close_all(stage, target_of(stage.world, call))
 
 
 def _toggle(stage: Stage, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
     """Press the switch; what that means is the same as in cached mode."""
-    return press(stage, target_of(stage.world, call), rng) or ACTIONS[call.skill](stage.world, call, rng)
+    return press(stage, target_of(stage.world, call)) or ACTIONS[call.skill](stage.world, call, rng)
 
 
 def _work(stage: Stage, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
@@ -152,7 +152,7 @@ def _work(stage: Stage, call: SkillCall, rng: np.random.Generator) -> Refusal | 
     target = target_of(world, call)
     touched = source_of(world, call) if target in world.carried else target
     free = touched not in world.carried and not world.carried
-    refusal = press(stage, touched, rng) if free else None
+    refusal = press(stage, touched) if free else None
     refusal = refusal or ACTIONS[call.skill](world, call, rng)
     if refusal is None:
         stage.bring_in_step()

@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from embomatrix.sim.actions import other_stands
 from embomatrix.sim.bounds import IDENTITY, joint_motion
 from embomatrix.sim.physical import body
 from embomatrix.sim.physical.fold import WAYS, approach, fold, unfold
 from embomatrix.sim.physical.grasp import cross, facing
 from embomatrix.sim.physical.hands import GENTLE, TOUCH_M
+from embomatrix.sim.physical.reach import JUMP_RAD, Reach, Track
 from embomatrix.sim.physical.reach import TOUCH_M as PRESS_M
-from embomatrix.sim.physical.reach import Reach, Track
 from embomatrix.sim.physical.space import Boxes, boxes_of, part_boxes, strikes
 from embomatrix.sim.physical.stage import compact
 from embomatrix.sim.physical.travel import SOMETHING
@@ -58,6 +59,8 @@ ENOUGH: Final = 0.5
 SHUT: Final = OPEN_FRACTION
 STRETCHES: Final = (1, 2, 4)
 """Into how many pulls the way is divided, with steps between them."""
+ELSEWHERE: Final = 1
+"""Other standing poses that the robot tries a leaf from: there it finds other places to work."""
 FAR_M: Final = 1.7
 """So far the base may go to lead a leaf."""
 
@@ -134,17 +137,17 @@ def leaves_of(stage: Stage, name: str) -> list[Leaf]:
     ]
 
 
-def open_all(stage: Stage, name: str, rng: np.random.Generator) -> Refusal | None:
+def open_all(stage: Stage, name: str) -> Refusal | None:
     """Open every leaf, the low ones first. It fails, and leaves what it did, when one does not get half open."""
-    return _lead_all(stage, name, 1.0, rng)
+    return _lead_all(stage, name, 1.0)
 
 
-def close_all(stage: Stage, name: str, rng: np.random.Generator) -> Refusal | None:
+def close_all(stage: Stage, name: str) -> Refusal | None:
     """Shut every leaf, the high ones first."""
-    return _lead_all(stage, name, 0.0, rng)
+    return _lead_all(stage, name, 0.0)
 
 
-def _lead_all(stage: Stage, name: str, goal: float, rng: np.random.Generator) -> Refusal | None:
+def _lead_all(stage: Stage, name: str, goal: float) -> Refusal | None:
     if not stage.dynamic.bodies.has_leaves(name):
         return refuse(FailureReason.ARM_BLOCKED, target=name, other=name)
     home = stage.told
@@ -154,7 +157,7 @@ def _lead_all(stage: Stage, name: str, goal: float, rng: np.random.Generator) ->
     for leaf in (*row, *row):
         if _is_done(stage.dynamic.bodies.joints(name)[leaf.number], goal):
             continue
-        refusal = _lead(stage, leaf, goal, rng)
+        refusal = _lead_from_anywhere(stage, leaf, goal)
         if _is_done(stage.dynamic.bodies.joints(name)[leaf.number], goal):
             refusal = None
         elif refusal is None:
@@ -162,7 +165,7 @@ def _lead_all(stage: Stage, name: str, goal: float, rng: np.random.Generator) ->
         if refusal is not None:
             break
     # Where the robot ends up does not undo what became of the door.
-    fold(stage, stage.world.navigator.aside(name, home), rng, name)
+    fold(stage, stage.world.navigator.aside(name, home), name)
     return refusal
 
 
@@ -176,28 +179,42 @@ def _is_done(reached: float, goal: float) -> bool:
     return reached >= ENOUGH if goal else reached <= SHUT
 
 
-def _lead(stage: Stage, leaf: Leaf, goal: float, rng: np.random.Generator) -> Refusal | None:
-    """Move one leaf to a share of its travel: in one stretch, else in ever more of them with steps between."""
+def _lead_from_anywhere(stage: Stage, leaf: Leaf, goal: float) -> Refusal | None:
+    """Move one leaf to a share of its travel from here, else from where else its object is served."""
+    refusal = _lead(stage, leaf, goal)
+    if refusal is not None:
+        for stand in itertools.islice(other_stands(stage.world, leaf.name), ELSEWHERE):
+            refusal = fold(stage, stand, leaf.name) or _lead(stage, leaf, goal)
+            if refusal is None:
+                break
+    return refusal
+
+
+def _lead(stage: Stage, leaf: Leaf, goal: float) -> Refusal | None:
+    """Move one leaf to a share of its travel: in one stretch, else in ever more of them with steps between.
+
+    Where it is open, or shut, far enough by then it stays: who tries for the rest may push it back.
+    """
     refusal: Refusal | None = None
     for stretches in STRETCHES:
         start = stage.dynamic.bodies.joints(leaf.name)[leaf.number]
         for number in range(stretches):
             now = stage.dynamic.bodies.joints(leaf.name)[leaf.number]
             aim = start + (number + 1) / stretches * (goal - start)
-            refusal = _stretch(stage, leaf, now, aim, rng) if abs(aim - now) > SHUT else None
+            refusal = _stretch(stage, leaf, now, aim) if abs(aim - now) > SHUT else None
             if refusal is not None:
                 break
-        if refusal is None:
+        if refusal is None or _is_done(stage.dynamic.bodies.joints(leaf.name)[leaf.number], goal):
             return None
     return refusal
 
 
-def _stretch(stage: Stage, leaf: Leaf, start: float, goal: float, rng: np.random.Generator) -> Refusal | None:
+def _stretch(stage: Stage, leaf: Leaf, start: float, goal: float) -> Refusal | None:
     """Take the leaf where it is and lead it to a share of its travel."""
     reach, ways = leading(stage, leaf, start, goal)
     for way in itertools.islice(ways, WAYS):
-        _draw_in(stage, way, rng)
-        swing = approach(stage, way, reach, rng, loaded=False)
+        _draw_in(stage, way)
+        swing = approach(stage, way, reach, loaded=False)
         if swing is not None and unfold(stage, swing) is None:
             return _pull(stage, way, leaf, goal)
     return refuse(FailureReason.ARM_BLOCKED, target=leaf.name, other=reach.hindrance or SOMETHING)
@@ -233,11 +250,11 @@ def leading(stage: Stage, leaf: Leaf, start: float, goal: float) -> tuple[Reach,
     return reach, reach.ways(itertools.chain([first], tracks), bases)
 
 
-def _draw_in(stage: Stage, way: Way, rng: np.random.Generator) -> None:
+def _draw_in(stage: Stage, way: Way) -> None:
     """Fold the arm where the last pull left it, before the base goes elsewhere: out it sweeps all that stands around."""
     now = stage.mover.posture
     if math.dist(now[:2], way.postures[0, :2]) > 0.01 and not compact(stage, now):
-        fold(stage, StandPose(*now[:3].tolist()), rng)
+        fold(stage, StandPose(*now[:3].tolist()))
 
 
 def _pull(stage: Stage, way: Way, leaf: Leaf, goal: float) -> Refusal | None:
@@ -254,7 +271,7 @@ def _pull(stage: Stage, way: Way, leaf: Leaf, goal: float) -> Refusal | None:
         stage.mover.follow((last + OVER * (last - way.postures[-3]))[None], PULL)
     stage.mover.wait(24)
     stage.dynamic.unhook()
-    stage.mover.follow(way.postures[-1:], 0.6)
+    stage.mover.follow(way.postures[-1:] if hit is None else _off(stage.mover.posture), 0.6)
     stage.dynamic.part()
     stage.mover.wait(4)
     if stage.dynamic.hindrance() == leaf.name and not _pushes(way.postures[-2], way.postures[-3]):
@@ -264,6 +281,16 @@ def _pull(stage: Stage, way: Way, leaf: Leaf, goal: float) -> Refusal | None:
     if abs(reached - goal) > 0.12 and hit is not None:
         return refuse(FailureReason.DOOR_BLOCKED, target=leaf.name, other=hit or SOMETHING)
     return None
+
+
+def _off(posture: FloatArray) -> FloatArray:
+    """Where the hand goes off a leaf that is not led to its end: straight back, shape (1, 11); nowhere when the arm can't."""
+    now = posture[None]
+    rotation, position = body.tools(now)
+    back = position - OFF_M * rotation[:, :, 2]
+    found = body.solve(rotation, back, now[:, :3], now[:, body.LIFT], now[:, -1])[0]
+    turned = np.nan_to_num(np.abs(found - posture).max(axis=1), nan=np.inf)
+    return found[turned.argmin()][None] if turned.min() < JUMP_RAD else now
 
 
 def _pushes(start: FloatArray, end: FloatArray) -> bool:

@@ -49,9 +49,7 @@ OVER_M: Final = 1.0
 """Loads are carried higher than this where that is possible: over counters."""
 
 
-def approach(
-    stage: Stage, way: Way, reach: Reach, rng: np.random.Generator, *, loaded: bool
-) -> FloatArray | None:
+def approach(stage: Stage, way: Way, reach: Reach, *, loaded: bool) -> FloatArray | None:
     """Postures that lead to the start of a way, (w, 11), None when none are found.
 
     The arm unfolds where it will work, or some way back from there, whence the base then drives on with the arm ready.
@@ -63,19 +61,19 @@ def approach(
         spot = start[:3] + away * back
         if away and not stage.floor.grid.drives_straight(_pair(spot), _pair(start)):
             continue
-        swing = reach.transit(standing(now, spot), start, rng, loaded=loaded)
+        swing = reach.transit(standing(now, spot), start, loaded=loaded)
         if swing is not None:
             return swing
     return None
 
 
 def arrivals(
-    stage: Stage, ways: Iterable[Way], reach: Reach, rng: np.random.Generator, *, loaded: bool
+    stage: Stage, ways: Iterable[Way], reach: Reach, *, loaded: bool
 ) -> Iterator[tuple[Way, Refusal | None]]:
     """Bring the arm to the start of one way after another, each with why it did not get there; it tries a few, no more."""
     attempts = 0
     for way in itertools.islice(ways, WAYS):
-        swing = approach(stage, way, reach, rng, loaded=loaded)
+        swing = approach(stage, way, reach, loaded=loaded)
         if swing is None:
             continue
         attempts += 1
@@ -103,13 +101,13 @@ def _pair(point: FloatArray) -> tuple[float, float]:
     return float(point[0]), float(point[1])
 
 
-def fold(stage: Stage, home: StandPose, rng: np.random.Generator, target: str = "") -> Refusal | None:
+def fold(stage: Stage, home: StandPose, target: str = "") -> Refusal | None:
     """Bring the arm, with what it holds, over the base, and the base back to where it stood to serve a target.
 
     Where the arm has no room to fold, the base first draws it back. What the hand still touches does not keep it there.
     """
     for _ in range(FOLDS):
-        if _drawn_over_base(stage, rng):
+        if _drawn_over_base(stage):
             break
     now = stage.mover.posture
     if (
@@ -121,7 +119,7 @@ def fold(stage: Stage, home: StandPose, rng: np.random.Generator, target: str = 
     return None
 
 
-def _drawn_over_base(stage: Stage, rng: np.random.Generator) -> bool:
+def _drawn_over_base(stage: Stage) -> bool:
     """Whether the arm is over the base, or finds no way there; not where something stopped it on the way it took."""
     now = stage.mover.posture
     reach = stage.reach(stage.boxes().drawn_in(*_limbs(stage, now), AIR_M))
@@ -129,7 +127,7 @@ def _drawn_over_base(stage: Stage, rng: np.random.Generator) -> bool:
     folded = carrying(stage, now)
     for spot in _retreats(reach, now, loaded):
         there = standing(now, spot)
-        swing = reach.transit(there, standing(folded, spot), rng, loaded=loaded, draws=DRAWS)
+        swing = reach.transit(there, standing(folded, spot), loaded=loaded, draws=DRAWS)
         if swing is not None:
             return stage.mover.sweep(swing) is None
     return True

@@ -43,15 +43,15 @@ def bases_at(stage: Stage, pose: Pose, course: float, out_m: float | None) -> li
     return stage.bases(point) if out_m is None else stage.bases(point, out_m + ROOM_M, course)
 
 
-def pick_up(stage: Stage, target: str, rng: np.random.Generator) -> Refusal | None:
+def pick_up(stage: Stage, target: str) -> Refusal | None:
     """Take an object that lies where the robot can reach it."""
     home = stage.told
     for _ in range(ATTEMPTS):
-        refusal = _take(stage, target, rng)
+        refusal = _take(stage, target)
         if refusal is None or not _was_pushed(stage, target):
             break
         stage.settle()
-    fold(stage, home, rng, target)
+    fold(stage, home, target)
     if refusal is None and stage.has_slipped():
         refusal = refuse(FailureReason.SLIPPED, target=target)
     if refusal is not None and stage.grip is not None:
@@ -66,9 +66,9 @@ def _was_pushed(stage: Stage, name: str) -> bool:
     return stage.grip is None and math.dist(now.position_m, then.position_m) > PUSHED_M
 
 
-def _take(stage: Stage, target: str, rng: np.random.Generator) -> Refusal | None:
+def _take(stage: Stage, target: str) -> Refusal | None:
     tracks, roofed, bases = ways_to(stage, target)
-    return take_by(stage, target, tracks, roofed, bases, rng)
+    return take_by(stage, target, tracks, roofed, bases)
 
 
 def ways_to(stage: Stage, target: str) -> tuple[list[Track], int, list[FloatArray]]:
@@ -90,16 +90,15 @@ def take_by(
     tracks: Sequence[Track],
     roofed: int,
     bases: Sequence[FloatArray],
-    rng: np.random.Generator,
 ) -> Refusal | None:
     """Take an object on any of some ways, the first ``roofed`` of which lead in under a roof, from any of the bases, (b, 3)."""
     reach = stage.reach(stage.boxes(), target)
     refusal = None
-    for way, lost in arrivals(stage, reach.ways(tracks, bases), reach, rng, loaded=False):
+    for way, lost in arrivals(stage, reach.ways(tracks, bases), reach, loaded=False):
         refusal = lost or _touch(stage, way, target)
         if refusal is None:
             return _lift(stage, way, target, ROOFED_RAISE_M if way.number < roofed else RAISE_M)
-        fold(stage, StandPose(*stage.mover.posture[:3].tolist()), rng)
+        fold(stage, StandPose(*stage.mover.posture[:3].tolist()))
         if _was_pushed(stage, target):
             return refusal
     return refusal or refuse(FailureReason.ARM_BLOCKED, target=target, other=reach.hindrance or SOMETHING)

@@ -44,14 +44,14 @@ def place(stage: Stage, target: str, asked: PlaceRelation, rng: np.random.Genera
     def counts() -> bool:
         return world.relations.holds(relation, held, target)
 
-    refusal = put(stage, found, counts, rng, target)
+    refusal = put(stage, found, counts, target)
     if refusal is not None and stage.grip is not None:
-        fold(stage, home, rng, target)
-        if regrasp(stage, found, counts, home, rng):
-            refusal = put(stage, found, counts, rng, target)
+        fold(stage, home, target)
+        if regrasp(stage, found, counts, home):
+            refusal = put(stage, found, counts, target)
         if refusal is not None and stage.grip is not None:
-            refusal = drop(stage, found, counts, rng, target)
-    fold(stage, home, rng, target)
+            refusal = drop(stage, found, counts, target)
+    fold(stage, home, target)
     if stage.grip is not None:
         return refusal
     stage.settle()

@@ -32,18 +32,18 @@ OFF_M: Final = 0.08
 BEYOND_M: Final = 0.02
 
 
-def press(stage: Stage, target: str, rng: np.random.Generator) -> Refusal | None:
+def press(stage: Stage, target: str) -> Refusal | None:
     """Touch a thing with the empty hand."""
     home = stage.told
-    refusal = _press(stage, target, rng)
-    fold(stage, home, rng, target)
+    refusal = _press(stage, target)
+    fold(stage, home, target)
     return refusal
 
 
-def _press(stage: Stage, target: str, rng: np.random.Generator) -> Refusal | None:
+def _press(stage: Stage, target: str) -> Refusal | None:
     reach, ways = pressing(stage, target)
     refusal = None
-    for way, refusal in arrivals(stage, ways, reach, rng, loaded=False):
+    for way, refusal in arrivals(stage, ways, reach, loaded=False):
         if refusal is not None:
             continue
         stage.wake_around(target)

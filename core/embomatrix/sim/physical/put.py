@@ -149,9 +149,7 @@ def _at(fit: Fit) -> tuple[Pose, float, float | None]:
     return fit.pose, fit.course, fit.out_m
 
 
-def put(
-    stage: Stage, poses: Sequence[Pose], counts: Callable[[], bool], rng: np.random.Generator, target: str
-) -> Refusal | None:
+def put(stage: Stage, poses: Sequence[Pose], counts: Callable[[], bool], target: str) -> Refusal | None:
     """Bring what is held to the first of several poses that the arm gets at, let go, and draw the hand back.
 
     ``counts`` tells whether what is held may stay where it stands in the planning scene. A refusal names the target where
@@ -159,29 +157,26 @@ def put(
     """
     assert stage.grip is not None
     delivery = Delivery(stage, stage.grip, poses, counts)
-    return _bring(stage, delivery, delivery.ways(), rng, target)
+    return _bring(stage, delivery, delivery.ways(), target)
 
 
-def drop(
-    stage: Stage, poses: Sequence[Pose], counts: Callable[[], bool], rng: np.random.Generator, target: str
-) -> Refusal | None:
+def drop(stage: Stage, poses: Sequence[Pose], counts: Callable[[], bool], target: str) -> Refusal | None:
     """As ``put``, but let it fall from as little above one of the poses as the hand can come."""
     assert stage.grip is not None
     delivery = Delivery(stage, stage.grip, poses, counts)
-    return _bring(stage, delivery, delivery.drops(), rng, target)
+    return _bring(stage, delivery, delivery.drops(), target)
 
 
 def _bring(
     stage: Stage,
     delivery: Delivery,
     ways: Iterator[Way],
-    rng: np.random.Generator,
     target: str,
 ) -> Refusal | None:
     grip = stage.grip
     assert grip is not None
     refusal = None
-    for way, refusal in arrivals(stage, ways, delivery.reach, rng, loaded=True):
+    for way, refusal in arrivals(stage, ways, delivery.reach, loaded=True):
         if refusal is None:
             return _set_down(stage, way)
     other = delivery.reach.hindrance or target

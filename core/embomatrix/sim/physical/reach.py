@@ -53,8 +53,9 @@ SAMPLED: Final = np.array([0.06, 0.06, 0.1, 0.06, 0.1, 0.1, 0.12, 0.12, 0.25, 0.
 MOST_SAMPLES: Final = 36
 LEVEL: Final = 0.93
 """Cosine of the steepest tilt, 21 degrees, at which what lies in a bowl stays there."""
+SCATTER: Final = 0
 DRAWS: Final = 24
-"""Random postures by which the arm may find its way to one place of work."""
+"""Scattered postures by which the arm may find its way to one place of work."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +142,6 @@ class Reach:
         self,
         start: FloatArray,
         end: FloatArray,
-        rng: np.random.Generator,
         *,
         loaded: bool,
         draws: int = DRAWS,
@@ -149,7 +149,7 @@ class Reach:
         """Postures (w, 11) that lead from one to another without touching anything, None when none are found.
 
         The arm moves where the base is at the start; then the base drives to where it is at the end. Straight on, or by way
-        of what ``draws`` random postures lead to.
+        of what so many scattered postures lead to.
         """
         held = self._held if loaded else None
         ready = np.concatenate([start[:3], end[3:]])
@@ -166,7 +166,7 @@ class Reach:
             reached = int(free.argmin()) if not free.all() else len(free)
             return between[reached - 1] if reached else one
 
-        drawn = _drawn(start, draws, rng, level=held is not None and held.up is not None)
+        drawn = _drawn(start, draws, level=held is not None and held.up is not None)
         drawn[:1] = (start + ready) / 2
         way = way_between(start, ready, drawn, SAMPLED, free_up_to)
         return None if way is None else np.concatenate([way, end[None]])
@@ -327,8 +327,12 @@ def _strain(postures: FloatArray) -> FloatArray:
     return np.asarray((((postures[:, 4:] - middle) / half) ** 4).sum(axis=1))
 
 
-def _drawn(start: FloatArray, count: int, rng: np.random.Generator, *, level: bool) -> FloatArray:
-    """Random postures, (n, 11), with the base where it is at the start; ``level``: what is held there turned about z alone."""
+def _drawn(start: FloatArray, count: int, *, level: bool) -> FloatArray:
+    """Postures, (n, 11), with the base where it is at the start; ``level``: what is held there turned about z alone.
+
+    They are scattered, and always the same: where a way is found in a scene once, it is found there again.
+    """
+    rng = np.random.default_rng(SCATTER)
     low = np.concatenate([[0.0], arm.LOW_RAD * 0.9])
     high = np.concatenate([[LIFT_M], arm.HIGH_RAD * 0.9])
     drawn = np.tile(start, (count, 1))

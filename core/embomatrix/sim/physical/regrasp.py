@@ -19,8 +19,6 @@ from embomatrix.world.state import Relation
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    import numpy as np
-
     from embomatrix.sim.physical.reach import Track
     from embomatrix.sim.physical.stage import Grip, Stage
     from embomatrix.world.poses import StandPose
@@ -45,7 +43,6 @@ def regrasp(
     poses: Sequence[Pose],
     counts: Callable[[], bool],
     home: StandPose,
-    rng: np.random.Generator,
 ) -> bool:
     """Put down what is held and take it so that the hand can bring it to one of some poses. Whether it is held again.
 
@@ -61,9 +58,9 @@ def regrasp(
     # Where exactly it will rest makes no difference to which holds lead to the goal.
     offered = grasp_tracks(asset, rests[0], engine.joints(name), home.yaw, None)
     kinds = _promising(stage, grip, offered, rests[0], poses[:FORESEEN], counts)
-    if not kinds or put(stage, rests, _anywhere, rng, name) is not None:
+    if not kinds or put(stage, rests, _anywhere, name) is not None:
         return False
-    fold(stage, home, rng)
+    fold(stage, home)
     stage.settle()
     pose = engine.pose(name)
     course, out_m = way_in(stage, name, engine.aabb(name), stage.boxes())
@@ -73,10 +70,10 @@ def regrasp(
     # Where none of the holds that lead to the goal can be taken, any is better than to leave the thing there.
     for wanted in (True, False):
         some = [track for track in tracks if (_kind(track) in kinds) is wanted]
-        refusal = take_by(stage, name, some, len(some) if out_m is not None else 0, bases, rng)
+        refusal = take_by(stage, name, some, len(some) if out_m is not None else 0, bases)
         if refusal is None:
             break
-    fold(stage, home, rng)
+    fold(stage, home)
     return refusal is None and stage.grip is not None
 
 

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 STANDS: Final = 2
 """Standing poses that are looked at: the robot steps aside to work, so that the others add little."""
-TRIALS: Final[Mapping[Handling, Callable[[Stage, str, np.random.Generator], Refusal | None]]] = {
+TRIALS: Final[Mapping[Handling, Callable[[Stage, str], Refusal | None]]] = {
     Handling.OPEN: open_all,
     Handling.CLOSE: close_all,
 }
@@ -59,14 +59,14 @@ class Foresight:
         self._known: dict[bytes, Look] = {}
         self._contents = Contents()
 
-    def survey(self, world: LiveWorld, poses: PoseCache, names: Iterable[str], *, seed: int) -> PoseCache:
+    def survey(self, world: LiveWorld, poses: PoseCache, names: Iterable[str]) -> PoseCache:
         """The cache with what the arm can do to these objects: stands from where it can first, and what bars all the others.
 
         ``world`` is at the start of its scene, and is left there. The answer follows from the arguments alone.
         """
         dynamic = DynamicWorld(world.scene)
         try:
-            surveyor = _Surveyor(Stage(world, dynamic, _idle), seed, self._known, self._contents)
+            surveyor = _Surveyor(Stage(world, dynamic, _idle), self._known, self._contents)
             return surveyor.surveyed(poses, tuple(dict.fromkeys(names)))
         finally:
             dynamic.close()
@@ -95,13 +95,11 @@ def _preferring(first: StandPose, stands: Sequence[StandPose]) -> tuple[StandPos
 class _Surveyor:
     """Puts the robot where it may stand, and looks for ways of the arm."""
 
-    def __init__(self, stage: Stage, seed: int, known: dict[bytes, Look], contents: Contents) -> None:
+    def __init__(self, stage: Stage, known: dict[bytes, Look], contents: Contents) -> None:
         self._stage = stage
         self._world = stage.world
-        self._seed = seed
         self._known = known
         self._contents = contents
-        self._rng = np.random.default_rng(seed)
         stage.begin()
 
     def surveyed(self, poses: PoseCache, names: tuple[str, ...]) -> PoseCache:
@@ -121,7 +119,9 @@ class _Surveyor:
     def _look(self, name: str, handling: Handling) -> tuple[StandPose | None, str]:
         """The first standing pose from which it can be done; None, and what bars the way, when there is none such."""
         self._make_ready(name, handling)
-        stands = self._world.navigator.stands(name, self._world.navigator.start)[:STANDS]
+        # From where else a door goes the robot finds out itself, when it tries.
+        looks = 1 if handling in TRIALS else STANDS
+        stands = self._world.navigator.stands(name, self._world.navigator.start)[:looks]
         if handling not in TRIALS:
             number, other = self._look_from(stands, name, handling)
         else:
@@ -133,7 +133,6 @@ class _Surveyor:
 
     def _look_from(self, stands: Sequence[StandPose], name: str, handling: Handling) -> Look:
         other = ""
-        self._rng = np.random.default_rng(self._seed)
         for number, stand in enumerate(stands):
             if number:
                 self._make_ready(name, handling)
@@ -152,7 +151,7 @@ class _Surveyor:
         self._make_ready(name, handling)
         self._world.robot = stand
         self._stage.begin()
-        refusal = TRIALS[handling](self._stage, name, self._rng)
+        refusal = TRIALS[handling](self._stage, name)
         self._world.hand.forget()
         self._stage.grip = None
         return refusal is None
@@ -182,7 +181,7 @@ class _Surveyor:
             for other in (name, *engine.near(window, frozenset((name,))))
         ]
         walls = [(wall.pose, wall.size_m) for wall in scene.walls if wall.aabb(IDENTITY).overlaps(window)]
-        return hashlib.sha256(repr((handling, self._seed, rows, walls, stands)).encode()).digest()
+        return hashlib.sha256(repr((handling, rows, walls, stands)).encode()).digest()
 
     def _swing(self, name: str, *shares: float) -> None:
         """Lead all leaves of an object through shares of their travel, with what rides on them, as far as there is room."""
@@ -206,12 +205,14 @@ class _Surveyor:
     def _bars_all(self, reach: Reach, ways: Iterator[Way]) -> str:
         """What bars all of some ways; "" when the arm gets to the start of one of them, which it then may go."""
         for way in itertools.islice(ways, WAYS):
-            if approach(self._stage, way, reach, self._rng, loaded=False) is not None:
+            if approach(self._stage, way, reach, loaded=False) is not None:
                 return ""
         return reach.hindrance or SOMETHING
 
     def _bars_leaves(self, name: str, goal: float) -> str:
         """What bars the way to lead every leaf of an object to a share of its travel, one after the other."""
+        if not self._stage.dynamic.bodies.has_leaves(name):
+            return name
         for leaf in in_turn(self._stage, name, goal):
             start = self._world.engine.joints(name)[leaf.number]
             other = SOMETHING

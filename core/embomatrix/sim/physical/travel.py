@@ -17,9 +17,13 @@ from embomatrix.skills.view import refuse
 from embomatrix.world.poses import StandPose
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from embomatrix.sim.physical.stage import Stage
     from embomatrix.skills.view import Refusal
     from embomatrix.world.geometry import FloatArray
+
+    BoolArray = NDArray[np.bool_]
 
 HEADINGS: Final = 24
 SPACING_M: Final = 0.12
@@ -28,6 +32,10 @@ TURNS: Final = 12
 """Marks at either end at which the robot may turn on the spot."""
 MOST_STEPS: Final = 1
 """Headings that it may turn by from one mark to the next."""
+CHAINS: Final = 4
+"""Ways to turn on the way that are looked at: what one strikes between two headings, the next avoids."""
+BETWEEN: Final = 3
+"""Headings between two that are looked at where the robot turns."""
 BACK_OUT_M: Final = (0.2, 0.4, 0.6)
 """So far the robot draws a load straight back where it can't turn with it."""
 BLOCKED_COST: Final = 100.0
@@ -116,21 +124,46 @@ def _headings(
     options = begin + np.arange(HEADINGS) * math.tau / HEADINGS
     danger = _danger(stage, start, marks[TURNS - 1 : 1 - TURNS], options)
     danger = np.concatenate([np.tile(danger[0], (TURNS - 1, 1)), danger, np.tile(danger[-1], (TURNS - 1, 1))])
-    chosen = _cheapest_chain(danger, np.abs([math.remainder(option - end, math.tau) for option in options]))
+    off = np.abs([math.remainder(option - end, math.tau) for option in options])
+    swept = np.zeros((len(marks), HEADINGS, HEADINGS))
+    number = np.arange(1, len(marks))
+    for _ in range(CHAINS):
+        chosen = np.array(_cheapest_chain(danger, swept, off))
+        found = np.unwrap(options[chosen])
+        strikes = _turns_striking(stage, start, marks, found)
+        if not (strikes & (swept[number, chosen[:-1], chosen[1:]] == 0.0)).any():
+            break
+        swept[number[strikes], chosen[:-1][strikes], chosen[1:][strikes]] = BLOCKED_COST
     # The first mark is where the robot is: what it touches there it touches already.
-    struck = int((danger[np.arange(1, len(marks)), chosen[1:]] >= BLOCKED_COST).sum())
-    found = np.unwrap(options[chosen])
+    struck = int((strikes | (danger[number, chosen[1:]] >= BLOCKED_COST)).sum())
     nearest = found[-1] + math.remainder(end - found[-1], math.tau)
-    close = abs(nearest - found[-1]) <= math.tau / HEADINGS
-    if close and _danger(stage, start, marks[-1:], np.array([nearest]))[0, 0] < BLOCKED_COST:
+    last, turned = np.tile(marks[-1], (2, 1)), np.array([found[-1], nearest])
+    if abs(nearest - found[-1]) <= math.tau / HEADINGS and not _turns_striking(stage, start, last, turned)[0]:
         found[-1] = nearest
     return marks, found, struck
 
 
-def _cheapest_chain(danger: FloatArray, off: FloatArray) -> list[int]:
+def _turns_striking(stage: Stage, start: FloatArray, marks: FloatArray, headings: FloatArray) -> BoolArray:
+    """Where arm or load strike something on the turn from one mark to the next, (marks - 1,).
+
+    An outstretched arm goes far between two headings, past what is at neither.
+    """
+    turning = np.flatnonzero(np.abs(np.diff(headings)) > 0.0)
+    found = np.zeros(len(marks) - 1, dtype=np.bool_)
+    if len(turning):
+        shares = np.linspace(0.0, 1.0, BETWEEN + 2)[1:, None]
+        bases = np.column_stack([marks, headings])
+        on_way = bases[turning, None] + shares * (bases[turning + 1] - bases[turning])[:, None]
+        cost = _cost_at(stage, start, on_way.reshape(-1, body.LIFT)).reshape(len(turning), -1)
+        found[turning] = (cost >= BLOCKED_COST).any(axis=1)
+    return found
+
+
+def _cheapest_chain(danger: FloatArray, swept: FloatArray, off: FloatArray) -> list[int]:
     """Numbers of headings, one a mark, the first of them 0: little turning, nothing struck, and the wanted heading in the end.
 
-    danger: (marks, headings); off: (headings,) how far each is from the one that is wanted.
+    danger: (marks, headings); swept: (marks, headings, headings) what it costs to turn so before a mark; off: (headings,) how
+    far each is from the one that is wanted.
     """
     step = np.abs(np.arange(HEADINGS)[:, None] - np.arange(HEADINGS)[None])
     step = np.minimum(step, HEADINGS - step)
@@ -138,7 +171,7 @@ def _cheapest_chain(danger: FloatArray, off: FloatArray) -> list[int]:
     cost = np.where(np.arange(HEADINGS) == 0, 0.0, np.inf)
     back = np.zeros((len(danger), HEADINGS), dtype=int)
     for number in range(1, len(danger)):
-        total = cost[:, None] + turn
+        total = cost[:, None] + turn + swept[number]
         back[number] = total.argmin(axis=0)
         cost = total.min(axis=0) + danger[number]
     chosen = [int((cost + 2.0 * off).argmin())]
@@ -149,9 +182,14 @@ def _cheapest_chain(danger: FloatArray, off: FloatArray) -> list[int]:
 
 def _danger(stage: Stage, start: FloatArray, marks: FloatArray, options: FloatArray) -> FloatArray:
     """What it costs to have arm and load at marks with headings, (marks, headings): much in things, little beside them."""
-    rows = np.tile(start, (len(marks) * len(options), 1))
-    rows[:, :2] = np.repeat(marks, len(options), axis=0)
-    rows[:, body.YAW] = np.tile(options, len(marks))
+    bases = np.column_stack([np.repeat(marks, len(options), axis=0), np.tile(options, len(marks))])
+    return _cost_at(stage, start, bases).reshape(len(marks), len(options))
+
+
+def _cost_at(stage: Stage, start: FloatArray, bases: FloatArray) -> FloatArray:
+    """The same for bases, (n, 3): shape (n,)."""
+    rows = np.tile(start, (len(bases), 1))
+    rows[:, : body.LIFT] = bases
     centres, radii = body.balls(rows), body.RADII
     if stage.grip is not None:
         centres = np.concatenate([centres, stage.grip.held.placed(rows)], axis=1)
@@ -161,4 +199,4 @@ def _danger(stage: Stage, start: FloatArray, marks: FloatArray, options: FloatAr
     low, high = centres.min(axis=(0, 1)) - 0.1, centres.max(axis=(0, 1)) + 0.1
     gaps = clearance(stage.boxes_within(low, high), centres, radii)
     cost = np.where(gaps < STRUCK_M, BLOCKED_COST, np.where(gaps < BESIDE_M, BESIDE_COST, 0.0))
-    return np.asarray(cost).reshape(len(marks), len(options))
+    return np.asarray(cost)

@@ -62,7 +62,7 @@ def cache_poses(
         poses = PoseCache(kept, standing_poses(engine, list(rows)))
         if foresight is None:
             return poses
-        return foresight.survey(LiveWorld(Bundle(scene, {}, poses), engine), poses, rows, seed=seed)
+        return foresight.survey(LiveWorld(Bundle(scene, {}, poses), engine), poses, rows)
 
 
 def _pairs(view: SceneView, about: tuple[str, ...]) -> Iterator[tuple[str, str, Relation]]:
