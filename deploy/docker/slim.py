@@ -24,7 +24,6 @@ NEVER_READ: Final = (
     "pybullet_robots",
     "torch/include",
     "torch/share",
-    "torch/bin",
     "torch/test",
     "**/*.pyc",
 )

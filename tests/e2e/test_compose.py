@@ -90,7 +90,7 @@ class Door:
             return json.load(answer)
 
     def ready_workers(self):
-        return sum(worker["state"] == "ready" for worker in self.status("/api/workers"))
+        return sum(worker["state"] == "ready" for worker in self.status("/api/v1/workers")["items"])
 
 
 def _until(condition, limit_s=90.0):
@@ -136,6 +136,6 @@ def test_a_trainer_in_a_container_trains_on_tasks_made_in_a_container(cluster):
     )
     assert "success" in result.stdout
     assert "0 lost and masked" in " ".join(result.stdout.split())
-    assert sum(worker["completed"] for worker in cluster.status("/api/workers")) > 0, (
+    assert sum(worker["completed"] for worker in cluster.status("/api/v1/workers")["items"]) > 0, (
         "no container executed anything"
     )

@@ -87,6 +87,6 @@ def test_the_commands_of_the_file_make_a_cluster_that_a_worker_joins_by_what_it_
         viewer = (tmp_path / "data" / "access" / "tokens" / "viewer").read_text().strip()
         with httpx.Client(base_url=f"https://127.0.0.1:{page}", verify=trusted) as http:
             assert http.get("/healthz").status_code == 200
-            assert http.get("/api/workers").status_code == 401
-            found = http.get("/api/workers", headers={"authorization": f"Bearer {viewer}"}).json()
+            assert http.get("/api/v1/workers").status_code == 401
+            found = http.get("/api/v1/workers", headers={"authorization": f"Bearer {viewer}"}).json()["items"]
             assert [each["state"] for each in found] == ["ready"]

@@ -48,18 +48,26 @@ async def test_page_shows_workers_slots_warm_scenes_and_throughput(browser, kitc
             results = [item async for item in client.execute(Batch(run_id, "b", 1, rollouts), deadline_s=60)]
             assert all(isinstance(result.outcome, Completed) for result in results)
             page = shown(browser, url, tmp_path)
+            workers = shown(browser, f"{url}#workers", tmp_path)
+            ahead = shown(browser, f"{url}#lookahead", tmp_path)
+            timeline = shown(browser, f"{url}#timeline", tmp_path)
+            failures = shown(browser, f"{url}#failures", tmp_path)
     short = digest.removeprefix("sha256:")[:8]
     assert re.search(r"up \S+ \S+ · 1 ready", page.words["link"])
-    assert re.search(rf"kitchen-worker ready 1 warm {short} .* {ROLLOUTS} ", page.words["workers"])
-    assert page.classes.count("slot") + page.classes.count("slot busy") == 2
-    assert page.classes.count("chip warm") == 1
+    assert page.words["health"].startswith("All is well.")
+    assert re.search(rf"kitchen-worker ready 1 warm {short} .* {ROLLOUTS} ", workers.words["workers"])
+    assert workers.classes.count("slot") + workers.classes.count("slot busy") == 2
+    assert workers.classes.count("chip warm") == 1
+    assert workers.words["total"] == "1 to 1 of 1"
     assert page.words["slots"] == "0/2"
     peak = re.fullmatch(rf"peak (\d+), {ROLLOUTS} in all", page.words["peak"])
     assert 1 < int(peak[1]) <= ROLLOUTS
     assert float(page.words["rate"]) >= 0
     assert page.words["runs"].startswith("run done open warm failed evening-run 24 0 ")
-    assert page.words["ahead"] == f"step 7 {short[:4]}·{ROLLOUTS}"
-    assert page.words["failures"].startswith("None.")
+    assert ahead.words["ahead"] == f"evening-run {short[:4]} step 7 {ROLLOUTS}"
+    assert ahead.classes.count("cell warm") == 1
+    assert timeline.classes.count("gantt") == 1
+    assert failures.words["failures"].startswith("None.")
 
 
 def test_page_of_a_cluster_with_a_token_asks_for_it_and_shows_nothing(browser, tmp_path):

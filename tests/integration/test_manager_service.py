@@ -326,9 +326,9 @@ async def test_calls_without_the_token_are_refused(tmp_path):
             assert len(await outcomes(client, batch(2))) == 2
         async with httpx.AsyncClient(base_url=at.status_url) as http:
             assert (await http.get("/healthz")).status_code == 200
-            assert (await http.get("/api/overview")).status_code == 401
+            assert (await http.get("/api/v1/overview")).status_code == 401
             signed = {"authorization": "Bearer secret"}
-            assert (await http.get("/api/overview", headers=signed)).status_code == 200
+            assert (await http.get("/api/v1/overview", headers=signed)).status_code == 200
 
 
 async def test_the_status_page_tells_what_happens(tmp_path):
@@ -338,17 +338,17 @@ async def test_the_status_page_tells_what_happens(tmp_path):
             "r1", 1, [LookaheadEntry(5, KITCHEN, 8), LookaheadEntry(6, BEDROOM, 4)]
         )
         async with httpx.AsyncClient(base_url=at.status_url) as http:
-            overview = (await http.get("/api/overview")).json()
+            overview = (await http.get("/api/v1/overview")).json()
             assert overview["slots"] == 2
             assert overview["outcomes"] == {"completed": 10}
-            (worker,) = (await http.get("/api/workers")).json()
+            (worker,) = (await http.get("/api/v1/workers")).json()["items"]
             assert worker["completed"] == 10
-            (run,) = (await http.get("/api/runs")).json()
+            (run,) = (await http.get("/api/v1/runs")).json()["items"]
             assert run["stats"]["delivered"] == 10
-            steps = (await http.get("/api/lookahead")).json()
+            steps = (await http.get("/api/v1/lookahead")).json()
             assert [step["step"] for step in steps] == [5, 6]
             assert steps[0]["cells"][0]["warmth"] == "warm"
             assert 'embo_rollouts_total{outcome="completed"} 10.0' in (await http.get("/metrics")).text
             assert "<html" in (await http.get("/")).text
-            stranger = await http.get("/api/overview", headers={"host": "evil.example"})
+            stranger = await http.get("/api/v1/overview", headers={"host": "evil.example"})
             assert stranger.status_code == 400

@@ -81,10 +81,10 @@ async def test_runs_and_events_can_be_read_without_grpc(tmp_path):
         good, bad = batch(8), batch(1, batch_id="b2", task="poison")
         await outcomes(client, Batch("r1", "mixed", 1, good.rollouts + bad.rollouts))
         await client.close_run("r1")
-        run = (await http.get("/api/runs/r1")).json()
-        events = (await http.get("/api/events", params={"run": "r1", "after": 2})).json()["events"]
-        fleet = (await http.get("/api/events")).json()["events"]
-        missing = await http.get("/api/runs/r2")
+        run = (await http.get("/api/v1/runs/r1")).json()
+        events = (await http.get("/api/v1/events", params={"run": "r1", "after": 2})).json()["events"]
+        fleet = (await http.get("/api/v1/events")).json()["events"]
+        missing = await http.get("/api/v1/runs/r2")
     assert (run["run"]["stats"]["delivered"], run["phases"]["execute"]["count"]) == (9, 8)
     assert run["failures"][0]["code"] == "slot_crashed"
     assert [event["kind"] for event in events].count("completed") == 8

@@ -300,23 +300,23 @@ async def http_cases(at):
 
     own = at.page.rstrip("/")
     tries = [
-        ("GET figures, no token", 401, "GET", "/api/workers", {}),
+        ("GET figures, no token", 401, "GET", "/api/v1/workers", {}),
         ("GET metrics, no token", 401, "GET", "/metrics", {}),
-        ("GET figures, a worker's token", 403, "GET", "/api/workers", bearer(Role.WORKER)),
-        ("DELETE, no token", 401, "DELETE", "/api/workers/victim", {}),
-        ("DELETE, a viewer", 403, "DELETE", "/api/workers/victim", bearer(Role.VIEWER)),
+        ("GET figures, a worker's token", 403, "GET", "/api/v1/workers", bearer(Role.WORKER)),
+        ("DELETE, no token", 401, "DELETE", "/api/v1/workers/victim", {}),
+        ("DELETE, a viewer", 403, "DELETE", "/api/v1/workers/victim", bearer(Role.VIEWER)),
         (
             "DELETE from another origin",
             403,
             "DELETE",
-            "/api/workers/victim",
+            "/api/v1/workers/victim",
             {**bearer(Role.ADMIN), "origin": "https://evil.example"},
         ),
         (
             "DELETE by a form elsewhere",
             403,
             "DELETE",
-            "/api/workers/victim",
+            "/api/v1/workers/victim",
             {**bearer(Role.ADMIN), "sec-fetch-site": "cross-site"},
         ),
         ("a foreign name (rebinding)", 400, "GET", "/", {"host": "evil.example"}),
@@ -326,7 +326,7 @@ async def http_cases(at):
         for what, status, method, path, headers in tries:
             answer = await http.request(method, path, headers=headers)
             yield what, str(status), (str(answer.status_code), answer.text, True)
-        assert (await http.get("/api/workers", headers=bearer(Role.VIEWER))).status_code == 200
+        assert (await http.get("/api/v1/workers", headers=bearer(Role.VIEWER))).status_code == 200
         assert (await http.get("/")).status_code == 200
 
 

@@ -21,6 +21,7 @@ from embomatrix.manager.assignments import DispatchLimits
 from embomatrix.manager.auditor import AuditRules
 from embomatrix.manager.bundles import BundleStore
 from embomatrix.manager.cluster_state import ClusterState
+from embomatrix.manager.expulsion import Expulsion
 from embomatrix.manager.garbage import only_young
 from embomatrix.manager.http_rules import HttpRules, allowed_hosts
 from embomatrix.manager.leadership import Leadership
@@ -122,7 +123,7 @@ async def running(
         await gate.open(protection.first)
         server, port = await build_server(runtime, gate, protection.tls, settings)
         rules = HttpRules(gate, hosts=allowed_hosts(settings.http_host, protection.tls))
-        http.show(build_api(runtime, rules))
+        http.show(build_api(runtime, rules, Expulsion(runtime, gate)))
         group.create_task(leadership.keep())
         group.create_task(runtime.serve())
         await server.start()

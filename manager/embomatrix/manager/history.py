@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import time
 from importlib.metadata import PackageNotFoundError, version
@@ -14,11 +15,13 @@ from embomatrix.rpc.status import NotFoundError
 from embomatrix.rpc.values import RunInfo
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from embomatrix.manager.archive import RunArchive
     from embomatrix.manager.chronicle import Chronicle, RunRecord
     from embomatrix.manager.cluster_state import ClusterState
     from embomatrix.reward.settings import RewardSettings
-    from embomatrix.rpc.run_log import PhaseSummary
+    from embomatrix.rpc.run_log import PhaseSummary, RunEvent
     from embomatrix.rpc.values import Batch, RunStats
 
 logger = logging.getLogger(__name__)
@@ -86,6 +89,21 @@ class RunHistory:
         summary, events = kept
         beyond = [event for event in events if event.sequence > after]
         return EventPage(tuple(beyond[:limit]), summary.events_dropped)
+
+    async def latest(self, run_id: str, seconds: float) -> EventPage:
+        """The last of a run's log: events of so many seconds before its last. Raises ``NotFoundError``."""
+        record = self._chronicle.runs.get(run_id)
+        if record is not None:
+            events: Sequence[RunEvent] = record.ring.events
+            dropped = record.ring.dropped
+        else:
+            kept = await self._archive.load(run_id)
+            if kept is None:
+                raise _unknown(run_id)
+            dropped, events = kept[0].events_dropped, kept[1]
+        since_s = events[-1].at_s - seconds if events else 0.0
+        late = itertools.takewhile(lambda event: event.at_s >= since_s, reversed(events))
+        return EventPage(tuple(late)[::-1], dropped)
 
     def _summed(self, record: RunRecord, info: RunInfo, leads: PhaseSummary) -> RunSummary:
         figures = record.figures

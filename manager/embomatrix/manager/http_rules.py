@@ -9,6 +9,7 @@ from urllib.parse import urlsplit
 from starlette.datastructures import Headers
 from starlette.responses import PlainTextResponse
 
+from embomatrix.manager.page import STATIC
 from embomatrix.manager.settings import is_loopback
 from embomatrix.rpc.channel import token_of
 from embomatrix.rpc.roles import Role
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from embomatrix.manager.access.protection import Tls
 
 OPEN_PATHS: Final = frozenset({"/", "/healthz"})
-"""The empty page, which asks for the token itself, and the health check."""
+"""The empty page, which asks for the token itself, and the health check; the page's own files lie below ``STATIC``."""
 READING: Final = frozenset({"GET", "HEAD", "OPTIONS"})
 VIEWERS: Final = frozenset({Role.VIEWER, Role.TRAINER, Role.ADMIN})
 LOOPBACK_NAMES: Final = frozenset({"localhost", "127.0.0.1", "::1"})
@@ -50,7 +51,7 @@ class HttpRules:
         changes = method not in READING
         if changes and _is_foreign(headers, host):
             return Refusal(403, "a page of another origin asks for a change: open the manager's own page")
-        if path in OPEN_PATHS and not changes:
+        if (path in OPEN_PATHS or path.startswith(STATIC)) and not changes:
             return None
         try:
             role = self.gate.caller(token_of(headers.get("authorization"))).role

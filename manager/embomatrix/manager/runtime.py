@@ -197,6 +197,11 @@ class ManagerRuntime:
             self._links[worker_id].resume()
         self._keeper.hurry()
 
+    @property
+    def paused(self) -> bool:
+        """Whether an operator stopped dispatch."""
+        return self._paused
+
     async def pause_dispatch(self) -> None:
         """No new leases are given, also by the managers that come after this one; what runs goes on.
 

@@ -8,6 +8,7 @@ import grpc
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
+from embomatrix.manager.expulsion import Expulsion
 from embomatrix.manager.listen import bind_server
 from embomatrix.manager.service_admin import AdminServicer
 from embomatrix.manager.service_auth import RoleInterceptor
@@ -58,7 +59,9 @@ async def build_server(
         RolloutServicer(runtime.runs, gate, authority=tls.authority if tls else b""), server
     )
     scene_service_pb2_grpc.add_SceneServiceServicer_to_server(SceneServicer(runtime.bundles), server)
-    admin_service_pb2_grpc.add_AdminServiceServicer_to_server(AdminServicer(runtime, gate), server)
+    admin_service_pb2_grpc.add_AdminServiceServicer_to_server(
+        AdminServicer(runtime, gate, Expulsion(runtime, gate)), server
+    )
     await _add_health(server)
     reflection.enable_server_reflection((*SERVICES, health.SERVICE_NAME, reflection.SERVICE_NAME), server)
     return server, bind_server(server, settings.host, settings.port, tls)

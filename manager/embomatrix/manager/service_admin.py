@@ -15,12 +15,13 @@ if TYPE_CHECKING:
     import grpc
 
     from embomatrix.manager.access.gate import Gate
+    from embomatrix.manager.expulsion import Expulsion
     from embomatrix.manager.runtime import ManagerRuntime
 
 
 class AdminServicer(TokenMethods):
-    def __init__(self, runtime: ManagerRuntime, gate: Gate) -> None:
-        super().__init__(runtime, gate)
+    def __init__(self, runtime: ManagerRuntime, gate: Gate, expulsion: Expulsion) -> None:
+        super().__init__(gate, expulsion)
         self._runtime = runtime
 
     async def ListWorkers(

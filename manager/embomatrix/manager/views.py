@@ -7,13 +7,13 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.manager.meter import FailureNote  # noqa: TC001  # the OpenAPI page is made of annotations
 from embomatrix.manager.registry import Standing
 from embomatrix.manager.window import Window
 from embomatrix.rpc.status import NotFoundError
 from embomatrix.rpc.values import Resident, ResidentState, RunInfo, RunStats, WorkerInfo
 
 if TYPE_CHECKING:
-    from embomatrix.manager.meter import FailureNote
     from embomatrix.manager.registry import Session
     from embomatrix.manager.runtime import ManagerRuntime
     from embomatrix.rpc.values import PlanCell
@@ -78,6 +78,8 @@ class LookaheadCell:
     bundle_digest: str
     count: int
     warmth: str
+    worker_ids: list[str]
+    """Those that hold the scene, or load it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,7 +142,7 @@ def lookahead(runtime: ManagerRuntime) -> list[LookaheadStep]:
     """The grid: steps by scenes, with how far each scene is."""
     steps: dict[tuple[str, int], list[LookaheadCell]] = {}
     for cell in plan(runtime):
-        found = LookaheadCell(cell.bundle_digest, cell.count, cell.warmth.value)
+        found = LookaheadCell(cell.bundle_digest, cell.count, cell.warmth.value, list(cell.worker_ids))
         steps.setdefault((cell.run_id, cell.step), []).append(found)
     return [LookaheadStep(run_id, step, cells) for (run_id, step), cells in sorted(steps.items())]
 

@@ -11,9 +11,9 @@ from importlib.resources import files
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.cli.cluster.charts import busy_chart, phase_chart, throughput_chart
-from embomatrix.cli.cluster.timeline import busy_share, slot_spans
 from embomatrix.reward.settings import PAPER
 from embomatrix.rpc.run_log import EventKind, Phase
+from embomatrix.rpc.timeline import busy_share, slot_spans
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence

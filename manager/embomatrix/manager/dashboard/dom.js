@@ -1,0 +1,45 @@
+// Elements and words. Text never becomes markup: whatever a worker or a task is called, it stays text.
+
+/** An element: h("td", {class: "n"}, "3"). Children are elements, text, or nothing. */
+export function h(tag, attributes = {}, ...children) {
+  const element = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) {
+    if (name.startsWith("on")) element.addEventListener(name.slice(2), value);
+    else if (value === true) element.setAttribute(name, "");
+    else if (value !== false && value !== undefined && value !== null) element.setAttribute(name, value);
+  }
+  element.append(...children.flat(3).filter(child => child !== null && child !== undefined && child !== false));
+  return element;
+}
+
+export const at = id => document.getElementById(id);
+export const brief = digest => digest.replace(/^sha256:/, "").slice(0, 8);
+export const count = number => Number(number).toLocaleString("en");
+export const share = (part, all) => all ? `${Math.round(100 * part / all)} %` : "–";
+export const clock = seconds => new Date(seconds * 1000).toLocaleTimeString();
+export const none = text => h("div", {class: "none"}, text);
+export const colour = name => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
+
+export function seconds(s) {
+  if (s === 0) return "–";
+  if (s < 1) return `${Math.round(s * 1000)} ms`;
+  if (s < 120) return `${s.toFixed(s < 10 ? 1 : 0)} s`;
+  return s < 7200 ? `${Math.round(s / 60)} min` : `${(s / 3600).toFixed(1)} h`;
+}
+
+/** A table of rows that are lists of cells; a heading is its text, or [text, class]. */
+export function table(headings, rows, caption) {
+  const head = headings.map(heading => {
+    const [text, kind] = Array.isArray(heading) ? heading : [heading, ""];
+    return h("th", {class: kind, scope: "col"}, text);
+  });
+  return h("div", {class: "scroll", tabindex: "0", role: "region", "aria-label": caption},
+    h("table", {}, h("thead", {}, h("tr", {}, head)), h("tbody", {}, rows)));
+}
+
+/** What the page shows in a place, replaced only when it differs: selections and focus outlive a refresh. */
+export function put(place, ...children) {
+  const fresh = h("div", {}, ...children);
+  if (fresh.innerHTML === place.innerHTML && !fresh.querySelector("canvas")) return;
+  place.replaceChildren(...fresh.childNodes);
+}

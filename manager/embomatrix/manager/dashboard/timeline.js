@@ -1,0 +1,152 @@
+// What each slot did: load, execute, deliver, idle; zoom to one rollout.
+import {ask} from "./ask.js";
+import {at, brief, colour, h, none, put, seconds} from "./dom.js";
+
+const ROW = 20, LEFT = 150, HEAD = 22, GRIP = 5, LEAST_PX = 1;
+const SPANS = [10, 60, 300, 1800];
+const KINDS = [["execute", "warm"], ["load", "warming"], ["deliver", "queued"], ["failed", "bad"]];
+let run = "", told = null, view = null, live = true, span = 60, painted = [], grabbed = null;
+
+export function open(main) {
+  run = decodeURIComponent(location.hash.split("?")[1] ?? "");
+  told = view = null; live = true;
+  const legend = KINDS.map(([word, tint]) => [h("i", {style: `background:var(--${tint})`}), word]);
+  main.replaceChildren(h("section", {},
+    h("h2", {}, "Slots ", h("small", {id: "range"}), h("span", {class: "legend"}, legend)),
+    h("div", {class: "bar"},
+      h("select", {id: "run", "aria-label": "run", onchange: event => { run = event.target.value; told = view = null; live = true; dispatchEvent(new Event("embomatrix-changed")); }}),
+      h("select", {"aria-label": "how far back", onchange: event => { span = Number(event.target.value); live = true; view = null; dispatchEvent(new Event("embomatrix-changed")); }}, SPANS.map(s => h("option", {value: s, selected: s === span}, `last ${seconds(s)}`))),
+      h("button", {type: "button", onclick: () => zoom(0.5)}, "Zoom in"), h("button", {type: "button", onclick: () => zoom(2)}, "Zoom out"),
+      h("button", {type: "button", onclick: () => pan(-0.25)}, "Earlier"), h("button", {type: "button", onclick: () => pan(0.25)}, "Later"),
+      h("button", {type: "button", id: "live", onclick: () => { live = true; view = null; dispatchEvent(new Event("embomatrix-changed")); }}, "Follow")),
+    h("p", {id: "one", class: "muted", role: "status"}, "Point at a span, or zoom in."),
+    h("div", {id: "tracks"})));
+}
+
+export async function show({runs}) {
+  const known = runs.map(r => r.run_id);
+  if (!run) run = known.at(-1) ?? "";
+  put(at("run"), (known.includes(run) || !run ? known : [run, ...known]).map(id => h("option", {value: id, selected: id === run}, runs.find(r => r.run_id === id)?.name || id)));
+  if (!run) { put(at("tracks"), none("No open run. A closed one: embomatrix cluster report RUN")); return; }
+  if (!live && told) return;
+  told = await ask(`runs/${encodeURIComponent(run)}/timeline?seconds=${span}`);
+  if (live) view = {from: told.until_s - span, until: told.until_s};
+  draw();
+}
+
+function draw() {
+  const place = at("tracks");
+  if (!place || !told) return;
+  if (!told.tracks.length) { put(place, none("Nothing was executed in this time.")); return; }
+  let canvas = place.querySelector("canvas");
+  if (!canvas) {
+    canvas = h("canvas", {class: "gantt", tabindex: "0", role: "img", onwheel: wheel, onpointermove: point, onpointerdown: grab, ondblclick: nearer, onkeydown: key});
+    place.replaceChildren(canvas);
+  }
+  const wide = place.clientWidth, high = HEAD + told.tracks.length * ROW, dense = devicePixelRatio || 1;
+  canvas.width = wide * dense; canvas.height = high * dense; canvas.style.height = `${high}px`;
+  canvas.setAttribute("aria-label", `${told.tracks.length} slots, ${told.tracks.reduce((sum, track) => sum + track.spans.length, 0)} rollouts`);
+  const pen = canvas.getContext("2d");
+  pen.scale(dense, dense);
+  const tint = Object.fromEntries(["ink", "soft", "line", "chip", "warm", "warming", "queued", "bad"].map(name => [name, colour(name)]));
+  const x = at_s => LEFT + (at_s - view.from) / (view.until - view.from) * (wide - LEFT);
+  scale(pen, tint, x, wide, high);
+  painted = [];
+  told.tracks.forEach((track, number) => {
+    const top = HEAD + number * ROW;
+    pen.fillStyle = tint.chip; pen.fillRect(LEFT, top + 2, wide - LEFT, ROW - 4);
+    for (const one of track.spans) {
+      if (one.end_s + one.deliver_s < view.from || one.begin_s - one.load_s > view.until) continue;
+      const failed = one.outcome !== "completed";
+      bar(pen, x, one.begin_s - one.load_s, one.begin_s, top, tint.warming);
+      bar(pen, x, one.end_s, one.end_s + one.deliver_s, top, tint.queued);
+      bar(pen, x, one.begin_s, one.end_s, top, failed ? tint.bad : tint.warm, true);
+      painted.push({left: x(one.begin_s - one.load_s), right: Math.max(x(one.end_s + one.deliver_s), x(one.begin_s) + GRIP), top, one, track});
+    }
+    pen.fillStyle = tint.soft; pen.fillText(`${short(track.worker_id)} ${track.slot}`, 0, top + ROW / 2 + 4, LEFT - 8);
+  });
+  at("range").textContent = `${seconds(view.until - view.from)}${told.dropped ? `; ${told.dropped} older events were dropped` : ""}`;
+}
+
+function bar(pen, x, begin, end, top, fill, always) {
+  const left = Math.max(LEFT, x(begin)), wide = x(end) - left;
+  if (wide <= 0 && !always) return;
+  pen.fillStyle = fill;
+  // A hair's breadth between neighbours, where there is room for it.
+  pen.fillRect(left, top + 3, Math.max(LEAST_PX, wide > 3 ? wide - 0.5 : wide), ROW - 6);
+}
+
+function scale(pen, tint, x, wide, high) {
+  const rough = (view.until - view.from) / Math.max(2, (wide - LEFT) / 110), power = 10 ** Math.floor(Math.log10(rough));
+  const step = [1, 2, 5, 10].map(n => n * power).find(n => n >= rough);
+  pen.font = "11px system-ui"; pen.strokeStyle = tint.line;
+  for (let tick = Math.ceil((view.from - told.until_s) / step) * step; tick <= view.until - told.until_s + 1e-9; tick += step) {
+    const left = x(told.until_s + tick);
+    pen.fillStyle = tint.soft; pen.fillText(Math.abs(tick) < step / 2 ? "now" : `${Number(tick.toPrecision(6))} s`, left + 3, 13);
+    pen.beginPath(); pen.moveTo(left, 0); pen.lineTo(left, high); pen.stroke();
+  }
+}
+
+const short = name => name.length > 20 ? `${name.slice(0, 9)}…${name.slice(-9)}` : name;
+
+function zoom(factor, middle = 0.5) {
+  if (!view) return;
+  const long = view.until - view.from, centre = view.from + long * middle, next = Math.min(span * 4, Math.max(0.001, long * factor));
+  live = false;
+  view = {from: centre - next * middle, until: centre + next * (1 - middle)};
+  draw();
+}
+
+function pan(share) {
+  if (!view) return;
+  const move = (view.until - view.from) * share;
+  live = false;
+  view = {from: view.from + move, until: view.until + move};
+  draw();
+}
+
+function wheel(event) {
+  if (!event.ctrlKey && !event.shiftKey) return;
+  event.preventDefault();
+  const box = event.target.getBoundingClientRect();
+  zoom(event.deltaY > 0 ? 1.25 : 0.8, Math.min(1, Math.max(0, (event.clientX - box.left - LEFT) / (box.width - LEFT))));
+}
+
+function key(event) {
+  const moves = {ArrowLeft: () => pan(-0.1), ArrowRight: () => pan(0.1), "+": () => zoom(0.5), "-": () => zoom(2)};
+  if (moves[event.key]) { event.preventDefault(); moves[event.key](); }
+}
+
+function hit(event) {
+  const box = event.target.getBoundingClientRect(), left = event.clientX - box.left, top = event.clientY - box.top;
+  return painted.find(item => left >= item.left && left <= item.right && top >= item.top && top < item.top + ROW);
+}
+
+function point(event) {
+  const found = hit(event);
+  if (found) at("one").textContent = describe(found);
+  if (event.buttons && grabbed !== null) {
+    const wide = event.target.getBoundingClientRect().width - LEFT;
+    pan((grabbed - event.clientX) / wide);
+    grabbed = event.clientX;
+  }
+}
+
+function grab(event) {
+  grabbed = event.clientX;
+}
+
+/** One rollout, and as much again on both sides of it. */
+function nearer(event) {
+  const found = hit(event);
+  if (!found) return;
+  const {one} = found, long = Math.max(0.002, one.end_s + one.deliver_s - one.begin_s + one.load_s);
+  live = false;
+  view = {from: one.begin_s - one.load_s - long, until: one.end_s + one.deliver_s + long};
+  draw();
+}
+
+function describe({one, track}) {
+  const long = seconds(one.end_s - one.begin_s), load = one.load_s ? `, loading ${seconds(one.load_s)}` : "";
+  return `${one.rollout_id} on ${track.worker_id} slot ${track.slot}: ${one.outcome}, executing ${long}${load}, scene ${brief(one.bundle_digest)}, attempt ${one.attempt || 1}`;
+}

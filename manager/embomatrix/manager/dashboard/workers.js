@@ -1,0 +1,85 @@
+// Every worker: what it holds, what it does, and why it doesn't; drain and resume for who may.
+import {Refused, change} from "./ask.js";
+import {at, brief, count, h, none, put, seconds, table} from "./dom.js";
+
+const ROWS = 100;
+const STATES = ["", "ready", "paused", "draining", "suspect", "lost", "quarantined"];
+const wish = {state: "", search: "", offset: 0, limit: ROWS};
+
+export const query = () => wish;
+
+export function open(main) {
+  const options = STATES.map(state => h("option", {value: state, selected: state === wish.state}, state || "every state"));
+  main.replaceChildren(h("section", {},
+    h("h2", {}, "Workers ", h("small", {id: "total"})),
+    h("div", {class: "bar"},
+      h("input", {type: "search", placeholder: "name", "aria-label": "search by name", value: wish.search, oninput: event => ask({search: event.target.value})}),
+      h("select", {"aria-label": "state", onchange: event => ask({state: event.target.value})}, options),
+      h("button", {id: "before", type: "button", onclick: () => ask({offset: Math.max(0, wish.offset - ROWS)})}, "Before"),
+      h("button", {id: "after", type: "button", onclick: () => ask({offset: wish.offset + ROWS})}, "After"),
+      h("button", {id: "dispatch", type: "button"}, "Pause dispatch"),
+      h("span", {id: "told", class: "bad", role: "alert"})),
+    h("div", {id: "workers"})));
+}
+
+export function show({workers, paused}) {
+  const last = Math.min(workers.total, workers.offset + workers.items.length);
+  at("total").textContent = workers.total ? `${count(workers.offset + 1)} to ${count(last)} of ${count(workers.total)}` : "";
+  at("before").disabled = workers.offset === 0;
+  at("after").disabled = last >= workers.total;
+  at("dispatch").textContent = paused ? "Resume dispatch" : "Pause dispatch";
+  at("dispatch").onclick = () => steer(`dispatch/${paused ? "resume" : "pause"}`);
+  const headings = ["worker", "state", "slots", "scenes", ["scene memory", "wideonly"], ["completed", "n"], ["cores", "n wideonly"], ["heard", "n wideonly"], ""];
+  const nobody = wish.state || wish.search ? "No worker is like that." : "No workers yet. Lend a machine: embomatrix worker run";
+  put(at("workers"), workers.items.length ? table(headings, workers.items.map(row), "workers") : none(nobody));
+  for (const button of at("workers").querySelectorAll("button")) button.onclick = () => steer(button.dataset.path);
+}
+
+function row(w) {
+  const used = w.residents.reduce((sum, r) => sum + r.memory_mb, 0);
+  const away = w.state === "draining";
+  return h("tr", {},
+    h("td", {class: "fit"}, w.worker_id, w.gpu && h("span", {class: "muted"}, ` ${w.gpu}`)),
+    h("td", {class: w.reason ? "" : "fit"}, h("span", {class: `dot ${w.state}`}), w.state, w.reason && h("span", {class: "muted"}, ` ${w.reason}`)),
+    h("td", {class: "fit"}, slots(w)),
+    h("td", {}, scenes(w)),
+    h("td", {class: "wideonly"}, h("meter", {min: 0, max: Math.max(1, w.memory_mb), value: used, title: `${Math.round(used)} of ${w.memory_mb} MB`, "aria-label": "memory of scenes"})),
+    h("td", {class: "n"}, count(w.completed)), h("td", {class: "n wideonly"}, w.cores),
+    h("td", {class: "n muted wideonly"}, w.silent_s < 5 ? "now" : `${seconds(Math.round(w.silent_s))} ago`),
+    h("td", {class: "fit"}, w.state !== "lost" && h("button", {class: "small", type: "button", "data-path": `workers/${encodeURIComponent(w.worker_id)}/${away ? "resume" : "drain"}`, "aria-label": `${away ? "resume" : "drain"} ${w.worker_id}`}, away ? "Resume" : "Drain")));
+}
+
+function slots(w) {
+  if (w.slots > 64) return `${w.busy}/${w.slots}`;
+  const boxes = Array.from({length: w.slots}, (_, i) => h("span", {class: i < w.busy ? "slot busy" : "slot"}));
+  return h("span", {class: "slots", style: `--n:${w.slots}`, role: "img", "aria-label": `${w.busy} of ${w.slots} busy`, title: `${w.busy} of ${w.slots} busy`}, boxes);
+}
+
+function scenes(w) {
+  const states = {};
+  for (const r of w.residents) states[r.state] = (states[r.state] || 0) + 1;
+  if (w.loads.length) states["on the way"] = w.loads.length;
+  const chips = [
+    ...w.residents.map(r => h("span", {class: `chip ${r.state}`, title: r.error ? `${r.bundle_digest}: ${r.error}` : r.bundle_digest}, `${brief(r.bundle_digest)}${r.load_s ? ` ${seconds(r.load_s)}` : ""}`)),
+    ...w.loads.map(digest => h("span", {class: "chip", title: digest}, brief(digest))),
+  ];
+  if (!chips.length) return h("span", {class: "muted"}, "none");
+  const told = Object.entries(states).map(([state, n]) => `${n} ${state}`).join(", ");
+  const broken = w.residents.find(r => r.error);
+  return [`${told} `, chips.slice(0, 6), chips.length > 6 && "…", broken && h("div", {class: "bad message"}, broken.error)];
+}
+
+function ask(changes) {
+  Object.assign(wish, {offset: 0}, changes);
+  dispatchEvent(new Event("embomatrix-changed"));
+}
+
+async function steer(path) {
+  at("told").textContent = "";
+  try {
+    await change(path);
+  } catch (error) {
+    at("told").textContent = error instanceof Refused ? error.message : "the manager does not answer";
+  }
+  dispatchEvent(new Event("embomatrix-changed"));
+}

@@ -1,0 +1,64 @@
+"""How a cluster does, in one sentence: the first thing that is wrong, or that all is well."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.manager.meter import FAILURES_KEPT
+
+if TYPE_CHECKING:
+    from embomatrix.manager.views import Overview
+
+RECENT_S: Final = 300.0
+"""A failure concerns an operator for so long."""
+
+
+class Mood(StrEnum):
+    """How much somebody should care."""
+
+    GOOD = "good"
+    IDLE = "idle"
+    WARNING = "warning"
+    BAD = "bad"
+
+
+@dataclass(frozen=True, slots=True)
+class Health:
+    mood: Mood
+    sentence: str
+
+
+def health(seen: Overview, *, paused: bool, now_s: float) -> Health:
+    """What an operator would want to hear first. ``now_s`` is wall time, as that of the failures."""
+    working = seen.workers.get("ready", 0) + seen.workers.get("suspect", 0)
+    if paused:
+        return Health(Mood.WARNING, "Dispatch is paused: nothing new is executed until somebody resumes it.")
+    if not seen.workers:
+        return Health(Mood.IDLE, "No worker has joined yet.")
+    if not working:
+        return Health(Mood.BAD, f"None of {sum(seen.workers.values())} workers works.")
+    if lost := seen.workers.get("quarantined", 0):
+        return Health(Mood.BAD, f"{_workers(lost)} in quarantine: results did not agree with others'.")
+    recent = [note for note in seen.failures if now_s - note.at_s < RECENT_S]
+    if recent:
+        # The meter keeps no more of them.
+        count = f"{len(recent)} or more" if len(recent) == FAILURES_KEPT else f"{len(recent)}"
+        return Health(
+            Mood.WARNING,
+            f"{count} rollouts were given up in the last {RECENT_S / 60:.0f} minutes, the last for {recent[0].code}.",
+        )
+    if lost := seen.workers.get("lost", 0):
+        return Health(Mood.WARNING, f"{_workers(lost)} lost a moment ago; what they held went to others.")
+    if seen.queued and not seen.leased:
+        return Health(Mood.WARNING, f"{seen.queued} rollouts wait and none runs: no scene is warm yet.")
+    if not seen.runs:
+        return Health(
+            Mood.IDLE, f"Ready: {_workers(working)} {'waits' if working == 1 else 'wait'} for a run."
+        )
+    return Health(Mood.GOOD, "All is well.")
+
+
+def _workers(count: int) -> str:
+    return f"{count} worker{'' if count == 1 else 's'}"

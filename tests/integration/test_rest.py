@@ -1,0 +1,141 @@
+"""The REST API and the page's files before a real manager: one snapshot for all, changes by admins alone, streams that end."""
+
+import asyncio
+import json
+
+import httpx
+import pytest
+from tests.fakes.worker import FakeWorker
+from tests.integration.test_manager_service import batch, manager, open_run, outcomes
+
+from embomatrix.manager.rest import PREFIX
+
+pytestmark = pytest.mark.timeout(60)
+
+
+def http_at(at, **headers):
+    return httpx.AsyncClient(base_url=at.status_url, trust_env=False, headers=headers)
+
+
+async def test_every_list_tells_the_same_moment(tmp_path):
+    async with (
+        manager(tmp_path) as at,
+        open_run(at.address) as client,
+        FakeWorker(at.address, "w1", slots=2),
+        http_at(at) as http,
+    ):
+        await outcomes(client, batch(10))
+        seen, workers, runs = [
+            (await http.get(f"{PREFIX}/{name}")).json() for name in ("snapshot", "workers", "runs")
+        ]
+    assert seen["workers"]["items"] == workers["items"]
+    assert seen["runs"] == runs["items"]
+    assert seen["at_s"] == workers["at_s"] == runs["at_s"]
+    assert seen["overview"]["outcomes"] == {"completed": 10}
+    assert sum(row["completed"] for row in workers["items"]) == 10
+
+
+async def test_an_operator_steers_by_rest_as_by_grpc(tmp_path):
+    async with (
+        manager(tmp_path) as at,
+        open_run(at.address) as client,
+        FakeWorker(at.address, "w1"),
+        FakeWorker(at.address, "w2"),
+        http_at(at) as http,
+    ):
+        assert (await http.post(f"{PREFIX}/dispatch/pause")).json() == {
+            "thing": "dispatch",
+            "state": "paused",
+        }
+        assert (
+            (await http.get(f"{PREFIX}/snapshot"))
+            .json()["health"]["sentence"]
+            .startswith("Dispatch is paused")
+        )
+        waiting = asyncio.create_task(outcomes(client, batch(2)))
+        assert (await http.post(f"{PREFIX}/dispatch/resume")).status_code == 200
+        assert len(await waiting) == 2
+        assert (await http.post(f"{PREFIX}/workers/w1/drain")).json()["state"] == "draining"
+        first = (await http.get(f"{PREFIX}/workers")).json()["items"][0]
+        assert (first["worker_id"], first["state"] in ("draining", "lost")) == ("w1", True)
+        unknown = await http.post(f"{PREFIX}/workers/nobody/drain")
+        assert (unknown.status_code, "nobody" in unknown.json()["detail"]) == (404, True)
+        assert (await http.post(f"{PREFIX}/workers/w2/revoke", json={})).status_code == 422
+        unguarded = await http.post(f"{PREFIX}/workers/w2/revoke", json={"reason": "sold"})
+        assert (unguarded.status_code, "manager init" in unguarded.json()["detail"]) == (409, True)
+
+
+@pytest.mark.parametrize(
+    "query",
+    ["workers?limit=0", "workers?limit=100000", "workers?offset=-1", "runs?limit=x", "events?after=-1"],
+)
+async def test_a_page_that_can_not_be_is_refused_by_name(tmp_path, query):
+    async with manager(tmp_path) as at, http_at(at) as http:
+        answer = await http.get(f"{PREFIX}/{query}")
+    assert answer.status_code == 422
+    assert answer.json()["detail"][0]["loc"][0] == "query"
+
+
+async def test_changes_are_refused_to_viewers_and_to_pages_elsewhere(tmp_path):
+    async with manager(tmp_path, token="secret") as at, http_at(at) as http:
+        foreign = {"authorization": "Bearer secret", "origin": "https://evil.example"}
+        told = [
+            (await http.post(f"{PREFIX}/dispatch/pause", headers=headers)).status_code
+            for headers in ({}, {"authorization": "Bearer wrong"}, foreign)
+        ]
+        own = await http.post(f"{PREFIX}/dispatch/pause", headers={"authorization": "Bearer secret"})
+    assert (told, own.status_code) == ([401, 401, 403], 200)
+
+
+async def test_events_stream_as_they_come_and_can_be_taken_up_again(tmp_path):
+    async def read(http, count, after=0):
+        async with http.stream(
+            "GET", f"{PREFIX}/events/stream", params={"run": "r1", "after": after}
+        ) as answer:
+            assert answer.headers["content-type"].startswith("text/event-stream")
+            found = []
+            async for line in answer.aiter_lines():
+                if line.startswith("data: "):
+                    found.append(json.loads(line.removeprefix("data: ")))
+                if len(found) == count:
+                    return found
+        return found
+
+    async with (
+        manager(tmp_path) as at,
+        open_run(at.address) as client,
+        FakeWorker(at.address, slots=2),
+        http_at(at) as http,
+    ):
+        reading = asyncio.create_task(read(http, 6))
+        await outcomes(client, batch(8))
+        first = await reading
+        rest = await read(http, 4, after=first[-1]["sequence"])
+        assert (await http.get(f"{PREFIX}/events/stream", params={"run": "nobody"})).status_code == 404
+    numbers = [event["sequence"] for event in (*first, *rest)]
+    assert numbers == sorted(set(numbers))
+
+
+async def test_the_page_loads_nothing_from_elsewhere_and_no_file_but_its_own(tmp_path):
+    async with manager(tmp_path, token="secret") as at, http_at(at) as http:
+        page = await http.get("/")
+        named = [part.split('"')[0] for part in page.text.split('="/')[1:]]
+        files = [(await http.get(f"/{path}")).status_code for path in named]
+        outside = [
+            (await http.get(path)).status_code
+            for path in ("/static/../api.py", "/static/%2e%2e/api.py", "/static/vendor/LICENSE", "/static/")
+        ]
+    assert "default-src 'none'" in page.headers["content-security-policy"]
+    assert "http" not in page.text.replace("http://www.w3.org", "")
+    assert (set(files), len(files)) == ({200}, 4)
+    assert set(outside) <= {401, 404}
+
+
+async def test_the_openapi_page_describes_every_answer(tmp_path):
+    async with manager(tmp_path) as at, http_at(at) as http:
+        told = (await http.get(f"{PREFIX}/openapi.json")).json()
+        for path, methods in told["paths"].items():
+            assert path.startswith(PREFIX)
+            if "get" in methods and "{" not in path and not path.endswith("stream"):
+                assert (await http.get(path)).status_code == 200
+    assert {"SnapshotPage", "WorkerPage", "Timeline", "Changed"} <= set(told["components"]["schemas"])

@@ -1,0 +1,115 @@
+"""What the page and the REST API show: health in a sentence, pages of one snapshot, tracks of slots."""
+
+from dataclasses import replace
+
+from embomatrix.manager.health import Mood, health
+from embomatrix.manager.meter import FAILURES_KEPT, FailureNote
+from embomatrix.manager.rest_values import run_page, worker_page
+from embomatrix.manager.slot_tracks import timeline
+from embomatrix.manager.snapshot import Snapshot
+from embomatrix.manager.views import Overview, RunView, WorkerView
+from embomatrix.rpc.run_log import EventKind, EventPage, RunEvent
+from embomatrix.rpc.values import RunStats, Timings
+
+CALM = Overview(
+    uptime_s=60.0,
+    workers={"ready": 2},
+    slots=4,
+    slots_busy=1,
+    queued=3,
+    leased=1,
+    runs=1,
+    outcomes={"completed": 9},
+    throughput=[1, 2],
+    latency_p50_s=0.1,
+    latency_p95_s=0.2,
+    prewarm_hits=9,
+    prewarm_misses=1,
+    prewarm_wasted=0,
+    prewarm_lead_s=1.0,
+    redispatched=0,
+    stale_results=0,
+    failures=[],
+)
+NOTE = FailureNote(1000.0, "slot_crashed", "signal 11", "w1", "r1", "x1")
+
+
+def mood(*, paused=False, now_s=1010.0, **changes):
+    told = health(replace(CALM, **changes), paused=paused, now_s=now_s)
+    return told.mood, told.sentence
+
+
+def test_health_says_first_what_matters_most():
+    assert mood() == (Mood.GOOD, "All is well.")
+    assert mood(runs=0, queued=0) == (Mood.IDLE, "Ready: 2 workers wait for a run.")
+    assert mood(workers={}) == (Mood.IDLE, "No worker has joined yet.")
+    assert mood(workers={"lost": 2, "paused": 1}) == (Mood.BAD, "None of 3 workers works.")
+    assert mood(workers={"ready": 1, "quarantined": 1})[0] is Mood.BAD
+    assert mood(workers={"ready": 1, "lost": 1})[1].startswith("1 worker lost a moment ago")
+    assert mood(leased=0)[1] == "3 rollouts wait and none runs: no scene is warm yet."
+    assert mood(paused=True, workers={})[1].startswith("Dispatch is paused")
+
+
+def test_failures_are_news_for_five_minutes():
+    assert (
+        mood(failures=[NOTE])[1]
+        == "1 rollouts were given up in the last 5 minutes, the last for slot_crashed."
+    )
+    assert mood(failures=[NOTE] * FAILURES_KEPT)[1].startswith(f"{FAILURES_KEPT} or more rollouts")
+    assert mood(failures=[NOTE], now_s=2000.0) == (Mood.GOOD, "All is well.")
+
+
+def worker(name, state):
+    return WorkerView(name, state, "", 2, 0, 0, 0, 4, 1024, 0, 0.0, "", {}, 0.5, [], [])
+
+
+SEEN = Snapshot(
+    1000.0,
+    health(CALM, paused=False, now_s=1000.0),
+    False,
+    CALM,
+    [
+        *(worker(f"w{number:04}", "ready") for number in range(1000)),
+        worker("Zoe", "lost"),
+        worker("ann", "paused"),
+    ],
+    [RunView(f"r{number}", "", 0, RunStats()) for number in range(5)],
+    [],
+)
+
+
+def test_pages_of_a_list_hold_every_row_once_and_trouble_comes_first():
+    found = []
+    while len(page := worker_page(SEEN, offset=len(found), limit=300).items):
+        found += [row.worker_id for row in page]
+    assert found[:2] == ["Zoe", "ann"]
+    assert sorted(found) == sorted(row.worker_id for row in SEEN.workers)
+    assert [row.run_id for row in run_page(SEEN, offset=1, limit=2).items] == ["r3", "r2"]
+
+
+def test_a_page_is_of_those_that_were_asked_for():
+    assert [row.worker_id for row in worker_page(SEEN, state="lost").items] == ["Zoe"]
+    assert worker_page(SEEN, search="W000", limit=3).total == 10
+    beyond = worker_page(SEEN, offset=5000)
+    assert (beyond.total, beyond.items) == (1002, [])
+
+
+def test_the_timeline_shows_the_last_seconds_of_each_slot():
+    def done(sequence, at_s, kind=EventKind.COMPLETED, code=""):
+        timings = Timings(execute_s=0.5, load_s=0.25, deliver_s=0.125)
+        rollout = f"x{sequence}"
+        return RunEvent(
+            sequence, at_s, kind, "r1", "b", rollout, "w1", "sha256:aa", 1, 2, code, timings=timings
+        )
+
+    page = EventPage((done(1, 90.0), done(2, 99.0), done(3, 100.0, EventKind.FAILED, "slot_oom")), 7)
+    told = timeline("r1", page, seconds=5.0)
+    assert (told.from_s, told.until_s, told.dropped) == (95.0, 100.0, 7)
+    (track,) = told.tracks
+    assert [(span.rollout_id, span.outcome) for span in track.spans] == [
+        ("x2", "completed"),
+        ("x3", "slot_oom"),
+    ]
+    first = track.spans[0]
+    assert (first.begin_s, first.end_s, first.load_s, first.deliver_s) == (98.5, 99.0, 0.25, 0.125)
+    assert timeline("r1", EventPage((), 0), seconds=5.0).tracks == []
