@@ -55,15 +55,19 @@ class Ground:
             obstacles = prepared.obstacles
             grid = FloorGrid.restored(self._scene, prepared.covered, prepared.free)
         else:
-            obstacles = Obstacles.joined([self._walls(), *(self._parts_of(item.name) for item in bars)])
+            obstacles = Obstacles.joined(
+                [self._walls(), *(self._parts_of(item.name, engine.pose(item.name)) for item in bars)]
+            )
             grid = FloorGrid(self._scene, obstacles.barring)
         self._at_start = Laid(obstacles, grid, OrderedDict())
         self._kept: OrderedDict[Floor, Laid] = OrderedDict()
-        self._moved: set[int] = set()
+        self._moved: dict[int, Pose | None] = {}
+        """As ``floor`` has them, in any order."""
         self._leaves = OpenLeaves(engine)
         self._one_open: dict[Ajar, FloorGrid] = {}
         """Where the robot fits on the floor of the start with the leaves of one more object wide open."""
         self._round, self._read = -1, 0
+        self._current: Laid | None = None
         self._now: FloorGrid | None = None
         self.refresh()
 
@@ -79,14 +83,20 @@ class Ground:
             if self._scene.objects[number].fixed:
                 self._leaves.note(number)
             else:
-                self._moved.add(number)
+                self._compare(number)
         self._read = len(journal.entries)
-        self.floor: Floor = tuple(self._difference())
+        self.floor: Floor = tuple(sorted(self._moved.items())) if self._moved else ()
         """What stands on the floor otherwise than at the start."""
         self.ajar: Ajar = self._leaves.ajar()
         """Whose leaves stand open."""
-        self._laid = self._lay_or_recall(self.floor) if self.floor else self._at_start
-        self._now = None if self.ajar else self._laid.grid
+        self._current = self._now = None
+
+    @property
+    def _laid(self) -> Laid:
+        """The floor as it is, made when it is asked for: after what is put down last, nobody drives."""
+        if self._current is None:
+            self._current = self._lay_or_recall(self.floor) if self.floor else self._at_start
+        return self._current
 
     @property
     def obstacles(self) -> Obstacles:
@@ -106,6 +116,8 @@ class Ground:
     @property
     def grid(self) -> FloorGrid:
         """Where the robot fits, made when it is asked for: many doors are shut again before it drives."""
+        if self._now is None and not self.ajar:
+            self._now = self._laid.grid
         if self._now is None:
             foreseen = self._one_open.get(self.ajar) if self._laid is self._at_start else None
             self._now = foreseen or self._narrowed()
@@ -140,14 +152,15 @@ class Ground:
         """Where the robot would fit if the leaves of one object were shut."""
         return self.shut.narrowed(self.leaves.without([number]).barring)
 
-    def _difference(self) -> Iterator[tuple[int, Pose | None]]:
-        """Movable objects that stand on the floor otherwise than at the start, in scene order; None: no more."""
-        for number in sorted(self._moved):
-            item = self._scene.objects[number]
-            pose = self._engine.pose(item.name) if self._on_floor(item.name) else None
-            before = item.pose_world_asset if number in self._on_floor_at_start else None
-            if pose is not before and pose != before:
-                yield number, pose
+    def _compare(self, number: int) -> None:
+        """Note whether a movable object stands on the floor otherwise than at the start."""
+        item = self._scene.objects[number]
+        pose = self._engine.pose(item.name) if self._on_floor(item.name) else None
+        before = item.pose_world_asset if number in self._on_floor_at_start else None
+        if pose is before or pose == before:
+            self._moved.pop(number, None)
+        else:
+            self._moved[number] = pose
 
     def _lay_or_recall(self, floor: Floor) -> Laid:
         if floor not in self._kept:
@@ -159,8 +172,12 @@ class Ground:
 
     def _lay(self, floor: Floor) -> Laid:
         moved = [number for number, _ in floor]
-        names = [self._scene.objects[number].name for number, pose in floor if pose is not None]
-        come = Obstacles.joined([Obstacles.of([], WALLS, []), *map(self._parts_of, names)])
+        parts = [
+            self._parts_of(self._scene.objects[number].name, pose)
+            for number, pose in floor
+            if pose is not None
+        ]
+        come = Obstacles.joined([Obstacles.of([], WALLS, []), *parts])
         obstacles, grid = self.at_start
         now = Obstacles.joined([obstacles.without(moved), come])
         return Laid(now, grid.changed(obstacles.only(moved).barring, come.barring), OrderedDict())
@@ -173,12 +190,12 @@ class Ground:
         boxes = [wall.aabb(world) for wall in self._scene.walls]
         return Obstacles.of(boxes, WALLS, [False] * len(boxes))
 
-    def _parts_of(self, name: str) -> Obstacles:
-        """Boxes of the object's parts with its joints shut."""
+    def _parts_of(self, name: str, pose: Pose) -> Obstacles:
+        """Boxes of the object's parts at a pose with its joints shut."""
         asset = self._scene.asset_of(name)
         if asset.asset_id not in self._parts:
             self._parts[asset.asset_id] = AssetParts(asset)
         shut = (0.0,) * len(asset.joints)
-        boxes = self._parts[asset.asset_id].boxes(self._engine.pose(name), shut)
+        boxes = self._parts[asset.asset_id].boxes(pose, shut)
         leaves = [link.joint is not None for link in asset.links for _ in link.parts]
         return Obstacles.of(boxes, self.numbers[name], leaves)

@@ -95,7 +95,9 @@ class Lineup:
         reached = np.hypot(away[:, 0], away[:, 1]) <= away_m
         # Of lowest and highest: twice the height of the middle.
         sums = self.lows_m[:, 2] + self.highs_m[:, 2]
-        return np.asarray(reached & (sums >= 2 * low_m) & (sums <= 2 * high_m))
+        reached &= sums >= 2 * low_m
+        reached &= sums <= 2 * high_m
+        return np.asarray(reached)
 
     def overlaps(self, others: Neighbours) -> tuple[BoolArray, IntArray]:
         """Whether the thing would surely meet a neighbour at each pose, and the one whose box it shares the most with.
