@@ -27,6 +27,12 @@ def _compose(*arguments, check=True):
     )
 
 
+def _docker(*arguments):
+    return subprocess.run(
+        ("docker", *arguments), capture_output=True, text=True, check=True, timeout=60
+    ).stdout
+
+
 def _has_plugin():
     return subprocess.run(["docker", "compose", "version"], capture_output=True, check=False).returncode == 0
 
@@ -42,31 +48,9 @@ def _engine_answers():
 def cluster():
     if not _engine_answers():
         pytest.skip("no Docker engine answers: start one to check the compose file")
-    for service, target in (
-        ("init", "manager"),
-        ("manager", "manager"),
-        ("worker", "worker"),
-        ("trainer", "trainer"),
-    ):
-        subprocess.run(
-            [
-                "docker",
-                "build",
-                "--network=host",
-                "--target",
-                target,
-                "-t",
-                f"embomatrix-check-{service}",
-                "-t",
-                f"embomatrix-check_{service}",
-                "-f",
-                "deploy/docker/Dockerfile",
-                ".",
-            ],
-            cwd=ROOT,
-            check=True,
-            timeout=1500,
-        )
+    for target in ("manager", "worker", "trainer"):
+        command = ("docker", "build", "--network=host", "--target", target, "-t", f"embomatrix/{target}")
+        subprocess.run((*command, "-f", "deploy/docker/Dockerfile", "."), cwd=ROOT, check=True, timeout=1500)
     _compose("up", "-d", "--no-build")
     yield Door()
     _compose("down", "--volumes", "--timeout", "20", check=False)
@@ -107,6 +91,40 @@ def _until(condition, limit_s=90.0):
 
 def test_two_workers_register_with_the_manager(cluster):
     _until(lambda: cluster.ready_workers() == 2)
+
+
+def test_images_are_small_and_run_without_root_on_a_system_that_they_can_not_write():
+    for name, most_mb in (("manager", 200), ("worker", 400)):
+        size = int(_docker("image", "inspect", "--format", "{{.Size}}", f"embomatrix/{name}"))
+        assert size <= most_mb * 1e6, f"{name} has {size / 1e6:.0f} MB"
+    for service in ("redis", "manager", "worker"):
+        assert _compose("exec", "-T", service, "id", "-u").stdout.strip() != "0"
+        assert _compose("exec", "-T", service, "touch", "/opt/here", check=False).returncode != 0
+
+
+def test_starting_twice_changes_nothing_and_workers_can_be_more(cluster):
+    before = _compose(
+        "exec", "-T", "manager", "sha256sum", "/data/access/ca.pem", "/data/access/tokens/worker"
+    ).stdout
+    _compose("up", "-d", "--no-build", "--scale", "worker=3")
+    _until(lambda: cluster.ready_workers() == 3)
+    after = _compose(
+        "exec", "-T", "manager", "sha256sum", "/data/access/ca.pem", "/data/access/tokens/worker"
+    ).stdout
+    assert before == after
+    _compose("up", "-d", "--no-build", "--scale", "worker=2")
+    _until(lambda: cluster.ready_workers() == 2)
+
+
+def test_a_worker_that_dies_comes_back_and_the_cluster_outlives_redis_and_the_manager(cluster):
+    _until(lambda: cluster.ready_workers() == 2)
+    _compose(
+        "exec", "-T", "worker", "python", "-c", "import os, signal; os.kill(-1, signal.SIGKILL)", check=False
+    )
+    _until(lambda: cluster.ready_workers() == 2)
+    for service in ("redis", "manager"):
+        _compose("restart", service)
+        _until(lambda: cluster.ready_workers() == 2)
 
 
 def test_a_trainer_in_a_container_trains_on_tasks_made_in_a_container(cluster):

@@ -45,10 +45,21 @@ def test_there_is_no_secret_in_the_file():
     assert all(token.startswith("@") for token in tokens)
 
 
+def test_every_service_runs_confined_within_limits_and_comes_back():
+    for name, service in SERVICES.items():
+        assert service["read_only"], name
+        assert service["cap_drop"] == ["ALL"], name
+        assert service["security_opt"] == ["no-new-privileges:true"], name
+        assert service["mem_limit"], name
+        assert service["pids_limit"], name
+        assert ("healthcheck" in service) == (name in ("redis", "manager", "worker")), name
+        assert ("restart" in service) == (name in ("redis", "manager", "worker")), name
+
+
 def placed(arguments, folder):
     """The container's folders as ones of this test; the published ports as free ones."""
     moved = [
-        re.sub(r"(=|:)/(data|for-worker|for-trainer|cache)", rf"\1{folder}/\2", each) for each in arguments
+        re.sub(r"(=|:)/(data|for-worker|for-trainer|cache|tmp/worker)", rf"\1{folder}/\2", each) for each in arguments
     ]
     return [each for each in moved if not each.startswith("--state=")]
 

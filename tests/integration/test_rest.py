@@ -127,7 +127,7 @@ async def test_the_page_loads_nothing_from_elsewhere_and_no_file_but_its_own(tmp
         ]
     assert "default-src 'none'" in page.headers["content-security-policy"]
     assert "http" not in page.text.replace("http://www.w3.org", "")
-    assert (set(files), len(files)) == ({200}, 4)
+    assert (set(files), len(files)) == ({200}, 11)
     assert set(outside) <= {401, 404}
 
 

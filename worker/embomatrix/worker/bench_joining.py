@@ -33,7 +33,7 @@ def joining(on_step: Callable[[str], None]) -> tuple[Figure, ...]:
         _told("manager", "init", data, "--san=localhost")
         serve = (_CLI, "manager", "serve", "--port=0", "--http-port=0", "--state=memory:", data)
         with running_process(folder, "manager", *serve) as manager:
-            port = _SERVES.search(_wait(manager, "status page"))
+            port = _SERVES.search(wait_for(manager, "status page"))
             if port is None:
                 raise BenchError(f"the manager did not tell its port: see what it said, {manager.log}")
             address, access = f"localhost:{port[1]}", folder / "manager" / "access"
@@ -49,7 +49,7 @@ def joining(on_step: Callable[[str], None]) -> tuple[Figure, ...]:
             with running_process(
                 folder, "worker", *join, f"--cache-dir={folder / 'cache'}", "--nice=0"
             ) as worker:
-                _wait(worker, "registered with the manager")
+                wait_for(worker, "registered with the manager")
                 taken_s = time.monotonic() - started_s
     return (Figure("join_s", taken_s, "s", Better.LOWER, 1, JOIN_S),)
 
@@ -64,7 +64,7 @@ def _told(*arguments: str) -> str:
     return done.stdout
 
 
-def _wait(process: Process, words: str) -> str:
+def wait_for(process: Process, words: str) -> str:
     """All that the process has said, once it said this."""
     deadline = time.monotonic() + LIMIT_S
     while time.monotonic() < deadline:

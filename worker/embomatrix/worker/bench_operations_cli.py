@@ -14,6 +14,7 @@ from embomatrix.worker.bench_figures import BenchResult, commit_here, describe_m
 from embomatrix.worker.bench_joining import joining
 from embomatrix.worker.bench_output import errors, hand_in, refusals
 from embomatrix.worker.bench_scenes import scenes_of
+from embomatrix.worker.bench_viewers import viewing
 from embomatrix.world.dataset import Dataset
 
 if TYPE_CHECKING:
@@ -26,6 +27,7 @@ class Part(StrEnum):
     IMAGES = "images"
     COMPOSE = "compose"
     JOIN = "join"
+    DASHBOARD = "dashboard"
 
 
 def operations(
@@ -36,7 +38,7 @@ def operations(
     ] = None,
     checkout: Annotated[Path, typer.Option(help="Folder of the compose file.")] = Path(),
 ) -> None:
-    """Measure `docker compose up` to its first rollout, the sizes of its images, and how fast a spare PC joins."""
+    """Measure `docker compose up` to its first rollout, sizes of images, joining, and what the dashboard costs."""
     parts = part or list(Part)
     with refusals(), errors.status("operations") as status:
         machine = describe_machine()
@@ -53,5 +55,7 @@ def operations(
             figures += first_rollout(compose_at(checkout), scene, on_step)
         if Part.JOIN in parts:
             figures += joining(on_step)
+        if Part.DASHBOARD in parts:
+            figures += viewing(on_step)
         result = BenchResult("operations", commit_here(), machine, tuple(figures))
     hand_in(result, json_file)

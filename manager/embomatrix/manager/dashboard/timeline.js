@@ -2,7 +2,7 @@
 import {ask} from "./ask.js";
 import {at, brief, colour, h, none, put, seconds} from "./dom.js";
 
-const ROW = 20, LEFT = 150, HEAD = 22, GRIP = 5, LEAST_PX = 1;
+const ROW = 20, LEFT = 150, HEAD = 22, GRIP = 5, LEAST_PX = 1, LEAST_S = 0.1;
 const SPANS = [10, 60, 300, 1800];
 const KINDS = [["execute", "warm"], ["load", "warming"], ["deliver", "queued"], ["failed", "bad"]];
 let run = "", told = null, view = null, live = true, span = 60, painted = [], grabbed = null;
@@ -16,7 +16,7 @@ export function open(main) {
     h("div", {class: "bar"},
       h("select", {id: "run", "aria-label": "run", onchange: event => { run = event.target.value; told = view = null; live = true; dispatchEvent(new Event("embomatrix-changed")); }}),
       h("select", {"aria-label": "how far back", onchange: event => { span = Number(event.target.value); live = true; view = null; dispatchEvent(new Event("embomatrix-changed")); }}, SPANS.map(s => h("option", {value: s, selected: s === span}, `last ${seconds(s)}`))),
-      h("button", {type: "button", onclick: () => zoom(0.5)}, "Zoom in"), h("button", {type: "button", onclick: () => zoom(2)}, "Zoom out"),
+      h("button", {type: "button", onclick: () => zoom(0.5, live ? 1 : 0.5)}, "Zoom in"), h("button", {type: "button", onclick: () => zoom(2, live ? 1 : 0.5)}, "Zoom out"),
       h("button", {type: "button", onclick: () => pan(-0.25)}, "Earlier"), h("button", {type: "button", onclick: () => pan(0.25)}, "Later"),
       h("button", {type: "button", id: "live", onclick: () => { live = true; view = null; dispatchEvent(new Event("embomatrix-changed")); }}, "Follow")),
     h("p", {id: "one", class: "muted", role: "status"}, "Point at a span, or zoom in."),
@@ -30,7 +30,10 @@ export async function show({runs}) {
   if (!run) { put(at("tracks"), none("No open run. A closed one: embomatrix cluster report RUN")); return; }
   if (!live && told) return;
   told = await ask(`runs/${encodeURIComponent(run)}/timeline?seconds=${span}`);
-  if (live) view = {from: told.until_s - span, until: told.until_s};
+  if (live) {
+    const first = Math.min(...told.tracks.flatMap(track => track.spans.map(one => one.begin_s - one.load_s)));
+    view = {from: Math.min(told.until_s - LEAST_S, Math.max(told.until_s - span, first)), until: told.until_s};
+  }
   draw();
 }
 
@@ -113,7 +116,7 @@ function wheel(event) {
 }
 
 function key(event) {
-  const moves = {ArrowLeft: () => pan(-0.1), ArrowRight: () => pan(0.1), "+": () => zoom(0.5), "-": () => zoom(2)};
+  const moves = {ArrowLeft: () => pan(-0.1), ArrowRight: () => pan(0.1), "+": () => zoom(0.5, live ? 1 : 0.5), "-": () => zoom(2, live ? 1 : 0.5)};
   if (moves[event.key]) { event.preventDefault(); moves[event.key](); }
 }
 
