@@ -28,6 +28,8 @@ _PREFIX: Final = struct.Struct("!II")
 PREFIX_BYTES: Final = _PREFIX.size
 MAX_FRAME_BYTES: Final = 64 * 1024 * 1024
 MIB: Final = 1024 * 1024
+STATM_BYTES: Final = 256
+"""More than the seven numbers of Linux's ``statm`` take."""
 _PR_SET_PDEATHSIG: Final = 1
 _PR_SET_THP_DISABLE: Final = 41
 
@@ -180,7 +182,12 @@ def give_back_memory() -> None:
 
 def resident_mb() -> float:
     """Memory of this process that lies in RAM, shared pages included, in MiB."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    # Asked after every rollout: through a file object it takes five times as long.
+    statm = os.open("/proc/self/statm", os.O_RDONLY)
+    try:
+        pages = int(os.read(statm, STATM_BYTES).split()[1])
+    finally:
+        os.close(statm)
     return pages * resource.getpagesize() / MIB
 
 
