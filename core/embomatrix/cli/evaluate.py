@@ -21,17 +21,19 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from embomatrix.cli.failure import INTERRUPTED, fail
+from embomatrix.skills.parse import plan_to_json
 from embomatrix.skills.prompt import Codec
+from embomatrix.trainer.eai.exam import CODEC as EAI_CODEC
+from embomatrix.trainer.eai.exam import NAME as NATIVE
+from embomatrix.trainer.eai.exam import NativeExam
 from embomatrix.trainer.errors import TrainerError
 from embomatrix.trainer.evaluation.answers import FILE, AnswerSheet, Setup, ordered, read_answers
-from embomatrix.trainer.evaluation.asking import BaselineAsker, EndpointAsker, PolicyAsker, questions_digest
+from embomatrix.trainer.evaluation.asking import EndpointAsker, PolicyAsker, WriterAsker, questions_digest
 from embomatrix.trainer.evaluation.baselines import BaselineName, baseline_for
 from embomatrix.trainer.evaluation.benchmark import find_benchmark
 from embomatrix.trainer.evaluation.cluster import ClusterExecutor
-from embomatrix.trainer.evaluation.judging import Judge
+from embomatrix.trainer.evaluation.exam import WorldExam
 from embomatrix.trainer.evaluation.page import evaluation_page
-from embomatrix.trainer.evaluation.pictures import chosen_pictures
-from embomatrix.trainer.evaluation.scoreboard import Scoreboard
 from embomatrix.trainer.evaluation.table import read_row, report_of, text_report
 from embomatrix.world.task import MAX_TABLE
 from embomatrix.world.whole_file import write_whole
@@ -39,9 +41,12 @@ from embomatrix.world.whole_file import write_whole
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
+    import numpy as np
+
     from embomatrix.trainer.evaluation.answers import Answer
     from embomatrix.trainer.evaluation.asking import Asker
     from embomatrix.trainer.evaluation.benchmark import Benchmark
+    from embomatrix.trainer.evaluation.exam import Exam
     from embomatrix.trainer.evaluation.judging import Executor
     from embomatrix.trainer.evaluation.table import Row
 
@@ -55,13 +60,26 @@ console = Console(highlight=False, markup=False, soft_wrap=True)
 
 @dataclass(frozen=True, slots=True)
 class Questions:
-    """How tasks are asked: None where the asked one's own default is wanted."""
+    """How tasks are asked. ``max_tokens``: None where the asked one's own default is wanted."""
 
     samples: int
     temperature: float
     seed: int
     max_tokens: int | None
     codec: Codec
+
+
+@dataclass(frozen=True, slots=True)
+class Chosen:
+    """Who is to be asked, as a person says it; one of the first three is given."""
+
+    model: str
+    endpoint: str
+    baseline: BaselineName | None
+    model_name: str
+    key: str
+    concurrent: int
+    attempts: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +91,27 @@ class Asked:
     codec: Codec
     rows: int
     max_tokens: int
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where plans are executed: on a cluster if ``manager`` is given, else in ``jobs`` processes of this machine."""
+
+    manager: str
+    token: str
+    ca: Path | None
+    jobs: int | None
+
+    def executor(self, bench: Benchmark) -> Executor:
+        if not self.manager:
+            from embomatrix.worker.rollout_pool import RolloutPool
+
+            return RolloutPool(bench.folder, self.jobs or os.cpu_count() or 1)
+        from embomatrix.rpc.client import ClusterClient
+        from embomatrix.rpc.trust import read_ca, read_token
+
+        connect = functools.partial(ClusterClient, self.manager, read_token(self.token), ca=read_ca(self.ca))
+        return ClusterExecutor(connect, bench.dataset.bundle_bytes)
 
 
 def evaluate(
@@ -93,7 +132,8 @@ def evaluate(
         Path | None, typer.Option(help="Judge the stored answers of an evaluation; asks nobody.")
     ] = None,
     bench: Annotated[
-        str, typer.Option(help="internal-verified, eai, a dataset folder, or a file of task records.")
+        str,
+        typer.Option(help="eai-native, eai, internal-verified, a dataset folder, or a file of task records."),
     ] = "",
     split: Annotated[
         str, typer.Option(help="heldout, train or all; else heldout where the dataset has any.")
@@ -139,20 +179,18 @@ def evaluate(
             raise TrainerError(
                 "expected one of --model, --endpoint, --baseline and --answers: give one of them"
             )
-        executor = functools.partial(_executor, manager, token, ca, jobs)
+        place = Place(manager, token, ca, jobs)
         if answers is not None:
-            _judge_stored(answers, bench, out, executor, beside or [])
+            _judge_stored(answers, bench, out, place, beside or [])
             return
-        found = find_benchmark(bench or DEFAULT_BENCH, split, tasks)
-        asked_for = Questions(samples, temperature, seed, max_tokens, codec)
-        folder = out or DEFAULT_OUT / _file_name(f"{Path(found.name).name}-{model or model_name or baseline}")
-        if model:
-            asked = _policy(model, asked_for, threads, device)
-        elif endpoint:
-            asked = _endpoint(endpoint, model_name, key, asked_for, (concurrent, attempts), folder)
-        else:
-            asked = _baseline(baseline or BaselineName.ORACLE)
-        _ask_and_judge(found, asked, asked_for, folder, executor, beside or [])
+        chosen = Chosen(model, endpoint, baseline, model_name, key, concurrent, attempts)
+        how = Questions(samples, temperature, seed, max_tokens, codec)
+        with _exam(place, bench or DEFAULT_BENCH, split, tasks) as exam:
+            label = model or model_name or str(baseline)
+            folder = out or DEFAULT_OUT / _file_name(f"{Path(exam.name).name}-{label}")
+            rows = [read_row(path, exam.digest) for path in beside or []]
+            setup, given = _ask(exam, _asked(exam, chosen, how, threads, device, folder), how, folder)
+            _judge(exam, setup, given, folder, rows)
 
 
 @contextlib.contextmanager
@@ -174,129 +212,126 @@ def _problems_shown() -> Iterator[None]:
         )
 
 
-def _executor(manager: str, token: str, ca: Path | None, jobs: int | None, found: Benchmark) -> Executor:
-    """A cluster where a manager is named, else processes of this machine."""
-    if not manager:
-        from embomatrix.worker.rollout_pool import RolloutPool
+@contextlib.contextmanager
+def _exam(place: Place, named: str, split: str, limit: int | None) -> Iterator[Exam]:
+    """The benchmark of this name, ready to ask and to judge."""
+    if named == NATIVE:
+        from embomatrix.trainer.eai.environment import JudgeEnvironment
+        from embomatrix.trainer.eai.judge import NativeJudge
 
-        return RolloutPool(found.folder, jobs or os.cpu_count() or 1)
-    from embomatrix.rpc.client import ClusterClient
-    from embomatrix.rpc.trust import read_ca, read_token
-
-    connect = functools.partial(ClusterClient, manager, read_token(token), ca=read_ca(ca))
-    return ClusterExecutor(connect, found.dataset.bundle_bytes)
-
-
-def _policy(model: str, asked_for: Questions, threads: int | None, device: str) -> Asked:
-    from embomatrix.trainer.evaluation.models import load_model
-
-    loaded = load_model(model, asked_for.codec, threads=threads, device=device)
-    tokens = asked_for.max_tokens or loaded.max_tokens
-    return Asked(PolicyAsker(loaded.policy), model, loaded.policy.codec, loaded.rows, tokens)
+        with NativeJudge(JudgeEnvironment.find()) as judge:
+            yield NativeExam(judge)
+        return
+    bench = find_benchmark(named, split, limit)
+    yield WorldExam(bench, place.executor(bench))
 
 
-def _endpoint(
-    url: str, name: str, key: str, asked_for: Questions, limits: tuple[int, int], folder: Path
+def _asked(
+    exam: Exam, chosen: Chosen, questions: Questions, threads: int | None, device: str, folder: Path
 ) -> Asked:
-    if not name:
+    if chosen.model:
+        from embomatrix.trainer.evaluation.models import load_model
+
+        loaded = load_model(chosen.model, questions.codec, threads=threads, device=device)
+        if isinstance(exam, NativeExam) and loaded.policy.codec is Codec.NAMES:
+            raise TrainerError(
+                f"{chosen.model} is a word-level policy and can't read the prompts of {NATIVE}"
+            )
+        tokens = questions.max_tokens or loaded.max_tokens
+        return Asked(PolicyAsker(loaded.policy), chosen.model, loaded.policy.codec, loaded.rows, tokens)
+    if chosen.endpoint:
+        return _endpoint(chosen, questions, folder)
+    name = chosen.baseline or BaselineName.ORACLE
+    return Asked(WriterAsker(_writer(exam, name)), name.value, Codec.JSON, MAX_TABLE, 1)
+
+
+def _writer(exam: Exam, name: BaselineName) -> Callable[[str, np.random.Generator], str]:
+    """How a baseline answers: in our world by its plans, in EAI's by the published human ones."""
+    if isinstance(exam, NativeExam):
+        if name is not BaselineName.HUMAN:
+            raise TrainerError(
+                f"the baseline `{name}` writes plans of our world: on {NATIVE} pass --baseline human"
+            )
+        return lambda task_id, rng: exam.human(task_id)
+    if name is BaselineName.HUMAN or not isinstance(exam, WorldExam):
+        raise TrainerError(f"the human plans are of {NATIVE}: pass --bench {NATIVE}, or --baseline oracle")
+    plan, tasks = baseline_for(name), exam.bench.tasks
+    return lambda task_id, rng: json.dumps(plan_to_json(plan(tasks[task_id], rng)))
+
+
+def _endpoint(chosen: Chosen, questions: Questions, folder: Path) -> Asked:
+    if not chosen.model_name:
         raise TrainerError("the endpoint's model has no name: pass --model-name as the endpoint calls it")
-    if asked_for.codec is Codec.NAMES:
+    if questions.codec is Codec.NAMES:
         raise TrainerError("the codec `names` is for word-level policies: pass --codec json or lines")
     from embomatrix.llm.endpoint import Endpoint, EndpointLimits
 
-    concurrent, attempts = limits
-    bounds = EndpointLimits(attempts=attempts, concurrent=concurrent)
-    opened = functools.partial(Endpoint, url, name, api_key=key, limits=bounds)
-    asker = EndpointAsker(opened, asked_for.codec, folder / "ledger.jsonl")
-    return Asked(asker, name, asked_for.codec, MAX_TABLE, asked_for.max_tokens or ENDPOINT_TOKENS)
+    limits = EndpointLimits(attempts=chosen.attempts, concurrent=chosen.concurrent)
+    opened = functools.partial(
+        Endpoint, chosen.endpoint, chosen.model_name, api_key=chosen.key, limits=limits
+    )
+    tokens = questions.max_tokens or ENDPOINT_TOKENS
+    return Asked(
+        EndpointAsker(opened, folder / "ledger.jsonl"), chosen.model_name, questions.codec, MAX_TABLE, tokens
+    )
 
 
-def _baseline(name: BaselineName) -> Asked:
-    return Asked(BaselineAsker(baseline_for(name)), name.value, Codec.JSON, MAX_TABLE, 1)
-
-
-def _ask_and_judge(
-    found: Benchmark,
-    asked: Asked,
-    asked_for: Questions,
-    folder: Path,
-    executor: Callable[[Benchmark], Executor],
-    beside: Sequence[Path],
-) -> None:
-    rows = [read_row(path, found.digest) for path in beside]
+def _ask(exam: Exam, asked: Asked, how: Questions, folder: Path) -> tuple[Setup, tuple[Answer, ...]]:
+    """Fill the answer sheet."""
+    questions = exam.questions(asked.codec, asked.rows)
     setup = Setup(
-        bench=found.name,
-        bench_digest=found.digest,
-        split=found.split,
-        tasks=len(found.records),
+        bench=exam.name,
+        bench_digest=exam.digest,
+        split=exam.split,
+        tasks=len(exam.task_ids),
         model=asked.label,
-        codec=asked.codec.value,
+        codec=asked.codec.value if isinstance(exam, WorldExam) else EAI_CODEC,
         rows=asked.rows,
-        samples=asked_for.samples,
-        temperature=asked_for.temperature,
+        samples=how.samples,
+        temperature=how.temperature,
         max_tokens=asked.max_tokens,
-        seed=asked_for.seed,
-        questions=questions_digest(found.tasks.values(), asked.codec, asked.rows),
-        by_rule=len(found.failed_by_rule),
+        seed=how.seed,
+        questions=questions_digest(questions),
+        by_rule=exam.by_rule,
     )
     began_s = time.monotonic()
     with AnswerSheet(folder / FILE, setup) as sheet:
         if len(sheet):
             console.print(f"{len(sheet)} answers are there already")
         with _bar("answers") as report:
-            asked.asker.ask(list(found.tasks.values()), sheet, report)
-        given = sheet.ordered(found.tasks)
+            asked.asker.ask(questions, sheet, report)
+        given = sheet.ordered(exam.task_ids)
     console.print(f"{len(given)} answers in {time.monotonic() - began_s:.1f} s: {folder / FILE}")
-    _judge(found, setup, given, executor(found), folder, rows)
+    return setup, given
 
 
-def _judge_stored(
-    path: Path,
-    bench: str,
-    out: Path | None,
-    executor: Callable[[Benchmark], Executor],
-    beside: Sequence[Path],
-) -> None:
+def _judge_stored(path: Path, bench: str, out: Path | None, place: Place, beside: Sequence[Path]) -> None:
     setup, stored = read_answers(path)
-    found = find_benchmark(bench or setup.bench, setup.split, setup.tasks)
-    if found.digest != setup.bench_digest:
-        raise TrainerError(
-            f"{path} answers other tasks than {bench or setup.bench} holds now (digest {setup.bench_digest[:19]}…, now "
-            f"{found.digest[:19]}…): pass the benchmark that was asked with --bench"
-        )
-    task_ids = [record.task.task_id for record in found.records]
-    given = ordered(stored, task_ids, setup.samples)
-    missing = len(task_ids) * setup.samples - len(given)
-    if missing:
-        console.print(
-            f"{missing} of {len(task_ids) * setup.samples} answers are missing: figures are over the others"
-        )
-    rows = [read_row(row, found.digest) for row in beside]
-    _judge(found, setup, given, executor(found), out or path.parent, rows)
+    with _exam(place, bench or setup.bench, setup.split, setup.tasks) as exam:
+        if exam.digest != setup.bench_digest:
+            raise TrainerError(
+                f"{path} answers other tasks than {bench or setup.bench} holds now (digest {setup.bench_digest[:19]}…, now "
+                f"{exam.digest[:19]}…): pass the benchmark that was asked with --bench"
+            )
+        given = ordered(stored, exam.task_ids, setup.samples)
+        asked_for = len(exam.task_ids) * setup.samples
+        if len(given) < asked_for:
+            missing = asked_for - len(given)
+            console.print(f"{missing} of {asked_for} answers are missing: figures are over the others")
+        _judge(exam, setup, given, out or path.parent, [read_row(row, exam.digest) for row in beside])
 
 
-def _judge(
-    found: Benchmark,
-    setup: Setup,
-    given: Sequence[Answer],
-    executor: Executor,
-    folder: Path,
-    rows: Sequence[Row],
-) -> None:
+def _judge(exam: Exam, setup: Setup, given: Sequence[Answer], folder: Path, rows: Sequence[Row]) -> None:
     began_s = time.monotonic()
-    with _bar("plans executed") as report:
-        judged = Judge(found, setup, executor).judge(given, report)
-    board = Scoreboard.of([record.task for record in found.records], judged.verdicts, setup.by_rule)
-    value = report_of(setup, board)
+    with _bar("plans judged") as report:
+        marked = exam.judge(setup, given, report)
+    value = report_of(setup, marked)
     text = text_report(value, rows)
-    page = evaluation_page(value, chosen_pictures(found, board, judged.plans), rows)
     _write(folder / "report.json", json.dumps(value, indent=1) + "\n")
     _write(folder / "report.txt", text)
-    _write(folder / "report.html", page)
+    _write(folder / "report.html", evaluation_page(value, marked.pictures, rows))
     console.print(text)
-    console.print(
-        f"executed and judged in {time.monotonic() - began_s:.1f} s: {folder / 'report.html'}, .json, .txt"
-    )
+    console.print(f"judged in {time.monotonic() - began_s:.1f} s: {folder / 'report.html'}, .json, .txt")
 
 
 def _write(path: Path, text: str) -> None:

@@ -14,12 +14,12 @@ from embomatrix.skills.parse import plan_to_json
 from embomatrix.skills.prompt import Codec
 from embomatrix.trainer.errors import TrainerError
 from embomatrix.trainer.evaluation.answers import Answer, AnswerSheet, Setup, read_answers
-from embomatrix.trainer.evaluation.asking import BaselineAsker, EndpointAsker, questions_digest
+from embomatrix.trainer.evaluation.asking import EndpointAsker, WriterAsker, questions_digest
 from embomatrix.trainer.evaluation.baselines import BaselineName, baseline_for
 from embomatrix.trainer.evaluation.benchmark import find_benchmark
+from embomatrix.trainer.evaluation.exam import WorldExam
 from embomatrix.trainer.evaluation.judging import Judge
 from embomatrix.trainer.evaluation.page import evaluation_page
-from embomatrix.trainer.evaluation.pictures import chosen_pictures
 from embomatrix.trainer.evaluation.scoreboard import Scoreboard
 from embomatrix.trainer.evaluation.table import read_row, report_of, text_report
 from embomatrix.worker.rollout_pool import RolloutPool
@@ -48,10 +48,22 @@ def judged(bench, answers, setup=None):
 
 def report(bench, answers, setup=None):
     setup = setup or setup_of(bench)
-    found, _ = judged(bench, answers, setup)
-    board = Scoreboard.of([record.task for record in bench.records], found.verdicts)
-    value = report_of(setup, board)
-    return value, evaluation_page(value, chosen_pictures(bench, board, found.plans))
+    marked = WorldExam(bench, HereExecutor(bench.folder)).judge(setup, answers, lambda *_: None)
+    value = report_of(setup, marked)
+    return value, evaluation_page(value, marked.pictures)
+
+
+def questions(bench, codec=Codec.LINES, rows=60):
+    return WorldExam(bench, HereExecutor(bench.folder)).questions(codec, rows)
+
+
+def categories(bench):
+    return {record.task.task_id: record.task.category for record in bench.records}
+
+
+def written(bench, name):
+    plan = baseline_for(name)
+    return WriterAsker(lambda task_id, rng: json.dumps(plan_to_json(plan(bench.tasks[task_id], rng))))
 
 
 def asked(bench, name, samples=1):
@@ -114,9 +126,7 @@ def test_processes_of_this_machine_give_what_this_process_gives(bench):
 def test_report_is_made_again_from_the_kept_answers_bit_for_bit(bench, tmp_path):
     setup = setup_of(bench, codec="json")
     with AnswerSheet(tmp_path / "answers.jsonl", setup) as sheet:
-        BaselineAsker(baseline_for(BaselineName.RANDOM)).ask(
-            list(bench.tasks.values()), sheet, lambda *_: None
-        )
+        written(bench, BaselineName.RANDOM).ask(questions(bench), sheet, lambda *_: None)
         first = report(bench, sheet.ordered(bench.tasks), setup)
     kept, answers = read_answers(tmp_path / "answers.jsonl")
     again = report(
@@ -147,14 +157,14 @@ def test_report_of_other_tasks_does_not_stand_in_the_same_table(bench, tmp_path)
 def test_lost_plans_count_in_no_figure(bench):
     found, _ = judged(bench, asked(bench, BaselineName.ORACLE))
     lost = [replace(found.verdicts[0], sample=7, success=False, lost=True), *found.verdicts]
-    board = Scoreboard.of([record.task for record in bench.records], lost)
+    board = Scoreboard.of(categories(bench), lost)
     assert board.lost == 1
     assert board.success().interval.value == 1.0
 
 
 def test_tasks_that_can_not_be_expressed_count_as_failed_in_the_success_over_all(bench):
     found, _ = judged(bench, asked(bench, BaselineName.ORACLE))
-    board = Scoreboard.of([record.task for record in bench.records], found.verdicts, by_rule=4)
+    board = Scoreboard.of(categories(bench), found.verdicts, by_rule=4)
     assert board.success().interval.value == 1.0
     assert board.success_over_all().interval.value == 0.5
 
@@ -211,16 +221,14 @@ def test_line_cut_short_by_a_kill_is_asked_again(bench, tmp_path):
 
 def endpoint_asker(url, tmp_path, attempts=1):
     limits = EndpointLimits(attempts=attempts, first_wait_s=0.01, concurrent=3)
-    return EndpointAsker(
-        lambda: Endpoint(url, "scripted", limits=limits), Codec.LINES, tmp_path / "ledger.jsonl"
-    )
+    return EndpointAsker(lambda: Endpoint(url, "scripted", limits=limits), tmp_path / "ledger.jsonl")
 
 
 def test_endpoint_is_asked_once_for_each_sample_and_what_it_cost_is_written(bench, tmp_path):
     server = ChatServer("move 10")
     with server.serving() as url, AnswerSheet(tmp_path / "answers.jsonl", setup_of(bench)) as sheet:
-        endpoint_asker(url, tmp_path).ask(list(bench.tasks.values()), sheet, lambda *_: None)
-        endpoint_asker(url, tmp_path).ask(list(bench.tasks.values()), sheet, lambda *_: None)
+        endpoint_asker(url, tmp_path).ask(questions(bench), sheet, lambda *_: None)
+        endpoint_asker(url, tmp_path).ask(questions(bench), sheet, lambda *_: None)
         assert len(sheet) == len(server.requests) == 2 * len(bench.records)
     assert server.most_at_once <= 3
     assert len({request["seed"] for request in server.requests}) == len(server.requests)
@@ -233,18 +241,17 @@ def test_endpoint_that_breaks_off_costs_no_answer_that_came(bench, tmp_path):
     path = tmp_path / "answers.jsonl"
     with server.serving() as url, AnswerSheet(path, setup_of(bench)) as sheet:
         with pytest.raises(TrainerError, match=r"answered 500.*; [123] of 8 answers are kept in"):
-            endpoint_asker(url, tmp_path).ask(list(bench.tasks.values()), sheet, lambda *_: None)
+            endpoint_asker(url, tmp_path).ask(questions(bench), sheet, lambda *_: None)
         kept = len(sheet)
     again = ChatServer("move 10")
     with again.serving() as url, AnswerSheet(path, setup_of(bench)) as sheet:
-        endpoint_asker(url, tmp_path).ask(list(bench.tasks.values()), sheet, lambda *_: None)
+        endpoint_asker(url, tmp_path).ask(questions(bench), sheet, lambda *_: None)
         assert len(sheet) == 8
     assert len(again.requests) == 8 - kept
 
 
 def test_other_prompts_are_other_questions(bench):
-    tasks = list(bench.tasks.values())
-    digests = {questions_digest(tasks, codec, rows) for codec in Codec for rows in (5, 60)}
+    digests = {questions_digest(questions(bench, codec, rows)) for codec in Codec for rows in (5, 60)}
     assert len(digests) == 6
 
 

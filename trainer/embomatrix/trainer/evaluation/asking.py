@@ -1,18 +1,15 @@
-"""Asks whoever is measured for plans: a policy in this process, a model behind an endpoint, or a baseline."""
+"""Asks whoever is measured: a policy in this process, a model behind an endpoint, or one that needs no words."""
 
 from __future__ import annotations
 
 import asyncio
 import hashlib
-import json
 from typing import TYPE_CHECKING, Final, Protocol
 
 import numpy as np
 
 from embomatrix.llm.ledger import Ledger
 from embomatrix.llm.values import ChatRequest, LlmError, Message, Speaker
-from embomatrix.skills.parse import plan_to_json
-from embomatrix.skills.prompt import limited, prompt_for
 from embomatrix.trainer.errors import TrainerError
 from embomatrix.trainer.evaluation.answers import Answer
 
@@ -21,10 +18,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from embomatrix.llm.endpoint import Endpoint
-    from embomatrix.skills.prompt import Codec, Prompt, Situation
-    from embomatrix.trainer.data import TrainingTask
     from embomatrix.trainer.evaluation.answers import AnswerSheet, Setup
-    from embomatrix.trainer.evaluation.baselines import Baseline
+    from embomatrix.trainer.evaluation.exam import Question
     from embomatrix.trainer.policy.protocol import Policy
 
     Report = Callable[[int, int], None]
@@ -36,22 +31,16 @@ MAX_SEED: Final = 2**31
 
 
 class Asker(Protocol):
-    """Fills an answer sheet. What is there already is not asked for again."""
+    """Fills an answer sheet. What is there already is not asked for again. ``report`` is told of answers there and in all."""
 
-    def ask(self, tasks: Sequence[TrainingTask], sheet: AnswerSheet, report: Report) -> None: ...
-
-
-def told(task: TrainingTask, rows: int) -> Situation:
-    """What is told of a task: rows of its table at most, chosen by the instruction alone."""
-    return limited(task.situation, rows)
+    def ask(self, questions: Sequence[Question], sheet: AnswerSheet, report: Report) -> None: ...
 
 
-def questions_digest(tasks: Iterable[TrainingTask], codec: Codec, rows: int) -> str:
+def questions_digest(questions: Iterable[Question]) -> str:
     """SHA-256 of all prompts in their order."""
     content = hashlib.sha256()
-    for task in tasks:
-        prompt = prompt_for(told(task, rows), codec)
-        content.update(f"{prompt.system}\0{prompt.user}\0".encode())
+    for question in questions:
+        content.update(f"{question.prompt.system}\0{question.prompt.user}\0".encode())
     return f"sha256:{content.hexdigest()}"
 
 
@@ -67,21 +56,18 @@ class PolicyAsker:
     def __init__(self, policy: Policy) -> None:
         self._policy = policy
 
-    def ask(self, tasks: Sequence[TrainingTask], sheet: AnswerSheet, report: Report) -> None:
+    def ask(self, questions: Sequence[Question], sheet: AnswerSheet, report: Report) -> None:
         import torch
 
         setup = sheet.setup
         device = next(iter(self._policy.parameters())).device
-        for at in range(0, len(tasks), CHUNK):
-            chunk = tasks[at : at + CHUNK]
-            wanted = [(task.task.task_id, sample) for task in chunk for sample in range(setup.samples)]
+        for at in range(0, len(questions), CHUNK):
+            chunk = questions[at : at + CHUNK]
+            wanted = [(question.task_id, sample) for question in chunk for sample in range(setup.samples)]
             if any(key not in sheet for key in wanted):
-                seed = seed_of(setup.seed, chunk[0].task.task_id, 0)
+                seed = seed_of(setup.seed, chunk[0].task_id, 0)
                 drawn = self._policy.sample(
-                    [
-                        self._policy.encode(prompt_for(told(task, setup.rows), self._policy.codec))
-                        for task in chunk
-                    ],
+                    [self._policy.encode(question.prompt) for question in chunk],
                     setup.samples,
                     setup.temperature,
                     setup.max_tokens,
@@ -92,7 +78,7 @@ class PolicyAsker:
                     Answer(task_id, sample, text, completion_tokens=int(count))
                     for (task_id, sample), text, count in zip(wanted, drawn.texts, tokens, strict=True)
                 )
-            report(len(sheet), len(tasks) * setup.samples)
+            report(len(sheet), len(questions) * setup.samples)
 
 
 class EndpointAsker:
@@ -101,16 +87,15 @@ class EndpointAsker:
     A question that stays without an answer ends the asking with an error: what came before is on the sheet.
     """
 
-    def __init__(self, open_endpoint: Callable[[], Endpoint], codec: Codec, ledger_file: Path) -> None:
+    def __init__(self, open_endpoint: Callable[[], Endpoint], ledger_file: Path) -> None:
         self._open_endpoint = open_endpoint
-        self._codec = codec
         self._ledger_file = ledger_file
 
-    def ask(self, tasks: Sequence[TrainingTask], sheet: AnswerSheet, report: Report) -> None:
+    def ask(self, questions: Sequence[Question], sheet: AnswerSheet, report: Report) -> None:
         """Raises TrainerError that tells how many answers are kept."""
-        total = len(tasks) * sheet.setup.samples
+        total = len(questions) * sheet.setup.samples
         try:
-            asyncio.run(self._ask_all(tasks, sheet, lambda: report(len(sheet), total)))
+            asyncio.run(self._ask_all(questions, sheet, lambda: report(len(sheet), total)))
         except ExceptionGroup as errors:
             first = errors.exceptions[0]
             if not isinstance(first, LlmError):
@@ -120,57 +105,46 @@ class EndpointAsker:
             ) from errors
 
     async def _ask_all(
-        self, tasks: Sequence[TrainingTask], sheet: AnswerSheet, report: Callable[[], None]
+        self, questions: Sequence[Question], sheet: AnswerSheet, report: Callable[[], None]
     ) -> None:
         async with self._open_endpoint() as endpoint:
             model = Ledger(endpoint, path=self._ledger_file)
 
-            async def one(prompt: Prompt, task_id: str, sample: int) -> None:
-                reply = await model.complete(_request(prompt, sheet.setup, task_id, sample))
-                used = reply.usage
-                sheet.add(
-                    [
-                        Answer(
-                            task_id,
-                            sample,
-                            reply.text,
-                            reply.finish,
-                            used.prompt_tokens,
-                            used.completion_tokens,
-                        )
-                    ]
-                )
+            async def one(question: Question, sample: int) -> None:
+                reply = await model.complete(_request(question, sheet.setup, sample))
+                used = (reply.usage.prompt_tokens, reply.usage.completion_tokens)
+                sheet.add([Answer(question.task_id, sample, reply.text, reply.finish, *used)])
                 report()
 
             async with asyncio.TaskGroup() as group:
-                for task in tasks:
-                    prompt = prompt_for(told(task, sheet.setup.rows), self._codec)
+                for question in questions:
                     for sample in range(sheet.setup.samples):
-                        if (task.task.task_id, sample) not in sheet:
-                            group.create_task(one(prompt, task.task.task_id, sample))
+                        if (question.task_id, sample) not in sheet:
+                            group.create_task(one(question, sample))
 
 
-class BaselineAsker:
-    """A baseline that needs no model. It answers in JSON."""
+class WriterAsker:
+    """Whoever answers without being asked in words: a baseline, or the human plans of a benchmark."""
 
-    def __init__(self, baseline: Baseline) -> None:
-        self._baseline = baseline
+    def __init__(self, write: Callable[[str, np.random.Generator], str]) -> None:
+        """``write`` gives the text for a task's id; equal generators give equal texts."""
+        self._write = write
 
-    def ask(self, tasks: Sequence[TrainingTask], sheet: AnswerSheet, report: Report) -> None:
-        for task in tasks:
+    def ask(self, questions: Sequence[Question], sheet: AnswerSheet, report: Report) -> None:
+        for question in questions:
             for sample in range(sheet.setup.samples):
-                rng = np.random.default_rng(seed_of(sheet.setup.seed, task.task.task_id, sample))
-                plan = self._baseline(task, rng)
-                sheet.add([Answer(task.task.task_id, sample, json.dumps(plan_to_json(plan)))])
-            report(len(sheet), len(tasks) * sheet.setup.samples)
+                rng = np.random.default_rng(seed_of(sheet.setup.seed, question.task_id, sample))
+                sheet.add([Answer(question.task_id, sample, self._write(question.task_id, rng))])
+            report(len(sheet), len(questions) * sheet.setup.samples)
 
 
-def _request(prompt: Prompt, setup: Setup, task_id: str, sample: int) -> ChatRequest:
+def _request(question: Question, setup: Setup, sample: int) -> ChatRequest:
+    prompt = question.prompt
     messages = [Message(Speaker.SYSTEM, prompt.system)] if prompt.system else []
     return ChatRequest(
         PURPOSE,
         (*messages, Message(Speaker.USER, prompt.user)),
         max_tokens=setup.max_tokens,
         temperature=setup.temperature,
-        seed=seed_of(setup.seed, task_id, sample),
+        seed=seed_of(setup.seed, question.task_id, sample),
     )

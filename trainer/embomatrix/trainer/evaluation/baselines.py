@@ -19,7 +19,7 @@ from embomatrix.world.goal import And, Atom, Exists, Forall, ForN, ForNPairs, Fo
 from embomatrix.world.state import Relation, State
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     import numpy as np
 
@@ -43,15 +43,13 @@ class BaselineName(StrEnum):
     ORACLE = "oracle"
     GREEDY = "greedy"
     RANDOM = "random"
+    HUMAN = "human"
+    """Not ours to write: the plans that EAI publishes."""
 
 
 def baseline_for(name: BaselineName) -> Baseline:
-    """The function that writes a task's plan; equal generators give equal plans."""
-    return {
-        BaselineName.ORACLE: oracle_plan,
-        BaselineName.GREEDY: greedy_plan,
-        BaselineName.RANDOM: random_plan,
-    }[name]
+    """The function that writes a task's plan; equal generators give equal plans. Not for ``HUMAN``."""
+    return PLANNERS[name]
 
 
 def oracle_plan(task: TrainingTask, rng: np.random.Generator) -> Plan:
@@ -202,3 +200,11 @@ def _at(row: Row, skill: Skill) -> Iterator[SkillCall]:
 def _opened(row: Row) -> Iterator[SkillCall]:
     if "closed" in row.states:
         yield from _at(row, Skill.OPEN)
+
+
+PLANNERS: Final[Mapping[BaselineName, Baseline]] = {
+    BaselineName.ORACLE: oracle_plan,
+    BaselineName.GREEDY: greedy_plan,
+    BaselineName.RANDOM: random_plan,
+}
+"""Baselines of our own world."""

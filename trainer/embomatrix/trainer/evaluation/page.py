@@ -59,7 +59,7 @@ def evaluation_page(
         about=html.escape(_about(report)),
         success=_table(head(report), table(rows, "success")),
         partial=_table(head(report), table(rows, "partial")),
-        by_rule=_by_rule(report),
+        notes=_notes(report),
         chart=_chart(report),
         passes=_table(("", *head(report)[1:]), pass_rows(report)),
         causes=_causes(report),
@@ -95,10 +95,15 @@ def _cell(text: str) -> str:
     return f"<b>{value}</b> <span>[{rest}</span>" if bracket else value
 
 
-def _by_rule(report: Mapping[str, Any]) -> str:
+def _notes(report: Mapping[str, Any]) -> str:
+    """Figures that stand beside the table: of all tasks, and those that only this exam has."""
+    others = "".join(
+        f'<p class="note">{html.escape(name)}: {percent(found)} %.</p>'
+        for name, found in report["others"].items()
+    )
     if not report["tasks_failed_by_rule"]:
-        return ""
-    return (
+        return others
+    return others + (
         f'<p class="note">{report["tasks_failed_by_rule"]} more tasks can\'t be expressed with these skills. '
         f"Where they count as failed: {percent(report['success_over_all'])} %.</p>"
     )

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from embomatrix.trainer.evaluation.verdicts import Verdict
-    from embomatrix.world.task import Task
 
 KS: Final = (1, 2, 3, 5, 10, 20, 50, 100)
 """The k of pass@k, as far as there are samples."""
@@ -57,19 +56,17 @@ class Scoreboard:
     by_rule: int = 0
 
     @staticmethod
-    def of(tasks: Sequence[Task], verdicts: Sequence[Verdict], by_rule: int = 0) -> Scoreboard:
-        """Verdicts in any order, sorted to their tasks."""
-        found: dict[str, list[Verdict]] = {task.task_id: [] for task in tasks}
+    def of(tasks: Mapping[str, TaskCategory], verdicts: Sequence[Verdict], by_rule: int = 0) -> Scoreboard:
+        """Verdicts in any order, sorted to their tasks; ``tasks`` are the ids and categories of all that were asked."""
+        found: dict[str, list[Verdict]] = {task_id: [] for task_id in tasks}
         for verdict in verdicts:
             found[verdict.task_id].append(verdict)
         return Scoreboard(
             tuple(
                 TaskResult(
-                    task.task_id,
-                    task.category,
-                    tuple(sorted(found[task.task_id], key=lambda verdict: verdict.sample)),
+                    task_id, category, tuple(sorted(found[task_id], key=lambda verdict: verdict.sample))
                 )
-                for task in tasks
+                for task_id, category in tasks.items()
             ),
             by_rule,
         )

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from embomatrix.trainer.errors import TrainerError
+from embomatrix.trainer.evaluation.scoreboard import estimate_to_json
 from embomatrix.trainer.evaluation.taxonomy import MEANINGS, Cause
 from embomatrix.world.task import TaskCategory
 
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from embomatrix.trainer.evaluation.answers import Setup
-    from embomatrix.trainer.evaluation.scoreboard import Scoreboard
+    from embomatrix.trainer.evaluation.exam import Marked
 
 VERSION: Final = 1
 NONE: Final = "–"
@@ -40,9 +41,10 @@ class Row:
     figures: Mapping[str, Any]
 
 
-def report_of(setup: Setup, board: Scoreboard) -> dict[str, Any]:
+def report_of(setup: Setup, marked: Marked) -> dict[str, Any]:
     """The evaluation as JSON. Equal answers give equal bytes, wherever their plans are executed."""
-    return {"report": VERSION, "setup": asdict(setup), **board.as_json()}
+    others = {name: estimate_to_json(found) for name, found in marked.others.items()}
+    return {"report": VERSION, "setup": asdict(setup), **marked.board.as_json(), "others": others}
 
 
 def read_row(path: Path, bench_digest: str) -> Row:
@@ -144,6 +146,8 @@ def text_report(report: Mapping[str, Any], beside: Sequence[Row] = ()) -> str:
             f"{report['tasks_failed_by_rule']} more tasks can't be expressed with these skills; where they count as failed: "
             f"{percent(report['success_over_all'])} %"
         )
+    if report["others"]:
+        parts.append("\n".join(f"{name}, %: {percent(found)}" for name, found in report["others"].items()))
     if report["overall"]["causes"]:
         parts.append(_grid("why plans failed", [("cause", "plans", "share", "meaning"), *cause_rows(report)]))
     return "\n\n".join([*parts, INTERVALS]) + "\n"

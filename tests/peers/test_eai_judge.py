@@ -1,0 +1,122 @@
+"""EAI's published judge, run without iGibson: what it says of the human plans, and of plans made wrong by hand.
+
+The first test makes the judge's own virtual environment (27 MB to fetch) unless EMBOMATRIX_EAI names one.
+"""
+
+import json
+
+import pytest
+
+from embomatrix.trainer.eai.environment import install
+from embomatrix.trainer.eai.exam import NativeExam
+from embomatrix.trainer.eai.judge import NativeJudge
+from embomatrix.trainer.evaluation.answers import Answer, Setup
+from embomatrix.trainer.evaluation.taxonomy import Cause
+
+pytestmark = [pytest.mark.eai, pytest.mark.timeout(900)]
+FRUIT = "bottling_fruit_0_Wainscott_0_int_0_2021-05-24_19-46-46"
+INCOMPARABLE = "rearranging_furniture"
+"""The record has four goals for it, the definition three."""
+
+
+@pytest.fixture(scope="module")
+def environment():
+    return install()
+
+
+@pytest.fixture(scope="module")
+def judge(environment):
+    with NativeJudge(environment) as started:
+        yield started
+
+
+@pytest.fixture(scope="module")
+def exam(judge):
+    return NativeExam(judge)
+
+
+def marked(exam, texts):
+    """Marks of one answer for each of these tasks."""
+    setup = Setup(exam.name, exam.digest, "all", len(texts), "me", "eai", 60, 1, 0.0, 1, 0)
+    answers = [Answer(task_id, 0, text) for task_id, text in texts.items()]
+    return exam.judge(setup, answers, lambda *_: None)
+
+
+def verdict(exam, *steps, text=None):
+    """What is said of one plan for the task of the fruit."""
+    plan = text if text is not None else json.dumps([{"action": a, "object": o} for a, o in steps])
+    board = marked(exam, {FRUIT: plan}).board
+    return next(task for task in board.tasks if task.task_id == FRUIT).verdicts[0]
+
+
+def test_human_plans_get_the_published_judges_figures(exam):
+    result = marked(exam, {task_id: exam.human(task_id) for task_id in exam.task_ids})
+    assert len(exam.task_ids) == 100
+    assert result.board.success().interval.value == pytest.approx(0.88)
+    assert result.others["goal exactly true and executed"].interval.value == pytest.approx(0.90)
+    assert result.others["executed to the end"].interval.value == pytest.approx(0.95)
+    assert result.board.lost == 0
+
+
+def test_categories_follow_the_rule(judge):
+    counts = {}
+    for task in judge.tasks():
+        counts[task.category] = counts.get(task.category, 0) + 1
+    assert counts == {"pick_and_place": 36, "appliance_use": 9, "kitchen_operation": 16, "compound": 39}
+
+
+@pytest.mark.parametrize(("published", "equal"), [(True, 362), (False, 360)])
+def test_reconstructed_start_agrees_with_the_real_simulators(environment, published, equal):
+    with NativeJudge(environment, published=published) as started:
+        truths = [started.first_truths(task.demo) for task in started.tasks() if task.task != INCOMPARABLE]
+    pairs = [pair for here, there in truths for pair in zip(here, there, strict=True)]
+    assert len(pairs) == 363
+    assert sum(here == there for here, there in pairs) == equal
+
+
+@pytest.mark.parametrize(
+    ("steps", "cause"),
+    [
+        ([("RIGHT_GRASP", "strawberry_0")], Cause.MISSING_STEP),
+        ([("OPEN", "fridge_97"), ("CLOSE", "fridge_97"), ("RIGHT_GRASP", "strawberry_0")], Cause.WRONG_ORDER),
+        ([("OPEN", "strawberry_0")], Cause.AFFORDANCE),
+        ([("OPEN", "fridge_97"), ("OPEN", "fridge_97")], Cause.GOAL_NOT_MET),
+        ([("OPEN", "fridge_98")], Cause.HALLUCINATED_OBJECT),
+        ([("open", "fridge_97")], Cause.HALLUCINATED_SKILL),
+        ([("NAVIGATE_TO", "fridge_97")], Cause.HALLUCINATED_SKILL),
+        ([("RIGHT_PLACE_NEXTTO_ONTOP", "fridge_97")], Cause.WRONG_ARGUMENT),
+        ([], Cause.UNPARSABLE),
+    ],
+)
+def test_plans_made_wrong_by_hand_get_their_verdicts(exam, steps, cause):
+    found = verdict(exam, *steps)
+    assert not found.success
+    assert found.cause is cause
+
+
+def test_text_of_a_model_is_never_executed(exam, tmp_path):
+    """Handed over as it is, the published parser would run it."""
+    trap = tmp_path / "trap"
+    text = f'[__import__("pathlib").Path({str(trap)!r}).touch()]'
+    assert verdict(exam, text=text).cause is Cause.UNPARSABLE
+    assert not trap.exists()
+
+
+def test_even_raw_text_can_not_write_or_start_anything_in_the_judges_process(judge, tmp_path):
+    trap = tmp_path / "trap"
+    for code in (
+        f'__import__("pathlib").Path({str(trap)!r}).write_text("x")',
+        f'__import__("os").system("touch {trap}")',
+        '__import__("socket").socket()',
+    ):
+        found = judge._asked({"op": "judge", "id": FRUIT, "demo": FRUIT, "text": f"[{code}]"})
+        assert found["errors"]["parsing"]
+    assert not trap.exists()
+
+
+def test_judge_that_an_answer_ends_is_started_again(judge):
+    assert (
+        judge._asked({"op": "judge", "id": FRUIT, "demo": FRUIT, "text": '[__import__("os")._exit(1)]'})
+        is None
+    )
+    assert judge.judge(FRUIT, '[{"action": "OPEN", "object": "fridge_97"}]').executed

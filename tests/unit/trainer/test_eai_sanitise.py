@@ -1,0 +1,47 @@
+"""What EAI's judge is given is pure JSON of plain names, whatever a model wrote: its parser calls eval."""
+
+import ast
+import json
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from embomatrix.trainer.eai.sanitise import sanitised
+
+STEP = {"action": "OPEN", "object": "fridge_97"}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        json.dumps([STEP]),
+        f"<think>first [this], then that</think>\n```json\n{json.dumps([STEP])}\n```",
+        f"[1, 2] is no plan, but {json.dumps([STEP])} is [indeed]",
+        f'[{{"action": "CLOSE", "object": "x"}}] or rather {json.dumps([STEP])}',
+        "[{'action': 'OPEN', 'object': 'fridge_97'}]",
+        json.dumps([{**STEP, "why": "__import__('os').system('true')"}]),
+    ],
+)
+def test_steps_are_found_in_what_models_write(text):
+    assert json.loads(sanitised(text)) == [STEP]
+
+
+@pytest.mark.parametrize(
+    "text", ["", "I can't.", "[", "[]", "[[[", '["OPEN"]', '[{"action": "OPEN"}]', "[" * 100_000]
+)
+def test_text_without_steps_is_empty(text):
+    assert sanitised(text) == ""
+
+
+def test_names_lose_what_could_end_a_string_or_a_list():
+    text = json.dumps([{"action": "OPEN", "object": 'a"]) or __import__("os")#'}])
+    assert json.loads(sanitised(text)) == [{"action": "OPEN", "object": "a??? or __import__??os???"}]
+
+
+@given(st.text(), st.text())
+def test_whatever_is_handed_over_is_a_literal_up_to_the_first_closing_bracket(action, thing):
+    """The published parser evaluates the text from the first "[" to the first "]"."""
+    text = sanitised(json.dumps([{"action": action, "object": thing}]))
+    value = ast.literal_eval(text[text.find("[") : text.find("]") + 1])
+    assert value == json.loads(text)

@@ -1,0 +1,241 @@
+"""One task of EAI's BEHAVIOR split as its judge needs it, put together from files of the package itself.
+
+What the package does not publish is reconstructed, by rules that are the same for all tasks: boxes (three classes), states that
+nobody mentions (false), cartons (open), and furniture (on its room's floor).
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+from pathlib import Path
+from typing import Any, Final
+
+from embomatrix.trainer.eai.inside.stand_ins import BINARY, UNARY, make_object, state_class
+
+PREDICATES: Final = {
+    "inside": "Inside",
+    "onfloor": "OnFloor",
+    "ontop": "OnTop",
+    "under": "Under",
+    "nextto": "NextTo",
+    "touching": "Touching",
+    "cooked": "Cooked",
+    "dusty": "Dusty",
+    "frozen": "Frozen",
+    "open": "Open",
+    "sliced": "Sliced",
+    "soaked": "Soaked",
+    "stained": "Stained",
+    "toggled_on": "ToggledOn",
+    "burnt": "Burnt",
+}
+RELATIONS: Final = frozenset(name for name, state in PREDICATES.items() if state in BINARY)
+STARTS_OPEN: Final = frozenset({"carton.n.02"})
+"""The published human plans put things into cartons without opening them; any other thing that opens starts shut."""
+OFF_FLOOR: Final = ("top_cabinet", "sink", "window", "door", "microwave", "room_floor")
+"""Beginnings of the names of fixed things that do not stand on the floor."""
+FURNITURE_M: Final = (1.0, 1.0, 1.0)
+CONTAINER_M: Final = (0.4, 0.4, 0.3125)
+SMALL_M: Final = (0.1, 0.1, 0.1)
+"""Boxes of the three classes. The judge compares volumes only, to say that something is too big."""
+_TOOLS: Final = {"slicer": "Slicer", "cleaningTool": "CleaningTool"}
+_ARTICULATED: Final = ("igibson.objects.articulated_object", "URDFObject")
+_FLOOR: Final = ("igibson.object_states.on_floor", "RoomFloor")
+_WRAPPERS: Final = "igibson.objects.multi_object_wrappers"
+
+
+class Package:
+    """The files of the installed package, read once. ``published``: use what it says of the real simulator's first state."""
+
+    def __init__(self, *, published: bool = True) -> None:
+        import behavior_eval
+        from bddl.object_taxonomy import ObjectTaxonomy
+
+        root = Path(behavior_eval.root_path)
+        self._evaluation = root / "evaluation"
+        stats = json.loads((root / "data" / "demo_stats.json").read_text())
+        self.stats: dict[str, dict[str, Any]] = {name: stats[name] for name in sorted(stats)}
+        prompts = self.read("action_sequencing/resources/prompts/helm_prompts.json")
+        self.prompts = {entry["identifier"]: str(entry["llm_prompt"]) for entry in prompts}
+        self.states = self.read("goal_interpretation/resources/data/all_objects.json")
+        first = self.read("subgoal_decomposition/resources/error_list_dict.json")
+        self.first_truths: dict[str, Any] = first if published else {}
+        self.record = first
+        self.taxonomy = ObjectTaxonomy()
+
+    def read(self, path: str) -> Any:
+        return json.loads((self._evaluation / path).read_text())
+
+    def human_plan(self, name: str) -> str:
+        path = self._evaluation / "action_sequencing/resources/human_annotations" / f"{name}.json"
+        return path.read_text()
+
+    def problem(self, name: str) -> str:
+        """The task as BDDL text."""
+        path = self._evaluation / "transition_modeling/resources/pddl_behavior" / f"{name}.pddl"
+        return path.read_text()
+
+    def abilities(self, synset: str, name: str) -> set[str]:
+        """Of the synset, and of the model's own category, from which iGibson takes them."""
+        found = (
+            dict(self.taxonomy.get_abilities(synset) or {}) if self.taxonomy.is_valid_class(synset) else {}
+        )
+        try:
+            own = self.taxonomy.get_class_name_from_igibson_category(re.sub(r"_\d+$", "", name))
+            found.update(self.taxonomy.get_abilities(own) or {} if own else {})
+        except ValueError:
+            pass
+        return set(found)
+
+
+def flat(value: Any) -> list[str]:
+    """The tokens of a nested list."""
+    return [token for entry in value for token in (flat(entry) if isinstance(entry, list) else [entry])]
+
+
+def simulator_names(prompt: str) -> list[dict[str, Any]]:
+    """Objects of a prompt, in its order, which is that of the BDDL instances."""
+    block = prompt[prompt.index("Your task:") :].split("interactable objects:")[1].split("Please output")[0]
+    return [ast.literal_eval(line) for line in block.strip().splitlines()]
+
+
+class Demo:
+    """What iGibson's BehaviorTask offers the judge. ``graph`` is the state that it judges, set by whoever runs it."""
+
+    def __init__(self, package: Package, name: str) -> None:
+        from bddl.activity import Conditions, get_goal_conditions, get_initial_conditions, get_object_scope
+
+        from embomatrix.trainer.eai.inside.goals import backend
+
+        self.name = name
+        self._package = package
+        stats = package.stats[name]
+        self._conditions = Conditions(stats["task"], stats["task_id"], simulator_name="igibson")
+        scope = get_object_scope(self._conditions)
+        self.instances = [instance for instance in scope if not instance.startswith("agent.")]
+        self.synset = {
+            instance: synset
+            for synset, instances in self._conditions.parsed_objects.items()
+            for instance in instances
+        }
+        self._init = self._conditions.parsed_initial_conditions
+        self.room = {fact[1]: fact[2] for fact in self._init if fact[0] == "inroom"}
+        self.things: dict[str, Any] = {}
+        """The object that each instance is, whole where it can be sliced."""
+        self.object_scope: dict[str, Any] = {
+            instance: object() for instance in scope if instance.startswith("agent.")
+        }
+        self._make_objects()
+        self._set_first_state()
+        self.initial_conditions = get_initial_conditions(self._conditions, backend(), self.object_scope)
+        self.goal_conditions = get_goal_conditions(self._conditions, backend(), self.object_scope)
+        self.graph: Any = None
+
+    def check_success(self) -> tuple[bool, dict[str, list[int]]]:
+        """The published check of the graph, in the form in which the judge asks the simulator."""
+        result = self.graph.check_success(self)
+        truths = result["subgoal_success"]
+        return result["success"], {
+            "satisfied": [at for at, true in enumerate(truths) if true],
+            "unsatisfied": [at for at, true in enumerate(truths) if not true],
+        }
+
+    def _make_objects(self) -> None:
+        names = simulator_names(self._package.prompts[self.name])
+        containers = self._containers()
+        for instance, told in zip(self.instances, names, strict=True):
+            if told["category"] != self.synset[instance]:
+                raise ValueError(f"{self.name}: {told} stands where {instance} should")
+            name, unary = told["name"], self._states_of(instance, told["name"])
+            box = list(self._box(instance, containers))
+            if name.startswith("room_floor"):
+                thing = self.object_scope[instance] = make_object(*_FLOOR, name, box, unary)
+            else:
+                thing = make_object(*_ARTICULATED, name, box, unary)
+                self.object_scope[instance] = (
+                    self._sliceable(thing, name, box, unary) if "Sliced" in unary else thing
+                )
+            self.things[instance] = thing
+
+    def _sliceable(self, whole: Any, name: str, box: list[float], unary: set[str]) -> Any:
+        """iGibson's switch between a whole and its two halves."""
+        import sys
+
+        module = sys.modules[_WRAPPERS]
+        halves = module.ObjectGrouper()
+        halves.objects = [
+            make_object(*_ARTICULATED, f"{name}_part_{half}", box, unary - {"Sliced"}) for half in (0, 1)
+        ]
+        switch = module.ObjectMultiplexer()
+        switch.name, switch._multiplexed_objects = f"{name}_multiplexer", [whole, halves]
+        return switch
+
+    def _states_of(self, instance: str, name: str) -> set[str]:
+        found = set(self._package.states[self.name].get(instance, ()))
+        abilities = self._package.abilities(self.synset[instance], name)
+        found |= {state for ability, state in _TOOLS.items() if ability in abilities}
+        for fact in self._init:
+            tokens = flat(fact)
+            if tokens[-1] == instance and len(tokens) == (3 if fact[0] == "not" else 2):
+                found.add(PREDICATES[tokens[-2]])
+        return found & {*BINARY, *UNARY}
+
+    def _containers(self) -> set[str]:
+        """Synsets of what something is, or is to be, inside of."""
+        found = set()
+        for condition in (*self._init, *self._conditions.parsed_goal_conditions):
+            tokens = flat(condition)
+            for at, token in enumerate(tokens):
+                if token == "inside":
+                    place = tokens[at + 2].strip("?")
+                    found.add(self.synset.get(place, place))
+        return found
+
+    def _box(self, instance: str, containers: set[str]) -> tuple[float, float, float]:
+        if instance in self.room:
+            return FURNITURE_M
+        return CONTAINER_M if self.synset[instance] in containers else SMALL_M
+
+    def _set_first_state(self) -> None:
+        for instance, thing in self.things.items():
+            opens = state_class("Open")
+            if self.synset[instance] in STARTS_OPEN and opens in thing.states:
+                thing.states[opens].holds = True
+        for fact in self._init:
+            holds = fact[0] != "not"
+            predicate, *args = fact if holds else fact[1]
+            if predicate != "inroom" and not any(arg.startswith("agent.") for arg in args):
+                self._set(predicate, args, holds=holds)
+        self._stand_on_floors()
+        # What the real simulator found true at the start, although nobody asked for it.
+        truths = self._package.first_truths.get(self.name, {"subgoals": (), "subgoal_success": ()})
+        for tokens, true in zip(truths["subgoals"], truths["subgoal_success"], strict=False):
+            known = len(tokens) == 3 and tokens[0] in RELATIONS and set(tokens[1:]) <= self.things.keys()
+            if true and known:
+                self._set(tokens[0], tokens[1:], holds=True)
+
+    def _set(self, predicate: str, args: list[str], *, holds: bool) -> None:
+        state = self.things[args[0]].states[state_class(PREDICATES[predicate])]
+        if predicate in RELATIONS:
+            state.related.add(self.things[args[1]].name)
+        else:
+            state.holds = holds
+
+    def _stand_on_floors(self) -> None:
+        on_floor = state_class("OnFloor")
+        floors = {
+            room: self.things[instance].name
+            for instance, room in self.room.items()
+            if self.things[instance].name.startswith("room_floor")
+        }
+        for instance, room in self.room.items():
+            thing = self.things[instance]
+            if room in floors and not thing.name.startswith(OFF_FLOOR):
+                thing.states[on_floor].related.add(floors[room])
+        for instance in self.instances:
+            thing = self.things[instance]
+            if thing.name.startswith("room_floor"):
+                # The published graph stops on a scene without any edge; this one is about nothing that a goal names.
+                thing.states[on_floor].related.add(thing.name)

@@ -1,0 +1,88 @@
+"""What can be measured on: something that asks questions, and marks the answers to them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Protocol
+
+from embomatrix.skills.prompt import limited, prompt_for
+from embomatrix.trainer.evaluation.judging import Judge
+from embomatrix.trainer.evaluation.pictures import chosen_pictures
+from embomatrix.trainer.evaluation.scoreboard import Scoreboard
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from embomatrix.skills.prompt import Codec, Prompt
+    from embomatrix.trainer.evaluation.answers import Answer, Setup
+    from embomatrix.trainer.evaluation.benchmark import Benchmark
+    from embomatrix.trainer.evaluation.intervals import Estimate
+    from embomatrix.trainer.evaluation.judging import Executor
+    from embomatrix.trainer.evaluation.page import Picture
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """What is asked about one task."""
+
+    task_id: str
+    prompt: Prompt
+
+
+@dataclass(frozen=True)
+class Marked:
+    """The figures, plans worth a picture, and figures that only this exam has, by what they are called."""
+
+    board: Scoreboard
+    pictures: Sequence[Picture]
+    others: Mapping[str, Estimate] = field(default_factory=dict)
+
+
+class Exam(Protocol):
+    """Tasks in their order. ``digest`` names exactly these; ``by_rule`` more can't be expressed and count as failed."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def digest(self) -> str: ...
+
+    @property
+    def split(self) -> str: ...
+
+    @property
+    def task_ids(self) -> Sequence[str]: ...
+
+    @property
+    def by_rule(self) -> int: ...
+
+    def questions(self, codec: Codec, rows: int) -> Sequence[Question]:
+        """A question for each task, with so many rows of its object table at most. Raises TrainerError."""
+        ...
+
+    def judge(self, setup: Setup, answers: Sequence[Answer], report: Callable[[int, int], None]) -> Marked:
+        """Mark answers; ``report`` is told of plans done and in all. Raises TrainerError and ClusterError."""
+        ...
+
+
+class WorldExam:
+    """A benchmark of our own tasks, executed in our simulator."""
+
+    def __init__(self, bench: Benchmark, executor: Executor) -> None:
+        self.bench = bench
+        self._executor = executor
+        self.name, self.digest, self.split = bench.name, bench.digest, bench.split
+        self.task_ids = tuple(record.task.task_id for record in bench.records)
+        self.by_rule = len(bench.failed_by_rule)
+
+    def questions(self, codec: Codec, rows: int) -> tuple[Question, ...]:
+        return tuple(
+            Question(task_id, prompt_for(limited(task.situation, rows), codec))
+            for task_id, task in self.bench.tasks.items()
+        )
+
+    def judge(self, setup: Setup, answers: Sequence[Answer], report: Callable[[int, int], None]) -> Marked:
+        judged = Judge(self.bench, setup, self._executor).judge(answers, report)
+        categories = {record.task.task_id: record.task.category for record in self.bench.records}
+        board = Scoreboard.of(categories, judged.verdicts, self.by_rule)
+        return Marked(board, chosen_pictures(self.bench, board, judged.plans))
