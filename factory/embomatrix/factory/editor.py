@@ -24,7 +24,7 @@ from embomatrix.world.geometry import Aabb, Part, Pose, Shape
 from embomatrix.world.scene import SceneObject
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from embomatrix.world.scene import Room, Scene
     from embomatrix.world.state import Relation, State
@@ -56,6 +56,7 @@ class SceneEditor:
         self._boxes: dict[str, Aabb] = {}
         self._solids = Solids.of_scene(scene)
         self._view = SceneView(scene)
+        self._kept: set[str] = set()
         self._floor = ReachableFloor(scene)
         self._unreached = {problem.names for problem in reach_problems(scene)}
         self._counts = Counter(self._assets[item.asset_id].category for item in scene.objects)
@@ -88,7 +89,7 @@ class SceneEditor:
         box = self._boxes.get(name)
         if box is None:
             item = self.known(name)
-            box = self._boxes[name] = _box(self._assets[item.asset_id], item.pose_world_asset)
+            box = self._boxes[name] = box_at(self._assets[item.asset_id], item.pose_world_asset)
         return box
 
     def is_unserved(self, name: str) -> bool:
@@ -98,6 +99,15 @@ class SceneEditor:
     def opens(self, name: str) -> bool:
         """Whether an object of the base scene has doors and drawers that open wide and meet nothing, or none at all."""
         return self._view.opens(name)
+
+    def keep(self, names: Iterable[str]) -> None:
+        """Tell which objects of the base scene must stay: the task is about them."""
+        self._kept.update(names)
+
+    def is_spare(self, name: str) -> bool:
+        """Whether an object of the base scene may be taken away, with all that rests on it."""
+        guests = {item.name for item in self._objects.values() if item.host == name}
+        return name in self.base.by_name and not self._kept & {name, *guests}
 
     def is_free(self, asset: Asset, pose: Pose) -> bool:
         """Whether an asset would overlap nothing at a pose."""
@@ -110,7 +120,7 @@ class SceneEditor:
         """
         if not self.is_free(asset, pose):
             return LayoutReason.NO_FREE_SPOT
-        box = _box(asset, pose)
+        box = box_at(asset, pose)
         room = self.base.room_at(box.center_m)
         if not room:
             return LayoutReason.NO_FREE_SPOT
@@ -125,7 +135,7 @@ class SceneEditor:
         """
         self._counts[asset.category] += 1
         name = f"{asset.category}_{self._counts[asset.category]}"
-        box = _box(asset, pose)
+        box = box_at(asset, pose)
         self._objects[name] = SceneObject(
             name=name,
             asset_id=asset.asset_id,
@@ -141,6 +151,10 @@ class SceneEditor:
         if box.low_m[2] < _ON_FLOOR_M:
             self._floor = ReachableFloor(self._as_scene())
         return name
+
+    def fasten(self, name: str) -> None:
+        """Make an object one that never moves, as what hangs on a wall. Raises PlacementError for an unknown name."""
+        self._objects[name] = replace(self.known(name), fixed=True)
 
     def remove(self, name: str) -> tuple[str, ...]:
         """Take an object out again, with all that rests on or in it; their names. Raises PlacementError for an unknown name."""
@@ -240,7 +254,8 @@ class SceneEditor:
         return {problem.names for problem in reach_problems(trial)} <= self._unreached
 
 
-def _box(asset: Asset, pose: Pose) -> Aabb:
+def box_at(asset: Asset, pose: Pose) -> Aabb:
+    """Box in the world of an asset at a pose, joints shut."""
     return Aabb.around(part.aabb(pose) for link in asset.links for part in link.parts)
 
 

@@ -7,7 +7,9 @@ arranged together. Object: a continuous pose, free, in reach, at rest. What fail
 from __future__ import annotations
 
 import contextlib
+import math
 import time
+from collections import Counter
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
@@ -48,6 +50,10 @@ if TYPE_CHECKING:
 
 ROUNDS: Final = 24
 """Trees that are asked for one room at most."""
+RESIGNED: Final = 2
+"""After so many places where no clear way leads to a thing, one is taken as it is: verification tells."""
+CLEARED: Final = 3
+"""Things of the base scene that are taken away from a full host, for what the task puts there."""
 SURFACES: Final = 4
 """Surfaces of one piece of furniture that are arranged; beyond them the sampler looks alone."""
 SHIFT_M: Final = 0.008
@@ -110,6 +116,7 @@ class _Waiting:
     item: Item
     asset: Asset
     choice: int = 0
+    cleared: int = 0
     last: Failure | None = None
 
 
@@ -130,6 +137,7 @@ class _RoomJob:
         self._agents = agents
         self._room = room
         self._seed = seed
+        self._round = 0
         self._record = record
         self._rng = np.random.default_rng((seed, 3))
         self._sampler = ObjectSampler(editor, self._rng)
@@ -144,7 +152,8 @@ class _RoomJob:
         for number in range(ROUNDS):
             if not self._waiting:
                 break
-            brief = self._brief(number)
+            self._round = number
+            brief = self._brief()
             tree = self._agents.organize(brief)
             self._record.rooms.append((brief, tree))
             hung = {branch.child for branch in tree.branches()}
@@ -168,12 +177,12 @@ class _RoomJob:
         whole = LayoutTree.of(self._room.name, [branch for branch in branches if branch.parent in known])
         return whole.pruned(self.names.values())
 
-    def _brief(self, number: int) -> RoomBrief:
+    def _brief(self) -> RoomBrief:
         things = tuple(self._with_carrier(self._thing(name)) for name in self._waiting)
         named = {thing.host for thing in things if thing.host in self._editor.objects}
         hosts = hosts_in(self._editor, self._room.name, named)
         room = next(room for room in rooms_of(self._editor) if room.name == self._room.name)
-        return RoomBrief(room, hosts, things, tuple(self._failures), self._seed * 31 + number)
+        return RoomBrief(room, hosts, things, tuple(self._failures), self._seed * 31 + self._round)
 
     def _with_carrier(self, thing: Thing) -> Thing:
         """What must stand beside an object that is there goes where that one stands."""
@@ -196,7 +205,7 @@ class _RoomJob:
             self._failures = [failure for failure in self._failures if failure.thing != name]
         elif self._waiting.keys() & {waiting.item.host, *waiting.item.beside}:
             return  # what it is to stand at has no place yet
-        elif not self._exchange(waiting.item.host):
+        elif not (self._exchange(waiting.item.host) or self._make_room(waiting)):
             del self._waiting[name]
             self._given_up.append(waiting.last or self._no_host(waiting))
 
@@ -211,6 +220,25 @@ class _RoomJob:
             if each.item.name != host:
                 each.choice, each.asset = 0, each.item.asset(0)
         self._next_model(host)
+        return True
+
+    def _make_room(self, waiting: _Waiting) -> bool:
+        """Take the largest loose thing that is not the task's from a full host that the task demands; False without one."""
+        host = self.names.get(waiting.item.host, waiting.item.host)
+        full = waiting.last is not None and waiting.last.reason is LayoutReason.NO_FREE_SPOT
+        if not full or waiting.cleared == CLEARED:
+            return False
+        loose = [
+            name
+            for name, item in self._editor.objects.items()
+            if item.host == host and not item.fixed and self._editor.is_spare(name)
+        ]
+        if not loose:
+            return False
+        self._editor.remove(max(loose, key=lambda name: math.prod(self._editor.box_of(name).size_m)))
+        waiting.cleared += 1
+        waiting.choice, waiting.asset = 0, waiting.item.asset(0)
+        self._failures = [failure for failure in self._failures if failure.thing != waiting.item.name]
         return True
 
     def _take_out(self, scene_name: str) -> None:
@@ -287,7 +315,7 @@ class _RoomJob:
 
     def _arrange(self, plane: Plane, children: Sequence[str], wishes: dict[str, tuple[Wish, ...]]) -> None:
         things = [(self._thing(name), self._waiting[name].asset) for name in children]
-        brief = brief_for(self._editor, plane, things, wishes, self._seed)
+        brief = brief_for(self._editor, plane, things, wishes, self._seed * 31 + self._round)
         began = time.process_time()
         found = self._agents.arrange(brief)
         spent = self._record.planar_s
@@ -328,6 +356,7 @@ class _RoomJob:
             self._failed(name, LayoutRelation.ATTACHED, self._room.name, error)
         else:
             self._insert(name, pose, None, "")
+            self._editor.fasten(self.names[name])
 
     def _insert(self, name: str, pose: Pose, relation: Relation | None, host: str) -> None:
         waiting = self._placed[name] = self._waiting.pop(name)
@@ -340,7 +369,9 @@ class _RoomJob:
 
     def _settle(self, fresh: Sequence[str]) -> None:
         """Let go of what geometry does not prove to be at rest; what does not stay has failed, with all on it."""
-        outcome = settle(self._editor, [self.names[name] for name in fresh])
+        tried = Counter(item.thing for item in self._failures if item.reason is LayoutReason.NOT_AT_HAND)
+        resigned = {self.names[name] for name in fresh if tried[name] >= RESIGNED}
+        outcome = settle(self._editor, [self.names[name] for name in fresh], resigned)
         self._record.settled += outcome.dropped
         owners = {scene_name: name for name, scene_name in self.names.items()}
         for scene_name, (reason, detail) in outcome.wrong.items():

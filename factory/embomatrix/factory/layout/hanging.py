@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.editor import PlacementError
+from embomatrix.factory.editor import PlacementError, box_at
 from embomatrix.factory.floorplan.walls import WALL_HEIGHT_M
 from embomatrix.factory.furnish.roles import HUNG_BOTTOM_M, Role, role_of, wall_height_m
 from embomatrix.factory.layout.values import LayoutReason
@@ -42,7 +42,7 @@ class Hanger:
         free = 0
         for pose in self._on_walls(asset):
             objection = self._editor.objection(asset, pose)
-            if objection is None:
+            if objection is None and not self._editor.clearance.bars_a_doorway(box_at(asset, pose)):
                 return pose
             free += objection is not LayoutReason.NO_FREE_SPOT
         reason = LayoutReason.OUT_OF_REACH if free else LayoutReason.NO_FREE_SPOT

@@ -15,7 +15,7 @@ import numpy as np
 from embomatrix.factory.furnish.hosts import NO_HOSTS, kept_behind_doors
 from embomatrix.factory.layout.customs import likes, on_appliance
 from embomatrix.factory.layout.tree import LayoutTree
-from embomatrix.factory.layout.values import MEANS, Branch, Kind, LayoutRelation, Means
+from embomatrix.factory.layout.values import MEANS, Branch, Kind, LayoutReason, LayoutRelation, Means
 from embomatrix.factory.writer.tables import suits
 
 if TYPE_CHECKING:
@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 
     from embomatrix.factory.layout.values import Failure, HostFacts, HostOffer, RoomBrief, Size3, Thing
 
+CHANCES: Final = 3
+AFTERWARDS: Final = frozenset({LayoutReason.UNSTABLE, LayoutReason.NOT_AT_HAND})
+"""Reasons that speak against a spot and not against its host."""
 HIGHEST_M: Final = 1.5
 """Nothing is put higher than this: the paper's bound."""
 LOWEST_M: Final = 0.15
@@ -87,11 +90,21 @@ def choices(brief: RoomBrief, thing: Thing, hung: Mapping[str, Branch]) -> Itera
 
     ``hung`` are the branches of the tree so far, by child.
     """
-    failed = {(item.host, item.relation) for item in brief.failures if item.thing == thing.name}
+    failed = Counter((item.host, item.relation) for item in brief.failures if item.thing == thing.name)
     for branch in _open_choices(brief, thing, hung):
         here = branch.parent == brief.room.name or branch.parent in hung
-        if here and (branch.parent, branch.relation) not in failed:
+        if here and failed[branch.parent, branch.relation] < _chances(branch, brief):
             yield branch
+
+
+def _chances(branch: Branch, brief: RoomBrief) -> int:
+    """How often a host is tried: what failed after it was placed may stand well elsewhere on the same host."""
+    reasons = {
+        item.reason
+        for item in brief.failures
+        if (item.thing, item.host, item.relation) == (branch.child, branch.parent, branch.relation)
+    }
+    return CHANCES if reasons and reasons <= AFTERWARDS else 1
 
 
 def _open_choices(brief: RoomBrief, thing: Thing, hung: Mapping[str, Branch]) -> Iterator[Branch]:

@@ -69,6 +69,11 @@ def planes_of(editor: SceneEditor, host: str) -> list[Plane]:
         found.append(
             Plane(f"{host}:{surface.name}", host, item.room, pose, surface.size_m, surface.clearance_m)
         )
+    if not found and asset.supports:
+        # Every asset has a surface by definition: the top of its box, as the lid of a chest.
+        x, y, z = asset.size_m
+        pose = item.pose_world_asset @ Pose((0.0, 0.0, z / 2))
+        found.append(Plane(f"{host}:top", host, item.room, pose, (x, y), math.inf))
     return sorted(
         found,
         key=lambda plane: (

@@ -12,7 +12,7 @@ from embomatrix.sim.pose_cache import standing_poses
 from embomatrix.sim.statics import base_of, is_level, rest_pose
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Container, Mapping, Sequence
 
     from embomatrix.factory.editor import SceneEditor
     from embomatrix.world.geometry import Pose
@@ -30,11 +30,11 @@ class Settling:
     wrong: Mapping[str, tuple[LayoutReason, str]]
 
 
-def settle(editor: SceneEditor, names: Sequence[str]) -> Settling:
+def settle(editor: SceneEditor, names: Sequence[str], resigned: Container[str] = ()) -> Settling:
     """Find where objects come to rest, and move them there; tell which don't stay, and which no standing robot gets at.
 
-    What moves less than 1 cm and tilts less than 10 degrees stays. Hosts stand before what rests on them. Raises EngineError
-    where the engine is missing.
+    What moves less than 1 cm and tilts less than 10 degrees stays. Whether the robot gets at the ``resigned`` is not asked.
+    Hosts stand before what rests on them. Raises EngineError where the engine is missing.
     """
     if not names:
         return Settling(0, {})
@@ -44,9 +44,9 @@ def settle(editor: SceneEditor, names: Sequence[str]) -> Settling:
     with contextlib.closing(BulletEngine(editor.freeze(editor.base.scene_id))) as engine:
         stands = standing_poses(engine, [name for name in names if editor.box_of(name).low_m[2] < HIGH_M])
         for name, poses in stands.items():
-            if not poses:
+            if not poses and name not in resigned:
                 wrong[name] = (
-                    LayoutReason.OUT_OF_REACH,
+                    LayoutReason.NOT_AT_HAND,
                     "the robot can stand nowhere with a clear way for its arm",
                 )
         for name in loose:

@@ -71,6 +71,7 @@ class LayoutReason(StrEnum):
     OUT_OF_REACH = "out_of_reach"
     BARS_THE_WAY = "bars_the_way"
     UNSTABLE = "unstable"
+    NOT_AT_HAND = "not_at_hand"
     RELATION_NOT_HELD = "relation_not_held"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections import defaultdict
 from typing import TYPE_CHECKING, Final
 
@@ -111,6 +112,11 @@ def _assign(
     Small things that the scene lacks are in neither.
     """
     catalog = Catalog.load()
+    hosts = {
+        item.atom.args[1]
+        for item in problem.init
+        if item.positive and item.atom.predicate in {Relation.ONTOP, Relation.INSIDE}
+    }
     domains: dict[str, list[str]] = {}
     missing: list[str] = []
     for name, room in wanted.items():
@@ -121,7 +127,10 @@ def _assign(
             if view.category(other) in categories and serves(view.asset(other), needs.get(name, frozenset()))
         ]
         if fits:
-            domains[name] = [str(other) for other in rng.permutation(fits)]
+            order = [str(other) for other in rng.permutation(fits)]
+            domains[name] = (
+                sorted(order, key=lambda other: -_spare_m2(view, other)) if name in hosts else order
+            )
         elif not any(_liftable(category) for category in categories):
             missing.append(name)
     while True:
@@ -131,6 +140,15 @@ def _assign(
             return found, missing
         missing.append(failed)
         del domains[failed]
+
+
+def _spare_m2(view: SceneView, name: str) -> float:
+    """Area of the largest surface of an object, less what stands on it already: what holds more is bound before others."""
+    largest = max((math.prod(surface.size_m) for surface in view.asset(name).supports), default=0.0)
+    taken = sum(
+        math.prod(view.asset(item.name).size_m[:2]) for item in view.scene.objects if item.host == name
+    )
+    return largest - taken
 
 
 def _backtrack(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import math
 import re
 from dataclasses import dataclass
@@ -31,7 +32,7 @@ from embomatrix.world.substances import MEANINGS, flows_from, is_substance
 from embomatrix.world.task import MAX_TABLE, Task, TaskCategory
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from embomatrix.factory.layout.jobs import Layout
     from embomatrix.factory.task_import.binding import Addition, Binding
@@ -57,6 +58,7 @@ class Lay(Protocol):
 MODEL_TRIES: Final = 5
 """Models of a type that are tried before it counts as not fitting its place."""
 KITCHEN: Final = frozenset({State.COOKED, State.FROZEN, State.HOT, State.SLICED, REAL})
+_THERMAL: Final = frozenset({State.COOKED, State.FROZEN, State.HOT})
 SWITCHED: Final = frozenset({State.OPEN, State.TOGGLED_ON})
 CLEANED: Final = frozenset((*MEANINGS, *SubstanceRelation))
 
@@ -154,6 +156,7 @@ class _Binder:
 
     def _laid(self, editor: SceneEditor, binding: Binding) -> dict[str, str]:
         """Put all that the scene lacks into it; names in the scene."""
+        editor.keep(binding.found.values())
         items = [self._item(addition, binding) for addition in binding.additions]
         layout = self._manner.lay(editor, items, int(self._rng.integers(2**31)))
         if layout.failures:
@@ -235,7 +238,8 @@ class _Binder:
         }
         goal = substitute(self._problem.goal, {**names, **self._substances, **binding.rooms})
         about = objects_of(goal, types)
-        table = object_table(view, tuple(dict.fromkeys(names.values())), self._rng)
+        needed = dict.fromkeys((*names.values(), *_sources_for(view, goal, types, names.values())))
+        table = object_table(view, tuple(needed), self._rng)
         missing = about - set(table)
         if missing:
             raise RefusedError(
@@ -282,6 +286,34 @@ class _Binder:
         if atom.predicate == INSOURCE:
             return self._substances.get(atom.args[1], "") in flows_from(type_name)
         return atom.predicate in (REAL, FUTURE) and is_substance(type_name)
+
+
+def _sources_for(
+    view: SceneView, goal: Formula, types: Mapping[str, tuple[str, ...]], known: Iterable[str]
+) -> Iterator[str]:
+    """Objects of the scene that heat, cook or freeze what the goal asks for, where no object of the problem does.
+
+    The paper's own tasks freeze things in coolers, which keep drinks cool and no more.
+    """
+    for atom in atoms_of(goal):
+        if atom.predicate not in _THERMAL:
+            continue
+        effect = State(atom.predicate)
+        things = types.get(atom.args[0].lstrip("?"), (atom.args[0],))
+        for thing in things:
+            if thing not in view.scene.by_name:
+                continue
+            if any(effect in view.thermal_effects(thing, name) for name in known):
+                continue
+            able = (
+                item.name
+                for item in view.scene.objects
+                if item.fixed
+                and view.is_source(item.name)
+                and effect in view.thermal_effects(thing, item.name)
+                and view.opens(item.name)
+            )
+            yield from itertools.islice(able, 1)
 
 
 def _renamed(literal: Literal, names: dict[str, str]) -> Atom:

@@ -1,0 +1,71 @@
+"""The paper's verification of a scene: the robot is sent to each thing that the task is about, and picks up what it can
+carry and what bears nothing.
+
+Executed in the simulator, each thing from the start; what lies behind a door is opened first.
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.skills.limits import ROBOT
+from embomatrix.skills.syntax import Skill, SkillCall
+from embomatrix.world.state import Relation
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from embomatrix.factory.writer.view import SceneView
+    from embomatrix.sim.executor import Simulator
+    from embomatrix.skills.syntax import Plan
+    from embomatrix.world.task import Task
+
+SEED: Final = 0
+
+
+def out_of_hand(stage: Simulator, task: Task, view: SceneView, names: Sequence[str]) -> tuple[str, ...]:
+    """Those of some objects that the robot can't get at, or not pick up though it could carry them; with why, in words.
+
+    Objects that are absent at the start, or hang higher than the arm reaches, are left out.
+    """
+    found = []
+    for name in names:
+        item = view.item(name)
+        low = item.pose_world_asset.position_m[2] - view.asset(name).size_m[2] / 2
+        if item.absent or low > ROBOT.reach_high_m or name not in task.table:
+            continue
+        why = ""
+        for plan in _plans(task, view, name):
+            trace = stage.execute(task, plan, SEED)
+            why = trace.steps[-1].message if trace.failure is not None else ""
+            if not why:
+                break
+        if why:
+            found.append(f"{name} ({why})")
+    return tuple(found)
+
+
+def _plans(task: Task, view: SceneView, name: str) -> Iterator[Plan]:
+    """Ways to get at an object: to its place, or with what shuts it in opened first, from there or from another place."""
+    shut = [
+        host
+        for guest, host in itertools.pairwise((name, *view.hosts(name)))
+        if view.rests(guest, Relation.INSIDE, host) and view.is_openable(host) and not view.is_open(host)
+    ]
+    bears = any(item.host == name for item in view.scene.objects)
+    go = _call(task, Skill.MOVE, name)
+    take = [_call(task, Skill.PICK_UP, name)] if view.is_portable(name) and not bears else []
+    opened = [
+        _call(task, skill, host)
+        for host in reversed(shut)
+        if host in task.table
+        for skill in (Skill.MOVE, Skill.OPEN)
+    ]
+    yield (*opened, go, *take)
+    if opened:
+        yield (*opened, *take)
+
+
+def _call(task: Task, skill: Skill, name: str) -> SkillCall:
+    return SkillCall(skill, object_index=task.table.index(name))

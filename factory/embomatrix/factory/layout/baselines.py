@@ -1,0 +1,124 @@
+"""Two simpler ways to lay a task out, in the paper's comparison: sampling without a tree, and poses without a solver.
+
+Neither looks at where the robot can stand, neither hears what failed. They take the same items and the same models as ``lay``.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from embomatrix.factory.editor import PlacementError
+from embomatrix.factory.layout.jobs import Layout, Record, thing_of
+from embomatrix.factory.layout.organization import in_order
+from embomatrix.factory.layout.sampling import LIFT_M, ObjectSampler
+from embomatrix.factory.layout.values import Failure, LayoutReason, LayoutRelation
+from embomatrix.world.geometry import Pose
+from embomatrix.world.state import Relation
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from embomatrix.factory.editor import SceneEditor
+    from embomatrix.factory.layout.jobs import Item
+    from embomatrix.world.asset import Asset
+
+TRIES: Final = 10
+"""Samples for one thing: what OmniGibson's own sampler is given in the paper's code."""
+ROUNDED_M: Final = 0.05
+"""Poses that are written down are round numbers."""
+SPREAD: Final = 0.3
+"""Written poses lie this share of a side around the middle of what they are on."""
+
+
+def lay_at_random(editor: SceneEditor, items: Sequence[Item], seed: int) -> Layout:
+    """Without tree: each thing at the first random pose that is free, in the relation that the task demands or on a floor."""
+    rng = np.random.default_rng((seed, 17))
+    sampler = ObjectSampler(editor, rng)
+    names: dict[str, str] = {}
+    failures: list[Failure] = []
+    for item in _hosts_first(items):
+        asset = item.asset(0)
+        relation, host = _demand(editor, item, names, rng)
+        try:
+            poses = itertools.islice(sampler.poses(asset, relation, host), TRIES)
+            pose = next((pose for pose in poses if editor.is_free(asset, pose)), None)
+        except PlacementError as error:
+            failures.append(_failure(item, host, error.reason, str(error)))
+            continue
+        if pose is None:
+            detail = f"none of {TRIES} random poses at {host} is free"
+            failures.append(_failure(item, host, LayoutReason.NO_FREE_SPOT, detail))
+            continue
+        names[item.name] = editor.insert(asset, pose, *sampler.rests(relation, host))
+    return Layout(names, {}, tuple(failures), Record())
+
+
+def lay_by_poses(editor: SceneEditor, items: Sequence[Item], seed: int) -> Layout:
+    """As LayoutGPT has a model write them: round absolute poses at what the task names, which nothing looks at."""
+    rng = np.random.default_rng((seed, 19))
+    sampler = ObjectSampler(editor, rng)
+    names: dict[str, str] = {}
+    failures: list[Failure] = []
+    for item in _hosts_first(items):
+        asset = item.asset(0)
+        relation, host = _demand(editor, item, names, rng)
+        if host not in editor.rooms and host not in editor.objects:
+            detail = f"what it is to stand at, {host!r}, has no place itself"
+            failures.append(_failure(item, host, LayoutReason.UNKNOWN_HOST, detail))
+            continue
+        pose = _written(editor, asset, relation, host, rng)
+        names[item.name] = editor.insert(asset, pose, *sampler.rests(relation, host))
+    return Layout(names, {}, tuple(failures), Record())
+
+
+def _written(
+    editor: SceneEditor, asset: Asset, relation: Relation | None, host: str, rng: np.random.Generator
+) -> Pose:
+    """A pose at the host's middle, give or take, at the height that its box suggests."""
+    if host in editor.rooms:
+        (x, y), (width, depth) = editor.rooms[host].center_m, editor.rooms[host].size_m
+        bottom = 0.0
+    else:
+        box = editor.box_of(host)
+        (x, y, middle), (width, depth, _) = box.center_m, box.size_m
+        heights = {Relation.ONTOP: box.high_m[2], Relation.INSIDE: middle - asset.size_m[2] / 2}
+        bottom = heights.get(relation, box.low_m[2]) if relation else box.high_m[2]
+        if relation is Relation.NEXTTO:
+            x += width / 2 + asset.size_m[0] / 2
+    dx, dy = rng.uniform(-SPREAD, SPREAD, 2)
+    yaw = float(rng.integers(4)) * math.pi / 2
+    return Pose.from_xyz_yaw(
+        _rounded(x + width * dx), _rounded(y + depth * dy), bottom + asset.size_m[2] / 2 + LIFT_M, yaw
+    )
+
+
+def _rounded(value: float) -> float:
+    return round(value / ROUNDED_M) * ROUNDED_M
+
+
+def _hosts_first(items: Sequence[Item]) -> Iterator[Item]:
+    by_name = {item.name: item for item in items}
+    for thing in in_order([thing_of(item, item.asset(0), {}) for item in items]):
+        yield by_name[thing.name]
+
+
+def _demand(
+    editor: SceneEditor, item: Item, names: dict[str, str], rng: np.random.Generator
+) -> tuple[Relation | None, str]:
+    """What the task demands of an item, in the scene's names; else the floor of a room that it may be in."""
+    if item.relation is not None:
+        host = names.get(item.host, item.host)
+        floor = host in editor.rooms
+        return (None, host) if floor else (Relation(item.relation.value), host)
+    if item.beside:
+        return Relation.NEXTTO, names.get(item.beside[0], item.beside[0])
+    rooms = item.rooms or tuple(editor.rooms)
+    return None, rooms[int(rng.integers(len(rooms)))]
+
+
+def _failure(item: Item, host: str, reason: LayoutReason, detail: str) -> Failure:
+    return Failure(item.name, item.relation or LayoutRelation.ONTOP, host, reason, detail)
