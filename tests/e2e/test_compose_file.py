@@ -59,7 +59,8 @@ def test_every_service_runs_confined_within_limits_and_comes_back():
 def placed(arguments, folder):
     """The container's folders as ones of this test; the published ports as free ones."""
     moved = [
-        re.sub(r"(=|:)/(data|for-worker|for-trainer|cache|tmp/worker)", rf"\1{folder}/\2", each) for each in arguments
+        re.sub(r"(=|:)/(data|for-worker|for-trainer|cache|tmp/worker)", rf"\1{folder}/\2", each)
+        for each in arguments
     ]
     return [each for each in moved if not each.startswith("--state=")]
 

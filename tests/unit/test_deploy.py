@@ -1,0 +1,117 @@
+"""Files that place a cluster elsewhere: they are valid, confined, and name commands, options and metrics that there are."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import kubernetes_validate
+import pytest
+import typer
+import yaml
+
+from embomatrix.manager.cli import app as manager_app
+from embomatrix.worker.cli import app as worker_app
+
+ROOT = Path(__file__).parents[2]
+DEPLOY = ROOT / "deploy"
+GUIDE = (ROOT / "docs" / "operations.md").read_text()
+MANIFESTS = yaml.safe_load((DEPLOY / "kubernetes" / "kustomization.yaml").read_text())["resources"]
+OBJECTS = [
+    item for name in MANIFESTS for item in yaml.safe_load_all((DEPLOY / "kubernetes" / name).read_text())
+]
+PODS = {
+    item["metadata"]["name"]: item["spec"]["template"]["spec"]
+    for item in OBJECTS
+    if "template" in item.get("spec", {})
+}
+METRIC = re.compile(r"\bembo_\w+")
+
+
+def options(app, name):
+    """What a command of ours takes."""
+    return {
+        option for parameter in typer.main.get_command(app).commands[name].params for option in parameter.opts
+    }
+
+
+def named(arguments):
+    return {word.split("=")[0] for word in arguments if word.startswith("--")}
+
+
+@pytest.mark.parametrize("item", OBJECTS, ids=lambda item: f"{item['kind']}-{item['metadata']['name']}")
+def test_what_kubernetes_reads_fits_its_schema(item):
+    kubernetes_validate.validate(item, "1.30", strict=True)
+
+
+def test_pods_run_without_root_rights_or_a_system_that_they_can_write():
+    assert set(PODS) == {"redis", "manager", "worker"}
+    for name, pod in PODS.items():
+        assert pod["securityContext"]["runAsNonRoot"], name
+        assert not pod["automountServiceAccountToken"], name
+        for container in (*pod["containers"], *pod.get("initContainers", ())):
+            allowed = container["securityContext"]
+            assert allowed["readOnlyRootFilesystem"], name
+            assert allowed["capabilities"] == {"drop": ["ALL"]}, name
+            assert not allowed["allowPrivilegeEscalation"], name
+            assert container["resources"]["limits"]["memory"], name
+
+
+def test_pods_are_given_options_that_there_are():
+    (manager,) = PODS["manager"]["containers"]
+    (init,) = PODS["manager"]["initContainers"]
+    (worker,) = PODS["worker"]["containers"]
+    assert named(manager["args"]) <= options(manager_app, "serve")
+    assert named(init["args"]) <= options(manager_app, "init")
+    assert named(worker["args"]) <= options(worker_app, "run")
+
+
+def test_a_slurm_task_runs_a_worker_with_its_cores_under_a_name_of_its_own(tmp_path):
+    fake = tmp_path / "srun"
+    fake.write_text('#!/bin/sh\nprintf "%s\\n" "$@"\n')
+    fake.chmod(0o755)
+    known = {"PATH": f"{tmp_path}:{os.environ['PATH']}", "SLURM_CPUS_PER_TASK": "4"}
+    told = {"EMBOMATRIX_MANAGER": "m:50070", "SLURM_ARRAY_JOB_ID": "7", "SLURM_ARRAY_TASK_ID": "3"}
+    script = ("bash", str(DEPLOY / "slurm" / "workers.sbatch"))
+    ran = subprocess.run(script, env=known | told, capture_output=True, text=True, check=True)
+    words = ran.stdout.splitlines()
+    assert words[:3] == ["embomatrix", "worker", "run"]
+    assert named(words) <= options(worker_app, "run")
+    assert (words[words.index("--name") + 1], words[words.index("--slots") + 1]) == ("slurm-7-3", "4")
+    nameless = subprocess.run(
+        script, env=known | {"SLURM_JOB_ID": "7"}, capture_output=True, text=True, check=False
+    )
+    assert (nameless.returncode, "set it to the HOST:PORT" in nameless.stderr) == (1, True)
+
+
+@pytest.mark.parametrize("name", ["prometheus/rules.yml", "grafana/dashboard.json"])
+def test_alarms_and_panels_ask_for_metrics_that_the_guide_explains(name):
+    explained = set(re.findall(r"^\| `(embo_\w+)` \|", GUIDE, flags=re.MULTILINE))
+    asked = {re.sub(r"_bucket$", "", metric) for metric in METRIC.findall((DEPLOY / name).read_text())}
+    assert asked
+    assert asked <= explained
+
+
+def test_the_dashboard_of_grafana_has_panels_that_do_not_overlap():
+    panels = json.loads((DEPLOY / "grafana" / "dashboard.json").read_text())["panels"]
+    taken = set()
+    for panel in panels:
+        at = panel["gridPos"]
+        cells = {(x, y) for x in range(at["x"], at["x"] + at["w"]) for y in range(at["y"], at["y"] + at["h"])}
+        assert not cells & taken, panel["title"]
+        taken |= cells
+    assert max(x for x, _ in taken) < 24
+
+
+def test_every_alarm_says_what_to_do():
+    (group,) = yaml.safe_load((DEPLOY / "prometheus" / "rules.yml").read_text())["groups"]
+    for rule in group["rules"]:
+        assert rule["annotations"]["action"], rule["alert"]
+        assert rule["labels"]["severity"] in ("warning", "critical")
+
+
+@pytest.mark.skipif(shutil.which("promtool") is None, reason="promtool is not installed")
+def test_prometheus_reads_the_rules():
+    subprocess.run(("promtool", "check", "rules", str(DEPLOY / "prometheus" / "rules.yml")), check=True)
