@@ -166,10 +166,10 @@ class DynamicBodies:
                     bullet.setCollisionFilterPair(body, other, link, other_link, 0, physicsClientId=client)
 
     def _gives(self, body: int, link: int, normal: Vec3) -> bool:
-        """Whether a force along a normal moves a link of a body."""
+        """Whether a force along a normal moves a link of a body; what is not of the scene, as the robot, moves."""
         name = self.name(body)
         if name not in self._joints:
-            return name in self.movable
+            return not name or name in self.movable
         while link >= 0 and link not in self._joints[name]:
             link = int(self._bullet.getJointInfo(body, link, physicsClientId=self._client)[16])
         if link < 0:

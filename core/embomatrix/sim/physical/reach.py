@@ -54,6 +54,7 @@ MOST_SAMPLES: Final = 36
 LEVEL: Final = 0.93
 """Cosine of the steepest tilt, 21 degrees, at which what lies in a bowl stays there."""
 SCATTER: Final = 0
+"""Seed of the postures that are scattered."""
 DRAWS: Final = 24
 """Scattered postures by which the arm may find its way to one place of work."""
 
