@@ -62,10 +62,10 @@ class Swings:
     def complete(self) -> Iterator[None]:
         """Find out how the leaves of each object open in the scene as it was loaded, one object at a step.
 
-        Work for a process that waits, in an engine in which nothing has changed. Changes no answer.
+        Work for a process that waits. Changes no answer: where anything is otherwise than it was loaded, nothing is foreseen.
         """
         for item in self._engine.scene.objects:
-            if item.joints and not item.absent:
+            if item.joints and not item.absent and not self._engine.state_bytes():
                 measure_swing(self._engine, item.name, (0.0, *SWING))
                 self._foresee(item.name)
                 yield

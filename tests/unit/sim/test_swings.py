@@ -63,6 +63,20 @@ def test_looking_ahead_leaves_the_scene_as_it_was(both) -> None:
         assert ahead.world.engine.state_bytes() == then.world.engine.state_bytes()
 
 
+def test_nothing_is_foreseen_in_a_scene_from_which_something_is_gone(both) -> None:
+    _, then = both
+    simulator = Simulator(Bundle(drawer_scene(), {}))
+    try:
+        simulator.world.engine.park("mug_2")
+        for _ in simulator.complete():
+            pass
+        plan = plan_of(task_over(then.world.scene), PLANS[0])
+        first, second = (item.execute(task_over(then.world.scene), plan, 0) for item in (simulator, then))
+        assert first.digest == second.digest, "the mug rides out with its drawer"
+    finally:
+        simulator.close()
+
+
 def test_what_was_foreseen_is_not_measured_again(both) -> None:
     ahead, _ = both
     ahead.reset(task_over(ahead.world.scene), 0)
