@@ -6,6 +6,7 @@ whose evaluator the tests compare with.
 
 from __future__ import annotations
 
+import dataclasses
 from typing import TYPE_CHECKING
 
 from embomatrix.world.goal import (
@@ -24,7 +25,7 @@ from embomatrix.world.goal import (
 from embomatrix.world.substances import is_substance
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from embomatrix.world.goal import Facts
 
@@ -151,6 +152,21 @@ def substitute(formula: Formula, names: Mapping[str, str]) -> Formula:
             return ForPairs(a, type_a, b, type_b, inner(body, a, b))
         case ForNPairs(count, a, type_a, b, type_b, body):
             return ForNPairs(count, a, type_a, b, type_b, inner(body, a, b))
+
+
+def map_atoms(formula: Formula, change: Callable[[Atom], Formula]) -> Formula:
+    """The formula with each of its atoms replaced by what ``change`` makes of it."""
+    match formula:
+        case Atom():
+            return change(formula)
+        case And(parts):
+            return And(tuple(map_atoms(part, change) for part in parts))
+        case Or(parts):
+            return Or(tuple(map_atoms(part, change) for part in parts))
+        case Imply(premise, conclusion):
+            return Imply(map_atoms(premise, change), map_atoms(conclusion, change))
+        case _:
+            return dataclasses.replace(formula, body=map_atoms(formula.body, change))
 
 
 def subformulas(formula: Formula) -> Iterator[Formula]:

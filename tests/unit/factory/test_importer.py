@@ -14,7 +14,8 @@ from tests.fakes.scenes import kitchen_scene
 from embomatrix.factory.refusal import Refusal, RefusalReason, RefusedError
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.task_import.batch import Verified, bind_first, verify
-from embomatrix.factory.task_import.binding import bind, check_expressible
+from embomatrix.factory.task_import.binding import bind
+from embomatrix.factory.task_import.expressible import check_expressible
 from embomatrix.factory.task_import.reach import Horizon
 from embomatrix.factory.task_import.scene import with_states
 from embomatrix.factory.task_import.sources import (

@@ -1,5 +1,6 @@
 """Tasks come of conversations: a cast that covers the scene, wishes that change, instructions that name who asks."""
 
+import dataclasses
 import re
 from itertools import pairwise
 
@@ -11,7 +12,9 @@ from pydantic import ValidationError
 
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.social.casting import GrammarRolePlayer
+from embomatrix.factory.social.fitting import is_plausible, why_of
 from embomatrix.factory.social.milieus import HOBBIES, NAMES
+from embomatrix.factory.social.occasions import Theme, occasion_of, occasions
 from embomatrix.factory.social.phrases import CLAUSES, TURNS
 from embomatrix.factory.social.values import ROBOT, Act, Cast, DaySlot, Person
 from embomatrix.factory.social.writer import SocialWriter
@@ -135,3 +138,60 @@ def test_a_time_of_day_has_four_digits(time):
 
 def test_the_robot_is_not_one_of_the_people():
     assert ROBOT not in NAMES
+
+
+def test_every_activity_of_the_table_has_reasons_and_every_theme_comes_up():
+    found = [occasion for each in occasions().values() for occasion in each]
+    assert {theme for occasion in found for theme in occasion.themes} == set(Theme)
+    assert all(occasion_of(occasion.doing).doing == occasion.doing for occasion in found)
+    assert not [why for occasion in found for why in occasion.why if why[0].isupper() or why.endswith(".")]
+
+
+@settings(max_examples=40)
+@given(st.integers(0, 2**32), st.sampled_from(["Rs_int", "shop"]))
+def test_people_do_what_somebody_of_their_age_and_place_does(seed, base):
+    cast = GrammarRolePlayer().cast(
+        dataclasses.replace(SCENE, base="grocery_x" if base == "shop" else base), np.random.default_rng(seed)
+    )
+    for slot in cast.day:
+        occasion = occasion_of(slot.activity)
+        assert occasion.suits(cast.of(slot.person))
+        assert base == "Rs_int" or not occasion.private
+
+
+def test_wishes_fit_what_the_person_does(drafts):
+    found, cast = drafts
+    doing = {slot.activity for slot in cast.day}
+    kitchen_work = [draft for draft in found if draft.task.category is TaskCategory.KITCHEN_OPERATION]
+    for draft in kitchen_work:
+        (activity,) = [each for each in doing if f"is {each}\n" in draft.transcript]
+        assert occasion_of(activity).themes & {Theme.COOKING, Theme.MEALS}
+    assert kitchen_work
+
+
+@pytest.mark.parametrize(
+    ("thing", "host", "room", "inside"),
+    [
+        ("comb", "bar", "bar", False),
+        ("hardback", "wall_mounted_sink", "bathroom", True),
+        ("pillar_candle", "bed", "bedroom", False),
+        ("chopping_board", "bottom_cabinet", "meeting_room", True),
+        ("mug", "oven", "kitchen", True),
+        ("wineglass", "fridge", "kitchen", True),
+        ("cell_phone", "swivel_chair", "private_office", False),
+    ],
+)
+def test_nobody_puts_such_things_there(thing, host, room, inside):
+    assert not is_plausible(thing, host, room, inside=inside)
+
+
+def test_people_put_things_where_they_belong():
+    assert is_plausible("apple", "furniture_sink", "kitchen", inside=True)
+    assert is_plausible("teddy_bear", "bed", "bedroom", inside=False)
+    assert is_plausible("carton_of_milk", "fridge", "kitchen", inside=True)
+    assert is_plausible("mug", "desk", "private_office", inside=False)
+
+
+def test_the_grammar_gives_no_reasons_for_what_it_did_not_make_up():
+    assert why_of("juggling eels") == ()
+    assert "the chain is off" in why_of("mending a bicycle")

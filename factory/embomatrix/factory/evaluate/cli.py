@@ -7,12 +7,11 @@ import contextlib
 import json
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from embomatrix.factory.evaluate.drafts import asked_of
@@ -31,16 +30,14 @@ from embomatrix.factory.evaluate.scenes import Method, fixed_tasks
 from embomatrix.factory.evaluate.tasks import panel, people_of
 from embomatrix.factory.pipeline.corpus import training_scenes
 from embomatrix.factory.pipeline.store import TRANSCRIPTS_FOLDER
-from embomatrix.factory.task_import.sources import SourceError
+from embomatrix.factory.terminal import mended, progress
 from embomatrix.llm.cassette import Cassette, CassetteMode
 from embomatrix.llm.endpoint import Endpoint
-from embomatrix.llm.values import LlmError
-from embomatrix.world.catalog import CatalogError
-from embomatrix.world.dataset import Dataset, DatasetError
+from embomatrix.world.dataset import Dataset
 from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
     from embomatrix.factory.evaluate.drafts import Asked
     from embomatrix.llm.values import ChatModel
@@ -77,15 +74,16 @@ def tasks(
     ] = None,
 ) -> None:
     """Diversity of instructions and goals, with and without social simulation."""
-    with _mended():
+    with mended():
         if llm and not model:
             raise EvaluationError("--llm needs the name of a model there: give --model")
         if dataset is not None:
             groups, evaluation = _of_dataset(dataset, each)
         else:
             chosen = tuple(dict.fromkeys(scenes or training_scenes()))
-            with _progress("scenes", len(chosen)) as advance:
-                written = written_for(chosen, each, seed, advance)
+            with progress(Console(stderr=True)) as bars:
+                bar = bars.add_task("scenes", total=len(chosen))
+                written = written_for(chosen, each, seed, lambda done: bars.update(bar, completed=done))
             groups, evaluation = written.social, evaluate_tasks(written, each, seed)
         if llm or cassette is not None:
             verdicts = asyncio.run(_judged(groups, llm, model, key, cassette, seed))
@@ -112,12 +110,16 @@ def scenes(
     ] = None,
 ) -> None:
     """Generation rate, verification pass rate and time of 140 fixed tasks, by layout tree and by two simpler ways."""
-    with _mended():
+    with mended():
         chosen = fixed_tasks(sample)[::only]
-        with _progress("tasks", len(chosen)) as advance:
-            evaluation, found = evaluate_scenes(chosen, methods or list(Method), seed, jobs, advance)
+        with progress(Console(stderr=True)) as bars:
+            bar = bars.add_task("tasks", total=len(chosen))
+            told = methods or list(Method)
+            evaluation, found = evaluate_scenes(
+                chosen, told, seed, jobs, lambda done: bars.update(bar, completed=done)
+            )
         if outcomes is not None:
-            with _mended(outcomes):
+            with mended(outcomes):
                 write_whole(outcomes, "".join(json.dumps(asdict(each)) + "\n" for each in found).encode())
         _hand_in(evaluation, json_file)
 
@@ -132,7 +134,7 @@ def aesthetics(
     ] = None,
 ) -> None:
     """How well the geometric score tells hand-made rooms from spoilt ones that its fit did not see."""
-    with _mended():
+    with mended():
         evaluation, fitted = evaluate_aesthetics(rooms, seed)
         if calibration is not None:
             write_whole(calibration, (json.dumps(asdict(fitted), indent=1) + "\n").encode("ascii"))
@@ -145,7 +147,7 @@ def page(
     out: Annotated[Path, typer.Option(help="Page whose part on the factory is replaced.")] = PAGE,
 ) -> None:
     """Write the factory's part of the page of benchmarks."""
-    with _mended(out):
+    with mended(out):
         evaluations = [read_evaluation(file) for file in files]
         before = out.read_text(encoding="utf-8") if out.exists() else ""
         write_whole(out, with_factory(before, evaluations).encode("utf-8"))
@@ -196,37 +198,7 @@ def _hand_in(evaluation: Evaluation, json_file: Path | None) -> None:
     for note in evaluation.notes:
         Console().print(note, highlight=False, markup=False)
     if json_file is not None:
-        with _mended(json_file):
+        with mended(json_file):
             write_whole(
                 json_file, (json.dumps(evaluation_to_json(evaluation), indent=1) + "\n").encode("ascii")
             )
-
-
-@contextlib.contextmanager
-def _progress(what: str, total: int) -> Iterator[Callable[[int], None]]:
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True)) as bars:
-        bar = bars.add_task(what, total=total)
-        yield lambda done: bars.update(bar, completed=done)
-
-
-@contextlib.contextmanager
-def _mended(out: Path | None = None) -> Iterator[None]:
-    """What a person can mend is one sentence and exit status 2, an interrupt one and 130."""
-    try:
-        yield
-    except (CatalogError, DatasetError, EvaluationError, LlmError, SourceError) as error:
-        _fail(str(error), 2)
-    except OSError as error:
-        if out is None:
-            raise
-        _fail(f"{out} can't be written ({error.strerror}): make room, or name another file", 2)
-    except KeyboardInterrupt:
-        _fail("interrupted: nothing was written", 130)
-
-
-def _fail(sentence: str, status: int) -> NoReturn:
-    Console(stderr=True).print(
-        f"embomatrix factory evaluate: {sentence}", highlight=False, markup=False, soft_wrap=True
-    )
-    raise typer.Exit(status) from None

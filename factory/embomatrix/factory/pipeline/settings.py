@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
+from embomatrix.world.catalog import Catalog
+
 DEFAULT_SCENES: Final = ("Rs_int", "Wainscott_0_int", "restaurant_diner")
 
 
@@ -28,3 +30,13 @@ class BuildSettings:
     writer: WriterKind = WriterKind.PLAIN
     look_ahead: bool = True
     """Whether to find out what the arm can do in each variant: about 12 s of CPU for one."""
+
+
+EVERY_SCENE: Final = "all"
+
+
+def scene_ids(asked: list[str] | None) -> tuple[str, ...]:
+    """The scenes asked for, without repetition; "all" stands for every base scene of the catalog, nothing for three."""
+    if asked and EVERY_SCENE in asked:
+        return Catalog.load().scene_ids
+    return tuple(dict.fromkeys(asked or DEFAULT_SCENES))

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final, Protocol
 
-from embomatrix.factory.social.milieus import HOBBIES, NAMES, activities_in, milieu_of
+from embomatrix.factory.social.milieus import HOBBIES, NAMES, milieu_of
+from embomatrix.factory.social.occasions import ELSEWHERE, occasions_in
 from embomatrix.factory.social.values import Cast, DaySlot, Person
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     import numpy as np
 
-    from embomatrix.factory.social.milieus import Role
+    from embomatrix.factory.social.milieus import Milieu, Role
+    from embomatrix.factory.social.occasions import Occasion
     from embomatrix.world.scene import Room, Scene
 
-SLOTS_EACH: Final = 3
+SLOTS_EACH: Final = 5
 """Things that a person does on the day, at least; every room sees somebody besides."""
 
 
@@ -44,7 +46,7 @@ class GrammarRolePlayer:
             update={"ties": {name: role.back for role, name in zip(roles[1:], names[1:], strict=True)}}
         )
         setting = milieu.setting[int(rng.integers(len(milieu.setting)))]
-        return Cast(setting=setting, people=tuple(people), day=_day(people, scene.rooms, rng))
+        return Cast(setting=setting, people=tuple(people), day=_day(people, scene.rooms, milieu, rng))
 
 
 def _person(
@@ -60,23 +62,36 @@ def _person(
     )
 
 
-def _day(people: Sequence[Person], rooms: Sequence[Room], rng: np.random.Generator) -> tuple[DaySlot, ...]:
+def _day(
+    people: Sequence[Person], rooms: Sequence[Room], milieu: Milieu, rng: np.random.Generator
+) -> tuple[DaySlot, ...]:
     """Everyone's own rooms first; then each room that nobody came to gets somebody."""
-    types = {room.name: room.type for room in rooms}
+    types = {room.name: _done_in(room.type, milieu) for room in rooms}
     slots = []
     for person in people:
         own = person.rooms or tuple(types)
         for _ in range(SLOTS_EACH):
-            slots.append(_slot(person.name, own[int(rng.integers(len(own)))], types, rng))
+            slots.append(_slot(person, own[int(rng.integers(len(own)))], types, rng))
     for room in types:
         if not any(slot.room == room for slot in slots):
-            owners = [person for person in people if room in person.rooms] or list(people)
-            slots.append(_slot(owners[int(rng.integers(len(owners)))].name, room, types, rng))
+            able = [person for person in people if any(each.suits(person) for each in types[room])]
+            owners = [person for person in able if room in person.rooms] or able or list(people)
+            slots.append(_slot(owners[int(rng.integers(len(owners)))], room, types, rng))
     return tuple(sorted(dict.fromkeys(slots), key=lambda slot: (slot.time, slot.person, slot.room)))
 
 
-def _slot(person: str, room: str, types: dict[str, str], rng: np.random.Generator) -> DaySlot:
-    options = activities_in(types[room])
-    hour, activity = options[int(rng.integers(len(options)))]
+def _done_in(room_type: str, milieu: Milieu) -> tuple[Occasion, ...]:
+    """What is done in such a room of such a place."""
+    return tuple(each for each in occasions_in(room_type) if milieu.lived_in or not each.private)
+
+
+def _slot(
+    person: Person, room: str, types: Mapping[str, tuple[Occasion, ...]], rng: np.random.Generator
+) -> DaySlot:
+    """Something that such a person does there; who does nothing of what the room is for passes through."""
+    options = [each for each in types[room] if each.suits(person)] or occasions_in(ELSEWHERE)
+    chosen = options[int(rng.integers(len(options)))]
     minute = 15 * int(rng.integers(4))
-    return DaySlot(time=f"{hour:02d}:{minute:02d}", person=person, room=room, activity=activity)
+    return DaySlot(
+        time=f"{chosen.hour:02d}:{minute:02d}", person=person.name, room=room, activity=chosen.doing
+    )

@@ -1,7 +1,7 @@
 """Social Simulation Agent, offline: a conversation in which a request takes shape over several rounds.
 
-The wishes that it ends with are pieces of a goal that the scene allows. What comes before is made from them: a vague need, a
-question, a first answer that is changed later, a chore that the robot has to refuse, a wish more.
+The wishes that it ends with are pieces of a goal that the scene allows. What comes before is made from them: a vague need with
+its reason, a question, a first answer that is changed later, a chore that the robot has to refuse, a wish more.
 """
 
 from __future__ import annotations
@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.social.chores import impossible_chore
-from embomatrix.factory.social.phrases import JOINS, MATTERS, QUESTIONS, TURNS, filled
+from embomatrix.factory.social.fitting import themes_of
+from embomatrix.factory.social.phrases import AGREEMENTS, JOINS, MATTERS, QUESTIONS, TURNS, filled
 from embomatrix.factory.social.values import ROBOT, Act, Conversation, Turn
 from embomatrix.factory.writer.goals import placed_elsewhere
 
@@ -24,18 +25,20 @@ if TYPE_CHECKING:
     from embomatrix.factory.writer.words import Voice
 
 REFUSED_SHARE: Final = 0.35
-AMENDED_SHARE: Final = 0.6
+AMENDED_SHARE: Final = 0.7
+PLACES_TRIED: Final = 5
 INTERJECTED_SHARE: Final = 0.4
 """Of amendments, those that somebody else brings up who is at home in the same room."""
 
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """Who needs what, where, when. ``pieces`` are the wishes that the conversation is to end with."""
+    """Who needs what, where, when, and why. ``pieces`` are the wishes that the conversation is to end with."""
 
     cast: Cast
     slot: DaySlot
     pieces: tuple[Piece, ...]
+    why: str
 
 
 class GrammarConversation:
@@ -49,17 +52,15 @@ class GrammarConversation:
         self._turns: list[Turn] = []
 
     def run(self) -> Conversation:
-        """Need, question, answer, changes, wishes more, confirmation."""
+        """Need, question, answer, changes, what the robot can't do and offers in its place, wishes more, confirmation."""
         slot, pieces = self._scenario.slot, self._scenario.pieces
-        first = pieces[0]
+        first, further = pieces[0], list(pieces[1:])
         self._open(first)
-        if self._rng.random() < REFUSED_SHARE:
-            chore, reason = impossible_chore(self._shop.view, slot.room, self._rng)
-            self._say(slot.person, Act.ADD, clause=chore)
-            self._say(ROBOT, Act.REFUSE, chore=chore, reason=reason)
-        earlier = placed_elsewhere(self._shop, first) if self._rng.random() < AMENDED_SHARE else None
+        earlier = self._earlier(first) if self._rng.random() < AMENDED_SHARE else None
         wished = self._settle(first, earlier)
-        for piece in pieces[1:]:
+        if self._rng.random() < REFUSED_SHARE:
+            self._refuse(further)
+        for piece in further:
             self._say(self._someone_near(), Act.ADD, clause=piece.clause)
         self._say(ROBOT, Act.CONFIRM, clauses=self._joined(pieces))
         return Conversation(
@@ -70,10 +71,30 @@ class GrammarConversation:
         )
 
     def _open(self, first: Piece) -> None:
-        matter = filled(self._voice.choose(MATTERS[first.kind]), thing=first.thing)
-        self._say(self._scenario.slot.person, Act.NEED, activity=self._scenario.slot.activity, matter=matter)
+        sign = "place" if first.kind == "place" else first.signs[0].partition("(")[0]
+        matter = filled(self._voice.choose(MATTERS[sign]), thing=first.thing)
+        slot = self._scenario.slot
+        self._say(slot.person, Act.NEED, activity=slot.activity, matter=matter, why=self._scenario.why)
         question = filled(self._voice.choose(QUESTIONS[first.kind]), thing=first.thing)
         self._say(ROBOT, Act.CLARIFY, question=question)
+
+    def _earlier(self, first: Piece) -> Piece | None:
+        """Another place for the same thing, where a person would put it too."""
+        for _ in range(PLACES_TRIED):
+            other = placed_elsewhere(self._shop, first)
+            if other is not None and themes_of(other, self._shop.view):
+                return other
+        return None
+
+    def _refuse(self, further: list[Piece]) -> None:
+        """Somebody asks for what the robot can't do; it offers the next wish, which is then no longer among the ``further``."""
+        slot = self._scenario.slot
+        chore, reason = impossible_chore(self._shop.view, slot.room, self._rng)
+        self._say(slot.person, Act.ADD, clause=chore)
+        self._say(ROBOT, Act.REFUSE, chore=chore, reason=reason)
+        if further:
+            self._say(ROBOT, Act.PROPOSE, clause=further.pop(0).clause)
+            self._turns.append(Turn(speaker=slot.person, act=Act.ANSWER, text=self._voice.choose(AGREEMENTS)))
 
     def _settle(self, first: Piece, earlier: Piece | None) -> str:
         """The first wish is agreed on, at once or after a change; returns what was wished at first."""

@@ -1,4 +1,4 @@
-"""Who is found in which kind of scene: roles with ages, jobs and ties, and what people do in which room at which hour."""
+"""Who is found in which kind of scene: roles with ages, jobs and ties."""
 
 from __future__ import annotations
 
@@ -27,6 +27,8 @@ class Milieu:
 
     setting: tuple[str, ...]
     roles: tuple[Role, ...]
+    lived_in: bool = False
+    """Whether people sleep and wash there."""
 
 
 _OFFICES: Final = ("private_office", "shared_office", "meeting_room", "break_room", "copy_room", "phone_room")
@@ -42,6 +44,7 @@ _HOME: Final = Milieu(
         Role(("pensioner",), (66, 84), "parent", "grown-up child", ("bedroom", "living_room", "garden")),
         Role(("student", "musician", "paramedic"), (21, 34), "lodger", "landlord", ("bedroom", "bathroom")),
     ),
+    lived_in=True,
 )  # fmt: skip
 _RESTAURANT: Final = Milieu(
     (
@@ -133,6 +136,7 @@ _HOTEL: Final = Milieu(
             ("spa", "gym", "hammam", "locker_room"),
         ),
     ),
+    lived_in=True,
 )
 _HALL: Final = Milieu(
     ("a hall on the morning of a conference", "a hall while a fair is being set up"),
@@ -167,54 +171,7 @@ HOBBIES: Final = (
     "jigsaw puzzles", "photography", "football", "knitting", "model trains", "pottery", "crime novels", "cycling", "karaoke",
 )  # fmt: skip
 
-ACTIVITIES: Final[Mapping[str, tuple[tuple[int, str], ...]]] = {
-    "kitchen": ((7, "making breakfast"), (12, "preparing lunch"), (18, "cooking dinner"), (21, "tidying up after a meal")),
-    "pantry_room": ((8, "checking the stocks"), (16, "looking for ingredients")),
-    "dining_room": ((7, "laying the tables"), (13, "waiting for a late lunch"), (19, "having people over for dinner")),
-    "bar": ((17, "getting the bar ready"), (20, "talking with a friend over a drink")),
-    "living_room": ((10, "reading the paper"), (16, "resting after a long day"), (20, "expecting friends for a film")),
-    "television_room": ((19, "watching the match"), (21, "choosing a film")),
-    "bedroom": ((6, "getting up early"), (14, "lying down with a headache"), (22, "going to bed")),
-    "childs_room": ((15, "doing homework"), (17, "playing on the floor"), (19, "clearing up before the bedtime story")),
-    "playroom": ((15, "building a tower"), (17, "having two friends to play")),
-    "bathroom": ((6, "brushing teeth"), (8, "getting ready to leave"), (21, "running a bath")),
-    "garden": ((11, "repotting plants"), (17, "setting up a small party"), (19, "eating outside")),
-    "private_office": ((9, "sorting the mail"), (11, "preparing a video call"), (16, "finishing a report")),
-    "shared_office": ((8, "starting the week"), (13, "working against a deadline"), (17, "clearing the desk")),
-    "meeting_room": ((9, "expecting clients"), (14, "preparing a workshop")),
-    "copy_room": ((10, "printing handouts"), (15, "looking for envelopes")),
-    "phone_room": ((10, "waiting for a call"),),
-    "break_room": ((10, "taking a short break"), (13, "eating a late lunch")),
-    "lobby": ((8, "welcoming visitors"), (18, "waiting for a taxi")),
-    "corridor": ((8, "passing by in a hurry"), (17, "getting ready to go home")),
-    "entryway": ((8, "leaving for work"), (18, "coming home with both hands full")),
-    "grocery_store": ((7, "filling the shelves"), (11, "helping a customer"), (18, "cashing up")),
-    "storage_room": ((9, "taking stock"), (15, "making room for a delivery")),
-    "utility_room": ((9, "doing the laundry"), (19, "looking for a tool")),
-    "closet": ((7, "choosing what to wear"), (20, "packing for a trip")),
-    "garage": ((10, "mending a bicycle"),),
-    "classroom": ((8, "preparing the first lesson"), (14, "correcting tests")),
-    "biology_lab": ((9, "setting up the microscopes"),),
-    "chemistry_lab": ((9, "setting up an experiment"),),
-    "computer_lab": ((11, "getting ready for a class"),),
-    "infirmary": ((10, "looking after a child with a scraped knee"),),
-    "gym": ((8, "preparing a circuit"), (17, "cooling down after practice")),
-    "exercise_room": ((7, "stretching"),),
-    "locker_room": ((16, "changing after practice"),),
-    "spa": ((10, "getting the treatment room ready"),),
-    "sauna": ((18, "cooling off"),),
-    "hammam": ((17, "resting on the warm stone"),),
-    "conference_hall": ((8, "setting up for the first talk"), (12, "clearing up after a session")),
-}  # fmt: skip
-"""What people do in a type of room, with the hour."""
-ELSEWHERE: Final = ((9, "passing through"), (16, "looking for something"), (19, "putting things in order"))
-
 
 def milieu_of(base: str) -> Milieu:
     """Of a base scene, by the first word of its name; houses that are named after places are homes."""
     return _BY_STEM.get(base.split("_")[0], _HOME)
-
-
-def activities_in(room_type: str) -> tuple[tuple[int, str], ...]:
-    """Hour and activity, for rooms of any type."""
-    return ACTIVITIES.get(room_type, ELSEWHERE)

@@ -15,23 +15,23 @@ CLAUSES: Final[Mapping[str, tuple[str, ...]]] = {
         "put {thing} on {place}",
         "lay {thing} on {place}",
         "set {thing} down on {place}",
-        "carry {thing} over and leave it on {place}",
+        "carry {thing} across and leave it on {place}",
         "find {thing} and place it on top of {place}",
         "get {thing} onto {place}",
         "see to it that {thing} ends up on {place}",
-        "take {thing} along and rest it on {place}",
-        "bring {thing} over and place it on {place}",
+        "move {thing} to {place}",
+        "bring {thing} along and place it on {place}",
     ),
     "inside": (
         "put {thing} in {place}",
         "tuck {thing} away in {place}",
         "stow {thing} inside {place}",
-        "drop {thing} into {place}",
+        "slip {thing} into {place}",
         "clear {thing} away into {place}",
         "find {thing} and store it in {place}",
         "see to it that {thing} ends up inside {place}",
-        "take {thing} along and leave it inside {place}",
-        "make room for {thing} in {place} and put it there",
+        "let {thing} disappear into {place}",
+        "find a corner for {thing} in {place}",
     ),
     "open": (
         "open {thing}",
@@ -85,12 +85,12 @@ CLAUSES: Final[Mapping[str, tuple[str, ...]]] = {
 
 TURNS: Final[Mapping[Act, tuple[str, ...]]] = {
     Act.NEED: (
-        "I am {activity}, and {matter}.",
-        "Robot, have you got a moment? I am {activity} and {matter}.",
-        "Good that you are here. {Matter}, and I am {activity}.",
-        "{Matter}. Could you help, while I am {activity}?",
-        "Sorry to bother you, but {matter}. I am {activity}, you see.",
-        "Listen: {matter}, and I can't see to it, I am {activity}.",
+        "I am {activity}, and {why}. Now {matter}.",
+        "Robot, have you got a moment? I am {activity}, and {matter}. {Why}.",
+        "Good that you are here. {Matter}, and I am {activity}: {why}.",
+        "{Matter}. Could you help, while I am {activity}? {Why}.",
+        "Sorry to bother you, but {matter}. I am {activity}, you see, and {why}.",
+        "Listen: {matter}, and I can't see to it, I am {activity}. {Why}.",
     ),
     Act.CLARIFY: (
         "Gladly. {Question}",
@@ -141,6 +141,9 @@ TURNS: Final[Mapping[Act, tuple[str, ...]]] = {
 }
 """Sentences by act. A name with a capital stands for the same words at the start of a sentence."""
 
+AGREEMENTS: Final = ("Yes, do that, please.", "That would help as well.", "Oh, gladly.", "Right, that too.")
+"""What somebody says to a proposal."""
+
 MATTERS: Final[Mapping[str, tuple[str, ...]]] = {
     "place": (
         "{thing} is not where it belongs",
@@ -150,20 +153,15 @@ MATTERS: Final[Mapping[str, tuple[str, ...]]] = {
         "{thing} is needed elsewhere",
         "I don't know what to do with {thing}",
     ),
-    "thermal": (
-        "{thing} is not ready yet",
-        "somebody should see to {thing}",
-        "I had hoped to have {thing} prepared by now",
-        "nobody has taken care of {thing}",
-    ),
-    "switch": (
-        "something is the matter with {thing}",
-        "{thing} is not as I want it",
-        "nobody has thought of {thing}",
-        "I can't leave {thing} like that",
-    ),
+    "hot": ("{thing} is still cold", "nobody wants to have {thing} cold"),
+    "cooked": ("{thing} is still raw", "somebody should see to {thing}"),
+    "frozen": ("{thing} will not keep until tomorrow", "{thing} is too warm as it is"),
+    "open": ("{thing} is shut, and I have no hand free", "nobody has thought of {thing}"),
+    "not open": ("somebody left {thing} standing open", "everybody walks into {thing}, open as it is"),
+    "toggled_on": ("{thing} is off", "nobody has thought of {thing}"),
+    "not toggled_on": ("{thing} is running for nobody", "somebody left {thing} on"),
 }
-"""What is the matter, by kind of wish."""
+"""What is the matter, by what is wished for."""
 
 QUESTIONS: Final[Mapping[str, tuple[str, ...]]] = {
     "place": (
@@ -172,18 +170,18 @@ QUESTIONS: Final[Mapping[str, tuple[str, ...]]] = {
         "where would you like to have {thing}?",
     ),
     "thermal": ("what shall I do with {thing}?", "how would you like to have {thing}?"),
-    "switch": ("how do you want {thing} to be?", "what shall I do about {thing}?"),
+    "switch": ("shall I see to it?", "what would you like me to do about it?", "how do you want it?"),
 }
 
 INSTRUCTIONS: Final = (
-    "{Who} is {activity}: {what}.",
-    "Before {who} starts {activity}, {what}.",
+    "{Who} is {activity}, and {why}: {what}.",
+    "{Why}, says {who}, who is {activity}. So {what}.",
     "It is {time} and {who} is {activity}. Could you {what}?",
-    "Lend {who} a hand, who is {activity}: {what}.",
-    "{Who} asks you to {what}.",
+    "Lend {who} a hand, who is {activity}: {what}. {Why}.",
+    "{Who} asks you to {what}, for {why}.",
     "For {who}, the {job}: {what}.",
     "While {who} is {activity}, {what}.",
-    "{What}. That is what {who} needs now.",
+    "{What}. That is what {who} needs now: {why}.",
     "{Who} will be {activity} at {time}. By then, {what}.",
     "Do {who} a favour and {what}.",
     "{Who} ({age}) is {activity} and can't see to it. Please {what}.",
@@ -192,10 +190,14 @@ INSTRUCTIONS: Final = (
     "You promised {who} to {what}.",
     "{Who} loves {hobby} and wants to get back to it: {what}.",
     "{What}, so that {who} has one thing less to think of.",
-    "On behalf of {who}, {what}.",
-    "{Who} has asked twice already. Now {what}.",
+    "On behalf of {who}, {what}: {why}.",
+    "{Who} has asked twice already, because {why}. Now {what}.",
     "Next on the list of {who}: {what}.",
     "{Who} would be glad if you were to {what}.",
+    "{Time}, {room}: {who} is {activity} and needs somebody to {what}.",
+    "Help {who} out. {Why}, so {what}.",
+    "Could you spare {who} the walk and {what}?",
+    "{Who} can't leave {room} just now. {What}, please.",
 )
 """The request as a robot is given it; every one names a person."""
 
@@ -209,7 +211,7 @@ JOINS: Final = (
     "; when that is done, ",
 )
 
-WHERE: Final = ("in {room}", "over in {room}", "that is in {room}")
+WHERE: Final = ("in {room}", "over in {room}")
 """Ways to say in which room a thing is."""
 
 

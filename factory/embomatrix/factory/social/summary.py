@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from embomatrix.factory.writer.words import Voice
 
 
-def instruction_of(conversation: Conversation, cast: Cast, view: SceneView, voice: Voice) -> str:
-    """One or two sentences. What the robot is to do are the conversation's last wishes, in their order."""
+def instruction_of(conversation: Conversation, cast: Cast, view: SceneView, voice: Voice, why: str) -> str:
+    """One or two sentences. What the robot is to do are the conversation's last wishes, in their order; ``why`` is a clause."""
     slot = conversation.slot
     who = cast.of(slot.person)
     others = [person.name for person in cast.people if person.name != who.name]
@@ -32,4 +32,5 @@ def instruction_of(conversation: Conversation, cast: Cast, view: SceneView, voic
         job=who.job,
         age=str(who.age),
         hobby=who.hobby,
+        why=why,
     )

@@ -5,12 +5,13 @@ from __future__ import annotations
 import dataclasses
 import zlib
 from collections import Counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from embomatrix.factory.social.casting import GrammarRolePlayer
-from embomatrix.factory.social.conversing import GrammarConversation, Scenario, starting_slots
+from embomatrix.factory.social.conversing import GrammarConversation, Scenario
+from embomatrix.factory.social.fitting import best_slot, why_of
 from embomatrix.factory.social.phrases import CLAUSES, WHERE
 from embomatrix.factory.social.summary import instruction_of
 from embomatrix.factory.social.transcript import transcript_of
@@ -19,12 +20,20 @@ from embomatrix.factory.writer.tasks import Draft, draft_of, pieces_of
 from embomatrix.factory.writer.words import FreshVoice
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from embomatrix.factory.social.casting import RolePlayingAgent
-    from embomatrix.factory.social.values import Cast
+    from embomatrix.factory.social.values import Cast, DaySlot
+    from embomatrix.factory.writer.goals import Piece
     from embomatrix.factory.writer.variant import Variant
     from embomatrix.factory.writer.view import SceneView
     from embomatrix.world.scene import Scene
     from embomatrix.world.task import TaskCategory
+
+SAME_WISHES: Final = 2
+"""Wishes of one kind in one variant: a third person who wants a sink running is one too many."""
+GOALS_TRIED: Final = 10
+"""Goals that are looked at for one task: somebody must want it."""
 
 
 class SocialWriter:
@@ -59,17 +68,41 @@ class SocialWriter:
     ) -> Draft | None:
         """What somebody who is in one of the variant's rooms on this day comes to ask for."""
         cast = self.cast_of(variant.scene)
-        voice = FreshVoice(rng, self._said_in(variant))
+        said = self._said_in(variant)
+        voice = FreshVoice(rng, said)
         shop = Workshop(view, variant, rng, phrases=CLAUSES, where=WHERE, voice=voice)
-        pieces = pieces_of(shop, category)
-        if not pieces:
+        chosen = _scenario(cast, shop, category, said)
+        if chosen is None:
             return None
-        about = {view.room(name) for piece in pieces for name in piece.objects}
-        slot = starting_slots(cast, tuple(about), rng)[0]
+        pieces, slot = chosen.pieces, chosen.slot
+        said.update((slot.person, slot.activity, _wish_of(pieces)))
         used = frozenset(name for piece in pieces for name in piece.objects)
-        talk = GrammarConversation(
-            Scenario(cast, slot, tuple(pieces)), dataclasses.replace(shop, used=used), voice
-        ).run()
-        instruction = instruction_of(talk, cast, view, voice)
+        talk = GrammarConversation(chosen, dataclasses.replace(shop, used=used), voice).run()
+        instruction = instruction_of(talk, cast, view, voice, chosen.why)
         transcript = transcript_of(cast, talk, instruction, pieces)
         return draft_of(shop, category, task_id, pieces, instruction, transcript)
+
+
+def _wish_of(pieces: Sequence[Piece]) -> str:
+    """The kind of a goal: nobody asks for the same again while there is something else to ask for."""
+    return " ".join(sign for piece in pieces for sign in piece.signs)
+
+
+def _scenario(cast: Cast, shop: Workshop, category: TaskCategory, said: Counter[str]) -> Scenario | None:
+    """Of some goals that the scene allows, that which suits best somebody's day; None where nobody would wish for any.
+
+    The clauses of goals that are not taken count as said: so the words stay fresh for whatever is tried next.
+    """
+    best: tuple[float, tuple[Piece, ...], DaySlot] | None = None
+    for _ in range(GOALS_TRIED):
+        pieces = tuple(pieces_of(shop, category))
+        found = best_slot(cast, pieces, shop.view, said) if pieces else None
+        if found is None or said[_wish_of(pieces)] >= SAME_WISHES:
+            continue
+        score, slot = found[0] - said[_wish_of(pieces)], found[1]
+        if best is None or score > best[0]:
+            best = (score, pieces, slot)
+    if best is None:
+        return None
+    _, pieces, slot = best
+    return Scenario(cast, slot, pieces, FreshVoice(shop.rng, said).choose(why_of(slot.activity)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Final, TypeVar
 
 from embomatrix.factory.admission import Admitted, admit
 from embomatrix.factory.pipeline.poses import Needs, cache_poses
@@ -28,6 +28,18 @@ if TYPE_CHECKING:
     from embomatrix.world.scene import Scene
 
 
+OF_THE_PROBLEM: Final = frozenset(
+    {
+        RefusalReason.UNKNOWN_TYPE,
+        RefusalReason.SUBSTANCE,
+        RefusalReason.INEXPRESSIBLE,
+        RefusalReason.ROOM_AS_OBJECT,
+        RefusalReason.AGENT_IN_GOAL,
+    }
+)
+"""Reasons that are the same in every scene."""
+
+
 @dataclass(frozen=True, slots=True)
 class Verified:
     """An imported task that was admitted, with its bundle."""
@@ -49,17 +61,24 @@ def bind_first(
 def imports(
     source: SourceText, bases: Sequence[Scene], *, seed: int, manner: Manner
 ) -> Iterator[Imported | Refusal]:
-    """The problem in each scene as it is, then, where the manner says so, in each with the furniture that it lacks."""
+    """The problem in each scene as it is, then, where the manner says so, in each with the furniture that it lacks.
+
+    The scene that it was written for comes first; once no scene would do, none is looked at further.
+    """
+    order = sorted(bases, key=lambda base: base.base != source.scene)
     for furnishing in (False, True) if manner.furnishing else (False,):
-        for base in bases:
-            yield import_problem(source, base, seed=seed, manner=replace(manner, furnishing=furnishing))
+        for base in order:
+            outcome = import_problem(source, base, seed=seed, manner=replace(manner, furnishing=furnishing))
+            yield outcome
+            if isinstance(outcome, Refusal) and outcome.reason in OF_THE_PROBLEM:
+                return
 
 
 def verify_first(
     source: SourceText,
     bases: Sequence[Scene],
     library: PlacementLibrary,
-    foresight: Foresight,
+    foresight: Foresight | None,
     *,
     seed: int = 0,
     manner: Manner | None = None,
@@ -90,9 +109,9 @@ def _first(outcomes: Iterable[T | Refusal]) -> T | Refusal:
 
 
 def verify(
-    imported: Imported, library: PlacementLibrary, foresight: Foresight, *, seed: int = 0
+    imported: Imported, library: PlacementLibrary, foresight: Foresight | None, *, seed: int = 0
 ) -> Verified | Refusal:
-    """Judge an imported task by execution, and pack it when it is admitted."""
+    """Judge an imported task by execution, and pack it when it is admitted. Without ``foresight`` the arm is not asked."""
     needs = Needs(imported.about, imported.task.table)
     poses = cache_poses(SceneView(imported.scene), [needs], library, foresight, seed)
     with contextlib.closing(Simulator(Bundle(imported.scene, {}, poses))) as stage:

@@ -7,12 +7,12 @@ are covered, filled or soaked with. Objects that are still to come are the halve
 
 from __future__ import annotations
 
-import difflib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.refusal import RefusalReason, RefusedError
-from embomatrix.factory.task_import.reach import FUTURE, HELD, INSOURCE, Horizon, pieces_of
+from embomatrix.factory.task_import.expressible import AGENT, FLOORS, check_evaluable, check_expressible
+from embomatrix.factory.task_import.reach import pieces_of
 from embomatrix.factory.task_import.search import needs_of, search
 from embomatrix.factory.writer.view import SceneView
 from embomatrix.world.bddl import is_room_instance
@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from embomatrix.world.goal import Atom
     from embomatrix.world.scene import Scene
 
-FLOORS: Final = frozenset({"floor.n.01"})
-AGENT: Final = "agent.n.01"
 PLACING: Final = (Relation.INSIDE, Relation.ONTOP, Relation.UNDER, Relation.NEXTTO)
 """Relations by which ``:init`` places an object, the most telling first."""
 
@@ -70,12 +68,20 @@ class Binding:
     robot_room: str
 
 
-def bind(problem: Problem, scene: Scene, rng: np.random.Generator, *, furnishing: bool = True) -> Binding:
+def bind(
+    problem: Problem,
+    scene: Scene,
+    rng: np.random.Generator,
+    *,
+    furnishing: bool = True,
+    reachable: bool = True,
+) -> Binding:
     """Find the problem's objects in the scene. Raises RefusedError with the first thing that can't be bound.
 
     Furniture that its rooms lack is to be added when ``furnishing``, as the paper's factory does; else that is a refusal.
+    A goal that no skill reaches is a refusal when it is to be ``reachable``.
     """
-    check_expressible(problem)
+    (check_expressible if reachable else check_evaluable)(problem)
     inroom = {
         item.atom.args[0]: item.atom.args[1]
         for item in problem.init
@@ -99,13 +105,6 @@ def bind(problem: Problem, scene: Scene, rng: np.random.Generator, *, furnishing
     return Binding(problem, found, floors, additions, rooms, _robot_room(problem, placed, floors, scene))
 
 
-def check_expressible(problem: Problem) -> None:
-    """Raise RefusedError for what no scene could hold and no skill could reach, whatever the scene."""
-    _check_types(problem)
-    _check_goal(problem)
-    _check_start(problem)
-
-
 def _spelt_out(problem: Problem, view: SceneView, rooms: Mapping[str, str], found: dict[str, str]) -> Problem:
     """The problem with wildcards replaced by all further objects of the type in the room, which are added to ``found``."""
     catalog = Catalog.load()
@@ -123,85 +122,6 @@ def _spelt_out(problem: Problem, view: SceneView, rooms: Mapping[str, str], foun
         members[wildcard] = tuple(f"{type_name}_{declared + 1 + n}" for n in range(len(others)))
         found |= zip(members[wildcard], others, strict=True)
     return problem.spelt_out(members)
-
-
-def _check_types(problem: Problem) -> None:
-    catalog = Catalog.load()
-    for name, type_name in problem.objects.items():
-        if type_name == AGENT or type_name in FLOORS:
-            continue
-        if not catalog.has_synset(type_name):
-            raise RefusedError(
-                RefusalReason.UNKNOWN_TYPE,
-                f"type {type_name!r} of {name!r} is in no catalog{_close_synsets(type_name)}",
-            )
-        if not is_substance(type_name) and not catalog.categories_of(type_name):
-            raise RefusedError(RefusalReason.UNKNOWN_TYPE, f"no category has a model of type {type_name!r}")
-
-
-def _close_synsets(type_name: str) -> str:
-    catalog = Catalog.load()
-    synsets = sorted({catalog.synset_of(category) for category in catalog.category_names})
-    close = difflib.get_close_matches(type_name, synsets, n=3, cutoff=0.6)
-    return f": did you mean {', '.join(close)}?" if close else ""
-
-
-def _check_goal(problem: Problem) -> None:
-    obstacle = Horizon(problem).obstacle(problem.goal)
-    if obstacle is not None:
-        solid = not any(
-            is_substance(_type(problem, arg)) for atom in atoms_of(obstacle) for arg in atom.args[:1]
-        )
-        raise RefusedError(
-            RefusalReason.INEXPRESSIBLE if solid else RefusalReason.SUBSTANCE,
-            f"the goal asks for {render(obstacle)}, which no skill brings about",
-        )
-    for atom in atoms_of(problem.goal):
-        _check_goal_args(problem, atom)
-
-
-def _check_start(problem: Problem) -> None:
-    pieces = {half for halves in pieces_of(problem).values() for half in halves}
-    for item in problem.init:
-        predicate, args = item.atom.predicate, item.atom.args
-        if item.positive and predicate not in HELD | {INSOURCE}:
-            raise RefusedError(
-                RefusalReason.INEXPRESSIBLE,
-                f"the start asks for {predicate!r}, which the world does not hold",
-            )
-        if predicate in set(Relation) and any(is_substance(_type(problem, arg)) for arg in args):
-            raise RefusedError(
-                RefusalReason.SUBSTANCE, f"the start asks for {render(item.atom)}: a substance has no place"
-            )
-        if predicate == FUTURE and args[0] not in pieces and not is_substance(_type(problem, args[0])):
-            raise RefusedError(
-                RefusalReason.INEXPRESSIBLE,
-                f"{args[0]!r} is to come, and no skill makes it: only halves are made",
-            )
-        for arg in args[: 1 if predicate == Relation.INROOM else 2]:
-            _check_no_room(problem, arg)
-
-
-def _type(problem: Problem, arg: str) -> str:
-    """Type of an object, or of a bound variable that is called by it, ``?water.n.06``."""
-    return problem.objects.get(arg, arg.lstrip("?"))
-
-
-def _check_goal_args(problem: Problem, atom: Atom) -> None:
-    objects = atom.args[:1] if atom.predicate == Relation.INROOM else atom.args
-    for arg in objects:
-        if arg.startswith("?"):
-            continue
-        _check_no_room(problem, arg)
-        if problem.objects[arg] == AGENT:
-            raise RefusedError(RefusalReason.AGENT_IN_GOAL, "the goal is about where the robot stands")
-
-
-def _check_no_room(problem: Problem, arg: str) -> None:
-    if arg not in problem.objects and is_room_instance(arg):
-        raise RefusedError(
-            RefusalReason.ROOM_AS_OBJECT, f"{arg!r} is a room and stands where an object should"
-        )
 
 
 def _placements(problem: Problem) -> dict[str, tuple[Relation, str]]:

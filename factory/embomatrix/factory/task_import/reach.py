@@ -7,10 +7,11 @@ or it is so from the start. What no skill does and the start does not hold makes
 from __future__ import annotations
 
 import functools
+import itertools
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.world.catalog import Catalog
-from embomatrix.world.evaluate import atoms_of, substitute
+from embomatrix.world.evaluate import atoms_of, render, substitute
 from embomatrix.world.goal import (
     And,
     Atom,
@@ -38,7 +39,7 @@ from embomatrix.world.substances import (
 from embomatrix.world.task import Profile
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
 
     from embomatrix.world.bddl import Problem
 
@@ -70,11 +71,50 @@ def pieces_of(problem: Problem) -> Mapping[str, tuple[str, ...]]:
     return found
 
 
-class Horizon:
-    """What can become of the objects of one problem."""
+def unreachable_atoms(problem: Problem, profile: Profile) -> tuple[str, ...]:
+    """Literals of the goal that no skill of the profile can make hold, in BDDL, each once.
 
-    def __init__(self, problem: Problem) -> None:
+    A literal about a variable counts when that is so for all that the variable ranges over.
+    """
+    horizon = Horizon(problem, profile)
+    found = [
+        render(atom if positive else Not(atom))
+        for atom, positive, scope in _literals(problem.goal, True, {})
+        if not any(
+            horizon.possible(substitute(atom, dict(zip(scope, names, strict=True))), positive)
+            for names in itertools.product(*(problem.types[type_name] for type_name in scope.values()))
+        )
+    ]
+    return tuple(dict.fromkeys(found))
+
+
+def _literals(
+    formula: Formula, positive: bool, scope: Mapping[str, str]
+) -> Iterator[tuple[Atom, bool, Mapping[str, str]]]:
+    """Atoms with their sign, and the types of the variables that they name."""
+    match formula:
+        case Atom(_, args):
+            yield formula, positive, {name: kind for name, kind in scope.items() if name in args}
+        case Not(body):
+            yield from _literals(body, not positive, scope)
+        case And(parts) | Or(parts):
+            for part in parts:
+                yield from _literals(part, positive, scope)
+        case Imply(premise, conclusion):
+            yield from _literals(premise, not positive, scope)
+            yield from _literals(conclusion, positive, scope)
+        case Forall(variable, kind, body) | Exists(variable, kind, body) | ForN(_, variable, kind, body):
+            yield from _literals(body, positive, {**scope, variable: kind})
+        case ForPairs(a, kind_a, b, kind_b, body) | ForNPairs(_, a, kind_a, b, kind_b, body):
+            yield from _literals(body, positive, {**scope, a: kind_a, b: kind_b})
+
+
+class Horizon:
+    """What can become of the objects of one problem by the skills of a profile."""
+
+    def __init__(self, problem: Problem, profile: Profile = Profile.HOUSEHOLD) -> None:
         self._problem = problem
+        self._profile = profile
         self._true = {_meaning(item.atom, problem) for item in problem.init if item.positive}
         self._pieces = pieces_of(problem)
         self._halves = {half for halves in self._pieces.values() for half in halves}
@@ -153,7 +193,7 @@ class Horizon:
     def _changes(self, atom: Atom) -> tuple[bool, bool]:
         """Whether skills can make the atom true, and whether they can make it false."""
         predicate, name = atom.predicate, atom.args[0]
-        if is_substance(self._type(name)):
+        if is_substance(self._type(name)) or (self._profile is Profile.PAPER and predicate in HOUSEHOLD):
             return False, False
         if predicate in set(Relation):
             solid = predicate == Relation.INROOM or not is_substance(self._type(atom.args[1]))

@@ -7,10 +7,16 @@ import importlib.util
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+
+
+EAI: Final = "eai"
+EAI_FOLDER: Final = "behavior_eval"
+EAI_PROBLEMS: Final = "evaluation/transition_modeling/resources/pddl_behavior"
+EAI_INSTRUCTIONS: Final = "evaluation/goal_interpretation/resources/data/instructions_by_activity_name.json"
 
 
 class SourceError(ValueError):
@@ -19,12 +25,16 @@ class SourceError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class SourceText:
-    """One problem as text. ``request`` is what a person says, empty where the problem's own name says it."""
+    """One problem as text. ``request`` is what a person says, empty where the problem's own name says it.
+
+    ``scene`` is the base scene that it was written for, empty where any will do.
+    """
 
     name: str
     text: str
     source: str
     request: str = ""
+    scene: str = ""
 
 
 def activity_names() -> tuple[str, ...]:
@@ -58,6 +68,36 @@ def read_jsonl(path: Path) -> Iterator[SourceText]:
         except (ValueError, KeyError, TypeError) as error:
             raise SourceError(f"{path}:{number}: expected an object with 'name' and 'bddl'") from error
         yield SourceText(str(name), str(text), "embomatrix")
+
+
+def read_eai(folder: Path) -> tuple[SourceText, ...]:
+    """The tasks of EAI's BEHAVIOR split, from the package's folder ``behavior_eval`` or the one that holds it.
+
+    ``onfloor`` is what BEHAVIOR-100 calls being on a floor. Raises SourceError when the folder lacks its files.
+    """
+    root = folder / EAI_FOLDER if (folder / EAI_FOLDER).is_dir() else folder
+    try:
+        stats = json.loads(_read(root / "data" / "demo_stats.json"))
+        words = json.loads(_read(root / EAI_INSTRUCTIONS))
+        return tuple(
+            SourceText(
+                name=demo["task"],
+                text=_in_our_bddl(_read(root / EAI_PROBLEMS / f"{name}.pddl")),
+                source=EAI,
+                request=words[demo["task"]],
+                scene=demo["scene_id"],
+            )
+            for name, demo in sorted(stats.items())
+        )
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise SourceError(
+            f"{folder} holds no tasks of EAI ({error!r}): unpack the wheel of eai-eval 1.0.5 and name the folder that holds "
+            f"{EAI_FOLDER}"
+        ) from error
+
+
+def _in_our_bddl(text: str) -> str:
+    return text.replace("(onfloor ", "(ontop ").replace(" home_office)", " private_office)")
 
 
 def _read(path: Path) -> str:

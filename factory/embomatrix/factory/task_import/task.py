@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import itertools
 import math
@@ -17,13 +18,15 @@ from embomatrix.factory.layout.generator import lay
 from embomatrix.factory.layout.jobs import Item
 from embomatrix.factory.layout.values import LayoutRelation
 from embomatrix.factory.refusal import Refusal, RefusalReason, RefusedError
-from embomatrix.factory.task_import.binding import AGENT, FLOORS, bind
+from embomatrix.factory.task_import.binding import bind
+from embomatrix.factory.task_import.dialects import read_problem
+from embomatrix.factory.task_import.expressible import AGENT, FLOORS
 from embomatrix.factory.task_import.reach import FUTURE, INSOURCE, REAL, pieces_of, profile_for
 from embomatrix.factory.task_import.scene import with_robot_in, with_states
 from embomatrix.factory.task_import.search import serves
 from embomatrix.factory.writer.tasks import object_table
 from embomatrix.factory.writer.view import SceneView, is_liftable
-from embomatrix.world.bddl import ROOM_TYPES, Literal, is_room_instance, parse_problem
+from embomatrix.world.bddl import ROOM_TYPES, Literal, is_room_instance
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.evaluate import atoms_of, objects_of, render, substitute, types_of
 from embomatrix.world.goal import Atom
@@ -74,6 +77,8 @@ class Imported:
     """The problem's objects, by their names in the scene."""
     rooms: tuple[str, ...]
     signature: str
+    notes: tuple[str, ...] = ()
+    """What was read into the problem, and which furniture was added to the scene for it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,17 +87,20 @@ class Manner:
 
     lay: Lay = lay
     furnishing: bool = True
+    reachable: bool = True
+    """Whether a goal that no skill reaches is refused; else it must only be told whether it holds."""
 
 
 def import_problem(
     source: SourceText, base: Scene, *, seed: int = 0, manner: Manner | None = None
 ) -> Imported | Refusal:
     """Bind a problem to a base scene and lay out what the scene lacks. Raises BddlError when the text can't be read."""
-    problem = parse_problem(source.text)
+    problem, notes = read_problem(source)
     digest = hashlib.sha256(f"{seed} {base.scene_id} {source.text}".encode()).digest()
     rng = np.random.default_rng(np.random.SeedSequence(list(digest[:8])))
     try:
-        return _Binder(source, problem, base, rng, digest.hex()[:6], manner or Manner()).imported()
+        imported = _Binder(source, problem, base, rng, digest.hex()[:6], manner or Manner()).imported()
+        return dataclasses.replace(imported, notes=(*notes, *imported.notes))
     except RefusedError as error:
         return error.refusal
 
@@ -124,7 +132,10 @@ class _Binder:
         """Objects, and types that variables range over, on or in which something is or is to be."""
 
     def imported(self) -> Imported:
-        binding = bind(self._problem, self._base, self._rng, furnishing=self._manner.furnishing)
+        manner = self._manner
+        binding = bind(
+            self._problem, self._base, self._rng, furnishing=manner.furnishing, reachable=manner.reachable
+        )
         self._problem = binding.problem
         editor = SceneEditor(self._base)
         names = {**binding.found, **self._laid(editor, binding)}
@@ -259,7 +270,13 @@ class _Binder:
             profile=profile_for(goal),
         )
         rooms = tuple(sorted({view.room(name) for name in about}))
-        return Imported(scene, task, start, tuple(names.values()), rooms, signature_of(goal, view))
+        added = tuple(
+            f"{self._base.base} lacks {each.type}: {names[each.name]} was added to {view.room(names[each.name])}"
+            for each in binding.additions
+            if view.item(names[each.name]).fixed
+        )
+        signature = signature_of(goal, view)
+        return Imported(scene, task, start, tuple(names.values()), rooms, signature, added)
 
     def _start(self, names: dict[str, str], binding: Binding) -> tuple[Literal, ...]:
         """``:init`` in the scene's names, without the floors that are no objects, the robot, and what is not the case.

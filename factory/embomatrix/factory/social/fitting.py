@@ -1,0 +1,247 @@
+"""Which wishes a person would have: what they do decides, and where people keep such things."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.factory.social.occasions import Occasion, Theme, occasion_of
+from embomatrix.factory.writer.tables import MEMBERS, Group
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from embomatrix.factory.social.values import Cast, DaySlot
+    from embomatrix.factory.writer.goals import Piece
+    from embomatrix.factory.writer.view import SceneView
+
+_GROUP_OF: Final[Mapping[str, Group]] = {
+    category: group for group, members in MEMBERS.items() for category in members
+}
+
+
+def _themes(words: str) -> frozenset[Theme]:
+    return frozenset(map(Theme, words.split()))
+
+
+GROUP_THEMES: Final[Mapping[Group, frozenset[Theme]]] = {
+    Group.FOOD: _themes("cooking meals stock guests"),
+    Group.FRUIT: _themes("cooking meals stock guests"),
+    Group.TABLEWARE: _themes("cooking meals guests"),
+    Group.PACKAGES: _themes("cooking meals stock guests screens"),
+    Group.BOOKS: _themes("reading papers sleep tidying"),
+    Group.TOYS: _themes("play tidying"),
+    Group.DEVICES: _themes("screens papers leaving tidying"),
+    Group.OFFICE: _themes("papers teaching tidying"),
+    Group.TOILETRIES: _themes("washing"),
+    Group.DECORATION: _themes("guests tidying leaving"),
+}
+"""What somebody has in mind who wants a thing of the group elsewhere."""
+
+_KITCHEN: Final = frozenset(
+    {"kitchen", "bar", "break_room", "pantry_room", "dining_room", "garden", "grocery_store"}
+)
+_EATING: Final = _KITCHEN | {"living_room", "television_room"}
+_WASHING: Final = frozenset(
+    {
+        "bathroom",
+        "spa",
+        "locker_room",
+        "bedroom",
+        "closet",
+        "utility_room",
+        "infirmary",
+        "hammam",
+        "sauna",
+        "gym",
+    }
+)
+GROUP_ROOMS: Final[Mapping[Group, frozenset[str]]] = {
+    Group.FOOD: _EATING,
+    Group.FRUIT: _EATING | {"private_office", "shared_office", "meeting_room", "lobby"},
+    Group.PACKAGES: _EATING | {"storage_room", "private_office", "shared_office", "meeting_room", "lobby"},
+    Group.TOILETRIES: _WASHING,
+}
+"""Types of rooms that people take things of a group to; of the groups that are not listed, to any."""
+ONLY_IN_KITCHENS: Final = frozenset({"chopping_board", "frying_pan", "saucepan"})
+NOT_NAMED: Final = frozenset({"eyeglasses"})
+"""Words that take a plural verb, which the sentences have not."""
+NOT_ON_SOFT: Final = frozenset(
+    {Group.DECORATION, Group.TABLEWARE, Group.FOOD, Group.FRUIT, Group.PACKAGES, Group.OFFICE}
+)
+SOFT: Final = frozenset({"bed", "sofa", "armchair", "ottoman", "carpet", "hospital_bed"})
+SEATS: Final = frozenset(
+    {"straight_chair", "swivel_chair", "taboret", "stool", "folding_chair", "bench", "booth", "bar_stool"}
+)
+BASINS: Final = frozenset(
+    {
+        "furniture_sink",
+        "pedestal_sink",
+        "commercial_kitchen_sink",
+        "sink",
+        "wall_mounted_sink",
+        "drop_in_sink",
+        "tabletop_sink",
+    }
+)
+COLD: Final = frozenset({"fridge", "freezer", "cooler", "wine_fridge", "display_fridge", "grocery_fridge"})
+OVENS: Final = frozenset({"oven", "microwave", "toaster_oven"})
+HOBS: Final = frozenset({"stove", "flat_top_grill", "burner", "charcoal_grill"})
+_INTO_BASINS: Final = frozenset(
+    {
+        *MEMBERS[Group.FRUIT],
+        *MEMBERS[Group.TABLEWARE],
+        "sponge",
+        "hand_towel",
+        "bar_soap",
+        "broccoli",
+        "carrot",
+        "potato",
+    }
+)
+_PANS: Final = frozenset({"frying_pan", "saucepan"})
+FOR_DRINKS: Final = frozenset({"coffee_maker", "espresso_machine"})
+"""They are hot, and nobody cooks with them."""
+NOT_COOKED: Final = frozenset({"avocado", "lemon", "orange", "bagel", "croissant"})
+
+SWITCHES: Final[Mapping[str, frozenset[Theme]]] = {
+    **dict.fromkeys(
+        (
+            "wall_mounted_tv",
+            "standing_tv",
+            "laptop",
+            "monitor",
+            "desktop_computer",
+            "gaming_controller",
+            "projection_screen",
+        ),
+        _themes("screens papers guests teaching"),
+    ),
+    **dict.fromkeys(
+        ("jukebox", "radio", "loudspeaker", "standing_loudspeaker", "headset"),
+        _themes("screens guests meals play"),
+    ),
+    **dict.fromkeys(BASINS | {"bathtub", "shower_stall"}, _themes("washing cooking laundry")),
+    **dict.fromkeys(
+        (*OVENS, *HOBS, "range_hood", "coffee_maker", "dishwasher", "toaster", "deep_fryer"),
+        _themes("cooking meals"),
+    ),
+    **dict.fromkeys((*COLD, "popcorn_machine", "espresso_machine"), _themes("cooking meals stock guests")),
+    **dict.fromkeys(
+        ("table_lamp", "floor_lamp", "desk_lamp"), _themes("reading sleep papers leaving guests")
+    ),
+    **dict.fromkeys(("washer", "clothes_dryer", "hamper"), _themes("laundry leaving")),
+    **dict.fromkeys(
+        ("printer", "photocopier", "desk_phone", "calculator", "shredder", "cell_phone"),
+        _themes("papers leaving"),
+    ),
+    **dict.fromkeys(("digital_camera", "electric_fan", "air_conditioner"), _themes("guests leaving sleep")),
+    **dict.fromkeys(("wardrobe", "locker", "suitcase"), _themes("leaving tidying laundry")),
+    "checkout_counter": _themes("stock"),
+    "grandfather_clock": _themes("guests"),
+}
+"""What somebody has in mind who wants such a thing opened or switched."""
+NEVER: Final = frozenset(
+    {
+        "fire_extinguisher",
+        "pay_phone",
+        "wall_mounted_soap_dispenser",
+        "soap_dispenser",
+        "vending_machine",
+        "toilet",
+        "urinal",
+        "alarm_clock",
+        "paper_towel_dispenser",
+        "cash_register",
+        "public_trash_can",
+        "trash_can",
+        "water_cooler",
+    }
+)
+"""Nobody asks a robot to open or to switch these."""
+STORAGE_THEMES: Final[Mapping[str, frozenset[Theme]]] = {
+    **dict.fromkeys(_KITCHEN, _themes("cooking meals tidying stock guests")),
+    **dict.fromkeys(
+        ("private_office", "shared_office", "meeting_room", "copy_room", "classroom"),
+        _themes("papers tidying teaching"),
+    ),
+    **dict.fromkeys(_WASHING, _themes("washing leaving tidying")),
+}
+_PLAIN: Final = _themes("tidying leaving")
+
+
+def fits(piece: Piece, view: SceneView, slot: DaySlot) -> bool:
+    """Whether somebody who does this would wish for that, for a slot that the grammar made."""
+    occasion = occasion_of(slot.activity)
+    return occasion is not None and bool(themes_of(piece, view) & occasion.themes)
+
+
+def themes_of(piece: Piece, view: SceneView) -> frozenset[Theme]:
+    """What a wish can be for; nothing for what no person would ask for."""
+    thing = view.category(piece.objects[0])
+    if thing in NOT_NAMED:
+        return frozenset()
+    if piece.kind == "thermal":
+        warmed = any(sign.startswith(("cooked", "hot")) for sign in piece.signs)
+        by_coffee = any(view.category(name) in FOR_DRINKS for name in piece.objects)
+        return frozenset() if by_coffee or (warmed and thing in NOT_COOKED) else _themes("cooking meals")
+    room_type = _room_type(view, piece.objects[0])
+    if piece.kind == "switch":
+        if thing in NEVER:
+            return frozenset()
+        return SWITCHES.get(thing, STORAGE_THEMES.get(room_type, _PLAIN))
+    places = piece.objects[1:]
+    inside = any(sign.startswith("inside") for sign in piece.signs)
+    if not places or not is_plausible(
+        thing, view.category(places[0]), _room_type(view, places[0]), inside=inside
+    ):
+        return frozenset()
+    return GROUP_THEMES.get(_GROUP_OF[thing], _PLAIN) if thing in _GROUP_OF else _PLAIN
+
+
+def is_plausible(thing: str, host: str, room_type: str, *, inside: bool) -> bool:
+    """Whether a person would put a thing of the category on or in such a host in such a room."""
+    group = _GROUP_OF.get(thing)
+    if group is not None and room_type not in GROUP_ROOMS.get(group, {room_type}):
+        return False
+    if thing in ONLY_IN_KITCHENS and room_type not in _KITCHEN:
+        return False
+    if host in SEATS or host in SOFT:
+        return host in SOFT and group not in NOT_ON_SOFT
+    if host in BASINS:
+        return inside and thing in _INTO_BASINS
+    if host in COLD:
+        return not inside or group in {Group.FOOD, Group.FRUIT, Group.PACKAGES}
+    if host in OVENS:
+        return not inside or group is Group.FOOD or thing in _PANS
+    return host not in HOBS or thing in _PANS
+
+
+def best_slot(
+    cast: Cast, pieces: Sequence[Piece], view: SceneView, asked: Mapping[str, int]
+) -> tuple[float, DaySlot] | None:
+    """The slot of the day in which somebody would wish for all of it, with a score; None where nobody would.
+
+    Somebody who is where the things are counts more, and so does who has asked for less until now.
+    """
+    rooms = [[view.room(name) for name in piece.objects] for piece in pieces]
+    found: list[tuple[float, DaySlot]] = []
+    for slot in cast.day:
+        if not all(fits(piece, view, slot) for piece in pieces):
+            continue
+        here = sum(slot.room in each for each in rooms) / len(pieces)
+        owned = sum(bool({*each} & {*cast.of(slot.person).rooms}) for each in rooms) / len(pieces)
+        if here or owned:
+            found.append(
+                (2 * here + owned - 0.5 * asked.get(slot.person, 0) - asked.get(slot.activity, 0), slot)
+            )
+    return max(found, key=lambda item: item[0]) if found else None
+
+
+def why_of(activity: str) -> tuple[str, ...]:
+    """Reasons to want help with something else; none where the grammar does not know the activity."""
+    occasion: Occasion | None = occasion_of(activity)
+    return occasion.why if occasion is not None else ()
+
+
+def _room_type(view: SceneView, name: str) -> str:
+    return {room.name: room.type for room in view.scene.rooms}.get(view.room(name), "")

@@ -1,0 +1,204 @@
+"""What problems of other worlds call things, in the words of the catalog; and what they leave unsaid, said.
+
+A word that the catalog's package has renamed is read as the new one. A word for a whole group of things (a table, a book)
+stands for a thing of the group that the catalog has models of, the first that the problem does not name already: what
+quantifiers range over stays the same.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import re
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.factory.task_import.expressible import FLOORS
+from embomatrix.factory.task_import.reach import FUTURE
+from embomatrix.factory.task_import.sources import EAI
+from embomatrix.world.bddl import Literal, is_room_instance, parse_problem
+from embomatrix.world.evaluate import map_atoms
+from embomatrix.world.goal import Atom
+from embomatrix.world.state import Relation
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from embomatrix.factory.task_import.sources import SourceText
+    from embomatrix.world.bddl import Problem
+
+
+RENAMED: Final[Mapping[str, tuple[str, ...]]] = {
+    "cupboard.n.01": ("cabinet.n.01",),
+    "burner.n.02": ("stove.n.01",),
+    "bar.n.02": ("countertop.n.01",),
+    "butternut_squash.n.01": ("butternut_squash.n.02",),
+    "shelf_shelf.n.01": ("shelf.n.01",),
+    "duffel_bag.n.01": ("backpack.n.01", "shoulder_bag.n.01"),
+}
+"""Words of the paper's tasks that bddl 3.6 has under another synset, or, of the duffel bag, no more."""
+
+GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
+    **RENAMED,
+    "alarm.n.02": ("alarm_clock.n.01",),
+    "apparel.n.01": ("sweatshirt.n.01", "dress.n.01"),
+    "ball.n.01": ("tennis_ball.n.01", "baseball.n.02"),
+    "basket.n.01": ("wicker_basket.n.01", "basket.n.03"),
+    "beef.n.02": ("steak.n.01",),
+    "beer.n.01": ("beer_bottle.n.01",),
+    "beverage.n.01": ("bottle__of__water.n.01", "bottle__of__milk.n.01"),
+    "bin.n.01": ("ashcan.n.01", "recycling_bin.n.01"),
+    "book.n.02": ("hardback.n.01", "paperback_book.n.01"),
+    "bottle.n.01": ("bottle__of__water.n.01", "bottle__of__milk.n.01"),
+    "box.n.01": ("carton.n.02", "packing_box.n.02"),
+    "bread.n.01": ("sour_bread.n.01", "baguet.n.01"),
+    "brush.n.02": ("scrub_brush.n.01", "hairbrush.n.01"),
+    "cake.n.03": ("chocolate_cake.n.01", "fruitcake.n.02"),
+    "candle.n.01": ("pillar_candle.n.01", "dip.n.07"),
+    "candy.n.01": ("hard_candy.n.01", "candy_cane.n.01"),
+    "catsup.n.01": ("bottle__of__catsup.n.01",),
+    "cereal.n.03": ("box__of__cereal.n.01",),
+    "chair.n.01": ("straight_chair.n.01", "swivel_chair.n.01"),
+    "cheese.n.01": ("cheesecake.n.01", "cheese_tart.n.01"),
+    "cleansing_agent.n.01": ("bottle__of__cleaner.n.01", "bottle__of__detergent.n.01"),
+    "cookie.n.01": ("butter_cookie.n.01", "chocolate_chip_cookie.n.01"),
+    "cracker.n.01": ("box__of__crackers.n.01",),
+    "cube.n.05": ("toy_dice.n.01",),
+    "cup.n.01": ("coffee_cup.n.01", "mug.n.04"),
+    "detergent.n.02": ("bottle__of__detergent.n.01",),
+    "dish.n.01": ("plate.n.04", "bowl.n.01"),
+    "document.n.01": ("legal_document.n.01",),
+    "dryer.n.01": ("clothes_dryer.n.01",),
+    "earphone.n.01": ("headset.n.01",),
+    "fish.n.02": ("trout.n.01", "salmon.n.03"),
+    "flour.n.01": ("bag__of__flour.n.01",),
+    "food.n.01": ("canned_food.n.01", "can__of__corn.n.01"),
+    "food.n.02": ("canned_food.n.01", "can__of__corn.n.01"),
+    "fork.n.01": ("tablefork.n.01",),
+    "highlighter.n.02": ("marker.n.03",),
+    "jar.n.01": ("hinged_jar.n.01",),
+    "jewelry.n.01": ("necklace.n.01", "bracelet.n.02"),
+    "juice.n.01": ("bottle__of__apple_juice.n.01", "bottle__of__lemon_juice.n.01"),
+    "knife.n.01": ("table_knife.n.01", "carving_knife.n.01"),
+    "lamp.n.02": ("table_lamp.n.01",),
+    "makeup.n.01": ("lipstick.n.01",),
+    "meat.n.01": ("virginia_ham.n.01", "steak.n.01"),
+    "melon.n.01": ("watermelon.n.02",),
+    "milk.n.01": ("carton__of__milk.n.01",),
+    "oatmeal.n.01": ("box__of__oatmeal.n.01",),
+    "pad.n.01": ("notepad.n.01",),
+    "pan.n.01": ("frying_pan.n.01",),
+    "pasta.n.02": ("pasta__box.n.01",),
+    "perfume.n.02": ("bottle__of__perfume.n.01",),
+    "piece_of_cloth.n.01": ("rag.n.01", "dishtowel.n.01"),
+    "plaything.n.01": ("toy_figure.n.01", "toy_car.n.01"),
+    "pool.n.01": ("wading_pool.n.01",),
+    "pop.n.02": ("bottle__of__pop.n.01",),
+    "receptacle.n.01": ("storage_container.n.01",),
+    "sandwich.n.01": ("club_sandwich.n.01",),
+    "sauce.n.01": ("bottle__of__barbecue_sauce.n.01", "bottle__of__hot_sauce.n.01"),
+    "saw.n.02": ("ripsaw.n.01",),
+    "seat.n.03": ("straight_chair.n.01", "bench.n.01"),
+    "shampoo.n.01": ("bottle__of__shampoo.n.01",),
+    "shirt.n.01": ("dress_shirt.n.01",),
+    "shower.n.01": ("shower_stall.n.01",),
+    "shoe.n.01": ("gym_shoe.n.01", "baby_shoe.n.01"),
+    "snack_food.n.01": ("bag__of__snacks.n.01",),
+    "soap.n.01": ("bar_soap.n.01",),
+    "soup.n.01": ("bottle__of__soup.n.01",),
+    "spoon.n.01": ("tablespoon.n.02", "teaspoon.n.02"),
+    "stocking.n.01": ("christmas_stocking.n.01", "sock.n.01"),
+    "sugar.n.01": ("granulated_sugar__sack.n.01",),
+    "sunglass.n.01": ("sunglasses.n.02",),
+    "sweater.n.01": ("sweatshirt.n.01",),
+    "table.n.02": ("breakfast_table.n.01", "coffee_table.n.01"),
+    "tomato.n.01": ("beefsteak_tomato.n.01",),
+    "toothpaste.n.01": ("tube__of__toothpaste.n.01",),
+    "towel.n.01": ("hand_towel.n.01", "bath_towel.n.01"),
+    "underwear.n.01": ("brassiere.n.01", "sock.n.01"),
+    "vegetable_oil.n.01": ("bottle__of__cooking_oil.n.01",),
+    "vehicle.n.01": ("car.n.01",),
+    "vessel.n.03": ("bowl.n.01",),
+    "water.n.06": ("bottle__of__water.n.01",),
+    "window.n.01": ("openable_window.n.01",),
+    "wrapping.n.01": ("wrapping_paper.n.01",),
+    "yogurt.n.01": ("cup__of__yogurt.n.01",),
+}
+"""Words of BEHAVIOR-100, in which EAI's tasks are written: groups, and foods and liquids that are things there, packed here."""
+_TYPE: Final = re.compile(r"(?<![\w.])([a-z_\-]+\.n\.\d+)(?![\d_])", re.IGNORECASE)
+
+
+@functools.lru_cache(maxsize=16)
+def read_problem(source: SourceText) -> tuple[Problem, tuple[str, ...]]:
+    """The problem of a source in the words of the catalog, whole, and what was read into it. Raises BddlError."""
+    text, replaced = in_catalog_words(source.text, GROUPS if source.source == EAI else RENAMED)
+    problem, added = said_whole(parse_problem(text))
+    return problem, (*replaced, *added)
+
+
+def in_catalog_words(text: str, words: Mapping[str, tuple[str, ...]]) -> tuple[str, tuple[str, ...]]:
+    """BDDL with types replaced by what they stand for, and a sentence for each replacement. Names of objects stay."""
+    found = dict.fromkeys(name.lower() for name in _TYPE.findall(text))
+    chosen: dict[str, str] = {}
+    for name in found:
+        options = words.get(name, ())
+        free = [other for other in options if other not in found and other not in chosen.values()]
+        if free:
+            chosen[name] = free[0]
+    notes = tuple(f"{name} is read as {other}" for name, other in chosen.items())
+    return _TYPE.sub(lambda match: chosen.get(match[1].lower(), match[1]), text), notes
+
+
+def said_whole(problem: Problem) -> tuple[Problem, tuple[str, ...]]:
+    """The problem with what it leaves unsaid, and a sentence for each addition.
+
+    A room in the place of a host is the room that the thing is in. A floor whose room is not told is the floor of the room
+    of what stands on it.
+    """
+    notes: list[str] = []
+    problem = _rooms_as_rooms(problem, notes)
+    return _placed(problem, notes), tuple(notes)
+
+
+def _rooms_as_rooms(problem: Problem, notes: list[str]) -> Problem:
+    def read(atom: Atom) -> Atom:
+        host = atom.args[-1]
+        names_room = host not in problem.objects and is_room_instance(host)
+        if len(atom.args) == 2 and atom.predicate in (Relation.ONTOP, Relation.INSIDE) and names_room:
+            notes.append(f"({atom.predicate} {atom.args[0]} {host}) is read as being in the room")
+            return Atom(Relation.INROOM.value, atom.args)
+        return atom
+
+    init = tuple(Literal(read(item.atom), item.positive) for item in problem.init)
+    return dataclasses.replace(problem, init=init, goal=map_atoms(problem.goal, read))
+
+
+def _placed(problem: Problem, notes: list[str]) -> Problem:
+    known = {
+        item.atom.args[0]: item.atom.args[1]
+        for item in problem.init
+        if item.positive and item.atom.predicate == Relation.INROOM
+    }
+    rests = {
+        item.atom.args[0]: item.atom.args[1]
+        for item in problem.init
+        if item.positive
+        and len(item.atom.args) == 2
+        and item.atom.predicate in set(Relation) - {Relation.INROOM}
+    }
+    if not known:
+        return problem
+    added: list[Literal] = []
+
+    def put(name: str, room: str) -> None:
+        known[name] = room
+        added.append(Literal(Atom(Relation.INROOM.value, (name, room))))
+        notes.append(f"of {name} no room is told: it is taken to be that of {room}")
+
+    first = next(iter(known.values()))
+    for name, type_name in problem.objects.items():
+        if type_name in FLOORS and name not in known:
+            above = next(
+                (known[thing] for thing, host in rests.items() if host == name and thing in known), first
+            )
+            put(name, above)
+    return dataclasses.replace(problem, init=(*problem.init, *added)) if added else problem

@@ -1,0 +1,115 @@
+"""What became of imported problems, for programs and for people: what could not be bound and why, what was read into them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+from embomatrix.factory.evaluate.figures import Evaluation, Figure
+from embomatrix.factory.refusal import Refusal
+from embomatrix.factory.task_import.batch import Verified
+from embomatrix.factory.task_import.dialects import read_problem
+from embomatrix.factory.task_import.reach import unreachable_atoms
+from embomatrix.world.task import Profile
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from embomatrix.factory.task_import.sources import SourceText
+    from embomatrix.factory.task_import.task import Imported
+
+FIGURES: Final[Mapping[str, tuple[str, float]]] = {
+    "embomatrix": ("import_rate_sample", 0.97),
+    "behavior-1k": ("import_rate_behavior", 0.6),
+    "eai": ("import_rate_eai", 1.0),
+}
+"""Figure and goal by source."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """One problem. ``scene`` is the base scene that it is bound to; empty, with reason and sentence, where it is refused.
+
+    ``unreachable`` are the goal's literals that no skill makes hold, by profile; ``notes`` what was read into the problem.
+    """
+
+    name: str
+    source: str
+    scene: str
+    reason: str
+    sentence: str
+    unreachable: Mapping[str, tuple[str, ...]]
+    notes: tuple[str, ...]
+
+    @property
+    def is_bound(self) -> bool:
+        return not self.reason
+
+
+def outcome_of(source: SourceText, judged: Imported | Verified | Refusal) -> Outcome:
+    """What is told of a problem. Raises BddlError where the source is no BDDL."""
+    problem, notes = read_problem(source)
+    unreachable = {profile.value: unreachable_atoms(problem, profile) for profile in Profile}
+    if isinstance(judged, Refusal):
+        return Outcome(
+            source.name, source.source, "", judged.reason.value, judged.sentence, unreachable, notes
+        )
+    if isinstance(judged, Verified):
+        scene = judged.record.task.scene_id.split("-")[0]
+        return Outcome(source.name, source.source, scene, "", "", unreachable, notes)
+    return Outcome(source.name, source.source, judged.scene.base, "", "", unreachable, judged.notes)
+
+
+def report_to_json(outcomes: Sequence[Outcome]) -> dict[str, Any]:
+    """Plain JSON values: counts by outcome, then every problem."""
+    return {
+        "problems": len(outcomes),
+        "bound": sum(outcome.is_bound for outcome in outcomes),
+        "refused": dict(Counter(outcome.reason for outcome in outcomes if outcome.reason).most_common()),
+        "outcomes": [dataclasses.asdict(outcome) for outcome in outcomes],
+    }
+
+
+def report_to_markdown(outcomes: Sequence[Outcome]) -> str:
+    """The same for a reader: counts, what is refused and why, then what each profile can't reach, and what was read in."""
+    bound = sum(outcome.is_bound for outcome in outcomes)
+    lines = ["# Imported problems", "", f"{bound} of {len(outcomes)} are bound to a scene.", ""]
+    refused = Counter(outcome.reason for outcome in outcomes if outcome.reason)
+    if refused:
+        lines += ["| refused | problems |", "| --- | ---: |"]
+        lines += [f"| {reason} | {count} |" for reason, count in refused.most_common()]
+        lines += ["", "## Refused", ""]
+        lines += [f"* `{each.name}` ({each.reason}): {each.sentence}" for each in outcomes if each.reason]
+        lines += [""]
+    for profile in Profile:
+        short = [outcome for outcome in outcomes if outcome.unreachable[profile.value]]
+        lines += [
+            f"## Goals that the profile `{profile.value}` does not reach: {len(short)}",
+            "",
+            *(
+                f"* `{each.name}`: {', '.join(f'`{atom}`' for atom in each.unreachable[profile.value])}"
+                for each in short
+            ),
+            "",
+        ]
+    read = [outcome for outcome in outcomes if outcome.notes]
+    lines += [f"## Read into problems: {len(read)}", ""]
+    lines += [f"* `{each.name}`: {'; '.join(each.notes)}" for each in read]
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def evaluation_of(outcomes: Sequence[Outcome], seed: int) -> Evaluation:
+    """Import rates by source, and how many goals each profile reaches."""
+    figures: list[Figure] = []
+    for source, (name, goal) in FIGURES.items():
+        mine = [outcome for outcome in outcomes if outcome.source == source]
+        if not mine:
+            continue
+        n = len(mine)
+        figures.append(Figure(name, sum(each.is_bound for each in mine) / n, "", n, "higher", goal))
+        for profile in Profile:
+            reached = sum(not each.unreachable[profile.value] for each in mine)
+            figures.append(Figure(f"{name} reached by {profile.value}", reached / n, "", n))
+    return Evaluation("imports", {"seed": seed}, tuple(figures))

@@ -1,0 +1,67 @@
+"""How the factory's commands talk: progress with the time that is left, and what a person can mend in one sentence."""
+
+from __future__ import annotations
+
+import contextlib
+from typing import TYPE_CHECKING, NoReturn
+
+import typer
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+from embomatrix.factory.evaluate.figures import EvaluationError
+from embomatrix.factory.task_import.sources import SourceError
+from embomatrix.llm.values import LlmError
+from embomatrix.sim.engine import EngineMissingError
+from embomatrix.world.catalog import CatalogError
+from embomatrix.world.dataset import DatasetError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+
+def progress(console: Console) -> Progress:
+    """Bars with how much is done, since when, and how long it will take yet."""
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        console=console,
+    )
+
+
+@contextlib.contextmanager
+def mended(out: Path | None = None, kept: str = "") -> Iterator[None]:
+    """What a person can mend is one sentence and exit status 2, an interrupt one and 130.
+
+    ``out`` is what is written, ``kept`` what an interrupt leaves in it.
+    """
+    try:
+        yield
+    except (CatalogError, DatasetError, EngineMissingError, EvaluationError, LlmError, SourceError) as error:
+        fail(str(error))
+    except OSError as error:
+        if out is None:
+            raise
+        fail(f"{out} can't be written ({error.strerror}): make room, or name another{kept}")
+    except KeyboardInterrupt:
+        fail(f"interrupted{kept}", status=130)
+
+
+def fail(sentence: str, status: int = 2) -> NoReturn:
+    """The sentence on standard error, and the end of the command."""
+    Console(stderr=True).print(
+        f"embomatrix factory: {sentence}", highlight=False, markup=False, soft_wrap=True
+    )
+    raise typer.Exit(status) from None

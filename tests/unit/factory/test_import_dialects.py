@@ -1,0 +1,185 @@
+"""Problems of other worlds in the words of the catalog: renamed types, groups, what is left unsaid; EAI, and the report."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+from tests.fakes.scenes import kitchen_scene
+
+from embomatrix.factory.refusal import Refusal, RefusalReason
+from embomatrix.factory.task_import.batch import bind_first
+from embomatrix.factory.task_import.dialects import GROUPS, RENAMED, in_catalog_words, said_whole
+from embomatrix.factory.task_import.reach import unreachable_atoms
+from embomatrix.factory.task_import.report import (
+    evaluation_of,
+    outcome_of,
+    report_to_json,
+    report_to_markdown,
+)
+from embomatrix.factory.task_import.sources import (
+    EAI_INSTRUCTIONS,
+    EAI_PROBLEMS,
+    SourceError,
+    SourceText,
+    read_eai,
+)
+from embomatrix.factory.task_import.task import Imported, Manner, import_problem
+from embomatrix.world.bddl import Literal, parse_formula, parse_problem
+from embomatrix.world.catalog import Catalog
+from embomatrix.world.goal import Atom
+from embomatrix.world.scene import Scene
+from embomatrix.world.task import Profile
+
+PROBLEM = """(define (problem Put_the_apples_in_the_fridge_in_kitchen_0)
+    (:domain omnigibson)
+    (:objects
+        apple.n.01_1 apple.n.01_2 - apple.n.01
+        electric_refrigerator.n.01_1 - electric_refrigerator.n.01
+        breakfast_table.n.01_1 - breakfast_table.n.01
+        floor.n.01_1 - floor.n.01
+        agent.n.01_1 - agent.n.01
+    )
+    (:init
+        (ontop apple.n.01_1 breakfast_table.n.01_1)
+        (ontop apple.n.01_2 breakfast_table.n.01_1)
+        (inroom electric_refrigerator.n.01_1 kitchen)
+        (inroom breakfast_table.n.01_1 kitchen)
+        (open electric_refrigerator.n.01_1)
+        (inroom floor.n.01_1 kitchen)
+        (ontop agent.n.01_1 floor.n.01_1)
+    )
+    (:goal
+        (and
+            (forall (?apple.n.01 - apple.n.01) (inside ?apple.n.01 ?electric_refrigerator.n.01_1))
+            (not (open ?electric_refrigerator.n.01_1))
+        )
+    )
+)
+"""
+
+
+def source(text: str = PROBLEM) -> SourceText:
+    return SourceText("apples", text, "file")
+
+
+@pytest.fixture(scope="module")
+def home() -> Scene:
+    return kitchen_scene()
+
+
+EVALUABLE = Manner(reachable=False)
+
+
+def test_renamed_types_are_read_as_what_the_catalog_calls_them() -> None:
+    text, notes = in_catalog_words(PROBLEM.replace("breakfast_table.n.01", "cupboard.n.01"), RENAMED)
+    assert "cupboard.n.01_1 - cabinet.n.01" in text
+    assert notes == ("cupboard.n.01 is read as cabinet.n.01",)
+
+
+def test_a_group_stands_for_a_type_that_the_problem_does_not_name_already() -> None:
+    text = "hardback.n.01_1 - hardback.n.01 book.n.02_1 - book.n.02"
+    assert (
+        in_catalog_words(text, GROUPS)[0]
+        == "hardback.n.01_1 - hardback.n.01 book.n.02_1 - paperback_book.n.01"
+    )
+
+
+def test_every_word_is_read_as_types_that_have_models() -> None:
+    catalog = Catalog.load()
+    for options in GROUPS.values():
+        for name in options:
+            assert catalog.has_synset(name), name
+            assert catalog.categories_of(name), name
+
+
+def test_what_a_problem_leaves_unsaid_is_said() -> None:
+    text = PROBLEM.replace("(ontop apple.n.01_2 breakfast_table.n.01_1)", "(inside apple.n.01_2 closet_1)")
+    problem, notes = said_whole(parse_problem(text))
+    assert Literal(Atom("inroom", ("apple.n.01_2", "closet_1"))) in problem.init
+    assert notes == ("(inside apple.n.01_2 closet_1) is read as being in the room",)
+    assert said_whole(problem) == (problem, ())
+
+
+def test_a_floor_without_a_room_is_that_of_what_stands_on_it() -> None:
+    text = PROBLEM.replace("(inroom floor.n.01_1 kitchen)", "(inroom apple.n.01_1 kitchen) (ontop apple.n.01_1 floor.n.01_1)")
+    problem, notes = said_whole(parse_problem(text))
+    assert Literal(Atom("inroom", ("floor.n.01_1", "kitchen"))) in problem.init
+    assert len(notes) == 1
+
+
+def test_a_goal_that_no_skill_reaches_is_bound_where_it_need_only_be_told(flat: Scene) -> None:
+    item = source(PROBLEM.replace("(not (open ?electric_refrigerator.n.01_1))", "(sliced ?breakfast_table.n.01_1)"))
+    refused = import_problem(item, flat)
+    assert isinstance(refused, Refusal)
+    assert refused.reason is RefusalReason.INEXPRESSIBLE
+    assert isinstance(import_problem(item, flat, manner=EVALUABLE), Imported)
+    folded = import_problem(source(PROBLEM.replace("(not (open ?", "(not (folded ?")), flat, manner=EVALUABLE)
+    assert isinstance(folded, Refusal)
+
+
+def test_atoms_beyond_a_profile_are_listed_with_their_sign() -> None:
+    problem = parse_problem(PROBLEM)
+    goal = parse_formula(
+        "(and (sliced apple.n.01_1) (forall (?a - apple.n.01) (not (folded ?a))) (ontop apple.n.01_2 breakfast_table.n.01_1))",
+        problem.objects,
+    )
+    problem = dataclasses.replace(problem, goal=goal)
+    assert unreachable_atoms(problem, Profile.PAPER) == ("(sliced apple.n.01_1)", "(not (folded ?a))")
+    assert unreachable_atoms(problem, Profile.HOUSEHOLD) == ("(not (folded ?a))",)
+
+
+EAI_PROBLEM = """(define (problem toys_0) (:domain igibson)
+    (:objects plaything.n.01_1 - plaything.n.01 table.n.02_1 - table.n.02 floor.n.01_1 - floor.n.01 agent.n.01_1 - agent.n.01)
+    (:init (onfloor plaything.n.01_1 floor.n.01_1) (dusty table.n.02_1) (inroom table.n.02_1 living_room)
+        (inroom floor.n.01_1 living_room) (onfloor agent.n.01_1 floor.n.01_1))
+    (:goal (and (forall (?plaything.n.01 - plaything.n.01) (ontop ?plaything.n.01 ?table.n.02_1))
+        (not (dusty table.n.02_1)))))"""
+
+
+@pytest.fixture
+def eai(tmp_path: Path) -> Path:
+    """A folder like that of the unpacked wheel, with one task."""
+    root = tmp_path / "behavior_eval"
+    files = {
+        "data/demo_stats.json": json.dumps(
+            {"toys_0_Rs_int": {"task": "toys", "task_id": 0, "scene_id": "Rs_int"}}
+        ),
+        f"{EAI_INSTRUCTIONS}": json.dumps({"toys": "Put the toys on the dusted table."}),
+        f"{EAI_PROBLEMS}/toys_0_Rs_int.pddl": EAI_PROBLEM,
+    }
+    for name, text in files.items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text(text)
+    return tmp_path
+
+
+def test_eai_s_tasks_are_bound_to_the_scene_that_they_were_written_for(
+    eai: Path, flat: Scene, home: Scene
+) -> None:
+    (item,) = read_eai(eai)
+    imported = bind_first(item, [home, flat], manner=EVALUABLE)
+    assert isinstance(imported, Imported)
+    assert imported.scene.base == "Rs_int"
+    assert imported.task.instruction == "Put the toys on the dusted table."
+    outcome = outcome_of(item, imported)
+    assert outcome.unreachable == {"paper": ("(not (dusty table.n.02_1))",), "household": ()}
+    assert "plaything.n.01 is read as toy_figure.n.01" in outcome.notes
+
+
+def test_the_report_counts_refusals_and_lists_what_no_skill_reaches(eai: Path, flat: Scene) -> None:
+    (item,) = read_eai(eai)
+    bound = outcome_of(item, bind_first(item, [flat], manner=EVALUABLE))
+    refused = outcome_of(item, Refusal(RefusalReason.DOES_NOT_FIT, "no room"))
+    told = report_to_json([bound, refused])
+    assert (told["problems"], told["bound"], told["refused"]) == (2, 1, {"does_not_fit": 1})
+    text = report_to_markdown([bound, refused])
+    assert "* `toys` (does_not_fit): no room" in text
+    assert "## Goals that the profile `paper` does not reach: 2" in text
+    rate = evaluation_of([bound, refused], 0).figure("import_rate_eai")
+    assert (rate.value, rate.goal, rate.n) == (0.5, 1.0, 2)
+
+
+def test_a_folder_without_eai_s_files_is_one_sentence(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match=r"can't be read|holds no tasks of EAI"):
+        read_eai(tmp_path)
