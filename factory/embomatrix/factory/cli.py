@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,7 +13,10 @@ from rich.table import Table
 
 from embomatrix.factory.assets_cli import app as assets_app
 from embomatrix.factory.evaluate.cli import app as evaluate_app
-from embomatrix.factory.pipeline.build import Summary, build_dataset
+from embomatrix.factory.export import card, encoded, export_rows
+from embomatrix.factory.inspection.cli import app as inspect_app
+from embomatrix.factory.pipeline.build import Check, Summary, build_dataset
+from embomatrix.factory.pipeline.cluster import ClusterJudge
 from embomatrix.factory.pipeline.settings import BuildSettings, WriterKind, scene_ids
 from embomatrix.factory.social.asking import Asked, asked_writer
 from embomatrix.factory.task_import.cli import app as import_app
@@ -20,6 +24,7 @@ from embomatrix.factory.terminal import fail, mended, progress
 from embomatrix.llm.ledger import Price
 from embomatrix.world.dataset import Dataset
 from embomatrix.world.task import TaskCategory
+from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:
     from embomatrix.factory.writer.tasks import TaskWriter
@@ -31,6 +36,7 @@ app = typer.Typer(
 app.add_typer(assets_app, name="assets")
 app.add_typer(evaluate_app, name="evaluate")
 app.add_typer(import_app)
+app.add_typer(inspect_app)
 MOST_JOBS = 8
 """Each holds some scenes: a few hundred MB."""
 
@@ -91,17 +97,31 @@ def generate(
     price: Annotated[
         tuple[float, float], typer.Option(help="Of a million tokens, in and out, for the account.")
     ] = (0.0, 0.0),
+    manager: Annotated[
+        str,
+        typer.Option(help="HOST:PORT of a manager, on whose slots the oracle's plans are executed as well."),
+    ] = "",
+    token: Annotated[str, typer.Option(envvar="EMBOMATRIX_TOKEN", help="Token for it.")] = "",
+    ca: Annotated[Path | None, typer.Option(envvar="EMBOMATRIX_CA", help="Its ca.pem.")] = None,
 ) -> None:
     """Play the people of each scene, and make tasks of what they come to ask the robot for; keep what they said."""
     names = scene_ids(scenes)
-    if not llm and cassette is None:
-        _make(out, BuildSettings(tasks, heldout, seed, names, WriterKind.SOCIAL, look_ahead), jobs=jobs)
-        return
+    kind = WriterKind.MODEL if llm or cassette is not None else WriterKind.SOCIAL
     if llm and not model:
         fail("--llm needs the name of a model there: give --model")
-    asked = Asked(llm, model, key, cassette, Price(*price), out / "ledger.jsonl")
-    with mended(out), asked_writer(asked) as (writer, ledger):
-        _make(out, BuildSettings(tasks, heldout, seed, names, WriterKind.MODEL, look_ahead), writer)
+    settings = BuildSettings(tasks, heldout, seed, names, kind, look_ahead)
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(mended(out))
+        check: Check | None = None
+        if manager:
+            trusted = ca.read_bytes() if ca is not None else b""
+            check = stack.enter_context(ClusterJudge(manager, token, trusted)).check
+        if kind is WriterKind.SOCIAL:
+            _make(out, settings, jobs=jobs, check=check)
+            return
+        asked = Asked(llm, model, key, cassette, Price(*price), out / "ledger.jsonl")
+        writer, ledger = stack.enter_context(asked_writer(asked))
+        _make(out, settings, writer, check=check)
         _print_account(ledger)
 
 
@@ -121,7 +141,11 @@ def _print_account(ledger: Ledger) -> None:
 
 
 def _make(
-    out: Path, settings: BuildSettings, writer: TaskWriter | None = None, jobs: int | None = None
+    out: Path,
+    settings: BuildSettings,
+    writer: TaskWriter | None = None,
+    jobs: int | None = None,
+    check: Check | None = None,
 ) -> None:
     """A data set in the folder, with progress and a summary."""
     console = Console()
@@ -137,6 +161,7 @@ def _make(
             lambda split, admitted: bars.update(tasks[split], completed=admitted),
             writer,
             jobs or min(MOST_JOBS, len(os.sched_getaffinity(0))),
+            check,
         )
         for split, bar in tasks.items():
             bars.update(bar, completed=summary.total(split))
@@ -145,7 +170,7 @@ def _make(
     for split, wanted in (("train", settings.train), ("heldout", settings.heldout)):
         if summary.total(split) < wanted:
             fail(
-                f"only {summary.total(split)} of {wanted} {split} tasks were admitted: see {out}/rejections.jsonl, "
+                f"only {summary.total(split)} of {wanted} {split} tasks were admitted: see {out}/attempts.jsonl, "
                 "or give more scenes"
             )
 
@@ -167,6 +192,22 @@ def list_(folder: Annotated[Path, typer.Argument(help="Folder of a dataset.")]) 
             task.instruction,
         )
     Console().print(table)
+
+
+@app.command()
+def export(
+    folder: Annotated[Path, typer.Argument(help="Folder of a dataset.")],
+    out: Annotated[Path, typer.Option(help="File to write, .jsonl or .parquet; the card goes beside it.")],
+) -> None:
+    """Write the tasks of a dataset for other tools, one row each, with a dataset card."""
+    with mended(out):
+        dataset = Dataset.load(folder)
+        data = encoded(export_rows(dataset), out.suffix)
+        write_whole(out, data)
+        write_whole(out.with_name("README.md"), card(dataset, out.name, data).encode("utf-8"))
+    Console().print(
+        f"{len(dataset.records)} tasks: {out}, card: {out.with_name('README.md')}", highlight=False
+    )
 
 
 def _print_summary(console: Console, summary: Summary) -> None:

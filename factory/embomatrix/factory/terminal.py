@@ -19,6 +19,7 @@ from rich.progress import (
 from embomatrix.factory.evaluate.figures import EvaluationError
 from embomatrix.factory.task_import.sources import SourceError
 from embomatrix.llm.values import LlmError
+from embomatrix.rpc.status import ClusterError
 from embomatrix.sim.engine import EngineMissingError
 from embomatrix.world.catalog import CatalogError
 from embomatrix.world.dataset import DatasetError
@@ -49,7 +50,15 @@ def mended(out: Path | None = None, kept: str = "") -> Iterator[None]:
     """
     try:
         yield
-    except (CatalogError, DatasetError, EngineMissingError, EvaluationError, LlmError, SourceError) as error:
+    except (
+        CatalogError,
+        ClusterError,
+        DatasetError,
+        EngineMissingError,
+        EvaluationError,
+        LlmError,
+        SourceError,
+    ) as error:
         fail(str(error))
     except OSError as error:
         if out is None:

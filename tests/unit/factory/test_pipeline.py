@@ -2,6 +2,8 @@
 
 import json
 import shutil
+from collections import Counter
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
@@ -9,11 +11,16 @@ from typer.testing import CliRunner
 
 from embomatrix.factory.cli import app
 from embomatrix.factory.pipeline.build import Summary, build_dataset, split_rooms
+from embomatrix.factory.pipeline.cluster import admitted_by
 from embomatrix.factory.pipeline.settings import BuildSettings, WriterKind
 from embomatrix.factory.pipeline.store import BuildStore
+from embomatrix.factory.pipeline.variants import VariantYield
+from embomatrix.factory.refusal import RefusalReason
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.writer.tasks import is_heldout_signature
+from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.reward.hierarchy import score
+from embomatrix.rpc.values import Completed, InfraCode, InfraFailure, Outcome, RolloutResult, Timings
 from embomatrix.sim.executor import Simulator
 from embomatrix.skills.parse import plan_from_json
 from embomatrix.world.dataset import Dataset, DatasetError
@@ -110,10 +117,36 @@ def test_build_file_without_settings_is_damaged(tmp_path: Path, content: str) ->
         BuildStore.open(tmp_path, {"seed": 2})
 
 
-def test_rejections_are_kept_with_their_reasons(folder: Path, summary: Summary) -> None:
-    lines = (folder / "rejections.jsonl").read_text().splitlines()
-    assert len(lines) == sum(summary.rejected.values())
-    assert all({"reason", "sentence", "goal"} <= set(json.loads(line)) for line in lines)
+def test_the_ledger_has_a_line_for_every_attempt_and_its_reason(folder: Path, summary: Summary) -> None:
+    lines = [json.loads(line) for line in (folder / "attempts.jsonl").read_text().splitlines()]
+    outcomes = Counter(line["outcome"] for line in lines)
+    assert outcomes.pop("admitted") == sum(summary.admitted.values())
+    assert outcomes == summary.rejected
+    assert all("task" in line if line["outcome"] == "admitted" else line["sentence"] for line in lines)
+
+
+def test_a_ledger_that_lost_its_end_is_whole_again_when_the_build_is_taken_up(
+    folder: Path, tmp_path: Path
+) -> None:
+    whole = (folder / "attempts.jsonl").read_text()
+    shutil.copy(folder / "build.jsonl", tmp_path)
+    (tmp_path / "attempts.jsonl").write_text(whole[: len(whole) // 2])
+    BuildStore.open(tmp_path, json.loads((folder / "build.jsonl").read_text().splitlines()[0])["settings"])
+    assert (tmp_path / "attempts.jsonl").read_text() == whole
+
+
+def test_what_a_second_judge_refuses_is_not_kept(tmp_path: Path) -> None:
+    settings = BuildSettings(train=2, heldout=0, seed=4, scenes=("Rs_int",), look_ahead=False)
+    asked: list[str] = []
+
+    def strict(made: VariantYield) -> VariantYield:
+        asked.extend(record.task.task_id for record in made.result.records)
+        return replace(made, result=replace(made.result, records=made.result.records[1:]))
+
+    build_dataset(tmp_path, settings, check=strict)
+    kept = {record.task.task_id for record in Dataset.load(tmp_path).records}
+    assert asked[0] not in kept
+    assert kept < set(asked)
 
 
 def test_every_room_is_on_one_side_and_every_kind_with_two_rooms_on_both() -> None:
@@ -210,5 +243,29 @@ def test_several_processes_make_the_same_data_set_as_one(tmp_path):
     )
     for name, jobs in (("one", 1), ("two", 2)):
         build_dataset(tmp_path / name, settings, jobs=jobs)
-    for file in ("tasks.jsonl", "build.jsonl", "rejections.jsonl"):
+    for file in ("tasks.jsonl", "build.jsonl", "attempts.jsonl"):
         assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "two" / file).read_bytes()
+
+
+def test_the_cluster_keeps_what_its_slots_solve_and_says_what_the_others_earn(
+    folder: Path, summary: Summary
+) -> None:
+    first = BuildStore.open(folder, asdict(SETTINGS)).results[0]
+    made = VariantYield(first, b"", {})
+    tasks = [record.task.task_id for record in first.records]
+
+    def result(task_id: str, outcome: Outcome) -> RolloutResult:
+        return RolloutResult(task_id, task_id, 1, 1, outcome)
+
+    def earned(success: bool) -> Completed:
+        reward = RewardBreakdown(0.0, 0.0, float(success), (), success)
+        return Completed(reward, (), (), "", "w1", Timings(), warm=True)
+
+    results = {task_id: result(task_id, earned(success=number > 0)) for number, task_id in enumerate(tasks)}
+    left = admitted_by(made, results)
+    assert [record.task.task_id for record in left.result.records] == tasks[1:]
+    assert left.result.rejections[-1].reason is RefusalReason.ORACLE_FAILED
+    assert "worker w1" in left.result.rejections[-1].sentence
+    results[tasks[0]] = result(tasks[0], InfraFailure(InfraCode.WORKER_LOST, "gone"))
+    with pytest.raises(DatasetError, match="could not execute"):
+        admitted_by(made, results)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from collections import Counter, defaultdict
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -22,7 +23,7 @@ from embomatrix.world.dataset import write_dataset
 from embomatrix.world.task import TaskCategory
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from embomatrix.factory.pipeline.makers import Make
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
     from embomatrix.world.dataset import TaskRecord
     from embomatrix.world.scene import Scene
 
+Check = Callable[[VariantYield], VariantYield]
+"""A second judge: leaves of a variant what is to be kept, and adds its refusals."""
 ROUND: Final = 6
 """Variants of a round, at most."""
 VARIANTS_FOR: Final = 4
@@ -86,8 +89,11 @@ def build_dataset(
     progress: Callable[[str, int], None] = lambda _split, _admitted: None,
     writer: TaskWriter | None = None,
     jobs: int = 1,
+    check: Check | None = None,
 ) -> Summary:
     """Write a data set, or go on with one that was cut short. ``progress`` hears of each split's admitted tasks.
+
+    ``check`` is a second judge, who leaves of each variant what is to be kept: a cluster, say.
 
     ``writer`` stands in for the one that the settings name, in this process; ``jobs`` is the number of processes otherwise.
     Raises CatalogError for an unknown scene, DatasetError when the folder holds a build of other settings, or when a
@@ -107,12 +113,11 @@ def build_dataset(
                 if make is None:
                     make = stack.enter_context(makers(settings, writer, jobs))
                 for made in make(orders):
-                    filler.take(made)
+                    filler.take(made if check is None else check(made))
                     progress(split, filler.admitted)
             progress(split, filler.admitted)
     records = [record for result in store.results for record in result.records]
     write_dataset(folder, records, {})
-    store.write_rejections()
     return _summary(store, rooms)
 
 

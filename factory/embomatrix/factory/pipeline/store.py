@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 BUILD_FILE: Final = "build.jsonl"
-REJECTIONS_FILE: Final = "rejections.jsonl"
+ATTEMPTS_FILE: Final = "attempts.jsonl"
+"""The ledger: a line for every draft that was judged, with the reason where it was not admitted."""
 TRANSCRIPTS_FOLDER: Final = "transcripts"
 
 
@@ -79,7 +80,9 @@ class BuildStore:
                 f"{folder} holds a build of other settings ({_differences(found, wanted)}): give the same again, or choose "
                 "another folder"
             )
-        return BuildStore(folder, _whole(path, lines))
+        store = BuildStore(folder, _whole(path, lines))
+        store._write_attempts()
+        return store
 
     def has(self, split: str, number: int) -> bool:
         return any(result.split == split and result.number == number for result in self.results)
@@ -99,11 +102,44 @@ class BuildStore:
         with (self.folder / BUILD_FILE).open("a", encoding="utf-8") as file:
             file.write(json.dumps(_to_json(result)) + "\n")
         self.results.append(result)
+        with (self.folder / ATTEMPTS_FILE).open("a", encoding="utf-8") as file:
+            file.write(_attempt_lines(result))
 
-    def write_rejections(self) -> None:
-        lines = [json.dumps(asdict(item)) for result in self.results for item in result.rejections]
-        text = "".join(f"{line}\n" for line in lines)
-        write_whole(self.folder / REJECTIONS_FILE, text.encode("utf-8"))
+    def _write_attempts(self) -> None:
+        """The whole ledger, from what is known: a build that was cut short may lack its last lines."""
+        text = "".join(_attempt_lines(result) for result in self.results)
+        write_whole(self.folder / ATTEMPTS_FILE, text.encode("utf-8"))
+
+
+def _attempt_lines(result: VariantResult) -> str:
+    """A line for each draft of a variant: the admitted ones, then the others."""
+    lines: list[dict[str, str | int]] = [
+        {
+            "split": result.split,
+            "variant": result.number,
+            "scene": record.task.scene_id,
+            "category": record.task.category.value,
+            "instruction": record.task.instruction,
+            "goal": record.task.goal_bddl,
+            "outcome": "admitted",
+            "task": record.task.task_id,
+        }
+        for record in result.records
+    ]
+    lines += [
+        {
+            "split": result.split,
+            "variant": result.number,
+            "scene": item.scene,
+            "category": item.category,
+            "instruction": item.instruction,
+            "goal": item.goal,
+            "outcome": item.reason.value,
+            "sentence": item.sentence,
+        }
+        for item in result.rejections
+    ]
+    return "".join(json.dumps(line) + "\n" for line in lines)
 
 
 def _differences(found: object, wanted: Mapping[str, Any]) -> str:
@@ -123,7 +159,7 @@ def _whole(path: Path, lines: list[str]) -> list[VariantResult]:
             if number != len(lines) - 1:
                 raise DatasetError(f"{path}:{number + 2}: {error}; choose another folder") from error
             kept = path.read_text(encoding="utf-8").splitlines()[:-1]
-            path.write_text("".join(f"{item}\n" for item in kept), encoding="utf-8")
+            write_whole(path, "".join(f"{item}\n" for item in kept).encode("utf-8"))
     return results
 
 

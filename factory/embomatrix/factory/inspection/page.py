@@ -1,0 +1,176 @@
+"""One task as one HTML file that needs nothing else: what is asked and why, layout, objects, the oracle's plan step by step.
+
+All text of a dataset is foreign: it is escaped where it becomes HTML, and what the script reads is JSON that can't end its
+element.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import re
+from html import escape
+from importlib import resources
+from string import Template
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from PIL import Image
+
+from embomatrix.factory.inspection.plan_view import PlanView
+from embomatrix.sim.bullet.camera import render_oblique
+from embomatrix.world.evaluate import objects_of
+
+if TYPE_CHECKING:
+    from embomatrix.factory.inspection.playing import Moment, Show
+    from embomatrix.world.dataset import TaskRecord
+    from embomatrix.world.scene import Scene
+
+TEMPLATE: Final = "page.html"
+PICTURE_PX: Final = (960, 720)
+_STRONG: Final = re.compile(r"\*\*(.+?)\*\*")
+
+
+def task_page(
+    record: TaskRecord,
+    scene: Scene,
+    show: Show,
+    transcript: str = "",
+    tree: object = None,
+    picture: str = "",
+) -> str:
+    """The page. ``transcript`` is Markdown as the social agents leave it, ``tree`` a layout tree of nested lists and mappings,
+    ``picture`` HTML, as of `scene_picture`.
+    """
+    task = record.task
+    about = objects_of(task.goal, task.types)
+    things = list(show.moments[0].things_m)
+    rooms = {scene.by_name[name].room for name in task.table if name in scene.by_name} | {
+        scene.room_at(moment.robot_m) for moment in show.moments
+    }
+    view = PlanView(scene, rooms)
+    template = Template(
+        (resources.files("embomatrix.factory.inspection") / TEMPLATE).read_text(encoding="utf-8")
+    )
+    verdict = "reaches the goal" if show.success else "does not reach the goal"
+    return template.substitute(
+        title=escape(task.task_id),
+        instruction=escape(task.instruction),
+        facts=_facts(record),
+        goal=escape(task.goal_bddl),
+        plan=view.svg(about, things),
+        moments=_script_json([_moment_json(moment, view) for moment in show.moments]),
+        steps=_steps(show),
+        verdict=escape(f"The plan {verdict} and earns {show.reward:.2f}."),
+        final=_items(show.final),
+        transcript=_section("Transcript", transcript_html(transcript)) if transcript else "",
+        tree=_section("Layout tree", _tree(tree)) if tree else "",
+        objects=_object_rows(record, scene, about),
+        picture=_section("Picture", picture) if picture else "",
+    )
+
+
+def transcript_html(text: str) -> str:
+    """The Markdown of transcripts as HTML: headings, lists, paragraphs, strong words; anything else stays text."""
+    lines: list[str] = []
+    for block in re.split(r"\n\s*\n", text.strip()):
+        if block.startswith("# "):
+            continue  # the page has the instruction as its own heading
+        if block.startswith("## "):
+            lines.append(f"<h3>{_inline(block[3:])}</h3>")
+        elif block.startswith("* "):
+            lines.append(_list([_inline(item[2:]) for item in block.splitlines()]))
+        else:
+            lines.append(f"<p>{_inline(block)}</p>")
+    return "".join(lines)
+
+
+def _inline(text: str) -> str:
+    return _STRONG.sub(r"<strong>\1</strong>", escape(text))
+
+
+def _items(words: tuple[str, ...]) -> str:
+    return _list([escape(each) for each in words])
+
+
+def _list(items: list[str]) -> str:
+    return f"<ul>{''.join(f'<li>{item}</li>' for item in items)}</ul>"
+
+
+def _section(heading: str, body: str) -> str:
+    return f'<section id="{heading.lower().replace(" ", "-")}"><h2>{escape(heading)}</h2>{body}</section>'
+
+
+def _facts(record: TaskRecord) -> str:
+    task = record.task
+    found = {
+        "scene": task.scene_id,
+        "category": task.category.value.replace("_", " "),
+        "split": record.split,
+        "source": task.source,
+        "profile": task.profile.value,
+        "rooms": ", ".join(record.rooms),
+        "kind of goal": record.signature,
+    }
+    return "".join(
+        f"<div><dt>{escape(name)}</dt><dd>{escape(value)}</dd></div>" for name, value in found.items()
+    )
+
+
+def _steps(show: Show) -> str:
+    rows = [("start", "")] + [(moment.call, moment.said) for moment in show.moments[1:]]
+    return "".join(
+        f'<li><button type="button" data-step="{number}"><b>{escape(call)}</b><span>{escape(said)}</span></button></li>'
+        for number, (call, said) in enumerate(rows)
+    )
+
+
+def _object_rows(record: TaskRecord, scene: Scene, about: frozenset[str]) -> str:
+    rows = []
+    for number, name in enumerate(record.task.table):
+        item, asset = scene.by_name[name], scene.asset_of(name)
+        where = f"{item.relation.value} {item.host}" if item.host and item.relation else "on the floor"
+        size = " × ".join(f"{extent:.2f}" for extent in asset.size_m)
+        told = ", ".join(sorted(state.value for state in item.states))
+        if any(share > 0 for share in item.joints):
+            told = ", ".join(filter(None, (told, "open")))
+        cells = (str(number), name, item.room, where, size, f"{asset.mass_kg:.1f}", told)
+        row = "".join(f"<td>{escape(cell)}</td>" for cell in cells)
+        rows.append(f'<tr class="{"goal" if name in about else ""}">{row}</tr>')
+    return "".join(rows)
+
+
+def _tree(node: object) -> str:
+    """Nested mappings and lists as nested lists."""
+    if isinstance(node, dict):
+        return _list([f"{escape(str(name))}{_tree(inner)}" for name, inner in node.items()])
+    if isinstance(node, list):
+        return _list([_tree(inner) for inner in node])
+    return escape(str(node)) if node not in ("", None) else ""
+
+
+def scene_picture(scene: Scene) -> str:
+    """An oblique view as an element that holds it. Drawn at twice the size: Bullet's renderer leaves edges jagged."""
+    width, height = PICTURE_PX
+    pixels = np.asarray(render_oblique(scene, width_px=2 * width, height_px=2 * height))
+    picture = Image.fromarray(pixels).convert("RGB").resize(PICTURE_PX, Image.Resampling.LANCZOS)
+    data = io.BytesIO()
+    picture.save(data, "JPEG", quality=82)
+    encoded = base64.b64encode(data.getvalue()).decode("ascii")
+    return f'<img alt="the scene from above, at an angle" src="data:image/jpeg;base64,{encoded}">'
+
+
+def _moment_json(moment: Moment, view: PlanView) -> dict[str, Any]:
+    return {
+        "robot": [*view.at(*moment.robot_m), round(-np.degrees(moment.yaw))],
+        "held": list(moment.held),
+        "things": {name: view.at(*place) for name, place in moment.things_m.items()},
+        "active": list(moment.open_or_on),
+        "goal": [[words, holds] for words, holds in moment.goal],
+    }
+
+
+def _script_json(value: object) -> str:
+    """JSON inside a script element: nothing in it can close the element or open a comment."""
+    return json.dumps(value).replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")

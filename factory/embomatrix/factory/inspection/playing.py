@@ -1,0 +1,93 @@
+"""A plan executed call by call, with what is to be seen after each: where the robot is, what it carries, what moved."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from embomatrix.factory.admission import SEED
+from embomatrix.reward.hierarchy import score
+from embomatrix.sim.executor import Simulator
+from embomatrix.skills.describe import call_in_words
+from embomatrix.skills.parse import plan_from_json
+from embomatrix.world.evaluate import evaluate, render, scored_atoms
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from embomatrix.world.bundle import Bundle
+    from embomatrix.world.dataset import TaskRecord
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """The state after a call; the first moment, without a call, is the start.
+
+    ``things_m`` are the middles of the table's small things in the world, ``held`` what the hand carries, ``goal`` the goal's
+    atoms with whether each holds.
+    """
+
+    call: str
+    said: str
+    robot_m: tuple[float, float]
+    yaw: float
+    held: tuple[str, ...]
+    things_m: dict[str, tuple[float, float]]
+    open_or_on: tuple[str, ...]
+    goal: tuple[tuple[str, bool], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Show:
+    """The oracle's plan from start to end. ``final`` describes the end in words, ``reward`` what it earns."""
+
+    moments: tuple[Moment, ...]
+    final: tuple[str, ...]
+    reward: float
+    success: bool
+
+
+def play_oracle(record: TaskRecord, bundle: Bundle) -> Show:
+    """Execute the record's oracle plan in its bundle. Raises EngineError where the scene can't be loaded."""
+    task = record.task
+    plan = plan_from_json(list(record.oracle), task.profile)
+    with contextlib.closing(Simulator(bundle)) as simulator:
+        simulator.reset(task, SEED)
+        moments = [_moment(simulator, record, "", "")]
+        for call in plan:
+            step = simulator.run_step(call)
+            moments.append(_moment(simulator, record, call_in_words(call, task.table), step.message))
+            if not step.ok:
+                break
+        trace = simulator.execute(task, plan, SEED)
+        reward = score(task, trace.touched, simulator.facts)
+    return Show(tuple(moments), trace.final, reward.total, reward.success)
+
+
+def _moment(simulator: Simulator, record: TaskRecord, call: str, said: str) -> Moment:
+    world, task = simulator.world, record.task
+    return Moment(
+        call=call,
+        said=said,
+        robot_m=(world.robot.x_m, world.robot.y_m),
+        yaw=world.robot.yaw,
+        held=tuple(world.carried),
+        things_m=_things(simulator, task.table),
+        open_or_on=tuple(name for name in task.table if world.is_open(name) or world.is_on(name)),
+        goal=tuple(
+            (render(atom), evaluate(atom, simulator.facts, task.types))
+            for atom in scored_atoms(task.goal, task.types)
+        ),
+    )
+
+
+def _things(simulator: Simulator, table: Sequence[str]) -> dict[str, tuple[float, float]]:
+    world = simulator.world
+    found: dict[str, tuple[float, float]] = {}
+    for name in table:
+        if world.is_fixed(name) or not world.is_real(name):
+            continue
+        x, y, _ = world.engine.aabb(name).center_m
+        found[name] = (world.robot.x_m, world.robot.y_m) if name in world.carried else (x, y)
+    return found

@@ -1,0 +1,158 @@
+"""A task is shown on one page that needs nothing else, no text of a dataset becomes markup, and a dataset is exported whole."""
+
+import dataclasses
+import json
+import re
+from html.parser import HTMLParser
+
+import pytest
+from tests.fakes.datasets import write_kitchen_dataset
+from typer.testing import CliRunner
+
+from embomatrix.factory.cli import app
+from embomatrix.factory.export import FIELDS, card, encoded, export_rows
+from embomatrix.factory.inspection.page import task_page, transcript_html
+from embomatrix.factory.inspection.plan_view import PlanView
+from embomatrix.factory.inspection.playing import play_oracle
+from embomatrix.world.dataset import Dataset, DatasetError
+
+EVIL = '</script><script>alert(1)</script><b onclick="x">'
+
+
+class _Tags(HTMLParser):
+    """What a browser would make of a page: its elements, and the scripts that would run."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.tags, self.links, self.scripts = [], [], 0
+        self.feed(page)
+
+    def handle_starttag(self, tag, attrs):
+        values = dict(attrs)
+        self.tags.append(tag)
+        self.scripts += tag == "script" and values.get("type") != "application/json"
+        self.links += [values[name] for name in ("src", "href") if name in values]
+        assert not [name for name in values if name.startswith("on")]
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("shown")
+    write_kitchen_dataset(folder)
+    return Dataset.load(folder)
+
+
+@pytest.fixture(scope="module")
+def shown(dataset):
+    record = dataset.records[0]
+    bundle = dataset.bundle(record.bundle_digest)
+    return record, bundle.scene, play_oracle(record, bundle)
+
+
+def test_the_oracle_is_played_from_the_start_to_the_goal(shown):
+    record, _, show = shown
+    assert len(show.moments) == len(record.oracle) + 1
+    assert show.success
+    assert not all(holds for _, holds in show.moments[0].goal)
+    assert all(holds for _, holds in show.moments[-1].goal)
+    assert len({moment.robot_m for moment in show.moments}) > 1
+
+
+def test_the_page_needs_nothing_else_and_shows_every_step_and_object(shown):
+    record, scene, show = shown
+    page = task_page(record, scene, show)
+    tags = _Tags(page)
+    assert all(link.startswith("data:") for link in tags.links)
+    assert tags.scripts == 1
+    assert tags.tags.count("svg") == 1
+    assert page.count("data-step=") == len(show.moments)
+    moments = json.loads(re.search(r'id="moments">(.*?)</script>', page, re.DOTALL)[1])
+    assert len(moments) == len(show.moments)
+    for name in record.task.table:
+        assert f"<td>{name}</td>" in page
+
+
+def test_no_text_of_a_dataset_becomes_markup(shown):
+    record, scene, show = shown
+    task = dataclasses.replace(record.task, instruction=EVIL, goal_bddl=EVIL, task_id=EVIL)
+    evil = dataclasses.replace(record, task=task, signature=EVIL, rooms=(EVIL,))
+    moments = tuple(
+        dataclasses.replace(moment, call=EVIL, said=EVIL, goal=((EVIL, True),)) for moment in show.moments
+    )
+    loud = dataclasses.replace(show, moments=moments, final=(EVIL,))
+    page = task_page(
+        evil, scene, loud, transcript=f"# x\n\n## {EVIL}\n\n* **{EVIL}**\n\n{EVIL}", tree={EVIL: [EVIL]}
+    )
+    tags = _Tags(page)
+    assert tags.scripts == 1
+    assert "<b onclick" not in page
+    assert "alert(1)</script>" not in page
+
+
+def test_a_transcript_keeps_its_headings_lists_and_strong_words():
+    text = "# Instruction\n\n## The people\n\n* **Mia**, 40\n* **Hugo**, 9\n\n**Mia** (need): I can't.\n"
+    assert transcript_html(text) == (
+        "<h3>The people</h3><ul><li><strong>Mia</strong>, 40</li><li><strong>Hugo</strong>, 9</li></ul>"
+        "<p><strong>Mia</strong> (need): I can&#x27;t.</p>"
+    )
+
+
+def test_the_plan_is_north_up_and_holds_all_of_its_rooms(shown):
+    _, scene, _ = shown
+    view = PlanView(scene, [room.name for room in scene.rooms])
+    room = scene.rooms[0]
+    left, bottom = view.at(*room.low_m)
+    right, top = view.at(*room.high_m)
+    assert 0 < left < right < view.size[0]
+    assert 0 < top < bottom < view.size[1]
+
+
+def test_the_command_writes_a_page_and_suggests_a_task_that_is_there(dataset, tmp_path):
+    task_id, out = dataset.records[0].task.task_id, tmp_path / "task.html"
+    done = CliRunner().invoke(
+        app, ["inspect", task_id, "--dataset", str(dataset.folder), "--out", str(out), "--no-picture"]
+    )
+    assert done.exit_code == 0, done.output
+    assert out.read_text().startswith("<!doctype html>")
+    wrong = CliRunner().invoke(
+        app, ["inspect", f"{task_id}x", "--dataset", str(dataset.folder), "--out", str(out)]
+    )
+    assert wrong.exit_code == 2
+    assert "did you mean" in wrong.output
+
+
+def test_every_task_is_exported_with_every_field(dataset):
+    rows = export_rows(dataset)
+    assert [row["task_id"] for row in rows] == [record.task.task_id for record in dataset.records]
+    assert all(list(row) == list(FIELDS) for row in rows)
+    assert [json.loads(line) for line in encoded(rows, ".jsonl").decode().splitlines()] == rows
+
+
+def test_parquet_holds_the_same_rows(dataset, tmp_path):
+    parquet = pytest.importorskip(
+        "pyarrow.parquet", reason="pyarrow is not installed: pip install 'embomatrix[export]'"
+    )
+    rows = export_rows(dataset)
+    path = tmp_path / "tasks.parquet"
+    path.write_bytes(encoded(rows, ".parquet"))
+    assert parquet.read_table(path).to_pylist() == rows
+
+
+def test_other_forms_are_refused_with_the_known_ones(dataset):
+    with pytest.raises(DatasetError, match=r"expected \.jsonl or \.parquet"):
+        encoded(export_rows(dataset), ".csv")
+
+
+def test_the_card_counts_what_is_there_and_explains_every_field(dataset):
+    text = card(dataset, "tasks.jsonl", b"abc")
+    assert "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad" in text
+    assert f"| all | {len(dataset.train)} | {len(dataset.heldout)} |" in text
+    assert all(f"| `{name}` |" in text for name in FIELDS)
+    assert "imported" in text
+
+
+def test_the_export_command_puts_the_card_beside_the_file(dataset, tmp_path):
+    done = CliRunner().invoke(app, ["export", str(dataset.folder), "--out", str(tmp_path / "tasks.jsonl")])
+    assert done.exit_code == 0, done.output
+    assert (tmp_path / "README.md").read_text().startswith("---\n")
+    assert (tmp_path / "tasks.jsonl").read_text().count("\n") == len(dataset.records)
