@@ -102,19 +102,23 @@ def test_what_a_problem_leaves_unsaid_is_said() -> None:
 
 
 def test_a_floor_without_a_room_is_that_of_what_stands_on_it() -> None:
-    text = PROBLEM.replace("(inroom floor.n.01_1 kitchen)", "(inroom apple.n.01_1 kitchen) (ontop apple.n.01_1 floor.n.01_1)")
+    text = PROBLEM.replace(
+        "(inroom floor.n.01_1 kitchen)", "(inroom apple.n.01_1 kitchen) (ontop apple.n.01_1 floor.n.01_1)"
+    )
     problem, notes = said_whole(parse_problem(text))
     assert Literal(Atom("inroom", ("floor.n.01_1", "kitchen"))) in problem.init
     assert len(notes) == 1
 
 
-def test_a_goal_that_no_skill_reaches_is_bound_where_it_need_only_be_told(flat: Scene) -> None:
-    item = source(PROBLEM.replace("(not (open ?electric_refrigerator.n.01_1))", "(sliced ?breakfast_table.n.01_1)"))
-    refused = import_problem(item, flat)
+def test_a_goal_that_no_skill_reaches_is_bound_where_it_need_only_be_told(home: Scene) -> None:
+    item = source(
+        PROBLEM.replace("(not (open ?electric_refrigerator.n.01_1))", "(sliced ?breakfast_table.n.01_1)")
+    )
+    refused = import_problem(item, home)
     assert isinstance(refused, Refusal)
     assert refused.reason is RefusalReason.INEXPRESSIBLE
-    assert isinstance(import_problem(item, flat, manner=EVALUABLE), Imported)
-    folded = import_problem(source(PROBLEM.replace("(not (open ?", "(not (folded ?")), flat, manner=EVALUABLE)
+    assert isinstance(import_problem(item, home, manner=EVALUABLE), Imported)
+    folded = import_problem(source(PROBLEM.replace("(not (open ?", "(not (folded ?")), home, manner=EVALUABLE)
     assert isinstance(folded, Refusal)
 
 

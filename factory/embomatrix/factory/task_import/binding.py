@@ -15,9 +15,7 @@ from embomatrix.factory.task_import.expressible import AGENT, FLOORS, check_eval
 from embomatrix.factory.task_import.reach import pieces_of
 from embomatrix.factory.task_import.search import needs_of, search
 from embomatrix.factory.writer.view import SceneView
-from embomatrix.world.bddl import is_room_instance
 from embomatrix.world.catalog import Catalog
-from embomatrix.world.evaluate import atoms_of, render
 from embomatrix.world.state import Relation
 from embomatrix.world.substances import is_substance
 
@@ -27,7 +25,6 @@ if TYPE_CHECKING:
     import numpy as np
 
     from embomatrix.world.bddl import Problem
-    from embomatrix.world.goal import Atom
     from embomatrix.world.scene import Scene
 
 PLACING: Final = (Relation.INSIDE, Relation.ONTOP, Relation.UNDER, Relation.NEXTTO)

@@ -13,7 +13,6 @@ import re
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.task_import.expressible import FLOORS
-from embomatrix.factory.task_import.reach import FUTURE
 from embomatrix.factory.task_import.sources import EAI
 from embomatrix.world.bddl import Literal, is_room_instance, parse_problem
 from embomatrix.world.evaluate import map_atoms
