@@ -42,7 +42,7 @@ async def test_page_shows_workers_slots_warm_scenes_and_throughput(browser, kitc
     )
     with cluster(tmp_path / "cluster") as (address, url):
         async with ClusterClient(address) as client:
-            run_id = await client.open_run("evening-run")
+            run_id = await client.open_run("evening <b>run</b>")
             await client.put_bundles({digest: dataset.bundle_bytes(digest)})
             await client.announce_lookahead(run_id, 1, [LookaheadEntry(7, digest, ROLLOUTS)])
             results = [item async for item in client.execute(Batch(run_id, "b", 1, rollouts), deadline_s=60)]
@@ -63,8 +63,8 @@ async def test_page_shows_workers_slots_warm_scenes_and_throughput(browser, kitc
     peak = re.fullmatch(rf"peak (\d+), {ROLLOUTS} in all", page.words["peak"])
     assert 1 < int(peak[1]) <= ROLLOUTS
     assert float(page.words["rate"]) >= 0
-    assert page.words["runs"].startswith("run done open warm failed evening-run 24 0 ")
-    assert ahead.words["ahead"] == f"evening-run {short[:4]} step 7 {ROLLOUTS}"
+    assert page.words["runs"].startswith("run done open warm failed evening <b>run</b> 24 0 ")
+    assert ahead.words["ahead"] == f"evening <b>run</b> {short[:4]} step 7 {ROLLOUTS}"
     assert ahead.classes.count("cell warm") == 1
     assert timeline.classes.count("gantt") == 1
     assert failures.words["failures"].startswith("None.")
