@@ -27,7 +27,7 @@ from embomatrix.manager.store.protocol import (
     StateFullError,
 )
 from embomatrix.manager.store.redis import RedisStore
-from embomatrix.manager.store.sqlite import SqliteStore
+from embomatrix.manager.store.sqlite import CHECKPOINT_BYTES, SqliteStore
 from embomatrix.manager.store.url import open_store
 
 
@@ -313,6 +313,38 @@ async def test_a_full_disk_is_told_and_what_was_written_before_is_still_there(tm
             await store.append_results([BatchResults("r1", "b1", large)])
     assert await store.results_after("r1", "b1", 0, 10) == rows(1)
     assert await store.append_results([BatchResults("r1", "b1", large)]) == 1
+    await store.close()
+
+
+async def test_a_write_waits_while_another_process_writes_to_the_file(tmp_path):
+    store = SqliteStore(tmp_path / "state.sqlite")
+    await store.claim(FIRST)
+    other = sqlite3.connect(tmp_path / "state.sqlite", isolation_level=None)
+    other.execute("BEGIN IMMEDIATE")
+    writing = asyncio.create_task(store.open_run(RunRow("r1", "")))
+    await asyncio.sleep(0.05)
+    assert not writing.done()
+    other.execute("COMMIT")
+    await writing
+    assert [run.run_id for run in await store.runs()] == ["r1"]
+    other.close()
+    await store.close()
+
+
+async def test_a_batch_is_kept_while_the_file_is_read_and_the_journal_is_emptied_later(tmp_path):
+    store = SqliteStore(tmp_path / "state.sqlite")
+    journal = tmp_path / "state.sqlite-wal"
+    await store.claim(FIRST)
+    await store.open_run(RunRow("r1", ""))
+    reader = sqlite3.connect(tmp_path / "state.sqlite", isolation_level=None)
+    reader.execute("BEGIN")
+    reader.execute("SELECT * FROM run").fetchall()
+    await fill(store)
+    assert journal.stat().st_size > CHECKPOINT_BYTES
+    reader.close()
+    await store.put_batch(BatchRow("r1", "last", "d", b""))
+    assert journal.stat().st_size < CHECKPOINT_BYTES
+    assert len(await store.batches("r1")) == 101
     await store.close()
 
 

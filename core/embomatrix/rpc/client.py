@@ -229,6 +229,8 @@ class ClusterClient(FleetClient):
                     results = each("results", rollout_result_from_proto, response.results)
                     groups = each("groups", group_done_from_proto, response.groups)
                 yield results, groups
+                if not attached.missing:
+                    return  # what is still to come says only that the stream ends
         except grpc.aio.AioRpcError as error:
             raise attached.explain(cluster_error(error, self._address)) from error
         finally:

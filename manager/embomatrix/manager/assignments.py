@@ -10,7 +10,6 @@ from embomatrix.manager.auditor import AuditRules
 from embomatrix.manager.audits import Audits
 from embomatrix.manager.batch_book import BatchBook
 from embomatrix.manager.commands import (
-    AcknowledgeLease,
     CancelLease,
     Command,
     DeliverResult,
@@ -33,7 +32,6 @@ from embomatrix.manager.pending import PendingQueues
 from embomatrix.manager.run_book import RunBook
 from embomatrix.rpc.values import (
     Cancelled,
-    Completed,
     InfraCode,
     InfraFailure,
     LeaseOrigin,
@@ -44,7 +42,6 @@ from embomatrix.rpc.values import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from embomatrix.manager.events import LeaseFinished
     from embomatrix.rpc.values import Batch
 
 CALLED_OFF = Cancelled("the trainer called it off")
@@ -216,7 +213,7 @@ class Assignments:
         record = lease.record
         if lease not in record.leases:
             return
-        self._end(lease)
+        self.end(lease)
         if counted:
             self._blame(record, lease.worker_id, failure)
         if record.leases or record.held:
@@ -295,13 +292,14 @@ class Assignments:
             )
         )
 
-    def _end(self, lease: LeaseRecord) -> None:
+    def end(self, lease: LeaseRecord) -> None:
+        """The lease is over: its slot is given away when the change is settled."""
         self.leases.end(lease, self.now_s)
         self._freed[lease.worker_id] = None
 
     def void(self, lease: LeaseRecord) -> None:
         """Take a lease back from a worker that may still hold it."""
-        self._end(lease)
+        self.end(lease)
         self.commands.append(CancelLease(lease.worker_id, lease.ref))
 
     def _steal_for(self, worker: WorkerRecord) -> None:
@@ -313,52 +311,6 @@ class Assignments:
                 return
             self.void(lease)
             self.give(lease.record, worker)
-
-    def settle(self, event: LeaseFinished) -> None:
-        self.commands.append(AcknowledgeLease(event.worker_id, event.ref))
-        lease = self.leases.find(event.worker_id, event.ref)
-        if lease is None:
-            run_id = self.leases.run_of_ended(event.ref)
-            if run_id is not None and run_id in self.runs:
-                self.runs.of(run_id).counters.stale_results += 1
-            return
-        match event.outcome:
-            case Completed() as completed:
-                self._complete(lease, completed)
-            case InfraFailure() as failure:
-                self._take_failure(
-                    lease, dataclasses.replace(failure, worker_id=failure.worker_id or event.worker_id)
-                )
-
-    def _complete(self, lease: LeaseRecord, completed: Completed) -> None:
-        record = lease.record
-        self._end(lease)
-        record.attempts += 1
-        run = self.runs.of(record.key.run_id)
-        self.fleet.time(lease, run.times, self.now_s, lost=False)
-        for other in record.leases:
-            self.fleet.time(other, run.times, self.now_s, lost=True)
-        self.fleet.workers[lease.worker_id].note_completed(completed.timings.execute_s)
-        timings = lease.timings(completed.timings, self.now_s)
-        warm = record.warm and completed.warm
-        noted = completed.noted(timings=timings, warm=warm, worker_id=lease.worker_id)
-        if not record.check:
-            run.counters.warm_starts += record.warm
-            run.counters.cold_starts += not record.warm
-            if self.audits.hold(lease, noted):
-                return
-        self.finish(record, noted)
-
-    def _take_failure(self, lease: LeaseRecord, failure: InfraFailure) -> None:
-        worker = self.fleet.workers[lease.worker_id]
-        scene = lease.record.scene
-        if failure.code in (InfraCode.SCENE_LOAD_FAILED, InfraCode.BUNDLE_CORRUPT):
-            # Until the worker reports again it is not taken for warm: the rollout would come straight back.
-            self.fleet.set_warm(worker, worker.warm - {scene})
-            self.failures.record(scene, worker.worker_id, failure.message, self.now_s)
-        self.give_back(lease, failure, counted=True)
-        self.judge(scene)
-        self.offer(scene)
 
     def judge(self, scene: str) -> None:
         """End the waiting rollouts of a scene that nobody can load."""

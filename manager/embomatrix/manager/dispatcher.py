@@ -19,6 +19,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.assignments import Assignments, DispatchLimits
+from embomatrix.manager.attendance import Attendance
 from embomatrix.manager.commands import CancelLease, Command
 from embomatrix.manager.events import (
     BatchCancelled,
@@ -46,11 +47,11 @@ from embomatrix.manager.events import (
     WorkerSuspected,
 )
 from embomatrix.manager.hedging import Hedger
+from embomatrix.manager.lease_ends import LeaseEnds
 from embomatrix.manager.patience import Patience
 from embomatrix.manager.recovery import Recovery
 from embomatrix.reward.settings import PAPER
-from embomatrix.rpc.values import InfraCode, InfraFailure, ResidentState
-from embomatrix.rpc.versions import SCORES_SINCE
+from embomatrix.rpc.values import InfraCode, InfraFailure
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -76,6 +77,8 @@ class Dispatcher:
         self._limits = limits
         self._desk = Assignments(limits, boot_id=boot_id, first_epoch=first_epoch, audit_key=audit_key)
         self._recovery = Recovery(self._desk, grace_s=limits.restart_grace_s)
+        self._attendance = Attendance(self._desk, self._recovery)
+        self._ends = LeaseEnds(self._desk)
         self._hedger = Hedger(self._desk, limits)
         self._patience = Patience(self._desk, limits.no_capacity_s)
 
@@ -89,7 +92,7 @@ class Dispatcher:
     def _take(self, event: Event) -> None:
         match event:
             case LeaseFinished():
-                self._desk.settle(event)
+                self._ends.settle(event)
             case LeasesRenewed():
                 self._on_renewed(event)
             case RunOpened(run_id, terms):
@@ -114,19 +117,17 @@ class Dispatcher:
                     self._desk.cancel((run_id, batch.batch_id))
                 self._desk.audits.drop_run(run_id)
             case WorkerJoined():
-                self._on_joined(event)
+                self._attendance.joined(event)
             case WorkerReported():
-                self._on_reported(event)
+                self._attendance.reported(event)
             case WorkerLost():
-                self._on_lost(event)
+                self._attendance.lost(event)
             case WorkerSuspected() | WorkerRecovered() | WorkerDrained() | WorkerResumed():
-                self._on_standing(event)
+                self._attendance.standing(event)
             case ScenesUnplaceable(reasons):
                 self._patience.note_unplaceable(reasons)
             case Tick():
                 self._on_tick()
-            case _:
-                pass
 
     def demand(self) -> DemandObserved:
         """What the Resource-Scheduler should know now. Forgets which leases were given since the last call."""
@@ -156,11 +157,6 @@ class Dispatcher:
     def waiting_scenes(self) -> int:
         """How many scenes have waiting or late rollouts; when it changes, the scheduler should look again."""
         return self._desk.pending.scenes + len(self._recovery.awaited()) + len(self._hedger.wanted)
-
-    @property
-    def paused(self) -> bool:
-        """Whether no leases are given."""
-        return self._desk.paused
 
     @property
     def queued(self) -> int:
@@ -214,89 +210,6 @@ class Dispatcher:
     def waiting_scenes_of(self, run_id: str) -> frozenset[str]:
         """Scenes of the run's rollouts without an outcome."""
         return frozenset().union(*(batch.open_scenes for batch in self._desk.batches.of_run(run_id)))
-
-    # Workers and time
-
-    def _on_joined(self, event: WorkerJoined) -> None:
-        self._on_lost(WorkerLost(event.worker_id, "a newer session of the same worker took over"))
-        resources = event.resources
-        joined = self._desk.fleet.join(
-            event.worker_id,
-            resources.slots,
-            resources.render_slots,
-            resources.versions,
-            scores=event.protocol >= SCORES_SINCE,
-        )
-        self._desk.audits.joined(joined)
-
-    def _on_reported(self, event: WorkerReported) -> None:
-        worker = self._desk.fleet.workers.get(event.worker_id)
-        if worker is None:
-            return
-        worker.reported = True
-        worker.leaving, worker.paused = event.draining, event.paused
-        self._desk.fleet.stand(worker)
-        self._desk.fleet.set_warm(
-            worker, (r.bundle_digest for r in event.residents if r.state is ResidentState.WARM)
-        )
-        if event.resync:
-            self._reconcile(worker, event)
-        self._desk.leases.renew(worker.worker_id, event.held, self._desk.now_s)
-        for scene in worker.warm:
-            self._desk.failures.forget(scene)
-        for resident in event.residents:
-            if resident.state is ResidentState.FAILED:
-                self._desk.failures.record(
-                    resident.bundle_digest, worker.worker_id, resident.error, self._desk.now_s
-                )
-                self._desk.judge(resident.bundle_digest)
-        self._desk.fill([worker.worker_id])
-
-    def _reconcile(self, worker: WorkerRecord, event: WorkerReported) -> None:
-        """After a reconnect: what the worker does not hold never reached it.
-
-        What it holds beyond our book, a former manager gave: it is taken up, or void.
-        """
-        held = set(event.held)
-        failure = InfraFailure(
-            InfraCode.WORKER_LOST, "the lease was lost with a broken session", worker.worker_id
-        )
-        for lease in [lease for lease in worker.held.values() if lease.ref not in held]:
-            self._desk.give_back(lease, failure, counted=False)
-            self._desk.offer(lease.record.scene)
-        self._recovery.heard(worker.worker_id)
-        origins = {claim.ref: claim.origin for claim in event.claims}
-        for ref in event.held:
-            if self._desk.leases.find(worker.worker_id, ref) is not None:
-                continue
-            if not self._recovery.adopt(worker, ref, origins.get(ref)):
-                self._desk.commands.append(CancelLease(worker.worker_id, ref))
-
-    def _on_lost(self, event: WorkerLost) -> None:
-        worker = self._desk.fleet.workers.get(event.worker_id)
-        if worker is None:
-            return
-        leases = list(worker.held.values())
-        self._desk.fleet.leave(worker.worker_id)
-        failure = InfraFailure(InfraCode.WORKER_LOST, f"worker lost: {event.reason}", worker.worker_id)
-        for lease in leases:
-            self._desk.give_back(lease, failure, counted=lease.started_s is not None)
-        for scene in dict.fromkeys(lease.record.scene for lease in leases):
-            self._desk.offer(scene)
-
-    def _on_standing(self, event: WorkerSuspected | WorkerRecovered | WorkerDrained | WorkerResumed) -> None:
-        worker = self._desk.fleet.workers.get(event.worker_id)
-        if worker is None:
-            return
-        match event:
-            case WorkerDrained() | WorkerResumed():
-                worker.drained = isinstance(event, WorkerDrained)
-                if isinstance(event, WorkerResumed):
-                    self._desk.audits.pardon(worker)
-            case WorkerSuspected() | WorkerRecovered():
-                worker.suspect = isinstance(event, WorkerSuspected)
-        self._desk.fleet.stand(worker)
-        self._desk.fill([event.worker_id])
 
     def _on_renewed(self, event: LeasesRenewed) -> None:
         """Whoever lives and does no step any more is stuck: liveness alone renews no lease for ever."""

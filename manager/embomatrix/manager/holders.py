@@ -148,6 +148,19 @@ class Holders:
         if not self._memory_mb[holder.resources.memory_mb]:
             del self._memory_mb[holder.resources.memory_mb]
 
+    def touch(self, used: Iterable[tuple[str, str]]) -> None:
+        """Scenes of these (worker, scene) pairs were just used: they come first, so that of the needless the oldest goes."""
+        # Sorted: equal histories shall give equal decisions in every process.
+        for worker_id, scene in sorted(used):
+            holder = self.by_id.get(worker_id)
+            if holder is not None and scene in holder.residents:
+                holder.residents = {scene: holder.residents[scene], **holder.residents}
+
+    def speed_of(self, worker_id: str) -> float:
+        """Its score, and 1 for one that is gone."""
+        holder = self.by_id.get(worker_id)
+        return max(holder.resources.score, 1e-3) if holder is not None else 1.0
+
     def changed(self, holder: Holder) -> None:
         """Bring the indices up to date with it."""
         self._index(holder.worker_id, frozenset(holder.standing()), frozenset(holder.warm_since_s))

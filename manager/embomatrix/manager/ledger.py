@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from embomatrix.rpc.values import LeaseRef, Rollout
 
 
-AHEAD_S: Final = 0.05
+AHEAD_S: Final = 0.1
 """A worker holds leases for this long ahead: its slots go on while results and new leases travel many to a message."""
 BEHIND: Final = 32
 """Leases that wait behind a slot at most, however fast it is."""

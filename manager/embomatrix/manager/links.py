@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.commands import AcknowledgeLease, CancelLease, GiveLease, SetDesired
 from embomatrix.rpc.values import Lease
@@ -13,6 +13,9 @@ if TYPE_CHECKING:
     from embomatrix.manager.registry import Session
     from embomatrix.rpc.status import ClusterError
     from embomatrix.rpc.values import LeaseRef
+
+ACKNOWLEDGE_S: Final = 0.02
+"""An acknowledgement waits for this long for something else to say: the worker only forgets a result with it."""
 
 WorkerCommand = SetDesired | GiveLease | CancelLease | AcknowledgeLease
 
@@ -36,6 +39,7 @@ class WorkerLink:
         self.session = session
         self._outbox = Outbox()
         self._ready = asyncio.Event()
+        self._later: asyncio.TimerHandle | None = None
         self._closed: ClusterError | None = None
 
     def put(self, command: WorkerCommand) -> None:
@@ -52,6 +56,9 @@ class WorkerLink:
                 self._outbox.cancelled.append(command.ref)
             case AcknowledgeLease():
                 self._outbox.acknowledged.append(command.ref)
+                if self._later is None:
+                    self._later = asyncio.get_running_loop().call_later(ACKNOWLEDGE_S, self._ready.set)
+                return
         self._ready.set()
 
     def drain(self) -> None:
@@ -74,5 +81,8 @@ class WorkerLink:
         if self._closed is not None:
             raise self._closed
         self._ready.clear()
+        if self._later is not None:
+            self._later.cancel()
+            self._later = None
         outbox, self._outbox = self._outbox, Outbox()
         return outbox

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import bisect
+import contextlib
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
@@ -12,8 +13,9 @@ if TYPE_CHECKING:
     from embomatrix.manager.store.protocol import ResultRow
 
 PER_MESSAGE: Final = 256
-LINGER_S: Final = 0.02
-"""Results are sent at once when a message is full, else after this: a batch that trickles shall not send one by one."""
+LINGER_S: Final = 0.04
+"""Results are sent at once when a message is full or the batch at its end, else after this: a batch that trickles shall not
+send one by one."""
 
 
 class BatchLog:
@@ -41,6 +43,7 @@ class BatchLog:
         self.dropped = False
         """The run was closed, or the log was given up: nothing more will come."""
         self._changed = asyncio.Event()
+        self._over = asyncio.Event()
 
     def append(self, rows: Sequence[ResultRow]) -> None:
         self.rows.extend(rows)
@@ -48,10 +51,12 @@ class BatchLog:
 
     def finish(self, now_s: float) -> None:
         self.finished_s = now_s
+        self._over.set()
         self._wake()
 
     def drop(self) -> None:
         self.dropped = True
+        self._over.set()
         self._wake()
 
     @property
@@ -66,7 +71,9 @@ class BatchLog:
         while self.last_cursor <= cursor and not self.ended:
             await self._changed.wait()
         if self.last_cursor - cursor < PER_MESSAGE and not self.ended:
-            await asyncio.sleep(LINGER_S)
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(LINGER_S):
+                    await self._over.wait()
         start = self._position(cursor)
         return self.rows[start : start + PER_MESSAGE]
 

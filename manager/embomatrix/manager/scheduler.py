@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from embomatrix.manager.commands import Command, SetDesired
 from embomatrix.manager.events import (
@@ -32,23 +32,18 @@ from embomatrix.manager.events import (
     WorkerResumed,
     WorkerSuspected,
 )
-from embomatrix.manager.holders import Holder, Holders, Places
+from embomatrix.manager.holders import Holders, Places
 from embomatrix.manager.outlook import Outlook, why_not
 from embomatrix.manager.placement import Need, needs_of, place
 from embomatrix.manager.prewarm import PrewarmLedger
+from embomatrix.manager.scene_costs import SceneCosts
 from embomatrix.manager.shares import Share
 from embomatrix.manager.window import Window, announcers
 from embomatrix.reward.settings import PAPER
-from embomatrix.rpc.values import Completed, Resident, ResidentState, RunTerms
+from embomatrix.rpc.values import Completed, Resident, RunTerms
 from embomatrix.rpc.versions import SCORES_SINCE
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-
 DEFAULT_TERMS: Final = RunTerms()
-LEARNING: Final = 0.05
-"""Weight of the latest of a row of measurements."""
 OVERDUE: Final = 3.0
 """A load that takes so many times longer than usual is not waited for."""
 LEASES_AT_A_TIME: Final = 64
@@ -91,11 +86,7 @@ class Scheduler:
         self._demand = DemandObserved({})
         self._peaks: dict[str, int] = {}
         self._copies: dict[str, int] = {}
-        self._size_mb: dict[str, float] = {}
-        self._load_s: dict[str, float] = {}
-        self._typical_load_s = 0.0
-        self._execute_s = 0.0
-        """Of an execution on a worker of speed 1, as lately measured; 0 before the first."""
+        self._costs = SceneCosts(limits.scene_mb)
         self._now_s = 0.0
         self.effort = 0
         """Needs and workers that the last placement looked at, and what it took to know what is in use."""
@@ -127,9 +118,7 @@ class Scheduler:
             case WorkerReported():
                 return self._on_reported(event)
             case LeaseFinished(outcome=Completed(timings=timings)):
-                holder = self._holders.by_id.get(event.worker_id)
-                speed = max(holder.resources.score, 1e-3) if holder is not None else 1.0
-                self._execute_s = _learned(self._execute_s, timings.execute_s * speed)
+                self._costs.executed(timings.execute_s * self._holders.speed_of(event.worker_id))
                 return Urgency.NONE
             case WorkerJoined() | WorkerLost():
                 return self._on_presence(event)
@@ -160,10 +149,10 @@ class Scheduler:
             for need in needs
         ]
         places = Places(self._holders, now_s, self._demand.in_use, self._limits.retry_load_s)
-        places.refuse_where_too_large(needs, self._size_mb)
+        places.refuse_where_too_large(needs, self._costs.known_mb)
         places.refuse_where_nothing_renders(needs)
         places.refuse_where_nothing_scores(self._scored())
-        placement = place(places, needs, self._estimate)
+        placement = place(places, needs, self._costs.size_mb)
         self._holders.fresh.clear()
         self.unplaceable = {
             scene: self._why_not(scene) for scene in placement.homeless if places.nobody_takes(scene)
@@ -175,11 +164,7 @@ class Scheduler:
     @property
     def outlook(self) -> Outlook:
         """How far scenes are, at this moment."""
-        return Outlook(self._holders, self.unplaceable, self.usual_load_s, self._now_s)
-
-    def usual_load_s(self, scene: str) -> float:
-        """What loading the scene takes, or a scene as a rule while nobody knows; 0 before the first."""
-        return self._load_s.get(scene, self._typical_load_s)
+        return Outlook(self._holders, self.unplaceable, self._costs.usual_load_s, self._now_s)
 
     def residents(self, worker_id: str) -> tuple[Resident, ...]:
         holder = self._holders.by_id.get(worker_id)
@@ -194,7 +179,7 @@ class Scheduler:
         self._demand = event
         self._holders.limit_scores(event.lags)
         self.prewarm.used(event.used)
-        self._touch(event.used)
+        self._holders.touch(event.used)
         # By its peak and not by what is left: a scene's copies shall not come and go while a batch runs down.
         self._peaks = {scene: max(count, self._peaks.get(scene, 0)) for scene, count in event.pending.items()}
         self._copies = {scene: self._copies[scene] for scene in event.pending if scene in self._copies}
@@ -256,27 +241,10 @@ class Scheduler:
         known = [scene for scene in holder.residents if scene in reported]
         holder.residents = {scene: reported[scene] for scene in dict.fromkeys([*known, *reported])}
         for resident in event.residents:
-            self._learn(holder, resident)
+            holder.note(resident, self._now_s)
+            self._costs.learn(resident)
         self._holders.changed(holder)
         return urgency
-
-    def _learn(self, holder: Holder, resident: Resident) -> None:
-        scene = resident.bundle_digest
-        if resident.memory_mb > 0:
-            self._size_mb[scene] = max(self._size_mb.get(scene, 0.0), resident.memory_mb)
-        holder.note(resident, self._now_s)
-        if resident.state is ResidentState.WARM and resident.load_s > 0:
-            before_s = self._load_s.get(scene, resident.load_s)
-            self._load_s[scene] = 0.5 * (before_s + resident.load_s)
-            self._typical_load_s = _learned(self._typical_load_s, resident.load_s)
-
-    def _touch(self, used: Iterable[tuple[str, str]]) -> None:
-        """Scenes that were just used move to the front, so that among the needless the oldest goes first."""
-        # Sorted: equal histories shall give equal decisions in every process.
-        for worker_id, scene in sorted(used):
-            holder = self._holders.by_id.get(worker_id)
-            if holder is not None and scene in holder.residents:
-                holder.residents = {scene: holder.residents[scene], **holder.residents}
 
     def _warm_since(self, scene: str) -> float | None:
         names = self._holders.warm_on(scene)
@@ -292,30 +260,29 @@ class Scheduler:
         waited_s = self._demand.waited_s.get(scene, 0.0)
         told = [holder for holder in self._holders.having(scene) if scene in (holder.desired or ())]
         # What a slow worker needed to load it says nothing of the others.
-        load_s = self._typical_load_s if all(h.is_slow for h in told) else self._load_s.get(scene, 0.0)
+        load_s = (
+            self._costs.typical_load_s if all(h.is_slow for h in told) else self._costs.load_s.get(scene, 0.0)
+        )
         if waited_s >= (load_s or self._limits.affinity_wait_s):
-            overdue_s = max(OVERDUE * self.usual_load_s(scene), self._limits.affinity_wait_s)
+            overdue_s = max(OVERDUE * self._costs.usual_load_s(scene), self._limits.affinity_wait_s)
             loading = any(holder.will_have(scene, self._now_s, overdue_s) for holder in told)
             if not loading and not self._demand.idle <= {holder.worker_id for holder in told}:
                 self._copies[scene] = len(told) + 1
         return dataclasses.replace(
             need,
             at_least=self._copies.get(scene, 1),
-            load_s=self.usual_load_s(scene),
-            work_s=need.count * self._execute_s,
+            load_s=self._costs.usual_load_s(scene),
+            work_s=need.count * self._costs.execute_s,
             turn=turn,
             share=share,
             render=need.render or scene in self._demand.rendering,
         )
 
-    def _estimate(self, scene: str) -> float:
-        return self._size_mb.get(scene, self._limits.scene_mb)
-
     def _why_not(self, scene: str) -> str:
         announced = {e.bundle_digest for w in self.windows.values() for e in w.entries if e.render}
         renders = scene in announced or scene in self._demand.rendering
         return why_not(
-            self._holders, scene, self._estimate(scene), renders=renders, scored=scene in self._scored()
+            self._holders, scene, self._costs.size_mb(scene), renders=renders, scored=scene in self._scored()
         )
 
     def _scored(self) -> frozenset[str]:
@@ -350,7 +317,3 @@ class Scheduler:
         self._holders.changed(holder)
         self._holders.fresh.discard(name)
         return SetDesired(name, scenes)
-
-
-def _learned(before: float, measured: float) -> float:
-    return before + LEARNING * (measured - before) if before else measured

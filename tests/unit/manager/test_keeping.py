@@ -29,6 +29,22 @@ def rows(first, last):
     return [ResultRow(cursor, f"x{cursor}", b"") for cursor in range(first, last + 1)]
 
 
+async def test_the_last_results_of_a_batch_wait_for_no_others():
+    log = BatchLog("r1", "b1", "d")
+    reader = asyncio.create_task(log.after(0))
+    await asyncio.sleep(0)
+    log.append(rows(1, 2))
+    for _ in range(10):
+        await asyncio.sleep(0)
+    assert not reader.done()
+    log.append(rows(3, 3))
+    log.finish(0.0)
+    for _ in range(10):
+        await asyncio.sleep(0)
+    assert reader.done()
+    assert reader.result() == rows(1, 3)
+
+
 async def test_a_reader_waits_for_results_and_ends_with_the_batch():
     log = BatchLog("r1", "b1", "d")
     reader = asyncio.create_task(log.after(0))

@@ -29,15 +29,6 @@ def test_a_result_is_sent_once_on_a_stream_and_kept():
     assert len(outbox) == 3
 
 
-def test_results_are_in_flight_from_being_sent_to_being_acknowledged():
-    outbox = _filled(2)
-    assert not outbox.in_flight
-    outbox.take_unsent(1)
-    assert outbox.in_flight
-    outbox.acknowledge(_result(0).ref)
-    assert not outbox.in_flight
-
-
 def test_a_new_stream_carries_what_was_not_acknowledged():
     outbox = _filled(3)
     outbox.take_unsent(3)

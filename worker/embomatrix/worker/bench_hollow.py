@@ -34,7 +34,7 @@ from embomatrix.rpc.values import (
 )
 from embomatrix.skills.trace import Step
 from embomatrix.worker.membership import Membership
-from embomatrix.worker.session import HEARTBEAT_S, LINGER_S, register
+from embomatrix.worker.session import HEARTBEAT_S, register
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Sequence
@@ -44,6 +44,8 @@ if TYPE_CHECKING:
 NAME: Final = "hollow"
 EXECUTE_S: Final = 0.0015
 """Told as the time of every execution: what a plan of the pinned workload takes."""
+PAUSE_S: Final = 0.025
+"""Between two messages with results."""
 FINAL: Final = tuple(f"thing_{number}: on countertop_{number} in kitchen_0" for number in range(6))
 MEMORY_MB: Final = 100_000
 
@@ -108,7 +110,7 @@ class _HollowSession:
         """Results many to a message, as a worker sends them that has enough ahead."""
         while True:
             await self._given.wait()
-            await asyncio.sleep(LINGER_S)
+            await asyncio.sleep(PAUSE_S)
             await self._worker.answering.wait()
             self._given.clear()
             message = pb.SessionRequest(session_id=self._session_id, session_epoch=self._epoch)

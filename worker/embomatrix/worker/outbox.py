@@ -55,11 +55,6 @@ class Outbox:
         return tuple(self._unsent.pop(ref) for ref in refs)
 
     @property
-    def in_flight(self) -> bool:
-        """Whether results were sent that the manager has not answered."""
-        return len(self._results) > len(self._unsent)
-
-    @property
     def has_unsent(self) -> bool:
         return bool(self._unsent)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import math
 import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
@@ -54,8 +55,10 @@ FETCH_S: Final = 30.0
 HEARTBEATS_MISSED: Final = 3
 """So many heartbeats in a row without an answer mean that the connection is dead."""
 RESULTS_PER_MESSAGE: Final = 256
-LINGER_S: Final = 0.025
-"""A message costs more than what it carries: results wait this long for others at most."""
+LINGER_S: Final = 0.04
+"""A message costs more than what it carries: while every slot has enough ahead, there is one in this time at most …"""
+SPACING_S: Final = 0.003
+"""… and in this time while slots run short: whoever comes first goes at once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,6 +139,8 @@ class Session:
         self._resync_due = False
         self._news = asyncio.Event()
         self._lingering: asyncio.TimerHandle | None = None
+        self._sent_s = -math.inf
+        """When results went last, on the loop's clock."""
         self._data_channel: grpc.aio.Channel | None = None
         self.attached = asyncio.Event()
         """Set once the manager was heard on the stream."""
@@ -143,11 +148,14 @@ class Session:
         """When a manager last renewed the leases, in this session or before it."""
 
     def tell(self) -> None:
-        """There are results to send: now, or gathered while earlier ones are under way or every slot has enough ahead."""
-        if not self._pool.ahead and not self._outbox.in_flight:
+        """There are results to send: now, or gathered with others until the next message is due."""
+        due_s = self._sent_s + (LINGER_S if self._pool.ahead else SPACING_S)
+        loop = asyncio.get_running_loop()
+        if due_s <= loop.time():
             self._news.set()
-        elif self._lingering is None:
-            self._lingering = asyncio.get_running_loop().call_later(LINGER_S, self._news.set)
+        elif self._lingering is None or self._lingering.when() > due_s:
+            self._linger_no_more()
+            self._lingering = loop.call_at(due_s, self._news.set)
 
     def tell_state(self) -> None:
         """Residents changed: the state is due."""
@@ -268,6 +276,8 @@ class Session:
                 results = self._outbox.take_unsent(RESULTS_PER_MESSAGE)
                 message = self._request(state=self._state() if self._state_due else None)
                 message.results.extend(lease_result_to_proto(result) for result in results)
+                if results:
+                    self._sent_s = asyncio.get_running_loop().time()
                 self._state_due = False
                 yield message
 

@@ -24,7 +24,7 @@ from embomatrix.manager.store.protocol import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Sequence
+    from collections.abc import Callable, Collection, Iterator, Sequence
     from pathlib import Path
 
 T = TypeVar("T")
@@ -32,9 +32,19 @@ T = TypeVar("T")
 _FULL: Final = (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR_WRITE)
 """The disk, or what the process may write, is used up."""
 
+BUSY_S: Final = 5.0
+"""How long a transaction waits for another process that writes to the same file."""
+BUSY_RETRY_S: Final = 0.005
+BRIEF_BYTES: Final = 128 * 1024
+"""A transaction that writes no more than this is done at once: handing it to a thread and back takes longer. It writes to
+memory of the system: with this journal only a checkpoint waits for the disk."""
+CHECKPOINT_BYTES: Final = 4 * 1024 * 1024
+"""The journal is copied into the file when it has grown to this."""
+
 _SCHEMA: Final = """
 PRAGMA journal_mode = WAL;
 PRAGMA synchronous = NORMAL;
+PRAGMA wal_autocheckpoint = 0;
 CREATE TABLE IF NOT EXISTS manager (only_row INTEGER PRIMARY KEY CHECK (only_row = 1), epoch INTEGER NOT NULL);
 INSERT OR IGNORE INTO manager VALUES (1, 0);
 CREATE TABLE IF NOT EXISTS run (run_id TEXT PRIMARY KEY, name TEXT NOT NULL, terms BLOB NOT NULL DEFAULT x'');
@@ -65,19 +75,23 @@ class SqliteStore:
 
     def __init__(self, path: Path, *, clock: Callable[[], float] = time.time) -> None:
         self._path = path
+        self._journal = path.with_name(path.name + "-wal")
         self._clock = clock
         self._epoch = 0
         self._candidate: Candidate | None = None
         self._lock = asyncio.Lock()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._db = sqlite3.connect(path, timeout=5.0, check_same_thread=False, isolation_level=None)
-            self._db.executescript(_SCHEMA)
-            self._take_up_older()
+            self._db = sqlite3.connect(path, timeout=0.0, check_same_thread=False, isolation_level=None)
+            self._patiently(self._prepare)
         except (sqlite3.Error, OSError) as error:
             raise StateError(
                 f"the state file {path} can't be used ({error}): check its folder's permissions, or pass --state"
             ) from error
+
+    def _prepare(self) -> None:
+        self._db.executescript(_SCHEMA)
+        self._take_up_older()
 
     async def claim(self, candidate: Candidate) -> Lead:
         def claim() -> Lead:
@@ -117,10 +131,11 @@ class SqliteStore:
             known = self._db.execute("SELECT digest FROM batch WHERE run_id = ? AND batch_id = ?", row[:2])
             return PutOutcome.SAME if known.fetchone()[0] == batch.digest else PutOutcome.CONFLICT
 
-        return await self._run(put)
+        return await self._run(put, written=len(batch.payload))
 
     async def append_results(self, parts: Sequence[BatchResults]) -> int:
-        return await self._run(lambda: sum(self._append(part) for part in parts))
+        written = sum(len(row.payload) for part in parts for row in part.rows)
+        return await self._run(lambda: sum(self._append(part) for part in parts), written=written)
 
     def _append(self, part: BatchResults) -> int:
         key = (part.run_id, part.batch_id)
@@ -202,22 +217,66 @@ class SqliteStore:
     async def _read(self, query: str, *values: object) -> list[tuple[Any, ...]]:
         return await self._run(lambda: self._db.execute(query, values).fetchall(), fenced=False)
 
-    async def _run(self, work: Callable[[], T], *, fenced: bool = True) -> T:
-        """The work in one transaction, on a thread: a slow disk shall not hold up heartbeats."""
+    async def _run(self, work: Callable[[], T], *, fenced: bool = True, written: int = BRIEF_BYTES + 1) -> T:
+        """The work in one transaction: at once when it is brief and nobody is in the way, else on a thread.
+
+        A slow disk, or another process that writes, shall not hold up heartbeats.
+        """
         async with self._lock:
-            thread = asyncio.ensure_future(asyncio.to_thread(self._transaction, work, fenced))
+            with self._errors():
+                if written <= BRIEF_BYTES and self._journal_bytes() < CHECKPOINT_BYTES:
+                    try:
+                        return self._transaction(work, fenced)
+                    except sqlite3.OperationalError as error:
+                        if not _is_busy(error):
+                            raise
+                return await self._on_thread(lambda: self._checkpointed(work, fenced))
+
+    @contextlib.contextmanager
+    def _errors(self) -> Iterator[None]:
+        try:
+            yield
+        except sqlite3.Error as error:
+            if getattr(error, "sqlite_errorcode", None) in _FULL:
+                raise StateFullError(
+                    f"the state file {self._path} can't be written ({error}): make room on its disk"
+                ) from error
+            raise StateError(f"the state file {self._path} failed: {error}") from error
+
+    async def _on_thread(self, work: Callable[[], T]) -> T:
+        thread = asyncio.ensure_future(asyncio.to_thread(work))
+        try:
+            return await asyncio.shield(thread)
+        except asyncio.CancelledError:
+            # The connection is the thread's until it is done, whoever waits for its answer no longer.
+            await asyncio.wait([thread])
+            raise
+
+    def _checkpointed(self, work: Callable[[], T], fenced: bool) -> T:
+        answer = self._patiently(lambda: self._transaction(work, fenced))
+        if self._journal_bytes() >= CHECKPOINT_BYTES:
+            # What was written is safe in the journal. Where it can't be emptied now, since somebody reads or the disk is full,
+            # the next transaction tries again.
+            with contextlib.suppress(sqlite3.Error):
+                self._db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+        return answer
+
+    def _journal_bytes(self) -> int:
+        try:
+            return self._journal.stat().st_size
+        except FileNotFoundError:
+            return 0
+
+    def _patiently(self, work: Callable[[], T]) -> T:
+        """Do it again while another process writes, for a bounded time."""
+        ends_s = time.monotonic() + BUSY_S
+        while True:
             try:
-                return await asyncio.shield(thread)
-            except asyncio.CancelledError:
-                # The connection is the thread's until it is done, whoever waits for its answer no longer.
-                await asyncio.wait([thread])
-                raise
-            except sqlite3.Error as error:
-                if getattr(error, "sqlite_errorcode", None) in _FULL:
-                    raise StateFullError(
-                        f"the state file {self._path} can't be written ({error}): make room on its disk"
-                    ) from error
-                raise StateError(f"the state file {self._path} failed: {error}") from error
+                return work()
+            except sqlite3.OperationalError as error:
+                if not _is_busy(error) or time.monotonic() >= ends_s:
+                    raise
+            time.sleep(BUSY_RETRY_S)
 
     def _transaction(self, work: Callable[[], T], fenced: bool) -> T:
         self._db.execute("BEGIN IMMEDIATE")
@@ -230,3 +289,8 @@ class SqliteStore:
             raise
         self._db.execute("COMMIT")
         return answer
+
+
+def _is_busy(error: sqlite3.OperationalError) -> bool:
+    """Another process writes: extended codes share the low byte."""
+    return getattr(error, "sqlite_errorcode", 0) & 0xFF == sqlite3.SQLITE_BUSY

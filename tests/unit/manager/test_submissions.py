@@ -1,0 +1,41 @@
+"""Large batches, taken in pieces."""
+
+import asyncio
+import contextlib
+
+from embomatrix.manager.events import BatchContinued, BatchSubmitted
+from embomatrix.manager.submissions import PIECE, Submissions
+from embomatrix.rpc.values import Batch, Rollout
+
+
+def batch(name, count):
+    return Batch("r1", name, 1, tuple(Rollout(f"x{i}", "g", "kitchen", "t", (), 0) for i in range(count)))
+
+
+async def told(batches):
+    """The events of these batches, which come at the same time."""
+    events = []
+    submissions = Submissions(events.append)
+    serving = asyncio.create_task(submissions.serve())
+    for one in batches:
+        submissions.enter(one)
+    for _ in range(20):
+        await asyncio.sleep(0)
+    serving.cancel()
+    with contextlib.suppress(asyncio.CancelledError):
+        await serving
+    return events
+
+
+async def test_a_batch_of_usual_size_is_taken_at_once():
+    small = batch("b1", PIECE)
+    assert await told([small]) == [BatchSubmitted(small, PIECE)]
+
+
+async def test_batches_that_come_together_take_turns_until_all_of_both_is_taken():
+    large, larger = batch("b1", 2 * PIECE + 1), batch("b2", 3 * PIECE)
+    assert await told([large, larger]) == [
+        BatchSubmitted(large, PIECE),
+        BatchSubmitted(larger, PIECE),
+        *(BatchContinued("r1", name, PIECE) for name in ("b1", "b2", "b1", "b2")),
+    ]
