@@ -36,8 +36,11 @@ LEVEL_M: Final = 0.002
 PROBE_M: Final = 0.01
 PROBED: Final = (0.04, 0.5, 0.96)
 """Where a box's underside is probed, as shares of its sides."""
-STAGES_KEPT: Final = 256
-"""Stages between two resets: a stage leaves about 5 kB behind, and a reset costs as much as ten."""
+STAGES_KEPT: Final = 1024
+"""Stages between two resets. A stage leaves 5 to 10 kB behind; a reset takes 7 MB for a forked process that it had shared.
+
+A slot is replaced before it has settled so many things.
+"""
 EVERYWHERE: Final = Aabb((-math.inf,) * 3, (math.inf,) * 3)
 
 
