@@ -1,15 +1,20 @@
 """A manager that asks for tokens and speaks TLS, as `embomatrix manager init` prepares it, in this process."""
 
+import asyncio
 import contextlib
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
+from tests.fakes.worker import FakeWorker
+
 from embomatrix.manager.access.folder import AccessFolder, prepare
 from embomatrix.manager.app import running
 from embomatrix.manager.settings import ManagerSettings
+from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.roles import Role
 from embomatrix.rpc.token_client import TokenClient
+from embomatrix.rpc.values import Batch, Rollout
 from embomatrix.world.inflation import bundle_digest
 
 
@@ -54,3 +59,38 @@ def packed(content):
     """A bundle that nothing but its limits says anything about, and its digest."""
     data = zlib.compress(content.encode())
     return bundle_digest(data), data
+
+
+KITCHEN, KITCHEN_DATA = packed("a kitchen")
+BEDROOM, BEDROOM_DATA = packed("a bedroom")
+
+
+def rollouts(count, *, task="t", scene=KITCHEN):
+    return tuple(Rollout(f"x{i}", "g", scene, task, (), 0) for i in range(count))
+
+
+async def until(condition, within_s=10.0):
+    async with asyncio.timeout(within_s):
+        while not condition():  # noqa: ASYNC110  # the fake's lists have no event to wait for
+            await asyncio.sleep(0.01)
+
+
+@contextlib.asynccontextmanager
+async def trainer(at):
+    async with ClusterClient(at.address, at.token(Role.TRAINER), ca=at.ca) as client:
+        await client.open_run("test", "r1")
+        await client.put_bundles({KITCHEN: KITCHEN_DATA, BEDROOM: BEDROOM_DATA})
+        yield client
+
+
+def worker(at, name, **options):
+    return FakeWorker(at.address, worker_id=name, ca=at.ca, boot_id=f"boot of {name}", **options)
+
+
+async def joined(at, name, **options):
+    """A worker that joined with a token of its own."""
+    return worker(at, name, join_token=await at.issue(Role.JOIN), **options)
+
+
+async def collect(client, count):
+    return [result async for result in client.execute(Batch("r1", "b1", 1, rollouts(count)), deadline_s=30)]

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import grpc
 from fastapi import FastAPI
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 
 from embomatrix.manager.listen import bind_server
+from embomatrix.manager.refusal import refusing
 from embomatrix.rpc.channel import SERVER_OPTIONS
-from embomatrix.rpc.status import StandbyError, translate
+from embomatrix.rpc.status import StandbyError
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-
     from embomatrix.manager.access.protection import Tls
 
 
@@ -56,7 +55,7 @@ class Standby:
 
 
 class _Refusal(grpc.GenericRpcHandler):  # type: ignore[misc]  # grpc is untyped
-    """Answers every method of every service, whatever its messages are."""
+    """Answers every method of every service."""
 
     def __init__(self, standby: Standby) -> None:
         self._standby = standby
@@ -64,10 +63,5 @@ class _Refusal(grpc.GenericRpcHandler):  # type: ignore[misc]  # grpc is untyped
     def service(self, handler_call_details: grpc.HandlerCallDetails) -> grpc.RpcMethodHandler | None:
         if handler_call_details.method.startswith("/grpc.health."):
             return None
-        return grpc.stream_stream_rpc_method_handler(self._refuse)
-
-    async def _refuse(
-        self, requests: AsyncIterator[bytes], context: grpc.aio.ServicerContext[Any, Any]
-    ) -> None:
-        async with translate(context):
-            raise StandbyError(self._standby.sentence, self._standby.leader)
+        refusal = StandbyError(self._standby.sentence, self._standby.leader)
+        return refusing(handler_call_details.method, refusal)

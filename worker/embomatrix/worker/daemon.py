@@ -83,22 +83,8 @@ class Daemon:
         # Each of several managers is asked as often as one would be.
         self._backoff = Backoff(rng, longest_s=LONGEST_WAIT_S / self._managers.count)
         self._outbox = Outbox()
-        folder = settings.cache_dir.expanduser()
-        folder.mkdir(parents=True, exist_ok=True)
-        self._cache = BundleCache(
-            folder / "bundles",
-            limit_bytes=settings.cache_mb * MIB,
-            fetch=functools.partial(fetch, lambda: self._session),
-        )
-        limits = SlotLimits(resources.slots, resources.memory_mb, settings.slot_memory_mb)
-        self._pool = SlotPool(
-            limits,
-            bundle_path=self._cache.path_of,
-            on_result=self._take_result,
-            on_change=self._residents_changed,
-            log=folder / "simulator.log",
-            program=program,
-        )
+        self._cache = self._opened_cache()
+        self._pool = self._new_pool(program)
         self._courtesy = Courtesy(
             settings.preferences,
             probe or Machine(lambda: daemon_pids(settings.state_dir)),
@@ -116,6 +102,26 @@ class Daemon:
         self._takeovers = Takeovers()
         self._draining = asyncio.Event()
         self._forced = asyncio.Event()
+
+    def _opened_cache(self) -> BundleCache:
+        folder = self._settings.cache_dir.expanduser()
+        folder.mkdir(parents=True, exist_ok=True)
+        return BundleCache(
+            folder / "bundles",
+            limit_bytes=self._settings.cache_mb * MIB,
+            fetch=functools.partial(fetch, lambda: self._session),
+        )
+
+    def _new_pool(self, program: tuple[str, ...]) -> SlotPool:
+        resources, settings = self._resources, self._settings
+        return SlotPool(
+            SlotLimits(resources.slots, resources.memory_mb, settings.slot_memory_mb),
+            bundle_path=self._cache.path_of,
+            on_result=self._take_result,
+            on_change=self._residents_changed,
+            log=settings.cache_dir.expanduser() / "simulator.log",
+            program=program,
+        )
 
     @property
     def held(self) -> int:

@@ -1,0 +1,159 @@
+"""Tokens that are taken back, shared, or handed on: to whoever holds them at once, and under every manager that comes."""
+
+import asyncio
+import contextlib
+import socket
+
+import grpc
+import pytest
+from tests.fakes.guarded import (
+    KITCHEN,
+    KITCHEN_DATA,
+    collect,
+    guarded,
+    joined,
+    rollouts,
+    trainer,
+    until,
+    worker,
+)
+from tests.fakes.redis_server import RedisServer
+
+from embomatrix.cli.local_cluster import free_port
+from embomatrix.manager.app import running
+from embomatrix.manager.settings import ManagerSettings
+from embomatrix.rpc.client import ClusterClient
+from embomatrix.rpc.roles import Role
+from embomatrix.rpc.status import (
+    NotSignedInError,
+    PreconditionError,
+    StandbyError,
+)
+from embomatrix.rpc.token_client import TokenClient
+from embomatrix.rpc.values import Batch, Completed
+
+pytestmark = pytest.mark.timeout(120)
+
+
+async def test_a_revoked_worker_ends_at_once_and_its_rollouts_go_elsewhere(tmp_path):
+    async with (
+        guarded(tmp_path) as at,
+        trainer(at) as client,
+        await joined(at, "bad", slots=4, stuck={"t"}) as bad,
+    ):
+        batch = asyncio.create_task(collect(client, 8))
+        await until(lambda: len(bad.executed) == 4)
+        async with await joined(at, "good", slots=4) as good:
+            async with at.operator() as operator:
+                await operator.revoke_worker("bad", "its results were wrong")
+            results = await batch
+            assert len(good.executed) == 8
+        with pytest.raises(grpc.aio.AioRpcError) as caught:
+            await worker(at, "bad", token=bad.token).__aenter__()
+        assert caught.value.code() is grpc.StatusCode.UNAUTHENTICATED
+        assert "its results were wrong" in caught.value.details()
+    assert all(isinstance(result.outcome, Completed) for result in results)
+
+
+async def test_a_worker_whose_token_is_revoked_ends_as_well(tmp_path):
+    async with guarded(tmp_path) as at:
+        fleet = await at.issue(Role.WORKER, label="the lab")
+        async with worker(at, "pod-1", token=fleet) as pod:
+            async with at.operator() as operator:
+                known = {info.token_id: info for info in await operator.listed()}
+                assert known[fleet.partition(".")[0]].label == "the lab"
+                await operator.revoke(fleet.partition(".")[0])
+            await until(lambda: not pod._tasks)
+
+
+async def test_a_trainer_whose_token_is_revoked_reads_no_further(tmp_path):
+    async with guarded(tmp_path) as at, trainer(at) as client, await joined(at, "w1", execute_s=0.05):
+        token = await at.issue(Role.TRAINER)
+        async with ClusterClient(at.address, token, ca=at.ca) as revoked:
+            stream = revoked.execute(Batch("r1", "b1", 1, rollouts(40)), deadline_s=30)
+            await anext(stream)
+            async with at.operator() as operator:
+                await operator.revoke(token.partition(".")[0])
+            with pytest.raises(NotSignedInError, match="revoked"):
+                async for _ in stream:
+                    pass
+        # Nothing of the batch is lost: who may read it attaches.
+        assert len(await collect(client, 40)) == 40
+
+
+async def test_tokens_and_credentials_outlive_the_manager_and_what_was_revoked_stays_so(tmp_path):
+    async with guarded(tmp_path) as at:
+        first = await joined(at, "w1")
+        async with first:
+            await asyncio.sleep(0.05)
+        async with at.operator() as operator:
+            await operator.revoke(at.token(Role.VIEWER).partition(".")[0])
+    async with guarded(tmp_path) as at:
+        async with worker(at, "w1", token=first.token) as again:
+            await asyncio.sleep(0.05)
+            assert again.session
+        with pytest.raises(grpc.aio.AioRpcError) as caught:
+            await worker(at, "w2", join_token=first.join_token).__aenter__()
+        assert "used already, by worker w1" in caught.value.details()
+        async with ClusterClient(at.address, at.token(Role.VIEWER), ca=at.ca) as client:
+            with pytest.raises(NotSignedInError, match="revoked"):
+                await client.list_workers()
+    stored = b"".join(path.read_bytes() for path in tmp_path.glob("state.sqlite*"))
+    assert first.token.partition(".")[2].encode() not in stored
+
+
+async def test_who_takes_a_cluster_over_knows_its_tokens(tmp_path):
+    """Two managers on one Redis: what the first handed out and took back holds at the second, which stood by with TLS too."""
+    with RedisServer(tmp_path / "redis", free_port()) as redis:
+        options = {"state": redis.url, "leader_ttl_s": 1.0}
+        standby = free_port()
+        over = asyncio.Event()
+
+        async def take_over():
+            async with guarded(tmp_path / "data", port=standby, **options) as at:
+                for token, outcome in ((given, None), (taken, NotSignedInError)):
+                    async with ClusterClient(at.address, token, ca=at.ca) as client:
+                        with contextlib.nullcontext() if outcome is None else pytest.raises(outcome):
+                            await client.open_run("test", "r1")
+                async with worker(at, "w1", token=first.token) as again:
+                    assert again.session
+                    await asyncio.sleep(0.05)
+                over.set()
+
+        async with guarded(tmp_path / "data", **options) as at:
+            given, taken = await at.issue(Role.TRAINER), await at.issue(Role.TRAINER)
+            async with at.operator() as operator:
+                await operator.revoke(taken.partition(".")[0])
+            async with await joined(at, "w1") as first:
+                await asyncio.sleep(0.05)
+            waiting = asyncio.create_task(take_over())
+            await until(lambda: stands_by(standby))
+            async with ClusterClient(f"127.0.0.1:{standby}", given, ca=at.ca) as client:
+                with pytest.raises(StandbyError):
+                    await client.list_workers()
+        await waiting
+        assert over.is_set()
+
+
+def stands_by(port):
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+async def test_one_shared_token_is_an_admins_for_everybody_beside_the_others(tmp_path):
+    async with guarded(tmp_path, token="one-for-all") as at, worker(at, "w1", token="one-for-all") as w1:
+        async with ClusterClient(at.address, "one-for-all", ca=at.ca) as client:
+            await client.open_run("test", "r1")
+            await client.put_bundles({KITCHEN: KITCHEN_DATA})
+            assert len(await collect(client, 4)) == 4
+            await client.drain_worker("w1")
+        assert len(w1.executed) == 4
+        async with ClusterClient(at.address, at.token(Role.VIEWER), ca=at.ca) as client:
+            assert [found.worker_id for found in await client.list_workers()] == ["w1"]
+
+
+async def test_an_open_manager_has_no_tokens_to_hand_out(tmp_path):
+    settings = ManagerSettings(port=0, http_port=0, data_dir=tmp_path, state="memory:")
+    async with running(settings) as at, TokenClient(at.address) as operator:
+        with pytest.raises(PreconditionError, match="embomatrix manager init"):
+            await operator.issue(Role.TRAINER)
