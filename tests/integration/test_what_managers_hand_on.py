@@ -92,6 +92,23 @@ async def test_dispatch_that_was_paused_stays_paused_under_the_next_manager_unti
         assert len(await outcomes(client, batch(2, batch_id="b2", run_id="r2"))) == 2
 
 
+async def test_a_manager_with_another_data_folder_than_the_one_before_says_so_at_its_start(
+    tmp_path, state, caplog
+):
+    warned = {}
+    for turn, folder in enumerate(("one", "one", "other")):
+        caplog.clear()
+        async with manager(tmp_path / folder, state=state):
+            pass
+        warned[turn] = [
+            line for line in caplog.messages if "is not that of the manager that led last" in line
+        ]
+    assert warned[1] == []
+    [line] = warned[2]
+    assert f"the data folder {tmp_path / 'other'} is not" in line
+    assert "--data-dir" in line
+
+
 async def test_a_pause_that_can_not_be_noted_holds_and_says_so(tmp_path):
     server = RedisServer(tmp_path, free_port())
     with server:

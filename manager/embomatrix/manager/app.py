@@ -30,6 +30,7 @@ from embomatrix.manager.registry import LivenessLimits, Registry
 from embomatrix.manager.runtime import ManagerRuntime
 from embomatrix.manager.scheduler import ScheduleLimits
 from embomatrix.manager.server import build_server
+from embomatrix.manager.shared_folder import note_folder, warn_of_another_folder
 from embomatrix.manager.standby import Standby
 from embomatrix.manager.store.protocol import Candidate, StateError
 from embomatrix.manager.store.url import open_store
@@ -112,12 +113,16 @@ async def running(
             settings = settings.model_copy(update={"port": probe.getsockname()[1]})
         store = open_store(settings.state_url)
         stack.push_async_callback(store.close)
+        with _folder_errors(settings):
+            await warn_of_another_folder(store, settings.data_dir)
         leadership = Leadership(store, _candidate(settings))
         standby = Standby(protection.tls)
         http = _HttpServer(standby.page(), http_socket, protection.tls)
         group = await stack.enter_async_context(_stopped_at_exit())
         group.create_task(http.serve())
         epoch = await _win(leadership, standby, settings, on_standby)
+        with _folder_errors(settings):
+            await note_folder(store, settings.data_dir)
         runtime = await _start_runtime(settings, store, bundles, leadership, epoch)
         gate = Gate(store, guarded=protection.guarded, shared_token=settings.token)
         await gate.open(protection.first)

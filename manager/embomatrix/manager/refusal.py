@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 def refusing(method: str, refusal: ClusterError) -> grpc.RpcMethodHandler:
     """A handler for ``/package.Service/Method`` that refuses, of the method's own kind.
 
-    gRPC answers a unary method's caller only through a unary handler. It has no deserializer: the message of a stranger stays bytes.
+    gRPC answers a unary method's caller only through a unary handler. It has no deserializer: a stranger's message stays bytes.
     """
 
     async def refuse(_: Any, context: grpc.aio.ServicerContext) -> None:
