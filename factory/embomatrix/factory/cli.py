@@ -15,6 +15,7 @@ from embomatrix.factory.assets_cli import app as assets_app
 from embomatrix.factory.evaluate.cli import app as evaluate_app
 from embomatrix.factory.export import card, encoded, export_rows
 from embomatrix.factory.inspection.cli import app as inspect_app
+from embomatrix.factory.layout_cli import agent, lay
 from embomatrix.factory.pipeline.build import Check, Summary, build_dataset
 from embomatrix.factory.pipeline.cluster import ClusterJudge
 from embomatrix.factory.pipeline.settings import BuildSettings, WriterKind, scene_ids
@@ -35,6 +36,8 @@ app = typer.Typer(
 )
 app.add_typer(assets_app, name="assets")
 app.add_typer(evaluate_app, name="evaluate")
+app.command()(agent)
+app.command()(lay)
 app.add_typer(import_app)
 app.add_typer(inspect_app)
 MOST_JOBS = 8

@@ -1,6 +1,6 @@
-"""The paper's verification of a scene: the robot is sent to each thing that the task is about, and picks up what it can
-carry and what bears nothing.
+"""The paper's verification of a scene: the robot is sent to each thing that the task is about, and picks up what it can.
 
+What bears something is not picked up.
 Executed in the simulator, each thing from the start; what lies behind a door is opened first.
 """
 

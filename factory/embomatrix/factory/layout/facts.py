@@ -60,7 +60,8 @@ def _hosts(
                 continue
         offers = _offers(asset, round(item.pose_world_asset.position_m[2], 3), asked=item.name in named)
         shut = any(interior.closed_by for interior in asset.interiors)
-        if shut and item.name in editor.base.by_name and not editor.opens(item.name):
+        given = item.name in named or item.name not in editor.base.by_name
+        if shut and not given and not editor.opens(item.name):
             offers = tuple(offer for offer in offers if offer.relation is not LayoutRelation.INSIDE)
         if offers:
             yield HostFacts(item.name, asset.category, offers, tuple(guests.get(item.name, ())), shut)

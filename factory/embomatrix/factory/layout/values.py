@@ -302,6 +302,35 @@ class Spot:
 
 
 @dataclass(frozen=True, slots=True)
+class SampleBrief:
+    """What the Object-level Sampling Agent decides on: one model of a category, any where empty, at a host of a base scene.
+
+    Without a relation the host is a room, on whose floor it goes.
+    """
+
+    scene: str
+    category: str
+    host: str
+    relation: LayoutRelation | None = None
+    model: str = ""
+    seed: int = 0
+    __pydantic_config__: ClassVar = _STRICT
+
+
+@dataclass(frozen=True, slots=True)
+class Sampled:
+    """A pose in the world, or why there is none."""
+
+    name: str = ""
+    position_m: Size3 | None = None
+    quat_xyzw: tuple[float, float, float, float] | None = None
+    room: str = ""
+    reason: LayoutReason | None = None
+    detail: str = ""
+    __pydantic_config__: ClassVar = _STRICT
+
+
+@dataclass(frozen=True, slots=True)
 class Arranged:
     """One joint arrangement of a plane's things with its score, and what found no place, with the reason."""
 

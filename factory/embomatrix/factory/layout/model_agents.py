@@ -1,0 +1,223 @@
+"""Layout agents behind a language model: typed answers, checked against the brief, asked for again with what is wrong.
+
+A model that stays wrong is no reason to lose a scene: then the rules answer, and a warning says so.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final, Self, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from embomatrix.factory.layout.distribution import distribute
+from embomatrix.factory.layout.doors import DOORS, AgentName
+from embomatrix.factory.layout.jobs import LayoutAgents
+from embomatrix.factory.layout.organization import choices, described, organize
+from embomatrix.factory.layout.prompts import DISTRIBUTOR, ORGANIZER, PLANNER, USER
+from embomatrix.factory.layout.tree import LayoutTree
+from embomatrix.factory.layout.values import (
+    ABOUT_THE_PLANE,
+    Arrangement,
+    Branch,
+    Distribution,
+    LayoutRelation,
+    Wish,
+    Wishes,
+)
+from embomatrix.factory.layout.wishes import wish
+from embomatrix.llm.structured import ask
+from embomatrix.llm.values import ChatRequest, Message, Speaker, UnusableReplyError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection
+    from contextlib import AbstractAsyncContextManager
+
+    from embomatrix.factory.layout.values import DistributionBrief, PlaneCompany, RoomBrief
+    from embomatrix.llm.values import ChatModel
+
+logger = logging.getLogger(__name__)
+TEMPERATURE: Final = 0.3
+T = TypeVar("T", bound=BaseModel)
+
+
+class _Answer(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class RoomsAnswer(_Answer):
+    """Rooms by thing."""
+
+    rooms: dict[str, str]
+    reasons: dict[str, str] = Field(default_factory=dict)
+
+
+class BranchAnswer(_Answer):
+    parent: str
+    relation: LayoutRelation
+    child: str
+
+
+class TreeAnswer(_Answer):
+    """What each thing hangs on."""
+
+    branches: tuple[BranchAnswer, ...] = Field(max_length=200)
+
+
+class WishAnswer(_Answer):
+    kind: Arrangement
+    other: str = ""
+
+
+class WishesAnswer(_Answer):
+    """Constraints by thing."""
+
+    of: dict[str, tuple[WishAnswer, ...]]
+
+
+class ModelLayoutAgents:
+    """Context manager over one event loop, which closes the ``endpoint`` at its end; asks one model for all agents."""
+
+    def __init__(
+        self,
+        model: ChatModel,
+        endpoint: AbstractAsyncContextManager[object] | None = None,
+        *,
+        attempts: int = 3,
+    ) -> None:
+        self._model = model
+        self._endpoint = endpoint
+        self._attempts = attempts
+        self._runner = asyncio.Runner()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._endpoint is not None:
+            self._runner.run(self._closed(self._endpoint))
+        self._runner.close()
+
+    @staticmethod
+    async def _closed(endpoint: AbstractAsyncContextManager[object]) -> None:
+        await endpoint.__aexit__(None, None, None)
+
+    def agents(self, modelled: Collection[AgentName]) -> LayoutAgents:
+        """Agents of which these are the model and the others rules."""
+        chosen = LayoutAgents()
+        if AgentName.DISTRIBUTOR in modelled:
+            chosen = replace(chosen, distribute=self.distribute)
+        if AgentName.ORGANIZER in modelled:
+            chosen = replace(chosen, organize=self.organize)
+        if AgentName.PLANNER in modelled:
+            chosen = replace(chosen, wish=self.wish)
+        return chosen
+
+    def distribute(self, brief: DistributionBrief) -> Distribution:
+        """Scene-level Distribution Agent. Raises EndpointError."""
+        rooms = {room.name for room in brief.rooms}
+
+        def check(answer: RoomsAnswer) -> None:
+            _all_there({thing.name for thing in brief.things}, answer.rooms, "a room")
+            for thing in brief.things:
+                room = answer.rooms[thing.name]
+                if room not in rooms:
+                    raise ValueError(f"there is no room {room!r}: the rooms are {', '.join(sorted(rooms))}")
+                if thing.rooms and room not in thing.rooms:
+                    raise ValueError(f"{thing.name} may be in {', '.join(thing.rooms)} only, not in {room}")
+                host = (
+                    room
+                    if thing.host in rooms
+                    else brief.homes.get(thing.host, answer.rooms.get(thing.host, room))
+                )
+                if host != room or (thing.host in rooms and thing.host != room):
+                    raise ValueError(f"{thing.name} belongs at {thing.host}, which is not in {room}")
+
+        answer = self._ask(AgentName.DISTRIBUTOR, DISTRIBUTOR, brief, RoomsAnswer, check, brief.seed)
+        return distribute(brief) if answer is None else Distribution(answer.rooms, answer.reasons)
+
+    def organize(self, brief: RoomBrief) -> LayoutTree:
+        """Room-level Organization Agent. Raises EndpointError."""
+        standing = [Branch(brief.room.name, LayoutRelation.ONTOP, host.name) for host in brief.hosts]
+
+        def tree_of(answer: TreeAnswer) -> LayoutTree:
+            new = [Branch(each.parent, each.relation, each.child) for each in answer.branches]
+            return LayoutTree.of(brief.room.name, [*standing, *new])
+
+        def check(answer: TreeAnswer) -> None:
+            hung = {branch.child: branch for branch in tree_of(answer).branches()}
+            _all_there({thing.name for thing in brief.things}, hung, "a parent")
+            for thing in brief.things:
+                allowed = [*choices(brief, thing, hung)]
+                mine = hung[thing.name]
+                nested = mine.parent in {other.name for other in brief.things} and thing.relation is None
+                if allowed and mine not in allowed and not nested:
+                    told = "; ".join(f"{branch.relation} {branch.parent}" for branch in allowed[:8])
+                    raise ValueError(f"{thing.name} can't be {mine.relation} {mine.parent}: it can be {told}")
+
+        answer = self._ask(
+            AgentName.ORGANIZER, ORGANIZER, brief, TreeAnswer, check, brief.seed, described(brief.failures)
+        )
+        return organize(brief) if answer is None else tree_of(answer)
+
+    def wish(self, company: PlaneCompany) -> Wishes:
+        """Planar-Level Placement Generator: constraints. Raises EndpointError."""
+        names = {thing.name for thing in company.things}
+        known = names | {name for name, _ in company.others}
+
+        def check(answer: WishesAnswer) -> None:
+            for thing, wishes in answer.of.items():
+                if thing not in names:
+                    raise ValueError(
+                        f"there is no thing {thing!r} to place: expected {', '.join(sorted(names))}"
+                    )
+                for each in wishes:
+                    if each.kind not in ABOUT_THE_PLANE and (each.other not in known or each.other == thing):
+                        raise ValueError(
+                            f"{thing}: {each.kind} needs another object of the plane, not {each.other!r}: one of "
+                            f"{', '.join(sorted(known - {thing}))}"
+                        )
+
+        answer = self._ask(AgentName.PLANNER, PLANNER, company, WishesAnswer, check, company.seed)
+        if answer is None:
+            return wish(company)
+        demanded = wish(company).of
+        return Wishes(
+            {
+                thing.name: (
+                    *(each for each in demanded[thing.name] if each.required),
+                    *(Wish(each.kind, each.other) for each in answer.of.get(thing.name, ())),
+                )
+                for thing in company.things
+            }
+        )
+
+    def _ask(
+        self,
+        name: AgentName,
+        system: str,
+        brief: object,
+        shape: type[T],
+        check: Callable[[T], None],
+        seed: int,
+        history: str = "",
+    ) -> T | None:
+        """A checked answer, None where the model gave none that can be used."""
+        text = USER.format(brief=DOORS[name].brief.dump_json(brief).decode())
+        if history:
+            text += f"\nWhat has failed so far:\n{history}"
+        messages = (Message(Speaker.SYSTEM, system), Message(Speaker.USER, text))
+        request = ChatRequest(name.value, messages, temperature=TEMPERATURE, seed=seed % 2**31)
+        try:
+            answer = self._runner.run(ask(self._model, request, shape, check=check, attempts=self._attempts))
+        except UnusableReplyError as error:
+            logger.warning("the rules stand in: %s", error)
+            return None
+        return answer.value
+
+
+def _all_there(wanted: Collection[str], given: Collection[str], what: str) -> None:
+    if missing := sorted(set(wanted) - set(given)):
+        raise ValueError(f"{missing[0]!r} has no {what.removeprefix('a ')}: give each thing {what}")

@@ -1,0 +1,209 @@
+"""``embomatrix factory agent`` and ``factory lay``: the layout agents one by one, and all of them on one task."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+
+import typer
+from rich.console import Console
+
+from embomatrix.factory.layout.baselines import lay_at_random, lay_by_poses
+from embomatrix.factory.layout.distribution import DistributionError
+from embomatrix.factory.layout.doors import DOORS, MODELLED, AgentName, BriefError
+from embomatrix.factory.layout.generator import lay as lay_by_tree
+from embomatrix.factory.layout.jobs import LayoutAgents
+from embomatrix.factory.layout.model_agents import ModelLayoutAgents
+from embomatrix.factory.pictures.scene import draw_plan
+from embomatrix.factory.refusal import Refusal
+from embomatrix.factory.scenes.build import build_base_scene
+from embomatrix.factory.task_import.sources import SourceError, read_activity, read_file
+from embomatrix.factory.task_import.task import Manner, import_problem
+from embomatrix.llm.cassette import Cassette, CassetteMode
+from embomatrix.llm.endpoint import Endpoint
+from embomatrix.llm.values import LlmError
+from embomatrix.world.bddl import BddlError
+from embomatrix.world.catalog import CatalogError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+    from embomatrix.factory.editor import SceneEditor
+    from embomatrix.factory.layout.jobs import Item, Layout, Record
+    from embomatrix.llm.values import ChatModel
+
+METHODS = ("tree", "random", "poses")
+Llm = Annotated[
+    str, typer.Option(help="Base URL of an OpenAI-compatible endpoint for agents that are models.")
+]
+Model = Annotated[str, typer.Option(help="Name of the model there.")]
+Key = Annotated[str, typer.Option("--llm-key", envvar="EMBOMATRIX_LLM_KEY", help="Its key.")]
+Tape = Annotated[
+    Path | None,
+    typer.Option("--cassette", help="Recorded answers: read where it has them, added to where not."),
+]
+
+
+def agent(
+    name: Annotated[AgentName, typer.Argument(help="Which agent.")],
+    brief: Annotated[
+        Path | None, typer.Option("--in", help="File with its brief as JSON; '-' reads standard input.")
+    ] = None,
+    schema: Annotated[bool, typer.Option("--schema", help="Print the JSON schema of its brief.")] = False,
+    llm: Llm = "",
+    model: Model = "",
+    key: Key = "",
+    cassette: Tape = None,
+) -> None:
+    """Run one agent of the scene layout alone: a brief in, its answer out, by rules or by a language model."""
+    door = DOORS[name]
+    if schema:
+        typer.echo(json.dumps(door.brief.json_schema(), indent=1))
+        return
+    if brief is None:
+        _fail(
+            f"{name}, {door.about}, needs a brief: give --in FILE; `factory lay --out` writes some, `--schema` tells the form"
+        )
+    with _mended():
+        asked = door.read(sys.stdin.read() if str(brief) == "-" else brief.read_text(encoding="utf-8"))
+        if not llm and cassette is None:
+            typer.echo(door.written(door.rules(asked)))
+            return
+        if name not in MODELLED:
+            _fail(
+                f"{name} has no form with a language model: leave out --llm; {', '.join(sorted(MODELLED))} have one"
+            )
+        with _modelled(llm, model, key, cassette) as agents:
+            answers: dict[AgentName, Callable[[Any], Any]] = {
+                AgentName.DISTRIBUTOR: agents.distribute,
+                AgentName.ORGANIZER: lambda value: tuple(agents.organize(value).branches()),
+                AgentName.PLANNER: agents.wish,
+            }
+            typer.echo(door.written(answers[name](asked)))
+
+
+def lay(
+    scene: Annotated[str, typer.Option(help="Base scene.")],
+    bddl: Annotated[Path | None, typer.Option(help="A BDDL problem file.")] = None,
+    activity: Annotated[str, typer.Option(help="An activity of the bddl package.")] = "",
+    method: Annotated[
+        str, typer.Option(help="tree, or one that it is compared with: random, poses.")
+    ] = "tree",
+    forms: Annotated[
+        list[str] | None, typer.Option("--agent", help="NAME=llm or NAME=rules; give it again for more.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Equal seeds give equal scenes.")] = 0,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for the plan's picture and for what each agent was told.")
+    ] = None,
+    llm: Llm = "",
+    model: Model = "",
+    key: Key = "",
+    cassette: Tape = None,
+) -> None:
+    """Lay one task out in a base scene and show its trees; nothing is executed."""
+    modelled = _modelled_agents(forms or [])
+    if method not in METHODS:
+        _fail(f"there is no method {method!r}: expected one of {', '.join(METHODS)}")
+    if (bddl is None) is (not activity):
+        _fail("expected exactly one of --bddl FILE and --activity NAME")
+    with _mended(), contextlib.ExitStack() as stack:
+        source = read_file(bddl) if bddl is not None else read_activity(activity)
+        agents = LayoutAgents()
+        if modelled:
+            agents = stack.enter_context(_modelled(llm, model, key, cassette)).agents(modelled)
+        kept: list[Layout] = []
+
+        def laying(editor: SceneEditor, items: Sequence[Item], seed: int) -> Layout:
+            by_name = {"random": lay_at_random, "poses": lay_by_poses}
+            other = by_name.get(method)
+            kept.append(other(editor, items, seed) if other else lay_by_tree(editor, items, seed, agents))
+            return kept[-1]
+
+        imported = import_problem(source, build_base_scene(scene), seed=seed, manner=Manner(laying))
+        for layout in kept:
+            _show(layout)
+            if out is not None:
+                _write_briefs(out, layout.record)
+        if isinstance(imported, Refusal):
+            _fail(f"{source.name} is refused ({imported.reason}): {imported.sentence}")
+        if out is not None:
+            out.mkdir(parents=True, exist_ok=True)
+            draw_plan(imported.scene).save(out / "plan.png")
+            Console().print(f"pictures and briefs: {out}", highlight=False)
+
+
+def _show(layout: Layout) -> None:
+    labels = {there: name for name, there in layout.names.items()}
+    for tree in layout.trees.values():
+        typer.echo(tree.drawn(labels))
+    for failure in layout.failures:
+        typer.echo(
+            f"left out: {failure.thing} {failure.relation} {failure.host}: {failure.reason}, {failure.detail}"
+        )
+
+
+def _write_briefs(out: Path, record: Record) -> None:
+    """Every brief as the file that ``factory agent NAME --in`` takes."""
+    out.mkdir(parents=True, exist_ok=True)
+    told = [(AgentName.DISTRIBUTOR, record.distribution[0])] if record.distribution else []
+    briefs: list[tuple[AgentName, object]] = [
+        *told,
+        *((AgentName.ORGANIZER, brief) for brief, _ in record.rooms),
+        *((AgentName.PLANNER, brief) for brief, _ in record.company),
+        *((AgentName.SOLVER, brief) for brief, _ in record.planes),
+    ]
+    for number, (name, brief) in enumerate(briefs):
+        path = out / f"{number:02d}-{name.value}.json"
+        path.write_bytes(DOORS[name].brief.dump_json(brief, indent=1))
+
+
+def _modelled_agents(forms: list[str]) -> frozenset[AgentName]:
+    """Agents that are to be a language model, of NAME=llm and NAME=rules."""
+    found = set()
+    for form in forms:
+        name, _, kind = form.partition("=")
+        if name not in set(AgentName) or kind not in ("llm", "rules"):
+            _fail(f"--agent {form!r}: expected NAME=llm or NAME=rules, NAME one of {', '.join(AgentName)}")
+        if kind == "llm":
+            if AgentName(name) not in MODELLED:
+                _fail(f"{name} has no form with a language model: {', '.join(sorted(MODELLED))} have one")
+            found.add(AgentName(name))
+    return frozenset(found)
+
+
+@contextlib.contextmanager
+def _modelled(url: str, model: str, key: str, cassette: Path | None) -> Iterator[ModelLayoutAgents]:
+    """Agents on an endpoint, on a recording, or on both."""
+    if url and not model:
+        _fail("--llm needs the name of a model there: give --model")
+    if not url and cassette is None:
+        _fail("an agent is to be a language model: give --llm URL and --model NAME, or --cassette FILE")
+    endpoint = Endpoint(url, model, api_key=key) if url else None
+    asked: ChatModel | None = endpoint
+    if cassette is not None:
+        asked = Cassette(cassette, CassetteMode.AUTO if asked else CassetteMode.REPLAY, asked)
+    assert asked is not None  # one of the two was given
+    with ModelLayoutAgents(asked, endpoint) as agents:
+        yield agents
+
+
+@contextlib.contextmanager
+def _mended() -> Iterator[None]:
+    """What a person can mend is one sentence and exit status 2."""
+    try:
+        yield
+    except (BddlError, BriefError, CatalogError, DistributionError, LlmError, SourceError) as error:
+        _fail(str(error))
+    except OSError as error:
+        _fail(f"{error.filename}: {error.strerror}: name a file or folder that can be used")
+
+
+def _fail(sentence: str) -> NoReturn:
+    Console(stderr=True).print(
+        f"embomatrix factory: {sentence}", highlight=False, markup=False, soft_wrap=True
+    )
+    raise typer.Exit(2) from None

@@ -1,0 +1,210 @@
+"""Rooms, trees and poses of a task's things: each level alone, and all of them in one flat."""
+
+import json
+from typing import TYPE_CHECKING
+
+import pytest
+from tests.fakes.chat_server import ChatServer
+
+from embomatrix.factory.editor import SceneEditor
+from embomatrix.factory.layout.baselines import lay_at_random, lay_by_poses
+from embomatrix.factory.layout.distribution import DistributionError, distribute
+from embomatrix.factory.layout.doors import DOORS, AgentName, BriefError
+from embomatrix.factory.layout.generator import lay
+from embomatrix.factory.layout.jobs import Item
+from embomatrix.factory.layout.model_agents import ModelLayoutAgents
+from embomatrix.factory.layout.organization import organize
+from embomatrix.factory.layout.tree import LayoutTree, TreeError
+from embomatrix.factory.layout.values import (
+    MEANS,
+    Branch,
+    DistributionBrief,
+    Failure,
+    HostFacts,
+    HostOffer,
+    LayoutReason,
+    LayoutRelation,
+    RoomBrief,
+    RoomFacts,
+    Thing,
+)
+from embomatrix.factory.scenes.check import check_scene
+from embomatrix.llm.endpoint import Endpoint, EndpointLimits
+from embomatrix.world.catalog import Catalog
+
+if TYPE_CHECKING:
+    from embomatrix.world.scene import Scene
+
+ON, IN = LayoutRelation.ONTOP, LayoutRelation.INSIDE
+KITCHEN = RoomFacts("kitchen_0", "kitchen", (4.0, 4.0), ("countertop", "fridge"))
+BEDROOM = RoomFacts("bedroom_0", "bedroom", (4.0, 4.0), ("bed", "nightstand"))
+TABLE = HostFacts("breakfast_table_1", "breakfast_table", (HostOffer(ON, ((0.8, 1.2, 9.0),), 0.7),))
+FRIDGE = HostFacts("fridge_1", "fridge", (HostOffer(IN, ((0.5, 0.5, 0.4),), 0.6),), shut=True)
+PLATE = Thing("plate_1", "plate", (0.24, 0.24, 0.02))
+
+
+def test_every_relation_of_a_tree_has_its_means():
+    assert set(MEANS) == set(LayoutRelation)
+    assert len(LayoutRelation) == 9
+
+
+def test_a_tree_is_read_back_from_its_branches_and_tells_parents_before_children():
+    branches = [
+        Branch("kitchen_0", ON, "table_1"),
+        Branch("table_1", ON, "bowl_1"),
+        Branch("bowl_1", IN, "apple_1"),
+    ]
+    tree = LayoutTree.of("kitchen_0", reversed(branches))
+    assert list(tree.branches()) == branches
+    assert tree.depth_of("apple_1") == 3
+    assert tree.nested() == {
+        "kitchen_0": {"ontop": {"table_1": {"ontop": {"bowl_1": {"inside": {"apple_1": {}}}}}}}
+    }
+    assert list(tree.pruned(["bowl_1"]).branches()) == branches[:2]
+
+
+@pytest.mark.parametrize(
+    ("branches", "problem"),
+    [
+        ([("a", "b"), ("a", "c"), ("root", "a"), ("c", "b")], "give every object one parent"),
+        ([("a", "b"), ("b", "a")], "does not lead to the root"),
+        ([("a", "root")], "being the root"),
+    ],
+)
+def test_branches_that_make_no_tree_are_told(branches, problem):
+    with pytest.raises(TreeError, match=problem):
+        LayoutTree.of("root", [Branch(parent, ON, child) for parent, child in branches])
+
+
+def test_things_go_where_people_keep_them_and_with_what_they_belong_to():
+    things = (
+        PLATE,
+        Thing("alarm_clock_1", "alarm_clock", (0.05, 0.1, 0.1)),
+        Thing("apple_1", "apple", (0.07, 0.07, 0.07), relation=ON, host="plate_1"),
+    )
+    found = distribute(DistributionBrief((KITCHEN, BEDROOM), things)).rooms
+    assert found == {"plate_1": "kitchen_0", "alarm_clock_1": "bedroom_0", "apple_1": "kitchen_0"}
+
+
+def test_what_belongs_together_and_is_wanted_apart_is_told():
+    things = (
+        Thing("plate_1", "plate", (0.24, 0.24, 0.02), rooms=("kitchen_0",)),
+        Thing("apple_1", "apple", (0.07, 0.07, 0.07), rooms=("bedroom_0",), relation=ON, host="plate_1"),
+    )
+    with pytest.raises(DistributionError, match="belong together"):
+        distribute(DistributionBrief((KITCHEN, BEDROOM), things))
+
+
+def test_a_host_that_failed_is_not_asked_again_and_what_fits_nowhere_is_left_out():
+    brief = RoomBrief(KITCHEN, (TABLE,), (PLATE,))
+    assert organize(brief).parent_of("plate_1") == Branch("breakfast_table_1", ON, "plate_1")
+    failed = Failure("plate_1", ON, "breakfast_table_1", LayoutReason.NO_FREE_SPOT, "full")
+    floor = RoomBrief(KITCHEN, (TABLE,), (PLATE,), (failed,))
+    assert organize(floor).parent_of("plate_1") == Branch("kitchen_0", ON, "plate_1")
+    nowhere = Failure("plate_1", ON, "kitchen_0", LayoutReason.BARS_THE_WAY, "")
+    assert organize(RoomBrief(KITCHEN, (TABLE,), (PLATE,), (failed, nowhere))).parent_of("plate_1") is None
+
+
+def test_what_the_task_demands_is_no_choice():
+    milk = Thing("milk_1", "carton_of_milk", (0.1, 0.1, 0.2), relation=IN, host="fridge_1")
+    assert organize(RoomBrief(KITCHEN, (TABLE, FRIDGE), (milk,))).parent_of("milk_1") == Branch(
+        "fridge_1", IN, "milk_1"
+    )
+
+
+def models(category: str) -> tuple[tuple[str, str], ...]:
+    return tuple((category, model.model_id) for model in Catalog.load().models_of(category)[:3])
+
+
+def items(flat: "Scene") -> list[Item]:
+    table = next(item.name for item in flat.objects if item.name.startswith("breakfast_table"))
+    return [
+        Item("bowl", models("bowl"), ON, table),
+        Item("apple", models("apple"), beside=("bowl",)),
+        Item("book", models("hardback")),
+        Item("chair", models("armchair"), rooms=("living_room_0",)),
+        Item("mirror", models("mirror"), rooms=("bathroom_0",)),
+    ]
+
+
+def test_a_task_is_laid_out_soundly_and_equally_for_equal_seeds(flat: "Scene") -> None:
+    editor = SceneEditor(flat)
+    layout = lay(editor, items(flat), 3)
+    scene = editor.freeze("laid")
+    assert not layout.failures
+    assert check_scene(scene) == ()
+    assert scene.by_name[layout.names["bowl"]].host == scene.by_name[layout.names["apple"]].host
+    assert scene.by_name[layout.names["book"]].host
+    assert scene.by_name[layout.names["mirror"]].pose_world_asset.position_m[2] > 1.0
+    assert layout.names["book"] in layout.trees[scene.by_name[layout.names["book"]].room].drawn()
+    again = SceneEditor(flat)
+    assert lay(again, items(flat), 3).names == layout.names
+    assert again.freeze("laid") == scene
+
+
+def test_what_fits_nowhere_is_left_out_with_its_reason_and_the_rest_is_laid(flat: "Scene") -> None:
+    fridge = next(item.name for item in flat.objects if item.name.startswith("fridge"))
+    layout = lay(SceneEditor(flat), [Item("bed", models("bed"), IN, fridge), Item("mug", models("mug"))], 0)
+    (failure,) = layout.failures
+    assert (failure.thing, failure.reason) == ("bed", LayoutReason.TOO_LARGE)
+    assert "mug" in layout.names
+
+
+@pytest.mark.parametrize("method", [lay_at_random, lay_by_poses])
+def test_the_ways_that_layouts_are_compared_with_take_the_same_items(flat: "Scene", method) -> None:
+    editor = SceneEditor(flat)
+    layout = method(editor, items(flat), 0)
+    assert layout.names.keys() | {failure.thing for failure in layout.failures} == {
+        each.name for each in items(flat)
+    }
+
+
+@pytest.mark.parametrize("name", AgentName)
+def test_every_agent_has_a_door_that_names_what_is_wrong_with_a_brief(name):
+    with pytest.raises(BriefError, match="--schema"):
+        DOORS[name].read('{"nonsense": 1}')
+    assert DOORS[name].about
+
+
+def test_a_brief_goes_through_its_door_unchanged():
+    door = DOORS[AgentName.ORGANIZER]
+    brief = RoomBrief(KITCHEN, (TABLE, FRIDGE), (PLATE,))
+    assert door.read(door.brief.dump_json(brief).decode()) == brief
+    assert json.loads(door.written(door.rules(brief)))[-1]["child"] == "plate_1"
+
+
+def organized(*script: str) -> tuple[LayoutTree, ChatServer]:
+    server = ChatServer(*script)
+    with server.serving() as url:
+        endpoint = Endpoint(
+            url, "small-1", limits=EndpointLimits(attempts=2, first_wait_s=0.01, timeout_s=5.0)
+        )
+        with ModelLayoutAgents(endpoint, endpoint) as agents:
+            return agents.organize(RoomBrief(KITCHEN, (TABLE, FRIDGE), (PLATE,))), server
+
+
+def branch(parent: str, child: str = "plate_1") -> str:
+    return json.dumps({"branches": [{"parent": parent, "relation": "ontop", "child": child}]})
+
+
+def test_a_model_organizes_a_room_and_hears_what_is_wrong():
+    tree, server = organized("I think", branch("unicorn_1"), branch("fridge_1"), branch("breakfast_table_1"))
+    assert tree.parent_of("plate_1") in (
+        Branch("breakfast_table_1", ON, "plate_1"),
+        Branch("kitchen_0", ON, "plate_1"),
+    )
+    told = [request["messages"][-1]["content"] for request in server.requests]
+    assert "no complete JSON value" in told[1]
+    assert "does not lead to the root" in told[2]
+
+
+def test_rules_stand_in_for_a_model_that_stays_wrong():
+    tree, server = organized("no", "no", "no")
+    assert tree.parent_of("plate_1") == Branch("breakfast_table_1", ON, "plate_1")
+    assert len(server.requests) == 3
+
+
+def test_a_model_s_tree_is_taken_when_it_is_allowed():
+    tree, server = organized(branch("kitchen_0"))
+    assert tree.parent_of("plate_1") == Branch("kitchen_0", ON, "plate_1")
+    assert "<brief>" in server.requests[0]["messages"][1]["content"]

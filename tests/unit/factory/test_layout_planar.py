@@ -1,0 +1,189 @@
+"""Constraints on a plane mean what they say, and what the solver finds meets nothing and is in reach."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from embomatrix.factory.layout.arrangement import WEIGHTS, Candidates, half_extents, holds, near_m, next_to_m
+from embomatrix.factory.layout.planar import arrange, unknown_names
+from embomatrix.factory.layout.values import (
+    Arrangement,
+    Footprint,
+    LayoutReason,
+    PlaneBrief,
+    PlaneThing,
+    Wish,
+)
+from embomatrix.skills.limits import ROBOT
+
+PLANE = (2.0, 1.2)
+CUP = (0.1, 0.1, 0.12)
+EAST = Footprint("laptop", (0.0, 0.0), 0.0, (0.3, 0.4), 0.0, 0.2)
+"""A thing in the middle whose front looks along the plane's x."""
+
+
+def held(kind, x, y, yaw=0.0, other=EAST, size_m=CUP):
+    spots = Candidates.of(np.array([[x, y]]), np.array([yaw]), size_m)
+    return bool(holds(Wish(kind, other.name if other else ""), spots, PLANE, size_m, other)[0])
+
+
+def test_every_constraint_has_a_weight():
+    assert set(WEIGHTS) == set(Arrangement)
+
+
+@pytest.mark.parametrize(
+    ("kind", "there", "not_there"),
+    [
+        (Arrangement.EDGE, (0.92, 0.0), (0.0, 0.0)),
+        (Arrangement.MIDDLE, (0.1, -0.1), (0.7, 0.0)),
+        (Arrangement.NEAR, (0.4, 0.0), (0.94, 0.54)),
+        (Arrangement.FAR, (0.94, 0.54), (0.4, 0.0)),
+        (Arrangement.IN_FRONT_OF, (0.6, 0.1), (-0.6, 0.1)),
+        (Arrangement.SIDE_OF, (0.1, 0.5), (0.6, 0.0)),
+        (Arrangement.CENTER_ALIGNED, (0.0, 0.5), (0.3, 0.4)),
+        (Arrangement.NEXT_TO, (0.22, 0.1), (0.5, 0.1)),
+    ],
+)
+def test_a_constraint_tells_where_it_holds(kind, there, not_there):
+    assert held(kind, *there)
+    assert not held(kind, *not_there)
+
+
+def test_a_thing_faces_another_when_its_front_looks_at_it_from_any_side():
+    rng = np.random.default_rng(0)
+    for angle in rng.uniform(-math.pi, math.pi, 50):
+        x, y = 0.5 * math.cos(angle), 0.5 * math.sin(angle)
+        assert held(Arrangement.FACE_TO, x, y, yaw=angle + math.pi)
+        assert not held(Arrangement.FACE_TO, x, y, yaw=angle + math.pi + 0.2)
+        assert not held(Arrangement.FACE_TO, x, y, yaw=angle)
+
+
+def test_front_and_side_turn_with_the_thing_that_they_are_about():
+    rng = np.random.default_rng(1)
+    for turn in rng.uniform(-math.pi, math.pi, 50):
+        turned = dataclasses.replace(EAST, yaw=float(turn))
+        ahead = (0.5 * math.cos(turn), 0.5 * math.sin(turn))
+        beside = (-ahead[1], ahead[0])
+        assert held(Arrangement.IN_FRONT_OF, *ahead, other=turned)
+        assert not held(Arrangement.SIDE_OF, *ahead, other=turned)
+        assert held(Arrangement.SIDE_OF, *beside, other=turned)
+        assert held(Arrangement.CENTER_ALIGNED, *beside, other=turned)
+
+
+def test_near_and_far_are_each_other_s_contrary():
+    rng = np.random.default_rng(2)
+    for x, y in rng.uniform((-0.9, -0.5), (0.9, 0.5), (50, 2)):
+        assert held(Arrangement.NEAR, x, y) is not held(Arrangement.FAR, x, y)
+
+
+def test_next_to_is_within_what_the_engine_calls_so_and_at_the_same_height():
+    assert next_to_m(CUP, EAST) >= 0.05
+    high = dataclasses.replace(EAST, low_m=0.5, high_m=0.7)
+    assert not held(Arrangement.NEXT_TO, 0.22, 0.1, other=high)
+    assert near_m((10.0, 10.0)) == 1.0
+
+
+def test_nothing_holds_about_what_is_not_there():
+    spots = Candidates.of(np.zeros((1, 2)), np.zeros(1), CUP)
+    for kind in set(Arrangement) - {Arrangement.EDGE, Arrangement.MIDDLE}:
+        assert not holds(Wish(kind, "nobody"), spots, PLANE, CUP, None)[0]
+
+
+def a_brief(seed: int) -> PlaneBrief:
+    rng = np.random.default_rng(seed)
+    kinds = [*Arrangement]
+    things = tuple(
+        PlaneThing(
+            f"thing_{n}",
+            tuple(rng.uniform(0.04, 0.3, 3).tolist()),
+            (Wish(kinds[int(rng.integers(len(kinds)))], f"thing_{int(rng.integers(4))}"),),
+            bool(rng.integers(2)),
+        )
+        for n in range(4)
+    )
+    obstacles = tuple(
+        Footprint(
+            f"old_{n}",
+            tuple(rng.uniform(-0.5, 0.5, 2).tolist()),
+            float(rng.uniform(0, 3)),
+            (0.2, 0.1),
+            0.0,
+            0.2,
+        )
+        for n in range(3)
+    )
+    stands = tuple((x, -1.0) for x in np.arange(-1.0, 1.1, 0.2).tolist())
+    return PlaneBrief("table", PLANE, things, obstacles, stands=stands, seed=seed)
+
+
+def corners(item: Footprint) -> np.ndarray:
+    x, y = item.size_m
+    square = np.array([(x, y), (-x, y), (-x, -y), (x, -y)]) / 2
+    turn = np.array([[math.cos(item.yaw), math.sin(item.yaw)], [-math.sin(item.yaw), math.cos(item.yaw)]])
+    return square @ turn + item.center_m
+
+
+def apart(a: Footprint, b: Footprint) -> bool:
+    """Whether an axis of either rectangle separates the two."""
+    return any(
+        (corners(a) @ axis).max() <= (corners(b) @ axis).min()
+        or (corners(b) @ axis).max() <= (corners(a) @ axis).min()
+        for yaw in (a.yaw, a.yaw + math.pi / 2, b.yaw, b.yaw + math.pi / 2)
+        for axis in (np.array([math.cos(yaw), math.sin(yaw)]),)
+    )
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_what_is_arranged_meets_nothing_lies_on_the_plane_and_is_in_reach(seed):
+    brief = a_brief(seed)
+    for way in arrange(brief):
+        sizes = {thing.name: thing.size_m for thing in brief.things}
+        placed = [
+            Footprint(spot.thing, spot.center_m, spot.yaw, sizes[spot.thing][:2], 0.0, sizes[spot.thing][2])
+            for spot in way.spots
+        ]
+        assert {spot.thing for spot in way.spots} | way.left_out.keys() == sizes.keys()
+        for number, item in enumerate(placed):
+            assert all(apart(item, other) for other in (*placed[:number], *brief.obstacles))
+            assert np.all(np.abs(corners(item)) <= np.array(PLANE) / 2)
+            half = half_extents(np.asarray(item.yaw), item.size_m)
+            off = np.maximum(np.abs(np.asarray(brief.stands) - item.center_m) - half, 0.0)
+            assert np.hypot(*off.T).min() <= ROBOT.reach_m
+
+
+def test_equal_briefs_are_arranged_equally_and_other_seeds_otherwise():
+    assert arrange(a_brief(3)) == arrange(a_brief(3))
+    assert arrange(a_brief(3)) != arrange(dataclasses.replace(a_brief(3), seed=4))
+
+
+def test_wishes_that_can_hold_do():
+    plate = PlaneThing("plate", (0.24, 0.24, 0.02), (Wish(Arrangement.EDGE),))
+    fork = PlaneThing("fork", (0.18, 0.03, 0.02), (Wish(Arrangement.NEXT_TO, "plate", required=True),))
+    vase = PlaneThing("vase", (0.1, 0.1, 0.3), (Wish(Arrangement.MIDDLE),))
+    best = arrange(PlaneBrief("table", PLANE, (fork, plate, vase)))[0]
+    assert all(spot.held for spot in best.spots)
+    assert not best.left_out
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"size_m": (0.05, 0.05)}, LayoutReason.TOO_LARGE),
+        ({"zones": ((-1.0, -0.6, 1.0, 0.6),)}, LayoutReason.NO_FREE_SPOT),
+        ({"stands": ((9.0, 9.0),)}, LayoutReason.OUT_OF_REACH),
+        (
+            {"things": (PlaneThing("cup", CUP, (Wish(Arrangement.NEXT_TO, "x", required=True),)),)},
+            LayoutReason.RELATION_NOT_HELD,
+        ),
+    ],
+)
+def test_what_finds_no_spot_says_why(change, reason):
+    brief = PlaneBrief("table", PLANE, (PlaneThing("cup", CUP),))
+    assert arrange(dataclasses.replace(brief, **change))[0].left_out == {"cup": reason}
+
+
+def test_names_that_are_not_on_the_plane_are_told():
+    things = (PlaneThing("cup", CUP, (Wish(Arrangement.NEAR, "ghost"), Wish(Arrangement.EDGE))),)
+    assert unknown_names(PlaneBrief("table", PLANE, things)) == ("ghost",)
