@@ -18,6 +18,7 @@ from embomatrix.factory.inspection.cli import app as inspect_app
 from embomatrix.factory.layout_cli import agent, lay
 from embomatrix.factory.pipeline.build import Check, Summary, build_dataset
 from embomatrix.factory.pipeline.cluster import ClusterJudge
+from embomatrix.factory.pipeline.corpus_cli import app as corpus_app
 from embomatrix.factory.pipeline.settings import BuildSettings, WriterKind, scene_ids
 from embomatrix.factory.social.asking import Asked, asked_writer
 from embomatrix.factory.task_import.cli import app as import_app
@@ -40,6 +41,7 @@ app.command()(agent)
 app.command()(lay)
 app.add_typer(import_app)
 app.add_typer(inspect_app)
+app.add_typer(corpus_app)
 MOST_JOBS = 8
 """Each holds some scenes: a few hundred MB."""
 

@@ -49,12 +49,15 @@ class Talk(BaseModel):
 
 
 class ModelAgents:
-    """All three agents on one model; ``temperature`` is that of what is made up."""
+    """All three agents on one model; ``temperature`` is that of what is made up, ``max_tokens`` bounds an answer."""
 
-    def __init__(self, model: ChatModel, *, temperature: float = 0.9, attempts: int = 3) -> None:
+    def __init__(
+        self, model: ChatModel, *, temperature: float = 0.9, attempts: int = 3, max_tokens: int = 2048
+    ) -> None:
         self._model = model
         self._temperature = temperature
         self._attempts = attempts
+        self._max_tokens = max_tokens
 
     async def cast(self, facts: SceneFacts, seed: int) -> Cast:
         """People who fit the scene and are found in every room of it. Raises LlmError."""
@@ -126,4 +129,4 @@ class ModelAgents:
 
     def _request(self, purpose: str, system: str, user: str, seed: int) -> ChatRequest:
         messages = (Message(Speaker.SYSTEM, system), Message(Speaker.USER, user))
-        return ChatRequest(purpose, messages, temperature=self._temperature, seed=seed)
+        return ChatRequest(purpose, messages, self._max_tokens, self._temperature, seed)

@@ -1,0 +1,111 @@
+"""A corpus keeps training and held-out tasks apart, and tells when what was frozen has changed."""
+
+import dataclasses
+import json
+
+import pytest
+from tests.fakes.datasets import write_kitchen_dataset
+from typer.testing import CliRunner
+
+from embomatrix.factory.cli import app
+from embomatrix.factory.pipeline.corpus import (
+    FROZEN_FILE,
+    HELDOUT_SCENES,
+    TRAIN,
+    UNSEEN,
+    VERIFIED,
+    CorpusSettings,
+    check_frozen,
+    freeze,
+)
+from embomatrix.world.dataset import Dataset, DatasetError, write_dataset
+
+
+@pytest.fixture(scope="module")
+def kitchen(tmp_path_factory):
+    return Dataset.load(write_kitchen_dataset(tmp_path_factory.mktemp("kitchen")))
+
+
+def _written(folder, kitchen, splits, scene, kinds):
+    """A dataset of kitchen tasks that claim to lie in a scene and to be of a kind."""
+    records = [
+        dataclasses.replace(
+            record,
+            split=split,
+            signature=kind,
+            task=dataclasses.replace(record.task, task_id=f"{scene}-{number}", scene_id=f"{scene}-x"),
+        )
+        for number, (record, split, kind) in enumerate(zip(kitchen.records, splits, kinds, strict=False))
+    ]
+    write_dataset(
+        folder,
+        records,
+        {record.bundle_digest: kitchen.bundle_bytes(record.bundle_digest) for record in records},
+    )
+
+
+@pytest.fixture
+def corpus(tmp_path, kitchen):
+    """Two tasks to train on and one held out in one scene, two in another."""
+    _written(tmp_path / TRAIN, kitchen, ("train", "train", "heldout"), "Rs_int", "abc")
+    _written(tmp_path / UNSEEN, kitchen, ("heldout", "heldout"), "Ihlen_1_int", "de")
+    return tmp_path
+
+
+def test_held_out_tasks_of_both_builds_are_frozen_together(corpus):
+    frozen = freeze(corpus)
+    assert (frozen.tasks, frozen.unseen, frozen.scenes) == (3, 2, ("Ihlen_1_int", "Rs_int"))
+    assert {record.split for record in Dataset.load(corpus / VERIFIED).records} == {"heldout"}
+    assert check_frozen(corpus) == frozen
+    assert freeze(corpus) == frozen
+
+
+def test_a_changed_task_is_told(corpus):
+    freeze(corpus)
+    path = corpus / VERIFIED / "tasks.jsonl"
+    path.write_text(path.read_text().replace('"signature":"d"', '"signature":"z"'))
+    with pytest.raises(DatasetError, match="is not what was frozen"):
+        check_frozen(corpus)
+
+
+def test_a_damaged_bundle_is_told(corpus):
+    freeze(corpus)
+    next((corpus / VERIFIED / "bundles").iterdir()).write_bytes(b"other")
+    with pytest.raises(DatasetError):
+        check_frozen(corpus)
+
+
+def test_a_kind_of_goal_on_both_sides_is_refused(corpus, kitchen):
+    _written(corpus / UNSEEN, kitchen, ("heldout", "heldout"), "Ihlen_1_int", "ae")
+    with pytest.raises(DatasetError, match="'a' are trained on and held out"):
+        freeze(corpus)
+
+
+def test_more_than_half_in_scenes_of_training_is_refused(corpus, kitchen):
+    _written(corpus / UNSEEN, kitchen, ("heldout",), "Rs_int", "d")
+    with pytest.raises(DatasetError, match="2 of 2 held-out tasks lie in scenes of training"):
+        freeze(corpus)
+
+
+def test_what_was_never_frozen_is_told(corpus):
+    with pytest.raises(DatasetError, match="does not tell what was frozen"):
+        check_frozen(corpus)
+
+
+def test_the_builds_share_a_seed_and_no_scene_and_most_is_held_out_elsewhere():
+    builds = CorpusSettings(seed=3).builds()
+    train, unseen = builds[TRAIN], builds[UNSEEN]
+    assert (train.train, train.heldout, unseen.heldout) == (2_000, 40, 60)
+    assert train.seed == unseen.seed == 3
+    assert len(train.scenes) == 45
+    assert not {*train.scenes} & {*unseen.scenes}
+    assert unseen.scenes == HELDOUT_SCENES
+
+
+def test_the_command_checks_a_corpus(corpus):
+    freeze(corpus)
+    done = CliRunner().invoke(app, ["corpus", "--out", str(corpus), "--check"])
+    assert done.exit_code == 0, done.output
+    assert json.loads((corpus / VERIFIED / FROZEN_FILE).read_text())["digest"] in done.output
+    (corpus / VERIFIED / FROZEN_FILE).write_text("{}")
+    assert CliRunner().invoke(app, ["corpus", "--out", str(corpus), "--check"]).exit_code == 2
