@@ -35,7 +35,7 @@ from embomatrix.trainer.evaluation.cluster import ClusterExecutor
 from embomatrix.trainer.evaluation.exam import WorldExam
 from embomatrix.trainer.evaluation.page import evaluation_page
 from embomatrix.trainer.evaluation.table import read_row, report_of, text_report
-from embomatrix.world.task import MAX_TABLE
+from embomatrix.world.task import MAX_TABLE, Profile
 from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:
@@ -67,6 +67,7 @@ class Questions:
     seed: int
     max_tokens: int | None
     codec: Codec
+    profile: Profile
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,6 +139,10 @@ def evaluate(
     split: Annotated[
         str, typer.Option(help="heldout, train or all; else heldout where the dataset has any.")
     ] = "",
+    profile: Annotated[
+        Profile,
+        typer.Option(help="paper: tasks that need one of the household's three skills more count as failed."),
+    ] = Profile.HOUSEHOLD,
     tasks: Annotated[int | None, typer.Option(min=1, help="The first so many tasks only.")] = None,
     samples: Annotated[int, typer.Option(min=1, max=1000, help="Plans of each task.")] = DEFAULT_SAMPLES,
     temperature: Annotated[float, typer.Option(min=0, help="0 takes the likeliest plan.")] = 1.0,
@@ -184,8 +189,8 @@ def evaluate(
             _judge_stored(answers, bench, out, place, beside or [])
             return
         chosen = Chosen(model, endpoint, baseline, model_name, key, concurrent, attempts)
-        how = Questions(samples, temperature, seed, max_tokens, codec)
-        with _exam(place, bench or DEFAULT_BENCH, split, tasks) as exam:
+        how = Questions(samples, temperature, seed, max_tokens, codec, profile)
+        with _exam(place, bench or DEFAULT_BENCH, split, tasks, profile) as exam:
             label = model or model_name or str(baseline)
             folder = out or DEFAULT_OUT / _file_name(f"{Path(exam.name).name}-{label}")
             rows = [read_row(path, exam.digest) for path in beside or []]
@@ -213,7 +218,7 @@ def _problems_shown() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _exam(place: Place, named: str, split: str, limit: int | None) -> Iterator[Exam]:
+def _exam(place: Place, named: str, split: str, limit: int | None, profile: Profile) -> Iterator[Exam]:
     """The benchmark of this name, ready to ask and to judge."""
     if named == NATIVE:
         from embomatrix.trainer.eai.environment import JudgeEnvironment
@@ -222,7 +227,7 @@ def _exam(place: Place, named: str, split: str, limit: int | None) -> Iterator[E
         with NativeJudge(JudgeEnvironment.find()) as judge:
             yield NativeExam(judge)
         return
-    bench = find_benchmark(named, split, limit)
+    bench = find_benchmark(named, split, limit, profile)
     yield WorldExam(bench, place.executor(bench))
 
 
@@ -293,6 +298,7 @@ def _ask(exam: Exam, asked: Asked, how: Questions, folder: Path) -> tuple[Setup,
         seed=how.seed,
         questions=questions_digest(questions),
         by_rule=exam.by_rule,
+        profile=how.profile.value,
     )
     began_s = time.monotonic()
     with AnswerSheet(folder / FILE, setup) as sheet:
@@ -307,7 +313,7 @@ def _ask(exam: Exam, asked: Asked, how: Questions, folder: Path) -> tuple[Setup,
 
 def _judge_stored(path: Path, bench: str, out: Path | None, place: Place, beside: Sequence[Path]) -> None:
     setup, stored = read_answers(path)
-    with _exam(place, bench or setup.bench, setup.split, setup.tasks) as exam:
+    with _exam(place, bench or setup.bench, setup.split, setup.tasks, _profile(setup, path)) as exam:
         if exam.digest != setup.bench_digest:
             raise TrainerError(
                 f"{path} answers other tasks than {bench or setup.bench} holds now (digest {setup.bench_digest[:19]}…, now "
@@ -319,6 +325,14 @@ def _judge_stored(path: Path, bench: str, out: Path | None, place: Place, beside
             missing = asked_for - len(given)
             console.print(f"{missing} of {asked_for} answers are missing: figures are over the others")
         _judge(exam, setup, given, out or path.parent, [read_row(row, exam.digest) for row in beside])
+
+
+def _profile(setup: Setup, path: Path) -> Profile:
+    if setup.profile not in set(Profile):
+        raise TrainerError(
+            f"{path} names the unknown profile {setup.profile!r}: expected {' or '.join(Profile)}"
+        )
+    return Profile(setup.profile)
 
 
 def _judge(exam: Exam, setup: Setup, given: Sequence[Answer], folder: Path, rows: Sequence[Row]) -> None:

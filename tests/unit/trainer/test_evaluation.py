@@ -23,6 +23,7 @@ from embomatrix.trainer.evaluation.page import evaluation_page
 from embomatrix.trainer.evaluation.scoreboard import Scoreboard
 from embomatrix.trainer.evaluation.table import read_row, report_of, text_report
 from embomatrix.worker.rollout_pool import RolloutPool
+from embomatrix.world.task import Profile
 
 APPLE = "apple_to_counter"
 SOLVED = "move 10; pick_up 10; move 0; place 0 ontop"
@@ -277,3 +278,18 @@ def test_benchmark_that_is_not_there_is_named(bench, named, split, words):
 def test_held_out_tasks_are_measured_unless_told_otherwise(bench):
     assert find_benchmark(str(bench.folder)).split == "heldout"
     assert find_benchmark(str(bench.folder), "all", 2).digest != bench.digest
+
+
+def test_refused_problems_of_an_import_and_goals_beyond_the_profile_are_failed_by_rule(bench, tmp_path):
+    folder = write_kitchen_dataset(tmp_path)
+    lines = [json.loads(line) for line in (folder / "tasks.jsonl").read_text().splitlines()]
+    lines[0]["task"]["profile"] = "household"
+    (folder / "tasks.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    outcomes = [{"name": "mopping", "reason": "inexpressible"}, {"name": "tidy_up", "reason": ""}]
+    (folder / "import.json").write_text(json.dumps({"outcomes": outcomes}))
+    paper, household = (find_benchmark(str(folder), "all", profile=profile) for profile in Profile)
+    assert (len(paper.records), paper.failed_by_rule) == (3, {"mopping", lines[0]["task"]["task_id"]})
+    assert (len(household.records), household.failed_by_rule) == (4, {"mopping"})
+    (folder / "import.json").write_text("[]")
+    with pytest.raises(TrainerError, match="is no report of an import"):
+        find_benchmark(str(folder), "all")

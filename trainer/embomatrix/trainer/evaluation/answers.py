@@ -43,6 +43,7 @@ class Setup:
     seed: int
     questions: str = ""
     by_rule: int = 0
+    profile: str = "household"
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.trainer.data import training_task
 from embomatrix.trainer.errors import TrainerError
 from embomatrix.world.dataset import TASKS_FILE, Dataset, DatasetError, record_to_json
+from embomatrix.world.task import Profile
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
     from embomatrix.world.scene import Scene
 
 ALL: Final = "all"
+IMPORT_REPORT: Final = "import.json"
+"""What `embomatrix factory import --report` wrote, in the dataset's folder: problems that were refused count as failed."""
 NAMED: Final[Mapping[str, Path]] = {
     "internal-verified": Path("build/internal-verified"),
     "eai": Path("build/eai"),
@@ -34,7 +37,7 @@ _BUILD_IT: Final[Mapping[str, str]] = {
 
 @dataclass(frozen=True)
 class Benchmark:
-    """Tasks in the order of their file. ``failed_by_rule`` are tasks that no plan can express, with the reason of each.
+    """Tasks in the order of their file. ``failed_by_rule`` are those that were refused or that no skill reaches.
 
     Those count as failures in the success over all tasks, and not at all in the other figures.
     """
@@ -43,7 +46,7 @@ class Benchmark:
     folder: Path
     split: str
     records: tuple[TaskRecord, ...]
-    failed_by_rule: Mapping[str, str] = field(default_factory=dict)
+    failed_by_rule: frozenset[str] = frozenset()
 
     @cached_property
     def digest(self) -> str:
@@ -83,11 +86,14 @@ class Benchmark:
             raise TrainerError(str(error)) from error
 
 
-def find_benchmark(named: str, split: str = "", limit: int | None = None) -> Benchmark:
+def find_benchmark(
+    named: str, split: str = "", limit: int | None = None, profile: Profile = Profile.HOUSEHOLD
+) -> Benchmark:
     """A benchmark by its name, its dataset folder, or a file of task records with its bundles beside it.
 
     ``split`` is one of the dataset's or "all"; empty takes the held-out tasks where there are any, else all. ``limit`` takes
-    the first so many. Raises TrainerError.
+    the first so many. With the profile ``PAPER``, tasks that need one of the household's three skills more are failed by rule.
+    Raises TrainerError.
     """
     path = NAMED.get(named, Path(named))
     if path.is_file():
@@ -101,7 +107,27 @@ def find_benchmark(named: str, split: str = "", limit: int | None = None) -> Ben
         )
         raise TrainerError(f"there is no benchmark at {path}: {remedy}")
     chosen, told = _of_split(records, split, path)
-    return Benchmark(named, folder, told, chosen[:limit])
+    within = [record for record in chosen if record.task.profile in (Profile.PAPER, profile)]
+    beyond = {record.task.task_id for record in chosen} - {record.task.task_id for record in within}
+    if not within:
+        raise TrainerError(
+            f"no task of {path} can be done with the skills of the profile {profile}: pass another --profile"
+        )
+    return Benchmark(named, folder, told, tuple(within[:limit]), frozenset(beyond | _refused(folder)))
+
+
+def _refused(folder: Path) -> set[str]:
+    """Names of the problems that an import refused."""
+    path = folder / IMPORT_REPORT
+    try:
+        outcomes = json.loads(path.read_bytes())["outcomes"]
+        return {str(outcome["name"]) for outcome in outcomes if outcome["reason"]}
+    except FileNotFoundError:
+        return set()
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise TrainerError(
+            f"{path} is no report of an import ({error!r}): write it again with `embomatrix factory import --report`"
+        ) from error
 
 
 def _of_folder(folder: Path) -> tuple[TaskRecord, ...]:

@@ -104,7 +104,7 @@ def _notes(report: Mapping[str, Any]) -> str:
     if not report["tasks_failed_by_rule"]:
         return others
     return others + (
-        f'<p class="note">{report["tasks_failed_by_rule"]} more tasks can\'t be expressed with these skills. '
+        f'<p class="note">{report["tasks_failed_by_rule"]} more tasks can\'t be expressed with these skills, or were refused. '
         f"Where they count as failed: {percent(report['success_over_all'])} %.</p>"
     )
 

@@ -143,8 +143,8 @@ def text_report(report: Mapping[str, Any], beside: Sequence[Row] = ()) -> str:
     ]
     if report["tasks_failed_by_rule"]:
         parts.append(
-            f"{report['tasks_failed_by_rule']} more tasks can't be expressed with these skills; where they count as failed: "
-            f"{percent(report['success_over_all'])} %"
+            f"{report['tasks_failed_by_rule']} more tasks can't be expressed with these skills, or were refused; where they "
+            f"count as failed: {percent(report['success_over_all'])} %"
         )
     if report["others"]:
         parts.append("\n".join(f"{name}, %: {percent(found)}" for name, found in report["others"].items()))
