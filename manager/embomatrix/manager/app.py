@@ -121,8 +121,6 @@ async def running(
         group = await stack.enter_async_context(_stopped_at_exit())
         group.create_task(http.serve())
         epoch = await _win(leadership, standby, settings, on_standby)
-        with _folder_errors(settings):
-            await note_folder(store, settings.data_dir)
         runtime = await _start_runtime(settings, store, bundles, leadership, epoch)
         gate = Gate(store, guarded=protection.guarded, shared_token=settings.token)
         await gate.open(protection.first)
@@ -168,10 +166,8 @@ async def _win(
             await server.stop(None)
 
 
-async def _start_runtime(
-    settings: ManagerSettings, store: StateStore, bundles: BundleStore, leadership: Leadership, epoch: int
-) -> ManagerRuntime:
-    dispatch = DispatchLimits(
+def _dispatch_limits(settings: ManagerSettings) -> DispatchLimits:
+    return DispatchLimits(
         lease_ttl_s=settings.lease_ttl_s,
         lease_limit_s=settings.lease_limit_s,
         execute_deadline_s=settings.execute_deadline_s,
@@ -184,6 +180,13 @@ async def _start_runtime(
         restart_grace_s=settings.restart_grace_s,
         audit=AuditRules(settings.audit_probation, settings.audit_share, settings.audits_all_runs),
     )
+
+
+async def _start_runtime(
+    settings: ManagerSettings, store: StateStore, bundles: BundleStore, leadership: Leadership, epoch: int
+) -> ManagerRuntime:
+    with _folder_errors(settings):
+        await note_folder(store, settings.data_dir)
     schedule = ScheduleLimits(affinity_wait_s=settings.affinity_wait_s)
     liveness = LivenessLimits(
         heartbeat_s=settings.heartbeat_s,
@@ -194,7 +197,7 @@ async def _start_runtime(
     first_epoch = (epoch << 32) + 1
     registry = Registry(liveness, first_epoch=first_epoch)
     cluster = ClusterState(
-        dispatch,
+        _dispatch_limits(settings),
         schedule,
         boot_id=secrets.token_hex(4),
         first_epoch=first_epoch,

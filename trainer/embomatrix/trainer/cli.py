@@ -63,6 +63,13 @@ _TRACK = Annotated[
     list[str] | None,
     typer.Option(help="Send metrics to `tensorboard`, `wandb` or `trackio` as well; repeatable."),
 ]
+_IMITATE = Annotated[float | None, typer.Option(min=0, help="Seconds of imitation; default 150.")]
+_REWARD = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="NAME=VALUE", help="A coefficient of the reward, as docs/rewards.md names it; repeatable."
+    ),
+]
 _THREADS = Annotated[int | None, typer.Option(min=1, help="Threads of torch; default: half of the cores.")]
 
 
@@ -73,18 +80,11 @@ def train(
     out: _OUT = Path("runs/train"),
     minutes: Annotated[float | None, typer.Option(min=0, help="Minutes of GRPO; default 5.")] = None,
     steps: Annotated[int | None, typer.Option(min=0, help="Steps of GRPO, in place of minutes.")] = None,
-    imitate_seconds: Annotated[
-        float | None, typer.Option(min=0, help="Seconds of imitation; default 150.")
-    ] = None,
+    imitate_seconds: _IMITATE = None,
     resume: _RESUME = False,
     seed: _SEED = None,
     settings_file: _SETTINGS = None,
-    reward: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME=VALUE", help="A coefficient of the reward, as docs/rewards.md names it; repeatable."
-        ),
-    ] = None,
+    reward: _REWARD = None,
     threads: _THREADS = None,
     device: _DEVICE = None,
     track: _TRACK = None,

@@ -143,13 +143,9 @@ class Daemon:
     async def run(self) -> None:
         """Start the simulator, join the manager and work until stopped."""
         await self._pool.start()
-        logger.info(
-            "worker %s: %d slots, %d MB for scenes, score %.2f",
-            self._membership.name,
-            self._resources.slots,
-            self._resources.memory_mb,
-            self._resources.score,
-        )
+        name, offers = self._membership.name, self._resources
+        told = "worker %s: %d slots, %d MB for scenes, score %.2f"
+        logger.info(told, name, offers.slots, offers.memory_mb, offers.score)
         works = (
             self._pool.run(),
             self._stay_connected(),
