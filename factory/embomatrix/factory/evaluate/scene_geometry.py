@@ -36,6 +36,7 @@ DOOR_M: Final = 0.6
 """What must be free before a doorway at least: the robot's width and a hand on either side."""
 RUG_M: Final = 0.03
 HUNG_M: Final = 2.0
+"""Of what hangs higher nobody asks the robot."""
 _HERE: Final = Pose((0.0, 0.0, 0.0))
 
 
@@ -62,7 +63,8 @@ def flaws_of(scene: Scene, added: Sequence[str]) -> tuple[tuple[str, Flaw], ...]
             found.append((name, Flaw.OUTSIDE))
         if _bars_doorway(scene, boxes[name]):
             found.append((name, Flaw.BARS_DOORWAY))
-        if not _is_reached(boxes[name], reached):
+        hung = scene.by_name[name].fixed and boxes[name][:, 2].min() > HUNG_M
+        if not hung and not _is_reached(boxes[name], reached):
             found.append((name, Flaw.UNREACHED))
     return tuple(found)
 
@@ -170,9 +172,7 @@ def _reached(scene: Scene, boxes: dict[str, FloatArray]) -> FloatArray:
 
 
 def _is_reached(parts: FloatArray, cells: FloatArray) -> bool:
-    """Whether the robot can stand within an arm's length of a thing; of what hangs under the ceiling nobody asks it."""
-    if parts[:, 2].min() > HUNG_M:
-        return True
+    """Whether the robot can stand within an arm's length of a thing, and the thing is no higher than its arm gets."""
     low, high = parts[:, :2].min(axis=0), parts[:, 3:5].max(axis=0)
     away = np.hypot(*(cells - np.clip(cells, low, high)).T)
-    return bool(np.any(away <= ROBOT.reach_m)) and parts[:, 2].min() <= ROBOT.reach_high_m
+    return bool(np.any(away <= ROBOT.reach_m)) and bool(parts[:, 2].min() <= ROBOT.reach_high_m)

@@ -1,0 +1,91 @@
+"""Scenes are judged by eyes of their own: each flaw is seen, sound scenes have none, and rates are what they say."""
+
+import json
+from importlib import resources
+from typing import TYPE_CHECKING
+
+import pytest
+
+from embomatrix.factory.assets.library import build_asset
+from embomatrix.factory.editor import SceneEditor
+from embomatrix.factory.evaluate.figures import EvaluationError
+from embomatrix.factory.evaluate.scene_geometry import Flaw, flaws_of
+from embomatrix.factory.evaluate.scenes import LIST, Method, Outcome, evaluation_of, fixed_tasks
+from embomatrix.factory.layout.generator import lay
+from embomatrix.factory.layout.jobs import Item
+from embomatrix.world.catalog import Catalog
+from embomatrix.world.geometry import Pose
+from embomatrix.world.state import Relation
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from embomatrix.world.scene import Scene
+
+
+def test_seventy_tasks_of_each_source_are_fixed_in_scenes_that_there_are() -> None:
+    text = (resources.files("embomatrix.factory.evaluate") / LIST).read_text(encoding="utf-8")
+    names = json.loads(text)
+    assert [len(names["sample"]), len(names["behavior"])] == [70, 70]
+    for source in names.values():
+        assert len({name for name, _ in source}) == 70
+        assert {scene for _, scene in source} <= set(Catalog.load().scene_ids)
+
+
+def test_a_sample_that_lacks_the_fixed_tasks_is_told(tmp_path: "Path") -> None:
+    file = tmp_path / "sample.jsonl"
+    file.write_text('{"name": "other", "bddl": "()"}\n', encoding="utf-8")
+    with pytest.raises(EvaluationError, match="lacks 70 of the fixed tasks"):
+        fixed_tasks(file)
+
+
+def test_what_the_generator_lays_has_no_flaw(flat: "Scene") -> None:
+    editor = SceneEditor(flat)
+    layout = lay(editor, [Item("mug", (("mug", Catalog.load().models_of("mug")[0].model_id),))], 0)
+    assert flaws_of(editor.freeze("sound"), tuple(layout.names.values())) == ()
+
+
+def placed(flat: "Scene", x: float, y: float, low_m: float, host: str = "") -> set[Flaw]:
+    """Flaws of a basket put somewhere, looked at by nobody."""
+    editor = SceneEditor(flat)
+    asset = build_asset(
+        Catalog.load(), "wicker_basket", Catalog.load().models_of("wicker_basket")[0].model_id
+    )
+    room = next(room.name for room in flat.rooms if room.name == "living_room_0")
+    relation = Relation.ONTOP if host else None
+    name = editor.insert(asset, Pose((x, y, low_m + asset.size_m[2] / 2)), relation, host, room)
+    return {flaw for found, flaw in flaws_of(editor.freeze("odd"), (name,)) if found == name}
+
+
+def test_each_flaw_of_a_thing_is_seen(flat: "Scene") -> None:
+    room = next(room for room in flat.rooms if room.name == "living_room_0")
+    table = next(
+        item for item in flat.objects if item.name.startswith("breakfast_table") and item.room == room.name
+    )
+    x, y, middle = table.pose_world_asset.position_m
+    top = middle + flat.asset_of(table.name).size_m[2] / 2
+    door = next(door for door in flat.doorways if room.name in door.rooms)
+    assert Flaw.PENETRATES in placed(flat, x, y, top - 0.02)
+    assert Flaw.FLOATS in placed(flat, x, y, top + 0.3)
+    assert Flaw.OUTSIDE in placed(flat, room.low_m[0], y, 0.001)
+    assert Flaw.BARS_DOORWAY in placed(flat, *door.center_m, 0.001)
+    assert Flaw.UNREACHED in placed(flat, x, y, 2.1)
+
+
+def outcome(method: Method, reason: str = "", *, generated: bool = True, verified: bool = True) -> Outcome:
+    return Outcome("task", "Rs_int", method, generated, verified, verified, reason, 1.0, (0.01,), 8.0)
+
+
+def test_rates_are_shares_and_only_the_tree_has_goals() -> None:
+    found = [
+        outcome(Method.TREE),
+        outcome(Method.TREE, "geometry: a floats", verified=False),
+        outcome(Method.TREE, "does_not_fit: full", generated=False, verified=False),
+        outcome(Method.RANDOM),
+    ]
+    evaluation = evaluation_of(found, {})
+    assert evaluation.figure("generation_rate").value == pytest.approx(200 / 3)
+    assert evaluation.figure("verification_pass_rate").value == 50.0
+    assert evaluation.figure("verification_pass_rate").goal == 99.0
+    assert evaluation.figure("generation_rate random").goal is None
+    assert "does_not_fit 1" in evaluation.notes[0]
