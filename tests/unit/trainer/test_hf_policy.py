@@ -196,3 +196,9 @@ def test_smollm2_takes_real_grpo_steps(smollm2, tmp_path):
     )
     assert summary.rollouts == 18
     assert not torch.equal(before, weights(policy))
+
+
+def test_model_folder_without_a_tokenizer_is_told_what_it_lacks(tmp_path):
+    (tmp_path / "config.json").write_text("{}")
+    with pytest.raises(TrainerError, match=r"has no tokenizer: copy the model's tokenizer\.json"):
+        HfPolicy.load(tmp_path, Codec.LINES)

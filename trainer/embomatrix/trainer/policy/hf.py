@@ -25,6 +25,15 @@ if TYPE_CHECKING:
     from embomatrix.trainer.policy.protocol import Tokens
 
 LOOK_UP_S: Final = 10.0
+TOKENIZERS: Final = (
+    "tokenizer.json",
+    "tokenizer_config.json",
+    "tokenizer.model",
+    "spiece.model",
+    "vocab.json",
+    "vocab.txt",
+)
+"""Files of which a folder with a tokenizer has at least one."""
 REMEDY: Final = "pass `tiny`, a folder with config.json, or a Hugging Face name; `embomatrix model import-gguf` makes a folder"
 
 
@@ -207,11 +216,15 @@ def _end_tokens(model: Any, tokenizer: Any) -> list[int]:
 
 
 def _look_up(name: str) -> None:
-    """Raise TrainerError unless the model is a folder, is kept from an earlier download, or is known to the hub.
+    """Raise TrainerError unless the model is a folder with a tokenizer, was downloaded before, or is known to the hub.
 
     The hub is asked once and briefly: the loaders of transformers would try for a minute.
     """
     if Path(name).is_dir():
+        if not any((Path(name) / file).is_file() for file in TOKENIZERS):
+            raise TrainerError(
+                f"the model folder {name} has no tokenizer: copy the model's tokenizer.json and tokenizer_config.json into it"
+            )
         return
     from huggingface_hub import HfApi, try_to_load_from_cache
 
