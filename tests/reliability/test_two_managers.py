@@ -29,13 +29,18 @@ async def answers(cluster, name):
     return health_pb2.HealthCheckResponse.ServingStatus.Name(answer.status)
 
 
-async def leads(cluster, name):
+async def leads(cluster, name, status="SERVING"):
     """Wait until this manager leads; returns how many seconds that took."""
     began_s = time.monotonic()
     async with asyncio.timeout(60):
-        while await answers(cluster, name) != "SERVING":  # noqa: ASYNC110
+        while await answers(cluster, name) != status:  # noqa: ASYNC110
             await asyncio.sleep(0.05)
     return time.monotonic() - began_s
+
+
+async def stands_by(cluster, name):
+    """Wait until this manager is up while another one leads."""
+    await leads(cluster, name, "NOT_SERVING")
 
 
 async def both(cluster):
@@ -53,7 +58,7 @@ async def failed_over(folder, *, count, kill_at, ttl_s, number=signal.SIGKILL):
         RealCluster(folder, state=redis.url, leader_ttl_s=ttl_s, restart_grace_s=15.0) as cluster,
     ):
         await both(cluster)
-        assert await answers(cluster, "second") == "NOT_SERVING"
+        await stands_by(cluster, "second")
         async with cluster.client() as client:
             await connected(client, "w1", "w2")
             batch = batch_of(await opened(client), count, "slow")
@@ -120,7 +125,7 @@ async def test_a_manager_that_stands_by_names_the_leader(tmp_path):
         cluster.start_manager("first")
         await leads(cluster, "first")
         cluster.start_manager("second")
-        await answers(cluster, "second")
+        await stands_by(cluster, "second")
         async with ClusterClient(f"127.0.0.1:{cluster.ports['second']}") as client:
             with pytest.raises(StandbyError, match="stands by") as caught:
                 await client.open_run("x")

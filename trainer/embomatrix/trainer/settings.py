@@ -227,7 +227,8 @@ def with_changes(values: dict[str, Any], changes: Mapping[str, Any]) -> TrainSet
         where = ".".join(map(str, first["loc"]))
         if first["type"] == "extra_forbidden":
             raise TrainerError(f"there is no setting {where!r}: mend its name or leave it out") from error
-        expected = first["msg"][:1].lower() + first["msg"][1:]
+        expected = first["msg"].removeprefix("Value error, ")
+        expected = expected[:1].lower() + expected[1:]
         raise TrainerError(f"setting {where!r}: {expected} (found {first.get('input')!r})") from error
 
 
