@@ -187,3 +187,20 @@ def test_the_report_counts_refusals_and_lists_what_no_skill_reaches(eai: Path, f
 def test_a_folder_without_eai_s_files_is_one_sentence(tmp_path: Path) -> None:
     with pytest.raises(SourceError, match=r"can't be read|holds no tasks of EAI"):
         read_eai(tmp_path)
+
+
+def test_rooms_of_other_worlds_may_be_counted_otherwise(home: Scene) -> None:
+    other = source(PROBLEM.replace(" kitchen)", " kitchen_7)"))
+    assert isinstance(import_problem(other, home), Refusal)
+    found = bind_first(other, [home])
+    assert isinstance(found, Imported)
+    assert "kitchen_7 is read as kitchen_0" in found.notes
+
+
+def test_a_room_that_a_scene_lacks_is_one_like_it_at_the_last(home: Scene) -> None:
+    text = PROBLEM.replace(
+        "(ontop apple.n.01_2 breakfast_table.n.01_1)", "(inroom apple.n.01_2 television_room_0)"
+    )
+    found = bind_first(source(text), [home])
+    assert isinstance(found, Imported)
+    assert "television_room_0 is read as living_room_0" in found.notes

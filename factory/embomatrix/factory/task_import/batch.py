@@ -63,12 +63,16 @@ def imports(
 ) -> Iterator[Imported | Refusal]:
     """The problem in each scene as it is, then, where the manner says so, in each with the furniture that it lacks.
 
-    The scene that it was written for comes first; once no scene would do, none is looked at further.
+    Last come the same scenes with their rooms counted otherwise. The scene that it was written for comes first; once no scene
+    would do, none is looked at further.
     """
     order = sorted(bases, key=lambda base: base.base != source.scene)
-    for furnishing in (False, True) if manner.furnishing else (False,):
+    furnished = [replace(manner, furnishing=False)]
+    if manner.furnishing:
+        furnished += [manner, replace(manner, renumbering=True)]
+    for tried in furnished:
         for base in order:
-            outcome = import_problem(source, base, seed=seed, manner=replace(manner, furnishing=furnishing))
+            outcome = import_problem(source, base, seed=seed, manner=tried)
             yield outcome
             if isinstance(outcome, Refusal) and outcome.reason in OF_THE_PROBLEM:
                 return

@@ -26,6 +26,14 @@ if TYPE_CHECKING:
 
 MAX_STEPS: Final = 20_000
 """Assignments that are looked at before a scene counts as lacking the objects."""
+ALIKE: Final[Mapping[str, str]] = {
+    "television_room": "living_room",
+    "childs_room": "bedroom",
+    "pantry_room": "storage_room",
+    "utility_room": "storage_room",
+    "playroom": "living_room",
+}
+"""Rooms that do for one that a scene lacks, when rooms are counted otherwise."""
 MAX_CHOICES: Final = 200
 """Ways to tell the problem's rooms among the scene's that are looked at."""
 
@@ -38,13 +46,16 @@ def search(
     rng: np.random.Generator,
     *,
     furnishing: bool,
+    renumbering: bool = False,
 ) -> tuple[dict[str, str], dict[str, str]]:
     """Rooms for the problem's rooms, and scene objects for its fixtures. All objects of one word are in one room.
 
-    Of the rooms that lack furniture those are taken that lack least.
+    Of the rooms that lack furniture those are taken that lack least. When ``renumbering``, ``kitchen_0`` is any kitchen,
+    another one before that of this name, and a room of a type that the scene lacks is one of a type like it.
     """
     words = sorted(set(inroom.values()))
-    options = {word: _rooms_for(view.scene, word, rng) for word in words}
+    find = _renumbered if renumbering else _rooms_for
+    options = {word: find(view.scene, word, rng) for word in words}
     needs = needs_of(problem)
     best: tuple[int, dict[str, str], dict[str, str]] | None = None
     lacking = ""
@@ -75,6 +86,13 @@ def _rooms_for(scene: Scene, word: str, rng: np.random.Generator) -> list[str]:
             f"{scene.base} has no {word!r}: its rooms are {', '.join(room.name for room in scene.rooms)}",
         )
     return [str(name) for name in rng.permutation(names)]
+
+
+def _renumbered(scene: Scene, word: str, rng: np.random.Generator) -> list[str]:
+    stem = word.rpartition("_")[0] if is_room_instance(word) else word
+    if not any(room.type == stem for room in scene.rooms):
+        stem = ALIKE.get(stem, stem)
+    return sorted(_rooms_for(scene, stem, rng), key=lambda name: name == word)
 
 
 def _room_choices(words: list[str], options: Mapping[str, list[str]]) -> Iterator[dict[str, str]]:

@@ -89,6 +89,8 @@ class Manner:
     furnishing: bool = True
     reachable: bool = True
     """Whether a goal that no skill reaches is refused; else it must only be told whether it holds."""
+    renumbering: bool = False
+    """Whether ``kitchen_0`` may be another kitchen: problems of other worlds count other rooms."""
 
 
 def import_problem(
@@ -134,7 +136,12 @@ class _Binder:
     def imported(self) -> Imported:
         manner = self._manner
         binding = bind(
-            self._problem, self._base, self._rng, furnishing=manner.furnishing, reachable=manner.reachable
+            self._problem,
+            self._base,
+            self._rng,
+            furnishing=manner.furnishing,
+            reachable=manner.reachable,
+            renumbering=manner.renumbering,
         )
         self._problem = binding.problem
         editor = SceneEditor(self._base)
@@ -275,8 +282,13 @@ class _Binder:
             for each in binding.additions
             if view.item(names[each.name]).fixed
         )
+        moved = tuple(
+            f"{word} is read as {room}"
+            for word, room in binding.rooms.items()
+            if is_room_instance(word) and word != room
+        )
         signature = signature_of(goal, view)
-        return Imported(scene, task, start, tuple(names.values()), rooms, signature, added)
+        return Imported(scene, task, start, tuple(names.values()), rooms, signature, (*added, *moved))
 
     def _start(self, names: dict[str, str], binding: Binding) -> tuple[Literal, ...]:
         """``:init`` in the scene's names, without the floors that are no objects, the robot, and what is not the case.
