@@ -115,65 +115,82 @@ class Place:
         return ClusterExecutor(connect, bench.dataset.bundle_bytes)
 
 
+_Model = Annotated[str, typer.Option(help="Checkpoint folder, or a Hugging Face model by name or folder.")]
+_Endpoint = Annotated[
+    str, typer.Option(help="Any OpenAI-compatible endpoint: what comes before /chat/completions.")
+]
+_ModelName = Annotated[str, typer.Option(help="The model's name at the endpoint.")]
+_Key = Annotated[str, typer.Option("--llm-key", envvar="EMBOMATRIX_LLM_KEY", help="Key of the endpoint.")]
+_Baseline = Annotated[
+    BaselineName | None, typer.Option(help="A baseline that needs no model.", show_default=False)
+]
+_Answers = Annotated[
+    Path | None, typer.Option(help="Judge the stored answers of an evaluation; asks nobody.")
+]
+_Bench = Annotated[
+    str,
+    typer.Option(help="eai-native, eai, internal-verified, a dataset folder, or a file of task records."),
+]
+_Split = Annotated[str, typer.Option(help="heldout, train or all; else heldout where the dataset has any.")]
+_Profile = Annotated[
+    Profile,
+    typer.Option(help="paper: tasks that need one of the household's three skills more count as failed."),
+]
+_Tasks = Annotated[int | None, typer.Option(min=1, help="The first so many tasks only.")]
+_Samples = Annotated[int, typer.Option(min=1, max=1000, help="Plans of each task.")]
+_Temperature = Annotated[float, typer.Option(min=0, help="0 takes the likeliest plan.")]
+_Seed = Annotated[int, typer.Option(min=0, help="Seed of sampling and of execution.")]
+_MaxTokens = Annotated[int | None, typer.Option(min=1, help="Tokens of an answer at most.")]
+_Codec = Annotated[Codec, typer.Option(help="How a language model writes plans: json or lines.")]
+_Concurrent = Annotated[int, typer.Option(min=1, help="Questions under way at the endpoint.")]
+_Attempts = Annotated[int, typer.Option(min=1, help="Attempts at a question, with waits between.")]
+_Manager = Annotated[
+    str,
+    typer.Option(
+        help="HOST:PORT of a manager that executes; else this machine.", envvar="EMBOMATRIX_MANAGER"
+    ),
+]
+_Token = Annotated[str, typer.Option(help="Token of the trainer role, or @FILE.", envvar="EMBOMATRIX_TOKEN")]
+_Ca = Annotated[
+    Path | None, typer.Option(help="The ca.pem of a manager that serves by TLS.", envvar="EMBOMATRIX_CA")
+]
+_Jobs = Annotated[int | None, typer.Option(min=1, help="Simulator processes without a manager.")]
+_Out = Annotated[
+    Path | None, typer.Option(help=f"Folder of answers and report; else {DEFAULT_OUT}/BENCH-MODEL.")
+]
+_Beside = Annotated[
+    list[Path] | None, typer.Option(help="A report.json of the same tasks, as a row beside. Repeatable.")
+]
+_Threads = Annotated[int | None, typer.Option(min=1, help="Threads of torch.")]
+_Device = Annotated[str, typer.Option(help="torch device of --model: cpu, cuda.")]
+
+
 def evaluate(
-    model: Annotated[
-        str, typer.Option(help="Checkpoint folder, or a Hugging Face model by name or folder.")
-    ] = "",
-    endpoint: Annotated[
-        str, typer.Option(help="Any OpenAI-compatible endpoint: what comes before /chat/completions.")
-    ] = "",
-    model_name: Annotated[str, typer.Option(help="The model's name at the endpoint.")] = "",
-    key: Annotated[
-        str, typer.Option("--llm-key", envvar="EMBOMATRIX_LLM_KEY", help="Key of the endpoint.")
-    ] = "",
-    baseline: Annotated[
-        BaselineName | None, typer.Option(help="A baseline that needs no model.", show_default=False)
-    ] = None,
-    answers: Annotated[
-        Path | None, typer.Option(help="Judge the stored answers of an evaluation; asks nobody.")
-    ] = None,
-    bench: Annotated[
-        str,
-        typer.Option(help="eai-native, eai, internal-verified, a dataset folder, or a file of task records."),
-    ] = "",
-    split: Annotated[
-        str, typer.Option(help="heldout, train or all; else heldout where the dataset has any.")
-    ] = "",
-    profile: Annotated[
-        Profile,
-        typer.Option(help="paper: tasks that need one of the household's three skills more count as failed."),
-    ] = Profile.HOUSEHOLD,
-    tasks: Annotated[int | None, typer.Option(min=1, help="The first so many tasks only.")] = None,
-    samples: Annotated[int, typer.Option(min=1, max=1000, help="Plans of each task.")] = DEFAULT_SAMPLES,
-    temperature: Annotated[float, typer.Option(min=0, help="0 takes the likeliest plan.")] = 1.0,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of sampling and of execution.")] = 0,
-    max_tokens: Annotated[int | None, typer.Option(min=1, help="Tokens of an answer at most.")] = None,
-    codec: Annotated[
-        Codec, typer.Option(help="How a language model writes plans: json or lines.")
-    ] = Codec.JSON,
-    concurrent: Annotated[int, typer.Option(min=1, help="Questions under way at the endpoint.")] = 8,
-    attempts: Annotated[int, typer.Option(min=1, help="Attempts at a question, with waits between.")] = 6,
-    manager: Annotated[
-        str,
-        typer.Option(
-            help="HOST:PORT of a manager that executes; else this machine.", envvar="EMBOMATRIX_MANAGER"
-        ),
-    ] = "",
-    token: Annotated[
-        str, typer.Option(help="Token of the trainer role, or @FILE.", envvar="EMBOMATRIX_TOKEN")
-    ] = "",
-    ca: Annotated[
-        Path | None, typer.Option(help="The ca.pem of a manager that serves by TLS.", envvar="EMBOMATRIX_CA")
-    ] = None,
-    jobs: Annotated[int | None, typer.Option(min=1, help="Simulator processes without a manager.")] = None,
-    out: Annotated[
-        Path | None, typer.Option(help=f"Folder of answers and report; else {DEFAULT_OUT}/BENCH-MODEL.")
-    ] = None,
-    beside: Annotated[
-        list[Path] | None, typer.Option(help="A report.json of the same tasks, as a row beside. Repeatable.")
-    ] = None,
-    threads: Annotated[int | None, typer.Option(min=1, help="Threads of torch.")] = None,
-    device: Annotated[str, typer.Option(help="torch device of --model: cpu, cuda.")] = "cpu",
+    model: _Model = "",
+    endpoint: _Endpoint = "",
+    model_name: _ModelName = "",
+    key: _Key = "",
+    baseline: _Baseline = None,
+    answers: _Answers = None,
+    bench: _Bench = "",
+    split: _Split = "",
+    profile: _Profile = Profile.HOUSEHOLD,
+    tasks: _Tasks = None,
+    samples: _Samples = DEFAULT_SAMPLES,
+    temperature: _Temperature = 1.0,
+    seed: _Seed = 0,
+    max_tokens: _MaxTokens = None,
+    codec: _Codec = Codec.JSON,
+    concurrent: _Concurrent = 8,
+    attempts: _Attempts = 6,
+    manager: _Manager = "",
+    token: _Token = "",
+    ca: _Ca = None,
+    jobs: _Jobs = None,
+    out: _Out = None,
+    beside: _Beside = None,
+    threads: _Threads = None,
+    device: _Device = "cpu",
 ) -> None:
     """Measure a model, an endpoint or a baseline: success by category with intervals, and why plans fail.
 
@@ -184,6 +201,8 @@ def evaluate(
             raise TrainerError(
                 "expected one of --model, --endpoint, --baseline and --answers: give one of them"
             )
+        if bench == NATIVE and (split or tasks):
+            raise TrainerError(f"{NATIVE} is measured as a whole: leave out --split and --tasks")
         place = Place(manager, token, ca, jobs)
         if answers is not None:
             _judge_stored(answers, bench, out, place, beside or [])

@@ -48,6 +48,10 @@ def told(*arguments):
             ("--endpoint=http://127.0.0.1:1/v1", "--bench=DATASET"),
             "pass --model-name as the endpoint calls it",
         ),
+        (
+            ("--bench=eai-native", "--baseline=human", "--tasks=3"),
+            "is measured as a whole: leave out --split",
+        ),
         (("--answers=OUT/none",), "none can't be read (No such file or directory)"),
     ],
 )
