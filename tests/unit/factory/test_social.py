@@ -173,6 +173,8 @@ def test_wishes_fit_what_the_person_does(drafts):
     ("thing", "host", "room", "inside"),
     [
         ("comb", "bar", "bar", False),
+        ("clipboard", "urinal", "bathroom", True),
+        ("envelope", "multi_station_furniture_sink", "bathroom", False),
         ("hardback", "wall_mounted_sink", "bathroom", True),
         ("pillar_candle", "bed", "bedroom", False),
         ("chopping_board", "bottom_cabinet", "meeting_room", True),

@@ -83,6 +83,18 @@ BASINS: Final = frozenset(
         "tabletop_sink",
     }
 )
+NO_HOSTS: Final = frozenset(
+    {
+        "urinal",
+        "toilet",
+        "bathtub",
+        "shower_stall",
+        "radiator",
+        "wood_fireplace",
+        "gas_fireplace",
+        "charcoal_grill",
+    }
+)
 COLD: Final = frozenset({"fridge", "freezer", "cooler", "wine_fridge", "display_fridge", "grocery_fridge"})
 OVENS: Final = frozenset({"oven", "microwave", "toaster_oven"})
 HOBS: Final = frozenset({"stove", "flat_top_grill", "burner", "charcoal_grill"})
@@ -207,7 +219,9 @@ def is_plausible(thing: str, host: str, room_type: str, *, inside: bool) -> bool
         return False
     if host in SEATS or host in SOFT:
         return host in SOFT and group not in NOT_ON_SOFT
-    if host in BASINS:
+    if host in NO_HOSTS:
+        return False
+    if host in BASINS or host.endswith("_sink"):
         return inside and thing in _INTO_BASINS
     if host in COLD:
         return not inside or group in {Group.FOOD, Group.FRUIT, Group.PACKAGES}
