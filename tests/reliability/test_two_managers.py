@@ -30,7 +30,7 @@ async def answers(cluster, name):
 
 
 async def leads(cluster, name, status="SERVING"):
-    """Wait until this manager leads; returns how many seconds that took."""
+    """Wait until this manager leads, or has another status; returns how many seconds that took."""
     began_s = time.monotonic()
     async with asyncio.timeout(60):
         while await answers(cluster, name) != status:  # noqa: ASYNC110
