@@ -13,7 +13,7 @@ from embomatrix.rpc.values import Batch, Completed, InfraCode, Rollout
 
 pytestmark = [pytest.mark.timeout(240), pytest.mark.slow]
 
-BAD = {"crash": InfraCode.SLOT_CRASHED, "hang": InfraCode.SLOT_TIMEOUT, "greedy": InfraCode.SLOT_CRASHED}
+BAD = {"crash": InfraCode.SLOT_CRASHED, "hang": InfraCode.SLOT_TIMEOUT, "greedy": InfraCode.SLOT_OOM}
 
 
 async def test_a_slot_that_crashes_hangs_or_runs_out_of_memory_costs_its_own_rollout_alone(tmp_path):
