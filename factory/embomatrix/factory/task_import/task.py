@@ -220,9 +220,10 @@ class _Binder:
         return Catalog.load().model(category, model).size_m
 
     def _models(self, addition: Addition) -> list[Model]:
-        """Models of the type that can do what is asked: liftable ones first, then furniture of a middling size.
+        """Models of the type that can do what is asked, the liftable ones before furniture.
 
-        Of what can be lifted large ones come first where it must hold others, else small ones.
+        Of what can be lifted large ones come first where it must hold others, else small ones. Of furniture two of a middling
+        size come first, then the smallest: where these don't fit, none does. On other furniture only small ones go.
         """
         catalog = Catalog.load()
         models = [
@@ -230,17 +231,16 @@ class _Binder:
             for category in catalog.categories_of(addition.type)
             for model in catalog.models_of(category)
         ]
-        if not models:
-            return []
         holds = addition.name in self._hosts or addition.type in self._hosts
-        middling = float(np.median([math.prod(model.size_m) for model, _ in models]))
-        ranked: list[tuple[bool, float, Model]] = []
+        light: list[tuple[float, Model]] = []
+        heavy: list[tuple[float, Model]] = []
         for model, mass in models:
             volume = math.prod(model.size_m) * float(self._rng.uniform(0.7, 1.4))
-            stays = not is_liftable(model.size_m, mass)
-            worth = abs(math.log(volume / middling)) if stays else -volume if holds else volume
-            ranked.append((stays, worth, model))
-        order = [model for _, _, model in sorted(ranked, key=lambda item: item[:2])]
+            if is_liftable(model.size_m, mass):
+                light.append((-math.prod(model.size_m) if holds else volume, model))
+            else:
+                heavy.append((volume, model))
+        order = [*_ranked(light), *(_ranked(heavy) if addition.host else _middling_first(heavy))]
         return [model for model in order[: 4 * MODEL_TRIES] if self._serves(model, addition)]
 
     def _serves(self, model: Model, addition: Addition) -> bool:
@@ -315,6 +315,19 @@ class _Binder:
         if atom.predicate == INSOURCE:
             return self._substances.get(atom.args[1], "") in flows_from(type_name)
         return atom.predicate in (REAL, FUTURE) and is_substance(type_name)
+
+
+def _ranked(models: Sequence[tuple[float, Model]]) -> list[Model]:
+    """Models by a number, the least first."""
+    return [model for _, model in sorted(models, key=lambda item: item[0])]
+
+
+def _middling_first(models: Sequence[tuple[float, Model]]) -> list[Model]:
+    """Models by volume, the least first, after two from the middle."""
+    order = _ranked(models)
+    middle = len(order) // 2
+    first = order[max(0, middle - 1) : middle + 1]
+    return [*reversed(first), *(model for model in order if model not in first)]
 
 
 def _sources_for(
