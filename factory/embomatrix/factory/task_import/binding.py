@@ -73,11 +73,13 @@ def bind(
     furnishing: bool = True,
     reachable: bool = True,
     renumbering: bool = False,
+    shunned: Container[str] = (),
 ) -> Binding:
     """Find the problem's objects in the scene. Raises RefusedError with the first thing that can't be bound.
 
     Furniture that its rooms lack is to be added when ``furnishing``, as the paper's factory does; else that is a refusal.
     A goal that no skill reaches is a refusal when it is to be ``reachable``; a room's number counts unless ``renumbering``.
+    Scene objects that are ``shunned`` are left.
     """
     (check_expressible if reachable else check_evaluable)(problem)
     inroom = {
@@ -96,7 +98,7 @@ def bind(
         and name not in problem.wildcards
     ]
     rooms, found = search(
-        problem, view, inroom, fixtures, rng, furnishing=furnishing, renumbering=renumbering
+        problem, view, inroom, fixtures, rng, furnishing=furnishing, renumbering=renumbering, shunned=shunned
     )
     problem = _spelt_out(problem, view, rooms, found)
     floors = {name: rooms[room] for name, room in inroom.items() if problem.objects.get(name) in FLOORS}

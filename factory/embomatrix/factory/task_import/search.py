@@ -15,7 +15,7 @@ from embomatrix.world.evaluate import atoms_of
 from embomatrix.world.state import Relation, State
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Container, Iterable, Iterator, Mapping
 
     import numpy as np
 
@@ -34,6 +34,8 @@ ALIKE: Final[Mapping[str, str]] = {
     "playroom": "living_room",
 }
 """Rooms that do for one that a scene lacks, when rooms are counted otherwise."""
+COVER_M: Final = 0.08
+"""What begins this near over a top leaves no room on it."""
 MAX_CHOICES: Final = 200
 """Ways to tell the problem's rooms among the scene's that are looked at."""
 
@@ -47,11 +49,13 @@ def search(
     *,
     furnishing: bool,
     renumbering: bool = False,
+    shunned: Container[str] = (),
 ) -> tuple[dict[str, str], dict[str, str]]:
     """Rooms for the problem's rooms, and scene objects for its fixtures. All objects of one word are in one room.
 
     Of the rooms that lack furniture those are taken that lack least. When ``renumbering``, ``kitchen_0`` is any kitchen,
-    another one before that of this name, and a room of a type that the scene lacks is one of a type like it.
+    another one before that of this name, and a room of a type that the scene lacks is one of a type like it. Scene objects
+    that are ``shunned`` are not taken.
     """
     words = sorted(set(inroom.values()))
     find = _renumbered if renumbering else _rooms_for
@@ -60,7 +64,9 @@ def search(
     best: tuple[int, dict[str, str], dict[str, str]] | None = None
     lacking = ""
     for rooms in itertools.islice(_room_choices(words, options), MAX_CHOICES):
-        found, missing = _assign(problem, view, {name: rooms[inroom[name]] for name in fixtures}, needs, rng)
+        found, missing = _assign(
+            problem, view, {name: rooms[inroom[name]] for name in fixtures}, needs, rng, shunned
+        )
         if not missing:
             return rooms, found
         first = missing[0]
@@ -124,6 +130,7 @@ def _assign(
     wanted: Mapping[str, str],
     needs: Mapping[str, frozenset[str]],
     rng: np.random.Generator,
+    shunned: Container[str],
 ) -> tuple[dict[str, str], list[str]]:
     """A scene object of its own for as many names as there is one for, and the names of furniture for which none is left.
 
@@ -142,7 +149,9 @@ def _assign(
         fits = [
             other
             for other in view.in_room.get(room, ())
-            if view.category(other) in categories and serves(view.asset(other), needs.get(name, frozenset()))
+            if view.category(other) in categories
+            and other not in shunned
+            and serves(view.asset(other), needs.get(name, frozenset()))
         ]
         if fits:
             order = [str(other) for other in rng.permutation(fits)]
@@ -161,12 +170,28 @@ def _assign(
 
 
 def _spare_m2(view: SceneView, name: str) -> float:
-    """Area of the largest surface of an object, less what stands on it already: what holds more is bound before others."""
-    largest = max((math.prod(surface.size_m) for surface in view.asset(name).supports), default=0.0)
-    taken = sum(
-        math.prod(view.asset(item.name).size_m[:2]) for item in view.scene.objects if item.host == name
-    )
-    return largest - taken
+    """Area of the largest surface of an object, less what stands on it already: what holds more is bound before others.
+
+    A top that something lies over, as a worktop over an oven, is none.
+    """
+    asset, item = view.asset(name), view.item(name)
+    x, y, z = item.pose_world_asset.position_m
+    top = z + asset.size_m[2] / 2
+    taken = 0.0
+    for other in view.scene.objects:
+        if other.host == name:
+            taken += math.prod(view.asset(other.name).size_m[:2])
+        elif other.room == item.room and other.name != name and other.fixed:
+            size = view.asset(other.name).size_m
+            ox, oy, oz = other.pose_world_asset.position_m
+            depth, width = size[:2] if abs(math.cos(other.pose_world_asset.yaw)) > 0.5 else size[1::-1]
+            if (
+                abs(ox - x) < depth / 2
+                and abs(oy - y) < width / 2
+                and -COVER_M <= oz - size[2] / 2 - top <= COVER_M
+            ):
+                return -1.0
+    return max((math.prod(surface.size_m) for surface in asset.supports), default=0.0) - taken
 
 
 def _backtrack(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import itertools
 import math
 import re
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from embomatrix.factory.assets.library import build_asset
 from embomatrix.factory.editor import SceneEditor
 from embomatrix.factory.layout.generator import lay
 from embomatrix.factory.layout.jobs import Item
-from embomatrix.factory.layout.values import LayoutRelation
+from embomatrix.factory.layout.values import Failure, LayoutRelation
 from embomatrix.factory.refusal import Refusal, RefusalReason, RefusedError
 from embomatrix.factory.task_import.binding import bind
 from embomatrix.factory.task_import.dialects import read_problem
@@ -24,6 +23,7 @@ from embomatrix.factory.task_import.expressible import AGENT, FLOORS
 from embomatrix.factory.task_import.reach import FUTURE, INSOURCE, REAL, pieces_of, profile_for
 from embomatrix.factory.task_import.scene import with_robot_in, with_states
 from embomatrix.factory.task_import.search import serves
+from embomatrix.factory.task_import.thermal import sources_for
 from embomatrix.factory.writer.tasks import object_table
 from embomatrix.factory.writer.view import SceneView, is_liftable
 from embomatrix.world.bddl import ROOM_TYPES, Literal, is_room_instance
@@ -35,7 +35,7 @@ from embomatrix.world.substances import MEANINGS, flows_from, is_substance
 from embomatrix.world.task import MAX_TABLE, Task, TaskCategory
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Sequence
 
     from embomatrix.factory.layout.jobs import Layout
     from embomatrix.factory.task_import.binding import Addition, Binding
@@ -60,8 +60,9 @@ class Lay(Protocol):
 
 MODEL_TRIES: Final = 5
 """Models of a type that are tried before it counts as not fitting its place."""
+SHUNNED: Final = 3
+"""Pieces of furniture that are given up for a problem at most, because they can't hold what it puts there."""
 KITCHEN: Final = frozenset({State.COOKED, State.FROZEN, State.HOT, State.SLICED, REAL})
-_THERMAL: Final = frozenset({State.COOKED, State.FROZEN, State.HOT})
 SWITCHED: Final = frozenset({State.OPEN, State.TOGGLED_ON})
 CLEANED: Final = frozenset((*MEANINGS, *SubstanceRelation))
 
@@ -134,18 +135,8 @@ class _Binder:
         """Objects, and types that variables range over, on or in which something is or is to be."""
 
     def imported(self) -> Imported:
-        manner = self._manner
-        binding = bind(
-            self._problem,
-            self._base,
-            self._rng,
-            furnishing=manner.furnishing,
-            reachable=manner.reachable,
-            renumbering=manner.renumbering,
-        )
+        binding, editor, names = self._bound()
         self._problem = binding.problem
-        editor = SceneEditor(self._base)
-        names = {**binding.found, **self._laid(editor, binding)}
         for whole, halves in pieces_of(self._problem).items():
             names |= zip(halves, self._add_pieces(editor, names[whole], halves), strict=True)
         for floor in self._floors_asked_for():
@@ -153,6 +144,35 @@ class _Binder:
         start = self._start(names, binding)
         scene = with_states(with_robot_in(editor.freeze(self._scene_id), binding.robot_room), start)
         return self._task(scene, names, binding, start)
+
+    def _bound(self) -> tuple[Binding, SceneEditor, dict[str, str]]:
+        """The problem bound and laid out; furniture of the scene that can't hold what it must is left for other furniture."""
+        manner, shunned = self._manner, set[str]()
+        first: RefusedError | None = None
+        while True:
+            try:
+                binding = bind(
+                    self._problem,
+                    self._base,
+                    self._rng,
+                    furnishing=manner.furnishing,
+                    reachable=manner.reachable,
+                    renumbering=manner.renumbering,
+                    shunned=shunned,
+                )
+            except RefusedError as error:
+                raise first or error from error
+            editor = SceneEditor(self._base)
+            laid = self._laid(editor, binding)
+            if isinstance(laid, dict):
+                return binding, editor, {**binding.found, **laid}
+            first = first or RefusedError(
+                RefusalReason.DOES_NOT_FIT,
+                f"{laid.thing!r} has no place {laid.relation} {laid.host}: {laid.detail}",
+            )
+            if laid.host not in binding.found.values() or len(shunned) == SHUNNED:
+                raise first
+            shunned.add(laid.host)
 
     def _add_floor(self, editor: SceneEditor, floor: str, binding: Binding) -> str:
         if floor not in binding.floors:
@@ -172,18 +192,12 @@ class _Binder:
             if type_name in FLOORS and {name, type_name} & about
         )
 
-    def _laid(self, editor: SceneEditor, binding: Binding) -> dict[str, str]:
-        """Put all that the scene lacks into it; names in the scene."""
+    def _laid(self, editor: SceneEditor, binding: Binding) -> dict[str, str] | Failure:
+        """Put all that the scene lacks into it; names in the scene, or what found no place."""
         editor.keep(binding.found.values())
         items = [self._item(addition, binding) for addition in binding.additions]
         layout = self._manner.lay(editor, items, int(self._rng.integers(2**31)))
-        if layout.failures:
-            failure = layout.failures[0]
-            raise RefusedError(
-                RefusalReason.DOES_NOT_FIT,
-                f"{failure.thing!r} has no place {failure.relation} {failure.host}: {failure.detail}",
-            )
-        return dict(layout.names)
+        return layout.failures[0] if layout.failures else dict(layout.names)
 
     def _item(self, addition: Addition, binding: Binding) -> Item:
         models = self._models(addition)[:MODEL_TRIES]
@@ -256,7 +270,7 @@ class _Binder:
         }
         goal = substitute(self._problem.goal, {**names, **self._substances, **binding.rooms})
         about = objects_of(goal, types)
-        needed = dict.fromkeys((*names.values(), *_sources_for(view, goal, types, names.values())))
+        needed = dict.fromkeys((*names.values(), *sources_for(view, goal, types, names.values())))
         table = object_table(view, tuple(needed), self._rng)
         missing = about - set(table)
         if missing:
@@ -328,34 +342,6 @@ def _middling_first(models: Sequence[tuple[float, Model]]) -> list[Model]:
     middle = len(order) // 2
     first = order[max(0, middle - 1) : middle + 1]
     return [*reversed(first), *(model for model in order if model not in first)]
-
-
-def _sources_for(
-    view: SceneView, goal: Formula, types: Mapping[str, tuple[str, ...]], known: Iterable[str]
-) -> Iterator[str]:
-    """Objects of the scene that heat, cook or freeze what the goal asks for, where no object of the problem does.
-
-    The paper's own tasks freeze things in coolers, which keep drinks cool and no more.
-    """
-    for atom in atoms_of(goal):
-        if atom.predicate not in _THERMAL:
-            continue
-        effect = State(atom.predicate)
-        things = types.get(atom.args[0].lstrip("?"), (atom.args[0],))
-        for thing in things:
-            if thing not in view.scene.by_name:
-                continue
-            if any(effect in view.thermal_effects(thing, name) for name in known):
-                continue
-            able = (
-                item.name
-                for item in view.scene.objects
-                if item.fixed
-                and view.is_source(item.name)
-                and effect in view.thermal_effects(thing, item.name)
-                and view.opens(item.name)
-            )
-            yield from itertools.islice(able, 1)
 
 
 def _renamed(literal: Literal, names: dict[str, str]) -> Atom:
