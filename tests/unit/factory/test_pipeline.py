@@ -135,6 +135,13 @@ def test_a_ledger_that_lost_its_end_is_whole_again_when_the_build_is_taken_up(
     assert (tmp_path / "attempts.jsonl").read_text() == whole
 
 
+def test_a_build_that_trains_on_nothing_holds_every_room_out(tmp_path: Path) -> None:
+    settings = BuildSettings(train=0, heldout=0, scenes=("Rs_int",), look_ahead=False)
+    rooms = build_dataset(tmp_path, settings).rooms
+    assert rooms["train"] == {"Rs_int": ()}
+    assert set(rooms["heldout"]["Rs_int"]) == {room.name for room in build_base_scene("Rs_int").rooms}
+
+
 def test_what_a_second_judge_refuses_is_not_kept(tmp_path: Path) -> None:
     settings = BuildSettings(train=2, heldout=0, seed=4, scenes=("Rs_int",), look_ahead=False)
     asked: list[str] = []

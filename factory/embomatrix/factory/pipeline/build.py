@@ -83,6 +83,12 @@ def split_rooms(scenes: Sequence[Scene], seed: int) -> dict[str, dict[str, tuple
     }
 
 
+def _all_held_out(scenes: Sequence[Scene]) -> dict[str, dict[str, tuple[str, ...]]]:
+    """Rooms by split and scene, where nothing is trained on: training sees none of them."""
+    everything = {scene.base: tuple(room.name for room in scene.rooms) for scene in scenes}
+    return {"train": dict.fromkeys(everything, ()), "heldout": everything}
+
+
 def build_dataset(
     folder: Path,
     settings: BuildSettings,
@@ -103,7 +109,7 @@ def build_dataset(
         Catalog.load().inventory(scene_id)  # a wrong name shall leave no folder behind
     store = BuildStore.open(folder, dataclasses.asdict(settings))
     bases = [build_base_scene(scene_id, seed=settings.seed) for scene_id in settings.scenes]
-    rooms = split_rooms(bases, settings.seed)
+    rooms = split_rooms(bases, settings.seed) if settings.train else _all_held_out(bases)
     with contextlib.ExitStack() as stack:
         make: Make | None = None
         for split, target in (("heldout", settings.heldout), ("train", settings.train)):
