@@ -28,8 +28,8 @@ PARTS: Final[Mapping[str, tuple[str, str]]] = {
         "Imports",
         "`embomatrix factory import … --instantiate --json FILE`: a problem counts when a base scene was built with all that "
         "it names where its start puts it, and its goal can be told true or false; whether the start holds in physics is "
-        "looked at only where a task is verified. *Reached* are goals of which each literal can be made to hold by a skill of the "
-        "profile.",
+        "looked at only where a task is verified. *Reached* are goals of which each literal can be made to hold by a skill "
+        "of the profile.",
     ),
     "aesthetics": (
         "Aesthetics",
