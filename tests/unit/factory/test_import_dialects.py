@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 
 import pytest
-from tests.fakes.scenes import kitchen_scene
+from tests.fakes.problems import PROBLEM, source
 
 from embomatrix.factory.refusal import Refusal, RefusalReason
 from embomatrix.factory.task_import.batch import bind_first
@@ -21,7 +21,6 @@ from embomatrix.factory.task_import.sources import (
     EAI_INSTRUCTIONS,
     EAI_PROBLEMS,
     SourceError,
-    SourceText,
     read_eai,
 )
 from embomatrix.factory.task_import.task import Imported, Manner, import_problem
@@ -30,43 +29,6 @@ from embomatrix.world.catalog import Catalog
 from embomatrix.world.goal import Atom
 from embomatrix.world.scene import Scene
 from embomatrix.world.task import Profile
-
-PROBLEM = """(define (problem Put_the_apples_in_the_fridge_in_kitchen_0)
-    (:domain omnigibson)
-    (:objects
-        apple.n.01_1 apple.n.01_2 - apple.n.01
-        electric_refrigerator.n.01_1 - electric_refrigerator.n.01
-        breakfast_table.n.01_1 - breakfast_table.n.01
-        floor.n.01_1 - floor.n.01
-        agent.n.01_1 - agent.n.01
-    )
-    (:init
-        (ontop apple.n.01_1 breakfast_table.n.01_1)
-        (ontop apple.n.01_2 breakfast_table.n.01_1)
-        (inroom electric_refrigerator.n.01_1 kitchen)
-        (inroom breakfast_table.n.01_1 kitchen)
-        (open electric_refrigerator.n.01_1)
-        (inroom floor.n.01_1 kitchen)
-        (ontop agent.n.01_1 floor.n.01_1)
-    )
-    (:goal
-        (and
-            (forall (?apple.n.01 - apple.n.01) (inside ?apple.n.01 ?electric_refrigerator.n.01_1))
-            (not (open ?electric_refrigerator.n.01_1))
-        )
-    )
-)
-"""
-
-
-def source(text: str = PROBLEM) -> SourceText:
-    return SourceText("apples", text, "file")
-
-
-@pytest.fixture(scope="module")
-def home() -> Scene:
-    return kitchen_scene()
-
 
 EVALUABLE = Manner(reachable=False)
 

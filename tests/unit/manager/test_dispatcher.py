@@ -1,16 +1,12 @@
 """The Task-Dispatcher, driven by hand: each test tells what happened and what should be done about it."""
 
-from dataclasses import replace
-
 import pytest
+from tests.fakes.dispatch import Table, crash, leases
 from tests.fakes.worker import completed
 
-from embomatrix.manager.assignments import DispatchLimits
-from embomatrix.manager.commands import AcknowledgeLease, CancelLease, DeliverResult, FinishBatch, GiveLease
-from embomatrix.manager.dispatcher import Dispatcher
+from embomatrix.manager.commands import AcknowledgeLease, CancelLease, FinishBatch
 from embomatrix.manager.events import (
     BatchCancelled,
-    BatchContinued,
     BatchSubmitted,
     LeaseFinished,
     LeasesRenewed,
@@ -21,7 +17,6 @@ from embomatrix.manager.events import (
     WorkerJoined,
     WorkerLost,
     WorkerRecovered,
-    WorkerReported,
     WorkerSuspected,
 )
 from embomatrix.rpc.values import (
@@ -31,66 +26,9 @@ from embomatrix.rpc.values import (
     InfraCode,
     InfraFailure,
     LeaseRef,
-    Resident,
-    ResidentState,
     Resources,
     Rollout,
 )
-
-LIMITS = DispatchLimits(
-    lease_ttl_s=30, lease_limit_s=100, rollout_deadline_s=600, no_capacity_s=60, lone_load_failure_s=10
-)
-
-
-class Table:
-    """A dispatcher and its clock. Commands are kept by kind."""
-
-    def __init__(self, limits=LIMITS):
-        self.dispatcher = Dispatcher(limits, boot_id="boot")
-        self.now_s = 0.0
-        self.results = {}
-
-    def tell(self, *events, after_s=0.0):
-        self.now_s += after_s
-        commands = [c for event in events for c in self.dispatcher.handle(event, now_s=self.now_s)]
-        for command in commands:
-            if isinstance(command, DeliverResult):
-                assert command.result.rollout_id not in self.results, "delivered twice"
-                self.results[command.result.rollout_id] = command.result
-        return commands
-
-    def worker(self, worker_id="w1", slots=1, warm=("kitchen",)):
-        self.tell(WorkerJoined(worker_id, Resources(slots, slots, 1024)))
-        return self.report(worker_id, warm=warm, resync=True)
-
-    def report(self, worker_id="w1", warm=(), failed=(), held=(), resync=False, draining=False):
-        residents = [Resident(scene, ResidentState.WARM) for scene in warm]
-        residents += [Resident(scene, ResidentState.FAILED, error="no mesh") for scene in failed]
-        return self.tell(WorkerReported(worker_id, tuple(residents), tuple(held), draining, resync))
-
-    def submit(self, count=1, scene="kitchen", batch_id="b1", group_size=1, run_id="r1"):
-        rollouts = tuple(
-            Rollout(f"{batch_id}-{i}", f"{batch_id}-g{i // group_size}", scene, "t", (), 0)
-            for i in range(count)
-        )
-        return self.tell(BatchSubmitted(Batch(run_id, batch_id, 1, rollouts)))
-
-    def submit_in_pieces(self, count, piece, group_size=1):
-        rollouts = tuple(
-            Rollout(f"b1-{i}", f"g{i // group_size}", "kitchen", "t", (), 0) for i in range(count)
-        )
-        return self.tell(BatchSubmitted(Batch("r1", "b1", 1, rollouts), piece))
-
-    def finish(self, lease, outcome=None):
-        return self.tell(LeaseFinished(lease.worker_id, lease.ref, outcome or completed(lease.worker_id)))
-
-
-def leases(commands):
-    return [command for command in commands if isinstance(command, GiveLease)]
-
-
-def crash():
-    return InfraFailure(InfraCode.SLOT_CRASHED, "signal 11")
 
 
 @pytest.fixture
@@ -392,54 +330,3 @@ def test_warm_and_cold_starts_are_told_apart(table):
     assert table.results["b2-0"].outcome.warm
     counters = table.dispatcher.counters("r1")
     assert (counters.cold_starts, counters.warm_starts) == (1, 1)
-
-
-def test_a_large_batch_is_taken_in_pieces_and_ends_when_all_of_them_are_done(table):
-    table.worker(slots=1)
-    first = leases(table.submit_in_pieces(5, 2))
-    assert [lease.rollout.rollout_id for lease in first] == ["b1-0", "b1-1"]
-    assert (table.dispatcher.queued, table.dispatcher.pending_of("r1")) == (3, 5)
-    for lease in first:
-        assert not [command for command in table.finish(lease) if isinstance(command, FinishBatch)]
-    rest = leases(table.tell(BatchContinued("r1", "b1", 2)))
-    assert [lease.rollout.rollout_id for lease in rest] == ["b1-2", "b1-3"]
-    table.finish(rest[0])
-    (last,) = leases(table.tell(BatchContinued("r1", "b1", 2)))
-    table.finish(rest[1])
-    assert table.finish(last)[-1] == FinishBatch("r1", "b1")
-    assert sorted(table.results) == [f"b1-{i}" for i in range(5)]
-
-
-def test_what_is_still_coming_is_cancelled_with_its_batch(table):
-    table.worker(slots=1)
-    table.submit_in_pieces(5, 2)
-    commands = table.tell(BatchCancelled("r1", "b1"))
-    assert commands.count(FinishBatch("r1", "b1")) == 1
-    assert {type(result.outcome) for result in table.results.values()} == {Cancelled}
-    assert len(table.results) == 5
-    assert table.tell(BatchContinued("r1", "b1", 2)) == []
-
-
-def test_members_that_are_still_coming_fail_with_their_group_and_the_others_are_queued():
-    table = Table(replace(LIMITS, max_attempts=1))
-    table.worker(slots=1)
-    (lease, *_) = leases(table.submit_in_pieces(6, 2, group_size=3))
-    given = leases(table.finish(lease, crash()))
-    assert sorted(table.results) == ["b1-0", "b1-1", "b1-2"]
-    assert [lease.rollout.rollout_id for lease in given] == ["b1-3", "b1-4"]
-    assert table.tell(BatchContinued("r1", "b1", 4)) == []
-
-
-def test_the_deadline_of_a_batch_ends_what_is_still_coming(table):
-    table.submit_in_pieces(3, 1)
-    table.tell(Tick(), after_s=601.0)
-    assert {result.outcome.code for result in table.results.values()} == {InfraCode.DEADLINE}
-    assert len(table.results) == 3
-
-
-def test_a_batch_that_comes_while_another_one_is_taken_goes_behind_all_of_it(table):
-    table.submit_in_pieces(3, 1)
-    table.submit(1, batch_id="b2")
-    table.tell(BatchContinued("r1", "b1", 2))
-    (lease, second) = leases(table.worker(slots=1))
-    assert [lease.rollout.rollout_id, second.rollout.rollout_id] == ["b1-0", "b1-1"]

@@ -1,0 +1,85 @@
+"""Problems are read from files, from BEHAVIOR-1K and from the paper's sample; each is bound or refused."""
+
+import json
+import re
+from collections import Counter
+from pathlib import Path
+
+import pytest
+from tests.fakes.problems import PROBLEM
+
+from embomatrix.factory.refusal import Refusal, RefusedError
+from embomatrix.factory.scenes.build import build_base_scene
+from embomatrix.factory.task_import.batch import bind_first
+from embomatrix.factory.task_import.expressible import check_expressible
+from embomatrix.factory.task_import.sources import (
+    SourceError,
+    SourceText,
+    activity_names,
+    read_activity,
+    read_file,
+    read_jsonl,
+)
+from embomatrix.factory.task_import.task import Imported, import_problem
+from embomatrix.world.bddl import parse_problem
+
+SAMPLE = Path(__file__).parents[4] / "shared" / "data" / "embomatrix_tasks_sample.jsonl"
+
+
+def test_as_many_goals_are_expressible_as_the_documentation_says() -> None:
+    pytest.importorskip("bddl", reason="the bddl package is not installed")
+    page = " ".join((Path(__file__).parents[3] / "docs" / "tasks.md").read_text().split())
+    said = re.search(r"1,016 activities (\d+) pass these checks, of the paper's 400 sample tasks (\d+)", page)
+    assert said
+
+    def is_expressible(item: SourceText) -> bool:
+        try:
+            check_expressible(parse_problem(item.text))
+        except RefusedError:
+            return False
+        return True
+
+    assert sum(is_expressible(read_activity(name)) for name in activity_names()) == int(said[1])
+    if SAMPLE.exists():
+        assert sum(map(is_expressible, read_jsonl(SAMPLE))) == int(said[2])
+
+
+def test_unknown_activity_suggests_a_close_name() -> None:
+    pytest.importorskip("bddl", reason="the bddl package is not installed")
+    with pytest.raises(SourceError, match="did you mean bringing_water"):
+        read_activity("bringin_water")
+    assert read_activity("bringing_water").request == "bringing water"
+    assert len(activity_names()) >= 1016
+
+
+def test_unreadable_sources_are_one_sentence(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match="can't be read"):
+        read_file(tmp_path / "missing.bddl")
+    with pytest.raises(SourceError, match="can't be read"):
+        list(read_jsonl(tmp_path / "missing.jsonl"))
+    (tmp_path / "bad.jsonl").write_text(json.dumps({"name": "a", "bddl": PROBLEM}) + "\n{}\n")
+    with pytest.raises(SourceError, match=r"bad.jsonl:2: expected an object"):
+        list(read_jsonl(tmp_path / "bad.jsonl"))
+
+
+@pytest.mark.skipif(
+    not SAMPLE.exists(), reason="the sample of the paper's tasks is not beside the repository"
+)
+def test_tasks_of_the_paper_s_factory_are_bound_or_refused() -> None:
+    bases = [build_base_scene("Rs_int"), build_base_scene("Wainscott_0_int")]
+    outcomes = [bind_first(item, bases) for item in list(read_jsonl(SAMPLE))[::8]]
+    counts = Counter(item.reason if isinstance(item, Refusal) else "bound" for item in outcomes)
+    assert counts["bound"] >= 3
+    assert sum(counts.values()) == 50
+
+
+def test_activities_of_behavior_1k_are_bound_or_refused() -> None:
+    pytest.importorskip("bddl", reason="the bddl package is not installed")
+    base = build_base_scene("Wainscott_0_int")
+    names = activity_names()[::32]
+    outcomes = [import_problem(read_activity(name), base) for name in names]
+    bound = [item for item in outcomes if isinstance(item, Imported)]
+    assert len(bound) >= 2
+    for item in bound:
+        assert item.task.source == "behavior-1k"
+        assert set(item.task.table) <= set(item.scene.by_name)

@@ -1,0 +1,68 @@
+"""What one result says of another, who is wrong among several, and what is remembered of a worker."""
+
+from dataclasses import replace
+
+from tests.fakes.worker import completed
+
+from embomatrix.manager.auditor import Auditor, AuditRules, Repute, Ruling, judge, opinion_of
+from embomatrix.manager.records import repute_of, repute_row
+from embomatrix.reward.breakdown import AtomResult
+
+SAME = {"platform": "a1", "pybullet": "3.2.7"}
+OTHER = {"platform": "b2", "pybullet": "3.2.7"}
+
+
+def opinion(worker_id="w1", versions=SAME, **changes):
+    return opinion_of(worker_id, versions, replace(completed(worker_id), **changes))
+
+
+def test_on_one_platform_traces_must_be_equal_to_the_bit_and_across_platforms_outcomes():
+    assert opinion().agrees(opinion("w2"))
+    assert not opinion().agrees(opinion("w2", trace_digest="sha256:another"))
+    assert opinion().agrees(opinion("w2", OTHER, trace_digest="sha256:another"))
+    better = replace(completed().reward, atoms=(AtomResult("inside(cup, sink)", True),))
+    assert not opinion().agrees(opinion("w2", OTHER, reward=better))
+    richer = replace(completed().reward, goal=30.0)
+    assert not opinion().agrees(opinion("w2", OTHER, reward=richer))
+
+
+def test_workers_that_tell_no_fingerprint_are_compared_by_outcomes_alone():
+    assert opinion(versions={}).agrees(opinion("w2", {}, trace_digest="sha256:another"))
+
+
+def test_only_who_contradicts_two_that_agree_is_wrong():
+    first, second, third = opinion("w1"), opinion("w2"), opinion("w3", trace_digest="invented")
+    assert judge([first]).ruling is Ruling.OPEN
+    assert judge([first, third]).ruling is Ruling.OPEN
+    assert judge([first, third, second]).wrong == (1,)
+    assert judge([first, third, opinion("w2", trace_digest="too")]).ruling is Ruling.SPLIT
+    # Another platform agrees with both of two that differ in their traces only: nobody can tell who is wrong.
+    assert judge([first, third, opinion("w2", OTHER)]).wrong == ()
+
+
+def test_a_repute_is_written_when_it_changed_and_read_without_the_disputes_that_were_open():
+    auditor = Auditor(AuditRules(probation=2), b"key")
+    auditor.took("w1")
+    auditor.agreed("w1")
+    auditor.of("w1").disputed += 1
+    auditor.convict("w2", "it contradicts w1 and w3")
+    written = [repute_row(worker_id, auditor.of(worker_id)) for worker_id in auditor.take_changed()]
+    assert auditor.take_changed() == []
+    successor = Auditor(AuditRules(probation=2), b"key")
+    successor.know({row.key: repute_of(row) for row in written})
+    assert successor.of("w1") == Repute(taken=1, agreed=1, audited=1)
+    assert successor.quarantined("w2") == "it contradicts w1 and w3"
+    assert successor.take_changed() == []
+
+
+def test_after_probation_a_share_is_drawn_by_a_key_that_no_worker_has():
+    rules = AuditRules(probation=2, share=0.1)
+    drawn = {}
+    for key in (b"one", b"two"):
+        auditor = Auditor(rules, key)
+        for _ in range(2):
+            assert auditor.wants("w1", "lease", verified=True)
+            auditor.agreed("w1")
+        drawn[key] = {n for n in range(5000) if auditor.wants("w1", f"boot-{n}", verified=True)}
+        assert 400 <= len(drawn[key]) <= 600
+    assert len(drawn[b"one"] & drawn[b"two"]) < 100

@@ -1,0 +1,73 @@
+"""Batches that are taken in pieces: their rest is cancelled, failed and timed out with what has come."""
+
+from dataclasses import replace
+
+import pytest
+from tests.fakes.dispatch import LIMITS, Table, crash, leases
+
+from embomatrix.manager.commands import FinishBatch
+from embomatrix.manager.events import (
+    BatchCancelled,
+    BatchContinued,
+    Tick,
+)
+from embomatrix.rpc.values import (
+    Cancelled,
+    InfraCode,
+)
+
+
+@pytest.fixture
+def table():
+    return Table()
+
+
+def test_a_large_batch_is_taken_in_pieces_and_ends_when_all_of_them_are_done(table):
+    table.worker(slots=1)
+    first = leases(table.submit_in_pieces(5, 2))
+    assert [lease.rollout.rollout_id for lease in first] == ["b1-0", "b1-1"]
+    assert (table.dispatcher.queued, table.dispatcher.pending_of("r1")) == (3, 5)
+    for lease in first:
+        assert not [command for command in table.finish(lease) if isinstance(command, FinishBatch)]
+    rest = leases(table.tell(BatchContinued("r1", "b1", 2)))
+    assert [lease.rollout.rollout_id for lease in rest] == ["b1-2", "b1-3"]
+    table.finish(rest[0])
+    (last,) = leases(table.tell(BatchContinued("r1", "b1", 2)))
+    table.finish(rest[1])
+    assert table.finish(last)[-1] == FinishBatch("r1", "b1")
+    assert sorted(table.results) == [f"b1-{i}" for i in range(5)]
+
+
+def test_what_is_still_coming_is_cancelled_with_its_batch(table):
+    table.worker(slots=1)
+    table.submit_in_pieces(5, 2)
+    commands = table.tell(BatchCancelled("r1", "b1"))
+    assert commands.count(FinishBatch("r1", "b1")) == 1
+    assert {type(result.outcome) for result in table.results.values()} == {Cancelled}
+    assert len(table.results) == 5
+    assert table.tell(BatchContinued("r1", "b1", 2)) == []
+
+
+def test_members_that_are_still_coming_fail_with_their_group_and_the_others_are_queued():
+    table = Table(replace(LIMITS, max_attempts=1))
+    table.worker(slots=1)
+    (lease, *_) = leases(table.submit_in_pieces(6, 2, group_size=3))
+    given = leases(table.finish(lease, crash()))
+    assert sorted(table.results) == ["b1-0", "b1-1", "b1-2"]
+    assert [lease.rollout.rollout_id for lease in given] == ["b1-3", "b1-4"]
+    assert table.tell(BatchContinued("r1", "b1", 4)) == []
+
+
+def test_the_deadline_of_a_batch_ends_what_is_still_coming(table):
+    table.submit_in_pieces(3, 1)
+    table.tell(Tick(), after_s=601.0)
+    assert {result.outcome.code for result in table.results.values()} == {InfraCode.DEADLINE}
+    assert len(table.results) == 3
+
+
+def test_a_batch_that_comes_while_another_one_is_taken_goes_behind_all_of_it(table):
+    table.submit_in_pieces(3, 1)
+    table.submit(1, batch_id="b2")
+    table.tell(BatchContinued("r1", "b1", 2))
+    (lease, second) = leases(table.worker(slots=1))
+    assert [lease.rollout.rollout_id, second.rollout.rollout_id] == ["b1-0", "b1-1"]
