@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from embomatrix.factory.layout.arrangement import WEIGHTS, Candidates, half_extents, holds, near_m, next_to_m
-from embomatrix.factory.layout.planar import arrange, unknown_names
+from embomatrix.factory.layout.planar import arrange
 from embomatrix.factory.layout.values import (
     Arrangement,
     Footprint,
@@ -182,8 +182,3 @@ def test_wishes_that_can_hold_do():
 def test_what_finds_no_spot_says_why(change, reason):
     brief = PlaneBrief("table", PLANE, (PlaneThing("cup", CUP),))
     assert arrange(dataclasses.replace(brief, **change))[0].left_out == {"cup": reason}
-
-
-def test_names_that_are_not_on_the_plane_are_told():
-    things = (PlaneThing("cup", CUP, (Wish(Arrangement.NEAR, "ghost"), Wish(Arrangement.EDGE))),)
-    assert unknown_names(PlaneBrief("table", PLANE, things)) == ("ghost",)

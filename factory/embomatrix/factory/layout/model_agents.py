@@ -5,10 +5,9 @@ A model that stays wrong is no reason to lose a scene: then the rules answer, an
 
 from __future__ import annotations
 
-import asyncio
 import logging
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final, Self, TypeVar
+from typing import TYPE_CHECKING, Final, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -28,6 +27,7 @@ from embomatrix.factory.layout.values import (
     Wishes,
 )
 from embomatrix.factory.layout.wishes import wish
+from embomatrix.llm.loop import OnOneLoop
 from embomatrix.llm.structured import ask
 from embomatrix.llm.values import ChatRequest, Message, Speaker, UnusableReplyError
 
@@ -77,8 +77,8 @@ class WishesAnswer(_Answer):
     of: dict[str, tuple[WishAnswer, ...]]
 
 
-class ModelLayoutAgents:
-    """Context manager over one event loop, which closes the ``endpoint`` at its end; asks one model for all agents."""
+class ModelLayoutAgents(OnOneLoop):
+    """Asks one model for all agents."""
 
     def __init__(
         self,
@@ -87,22 +87,9 @@ class ModelLayoutAgents:
         *,
         attempts: int = 3,
     ) -> None:
+        super().__init__(endpoint)
         self._model = model
-        self._endpoint = endpoint
         self._attempts = attempts
-        self._runner = asyncio.Runner()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._endpoint is not None:
-            self._runner.run(self._closed(self._endpoint))
-        self._runner.close()
-
-    @staticmethod
-    async def _closed(endpoint: AbstractAsyncContextManager[object]) -> None:
-        await endpoint.__aexit__(None, None, None)
 
     def agents(self, modelled: Collection[AgentName]) -> LayoutAgents:
         """Agents of which these are the model and the others rules."""

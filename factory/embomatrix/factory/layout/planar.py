@@ -24,7 +24,6 @@ from embomatrix.factory.layout.arrangement import (
     margins,
 )
 from embomatrix.factory.layout.values import (
-    ABOUT_THE_PLANE,
     Arranged,
     Arrangement,
     Footprint,
@@ -263,16 +262,3 @@ def _line(extent: float, step: float) -> NDArray[np.float64]:
     """Grid points along one side, the middle among them."""
     count = int(extent / 2 / step)
     return np.asarray(np.arange(-count, count + 1) * step, dtype=np.float64)
-
-
-def unknown_names(brief: PlaneBrief) -> tuple[str, ...]:
-    """Objects that wishes name and that are not on the plane."""
-    known = {item.name for item in brief.obstacles} | {thing.name for thing in brief.things}
-    return tuple(
-        dict.fromkeys(
-            wish.other
-            for thing in brief.things
-            for wish in thing.wishes
-            if wish.kind not in ABOUT_THE_PLANE and wish.other not in known
-        )
-    )

@@ -85,16 +85,6 @@ class LayoutTree:
         """The edge that ends at an object; None for the root and for what is not in the tree."""
         return next((branch for branch in self.branches() if branch.child == name), None)
 
-    def depth_of(self, name: str) -> int:
-        """Edges between the root and an object. Raises KeyError for what is not in the tree."""
-        above = {branch.child: branch.parent for branch in self.branches()}
-        if name != self.root.name and name not in above:
-            raise KeyError(name)
-        depth = 0
-        while name != self.root.name:
-            name, depth = above[name], depth + 1
-        return depth
-
     def nested(self) -> dict[str, Any]:
         """Object and relation names in turn, leaves empty: the form in which the paper's factory writes its trees."""
         return {self.root.name: _nested(self.root)}

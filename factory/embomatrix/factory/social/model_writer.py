@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import asyncio
 import logging
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING
 
 from embomatrix.factory.social.conversing import starting_slots
 from embomatrix.factory.social.facts import facts_of
@@ -12,6 +11,7 @@ from embomatrix.factory.social.requests import piece_of
 from embomatrix.factory.social.transcript import transcript_of
 from embomatrix.factory.writer.goals import Workshop
 from embomatrix.factory.writer.tasks import Draft, draft_of
+from embomatrix.llm.loop import OnOneLoop
 from embomatrix.llm.values import UnusableReplyError
 
 if TYPE_CHECKING:
@@ -29,31 +29,15 @@ logger = logging.getLogger(__name__)
 SEEDS = 2**31
 
 
-class ModelWriter:
-    """Context manager over one event loop, which closes the ``endpoint`` at its end.
-
-    An answer that stays unusable costs its draft and no more.
-    """
+class ModelWriter(OnOneLoop):
+    """Writes drafts by what the agents answer. An answer that stays unusable costs its draft and no more."""
 
     def __init__(
         self, agents: ModelAgents, endpoint: AbstractAsyncContextManager[object] | None = None
     ) -> None:
+        super().__init__(endpoint)
         self._agents = agents
-        self._endpoint = endpoint
         self._casts: dict[str, Cast] = {}
-        self._runner = asyncio.Runner()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._endpoint is not None:
-            self._runner.run(self._closed(self._endpoint))
-        self._runner.close()
-
-    @staticmethod
-    async def _closed(endpoint: AbstractAsyncContextManager[object]) -> None:
-        await endpoint.__aexit__(None, None, None)
 
     def write(
         self,
