@@ -21,6 +21,7 @@ from embomatrix.cli.cluster.tables import (
     worker_table,
 )
 from embomatrix.cli.cluster.trace import chrome_trace
+from embomatrix.cli.connection import Ca, Manager, Token  # noqa: TC001  typer reads the annotations when a command runs
 from embomatrix.cli.failure import fail
 from embomatrix.rpc.admin import AdminClient
 from embomatrix.rpc.channel import DEFAULT_ADDRESS
@@ -45,16 +46,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-Manager = Annotated[str, typer.Option(help="HOST:PORT of the manager.", envvar="EMBOMATRIX_MANAGER")]
-Token = Annotated[
-    str, typer.Option(envvar="EMBOMATRIX_TOKEN", help="A token, or @FILE that holds it.", show_default=False)
-]
-Ca = Annotated[
-    Path | None,
-    typer.Option(
-        envvar="EMBOMATRIX_CA", help="The ca.pem of a manager that serves by TLS.", show_default=False
-    ),
-]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 Worker = Annotated[str, typer.Argument(help="Id of the worker, as `embomatrix cluster workers` shows it.")]
 Run = Annotated[str, typer.Argument(help="Id of the run, as `embomatrix cluster runs` shows it.")]

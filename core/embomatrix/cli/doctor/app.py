@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
@@ -12,6 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from embomatrix.cli.cluster.tables import show_json
+from embomatrix.cli.connection import Ca, Token  # noqa: TC001  typer reads the annotations when a command runs
 from embomatrix.cli.doctor.findings import Level, verdict
 from embomatrix.cli.doctor.machine import machine
 from embomatrix.cli.doctor.manager import Visit, manager
@@ -35,15 +35,6 @@ Manager = Annotated[
         help="HOST:PORT of the manager to visit.",
         envvar="EMBOMATRIX_MANAGER",
         show_default=False,
-    ),
-]
-Token = Annotated[
-    str, typer.Option(envvar="EMBOMATRIX_TOKEN", help="A token, or @FILE that holds it.", show_default=False)
-]
-Ca = Annotated[
-    Path | None,
-    typer.Option(
-        envvar="EMBOMATRIX_CA", help="The ca.pem of a manager that serves by TLS.", show_default=False
     ),
 ]
 PagePort = Annotated[

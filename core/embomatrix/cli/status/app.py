@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import time
 from collections import deque
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
@@ -14,6 +13,7 @@ from rich.console import Console
 from rich.live import Live
 
 from embomatrix.cli.cluster.tables import show_json
+from embomatrix.cli.connection import Ca, Manager, Token  # noqa: TC001  typer reads the annotations when a command runs
 from embomatrix.cli.failure import fail
 from embomatrix.cli.status.live import Glance, earliest, screen
 from embomatrix.cli.status.words import sentences
@@ -24,23 +24,13 @@ from embomatrix.rpc.trust import read_ca, read_token
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine
+    from pathlib import Path
 
 REFRESH_S: Final = 1.0
 RATE_S: Final = 5.0
 """Throughput is that of so many seconds."""
 PATIENCE_S: Final = 2.0
 """For a manager that is away: who looks on wants to know."""
-
-Manager = Annotated[str, typer.Option(help="HOST:PORT of the manager.", envvar="EMBOMATRIX_MANAGER")]
-Token = Annotated[
-    str, typer.Option(envvar="EMBOMATRIX_TOKEN", help="A token, or @FILE that holds it.", show_default=False)
-]
-Ca = Annotated[
-    Path | None,
-    typer.Option(
-        envvar="EMBOMATRIX_CA", help="The ca.pem of a manager that serves by TLS.", show_default=False
-    ),
-]
 
 
 def status(
