@@ -11,6 +11,7 @@ from importlib.resources import files
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.cli.cluster.charts import busy_chart, phase_chart, throughput_chart
+from embomatrix.pages.head import page_head
 from embomatrix.reward.settings import PAPER
 from embomatrix.rpc.run_log import EventKind, Phase
 from embomatrix.rpc.timeline import busy_share, slot_spans
@@ -38,6 +39,7 @@ def report_page(summary: RunSummary, events: Sequence[RunEvent]) -> str:
     template = files("embomatrix.cli.cluster").joinpath("report.html").read_text(encoding="utf-8")
     run = summary.run
     return string.Template(template).substitute(
+        head=page_head(f"{run.name or run.run_id} · EmboMatrix run"),
         title=_text(run.name or run.run_id),
         about=_text(_about(summary)),
         tiles=_tiles(summary),

@@ -19,6 +19,7 @@ import numpy as np
 from PIL import Image
 
 from embomatrix.factory.inspection.plan_view import PlanView
+from embomatrix.pages.head import page_head
 from embomatrix.sim.bullet.camera import render_oblique
 from embomatrix.world.evaluate import objects_of
 
@@ -55,7 +56,7 @@ def task_page(
     )
     verdict = "reaches the goal" if show.success else "does not reach the goal"
     return template.substitute(
-        title=escape(task.task_id),
+        head=page_head(f"{task.task_id} · EmboMatrix task"),
         instruction=escape(task.instruction),
         facts=_facts(record),
         goal=escape(task.goal_bddl),

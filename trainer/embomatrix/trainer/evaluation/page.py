@@ -9,6 +9,7 @@ from importlib.resources import files
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any, Final
 
+from embomatrix.pages.head import page_head
 from embomatrix.trainer.evaluation.plan_view import Drawn, plan_view
 from embomatrix.trainer.evaluation.table import (
     COLUMNS,
@@ -54,8 +55,10 @@ def evaluation_page(
     template = files("embomatrix.trainer.evaluation").joinpath("page.html").read_text(encoding="utf-8")
     setup = report["setup"]
     rows = [Row(setup["model"], report), *beside]
+    title = f"{setup['model']} on {PurePath(setup['bench']).name}"
     return string.Template(template).substitute(
-        title=html.escape(f"{setup['model']} on {PurePath(setup['bench']).name}"),
+        head=page_head(f"{title} · EmboMatrix evaluation"),
+        title=html.escape(title),
         about=html.escape(_about(report)),
         success=_table(head(report), table(rows, "success")),
         partial=_table(head(report), table(rows, "partial")),
