@@ -41,7 +41,8 @@ TITLES: Final[Mapping[str, tuple[str, str]]] = {
         "of the worker's root. *rollouts_per_s* is executed and scored in a slot, with all that goes over its stream. "
         "*private_mb_per_slot* is what a slot that waits holds for itself after fifty rollouts. A rollout checks every "
         "precondition, every placed thing for penetration, relations and the reward. Names without a size are for scenes "
-        "of about 300 bodies.",
+        "of about 300 bodies. What bounds the time of a rollout and the memory of a slot, and what was tried, is told in "
+        "decisions [0023](decisions/0023-what-bounds-a-rollout.md) and [0015](decisions/0015-what-a-slot-holds-for-itself.md).",
     ),
     "fidelity": (
         "Fidelity of the two modes",

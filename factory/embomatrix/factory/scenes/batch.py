@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import multiprocessing
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from embomatrix.factory.importers.shelf import read_assets
-from embomatrix.factory.scenes.report import SceneReport, report_on
+from embomatrix.factory.scenes.report import SceneReport, report_on, report_on_file
+from embomatrix.factory.scenes.scene_file import write_scene
 from embomatrix.world.catalog import Catalog
-from embomatrix.world.codec import scene_to_json
-from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -21,12 +19,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class SceneJob:
-    """One scene to build and check; ``path`` is the file to write it to, ``assets`` a folder of imported ones."""
+    """One scene to build and check; ``path`` is the file to write it to, ``assets`` a folder of imported ones.
+
+    One with a ``source``, a file that an earlier build wrote, is only checked.
+    """
 
     scene_id: str
     seed: int
     path: Path | None = None
     assets: Path | None = None
+    source: Path | None = None
 
 
 def run_batch(jobs: Sequence[SceneJob], *, processes: int) -> Iterator[SceneReport]:
@@ -37,14 +39,14 @@ def run_batch(jobs: Sequence[SceneJob], *, processes: int) -> Iterator[SceneRepo
     is told in the reports of all that it leaves undone.
     """
     catalog = Catalog.load()
-    things = {job.scene_id: _things(catalog, job.scene_id) for job in jobs}
+    things = {job: _things(catalog, job) for job in jobs}
     if len(jobs) == 1:
         yield _run(jobs[0])
         return
     # spawned, not forked: a child shall not inherit what the parent's libraries hold
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(processes, len(jobs)), context) as pool:
-        largest_first = sorted(jobs, key=lambda job: -things[job.scene_id])
+        largest_first = sorted(jobs, key=lambda job: -things[job])
         waiting = {pool.submit(_run, job): job for job in largest_first}
         try:
             for done in as_completed(waiting):
@@ -58,17 +60,21 @@ def run_batch(jobs: Sequence[SceneJob], *, processes: int) -> Iterator[SceneRepo
 
 
 def _run(job: SceneJob) -> SceneReport:
+    if job.source is not None:
+        return report_on_file(job.scene_id, job.seed, job.source)
     imported = read_assets(job.assets) if job.assets is not None else {}
     report, scene = report_on(job.scene_id, job.seed, imported)
     if scene is not None and job.path is not None:
         try:
-            write_whole(job.path, json.dumps(scene_to_json(scene)).encode("utf-8"))
+            write_scene(job.path, scene)
         except OSError as error:
             # a full disk doesn't say which file it is about
             raise OSError(error.errno, error.strerror, str(job.path)) from error
     return report
 
 
-def _things(catalog: Catalog, scene_id: str) -> int:
+def _things(catalog: Catalog, job: SceneJob) -> int:
     """How much there is to place: the time that a scene takes follows it."""
-    return sum(count for room in catalog.inventory(scene_id).rooms for _, _, count in room.items)
+    if job.source is not None:
+        return 0
+    return sum(count for room in catalog.inventory(job.scene_id).rooms for _, _, count in room.items)

@@ -25,6 +25,7 @@ from embomatrix.factory.pictures.scene import draw_plan
 from embomatrix.factory.pictures.sheet import draw_sheet, draw_views
 from embomatrix.factory.scenes.batch import SceneJob, run_batch
 from embomatrix.factory.scenes.build import build_base_scene
+from embomatrix.factory.scenes.scene_file import SUFFIX, SceneFileError, read_scene
 from embomatrix.factory.scenes.tables import TABLE_COLUMNS, problem_lines, report_table
 from embomatrix.sim.bullet.camera import render_egocentric, render_oblique
 from embomatrix.sim.engine import EngineError
@@ -43,8 +44,19 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-SceneId = Annotated[str, typer.Argument(help="Name of a scene, as `embomatrix scene list` shows it.")]
 SceneIds = Annotated[list[str] | None, typer.Argument(help="Names of scenes, or none with --all.")]
+SceneSource = Annotated[
+    str,
+    typer.Argument(
+        help="Name of a scene, as `embomatrix scene list` shows it, or a .json file that `scene build` wrote."
+    ),
+]
+SceneSources = Annotated[
+    list[str] | None,
+    typer.Argument(
+        help="Names of scenes, or .json files that `scene build` wrote, which have their seed; none with --all."
+    ),
+]
 All = Annotated[bool, typer.Option("--all", help="All 51 scenes.")]
 Seed = Annotated[
     int, typer.Option(min=0, help="Another seed gives another arrangement of the same inventory.")
@@ -86,6 +98,7 @@ def build(
 ) -> None:
     """Lay out and furnish scenes, check them, and write them as JSON; exit status 1 when one has a problem."""
     chosen = _chosen(scene_ids, every)
+    _known(chosen)
     _check_assets(assets)
     _check_writable(report)
     folder = _folder(out)
@@ -102,53 +115,38 @@ def build(
 
 @app.command()
 def check(
-    scene_ids: SceneIds = None,
+    scenes: SceneSources = None,
     every: All = False,
     seeds: Seeds = None,
     report: Report = None,
     jobs: Jobs = CORES,
 ) -> None:
     """Test scenes for penetration, unstable and floating things and blocked ways; exit status 1 when something is wrong."""
-    chosen = _chosen(scene_ids, every)
+    orders = _to_check(_chosen(scenes, every), tuple(dict.fromkeys(seeds or (0,))))
     _check_writable(report)
-    _tell(
-        _run([SceneJob(name, seed) for name in chosen for seed in dict.fromkeys(seeds or (0,))], jobs), report
-    )
+    _tell(_run(orders, jobs), report)
 
 
 @app.command()
-def show(scene_id: SceneId, seed: Seed = 0) -> None:
+def show(scene: SceneSource, seed: Seed = 0) -> None:
     """Print rooms, doorways, objects and what was left out."""
-    scene = _built(scene_id, seed)
-    console = Console()
-    table = Table("room", "size (m)", "doors to", "windows", "objects")
-    for room in scene.rooms:
-        doors = [d for d in scene.doorways if room.name in d.rooms]
-        beyond = [next((r or "outside" for r in d.rooms if r != room.name), "outside") for d in doors]
-        windows = sum(room.name in window.rooms for window in scene.windows)
-        counts = Counter(scene.assets[o.asset_id].category for o in scene.objects if o.room == room.name)
-        listed = ", ".join(f"{n} {c}" if n > 1 else c for c, n in sorted(counts.items()))
-        size = f"{room.size_m[0]:.2f} x {room.size_m[1]:.2f}"
-        table.add_row(room.name, size, ", ".join(beyond), str(windows), listed)
-    console.print(table)
-    for sentence in scene.left_out:
-        console.print(f"left out: {sentence}", highlight=False, markup=False)
+    _print_scene(_built(scene, seed))
 
 
 @app.command()
-def render(scene_id: SceneId, seed: Seed = 0, out: Out = Path()) -> None:
+def render(scene: SceneSource, seed: Seed = 0, out: Out = Path()) -> None:
     """Draw a plan from above, an oblique view, and what the robot sees where it starts, as PNG files."""
-    _known([scene_id])
+    _there([scene])
     folder = _folder(out)
-    scene = _built(scene_id, seed)
+    built = _built(scene, seed)
     with _engine_refusals():
         pictures = {
-            "plan": draw_plan(scene),
-            "view": Image.fromarray(np.asarray(render_oblique(scene))),
-            "eyes": Image.fromarray(np.asarray(render_egocentric(scene, width_px=640, height_px=480))),
+            "plan": draw_plan(built),
+            "view": Image.fromarray(np.asarray(render_oblique(built))),
+            "eyes": Image.fromarray(np.asarray(render_egocentric(built, width_px=640, height_px=480))),
         }
     for kind, picture in pictures.items():
-        path = folder / f"{scene_id}_{kind}.png"
+        path = folder / f"{built.scene_id}_{kind}.png"
         _write(path, _png(picture))
         Console().print(str(path), highlight=False)
 
@@ -165,28 +163,46 @@ def relations(out: Out = Path()) -> None:
 
 @app.command()
 def sheet(
-    scene_ids: SceneIds = None,
+    scenes: SceneSources = None,
     every: All = False,
     seed: Seed = 0,
     out: Picture = Path("scenes.png"),
 ) -> None:
     """Draw the plans of many scenes on one sheet, as a PNG file."""
-    chosen = _chosen(scene_ids, every)
+    chosen = _chosen(scenes, every)
+    _there(chosen)
     _check_writable(out)
     _write(out, _png(draw_sheet(_built_all(chosen, seed)).quantize(64)))
     Console().print(str(out), highlight=False)
 
 
 @app.command()
-def views(scene_ids: SceneIds = None, seed: Seed = 0, out: Picture = Path("views.png")) -> None:
+def views(scenes: SceneSources = None, seed: Seed = 0, out: Picture = Path("views.png")) -> None:
     """Draw oblique views of some scenes side by side, as a PNG file."""
-    chosen = _chosen(scene_ids, every=False)
+    chosen = _chosen(scenes, every=False)
+    _there(chosen)
     _check_writable(out)
-    scenes = _built_all(chosen, seed)
+    built = _built_all(chosen, seed)
     with _engine_refusals():
-        picture = draw_views(scenes)
+        picture = draw_views(built)
     _write(out, _png(picture.quantize(128)))
     Console().print(str(out), highlight=False)
+
+
+def _print_scene(scene: Scene) -> None:
+    console = Console()
+    table = Table("room", "size (m)", "doors to", "windows", "objects")
+    for room in scene.rooms:
+        doors = [d for d in scene.doorways if room.name in d.rooms]
+        beyond = [next((r or "outside" for r in d.rooms if r != room.name), "outside") for d in doors]
+        windows = sum(room.name in window.rooms for window in scene.windows)
+        counts = Counter(scene.assets[o.asset_id].category for o in scene.objects if o.room == room.name)
+        listed = ", ".join(f"{n} {c}" if n > 1 else c for c, n in sorted(counts.items()))
+        size = f"{room.size_m[0]:.2f} x {room.size_m[1]:.2f}"
+        table.add_row(room.name, size, ", ".join(beyond), str(windows), listed)
+    console.print(table)
+    for sentence in scene.left_out:
+        console.print(f"left out: {sentence}", highlight=False, markup=False)
 
 
 def _built_all(names: Sequence[str], seed: int) -> list[Scene]:
@@ -248,17 +264,38 @@ def _tell(reports: Sequence[SceneReport], path: Path | None) -> None:
     )
 
 
-def _chosen(scene_ids: Sequence[str] | None, every: bool) -> tuple[str, ...]:
-    """Before anything is made: a wrong name shall leave no folder behind."""
-    if every and scene_ids:
-        raise _refused(f"--all and {scene_ids[0]!r} exclude one another: give names, or --all")
-    if not every and not scene_ids:
+def _chosen(names: Sequence[str] | None, every: bool) -> tuple[str, ...]:
+    if every and names:
+        raise _refused(f"--all and {names[0]!r} exclude one another: give names, or --all")
+    if not every and not names:
         raise _refused("no scene is named: give a name that `embomatrix scene list` shows, or --all")
-    _known(scene_ids or ())
-    return Catalog.load().scene_ids if every else tuple(dict.fromkeys(scene_ids or ()))
+    return Catalog.load().scene_ids if every else tuple(dict.fromkeys(names or ()))
+
+
+def _to_check(names: Sequence[str], seeds: Sequence[int]) -> list[SceneJob]:
+    """Each file once, as it has its own seed, and each inventory with all seeds."""
+    orders = []
+    for name in names:
+        if _is_file(name):
+            scene = _read(name)
+            orders.append(SceneJob(scene.scene_id, scene.seed, source=Path(name)))
+        else:
+            _known([name])
+            orders += [SceneJob(name, seed) for seed in seeds]
+    return orders
+
+
+def _there(names: Sequence[str]) -> None:
+    """Before anything is made: a wrong name or a damaged file shall leave no folder behind."""
+    for name in names:
+        if _is_file(name):
+            _read(name)
+        else:
+            _known([name])
 
 
 def _known(names: Sequence[str]) -> None:
+    """Before anything is made: a wrong name shall leave no folder behind."""
     try:
         for name in names:
             Catalog.load().inventory(name)
@@ -266,9 +303,22 @@ def _known(names: Sequence[str]) -> None:
         raise _refused(str(error)) from None
 
 
-def _built(scene_id: str, seed: int) -> Scene:
+def _is_file(name: str) -> bool:
+    return name.endswith(SUFFIX)
+
+
+def _read(name: str) -> Scene:
     try:
-        return build_base_scene(scene_id, seed=seed)
+        return read_scene(Path(name))
+    except SceneFileError as error:
+        raise _refused(str(error)) from None
+
+
+def _built(name: str, seed: int) -> Scene:
+    if _is_file(name):
+        return _read(name)
+    try:
+        return build_base_scene(name, seed=seed)
     except (CatalogError, FloorPlanError) as error:
         raise _refused(str(error)) from None
 

@@ -14,11 +14,13 @@ from embomatrix.factory.floorplan.spec import FloorPlanError
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.check import Problem, ProblemKind, check_in_engine, check_scene, check_settled
 from embomatrix.factory.scenes.floor import ReachableFloor
+from embomatrix.factory.scenes.scene_file import SceneFileError, read_scene
 from embomatrix.sim.engine import EngineError
 from embomatrix.world.catalog import Catalog, CatalogError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+    from pathlib import Path
 
     from embomatrix.world.asset import Asset
     from embomatrix.world.scene import Scene
@@ -86,6 +88,14 @@ def report_on(
     except EngineError as error:
         return SceneReport(scene_id, seed, error=str(error), build_s=built - started), scene
     return report, scene
+
+
+def report_on_file(scene_id: str, seed: int, path: Path) -> SceneReport:
+    """Check the scene in a file, of this name and seed; what fails is told in the report."""
+    try:
+        return report_of(read_scene(path))
+    except (SceneFileError, EngineError) as error:
+        return SceneReport(scene_id, seed, error=str(error))
 
 
 def report_of(scene: Scene, *, build_s: float = 0.0) -> SceneReport:

@@ -1,0 +1,109 @@
+"""Scenes in files: what was built is shown, drawn and checked again; anything else is refused in a sentence."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import pytest
+from typer.testing import CliRunner
+
+from embomatrix.factory.scenes.cli import app
+from embomatrix.factory.scenes.scene_file import MAX_BYTES, SceneFileError, read_scene, write_scene
+from embomatrix.world.codec import scene_to_json
+from embomatrix.world.geometry import Pose
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from embomatrix.world.scene import Scene
+
+
+@pytest.fixture
+def path(flat: Scene, tmp_path: Path) -> Path:
+    path = tmp_path / "built.json"
+    write_scene(path, flat)
+    return path
+
+
+def test_a_scene_is_read_back_equal_and_its_file_is_far_below_the_limit(flat: Scene, path: Path) -> None:
+    assert read_scene(path) == flat
+    assert path.stat().st_size * 40 < MAX_BYTES
+
+
+def test_a_file_is_shown_and_drawn_as_the_scene_that_it_holds(flat: Scene, path: Path) -> None:
+    shown = CliRunner().invoke(app, ["show", str(path)])
+    assert shown.exit_code == 0, shown.output
+    assert all(room.name in shown.output for room in flat.rooms)
+    drawn = CliRunner().invoke(app, ["sheet", str(path), "--out", str(path.parent / "sheet.png")])
+    assert drawn.exit_code == 0, drawn.output
+    assert (path.parent / "sheet.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_file_is_checked_once_with_the_seed_that_it_has(flat: Scene, path: Path) -> None:
+    borne = next(item for item in flat.objects if item.host and not item.fixed)
+    x, y, z = borne.pose_world_asset.position_m
+    hanging = replace(borne, pose_world_asset=Pose((x, y, z + 0.2), borne.pose_world_asset.quat_xyzw))
+    lifted = replace(flat, objects=tuple(hanging if item is borne else item for item in flat.objects), seed=7)
+    write_scene(path, lifted)
+    report = path.parent / "report.json"
+    result = CliRunner().invoke(
+        app, ["check", str(path), "--seed", "0", "--seed", "1", "--report", str(report)]
+    )
+    assert result.exit_code == 1
+    (entry,) = json.loads(report.read_text())
+    assert (entry["scene_id"], entry["seed"]) == (flat.scene_id, 7)
+    assert ["floating", borne.name] in [[kind, names[0]] for kind, names, _ in entry["problems"]]
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (b"", "is no JSON"),
+        (b"\x00\xff\xfe", "is no JSON"),
+        (b"[" * 100_000, "is no JSON"),
+        (b"[]", "scene"),
+        (b'{"objects": []}', "scene"),
+    ],
+)
+def test_a_file_that_holds_no_scene_is_refused_in_a_sentence(tmp_path: Path, data: bytes, words: str) -> None:
+    path = tmp_path / "bad.json"
+    path.write_bytes(data)
+    with pytest.raises(SceneFileError, match=words):
+        read_scene(path)
+
+
+@pytest.mark.parametrize("name", ["../../etc/passwd", "/dev/zero", "a/b"])
+def test_a_path_in_the_place_of_a_name_never_becomes_one(flat: Scene, tmp_path: Path, name: str) -> None:
+    path = tmp_path / "bad.json"
+    path.write_text(json.dumps({**scene_to_json(flat), "scene_id": name}))
+    result = CliRunner().invoke(app, ["render", str(path), "--out", str(tmp_path / "pictures")])
+    assert result.exit_code == 2
+    assert "scene.scene_id" in result.output
+    assert not (tmp_path / "pictures").exists()
+
+
+def test_a_file_of_a_gigabyte_is_refused_before_it_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "big.json"
+    with path.open("wb") as file:
+        file.truncate(1 << 30)
+    for command in ("check", "render"):
+        result = CliRunner().invoke(app, [command, str(path)])
+        assert result.exit_code == 2, result.output
+        assert "over 67,108,864 bytes" in result.output
+
+
+@pytest.mark.parametrize("name", ["nowhere.json", "folder.json"])
+def test_a_file_that_is_none_is_named(tmp_path: Path, name: str) -> None:
+    (tmp_path / "folder.json").mkdir()
+    result = CliRunner().invoke(app, ["check", str(tmp_path / name)])
+    assert result.exit_code == 2
+    assert f"{name} is no file" in result.output
+
+
+def test_building_takes_names_alone(path: Path) -> None:
+    result = CliRunner().invoke(app, ["build", str(path), "--out", str(path.parent / "out")])
+    assert result.exit_code == 2
+    assert "unknown scene" in result.output
+    assert not (path.parent / "out").exists()
