@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
 MAX_TEXT: Final = 4 * 1024 * 1024
 MAX_LINKS: Final = 100
+MAX_EXTENT_M: Final = 100.0
 _FORBIDDEN: Final = re.compile(r"<!\s*(DOCTYPE|ENTITY)", re.IGNORECASE)
 _PACKAGE: Final = "package://"
 _KINDS: Final = {
@@ -191,12 +192,12 @@ def _shapes(link: ET.Element, frame: FloatArray, folder: Path) -> list[Mesh]:
 def _geometry(shape: ET.Element, name: str, folder: Path) -> list[Mesh]:
     match shape.tag:
         case "box":
-            made = trimesh.creation.box(extents=_numbers(shape, "size", None, name))
+            made = trimesh.creation.box(extents=_extents(shape, "size", name, count=3))
         case "cylinder":
-            radius, length = (_number(shape, key, None, name) for key in ("radius", "length"))
+            (radius,), (length,) = (_extents(shape, key, name) for key in ("radius", "length"))
             made = trimesh.creation.cylinder(radius=radius, height=length, sections=16)
         case "sphere":
-            made = trimesh.creation.icosphere(subdivisions=2, radius=_number(shape, "radius", None, name))
+            made = trimesh.creation.icosphere(subdivisions=2, radius=_extents(shape, "radius", name)[0])
         case "mesh":
             scale = np.array(_numbers(shape, "scale", (1.0, 1.0, 1.0), name))
             groups = read_groups(_mesh_path(shape.get("filename", ""), name, folder))
@@ -257,6 +258,16 @@ def _numbers(
         values = ()
     if len(values) != count or not all(map(math.isfinite, values)):
         raise ModelFileError(f"{name!r}: {key} is {text[:40]!r}, expected {count} finite numbers")
+    return values
+
+
+def _extents(shape: ET.Element, key: str, name: str, *, count: int = 1) -> tuple[float, ...]:
+    """Lengths of a shape in metres, none of them longer than any piece of furniture."""
+    values = _numbers(shape, key, None, name, count)
+    if not all(0 < value <= MAX_EXTENT_M for value in values):
+        raise ModelFileError(
+            f"{name!r}: {key} is {shape.get(key, '')[:40]!r}, expected metres above 0, at most {MAX_EXTENT_M:g}"
+        )
     return values
 
 
