@@ -92,8 +92,6 @@ def encoded(rows: Sequence[Mapping[str, Any]], suffix: str) -> bytes:
 def card(dataset: Dataset, file_name: str, data: bytes) -> str:
     """The dataset card in Markdown, with the head that dataset hubs read."""
     records = dataset.records
-    splits = Counter(record.split for record in records)
-    categories = Counter((record.task.category.value, record.split) for record in records)
     scenes = {record.task.scene_id.split("-")[0] for record in records}
     kinds = {record.signature for record in records}
     lines = [
@@ -110,20 +108,11 @@ def card(dataset: Dataset, file_name: str, data: bytes) -> str:
         "",
         f"File: `{file_name}`, SHA-256 `{hashlib.sha256(data).hexdigest()}`.",
         "",
-        "| category | train | heldout |",
-        "| --- | ---: | ---: |",
-    ]
-    for category in sorted({category for category, _ in categories}):
-        counts = " | ".join(f"{categories[category, split]:,}" for split in ("train", "heldout"))
-        lines.append(f"| {category} | {counts} |")
-    lines += [
-        f"| all | {splits['train']:,} | {splits['heldout']:,} |",
+        *_counts(records),
         "",
         "| field | what it holds |",
         "| --- | --- |",
-    ]
-    lines += [f"| `{name}` | {words} |" for name, words in FIELDS.items()]
-    lines += [
+        *(f"| `{name}` | {words} |" for name, words in FIELDS.items()),
         "",
         "## How it was made",
         "",
@@ -135,6 +124,17 @@ def card(dataset: Dataset, file_name: str, data: bytes) -> str:
         "",
     ]
     return "\n".join(lines)
+
+
+def _counts(records: Sequence[TaskRecord]) -> list[str]:
+    """A table of how many tasks of each category there are in each split."""
+    categories = Counter((record.task.category.value, record.split) for record in records)
+    splits = Counter(record.split for record in records)
+    lines = ["| category | train | heldout |", "| --- | ---: | ---: |"]
+    for category in sorted({category for category, _ in categories}):
+        counts = " | ".join(f"{categories[category, split]:,}" for split in ("train", "heldout"))
+        lines.append(f"| {category} | {counts} |")
+    return [*lines, f"| all | {splits['train']:,} | {splits['heldout']:,} |"]
 
 
 _SOURCES: Final = (

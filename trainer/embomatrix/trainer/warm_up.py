@@ -41,15 +41,14 @@ def warm_up(
     is left to go on from. Raises TrainerError.
     """
     store = CheckpointStore(out / CHECKPOINTS, keep=settings.keep_checkpoints)
-    imitation = Imitation(
-        policy, teller, tasks, settings.imitation, seed=settings.seed, state=progress.imitation
-    )
-    if progress.imitation.done:
+    state = progress.imitation
+    imitation = Imitation(policy, teller, tasks, settings.imitation, seed=settings.seed, state=state)
+    if state.done:
         return
-    newest = store.latest() if progress.imitation.step else None
+    newest = store.latest() if state.step else None
     if newest is not None:
         restore(newest, imitation.restore)
-    recorder.forget_after(progress.imitation.step, IMITATION)
+    recorder.forget_after(state.step, IMITATION)
     saved_s = time.monotonic()
 
     def told(step: ImitationProgress) -> None:
@@ -64,5 +63,5 @@ def warm_up(
     try:
         imitation.run(told)
     finally:
-        if progress.imitation.step:
+        if state.step:
             store.save(policy, imitation.tensors(), progress, settings)

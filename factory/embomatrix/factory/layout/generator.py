@@ -109,6 +109,15 @@ def _failure(item: Item, host: str, reason: LayoutReason, detail: str) -> Failur
     return Failure(item.name, item.relation or LayoutRelation.ONTOP, host, reason, detail)
 
 
+def _with_carrier(editor: SceneEditor, thing: Thing) -> Thing:
+    """What must stand beside an object that is there goes where that one stands."""
+    other = next((editor.objects[name] for name in thing.beside if name in editor.objects), None)
+    if other is None or thing.relation is not None:
+        return thing
+    inside = other.relation is Relation.INSIDE
+    return replace(thing, relation=LayoutRelation.INSIDE if inside else LayoutRelation.ONTOP, host=other.host)
+
+
 @dataclass(slots=True)
 class _Waiting:
     """An item without a place: which of its models is tried, and why it has none yet."""
@@ -118,6 +127,16 @@ class _Waiting:
     choice: int = 0
     cleared: int = 0
     last: Failure | None = None
+
+    def failure(self, room: str) -> Failure:
+        """Why it found no place in a room."""
+        if self.last is not None:
+            return self.last
+        size = " x ".join(f"{extent:.2f}" for extent in self.asset.size_m)
+        detail = (
+            f"nothing in {room} takes {self.asset.asset_id}, {size} m: try another room or a smaller model"
+        )
+        return _failure(self.item, self.item.host or room, LayoutReason.NO_HOST, detail)
 
 
 class _RoomJob:
@@ -163,7 +182,7 @@ class _RoomJob:
             self._realise(tree)
             self._settle([name for name in self.names if name not in before])
         for waiting in self._waiting.values():
-            self._given_up.append(waiting.last or self._no_host(waiting))
+            self._given_up.append(waiting.failure(self._room.name))
         return self._given_up
 
     def tree(self) -> LayoutTree:
@@ -178,23 +197,11 @@ class _RoomJob:
         return whole.pruned(self.names.values())
 
     def _brief(self) -> RoomBrief:
-        things = tuple(self._with_carrier(self._thing(name)) for name in self._waiting)
+        things = tuple(_with_carrier(self._editor, self._thing(name)) for name in self._waiting)
         named = {thing.host for thing in things if thing.host in self._editor.objects}
         hosts = hosts_in(self._editor, self._room.name, named)
         room = next(room for room in rooms_of(self._editor) if room.name == self._room.name)
         return RoomBrief(room, hosts, things, tuple(self._failures), self._seed * 31 + self._round)
-
-    def _with_carrier(self, thing: Thing) -> Thing:
-        """What must stand beside an object that is there goes where that one stands."""
-        other = next(
-            (self._editor.objects[name] for name in thing.beside if name in self._editor.objects), None
-        )
-        if other is None or thing.relation is not None:
-            return thing
-        inside = other.relation is Relation.INSIDE
-        return replace(
-            thing, relation=LayoutRelation.INSIDE if inside else LayoutRelation.ONTOP, host=other.host
-        )
 
     def _next_model(self, name: str) -> None:
         """Try the item with its next model, as if nothing had been tried; give it up after the last."""
@@ -207,7 +214,7 @@ class _RoomJob:
             return  # what it is to stand at has no place yet
         elif not (self._exchange(waiting.item.host) or self._make_room(waiting)):
             del self._waiting[name]
-            self._given_up.append(waiting.last or self._no_host(waiting))
+            self._given_up.append(waiting.failure(self._room.name))
 
     def _exchange(self, host: str) -> bool:
         """Take out what an item was to stand at, with all on it, to try that with its next model; False where there is none."""
@@ -248,11 +255,6 @@ class _RoomJob:
             name = owners[gone]
             del self.names[name]
             self._waiting[name] = self._placed.pop(name)
-
-    def _no_host(self, waiting: _Waiting) -> Failure:
-        size = " x ".join(f"{extent:.2f}" for extent in waiting.asset.size_m)
-        detail = f"nothing in {self._room.name} takes {waiting.asset.asset_id}, {size} m: try another room or a smaller model"
-        return _failure(waiting.item, waiting.item.host or self._room.name, LayoutReason.NO_HOST, detail)
 
     def _realise(self, tree: LayoutTree) -> None:
         """Place what the tree says, parents before their children; what stands on one thing together."""

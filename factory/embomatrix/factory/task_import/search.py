@@ -136,6 +136,25 @@ def _assign(
 
     Small things that the scene lacks are in neither.
     """
+    domains, missing = _domains(problem, view, wanted, needs, rng, shunned)
+    while True:
+        found: dict[str, str] = {}
+        failed = _backtrack(sorted(domains, key=lambda name: len(domains[name])), domains, found, [0])
+        if not failed:
+            return found, missing
+        missing.append(failed)
+        del domains[failed]
+
+
+def _domains(
+    problem: Problem,
+    view: SceneView,
+    wanted: Mapping[str, str],
+    needs: Mapping[str, frozenset[str]],
+    rng: np.random.Generator,
+    shunned: Container[str],
+) -> tuple[dict[str, list[str]], list[str]]:
+    """Objects of the scene that each name may stand for, the first choice first, and the names of furniture that has none."""
     catalog = Catalog.load()
     hosts = {
         item.atom.args[1]
@@ -160,13 +179,7 @@ def _assign(
             )
         elif not any(_liftable(category) for category in categories):
             missing.append(name)
-    while True:
-        found: dict[str, str] = {}
-        failed = _backtrack(sorted(domains, key=lambda name: len(domains[name])), domains, found, [0])
-        if not failed:
-            return found, missing
-        missing.append(failed)
-        del domains[failed]
+    return domains, missing
 
 
 def _spare_m2(view: SceneView, name: str) -> float:

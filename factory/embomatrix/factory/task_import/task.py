@@ -35,7 +35,7 @@ from embomatrix.world.substances import MEANINGS, flows_from, is_substance
 from embomatrix.world.task import MAX_TABLE, Task, TaskCategory
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from embomatrix.factory.layout.jobs import Layout
     from embomatrix.factory.task_import.binding import Addition, Binding
@@ -291,6 +291,11 @@ class _Binder:
             profile=profile_for(goal),
         )
         rooms = tuple(sorted({view.room(name) for name in about}))
+        notes = self._notes(view, names, binding)
+        return Imported(scene, task, start, tuple(names.values()), rooms, signature_of(goal, view), notes)
+
+    def _notes(self, view: SceneView, names: Mapping[str, str], binding: Binding) -> tuple[str, ...]:
+        """What was done to scene and problem to bring them together, a sentence each."""
         added = tuple(
             f"{self._base.base} lacks {each.type}: {names[each.name]} was added to {view.room(names[each.name])}"
             for each in binding.additions
@@ -301,8 +306,7 @@ class _Binder:
             for word, room in binding.rooms.items()
             if is_room_instance(word) and word != room
         )
-        signature = signature_of(goal, view)
-        return Imported(scene, task, start, tuple(names.values()), rooms, signature, (*added, *moved))
+        return (*added, *moved)
 
     def _start(self, names: dict[str, str], binding: Binding) -> tuple[Literal, ...]:
         """``:init`` in the scene's names, without the floors that are no objects, the robot, and what is not the case.
