@@ -15,7 +15,7 @@ from embomatrix.sim.floor_ways import RecentDistances, cheapest_way
 from embomatrix.skills.limits import ROBOT
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
@@ -45,7 +45,7 @@ class FloorGrid:
     def __init__(self, scene: Scene, boxes: FloatArray) -> None:
         """Rasterise obstacles, shape (n, 6), and inflate them by the robot's radius."""
         self._lay_out(scene)
-        covered = (~self._floor_of(scene)).astype(np.int16)
+        covered = (~_floor_of(scene, self._shape, self._window)).astype(np.int16)
         for box in boxes.tolist():
             covered[self._window(box[:2], box[2:4])] += 1
         for edge in (np.s_[0, :], np.s_[-1, :], np.s_[:, 0], np.s_[:, -1]):
@@ -273,26 +273,28 @@ class FloorGrid:
         low_x, low_y = self._origin_m
         return math.floor((x_m - low_x) / CELL_M), math.floor((y_m - low_y) / CELL_M)
 
-    def _floor_of(self, scene: Scene) -> BoolArray:
-        floor = np.zeros(self._shape, dtype=np.bool_)
-        for room in scene.rooms:
-            floor[self._window(room.low_m, room.high_m)] = True
-        for doorway in scene.doorways:
-            half = np.array([doorway.width_m, DOORWAY_DEPTH_M]) / 2
-            if doorway.along == "y":
-                half = half[::-1]
-            if all(doorway.rooms):
-                floor[
-                    self._window((doorway.center_m - half).tolist(), (doorway.center_m + half).tolist())
-                ] = True
-        return floor
-
     def _window(self, low: Sequence[float], high: Sequence[float]) -> Window:
         """Cells that a rectangle touches with more than its edge."""
         rows, columns = (
             slice(*_cells_between(*ends)) for ends in zip(low, high, self._origin_m, self._shape, strict=True)
         )
         return rows, columns
+
+
+def _floor_of(
+    scene: Scene, shape: tuple[int, int], window: Callable[[Sequence[float], Sequence[float]], Window]
+) -> BoolArray:
+    """Which cells are of a room or of a doorway between two; ``window`` gives the cells of a rectangle."""
+    floor = np.zeros(shape, dtype=np.bool_)
+    for room in scene.rooms:
+        floor[window(room.low_m, room.high_m)] = True
+    for doorway in scene.doorways:
+        half = np.array([doorway.width_m, DOORWAY_DEPTH_M]) / 2
+        if doorway.along == "y":
+            half = half[::-1]
+        if all(doorway.rooms):
+            floor[window((doorway.center_m - half).tolist(), (doorway.center_m + half).tolist())] = True
+    return floor
 
 
 def _lots(boxes: FloatArray, apart_m: float) -> list[list[float]]:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from embomatrix.sim.relations import Relations
     from embomatrix.world.asset import Asset
     from embomatrix.world.geometry import Aabb, FloatArray, Vec2
-    from embomatrix.world.scene import Room
+    from embomatrix.world.scene import Room, Scene
 
 ROOFED_M: Final = 1.5
 """A cavity whose floor has less free height than this can't be reached from above."""
@@ -132,7 +132,7 @@ class Navigator:
         centers = self.ground.grid.free_centers(low, high, self.ground.grid.label(start))
         if not len(centers):
             return None
-        doors = np.array(self._doors_of(target))  # (d, 2)
+        doors = np.array(_doors_of(self._scene, target))  # (d, 2)
         away = np.linalg.norm(centers[:, None] - doors[None], axis=2).min(axis=1)  # (n,)
         x, y = centers[int(np.argmin(away))].tolist()
         return StandPose(x, y, math.atan2(target.center_m[1] - y, target.center_m[0] - x))
@@ -290,11 +290,11 @@ class Navigator:
     def _cell(self, pose: StandPose) -> Cell | None:
         return self.ground.grid.cell(pose.x_m, pose.y_m)
 
-    def _doors_of(self, room: Room) -> list[tuple[float, float]]:
-        doors = [
-            item.center_m for item in self._scene.doorways if room.name in item.rooms and all(item.rooms)
-        ]
-        return doors or [room.center_m]
+
+def _doors_of(scene: Scene, room: Room) -> list[tuple[float, float]]:
+    """Middles of the doorways between a room and others; its own middle where there are none."""
+    doors = [item.center_m for item in scene.doorways if room.name in item.rooms and all(item.rooms)]
+    return doors or [room.center_m]
 
 
 def _within_reach(rectangles: FloatArray, box: Aabb) -> FloatArray:

@@ -225,7 +225,7 @@ class Placer:
         if not crowded:
             return
         boxes, rows = boxes.at(crowded), [rows[place] for place in crowded]
-        taken, most = (answers.tolist() for answers in boxes.overlaps(self._neighbours(near)))
+        taken, most = (answers.tolist() for answers in boxes.overlaps(_neighbours(self._engine, near)))
         for number, full, nearest in zip(rows, taken, most, strict=True):
             if not full:
                 yield number, near[nearest]
@@ -241,15 +241,6 @@ class Placer:
         if any(fractions):
             reached &= ~behind_leaves(boxes, asset, self._engine.pose(target), fractions, stand)
         return reached
-
-    def _neighbours(self, names: Sequence[str]) -> Neighbours:
-        items = [self._scene.by_name[name] for name in names]
-        links = [self._scene.assets[item.asset_id].links for item in items]
-        return Neighbours.of(
-            [self._engine.aabb(name) for name in names],
-            [len(chain) == 1 and len(chain[0].parts) == 1 for chain in links],
-            [not item.fixed for item in items],
-        )
 
     def _frames(self, errand: Errand) -> dict[str, Pose]:
         """Frame of each link of the target on which something can be placed; not of a drawer that is shut."""
@@ -309,6 +300,16 @@ class Placer:
 
     def _reaches(self, errand: Errand) -> bool:
         return in_reach(self._engine.aabb(errand.held), errand.robot)
+
+
+def _neighbours(engine: PhysicsEngine, names: Sequence[str]) -> Neighbours:
+    items = [engine.scene.by_name[name] for name in names]
+    links = [engine.scene.assets[item.asset_id].links for item in items]
+    return Neighbours.of(
+        [engine.aabb(name) for name in names],
+        [len(chain) == 1 and len(chain[0].parts) == 1 for chain in links],
+        [not item.fixed for item in items],
+    )
 
 
 def in_reach(box: Aabb, robot: StandPose) -> bool:

@@ -29,7 +29,7 @@ from embomatrix.sim.neighbourhood import Neighbourhood
 from embomatrix.sim.validation import check_fractions, check_pose, check_scene
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from embomatrix.sim.bounds import AssetBounds
     from embomatrix.sim.prepared import Prepared
@@ -68,18 +68,16 @@ class BulletEngine:
         self._poses = [item.pose_world_asset for item in scene.objects]
         self._fractions = [tuple(item.joints) for item in scene.objects]
         self._present = [not item.absent for item in scene.objects]
-        self._boxes = (
-            list(prepared.object_boxes) if prepared else list(map(self._box, range(len(self._names))))
-        )
+        boxes = prepared.object_boxes if prepared else map(self._box, range(len(self._names)))
+        self._boxes = list(boxes)
         self._boxes_at_start = tuple(self._boxes)
         self._around = Neighbourhood()
         for number, box in enumerate(self._boxes):
             if self._present[number]:
                 self._around.put(number, box)
-        self._walls_around = Neighbourhood()
-        walls = prepared.wall_boxes if prepared else [wall.aabb(IDENTITY) for wall in scene.walls]
-        for number, box in enumerate(walls):
-            self._walls_around.put(number, box)
+        self._walls_around = _neighbourhood(
+            prepared.wall_boxes if prepared else [wall.aabb(IDENTITY) for wall in scene.walls]
+        )
         self._journal = Journal()
         self._changed: set[int] = set()
         self._chunks: dict[int, bytes] = {}
@@ -326,3 +324,10 @@ class BulletEngine:
         """Smallest signed distance between two bodies, infinity when it is more than ``limit_m`` (at least 0)."""
         contacts = self._bullet.getClosestPoints(body, other, max(limit_m, 0.0), physicsClientId=self._client)
         return min([contact[8] for contact in contacts]) if contacts else math.inf
+
+
+def _neighbourhood(boxes: Iterable[Aabb]) -> Neighbourhood:
+    around = Neighbourhood()
+    for number, box in enumerate(boxes):
+        around.put(number, box)
+    return around
