@@ -1,4 +1,4 @@
-"""The layout that imports rely on."""
+"""The layout that imports rely on, and that of the decisions."""
 
 import subprocess
 import sys
@@ -26,3 +26,18 @@ def test_manager_and_trainer_import_without_a_physics_engine():
         "import embomatrix.manager.cli, embomatrix.manager.app, embomatrix.trainer.cli, embomatrix.trainer.loop\n"
     )
     subprocess.run([sys.executable, "-c", program], check=True, timeout=120)
+
+
+def test_every_decision_stands_in_the_index_by_its_title():
+    folder = ROOT / "docs" / "decisions"
+    pages = sorted(page for page in folder.glob("*.md") if page.name != "README.md")
+    titles = [
+        page.read_text(encoding="utf-8").splitlines()[0].removeprefix("# ").split(": ", 1) for page in pages
+    ]
+    listed = [
+        line for line in (folder / "README.md").read_text(encoding="utf-8").splitlines() if line[:1] == "*"
+    ]
+    assert listed == [
+        f"* [{number}]({page.name}): {title}" for page, (number, title) in zip(pages, titles, strict=True)
+    ]
+    assert all(page.name.startswith(number) for page, (number, _) in zip(pages, titles, strict=True))

@@ -26,6 +26,8 @@ class Mood(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Health:
+    """How the cluster does, in a word and in a sentence."""
+
     mood: Mood
     sentence: str
 

@@ -29,6 +29,8 @@ LOOPBACK_NAMES: Final = frozenset({"localhost", "127.0.0.1", "::1"})
 
 
 class Refusal(NamedTuple):
+    """Why a request gets no answer: the HTTP status, and a sentence for whoever asked."""
+
     status: int
     sentence: str
 

@@ -59,6 +59,7 @@ def repute_row(worker_id: str, repute: Repute) -> ShelfRow:
 
 
 def repute_of(row: ShelfRow) -> Repute:
+    """What `repute_row` wrote."""
     return Repute(**json.loads(row.payload))
 
 

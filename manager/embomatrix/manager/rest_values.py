@@ -33,6 +33,8 @@ class WorkerPage:
 
 @dataclass(frozen=True, slots=True)
 class RunPage:
+    """Some of the runs, those from ``offset`` on, of ``total``; ``at_s`` is wall time."""
+
     at_s: float
     total: int
     offset: int
@@ -68,6 +70,8 @@ class SlotSpan:
 
 @dataclass(frozen=True, slots=True)
 class SlotTrack:
+    """What one slot of a worker did, in the order of time."""
+
     worker_id: str
     slot: int
     spans: list[SlotSpan]

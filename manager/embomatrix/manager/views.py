@@ -75,6 +75,8 @@ class WorkerView:
 
 @dataclass(frozen=True, slots=True)
 class LookaheadCell:
+    """A scene that a step of the look-ahead wants, how often, and whether it is warm anywhere."""
+
     bundle_digest: str
     count: int
     warmth: str
@@ -93,6 +95,8 @@ class LookaheadStep:
 
 @dataclass(frozen=True, slots=True)
 class RunView:
+    """An open run: rollouts that wait or are under way, and what its results came to so far."""
+
     run_id: str
     name: str
     pending: int

@@ -95,6 +95,7 @@ def gaps(spots: Candidates, other: Footprint) -> FloatArray:
 
 
 def near_m(plane_m: Size2) -> float:
+    """How far apart two things on a plane of these sides may be and still be near one another, in metres."""
     return min(NEAR_M, NEAR_SHARE * math.hypot(*plane_m))
 
 

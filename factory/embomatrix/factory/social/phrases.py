@@ -222,4 +222,5 @@ def filled(template: str, **words: str) -> str:
 
 
 def capital(text: str) -> str:
+    """The text with a capital first letter, the rest as it is."""
     return text[:1].upper() + text[1:]

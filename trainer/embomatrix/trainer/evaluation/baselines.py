@@ -40,6 +40,8 @@ COOLERS: Final = ("fridge", "freezer")
 
 
 class BaselineName(StrEnum):
+    """Who writes plans without a model."""
+
     ORACLE = "oracle"
     GREEDY = "greedy"
     RANDOM = "random"
