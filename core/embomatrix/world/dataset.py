@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any, Final
 from embomatrix.world.bundle import decode_bundle
 from embomatrix.world.codec_task import task_from_json, task_to_json
 from embomatrix.world.field import Field, SceneInvalidError
-from embomatrix.world.inflation import BundleError
-from embomatrix.world.whole_file import write_whole
+from embomatrix.world.inflation import DEFAULT_LIMITS, BundleError
+from embomatrix.world.whole_file import read_whole, write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -88,10 +88,10 @@ class Dataset:
         return tuple(record for record in self.records if record.split == "heldout")
 
     def bundle_bytes(self, digest: str) -> bytes:
-        """Compressed bundle. Raises DatasetError when the folder lacks it."""
+        """Compressed bundle. Raises DatasetError when the folder lacks it, or it is larger than any."""
         path = self.folder / BUNDLES_FOLDER / bundle_file(digest)
         try:
-            return path.read_bytes()
+            return read_whole(path, at_most=DEFAULT_LIMITS.compressed_bytes)
         except OSError as error:
             raise DatasetError(
                 f"the bundle {path} of the dataset can't be read ({error.strerror}): {_REMEDY}"

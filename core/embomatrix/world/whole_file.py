@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Files that appear whole or not at all, and are read whole or not at all."""
 
 from __future__ import annotations
 
@@ -19,6 +19,15 @@ def write_whole(path: Path, data: bytes) -> None:
     except BaseException:
         part.unlink(missing_ok=True)
         raise
+
+
+def read_whole(path: Path, *, at_most: int) -> bytes:
+    """A file's bytes, of which no more than ``at_most`` are ever in memory. Raises OSError, EFBIG for a larger file."""
+    with path.open("rb") as file:
+        data = file.read(at_most + 1)
+    if len(data) > at_most:
+        raise OSError(errno.EFBIG, f"it has over {at_most:,} bytes", str(path))
+    return data
 
 
 def check_writable(path: Path) -> None:

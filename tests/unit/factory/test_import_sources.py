@@ -57,6 +57,10 @@ def test_unreadable_sources_are_one_sentence(tmp_path: Path) -> None:
         read_file(tmp_path / "missing.bddl")
     with pytest.raises(SourceError, match="can't be read"):
         list(read_jsonl(tmp_path / "missing.jsonl"))
+    with (tmp_path / "huge.bddl").open("wb") as file:
+        file.truncate(1 << 30)
+    with pytest.raises(SourceError, match="over 1,048,576 bytes"):
+        read_file(tmp_path / "huge.bddl")
     (tmp_path / "bad.jsonl").write_text(json.dumps({"name": "a", "bddl": PROBLEM}) + "\n{}\n")
     with pytest.raises(SourceError, match=r"bad.jsonl:2: expected an object"):
         list(read_jsonl(tmp_path / "bad.jsonl"))

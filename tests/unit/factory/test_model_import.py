@@ -305,6 +305,10 @@ def test_a_folder_of_assets_reads_back_equal_and_names_what_is_damaged(tmp_path:
     written.write_text(written.read_text().replace('"mass_kg"', '"mass"'))
     with pytest.raises(ModelFileError, match=str(written)):
         read_assets(shelf)
+    with written.open("wb") as file:
+        file.truncate(1 << 30)
+    with pytest.raises(ModelFileError, match="over 4,194,304 bytes"):
+        read_assets(shelf)
     with pytest.raises(ModelFileError, match="holds no file"):
         read_assets(tmp_path)
     with pytest.raises(ModelFileError, match="is no folder"):

@@ -64,6 +64,10 @@ def test_missing_and_damaged_bundles_are_named(tmp_path: Path, bundle: Bundle, t
         DatasetError, match=rf"{file} of the dataset is damaged .* expected {record.bundle_digest}"
     ):
         Dataset.load(tmp_path).bundle(record.bundle_digest)
+    with file.open("wb") as opened:
+        opened.truncate(1 << 30)
+    with pytest.raises(DatasetError, match=r"can't be read \(it has over 8,388,608 bytes\)"):
+        Dataset.load(tmp_path).bundle(record.bundle_digest)
     file.unlink()
     with pytest.raises(DatasetError, match=r"can't be read.*: copy the dataset again, or build one"):
         Dataset.load(tmp_path).bundle(record.bundle_digest)

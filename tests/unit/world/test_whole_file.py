@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from embomatrix.world.whole_file import check_writable, write_whole
+from embomatrix.world.whole_file import check_writable, read_whole, write_whole
 
 
 def test_file_is_written_and_nothing_else_remains(tmp_path: Path) -> None:
@@ -28,3 +28,16 @@ def test_asking_first_changes_nothing_and_tells_what_would_fail(tmp_path: Path) 
     for impossible in (tmp_path, tmp_path / "nowhere" / "a.json", target / "a.json"):
         with pytest.raises(OSError):
             check_writable(impossible)
+
+
+def test_file_is_read_up_to_its_limit_and_not_beyond(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    path.write_bytes(b"four")
+    assert read_whole(path, at_most=4) == b"four"
+    with pytest.raises(OSError, match="over 3 bytes"):
+        read_whole(path, at_most=3)
+
+
+def test_endless_file_is_refused() -> None:
+    with pytest.raises(OSError, match="over 1,000 bytes"):
+        read_whole(Path("/dev/zero"), at_most=1_000)

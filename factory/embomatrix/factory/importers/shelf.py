@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.factory.importers.model import ModelFileError
 from embomatrix.world.codec_asset import asset_from_json, asset_to_json
 from embomatrix.world.field import SceneInvalidError
-from embomatrix.world.whole_file import write_whole
+from embomatrix.world.whole_file import read_whole, write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from embomatrix.world.asset import Asset
 
 SUFFIX: Final = ".asset.json"
+MAX_BYTES: Final = 4 * 1024 * 1024
+"""Far more than an asset takes that has as many parts as the engine holds."""
 
 
 def save_asset(folder: Path, asset: Asset) -> Path:
@@ -34,7 +36,7 @@ def read_assets(folder: Path) -> Mapping[str, Asset]:
     found: dict[str, Asset] = {}
     for path in sorted(folder.glob(f"*{SUFFIX}")):
         try:
-            asset = asset_from_json(json.loads(path.read_bytes()))
+            asset = asset_from_json(json.loads(read_whole(path, at_most=MAX_BYTES)))
         except (OSError, ValueError, SceneInvalidError) as error:
             raise ModelFileError(f"{path} is no asset that can be read: {error}") from None
         found[asset.asset_id] = asset

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.world.codec import scene_from_json, scene_to_json
 from embomatrix.world.field import SceneInvalidError
-from embomatrix.world.whole_file import write_whole
+from embomatrix.world.whole_file import read_whole, write_whole
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -33,14 +33,11 @@ def read_scene(path: Path) -> Scene:
     if not path.is_file():
         raise SceneFileError(f"{path} is no file: expected one that `embomatrix scene build` wrote")
     try:
-        with path.open("rb") as file:
-            data = file.read(MAX_BYTES + 1)
+        return scene_from_json(json.loads(read_whole(path, at_most=MAX_BYTES)))
     except OSError as error:
-        raise SceneFileError(f"{path} can't be read ({error.strerror}): make it readable") from error
-    if len(data) > MAX_BYTES:
-        raise SceneFileError(f"{path} has over {MAX_BYTES:,} bytes: expected a scene, which takes far less")
-    try:
-        return scene_from_json(json.loads(data))
+        raise SceneFileError(
+            f"{path} can't be read ({error.strerror}): expected what `embomatrix scene build` wrote"
+        ) from error
     except SceneInvalidError as error:
         raise SceneFileError(f"{path}: {error}") from error
     except (ValueError, RecursionError) as error:

@@ -9,9 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.world.whole_file import read_whole
+
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+MAX_PROBLEM_BYTES: Final = 1024 * 1024
+MAX_RECORDS_BYTES: Final = 256 * 1024 * 1024
+"""A hundred thousand tasks as the paper's factory writes them take half of that."""
 
 EAI: Final = "eai"
 EAI_FOLDER: Final = "behavior_eval"
@@ -54,7 +59,7 @@ def read_activity(name: str) -> SourceText:
 
 def read_file(path: Path) -> SourceText:
     """A ``.bddl`` file. Raises SourceError when it can't be read."""
-    return SourceText(path.stem, _read(path), "file")
+    return SourceText(path.stem, _read(path, at_most=MAX_PROBLEM_BYTES), "file")
 
 
 def read_jsonl(path: Path) -> Iterator[SourceText]:
@@ -100,11 +105,11 @@ def _in_our_bddl(text: str) -> str:
     return text.replace("(onfloor ", "(ontop ").replace(" home_office)", " private_office)")
 
 
-def _read(path: Path) -> str:
+def _read(path: Path, *, at_most: int = MAX_RECORDS_BYTES) -> str:
     try:
-        return path.read_text(encoding="utf-8")
+        return read_whole(path, at_most=at_most).decode("utf-8")
     except OSError as error:
-        raise SourceError(f"{path} can't be read ({error.strerror}): name a file that is there") from error
+        raise SourceError(f"{path} can't be read ({error.strerror}): name a file of BDDL problems") from error
     except UnicodeDecodeError as error:
         raise SourceError(f"{path} is no text in UTF-8: expected BDDL problems") from error
 
