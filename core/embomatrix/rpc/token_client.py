@@ -18,10 +18,6 @@ _ROLES: Final[Mapping[Role, pb.Role.ValueType]] = {role: pb.Role.Value(f"ROLE_{r
 _ROLE_VALUES: Final = {number: role for role, number in _ROLES.items()}
 
 
-def role_to_proto(role: Role) -> pb.Role.ValueType:
-    return _ROLES[role]
-
-
 def role_from_proto(number: pb.Role.ValueType) -> Role:
     role = _ROLE_VALUES.get(number)
     if role is None:

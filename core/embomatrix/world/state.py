@@ -48,7 +48,6 @@ class SubstanceFact:
     substance: str
 
 
-AMBIENT_C = 23.0
 HOT_C = 40.0
 COOK_C = 70.0
 FREEZE_C = 0.0

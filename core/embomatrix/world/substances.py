@@ -10,7 +10,6 @@ from __future__ import annotations
 import functools
 import gzip
 import json
-import re
 from enum import StrEnum
 from importlib import resources
 from typing import TYPE_CHECKING, Any, Final
@@ -41,7 +40,6 @@ WORDS: Final[Mapping[SubstanceRelation, str]] = {
     SubstanceRelation.SATURATED: "soaked with",
 }
 _STATE_OF: Final = {fact: state for state, fact in MEANINGS.items()}
-_SYNSET: Final = re.compile(r"[a-z0-9_'-]+\.[nv]\.\d+")
 
 
 class SubstanceKind(StrEnum):
@@ -59,11 +57,6 @@ Need = frozenset[str]
 def is_substance(name: str) -> bool:
     """Whether the name is the synset of a substance that the catalog knows."""
     return name in _table()["kinds"]
-
-
-def is_synset(name: str) -> bool:
-    """Whether the name is written as a synset is, ``dust.n.01``. Names of scene objects never are."""
-    return _SYNSET.fullmatch(name) is not None
 
 
 def kind_of(substance: str) -> SubstanceKind:
