@@ -51,14 +51,17 @@ class SceneEditor:
         self.base = scene
         self.rooms: Mapping[str, Room] = {room.name: room for room in scene.rooms}
         self.clearance = Clearance(scene)
+        self.view = SceneView(scene)
+        """The base scene."""
         self._objects: dict[str, SceneObject] = {item.name: item for item in scene.objects}
         self._assets: dict[str, Asset] = dict(scene.assets)
         self._boxes: dict[str, Aabb] = {}
         self._solids = Solids.of_scene(scene)
-        self._view = SceneView(scene)
         self._kept: set[str] = set()
         self._floor = ReachableFloor(scene)
         self._unreached = {problem.names for problem in reach_problems(scene)}
+        self.unserved = frozenset(name for names in self._unreached for name in names)
+        """Objects of the base scene that the robot could not get at to begin with."""
         self._counts = Counter(self._assets[item.asset_id].category for item in scene.objects)
 
     @property
@@ -91,14 +94,6 @@ class SceneEditor:
             item = self.known(name)
             box = self._boxes[name] = box_at(self._assets[item.asset_id], item.pose_world_asset)
         return box
-
-    def is_unserved(self, name: str) -> bool:
-        """Whether the robot could not get at an object of the base scene to begin with."""
-        return any(name in names for names in self._unreached)
-
-    def opens(self, name: str) -> bool:
-        """Whether an object of the base scene has doors and drawers that open wide and meet nothing, or none at all."""
-        return self._view.opens(name)
 
     def keep(self, names: Iterable[str]) -> None:
         """Tell which objects of the base scene must stay: the task is about them."""
@@ -195,14 +190,6 @@ class SceneEditor:
         self._objects[whole] = replace(origin, pieces=(*origin.pieces, *names))
         return tuple(names)
 
-    def add_floor(self, room: str) -> str:
-        """Make the floor of a room an object that plans and goals can name, and return its name."""
-        area = self.rooms[room]
-        x, y = area.center_m
-        name = self.insert(floor_asset(area), Pose((x, y, -_SUNK_M - _PLATE_M / 2)), None, "", room)
-        self._objects[name] = replace(self._objects[name], fixed=True)
-        return name
-
     def set_states(self, name: str, states: frozenset[State]) -> None:
         """Give an object these symbolic states. Raises PlacementError for an unknown name."""
         self._objects[name] = replace(self.known(name), states=frozenset(states))
@@ -257,6 +244,15 @@ class SceneEditor:
 def box_at(asset: Asset, pose: Pose) -> Aabb:
     """Box in the world of an asset at a pose, joints shut."""
     return Aabb.around(part.aabb(pose) for link in asset.links for part in link.parts)
+
+
+def add_floor(editor: SceneEditor, room: str) -> str:
+    """Make the floor of a room an object that plans and goals can name, and return its name."""
+    area = editor.rooms[room]
+    x, y = area.center_m
+    name = editor.insert(floor_asset(area), Pose((x, y, -_SUNK_M - _PLATE_M / 2)), None, "", room)
+    editor.fasten(name)
+    return name
 
 
 def floor_asset(room: Room) -> Asset:

@@ -56,12 +56,12 @@ def _hosts(
         asset = editor.asset_of(item.name)
         if item.name not in named:
             nobody = HOST_GROUPS.get(asset.category) == frozenset()
-            if item.room != room or not item.fixed or nobody or editor.is_unserved(item.name):
+            if item.room != room or not item.fixed or nobody or item.name in editor.unserved:
                 continue
         offers = _offers(asset, round(item.pose_world_asset.position_m[2], 3), asked=item.name in named)
         shut = any(interior.closed_by for interior in asset.interiors)
         given = item.name in named or item.name not in editor.base.by_name
-        if shut and not given and not editor.opens(item.name):
+        if shut and not given and not editor.view.opens(item.name):
             offers = tuple(offer for offer in offers if offer.relation is not LayoutRelation.INSIDE)
         if offers:
             yield HostFacts(item.name, asset.category, offers, tuple(guests.get(item.name, ())), shut)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final, Protocol
 import numpy as np
 
 from embomatrix.factory.assets.library import build_asset
-from embomatrix.factory.editor import SceneEditor
+from embomatrix.factory.editor import SceneEditor, add_floor
 from embomatrix.factory.layout.generator import lay
 from embomatrix.factory.layout.jobs import Item
 from embomatrix.factory.layout.values import Failure, LayoutRelation
@@ -179,7 +179,7 @@ class _Binder:
             raise RefusedError(
                 RefusalReason.NO_PLACE_GIVEN, f"the start does not say of which room {floor!r} is the floor"
             )
-        return editor.add_floor(binding.floors[floor])
+        return add_floor(editor, binding.floors[floor])
 
     def _floors_asked_for(self) -> tuple[str, ...]:
         """Floors that the goal is about: these become objects. Others are just where things stand."""
