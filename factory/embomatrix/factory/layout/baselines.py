@@ -15,12 +15,12 @@ from embomatrix.factory.editor import PlacementError
 from embomatrix.factory.layout.jobs import Layout, Record, thing_of
 from embomatrix.factory.layout.organization import in_order
 from embomatrix.factory.layout.sampling import LIFT_M, ObjectSampler
-from embomatrix.factory.layout.values import Failure, LayoutReason, LayoutRelation
+from embomatrix.factory.layout.values import Failure, LayoutReason
 from embomatrix.world.geometry import Pose
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from embomatrix.factory.editor import SceneEditor
     from embomatrix.factory.layout.jobs import Item
@@ -38,40 +38,48 @@ def lay_at_random(editor: SceneEditor, items: Sequence[Item], seed: int) -> Layo
     """Without tree: each thing at the first random pose that is free, in the relation that the task demands or on a floor."""
     rng = np.random.default_rng((seed, 17))
     sampler = ObjectSampler(editor, rng)
+
+    def first_free(asset: Asset, relation: Relation | None, host: str) -> Pose:
+        for pose in itertools.islice(sampler.poses(asset, relation, host), TRIES):
+            if editor.is_free(asset, pose):
+                return pose
+        raise PlacementError(LayoutReason.NO_FREE_SPOT, f"none of {TRIES} random poses at {host} is free")
+
+    return _laid(editor, items, sampler, rng, first_free)
+
+
+def lay_by_poses(editor: SceneEditor, items: Sequence[Item], seed: int) -> Layout:
+    """As LayoutGPT has a model write them: round absolute poses at what the task names, which nothing looks at."""
+    rng = np.random.default_rng((seed, 19))
+
+    def written(asset: Asset, relation: Relation | None, host: str) -> Pose:
+        if host not in editor.rooms and host not in editor.objects:
+            detail = f"what it is to stand at, {host!r}, has no place itself"
+            raise PlacementError(LayoutReason.UNKNOWN_HOST, detail)
+        return _written(editor, asset, relation, host, rng)
+
+    return _laid(editor, items, ObjectSampler(editor, rng), rng, written)
+
+
+def _laid(
+    editor: SceneEditor,
+    items: Sequence[Item],
+    sampler: ObjectSampler,
+    rng: np.random.Generator,
+    pose_for: Callable[[Asset, Relation | None, str], Pose],
+) -> Layout:
+    """Each thing at the pose that is found for it, or left out with the reason."""
     names: dict[str, str] = {}
     failures: list[Failure] = []
     for item in _hosts_first(items):
         asset = item.asset(0)
         relation, host = _demand(editor, item, names, rng)
         try:
-            poses = itertools.islice(sampler.poses(asset, relation, host), TRIES)
-            pose = next((pose for pose in poses if editor.is_free(asset, pose)), None)
+            pose = pose_for(asset, relation, host)
         except PlacementError as error:
-            failures.append(_failure(item, host, error.reason, str(error)))
-            continue
-        if pose is None:
-            detail = f"none of {TRIES} random poses at {host} is free"
-            failures.append(_failure(item, host, LayoutReason.NO_FREE_SPOT, detail))
-            continue
-        names[item.name] = editor.insert(asset, pose, *sampler.rests(relation, host))
-    return Layout(names, {}, tuple(failures), Record())
-
-
-def lay_by_poses(editor: SceneEditor, items: Sequence[Item], seed: int) -> Layout:
-    """As LayoutGPT has a model write them: round absolute poses at what the task names, which nothing looks at."""
-    rng = np.random.default_rng((seed, 19))
-    sampler = ObjectSampler(editor, rng)
-    names: dict[str, str] = {}
-    failures: list[Failure] = []
-    for item in _hosts_first(items):
-        asset = item.asset(0)
-        relation, host = _demand(editor, item, names, rng)
-        if host not in editor.rooms and host not in editor.objects:
-            detail = f"what it is to stand at, {host!r}, has no place itself"
-            failures.append(_failure(item, host, LayoutReason.UNKNOWN_HOST, detail))
-            continue
-        pose = _written(editor, asset, relation, host, rng)
-        names[item.name] = editor.insert(asset, pose, *sampler.rests(relation, host))
+            failures.append(item.failure(host, error.reason, str(error)))
+        else:
+            names[item.name] = editor.insert(asset, pose, *sampler.rests(relation, host))
     return Layout(names, {}, tuple(failures), Record())
 
 
@@ -118,7 +126,3 @@ def _demand(
         return Relation.NEXTTO, names.get(item.beside[0], item.beside[0])
     rooms = item.rooms or tuple(editor.rooms)
     return None, rooms[int(rng.integers(len(rooms)))]
-
-
-def _failure(item: Item, host: str, reason: LayoutReason, detail: str) -> Failure:
-    return Failure(item.name, item.relation or LayoutRelation.ONTOP, host, reason, detail)

@@ -39,7 +39,7 @@ import numpy as np
 
 
 class AgentName(StrEnum):
-    """Agents of stage 2 that can be run alone."""
+    """Agents that can be run alone."""
 
     DISTRIBUTOR = "scene-distributor"
     ORGANIZER = "room-organizer"

@@ -76,7 +76,7 @@ def lay(editor: SceneEditor, items: Sequence[Item], seed: int, agents: LayoutAge
     try:
         rooms = _distributed(editor, items, seed, agents, record)
     except DistributionError as error:
-        failures = [_failure(item, item.host, LayoutReason.NO_HOST, str(error)) for item in items]
+        failures = [item.failure(item.host, LayoutReason.NO_HOST, str(error)) for item in items]
         return Layout({}, {}, tuple(failures), record)
     left: list[Failure] = []
     for number, room in enumerate(dict.fromkeys(rooms.values())):
@@ -103,10 +103,6 @@ def _distributed(
 
 def _first_look(item: Item) -> Thing:
     return thing_of(item, item.asset(0), {})
-
-
-def _failure(item: Item, host: str, reason: LayoutReason, detail: str) -> Failure:
-    return Failure(item.name, item.relation or LayoutRelation.ONTOP, host, reason, detail)
 
 
 def _with_carrier(editor: SceneEditor, thing: Thing) -> Thing:
@@ -136,7 +132,7 @@ class _Waiting:
         detail = (
             f"nothing in {room} takes {self.asset.asset_id}, {size} m: try another room or a smaller model"
         )
-        return _failure(self.item, self.item.host or room, LayoutReason.NO_HOST, detail)
+        return self.item.failure(self.item.host or room, LayoutReason.NO_HOST, detail)
 
 
 class _RoomJob:

@@ -1,4 +1,4 @@
-"""What stage 2 is asked to lay out, who does it, and what came of it."""
+"""What is to be laid out, who does it, and what came of it."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from embomatrix.factory.layout.values import (
     DistributionBrief,
     Failure,
     Kind,
+    LayoutReason,
     LayoutRelation,
     PlaneBrief,
     PlaneCompany,
@@ -68,6 +69,10 @@ class Item:
     def asset(self, choice: int) -> Asset:
         """The asset of one of its models. Raises IndexError beyond the last one."""
         return build_asset(Catalog.load(), *self.models[choice])
+
+    def failure(self, host: str, reason: LayoutReason, detail: str) -> Failure:
+        """That it found no place at ``host``, in the relation that the task demands or else on top."""
+        return Failure(self.name, self.relation or LayoutRelation.ONTOP, host, reason, detail)
 
 
 def thing_of(item: Item, asset: Asset, names: Mapping[str, str]) -> Thing:
