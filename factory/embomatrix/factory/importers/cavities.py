@@ -18,12 +18,15 @@ if TYPE_CHECKING:
     from embomatrix.world.geometry import FloatArray, Vec3
 
     Grid = NDArray[np.bool_]
+    Cells = NDArray[np.int64]
 
 CELLS: Final = 40
 """Cells along each side of the box: what is thinner than a fortieth of it may be missed."""
 LEAST_SHARE: Final = 0.12
 """A surface or a cavity that takes less than this share of the box along x or y is none to put things on or in."""
 MAX_CAVITIES: Final = 12
+REMNANT_SHARE: Final = 0.25
+"""What a box leaves of a hollow that is no box is a cavity of its own from this share of that box's volume."""
 FLOOR_SHARE: Final = 0.6
 """The share of a cavity's floor that is solid, at least: boards may have slots."""
 
@@ -71,19 +74,25 @@ def cavities(solid: Grid, size_m: Vec3) -> tuple[Cavity, ...]:
     for axis, ahead in ((0, False), (1, False), (1, True), (2, False)):
         free &= _behind(solid, axis, ahead=ahead)
     found: list[Cavity] = []
+    taken: list[tuple[Cells, Cells]] = []
     for _ in range(MAX_CAVITIES):
         box = _largest_box(free)
         if box is None:
             break
         low, high = box
-        if _is_roomy(low, high) and _has_floor(solid, low, high):
+        if (
+            _is_roomy(low, high)
+            and _has_floor(solid, low, high)
+            and not any(_is_remnant(low, high, *other) for other in taken)
+        ):
+            taken.append((low, high))
             above = solid[low[0] : high[0], low[1] : high[1], high[2] :]
             found.append(Cavity(_box(tuple(low), tuple(high), size_m), bool(above.any())))
         free[tuple(slice(a, b) for a, b in zip(low, high, strict=True))] = False
     return tuple(sorted(found, key=lambda item: (item.box.low_m[2], item.box.low_m[1])))
 
 
-def _largest_box(free: Grid) -> tuple[NDArray[np.int64], NDArray[np.int64]] | None:
+def _largest_box(free: Grid) -> tuple[Cells, Cells] | None:
     """A box of free cells about the one that is furthest from any other cell, grown on all sides in turn."""
     room = ndimage.distance_transform_cdt(np.pad(free, 1), metric="chessboard")[1:-1, 1:-1, 1:-1]
     if room.max() < 2:
@@ -99,17 +108,23 @@ def _largest_box(free: Grid) -> tuple[NDArray[np.int64], NDArray[np.int64]] | No
     return low, high
 
 
-def _is_roomy(low: NDArray[np.int64], high: NDArray[np.int64]) -> bool:
+def _is_roomy(low: Cells, high: Cells) -> bool:
     return bool(min(high - low) >= LEAST_SHARE * CELLS)
 
 
-def _has_floor(solid: Grid, low: NDArray[np.int64], high: NDArray[np.int64]) -> bool:
+def _is_remnant(low: Cells, high: Cells, other_low: Cells, other_high: Cells) -> bool:
+    """Whether a box is what a much larger one beside it, nothing solid between them, left of a round or bevelled hollow."""
+    is_beside = bool((low <= other_high).all() and (other_low <= high).all())
+    return is_beside and bool(np.prod(high - low) < REMNANT_SHARE * np.prod(other_high - other_low))
+
+
+def _has_floor(solid: Grid, low: Cells, high: Cells) -> bool:
     """Whether most of what lies right below a box is solid: a cavity above another's mouth has no floor of its own."""
     below = solid[low[0] : high[0], low[1] : high[1], low[2] - 1] if low[2] > 0 else np.zeros(1)
     return bool(below.mean() >= FLOOR_SHARE)
 
 
-def _grow(free: Grid, low: NDArray[np.int64], high: NDArray[np.int64], axis: int, end: int) -> bool:
+def _grow(free: Grid, low: Cells, high: Cells, axis: int, end: int) -> bool:
     """Move one face of the box out by a cell, when all cells of that layer are free."""
     at = low[axis] - 1 if end == 0 else high[axis]
     if not 0 <= at < CELLS:
