@@ -46,7 +46,7 @@ def started(
     threads = changes.get("threads") or max(1, (os.cpu_count() or 2) // 2)
     defaults = {} if is_tiny(model) else LANGUAGE_MODEL_DEFAULTS
     settings = read_settings(settings_file, {**changes, "model": model, "threads": threads}, defaults)
-    if has_checkpoint(out):
+    if any((out / CHECKPOINTS).glob("[!.]*")):
         raise TrainerError(f"{out} holds another run: pass --resume to go on with it, or another --out")
     tasks = loaded(dataset, settings)
     policy = new_policy(settings, tasks)

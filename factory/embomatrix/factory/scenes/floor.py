@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from embomatrix.sim.bounds import joint_motion
 from embomatrix.sim.floor_grid import CELL_M, FloorGrid
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.geometry import Aabb, Pose
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Iterator
 
     from embomatrix.world.geometry import FloatArray
     from embomatrix.world.scene import Room, Scene, SceneObject
@@ -24,17 +25,12 @@ _FRONT_COSINE: Final = math.cos(math.radians(65.0))
 
 
 class ReachableFloor:
-    """Free floor connected to the robot's start, with all joints shut."""
+    """Free floor connected to the robot's start, with doors and drawers as they stand: open ones take floor."""
 
     def __init__(self, scene: Scene) -> None:
         self._rooms = scene.rooms
         walls = [wall.aabb(_ORIGIN) for wall in scene.walls]
-        self._standing = _barring(
-            part.aabb(item.pose_world_asset)
-            for item in scene.objects
-            for link in scene.assets[item.asset_id].links
-            for part in link.parts
-        )
+        self._standing = _barring(box for item in scene.objects for box in _part_boxes(scene, item))
         boxes = [box_of(scene, item) for item in scene.objects]
         self._footprints = _barring(boxes)[:, :4]
         self._grid = FloorGrid(scene, np.concatenate([_barring(walls), self._standing]))
@@ -101,6 +97,17 @@ def box_of(scene: Scene, item: SceneObject) -> Aabb:
     """Bounding box of an object in the world, joints shut."""
     asset = scene.assets[item.asset_id]
     return Aabb.around(part.aabb(item.pose_world_asset) for link in asset.links for part in link.parts)
+
+
+def _part_boxes(scene: Scene, item: SceneObject) -> Iterator[Aabb]:
+    """Boxes in the world of an object's parts, joints as they stand."""
+    shares = iter(item.joints)
+    for link in scene.assets[item.asset_id].links:
+        frame = item.pose_world_asset
+        if link.joint is not None and (share := next(shares, 0.0)):
+            frame = frame @ joint_motion(link.joint, share)
+        for part in link.parts:
+            yield part.aabb(frame)
 
 
 def _barring(boxes: Iterable[Aabb]) -> FloatArray:

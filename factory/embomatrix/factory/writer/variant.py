@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.factory.editor import SceneEditor
 from embomatrix.factory.layout.generator import lay
 from embomatrix.factory.layout.jobs import Item
-from embomatrix.factory.scenes.joints import bumped_into
-from embomatrix.factory.scenes.solids import Solids, placed_parts
+from embomatrix.factory.writer.starts import OpenStarts
 from embomatrix.factory.writer.tables import BASKETS, MEMBERS, Group, groups_for
 from embomatrix.factory.writer.view import SceneView, is_liftable
 from embomatrix.world.catalog import Catalog
@@ -110,14 +109,10 @@ def _set_doors_and_lights(
     editor: SceneEditor, view: SceneView, rooms: Sequence[str], rng: np.random.Generator
 ) -> None:
     """Open some doors that have room, switch some things on. What runs only when closed stays off: its door may be open."""
-    scene = editor.freeze(view.scene.scene_id)
-    solids = Solids.of_scene(scene)
-    for room in rooms:
-        for name in view.in_room[room]:
-            if view.is_openable(name) and rng.random() < OPEN_SHARE:
-                asset, wide = view.asset(name), [1.0] * len(view.asset(name).joints)
-                if not bumped_into(scene, solids, name, wide):
-                    editor.set_joints(name, wide)
-                    solids.add(name, placed_parts(asset, view.item(name).pose_world_asset, wide))
-            elif view.is_toggleable(name) and not view.asset(name).joints and rng.random() < ON_SHARE:
-                editor.set_states(name, view.item(name).states | {State.TOGGLED_ON})
+    names = [name for room in rooms for name in view.in_room[room]]
+    starts = OpenStarts(editor, filter(view.is_openable, names))
+    for name in names:
+        if view.is_openable(name) and rng.random() < OPEN_SHARE:
+            starts.open(name)
+        elif view.is_toggleable(name) and not view.asset(name).joints and rng.random() < ON_SHARE:
+            editor.set_states(name, view.item(name).states | {State.TOGGLED_ON})

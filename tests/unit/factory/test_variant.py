@@ -1,0 +1,39 @@
+"""A variant is a scene in which every task can begin: what stands open is in nobody's way."""
+
+import numpy as np
+import pytest
+
+from embomatrix.factory.scenes.build import build_base_scene
+from embomatrix.factory.scenes.check import reach_problems
+from embomatrix.factory.scenes.floor import ReachableFloor, box_of
+from embomatrix.factory.scenes.solids import Solids, placed_parts
+from embomatrix.factory.writer.variant import build_variant
+from embomatrix.world.scene import Scene
+
+
+@pytest.fixture(scope="module")
+def base() -> Scene:
+    return build_base_scene("Rs_int", seed=0)
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_doors_that_stand_open_at_the_start_bar_no_way_and_no_other_door(base: Scene, seed: int) -> None:
+    rooms = [room.name for room in base.rooms]
+    changed = build_variant(base, rooms, "open", np.random.default_rng(seed)).scene
+    ajar = [item.name for item in changed.objects if any(item.joints)]
+    assert ajar
+    before, after = ({p.names for p in reach_problems(told)} for told in (base, changed))
+    assert after <= before
+    floor = ReachableFloor(changed)
+    for item in changed.objects:
+        if not item.fixed and item.name not in base.by_name:
+            assert len(floor.spots(box_of(changed, item))) > 0, item.name
+    solids = Solids()
+    for name in ajar:
+        item = changed.by_name[name]
+        solids.add(name, placed_parts(changed.asset_of(name), item.pose_world_asset, item.joints))
+    for item in changed.objects:
+        asset = changed.asset_of(item.name)
+        if asset.can("openable") and asset.joints and item.name not in ajar:
+            wide = placed_parts(asset, item.pose_world_asset, [1.0] * len(asset.joints))
+            assert not solids.overlaps(wide), item.name
