@@ -87,8 +87,11 @@ def test_without_processes_the_results_so_far_are_summed_up(suite, dataset, tmp_
     with pytest.raises(BenchError, match="no result to sum up"):
         run_fidelity(dataset, SMALL, tmp_path, 0, modes, QUIET)
     lines = (folder / RESULTS_FILE).read_text().splitlines()
-    (tmp_path / RESULTS_FILE).write_text("\n".join(lines[:3]) + "\n")
-    assert len(run_fidelity(dataset, SMALL, tmp_path, 0, modes, QUIET).comparisons) == 3
+    (tmp_path / RESULTS_FILE).write_text("\n".join(lines[:3]) + "\n" + lines[3][:40])
+    with (tmp_path / RESULTS_FILE).open("a") as running:  # of a suite that goes on meanwhile
+        assert len(run_fidelity(dataset, SMALL, tmp_path, 0, modes, QUIET).comparisons) == 3
+        running.write(lines[3][40:] + "\n")
+    assert (tmp_path / RESULTS_FILE).read_text().splitlines() == lines[:4]
 
 
 def test_a_folder_of_other_settings_is_refused(suite, dataset):

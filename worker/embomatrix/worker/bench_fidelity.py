@@ -95,17 +95,17 @@ def run_fidelity(
     with _told(folder):
         folder.mkdir(parents=True, exist_ok=True)
         trials = _trials(dataset, settings, folder, modes, progress)
-        done = _results(folder / RESULTS_FILE)
+        path = folder / RESULTS_FILE
+        done = {value["trial"]: value for value in _lines(path)}
         jobs = _jobs(trial for trial in trials if trial.trial_id not in done)
-        with (folder / RESULTS_FILE).open("a", encoding="utf-8") as results:
+        if processes:
+            with _appending(path, done.values()) as append:
 
-            def keep(value: Mapping[str, Any]) -> None:
-                results.write(json.dumps(value) + "\n")
-                results.flush()
-                done[value["trial"]] = dict(value)
-                progress.executed(len(done), len(trials))
+                def keep(value: Mapping[str, Any]) -> None:
+                    append(value)
+                    done[value["trial"]] = dict(value)
+                    progress.executed(len(done), len(trials))
 
-            if processes:
                 FidelityPool(dataset.folder, modes, processes, LIMIT_S).run(jobs, keep)
         if not done:
             raise BenchError(f"{folder} holds no result to sum up: run the suite with one process or more")
@@ -205,11 +205,22 @@ def _outcome(trials: Sequence[Trial], done: Mapping[str, Mapping[str, Any]], fol
     return Outcome(comparisons, tuple(f"{v['trial']}: {v[LOST]}" for v in values if LOST in v))
 
 
-def _results(path: Path) -> dict[str, dict[str, Any]]:
-    """Results by trial. The file is written anew without a last line that was cut short, to go on from there."""
-    values = list(_lines(path))
+@contextlib.contextmanager
+def _appending(
+    path: Path, values: Iterable[Mapping[str, Any]]
+) -> Iterator[Callable[[Mapping[str, Any]], None]]:
+    """Adds results to the file, written anew first without a last line that was cut short.
+
+    Only who executes does that: a suite that is summed up meanwhile keeps the file which it writes to.
+    """
     write_whole(path, "".join(json.dumps(value) + "\n" for value in values).encode("utf-8"))
-    return {value["trial"]: value for value in values}
+    with path.open("a", encoding="utf-8") as file:
+
+        def append(value: Mapping[str, Any]) -> None:
+            file.write(json.dumps(value) + "\n")
+            file.flush()
+
+        yield append
 
 
 def _lines(path: Path) -> Iterator[dict[str, Any]]:
