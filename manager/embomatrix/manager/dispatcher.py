@@ -237,11 +237,17 @@ class Dispatcher:
         for scene in self._desk.failures.scenes():
             self._desk.judge(scene)
         self._patience.give_up()
-        if self._desk.fleet.live <= 1:
-            self._desk.fleet.forgive()
-        self._desk.fill([*self._desk.fleet.thieves(), *self._desk.fleet.lags])
+        self._seek()
         self._hedger.look()
         self._desk.audits.look()
+
+    def _seek(self) -> None:
+        """Free slots look again. Time alone makes a rollout somebody's that it was not: it waited for longer than a slow
+        worker holds back, or failed there long enough ago.
+        """
+        fleet = self._desk.fleet
+        forgiven = fleet.forgive() if fleet.live <= 1 else []
+        self._desk.fill([*forgiven, *fleet.seekers(), *fleet.lags])
 
     def _expire(self, lease: LeaseRecord) -> None:
         if lease.expires_s <= self._desk.now_s:

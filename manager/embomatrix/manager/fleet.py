@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from embomatrix.manager.run_book import SlotTimes
 
 VICTIMS: Final = 8
-THIEVES: Final = 64
+SEEKERS: Final = 64
 CANDIDATES: Final = 64
 """Busy workers, idle workers and holders of a scene looked at in one go, each time others: bounds, so that a large cluster
 costs no more than a small one."""
@@ -121,13 +121,15 @@ class Fleet:
     def has_warm(self, scene: str) -> bool:
         return scene in self._warm_on
 
-    def forgive(self) -> None:
-        """Take nobody for slow any more: there is nobody to be slower than."""
-        for worker_id in list(self.lags):
+    def forgive(self) -> list[str]:
+        """Take nobody for slow any more: there is nobody to be slower than. Returns those who may take more now."""
+        forgiven = list(self.lags)
+        for worker_id in forgiven:
             worker = self.workers[worker_id]
             worker.log_lag = worker.reluctance_s = 0.0
             del self.lags[worker_id]
             self._weigh(worker)
+        return forgiven
 
     def hold(self, worker: WorkerRecord, lease: LeaseRecord) -> None:
         worker.held[lease.ref.lease_id] = lease
@@ -190,11 +192,9 @@ class Fleet:
         """Ids of workers with a free slot."""
         return frozenset(self._idle)
 
-    def thieves(self) -> list[str]:
-        """Some workers with a free slot, while others have leases behind a busy one."""
-        if not self._backlogged:
-            return []
-        some = list(islice(self._idle, THIEVES))
+    def seekers(self) -> list[str]:
+        """Some workers with a free slot, each time others: what was not for them before may be now."""
+        some = list(islice(self._idle, SEEKERS))
         _move_to_end(self._idle, some)
         _move_to_end(self._backlogged, list(islice(self._backlogged, VICTIMS)))
         return some

@@ -20,6 +20,7 @@ from embomatrix.manager.events import (
     WorkerJoined,
     WorkerReported,
     WorkerResumed,
+    WorkerSuspected,
 )
 from embomatrix.manager.shares import Share, in_turns, quotas
 from embomatrix.rpc.values import (
@@ -227,6 +228,32 @@ def test_a_straggler_whose_scene_is_nowhere_else_has_it_loaded(desk):
     desk.report("w2")
     desk.tell(Tick())
     assert [hedge.worker_id for hedge in desk.hedges] == ["w2"]
+
+
+# Slow workers
+
+
+def test_a_worker_that_was_slow_beside_nobody_takes_what_waits_at_the_next_tick(desk):
+    desk.worker("w1", slots=2)
+    desk.submit(30)
+    for index in range(24):
+        desk.finish(f"b1.0.{index}", after_s=0.01)
+    for index in range(24, 30):
+        desk.finish(f"b1.0.{index}", after_s=2.0)
+    desk.submit(20, batch_id="b2")
+    desk.tell(Tick(), after_s=0.05)
+    assert len([name for name in desk.held if name.startswith("b2") and desk.held[name]]) >= 2
+
+
+def test_what_failed_on_the_only_worker_that_is_left_is_given_to_it_again_in_time(desk):
+    desk.worker("w1", slots=2)
+    desk.worker("w2", warm=())
+    desk.submit(1)
+    desk.finish("b1.0.0", CRASH)
+    assert not desk.held["b1.0.0"]
+    desk.tell(WorkerSuspected("w2"))
+    desk.tell(Tick(), after_s=LIMITS.elsewhere_s + 0.1)
+    assert list(desk.held["b1.0.0"]) == ["w1"]
 
 
 # Progress

@@ -1,6 +1,6 @@
 """Workers in a large cluster: found by scene, by free slots and by backlog, without looking at all of them."""
 
-from embomatrix.manager.fleet import CANDIDATES, THIEVES, Fleet
+from embomatrix.manager.fleet import CANDIDATES, SEEKERS, Fleet
 from embomatrix.manager.ledger import AHEAD_S, BEHIND, LeaseRecord, RolloutKey, RolloutRecord
 from embomatrix.rpc.values import LeaseRef, Rollout
 
@@ -50,17 +50,16 @@ def test_an_idle_worker_finds_a_lease_behind_a_busy_slot():
     fleet = fleet_of(2)
     load(fleet, "w0000", 2, given_s=1.0)
     thief = fleet.workers["w0001"]
-    assert fleet.thieves() == ["w0001"]
+    assert fleet.seekers() == ["w0001"]
     assert fleet.waiting_behind(thief, before_s=0.5, now_s=2.0) is None
     assert fleet.waiting_behind(thief, before_s=1.0, now_s=2.0).ref.lease_id == "w0000.1"
 
 
-def test_different_idle_workers_are_asked_each_time_and_none_while_nobody_waits():
-    fleet = fleet_of(2 * THIEVES + 1)
-    assert fleet.thieves() == []
+def test_different_idle_workers_look_each_time():
+    fleet = fleet_of(2 * SEEKERS + 1)
     load(fleet, "w0000", 2)
-    first, second = fleet.thieves(), fleet.thieves()
-    assert len(set(first) | set(second)) == 2 * THIEVES
+    first, second = fleet.seekers(), fleet.seekers()
+    assert len(set(first) | set(second)) == 2 * SEEKERS
 
 
 def test_a_worker_that_drains_or_is_suspected_is_neither_live_nor_idle():

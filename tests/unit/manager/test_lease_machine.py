@@ -248,6 +248,15 @@ class LeaseMachine(RuleBasedStateMachine):
                 told = tuple(LeaseProgress(ref, self.steps[ref]) for ref in held if self.steps[ref] >= 0)
                 self.tell(LeasesRenewed(worker, tuple(held), told))
         self.tell(Tick())
+        self.nobody_idles_while_something_waits()
+
+    def nobody_idles_while_something_waits(self):
+        """After a tick a free slot has looked at what waits, whatever kept it from that before."""
+        desk = self.cluster.dispatcher._desk
+        for record in () if desk.paused else desk.pending:
+            for worker in desk.fleet.workers.values():
+                fits = record.scene in worker.warm and worker.takes(record, self.now_s)
+                assert not (fits and worker.free_slots > 0), (record.key, worker)
 
     @invariant()
     def every_rollout_is_queued_or_leased_or_done(self):
