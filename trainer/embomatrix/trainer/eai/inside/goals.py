@@ -29,7 +29,8 @@ def backend() -> Any:
         return _truths[-1](self.STATE_NAME, self.input)
 
     def unasked(self: Any, *args: Any) -> bool:
-        raise NotImplementedError
+        """bddl wants both methods of an atom. ``evaluate`` above never comes to the one, and a judge samples no state."""
+        raise NotImplementedError(f"{self.STATE_NAME} is only judged here: no state is sampled")
 
     class Backend(BDDLBackend):  # type: ignore[misc]
         def get_predicate_class(self, predicate_name: str) -> type:
