@@ -17,7 +17,6 @@ from embomatrix.factory.evaluate.drafts import Asked, asked_in
 from embomatrix.factory.evaluate.figures import (
     Evaluation,
     EvaluationError,
-    Figure,
     evaluation_to_json,
     read_evaluation,
 )
@@ -29,6 +28,7 @@ from embomatrix.factory.evaluate.tasks import evenness, panel, people_of
 from embomatrix.factory.pipeline.corpus import HELDOUT_SCENES, training_scenes
 from embomatrix.factory.social.milieus import NAMES
 from embomatrix.factory.social.writer import SocialWriter
+from embomatrix.pages.figures import Better, Figure
 from embomatrix.world.catalog import Catalog
 
 BED = Item("bed", (1.0, 0.8), (1.0, 0.8), 0.0, 0.0, 0.6, FLOOR)
@@ -190,7 +190,10 @@ def test_scenes_to_train_in_and_held_out_ones_are_all_scenes_and_share_none():
 EVALUATION = Evaluation(
     "tasks",
     {"scenes": 45, "seed": 0},
-    (Figure("self_bleu4", 0.3, "", 450, "lower", 0.35), Figure("words", 20.0, "words", 450)),
+    (
+        Figure("self_bleu4", 0.3, "", Better.LOWER, 450, 0.35),
+        Figure("words", 20.0, "words", Better.NEITHER, 450),
+    ),
     ("A note.",),
 )
 

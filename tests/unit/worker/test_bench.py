@@ -13,9 +13,7 @@ from typer.testing import CliRunner
 
 from embomatrix.skills.syntax import Skill
 from embomatrix.worker.bench_cli import app
-from embomatrix.worker.bench_figures import (
-    BenchError,
-)
+from embomatrix.worker.bench_figures import BenchError
 from embomatrix.worker.bench_page import END
 from embomatrix.worker.bench_processes import bench_cluster
 from embomatrix.worker.bench_scenes import scenes_of

@@ -4,11 +4,12 @@ import pytest
 from tests.fakes.datasets import write_flats_dataset
 from typer.testing import CliRunner
 
+from embomatrix.pages.figures import Better, Figure
 from embomatrix.worker.bench_ablation import AblationSizes, bench_ablation
 from embomatrix.worker.bench_ablation_page import ROWS, ablation_lines
 from embomatrix.worker.bench_cli import app
 from embomatrix.worker.bench_cpu import CpuUse
-from embomatrix.worker.bench_figures import BenchError, BenchResult, Better, Figure
+from embomatrix.worker.bench_figures import BenchError, BenchResult
 from embomatrix.worker.bench_page import render_page
 from embomatrix.worker.bench_prewarm import PrewarmSizes, bench_prewarm
 from embomatrix.worker.bench_work import main_work, whole_work

@@ -6,18 +6,16 @@ from dataclasses import replace
 import pytest
 from typer.testing import CliRunner
 
+from embomatrix.pages.figures import Better, Figure, shown
 from embomatrix.worker.bench_cli import app
 from embomatrix.worker.bench_figures import (
     BenchError,
     BenchResult,
-    Better,
-    Figure,
     figure_in,
     is_shared,
     put_together,
     quantile_figure,
     result_to_json,
-    shown,
 )
 from embomatrix.worker.bench_page import END, render_page
 

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from embomatrix.pages.figures import Better, Figure
 from embomatrix.worker.bench_cpu import cpu_use
-from embomatrix.worker.bench_figures import Better, Figure
 from embomatrix.worker.bench_one_process import cached_s, naive
 from embomatrix.worker.bench_processes import bench_cluster
 from embomatrix.worker.bench_stepping import Stepping, take_steps

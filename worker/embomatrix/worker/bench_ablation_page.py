@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.pages.figures import shown
 from embomatrix.worker.bench_ablation import DELAY_S
-from embomatrix.worker.bench_figures import shown
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from embomatrix.worker.bench_figures import Figure
+    from embomatrix.pages.figures import Figure
 
 
 @dataclass(frozen=True, slots=True)

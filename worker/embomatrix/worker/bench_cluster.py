@@ -10,9 +10,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.pages.figures import Better, Figure
 from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.values import Batch, Completed, LookaheadEntry, ResidentState, Rollout, RunStats, Warmth
-from embomatrix.worker.bench_figures import BenchError, Better, Figure, quantile_figure
+from embomatrix.worker.bench_figures import BenchError, quantile_figure
 from embomatrix.worker.bench_processes import bench_cluster
 from embomatrix.worker.bench_trainer import connected
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from pathlib import Path
 
-    from embomatrix.worker.bench_figures import Figure
+    from embomatrix.pages.figures import Figure
 
     OnStep = Callable[[str], None]
 

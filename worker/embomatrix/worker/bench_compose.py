@@ -12,10 +12,11 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.pages.figures import Better, Figure
 from embomatrix.rpc.client import ClientLimits, ClusterClient
 from embomatrix.rpc.status import ClusterError
 from embomatrix.rpc.values import Batch, Completed, Rollout
-from embomatrix.worker.bench_figures import BenchError, Better, Figure
+from embomatrix.worker.bench_figures import BenchError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

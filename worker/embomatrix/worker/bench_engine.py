@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from embomatrix.pages.figures import Better, Figure
 from embomatrix.reward.hierarchy import score
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
@@ -23,7 +24,7 @@ from embomatrix.sim.pose_cache import PlacementLibrary, analyse_scene
 from embomatrix.sim.prepared import Prepared
 from embomatrix.sim.zygote import resident_mb
 from embomatrix.skills.syntax import Skill
-from embomatrix.worker.bench_figures import BenchError, Better, Figure, quantile
+from embomatrix.worker.bench_figures import BenchError, quantile
 from embomatrix.worker.bench_slots import SlotSample, measure_slots
 from embomatrix.worker.bench_subject import CountingEngine, frozen_heap
 from embomatrix.worker.bench_workload import SIZES

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Final
 
 from rich.table import Table
 
+from embomatrix.pages.figures import Better, Figure
 from embomatrix.sim.fidelity.compare import objects_in, true_atoms
 from embomatrix.sim.fidelity.records import trial_from_json
 from embomatrix.sim.fidelity.report import MANIPULATION, calls_of, report_on
 from embomatrix.sim.fidelity.sampler import SKILLS
-from embomatrix.worker.bench_figures import BenchError, Better, Figure
+from embomatrix.worker.bench_figures import BenchError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -7,13 +7,13 @@ import os
 import platform
 import subprocess
 from dataclasses import dataclass
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import psutil
 
+from embomatrix.pages.figures import Better, Figure, figure_from_json, figure_to_json
 from embomatrix.sim.zygote import MIB
 from embomatrix.worker.gpu import find_gpu
 from embomatrix.worker.resources import measure_score, versions
@@ -28,35 +28,6 @@ GIT_S: Final = 10.0
 
 class BenchError(Exception):
     """A bench can't be run or has no result. One sentence that names the remedy."""
-
-
-class Better(StrEnum):
-    """Which way a figure improves."""
-
-    HIGHER = "higher"
-    LOWER = "lower"
-
-
-@dataclass(frozen=True, slots=True)
-class Figure:
-    """One measured number of ``n`` measurements. ``goal`` is in the same unit, None where none is set."""
-
-    name: str
-    value: float
-    unit: str
-    better: Better
-    n: int
-    goal: float | None = None
-
-    @property
-    def verdict(self) -> str:
-        """How the value stands to its goal, in words; empty without a goal."""
-        if self.goal is None:
-            return ""
-        reached = self.value <= self.goal if self.better is Better.LOWER else self.value >= self.goal
-        if reached:
-            return "reached"
-        return f"{self.value / self.goal:.3g} × the goal" if self.goal else "missed"
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,17 +50,7 @@ def result_to_json(result: BenchResult) -> dict[str, Any]:
         "bench": result.bench,
         "commit": result.commit,
         "machine": dict(result.machine),
-        "figures": [
-            {
-                "name": figure.name,
-                "value": float(f"{figure.value:.6g}"),
-                "unit": figure.unit,
-                "goal": figure.goal,
-                "better": figure.better.value,
-                "n": figure.n,
-            }
-            for figure in result.figures
-        ],
+        "figures": [figure_to_json(figure) for figure in result.figures],
     }
 
 
@@ -99,7 +60,7 @@ def read_result(path: Path) -> BenchResult:
         value = json.loads(path.read_text(encoding="utf-8"))
         machine = dict(value["machine"])
         float(machine["load_before"]), float(machine["cores"])
-        figures = tuple(_figure_from(item) for item in value["figures"])
+        figures = tuple(figure_from_json(item) for item in value["figures"])
         return BenchResult(str(value["bench"]), str(value["commit"]), machine, figures)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise BenchError(
@@ -126,18 +87,6 @@ def put_together(results: Sequence[BenchResult]) -> list[BenchResult]:
     return list(whole.values())
 
 
-def _figure_from(item: Mapping[str, Any]) -> Figure:
-    goal = None if item["goal"] is None else float(item["goal"])
-    return Figure(
-        str(item["name"]),
-        float(item["value"]),
-        str(item["unit"]),
-        Better(item["better"]),
-        int(item["n"]),
-        goal,
-    )
-
-
 def figure_in(path: Path, name: str) -> Figure:
     """A figure of a file that `bench fidelity` wrote. Raises BenchError when it has none of that name."""
     try:
@@ -161,11 +110,6 @@ def quantile_figure(
     """A quantile of durations, told in ``unit``: "ms" or "µs"."""
     value = quantile(seconds, share) * {"ms": 1e3, "µs": 1e6}[unit]
     return Figure(f"{name}, p{share * 100:.0f}", value, unit, Better.LOWER, len(seconds), goal)
-
-
-def shown(value: float) -> str:
-    """Three digits, or all of them left of the point."""
-    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
 
 
 def describe_machine() -> dict[str, Any]:

@@ -16,10 +16,11 @@ from typing import TYPE_CHECKING, Final
 
 import psutil
 
+from embomatrix.pages.figures import Better, Figure
 from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.convert import rollout_from_proto, rollout_to_proto
 from embomatrix.worker.bench_cpu import cpu_use
-from embomatrix.worker.bench_figures import Better, Figure, quantile
+from embomatrix.worker.bench_figures import quantile
 from embomatrix.worker.bench_hollow import hollow_worker
 from embomatrix.worker.bench_processes import bench_cluster
 from embomatrix.worker.bench_trainer import trainer_on

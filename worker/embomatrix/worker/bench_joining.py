@@ -10,7 +10,8 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.worker.bench_figures import BenchError, Better, Figure
+from embomatrix.pages.figures import Better, Figure
+from embomatrix.worker.bench_figures import BenchError
 from embomatrix.worker.bench_processes import running_process
 
 if TYPE_CHECKING:

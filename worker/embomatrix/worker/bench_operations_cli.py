@@ -18,7 +18,7 @@ from embomatrix.worker.bench_viewers import viewing
 from embomatrix.world.dataset import Dataset
 
 if TYPE_CHECKING:
-    from embomatrix.worker.bench_figures import Figure
+    from embomatrix.pages.figures import Figure
 
 
 class Part(StrEnum):

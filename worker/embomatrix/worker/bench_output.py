@@ -10,9 +10,10 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from embomatrix.pages.figures import shown
 from embomatrix.rpc.status import ClusterError
 from embomatrix.sim.engine import EngineError
-from embomatrix.worker.bench_figures import BenchError, is_shared, result_to_json, shown
+from embomatrix.worker.bench_figures import BenchError, is_shared, result_to_json
 from embomatrix.world.dataset import DatasetError
 from embomatrix.world.inflation import BundleError
 

@@ -6,15 +6,17 @@ import re
 import textwrap
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.pages.figures import shown
 from embomatrix.worker.bench_ablation_page import EXPLANATION, ablation_lines
-from embomatrix.worker.bench_figures import BenchError, is_shared, shown
+from embomatrix.worker.bench_figures import BenchError, is_shared
 from embomatrix.worker.bench_peers_page import CONTEST, PREFIX, contest_lines
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from typing import Any
 
-    from embomatrix.worker.bench_figures import BenchResult, Figure
+    from embomatrix.pages.figures import Figure
+    from embomatrix.worker.bench_figures import BenchResult
 
 HEAD: Final = "<!-- Written by `embomatrix bench all`: edit the parts between the marks `by hand` only, they are kept. -->"
 WIDTH: Final = 128
@@ -155,11 +157,8 @@ def _machine_lines(results: Sequence[BenchResult]) -> list[str]:
 def _table(figures: Sequence[Figure]) -> list[str]:
     lines = ["| figure | value | goal | | n |", "| --- | ---: | ---: | --- | ---: |"]
     for figure in figures:
-        goal = (
-            "" if figure.goal is None else f"{'≤' if figure.better == 'lower' else '≥'} {shown(figure.goal)}"
-        )
         lines.append(
-            f"| {_cell(figure.name)} | {shown(figure.value)} {figure.unit} | {goal} | {figure.verdict} | {figure.n:,} |"
+            f"| {_cell(figure.name)} | {shown(figure.value)} {figure.unit} | {figure.bound} | {figure.verdict} | {figure.n:,} |"
         )
     short = [figure.name for figure in figures if figure.verdict not in ("", "reached")]
     goals = sum(figure.goal is not None for figure in figures)

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.worker.bench_figures import Better, Figure, quantile, shown
+from embomatrix.pages.figures import Better, Figure, shown
+from embomatrix.worker.bench_figures import quantile
 from embomatrix.worker.bench_peers import Peer
 
 if TYPE_CHECKING:

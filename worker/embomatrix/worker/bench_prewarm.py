@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.worker.bench_figures import BenchError, Better, Figure
+from embomatrix.pages.figures import Better, Figure
+from embomatrix.worker.bench_figures import BenchError
 from embomatrix.worker.bench_stepping import Stepping, take_steps
 
 if TYPE_CHECKING:

@@ -7,13 +7,14 @@ import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.pages.figures import Better, Figure
 from embomatrix.reward.hierarchy import score
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.prepared import Prepared
 from embomatrix.skills.syntax import Skill
-from embomatrix.worker.bench_figures import Better, Figure, quantile, quantile_figure
+from embomatrix.worker.bench_figures import quantile, quantile_figure
 from embomatrix.worker.bench_subject import CountingEngine, frozen_heap
 from embomatrix.worker.physics import CLIENTS_PER_SCENE
 from embomatrix.world.bundle import decode_bundle

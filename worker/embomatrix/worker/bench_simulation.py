@@ -5,7 +5,8 @@ from __future__ import annotations
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.worker.bench_figures import BenchError, Better, Figure
+from embomatrix.pages.figures import Better, Figure
+from embomatrix.worker.bench_figures import BenchError
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -15,12 +15,13 @@ from typing import TYPE_CHECKING, Final
 
 import psutil
 
+from embomatrix.pages.figures import Better, Figure
 from embomatrix.proto.v1 import worker_service_pb2 as pb
 from embomatrix.proto.v1 import worker_service_pb2_grpc
 from embomatrix.rpc.channel import open_channel
 from embomatrix.rpc.convert_session import worker_state_to_proto
 from embomatrix.rpc.values import Resident, ResidentState, Resources, WorkerState
-from embomatrix.worker.bench_figures import BenchError, Better, Figure
+from embomatrix.worker.bench_figures import BenchError
 from embomatrix.worker.bench_joining import wait_for
 from embomatrix.worker.bench_processes import running_process
 from embomatrix.worker.membership import Membership

@@ -18,7 +18,6 @@ from embomatrix.factory.evaluate.drafts import asked_of
 from embomatrix.factory.evaluate.figures import (
     Evaluation,
     EvaluationError,
-    Figure,
     evaluation_to_json,
     read_evaluation,
 )
@@ -33,6 +32,7 @@ from embomatrix.factory.pipeline.store import TRANSCRIPTS_FOLDER
 from embomatrix.factory.terminal import mended, progress
 from embomatrix.llm.cassette import Cassette, CassetteMode
 from embomatrix.llm.endpoint import Endpoint
+from embomatrix.pages.figures import Better, Figure
 from embomatrix.world.dataset import Dataset
 from embomatrix.world.whole_file import write_whole
 
@@ -182,6 +182,7 @@ async def _judged(
             f"judge {name}",
             float(np.mean([getattr(each, name) for each in verdicts])),
             "of 10",
+            Better.NEITHER,
             len(verdicts),
         )
         for name in ("variety", "characters", "overall")
@@ -191,9 +192,10 @@ async def _judged(
 def _hand_in(evaluation: Evaluation, json_file: Path | None) -> None:
     table = Table("figure", "value", "goal", "", "n")
     for figure in evaluation.figures:
-        goal = "" if figure.goal is None else f"{'≤' if figure.better == 'lower' else '≥'} {figure.goal:.3g}"
         verdict = "" if figure.goal is None else "reached" if figure.is_reached else "short"
-        table.add_row(figure.name, f"{figure.value:.3g} {figure.unit}".strip(), goal, verdict, str(figure.n))
+        table.add_row(
+            figure.name, f"{figure.value:.3g} {figure.unit}".strip(), figure.bound, verdict, str(figure.n)
+        )
     Console().print(table)
     for note in evaluation.notes:
         Console().print(note, highlight=False, markup=False)

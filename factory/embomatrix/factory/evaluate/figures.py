@@ -6,35 +6,17 @@ import json
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from embomatrix.pages.figures import figure_from_json, figure_to_json
+
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
+    from embomatrix.pages.figures import Figure
+
 
 class EvaluationError(Exception):
     """An evaluation can't be made or read. One sentence that names the remedy."""
-
-
-@dataclass(frozen=True, slots=True)
-class Figure:
-    """One number of ``n`` measurements. ``goal`` is in the same unit, None where none is set.
-
-    ``better`` is "higher", "lower", or empty for what is neither.
-    """
-
-    name: str
-    value: float
-    unit: str
-    n: int
-    better: str = ""
-    goal: float | None = None
-
-    @property
-    def is_reached(self) -> bool:
-        """Whether the value is at least as good as its goal; true without one."""
-        if self.goal is None:
-            return True
-        return self.value <= self.goal if self.better == "lower" else self.value >= self.goal
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,17 +38,7 @@ def evaluation_to_json(evaluation: Evaluation) -> dict[str, Any]:
     return {
         "part": evaluation.part,
         "conditions": dict(evaluation.conditions),
-        "figures": [
-            {
-                "name": figure.name,
-                "value": float(f"{figure.value:.6g}"),
-                "unit": figure.unit,
-                "n": figure.n,
-                "better": figure.better,
-                "goal": figure.goal,
-            }
-            for figure in evaluation.figures
-        ],
+        "figures": [figure_to_json(figure) for figure in evaluation.figures],
         "notes": list(evaluation.notes),
     }
 
@@ -78,7 +50,7 @@ def read_evaluation(path: Path) -> Evaluation:
         return Evaluation(
             str(value["part"]),
             dict(value["conditions"]),
-            tuple(_figure_from(item) for item in value["figures"]),
+            tuple(figure_from_json(item) for item in value["figures"]),
             tuple(map(str, value["notes"])),
         )
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
@@ -86,15 +58,3 @@ def read_evaluation(path: Path) -> Evaluation:
             f"{path} holds no figures of an evaluation ({error}): expected a file that 'embomatrix factory evaluate' "
             "wrote with --json"
         ) from error
-
-
-def _figure_from(item: Mapping[str, Any]) -> Figure:
-    goal = None if item["goal"] is None else float(item["goal"])
-    return Figure(
-        str(item["name"]),
-        float(item["value"]),
-        str(item["unit"]),
-        int(item["n"]),
-        str(item["better"]),
-        goal,
-    )

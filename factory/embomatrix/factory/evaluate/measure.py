@@ -9,7 +9,7 @@ import numpy as np
 
 from embomatrix.factory.evaluate.aesthetics import Calibration, auc, fit, score_room
 from embomatrix.factory.evaluate.drafts import asked_in
-from embomatrix.factory.evaluate.figures import Evaluation, EvaluationError, Figure
+from embomatrix.factory.evaluate.figures import Evaluation, EvaluationError
 from embomatrix.factory.evaluate.rooms import read_rooms
 from embomatrix.factory.evaluate.spoiling import SPOILERS
 from embomatrix.factory.evaluate.tasks import panel
@@ -17,6 +17,7 @@ from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.social.milieus import NAMES
 from embomatrix.factory.social.writer import SocialWriter
 from embomatrix.factory.writer.tasks import PlainWriter
+from embomatrix.pages.figures import Better, Figure
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -92,10 +93,13 @@ def evaluate_aesthetics(rooms_file: Path, seed: int) -> tuple[Evaluation, Calibr
         bad.append(everything.mean())
     n = SPLITS * (len(rooms) - len(rooms) // 2)
     figures = (
-        Figure("aesthetics_auc", float(np.mean(found["auc"])), "", n, "higher", AUC_GOAL),
-        *(Figure(f"aesthetics_auc {name}", float(np.mean(found[name])), "", n) for name in SPOILERS),
-        Figure("aesthetics hand-made", float(np.mean(good)), "of 10", n),
-        Figure("aesthetics spoilt", float(np.mean(bad)), "of 10", 3 * n),
+        Figure("aesthetics_auc", float(np.mean(found["auc"])), "", Better.HIGHER, n, AUC_GOAL),
+        *(
+            Figure(f"aesthetics_auc {name}", float(np.mean(found[name])), "", Better.NEITHER, n)
+            for name in SPOILERS
+        ),
+        Figure("aesthetics hand-made", float(np.mean(good)), "of 10", Better.NEITHER, n),
+        Figure("aesthetics spoilt", float(np.mean(bad)), "of 10", Better.NEITHER, 3 * n),
     )
     conditions = {"rooms": len(rooms), "halvings": SPLITS, "seed": seed}
     return Evaluation("aesthetics", conditions, figures), fit(rooms, _spoilt(rooms, rng))

@@ -6,11 +6,13 @@ import textwrap
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.evaluate.figures import EvaluationError
+from embomatrix.pages.figures import shown
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from embomatrix.factory.evaluate.figures import Evaluation, Figure
+    from embomatrix.factory.evaluate.figures import Evaluation
+    from embomatrix.pages.figures import Figure
 
 WIDTH: Final = 128
 BEGIN: Final = "<!-- by hand: factory -->"
@@ -85,17 +87,10 @@ def render(evaluations: Sequence[Evaluation]) -> str:
 def _table(figures: Sequence[Figure]) -> list[str]:
     lines = ["| figure | value | goal | | n |", "| --- | ---: | ---: | --- | ---: |"]
     for figure in figures:
-        goal = (
-            "" if figure.goal is None else f"{'≤' if figure.better == 'lower' else '≥'} {_shown(figure.goal)}"
-        )
         verdict = "" if figure.goal is None else "reached" if figure.is_reached else "short"
-        value = f"{_shown(figure.value)} {figure.unit}".strip()
-        lines.append(f"| {figure.name} | {value} | {goal} | {verdict} | {figure.n:,} |")
+        value = f"{shown(figure.value)} {figure.unit}".strip()
+        lines.append(f"| {figure.name} | {value} | {figure.bound} | {verdict} | {figure.n:,} |")
     return lines
-
-
-def _shown(value: float) -> str:
-    return f"{value:,.0f}" if abs(value) >= 1_000 else f"{value:.3g}"
 
 
 def _paragraph(text: str) -> str:

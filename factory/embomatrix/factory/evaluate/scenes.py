@@ -22,7 +22,7 @@ import numpy as np
 
 from embomatrix.factory.admission import Admitted, admit
 from embomatrix.factory.evaluate.aesthetics import Calibration, score_room
-from embomatrix.factory.evaluate.figures import Evaluation, EvaluationError, Figure
+from embomatrix.factory.evaluate.figures import Evaluation, EvaluationError
 from embomatrix.factory.evaluate.manipulation import out_of_hand
 from embomatrix.factory.evaluate.rooms import plan_of
 from embomatrix.factory.evaluate.scene_geometry import flaws_of
@@ -33,6 +33,7 @@ from embomatrix.factory.refusal import Refusal, RefusalReason
 from embomatrix.factory.task_import.sources import SourceText, read_activity
 from embomatrix.factory.task_import.task import Imported, Manner, import_problem
 from embomatrix.factory.writer.view import SceneView
+from embomatrix.pages.figures import Better, Figure
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.planner.oracle import find_plan
 from embomatrix.world.bundle import Bundle
@@ -209,20 +210,25 @@ def _figures(outcomes: Sequence[Outcome], method: Method) -> Iterable[Figure]:
     verified = sum(outcome.verified for outcome in generated)
     n = len(outcomes)
     yield Figure(
-        f"generation_rate{label}", 100 * len(generated) / n, "%", n, "higher", 95.0 if goals else None
+        f"generation_rate{label}", 100 * len(generated) / n, "%", Better.HIGHER, n, 95.0 if goals else None
     )
     if generated:
         rate = 100 * verified / len(generated)
         yield Figure(
-            f"verification_pass_rate{label}", rate, "%", len(generated), "higher", 99.0 if goals else None
+            f"verification_pass_rate{label}",
+            rate,
+            "%",
+            Better.HIGHER,
+            len(generated),
+            99.0 if goals else None,
         )
         solved = 100 * sum(outcome.solved for outcome in generated) / len(generated)
-        yield Figure(f"oracle_solved_rate{label}", solved, "%", len(generated), "higher")
+        yield Figure(f"oracle_solved_rate{label}", solved, "%", Better.HIGHER, len(generated))
     middle = float(np.median([outcome.scene_s for outcome in outcomes]))
-    yield Figure(f"scene_s_p50{label}", middle, "s", n, "lower", 2.0 if goals else None)
+    yield Figure(f"scene_s_p50{label}", middle, "s", Better.LOWER, n, 2.0 if goals else None)
     if planar:
         solve = 1000 * float(np.median(planar))
-        yield Figure(f"planar_ms_p50{label}", solve, "ms", len(planar), "lower", 50.0 if goals else None)
+        yield Figure(f"planar_ms_p50{label}", solve, "ms", Better.LOWER, len(planar), 50.0 if goals else None)
     scores = [outcome.aesthetics for outcome in outcomes if outcome.aesthetics is not None]
     if scores and math.isfinite(sum(scores)):
-        yield Figure(f"aesthetics{label}", float(np.mean(scores)), "of 10", len(scores), "higher")
+        yield Figure(f"aesthetics{label}", float(np.mean(scores)), "of 10", Better.HIGHER, len(scores))

@@ -7,8 +7,8 @@ import math
 import re
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.evaluate.figures import Figure
 from embomatrix.factory.metrics.diversity import diversity, normalised_entropy
+from embomatrix.pages.figures import Better, Figure
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
@@ -16,11 +16,11 @@ if TYPE_CHECKING:
 
     from embomatrix.factory.evaluate.drafts import Asked
 
-GOALS: Final[Mapping[str, tuple[str, float]]] = {
-    "self_bleu4": ("lower", 0.35),
-    "near_duplicate_rate": ("lower", 0.01),
-    "named_share": ("higher", 0.9),
-    "signature_entropy": ("higher", 0.9),
+GOALS: Final[Mapping[str, tuple[Better, float]]] = {
+    "self_bleu4": (Better.LOWER, 0.35),
+    "near_duplicate_rate": (Better.LOWER, 0.01),
+    "named_share": (Better.HIGHER, 0.9),
+    "signature_entropy": (Better.HIGHER, 0.9),
 }
 """For tasks with social simulation."""
 _SIGN: Final = re.compile(r"([\w ]+)\(([^()]*)\)")
@@ -71,10 +71,10 @@ def people_of(folder: Path) -> frozenset[str]:
 
 
 def _figure(name: str, value: float, n: int, label: str) -> Figure:
-    better, goal = GOALS.get(name, ("", 0.0))
+    better, goal = GOALS.get(name, (Better.NEITHER, 0.0))
     unit = "words" if name == "words" else ""
     shown = f"{name} {label}".strip()
-    return Figure(shown, value, unit, n, better, goal if better and not label else None)
+    return Figure(shown, value, unit, better, n, goal if better and not label else None)
 
 
 def _share(held: Sequence[bool]) -> float:

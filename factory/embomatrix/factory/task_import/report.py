@@ -7,11 +7,12 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from embomatrix.factory.evaluate.figures import Evaluation, Figure
+from embomatrix.factory.evaluate.figures import Evaluation
 from embomatrix.factory.refusal import Refusal
 from embomatrix.factory.task_import.batch import Verified
 from embomatrix.factory.task_import.dialects import read_problem
 from embomatrix.factory.task_import.reach import unreachable_atoms
+from embomatrix.pages.figures import Better, Figure
 from embomatrix.world.task import Profile
 
 if TYPE_CHECKING:
@@ -108,8 +109,8 @@ def evaluation_of(outcomes: Sequence[Outcome], seed: int) -> Evaluation:
         if not mine:
             continue
         n = len(mine)
-        figures.append(Figure(name, sum(each.is_bound for each in mine) / n, "", n, "higher", goal))
+        figures.append(Figure(name, sum(each.is_bound for each in mine) / n, "", Better.HIGHER, n, goal))
         for profile in Profile:
             reached = sum(not each.unreachable[profile.value] for each in mine)
-            figures.append(Figure(f"{name} reached by {profile.value}", reached / n, "", n))
+            figures.append(Figure(f"{name} reached by {profile.value}", reached / n, "", Better.NEITHER, n))
     return Evaluation("imports", {"seed": seed}, tuple(figures))
