@@ -2,7 +2,6 @@
 
 import contextlib
 import re
-import resource
 import socket
 import zlib
 from pathlib import Path
@@ -182,11 +181,6 @@ async def test_bundle_damaged_in_a_cache_is_fetched_again(kitchen, tmp_path):
         assert "bundle damaged on disk, removed" in serving.text
 
 
-def _small_files():
-    """A disk that takes files of 64 kB at most: a checkpoint fails in the middle, as on a full one."""
-    resource.setrlimit(resource.RLIMIT_FSIZE, (64 * 1024, 64 * 1024))
-
-
 def test_training_tells_how_it_was_interrupted_and_what_could_not_be_written(kitchen, tmp_path):
     with manager(tmp_path / "data") as (_, address, _), worker(tmp_path / "cache", address):
         common = ("train", f"--dataset={kitchen}", f"--manager={address}", "--threads=1")
@@ -205,7 +199,9 @@ def test_training_tells_how_it_was_interrupted_and_what_could_not_be_written(kit
             )
         newest = max((tmp_path / "late" / "checkpoints").iterdir())
         assert newest.name.startswith("step-")
-        full = run_anew(*common, f"--out={tmp_path / 'full'}", "--imitate-seconds=0.5", before=_small_files)
+        full = run_anew(
+            *common, f"--out={tmp_path / 'full'}", "--imitate-seconds=0.5", largest_file=64 * 1024
+        )
         assert_told(full, 2, "can't be written", "make room there, or give rights")
         assert not list((tmp_path / "full").glob("reference*"))
 

@@ -1,7 +1,6 @@
 """What a person gets wrong: one sentence that names the thing and the remedy, an exit status, and never a traceback."""
 
 import json
-import resource
 import shutil
 
 import pytest
@@ -241,13 +240,8 @@ def test_folder_that_can_not_be_written_is_named(kitchen, tmp_path, arguments, w
     assert_told(run(*filled), 2, str(out), words)
 
 
-def _small_files():
-    """A disk that takes files of 4 kB at most: writes beyond fail in the middle, as on a full one."""
-    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
-
-
 def test_full_disk_leaves_no_half_scene(tmp_path):
-    told = run_anew("scene", "build", "Rs_int", f"--out={tmp_path}", before=_small_files)
+    told = run_anew("scene", "build", "Rs_int", f"--out={tmp_path}", largest_file=4096)
     assert_told(told, 2, "Rs_int.json can't be written (File too large): make room")
     assert list(tmp_path.iterdir()) == []
 

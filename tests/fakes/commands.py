@@ -65,17 +65,29 @@ def run(*arguments, text="", **changes):
         return Told(status, _words(said.read()))
 
 
-def run_anew(*arguments, text="", before=None, **changes):
-    """The same in a process that starts from nothing. ``before`` runs in it first."""
+# What a process does before it becomes the command. Not a ``preexec_fn``: that runs in a fork of this process, where gRPC's
+# threads are missing, and now and then one crashed.
+_BEFORE = "import os, resource, signal, sys; {}; os.execv(sys.executable, [sys.executable, *sys.argv[1:]])"
+_HEARS_INTERRUPTS = "signal.signal(signal.SIGINT, signal.SIG_DFL)"
+_SMALL_FILES = "resource.setrlimit(resource.RLIMIT_FSIZE, ({0}, {0}))"
+
+
+def _after(before, arguments):
+    _, *rest = embomatrix_command(*map(str, arguments))
+    return [sys.executable, "-S", "-c", _BEFORE.format(before), *rest]
+
+
+def run_anew(*arguments, text="", largest_file=None, **changes):
+    """The same in a process that starts from nothing; no file may grow beyond ``largest_file`` bytes, as on a full disk."""
+    before = "pass" if largest_file is None else _SMALL_FILES.format(largest_file)
     result = subprocess.run(
-        embomatrix_command(*map(str, arguments)),
+        _after(before, arguments),
         input=_bytes(text),
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         env=environment(**changes),
         timeout=LIMIT_S,
         check=False,
-        preexec_fn=before,
     )
     return Told(result.returncode, _words(result.stdout))
 
@@ -116,14 +128,13 @@ class Background:
         self._log = Path(log)
         with self._log.open("wb") as file:
             self.process = subprocess.Popen(
-                embomatrix_command(*map(str, arguments)),
+                # A shell has what it runs in the background ignore Ctrl-C, and that is inherited.
+                _after(_HEARS_INTERRUPTS, arguments),
                 stdin=subprocess.DEVNULL,
                 stdout=file,
                 stderr=subprocess.STDOUT,
                 env=environment(**changes),
                 start_new_session=True,
-                # A shell has what it runs in the background ignore Ctrl-C, and that is inherited.
-                preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
             )
 
     @property
