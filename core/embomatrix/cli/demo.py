@@ -5,26 +5,19 @@ from __future__ import annotations
 import itertools
 import logging
 import os
-import signal
-import subprocess
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import Annotated, Final
 
 import typer
 from rich.console import Console
 from rich.logging import RichHandler
 
-from embomatrix.cli.failure import INTERRUPTED, fail
-from embomatrix.cli.local_cluster import LocalCluster, local_cluster, without_membership
-from embomatrix.cli.supervisor import DIE_WITH_PARENT, embomatrix_command
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
+from embomatrix.cli.failure import fail
+from embomatrix.cli.foreground import cluster_problem, no_problem, run_command
+from embomatrix.cli.local_cluster import LocalCluster, local_cluster
 
 DEFAULT_OUT: Final = Path("runs/demo")
-STOP_S: Final = 60.0
-"""An interrupted command may take this long to write what it keeps."""
 console = Console()
 
 
@@ -53,7 +46,9 @@ def demo(
     if not (dataset / "tasks.jsonl").exists():
         console.rule("tasks")
         # A run to look at: what the arm of physical mode could not do after all is not looked for.
-        _run(_no_problem, "factory", "build", f"--out={dataset}", f"--seed={seed}", "--no-look-ahead")
+        run_command(
+            "demo", no_problem, "factory", "build", f"--out={dataset}", f"--seed={seed}", "--no-look-ahead"
+        )
     built_s = time.monotonic()
     cluster = local_cluster(folder / "cluster", workers=workers, slots=slots)
     with cluster.supervisor:
@@ -62,8 +57,9 @@ def demo(
             f"manager at {cluster.address}, {workers} workers of {slots} slot, dashboard at {cluster.dashboard}",
             highlight=False,
         )
-        _run(
-            lambda: _problem(cluster),
+        run_command(
+            "demo",
+            lambda: cluster_problem(cluster),
             "train",
             f"--dataset={dataset}",
             f"--manager={cluster.address}",
@@ -108,56 +104,3 @@ def _folder(wanted: Path | None) -> Path:
 
 def _holds_run(folder: Path) -> bool:
     return any((folder / "checkpoints").glob("step-*"))
-
-
-def _problem(cluster: LocalCluster) -> str:
-    """Why training can't go on: the manager is gone for good, or the last worker is."""
-    failed = cluster.supervisor.failed()
-    if "manager" not in failed and not set(cluster.workers) <= set(failed):
-        return ""
-    name = "manager" if "manager" in failed else failed[0]
-    log = cluster.supervisor.log_path(name)
-    return f"the cluster can't work, {name} ended with: {cluster.supervisor.last_words(name)} (log: {log})"
-
-
-def _no_problem() -> str:
-    return ""
-
-
-def _run(problem: Callable[[], str], *arguments: str) -> None:
-    """Run one `embomatrix` command in the foreground; its failure is ours, with its own message and status.
-
-    It is stopped when there is a ``problem``. An interrupt is handed on to it once, whoever it was sent to, so that it can
-    write what it keeps.
-    """
-    with subprocess.Popen(
-        embomatrix_command(*arguments),
-        start_new_session=True,
-        preexec_fn=DIE_WITH_PARENT,
-        env=without_membership(os.environ),
-    ) as child:
-        try:
-            while (status := _status_of(child)) is None:
-                if sentence := problem():
-                    child.send_signal(signal.SIGTERM)
-                    fail("demo", sentence)
-        except KeyboardInterrupt:
-            child.send_signal(signal.SIGINT)
-            _end(child)
-            raise SystemExit(INTERRUPTED) from None
-    if status:
-        raise SystemExit(status)
-
-
-def _status_of(child: subprocess.Popen[bytes]) -> int | None:
-    try:
-        return child.wait(timeout=0.5)
-    except subprocess.TimeoutExpired:
-        return None
-
-
-def _end(child: subprocess.Popen[bytes]) -> None:
-    try:
-        child.wait(timeout=STOP_S)
-    except (subprocess.TimeoutExpired, KeyboardInterrupt):
-        child.kill()

@@ -47,6 +47,7 @@ COMMANDS: Final[Mapping[str, Command]] = {
     "imitate": Command("warm a policy up on the oracle's plans, without a cluster", "trainer"),
     "train": Command("train a policy with imitation and GRPO on a cluster", "trainer"),
     "eval": Command("measure a model, an endpoint or a baseline on a benchmark", "trainer"),
+    "experiment": Command("repeat the paper's experiments: learning curves, tables, times", "all"),
     "eai": Command("install the judge of the EAI benchmark, and judge answers with it", "trainer"),
     "model": Command("bring a packaged language model into a folder to train", "hf"),
     "bench": Command("measure rollouts and the cluster on this machine", "worker"),

@@ -12,6 +12,7 @@ from embomatrix.trainer.augment import Variation
 from embomatrix.trainer.checkpoint import CHECKPOINTS, CheckpointStore, read_state
 from embomatrix.trainer.errors import TrainerError
 from embomatrix.trainer.loop import REFERENCE, Parts, TrainingRun
+from embomatrix.trainer.outcome import read_outcome
 from embomatrix.trainer.policy.choice import new_policy, saved_policy
 from embomatrix.trainer.progress import LineDisplay, LiveDisplay
 from embomatrix.trainer.recorder import read_metrics
@@ -100,6 +101,9 @@ def test_a_run_leaves_report_metrics_samples_and_the_newest_checkpoints(tmp_path
     assert summary.checkpoint.name == "step-000006"
     assert sum(seconds for _, seconds, _ in time_rows(summary)) == pytest.approx(summary.wall_s)
     assert success_rows(summary)[0][0] == "all tasks"
+    told = read_outcome(tmp_path)
+    assert (told.steps, told.rollouts, len(told.before), len(told.after)) == (6, 96, 4, 4)
+    assert 0 <= told.wait_share <= told.overhead < 1
 
 
 def test_the_window_of_every_step_is_announced_with_the_steps_ahead(tmp_path):

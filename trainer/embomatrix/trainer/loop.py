@@ -16,8 +16,9 @@ import torch
 from embomatrix.trainer.checkpoint import CHECKPOINTS, CheckpointStore, Progress, restore, whole_folder
 from embomatrix.trainer.data import Curriculum, Schedule
 from embomatrix.trainer.evaluate import Evaluation, evaluate_policy
+from embomatrix.trainer.outcome import write_outcome
 from embomatrix.trainer.recorder import METRICS, SAMPLES, Recorder, read_metrics
-from embomatrix.trainer.report import REPORT, Summary, write_report
+from embomatrix.trainer.report import REPORT, Summary, outcome_of, write_report
 from embomatrix.trainer.stopwatch import Activity, Stopwatch
 from embomatrix.trainer.update import StepPlan, Updater
 from embomatrix.trainer.warm_up import warm_up
@@ -101,6 +102,7 @@ class TrainingRun:
         after = self._evaluate("after GRPO")
         summary = self._summary(checkpoint, after, earlier_s + time.monotonic() - began_s)
         write_report(summary, read_metrics(self._out), machine())
+        write_outcome(self._out, outcome_of(summary))
         return summary
 
     def _put_back(self, updater: Updater, tensors: Mapping[str, Any]) -> None:
@@ -245,6 +247,7 @@ class TrainingRun:
             lost=progress.lost,
             imitation_steps=progress.imitation.step,
             wall_s=wall_s,
+            grpo_s=progress.grpo_s,
             spent_s=dict(self._stopwatch.spent_s),
             before=Evaluation.from_json(progress.before) if progress.before else None,
             after=after,

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from embomatrix.trainer.evaluate import improvement
+from embomatrix.trainer.outcome import RunOutcome, TaskRate
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -36,6 +37,7 @@ class Summary:
     lost: int
     imitation_steps: int
     wall_s: float
+    grpo_s: float
     spent_s: Mapping[str, float]
     before: Evaluation | None
     after: Evaluation | None
@@ -68,6 +70,29 @@ def success_rows(summary: Summary) -> list[tuple[str, str, str, str]]:
             )
         )
     return rows
+
+
+def outcome_of(summary: Summary) -> RunOutcome:
+    """The summary's numbers, for programs."""
+    return RunOutcome(
+        model=summary.model,
+        imitation_steps=summary.imitation_steps,
+        steps=summary.steps,
+        rollouts=summary.rollouts,
+        lost=summary.lost,
+        wall_s=summary.wall_s,
+        grpo_s=summary.grpo_s,
+        spent_s=dict(summary.spent_s),
+        before=_rates(summary.before),
+        after=_rates(summary.after),
+    )
+
+
+def _rates(evaluation: Evaluation | None) -> tuple[TaskRate, ...]:
+    scores = evaluation.scores if evaluation is not None else ()
+    return tuple(
+        TaskRate(score.task_id, score.category, score.rate if score.samples else None) for score in scores
+    )
 
 
 def _only(evaluation: Evaluation, category: str) -> Evaluation:

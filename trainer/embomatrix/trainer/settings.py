@@ -220,6 +220,11 @@ def read_settings(
 def with_changes(values: dict[str, Any], changes: Mapping[str, Any]) -> TrainSettings:
     """Settings of nested ``values`` with ``changes`` on top. Raises TrainerError that names the field."""
     _set_all(values, changes)
+    return checked_settings(values)
+
+
+def checked_settings(values: Mapping[str, Any]) -> TrainSettings:
+    """Settings of nested ``values``. Raises TrainerError that names the field."""
     try:
         return TrainSettings.model_validate(values)
     except ValidationError as error:
