@@ -1,13 +1,16 @@
 """The status page in a real browser, before a real manager with a real worker: what the cluster does is what the page shows."""
 
+import asyncio
 import contextlib
 import re
 
 import pytest
 from tests.fakes.browser import shown
 from tests.fakes.commands import background
+from tests.integration.test_manager_service import manager
 
 from embomatrix.rpc.client import ClusterClient
+from embomatrix.rpc.training import RewardTiers, SampledPlan, SampledStep, TrainingReport
 from embomatrix.rpc.values import Batch, Completed, LookaheadEntry, Rollout
 from embomatrix.skills.parse import plan_from_json
 from embomatrix.world.dataset import Dataset
@@ -68,6 +71,38 @@ async def test_page_shows_workers_slots_warm_scenes_and_throughput(browser, kitc
     assert ahead.classes.count("cell warm") == 1
     assert timeline.classes.count("gantt") == 1
     assert failures.words["failures"].startswith("None.")
+
+
+async def test_page_of_training_shows_curves_and_plans_and_runs_no_script_of_a_model(browser, tmp_path):
+    steps = (SampledStep("pick_up", True, "holds the vase"), SampledStep("place", False, "it is closed"))
+    solved = SampledPlan("t1", "Tidy <b>up</b>", "move 3", RewardTiers(0.5, 0.4, 30.0, True), 1.5, "", steps)
+    script = "<script>document.title = 'taken'</script>"
+    lost = SampledPlan("t1", "Tidy <b>up</b>", script, None, 0.0, "worker_lost: it went silent")
+    async with manager(tmp_path / "data") as at, ClusterClient(at.address) as client:
+        run_id = await client.open_run("evening run")
+        for step in (1, 2, 3):
+            figures = {"reward": 10.0 * step, "reward_goal": 9.0 * step, "success": 0.25, "entropy": 0.5}
+            figures |= {"success_by_category/compound": 0.5, "spent_s/update": 30.0, "spent_s/sampling": 10.0}
+            await client.report_training(run_id, TrainingReport("grpo", step, figures, (solved, lost)))
+        before = TrainingReport("success before GRPO", 0, {"all": 0.21})
+        await client.report_training(run_id, before)
+        page = await asyncio.to_thread(shown, browser, f"{at.status_url}#training", tmp_path)
+    assert (page.words["step"], page.words["reward"], page.words["solved"]) == ("3", "20.00", "25 %")
+    assert page.words["success"] == "step – all – compound –"
+    assert page.words["spent"].startswith("activity share time update 75 % 30 s sampling 25 % 10 s")
+    assert page.words["heldout"] == "tasks before GRPO after GRPO all tasks 21 % –"
+    assert page.words["which"] == "that differ most in step 3: Tidy <b>up</b>"
+    sampled = page.words["sampled"]
+    assert sampled.startswith("reached the goal · reward 30.90 (form 0.50, relevance 0.40, goal 30.00)")
+    assert "pick_up holds the vase place it is closed" in sampled
+    assert f"lost, not judged · t1 worker_lost: it went silent {script}" in sampled
+
+
+async def test_page_of_training_says_what_to_do_where_nobody_trains(browser, tmp_path):
+    async with manager(tmp_path / "data") as at:
+        page = await asyncio.to_thread(shown, browser, f"{at.status_url}#training", tmp_path)
+    assert page.words["nothing"].startswith("No trainer has reported yet.")
+    assert "sampled" not in page.words
 
 
 def test_page_of_a_cluster_with_a_token_asks_for_it_and_shows_nothing(browser, tmp_path):

@@ -33,6 +33,7 @@ from embomatrix.world.task import Task, TaskCategory
 
 if TYPE_CHECKING:
     from embomatrix.reward.breakdown import RewardBreakdown
+    from embomatrix.rpc.training import TrainingReport
 
 CONTAINERS = ("fridge", "microwave", "oven", "cabinet", "dishwasher", "drawer", "wardrobe", "washer")
 SURFACES = ("countertop", "table", "desk", "shelf", "sofa", "bed", "stool", "bench")
@@ -286,6 +287,7 @@ class SymbolicCluster:
     batches: list[str] = field(default_factory=list)
     sent: set[str] = field(default_factory=set)
     executed: int = 0
+    reports: list[TrainingReport] = field(default_factory=list)
     closed: bool = False
     terms: RunTerms = field(default_factory=RunTerms)
 
@@ -302,6 +304,9 @@ class SymbolicCluster:
     async def announce_lookahead(self, run_id, version, entries):
         self.announced.append((version, [entry.step for entry in entries]))
         return {}
+
+    async def report_training(self, run_id, report):
+        self.reports.append(report)
 
     async def put_bundles(self, bundles):
         self.sent |= set(bundles)

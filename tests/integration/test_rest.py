@@ -9,6 +9,8 @@ from tests.fakes.worker import FakeWorker
 from tests.integration.test_manager_service import batch, manager, open_run, outcomes
 
 from embomatrix.manager.rest import PREFIX
+from embomatrix.rpc.status import NotFoundError
+from embomatrix.rpc.training import RewardTiers, SampledPlan, TrainingReport
 
 pytestmark = pytest.mark.timeout(60)
 
@@ -131,7 +133,7 @@ async def test_the_page_loads_nothing_from_elsewhere_and_no_file_but_its_own(tmp
         ]
     assert "default-src 'none'" in page.headers["content-security-policy"]
     assert "http" not in page.text.replace("http://www.w3.org", "")
-    assert (set(files), len(files)) == ({200}, 11)
+    assert (set(files), len(files)) == ({200}, 13)
     assert set(outside) <= {401, 404}
 
 
@@ -143,3 +145,24 @@ async def test_the_openapi_page_describes_every_answer(tmp_path):
             if "get" in methods and "{" not in path and not path.endswith("stream"):
                 assert (await http.get(path)).status_code == 200
     assert {"SnapshotPage", "WorkerPage", "Timeline", "Changed"} <= set(told["components"]["schemas"])
+
+
+async def test_training_is_shown_as_it_is_reported_and_after_its_run_was_closed(tmp_path):
+    plan = SampledPlan("t1", "tidy <b>up</b>", "move 3", RewardTiers(0.5, 0.2, 15.0, False), 1.0)
+    async with manager(tmp_path) as at, open_run(at.address) as client, http_at(at) as http:
+        for step in (1, 2):
+            figures = {"reward": float(step)}
+            await client.report_training("r1", TrainingReport("grpo", step, figures, (plan,)))
+        with pytest.raises(NotFoundError, match="nobody"):
+            await client.report_training("nobody", TrainingReport("grpo", 1))
+        told = (await http.get(f"{PREFIX}/training/r1")).json()
+        await client.close_run("r1")
+        later = (await http.get(f"{PREFIX}/training/r1")).json()
+        unknown = await http.get(f"{PREFIX}/training/nobody")
+        listed = (await http.get(f"{PREFIX}/training")).json()
+        seen = (await http.get(f"{PREFIX}/snapshot")).json()
+    assert told["phases"] == [{"phase": "grpo", "steps": [1, 2], "figures": {"reward": [1.0, 2.0]}}]
+    assert (told["plans"][0]["instruction"], told["plans_step"]) == ("tidy <b>up</b>", 2)
+    assert later == told
+    assert listed == seen["training"] == [told["run"]]
+    assert (unknown.status_code, "nobody" in unknown.json()["detail"]) == (404, True)

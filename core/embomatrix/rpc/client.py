@@ -32,6 +32,7 @@ from embomatrix.rpc.convert_run import (
     run_stats_from_proto,
     run_terms_to_proto,
 )
+from embomatrix.rpc.convert_training import training_report_to_proto
 from embomatrix.rpc.fleet_client import FleetClient
 from embomatrix.rpc.managers import PATIENCE_S, of_the_leader
 from embomatrix.rpc.status import (
@@ -51,6 +52,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, AsyncIterator, Iterable, Mapping, Sequence
 
     from embomatrix.rpc.status import ClusterError
+    from embomatrix.rpc.training import TrainingReport
     from embomatrix.rpc.values import (
         Batch,
         GroupDone,
@@ -242,6 +244,13 @@ class ClusterClient(FleetClient):
         request = rollout_service_pb2.CancelBatchRequest(run_id=run_id, batch_id=batch_id)
         with cluster_errors(self._address):
             await self._rollouts.CancelBatch(request, timeout=self._limits.call_s)
+
+    @of_the_leader
+    async def report_training(self, run_id: str, report: TrainingReport) -> None:
+        """Tell people who watch how training goes. PreconditionError where the manager is too old to listen."""
+        request = training_report_to_proto(run_id, report)
+        with cluster_errors(self._address):
+            await self._rollouts.ReportTraining(request, timeout=self._limits.call_s)
 
     @of_the_leader
     async def close_run(self, run_id: str) -> RunStats:

@@ -13,7 +13,8 @@ from typing import Final
 from embomatrix.rpc.status import PreconditionError
 
 PROTOCOL_VERSION: Final = 2
-"""1: sessions, leases, batches. 2: credentials, leaving, progress of leases, coefficients of a run, policies of groups."""
+"""1: sessions, leases, batches. 2: credentials, leaving, progress of leases, coefficients of a run, policies of groups,
+reports of training."""
 PROTOCOL_OLDEST: Final = 1
 SCORES_SINCE: Final = 2
 """Workers of an older version score with the paper's coefficients, whatever a lease asks for."""

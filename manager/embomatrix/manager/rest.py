@@ -26,6 +26,7 @@ from embomatrix.manager.rest_values import (
     worker_page,
 )
 from embomatrix.manager.slot_tracks import timeline
+from embomatrix.manager.training import TrainingDetail, TrainingView
 from embomatrix.manager.views import LookaheadStep, Overview
 from embomatrix.rpc.status import ClusterError, NotFoundError, PreconditionError, UnavailableError
 
@@ -75,7 +76,14 @@ def reading(runtime: ManagerRuntime, snapshots: Snapshots) -> APIRouter:
         workers = worker_page(seen, state=state, search=search, offset=offset, limit=limit)
         return _json(
             SnapshotPage(
-                seen.at_s, seen.health, seen.paused, seen.overview, workers, seen.runs, seen.lookahead
+                seen.at_s,
+                seen.health,
+                seen.paused,
+                seen.overview,
+                workers,
+                seen.runs,
+                seen.lookahead,
+                seen.training,
             )
         )
 
@@ -93,6 +101,7 @@ def reading(runtime: ManagerRuntime, snapshots: Snapshots) -> APIRouter:
 
     _figures(router, snapshots)
     _logs(router, runtime)
+    _training(router, runtime, snapshots)
     _stream(router, runtime)
     return router
 
@@ -174,6 +183,19 @@ def _logs(router: APIRouter, runtime: ManagerRuntime) -> None:
         with _answered():
             page = await history.events(run, after, 0)
         return JSONResponse({"events": [_event(event) for event in page.events], "dropped": page.dropped})
+
+
+def _training(router: APIRouter, runtime: ManagerRuntime, snapshots: Snapshots) -> None:
+    @router.get("/training", response_model=list[TrainingView])
+    async def reporting() -> Response:
+        """Runs whose trainers report, the one that did last first; also some that were closed."""
+        return JSONResponse([dataclasses.asdict(view) for view in snapshots.now().training])
+
+    @router.get("/training/{run_id}", response_model=TrainingDetail)
+    async def detail(run_id: str) -> Response:
+        """Learning curves of a run, and plans that its policy wrote of late."""
+        with _answered():
+            return _json(runtime.training.detail(run_id))
 
 
 def _stream(router: APIRouter, runtime: ManagerRuntime) -> None:

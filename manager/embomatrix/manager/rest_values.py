@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.health import Health
+from embomatrix.manager.training import TrainingView
 from embomatrix.manager.views import LookaheadStep, Overview, RunView, WorkerView
 
 if TYPE_CHECKING:
@@ -52,6 +53,7 @@ class SnapshotPage:
     workers: WorkerPage
     runs: list[RunView]
     lookahead: list[LookaheadStep]
+    training: list[TrainingView]
 
 
 @dataclass(frozen=True, slots=True)

@@ -227,6 +227,11 @@ class Runs:
                 with contextlib.suppress(UnavailableError):
                     await self.close_run(run_id)
 
+    def hear_of(self, run_id: str) -> RunRow:
+        """The open run, which its trainer has not forgotten. NotFoundError where there is none."""
+        self._check_run(run_id)
+        return self._runs[run_id]
+
     def _check_run(self, run_id: str) -> None:
         if run_id not in self._runs:
             raise NotFoundError(f"run {run_id!r} is not open: open it with OpenRun")

@@ -35,6 +35,7 @@ from embomatrix.manager.meter import Meter
 from embomatrix.manager.results import ResultLogs
 from embomatrix.manager.runs import RunLimits, Runs
 from embomatrix.manager.store.timed import timed_store
+from embomatrix.manager.training import TrainingBook
 from embomatrix.manager.views import UNAUDITED
 from embomatrix.rpc.status import SupersededError, UnavailableError
 from embomatrix.rpc.versions import PROTOCOL_VERSION
@@ -88,6 +89,7 @@ class ManagerRuntime:
         self.bundles = bundles
         bundles.keep(cluster.needed_scenes)
         self.meter = Meter()
+        self.training = TrainingBook()
         self.effort = Effort()
         store = timed_store(store, self.effort.operated)
         self.started_s = time.monotonic()

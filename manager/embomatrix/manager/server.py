@@ -56,7 +56,8 @@ async def build_server(
         WorkerServicer(runtime, gate, lease_ttl_s=settings.lease_ttl_s), server
     )
     rollout_service_pb2_grpc.add_RolloutServiceServicer_to_server(
-        RolloutServicer(runtime.runs, gate, authority=tls.authority if tls else b""), server
+        RolloutServicer(runtime.runs, runtime.training, gate, authority=tls.authority if tls else b""),
+        server,
     )
     scene_service_pb2_grpc.add_SceneServiceServicer_to_server(SceneServicer(runtime.bundles), server)
     admin_service_pb2_grpc.add_AdminServiceServicer_to_server(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.group_ends import GroupEnds
@@ -16,6 +17,7 @@ from embomatrix.rpc.convert_run import (
     run_stats_to_proto,
     run_terms_from_proto,
 )
+from embomatrix.rpc.convert_training import training_report_from_proto
 from embomatrix.rpc.logs import bind
 from embomatrix.rpc.status import NotFoundError, TrimmedError, translate
 from embomatrix.rpc.versions import PROTOCOL_OLDEST, SPOKEN, VersionRange, agree, software_version
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
     from embomatrix.manager.results import BatchLog
     from embomatrix.manager.runs import Runs
     from embomatrix.manager.store.protocol import ResultRow
+    from embomatrix.manager.training import TrainingBook
     from embomatrix.rpc.values import Batch, Rollout
 
 SLICE: Final = 128
@@ -39,8 +42,9 @@ SLICE: Final = 128
 class RolloutServicer(rollout_service_pb2_grpc.RolloutServiceServicer):
     """``gate`` knows who calls; ``authority`` is the certificate (PEM) of who signed the manager's, empty without TLS."""
 
-    def __init__(self, runs: Runs, gate: Gate, *, authority: bytes = b"") -> None:
+    def __init__(self, runs: Runs, training: TrainingBook, gate: Gate, *, authority: bytes = b"") -> None:
         self._runs = runs
+        self._training = training
         self._gate = gate
         self._authority = authority.decode("ascii")
 
@@ -105,6 +109,16 @@ class RolloutServicer(rollout_service_pb2_grpc.RolloutServiceServicer):
             bind("batch", request.batch_id)
             self._runs.cancel(request.run_id, request.batch_id)
         return pb.CancelBatchResponse()
+
+    async def ReportTraining(
+        self, request: pb.ReportTrainingRequest, context: grpc.aio.ServicerContext
+    ) -> pb.ReportTrainingResponse:
+        async with translate(context):
+            bind("run", request.run_id)
+            report = training_report_from_proto(request)
+            name = self._runs.hear_of(request.run_id).name
+            self._training.note(request.run_id, name, report, at_s=time.time())
+        return pb.ReportTrainingResponse()
 
     async def CloseRun(
         self, request: pb.CloseRunRequest, context: grpc.aio.ServicerContext

@@ -12,6 +12,7 @@ from embomatrix.manager.health import health
 if TYPE_CHECKING:
     from embomatrix.manager.health import Health
     from embomatrix.manager.runtime import ManagerRuntime
+    from embomatrix.manager.training import TrainingView
     from embomatrix.manager.views import LookaheadStep, Overview, RunView, WorkerView
 
 FRESH_S: Final = 0.9
@@ -29,6 +30,7 @@ class Snapshot:
     workers: list[WorkerView]
     runs: list[RunView]
     lookahead: list[LookaheadStep]
+    training: list[TrainingView]
 
 
 class Snapshots:
@@ -61,4 +63,5 @@ class Snapshots:
             workers=views.workers(runtime),
             runs=views.runs(runtime),
             lookahead=views.lookahead(runtime),
+            training=runtime.training.views(),
         )

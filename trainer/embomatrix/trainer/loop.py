@@ -19,6 +19,7 @@ from embomatrix.trainer.evaluate import Evaluation, evaluate_policy
 from embomatrix.trainer.outcome import write_outcome
 from embomatrix.trainer.recorder import METRICS, SAMPLES, Recorder, read_metrics
 from embomatrix.trainer.report import REPORT, Summary, outcome_of, write_report
+from embomatrix.trainer.reporting import Reporter
 from embomatrix.trainer.stopwatch import Activity, Stopwatch
 from embomatrix.trainer.update import StepPlan, Updater
 from embomatrix.trainer.warm_up import warm_up
@@ -73,7 +74,8 @@ class TrainingRun:
         self._stopwatch = Stopwatch()
         self._stopwatch.spent_s.update(self._progress.spent_s)
         self._store = CheckpointStore(out / CHECKPOINTS, keep=settings.keep_checkpoints)
-        self._recorder = Recorder(out, trackers)
+        self._reporter = Reporter(parts.gateway.report)
+        self._recorder = Recorder(out, (*trackers, self._reporter))
         device = next(iter(parts.policy.parameters())).device
         self._generator = torch.Generator(device).manual_seed(settings.seed)
 
@@ -216,6 +218,7 @@ class TrainingRun:
         self._progress.rollouts += record.rollouts
         self._progress.lost += record.lost
         self._recorder.step(record, seconds)
+        self._reporter.sampled(record.step, logs, self._stopwatch.spent_s)
         if record.step % self._settings.samples_every == 1 or self._settings.samples_every == 1:
             self._recorder.samples(record.step, logs[0])
         logger.info(

@@ -10,12 +10,13 @@ import asyncio
 import logging
 import math
 import threading
+from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Protocol, Self, TypeVar
 
 from embomatrix.reward.hierarchy import unparsable
 from embomatrix.rpc.logs import bind
-from embomatrix.rpc.status import ClusterError
+from embomatrix.rpc.status import ClusterError, DeadlineError, PreconditionError, UnavailableError
 from embomatrix.rpc.values import Batch, Completed, LookaheadEntry, Rollout, RunStats, RunTerms
 from embomatrix.skills.parse import PlanError, parse_plan
 from embomatrix.skills.prompt import Codec, with_indices
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 
     from embomatrix.reward.breakdown import RewardBreakdown
     from embomatrix.reward.settings import RewardSettings
+    from embomatrix.rpc.training import TrainingReport
     from embomatrix.rpc.values import Outcome, RolloutResult, Warmth
     from embomatrix.skills.prompt import Situation
     from embomatrix.skills.syntax import Plan
@@ -38,6 +40,8 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 T = TypeVar("T")
 DEFAULT_TERMS: Final = RunTerms()
+REPORTS_KEPT: Final = 64
+"""That wait for a manager which is away: those of the last steps."""
 
 
 class Cluster(Protocol):
@@ -52,6 +56,8 @@ class Cluster(Protocol):
     async def put_bundles(self, bundles: Mapping[str, bytes]) -> tuple[str, ...]: ...
 
     def execute(self, batch: Batch) -> AsyncIterator[RolloutResult]: ...
+
+    async def report_training(self, run_id: str, report: TrainingReport) -> None: ...
 
     async def close_run(self, run_id: str) -> RunStats: ...
 
@@ -112,6 +118,8 @@ class Gateway:
         self._terms = terms
         self._announced = 0
         self._sent: dict[str, asyncio.Task[None]] = {}
+        self._reports: deque[TrainingReport] = deque(maxlen=REPORTS_KEPT)
+        self._reporting = asyncio.Lock()
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="gateway", daemon=True)
         self._stats: RunStats | None = None
@@ -159,6 +167,7 @@ class Gateway:
         for task in pending:
             task.cancel()
         await asyncio.gather(*pending, return_exceptions=True)
+        await self._send_reports()
         return await self._cluster.close_run(self.run_id)
 
     def _stop_thread(self) -> None:
@@ -195,6 +204,28 @@ class Gateway:
 
     async def _send_bundle(self, digest: str) -> None:
         await self._cluster.put_bundles({digest: self._bundle_bytes(digest)})
+
+    def report(self, report: TrainingReport) -> None:
+        """Tell people who watch how training goes. Waits for nobody: what can't be told is dropped, and logged."""
+        self._reports.append(report)
+        asyncio.run_coroutine_threadsafe(self._send_reports(), self._loop)
+
+    async def _send_reports(self) -> None:
+        async with self._reporting:
+            while self._reports:
+                report = self._reports[0]
+                try:
+                    await self._cluster.report_training(self.run_id, report)
+                except (UnavailableError, DeadlineError):
+                    return  # the next report tries again, with those that wait
+                except PreconditionError as error:
+                    logger.warning("the dashboard does not show this training: %s", error)
+                    self._reports = deque(maxlen=0)
+                except ClusterError as error:
+                    logger.warning("a report of training was not taken: %s", error)
+                # A newer one may have pushed it out meanwhile.
+                if self._reports and self._reports[0] is report:
+                    self._reports.popleft()
 
     def submit(
         self,

@@ -31,6 +31,7 @@ _TABLE: Final[Mapping[str, Mapping[str, frozenset[Role]]]] = {
         "Execute": _TRAINER,
         "WaitExecution": _TRAINER,
         "CancelBatch": _TRAINER,
+        "ReportTraining": _TRAINER,
         "CloseRun": _TRAINER,
     },
     f"{_PACKAGE}.SceneService": {

@@ -5,9 +5,10 @@ import * as failures from "./failures.js";
 import * as lookahead from "./lookahead.js";
 import * as overview from "./overview.js";
 import * as timeline from "./timeline.js";
+import * as training from "./training.js";
 import * as workers from "./workers.js";
 
-const PAGES = {overview, workers, lookahead, timeline, failures};
+const PAGES = {overview, workers, lookahead, timeline, failures, training};
 const REFRESH_MS = 1000;
 let page = null;
 let waiting = 0;

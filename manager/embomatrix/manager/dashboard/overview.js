@@ -1,35 +1,26 @@
 // How the cluster does: throughput, latency, hits, failures, runs.
-import {at, colour, count, h, none, put, seconds, share, table} from "./dom.js";
+import {chart} from "./charts.js";
+import {at, count, h, none, put, seconds, share, table} from "./dom.js";
 
 const TILES = [
   ["rate", "Throughput", "rollouts/s, mean of 10 s"], ["p50", "Latency p50", "submitted to result"], ["p95", "Latency p95", "latest 2,048 rollouts"],
   ["hits", "Prewarm hits", ""], ["slots", "Slots busy", ""], ["bad", "Failures", ""],
 ];
-let chart = null;
-let watcher = null;
+let drawn = null;
 
 export function open(main) {
   main.replaceChildren(
     ...TILES.map(([id, title, note]) => h("section", {class: "tile"}, h("h2", {}, title), h("b", {id}, "–"), h("span", {id: `${id}note`}, note))),
-    h("section", {class: "most"}, h("h2", {}, "Completed rollouts per second ", h("small", {id: "peak"})), h("div", {class: "chart", id: "chart", role: "img", "aria-label": "rollouts per second over two minutes"})),
+    h("section", {class: "most"}, h("h2", {}, "Completed rollouts per second ", h("small", {id: "peak"})), h("div", {id: "chart", role: "img", "aria-label": "rollouts per second over two minutes"})),
     h("section", {class: "third"}, h("h2", {}, "Runs"), h("div", {id: "runs"})),
     h("section", {}, h("h2", {}, "Outcomes ", h("small", {}, "of all rollouts since the manager started")), h("div", {id: "outcomes"})),
   );
-  const place = at("chart");
-  const axis = {stroke: () => colour("faint"), grid: {stroke: () => colour("line"), width: 1}, ticks: {show: false}, font: "11px system-ui"};
-  chart = new uPlot({
-    width: place.clientWidth, height: 190, legend: {show: false}, cursor: {y: false}, scales: {x: {time: false}, y: {range: (_, low, high) => [0, Math.max(1, high) * 1.08]}},
-    axes: [{...axis, values: (_, ticks) => ticks.map(tick => tick === 0 ? "now" : `${tick} s`)}, {...axis, size: 52}],
-    series: [{}, {stroke: () => colour("warm"), fill: () => `${colour("warm")}22`, width: 1.6, points: {show: false}}],
-  }, [[], []], place);
-  watcher = new ResizeObserver(() => chart?.setSize({width: place.clientWidth, height: 190}));
-  watcher.observe(place);
+  drawn = chart(at("chart"), ["rollouts/s"], {fill: true, legend: false, words: tick => tick === 0 ? "now" : `${tick} s`});
 }
 
 export function close() {
-  watcher?.disconnect();
-  chart?.destroy();
-  chart = null;
+  drawn?.close();
+  drawn = null;
 }
 
 export function show({overview: o, runs}) {
@@ -44,7 +35,7 @@ export function show({overview: o, runs}) {
   };
   for (const [id, text] of Object.entries(told)) at(id).textContent = text;
   at("bad").className = failed ? "bad" : "";
-  chart.setData([o.throughput.map((_, i) => i - o.throughput.length + 1), o.throughput]);
+  drawn.draw(o.throughput.map((_, i) => i - o.throughput.length + 1), [o.throughput]);
   put(at("runs"), runs.length ? table(["run", ["done", "n"], ["open", "n"], ["warm", "n"], ["failed", "n"]], runs.slice(-8).reverse().map(run), "open runs") : none("No open runs."));
   const rows = Object.entries(o.outcomes).sort((a, b) => b[1] - a[1]).map(([name, n]) => h("tr", {}, h("td", {}, h("code", {}, name)), h("td", {class: "n"}, count(n))));
   put(at("outcomes"), rows.length ? table(["outcome", ["rollouts", "n"]], rows, "outcomes") : none("Nothing has been executed yet."));

@@ -387,6 +387,152 @@ class CancelBatchResponse(google.protobuf.message.Message):
 Global___CancelBatchResponse: typing_extensions.TypeAlias = CancelBatchResponse
 
 @typing.final
+class SampledStep(google.protobuf.message.Message):
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    SKILL_FIELD_NUMBER: builtins.int
+    OK_FIELD_NUMBER: builtins.int
+    MESSAGE_FIELD_NUMBER: builtins.int
+    skill: builtins.str
+    ok: builtins.bool
+    message: builtins.str
+    """What happened, in words."""
+    def __init__(
+        self,
+        *,
+        skill: builtins.str = ...,
+        ok: builtins.bool = ...,
+        message: builtins.str = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["message", b"message", "ok", b"ok", "skill", b"skill"]) -> None: ...
+
+Global___SampledStep: typing_extensions.TypeAlias = SampledStep
+
+@typing.final
+class SampledPlan(google.protobuf.message.Message):
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    TASK_ID_FIELD_NUMBER: builtins.int
+    INSTRUCTION_FIELD_NUMBER: builtins.int
+    TEXT_FIELD_NUMBER: builtins.int
+    REWARD_FIELD_NUMBER: builtins.int
+    ADVANTAGE_FIELD_NUMBER: builtins.int
+    PROBLEM_FIELD_NUMBER: builtins.int
+    STEPS_FIELD_NUMBER: builtins.int
+    task_id: builtins.str
+    instruction: builtins.str
+    text: builtins.str
+    """As the policy wrote it, cut to the manager's limit."""
+    advantage: builtins.float
+    problem: builtins.str
+    """Why there was nothing to execute, or nothing came back."""
+    @property
+    def reward(self) -> Global___RewardTiers:
+        """Absent where the infrastructure lost the rollout."""
+
+    @property
+    def steps(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___SampledStep]: ...
+    def __init__(
+        self,
+        *,
+        task_id: builtins.str = ...,
+        instruction: builtins.str = ...,
+        text: builtins.str = ...,
+        reward: Global___RewardTiers | None = ...,
+        advantage: builtins.float = ...,
+        problem: builtins.str = ...,
+        steps: collections.abc.Iterable[Global___SampledStep] | None = ...,
+    ) -> None: ...
+    def HasField(self, field_name: typing.Literal["reward", b"reward"]) -> builtins.bool: ...
+    def ClearField(self, field_name: typing.Literal["advantage", b"advantage", "instruction", b"instruction", "problem", b"problem", "reward", b"reward", "steps", b"steps", "task_id", b"task_id", "text", b"text"]) -> None: ...
+
+Global___SampledPlan: typing_extensions.TypeAlias = SampledPlan
+
+@typing.final
+class RewardTiers(google.protobuf.message.Message):
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    FORMAT_FIELD_NUMBER: builtins.int
+    RELEVANCE_FIELD_NUMBER: builtins.int
+    GOAL_FIELD_NUMBER: builtins.int
+    SUCCESS_FIELD_NUMBER: builtins.int
+    format: builtins.float
+    relevance: builtins.float
+    goal: builtins.float
+    success: builtins.bool
+    def __init__(
+        self,
+        *,
+        format: builtins.float = ...,
+        relevance: builtins.float = ...,
+        goal: builtins.float = ...,
+        success: builtins.bool = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["format", b"format", "goal", b"goal", "relevance", b"relevance", "success", b"success"]) -> None: ...
+
+Global___RewardTiers: typing_extensions.TypeAlias = RewardTiers
+
+@typing.final
+class ReportTrainingRequest(google.protobuf.message.Message):
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    @typing.final
+    class FiguresEntry(google.protobuf.message.Message):
+        DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+        KEY_FIELD_NUMBER: builtins.int
+        VALUE_FIELD_NUMBER: builtins.int
+        key: builtins.str
+        value: builtins.float
+        def __init__(
+            self,
+            *,
+            key: builtins.str = ...,
+            value: builtins.float = ...,
+        ) -> None: ...
+        def ClearField(self, field_name: typing.Literal["key", b"key", "value", b"value"]) -> None: ...
+
+    RUN_ID_FIELD_NUMBER: builtins.int
+    PHASE_FIELD_NUMBER: builtins.int
+    STEP_FIELD_NUMBER: builtins.int
+    FIGURES_FIELD_NUMBER: builtins.int
+    PLANS_FIELD_NUMBER: builtins.int
+    run_id: builtins.str
+    phase: builtins.str
+    """Each phase counts its own steps: `grpo`, `imitation`."""
+    step: builtins.int
+    @property
+    def figures(self) -> google.protobuf.internal.containers.ScalarMap[builtins.str, builtins.float]:
+        """By name; those of a table as `table/name`."""
+
+    @property
+    def plans(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___SampledPlan]:
+        """Some of the step's plans."""
+
+    def __init__(
+        self,
+        *,
+        run_id: builtins.str = ...,
+        phase: builtins.str = ...,
+        step: builtins.int = ...,
+        figures: collections.abc.Mapping[builtins.str, builtins.float] | None = ...,
+        plans: collections.abc.Iterable[Global___SampledPlan] | None = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["figures", b"figures", "phase", b"phase", "plans", b"plans", "run_id", b"run_id", "step", b"step"]) -> None: ...
+
+Global___ReportTrainingRequest: typing_extensions.TypeAlias = ReportTrainingRequest
+
+@typing.final
+class ReportTrainingResponse(google.protobuf.message.Message):
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    def __init__(
+        self,
+    ) -> None: ...
+
+Global___ReportTrainingResponse: typing_extensions.TypeAlias = ReportTrainingResponse
+
+@typing.final
 class CloseRunRequest(google.protobuf.message.Message):
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 

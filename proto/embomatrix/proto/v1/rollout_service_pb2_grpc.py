@@ -65,6 +65,11 @@ class RolloutServiceStub(object):
                 request_serializer=embomatrix_dot_proto_dot_v1_dot_rollout__service__pb2.CancelBatchRequest.SerializeToString,
                 response_deserializer=embomatrix_dot_proto_dot_v1_dot_rollout__service__pb2.CancelBatchResponse.FromString,
                 _registered_method=True)
+        self.ReportTraining = channel.unary_unary(
+                '/embomatrix.proto.v1.RolloutService/ReportTraining',
+                request_serializer=embomatrix_dot_proto_dot_v1_dot_rollout__service__pb2.ReportTrainingRequest.SerializeToString,
+                response_deserializer=embomatrix_dot_proto_dot_v1_dot_rollout__service__pb2.ReportTrainingResponse.FromString,
+                _registered_method=True)
         self.CloseRun = channel.unary_unary(
                 '/embomatrix.proto.v1.RolloutService/CloseRun',
                 request_serializer=embomatrix_dot_proto_dot_v1_dot_rollout__service__pb2.CloseRunRequest.SerializeToString,
@@ -116,6 +121,13 @@ class RolloutServiceServicer(object):
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def ReportTraining(self, request, context):
+        """How training goes, for people who watch: nothing is decided by it. The same phase and step again adds to what is known.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
     def CloseRun(self, request, context):
         """Missing associated documentation comment in .proto file."""
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
@@ -154,6 +166,11 @@ def add_RolloutServiceServicer_to_server(servicer, server):
                     servicer.CancelBatch,
                     request_deserializer=embomatrix_dot_proto_dot_v1_dot_rollout__service__pb2.CancelBatchRequest.FromString,
                     response_serializer=embomatrix_dot_proto_dot_v1_dot_rollout__service__pb2.CancelBatchResponse.SerializeToString,
+            ),
+            'ReportTraining': grpc.unary_unary_rpc_method_handler(
+                    servicer.ReportTraining,
+                    request_deserializer=embomatrix_dot_proto_dot_v1_dot_rollout__service__pb2.ReportTrainingRequest.FromString,
+                    response_serializer=embomatrix_dot_proto_dot_v1_dot_rollout__service__pb2.ReportTrainingResponse.SerializeToString,
             ),
             'CloseRun': grpc.unary_unary_rpc_method_handler(
                     servicer.CloseRun,
@@ -324,6 +341,33 @@ class RolloutService(object):
             '/embomatrix.proto.v1.RolloutService/CancelBatch',
             embomatrix_dot_proto_dot_v1_dot_rollout__service__pb2.CancelBatchRequest.SerializeToString,
             embomatrix_dot_proto_dot_v1_dot_rollout__service__pb2.CancelBatchResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def ReportTraining(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/embomatrix.proto.v1.RolloutService/ReportTraining',
+            embomatrix_dot_proto_dot_v1_dot_rollout__service__pb2.ReportTrainingRequest.SerializeToString,
+            embomatrix_dot_proto_dot_v1_dot_rollout__service__pb2.ReportTrainingResponse.FromString,
             options,
             channel_credentials,
             insecure,

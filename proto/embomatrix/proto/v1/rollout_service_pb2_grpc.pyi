@@ -121,6 +121,22 @@ _RolloutServiceCancelBatchType = typing_extensions.TypeVar(
     ],
 )
 
+_RolloutServiceReportTrainingType = typing_extensions.TypeVar(
+    '_RolloutServiceReportTrainingType',
+    grpc.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.rollout_service_pb2.ReportTrainingRequest,
+        embomatrix.proto.v1.rollout_service_pb2.ReportTrainingResponse,
+    ],
+    grpc.aio.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.rollout_service_pb2.ReportTrainingRequest,
+        embomatrix.proto.v1.rollout_service_pb2.ReportTrainingResponse,
+    ],
+    default=grpc.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.rollout_service_pb2.ReportTrainingRequest,
+        embomatrix.proto.v1.rollout_service_pb2.ReportTrainingResponse,
+    ],
+)
+
 _RolloutServiceCloseRunType = typing_extensions.TypeVar(
     '_RolloutServiceCloseRunType',
     grpc.UnaryUnaryMultiCallable[
@@ -137,7 +153,7 @@ _RolloutServiceCloseRunType = typing_extensions.TypeVar(
     ],
 )
 
-class RolloutServiceStub(typing.Generic[_RolloutServiceGetCapabilitiesType, _RolloutServiceOpenRunType, _RolloutServiceAnnounceLookaheadType, _RolloutServiceExecuteType, _RolloutServiceWaitExecutionType, _RolloutServiceCancelBatchType, _RolloutServiceCloseRunType]):
+class RolloutServiceStub(typing.Generic[_RolloutServiceGetCapabilitiesType, _RolloutServiceOpenRunType, _RolloutServiceAnnounceLookaheadType, _RolloutServiceExecuteType, _RolloutServiceWaitExecutionType, _RolloutServiceCancelBatchType, _RolloutServiceReportTrainingType, _RolloutServiceCloseRunType]):
     """Trainer to manager."""
 
     @typing.overload
@@ -165,6 +181,10 @@ class RolloutServiceStub(typing.Generic[_RolloutServiceGetCapabilitiesType, _Rol
         grpc.UnaryUnaryMultiCallable[
             embomatrix.proto.v1.rollout_service_pb2.CancelBatchRequest,
             embomatrix.proto.v1.rollout_service_pb2.CancelBatchResponse,
+        ],
+        grpc.UnaryUnaryMultiCallable[
+            embomatrix.proto.v1.rollout_service_pb2.ReportTrainingRequest,
+            embomatrix.proto.v1.rollout_service_pb2.ReportTrainingResponse,
         ],
         grpc.UnaryUnaryMultiCallable[
             embomatrix.proto.v1.rollout_service_pb2.CloseRunRequest,
@@ -199,6 +219,10 @@ class RolloutServiceStub(typing.Generic[_RolloutServiceGetCapabilitiesType, _Rol
             embomatrix.proto.v1.rollout_service_pb2.CancelBatchResponse,
         ],
         grpc.aio.UnaryUnaryMultiCallable[
+            embomatrix.proto.v1.rollout_service_pb2.ReportTrainingRequest,
+            embomatrix.proto.v1.rollout_service_pb2.ReportTrainingResponse,
+        ],
+        grpc.aio.UnaryUnaryMultiCallable[
             embomatrix.proto.v1.rollout_service_pb2.CloseRunRequest,
             embomatrix.proto.v1.rollout_service_pb2.CloseRunResponse,
         ],
@@ -219,6 +243,9 @@ class RolloutServiceStub(typing.Generic[_RolloutServiceGetCapabilitiesType, _Rol
     """Attaches to a batch after a broken stream: results after the cursor."""
 
     CancelBatch: _RolloutServiceCancelBatchType
+
+    ReportTraining: _RolloutServiceReportTrainingType
+    """How training goes, for people who watch: nothing is decided by it. The same phase and step again adds to what is known."""
 
     CloseRun: _RolloutServiceCloseRunType
 
@@ -246,6 +273,10 @@ RolloutServiceAsyncStub: typing_extensions.TypeAlias = RolloutServiceStub[
     grpc.aio.UnaryUnaryMultiCallable[
         embomatrix.proto.v1.rollout_service_pb2.CancelBatchRequest,
         embomatrix.proto.v1.rollout_service_pb2.CancelBatchResponse,
+    ],
+    grpc.aio.UnaryUnaryMultiCallable[
+        embomatrix.proto.v1.rollout_service_pb2.ReportTrainingRequest,
+        embomatrix.proto.v1.rollout_service_pb2.ReportTrainingResponse,
     ],
     grpc.aio.UnaryUnaryMultiCallable[
         embomatrix.proto.v1.rollout_service_pb2.CloseRunRequest,
@@ -301,6 +332,14 @@ class RolloutServiceServicer(metaclass=abc.ABCMeta):
         request: embomatrix.proto.v1.rollout_service_pb2.CancelBatchRequest,
         context: _ServicerContext,
     ) -> typing.Union[embomatrix.proto.v1.rollout_service_pb2.CancelBatchResponse, collections.abc.Awaitable[embomatrix.proto.v1.rollout_service_pb2.CancelBatchResponse]]: ...
+
+    @abc.abstractmethod
+    def ReportTraining(
+        self,
+        request: embomatrix.proto.v1.rollout_service_pb2.ReportTrainingRequest,
+        context: _ServicerContext,
+    ) -> typing.Union[embomatrix.proto.v1.rollout_service_pb2.ReportTrainingResponse, collections.abc.Awaitable[embomatrix.proto.v1.rollout_service_pb2.ReportTrainingResponse]]:
+        """How training goes, for people who watch: nothing is decided by it. The same phase and step again adds to what is known."""
 
     @abc.abstractmethod
     def CloseRun(

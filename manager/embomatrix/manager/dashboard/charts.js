@@ -1,0 +1,33 @@
+// Lines over steps or seconds, by the one library of charts: colours follow the theme, the width follows the page.
+import {colour, h} from "./dom.js";
+
+const DASHES = [[], [6, 3], [2, 2], [9, 3, 2, 3], [1, 4]];
+const TINTS = ["c1", "c2", "c3", "c4", "c5"];
+
+/** A chart in a place of its own. `lines` are their names; `words` turns a value at the foot into text; `fill` for one line. */
+export function chart(place, lines, {high = 190, words, fill = false, legend = true} = {}) {
+  const axis = {stroke: () => colour("faint"), grid: {stroke: () => colour("line"), width: 1}, ticks: {show: false}, font: "11px system-ui"};
+  const series = lines.map((label, i) => ({
+    label, width: 1.6, dash: DASHES[Math.floor(i / TINTS.length) % DASHES.length], points: {show: false}, spanGaps: true,
+    stroke: () => colour(TINTS[i % TINTS.length]), ...(fill ? {fill: () => `${colour(TINTS[i])}22`} : {}),
+    value: (_, value) => value === null || value === undefined ? "–" : Number(value.toPrecision(3)),
+  }));
+  const range = (_, low, top) => {
+    const least = Math.min(0, low ?? 0), most = Math.max(least + 1e-3, top ?? 1);
+    return [least && least * 1.08, fill ? Math.max(1, most) * 1.08 : most + (most - least) * 0.08];
+  };
+  const box = h("div", {class: "chart"});
+  place.replaceChildren(box);
+  const drawn = new uPlot({
+    width: box.clientWidth, height: high, legend: {show: legend}, cursor: {y: false}, scales: {x: {time: false}, y: {range}},
+    axes: [{...axis, size: 28, ...(words ? {values: (_, ticks) => ticks.map(words)} : {})}, {...axis, size: 52}],
+    series: [{label: "step", value: (_, value) => value ?? "–"}, ...series],
+  }, [[], ...lines.map(() => [])], box);
+  const watcher = new ResizeObserver(() => drawn.setSize({width: box.clientWidth, height: high}));
+  watcher.observe(box);
+  return {
+    lines,
+    draw(at, columns) { drawn.setData([at, ...columns]); },
+    close() { watcher.disconnect(); drawn.destroy(); },
+  };
+}

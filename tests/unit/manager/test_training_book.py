@@ -1,0 +1,83 @@
+"""What the manager keeps of training: curves that fit into memory however long a run is, and the latest runs."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from embomatrix.manager.training import PHASES_KEPT, RUNS_KEPT, STEPS_KEPT, Curves, TrainingBook
+from embomatrix.rpc.status import NotFoundError
+from embomatrix.rpc.training import FIGURES, SampledPlan, TrainingReport
+
+PLAN = SampledPlan("task-1", "tidy up", "move 3", None, 0.0)
+
+
+def curves_of(book, run_id="r1"):
+    return {curves.phase: curves for curves in book.detail(run_id).phases}
+
+
+def test_a_step_that_is_told_twice_has_the_figures_of_both():
+    book = TrainingBook()
+    book.note("r1", "evening", TrainingReport("grpo", 1, {"reward": 1.5}), at_s=1.0)
+    book.note("r1", "evening", TrainingReport("grpo", 2, {"reward": 2.0}), at_s=2.0)
+    book.note("r1", "evening", TrainingReport("grpo", 2, {"spent_s/sampling": 7.0}, (PLAN,)), at_s=3.0)
+    curves = curves_of(book)["grpo"]
+    assert curves.steps == [1, 2]
+    assert curves.figures == {"reward": [1.5, 2.0], "spent_s/sampling": [None, 7.0]}
+    detail = book.detail("r1")
+    assert (detail.plans, detail.plans_step) == ([PLAN], 2)
+    assert (detail.run.name, detail.run.step, detail.run.reported_s, detail.run.revision) == (
+        "evening",
+        2,
+        3.0,
+        3,
+    )
+
+
+def test_a_lower_step_takes_back_what_a_resumed_run_will_do_again():
+    book = TrainingBook()
+    for step in (1, 2, 3, 2):
+        book.note("r1", "", TrainingReport("grpo", step, {"reward": float(step)}), at_s=0.0)
+    assert curves_of(book)["grpo"] == Curves("grpo", [1, 2], {"reward": [1.0, 2.0]})
+
+
+def test_a_long_run_keeps_its_first_and_its_last_step():
+    book = TrainingBook()
+    for step in range(1, 5 * STEPS_KEPT):
+        book.note("r1", "", TrainingReport("grpo", step, {"reward": float(step)}), at_s=0.0)
+    curves = curves_of(book)["grpo"]
+    assert len(curves.steps) <= STEPS_KEPT
+    assert (curves.steps[0] < 32, curves.steps[-1]) == (True, 5 * STEPS_KEPT - 1)
+    assert curves.figures["reward"] == [float(step) for step in curves.steps]
+
+
+def test_the_run_that_was_silent_longest_makes_room():
+    book = TrainingBook()
+    for number in range(RUNS_KEPT):
+        book.note(f"r{number}", "", TrainingReport("grpo", 1, {"reward": 0.0}), at_s=0.0)
+    book.note("r0", "", TrainingReport("grpo", 2, {"reward": 0.0}), at_s=1.0)
+    book.note("new", "", TrainingReport("grpo", 1, {"reward": 0.0}), at_s=2.0)
+    assert [view.run_id for view in book.views()][:2] == ["new", "r0"]
+    assert len(book.views()) == RUNS_KEPT
+    with pytest.raises(NotFoundError, match="r1"):
+        book.detail("r1")
+
+
+reports = st.builds(
+    TrainingReport,
+    phase=st.sampled_from([f"phase-{number}" for number in range(PHASES_KEPT + 2)]),
+    step=st.integers(0, 40),
+    figures=st.dictionaries(st.integers(0, 2 * FIGURES).map(str), st.floats(-1, 1), max_size=8),
+)
+
+
+@given(st.lists(reports, max_size=120))
+def test_columns_are_as_long_as_steps_whatever_is_reported(told):
+    book = TrainingBook()
+    for report in told:
+        book.note("r1", "", report, at_s=0.0)
+    phases = curves_of(book).values() if told else []
+    assert len(phases) <= PHASES_KEPT
+    for curves in phases:
+        assert curves.steps == sorted(set(curves.steps))
+        assert len(curves.figures) <= FIGURES
+        assert {len(column) for column in curves.figures.values()} <= {len(curves.steps)}
