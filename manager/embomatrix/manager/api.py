@@ -11,6 +11,7 @@ from embomatrix.manager.http_rules import Guard
 from embomatrix.manager.page import page
 from embomatrix.manager.prometheus import CONTENT_TYPE, metrics_page
 from embomatrix.manager.rest import PREFIX, changing, reading
+from embomatrix.manager.rewards import rewarding
 from embomatrix.manager.snapshot import Snapshots
 from embomatrix.rpc.versions import software_version
 
@@ -25,7 +26,7 @@ def build_api(runtime: ManagerRuntime, rules: HttpRules, expulsion: Expulsion) -
     app = FastAPI(
         title="EmboMatrix manager",
         version=software_version() or "source",
-        description="What a cluster does, and an operator's verbs. With tokens: `Authorization: Bearer TOKEN`.",
+        description="What a cluster does, an operator's verbs, rewards. With tokens: `Authorization: Bearer TOKEN`.",
         openapi_url=f"{PREFIX}/openapi.json",
         # Those of FastAPI load scripts from elsewhere.
         docs_url=None,
@@ -36,6 +37,7 @@ def build_api(runtime: ManagerRuntime, rules: HttpRules, expulsion: Expulsion) -
     app.include_router(page())
     app.include_router(reading(runtime, snapshots))
     app.include_router(changing(runtime, snapshots, expulsion))
+    app.include_router(rewarding(runtime.runs))
 
     @app.get("/healthz", include_in_schema=False)
     async def health() -> dict[str, str]:

@@ -10,6 +10,7 @@ from starlette.datastructures import Headers
 from starlette.responses import PlainTextResponse
 
 from embomatrix.manager.page import STATIC
+from embomatrix.manager.rewards import REWARDS
 from embomatrix.manager.settings import is_loopback
 from embomatrix.rpc.channel import token_of
 from embomatrix.rpc.roles import Role
@@ -25,6 +26,8 @@ OPEN_PATHS: Final = frozenset({"/", "/healthz"})
 """The empty page, which asks for the token itself, and the health check; the page's own files lie below ``STATIC``."""
 READING: Final = frozenset({"GET", "HEAD", "OPTIONS"})
 VIEWERS: Final = frozenset({Role.VIEWER, Role.TRAINER, Role.ADMIN})
+TRAINERS: Final = frozenset({Role.TRAINER, Role.ADMIN})
+ADMINS: Final = frozenset({Role.ADMIN})
 LOOPBACK_NAMES: Final = frozenset({"localhost", "127.0.0.1", "::1"})
 
 
@@ -59,8 +62,8 @@ class HttpRules:
             role = self.gate.caller(token_of(headers.get("authorization"))).role
         except NotSignedInError as error:
             return Refusal(401, f"{error}; HTTP requests show it as `Authorization: Bearer TOKEN`")
-        if role not in (frozenset({Role.ADMIN}) if changes else VIEWERS):
-            needed = Role.ADMIN if changes else Role.VIEWER
+        if role not in _allowed(path, changes=changes):
+            needed = Role.TRAINER if path == REWARDS else Role.ADMIN if changes else Role.VIEWER
             return Refusal(403, f"a token of the role {role} may not do this: it takes {needed}")
         return None
 
@@ -89,6 +92,12 @@ def allowed_hosts(bound: str, tls: Tls | None) -> frozenset[str]:
     if tls is not None:
         return LOOPBACK_NAMES | {name.lower() for name in tls.names}
     return LOOPBACK_NAMES if is_loopback(bound) else frozenset()
+
+
+def _allowed(path: str, *, changes: bool) -> frozenset[Role]:
+    if path == REWARDS:
+        return TRAINERS
+    return ADMINS if changes else VIEWERS
 
 
 def _is_foreign(headers: Headers, host: str) -> bool:

@@ -28,7 +28,14 @@ from embomatrix.manager.rest_values import (
 from embomatrix.manager.slot_tracks import timeline
 from embomatrix.manager.training import TrainingDetail, TrainingView
 from embomatrix.manager.views import LookaheadStep, Overview
-from embomatrix.rpc.status import ClusterError, NotFoundError, PreconditionError, UnavailableError
+from embomatrix.rpc.status import (
+    ClusterError,
+    InvalidRequestError,
+    NotFoundError,
+    OverloadedError,
+    PreconditionError,
+    UnavailableError,
+)
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator, Mapping
@@ -42,7 +49,9 @@ PREFIX: Final = "/api/v1"
 VIEWERS: Final = 256
 """Streams of events at the same time. One that nobody reads waits, and keeps no more than a page."""
 STATUSES: Final[Mapping[type[ClusterError], int]] = {
+    InvalidRequestError: 422,
     NotFoundError: 404,
+    OverloadedError: 503,
     PreconditionError: 409,
     UnavailableError: 503,
 }
@@ -166,7 +175,7 @@ def _logs(router: APIRouter, runtime: ManagerRuntime) -> None:
     @router.get("/runs/{run_id}")
     async def run(run_id: str) -> Response:
         """What a run came to, so far or in the end; also of the last 50 that were closed."""
-        with _answered():
+        with answered():
             summary = await history.summary(run_id)
         told = dataclasses.asdict(dataclasses.replace(summary, failures=()))
         return JSONResponse({**told, "failures": [_event(event) for event in summary.failures]})
@@ -174,13 +183,13 @@ def _logs(router: APIRouter, runtime: ManagerRuntime) -> None:
     @router.get("/runs/{run_id}/timeline", response_model=Timeline)
     async def tracks(run_id: str, seconds: Seconds = 60.0) -> Response:
         """What each slot did in the last seconds of a run."""
-        with _answered():
+        with answered():
             return _json(timeline(run_id, await history.latest(run_id, seconds), seconds=seconds))
 
     @router.get("/events")
     async def events(run: Run = "", after: After = 0) -> Response:
         """A page of the log of a run, or of workers and scenes."""
-        with _answered():
+        with answered():
             page = await history.events(run, after, 0)
         return JSONResponse({"events": [_event(event) for event in page.events], "dropped": page.dropped})
 
@@ -205,7 +214,7 @@ def _stream(router: APIRouter, runtime: ManagerRuntime) -> None:
     async def stream(run: Run = "", after: After = 0) -> Response:
         """The same as it grows, as server-sent events: `id` is the sequence, `data` the event as JSON."""
         nonlocal viewers
-        with _answered():
+        with answered():
             await runtime.history.events(run, after, 1)
         if viewers >= VIEWERS:
             raise HTTPException(503, f"{VIEWERS} streams are open: close one, or ask for pages of /events")
@@ -254,7 +263,7 @@ def _json(value: Any) -> Response:
 
 
 @contextlib.contextmanager
-def _answered() -> Iterator[None]:
+def answered() -> Iterator[None]:
     """What can't be is an answer, with the same sentence that gRPC has for it."""
     try:
         yield
@@ -267,7 +276,7 @@ def _answered() -> Iterator[None]:
 def _told(snapshots: Snapshots) -> Iterator[None]:
     """A change: who looks next sees what it came to."""
     try:
-        with _answered():
+        with answered():
             yield
     finally:
         snapshots.forget()

@@ -189,8 +189,10 @@ class Gateway:
     async def _announce(self, version: int, entries: list[LookaheadEntry]) -> None:
         try:
             for entry in entries:
+                if version != self._announced:
+                    return  # a newer window has overtaken this one
                 await self._bundle_sent(entry.bundle_digest)
-            if version == self._announced:  # a newer window may have overtaken this one
+            if version == self._announced:
                 await self._cluster.announce_lookahead(self.run_id, version, entries)
         except ClusterError as error:
             logger.warning("the look-ahead was not taken: %s", error)

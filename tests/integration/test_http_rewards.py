@@ -1,0 +1,125 @@
+"""Rewards over HTTP: the shape that OpenRLHF reads, who may ask, and what is refused by a sentence."""
+
+import asyncio
+
+import httpx
+import pytest
+from tests.fakes.guarded import guarded
+from tests.fakes.worker import FakeWorker
+from tests.integration.test_manager_service import KITCHEN, manager, open_run
+from tests.integration.test_rest import http_at
+
+from embomatrix.manager.rewards import REWARDS, RUN_ID
+from embomatrix.rpc.reward_label import RewardLabel
+from embomatrix.rpc.roles import Role
+from embomatrix.world.task import Profile
+
+pytestmark = pytest.mark.timeout(60)
+PROMPT = 'Answer with a plan, such as [{"action": "move", "object_index": 1}].'
+LABEL = RewardLabel("t", KITCHEN, Profile.PAPER, 7).text()
+
+
+def asked(*answers, prompt=PROMPT, label=LABEL, mark=""):
+    count = len(answers)
+    return {
+        "query": [f"{mark}{prompt}{answer}" for answer in answers],
+        "prompts": [prompt] * count,
+        "labels": [label] * count,
+    }
+
+
+async def test_plans_are_executed_and_scored_in_their_order_and_texts_that_are_none_never_are(tmp_path):
+    async with (
+        manager(tmp_path) as at,
+        open_run(at.address),
+        FakeWorker(at.address, slots=2) as worker,
+        http_at(at) as http,
+    ):
+        answer = await http.post(REWARDS, json=asked("move 3", "I can't.", "open 2", mark="<s>"))
+        runs = (await http.get("/api/v1/runs")).json()["items"]
+    assert answer.status_code == 200, answer.text
+    told = answer.json()
+    assert told["rewards"] == [pytest.approx(15.7), -1.0, pytest.approx(15.7)]
+    assert told["scores"] == [0.0, 0.0, 0.0]
+    assert {name: len(values) for name, values in told["extra_logs"].items()} == {
+        "format": 3,
+        "relevance": 3,
+        "goal": 3,
+    }
+    assert len(worker.executed) == 2
+    assert RUN_ID in {run["run_id"] for run in runs}
+
+
+async def test_requests_at_the_same_time_share_a_run_and_get_each_their_own(tmp_path):
+    async with (
+        manager(tmp_path) as at,
+        open_run(at.address),
+        FakeWorker(at.address, slots=2),
+        http_at(at) as http,
+    ):
+        answers = await asyncio.gather(
+            *(http.post(REWARDS, json=asked(*["move 1"] * count)) for count in (1, 2, 3))
+        )
+    assert [len(answer.json()["rewards"]) for answer in answers] == [1, 2, 3]
+
+
+async def test_a_lost_rollout_is_an_answer_to_try_again_and_no_number(tmp_path):
+    async with (
+        manager(tmp_path) as at,
+        open_run(at.address),
+        FakeWorker(at.address, poison={"t"}),
+        http_at(at) as http,
+    ):
+        answer = await http.post(REWARDS, json=asked("move 3"))
+    assert (answer.status_code, "lost an answer's rollout" in answer.json()["detail"]) == (503, True)
+
+
+@pytest.mark.parametrize(
+    ("body", "status", "words"),
+    [
+        ({"query": ["a"]}, 422, "prompts"),
+        ({"query": [], "prompts": [], "labels": []}, 422, "query"),
+        ({**asked("move 1"), "labels": []}, 422, "send as many of each"),
+        (asked("move 1", label="42"), 422, "found the label '42'"),
+        (
+            asked("move 1", label=RewardLabel("t", KITCHEN, Profile.PAPER, -1).text()),
+            422,
+            "found the seed -1",
+        ),
+        ({**asked("move 1"), "query": ["move 1"]}, 422, "query 0 does not hold its prompt"),
+        (
+            asked("move 1", label=RewardLabel("t", f"sha256:{'0' * 64}", Profile.PAPER, 0).text()),
+            409,
+            "lacks 1 bundles",
+        ),
+    ],
+)
+async def test_what_can_not_be_scored_is_refused_by_a_sentence(tmp_path, body, status, words):
+    async with manager(tmp_path) as at, open_run(at.address), http_at(at) as http:
+        answer = await http.post(REWARDS, json=body)
+    assert answer.status_code == status
+    assert words in answer.json()["detail"]
+
+
+async def test_text_that_is_no_json_and_more_than_fits_are_refused(tmp_path):
+    async with manager(tmp_path) as at, http_at(at) as http:
+        broken = await http.post(REWARDS, content=b"{")
+        large = await http.post(REWARDS, content=b" " * (64 * 1024 * 1024 + 1), timeout=30)
+    assert (broken.status_code, large.status_code) == (422, 413)
+
+
+async def test_it_takes_a_token_of_the_trainer_role(tmp_path):
+    async with guarded(tmp_path) as at, httpx.AsyncClient(base_url=at.page, verify=False) as http:
+        told = {
+            role: (
+                await http.post(REWARDS, json={}, headers={"authorization": f"Bearer {at.token(role)}"})
+            ).status_code
+            for role in (Role.WORKER, Role.VIEWER, Role.TRAINER, Role.ADMIN)
+        }
+        anonymous = await http.post(REWARDS, json={})
+    assert told == {Role.WORKER: 403, Role.VIEWER: 403, Role.TRAINER: 422, Role.ADMIN: 422}
+    assert anonymous.status_code == 401
+
+
+def test_a_label_can_be_read_back():
+    assert RewardLabel.parse(LABEL) == RewardLabel("t", KITCHEN, Profile.PAPER, 7)

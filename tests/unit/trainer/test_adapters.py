@@ -1,0 +1,201 @@
+"""Adapters to other trainers, on a cluster of symbolic rules: what they score, what they never do, what they announce."""
+
+import asyncio
+import pickle
+import time
+
+import pytest
+from tests.fakes.symbolic_household import SymbolicCluster, make_tasks
+
+from embomatrix.skills.prompt import Codec
+from embomatrix.trainer.adapters import verl
+from embomatrix.trainer.adapters.scorer import PlanScorer, scorer_for
+from embomatrix.trainer.adapters.trl import AnnouncedSampler, ClusterLookahead, ClusterReward, text_of
+from embomatrix.trainer.errors import TrainerError
+from embomatrix.trainer.telling import plan_text
+
+TASKS = make_tasks(6, 1)
+FIRST, SECOND = TASKS.train[:2]
+IDS = [task.task.task_id for task in TASKS.train]
+
+
+def oracle(task):
+    return plan_text(task.oracle, task.situation, Codec.JSON)
+
+
+def scorer(cluster, **options):
+    return PlanScorer(lambda: TASKS, lambda: cluster, **options)
+
+
+@pytest.fixture
+def cluster():
+    return SymbolicCluster(TASKS)
+
+
+@pytest.fixture
+def on_cluster(cluster):
+    with scorer(cluster) as opened:
+        yield opened
+
+
+async def test_texts_of_several_tasks_are_scored_in_their_order_a_batch_for_each_task(cluster, on_cluster):
+    texts = [oracle(FIRST), "no plan", oracle(SECOND), "toggle_on 0"]
+    ids = [FIRST.task.task_id, SECOND.task.task_id, SECOND.task.task_id, FIRST.task.task_id]
+    outcomes = await on_cluster.score(ids, texts)
+    assert [outcome.text for outcome in outcomes] == texts
+    assert [outcome.success for outcome in outcomes] == [True, False, True, False]
+    assert outcomes[1].value == -1
+    assert (len(cluster.batches), cluster.executed) == (2, 3)
+
+
+async def test_a_scorer_serves_several_event_loops(on_cluster):
+    def in_a_loop_of_its_own():
+        return asyncio.run(on_cluster.score([FIRST.task.task_id], [oracle(FIRST)]))
+
+    found = await asyncio.gather(*(asyncio.to_thread(in_a_loop_of_its_own) for _ in range(3)))
+    assert all(outcome.success for (outcome,) in found)
+
+
+async def test_texts_scored_one_by_one_are_gathered_by_task(cluster, on_cluster):
+    ids = [FIRST.task.task_id] * 5 + [SECOND.task.task_id] * 3
+    outcomes = await asyncio.gather(
+        *(on_cluster.score_one(task_id, f"toggle_on {index}") for index, task_id in enumerate(ids))
+    )
+    assert [outcome.text for outcome in outcomes] == [f"toggle_on {index}" for index in range(8)]
+    assert len(cluster.batches) == 2
+
+
+async def test_a_task_that_the_dataset_lacks_is_one_sentence(on_cluster):
+    with pytest.raises(TrainerError, match=r"no task 'elsewhere' among its 7"):
+        await on_cluster.score(["elsewhere"], ["move 1"])
+
+
+def given_tasks():
+    return TASKS
+
+
+def new_cluster():
+    return SymbolicCluster(TASKS)
+
+
+def test_a_scorer_that_is_open_can_be_pickled_and_the_copy_opens_a_run_of_its_own():
+    with PlanScorer(given_tasks, new_cluster) as original:
+        copy = pickle.loads(pickle.dumps(original))
+        outcomes = asyncio.run(copy.score([FIRST.task.task_id], [oracle(FIRST)]))
+        copy.close()
+    assert outcomes[0].success
+
+
+def test_closing_ends_the_run_and_the_next_score_opens_another(cluster, on_cluster):
+    on_cluster.close()
+    assert cluster.closed
+    assert asyncio.run(on_cluster.score([FIRST.task.task_id], [oracle(FIRST)]))[0].success
+
+
+def test_a_token_file_that_is_missing_is_one_sentence(tmp_path):
+    with pytest.raises(TrainerError, match="can't be read"):
+        scorer_for(tmp_path, token=f"@{tmp_path / 'token'}")
+
+
+async def test_trl_gets_a_number_for_each_completion_and_none_for_a_lost_one():
+    lossy = SymbolicCluster(TASKS, lost=frozenset({"score-0/1"}))
+    metrics, columns = {}, {}
+    with scorer(lossy) as opened:
+        rewards = await ClusterReward(opened)(
+            prompts=["p"] * 3,
+            completions=[[{"role": "assistant", "content": oracle(FIRST)}], oracle(FIRST), "hm"],
+            completion_ids=[[1], [2], [3]],
+            task_id=[FIRST.task.task_id] * 3,
+            trainer_state=None,
+            log_metric=metrics.__setitem__,
+            log_extra=columns.__setitem__,
+        )
+    assert rewards[0] > 30
+    assert rewards[1:] == [None, -1.0]
+    assert metrics["embomatrix/lost"] == pytest.approx(1 / 3)
+    assert metrics["embomatrix/success"] == 0.5
+    assert columns["task"] == [FIRST.task.task_id] * 3
+    assert columns["became"][1] == "lost by the infrastructure"
+
+
+@pytest.mark.parametrize("completion", [None, [], [{"role": "assistant"}], [{"content": None}], 3])
+def test_a_completion_without_text_is_an_empty_one(completion):
+    assert text_of(completion) == ""
+
+
+def test_the_sampler_tells_of_each_portion_before_its_first_index():
+    told = []
+    sampler = AnnouncedSampler([4, 4, 1, 1, 0, 0, 2, 2, 3, 3], 4, 1, told.append)
+    drawn = []
+    for index in sampler:
+        drawn.append((index, len(told)))
+    assert [index for index, _ in drawn] == [4, 4, 1, 1, 0, 0, 2, 2, 3, 3]
+    assert [count for _, count in drawn] == [1] * 4 + [2] * 4 + [3] * 2
+    assert told == [[[4, 1], [0, 2]], [[0, 2], [3]], [[3]]]
+    assert len(sampler) == 10
+
+
+class Arguments:
+    generation_batch_size, steps_per_generation = 4, 2
+
+
+class Accelerator:
+    is_main_process = True
+
+
+class TrainerOfTheirs:
+    """What the mixin relies on in TRL's trainer; that TRL has it, a test beside TRL says."""
+
+    args, accelerator = Arguments, Accelerator
+    num_generations, num_iterations = 2, 1
+
+    def __init__(self, *rewards):
+        self.train_dataset = {"task_id": IDS}
+        self.reward_funcs = rewards
+
+    def _get_train_sampler(self, dataset=None):
+        return [
+            index for pair in ((0, 1), (2, 3)) for _ in range(2) for index in (*pair[:1] * 2, *pair[1:] * 2)
+        ]
+
+
+class LookingAhead(ClusterLookahead, TrainerOfTheirs):
+    lookahead_steps = 1
+
+
+def test_the_mixin_announces_each_generation_and_the_next_to_the_cluster(cluster, on_cluster):
+    sampler = LookingAhead(ClusterReward(on_cluster))._get_train_sampler()
+    drawn = iter(sampler)
+    next(drawn)
+    until(lambda: cluster.announced)
+    assert cluster.announced == [(1, [0, 0, 1, 1])]
+    assert cluster.sent == {task.bundle_digest for task in TASKS.train[:4]}
+    assert len([0, *drawn]) == len(sampler) == 16
+
+
+def test_the_mixin_leaves_a_trainer_without_our_reward_alone():
+    assert isinstance(LookingAhead(len)._get_train_sampler(), list)
+
+
+def until(condition, seconds=20.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.005)
+
+
+async def test_verl_gets_the_same_keys_for_a_plan_and_for_none(on_cluster):
+    good = await verl.scored(on_cluster, FIRST.task.task_id, oracle(FIRST))
+    none = await verl.scored(on_cluster, FIRST.task.task_id, "hm")
+    assert good.keys() == none.keys()
+    assert (good["score"] > 30, good["success"], none["score"]) == (True, 1.0, -1.0)
+
+
+async def test_verl_never_sees_a_lost_plan_it_is_tried_again_and_then_given_up():
+    with scorer(SymbolicCluster(TASKS, lost=frozenset({"score-0/"}))) as opened:
+        assert (await verl.scored(opened, FIRST.task.task_id, oracle(FIRST)))["success"] == 1.0
+    with (
+        scorer(SymbolicCluster(TASKS, lose_first=True)) as opened,
+        pytest.raises(TrainerError, match="lost a plan of the task 'task-0' 3 times"),
+    ):
+        await verl.scored(opened, FIRST.task.task_id, oracle(FIRST))

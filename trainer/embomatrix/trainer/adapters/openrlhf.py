@@ -1,0 +1,103 @@
+"""OpenRLHF on our cluster, by either of its two ways to ask for rewards.
+
+``--reward.remote_url http://MANAGER:PORT/api/v1/rewards`` asks the manager itself, which needs the bundles first
+(``give_bundles``); ``--reward.remote_url THIS_FILE`` calls ``reward_func`` in OpenRLHF's own process.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import torch
+
+from embomatrix.rpc.reward_label import RewardLabel
+from embomatrix.trainer.adapters.rows import messages, tasks_of
+from embomatrix.trainer.adapters.scorer import ATTEMPTS, given_up, scorer_for
+from embomatrix.trainer.data import group_seed, load_tasks
+from embomatrix.trainer.errors import TrainerError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from embomatrix.reward.breakdown import RewardBreakdown
+    from embomatrix.rpc.client import ClusterClient
+    from embomatrix.trainer.adapters.scorer import PlanScorer
+
+DATASET: Final = "EMBOMATRIX_DATASET"
+
+
+def rows(dataset: str | Path, split: str = "train", seed: int = 0) -> list[dict[str, Any]]:
+    """``{"input": messages, "label": text}`` for each task of a split: ``--data.input_key input --data.label_key label``."""
+    return [
+        {
+            "input": messages(task.situation),
+            "label": RewardLabel(
+                task.task.task_id,
+                task.bundle_digest,
+                task.task.profile,
+                group_seed(seed, task.task.task_id),
+            ).text(),
+        }
+        for task in tasks_of(dataset, split)
+    ]
+
+
+async def give_bundles(dataset: str | Path, client: ClusterClient) -> int:
+    """Give the manager the scenes that it lacks; returns how many. Raises ClusterError."""
+    tasks = load_tasks(Path(dataset))
+    digests = {task.bundle_digest for task in (*tasks.train, *tasks.heldout)}
+    sent = 0
+    for digest in sorted(digests):
+        sent += len(await client.put_bundles({digest: tasks.bundle_bytes(digest)}))
+    return sent
+
+
+@functools.cache
+def _scorer() -> PlanScorer:
+    dataset = os.environ.get(DATASET, "")
+    if not dataset:
+        raise TrainerError(f"{DATASET} is not set: it names the dataset's folder")
+    return scorer_for(dataset)
+
+
+def reward_func(queries: Sequence[str], prompts: Sequence[str], labels: Sequence[str]) -> dict[str, Any]:
+    """OpenRLHF's hook. The dataset and the cluster come from the environment. Raises TrainerError."""
+    answers = [query.partition(prompt)[2] for query, prompt in zip(queries, prompts, strict=True)]
+    task_ids = [RewardLabel.parse(label).task_id for label in labels]
+    return told(asyncio.run(rewards_of(_scorer(), task_ids, answers)))
+
+
+async def rewards_of(
+    scorer: PlanScorer, task_ids: Sequence[str], answers: Sequence[str]
+) -> list[RewardBreakdown]:
+    """The reward of each answer. What the infrastructure lost is executed again, and given up after ``ATTEMPTS``."""
+    found: dict[int, RewardBreakdown] = {}
+    missing = list(range(len(answers)))
+    for _attempt in range(ATTEMPTS):
+        outcomes = await scorer.score([task_ids[at] for at in missing], [answers[at] for at in missing])
+        found |= {
+            at: outcome.reward
+            for at, outcome in zip(missing, outcomes, strict=True)
+            if outcome.reward is not None
+        }
+        missing = [at for at in missing if at not in found]
+        if not missing:
+            return [found[at] for at in range(len(answers))]
+    raise given_up(task_ids[missing[0]])
+
+
+def told(rewards: Sequence[RewardBreakdown]) -> dict[str, Any]:
+    """As OpenRLHF reads it: rewards, scores in 0…1 for its filter, and what is logged."""
+    return {
+        "rewards": torch.tensor([reward.total for reward in rewards]),
+        "scores": torch.tensor([float(reward.success) for reward in rewards]),
+        "extra_logs": {
+            "format": torch.tensor([reward.format for reward in rewards]),
+            "relevance": torch.tensor([reward.relevance for reward in rewards]),
+            "goal": torch.tensor([reward.goal for reward in rewards]),
+        },
+    }

@@ -1,0 +1,53 @@
+"""Rows of a dataset as other trainers read them: the prompt, and by what the reward finds the task again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from embomatrix.skills.prompt import Codec, prompt_for
+from embomatrix.trainer.data import load_tasks
+from embomatrix.trainer.errors import TrainerError
+
+if TYPE_CHECKING:
+    from embomatrix.skills.prompt import Situation
+    from embomatrix.trainer.data import TrainingTask
+
+SOURCE = "embomatrix"
+
+
+def messages(situation: Situation, codec: Codec = Codec.JSON) -> list[dict[str, str]]:
+    """The prompt of a task as chat messages."""
+    prompt = prompt_for(situation, codec)
+    return [{"role": "system", "content": prompt.system}, {"role": "user", "content": prompt.user}]
+
+
+def prompt_rows(dataset: str | Path, split: str = "train", codec: Codec = Codec.JSON) -> list[dict[str, Any]]:
+    """``{"prompt": messages, "task_id": id}`` for each task of a split, for TRL. Raises TrainerError."""
+    return [
+        {"prompt": messages(task.situation, codec), "task_id": task.task.task_id}
+        for task in tasks_of(dataset, split)
+    ]
+
+
+def verl_rows(dataset: str | Path, split: str = "train", codec: Codec = Codec.JSON) -> list[dict[str, Any]]:
+    """The columns of verl's datasets; the ground truth is the task's id. Raises TrainerError."""
+    return [
+        {
+            "data_source": SOURCE,
+            "prompt": messages(task.situation, codec),
+            "ability": task.task.category.value,
+            "reward_model": {"style": "rule", "ground_truth": task.task.task_id},
+            "extra_info": {"split": split, "index": index},
+        }
+        for index, task in enumerate(tasks_of(dataset, split))
+    ]
+
+
+def tasks_of(dataset: str | Path, split: str) -> tuple[TrainingTask, ...]:
+    """The tasks of a dataset's split. Raises TrainerError."""
+    tasks = load_tasks(Path(dataset))
+    splits = {"train": tasks.train, "heldout": tasks.heldout}
+    if split not in splits:
+        raise TrainerError(f"a dataset has no split {split!r}: expected {' or '.join(splits)}")
+    return splits[split]
