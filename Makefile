@@ -16,10 +16,10 @@ run: $(VENV)/.runtime
 # A process for each core, eight at most; a file's tests stay together, for they share what is costly. `ARGS=-n0` runs
 # all of them in one process, which prints what the tests print.
 test: $(VENV)/.dev
-	$(BIN)/python -m pytest -n logical --maxprocesses=8 --dist=loadfile -m "not slow and not docker and not hf and not eai" $(ARGS)
+	$(BIN)/python -m pytest -n logical --maxprocesses=8 --dist=loadfile -m "not slow and not docker and not hf and not eai and not peers" $(ARGS)
 
 test-slow: $(VENV)/.dev
-	$(BIN)/python -m pytest -m "slow or hf or eai" $(ARGS)
+	$(BIN)/python -m pytest -m "slow or hf or eai or peers" $(ARGS)
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .

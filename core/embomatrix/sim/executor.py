@@ -96,6 +96,11 @@ class Simulator:
         """The state reached, live until the next reset. For reading only."""
         return self._world
 
+    @property
+    def touched(self) -> frozenset[str]:
+        """Objects on which a call succeeded since the last reset."""
+        return frozenset(self._touched)
+
     def reset(self, task: Task, seed: int) -> None:
         """Back to the scene's start. ``seed`` decides between outcomes that are equally good; it is not negative."""
         self._world.reset(task)
@@ -142,7 +147,7 @@ class Simulator:
         return Trace(
             plan=plan,
             steps=tuple(steps),
-            touched=frozenset(self._touched),
+            touched=self.touched,
             final=self.describe(task),
             digest=f"sha256:{self._hash.hexdigest()}",
         )
@@ -152,6 +157,10 @@ class Simulator:
         told = task.goal_objects | self._touched
         names = [name for name in task.table if name in told]
         return final_lines([self._sight(name) for name in names])
+
+    def survey(self, task: Task) -> tuple[str, ...]:
+        """State of every object of the task's table, in its order, in words: it tells nothing of the goal."""
+        return final_lines([self._sight(name) for name in task.table])
 
     def complete(self) -> Iterator[None]:
         """Make what executions would make when they first need it, a little at a step. Changes no answer.

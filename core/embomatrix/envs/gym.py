@@ -1,0 +1,161 @@
+"""A Gymnasium environment: an action is one skill call, an observation is text, the rewards of an episode add up to its plan's.
+
+Needs ``gymnasium``, which nothing else here does.
+"""
+
+from __future__ import annotations
+
+import math
+import string
+from typing import TYPE_CHECKING, Any, Final, SupportsFloat
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from embomatrix.envs.episode import Household
+from embomatrix.skills.limits import ROBOT
+from embomatrix.skills.syntax import PROFILES, SIGNATURES, Arg, PlaceRelation, SkillCall
+from embomatrix.world.dataset import SPLITS, DatasetError
+from embomatrix.world.task import MAX_TABLE, Profile
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from embomatrix.envs.episode import Episode, Turn
+
+SKILLS: Final = PROFILES[Profile.HOUSEHOLD]
+RELATIONS: Final = tuple(PlaceRelation)
+MOST_ROOMS: Final = 32
+CHARACTERS: Final = string.printable
+LONGEST_TEXT: Final = 32_768
+
+
+class HouseholdEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):  # type: ignore[misc]  # untyped where it is not installed
+    """Tasks of a dataset, one an episode: ``reset(seed=…)`` draws one, ``options={"task_id": …}`` names it.
+
+    *Action*, a dict: ``skill`` (in the order of ``SKILLS``), ``object`` and ``source`` (rows of the object table), ``relation``
+    (in the order of ``RELATIONS``), ``room`` (in the order of ``info["rooms"]``), ``yaw`` (rad), ``distance`` (m). What the
+    skill does not take is left alone.
+
+    *Observation*, a dict of texts: ``task`` (the prompt, the same all along), ``state`` (a line for each object),
+    ``message`` (what became of the last call).
+
+    The reward of a step is what it added to the plan's. An episode terminates at the goal and is truncated after 64 calls; a
+    failed call changes nothing.
+    """
+
+    metadata: Final = {"render_modes": ["ansi"], "render_fps": 1}
+
+    def __init__(self, dataset: str | Path, split: str = "train", render_mode: str | None = None) -> None:
+        if split not in SPLITS:
+            raise ValueError(f"a dataset has no split {split!r}: expected {' or '.join(SPLITS)}")
+        self.render_mode = render_mode
+        self._household = Household(dataset)
+        self._task_ids = [record.task.task_id for record in self._household.records if record.split == split]
+        if not self._task_ids:
+            raise DatasetError(f"the dataset at {dataset} has no task of the split {split!r}: pass another")
+        self._episode: Episode | None = None
+        self._message = ""
+        self.action_space = spaces.Dict(
+            {
+                "skill": spaces.Discrete(len(SKILLS)),
+                "object": spaces.Discrete(MAX_TABLE),
+                "source": spaces.Discrete(MAX_TABLE),
+                "relation": spaces.Discrete(len(RELATIONS)),
+                "room": spaces.Discrete(MOST_ROOMS),
+                "yaw": spaces.Box(-math.pi, math.pi, (), np.float64),
+                "distance": spaces.Box(0.0, ROBOT.max_step_m, (), np.float64),
+            }
+        )
+        text = spaces.Text(LONGEST_TEXT, min_length=0, charset=CHARACTERS)
+        self.observation_space = spaces.Dict({"task": text, "state": text, "message": text})
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Begin an episode. Raises DatasetError for an unknown task."""
+        super().reset(seed=seed)
+        drawn = self._task_ids[int(self.np_random.integers(len(self._task_ids)))]
+        self._episode = self._household.episode(str((options or {}).get("task_id", drawn)))
+        self._episode.reset(int(self.np_random.integers(2**31)))
+        self._message = ""
+        return self._observed(self._episode), {
+            "task_id": self._episode.task.task_id,
+            "rooms": self._episode.situation.rooms,
+            "objects": self._episode.task.table,
+        }
+
+    def step(
+        self, action: dict[str, Any]
+    ) -> tuple[dict[str, Any], SupportsFloat, bool, bool, dict[str, Any]]:
+        """Execute one call. ``info`` has the reward's tiers, success, and the reason of a failed call."""
+        if self._episode is None:
+            raise RuntimeError("no episode was begun: call reset() first")
+        turn = self._episode.act(call_of(action, self._episode.situation.rooms))
+        self._message = turn.step.message
+        success = turn.reward.success
+        return self._observed(self._episode), turn.gain, success, turn.over and not success, told(turn)
+
+    def render(self) -> str | None:
+        """The state in words, with ``render_mode="ansi"``."""
+        if self.render_mode != "ansi" or self._episode is None:
+            return None
+        return "\n".join([*self._episode.state(), self._message])
+
+    def close(self) -> None:
+        self._household.close()
+
+    def _observed(self, episode: Episode) -> dict[str, Any]:
+        prompt = episode.prompt()
+        texts = {
+            "task": f"{prompt.system}\n\n{prompt.user}",
+            "state": "\n".join(episode.state()),
+            "message": self._message,
+        }
+        return {name: _plain(text) for name, text in texts.items()}
+
+
+def call_of(action: dict[str, Any], rooms: tuple[str, ...]) -> SkillCall:
+    """The skill call of an action. A room beyond those there are is a name that no room has."""
+    skill = SKILLS[int(action["skill"])]
+    room = int(action["room"])
+    values: dict[Arg, Any] = {
+        Arg.OBJECT: int(action["object"]),
+        Arg.SOURCE: int(action["source"]),
+        Arg.RELATION: RELATIONS[int(action["relation"])],
+        Arg.YAW: float(action["yaw"]),
+        Arg.DISTANCE: float(action["distance"]),
+        Arg.ROOM: rooms[room] if room < len(rooms) else f"room_{room}",
+    }
+    return SkillCall(skill, **{argument.value: values[argument] for argument in SIGNATURES[skill]})
+
+
+def action_of(call: SkillCall, rooms: tuple[str, ...]) -> dict[str, Any]:
+    """The inverse of ``call_of``: oracle plans as actions. ValueError for a room that is not among them."""
+    return {
+        "skill": SKILLS.index(call.skill),
+        "object": call.object_index or 0,
+        "source": call.source_index or 0,
+        "relation": RELATIONS.index(call.relation) if call.relation is not None else 0,
+        "room": rooms.index(call.room_name) if call.room_name is not None else 0,
+        "yaw": np.asarray(call.yaw or 0.0),
+        "distance": np.asarray(call.distance or 0.0),
+    }
+
+
+def told(turn: Turn) -> dict[str, Any]:
+    """What ``info`` says of a step."""
+    reward = turn.reward
+    return {
+        "success": reward.success,
+        "failure": turn.step.failure.value if turn.step.failure is not None else "",
+        "format": reward.format,
+        "relevance": reward.relevance,
+        "goal": reward.goal,
+    }
+
+
+def _plain(text: str) -> str:
+    """In the characters of the observation space, no longer than it allows."""
+    return "".join(letter if letter in CHARACTERS else "?" for letter in text[:LONGEST_TEXT])
