@@ -13,6 +13,7 @@ from embomatrix.cli.experiment.conduct import IMITATED, Conductor, Venue
 from embomatrix.cli.experiment.design import (
     RELEVANCE_ARMS,
     Arm,
+    Budget,
     Design,
     checked_arms,
     keep_design,
@@ -32,9 +33,9 @@ DESIGN = Design(
     dataset="`ds` (abc)",
     model="tiny",
     seeds=(0, 1),
-    imitate_seconds=60.0,
+    imitation=Budget(60.0),
     patience=3,
-    minutes=2.0,
+    grpo=Budget(120.0, 50),
     threads=2,
     shared={},
     arms=RELEVANCE_ARMS,
@@ -114,6 +115,8 @@ def test_a_curve_has_ten_stretches_or_as_many_as_there_are_steps():
 def test_the_section_tells_configuration_success_curves_and_times():
     text = learning_section(DESIGN, ARMS, MACHINE, "abc", TODAY)
     assert text.startswith("## 2026-11-21: learning")
+    assert "at most 60 s of imitation" in text
+    assert "50 steps of GRPO an" in text
     assert "| without-relevance | `grpo.relevance = 0.0` |" in text
     assert "| with-relevance | all |  |  |  | 35.0%" in text
     assert "| with-relevance | 1 | groups without signal | 0.50 |" in text
@@ -155,8 +158,8 @@ def test_arms_of_one_name_are_refused():
 def test_an_experiment_goes_on_only_as_what_it_is(tmp_path):
     keep_design(tmp_path, DESIGN)
     keep_design(tmp_path, DESIGN)
-    with pytest.raises(TrainerError, match="another experiment: minutes differ"):
-        keep_design(tmp_path, replace(DESIGN, minutes=3.0))
+    with pytest.raises(TrainerError, match="another experiment: grpo differ"):
+        keep_design(tmp_path, replace(DESIGN, grpo=Budget(120.0)))
 
 
 def test_what_is_done_is_not_done_again(tmp_path):

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from rich.console import Console
+from tests.fakes.small_llama import random_llama, word_tokenizer
 from tests.fakes.symbolic_household import SymbolicCluster, make_tasks
 
 from embomatrix.skills.prompt import Codec, prompt_for
@@ -21,49 +22,20 @@ from embomatrix.trainer.progress import LineDisplay
 from embomatrix.trainer.recorder import read_metrics
 from embomatrix.trainer.rollout import Gateway
 from embomatrix.trainer.settings import LANGUAGE_MODEL_DEFAULTS, read_settings
-from embomatrix.trainer.telling import Teller, plan_text
+from embomatrix.trainer.telling import Teller
 
 TASKS = make_tasks(6, 2, objects=8)
 
 
 @pytest.fixture(scope="module")
 def tokenizer():
-    """Word-level, built here: every word of the tasks' prompts and plans."""
-    tokenizers = pytest.importorskip("tokenizers")
-    from transformers import PreTrainedTokenizerFast
-
-    texts = []
-    for task in TASKS.train:
-        prompt = prompt_for(task.situation, Codec.LINES)
-        texts += [prompt.system, prompt.user, plan_text(task.oracle, task.situation, Codec.LINES)]
-    inner = tokenizers.Tokenizer(tokenizers.models.WordLevel(unk_token="<unk>"))
-    inner.pre_tokenizer = tokenizers.pre_tokenizers.WhitespaceSplit()
-    inner.train_from_iterator(texts, tokenizers.trainers.WordLevelTrainer(special_tokens=["<unk>", "<end>"]))
-    return PreTrainedTokenizerFast(tokenizer_object=inner, unk_token="<unk>", eos_token="<end>")
+    pytest.importorskip("tokenizers")
+    return word_tokenizer(TASKS.train)
 
 
 @pytest.fixture
 def policy(tokenizer):
-    from transformers import LlamaConfig, LlamaForCausalLM
-
-    torch.set_num_threads(1)
-    torch.manual_seed(0)
-    config = LlamaConfig(
-        vocab_size=len(tokenizer),
-        hidden_size=32,
-        intermediate_size=64,
-        num_hidden_layers=2,
-        num_attention_heads=4,
-        num_key_value_heads=2,
-        max_position_embeddings=1024,
-        tie_word_embeddings=True,
-        eos_token_id=tokenizer.eos_token_id,
-    )
-    model = LlamaForCausalLM(config)
-    with torch.no_grad():
-        for parameter in model.parameters():  # far from uniform, so that differences would show
-            parameter.mul_(6 if parameter.dim() > 1 else 1)
-    return HfPolicy(model, tokenizer, Codec.LINES, "random llama")
+    return HfPolicy(random_llama(tokenizer), tokenizer, Codec.LINES, "random llama")
 
 
 def prompts(policy, count=3):

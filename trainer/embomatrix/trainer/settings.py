@@ -54,6 +54,17 @@ class TinySettings(_Frozen):
     inner: int = Field(default=384, ge=16)
 
 
+class LoraSettings(_Frozen):
+    """Low-rank adapters for a Hugging Face model, in place of learning all of its weights."""
+
+    rank: int = Field(default=0, ge=0)
+    """0: none, the whole model learns."""
+    alpha: float = Field(default=32.0, gt=0)
+    """What the adapters add is scaled by alpha / rank."""
+    targets: tuple[str, ...] = ()
+    """Last parts of the names of the linear layers that get one; none: all but the output layer."""
+
+
 class PromptSettings(_Frozen):
     """What of a task's table is told, and how the telling varies during training."""
 
@@ -178,7 +189,10 @@ class TrainSettings(_Frozen):
     """Where metrics go besides the run's own files."""
     samples_every: int = Field(default=10, ge=1)
     """Steps between two groups that are written to the sample log."""
+    gradient_checkpointing: bool = False
+    """Hugging Face models: keep only the inputs of layers for the way back, and compute the rest again."""
     tiny: TinySettings = TinySettings()
+    lora: LoraSettings = LoraSettings()
     prompt: PromptSettings = PromptSettings()
     imitation: ImitationSettings = ImitationSettings()
     grpo: GrpoSettings = GrpoSettings()

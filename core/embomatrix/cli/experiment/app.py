@@ -18,6 +18,7 @@ from embomatrix.cli.experiment.conduct import Conductor, Venue, own_venue
 from embomatrix.cli.experiment.design import (
     RELEVANCE_ARMS,
     Arm,
+    Budget,
     Design,
     checked_arms,
     keep_design,
@@ -56,6 +57,8 @@ _Out = Annotated[Path, typer.Option(help="Folder for all runs; the same command 
 _Seeds = Annotated[list[int] | None, typer.Option("--seed", help="A seed; repeatable. Default: 0, 1, 2.")]
 _Minutes = Annotated[float, typer.Option(min=0, help="Minutes of GRPO of each arm.")]
 _Imitate = Annotated[float, typer.Option(min=0, help="Seconds of imitation at most.")]
+_Steps = Annotated[int | None, typer.Option(min=1, help="Steps of GRPO of each arm, in place of minutes.")]
+_ImitateSteps = Annotated[int | None, typer.Option(min=1, help="Steps of imitation, in place of seconds.")]
 _Patience = Annotated[
     int, typer.Option(min=0, help="Measurements without a lower loss that end imitation; 0: none do.")
 ]
@@ -80,7 +83,9 @@ def learning(
     out: _Out = Path("runs/experiments/learning"),
     seeds: _Seeds = None,
     minutes: _Minutes = 10.0,
+    steps: _Steps = None,
     imitate_seconds: _Imitate = 600.0,
+    imitate_steps: _ImitateSteps = None,
     patience: _Patience = 3,
     model: _Model = "tiny",
     settings: _Set = None,
@@ -95,9 +100,9 @@ def learning(
     """Learning curves with and without the reward's relevance tier, each seed's arms from one imitated policy."""
     with _problems_shown():
         name = "learning with and without the relevance reward"
-        design = _design(
-            name, dataset, model, seeds, imitate_seconds, patience, minutes, threads, settings, RELEVANCE_ARMS
-        )
+        budgets = (Budget(imitate_seconds, imitate_steps), Budget(60 * minutes, steps))
+        arms = RELEVANCE_ARMS
+        design = _design(name, arms, dataset, model, seeds, *budgets, patience, threads, settings)
         _experiment(design, dataset, out, _place(manager, token, ca, out, workers), json_file, page)
 
 
@@ -107,7 +112,9 @@ def times(
     out: _Out = Path("runs/experiments/times"),
     seeds: _Seeds = None,
     minutes: _Minutes = 3.0,
+    steps: _Steps = None,
     imitate_seconds: _Imitate = 120.0,
+    imitate_steps: _ImitateSteps = None,
     model: _Model = "tiny",
     settings: _Set = None,
     manager: _Manager = "",
@@ -120,18 +127,9 @@ def times(
 ) -> None:
     """Where training time goes, and the system's share of it, with simulation hidden and not (the paper: about 20 %)."""
     with _problems_shown():
-        design = _design(
-            "training time",
-            dataset,
-            model,
-            seeds or [0],
-            imitate_seconds,
-            0,
-            minutes,
-            threads,
-            settings,
-            OVERLAP_ARMS,
-        )
+        budgets = (Budget(imitate_seconds, imitate_steps), Budget(60 * minutes, steps))
+        arms = OVERLAP_ARMS
+        design = _design("training time", arms, dataset, model, seeds or [0], *budgets, 0, threads, settings)
         _experiment(design, dataset, out, _place(manager, token, ca, out, workers), json_file, page)
 
 
@@ -148,7 +146,9 @@ def compare(
     title: Annotated[str, typer.Option(help="Heading of the section.")] = "settings compared",
     seeds: _Seeds = None,
     minutes: _Minutes = 3.0,
+    steps: _Steps = None,
     imitate_seconds: _Imitate = 300.0,
+    imitate_steps: _ImitateSteps = None,
     patience: _Patience = 3,
     model: _Model = "tiny",
     settings: _Set = None,
@@ -163,9 +163,8 @@ def compare(
     """Any settings against one another, from one imitated policy for each seed."""
     with _problems_shown():
         arms = checked_arms([parse_arm(told) for told in arm])
-        design = _design(
-            title, dataset, model, seeds or [0], imitate_seconds, patience, minutes, threads, settings, arms
-        )
+        budgets = (Budget(imitate_seconds, imitate_steps), Budget(60 * minutes, steps))
+        design = _design(title, arms, dataset, model, seeds or [0], *budgets, patience, threads, settings)
         _experiment(design, dataset, out, _place(manager, token, ca, out, workers), json_file, page)
 
 
@@ -216,15 +215,15 @@ def _stages(run: Path) -> tuple[Stage, ...]:
 
 def _design(
     name: str,
+    arms: tuple[Arm, ...],
     dataset: Path,
     model: str,
     seeds: Sequence[int] | None,
-    imitate_seconds: float,
+    imitation: Budget,
+    grpo: Budget,
     patience: int,
-    minutes: float,
     threads: int,
     settings: Sequence[str] | None,
-    arms: tuple[Arm, ...],
 ) -> Design:
     tasks = dataset / "tasks.jsonl"
     if not tasks.is_file():
@@ -237,9 +236,9 @@ def _design(
         dataset=f"`{dataset.name}` ({digest})",
         model=model,
         seeds=tuple(dict.fromkeys(seeds or (0, 1, 2))),
-        imitate_seconds=imitate_seconds,
+        imitation=imitation,
         patience=patience,
-        minutes=minutes,
+        grpo=grpo,
         threads=threads or os.cpu_count() or 1,
         shared=parse_settings(settings or ()),
         arms=arms,

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
     from pathlib import Path
 
-    from embomatrix.cli.experiment.design import Arm, Design
+    from embomatrix.cli.experiment.design import Arm, Budget, Design
 
 IMITATED = "imitated"
 """Folder of a seed's imitation, beside those of its arms."""
@@ -61,7 +61,7 @@ class Conductor:
             no_problem,
             "imitate",
             f"--model={design.model}",
-            f"--seconds={design.imitate_seconds}",
+            _told("seconds", design.imitation.seconds, design.imitation),
             f"--patience={design.patience}",
             f"--seed={seed}",
         )
@@ -79,7 +79,7 @@ class Conductor:
             "train",
             f"--model={self.folder_of(seed, IMITATED) / 'reference'}",
             "--imitate-seconds=0",
-            f"--minutes={self.design.minutes}",
+            _told("minutes", self.design.grpo.seconds / 60, self.design.grpo),
             f"--seed={seed}",
             *place.arguments,
         )
@@ -110,3 +110,8 @@ class Conductor:
             f"--threads={self.design.threads}",
             *rest,
         )
+
+
+def _told(unit: str, amount: float, budget: Budget) -> str:
+    """The option that gives a command its budget."""
+    return f"--{unit}={amount}" if budget.steps is None else f"--steps={budget.steps}"

@@ -30,20 +30,31 @@ class Arm:
 
 
 @dataclass(frozen=True, slots=True)
+class Budget:
+    """Seconds on the clock, or in their place a number of steps: what is found then does not depend on what else runs."""
+
+    seconds: float
+    steps: int | None = None
+
+    def __str__(self) -> str:
+        return f"{self.seconds:g} s" if self.steps is None else f"{self.steps} steps"
+
+
+@dataclass(frozen=True, slots=True)
 class Design:
     """Everything that decides an experiment but the machine. ``shared`` settings hold for imitation and for all arms.
 
-    For each seed a policy imitates for ``imitate_seconds`` at most, and ends earlier after ``patience`` measurements without
-    a lower loss; each arm then starts from it. ``dataset`` is the folder's name and the digest of its tasks.
+    For each seed a policy imitates for its budget at most, and ends earlier after ``patience`` measurements without a lower
+    loss; each arm then starts from it. ``dataset`` is the folder's name and the digest of its tasks.
     """
 
     name: str
     dataset: str
     model: str
     seeds: tuple[int, ...]
-    imitate_seconds: float
+    imitation: Budget
     patience: int
-    minutes: float
+    grpo: Budget
     threads: int
     shared: Mapping[str, str]
     arms: tuple[Arm, ...]

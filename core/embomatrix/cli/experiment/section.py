@@ -80,7 +80,7 @@ def _configuration(design: Design, machine: Mapping[str, Any], commit: str) -> s
     shared = f", all with {_told(design.shared)}" if design.shared else ""
     return (
         f"Dataset {design.dataset}; model `{design.model}`; seeds {', '.join(map(str, design.seeds))}; at most "
-        f"{design.imitate_seconds:g} s of imitation{_stop(design.patience)}; {design.minutes:g} minutes of GRPO an "
+        f"{design.imitation} of imitation{_stop(design.patience)}; {design.grpo} of GRPO an "
         f"arm{shared}; {design.threads} threads. Commit `{commit}`, "
         f"{machine['cores']} cores ({machine['cpu']}), load {machine['load_before']} at the start of the command."
     )

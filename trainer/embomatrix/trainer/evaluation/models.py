@@ -13,7 +13,7 @@ from embomatrix.trainer.errors import TrainerError, reason_of
 from embomatrix.trainer.policy.choice import saved_policy
 from embomatrix.trainer.policy.hf import HfPolicy
 from embomatrix.trainer.policy.tiny import TinyPolicy
-from embomatrix.trainer.settings import LANGUAGE_MODEL_DEFAULTS, read_settings
+from embomatrix.trainer.settings import LANGUAGE_MODEL_DEFAULTS, LoraSettings, read_settings
 
 if TYPE_CHECKING:
     from embomatrix.skills.prompt import Codec
@@ -34,7 +34,8 @@ def load_model(named: str, codec: Codec, *, threads: int | None, device: str) ->
     folder = Path(named)
     if folder.is_dir() and (folder / "policy").is_dir():
         _, settings = read_state(folder)
-        settings = settings.model_copy(update={"device": device})
+        # A checkpoint holds the merged model: the one that adapters were added to need not be here.
+        settings = settings.model_copy(update={"device": device, "lora": LoraSettings()})
         _prepare(threads or settings.threads, device)
         policy: Policy = saved_policy(folder / "policy", settings)
         return LoadedModel(policy, settings.prompt.rows, settings.grpo.max_new)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.trainer.errors import DAMAGE, TrainerError, reason_of
 from embomatrix.trainer.policy.decoder import DecoderShape
 from embomatrix.trainer.policy.hf import HfPolicy
+from embomatrix.trainer.policy.lora import LoraShape, has_adapters
 from embomatrix.trainer.policy.tiny import TinyPolicy
 from embomatrix.trainer.policy.words import build_vocabulary
 
@@ -27,7 +28,11 @@ def is_tiny(model: str) -> bool:
 def new_policy(settings: TrainSettings, tasks: TaskSet) -> Policy:
     """The policy that a run starts from. Raises TrainerError where the model is unknown or can't be loaded."""
     if not is_tiny(settings.model):
-        return HfPolicy.load(settings.model, settings.codec, device=settings.device)
+        return _language_model(settings.model, settings)
+    if settings.lora.rank or settings.gradient_checkpointing:
+        raise TrainerError(
+            "lora and gradient_checkpointing are for Hugging Face models: the word-level policy needs neither, leave them out"
+        )
     if settings.model != TINY:
         return saved_policy(Path(settings.model), settings)
     situations = [task.situation for task in (*tasks.train, *tasks.heldout)]
@@ -45,8 +50,27 @@ def saved_policy(folder: Path, settings: TrainSettings) -> Policy:
         raise TrainerError(
             f"the policy in {folder} is damaged ({reason_of(error)}): use another checkpoint"
         ) from error
+    if settings.lora.rank and has_adapters(folder):
+        return _language_model(settings.model, settings, folder)
     if HfPolicy.is_saved_in(folder):
-        return HfPolicy.load(folder, settings.codec, device=settings.device, label=settings.model)
+        return HfPolicy.load(
+            folder,
+            settings.codec,
+            device=settings.device,
+            label=settings.model,
+            recompute=settings.gradient_checkpointing,
+        )
     raise TrainerError(
         f"there is no policy in {folder}: pass a checkpoint folder, runs/NAME/checkpoints/step-000050"
     )
+
+
+def _language_model(named: str, settings: TrainSettings, adapters: Path | None = None) -> HfPolicy:
+    """A Hugging Face model, with adapters where the settings want them: new ones, or those of a folder."""
+    policy = HfPolicy.load(
+        named, settings.codec, device=settings.device, recompute=settings.gradient_checkpointing
+    )
+    if settings.lora.rank:
+        shape = LoraShape(settings.lora.rank, settings.lora.alpha, settings.lora.targets)
+        policy.adapt(shape, seed=settings.seed, saved=adapters)
+    return policy

@@ -14,7 +14,9 @@ import torch
 
 from embomatrix.trainer.errors import TrainerError, reason_of
 from embomatrix.trainer.policy.drawing import draw
+from embomatrix.trainer.policy.lora import adapt, load_adapters, merged, save_adapters
 from embomatrix.trainer.policy.protocol import Samples, Scored
+from embomatrix.trainer.policy.recompute import recomputing
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
     from torch import Tensor, nn
 
     from embomatrix.skills.prompt import Codec, Prompt
+    from embomatrix.trainer.policy.lora import LoraShape
     from embomatrix.trainer.policy.protocol import Tokens
 
 LOOK_UP_S: Final = 10.0
@@ -38,10 +41,17 @@ REMEDY: Final = "pass `tiny`, a folder with config.json, or a Hugging Face name;
 
 
 class HfPolicy:
-    """``model`` and ``tokenizer`` as transformers loads them; plans are written in ``codec``."""
+    """``model`` and ``tokenizer`` as transformers loads them; plans are written in ``codec``.
 
-    def __init__(self, model: Any, tokenizer: Any, codec: Codec, name: str) -> None:
+    ``recompute`` trades time for memory in the update: layers are computed twice, and the prompt once for each plan.
+    """
+
+    def __init__(
+        self, model: Any, tokenizer: Any, codec: Codec, name: str, *, recompute: bool = False
+    ) -> None:
         self._model = model.eval()
+        self._recompute = recompute
+        self._lora: LoraShape | None = None
         self._tokenizer = tokenizer
         self._codec = codec
         self._name = name
@@ -49,7 +59,15 @@ class HfPolicy:
         self._pad = self._end[0] if tokenizer.pad_token_id is None else int(tokenizer.pad_token_id)
 
     @classmethod
-    def load(cls, name: str | Path, codec: Codec, *, device: str = "cpu", label: str = "") -> HfPolicy:
+    def load(
+        cls,
+        name: str | Path,
+        codec: Codec,
+        *,
+        device: str = "cpu",
+        label: str = "",
+        recompute: bool = False,
+    ) -> HfPolicy:
         """Read a model by name or folder. Raises TrainerError with a remedy where that fails."""
         try:
             _look_up(str(name))
@@ -70,7 +88,14 @@ class HfPolicy:
             raise TrainerError(
                 f"the model {str(name)!r} can't be loaded ({reason_of(error)}): {REMEDY}"
             ) from error
-        return cls(model, tokenizer, codec, label or str(name))
+        return cls(model, tokenizer, codec, label or str(name), recompute=recompute)
+
+    def adapt(self, shape: LoraShape, *, seed: int, saved: Path | None = None) -> None:
+        """From now on adapters learn and the model does not. ``saved``: a folder to take them from. Raises TrainerError."""
+        adapt(self._model, shape, seed=seed, head=self._model.get_output_embeddings())
+        self._lora = shape
+        if saved is not None:
+            load_adapters(self._model, shape, saved)
 
     @property
     def name(self) -> str:
@@ -85,7 +110,9 @@ class HfPolicy:
         return self._model  # type: ignore[no-any-return]
 
     def parameters(self) -> Iterator[nn.Parameter]:
-        return self.module.parameters()
+        """Those that learn; of a frozen copy, all."""
+        learning = [parameter for parameter in self.module.parameters() if parameter.requires_grad]
+        return iter(learning or self.module.parameters())
 
     def encode(self, prompt: Prompt) -> Tokens:
         """The chat template's text where the model has one, else system and user text and a cue."""
@@ -137,6 +164,15 @@ class HfPolicy:
     def logprobs(
         self, prompts: Sequence[Tokens], tokens: Tensor, mask: Tensor, group: int, temperature: float
     ) -> Scored:
+        again = self._recompute and torch.is_grad_enabled()
+        scores = (self._scores_recomputed if again else self._scores)(prompts, tokens, group)
+        spread = torch.log_softmax(scores / (temperature or 1.0), dim=-1)  # (rows, T, V)
+        chosen = spread.gather(-1, tokens[..., None])[..., 0]
+        entropy = -(spread.exp() * spread).sum(dim=-1)
+        return Scored(chosen * mask, entropy * mask)
+
+    def _scores(self, prompts: Sequence[Tokens], tokens: Tensor, group: int) -> Tensor:
+        """Scores (rows, T, V) of each of the tokens (rows, T), a group's prompt run once."""
         cache, prompt_mask, first = self._read(prompts, group)
         scores = first[:, None]  # (rows, 1, V)
         length = tokens.shape[1]
@@ -145,22 +181,39 @@ class HfPolicy:
             begin = prompt_mask.sum(dim=1, keepdim=True)
             positions = begin + torch.arange(length - 1, device=tokens.device)
             scores = torch.cat([scores, self._extend(tokens[:, :-1], seen, positions, cache)], dim=1)
-        spread = torch.log_softmax(scores / (temperature or 1.0), dim=-1)  # (rows, T, V)
-        chosen = spread.gather(-1, tokens[..., None])[..., 0]
-        entropy = -(spread.exp() * spread).sum(dim=-1)
-        return Scored(chosen * mask, entropy * mask)
+        return scores
 
-    def _read(self, prompts: Sequence[Tokens], group: int) -> tuple[Any, Tensor, Tensor]:
-        """Run the prompts once; cache, mask (rows, P) and next-token scores (rows, V) are repeated for the samples."""
-        from transformers import DynamicCache
+    def _scores_recomputed(self, prompts: Sequence[Tokens], tokens: Tensor, group: int) -> Tensor:
+        """The same without a cache, in memory for each layer's input alone."""
+        ids, mask = self._padded(prompts)
+        rest = tokens[:, :-1]
+        whole = torch.cat([ids.repeat_interleave(group, dim=0), rest], dim=1)  # (rows, P + T - 1)
+        seen = torch.cat([mask.repeat_interleave(group, dim=0), mask.new_ones(rest.shape)], dim=1)
+        with recomputing(self._model):
+            result = self._model(
+                whole,
+                attention_mask=seen,
+                position_ids=(seen.cumsum(dim=1) - 1).clamp(min=0),
+                use_cache=False,
+                logits_to_keep=tokens.shape[1],
+            )
+        return result.logits.float()  # type: ignore[no-any-return]
 
+    def _padded(self, prompts: Sequence[Tokens]) -> tuple[Tensor, Tensor]:
+        """Prompts as rows of tokens that end together, and the mask that is 1 on them; both (prompts, P)."""
         longest = max(len(prompt) for prompt in prompts)
         ids = torch.full((len(prompts), longest), self._pad)
         mask = torch.zeros(len(prompts), longest, dtype=torch.long)
         for row, prompt in enumerate(prompts):
             ids[row, longest - len(prompt) :] = torch.tensor(prompt)
             mask[row, longest - len(prompt) :] = 1
-        ids, mask = ids.to(self._model.device), mask.to(self._model.device)
+        return ids.to(self._model.device), mask.to(self._model.device)
+
+    def _read(self, prompts: Sequence[Tokens], group: int) -> tuple[Any, Tensor, Tensor]:
+        """Run the prompts once; cache, mask (rows, P) and next-token scores (rows, V) are repeated for the samples."""
+        from transformers import DynamicCache
+
+        ids, mask = self._padded(prompts)
         cache = DynamicCache(config=self._model.config)
         result = self._model(
             ids,
@@ -189,14 +242,20 @@ class HfPolicy:
         )
 
     def frozen_copy(self) -> HfPolicy:
+        """What never learns is shared, not copied: beside adapters the model itself."""
         twin = copy.copy(self)
-        twin._model = copy.deepcopy(self._model).requires_grad_(False)
+        still = {id(each): each for each in self._model.parameters() if not each.requires_grad}
+        twin._model = copy.deepcopy(self._model, still).requires_grad_(False)
         return twin
 
     def save(self, folder: Path) -> None:
+        """The model with its adapters merged in, which anyone can load, and the adapters beside it to go on with."""
         folder.mkdir(parents=True, exist_ok=True)
-        self._model.save_pretrained(folder)
+        with merged(self._model):
+            self._model.save_pretrained(folder)
         self._tokenizer.save_pretrained(folder)
+        if self._lora is not None:
+            save_adapters(self._model, self._lora, folder)
 
     @staticmethod
     def is_saved_in(folder: Path) -> bool:

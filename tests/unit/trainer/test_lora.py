@@ -1,0 +1,211 @@
+"""Adapters learn in a model's place, are merged when it is saved, and go on exactly; layers may be computed twice."""
+
+import shutil
+
+import pytest
+import torch
+from rich.console import Console
+from tests.fakes.small_llama import random_llama, word_tokenizer
+from tests.fakes.symbolic_household import SymbolicCluster, make_tasks
+
+from embomatrix.skills.prompt import Codec, prompt_for
+from embomatrix.trainer.augment import Variation
+from embomatrix.trainer.checkpoint import CHECKPOINTS, CheckpointStore, read_state
+from embomatrix.trainer.errors import TrainerError
+from embomatrix.trainer.evaluation.models import load_model
+from embomatrix.trainer.loop import REFERENCE, Parts, TrainingRun
+from embomatrix.trainer.policy.choice import new_policy, saved_policy
+from embomatrix.trainer.policy.hf import HfPolicy
+from embomatrix.trainer.policy.lora import LoraShape, adapters
+from embomatrix.trainer.progress import LineDisplay
+from embomatrix.trainer.rollout import Gateway
+from embomatrix.trainer.settings import LANGUAGE_MODEL_DEFAULTS, read_settings
+from embomatrix.trainer.telling import Teller
+
+TASKS = make_tasks(6, 2, objects=8)
+SHAPE = LoraShape(rank=4, alpha=8.0)
+SHORT = {
+    "lora.rank": 4,
+    "lora.alpha": 8.0,
+    "imitation.steps": 2,
+    "imitation.learning_rate": 1e-2,
+    "grpo.steps": 4,
+    "grpo.tasks_per_step": 2,
+    "grpo.group": 3,
+    "grpo.max_new": 8,
+    "grpo.learning_rate": 1e-2,
+    "evaluation.samples": 1,
+    "checkpoint_every": 2,
+    "keep_checkpoints": 9,
+}
+
+
+@pytest.fixture(scope="module")
+def tokenizer():
+    pytest.importorskip("tokenizers")
+    return word_tokenizer(TASKS.train)
+
+
+@pytest.fixture(scope="module")
+def model_folder(tokenizer, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("model")
+    HfPolicy(random_llama(tokenizer), tokenizer, Codec.LINES, "random llama").save(folder)
+    return folder
+
+
+def policy_of(tokenizer, *, seed=0, recompute=False):
+    return HfPolicy(
+        random_llama(tokenizer, seed), tokenizer, Codec.LINES, "random llama", recompute=recompute
+    )
+
+
+def moved(policy):
+    """Give the adapters something to say."""
+    with torch.no_grad():
+        for at, layer in enumerate(adapters(policy.module).values()):
+            drawn = torch.randn(layer.up.shape, generator=torch.Generator().manual_seed(at))
+            layer.up.copy_(0.3 * drawn)
+    return policy
+
+
+def scored(policy, *, rows=4):
+    """Log-probabilities of the same plans under any policy; prompts differ in length."""
+    told = [policy.encode(prompt_for(task.situation, Codec.LINES)) for task in TASKS.train[:2]]
+    told[0] = told[0][20:]
+    tokens = torch.arange(rows * 5).view(rows, 5) % 30 + 2
+    mask = torch.ones(rows, 5, dtype=torch.bool)
+    mask[1, 3:] = False
+    return policy.logprobs(told, tokens, mask, rows // 2, 0.9)
+
+
+def train(out, changes, *, resume=False):
+    settings = read_settings(None, {**SHORT, **changes}, LANGUAGE_MODEL_DEFAULTS)
+    progress = reference = None
+    if resume:
+        newest = CheckpointStore(out / CHECKPOINTS, keep=9).latest()
+        progress, settings = read_state(newest)
+        policy = saved_policy(newest / "policy", settings)
+        reference = saved_policy(out / REFERENCE, settings).frozen_copy()
+    else:
+        policy = new_policy(settings, TASKS)
+    teller = Teller(policy, settings.prompt.rows, Variation(TASKS.kinds, 0.0, 0.5))
+    display = LineDisplay(Console(quiet=True))
+    with Gateway(lambda: SymbolicCluster(TASKS), TASKS.bundle_bytes, run_name="lora", run_seed=0) as gateway:
+        parts = Parts(policy, teller, TASKS, gateway, display, reference)
+        summary = TrainingRun(parts, settings, out, progress).run()
+    return policy, summary
+
+
+def learnt(policy):
+    return torch.cat([parameter.detach().flatten() for parameter in policy.parameters()])
+
+
+def test_a_model_with_new_adapters_is_the_model(tokenizer):
+    plain, adapted = policy_of(tokenizer), policy_of(tokenizer)
+    adapted.adapt(SHAPE, seed=0)
+    assert torch.equal(scored(plain).logprobs, scored(adapted).logprobs)
+
+
+def test_adapters_alone_learn_and_the_output_layer_has_none(tokenizer):
+    policy = policy_of(tokenizer)
+    policy.adapt(SHAPE, seed=0)
+    scored(policy).logprobs.sum().backward()
+    names = {name for name, each in policy.module.named_parameters() if each.grad is not None}
+    assert names
+    assert all(name.endswith((".up", ".down")) for name in names)
+    assert len(list(policy.parameters())) == 2 * 7 * 2  # seven linear layers in each of two blocks
+    assert not any("lm_head" in name for name in adapters(policy.module))
+
+
+def test_the_merged_model_says_what_the_adapted_one_says(tokenizer, tmp_path):
+    policy = policy_of(tokenizer)
+    policy.adapt(SHAPE, seed=0)
+    before = scored(policy).logprobs
+    expected = scored(moved(policy)).logprobs
+    policy.save(tmp_path)
+    assert torch.equal(scored(policy).logprobs, expected)  # saving leaves the adapters where they are
+    assert not torch.allclose(before, expected, atol=1e-2)
+    assert torch.allclose(scored(HfPolicy.load(tmp_path, Codec.LINES)).logprobs, expected, atol=1e-4)
+
+
+def test_a_frozen_copy_shares_the_model_and_not_the_adapters(tokenizer):
+    policy = policy_of(tokenizer)
+    policy.adapt(SHAPE, seed=0)
+    twin = policy.frozen_copy()
+    before = scored(twin).logprobs
+    moved(policy)
+    assert torch.equal(scored(twin).logprobs, before)
+    for name, layer in adapters(policy.module).items():
+        assert adapters(twin.module)[name].inner.weight is layer.inner.weight
+    assert not any(parameter.requires_grad for parameter in twin.module.parameters())
+
+
+def test_four_steps_with_adapters_are_two_and_two_after_a_resume(model_folder, tmp_path):
+    whole, summary = train(tmp_path / "whole", {"model": str(model_folder)})
+    train(tmp_path / "halves", {"model": str(model_folder)})
+    shutil.rmtree(tmp_path / "halves" / CHECKPOINTS / "step-000004")  # as if killed after its second step
+    resumed, _ = train(tmp_path / "halves", {}, resume=True)
+    assert torch.equal(learnt(whole), learnt(resumed))
+    assert learnt(whole).abs().sum() > 0
+    frozen = adapters(whole.module)
+    for name, layer in adapters(new_policy(settings_of(model_folder), TASKS).module).items():
+        assert torch.equal(layer.inner.weight, frozen[name].inner.weight)
+    loaded = load_model(str(summary.checkpoint), Codec.LINES, threads=1, device="cpu").policy
+    assert not adapters(loaded.module)
+    assert torch.allclose(scored(loaded).logprobs, scored(whole).logprobs, atol=1e-4)
+
+
+def settings_of(folder, **changes):
+    return read_settings(None, {"model": str(folder), "lora.rank": 4, "lora.alpha": 8.0, **changes})
+
+
+def test_adapters_of_another_model_or_shape_are_refused(tokenizer, tmp_path):
+    policy = policy_of(tokenizer)
+    policy.adapt(SHAPE, seed=0)
+    policy.save(tmp_path)
+    other = policy_of(tokenizer, seed=1)
+    with pytest.raises(TrainerError, match="belong to another model"):
+        other.adapt(SHAPE, seed=0, saved=tmp_path)
+    with pytest.raises(TrainerError, match="resume with the settings of the run"):
+        policy_of(tokenizer).adapt(LoraShape(rank=2, alpha=8.0), seed=0, saved=tmp_path)
+    (tmp_path / "lora.pt").write_bytes(b"rubbish")
+    with pytest.raises(TrainerError, match="are damaged"):
+        policy_of(tokenizer).adapt(SHAPE, seed=0, saved=tmp_path)
+
+
+def test_layers_that_a_model_has_not_are_named(tokenizer):
+    with pytest.raises(TrainerError, match=r"no linear layer called query.*such as q_proj"):
+        policy_of(tokenizer).adapt(LoraShape(4, 8.0, ("query",)), seed=0)
+
+
+@pytest.mark.parametrize("changes", [{"lora.rank": 4}, {"gradient_checkpointing": True}])
+def test_the_word_level_policy_takes_neither(changes):
+    with pytest.raises(TrainerError, match="are for Hugging Face models"):
+        new_policy(read_settings(None, changes), TASKS)
+
+
+@pytest.mark.parametrize("adapted", [False, True])
+def test_layers_computed_twice_give_the_same_gradient_from_less_memory(tokenizer, adapted):
+    gradients, kept = [], []
+    for recompute in (False, True):
+        policy = policy_of(tokenizer, recompute=recompute)
+        if adapted:
+            policy.adapt(SHAPE, seed=0)
+            moved(policy)
+        sizes = []
+        with torch.autograd.graph.saved_tensors_hooks(
+            lambda x, to=sizes: to.append(x.numel()) or x, lambda x: x
+        ):
+            result = scored(policy, rows=8)
+        (result.logprobs * torch.arange(5.0)).sum().backward()
+        gradients.append(torch.cat([each.grad.flatten() for each in policy.parameters()]))
+        kept.append(sum(sizes))
+    assert torch.allclose(gradients[0], gradients[1], atol=1e-3, rtol=1e-3)
+    assert gradients[0].abs().max() > 0.1
+    assert kept[1] < 0.7 * kept[0]
+
+
+def test_layers_are_left_as_they_were(tokenizer):
+    policy = policy_of(tokenizer, recompute=True)
+    scored(policy)
+    assert all("forward" not in vars(module) for module in policy.module.modules())
