@@ -49,6 +49,20 @@ def joint_motion(joint: Joint, fraction: float) -> Pose:
     return turn @ Pose((-ox, -oy, -oz))
 
 
+def quarter_turns(frame: Pose) -> int:
+    """By how many quarter turns about z, 0 to 3, a frame is turned, to a microradian; -1 when it is turned otherwise."""
+    x, y, z, w = frame.quat_xyzw
+    if abs(x) > SQUARE or abs(y) > SQUARE:
+        return -1
+    if abs(z) <= SQUARE:
+        return 0
+    if abs(w) <= SQUARE:
+        return 2
+    if abs(z - w) <= SQUARE:
+        return 1
+    return 3 if abs(z + w) <= SQUARE else -1
+
+
 def square_box(box: Aabb, frame: Pose) -> Aabb | None:
     """A box in the frame that ``frame`` leads to; None when its sides are not along that frame's axes, to a microradian."""
     x, y, z, w = (abs(value) for value in frame.quat_xyzw)
@@ -122,8 +136,9 @@ class AssetBounds:
         points, radii = self._placed(fractions)
         turned = pose.rotation @ points  # (3, m)
         lows, highs = (turned, turned) if radii is None else (turned - radii, turned + radii)
-        a, b, c = lows.min(axis=1).tolist()
-        d, e, f = highs.max(axis=1).tolist()
+        # The reductions of the ufuncs: those of arrays go through Python, which costs as much again.
+        a, b, c = np.minimum.reduce(lows, 1).tolist()
+        d, e, f = np.maximum.reduce(highs, 1).tolist()
         return (a, b, c), (d, e, f)
 
 

@@ -79,6 +79,7 @@ class Simulator:
         ``actor`` is the execution mode, cached unless told otherwise. Engine and actor are closed with the simulator.
         """
         self._world = LiveWorld(bundle, engine if engine is not None else BulletEngine(bundle.scene))
+        self._tables = [task.table for task in bundle.tasks.values()]
         self._actor: Actor = actor if actor is not None else CachedActor()
         self._draws = Draws()
         self._seed = 0
@@ -169,7 +170,7 @@ class Simulator:
         """
         world = self._world
         yield from world.relations.footings.complete()
-        yield from world.placer.complete()
+        yield from world.placer.complete(self._tables)
         yield from world.navigator.complete()
         yield from world.swings.complete()
 

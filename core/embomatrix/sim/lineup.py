@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.sim.bounds import IDENTITY
+from embomatrix.sim.bounds import IDENTITY, quarter_turns
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.geometry import Aabb
 
@@ -115,6 +115,60 @@ class Lineup:
         return np.asarray(meets.any(axis=1)), np.asarray(most)
 
 
+_COLUMNS: Final = tuple(
+    np.array(columns)
+    for columns in ((0, 1, 2, 3, 4, 5), (4, 0, 2, 1, 3, 5), (3, 4, 2, 0, 1, 5), (1, 3, 2, 4, 0, 5))
+)
+_SIGNS: Final = tuple(
+    np.array(signs, dtype=np.float64)
+    for signs in ((1, 1, 1, 1, 1, 1), (-1, 1, 1, -1, 1, 1), (-1, -1, 1, -1, -1, 1), (1, -1, 1, 1, -1, 1))
+)
+"""From which column of a box's corners each one comes after so many quarter turns about z, and with which sign."""
+
+
+@dataclass(frozen=True, slots=True)
+class LinkBoxes:
+    """Boxes of one thing at n poses, each in the frame of the support's link that it rides on.
+
+    ``corners_m`` has shape (n, 6), the low corner first; ``link_of``, shape (n,), tells where in ``links`` each one rides.
+    """
+
+    corners_m: FloatArray
+    links: tuple[str, ...]
+    link_of: IntArray
+
+    def moved(self, rows: IntArray, by_m: FloatArray) -> LinkBoxes:
+        """The boxes of these rows, shape (m,), each moved on its link by its own way, shape (m, 3)."""
+        return LinkBoxes(self.corners_m[rows] + np.tile(by_m, 2), self.links, self.link_of[rows])
+
+    def lineup(self, frames: Mapping[str, Pose]) -> Lineup | None:
+        """The boxes in the world; at infinity on links without a frame, None when a frame is not square to the world."""
+        turns = {link: quarter_turns(frames[link]) for link in self.links if link in frames}
+        if -1 in turns.values():
+            return None
+        if len(self.links) == 1 and turns:
+            (link,) = self.links
+            return _split(_turned(self.corners_m, turns[link], frames[link]))
+        placed = np.full_like(self.corners_m, np.inf)
+        for number, link in enumerate(self.links):
+            if link in turns:
+                rows = self.link_of == number
+                placed[rows] = _turned(self.corners_m[rows], turns[link], frames[link])
+        return _split(placed)
+
+
+def _turned(corners_m: FloatArray, turns: int, frame: Pose) -> FloatArray:
+    """Boxes of a frame, shape (n, 6), in the world, where the frame is turned by so many quarter turns about z."""
+    placed = corners_m[:, _COLUMNS[turns]]
+    placed *= _SIGNS[turns]
+    placed += np.array(frame.position_m * 2)
+    return placed
+
+
+def _split(corners_m: FloatArray) -> Lineup:
+    return Lineup(corners_m[:, :3], corners_m[:, 3:])
+
+
 @dataclass(frozen=True, slots=True)
 class PoseSet:
     """n poses of a thing in the frames of a support's links, as arrays.
@@ -152,6 +206,11 @@ class PoseSet:
         """The poses in turn, again and again, moved to positions on their links, shape (m, 3)."""
         rows = np.arange(len(positions_m)) % max(len(self.link_of), 1)
         return PoseSet(positions_m, self.rotations, self.turn_of[rows], self.links, self.link_of[rows])
+
+    def boxes(self, bounds: AssetBounds) -> LinkBoxes:
+        """Boxes of a thing with these bounds, its joints shut, in the frames of the links."""
+        found = self.lineup(bounds, (), dict.fromkeys(self.links, IDENTITY))
+        return LinkBoxes(np.concatenate([found.lows_m, found.highs_m], axis=1), self.links, self.link_of)
 
     def lineup(self, bounds: AssetBounds, fractions: Sequence[float], frames: Mapping[str, Pose]) -> Lineup:
         """Boxes of a thing with these bounds and joint positions, where the links are; at infinity on links without frame."""

@@ -155,11 +155,11 @@ class Navigator:
         start = self._cell(origin)
         if start is None or self._engine.is_parked(name):
             return
-        shut = self.stands_past_shut(name, StandPose(*self.ground.grid.center(start), 0.0))
         grid = self.ground.grid
         if grid is self.ground.shut:
-            yield from shut
+            yield from self._stands_on_shut(name, start)
             return
+        shut = self.stands_past_shut(name, StandPose(*grid.center(start), 0.0))
         label = grid.label(start)
         found = False
         for stand in shut:
@@ -174,6 +174,10 @@ class Navigator:
         start = self.ground.shut.cell(origin.x_m, origin.y_m)
         if start is None or self._engine.is_parked(name):
             return ()
+        return self._stands_on_shut(name, start)
+
+    def _stands_on_shut(self, name: str, start: Cell) -> tuple[StandPose, ...]:
+        """``stands_past_shut`` for an object that is in the world, from a free cell."""
         label = self.ground.shut.label(start)
         found = self._found_before.get(name) if label == self._part_of_start else None
         if found is not None and self.is_as_loaded(name) and self._is_untouched(name):

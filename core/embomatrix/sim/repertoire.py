@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
+from dataclasses import dataclass
 from itertools import cycle, islice
 from typing import TYPE_CHECKING, Final
+
+import numpy as np
 
 from embomatrix.sim.bounds import IDENTITY, bounds_of
 from embomatrix.sim.candidates import patches, proposed_places
 from embomatrix.sim.footprints import LEVEL_FLOOR, footprint_of, pose_box_asset
-from embomatrix.sim.lineup import PoseSet
+from embomatrix.sim.lineup import LinkBoxes, PoseSet
 from embomatrix.sim.spots import link_under, links_with_spots
 from embomatrix.sim.statics import base_of
 from embomatrix.world.geometry import Aabb, Pose
@@ -17,7 +21,7 @@ from embomatrix.world.poses import PlacementKey
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from embomatrix.sim.bounds import AssetBounds
     from embomatrix.sim.candidates import Patch
@@ -28,18 +32,25 @@ if TYPE_CHECKING:
     from embomatrix.world.poses import PoseCache
     from embomatrix.world.scene import Scene
 
-LINEUPS_KEPT: Final = 16
-"""Answers in memory for each thing and support, about 2 kB each: as many as equal supports stand in a scene."""
+PLACED: Final = (Relation.ONTOP, Relation.INSIDE, Relation.UNDER)
+"""Relations that a thing can be placed in."""
 
 
 class Spots:
     """Poses of one asset in the frames of a support's links. ``local`` gives a pose by its number."""
 
-    def __init__(self, local: Callable[[int], Pose], links: Sequence[str], places: PoseSet) -> None:
+    def __init__(
+        self,
+        local: Callable[[int], Pose],
+        links: Sequence[str],
+        boxes: LinkBoxes,
+        places: Callable[[], PoseSet],
+    ) -> None:
+        """``boxes`` are those of the asset with its joints shut. ``places`` makes the poses as arrays, for other joints."""
         self._local = local
         self._links = links
+        self._boxes = boxes
         self._places = places
-        self._lineups: dict[tuple[object, ...], Lineup] = {}
 
     def __len__(self) -> int:
         return len(self._links)
@@ -52,15 +63,22 @@ class Spots:
         """The link that a pose rides on, and the pose in that link's frame."""
         return self._links[number], self._local(number)
 
-    def lineup(self, bounds: AssetBounds, fractions: tuple[float, ...], frames: Mapping[str, Pose]) -> Lineup:
-        """Boxes at all the poses in the world, of the asset with these bounds; at infinity on links without a frame."""
-        key = (fractions, *frames.items())
-        known = self._lineups.get(key)
-        if known is None:
-            if len(self._lineups) >= LINEUPS_KEPT:
-                self._lineups.clear()
-            known = self._lineups[key] = self._places.lineup(bounds, fractions, frames)
-        return known
+    def lineup(self, bounds: AssetBounds, fractions: Sequence[float], frames: Mapping[str, Pose]) -> Lineup:
+        """Boxes at all the poses in the world, of the asset with these bounds; at infinity on links without a frame.
+
+        Furniture stands square to the world: there the boxes in its frame are those in the world, but for a quarter turn.
+        """
+        square = None if any(fractions) else self._boxes.lineup(frames)
+        return square if square is not None else self._places().lineup(bounds, fractions, frames)
+
+
+@dataclass(frozen=True, slots=True)
+class Pattern:
+    """Where one asset fits on another by geometry alone; ``middles`` and ``boxes`` are of one pose for each patch."""
+
+    patches: tuple[Patch, ...]
+    middles: PoseSet
+    boxes: LinkBoxes
 
 
 class Repertoire:
@@ -73,7 +91,21 @@ class Repertoire:
         self._by_class: dict[PlacementKey, Spots] = {}
         self._footprints: dict[str, tuple[str, Pose]] = {}
         self._bases: dict[str, Base | None] = {}
-        self._patches: dict[PlacementKey, tuple[tuple[Patch, ...], PoseSet]] = {}
+        self._patterns: dict[PlacementKey, Pattern] = {}
+
+    def complete(self, tables: Iterable[Sequence[str]]) -> Iterator[None]:
+        """Look up what was verified for the things and supports of each table, one pair of assets at a step.
+
+        Work for a process that waits. Changes no answer.
+        """
+        scene = self._scene
+        for table in tables:
+            movable = [name for name in table if not scene.by_name[name].fixed]
+            hosts = [name for name in table if links_with_spots(scene.asset_of(name))]
+            for held, target, relation in itertools.product(movable, hosts, PLACED):
+                for spots in self.verified(held, target, relation):
+                    if spots is not NO_SPOTS:
+                        yield
 
     def verified(self, held: str, target: str, relation: Relation) -> Iterator[Spots]:
         """Spots verified for this pair of assets, then those verified for the footprint of what is held."""
@@ -92,19 +124,13 @@ class Repertoire:
         """At most so many poses by geometry alone, spread over the surfaces; ``shift`` moves the whole pattern."""
         one, other = self._scene.asset_of(held), self._scene.asset_of(target)
         key = PlacementKey(one.asset_id, other.asset_id, relation)
-        if key not in self._patches:
+        pattern = self._patterns.get(key)
+        if pattern is None:
             found = patches(bounds_of(one), other, relation)
             middles = [Pose.from_xyz_yaw(*patch.center_m, patch.yaw) for patch in found]
-            self._patches[key] = (found, PoseSet.of(pose_rows(middles), [patch.link for patch in found]))
-        found, middle = self._patches[key]
-        points = proposed_places(found, shift, tries)
-        links = [patch.link for patch in islice(cycle(found), len(points))]
-
-        def local(number: int) -> Pose:
-            x, y, z = points[number].tolist()
-            return Pose.from_xyz_yaw(x, y, z, found[number % len(found)].yaw)
-
-        return Spots(local, links, middle.repeated_at(points))
+            places = PoseSet.of(pose_rows(middles), [patch.link for patch in found])
+            pattern = self._patterns[key] = Pattern(found, places, places.boxes(bounds_of(one)))
+        return _spread(pattern, shift, tries)
 
     def base(self, asset: Asset) -> Base | None:
         """What the asset stands on when it stands upright, as ``statics`` has it."""
@@ -126,7 +152,10 @@ class Repertoire:
         return known
 
 
-NO_SPOTS: Final = Spots(lambda number: IDENTITY, (), PoseSet.of(pose_rows(()), ()))
+_NO_PLACES: Final = PoseSet.of(pose_rows(()), ())
+NO_SPOTS: Final = Spots(
+    lambda number: IDENTITY, (), LinkBoxes(np.zeros((0, 6)), (), _NO_PLACES.link_of), lambda: _NO_PLACES
+)
 
 
 def _spots(rows: FloatArray, then: Pose, held: Asset, support: Asset, relation: Relation) -> Spots:
@@ -137,15 +166,34 @@ def _spots(rows: FloatArray, then: Pose, held: Asset, support: Asset, relation: 
     if not len(rows):
         return NO_SPOTS
     links = [""] * len(rows)
-    plain = PoseSet.of(rows, links, then)
+    places = PoseSet.of(rows, links, then)
+    boxes = places.boxes(bounds_of(held))
     if not links_with_spots(support) <= {""}:
-        boxes = plain.lineup(bounds_of(held), (), {"": IDENTITY})
-        corners = zip(boxes.lows_m.tolist(), boxes.highs_m.tolist(), strict=True)
-        links = [link_under(Aabb(tuple(low), tuple(high)), support, relation) for low, high in corners]
-        plain = PoseSet.of(rows, links, then)
+        links = [
+            link_under(Aabb((a, b, c), (d, e, f)), support, relation)
+            for a, b, c, d, e, f in boxes.corners_m.tolist()
+        ]
+        places = PoseSet.of(rows, links, then)
+        boxes = LinkBoxes(boxes.corners_m, places.links, places.link_of)
 
     def local(number: int) -> Pose:
         x, y, z, a, b, c, d = rows[number].tolist()
         return Pose((x, y, z), (a, b, c, d)) @ then
 
-    return Spots(local, links, plain)
+    # Kept are the boxes only: what makes the arrays anew is asked where something stands askew, or is placed half open.
+    return Spots(local, links, boxes, lambda: PoseSet.of(rows, links, then))
+
+
+def _spread(pattern: Pattern, shift: Vec2, tries: int) -> Spots:
+    """Spots at so many poses, the patches taken in turn."""
+    found, middles = pattern.patches, pattern.middles
+    points = proposed_places(found, shift, tries)
+    links = [patch.link for patch in islice(cycle(found), len(points))]
+    rows = np.arange(len(points)) % max(len(found), 1)
+    boxes = pattern.boxes.moved(rows, points - middles.positions_m[rows])
+
+    def local(number: int) -> Pose:
+        x, y, z = points[number].tolist()
+        return Pose.from_xyz_yaw(x, y, z, found[number % len(found)].yaw)
+
+    return Spots(local, links, boxes, lambda: middles.repeated_at(points))

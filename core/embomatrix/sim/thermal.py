@@ -64,10 +64,12 @@ class Thermal:
 
     def works(self, name: str, source: Source) -> bool:
         """Whether the source is on and closed, as far as it must be."""
+        # The switch first: most sources of a scene are off, and all are asked after every change.
+        if source.requires_on and State.TOGGLED_ON not in self._states.get(name, ()):
+            return False
         if self._engine.is_parked(name):
             return False
-        on = State.TOGGLED_ON in self._states.get(name, ())
-        return (on or not source.requires_on) and not (source.requires_closed and self._relations.open(name))
+        return not (source.requires_closed and self._relations.open(name))
 
     def is_at(self, item: str, name: str, source: Source) -> bool:
         """Whether the source acts on the object where it lies: inside it, or on it, or in or on a vessel on it."""

@@ -52,7 +52,7 @@ class Water:
         if news.again and self._acting_at_start is not None:
             self._acting = set(self._acting_at_start)
         for name, machine in self._sources:
-            if not self._runs(name, machine):
+            if State.TOGGLED_ON not in self._states.get(name, ()) or not self._runs(name, machine):
                 self._acting.discard(name)
             # What a source did to a thing nothing undoes: it acts again when it was started, or something came.
             elif name not in self._acting or news.concerns(name, self._engine.aabb(name)):
@@ -64,7 +64,8 @@ class Water:
         return changes
 
     def _runs(self, name: str, machine: Washing | None) -> bool:
-        if State.TOGGLED_ON not in self._states.get(name, ()) or self._engine.is_parked(name):
+        """Whether a source that is switched on is in the world, and closed if it must be."""
+        if self._engine.is_parked(name):
             return False
         return machine is None or not machine.requires_closed or not self._relations.open(name)
 

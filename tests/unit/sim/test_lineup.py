@@ -57,6 +57,47 @@ def test_boxes_of_many_poses_are_those_of_each(spots, frame, drawer, then) -> No
         assert lineup.highs_m[row].tolist() == pytest.approx(box.high_m, abs=1e-9)
 
 
+SQUARE_POSE = st.builds(
+    lambda x, y, z, quarters: Pose.from_xyz_yaw(x, y, z, quarters * math.pi / 2),
+    COORDINATE,
+    COORDINATE,
+    COORDINATE,
+    st.integers(-3, 4),
+)
+
+
+@given(
+    st.lists(st.tuples(POSE, st.sampled_from(("", "drawer", "gone"))), min_size=1, max_size=5),
+    SQUARE_POSE,
+    SQUARE_POSE,
+)
+def test_boxes_kept_in_a_supports_frame_are_those_in_the_world_where_it_stands_square(spots, frame, drawer):
+    places = PoseSet.of(pose_rows([pose for pose, _ in spots]), [link for _, link in spots])
+    frames = {"": frame, "drawer": drawer}
+    expected = places.lineup(bounds_of(LAMP), (0.0,), frames)
+    found = places.boxes(bounds_of(LAMP)).lineup(frames)
+    assert found is not None
+    assert found.lows_m == pytest.approx(expected.lows_m, abs=1e-9)
+    assert found.highs_m == pytest.approx(expected.highs_m, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    "askew", [Pose.from_xyz_yaw(0.0, 0.0, 0.0, 0.1), Pose((0.0, 0.0, 0.0), (0.6, 0.0, 0.0, 0.8))]
+)
+def test_boxes_kept_in_a_supports_frame_tell_nothing_of_one_that_stands_askew(askew) -> None:
+    places = PoseSet.of(pose_rows([Pose((0.0, 0.0, 0.5))]), [""])
+    assert places.boxes(bounds_of(LAMP)).lineup({"": askew}) is None
+
+
+def test_boxes_that_are_moved_keep_their_links_and_sizes() -> None:
+    places = PoseSet.of(pose_rows([Pose((0.0, 0.0, 0.5)), Pose((0.0, 0.0, 0.9))]), ["", "drawer"])
+    boxes = places.boxes(bounds_of(LAMP))
+    moved = boxes.moved(np.array([1, 0, 1]), np.array([(1.0, 0.0, 0.0), (0.0, 2.0, 0.0), (0.0, 0.0, 3.0)]))
+    assert [moved.links[number] for number in moved.link_of] == ["drawer", "", "drawer"]
+    assert moved.corners_m[0] == pytest.approx(boxes.corners_m[1] + (1.0, 0.0, 0.0, 1.0, 0.0, 0.0))
+    assert moved.corners_m[2] == pytest.approx(boxes.corners_m[1] + (0.0, 0.0, 3.0, 0.0, 0.0, 3.0))
+
+
 @given(st.lists(BOX, min_size=1, max_size=6), COORDINATE, COORDINATE)
 def test_reach_to_many_boxes_is_that_to_each(boxes, x, y) -> None:
     stand = StandPose(x, y, 0.0)
