@@ -68,3 +68,101 @@ async def test_trl_trains_on_the_cluster_and_announces_what_comes(cluster, datas
     assert run.closed_s, "the script's end closes its run"
     assert 0 < run.stats.delivered <= 3 * 2 * 4
     assert run.stats.prewarm_hits + run.stats.prewarm_misses > 0, "nothing was announced"
+
+
+VERIFIERS = """
+import asyncio, json, sys
+sys.path.append(sys.argv[2])
+import verifiers.v1 as vf
+from verifiers.v1.utils.loaders import load_taskset
+from verifiers.v1.types import AssistantMessage
+from embomatrix.trainer.adapters.verifiers import HouseholdConfig
+from embomatrix.world.dataset import Dataset
+
+taskset = load_taskset(HouseholdConfig(id="embomatrix-household", dataset=sys.argv[1]))
+records = Dataset.load(sys.argv[1]).train
+oracles = {record.task.task_id: json.dumps([dict(call) for call in record.oracle]) for record in records}
+
+def trace_of(task, reply):
+    node = vf.MessageNode(message=AssistantMessage(content=reply), sampled=True)
+    seed = vf.TraceTask(type=type(task).__name__, data=task.data)
+    return vf.Trace.model_construct(task=seed, nodes=[node], rewards={}, metrics={}, info={}, root_reply=None)
+
+async def main():
+    tasks = list(taskset)
+    good = [trace_of(task, oracles[task.data.id]) for task in tasks]
+    none = [trace_of(task, "hm") for task in tasks]
+    await asyncio.gather(*(task.score(trace) for task, trace in zip(tasks * 2, good + none, strict=True)))
+    for trace in good + none:
+        total = sum(reward.score * reward.weight for reward in trace.rewards.values())
+        print(json.dumps({"total": total, "success": trace.metrics["success"]}))
+
+asyncio.run(main())
+"""
+
+
+async def test_verifiers_scores_the_replies_of_its_tasks(cluster, dataset):
+    peer = Peer("verifiers", "verifiers==0.4.0")
+    printed = peer.run("-c", VERIFIERS, dataset, EXAMPLES, EMBOMATRIX_MANAGER=cluster[0].address)
+    told = [json.loads(line) for line in printed.splitlines()]
+    assert [each["success"] for each in told] == [1, 1, 1, 0, 0, 0]
+    assert all(each["total"] > 30 for each in told[:3])
+    assert [each["total"] for each in told[3:]] == [-1, -1, -1]
+
+
+VERL = """
+import asyncio, json, sys
+import torch
+from omegaconf import OmegaConf
+from tensordict import TensorDict
+from verl import DataProto
+from verl.experimental.reward_loop.reward_manager.naive import NaiveRewardManager
+from verl.trainer.ppo.reward import get_custom_reward_fn
+from embomatrix.trainer.adapters.rows import verl_rows
+from embomatrix.world.dataset import Dataset
+
+class Letters:
+    def decode(self, ids, skip_special_tokens):
+        return "".join(map(chr, ids.tolist()))
+
+config = OmegaConf.create({"reward": {"custom_reward_function": {
+    "path": "pkg://embomatrix.trainer.adapters.verl", "name": "compute_score", "reward_kwargs": {"dataset": sys.argv[1]},
+}}})
+records = Dataset.load(sys.argv[1]).train
+oracles = {record.task.task_id: json.dumps([dict(call) for call in record.oracle]) for record in records}
+
+def sample(row, text):
+    ids = torch.tensor([[ord(letter) for letter in text]])
+    batch = TensorDict({"responses": ids, "attention_mask": torch.ones_like(ids)}, batch_size=1)
+    names = ("data_source", "reward_model", "extra_info")
+    return DataProto.from_dict(dict(batch), non_tensors={name: [row[name]] for name in names})
+
+async def main():
+    manager = NaiveRewardManager(config, Letters(), get_custom_reward_fn(config))
+    rows = verl_rows(sys.argv[1])
+    texts = [oracles[row["reward_model"]["ground_truth"]] for row in rows]
+    samples = [sample(row, text) for row, text in zip(rows * 2, texts + ["hm"] * len(rows), strict=True)]
+    for told in await asyncio.gather(*(manager.run_single(each) for each in samples)):
+        print(json.dumps({"score": told["reward_score"], **told["reward_extra_info"]}))
+
+asyncio.run(main())
+"""
+
+
+async def test_verl_s_reward_manager_awaits_the_cluster(cluster, dataset):
+    libraries = (
+        "tensordict",
+        "omegaconf",
+        "hydra-core",
+        "ray",
+        "transformers",
+        "codetiming",
+        "pandas",
+        "datasets",
+    )
+    peer = Peer("verl", TORCH, *libraries, "verl==0.9.1")
+    printed = peer.run("-c", VERL, dataset, EMBOMATRIX_MANAGER=cluster[0].address)
+    told = [json.loads(line) for line in printed.splitlines() if line.startswith("{")]
+    assert [each["success"] for each in told] == [1, 1, 1, 0, 0, 0]
+    assert all(each["score"] == each["format"] + each["relevance"] + each["goal"] for each in told)
+    assert [each["score"] for each in told[3:]] == [-1, -1, -1]

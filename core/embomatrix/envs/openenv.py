@@ -1,0 +1,141 @@
+"""An OpenEnv environment and its server: an action is the text of a call or of a whole plan, each episode is one task.
+
+Needs ``openenv``, which nothing else here does. ``uvicorn.run(server("build/dataset"))`` serves it.
+"""
+
+from __future__ import annotations
+
+import functools
+import uuid
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from openenv.core.env_server.http_server import create_app
+from openenv.core.env_server.interfaces import Environment
+from openenv.core.env_server.types import Action, Observation, State
+
+from embomatrix.envs.episode import Household
+from embomatrix.reward.settings import PAPER
+from embomatrix.skills.parse import PlanError, parse_plan
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from embomatrix.envs.episode import Episode
+
+SESSIONS: Final = 4
+"""Episodes at a time. Each has simulators of its own: some 100 MB a scene."""
+
+
+class PlanAction(Action):  # type: ignore[misc]  # untyped where it is not installed
+    """``text``: calls as a plan writes them, ``move 3`` or JSON. They are executed up to the first that fails."""
+
+    text: str
+
+
+class HouseholdObservation(Observation):  # type: ignore[misc]
+    """``task`` is the prompt, ``state`` a line for each object, ``messages`` what became of each call."""
+
+    task: str
+    state: list[str]
+    messages: list[str] = []  # noqa: RUF012  # pydantic copies it
+
+
+class HouseholdState(State):  # type: ignore[misc]
+    """Which task it is, and how the reward is made up so far."""
+
+    task_id: str = ""
+    success: bool = False
+    format: float = 0.0
+    relevance: float = 0.0
+    goal: float = 0.0
+
+
+class HouseholdEnvironment(Environment[PlanAction, HouseholdObservation, HouseholdState]):  # type: ignore[misc]
+    """Tasks of a dataset. ``reset(seed=…)`` draws one, ``reset(task_id=…)`` names it.
+
+    The reward of a step is what its calls added to the plan's; a text that is no plan changes nothing and gets −1. Done at
+    the goal or after 64 calls.
+    """
+
+    SUPPORTS_CONCURRENT_SESSIONS = True
+
+    def __init__(self, dataset: str | Path, split: str = "train") -> None:
+        super().__init__()
+        self._household = Household(dataset)
+        self._task_ids = [record.task.task_id for record in self._household.records if record.split == split]
+        self._episode: Episode | None = None
+        self._state = HouseholdState()
+
+    def reset(
+        self,
+        seed: int | None = None,
+        episode_id: str | None = None,
+        *,
+        task_id: str = "",
+        **_: Any,
+    ) -> HouseholdObservation:
+        """Begin an episode. Raises DatasetError for an unknown task."""
+        draw = np.random.default_rng(seed)
+        named = task_id or self._task_ids[int(draw.integers(len(self._task_ids)))]
+        self._episode = self._household.episode(named)
+        self._episode.reset(int(draw.integers(2**31)))
+        self._state = HouseholdState(episode_id=episode_id or uuid.uuid4().hex, step_count=0, task_id=named)
+        return self._observation(self._episode, 0.0, [], done=False)
+
+    def step(self, action: PlanAction, timeout_s: float | None = None, **_: Any) -> HouseholdObservation:
+        """Execute the calls of a text, up to the first that fails."""
+        if self._episode is None:
+            raise RuntimeError("no episode was begun: call reset first")
+        try:
+            plan = parse_plan(action.text, self._episode.task.profile)
+        except PlanError as error:
+            return self._observation(self._episode, PAPER.unparsable, [str(error)], done=False)
+        gain, messages, done = 0.0, [], False
+        for call in plan:
+            turn = self._episode.act(call)
+            gain += turn.gain
+            messages.append(turn.step.message)
+            reward = turn.reward
+            done = reward.success or turn.over
+            self._state = self._state.model_copy(
+                update={
+                    "step_count": self._state.step_count + 1,
+                    "success": reward.success,
+                    "format": reward.format,
+                    "relevance": reward.relevance,
+                    "goal": reward.goal,
+                }
+            )
+            if done or not turn.step.ok:
+                break
+        return self._observation(self._episode, gain, messages, done=done)
+
+    @property
+    def state(self) -> HouseholdState:
+        """Of the episode under way."""
+        return self._state
+
+    def close(self) -> None:
+        """Free the simulators."""
+        self._household.close()
+
+    def _observation(
+        self, episode: Episode, gain: float, messages: list[str], *, done: bool
+    ) -> HouseholdObservation:
+        prompt = episode.prompt()
+        return HouseholdObservation(
+            task=f"{prompt.system}\n\n{prompt.user}",
+            state=list(episode.state()),
+            messages=messages,
+            reward=gain,
+            done=done,
+        )
+
+
+def server(dataset: str | Path, split: str = "train", sessions: int = SESSIONS) -> Any:
+    """The ASGI application, with so many sessions at a time at most."""
+    environment = functools.partial(HouseholdEnvironment, dataset, split)
+    return create_app(
+        environment, PlanAction, HouseholdObservation, env_name="embomatrix", max_concurrent_envs=sessions
+    )
