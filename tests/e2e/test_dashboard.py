@@ -105,6 +105,35 @@ async def test_page_of_training_says_what_to_do_where_nobody_trains(browser, tmp
     assert "sampled" not in page.words
 
 
+async def test_pages_of_tasks_show_a_gallery_and_the_oracle_s_plan_on_the_plan_view(
+    browser, kitchen, tmp_path
+):
+    dataset = Dataset.load(kitchen)
+    record = dataset.train[0]
+    async with manager(tmp_path / "data", dataset=kitchen) as at:
+        page = await asyncio.to_thread(shown, browser, f"{at.status_url}#tasks", tmp_path)
+        chosen = f"{at.status_url}#tasks?{record.task.task_id}"
+        one = await asyncio.to_thread(shown, browser, chosen, tmp_path)
+        none = await asyncio.to_thread(shown, browser, f"{at.status_url}#tasks?nothing", tmp_path)
+    every = len(dataset.records)
+    assert page.words["total"] == f"1 to {every} of {every} tasks, 1 scenes"
+    assert record.task.instruction in page.words["cards"]
+    assert page.classes.count("card") == every
+    assert page.classes.count("floor") > 0
+    assert record.task.instruction in one.words["main"]
+    assert one.words["said"] == f"0 of {len(record.oracle)}"
+    assert one.classes.count("step") == len(record.oracle) + 1
+    assert one.classes.count("goal") == len(record.task.goal_objects)
+    assert one.classes.count("floor") == 1
+    assert "the dataset holds no task 'nothing'" in none.words["main"]
+
+
+async def test_page_of_tasks_says_how_to_show_a_dataset(browser, tmp_path):
+    async with manager(tmp_path / "data") as at:
+        page = await asyncio.to_thread(shown, browser, f"{at.status_url}#tasks", tmp_path)
+    assert page.words["cards"] == "no dataset is shown: start the manager with --dataset FOLDER"
+
+
 def test_page_of_a_cluster_with_a_token_asks_for_it_and_shows_nothing(browser, tmp_path):
     with cluster(tmp_path / "cluster", "--token=the-secret") as (_, url):
         page = shown(browser, url, tmp_path)

@@ -133,7 +133,7 @@ async def test_the_page_loads_nothing_from_elsewhere_and_no_file_but_its_own(tmp
         ]
     assert "default-src 'none'" in page.headers["content-security-policy"]
     assert "http" not in page.text.replace("http://www.w3.org", "")
-    assert (set(files), len(files)) == ({200}, 13)
+    assert (set(files), len(files)) == ({200}, 16)
     assert set(outside) <= {401, 404}
 
 
@@ -166,3 +166,13 @@ async def test_training_is_shown_as_it_is_reported_and_after_its_run_was_closed(
     assert later == told
     assert listed == seen["training"] == [told["run"]]
     assert (unknown.status_code, "nobody" in unknown.json()["detail"]) == (404, True)
+
+
+async def test_tasks_are_told_to_viewers_alone_and_refused_by_name(tmp_path):
+    async with manager(tmp_path, token="secret", dataset=tmp_path / "nowhere") as at, http_at(at) as http:
+        stranger = await http.get(f"{PREFIX}/tasks")
+        own = {"authorization": "Bearer secret"}
+        damaged = await http.get(f"{PREFIX}/tasks", headers=own)
+        wrong = await http.get(f"{PREFIX}/tasks", params={"limit": 100_000}, headers=own)
+    assert (stranger.status_code, damaged.status_code, wrong.status_code) == (401, 503, 422)
+    assert "--dataset" in damaged.json()["detail"]

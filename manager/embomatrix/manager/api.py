@@ -11,17 +11,19 @@ from embomatrix.manager.http_rules import Guard
 from embomatrix.manager.page import page
 from embomatrix.manager.prometheus import CONTENT_TYPE, metrics_page
 from embomatrix.manager.rest import PREFIX, changing, reading
+from embomatrix.manager.rest_tasks import showing
 from embomatrix.manager.rewards import rewarding
 from embomatrix.manager.snapshot import Snapshots
 from embomatrix.rpc.versions import software_version
 
 if TYPE_CHECKING:
     from embomatrix.manager.expulsion import Expulsion
+    from embomatrix.manager.gallery import Gallery
     from embomatrix.manager.http_rules import HttpRules
     from embomatrix.manager.runtime import ManagerRuntime
 
 
-def build_api(runtime: ManagerRuntime, rules: HttpRules, expulsion: Expulsion) -> FastAPI:
+def build_api(runtime: ManagerRuntime, rules: HttpRules, expulsion: Expulsion, gallery: Gallery) -> FastAPI:
     """The application. With tokens, everything but the page's own files and the health check asks for one."""
     app = FastAPI(
         title="EmboMatrix manager",
@@ -36,6 +38,7 @@ def build_api(runtime: ManagerRuntime, rules: HttpRules, expulsion: Expulsion) -
     snapshots = Snapshots(runtime)
     app.include_router(page())
     app.include_router(reading(runtime, snapshots))
+    app.include_router(showing(gallery))
     app.include_router(changing(runtime, snapshots, expulsion))
     app.include_router(rewarding(runtime.runs))
 

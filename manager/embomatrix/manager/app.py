@@ -22,6 +22,7 @@ from embomatrix.manager.auditor import AuditRules
 from embomatrix.manager.bundles import BundleStore
 from embomatrix.manager.cluster_state import ClusterState
 from embomatrix.manager.expulsion import Expulsion
+from embomatrix.manager.gallery import Gallery
 from embomatrix.manager.garbage import only_young
 from embomatrix.manager.http_rules import HttpRules, allowed_hosts
 from embomatrix.manager.leadership import Leadership
@@ -126,7 +127,8 @@ async def running(
         await gate.open(protection.first)
         server, port = await build_server(runtime, gate, protection.tls, settings)
         rules = HttpRules(gate, hosts=allowed_hosts(settings.http_host, protection.tls))
-        http.show(build_api(runtime, rules, Expulsion(runtime, gate)))
+        gallery = Gallery(settings.dataset)
+        http.show(build_api(runtime, rules, Expulsion(runtime, gate), gallery))
         group.create_task(leadership.keep())
         group.create_task(runtime.serve())
         await server.start()

@@ -39,6 +39,9 @@ Ca = Annotated[
     ),
 ]
 DataDir = Annotated[Path | None, typer.Option(help="Folder of bundles and state.", show_default=False)]
+ShownDataset = Annotated[
+    Path | None, typer.Option(help="Folder of a dataset whose tasks the dashboard shows.", show_default=False)
+]
 State = Annotated[
     str,
     typer.Option(help="memory: | sqlite:PATH | redis://HOST:PORT/DB. Default: a file in the data folder."),
@@ -84,6 +87,7 @@ def serve(
     state: State = "",
     advertise: Advertise = "",
     data_dir: DataDir = None,
+    dataset: ShownDataset = None,
     token: SharedToken = "",
     tls_cert: TlsCert = None,
     tls_key: TlsKey = None,
@@ -101,6 +105,7 @@ def serve(
         "http_port": http_port,
         "state": state,
         "advertise": advertise,
+        "dataset": dataset,
         "token": _token(token),
         "tls_cert": tls_cert,
         "tls_key": tls_key,

@@ -203,7 +203,7 @@ def _training(router: APIRouter, runtime: ManagerRuntime, snapshots: Snapshots) 
     @router.get("/training/{run_id}", response_model=TrainingDetail)
     async def detail(run_id: str) -> Response:
         """Learning curves of a run, and plans that its policy wrote of late."""
-        with _answered():
+        with answered():
             return _json(runtime.training.detail(run_id))
 
 

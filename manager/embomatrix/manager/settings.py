@@ -34,6 +34,8 @@ class ManagerSettings(BaseModel):
         default_factory=lambda: Path.home() / ".local" / "share" / "embomatrix" / "manager"
     )
     """Folder of bundles and of the embedded state."""
+    dataset: Path | None = None
+    """Folder of a dataset whose tasks the dashboard shows. It is read, never written."""
     state: str = ""
     """``memory:``, ``sqlite:PATH`` or ``redis://HOST:PORT/DB``. Empty: a file in the data folder."""
     token: str = Field("", repr=False, pattern=TOKEN_PATTERN)

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import re
+import shutil
 from html.parser import HTMLParser
 
 import pytest
@@ -119,6 +120,17 @@ def test_the_command_writes_a_page_and_suggests_a_task_that_is_there(dataset, tm
     )
     assert wrong.exit_code == 2
     assert "did you mean" in wrong.output
+
+
+def test_pictures_of_scenes_are_drawn_once(dataset, tmp_path):
+    folder = tmp_path / "data"
+    shutil.copytree(dataset.folder, folder)
+    done = [CliRunner().invoke(app, ["pictures", str(folder)]) for _ in range(2)]
+    bundles = {record.bundle_digest.removeprefix("sha256:") for record in dataset.records}
+    assert {file.stem for file in (folder / "pictures").glob("*.jpg")} == bundles
+    assert [told.output.split(" pictures")[0].split()[-1] for told in done] == [f"{len(bundles)}", "0"]
+    wrong = CliRunner().invoke(app, ["pictures", str(tmp_path / "nowhere")])
+    assert (wrong.exit_code, "there is no dataset" in " ".join(wrong.output.split())) == (2, True)
 
 
 def test_every_task_is_exported_with_every_field(dataset):

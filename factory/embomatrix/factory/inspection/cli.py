@@ -10,17 +10,19 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from embomatrix.factory.inspection.page import scene_picture, task_page
+from embomatrix.factory.inspection.page import scene_jpeg, scene_picture, task_page
 from embomatrix.factory.inspection.playing import play_oracle
 from embomatrix.factory.pipeline.store import TRANSCRIPTS_FOLDER
-from embomatrix.factory.terminal import mended
-from embomatrix.world.dataset import Dataset, DatasetError
+from embomatrix.factory.terminal import mended, progress
+from embomatrix.world.dataset import Dataset, DatasetError, bundle_file
 from embomatrix.world.whole_file import check_writable, write_whole
 
 if TYPE_CHECKING:
     from embomatrix.world.dataset import TaskRecord
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+PICTURES_FOLDER = "pictures"
+CARD_PX = (720, 540)
 TREES_FOLDER = "trees"
 """Of a dataset whose scenes were laid out by tree: JSON by task."""
 
@@ -51,6 +53,27 @@ def inspect(
         )
         write_whole(file, page.encode("utf-8"))
     Console().print(f"page: {file}", highlight=False, markup=False)
+
+
+@app.command()
+def pictures(
+    dataset: Annotated[Path, typer.Argument(help="Folder of the dataset.")],
+) -> None:
+    """Draw the scene of each bundle into the dataset, for the dashboard's gallery; those that are there stay."""
+    console = Console()
+    folder = dataset / PICTURES_FOLDER
+    with mended(folder, kept=": pictures that are drawn are kept"):
+        loaded = Dataset.load(dataset)
+        missing = {
+            digest: file
+            for digest in dict.fromkeys(record.bundle_digest for record in loaded.records)
+            if not (file := (folder / bundle_file(digest)).with_suffix(".jpg")).exists()
+        }
+        folder.mkdir(exist_ok=True)
+        with progress(console) as bars:
+            for digest, file in bars.track(missing.items(), description="pictures"):
+                write_whole(file, scene_jpeg(loaded.read_bundle(digest).scene, CARD_PX))
+    console.print(f"{len(missing)} pictures: {folder}", highlight=False, markup=False)
 
 
 def _record(dataset: Dataset, task_id: str) -> TaskRecord:

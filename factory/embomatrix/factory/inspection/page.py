@@ -151,14 +151,19 @@ def _tree(node: object) -> str:
     return escape(str(node)) if node not in ("", None) else ""
 
 
-def scene_picture(scene: Scene) -> str:
-    """An oblique view as an element that holds it. Drawn at twice the size: Bullet's renderer leaves edges jagged."""
-    width, height = PICTURE_PX
+def scene_jpeg(scene: Scene, size_px: tuple[int, int] = PICTURE_PX) -> bytes:
+    """An oblique view. Drawn at twice the size: Bullet's renderer leaves edges jagged."""
+    width, height = size_px
     pixels = np.asarray(render_oblique(scene, width_px=2 * width, height_px=2 * height))
-    picture = Image.fromarray(pixels).convert("RGB").resize(PICTURE_PX, Image.Resampling.LANCZOS)
+    picture = Image.fromarray(pixels).convert("RGB").resize(size_px, Image.Resampling.LANCZOS)
     data = io.BytesIO()
     picture.save(data, "JPEG", quality=82)
-    encoded = base64.b64encode(data.getvalue()).decode("ascii")
+    return data.getvalue()
+
+
+def scene_picture(scene: Scene) -> str:
+    """The same as an element that holds it."""
+    encoded = base64.b64encode(scene_jpeg(scene)).decode("ascii")
     return f'<img alt="the scene from above, at an angle" src="data:image/jpeg;base64,{encoded}">'
 
 

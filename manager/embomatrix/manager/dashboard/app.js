@@ -4,11 +4,12 @@ import {at, seconds} from "./dom.js";
 import * as failures from "./failures.js";
 import * as lookahead from "./lookahead.js";
 import * as overview from "./overview.js";
+import * as tasks from "./tasks.js";
 import * as timeline from "./timeline.js";
 import * as training from "./training.js";
 import * as workers from "./workers.js";
 
-const PAGES = {overview, workers, lookahead, timeline, failures, training};
+const PAGES = {overview, workers, lookahead, timeline, failures, training, tasks};
 const REFRESH_MS = 1000;
 let page = null;
 let waiting = 0;

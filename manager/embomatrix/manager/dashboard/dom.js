@@ -12,6 +12,14 @@ export function h(tag, attributes = {}, ...children) {
   return element;
 }
 
+/** The same for a shape of a picture. */
+export function shape(tag, attributes = {}, ...children) {
+  const element = document.createElementNS("http://www.w3.org/2000/svg", tag);
+  for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
+  element.append(...children.flat().filter(Boolean));
+  return element;
+}
+
 export const at = id => document.getElementById(id);
 export const brief = digest => digest.replace(/^sha256:/, "").slice(0, 8);
 export const count = number => Number(number).toLocaleString("en");

@@ -1,0 +1,84 @@
+// One task: what is asked, its objects, who said what, and the oracle's plan played on the plan view.
+import {ask, picture} from "./ask.js";
+import {at, h, put, table} from "./dom.js";
+import {drawn} from "./plan.js";
+
+const STEP_MS = 1200;
+let playing = 0, number = 0, moments = [], view = null;
+
+export function close() {
+  clearInterval(playing);
+  playing = 0;
+}
+
+/** Show the task in a place; throws Refused. */
+export async function open(place, task_id) {
+  const told = await ask(`tasks/${encodeURIComponent(task_id)}`), {card} = told, about = new Set(told.objects.filter(row => row.goal).map(row => row.name));
+  ({moments} = told);
+  view = drawn(told.floor, {rooms: told.rooms, about, things: told.things, label: `plan view of ${card.scene_id}`});
+  const facts = [["scene", card.scene_id], ["category", card.category.replaceAll("_", " ")], ["split", card.split], ["source", told.source], ["profile", told.profile], ["kind of goal", told.signature]];
+  const steps = moments.map((moment, i) => h("li", {}, h("button", {type: "button", class: "step", onclick: () => { close(); go(i); }}, moment.call || "the start")));
+  const button = (id, words, act) => h("button", {type: "button", id, onclick: act}, words);
+  place.replaceChildren(
+    h("section", {}, h("h2", {}, h("a", {href: "#tasks"}, "All tasks"), h("small", {}, card.task_id)), h("p", {class: "instruction"}, card.instruction),
+      h("dl", {class: "facts"}, facts.filter(([, value]) => value).map(([name, value]) => h("div", {}, h("dt", {}, name), h("dd", {}, value))))),
+    h("section", {class: "most"}, h("h2", {}, "The oracle's plan ", h("small", {}, "things are drawn where a call puts them, not at their verified poses")), view.picture,
+      h("div", {class: "bar"}, button("first", "Start", () => { close(); go(0); }), button("back", "Back", () => { close(); go(number - 1); }), button("play", "Play", play), button("next", "Next", () => { close(); go(number + 1); }),
+        h("span", {id: "said", role: "status"}))),
+    h("section", {class: "third"}, h("h2", {}, "Steps ", h("small", {}, told.problem)), h("ol", {class: "calls", start: "0", onkeydown: key}, steps)),
+    card.picture ? h("section", {class: "half"}, h("h2", {}, "Picture"), h("div", {id: "picture"})) : "",
+    h("section", {class: card.picture ? "half" : ""}, h("h2", {}, "Goal"), h("pre", {class: "told", tabindex: "0"}, told.goal)),
+    h("section", {}, h("h2", {}, "Objects ", h("small", {}, "rows of the table that plans name; those of the goal in bold")), objects(told.objects)),
+    told.transcript ? h("section", {class: told.tree ? "half" : ""}, h("h2", {}, "Transcript"), transcript(told.transcript)) : "",
+    told.tree ? h("section", {class: told.transcript ? "half" : ""}, h("h2", {}, "Layout tree"), tree(told.tree)) : "");
+  go(0);
+  if (card.picture) put(at("picture"), h("img", {alt: `the scene ${card.scene_id} at an angle`, src: await picture(`scenes/${card.bundle_digest}/picture`)}));
+}
+
+function go(to) {
+  number = Math.max(0, Math.min(moments.length - 1, to));
+  const moment = moments[number];
+  view.show(moments, number);
+  document.querySelectorAll(".calls button").forEach((button, i) => { if (i === number) button.setAttribute("aria-current", "step"); else button.removeAttribute("aria-current"); });
+  at("said").textContent = `${number} of ${moments.length - 1}${moment.held.length ? `, holds ${moment.held.join(", ")}` : ""}${moment.active.length ? `, open or on: ${moment.active.join(", ")}` : ""}`;
+  at("back").disabled = at("first").disabled = number === 0;
+  at("next").disabled = number === moments.length - 1;
+  at("play").textContent = playing ? "Pause" : "Play";
+}
+
+function play() {
+  if (playing) { close(); go(number); return; }
+  if (number === moments.length - 1) number = 0;
+  playing = setInterval(() => { if (number >= moments.length - 2) close(); go(number + 1); }, STEP_MS);
+  go(number);
+}
+
+function key(event) {
+  const moves = {ArrowDown: 1, ArrowUp: -1};
+  if (!(event.key in moves)) return;
+  event.preventDefault();
+  close();
+  go(number + moves[event.key]);
+  document.querySelectorAll(".calls button")[number].focus();
+}
+
+function objects(rows) {
+  return table([["row", "n"], "name", "room", "where", ["size (m)", "wideonly"], ["mass (kg)", "n wideonly"], "state"], rows.map((row, i) => h("tr", {class: row.goal ? "goal" : ""},
+    h("td", {class: "n fit"}, i), h("td", {}, row.name), h("td", {}, row.room), h("td", {}, row.where), h("td", {class: "wideonly"}, row.size_m.map(m => m.toFixed(2)).join(" × ")), h("td", {class: "n wideonly"}, row.mass_kg), h("td", {}, row.states))), "objects of the task");
+}
+
+/** Markdown as the social agents leave it: headings, lists, strong words; anything else stays text. */
+function transcript(text) {
+  const strong = line => line.split(/\*\*(.+?)\*\*/).map((part, i) => i % 2 ? h("strong", {}, part) : part);
+  return h("div", {class: "talk"}, text.trim().split(/\n\s*\n/).filter(block => !block.startsWith("# ")).map(block => {
+    if (block.startsWith("## ")) return h("h3", {}, strong(block.slice(3)));
+    if (block.startsWith("* ")) return h("ul", {}, block.split("\n").map(line => h("li", {}, strong(line.replace(/^\* /, "")))));
+    return h("p", {}, strong(block));
+  }));
+}
+
+function tree(node) {
+  if (Array.isArray(node)) return h("ul", {}, node.map(inner => h("li", {}, tree(inner))));
+  if (node && typeof node === "object") return h("ul", {}, Object.entries(node).map(([name, inner]) => h("li", {}, `${name} `, tree(inner))));
+  return h("span", {}, node === null ? "" : String(node));
+}

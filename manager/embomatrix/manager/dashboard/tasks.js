@@ -1,0 +1,91 @@
+// The dataset's tasks: a gallery with pictures of their scenes, and one of them.
+import {Refused, ask, picture} from "./ask.js";
+import {at, count, h, none, put} from "./dom.js";
+import {drawn} from "./plan.js";
+import * as task from "./task.js";
+
+const CARDS = 24, TYPING_MS = 250;
+const wish = {search: "", scene: "", category: "", offset: 0};
+let pictures = new Map(), watcher = null, typed = 0, total = 0;
+
+export function open(main) {
+  const chosen = location.hash.split("?")[1];
+  if (chosen) {
+    main.replaceChildren(h("section", {}, none("Reading the task…")));
+    task.open(main, decodeURIComponent(chosen)).catch(error => main.replaceChildren(h("section", {}, h("p", {}, h("a", {href: "#tasks"}, "All tasks")), refused(error))));
+    return;
+  }
+  watcher = new IntersectionObserver(seen => seen.filter(one => one.isIntersecting).forEach(({target}) => { watcher.unobserve(target); look(target); }), {rootMargin: "200px"});
+  main.replaceChildren(h("section", {}, h("h2", {}, "Scenes and tasks ", h("small", {id: "total"})),
+    h("div", {class: "bar"},
+      h("input", {type: "search", placeholder: "words of an instruction", "aria-label": "search", value: wish.search, oninput: event => { clearTimeout(typed); typed = setTimeout(() => turn({search: event.target.value}), TYPING_MS); }}),
+      h("select", {id: "scene", "aria-label": "scene", onchange: event => turn({scene: event.target.value})}),
+      h("select", {id: "category", "aria-label": "category", onchange: event => turn({category: event.target.value})}),
+      h("button", {id: "before", type: "button", onclick: () => turn({offset: Math.max(0, wish.offset - CARDS)})}, "Before"),
+      h("button", {id: "after", type: "button", onclick: () => turn({offset: wish.offset + CARDS})}, "After")),
+    h("div", {id: "cards", class: "cards"}, none("Reading the dataset…"))));
+  turn({offset: wish.offset});
+}
+
+export function close() {
+  task.close();
+  clearTimeout(typed);
+  watcher?.disconnect();
+  watcher = null;
+}
+
+/** Tasks are files: nothing of them comes with the snapshot. */
+export function show() {}
+
+async function turn(changes) {
+  Object.assign(wish, {offset: 0}, changes);
+  try {
+    const page = await ask(`tasks?${new URLSearchParams({...wish, limit: CARDS})}`);
+    if (watcher) list(page);
+  } catch (error) {
+    if (watcher) put(at("cards"), refused(error));
+  }
+}
+
+function list(page) {
+  ({total} = page);
+  const last = page.offset + page.items.length;
+  at("total").textContent = total ? `${count(page.offset + 1)} to ${count(last)} of ${count(total)} tasks, ${count(page.scenes.length)} scenes` : "";
+  at("before").disabled = page.offset === 0;
+  at("after").disabled = last >= total;
+  choices("scene", "every scene", page.scenes.map(one => [one.scene_id, `${one.scene_id} (${count(one.tasks)})`]));
+  choices("category", "every category", page.categories.map(name => [name, name.replaceAll("_", " ")]));
+  put(at("cards"), page.items.length ? page.items.map(card) : none(page.notice || "No task is like that."));
+  for (const place of at("cards").querySelectorAll(".thumb:empty")) watcher.observe(place);
+}
+
+function choices(id, every, pairs) {
+  put(at(id), h("option", {value: ""}, every), pairs.map(([value, words]) => h("option", {value, selected: value === wish[id]}, words)));
+}
+
+function card(one) {
+  return h("a", {class: "card", href: `#tasks?${encodeURIComponent(one.task_id)}`}, h("span", {class: "thumb", "data-digest": one.bundle_digest, "data-picture": String(one.picture), "data-scene": one.scene_id}),
+    h("span", {class: "instruction"}, one.instruction), h("span", {class: "muted"}, `${one.category.replaceAll("_", " ")} · ${one.scene_id} · ${one.steps} steps · ${one.split}`));
+}
+
+async function look(place) {
+  const {digest, scene} = place.dataset;
+  try {
+    if (place.dataset.picture === "true") {
+      place.replaceChildren(h("img", {alt: `the scene ${scene}`, src: await once(`scenes/${digest}/picture`, picture)}));
+    } else {
+      place.replaceChildren(drawn(await once(`scenes/${digest}/floor`, ask), {label: `plan of ${scene}`}).picture);
+    }
+  } catch (error) {
+    place.replaceChildren(refused(error));
+  }
+}
+
+/** The same scene is asked for once, however many of its tasks are shown. */
+function once(path, how) {
+  if (pictures.size > 4 * CARDS) pictures = new Map();
+  if (!pictures.has(path)) pictures.set(path, how(path).catch(error => { pictures.delete(path); throw error; }));
+  return pictures.get(path);
+}
+
+const refused = error => none(error instanceof Refused ? error.message : "the manager does not answer");

@@ -1,0 +1,61 @@
+"""The REST API of the dataset that the manager was told of: its tasks in pages, each with everything about it."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING, Annotated
+
+from fastapi import APIRouter, Query, Response
+from fastapi.responses import JSONResponse
+
+from embomatrix.manager.floor_plan import FloorPlan
+from embomatrix.manager.gallery_values import TaskDetail, TaskPage
+from embomatrix.manager.rest import PREFIX, Limit, Offset, answered
+
+if TYPE_CHECKING:
+    from embomatrix.manager.gallery import Gallery
+
+CARDS = 24
+Words = Annotated[str, Query(max_length=200, description="Only tasks with these words.")]
+Scene = Annotated[str, Query(max_length=256, description="Only tasks in this scene.")]
+Category = Annotated[str, Query(max_length=64, description="Only tasks of this category.")]
+
+
+def showing(gallery: Gallery) -> APIRouter:
+    """What a viewer may ask about tasks."""
+    router = APIRouter(prefix=PREFIX, tags=["tasks"])
+
+    @router.get("/tasks", response_model=TaskPage)
+    async def tasks(
+        search: Words = "",
+        scene: Scene = "",
+        category: Category = "",
+        offset: Offset = 0,
+        limit: Limit = CARDS,
+    ) -> Response:
+        """Tasks of the dataset, in its order."""
+        with answered():
+            found = await gallery.page(
+                search=search, scene=scene, category=category, offset=offset, limit=limit
+            )
+        return JSONResponse(dataclasses.asdict(found))
+
+    @router.get("/tasks/{task_id}", response_model=TaskDetail)
+    async def task(task_id: str) -> Response:
+        """One task: what is asked, its objects, and the oracle's plan on the plan view."""
+        with answered():
+            return JSONResponse(dataclasses.asdict(await gallery.detail(task_id)))
+
+    @router.get("/scenes/{digest}/floor", response_model=FloorPlan)
+    async def floor(digest: str) -> Response:
+        """A scene from above."""
+        with answered():
+            return JSONResponse(dataclasses.asdict(await gallery.floor(digest)))
+
+    @router.get("/scenes/{digest}/picture", response_class=Response)
+    async def picture(digest: str) -> Response:
+        """A scene at an angle, as a JPEG."""
+        with answered():
+            return Response(await gallery.picture(digest), media_type="image/jpeg")
+
+    return router

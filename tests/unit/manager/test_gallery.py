@@ -1,0 +1,132 @@
+"""A dataset on the dashboard: found by words, shown with its plan, and never a way to a file beside it."""
+
+import json
+from dataclasses import replace
+
+import pytest
+from tests.fakes.scenes import kitchen_scene, kitchen_tasks
+
+from embomatrix.manager.floor_plan import floor_plan, played, small_things
+from embomatrix.manager.gallery import NO_DATASET, Gallery
+from embomatrix.rpc.status import NotFoundError, UnavailableError
+from embomatrix.skills.parse import parse_plan, plan_to_json
+from embomatrix.world.bundle import Bundle, encode_bundle
+from embomatrix.world.dataset import TaskRecord, write_dataset
+from embomatrix.world.inflation import bundle_digest
+
+SCENE = kitchen_scene()
+TASK = kitchen_tasks(SCENE)[0]
+EVERY = {"search": "", "scene": "", "category": "", "offset": 0, "limit": 24}
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Tasks by an honest name, by one that has a meaning in paths, and by a script."""
+    names = ("tidy", "..", "<script>alert(1)<b>")
+    tasks = [replace(TASK, task_id=name, instruction=f"Please {name} up") for name in names]
+    data = encode_bundle(Bundle(SCENE, {task.task_id: task for task in tasks}))
+    digest = bundle_digest(data)
+    oracle = tuple(plan_to_json(parse_plan("move 0\npick_up 0")))
+    records = [TaskRecord(task, digest, "train", oracle, ("kitchen_0",), "kind") for task in tasks]
+    write_dataset(tmp_path / "data", records, {digest: data})
+    for name in ("transcripts", "trees", "pictures"):
+        (tmp_path / "data" / name).mkdir()
+    (tmp_path / "data" / "secret.md").write_text("nobody may read this")
+    (tmp_path / "secret.md").write_text("nor this")
+    return tmp_path / "data"
+
+
+def digest_of(folder):
+    return f"sha256:{next((folder / 'bundles').iterdir()).stem}"
+
+
+async def test_tasks_are_found_by_words_and_scene_and_come_in_pages(folder):
+    gallery = Gallery(folder)
+    page = await gallery.page(**EVERY)
+    assert [card.task_id for card in page.items] == ["tidy", "..", "<script>alert(1)<b>"]
+    assert [(one.scene_id, one.tasks) for one in page.scenes] == [(SCENE.scene_id, 3)]
+    assert page.categories == [TASK.category.value]
+    found = await gallery.page(**{**EVERY, "search": "UP tidy"})
+    assert [card.task_id for card in found.items] == ["tidy"]
+    second = await gallery.page(**{**EVERY, "offset": 1, "limit": 1})
+    assert (second.total, [card.task_id for card in second.items]) == (3, [".."])
+    assert (await gallery.page(**{**EVERY, "scene": "elsewhere"})).total == 0
+
+
+async def test_a_task_is_shown_with_its_objects_what_was_said_and_its_tree(folder):
+    (folder / "transcripts" / "tidy.md").write_text("**Mia** (need): tidy up")
+    (folder / "trees" / "tidy.json").write_text(json.dumps({"kitchen_0": ["apple"]}))
+    told = await Gallery(folder).detail("tidy")
+    assert (told.transcript, told.tree) == ("**Mia** (need): tidy up", {"kitchen_0": ["apple"]})
+    assert [row.name for row in told.objects] == list(TASK.table)
+    assert {row.name for row in told.objects if row.goal} == set(TASK.goal_objects) & set(TASK.table)
+    assert len(told.moments) == 3
+    assert "kitchen_0" in told.rooms
+
+
+async def test_a_name_that_is_a_path_leads_to_no_file(folder):
+    gallery = Gallery(folder)
+    assert (await gallery.detail("..")).transcript == ""
+    for name in ("../secret.md", "/etc/passwd", "transcripts/tidy", ""):
+        with pytest.raises(NotFoundError, match="no task"):
+            await gallery.detail(name)
+    for digest in ("../../secret", "sha256:../../secret", f"sha256:{'0' * 64}"):
+        with pytest.raises(NotFoundError, match="no task of the dataset"):
+            await gallery.floor(digest)
+
+
+async def test_a_link_out_of_the_folder_and_a_file_without_end_are_not_read(folder):
+    (folder / "transcripts" / "tidy.md").symlink_to(folder.parent / "secret.md")
+    (folder / "trees" / "tidy.json").write_text("[" * 400_000)
+    told = await Gallery(folder).detail("tidy")
+    assert (told.transcript, told.tree) == ("", None)
+
+
+async def test_a_picture_is_a_jpeg_or_none(folder):
+    gallery, digest = Gallery(folder), digest_of(folder)
+    with pytest.raises(NotFoundError, match="factory pictures"):
+        await gallery.picture(digest)
+    file = folder / "pictures" / f"{digest.removeprefix('sha256:')}.jpg"
+    file.write_bytes(b"<svg onload='alert(1)'/>")
+    with pytest.raises(NotFoundError, match="factory pictures"):
+        await gallery.picture(digest)
+    file.write_bytes(b"\xff\xd8\xff\xe0")
+    assert await gallery.picture(digest) == b"\xff\xd8\xff\xe0"
+    assert (await gallery.page(**EVERY)).items[0].picture
+
+
+async def test_a_dataset_that_is_not_there_or_damaged_is_told_in_a_sentence(folder, tmp_path):
+    assert (await Gallery(None).page(**EVERY)).notice == NO_DATASET
+    with pytest.raises(UnavailableError, match="--dataset"):
+        await Gallery(tmp_path / "nowhere").page(**EVERY)
+    gallery = Gallery(folder)
+    assert (await gallery.page(**EVERY)).total == 3
+    (folder / "tasks.jsonl").write_text("{}\n")
+    with pytest.raises(UnavailableError, match=r"tasks\.jsonl:1 is damaged"):
+        await gallery.page(**EVERY)
+
+
+def test_a_plan_carries_what_it_picks_up_to_where_it_is_put():
+    things = small_things(SCENE, TASK)
+    thing = next(iter(things))
+    row = TASK.table.index(thing)
+    target = next(name for name in TASK.table if SCENE.by_name[name].fixed)
+    to = TASK.table.index(target)
+    plan = parse_plan(f"move {row}\npick_up {row}\nmove {to}\nopen {to}\nplace {to} inside\nclose {to}")
+    start, at_thing, carried, moved, opened, placed, closed = played(SCENE, TASK, plan)
+    assert (start.held, start.things) == ([], {})
+    assert at_thing.robot != start.robot
+    assert carried.held == [thing]
+    assert moved.things[thing] == moved.robot
+    assert (opened.active, closed.active) == ([target], [])
+    x, y, _ = SCENE.box_of(target).center_m
+    assert placed.held == []
+    assert placed.things[thing] == pytest.approx([x, y], abs=0.01)
+
+
+def test_a_floor_plan_holds_rooms_and_what_stands_in_them():
+    plan = floor_plan(SCENE)
+    assert [room[0] for room in plan.rooms] == [room.name for room in SCENE.rooms]
+    names = {piece[0] for piece in plan.pieces}
+    assert {item.name for item in SCENE.objects if item.absent}.isdisjoint(names)
+    assert all(west < east and south < north for _, west, south, east, north in (*plan.rooms, *plan.pieces))
