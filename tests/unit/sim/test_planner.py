@@ -226,6 +226,24 @@ def test_a_goal_that_needs_an_object_outside_the_table_has_no_plan(flat):
     assert find_plan(flat, task) == PlanNotFound("apple_1 is not in the object table: no plan can name it")
 
 
+def test_what_may_be_left_nowhere_ends_in_the_hand_once_all_else_is_done(flat):
+    goal = And((Not(atom("inroom", "apple_1", "kitchen_0")), atom("open", "fridge_1")))
+    task = replace(
+        task_over(flat.world.scene, goal), table=("apple_1", "breakfast_table_1", "countertop_1", "fridge_1")
+    )
+    plan = find_plan(flat, task)
+    assert not isinstance(plan, PlanNotFound)
+    assert words_of(plan, task) == "move fridge_1; open fridge_1; move apple_1; pick_up apple_1"
+
+
+def test_two_things_that_may_be_left_nowhere_are_too_many_for_one_hand(flat):
+    goal = And(tuple(Not(atom("inroom", name, "kitchen_0")) for name in ("apple_1", "bowl_1")))
+    task = replace(task_over(flat.world.scene, goal), table=("apple_1", "bowl_1", "breakfast_table_1"))
+    found = find_plan(flat, task)
+    assert isinstance(found, PlanNotFound)
+    assert "there is no free surface in the object table to put bowl_1 on" in found.reason
+
+
 def test_a_running_microwave_can_not_end_open_and_on(flat):
     goal = And((atom("open", "microwave_1"), atom("toggled_on", "microwave_1")))
     assert "goal does not hold" in oracle(flat, goal)

@@ -63,11 +63,11 @@ class Errands:
             rest = {other.target for other in self.placements[number + 1 :]}
             if item.target not in rest and not self._still_holds_something(item.target, number, world):
                 self._finish(item.target, script)
-        for item in self.leave:
-            if script.holds(item.relation, item.name, item.target):
-                self._part(item, script, world)
+        kept = self._leave(script, world)
         for name in dict.fromkeys((*self.open, *self.on)):
             self._finish(name, script)
+        if kept:
+            script.take(kept)
 
     def _still_holds_something(self, target: str, number: int, world: LiveWorld) -> bool:
         """Whether something that is yet to be carried lies in the target."""
@@ -113,15 +113,31 @@ class Errands:
         for carry in found[self.way % len(found)]:
             script.transfer(carry.name, carry.target, carry.relation)
 
+    def _leave(self, script: PlanScript, world: LiveWorld) -> str:
+        """End the relations that must end. Returns what has to end in the hand, as there is no room for it; else "".
+
+        What the hand holds stands in no relation, and it holds one thing.
+        """
+        kept = ""
+        for item in self.leave:
+            if not script.holds(item.relation, item.name, item.target):
+                continue
+            carried = item.name if item.relation is Relation.INROOM else _carried_of(item, world)
+            try:
+                self._part(item, script, world)
+            except StuckError:
+                if kept not in ("", carried):
+                    raise
+                kept = carried
+        return kept
+
     def _part(self, item: Placement, script: PlanScript, world: LiveWorld) -> None:
         """End a relation: carry the first object elsewhere, or the second where the first can't be carried."""
         if item.relation is Relation.INROOM:
             here = frozenset(name for name in world.scene.by_name if world.room_of(name) == item.target)
             script.put_away(item.name, here)
-        elif world.is_fixed(item.name):
-            script.put_away(item.target, frozenset((item.name, item.target)))
         else:
-            script.put_away(item.name, frozenset((item.name, item.target)))
+            script.put_away(_carried_of(item, world), frozenset((item.name, item.target)))
 
     def _finish(self, name: str, script: PlanScript) -> None:
         """Bring the doors and the switch of an object into the position in which they must end."""
@@ -134,6 +150,11 @@ class Errands:
                 script.close(name)
         if self.on.get(name):
             script.switch_on(name)
+
+
+def _carried_of(item: Placement, world: LiveWorld) -> str:
+    """Which of two objects is carried away from the other: the first, unless it is fixed."""
+    return item.target if world.is_fixed(item.name) else item.name
 
 
 def _way_in(source: Source) -> PlaceRelation:
