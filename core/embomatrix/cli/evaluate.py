@@ -27,7 +27,15 @@ from embomatrix.trainer.eai.exam import CODEC as EAI_CODEC
 from embomatrix.trainer.eai.exam import NAME as NATIVE
 from embomatrix.trainer.eai.exam import NativeExam
 from embomatrix.trainer.errors import TrainerError
-from embomatrix.trainer.evaluation.answers import FILE, AnswerSheet, Setup, ordered, read_answers
+from embomatrix.trainer.evaluation.answers import (
+    FILE,
+    MOST_SAMPLES,
+    AnswerSheet,
+    Setup,
+    check_asked_for,
+    ordered,
+    read_answers,
+)
 from embomatrix.trainer.evaluation.asking import EndpointAsker, PolicyAsker, WriterAsker, questions_digest
 from embomatrix.trainer.evaluation.baselines import BaselineName, baseline_for
 from embomatrix.trainer.evaluation.benchmark import find_benchmark
@@ -137,7 +145,7 @@ _Profile = Annotated[
     typer.Option(help="paper: tasks that need one of the household's three skills more count as failed."),
 ]
 _Tasks = Annotated[int | None, typer.Option(min=1, help="The first so many tasks only.")]
-_Samples = Annotated[int, typer.Option(min=1, max=1000, help="Plans of each task.")]
+_Samples = Annotated[int, typer.Option(min=1, max=MOST_SAMPLES, help="Plans of each task.")]
 _Temperature = Annotated[float, typer.Option(min=0, help="0 takes the likeliest plan.")]
 _Seed = Annotated[int, typer.Option(min=0, help="Seed of sampling and of execution.")]
 _MaxTokens = Annotated[int | None, typer.Option(min=1, help="Tokens of an answer at most.")]
@@ -338,6 +346,7 @@ def _judge_stored(path: Path, bench: str, out: Path | None, place: Place, beside
                 f"{path} answers other tasks than {bench or setup.bench} holds now (digest {setup.bench_digest[:19]}…, now "
                 f"{exam.digest[:19]}…): pass the benchmark that was asked with --bench"
             )
+        check_asked_for(stored, exam.task_ids, setup, path)
         given = ordered(stored, exam.task_ids, setup.samples)
         asked_for = len(exam.task_ids) * setup.samples
         if len(given) < asked_for:

@@ -130,10 +130,15 @@ class Dataset:
 
 def bundle_file(digest: str) -> str:
     """File name of a bundle: its hash without the algorithm. Raises DatasetError for anything but a digest."""
-    algorithm, _, hexdigits = digest.partition(":")
-    if algorithm != "sha256" or len(hexdigits) != 64 or not set(hexdigits) <= set("0123456789abcdef"):
+    if not is_digest(digest):
         raise DatasetError(f"found the digest {digest[:80]!r}: expected 'sha256:' and 64 hexadecimal digits")
-    return f"{hexdigits}.bundle"
+    return f"{digest.removeprefix('sha256:')}.bundle"
+
+
+def is_digest(text: str) -> bool:
+    """Whether the text can be a bundle's digest."""
+    algorithm, _, hexdigits = text.partition(":")
+    return algorithm == "sha256" and len(hexdigits) == 64 and set(hexdigits) <= set("0123456789abcdef")
 
 
 def write_dataset(folder: Path | str, records: Sequence[TaskRecord], bundles: Mapping[str, bytes]) -> None:
@@ -163,10 +168,12 @@ def record_from_json(value: object) -> TaskRecord:
     split = fields["split"].text()
     if split not in SPLITS:
         fields["split"].fail(f"found {split[:40]!r}: expected one of {', '.join(SPLITS)}")
+    if not is_digest(digest := fields["bundle"].name()):
+        fields["bundle"].fail(f"found {digest[:80]!r}: expected 'sha256:' and 64 hexadecimal digits")
     oracle = [dict(call.entries()) for call in fields["oracle"].items()]
     return TaskRecord(
         task=task_from_json(fields["task"].value),
-        bundle_digest=fields["bundle"].name(),
+        bundle_digest=digest,
         split=split,
         oracle=tuple({key: item.value for key, item in call.items()} for call in oracle),
         rooms=fields["rooms"].texts(),

@@ -93,6 +93,22 @@ def test_answers_to_other_tasks_are_refused(measured, kitchen):
     assert "answers other tasks than" in text
 
 
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("task_id", "elsewhere"), ("sample", 3), ("sample", -1)],
+    ids=["task", "many", "negative"],
+)
+def test_an_answer_that_was_never_asked_for_is_named(measured, tmp_path, field, value):
+    lines = (measured / "answers.jsonl").read_text().splitlines()
+    stranger = {**json.loads(lines[1]), field: value}
+    (tmp_path / "answers.jsonl").write_text("\n".join([*lines, json.dumps(stranger), ""]))
+    status, text = told(f"--answers={tmp_path / 'answers.jsonl'}")
+    assert status == 2
+    assert (
+        f"answer to sample {stranger['sample']} of the task '{stranger['task_id']}', which was never" in text
+    )
+
+
 def write_other(folder):
     """The same dataset with another oracle's plan: other records."""
     other = write_kitchen_dataset(folder / "other")

@@ -183,7 +183,15 @@ def test_page_escapes_what_models_and_tasks_say(bench):
         (lambda text: text.replace('"answers": 1', '"answers": 99'), "is of another version"),
         (lambda text: text.replace('"sample": 0', '"sample": "x"'), "line 2, is damaged: 'sample'"),
         (lambda text: "", "holds no answers"),
-        (lambda text: "{}\n" + text, "is of another version"),
+        (lambda text: "{}\n" + text, "is no file of answers"),
+        (lambda text: text.replace('"samples": 2', '"samples": 1000000000'), "found samples 1000000000"),
+        (lambda text: text.replace('"seed": 0', '"seed": -1'), "found seed -1, expected 0 or more"),
+        (lambda text: text.replace('"temperature": 1.0', '"temperature": NaN'), "found temperature nan"),
+        (
+            lambda text: text.replace('"codec": "lines"', '"codec": "verse"'),
+            "found codec 'verse', expected eai",
+        ),
+        (lambda text: text + "[" * 100_000 + "\n", "line 3, is damaged"),
         (lambda text: text + "nonsense\n", "is damaged"),
     ],
 )

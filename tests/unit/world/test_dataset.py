@@ -6,7 +6,14 @@ from pathlib import Path
 import pytest
 
 from embomatrix.world.bundle import Bundle, encode_bundle
-from embomatrix.world.dataset import Dataset, DatasetError, TaskRecord, record_to_json, write_dataset
+from embomatrix.world.dataset import (
+    TASKS_FILE,
+    Dataset,
+    DatasetError,
+    TaskRecord,
+    record_to_json,
+    write_dataset,
+)
 from embomatrix.world.inflation import bundle_digest
 from embomatrix.world.task import Task
 
@@ -80,3 +87,14 @@ def test_digest_that_is_no_digest_never_becomes_a_path(
     write(tmp_path, bundle, task)
     with pytest.raises(DatasetError, match="64 hexadecimal digits"):
         Dataset.load(tmp_path).bundle_bytes(digest)
+
+
+@pytest.mark.parametrize("digest", ["Atlantis", "sha256:" + "g" * 64])
+def test_record_without_a_digest_is_named_by_its_line(
+    tmp_path: Path, bundle: Bundle, task: Task, digest: str
+) -> None:
+    record = write(tmp_path, bundle, task)
+    tasks = tmp_path / TASKS_FILE
+    tasks.write_text(tasks.read_text().replace(record.bundle_digest, digest))
+    with pytest.raises(DatasetError, match=r"tasks.jsonl:1 is damaged: .*bundle.* 64 hexadecimal digits"):
+        Dataset.load(tmp_path)

@@ -6,10 +6,12 @@ Lines are appended as answers come, so that an interrupted evaluation loses none
 from __future__ import annotations
 
 import json
+import math
 import os
 from dataclasses import asdict, dataclass, fields
 from typing import TYPE_CHECKING, Any, Final, Self
 
+from embomatrix.skills.prompt import Codec
 from embomatrix.trainer.errors import TrainerError
 
 if TYPE_CHECKING:
@@ -20,6 +22,10 @@ if TYPE_CHECKING:
 VERSION: Final = 1
 """Of the file's format and of what a verdict depends on. Answers of another version can't be judged by this one."""
 FILE: Final = "answers.jsonl"
+MOST_SAMPLES: Final = 1000
+"""Of a task."""
+CODECS: Final = frozenset({*(codec.value for codec in Codec), "eai"})
+"""Our own, and EAI's."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,6 +157,19 @@ def ordered(
     return tuple(answers[key] for key in keys if key in answers)
 
 
+def check_asked_for(
+    stored: Iterable[tuple[str, int]], task_ids: Iterable[str], setup: Setup, path: Path
+) -> None:
+    """Raises TrainerError where a (task, sample) that was answered was never asked for."""
+    known = set(task_ids)
+    for task_id, sample in stored:
+        if task_id not in known or not 0 <= sample < setup.samples:
+            raise TrainerError(
+                f"{path} holds an answer to sample {sample} of the task {task_id[:80]!r}, which was never asked for: remove "
+                "its line"
+            )
+
+
 def _read(path: Path) -> tuple[Setup, list[Answer], int]:
     """The setup, the answers, and the length in bytes of the lines that are whole."""
     data = path.read_bytes()
@@ -159,23 +178,46 @@ def _read(path: Path) -> tuple[Setup, list[Answer], int]:
     if not lines:
         raise TrainerError(f"{path} holds no answers: expected the {FILE} of an evaluation")
     header = _line(lines[0], path, 1)
-    version = header.pop("answers", None)
+    if "answers" not in header:
+        raise TrainerError(
+            f"{path} is no file of answers (its first line names no version): expected the {FILE} of an evaluation"
+        )
+    version = header.pop("answers")
     if version != VERSION:
         raise TrainerError(
             f"{path} is of another version (found {version!r}, expected {VERSION}): ask the model again, or judge it with the "
             "version of embomatrix that wrote it"
         )
     setup = _made(Setup, header, path, 1)
+    _check(setup, path)
     answers = [
         _made(Answer, _line(line, path, number), path, number) for number, line in enumerate(lines[1:], 2)
     ]
     return setup, answers, whole
 
 
+def _check(setup: Setup, path: Path) -> None:
+    """What were options of the command is what it takes. Raises TrainerError."""
+    for name, sound, expected in (
+        ("samples", 1 <= setup.samples <= MOST_SAMPLES, f"1 to {MOST_SAMPLES}"),
+        ("tasks", setup.tasks >= 1, "1 or more"),
+        ("rows", setup.rows >= 1, "1 or more"),
+        ("max_tokens", setup.max_tokens >= 1, "1 or more"),
+        ("seed", setup.seed >= 0, "0 or more"),
+        ("by_rule", setup.by_rule >= 0, "0 or more"),
+        ("temperature", 0 <= setup.temperature < math.inf, "0 or more"),
+        ("codec", setup.codec in CODECS, ", ".join(sorted(CODECS))),
+    ):
+        if not sound:
+            raise TrainerError(
+                f"{path}, line 1, is damaged: found {name} {getattr(setup, name)!r}, expected {expected}; ask the model again"
+            )
+
+
 def _line(line: bytes, path: Path, number: int) -> dict[str, Any]:
     try:
         value = json.loads(line)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise TrainerError(f"{path}, line {number}, is damaged ({error}): remove the line") from error
     if not isinstance(value, dict):
         raise TrainerError(f"{path}, line {number}, is damaged (expected an object): remove the line")

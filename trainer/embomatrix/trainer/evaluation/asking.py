@@ -100,8 +100,9 @@ class EndpointAsker:
             first = errors.exceptions[0]
             if not isinstance(first, LlmError):
                 raise first from errors
+            told = str(first).removeprefix(f"{PURPOSE}: ")  # the command's own name stands before it already
             raise TrainerError(
-                f"{first}; {len(sheet)} of {total} answers are kept in {sheet.path}: the same command goes on from there"
+                f"{told}; {len(sheet)} of {total} answers are kept in {sheet.path}: the same command goes on from there"
             ) from errors
 
     async def _ask_all(
