@@ -17,7 +17,7 @@ from embomatrix.cli.supervisor import embomatrix_command
 STEPS = 12
 HOLD_S = 2.5
 """Longer than a step takes to reach the workers, shorter than the silence after which the manager gives a worker nothing."""
-pytestmark = pytest.mark.timeout(420)
+pytestmark = pytest.mark.timeout(1200)
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ def run(tmp_path_factory):
         os.kill(children.pid("worker-1"), signal.SIGSTOP)
         time.sleep(HOLD_S)
         os.kill(children.pid("worker-1"), signal.SIGKILL)
-        told, _ = trainer.communicate(timeout=240)
+        told, _ = trainer.communicate(timeout=600)
         assert trainer.returncode == 0, told
         restarts = {name: children.restarts(name) for name in ("manager", *cluster.workers)}
     return Run(told, out, _metrics(out), restarts)
@@ -87,7 +87,7 @@ def _training(dataset, address, out):
 
 
 def _run(*arguments):
-    subprocess.run(embomatrix_command(*arguments), check=True, timeout=240, stdout=subprocess.PIPE)
+    subprocess.run(embomatrix_command(*arguments), check=True, timeout=600, stdout=subprocess.PIPE)
 
 
 def _metrics(out):
