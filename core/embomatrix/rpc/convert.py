@@ -218,6 +218,23 @@ def rollout_from_proto(message: types_pb2.Rollout) -> Rollout:
     return rollout
 
 
+def unread_rollout(message: types_pb2.Rollout) -> Rollout:
+    """The rollout for whoever only passes it on: whether its plan is one is found when it is read."""
+    return Rollout.unread(
+        message.SerializeToString(),
+        _rollout_fields,
+        bundle_digest=required("bundle_digest", message.bundle_digest),
+    )
+
+
+def _rollout_fields(wire: bytes) -> Mapping[str, object]:
+    rollout = rollout_from_proto(types_pb2.Rollout.FromString(wire))
+    return {
+        name: getattr(rollout, name)
+        for name in ("rollout_id", "group_id", "task_id", "plan", "seed", "render")
+    }
+
+
 def reward_to_proto(reward: RewardBreakdown) -> types_pb2.Reward:
     return types_pb2.Reward(
         format=reward.format,
@@ -306,6 +323,16 @@ def completed_from_proto(message: types_pb2.Completed) -> Completed:
     )
     object.__setattr__(completed, "wire", message.SerializeToString())
     return completed
+
+
+def unread_completed(wire: bytes, *, timings: Timings, warm: bool) -> Completed:
+    """The result in this message for whoever only passes it on: what else it says is found when it is read."""
+    return Completed.unread(wire, _completed_fields, timings=timings, warm=warm)
+
+
+def _completed_fields(wire: bytes) -> Mapping[str, object]:
+    completed = completed_from_proto(types_pb2.Completed.FromString(wire))
+    return {name: getattr(completed, name) for name in ("reward", "steps", "final", "trace_digest")}
 
 
 def infra_failure_to_proto(failure: InfraFailure) -> types_pb2.InfraFailure:

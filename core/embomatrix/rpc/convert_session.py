@@ -14,8 +14,8 @@ from embomatrix.rpc.convert import (
     infra_failure_to_proto,
     inside,
     required,
-    rollout_from_proto,
     rollout_to_proto,
+    unread_rollout,
     write_completed,
 )
 from embomatrix.rpc.convert_run import (
@@ -167,6 +167,7 @@ def lease_to_proto(lease: Lease) -> worker_service_pb2.Lease:
 
 
 def lease_from_proto(message: worker_service_pb2.Lease) -> Lease:
+    """The lease, with its rollout unread: the slot that executes it reads it."""
     ref = inside("ref", lease_ref_from_proto, message.ref)
     if finite("deadline_s", message.deadline_s) <= 0:
         raise ConvertError("deadline_s", f"is {message.deadline_s}: it must be above 0")
@@ -175,7 +176,7 @@ def lease_from_proto(message: worker_service_pb2.Lease) -> Lease:
         origin = inside("origin", lease_origin_from_proto, message.origin)
     return Lease(
         ref,
-        inside("rollout", rollout_from_proto, message.rollout),
+        inside("rollout", unread_rollout, message.rollout),
         message.deadline_s,
         origin,
         reward_settings_of(message),

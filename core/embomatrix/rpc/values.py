@@ -7,21 +7,53 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar, Self
 
 from embomatrix.reward.settings import PAPER, RewardSettings
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     from embomatrix.reward.breakdown import RewardBreakdown
     from embomatrix.skills.syntax import Plan
     from embomatrix.skills.trace import Step
 
+    Reader = Callable[[bytes], Mapping[str, object]]
+
+
+class _ReadWhenAsked:
+    """A value that is passed on more often than it is looked at: some of its slots stay empty until one of them is asked for.
+
+    Then all of them are read from its message, by the function that it was made with.
+    """
+
+    __slots__ = ()
+    _left: ClassVar[frozenset[str]]
+    """The slots that may be empty."""
+
+    @classmethod
+    def _unread(cls, read: Reader, **known: object) -> Self:
+        value = object.__new__(cls)
+        for name, content in (*known.items(), ("read", read)):
+            object.__setattr__(value, name, content)
+        return value
+
+    if not TYPE_CHECKING:  # else a type checker would believe that there are attributes of any name
+
+        def __getattr__(self, name: str) -> object:
+            """Called for what is in no slot."""
+            if name not in self._left:
+                raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+            for field_name, content in self.read(self.wire).items():
+                object.__setattr__(self, field_name, content)
+            return object.__getattribute__(self, name)
+
 
 @dataclass(frozen=True, slots=True)
-class Rollout:
+class Rollout(_ReadWhenAsked):
     """One plan to execute once. The plans of one task in one batch share ``group_id`` and ``seed``."""
+
+    _left = frozenset({"rollout_id", "group_id", "task_id", "plan", "seed", "render"})
 
     rollout_id: str
     group_id: str
@@ -33,6 +65,13 @@ class Rollout:
     """It needs a slot that renders on a GPU."""
     wire: bytes = field(default=b"", init=False, compare=False, repr=False)
     """The message that it came in, which is passed on instead of written anew; a changed copy has none."""
+    read: Reader | None = field(default=None, init=False, compare=False, repr=False)
+    """Reads the rest from ``wire`` when it is first asked for; None where it was read at once."""
+
+    @classmethod
+    def unread(cls, wire: bytes, read: Reader, *, bundle_digest: str) -> Rollout:
+        """A rollout of which only the scene is known, until somebody asks ``read`` for the rest."""
+        return cls._unread(read, wire=wire, bundle_digest=bundle_digest)
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,8 +103,10 @@ class Timings:
 
 
 @dataclass(frozen=True, slots=True)
-class Completed:
+class Completed(_ReadWhenAsked):
     """The plan was executed and scored: evidence about the policy, whatever the reward."""
+
+    _left = frozenset({"reward", "steps", "final", "trace_digest"})
 
     reward: RewardBreakdown
     steps: tuple[Step, ...]
@@ -77,20 +118,26 @@ class Completed:
     wire: bytes = field(default=b"", init=False, compare=False, repr=False)
     """The message that it came in, which is passed on instead of written anew, but for what was ``noted``; a copy that was
     changed otherwise has none."""
+    read: Reader | None = field(default=None, init=False, compare=False, repr=False)
+    """Reads from ``wire`` what is not noted, when it is first asked for; None where it was read at once."""
+
+    @classmethod
+    def unread(
+        cls, wire: bytes, read: Reader, *, timings: Timings, warm: bool, worker_id: str = ""
+    ) -> Completed:
+        """A result of which only what is noted on its way is known, until somebody asks ``read`` for the rest."""
+        return cls._unread(read, wire=wire, timings=timings, warm=warm, worker_id=worker_id)
 
     def noted(
         self, *, timings: Timings | None = None, worker_id: str | None = None, warm: bool | None = None
     ) -> Completed:
         """The same result with what is noted on its way."""
-        copy = Completed(
-            self.reward,
-            self.steps,
-            self.final,
-            self.trace_digest,
-            self.worker_id if worker_id is None else worker_id,
-            self.timings if timings is None else timings,
-            self.warm if warm is None else warm,
-        )
+        timings = self.timings if timings is None else timings
+        worker_id = self.worker_id if worker_id is None else worker_id
+        warm = self.warm if warm is None else warm
+        if self.read is not None:
+            return Completed.unread(self.wire, self.read, timings=timings, warm=warm, worker_id=worker_id)
+        copy = Completed(self.reward, self.steps, self.final, self.trace_digest, worker_id, timings, warm)
         object.__setattr__(copy, "wire", self.wire)
         return copy
 

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
 _PREFIX: Final = struct.Struct("!II")
+_written: Final = json.JSONEncoder(separators=(",", ":")).encode
 PREFIX_BYTES: Final = _PREFIX.size
 MAX_FRAME_BYTES: Final = 64 * 1024 * 1024
 MIB: Final = 1024 * 1024
@@ -50,7 +51,7 @@ class Frame:
 
 def pack(frame: Frame) -> bytes:
     """The frame as bytes: two lengths, header, body. File descriptors travel beside it, with its first byte."""
-    header = json.dumps(frame.header, separators=(",", ":")).encode()
+    header = _written(frame.header).encode()
     return _PREFIX.pack(len(header), len(frame.body)) + header + frame.body
 
 

@@ -135,6 +135,40 @@ def test_a_result_that_is_passed_on_says_what_was_noted_on_its_way(completed, qu
     assert passed == noted == dataclasses.replace(completed, timings=timings, worker_id=worker_id, warm=warm)
 
 
+@given(COMPLETED, NUMBERS, NAMES, st.booleans())
+def test_a_result_that_nobody_looked_at_is_passed_on_like_one_that_was_read(
+    completed, load_s, worker_id, warm
+):
+    message = convert.completed_to_proto(completed)
+    timings = Timings(load_s=load_s)
+    unread = convert.unread_completed(message.SerializeToString(), timings=timings, warm=not warm)
+    noted = unread.noted(worker_id=worker_id, warm=warm)
+    read = convert.completed_from_proto(message).noted(timings=timings, worker_id=worker_id, warm=warm)
+    assert convert.completed_to_proto(noted) == convert.completed_to_proto(read)
+    assert (noted.timings, noted.worker_id, noted.warm) == (timings, worker_id, warm)
+    assert noted == read  # and now it was looked at
+
+
+@given(ROLLOUTS)
+def test_a_rollout_that_nobody_looked_at_is_passed_on_like_one_that_was_read(rollout):
+    message = convert.rollout_to_proto(rollout)
+    unread = convert.unread_rollout(message)
+    assert unread.bundle_digest == rollout.bundle_digest
+    assert convert.rollout_to_proto(unread) == message
+    assert unread == rollout
+    assert dataclasses.replace(unread, seed=7) == dataclasses.replace(rollout, seed=7)
+
+
+def test_what_can_not_be_read_is_told_when_somebody_looks():
+    unread = convert.unread_completed(
+        types_pb2.Completed(trace_digest="t").SerializeToString(), timings=Timings(), warm=True
+    )
+    with pytest.raises(ConvertError, match="reward: is missing"):
+        _ = unread.steps
+    with pytest.raises(AttributeError, match="no attribute 'stops'"):
+        _ = unread.stops
+
+
 def test_fields_that_this_side_does_not_know_are_passed_on():
     rollout = convert.rollout_to_proto(Rollout("r", "g", "b", "t", (), 1)).SerializeToString()
     passed = convert.rollout_to_proto(

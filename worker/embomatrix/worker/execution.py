@@ -1,26 +1,49 @@
-"""One lease in a slot of its scene: what becomes of the rollout, and of the process that executed it."""
+"""What a slot executes from being taken to being given back, and what becomes of the rollouts and of its process.
+
+A slot's process has the next plans in its stream before it has answered the last, so that it never waits for the daemon;
+and while that is so, the daemon takes the answers of some milliseconds at once.
+"""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import dataclasses
+import time
+from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from embomatrix.proto.v1 import types_pb2
 from embomatrix.reward.settings import PAPER
-from embomatrix.rpc.convert import completed_from_proto, rollout_to_proto
+from embomatrix.rpc.convert import rollout_to_proto, unread_completed
 from embomatrix.rpc.values import InfraCode, InfraFailure, Timings
 from embomatrix.sim.zygote import Frame
 from embomatrix.worker.processes import ProcessGoneError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+
     from embomatrix.rpc.values import Completed, Lease
     from embomatrix.worker.residents import Residents, Scene, Slot
+
+    More = Callable[[int], Sequence["Ticket"]]
+    Done = Callable[["Ticket", Completed | InfraFailure], None]
 
 ROLLOUTS_PER_SLOT: Final = 5_000
 GROWTH_MB: Final = 128.0
 """A slot's process is replaced after this many rollouts, or when it has grown by this much."""
+AHEAD_S: Final = 0.03
+"""Leases that wait in a slot's stream can't be given to another, nor taken back: they last about this long."""
+MOST_AHEAD: Final = 16
+LARGEST_AHEAD: Final = 4096
+"""Bytes of a plan that may wait in a stream: its buffer holds all of them, and nobody waits to write."""
+GATHER_S: Final = 0.01
+"""Answers are taken together that come within this time …"""
+GATHER_SHARE: Final = 0.5
+"""… or within this share of the time that the leases ahead will last, if that is less."""
+LEAST_GATHER_S: Final = 0.002
+RECENT: Final = 0.1
+"""Weight of the last execution in the mean of those before it."""
 
 
 @dataclass(slots=True, eq=False)
@@ -35,65 +58,149 @@ class Ticket:
     """The permit that it has, from 1; 0 before."""
     began_s: float = 0.0
     """When it got the permit, on the monotonic clock."""
-    task: asyncio.Task[None] | None = None
+    turn_s: float = 0.0
+    """When it was the first in its slot's stream: it may take its deadline from here."""
+    called_off: bool = False
+    """Nobody waits for its result."""
 
     @property
     def digest(self) -> str:
         return self.lease.rollout.bundle_digest
 
-
-async def execute(ticket: Ticket, scene: Scene, slot: Slot, residents: Residents) -> Completed | InfraFailure:
-    """Run the rollout; the slot is kept for the scene's next one, or ended when it failed or has done enough."""
-    body = ticket.lease.rollout.wire or rollout_to_proto(ticket.lease.rollout).SerializeToString()
-    try:
-        async with asyncio.timeout(ticket.lease.deadline_s):
-            answer = await slot.child.peer.ask(Frame(_order(ticket), body))
-    except TimeoutError:
-        residents.end_later(slot.child)
-        late = f"the rollout took longer than its {ticket.lease.deadline_s:g} s and was killed"
-        return InfraFailure(InfraCode.SLOT_TIMEOUT, late)
-    except ProcessGoneError:
-        how = await slot.child.end()
-        return InfraFailure(InfraCode.SLOT_CRASHED, f"the simulator ended during the rollout: {how}")
-    except asyncio.CancelledError:
-        residents.end_later(slot.child)
-        raise
-    return _outcome(ticket, scene, slot, answer, residents)
+    @property
+    def small(self) -> bool:
+        """Whether its plan may wait in a slot's stream."""
+        return 0 < len(self.lease.rollout.wire) <= LARGEST_AHEAD
 
 
-def _order(ticket: Ticket) -> dict[str, Any]:
-    reward = ticket.lease.reward
-    own = {} if reward is PAPER else {"reward": dataclasses.asdict(reward)}
-    return {"op": "execute", "slot": ticket.slot, **own}
+class Shift:
+    """One permit at work in one scene: the leases in its slot's stream, of which the first is executed."""
 
+    def __init__(self, permit: int, scene: Scene) -> None:
+        self.permit = permit
+        self.scene = scene
+        self.given: deque[Ticket] = deque()
+        self.task: asyncio.Task[None] | None = None
+        """What works it off."""
 
-def _outcome(
-    ticket: Ticket, scene: Scene, slot: Slot, answer: Frame, residents: Residents
-) -> Completed | InfraFailure:
-    header = answer.header
-    if "error" in header:
-        # What an exception left behind in the process is unknown.
-        residents.end_later(slot.child)
-        return InfraFailure(InfraCode(header["code"]), header["error"])
-    if _worn(slot, float(header["resident_mb"])):
-        residents.end_later(slot.child)
-    else:
-        residents.keep_slot(scene, slot)
-    return _completed(ticket, scene, answer)
+    def give(self, ticket: Ticket) -> None:
+        """One more lease, behind the others."""
+        ticket.slot = self.permit
+        ticket.began_s = ticket.turn_s = time.monotonic()
+        self.given.append(ticket)
 
+    def call_off(self, ticket: Ticket) -> None:
+        """Nobody waits for this one any more: what runs is killed, what waits in the stream gives no result."""
+        ticket.called_off = True
+        if self.given and self.given[0] is ticket and self.task is not None:
+            self.task.cancel()
 
-def _completed(ticket: Ticket, scene: Scene, answer: Frame) -> Completed:
-    timings = Timings(
+    async def work(self, slot: Slot, residents: Residents, *, more: More, done: Done) -> None:
+        """Execute what was given, and what ``more`` gives up to a count meanwhile; ``done`` takes the outcomes.
+
+        The slot is kept for the scene's next leases, or ended when one failed or it has done enough. Leases that are left
+        in ``given`` were not begun, or were called off.
+        """
+        try:
+            fit = await self._work_off(slot, more, done)
+        except TimeoutError:
+            residents.end_later(slot.child)
+            late = f"the rollout took longer than its {self.given[0].lease.deadline_s:g} s and was killed"
+            done(self.given.popleft(), InfraFailure(InfraCode.SLOT_TIMEOUT, late))
+        except ProcessGoneError:
+            how = await slot.child.end()
+            died = f"the simulator ended during the rollout: {how}"
+            done(self.given.popleft(), InfraFailure(InfraCode.SLOT_CRASHED, died))
+        except BaseException:
+            residents.end_later(slot.child)
+            raise
+        else:
+            if fit and not slot.worn:
+                residents.keep_slot(self.scene, slot)
+            else:
+                residents.end_later(slot.child)
+
+    async def _work_off(self, slot: Slot, more: More, done: Done) -> bool:
+        """Execute until nothing is left; tells whether the slot's process may execute more."""
+        self.given[0].turn_s = time.monotonic()
+        await _order(slot, self.given)
+        waited = False
+        while self.given:
+            ahead = more(self._room()) if not slot.worn else ()
+            if ahead:
+                await _order(slot, ahead)
+            # A long rollout is listened to: its stream is not looked into again and again.
+            answers = await self._answers(slot, 0.0 if waited else self._pause_s())
+            waited = not answers
+            for answer in answers:
+                if not self._take(answer, slot, done):
+                    return False
+            if self.given and self.given[0].called_off:
+                return False
+        return True
+
+    def _take(self, answer: Frame, slot: Slot, done: Done) -> bool:
+        """Tells whether the process may execute more: what an exception left behind in it is unknown."""
+        ticket = self.given.popleft()
+        if "error" in answer.header:
+            done(ticket, InfraFailure(InfraCode(answer.header["code"]), answer.header["error"]))
+            return False
+        _wear(slot, float(answer.header["resident_mb"]))
+        done(ticket, self._completed(ticket, answer))
+        if self.given:
+            self.given[0].turn_s = time.monotonic()
+        return True
+
+    async def _answers(self, slot: Slot, pause_s: float) -> list[Frame]:
+        """What has come after the pause, or without one is waited for. Raises TimeoutError at the first lease's deadline."""
+        peer = slot.child.peer
+        if pause_s:
+            return await peer.gathered(pause_s)
+        first = self.given[0]
+        left_s = first.turn_s + first.lease.deadline_s - time.monotonic()
+        try:
+            async with asyncio.timeout(left_s):
+                return await peer.gathered(0.0)
+        except TimeoutError:
+            # It may have answered, and it is the next that takes long.
+            if answers := peer.arrived():
+                return answers
+            raise
+
+    def _room(self) -> int:
+        """How many more leases the slot's stream may hold."""
+        pace_s = self.scene.pace_s
+        return min(MOST_AHEAD, int(AHEAD_S / pace_s)) - (len(self.given) - 1) if pace_s else 0
+
+    def _pause_s(self) -> float:
+        """For how long the answers may lie in the stream."""
+        pause_s = min(GATHER_S, GATHER_SHARE * self.scene.pace_s * (len(self.given) - 1))
+        return pause_s if pause_s >= LEAST_GATHER_S else 0.0
+
+    def _completed(self, ticket: Ticket, answer: Frame) -> Completed:
+        scene, execute_s = self.scene, float(answer.header["execute_s"])
+        scene.pace_s += (execute_s - scene.pace_s) * (RECENT if scene.pace_s else 1.0)
         # Loading may have begun before the lease came.
-        load_s=0.0 if ticket.found_warm else min(scene.load_s, ticket.began_s - ticket.taken_s),
-        execute_s=float(answer.header["execute_s"]),
-    )
-    completed = completed_from_proto(types_pb2.Completed.FromString(answer.body))
-    return completed.noted(timings=timings, warm=ticket.found_warm)
+        load_s = 0.0 if ticket.found_warm else min(scene.load_s, ticket.began_s - ticket.taken_s)
+        timings = Timings(load_s=load_s, execute_s=execute_s)
+        return unread_completed(answer.body, timings=timings, warm=ticket.found_warm)
 
 
-def _worn(slot: Slot, resident_mb: float) -> bool:
-    """Count a rollout, and tell whether the slot has done enough."""
+async def _order(slot: Slot, tickets: Iterable[Ticket]) -> None:
+    # Of a process that has died there may be answers to read, and then comes the end of its stream.
+    with contextlib.suppress(ProcessGoneError):
+        await slot.child.peer.post(_frame(ticket) for ticket in tickets)
+
+
+def _frame(ticket: Ticket) -> Frame:
+    lease = ticket.lease
+    own = {} if lease.reward is PAPER else {"reward": dataclasses.asdict(lease.reward)}
+    header: dict[str, Any] = {"op": "execute", "slot": ticket.slot, **own}
+    return Frame(header, lease.rollout.wire or rollout_to_proto(lease.rollout).SerializeToString())
+
+
+def _wear(slot: Slot, resident_mb: float) -> None:
+    """Count a rollout; a slot that has done enough, or has grown, is worn."""
     slot.rollouts += 1
     slot.first_mb = slot.first_mb or resident_mb
-    return slot.rollouts >= ROLLOUTS_PER_SLOT or resident_mb > slot.first_mb + GROWTH_MB
+    slot.worn = slot.rollouts >= ROLLOUTS_PER_SLOT or resident_mb > slot.first_mb + GROWTH_MB

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.sim.zygote import PREFIX_BYTES, Frame, frame_lengths, pack, unpack
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
     from pathlib import Path
 
     from embomatrix.worker.progress import ProgressBoard
@@ -48,8 +49,8 @@ class Peer:
         self._heard = bytearray()
         self._gone = ""
         self._listener: asyncio.Future[None] | None = None
-        # For good, not for each answer: taking it out and in again costs more than the answer itself.
-        asyncio.get_running_loop().add_reader(connection, self._readable)
+        self._listening = False
+        self._listen()
 
     async def ask(self, frame: Frame) -> Frame:
         """Send the frame with its descriptors and wait for the answer. Raises ProcessGoneError.
@@ -68,21 +69,73 @@ class Peer:
         header_bytes, body_bytes = frame_lengths(await self._take(PREFIX_BYTES))
         return unpack(await self._take(header_bytes + body_bytes), header_bytes)
 
+    async def post(self, frames: Iterable[Frame]) -> None:
+        """Send questions whose answers are ``gathered``, in one write. Raises ProcessGoneError."""
+        try:
+            await self._send_all(b"".join(map(pack, frames)))
+        except OSError as error:
+            raise ProcessGoneError(str(error)) from error
+
+    async def gathered(self, pause_s: float) -> list[Frame]:
+        """All that came when the pause is over: none perhaps; without a pause, one frame at least is waited for.
+
+        Raises ProcessGoneError when nothing came and nothing can come.
+        """
+        if pause_s > 0:
+            # Not listened to meanwhile: each answer would wake this process for itself.
+            self._listen_no_more()
+            await asyncio.sleep(pause_s)
+            return self.arrived()
+        while not (frames := self.arrived()):
+            self._listen()
+            await self._news()
+        return frames
+
+    def arrived(self) -> list[Frame]:
+        """All whole frames that have come. Raises ProcessGoneError when there is none and the stream has ended."""
+        while not self._gone and self._receive() == READ_BYTES:
+            pass
+        frames, at = [], 0
+        while len(self._heard) - at >= PREFIX_BYTES:
+            begin = at + PREFIX_BYTES
+            header_bytes, body_bytes = frame_lengths(bytes(self._heard[at:begin]))
+            end = begin + header_bytes + body_bytes
+            if end > len(self._heard):
+                break
+            frames.append(unpack(bytes(self._heard[begin:end]), header_bytes))
+            at = end
+        del self._heard[:at]
+        if self._gone and not frames:
+            raise ProcessGoneError(self._gone)
+        return frames
+
     def close(self) -> None:
         """Close the stream. Whoever still waits for an answer on it must be cancelled."""
         if self._connection.fileno() >= 0:
             # Left behind, these would hear what comes on the next socket that is given this one's number.
-            loop = asyncio.get_running_loop()
-            loop.remove_reader(self._connection)
-            loop.remove_writer(self._connection)
+            self._listen_no_more()
+            asyncio.get_running_loop().remove_writer(self._connection)
         self._connection.close()
+
+    def _listen(self) -> None:
+        """For good, not for each answer: taking it out and in again costs more than the answer itself."""
+        if not self._listening and not self._gone:
+            asyncio.get_running_loop().add_reader(self._connection, self._readable)
+            self._listening = True
+
+    def _listen_no_more(self) -> None:
+        if self._listening:
+            asyncio.get_running_loop().remove_reader(self._connection)
+            self._listening = False
 
     async def _send(self, frame: Frame) -> None:
         data = pack(frame)
         # A question finds the buffer empty: all but the largest are taken at once. Descriptors go with the first byte.
-        sent = (
-            socket.send_fds(self._connection, [data], list(frame.fds)) if frame.fds else self._send_now(data)
-        )
+        sent = socket.send_fds(self._connection, [data], list(frame.fds)) if frame.fds else 0
+        await self._send_all(data[sent:])
+
+    async def _send_all(self, data: bytes) -> None:
+        sent = self._send_now(data) if data else 0
         if sent < len(data):
             await asyncio.get_running_loop().sock_sendall(self._connection, data[sent:])
 
@@ -97,28 +150,38 @@ class Peer:
         while len(self._heard) < count:
             if self._gone:
                 raise ProcessGoneError(self._gone)
-            self._listener = asyncio.get_running_loop().create_future()
-            try:
-                await self._listener
-            finally:
-                self._listener = None
+            self._listen()
+            await self._news()
         taken = bytes(memoryview(self._heard)[:count])
         del self._heard[:count]
         return taken
 
+    async def _news(self) -> None:
+        """Wait until more was heard, or the stream ended."""
+        self._listener = asyncio.get_running_loop().create_future()
+        try:
+            await self._listener
+        finally:
+            self._listener = None
+
     def _readable(self) -> None:
+        self._receive()
+        if self._listener is not None and not self._listener.done():
+            self._listener.set_result(None)
+
+    def _receive(self) -> int:
+        """Take what is there, up to a limit; tells how many bytes."""
         try:
             part = self._connection.recv(READ_BYTES)
             self._gone = "" if part else "its stream ended"
         except BlockingIOError:
-            return
+            return 0
         except OSError as error:
             part, self._gone = b"", str(error)
         self._heard += part
         if self._gone:
-            asyncio.get_running_loop().remove_reader(self._connection)
-        if self._listener is not None and not self._listener.done():
-            self._listener.set_result(None)
+            self._listen_no_more()
+        return len(part)
 
 
 class Zygote:

@@ -69,6 +69,8 @@ class Slot:
     child: Child
     rollouts: int = 0
     first_mb: float = 0.0
+    worn: bool = False
+    """It has done enough, or has grown: another one takes its place."""
 
 
 @dataclass(slots=True, eq=False)
@@ -84,6 +86,8 @@ class Scene:
     code: InfraCode = InfraCode.SCENE_LOAD_FAILED
     failed_s: float = 0.0
     last_used: int = 0
+    pace_s: float = 0.0
+    """What a rollout took of late, on average; 0 before the first."""
     running: int = 0
     idle: list[Slot] = field(default_factory=list)
 

@@ -118,7 +118,10 @@ def _hold_scene(simulation: Simulation, connection: socket.socket, board: Progre
 
 
 def _run_slot(scene: LoadedScene, connection: socket.socket, memory_mb: int, board: ProgressBoard) -> None:
-    """Execute rollouts, one after another, until the daemon closes the stream."""
+    """Execute rollouts, one after another, until the daemon closes the stream or one fails.
+
+    The next ones may lie in the stream already: what an exception left behind in this process must not execute them.
+    """
     limit_memory(memory_mb)
     take_small_pages()
     # A rollout leaves few cycles behind: they are looked for between rollouts, not many times within each.
@@ -133,7 +136,11 @@ def _run_slot(scene: LoadedScene, connection: socket.socket, memory_mb: int, boa
         if request is None:
             return
         on_step = functools.partial(board.set, int(request.header.get("slot", 0)))
-        send(connection, _answer(scene, request, on_step))
+        on_step(0)
+        answer = _answer(scene, request, on_step)
+        send(connection, answer)
+        if "error" in answer.header:
+            return
 
 
 def _answer(scene: LoadedScene, request: Frame, on_step: Callable[[int], None]) -> Frame:

@@ -6,12 +6,14 @@ import asyncio
 import contextlib
 import functools
 import heapq
+import itertools
 import logging
 import time
 from collections import deque
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.rpc.values import (
+    Completed,
     InfraCode,
     InfraFailure,
     LeaseClaim,
@@ -19,7 +21,7 @@ from embomatrix.rpc.values import (
     LeaseResult,
     ResidentState,
 )
-from embomatrix.worker.execution import Ticket, execute
+from embomatrix.worker.execution import Shift, Ticket
 from embomatrix.worker.processes import SIMULATOR_PROGRAM, ProcessGoneError
 from embomatrix.worker.progress import ProgressBoard
 from embomatrix.worker.residents import Residents
@@ -28,7 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable
     from pathlib import Path
 
-    from embomatrix.rpc.values import Completed, Lease, LeaseRef, Resident
+    from embomatrix.rpc.values import Lease, LeaseRef, Resident
     from embomatrix.worker.residents import Scene, SlotLimits
 
 logger = logging.getLogger(__name__)
@@ -72,8 +74,8 @@ class SlotPool:
         self._tickets: dict[LeaseRef, Ticket] = {}
         self._free = list(range(1, limits.slots + 1))
         """Permits that nobody has, as a heap: the lowest is given first, so that a little work stays on few."""
-        self._at_work: dict[int, Scene] = {}
-        """The scene that each occupied permit executes in."""
+        self._at_work: dict[int, Shift] = {}
+        """What each occupied permit executes."""
         self._tasks: asyncio.TaskGroup | None = None
         self._clock = 0
         self._resting = False
@@ -89,7 +91,7 @@ class SlotPool:
     @property
     def ahead(self) -> bool:
         """Whether every slot executes something, and enough waits behind it until more can come."""
-        return not self._free and len(self._waiting) >= AHEAD * self._limits.slots
+        return not self._free and len(self._tickets) >= (1 + AHEAD) * self._limits.slots
 
     @property
     def memory_used_mb(self) -> float:
@@ -104,8 +106,12 @@ class SlotPool:
 
     def progress(self) -> tuple[LeaseProgress, ...]:
         """How far the leases are that run."""
-        running = ((ref, ticket.slot) for ref, ticket in self._tickets.items() if ticket.slot)
-        return tuple(LeaseProgress(ref, self._board.steps(slot)) for ref, slot in running)
+        running = ((shift.given[0], permit) for permit, shift in self._at_work.items() if shift.given)
+        return tuple(
+            LeaseProgress(ticket.lease.ref, self._board.steps(permit))
+            for ticket, permit in running
+            if not ticket.called_off
+        )
 
     def claims(self) -> tuple[LeaseClaim, ...]:
         """What these leases are for."""
@@ -138,14 +144,15 @@ class SlotPool:
             ticket = self._tickets.pop(ref, None)
             if ticket is None:
                 continue
-            if ticket.task is None:
+            shift = self._at_work.get(ticket.slot)
+            if shift is None:
                 self._waiting.remove(ticket)
             else:
-                ticket.task.cancel()
+                shift.call_off(ticket)
         self._wake.set()
 
     def rest(self) -> None:
-        """Begin nothing from now on, neither leases nor loading; what runs goes on, and scenes stay."""
+        """Begin nothing from now on, neither leases nor loading; what slots were given goes on, and scenes stay."""
         self._resting = True
 
     def go_on(self) -> None:
@@ -205,12 +212,11 @@ class SlotPool:
     def _start_leases(self) -> None:
         """Occupy free permits as long as a lease waits whose scene is warm."""
         while self._tasks is not None and self._free and (found := self._next_lease()) is not None:
-            ticket, scene = found
-            slot = heapq.heappop(self._free)
-            self._occupy(slot, ticket, scene)
-            ticket.task = self._tasks.create_task(self._serve(slot, ticket, scene))
+            permit = heapq.heappop(self._free)
+            shift = self._occupy(permit, *found)
+            shift.task = self._tasks.create_task(self._serve(shift))
             # A task that is cancelled before its first step runs no `finally` of its own.
-            ticket.task.add_done_callback(functools.partial(self._vacate, slot))
+            shift.task.add_done_callback(functools.partial(self._vacate, permit))
 
     def _next_lease(self) -> tuple[Ticket, Scene] | None:
         if self._resting:
@@ -222,69 +228,94 @@ class SlotPool:
                 return ticket, scene
         return None
 
-    def _occupy(self, slot: int, ticket: Ticket, scene: Scene) -> None:
+    def _more(self, scene: Scene, count: int) -> list[Ticket]:
+        """Leases of this scene from the front of those that wait, up to a count: no more than a slot's share of them all."""
+        count = min(count, len(self._waiting) // self._limits.slots)
+        if self._resting or self._residents.warm(scene.digest) is not scene:
+            return []
+        fitting = itertools.takewhile(
+            lambda ticket: ticket.digest == scene.digest and ticket.small,
+            itertools.islice(self._waiting, max(0, count)),
+        )
+        return [self._waiting.popleft() for _ in list(fitting)]
+
+    def _occupy(self, permit: int, ticket: Ticket, scene: Scene) -> Shift:
         self._clock += 1
         scene.last_used = self._clock
         scene.running += 1
-        ticket.slot, ticket.began_s = slot, time.monotonic()
-        self._board.set(slot, 0)
-        self._at_work[slot] = scene
+        self._board.set(permit, 0)
+        shift = self._at_work[permit] = Shift(permit, scene)
+        shift.give(ticket)
+        return shift
 
-    def _leave(self, slot: int) -> None:
-        scene = self._at_work.pop(slot)
-        self._residents.release(scene)
-        if self._unsettled and not scene.running:
+    def _leave(self, permit: int) -> None:
+        """The shift is over; what was not begun in it waits again, in front."""
+        shift = self._at_work.pop(permit)
+        for ticket in reversed(shift.given):
+            if not ticket.called_off:
+                ticket.slot = 0
+                self._waiting.appendleft(ticket)
+        self._residents.release(shift.scene)
+        if self._unsettled and not shift.scene.running:
             self._wake.set()
 
-    def _vacate(self, slot: int, _: asyncio.Task[None]) -> None:
-        if slot in self._at_work:
-            self._leave(slot)
-        heapq.heappush(self._free, slot)
+    def _vacate(self, permit: int, _: asyncio.Task[None]) -> None:
+        if permit in self._at_work:
+            self._leave(permit)
+        heapq.heappush(self._free, permit)
         self._start_leases()
 
-    async def _serve(self, slot: int, ticket: Ticket, scene: Scene) -> None:
-        """Execute this lease, and under the same permit those that wait behind it."""
-        task = ticket.task
+    async def _serve(self, shift: Shift) -> None:
+        """Work this shift off, and under the same permit the leases that wait behind it."""
+        permit, task = shift.permit, shift.task
         while True:
-            await self._run_lease(ticket, scene)
-            self._leave(slot)
+            await self._work_off(shift)
+            self._leave(permit)
             found = self._next_lease()
             if found is None:
                 return
-            ticket, scene = found
-            self._occupy(slot, ticket, scene)
-            ticket.task = task
+            shift = self._occupy(permit, *found)
+            shift.task = task
 
-    async def _run_lease(self, ticket: Ticket, scene: Scene) -> None:
-        outcome: Completed | InfraFailure | None
-        try:
-            outcome = await self._execute(ticket, scene)
-        except Exception as error:
-            logger.exception("defect while executing lease=%s", ticket.lease.ref.lease_id)
-            outcome = InfraFailure(InfraCode.SLOT_CRASHED, f"{type(error).__name__}: {error}"[:500])
-        if outcome is not None:
-            self._finish(ticket, outcome)
+    async def _work_off(self, shift: Shift) -> None:
+        def more(count: int) -> list[Ticket]:
+            tickets = self._more(shift.scene, count)
+            for ticket in tickets:
+                shift.give(ticket)
+            return tickets
 
-    async def _execute(self, ticket: Ticket, scene: Scene) -> Completed | InfraFailure | None:
-        """Run the rollout in a slot of its scene; None when the scene had died and the lease waits again."""
         try:
-            slot = await scene.take_slot(self._limits.fork_s)
+            slot = await shift.scene.take_slot(self._limits.fork_s)
         except ProcessGoneError as error:
-            return self._scene_died(ticket, scene, str(error))
-        return await execute(ticket, scene, slot, self._residents)
+            self._scene_died(shift, str(error))
+            return
+        try:
+            await shift.work(slot, self._residents, more=more, done=self._finish)
+        except Exception as error:
+            if not shift.given:
+                raise
+            ticket = shift.given.popleft()
+            logger.exception("defect while executing lease=%s", ticket.lease.ref.lease_id)
+            defect = f"{type(error).__name__}: {error}"[:500]
+            self._finish(ticket, InfraFailure(InfraCode.SLOT_CRASHED, defect))
 
-    def _scene_died(self, ticket: Ticket, scene: Scene, reason: str) -> InfraFailure | None:
+    def _scene_died(self, shift: Shift, reason: str) -> None:
         """Have the scene loaded anew for this lease, once."""
-        self._residents.lost(scene, reason)
+        self._residents.lost(shift.scene, reason)
+        ticket = shift.given[0]
         if ticket.requeued:
-            return InfraFailure(
-                InfraCode.SLOT_CRASHED, "the scene's process died twice before the rollout began"
-            )
-        ticket.requeued, ticket.found_warm, ticket.task, ticket.slot = True, False, None, 0
-        self._waiting.appendleft(ticket)
-        return None
+            shift.given.popleft()
+            died = "the scene's process died twice before the rollout began"
+            self._finish(ticket, InfraFailure(InfraCode.SLOT_CRASHED, died))
+        ticket.requeued, ticket.found_warm = True, False
 
     def _finish(self, ticket: Ticket, outcome: Completed | InfraFailure) -> None:
-        if self._tickets.pop(ticket.lease.ref, None) is not None:
-            held_s = time.monotonic() - ticket.began_s if ticket.slot else 0.0
-            self._on_result(LeaseResult(ticket.lease.ref, outcome, ticket.lease.origin, ticket.slot, held_s))
+        lease = ticket.lease
+        if self._tickets.get(lease.ref) is not ticket:
+            return
+        del self._tickets[lease.ref]
+        held_s = time.monotonic() - ticket.turn_s if ticket.slot else 0.0
+        if isinstance(outcome, Completed):
+            # Of answers that came together, all but the first seem to have taken no time.
+            held_s = max(held_s, outcome.timings.execute_s)
+        self._on_result(LeaseResult(lease.ref, outcome, lease.origin, ticket.slot, held_s))

@@ -1,0 +1,156 @@
+"""What lies ahead in a slot's stream: it is executed without the daemon, and what becomes of its process costs it nothing."""
+
+import asyncio
+import random
+import time
+from collections import Counter
+
+import pytest
+from tests.unit.worker.test_slots import running
+
+from embomatrix.rpc.convert_session import lease_from_proto, lease_to_proto
+from embomatrix.rpc.values import Completed, InfraCode, Lease, LeaseRef, Rollout
+
+pytestmark = pytest.mark.timeout(60)
+
+
+@pytest.fixture
+def executions(tmp_path, monkeypatch):
+    """Tells how often each rollout was begun, by its id."""
+    path = tmp_path / "executions"
+    monkeypatch.setenv("FAKE_EXECUTIONS", str(path))
+    return lambda: Counter(path.read_text().split())
+
+
+def submit(harness, lease_id, task="ok", deadline_s=30.0):
+    """As the manager's leases come: with the rollout's message, which may wait in a stream."""
+    lease = Lease(LeaseRef(lease_id, 1), Rollout(lease_id, "g", "scene", task, (), 1), deadline_s)
+    lease = lease_from_proto(lease_to_proto(lease))
+    harness.pool.submit(lease)
+    return lease.ref
+
+
+async def learn_pace(harness):
+    """Only where executions were seen to be brief does a slot get leases ahead."""
+    for number in range(4):
+        submit(harness, f"early{number}")
+        await harness.outcomes(number + 1)
+    harness.results.clear()
+
+
+async def test_a_slot_goes_on_while_the_daemon_does_something_else(tmp_path, executions):
+    async with running(tmp_path, slots=1) as harness:
+        await learn_pace(harness)
+        for number in range(12):
+            submit(harness, f"l{number}", "brief")
+        await harness.until(lambda: len(harness.results) >= 1)
+        before = len(harness.results)
+        time.sleep(0.5)  # noqa: ASYNC251  # nothing of the daemon runs meanwhile
+        assert sum(executions().values()) - 4 >= before + 3, "one that runs, and more"
+        outcomes = await harness.outcomes(12)
+    assert all(isinstance(outcome, Completed) for outcome in outcomes.values())
+    assert set(executions().values()) == {1}
+
+
+@pytest.mark.parametrize(
+    ("task", "code"),
+    [
+        ("crash", InfraCode.SLOT_CRASHED),
+        ("raise", InfraCode.SLOT_CRASHED),
+        ("greedy", InfraCode.SLOT_OOM),
+        ("hang", InfraCode.SLOT_TIMEOUT),
+    ],
+)
+async def test_what_a_rollout_does_to_its_process_costs_none_of_those_behind_it(
+    tmp_path, executions, task, code
+):
+    async with running(tmp_path, slots=1) as harness:
+        await learn_pace(harness)
+        for number in range(4):
+            submit(harness, f"before{number}")
+        submit(harness, "bad", task, deadline_s=1.0)
+        for number in range(8):
+            submit(harness, f"behind{number}")
+        outcomes = await harness.outcomes(13)
+    assert outcomes.pop("bad").code is code
+    assert all(isinstance(outcome, Completed) for outcome in outcomes.values())
+    assert set(executions().values()) == {1}, "each was begun once: none of those behind it had been lost"
+    processes = {name: outcome.final[0].split()[3] for name, outcome in outcomes.items()}
+    before, behind = (
+        {pid for name, pid in processes.items() if name.startswith(word)} for word in ("before", "behind")
+    )
+    assert before.isdisjoint(behind), "a damaged process executes nothing more"
+
+
+async def test_a_lease_that_is_cancelled_in_a_stream_gives_no_result_and_nothing_is_killed(
+    tmp_path, executions
+):
+    async with running(tmp_path, slots=1) as harness:
+        await learn_pace(harness)
+        submit(harness, "first", "slow")
+        refs = [submit(harness, f"l{number}") for number in range(6)]
+        await harness.until(lambda: executions()["first"])
+        harness.pool.cancel(refs[1:3])
+        outcomes = await harness.outcomes(5)
+        assert harness.pool.held() == ()
+    assert set(outcomes) == {"first", "l0", "l3", "l4", "l5"}
+    assert all(isinstance(outcome, Completed) for outcome in outcomes.values())
+
+
+async def test_what_waits_behind_a_rollout_that_is_cancelled_is_executed_elsewhere(tmp_path, executions):
+    async with running(tmp_path, slots=1) as harness:
+        await learn_pace(harness)
+        stuck = submit(harness, "stuck", "hang")
+        for number in range(4):
+            submit(harness, f"l{number}")
+        await harness.until(lambda: executions()["stuck"])
+        harness.pool.cancel([stuck])
+        outcomes = await harness.outcomes(4)
+    assert set(outcomes) == {f"l{number}" for number in range(4)}
+    assert set(executions().values()) == {1}
+
+
+async def test_a_lease_that_is_given_again_after_it_was_cancelled_has_one_result(tmp_path):
+    async with running(tmp_path, slots=1) as harness:
+        await learn_pace(harness)
+        submit(harness, "first", "slow")
+        ref = submit(harness, "again")
+        for number in range(4):
+            submit(harness, f"l{number}")
+        await asyncio.sleep(0.1)
+        harness.pool.cancel([ref])
+        submit(harness, "again")
+        await harness.outcomes(6)
+        await asyncio.sleep(0.1)
+        assert len(harness.results) == 6
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+async def test_whatever_happens_in_slots_every_lease_that_is_waited_for_has_one_result(
+    tmp_path, executions, seed
+):
+    rng = random.Random(seed)
+    kinds = {"ok": 12, "brief": 2, "crash": 1, "raise": 1, "hang": 1}
+    tasks = dict(enumerate(rng.choices(list(kinds), list(kinds.values()), k=50)))
+    cancelled = set()
+    async with running(tmp_path, slots=2) as harness:
+        await learn_pace(harness)
+        for number, task in tasks.items():
+            ref = submit(harness, str(number), task, deadline_s=0.5 if task == "hang" else 30.0)
+            if rng.random() < 0.3:
+                await asyncio.sleep(rng.random() * 0.02)
+            if rng.random() < 0.1 and ref in harness.pool.held():
+                harness.pool.cancel([ref])
+                cancelled.add(number)
+        await harness.until(lambda: not harness.pool.held(), limit_s=45.0)
+    results = Counter(result.ref.lease_id for result in harness.results)
+    assert results == Counter(str(number) for number in tasks if number not in cancelled)
+    failed = {
+        int(result.ref.lease_id) for result in harness.results if not isinstance(result.outcome, Completed)
+    }
+    bad = {number for number, task in tasks.items() if task in ("crash", "raise", "hang")}
+    assert failed == bad - cancelled
+    finished = [str(number) for number in tasks if number not in bad | cancelled]
+    kills = 1 + len(cancelled)
+    begun = executions()
+    assert all(begun[name] <= kills for name in finished), "only what is called off costs others their work"
