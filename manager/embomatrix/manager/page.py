@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 from importlib.resources import files
 from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, Final
 
-from fastapi import APIRouter, HTTPException
-from fastapi.responses import Response
+from fastapi import APIRouter, HTTPException, Request, Response
+
+from embomatrix.manager.packing import packed
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -36,18 +38,21 @@ def page() -> APIRouter:
     }
 
     @router.get("/")
-    async def index() -> Response:
-        return _answer("index.html")
+    async def index(request: Request) -> Response:
+        return _answer(request, "index.html")
 
     @router.get(f"{STATIC}{{path:path}}")
-    async def static(path: str) -> Response:
-        return _answer(path)
+    async def static(request: Request, path: str) -> Response:
+        return _answer(request, path)
 
-    def _answer(path: str) -> Response:
+    def _answer(request: Request, path: str) -> Response:
         if path not in served:
             raise HTTPException(404, f"the page has no file {path[:100]!r}")
         content, kind = served[path]
-        return Response(content, media_type=kind, headers=dict(GUARDED))
+        headers = {**GUARDED, "etag": f'"{hashlib.sha256(content).hexdigest()[:16]}"'}
+        if request.headers.get("if-none-match") == headers["etag"]:
+            return Response(status_code=304, headers=headers)
+        return packed(request, content, kind, headers)
 
     return router
 

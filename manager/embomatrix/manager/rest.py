@@ -11,9 +11,10 @@ import dataclasses
 import json
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
-from fastapi import APIRouter, Body, HTTPException, Query, Response
+from fastapi import APIRouter, Body, HTTPException, Query, Request, Response
 from fastapi.responses import JSONResponse, StreamingResponse
 
+from embomatrix.manager.packing import packed
 from embomatrix.manager.rest_values import (
     LARGEST_PAGE,
     PAGE,
@@ -42,7 +43,7 @@ if TYPE_CHECKING:
 
     from embomatrix.manager.expulsion import Expulsion
     from embomatrix.manager.runtime import ManagerRuntime
-    from embomatrix.manager.snapshot import Snapshots
+    from embomatrix.manager.snapshot import Snapshot, Snapshots
     from embomatrix.rpc.run_log import RunEvent
 
 PREFIX: Final = "/api/v1"
@@ -78,13 +79,13 @@ def reading(runtime: ManagerRuntime, snapshots: Snapshots) -> APIRouter:
 
     @router.get("/snapshot", response_model=SnapshotPage)
     async def snapshot(
-        state: State = "", search: Search = "", offset: Offset = 0, limit: Limit = PAGE
+        request: Request, state: State = "", search: Search = "", offset: Offset = 0, limit: Limit = PAGE
     ) -> Response:
-        """The cluster at one moment: health, figures, a page of workers, runs, look-ahead."""
-        seen = snapshots.now()
-        workers = worker_page(seen, state=state, search=search, offset=offset, limit=limit)
-        return _json(
-            SnapshotPage(
+        """The cluster at one moment: health, figures, a page of workers, runs, look-ahead, training."""
+
+        def page(seen: Snapshot) -> SnapshotPage:
+            workers = worker_page(seen, state=state, search=search, offset=offset, limit=limit)
+            return SnapshotPage(
                 seen.at_s,
                 seen.health,
                 seen.paused,
@@ -94,7 +95,8 @@ def reading(runtime: ManagerRuntime, snapshots: Snapshots) -> APIRouter:
                 seen.lookahead,
                 seen.training,
             )
-        )
+
+        return packed(request, snapshots.told((state, search, offset, limit), page))
 
     @router.get("/workers", response_model=WorkerPage)
     async def workers(
@@ -201,10 +203,11 @@ def _training(router: APIRouter, runtime: ManagerRuntime, snapshots: Snapshots) 
         return JSONResponse([dataclasses.asdict(view) for view in snapshots.now().training])
 
     @router.get("/training/{run_id}", response_model=TrainingDetail)
-    async def detail(run_id: str) -> Response:
+    async def detail(request: Request, run_id: str) -> Response:
         """Learning curves of a run, and plans that its policy wrote of late."""
         with answered():
-            return _json(runtime.training.detail(run_id))
+            told = dataclasses.asdict(runtime.training.detail(run_id))
+        return packed(request, json.dumps(told, separators=(",", ":")).encode())
 
 
 def _stream(router: APIRouter, runtime: ManagerRuntime) -> None:

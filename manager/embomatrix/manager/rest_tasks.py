@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from typing import TYPE_CHECKING, Annotated
 
-from fastapi import APIRouter, Query, Response
+from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import JSONResponse
 
 from embomatrix.manager.floor_plan import FloorPlan
 from embomatrix.manager.gallery_values import TaskDetail, TaskPage
+from embomatrix.manager.packing import packed
 from embomatrix.manager.rest import PREFIX, Limit, Offset, answered
 
 if TYPE_CHECKING:
@@ -41,16 +43,16 @@ def showing(gallery: Gallery) -> APIRouter:
         return JSONResponse(dataclasses.asdict(found))
 
     @router.get("/tasks/{task_id}", response_model=TaskDetail)
-    async def task(task_id: str) -> Response:
+    async def task(request: Request, task_id: str) -> Response:
         """One task: what is asked, its objects, and the oracle's plan on the plan view."""
         with answered():
-            return JSONResponse(dataclasses.asdict(await gallery.detail(task_id)))
+            return _json(request, await gallery.detail(task_id))
 
     @router.get("/scenes/{digest}/floor", response_model=FloorPlan)
-    async def floor(digest: str) -> Response:
+    async def floor(request: Request, digest: str) -> Response:
         """A scene from above."""
         with answered():
-            return JSONResponse(dataclasses.asdict(await gallery.floor(digest)))
+            return _json(request, await gallery.floor(digest))
 
     @router.get("/scenes/{digest}/picture", response_class=Response)
     async def picture(digest: str) -> Response:
@@ -59,3 +61,7 @@ def showing(gallery: Gallery) -> APIRouter:
             return Response(await gallery.picture(digest), media_type="image/jpeg")
 
     return router
+
+
+def _json(request: Request, value: TaskDetail | FloorPlan) -> Response:
+    return packed(request, json.dumps(dataclasses.asdict(value), separators=(",", ":")).encode())

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import time
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from embomatrix.manager import views
 from embomatrix.manager.health import health
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Hashable
+
     from embomatrix.manager.health import Health
     from embomatrix.manager.runtime import ManagerRuntime
     from embomatrix.manager.training import TrainingView
     from embomatrix.manager.views import LookaheadStep, Overview, RunView, WorkerView
 
+ANSWERS_KEPT: Final = 64
+"""To different questions about one snapshot."""
 FRESH_S: Final = 0.9
 """Pages ask once a second. However many viewers there are, the cluster is looked at once for all of them."""
 
@@ -40,13 +46,24 @@ class Snapshots:
         self._runtime = runtime
         self._taken_s = float("-inf")
         self._last: Snapshot | None = None
+        self._told: dict[Hashable, bytes] = {}
 
     def now(self) -> Snapshot:
         """That of this moment, or of less than ``FRESH_S`` ago."""
         if self._last is None or time.monotonic() - self._taken_s >= FRESH_S:
             self._last = self._take()
+            self._told.clear()
             self._taken_s = time.monotonic()
         return self._last
+
+    def told(self, asked: Hashable, page: Callable[[Snapshot], Any]) -> bytes:
+        """A dataclass made of the snapshot, as JSON: made once for all who ask the same of this moment."""
+        seen = self.now()
+        if asked not in self._told:
+            if len(self._told) >= ANSWERS_KEPT:
+                self._told.clear()
+            self._told[asked] = json.dumps(dataclasses.asdict(page(seen)), separators=(",", ":")).encode()
+        return self._told[asked]
 
     def forget(self) -> None:
         """Something was changed: who looks next wants to see it."""

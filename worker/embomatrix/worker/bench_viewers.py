@@ -144,7 +144,7 @@ async def _view(page: str) -> None:
 
 
 def _ask(page: str) -> None:
-    with urllib.request.urlopen(f"{page}api/v1/snapshot?limit=100", timeout=5.0) as answer:
+    with urllib.request.urlopen(f"{page}api/v1/snapshot?limit=50", timeout=5.0) as answer:
         answer.read()
 
 

@@ -1,36 +1,52 @@
 // The dashboard: one snapshot a second feeds whichever page is shown.
 import {ask} from "./ask.js";
 import {at, seconds} from "./dom.js";
-import * as failures from "./failures.js";
-import * as lookahead from "./lookahead.js";
-import * as overview from "./overview.js";
-import * as tasks from "./tasks.js";
-import * as timeline from "./timeline.js";
-import * as training from "./training.js";
-import * as workers from "./workers.js";
 
-const PAGES = {overview, workers, lookahead, timeline, failures, training, tasks};
+// A page's code comes when it is opened, and the first snapshot with it: nobody waits for what isn't shown.
+const PAGES = {
+  overview: () => import("./overview.js"), workers: () => import("./workers.js"), lookahead: () => import("./lookahead.js"), timeline: () => import("./timeline.js"),
+  failures: () => import("./failures.js"), training: () => import("./training.js"), tasks: () => import("./tasks.js"),
+};
 const REFRESH_MS = 1000;
+/** Rows of workers that the page shows at once; the others show none. */
+const ROWS = {workers: 50};
 let page = null;
 let waiting = 0;
+let opened = 0;
 
-function open() {
-  const name = location.hash.slice(1).split("?")[0] in PAGES ? location.hash.slice(1).split("?")[0] : "overview";
+async function open() {
+  const asked = location.hash.slice(1).split("?")[0], name = Object.hasOwn(PAGES, asked) ? asked : "overview", turn = ++opened;
+  clearTimeout(waiting);
+  const first = ask(`snapshot?${new URLSearchParams({limit: ROWS[name] ?? 1})}`);
+  first.catch(() => {}); // it is asked for again
+  let code;
+  try {
+    code = await PAGES[name]();
+  } catch {
+    at("dot").className = "dot lost";
+    at("link").textContent = "a part of the page did not come: load it again";
+    return;
+  }
+  if (turn !== opened) return;
   page?.close?.();
-  page = PAGES[name];
+  page = code;
   for (const link of at("nav").children) {
     if (link.getAttribute("href") === `#${name}`) link.setAttribute("aria-current", "page");
     else link.removeAttribute("aria-current");
   }
   document.title = `${name[0].toUpperCase()}${name.slice(1)} · EmboMatrix cluster`;
   page.open(at("main"));
-  refresh();
+  await refresh(page.asksMore?.() ? null : first);
+  // The other pages while there is time: they open at once then, and also while the manager is away.
+  setTimeout(() => Promise.allSettled(Object.values(PAGES).map(load => load())), REFRESH_MS);
 }
 
-async function refresh() {
+/** Ask, and show what is told; `first` is an answer that is on its way. */
+async function refresh(first = null) {
   clearTimeout(waiting);
+  if (!page) return;
   try {
-    const asked = page, told = await ask(`snapshot?${new URLSearchParams(asked.query?.() ?? {limit: 1})}`);
+    const asked = page, told = await (first ?? ask(`snapshot?${new URLSearchParams(asked.query?.() ?? {limit: 1})}`));
     if (asked === page) {
       say(told);
       await page.show(told);
@@ -60,6 +76,6 @@ at("ask").addEventListener("submit", event => {
   refresh();
 });
 addEventListener("hashchange", open);
-addEventListener("embomatrix-changed", refresh);
+addEventListener("embomatrix-changed", () => refresh());
 document.addEventListener("visibilitychange", () => { if (!document.hidden) refresh(); });
 open();

@@ -1,6 +1,12 @@
 // Lines over steps or seconds, by the one library of charts: colours follow the theme, the width follows the page.
 import {colour, h} from "./dom.js";
 
+/** The library is no module: it comes when the first page with a chart does. */
+await Promise.all([
+  new Promise((done, failed) => document.head.append(h("script", {src: "/static/vendor/uPlot.iife.min.js", onload: done, onerror: () => failed(new TypeError("the charts did not come"))}))),
+  new Promise(done => document.head.append(h("link", {rel: "stylesheet", href: "/static/vendor/uPlot.min.css", onload: done, onerror: done}))),
+]);
+
 const DASHES = [[], [6, 3], [2, 2], [9, 3, 2, 3], [1, 4]];
 const TINTS = ["c1", "c2", "c3", "c4", "c5"];
 

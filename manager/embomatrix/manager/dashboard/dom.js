@@ -45,9 +45,13 @@ export function table(headings, rows, caption) {
     h("table", {}, h("thead", {}, h("tr", {}, head)), h("tbody", {}, rows)));
 }
 
+const last = new WeakMap();
+
 /** What the page shows in a place, replaced only when it differs: selections and focus outlive a refresh. */
 export function put(place, ...children) {
-  const fresh = h("div", {}, ...children);
-  if (fresh.innerHTML === place.innerHTML && !fresh.querySelector("canvas")) return;
+  const fresh = h("div", {}, ...children), told = fresh.innerHTML;
+  const before = last.get(place);
+  if (before?.told === told && before.first === place.firstChild) return;
+  last.set(place, {told, first: fresh.firstChild});
   place.replaceChildren(...fresh.childNodes);
 }

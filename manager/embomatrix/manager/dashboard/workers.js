@@ -2,11 +2,13 @@
 import {Refused, change} from "./ask.js";
 import {at, brief, count, h, none, put, seconds, table} from "./dom.js";
 
-const ROWS = 100;
+const ROWS = 50;
 const STATES = ["", "ready", "paused", "draining", "suspect", "lost", "quarantined"];
 const wish = {state: "", search: "", offset: 0, limit: ROWS};
 
 export const query = () => wish;
+/** Whether the viewer chose some of them, before. */
+export const asksMore = () => Boolean(wish.state || wish.search || wish.offset);
 
 export function open(main) {
   const options = STATES.map(state => h("option", {value: state, selected: state === wish.state}, state || "every state"));
