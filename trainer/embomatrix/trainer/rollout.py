@@ -90,6 +90,22 @@ class PlanOutcome:
         return self.reward is not None and self.reward.success
 
 
+class Submitting(Protocol):
+    """What a step of GRPO needs of a gateway."""
+
+    def submit(
+        self,
+        batch_id: str,
+        step: int,
+        task: TrainingTask,
+        situation: Situation,
+        texts: Sequence[str],
+        codec: Codec,
+    ) -> Future[tuple[PlanOutcome, ...]]:
+        """Have the plans of one task executed; outcomes come in the order of ``texts``."""
+        ...
+
+
 def parsed(text: str, situation: Situation, codec: Codec) -> Plan:
     """The plan that a policy's text means. Raises PlanError when it means none."""
     return parse_plan(with_indices(text, situation) if codec is Codec.NAMES else text, situation.profile)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from embomatrix.trainer.data import TrainingTask
     from embomatrix.trainer.policy.protocol import Policy, Samples
-    from embomatrix.trainer.rollout import Gateway, PlanOutcome
+    from embomatrix.trainer.rollout import PlanOutcome, Submitting
     from embomatrix.trainer.settings import GrpoSettings
     from embomatrix.trainer.telling import Teller, Told
 
@@ -60,7 +60,7 @@ class Sampler:
     """Samples a policy on tasks, and has its plans executed meanwhile."""
 
     def __init__(
-        self, policy: Policy, reference: Policy, teller: Teller, gateway: Gateway, settings: GrpoSettings
+        self, policy: Policy, reference: Policy, teller: Teller, gateway: Submitting, settings: GrpoSettings
     ) -> None:
         self._policy = policy
         self._reference = reference

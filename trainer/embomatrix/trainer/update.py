@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
     from embomatrix.trainer.data import TrainingTask
     from embomatrix.trainer.policy.protocol import Policy
-    from embomatrix.trainer.rollout import Gateway, PlanOutcome
+    from embomatrix.trainer.rollout import PlanOutcome, Submitting
     from embomatrix.trainer.sampling import Chunk
     from embomatrix.trainer.settings import GrpoSettings
     from embomatrix.trainer.stopwatch import Stopwatch
@@ -75,7 +75,7 @@ class Updater:
         policy: Policy,
         reference: Policy,
         teller: Teller,
-        gateway: Gateway,
+        gateway: Submitting,
         settings: GrpoSettings,
         stopwatch: Stopwatch,
     ) -> None:

@@ -53,6 +53,7 @@ from embomatrix.worker.bench_output import console, errors, hand_in, refusals, w
 from embomatrix.worker.bench_page import hand_parts, render_page
 from embomatrix.worker.bench_rollout import bench_rollout
 from embomatrix.worker.bench_scenes import scenes_of
+from embomatrix.worker.bench_trainer_cli import trainer
 from embomatrix.worker.bench_workload import PINNED, SIZES, read_workload, workload_to_text, write_workload
 from embomatrix.world.dataset import Dataset
 
@@ -78,6 +79,7 @@ MODES = Modes(cached=Simulator, physical=physical_simulator)
 
 app.command()(cluster)
 app.command()(operations)
+app.command()(trainer)
 
 
 @app.command()

@@ -9,13 +9,13 @@ from typing import Annotated, Final
 import typer
 
 from embomatrix.worker.bench_ablation import AblationSizes
+from embomatrix.worker.bench_brought import bench_simulation
 from embomatrix.worker.bench_cluster import ClusterLoad
 from embomatrix.worker.bench_cluster_parts import ClusterJob, ClusterPart, bench_cluster_parts
 from embomatrix.worker.bench_figures import BenchResult, commit_here, describe_machine
 from embomatrix.worker.bench_output import console, errors, hand_in, refusals
 from embomatrix.worker.bench_peers import Peer
 from embomatrix.worker.bench_prewarm import PrewarmSizes
-from embomatrix.worker.bench_simulation import bench_simulation
 from embomatrix.worker.bench_workload import PINNED
 
 DATASET: Final = Path("build/dataset")

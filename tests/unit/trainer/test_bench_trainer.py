@@ -1,0 +1,66 @@
+"""What `embomatrix bench trainer` measures: one load for two trainers, and sentences where nothing can be measured."""
+
+import sys
+from dataclasses import replace
+
+import pytest
+from tests.fakes.datasets import write_kitchen_dataset
+from tests.fakes.symbolic_household import make_tasks
+from typer.testing import CliRunner
+
+from embomatrix.cli.bench_trainer import bench_trainer, seconds_told
+from embomatrix.trainer.bench.load import load_of, read_load, write_load
+from embomatrix.trainer.bench.own_steps import measure, policy_of
+from embomatrix.trainer.errors import TrainerError
+from embomatrix.worker.bench_cli import app
+from embomatrix.worker.bench_figures import BenchError
+
+TASKS = make_tasks(3, 0, objects=6).train
+SMALL = {"tasks": 2, "group": 3, "new": 4, "steps": 2, "layers": 1, "width": 32, "heads": 2, "inner": 32}
+
+
+def test_a_load_knows_every_word_of_its_prompts_and_comes_back_from_its_file(tmp_path):
+    load = load_of(TASKS)
+    assert {word for prompt in load.prompts for word in prompt.split()} <= set(load.words)
+    write_load(tmp_path / "load.json", load)
+    assert read_load(tmp_path / "load.json") == load
+    (tmp_path / "load.json").write_text("{}")
+    with pytest.raises(TrainerError, match="is no load of `embomatrix bench trainer`"):
+        read_load(tmp_path / "load.json")
+
+
+def test_our_steps_are_taken_on_the_prompts_of_the_load():
+    pytest.importorskip("transformers")
+    load = replace(load_of(TASKS), **SMALL)
+    assert len(measure(load, TASKS)) == 2
+    policy = policy_of(load)
+    words = [load.words[token] for token in policy.encode_plan(load.prompts[0])[:-1]]
+    assert words == load.prompts[0].split()
+
+
+@pytest.mark.parametrize("output", ["", "no json", "[]", '{"step_s": null}'])
+def test_a_program_that_tells_no_times_is_one_sentence(output):
+    with pytest.raises(BenchError, match="told no times of steps"):
+        seconds_told(output)
+
+
+def test_times_are_on_the_last_line_whatever_a_library_says_before():
+    assert seconds_told('a warning\n{"step_s": [1.5, 2]}\n') == [1.5, 2.0]
+
+
+def test_a_dataset_that_is_not_there_is_one_sentence():
+    result = CliRunner().invoke(app, ["trainer", "--dataset=nowhere", "--part=step"])
+    assert result.exit_code == 2
+    assert "no dataset at nowhere" in " ".join(result.output.split())
+
+
+@pytest.mark.slow
+def test_steps_are_compared_with_those_of_the_interpreter_that_is_named(tmp_path):
+    pytest.importorskip("transformers")
+    folder = write_kitchen_dataset(tmp_path / "kitchen")
+    stand_in = tmp_path / "python"
+    stand_in.write_text(f"#!{sys.executable}\nprint('{{\"step_s\": [1000.0]}}')\n")
+    stand_in.chmod(0o755)
+    figures = bench_trainer(folder, stand_in, ["step"], lambda _: None)
+    found = {figure.name: figure for figure in figures}
+    assert found["grpo_step_vs_trl"].value == pytest.approx(1000.0 / found["grpo_step_cpu_s"].value)
