@@ -173,6 +173,24 @@ def test_what_is_done_is_not_done_again(tmp_path):
     conductor.train(0, RELEVANCE_ARMS[0], place)
 
 
+def test_what_finished_runs_found_is_told_while_others_are_not_done(dataset, tmp_path):
+    out, page = tmp_path / "out", tmp_path / "page.md"
+    options = ("--seed=0", "--seed=1", "--so-far", f"--dataset={dataset}", f"--out={out}", f"--page={page}")
+    status, text = told("learning", *options)
+    assert (status, "no run in" in text) == (2, True)
+    done = out / "seed-1" / "with-relevance"
+    done.mkdir(parents=True)
+    write_outcome(done, outcome((0.2, 0.2), (0.5, 0.9)))
+    status, text = told("learning", *options, f"--json={tmp_path / 'figures.json'}")
+    assert status == 0, text
+    assert "| with-relevance | 1 | 20 | 320 | 0 | 20.0% | 70.0% |" in page.read_text()
+    figures = {
+        each["name"]: each["value"] for each in json.loads((tmp_path / "figures.json").read_text())["figures"]
+    }
+    assert figures["success_after"] == 0.7
+    assert "success_after_no_relevance" not in figures
+
+
 def test_an_outcome_is_read_as_it_was_written(tmp_path):
     found = outcome((0.2, None), (0.5, 1.0))
     write_outcome(tmp_path, found)

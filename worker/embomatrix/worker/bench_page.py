@@ -79,8 +79,8 @@ TITLES: Final[Mapping[str, tuple[str, str]]] = {
         "hand: the median of five steps' processor seconds, of ours and of TRL's GRPOTrainer one after the other. "
         "*sim_wait_share* and *overhead_ratio* are of 15 steps of the word-level policy with default settings, after 120 steps "
         "of imitation, on a cluster of two workers on the same cores: the shares of the steps' time in which the trainer "
-        "waited for simulation, and in which it neither sampled nor learnt. *eval_s* is from the command's start to its end, random "
-        "plans for 100 tasks.",
+        "waited for simulation, and in which it neither sampled nor learnt. *eval_s* is from the command's start to its end, "
+        "random plans for 100 tasks.",
     ),
 }
 """Heading and explanation of each bench, in the order of the page."""

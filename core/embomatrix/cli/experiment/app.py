@@ -32,7 +32,7 @@ from embomatrix.cli.failure import fail
 from embomatrix.cli.foreground import no_problem, run_command
 from embomatrix.pages.figures import figure_to_json, shown
 from embomatrix.trainer.errors import TrainerError
-from embomatrix.trainer.outcome import read_outcome
+from embomatrix.trainer.outcome import OUTCOME, read_outcome
 from embomatrix.trainer.recorder import read_metrics
 from embomatrix.world.whole_file import write_whole
 
@@ -73,6 +73,7 @@ _Ca = Annotated[Path | None, typer.Option(help="The ca.pem of a manager that ser
 _Workers = Annotated[int, typer.Option(min=1, max=64, help="Workers of one slot in a cluster of our own.")]
 _Threads = Annotated[int, typer.Option(min=0, help="Threads of torch; 0: one a core.")]
 _Json = Annotated[Path | None, typer.Option("--json", help="File for the figures.")]
+_SoFar = Annotated[bool, typer.Option("--so-far", help="Train nothing: tell what the finished runs found.")]
 _Page = Annotated[Path | None, typer.Option(help="Page to add the section to, such as docs/experiments.md.")]
 DATASET: Final = Path("build/dataset")
 
@@ -94,6 +95,7 @@ def learning(
     ca: _Ca = None,
     workers: _Workers = 2,
     threads: _Threads = 0,
+    so_far: _SoFar = False,
     json_file: _Json = None,
     page: _Page = None,
 ) -> None:
@@ -103,7 +105,8 @@ def learning(
         budgets = (Budget(imitate_seconds, imitate_steps), Budget(60 * minutes, steps))
         arms = RELEVANCE_ARMS
         design = _design(name, arms, dataset, model, seeds, *budgets, patience, threads, settings)
-        _experiment(design, dataset, out, _place(manager, token, ca, out, workers), json_file, page)
+        place = None if so_far else _place(manager, token, ca, out, workers)
+        _experiment(design, dataset, out, place, json_file, page)
 
 
 @app.command()
@@ -122,6 +125,7 @@ def times(
     ca: _Ca = None,
     workers: _Workers = 2,
     threads: _Threads = 0,
+    so_far: _SoFar = False,
     json_file: _Json = None,
     page: _Page = None,
 ) -> None:
@@ -130,7 +134,8 @@ def times(
         budgets = (Budget(imitate_seconds, imitate_steps), Budget(60 * minutes, steps))
         arms = OVERLAP_ARMS
         design = _design("training time", arms, dataset, model, seeds or [0], *budgets, 0, threads, settings)
-        _experiment(design, dataset, out, _place(manager, token, ca, out, workers), json_file, page)
+        place = None if so_far else _place(manager, token, ca, out, workers)
+        _experiment(design, dataset, out, place, json_file, page)
 
 
 @app.command()
@@ -157,6 +162,7 @@ def compare(
     ca: _Ca = None,
     workers: _Workers = 2,
     threads: _Threads = 0,
+    so_far: _SoFar = False,
     json_file: _Json = None,
     page: _Page = None,
 ) -> None:
@@ -165,7 +171,8 @@ def compare(
         arms = checked_arms([parse_arm(told) for told in arm])
         budgets = (Budget(imitate_seconds, imitate_steps), Budget(60 * minutes, steps))
         design = _design(title, arms, dataset, model, seeds or [0], *budgets, patience, threads, settings)
-        _experiment(design, dataset, out, _place(manager, token, ca, out, workers), json_file, page)
+        place = None if so_far else _place(manager, token, ca, out, workers)
+        _experiment(design, dataset, out, place, json_file, page)
 
 
 @app.command()
@@ -258,30 +265,38 @@ def _experiment(
     design: Design,
     dataset: Path,
     out: Path,
-    place: AbstractContextManager[Venue],
+    place: AbstractContextManager[Venue] | None,
     json_file: Path | None,
     page: Path | None,
 ) -> None:
-    """Conduct what is not done yet, then tell what all of it found."""
+    """Conduct what is not done yet, unless there is no ``place``; then tell what the finished runs found."""
     _check_settings(design)
     # Threads that spin while they wait would take the cores from the simulators.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     machine, commit = _machine(), _commit()
     keep_design(out, design)
     conductor = Conductor(design, dataset, out, console.rule)
-    for seed in design.seeds:
-        conductor.imitate(seed)
-    with place as venue:
-        for seed in design.seeds:
-            for arm in design.arms:
-                conductor.train(seed, arm, venue)
+    if place is not None:
+        _conduct(conductor, place)
     arms = []
     for arm in design.arms:
         folders = {seed: conductor.folder_of(seed, arm.name) for seed in design.seeds}
-        runs = [Run(seed, arm.name, read_outcome(at), read_metrics(at)) for seed, at in folders.items()]
-        arms.append(findings_of(arm.name, runs))
+        done = {seed: folder for seed, folder in folders.items() if (folder / OUTCOME).is_file()}
+        runs = [Run(seed, arm.name, read_outcome(at), read_metrics(at)) for seed, at in done.items()]
+        arms += [findings_of(arm.name, runs)] if runs else []
+    if not arms:
+        raise TrainerError(f"no run in {out} is finished: give the command without --so-far")
     _hand_in(design.name, figures_of(arms), json_file)
     _publish(learning_section(design, arms, machine, commit, date.today()), out / "section.md", page)
+
+
+def _conduct(conductor: Conductor, place: AbstractContextManager[Venue]) -> None:
+    for seed in conductor.design.seeds:
+        conductor.imitate(seed)
+    with place as venue:
+        for seed in conductor.design.seeds:
+            for arm in conductor.design.arms:
+                conductor.train(seed, arm, venue)
 
 
 def _check_settings(design: Design) -> None:
