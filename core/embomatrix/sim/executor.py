@@ -170,9 +170,11 @@ class Simulator:
         """
         world = self._world
         yield from world.relations.footings.complete()
-        yield from world.placer.complete(self._tables)
+        yield from world.placer.complete()
         yield from world.navigator.complete()
         yield from world.swings.complete()
+        # Last: a slot that is forked before it is all done misses this the least.
+        yield from world.placer.look_up(self._tables)
 
     def close(self) -> None:
         """Free the engine and the actor. The simulator can't be used afterwards."""

@@ -70,10 +70,10 @@ class Placer:
         self._scene = engine.scene
         self._repertoire = Repertoire(engine.scene, cache)
 
-    def complete(self, tables: Iterable[Sequence[str]]) -> Iterator[None]:
-        """Find out what everything stands on, and where it may be put, one asset or pair of assets at a step.
+    def complete(self) -> Iterator[None]:
+        """Find out what everything stands on, and where the parts of what it may be put on are, one asset at a step.
 
-        ``tables`` name what plans will speak of. Work for a process that waits. Changes no answer.
+        Work for a process that waits. Changes no answer.
         """
         movable = {item.asset_id for item in self._scene.objects if not item.fixed}
         for asset_id, asset in self._scene.assets.items():
@@ -83,7 +83,13 @@ class Placer:
                 yield
             parts_of(asset).boxes(IDENTITY, (0.0,) * len(asset.joints))
             yield
-        yield from self._repertoire.complete(tables)
+
+    def look_up(self, tables: Iterable[Sequence[str]]) -> Iterator[None]:
+        """Look up where the things of each table may be put on its supports, one pair of assets at a step.
+
+        Work for a process that waits. Changes no answer.
+        """
+        return self._repertoire.complete(tables)
 
     def find(
         self,
