@@ -14,14 +14,15 @@ from embomatrix.sim.bullet.dynamic import DynamicWorld
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.navigation import Navigator
 from embomatrix.sim.physical import arm, body
+from embomatrix.sim.physical.doors import Leaf
 from embomatrix.sim.physical.floor import Floor
 from embomatrix.sim.physical.grasp import cross
 from embomatrix.sim.physical.motion import Mover
-from embomatrix.sim.physical.space import boxes_of, clearance, strikes
+from embomatrix.sim.physical.space import boxes_of, clearance, strikes, struck
 from embomatrix.sim.physical.stage import tucked
 from embomatrix.sim.relations import Relations
 from embomatrix.world.asset import Joint, JointKind, Link
-from embomatrix.world.geometry import Part, Pose, Shape
+from embomatrix.world.geometry import Aabb, Part, Pose, Shape
 from embomatrix.world.poses import StandPose
 
 SHARES = arrays.arrays(np.float64, (5, arm.JOINTS), elements=st.floats(0.02, 0.98))
@@ -69,7 +70,7 @@ def test_the_folded_arm_keeps_within_the_robots_disc_and_off_its_own_trunk():
     posture = np.concatenate([[0.0, 0.0, 0.0, 0.0], TUCKED])[None]
     wide = np.linalg.norm(body.balls(posture)[0, :, :2], axis=1) + body.RADII
     assert wide.max() <= ROBOT.radius_m + 0.005
-    assert not body.strikes_itself(posture)[0]
+    assert not body.strikes_itself(posture, body.balls(posture), body.RADII)[0]
 
 
 def test_balls_strike_a_turned_box_where_they_are_in_it():
@@ -78,6 +79,35 @@ def test_balls_strike_a_turned_box_where_they_are_in_it():
     balls = np.array([[[0.5, 0.5, 0.0]], [[1.5, 0.5, 0.0]]])  # the beam runs along (-1, 1)
     assert strikes(boxes, balls, np.array([0.05]), 0.0).tolist() == [0, -1]
     np.testing.assert_allclose(clearance(boxes, balls, np.array([0.05])), (-0.15, 0.5571), atol=1e-3)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_who_strikes_nothing_is_told_sooner_and_is_the_same(seed):
+    rng = np.random.default_rng(seed)
+    postures = np.zeros((int(rng.integers(1, 60)), body.NUMBERS))
+    postures[:, body.ARM] = rng.uniform(arm.LOW_RAD, arm.HIGH_RAD, (len(postures), arm.JOINTS))
+    places = rng.uniform(
+        (-1.5, -1.5, 0.0, -3.0), (1.5, 1.5, 2.0, 3.0), (int(rng.integers(1, 40)), 4)
+    ).tolist()
+    boxes = boxes_of(
+        [(Pose.from_xyz_yaw(*place), tuple(rng.uniform(0.05, 0.4, 3).tolist()), "box") for place in places]
+    )
+    balls = body.balls(postures)
+    for margin_m in (-0.003, 0.0, 0.012):
+        expected = strikes(boxes, balls, body.RADII, margin_m) >= 0
+        np.testing.assert_array_equal(struck(boxes, balls, body.RADII, margin_m), expected)
+
+
+def test_a_door_is_at_its_front_when_it_is_shut_and_before_it_when_it_is_open():
+    front = Part(Shape.BOX, Pose((0.31, 0.0, 0.0)), (0.02, 0.6, 1.0))
+    hinge = Joint(JointKind.REVOLUTE, (0.31, -0.3, 0.0), (0.0, 0.0, 1.0), -np.pi / 2)
+    link = Link("door", (front,), hinge)
+    fridge = make.asset("fridge", "electric_refrigerator.n.01", (0.6, 0.6, 1.0), [], links=[link])
+    around = Aabb.around([front.aabb(Pose((0.0, 0.0, 0.0)))])
+    leaf = Leaf("fridge_1", 0, link, hinge, fridge, Pose((1.0, 2.0, 0.5)), around)
+    shut, opened = leaf.at(0.0), leaf.at(1.0)
+    np.testing.assert_allclose((shut.low_m[0], shut.high_m[0]), (1.3, 1.32), atol=1e-9)
+    np.testing.assert_allclose((opened.low_m[0], opened.high_m[0]), (1.31, 1.91), atol=0.02)
 
 
 def test_what_the_arm_touches_is_drawn_in_until_it_does_not_and_the_rest_stays():
@@ -158,6 +188,6 @@ def test_the_lift_bears_its_load_beside_a_leaf_that_fits_closely_between_its_nei
     poses = {item.name: item.pose_world_asset for item in scene.objects}
     world.build(poses, {item.name: item.joints for item in scene.objects}, tucked(StandPose(2.16, 1.6, 0.0)))
     mover = Mover(world, lambda: None)
-    assert mover.drive(mover.posture + np.eye(body.NUMBERS)[1:2] * 0.8) is None
+    assert mover.sweep(mover.posture + np.eye(body.NUMBERS)[1:2] * 0.8) is None
     assert mover.posture[body.LIFT] > -0.005
     world.close()

@@ -62,7 +62,8 @@ def test_an_arm_laid_on_the_base_strikes_it():
     down = np.array([[0.0, 0.0, 0.0, 0.0, -np.pi / 2, -1.6, 0.0, -0.4, 0.0, 2.6, 0.785]])
     up = down.copy()
     up[0, 5] = 1.6
-    assert body.strikes_itself(np.concatenate([down, up])).tolist() == [True, False]
+    both = np.concatenate([down, up])
+    assert body.strikes_itself(both, body.balls(both), body.RADII).tolist() == [True, False]
 
 
 @pytest.mark.parametrize("height_m", [0.15, 0.3, 1.0, 1.7])

@@ -51,7 +51,7 @@ class Posture:
 
     @staticmethod
     def of(numbers: Sequence[float]) -> Posture:
-        x, y, yaw, lift, *arm = (float(value) for value in numbers)
+        x, y, yaw, lift, *arm = map(float, numbers)
         return Posture(x, y, yaw, lift, tuple(arm))
 
 

@@ -129,8 +129,11 @@ def balls(postures: FloatArray) -> FloatArray:
     """Centres of the arm's balls in the world, (n, balls, 3); radii are ``RADII``."""
     turn, place = mounts(postures)
     rotation, position = arm.frames(postures[:, ARM])
-    local = position[:, _LINK] + np.einsum("nbij,bj->nbi", rotation[:, _LINK], _CENTRE)
-    return np.asarray(place[:, None] + np.einsum("nij,nbj->nbi", turn, local))
+    axes = rotation[:, _LINK]  # (n, balls, 3, 3)
+    local = position[:, _LINK]
+    for number in range(3):
+        local += axes[..., number] * _CENTRE[:, number, None]
+    return np.asarray(place[:, None] + local @ turn.transpose(0, 2, 1))
 
 
 def trunk_balls(postures: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -141,22 +144,18 @@ def trunk_balls(postures: FloatArray) -> tuple[FloatArray, FloatArray]:
     return centres, _TRUNK_RADII
 
 
-def strikes_itself(
-    postures: FloatArray, extra: FloatArray | None = None, radii: FloatArray | None = None
-) -> BoolArray:
+def strikes_itself(postures: FloatArray, points: FloatArray, radii: FloatArray) -> BoolArray:
     """Whether arm, hand or what it holds touch the robot's own base, mast or carriage, or the arm's foot, shape (n,).
 
-    ``extra``: (n, k, 3) centres of balls that the hand holds, with their ``radii`` (k,).
+    points: (n, balls + k, 3), the arm's ``balls`` and then those of what the hand holds; radii: (balls + k,).
     """
-    points, sizes, moving = balls(postures)[:, _SWINGING], RADII[_SWINGING], _MOVING
-    if extra is not None and radii is not None:
-        points = np.concatenate([points, extra], axis=1)
-        sizes = np.concatenate([sizes, radii])
-        moving = np.concatenate([moving, np.ones(len(radii), dtype=np.bool_)])
-    sizes = sizes + AIR_M
+    loads = np.ones(len(radii) - len(RADII), dtype=np.bool_)
+    swinging = np.concatenate([_SWINGING, loads])
+    points, sizes = points[:, swinging], radii[swinging] + AIR_M
+    moving = np.concatenate([_MOVING, loads])
     turn, place = mounts(postures)
-    seen = np.einsum("nji,nbj->nbi", turn, points - place[:, None])  # in the mount's frame
-    local = np.einsum("ij,nbj->nbi", _MOUNT, seen)
+    seen = (points - place[:, None]) @ turn  # in the mount's frame
+    local = seen @ _MOUNT.T
     local += np.array([MOUNT_X_M, 0.0, 0.0])
     local[:, :, 2] += place[:, None, 2]
     off = np.maximum(np.hypot(local[..., 0], local[..., 1]) - BASE_RADIUS_M, 0.0)
@@ -173,7 +172,8 @@ def strikes_itself(
 def _outside(points: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
     """Distances of points, (n, b, 3), from a box between two corners, (n, b)."""
     off = np.maximum(np.maximum(low - points, points - high), 0.0)
-    return np.asarray(np.sqrt((off**2).sum(axis=-1)))
+    off *= off
+    return np.asarray(np.sqrt(off[..., 0] + off[..., 1] + off[..., 2]))
 
 
 def solve(

@@ -19,7 +19,7 @@ from embomatrix.sim.physical.grasp import cross, facing
 from embomatrix.sim.physical.hands import GENTLE, TOUCH_M
 from embomatrix.sim.physical.reach import JUMP_RAD, Reach, Track
 from embomatrix.sim.physical.reach import TOUCH_M as PRESS_M
-from embomatrix.sim.physical.space import Boxes, boxes_of, part_boxes, strikes
+from embomatrix.sim.physical.space import Boxes, boxes_of, part_boxes, struck
 from embomatrix.sim.physical.stage import compact
 from embomatrix.sim.physical.travel import SOMETHING
 from embomatrix.skills.failure import FailureReason
@@ -30,7 +30,7 @@ from embomatrix.world.poses import StandPose
 from embomatrix.world.state import OPEN_FRACTION
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from embomatrix.sim.physical.reach import Way
     from embomatrix.sim.physical.stage import Stage
@@ -91,6 +91,11 @@ class Leaf:
         """Height of its middle above the floor with the joint at zero, to the centimetre: leaves of one row are equal."""
         box = Aabb.around(part.aabb(self.pose) for part in self.link.parts)
         return round(box.center_m[2], 2)
+
+    def at(self, fraction: float) -> Aabb:
+        """Around its parts in the world, at a share of its travel."""
+        frame = self.pose @ joint_motion(self.joint, fraction)
+        return Aabb.around(part.aabb(frame) for part in self.link.parts)
 
     def grips(self, fraction: float, along: float, spot: Spot) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Point on the leaf in the world at a share of its travel, the way out of its surface there, and the edge's line."""
@@ -234,8 +239,8 @@ def leading(stage: Stage, leaf: Leaf, start: float, goal: float) -> tuple[Reach,
         trunk, sizes = body.trunk_balls(postures)
         points = np.concatenate([arms, trunk], axis=1)
         radii = np.concatenate([body.RADII[~body.HAND_BALLS], sizes])
-        return all(
-            strikes(moving[number], points[row : row + 1], radii, PRESS_M)[0] < 0
+        return not any(
+            struck(moving[number], points[row : row + 1], radii, PRESS_M)[0]
             for row, number in enumerate(course.tolist())
         )
 
@@ -259,7 +264,8 @@ def _draw_in(stage: Stage, way: Way) -> None:
 
 def _pull(stage: Stage, way: Way, leaf: Leaf, goal: float) -> Refusal | None:
     """Touch the leaf, lead it along the way, let go and step back."""
-    stage.wake_around(leaf.name)
+    # Not what stands in the furniture: bottles in a fridge rest until something comes to them, and awake they are dear.
+    stage.wake_around(leaf.at(stage.dynamic.bodies.joints(leaf.name)[leaf.number]))
     touch = way.postures[1:3]
     stage.mover.follow(touch, GENTLE, lambda: stage.dynamic.gap(leaf.name) < TOUCH_M)
     if stage.dynamic.gap(leaf.name) > 3 * TOUCH_M:
@@ -323,24 +329,30 @@ def _tracks(leaf: Leaf, fractions: FloatArray) -> Iterator[Track]:
     else:
         spots = (Spot.OUTSIDE, Spot.EDGE)
     turns = FOLLOWED if leaf.joint.kind is JointKind.REVOLUTE else FOLLOWED[:1]
+    grips = functools.cache(leaf.grips)  # many ways go by the same points
     for spot, tilt, along, followed in itertools.product(spots, TILTS, ALONG, turns):
-        yield _track(leaf, fractions, along, followed, spot, tilt)
+        yield _track(grips, fractions, along, followed, spot, tilt)
 
 
 def _track(
-    leaf: Leaf, fractions: FloatArray, along: float, followed: float, spot: Spot, tilt: float
+    grips: Callable[[float, float, Spot], tuple[FloatArray, FloatArray, FloatArray]],
+    fractions: FloatArray,
+    along: float,
+    followed: float,
+    spot: Spot,
+    tilt: float,
 ) -> Track:
     down = np.array([0.0, 0.0, -math.sin(math.radians(tilt))])
     start = float(fractions[0])
     rotations, positions = [], []
     for fraction in fractions.tolist():
-        point, _, _ = leaf.grips(fraction, along, spot)
-        _, out, edge = leaf.grips(start + followed * (fraction - start), along, spot)
+        point, _, _ = grips(fraction, along, spot)
+        _, out, edge = grips(start + followed * (fraction - start), along, spot)
         course = down - math.cos(math.radians(tilt)) * out
         course = course / np.linalg.norm(course)
         rotations.append(facing(course, 0.0 if abs(edge[2]) < 0.5 else math.pi / 2, edge))
         positions.append(point)
-    first, last = leaf.grips(start, along, spot)[1], -rotations[-1][:, 2]
+    first, last = grips(start, along, spot)[1], -rotations[-1][:, 2]
     positions = [
         positions[0] + OFF_M * first,
         positions[0] + 0.01 * first,

@@ -11,7 +11,7 @@ import numpy as np
 from embomatrix.sim.physical import arm, body
 from embomatrix.sim.physical.motion import standing, with_arm
 from embomatrix.sim.physical.reach import AIR_M
-from embomatrix.sim.physical.space import clearance
+from embomatrix.sim.physical.space import struck
 from embomatrix.sim.physical.stage import TUCKED, TUCKED_LIFT_M, compact
 from embomatrix.sim.physical.travel import SOMETHING, travel
 from embomatrix.sim.robot_dimensions import SHOULDER_LOW_M
@@ -205,5 +205,6 @@ def _carrying_cost(rows: FloatArray, now: FloatArray, held: Held, boxes: Boxes) 
     cost += 0.04 * np.abs(rows[:, 4:] - now[4:]).max(axis=1)
     cost += np.maximum(wide.max(axis=1), limbs.max(axis=1))
     radii = np.concatenate([body.RADII, held.radii])
-    cost += np.where(clearance(boxes, np.concatenate([arms, load], axis=1), radii) < AIR_M, 2.0, 0.0)
-    return np.where(body.strikes_itself(rows, load, held.radii), math.inf, cost)
+    points = np.concatenate([arms, load], axis=1)
+    cost += np.where(struck(boxes, points, radii, AIR_M), 2.0, 0.0)
+    return np.where(body.strikes_itself(rows, points, radii), math.inf, cost)

@@ -106,7 +106,7 @@ def take_by(
 
 def _touch(stage: Stage, way: Way, target: str) -> Refusal | None:
     """Go along a way until the hand touches the target, and hold it."""
-    stage.wake_around(target)
+    stage.wake_around(stage.world.engine.aabb(target))
     hit = stage.mover.follow(way.postures[1:-2]) if len(way.postures) > 3 else None
     if hit is None:
         hit = stage.mover.follow(way.postures[-2:], GENTLE, lambda: stage.dynamic.gap(target) < TOUCH_M)

@@ -10,7 +10,7 @@ from embomatrix.sim.bullet.robot import Posture
 from embomatrix.sim.physical.body import ARM, LIFT, YAW
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from embomatrix.sim.bullet.dynamic import DynamicWorld
     from embomatrix.world.geometry import FloatArray
@@ -22,6 +22,7 @@ STEERED: Final = 4
 STEPS_A_SECOND: Final = 240
 LAG: Final = np.array([0.08, 0.08, 0.15, 0.06, 0.3, 0.3, 0.3, 0.3, 0.4, 0.4, 0.4])
 """A joint that falls this far behind is held up by something."""
+_LAGS: Final = tuple(LAG.tolist())
 ARRIVAL_STEPS: Final = 12
 LEAST_COMMANDS: Final = 3
 SHARP_RAD: Final = 1.2
@@ -57,10 +58,6 @@ class Mover:
         """Move through postures, as ``follow`` does, where nothing is to be touched: time passes in coarser steps."""
         return self._along(postures, 1.0, self._world.glide, None)
 
-    def drive(self, postures: FloatArray) -> str | None:
-        """Move the base through postures, as ``follow`` does, with the arm at rest."""
-        return self._along(postures, 1.0, self._world.roll, None)
-
     def _along(
         self,
         postures: FloatArray,
@@ -69,19 +66,24 @@ class Mover:
         until: Callable[[], bool] | None,
     ) -> str | None:
         commands = _commands(np.concatenate([self.posture[None], postures]), pace)
-        for command in commands:
-            pursue(Posture.of(command.tolist()), STEERED)
+        for command in commands.tolist():
+            pursue(Posture.of(command), STEERED)
             self._watch()
             if until is not None and until():
                 self._world.robot.steer(self._world.robot.posture)
                 return None
-            if (np.abs(self.posture - command) > LAG).any():
+            if self._lags(command):
                 hindrance = self._world.hindrance()
                 self._world.robot.steer(self._world.robot.posture)
                 return hindrance
         self._world.robot.steer(Posture.of(commands[-1].tolist()))
         self.wait(ARRIVAL_STEPS)
         return None
+
+    def _lags(self, command: Sequence[float]) -> bool:
+        """Whether a joint is far behind a command: asked so often that eleven numbers are compared one by one."""
+        now = self._world.robot.posture.numbers
+        return any(abs(is_at - wanted) > lag for is_at, wanted, lag in zip(now, command, _LAGS, strict=True))
 
     def wait(self, steps: int) -> None:
         """Let time pass with the motors at their targets."""

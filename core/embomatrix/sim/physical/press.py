@@ -46,7 +46,8 @@ def _press(stage: Stage, target: str) -> Refusal | None:
     for way, refusal in arrivals(stage, ways, reach, loaded=False):
         if refusal is not None:
             continue
-        stage.wake_around(target)
+        if not stage.world.is_fixed(target):
+            stage.wake_around(stage.world.engine.aabb(target))
         hit = stage.mover.follow(way.postures[1:3], GENTLE, lambda: stage.dynamic.gap(target) < TOUCH_M)
         touched = stage.dynamic.gap(target) < 2 * TOUCH_M
         stage.mover.follow(way.postures[:1])

@@ -14,7 +14,7 @@ import numpy as np
 
 from embomatrix.sim.physical import arm, body
 from embomatrix.sim.physical.roadmap import way_between
-from embomatrix.sim.physical.space import Boxes, strikes
+from embomatrix.sim.physical.space import Boxes, strikes, struck
 from embomatrix.sim.robot_dimensions import LIFT_M, SHOULDER_LOW_M
 
 if TYPE_CHECKING:
@@ -124,8 +124,15 @@ class Reach:
         self._standing = boxes.without(("floor",))
         self._at_work = at_work
         self._held = held
-        self.hindrance = ""
-        """Owner of the box that barred the last way that was not free."""
+        self._struck: tuple[Boxes, FloatArray, FloatArray, float] | None = None
+
+    @property
+    def hindrance(self) -> str:
+        """Owner of the box that barred the last way that was not free; "" when none did."""
+        if self._struck is None:
+            return ""
+        number = int(strikes(*self._struck)[0])
+        return self._struck[0].owners[number] if number >= 0 else ""
 
     def ways(self, tracks: Iterable[Track], places: Sequence[FloatArray]) -> Iterator[Way]:
         """Free ways along any of the tracks, the preferred tracks first, from any base of groups of them, (b, 3) each.
@@ -176,8 +183,8 @@ class Reach:
         """Whether the base can drive straight from one posture to another with the arm as it is."""
         line = _between(start, end)
         trunk, radii = body.trunk_balls(line)
-        gaps = strikes(self._standing, trunk, radii, 0.0)
-        return bool((gaps < 0).all()) and self._is_free(line, self._held if loaded else None)
+        hit = struck(self._standing, trunk, radii, 0.0)
+        return not hit.any() and self._is_free(line, self._held if loaded else None)
 
     def _is_free(self, postures: FloatArray, held: Held | None) -> bool:
         """Whether all but the first and the last posture keep clear: these are where the robot is, and where it must be."""
@@ -228,8 +235,7 @@ class Reach:
 
     def _passes(self, track: Track, postures: FloatArray) -> bool:
         trunk, radii = body.trunk_balls(postures[:1])
-        hit = strikes(self._standing, trunk, radii, TOUCH_M)
-        if hit[0] >= 0:
+        if struck(self._standing, trunk, radii, TOUCH_M)[0]:
             return False
         for mask, held in ((~track.loaded, None), (track.loaded, self._held)):
             if mask.any() and not self._free(postures[mask], self._at_work, held, TOUCH_M).all():
@@ -240,21 +246,17 @@ class Reach:
         """Whether arm and load keep a margin from the boxes and from the robot's own trunk, shape (n,)."""
         if not len(postures):
             return np.zeros(0, dtype=np.bool_)
-        load = held.placed(postures) if held is not None else None
-        sizes = held.radii if held is not None else None
-        centres = body.balls(postures)
-        radii = body.RADII
-        if load is not None and sizes is not None:
-            centres = np.concatenate([centres, load], axis=1)
-            radii = np.concatenate([radii, sizes])
-        low = (centres - radii[None, :, None]).min(axis=(0, 1)) - 0.05
-        high = (centres + radii[None, :, None]).max(axis=(0, 1)) + 0.05
-        close = boxes.near(low, high)
-        hit = strikes(close, centres, radii, margin_m)
-        if (hit >= 0).any():
-            self.hindrance = close.owners[int(hit[hit >= 0][0])]
-        free = hit < 0
-        free[free] = ~body.strikes_itself(postures[free], load[free] if load is not None else None, sizes)
+        centres, radii = body.balls(postures), body.RADII
+        if held is not None:
+            centres = np.concatenate([centres, held.placed(postures)], axis=1)
+            radii = np.concatenate([radii, held.radii])
+        widest = float(radii.max()) + 0.05
+        close = boxes.near(centres.min(axis=(0, 1)) - widest, centres.max(axis=(0, 1)) + widest)
+        free = ~struck(close, centres, radii, margin_m)
+        if not free.all():
+            first = int(free.argmin())
+            self._struck = close, centres[first : first + 1], radii, margin_m
+        free[free] = ~body.strikes_itself(postures[free], centres[free], radii)
         if held is not None and held.up is not None:
             free[free] = held.is_level(postures[free])
         return np.asarray(free)

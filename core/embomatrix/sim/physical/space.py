@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     BoolArray = NDArray[np.bool_]
     IntArray = NDArray[np.int_]
 
+TOGETHER: Final = 6
+"""Balls, neighbours of one limb, that are looked at as one before each of them is."""
 CHUNK: Final = 40_000
 """Pairs of balls and boxes that are compared at once: what fits into a processor's cache."""
 
@@ -69,6 +71,20 @@ class Boxes:
         reach = np.einsum("mij,mj->mi", np.abs(self.rotation), self.half)
         keep = ((self.centre - reach <= high) & (self.centre + reach >= low)).all(axis=1)
         return self.where(keep)
+
+    def within(self, points: FloatArray, reach_m: FloatArray) -> BoolArray:
+        """Whether points, (k, 3), are nearer than a distance of their own, (k,) and positive, to each of the boxes, (k, m)."""
+        offset = np.einsum("mj,mji->im", self.centre, self.rotation)
+        squares = np.zeros((len(points), len(self.owners)))
+        for axis in range(3):
+            local = points @ self.rotation[:, :, axis].T
+            local -= offset[axis]
+            np.abs(local, out=local)
+            local -= self.half[:, axis]
+            np.maximum(local, 0.0, out=local)
+            local *= local
+            squares += local
+        return np.asarray(squares < (reach_m * reach_m)[:, None])
 
     def gaps(self, points: FloatArray) -> FloatArray:
         """Signed distances of points, (k, 3), to every box, (k, m): negative inside."""
@@ -152,6 +168,34 @@ def strikes(boxes: Boxes, balls: FloatArray, radii: FloatArray, margin_m: float)
         deepest = nearest.argmin(axis=1)
         hit = nearest[np.arange(len(part)), deepest] < margin_m
         found[start : start + rows][hit] = deepest[hit]
+    return found
+
+
+def struck(boxes: Boxes, balls: FloatArray, radii: FloatArray, margin_m: float) -> BoolArray:
+    """Whether each of n sets of balls, (n, b, 3), comes nearer than a margin to any of the boxes, shape (n,).
+
+    radii: (b,), each larger than what a margin below zero lets them sink in. The answer of ``strikes`` without who is struck:
+    neighbours among the balls are first looked at as one, and only what is near then ball by ball.
+    """
+    count, each, _ = balls.shape
+    found = np.zeros(count, dtype=np.bool_)
+    if not boxes.owners or not count:
+        return found
+    whole = np.minimum(np.arange(each + -each % TOGETHER), each - 1)
+    some, sizes = balls[:, whole].reshape(count, -1, TOGETHER, 3), (radii + margin_m)[whole]
+    middle = some.mean(axis=2)  # (n, groups, 3)
+    off = some - middle[:, :, None]
+    wide = (np.sqrt((off * off).sum(axis=3)) + sizes.reshape(-1, TOGETHER)).max(axis=2)  # (n, groups)
+    rows = max(1, CHUNK // (middle.shape[1] * len(boxes.owners)))
+    for start in range(0, count, rows):
+        part = slice(start, start + rows)
+        near = boxes.within(middle[part].reshape(-1, 3), wide[part].ravel())
+        group = np.flatnonzero(near.any(axis=1))
+        close = boxes.where(np.asarray(near.any(axis=0)))
+        points = some[part].reshape(-1, TOGETHER, 3)[group].reshape(-1, 3)
+        reach_m = np.tile(sizes, (len(some[part]), 1)).reshape(-1, TOGETHER)[group].ravel()
+        hit = close.within(points, reach_m).any(axis=1).reshape(-1, TOGETHER).any(axis=1)
+        found[start + group[hit] // middle.shape[1]] = True
     return found
 
 

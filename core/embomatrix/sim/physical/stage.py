@@ -188,11 +188,9 @@ class Stage:
         wanted = tool @ self.grip.pose_tool_object
         return math.dist(wanted.position_m, self.dynamic.bodies.pose(self.grip.name).position_m) > SLIP_M
 
-    def wake_around(self, name: str) -> None:
-        """Wake what lies at or on an object that is about to move."""
-        (a, b, c), (d, e, f) = self.world.engine.aabb(name).low_m, self.world.engine.aabb(name).high_m
-        box = Aabb((a - WAKE_M, b - WAKE_M, c - WAKE_M), (d + WAKE_M, e + WAKE_M, f + WAKE_M))
-        self.wake(self.world.engine.near(box))
+    def wake_around(self, box: Aabb) -> None:
+        """Wake what lies at or on something between two corners that is about to move."""
+        self.wake(self.world.engine.near(box.grown(WAKE_M)))
 
     def wake(self, names: Iterable[str]) -> None:
         """Wake movable objects."""

@@ -74,7 +74,7 @@ def drive(stage: Stage, points: FloatArray, yaw: float) -> Refusal | None:
     marks, headings = _course(stage, start, points, yaw)
     postures = np.tile(start, (len(marks), 1))
     postures[:, : body.LIFT] = np.column_stack([marks, headings])
-    hit = stage.mover.drive(postures[1:] if len(postures) > 1 else postures)
+    hit = stage.mover.sweep(postures[1:] if len(postures) > 1 else postures)
     if hit is not None:
         return refuse(FailureReason.COLLIDED, other=hit or SOMETHING)
     if stage.has_slipped():
