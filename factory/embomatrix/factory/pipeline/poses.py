@@ -5,24 +5,25 @@ Other pairs are left to the executor's live search: a plan that goes its own way
 
 from __future__ import annotations
 
-import contextlib
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Self
 
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.live_world import LiveWorld
 from embomatrix.sim.pose_cache import footprint_placements, standing_poses
 from embomatrix.world.bundle import Bundle
-from embomatrix.world.poses import PlacementKey, PoseCache
+from embomatrix.world.poses import Handling, PlacementKey, PoseCache
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable, Iterator, Sequence
 
     from embomatrix.factory.writer.view import SceneView
     from embomatrix.sim.physical.survey import Foresight
     from embomatrix.sim.pose_cache import PlacementLibrary
     from embomatrix.world.geometry import Pose
+    from embomatrix.world.poses import StandPose
+    from embomatrix.world.scene import Scene
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,13 +34,61 @@ class Needs:
     table: tuple[str, ...]
 
 
+class SceneSurvey:
+    """Where the robot stands to work on the objects of a scene, and what the arm can't do there; found out when it is asked.
+
+    Context manager over an engine. Answers do not depend on the order of questions.
+    """
+
+    def __init__(self, scene: Scene, foresight: Foresight | None) -> None:
+        """Without ``foresight`` nothing is looked up about the arm. Raises EngineError when the scene can't be loaded."""
+        self._foresight = foresight
+        self._engine = BulletEngine(scene)
+        self._world = LiveWorld(Bundle(scene, {}, PoseCache()), self._engine)
+        self._stands: dict[str, tuple[StandPose, ...]] = {}
+        self._barred: dict[Handling, dict[str, str]] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._engine.close()
+
+    def bars(self, handled: Sequence[tuple[Handling, str]]) -> bool:
+        """Whether the arm finds no way to do one of some things, each to an object, as the scene begins."""
+        self._look_at(name for _, name in handled)
+        return any(name in self._barred.get(handling, {}) for handling, name in handled)
+
+    def poses(self, names: Iterable[str]) -> PoseCache:
+        """What is known of these objects, as a bundle carries it; no placements."""
+        wanted = dict.fromkeys(names)
+        self._look_at(wanted)
+        barred = {
+            handling: {name: found[name] for name in wanted if name in found}
+            for handling in Handling
+            if (found := self._barred.get(handling, {})).keys() & wanted.keys()
+        }
+        return PoseCache({}, {name: self._stands[name] for name in wanted}, barred)
+
+    def _look_at(self, names: Iterable[str]) -> None:
+        fresh = [name for name in dict.fromkeys(names) if name not in self._stands]
+        if not fresh:
+            return
+        found = PoseCache({}, standing_poses(self._engine, fresh))
+        if self._foresight is not None:
+            found = self._foresight.survey(self._world, found, fresh)
+        self._stands.update(found.stands)
+        for handling, others in found.barred.items():
+            self._barred.setdefault(handling, {}).update(others)
+
+
 def cache_poses(
-    view: SceneView, tasks: Iterable[Needs], library: PlacementLibrary, foresight: Foresight | None, seed: int
+    view: SceneView, tasks: Iterable[Needs], library: PlacementLibrary, survey: SceneSurvey, seed: int
 ) -> PoseCache:
-    """Poses for every thing of a task on, or in, whatever of the same task can hold it, and what the arm can do to all rows.
+    """Poses for every thing of a task on, or in, whatever of the same task can hold it, and what the survey knows of all rows.
 
     What a goal brings together has poses of its own; for all other rows of a task's table there are those of their
-    footprints. Without ``foresight`` nothing is looked up about the arm.
+    footprints.
     """
     scene = view.scene
     placements: dict[PlacementKey, tuple[Pose, ...]] = {}
@@ -58,11 +107,7 @@ def cache_poses(
         ]
         placements.update(footprint_placements(scene, portable, holders, library, seed))
     kept = {key: poses for key, poses in placements.items() if poses}
-    with contextlib.closing(BulletEngine(scene)) as engine:
-        poses = PoseCache(kept, standing_poses(engine, list(rows)))
-        if foresight is None:
-            return poses
-        return foresight.survey(LiveWorld(Bundle(scene, {}, poses), engine), poses, rows)
+    return replace(survey.poses(rows), placements=kept)
 
 
 def _pairs(view: SceneView, about: tuple[str, ...]) -> Iterator[tuple[str, str, Relation]]:

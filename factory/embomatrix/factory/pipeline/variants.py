@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.factory.admission import Admitted, admit
-from embomatrix.factory.pipeline.poses import Needs, cache_poses
+from embomatrix.factory.pipeline.poses import Needs, SceneSurvey, cache_poses
 from embomatrix.factory.pipeline.settings import WriterKind
 from embomatrix.factory.pipeline.store import Rejection, VariantResult
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.social.writer import SocialWriter
+from embomatrix.factory.writer.rehearsal import Rehearsal
 from embomatrix.factory.writer.tasks import PlainWriter, is_heldout_signature
 from embomatrix.factory.writer.variant import Variant, build_variant
 from embomatrix.factory.writer.view import SceneView
@@ -136,28 +137,32 @@ class _VariantJob:
         self._library = bench.library
         self._foresight = bench.foresight
         self._known = set(order.known)
-        self._view = SceneView(variant.scene)
         self._admitted: list[tuple[Draft, Plan]] = []
         self._rejections: list[Rejection] = []
 
     def run(self, rng: np.random.Generator) -> VariantYield:
         """The variant's records with their bundle, the missing categories in turns."""
         missing = self._order.missing
-        drafts = self._write(missing, rng)
-        needs = [Needs(draft.about, draft.task.table) for draft in drafts]
-        poses = cache_poses(self._view, needs, self._library, self._foresight, self._seed)
+        scene = self._variant.scene
+        with SceneSurvey(scene, self._foresight) as survey:
+            with Rehearsal(scene, survey.bars) as robot:
+                drafts = self._write(missing, SceneView(scene, robot), rng)
+            needs = [Needs(draft.about, draft.task.table) for draft in drafts]
+            poses = cache_poses(SceneView(scene), needs, self._library, survey, self._seed)
         left = dict(missing)
-        with contextlib.closing(Simulator(Bundle(self._variant.scene, {}, poses))) as stage:
+        with contextlib.closing(Simulator(Bundle(scene, {}, poses))) as stage:
             for draft in drafts:
                 if len(self._admitted) == TASKS_EACH:
                     break
                 if left[draft.task.category] > 0 and self._judge(stage, draft):
                     left[draft.task.category] -= 1
             tasks = {draft.task.task_id: draft.task for draft, _ in self._admitted}
-            data = encode_bundle(prepare(Bundle(self._variant.scene, tasks, poses), stage.world))
+            data = encode_bundle(prepare(Bundle(scene, tasks, poses), stage.world))
         return VariantYield(self._result(bundle_digest(data)), data, self._transcripts())
 
-    def _write(self, missing: Mapping[TaskCategory, int], rng: np.random.Generator) -> list[Draft]:
+    def _write(
+        self, missing: Mapping[TaskCategory, int], view: SceneView, rng: np.random.Generator
+    ) -> list[Draft]:
         """Drafts whose kinds of goal belong to this split, all different, the missing categories in turns."""
         wanted = [category for category, count in missing.items() if count > 0]
         drafts: list[Draft] = []
@@ -166,7 +171,7 @@ class _VariantJob:
                 break
             task_id = f"{self._variant.scene.scene_id}-{len(drafts):02d}"
             category = wanted[attempt % len(wanted)]
-            draft = self._writer.write(self._variant, self._view, category, task_id, rng)
+            draft = self._writer.write(self._variant, view, category, task_id, rng)
             if draft is not None and self._is_new(draft):
                 drafts.append(draft)
                 self._known.add(key_of(draft.signature, draft.task.instruction))

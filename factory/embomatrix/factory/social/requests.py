@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from embomatrix.factory.writer.goals import Piece
 from embomatrix.world.goal import Atom, Formula, Not
+from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
     from embomatrix.factory.writer.view import SceneView
@@ -71,20 +72,20 @@ def _problem(wish: Wish, view: SceneView, known: frozenset[str]) -> str:
     if wish.predicate in THERMAL:
         if not wish.holds:
             return "only what is to be cooked, hot or frozen can be asked for, not the contrary"
-        return (
-            ""
-            if view.asset(wish.thing).can("cookable")
-            else f"{wish.thing} is nothing to cook, heat or freeze"
-        )
+        if not view.asset(wish.thing).can("cookable"):
+            return f"{wish.thing} is nothing to cook, heat or freeze"
+        return "" if view.robot.fetches(wish.thing) else _beyond(wish.thing)
     if wish.predicate is Wanted.OPEN:
         if not view.is_openable(wish.thing):
             return f"{wish.thing} has no door or drawer"
-        done = view.is_open(wish.thing)
+        done, works = view.is_open(wish.thing), view.robot.swings(wish.thing, shut=not wish.holds)
     else:
         if not view.is_toggleable(wish.thing):
             return f"{wish.thing} can't be switched"
-        done = view.is_on(wish.thing)
-    return f"{wish.thing} is so already" if done is wish.holds else ""
+        done, works = view.is_on(wish.thing), view.robot.switches(wish.thing, on=wish.holds)
+    if done is wish.holds:
+        return f"{wish.thing} is so already"
+    return "" if works else _beyond(wish.thing)
 
 
 def _placing_problem(wish: Wish, view: SceneView) -> str:
@@ -102,7 +103,13 @@ def _placing_problem(wish: Wish, view: SceneView) -> str:
         return f"{wish.thing} does not go {'into' if inside else 'onto'} {wish.place}"
     if view.item(wish.thing).host == wish.place:
         return f"{wish.thing} is there already"
+    if not view.robot.puts(wish.thing, Relation(wish.predicate.value), wish.place):
+        return f"the robot tried, and can't bring {wish.thing} there: ask for another thing or place"
     return ""
+
+
+def _beyond(name: str) -> str:
+    return f"the robot tried, and does not get at {name}: ask for something else"
 
 
 def piece_of(wish: Wish, view: SceneView) -> Piece:

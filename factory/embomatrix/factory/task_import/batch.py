@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, TypeVar
 
 from embomatrix.factory.admission import Admitted, admit
-from embomatrix.factory.pipeline.poses import Needs, cache_poses
+from embomatrix.factory.pipeline.poses import Needs, SceneSurvey, cache_poses
 from embomatrix.factory.refusal import Refusal, RefusalReason
 from embomatrix.factory.task_import.task import Imported, Manner, import_problem
 from embomatrix.factory.writer.view import SceneView
@@ -127,7 +127,8 @@ def verify(
 ) -> Verified | Refusal:
     """Judge an imported task by execution, and pack it when it is admitted. Without ``foresight`` the arm is not asked."""
     needs = Needs(imported.about, imported.task.table)
-    poses = cache_poses(SceneView(imported.scene), [needs], library, foresight, seed)
+    with SceneSurvey(imported.scene, foresight) as survey:
+        poses = cache_poses(SceneView(imported.scene), [needs], library, survey, seed)
     with contextlib.closing(Simulator(Bundle(imported.scene, {}, poses))) as stage:
         verdict = admit(stage, imported.task, find_plan, imported.init)
         if not isinstance(verdict, Admitted):

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.factory.writer.tables import suits
 from embomatrix.factory.writer.words import PHRASES, Voice, phrase, refer, spoken
 from embomatrix.world.goal import And, Atom, Exists, Formula, Not
+from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
     import numpy as np
 
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
 
 MAX_ALIKE: Final = 4
 """Furniture of one category in one room, of which a goal may mean any."""
+PICKS: Final = 4
+"""Objects that the robot tries before a wish is given up."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,9 +69,11 @@ class Workshop:
     def _voice(self) -> Voice:
         return self.voice or Voice(self.rng)
 
-    def pick(self, names: list[str]) -> str | None:
+    def pick(self, names: Sequence[str], works: Callable[[str], bool] = lambda _: True) -> str | None:
+        """One of some objects, none that is used already, with which it works; None where the first few do not."""
         fresh = [name for name in names if name not in self.used]
-        return fresh[int(self.rng.integers(len(fresh)))] if fresh else None
+        order = self.rng.permutation(len(fresh))[:PICKS]
+        return next((fresh[index] for index in order if works(fresh[index])), None)
 
     def fixtures(self, wanted: Callable[[str], bool]) -> list[str]:
         """Objects of the variant's rooms that are wanted, that open, and that words can name, alone or as one of a few."""
@@ -87,7 +92,9 @@ class Workshop:
 
 def place_piece(shop: Workshop) -> Piece | None:
     """Put a thing on or in another: furniture, an appliance or a basket."""
-    thing = shop.pick([name for name in shop.things() if not shop.view.is_basket(name)])
+    thing = shop.pick(
+        [name for name in shop.things() if not shop.view.is_basket(name)], shop.view.robot.fetches
+    )
     if thing is None:
         return None
     return _placed(shop, thing, shop.refer(thing))
@@ -103,6 +110,7 @@ def _placed(shop: Workshop, thing: str, called: str) -> Piece | None:
     )
     here = {view.category(host) for host in view.hosts(thing)}
     category = view.category(thing)
+    relation = Relation.INSIDE if inside else Relation.ONTOP
     target = shop.pick(
         [
             name
@@ -110,11 +118,12 @@ def _placed(shop: Workshop, thing: str, called: str) -> Piece | None:
             if view.category(name) not in here
             and suits(category, view.category(name))
             and view.takes(name, thing, inside=inside)
-        ]
+        ],
+        lambda host: view.robot.puts(thing, relation, host),
     )
     if target is None:
         return None
-    predicate = "inside" if inside else "ontop"
+    predicate = relation.value
     goal, types, objects, place = _one_of(shop, target, lambda host: Atom(predicate, (thing, host)))
     return Piece(
         goal=goal,
@@ -166,6 +175,12 @@ def switch_piece(shop: Workshop) -> Piece | None:
         _holds(view, predicate, other) != holds for other in view.alike(name)
     ):
         return None  # "open a cabinet" asks for nothing where one is open already
+    if not (
+        view.robot.swings(name, shut=holds)
+        if predicate == "open"
+        else view.robot.switches(name, on=not holds)
+    ):
+        return None
     kind = f"not {predicate}" if holds else predicate
 
     def atom(target: str) -> Formula:
@@ -190,15 +205,17 @@ def _holds(view: SceneView, predicate: str, name: str) -> bool:
 def thermal_piece(shop: Workshop) -> Piece | None:
     """Heat, cook or freeze food with a source of the variant's rooms, and now and then leave it there."""
     view, rng = shop.view, shop.rng
-    food = shop.pick([name for name in shop.things() if view.asset(name).can("cookable")])
+    foods = [name for name in shop.things() if view.asset(name).can("cookable")]
+    food = shop.pick(foods, view.robot.fetches)
     source = shop.pick(shop.fixtures(view.is_source))
     if food is None or source is None or source in view.hosts(food):
         return None
-    effects = view.thermal_effects(food, source)
+    effects = [
+        state for state in view.thermal_effects(food, source) if view.robot.exposes(food, source, state)
+    ]
     if not effects:
         return None
-    predicate = effects[int(rng.integers(len(effects)))].value
-    return _thermal(shop, food, source, predicate)
+    return _thermal(shop, food, source, effects[int(rng.integers(len(effects)))].value)
 
 
 def _thermal(shop: Workshop, food: str, source: str, predicate: str) -> Piece:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.scenes.joints import bumped_into
 from embomatrix.factory.scenes.solids import Solids
+from embomatrix.factory.writer.robot import AnyRobot
 from embomatrix.factory.writer.tables import NEVER_SWITCHED
 from embomatrix.sim.swings import SWING
 from embomatrix.skills.appliance import cold_source, cooks, freezes, heat_source, heats
@@ -17,6 +18,7 @@ from embomatrix.world.state import OPEN_FRACTION, Relation, State
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from embomatrix.factory.writer.robot import Robot
     from embomatrix.world.asset import Asset
     from embomatrix.world.scene import Scene, SceneObject
 
@@ -31,8 +33,10 @@ HIGH_SURFACE_M: Final = 1.5
 class SceneView:
     """A scene indexed for writing tasks. Names are those of scene objects."""
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, robot: Robot | None = None) -> None:
         self.scene = scene
+        self.robot: Robot = robot if robot is not None else AnyRobot()
+        """Who is to do what is asked for. Without one nobody asks whether it can."""
         self._opens: dict[str, bool] = {}
 
     @cached_property
