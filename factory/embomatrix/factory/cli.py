@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 from embomatrix.factory.assets_cli import app as assets_app
 from embomatrix.factory.evaluate.cli import app as evaluate_app
@@ -185,7 +185,8 @@ def list_(folder: Annotated[Path, typer.Argument(help="Folder of a dataset.")]) 
     """Show the tasks of a dataset."""
     with mended():
         dataset = Dataset.load(folder)
-    table = Table("task", "split", "category", "rows", "steps", "instruction")
+    # a task's id is what other commands ask for: it is never cut short
+    table = Table(Column("task", no_wrap=True), "split", "category", "rows", "steps", "instruction")
     for record in dataset.records:
         task = record.task
         table.add_row(

@@ -249,7 +249,7 @@ def test_entities_are_refused_in_any_encoding(tmp_path: Path, encoding: str) -> 
         ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 inf 0\nf 1 2 3", "not a finite number"),
         ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3", "expected a solid, not a sheet"),
         ("a.glb", b"glTF but not really", "no glb that can be read"),
-        ("a.blend", b"BLENDER", "ends in '.blend'"),
+        ("a.blend", b"BLENDER", "ends in '.blend': expected one of .glb, .obj, .stl, .urdf"),
     ],
 )
 def test_a_damaged_mesh_file_is_named(tmp_path: Path, name: str, data: bytes, message: str) -> None:

@@ -179,6 +179,7 @@ def test_list_shows_the_tasks(folder: Path, dataset: Dataset) -> None:
     code, output = run("list", str(folder))
     assert code == 0
     assert "heldout" in output
+    assert all(f" {record.task.task_id} " in output for record in dataset.records)
 
 
 def test_bddl_file_is_imported_and_its_plan_shown(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from embomatrix.factory.assets.shapes import box, hull, mesh_of, rounded
 from embomatrix.factory.importers.cavities import cavities, solid_cells, top_surface
 from embomatrix.factory.importers.convex import MAX_HULLS, MAX_VERTICES, merged
 from embomatrix.factory.importers.hinges import linked
-from embomatrix.factory.importers.meshes import read_groups
+from embomatrix.factory.importers.meshes import GROUPED, read_groups
 from embomatrix.factory.importers.model import Frame, Mesh, ModelFileError, RawModel
 from embomatrix.factory.importers.urdf import read_urdf
 from embomatrix.world.asset import Asset, Joint, JointKind, Link
@@ -65,11 +65,14 @@ def read_model(path: Path, frame: Frame | None = None) -> RawModel:
 
     Raises ModelFileError for a file that is of another kind, damaged or too large.
     """
-    if path.suffix.lower() == ".urdf":
+    suffix = path.suffix.lower()
+    if suffix == ".urdf":
         model = read_urdf(path)
+    elif suffix in GROUPED:
+        model = linked(read_groups(path), frame or (Frame.Z_UP if suffix == ".stl" else Frame.Y_UP))
     else:
-        groups = read_groups(path)
-        model = linked(groups, frame or (Frame.Z_UP if path.suffix.lower() == ".stl" else Frame.Y_UP))
+        kinds = ", ".join(sorted((*GROUPED, ".urdf")))
+        raise ModelFileError(f"{path} ends in {suffix!r}: expected one of {kinds}")
     return RawModel(model.links, frame or model.frame)
 
 

@@ -42,7 +42,7 @@ ROOMS: Final = (
 COLUMNS: Final = 4
 PANEL_PX: Final = (300, 240)
 LABEL_PX: Final = 40
-LEAST_SPAN_M: Final = 0.42
+LEAST_SPAN_M: Final = 0.3
 """The camera comes no nearer than for things of this size."""
 
 
@@ -64,10 +64,12 @@ class Panel:
     open: float = 0.0
     side: float = -1.3
     """How far to the right of the second's front the camera stands, in spans: positive looks past its open door."""
+    above: float = 1.1
+    """How far above what it looks at the camera stands, in spans: low to see what is between a thing and a surface."""
 
 
 PANELS: Final = (
-    Panel("ontop", "apple", "table", (0.1, 0.2, 0.0), "rests on its top", "top"),
+    Panel("ontop", "apple", "table", (0.1, 0.2, 0.0), "rests on its top", "top", above=0.06),
     Panel("ontop", "bowl", "bookcase", (0.05, 0.0, 0.0), "an open board is a surface", "shelf2_floor"),
     Panel(
         "ontop",
@@ -79,7 +81,7 @@ PANELS: Final = (
         1.0,
         0.9,
     ),
-    Panel("ontop", "apple", "table", (0.1, 0.2, 0.05), "5 cm above its top", "top"),
+    Panel("ontop", "apple", "table", (0.1, 0.2, 0.05), "5 cm above its top", "top", above=0.06),
     Panel("inside", "apple", "fridge", (0.1, 0.0, 0.0), "its box is in a cavity", "shelf2_floor", 1.0, 0.9),
     Panel("inside", "apple", "bowl", (0.0, 0.0, 0.0), "it may stick out of an open cavity", "inside_floor"),
     Panel(
@@ -90,8 +92,8 @@ PANELS: Final = (
     Panel("under", "carton", "table", (0.0, 1.0, 0.0), "beside it"),
     Panel("nextto", "apple", "mug", (0.0, 0.15, 0.0), "5 cm apart or less"),
     Panel("nextto", "apple", "mug", (0.0, 0.35, 0.0), "too far for their sizes"),
-    Panel("touching", "apple", "carton", (0.0, -0.147, 0.0), "5 mm apart or less"),
-    Panel("touching", "apple", "carton", (0.0, -0.19, 0.0), "nextto, and not touching"),
+    Panel("touching", "apple", "carton", (0.0, -0.147, 0.0), "5 mm apart or less", side=0.0),
+    Panel("touching", "apple", "carton", (0.0, -0.19, 0.0), "nextto, and not touching", side=0.0),
     Panel("inroom", "carton", "kitchen_0", (0.0, -0.11, 0.0), "its middle is over the floor"),
     Panel("inroom", "carton", "kitchen_0", (0.0, 0.11, 0.0), "its middle is over the next room's"),
     Panel("open", "", "cabinet", (0.0, 0.0, 0.0), "a joint past 5 % of its travel", open=0.5),
@@ -165,7 +167,7 @@ def _drawn(panel: Panel) -> Image.Image:
         if panel.predicate == Relation.INROOM:
             stage.add_floors()
         stage.add_objects()
-        picture = Image.fromarray(np.asarray(_photographed(stage, _framed(scene, panel), panel.side)))
+        picture = Image.fromarray(np.asarray(_photographed(stage, _framed(scene, panel), panel)))
     whole = Image.new("RGB", (PANEL_PX[0], PANEL_PX[1] + LABEL_PX), "white")
     whole.paste(picture, (0, 0))
     holds = verdict(panel)
@@ -180,7 +182,7 @@ def _drawn(panel: Panel) -> Image.Image:
 
 
 def _framed(scene: Scene, panel: Panel) -> Aabb:
-    """What the camera looks at: all of the second object where it counts, else the first, else both."""
+    """What the camera looks at: all of the second object where it counts or hides the first, the first, or both."""
     boxes = {
         item.name: AssetBounds(scene.asset_of(item.name)).box(item.pose_world_asset) for item in scene.objects
     }
@@ -189,13 +191,15 @@ def _framed(scene: Scene, panel: Panel) -> Aabb:
             return Aabb.around(boxes.values())
         case "under" | "open":
             return boxes[panel.b]
+        case "inside" if not panel.open and scene.asset_of(panel.b).can("openable"):
+            return boxes[panel.b]
         case _:
             return boxes[panel.a]
 
 
-def _photographed(stage: Stage, box: Aabb, side: float) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
+def _photographed(stage: Stage, box: Aabb, panel: Panel) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
     span = max(LEAST_SPAN_M, *box.size_m)
     x, y, z = box.center_m
-    eye = (x + 2.6 * span, y + side * span, z + 1.1 * span)
+    eye = (x + 2.6 * span, y + panel.side * span, z + panel.above * span)
     lens = stage.lens(32.0, PANEL_PX[0] / PANEL_PX[1], 0.05, 50.0)
     return stage.shoot(stage.look_at(eye, (x, y, z)), lens, *PANEL_PX)

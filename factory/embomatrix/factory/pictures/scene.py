@@ -1,24 +1,36 @@
-"""Top-down picture of a scene: rooms, walls, doorways, furniture with its front, small things as numbered dots."""
+"""Top-down picture of a scene: rooms, walls, doorways, furniture with its front, small things as dots."""
 
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw
 
+from embomatrix.factory.pictures.labels import Labels, boxes
+from embomatrix.factory.pictures.legend import counted, draw_legend, in_order
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.geometry import Aabb, Pose
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from embomatrix.factory.pictures.labels import Box
     from embomatrix.world.scene import Scene, SceneObject
 
 _ORIGIN: Final = Pose((0.0, 0.0, 0.0))
-_MARGIN_PX: Final = 30
+_MARGIN_PX: Final = 15
+_FINEST_PX_PER_M: Final = 110.0
 _LONG_SIDE_PX: Final = 1500
-_LINE_PX: Final = 15
-_COLUMN_PX: Final = 330
+_COARSEST_PX_PER_M: Final = 60.0
+"""Below this, names of rooms and furniture don't fit where they are: large scenes get a larger picture instead ..."""
+_LONGEST_SIDE_PX: Final = 3000
+"""... up to this size."""
+_LEAST_HEIGHT_PX: Final = 700
+_EACH_BY_NUMBER: Final = 3
+"""So many things on one host have numbers; more are told in one line of the legend."""
 _PANE_M: Final = 0.03
 """Half the thickness at which windows are drawn."""
 _SMALL_M: Final = 0.3
@@ -41,20 +53,31 @@ _LEGEND: Final = (
     ("rug", "rug"),
     ("plant", "plant"),
 )
-_SIGNS: Final = ("triangle: front · red: doorway", "blue: window · ring: light or fan")
+_SIGNS: Final = (
+    "triangle: front · red: doorway · blue: window",
+    "ring: light or fan · dot: small thing, green if it can move",
+)
+_ROOM_COLOR: Final = "#b03030"
 _PLANTS: Final = frozenset({"tree", "low_resolution_tree", "bush", "pot_plant"})
 _WORKS: Final = ("toggleable", "heatSource", "coldSource", "particleSource")
 
 
 def draw_plan(scene: Scene) -> Image.Image:
-    """The scene from above, north up, with a legend of everything small on the right. Returns an RGB image."""
-    picture = _Plan(scene)
-    picture.rooms()
-    picture.walls()
-    picture.furniture()
-    picture.small_things()
-    picture.robot()
-    return picture.image
+    """The scene from above, north up; on the right a legend of all that has no room for its name. Returns an RGB image."""
+    plan = _Plan(scene)
+    plan.rooms()
+    plan.walls()
+    plan.furniture()
+    plan.small_things()
+    plan.robot()
+    lines = plan.label()
+    legend = draw_legend(
+        [(FILL[kind], words) for kind, words in _LEGEND], [*_SIGNS, "", *lines], plan.image.height
+    )
+    whole = Image.new("RGB", (plan.image.width + legend.width, plan.image.height), "white")
+    whole.paste(plan.image, (0, 0))
+    whole.paste(legend, (plan.image.width, 0))
+    return whole
 
 
 def footprint(scene: Scene, item: SceneObject) -> Aabb:
@@ -84,25 +107,27 @@ def kind_of(scene: Scene, item: SceneObject, box: Aabb) -> str:
 class _Plan:
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
-        low = np.min([r.low_m for r in scene.rooms], axis=0) - 0.3
-        high = np.max([r.high_m for r in scene.rooms], axis=0) + 0.3
-        self._low, self._high = low, high
-        self._scale = min(110.0, _LONG_SIDE_PX / float(max(high - low)))
-        width, height = ((high - low) * self._scale).astype(int)
-        self._small = [o for o in scene.objects if self._is_small(o)]
-        self._legend_x = int(width) + _MARGIN_PX
-        rows = len(self._small) + len(_LEGEND) + len(_SIGNS) + 5
-        columns = max(1, math.ceil(rows * _LINE_PX / max(int(height), 700)))
-        size = (self._legend_x + columns * _COLUMN_PX, max(int(height), 700) + 2 * _MARGIN_PX)
-        self.image = Image.new("RGB", size, "white")
+        self._low = np.min([r.low_m for r in scene.rooms], axis=0) - 0.3
+        self._high = np.max([r.high_m for r in scene.rooms], axis=0) + 0.3
+        extent = self._high - self._low
+        longest = float(max(extent))
+        self._scale = min(
+            _FINEST_PX_PER_M,
+            max(_LONG_SIDE_PX / longest, min(_COARSEST_PX_PER_M, _LONGEST_SIDE_PX / longest)),
+        )
+        width, height = (int(side * self._scale) + 2 * _MARGIN_PX for side in extent)
+        self.image = Image.new("RGB", (width, max(height, _LEAST_HEIGHT_PX)), "white")
         self._draw = ImageDraw.Draw(self.image)
-        self._row = 0
+        self._small = [o for o in scene.objects if self._is_small(o)]
+        self._named: list[tuple[SceneObject, Box, str]] = []
+        """Furniture with the box that its name may stand in, and its colour."""
+        self._marks: list[Box] = []
+        """What words had better not cover: dots and fronts."""
 
     def rooms(self) -> None:
         for number, room in enumerate(self._scene.rooms):
             corners = [self._px(*room.low_m), self._px(*room.high_m)]
             self._draw.rectangle(_ordered(corners), fill=PALE[number % len(PALE)])
-        # Names last, at the top left of each room, where furniture seldom hides them.
 
     def walls(self) -> None:
         for part in self._scene.walls:
@@ -137,35 +162,13 @@ class _Plan:
                 corners, fill=None if kind == "hung" else FILL[kind], outline=outline, width=2
             )
             self._front(item, outline)
-            self._label(item.name, corners, "#5a3f88" if kind == "hung" else "black")
-        for room in self._scene.rooms:
-            x, y = self._px(room.low_m[0] + 0.08, room.high_m[1] - 0.06)
-            self._text((x, y), f"{room.name}  {room.size_m[0]:.1f} x {room.size_m[1]:.1f} m", 13, "#b03030")
+            self._named.append((item, corners, "#5a3f88" if kind == "hung" else "black"))
 
     def small_things(self) -> None:
-        self._say("Legend", 15)
-        for kind, words in _LEGEND:
-            x, y = self._place()
-            self._draw.rectangle((x, y + 2, x + 14, y + 12), fill=FILL[kind], outline="#555555")
-            self._text((x + 22, y), words, 11, "black")
-            self._row += 1
-        for signs in _SIGNS:
-            self._say(f"      {signs}")
-        self._say("")
-        for number, item in enumerate(self._small, start=1):
+        for item in self._small:
             x, y = self._px(*item.pose_world_asset.position_m[:2])
-            color = "#1b7f3b" if not item.fixed else "#204a87"
-            self._draw.ellipse((x - 3, y - 3, x + 3, y + 3), fill=color)
-            self._text((x + 3, y - 9), str(number), 9, color)
-            z = footprint(self._scene, item).low_m[2]
-            where = (
-                f"{item.relation.value} {item.host}"
-                if item.relation and item.host
-                else "on the wall"
-                if z > 0.05
-                else "on the floor"
-            )
-            self._say(f"{number:>3} {item.name}  {where}")
+            self._draw.ellipse((x - 3, y - 3, x + 3, y + 3), fill=_dot_color(item))
+            self._marks.append((x - 3, y - 3, x + 3, y + 3))
 
     def robot(self) -> None:
         start = self._scene.robot
@@ -174,7 +177,58 @@ class _Plan:
         self._draw.ellipse((x - r, y - r, x + r, y + r), outline="#d02020", width=2)
         tip = (x + r * math.cos(start.yaw), y - r * math.sin(start.yaw))
         self._draw.line((x, y, *tip), fill="#d02020", width=2)
-        self._text((x - r, y + r), "robot", 11, "#d02020")
+
+    def label(self) -> list[str]:
+        """Write names where they fit, numbers where they don't. Returns the legend's lines."""
+        labels = Labels(self.image)
+        self._label_rooms(labels)
+        marks = boxes(self._marks)
+        numbered: list[tuple[SceneObject, Box, str]] = []
+        # what lies on something first, for it hides that; then the small, for a large box has more places
+        for item, box, color in sorted(self._named, key=lambda named: (not named[0].host, _area(named[1]))):
+            if not labels.inside(item.name, box, color, marks):
+                numbered.append((item, box, color))
+        told = self._told_by_host()
+        hidden = {name for names in told.values() for name in names}
+        for item in self._small:
+            if item.name not in hidden:
+                x, y = self._px(*item.pose_world_asset.position_m[:2])
+                numbered.append((item, (x, y, x, y), _dot_color(item)))
+        lines = []
+        for number, (item, box, color) in enumerate(sorted(numbered, key=lambda n: in_order(n[0].name)), 1):
+            if not labels.inside(str(number), box, color, marks):
+                labels.beside(str(number), _middle(box), color, marks)
+            lines.append(f"{number}  {item.name}  {self._where(item)}".rstrip())
+        groups = [f"{where}: {counted(names)}" for where, names in sorted(told.items())]
+        return [*lines, *([""] if groups else []), *groups]
+
+    def _label_rooms(self, labels: Labels) -> None:
+        standing = boxes(box for _, box, _ in self._named)
+        for room in self._scene.rooms:
+            box = _ordered([self._px(*room.low_m), self._px(*room.high_m)])
+            size = f"{room.size_m[0]:.1f} x {room.size_m[1]:.1f} m"
+            if not any(
+                labels.inside(words, box, _ROOM_COLOR, standing)
+                for words in (f"{room.name}  {size}", room.name)
+            ):
+                labels.beside(room.name, _middle(box), _ROOM_COLOR, standing)
+        x, y = self._px(self._scene.robot.x_m, self._scene.robot.y_m)
+        labels.beside("robot", (x, y + int(ROBOT.radius_m * self._scale)), "#d02020", standing)
+
+    def _told_by_host(self) -> Mapping[str, Sequence[str]]:
+        """Names of small things by the host that they crowd, as ``inside shelf_1``."""
+        told = defaultdict(list)
+        for item in self._small:
+            if item.relation and item.host:
+                told[self._where(item)].append(item.name)
+        return {where: names for where, names in told.items() if len(names) > _EACH_BY_NUMBER}
+
+    def _where(self, item: SceneObject) -> str:
+        if item.relation and item.host:
+            return f"{item.relation.value} {item.host}"
+        if not self._is_small(item):
+            return ""
+        return "on the wall" if footprint(self._scene, item).low_m[2] > 0.05 else "on the floor"
 
     def _is_small(self, item: SceneObject) -> bool:
         box = footprint(self._scene, item)
@@ -194,41 +248,30 @@ class _Plan:
         tip = pose.apply((size[0] / 2, 0.0, 0.0))
         base = max(0.0, size[0] / 2 - 0.09)
         left, right = pose.apply((base, 0.06, 0.0)), pose.apply((base, -0.06, 0.0))
-        self._draw.polygon([self._px(*p[:2]) for p in (tip, left, right)], fill=color)
-
-    def _label(self, name: str, box: tuple[int, int, int, int], color: str) -> None:
-        """The name inside the box, along its longer side, as large as it fits between 8 and 12 points."""
-        width, height = box[2] - box[0], box[3] - box[1]
-        upright = height > 1.4 * width
-        room = max(width, height) if upright else width
-        size = int(min(12, max(8, room / max(1, len(name)) * 1.9)))
-        font = ImageFont.load_default(size)
-        _left, _top, right, bottom = font.getbbox(name)
-        tag = Image.new("L", (int(right) + 2, int(bottom) + 2), 0)
-        ImageDraw.Draw(tag).text((1, 1), name, fill=255, font=font)
-        if upright:
-            tag = tag.rotate(90, expand=True)
-        x, y = (box[0] + box[2] - tag.width) // 2, (box[1] + box[3] - tag.height) // 2
-        self.image.paste(color, (int(x), int(y)), tag)
-
-    def _say(self, line: str, size: int = 11) -> None:
-        self._text(self._place(), line, size, "black")
-        self._row += 1
-
-    def _place(self) -> tuple[int, int]:
-        rows = (self.image.height - 2 * _MARGIN_PX) // _LINE_PX
-        return (self._legend_x + _COLUMN_PX * (self._row // rows), _MARGIN_PX + _LINE_PX * (self._row % rows))
-
-    def _text(self, at: tuple[float, float], words: str, size: int, color: str) -> None:
-        self._draw.text(at, words, fill=color, font=ImageFont.load_default(size))
+        corners = [self._px(*p[:2]) for p in (tip, left, right)]
+        self._draw.polygon(corners, fill=color)
+        x, y = zip(*corners, strict=True)
+        self._marks.append((min(x), min(y), max(x), max(y)))
 
     def _px(self, x: float, y: float) -> tuple[int, int]:
         return (
-            int(_MARGIN_PX / 2 + (x - self._low[0]) * self._scale),
-            int(_MARGIN_PX / 2 + (self._high[1] - y) * self._scale),
+            int(_MARGIN_PX + (x - self._low[0]) * self._scale),
+            int(_MARGIN_PX + (self._high[1] - y) * self._scale),
         )
 
 
-def _ordered(corners: list[tuple[int, int]]) -> tuple[int, int, int, int]:
+def _dot_color(item: SceneObject) -> str:
+    return "#204a87" if item.fixed else "#1b7f3b"
+
+
+def _area(box: Box) -> int:
+    return (box[2] - box[0]) * (box[3] - box[1])
+
+
+def _middle(box: Box) -> tuple[int, int]:
+    return (box[0] + box[2]) // 2, (box[1] + box[3]) // 2
+
+
+def _ordered(corners: Sequence[tuple[int, int]]) -> Box:
     (a, b), (c, d) = corners
     return (min(a, c), min(b, d), max(a, c), max(b, d))

@@ -1,0 +1,158 @@
+"""Words on a picture: each where it is legible and hides no other."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+Box = tuple[int, int, int, int]
+"""Left, top, right and bottom in pixels, y down."""
+Boxes = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
+"""Boxes in rows, (n, 4)."""
+
+SIZES: Final = (13, 12, 11, 10)
+"""Sizes of letters that are tried, in pixels: smaller ones can't be read."""
+_HALO_PX: Final = 1
+_INSET_PX: Final = 2
+_PLACES: Final = (0.5, 0.25, 0.75, 0.0, 1.0)
+"""Where in a box words may stand, as shares of the room that they leave: the middle first."""
+_NUMBER_SIZE: Final = 11
+_GAPS_PX: Final = (4, 10, 18)
+"""How far from a point its number may stand: near, unless others are there."""
+_LINES: Final = 3
+
+
+@dataclass(frozen=True, slots=True)
+class _Setting:
+    """One way to set words: broken into lines, at a size, upright or not, with the pixels that they take."""
+
+    words: str
+    size: int
+    upright: bool
+    width: int
+    height: int
+
+
+class Labels:
+    """What is written on one picture so far, and where it must not be written over."""
+
+    def __init__(self, image: Image.Image) -> None:
+        self._image = image
+        self._kept = boxes(())
+
+    def inside(self, name: str, box: Box, color: str, clear_of: Boxes) -> bool:
+        """Write a name within a box, broken at its underscores if need be, off ``clear_of`` if it can be.
+
+        False where no size that can be read has room.
+        """
+        for marks in (np.vstack([self._kept, clear_of]), self._kept):
+            for setting in _settings(name, box):
+                for at in _places(setting, box):
+                    if not _meets(_taken(setting, at), marks):
+                        self._write(setting, at, color)
+                        return True
+        return False
+
+    def beside(self, words: str, at: tuple[int, int], color: str, clear_of: Boxes) -> None:
+        """Write a few letters next to a point, on the first free side of it; above to the right where none is."""
+        width, height = _measured(words, _NUMBER_SIZE)
+        setting = _Setting(words, _NUMBER_SIZE, False, width, height)
+        corners = [
+            (at[0] + dx, at[1] + dy)
+            for gap in _GAPS_PX
+            for dx in (gap, -width - gap, -width // 2)
+            for dy in (-height - gap + 4, gap - 4)
+        ]
+        free = (
+            corner
+            for marks in (np.vstack([self._kept, clear_of]), self._kept)
+            for corner in corners
+            if not _meets(_taken(setting, corner), marks)
+        )
+        self._write(setting, next(free, corners[0]), color)
+
+    def _write(self, setting: _Setting, at: tuple[int, int], color: str) -> None:
+        font = ImageFont.load_default(setting.size)
+        flat = (setting.height, setting.width) if setting.upright else (setting.width, setting.height)
+        for tint, halo in (("white", _HALO_PX), (color, 0)):
+            tag = Image.new("L", flat, 0)
+            middle = (flat[0] / 2, flat[1] / 2)
+            ImageDraw.Draw(tag).multiline_text(
+                middle, setting.words, 255, font, "mm", spacing=1, align="center", stroke_width=halo
+            )
+            tag = tag.rotate(90, expand=True) if setting.upright else tag
+            self._image.paste(tint, at, tag)
+        self._kept = np.vstack([self._kept, boxes([_taken(setting, at)])])
+
+
+def boxes(rows: Iterable[Box]) -> Boxes:
+    """Boxes in rows, (n, 4), of which there may be none."""
+    return np.array([*rows], dtype=np.int64).reshape(-1, 4)
+
+
+def _taken(setting: _Setting, at: tuple[int, int]) -> Box:
+    return (*at, at[0] + setting.width, at[1] + setting.height)
+
+
+def _settings(name: str, box: Box) -> Iterator[_Setting]:
+    """Ways to set a name that the box has room for: large before small, on one line before several, level before upright."""
+    width, height = box[2] - box[0] - 2 * _INSET_PX, box[3] - box[1] - 2 * _INSET_PX
+    one, *more = _broken(name)
+    for size in SIZES:
+        for ways, upright in itertools.product(((one,), more), (False, True)):
+            for words in ways:
+                long, high = _measured(words, size)
+                w, h = (high, long) if upright else (long, high)
+                if w <= width and h <= height:
+                    yield _Setting(words, size, upright, w, h)
+
+
+def _places(setting: _Setting, box: Box) -> Iterator[tuple[int, int]]:
+    """Left upper corners at which the words lie within the box."""
+    left, top = box[0] + _INSET_PX, box[1] + _INSET_PX
+    spare_x = box[2] - _INSET_PX - left - setting.width
+    spare_y = box[3] - _INSET_PX - top - setting.height
+    for y, x in itertools.product(_PLACES, _PLACES):
+        yield left + int(spare_x * x), top + int(spare_y * y)
+
+
+@lru_cache(maxsize=4096)
+def _broken(name: str) -> tuple[str, ...]:
+    """The name on one line, and on two and three as even as its underscores allow."""
+    parts = [f"{part}_" for part in name.split("_")]
+    parts[-1] = parts[-1][:-1]
+    ways = [name]
+    for lines in range(2, min(_LINES, len(parts)) + 1):
+        cuts = (
+            [0, *middle, len(parts)] for middle in itertools.combinations(range(1, len(parts)), lines - 1)
+        )
+        broken = (["".join(parts[a:b]) for a, b in itertools.pairwise(cut)] for cut in cuts)
+        ways.append("\n".join(min(broken, key=lambda rows: max(map(len, rows)))))
+    return tuple(ways)
+
+
+@lru_cache(maxsize=4096)
+def _measured(words: str, size: int) -> tuple[int, int]:
+    """Width and height in pixels of lines with their halo."""
+    font = ImageFont.load_default(size)
+    pen = ImageDraw.Draw(Image.new("L", (1, 1)))
+    left, top, right, bottom = pen.multiline_textbbox((0, 0), words, font, spacing=1, stroke_width=_HALO_PX)
+    return int(right - left) + 2, int(bottom - top) + 2
+
+
+def _meets(box: Box, others: Boxes) -> bool:
+    """Whether a box overlaps one of the others."""
+    left, top, right, bottom = box
+    return bool(
+        np.any(
+            (others[:, 0] < right) & (others[:, 2] > left) & (others[:, 1] < bottom) & (others[:, 3] > top)
+        )
+    )

@@ -1,0 +1,106 @@
+"""Words on plans: names where they can be read, numbers and a legend for the others."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from embomatrix.factory.pictures.labels import Labels, boxes
+from embomatrix.factory.pictures.legend import counted, draw_legend
+from embomatrix.factory.pictures.scene import draw_plan
+
+if TYPE_CHECKING:
+    from embomatrix.world.scene import Scene
+
+NOTHING = boxes(())
+
+
+def written(image: Image.Image) -> np.ndarray:
+    """Where the picture is not grey any more: (height, width)."""
+    return np.any(np.asarray(image) != 128, axis=2)
+
+
+def grey() -> Image.Image:
+    return Image.new("RGB", (200, 120), (128, 128, 128))
+
+
+@pytest.mark.parametrize(
+    "box",
+    [(20, 20, 180, 50), (20, 20, 90, 70), (20, 10, 40, 115), (20, 10, 56, 110)],
+    ids=["long", "in lines", "upright", "narrow"],
+)
+def test_a_name_stays_within_its_box(box: tuple[int, int, int, int]) -> None:
+    image = grey()
+    assert Labels(image).inside("straight_chair_1", box, "black", NOTHING)
+    rows, columns = np.nonzero(written(image))
+    assert box[0] <= columns.min()
+    assert columns.max() < box[2]
+    assert box[1] <= rows.min()
+    assert rows.max() < box[3]
+
+
+def test_a_name_that_could_not_be_read_is_not_written() -> None:
+    image = grey()
+    assert not Labels(image).inside("straight_chair_1", (20, 20, 50, 50), "black", NOTHING)
+    assert not written(image).any()
+
+
+def test_names_of_one_box_stand_apart_until_it_is_full() -> None:
+    image = grey()
+    labels = Labels(image)
+    inks = []
+    while labels.inside("bed_1", (20, 20, 80, 80), "black", NOTHING):
+        inks.append(written(image).sum())
+    assert len(inks) >= 3
+    assert all(more - less == inks[0] for less, more in pairwise(inks))
+
+
+@pytest.mark.parametrize(("mark", "must"), [((40, 20, 160, 70), False), ((0, 0, 200, 120), True)])
+def test_a_name_covers_marks_only_where_it_must(mark: tuple[int, int, int, int], must: bool) -> None:
+    image = grey()
+    assert Labels(image).inside("bed_1", (20, 20, 180, 100), "black", boxes([mark]))
+    assert written(image)[mark[1] : mark[3], mark[0] : mark[2]].any() == must
+
+
+def test_numbers_of_one_point_stand_around_it() -> None:
+    image = grey()
+    labels = Labels(image)
+    inks = []
+    for _ in range(6):
+        labels.beside("7", (100, 60), "black", NOTHING)
+        inks.append(int(written(image).sum()))
+    assert inks == [inks[0] * count for count in range(1, 7)]
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        (["book_1", "book_2", "book_3", "cup_1"], "book_1-3, cup_1"),
+        (["book_9", "book_10", "book_2"], "book_2, 9-10"),
+        (["floors", "cup_4"], "floors, cup_4"),
+    ],
+)
+def test_names_are_told_in_few_words(names: list[str], words: str) -> None:
+    assert counted(names) == words
+
+
+def test_a_legend_grows_by_columns_and_not_in_height() -> None:
+    one, two = (draw_legend([("red", "opens")], ["bed_1"] * count, 320) for count in (5, 25))
+    assert one.height == two.height == 320
+    assert two.width == 2 * one.width
+    assert np.asarray(two.crop((one.width, 0, two.width, 320)).convert("L")).min() < 64
+
+
+def test_large_scenes_get_larger_pictures_within_limits(home: Scene) -> None:
+    room = replace(home.rooms[0], name="hall_9", low_m=(0.0, 0.0), high_m=(45.0, 20.0))
+    hall = draw_plan(replace(home, rooms=(*home.rooms, room)))
+    field = draw_plan(replace(home, rooms=(*home.rooms, replace(room, high_m=(400.0, 20.0)))))
+    legend = 2 * 360
+    assert draw_plan(home).width < 1500 + legend
+    assert 45 * 60 < hall.width < 45 * 62 + legend + 100
+    assert field.width < 3100 + legend
