@@ -119,11 +119,12 @@ _COLUMNS: Final = tuple(
     np.array(columns)
     for columns in ((0, 1, 2, 3, 4, 5), (4, 0, 2, 1, 3, 5), (3, 4, 2, 0, 1, 5), (1, 3, 2, 4, 0, 5))
 )
+"""From which column of a box's corners each one comes after 0 to 3 quarter turns about z."""
 _SIGNS: Final = tuple(
     np.array(signs, dtype=np.float64)
     for signs in ((1, 1, 1, 1, 1, 1), (-1, 1, 1, -1, 1, 1), (-1, -1, 1, -1, -1, 1), (1, -1, 1, 1, -1, 1))
 )
-"""From which column of a box's corners each one comes after so many quarter turns about z, and with which sign."""
+"""And with which sign."""
 
 
 @dataclass(frozen=True, slots=True)

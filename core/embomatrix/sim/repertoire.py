@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from embomatrix.world.scene import Scene
 
 PLACED: Final = (Relation.ONTOP, Relation.INSIDE, Relation.UNDER)
-"""Relations that a thing can be placed in."""
+"""The relations that placing brings about."""
 
 
 class Spots:
@@ -102,10 +102,11 @@ class Repertoire:
         for table in tables:
             movable = [name for name in table if not scene.by_name[name].fixed]
             hosts = [name for name in table if links_with_spots(scene.asset_of(name))]
-            for held, target, relation in itertools.product(movable, hosts, PLACED):
-                for spots in self.verified(held, target, relation):
-                    if spots is not NO_SPOTS:
-                        yield
+            for held, target in itertools.product(movable, hosts):
+                for relation in PLACED:
+                    for _ in self.verified(held, target, relation):
+                        pass
+                yield
 
     def verified(self, held: str, target: str, relation: Relation) -> Iterator[Spots]:
         """Spots verified for this pair of assets, then those verified for the footprint of what is held."""
