@@ -9,10 +9,13 @@ from tests.fakes.worker import FakeWorker
 from tests.integration.test_manager_service import BUNDLES, batch, manager, outcomes, until
 
 from embomatrix.cli.local_cluster import free_port
+from embomatrix.manager.store.url import open_store
 from embomatrix.rpc.admin import AdminClient
 from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.status import UnavailableError
-from embomatrix.rpc.values import Completed, GroupPolicy, RunTerms
+from embomatrix.rpc.values import Completed, GroupPolicy, Resources, RunTerms
+from embomatrix.worker.membership import Membership
+from embomatrix.worker.session import register
 
 pytestmark = pytest.mark.timeout(60)
 VERIFIED = RunTerms(GroupPolicy.PARTIAL, verified=True)
@@ -71,6 +74,15 @@ async def test_a_worker_in_quarantine_stays_there_under_the_next_manager_until_a
     third = manager(tmp_path / "third", state=state)
     async with third as at, people(at.address) as (_, admin), FakeWorker(at.address, "liar"):
         assert await states(admin) == {"liar": "ready"}
+
+
+async def test_the_next_manager_waits_for_a_worker_from_the_moment_it_has_joined(tmp_path, state):
+    async with manager(tmp_path, state=state) as at:
+        for name in ("w1", "w2", "w3"):
+            await register(Membership(at.address, name), boot_id=name, resources=Resources(1, 1, 100))
+            store = open_store(state)
+            assert name in await store.workers()
+            await store.close()
 
 
 async def test_dispatch_that_was_paused_stays_paused_under_the_next_manager_until_it_is_resumed(

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 ROSTER_S: Final = 0.5
+NOTED_S: Final = 2.0
+"""A worker that joins waits this long to be noted: while the store is away, workers join all the same."""
 _DISPATCH: Final = "dispatch"
 _PAUSED: Final = b"paused"
 
@@ -32,6 +34,8 @@ class Keeper:
         self._registry = registry
         self._dispatcher = dispatcher
         self._present: frozenset[str] | None = None
+        self._written = asyncio.Event()
+        """Set when the workers that are there have been noted next."""
         self._urgent = asyncio.Event()
 
     async def reputes(self) -> ReputesKnown:
@@ -58,6 +62,17 @@ class Keeper:
         """What changed is to be noted at once: a worker was put in quarantine, or taken out of it."""
         self._urgent.set()
 
+    async def noted(self, worker_id: str) -> None:
+        """Return when the manager that comes after this one would wait for the worker.
+
+        It gets no lease before: what it holds would be given out a second time. Workers that join together are noted together.
+        """
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(NOTED_S):
+                while worker_id not in (self._present or ()):
+                    self.hurry()
+                    await self._written.wait()
+
     async def serve(self) -> None:
         """Note what changed, again and again, and once more when this is cancelled: a manager that is killed loses a moment."""
         try:
@@ -78,6 +93,8 @@ class Keeper:
             with contextlib.suppress(StateError):
                 await self._store.put_workers(present)
                 self._present = present
+                self._written.set()
+                self._written = asyncio.Event()
 
     async def _note_reputes(self) -> None:
         auditor = self._dispatcher.auditor

@@ -122,7 +122,7 @@ class ManagerRuntime:
             group.create_task(self._delivery.serve())
             group.create_task(self.runs.serve())
 
-    def register(
+    async def register(
         self,
         worker_id: str,
         boot_id: str,
@@ -131,7 +131,7 @@ class ManagerRuntime:
         credential_id: str = "",
         protocol: int = PROTOCOL_VERSION,
     ) -> tuple[Session, float]:
-        """Open a session for a worker; returns it and the heartbeat's interval in seconds."""
+        """Open a session for a worker; returns it and the heartbeat's interval in seconds once the worker is noted."""
         if self._lapsed_s() > LET_GO_S:
             raise UnavailableError(STORE_AWAY)
         session, commands = self._intake.register(
@@ -142,6 +142,7 @@ class ManagerRuntime:
         self.chronicle.fleet.joined(worker_id, resources, now_s=time.monotonic())
         self._carry_out(commands)
         logger.info("worker registered worker=%s slots=%d", worker_id, resources.slots)
+        await self._keeper.noted(worker_id)
         return session, self.registry.interval_s
 
     @contextlib.contextmanager

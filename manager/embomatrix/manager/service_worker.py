@@ -66,7 +66,7 @@ class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
             admission = await self._gate.admit(
                 context, request.join_token, request.worker_id, request.boot_id
             )
-            session, interval_s = self._runtime.register(
+            session, interval_s = await self._runtime.register(
                 request.worker_id,
                 request.boot_id,
                 resources,
