@@ -125,6 +125,13 @@ def test_the_section_tells_configuration_success_curves_and_times():
     assert widths == {14}
 
 
+def test_where_no_task_is_held_out_there_is_no_success_to_tell():
+    found = findings_of("a", [run(0, "a", (), ())])
+    assert [figure.name for figure in figures_of([found])] == ["sim_wait_share", "overhead_ratio"]
+    text = learning_section(DESIGN, [found], MACHINE, "abc", TODAY)
+    assert "| a | 0 | 20 | 320 | 0 | – | – | – |" in text
+
+
 def test_sections_are_added_and_none_is_taken_away(tmp_path):
     page = tmp_path / "docs" / "experiments.md"
     add_section(page, "## one\n")

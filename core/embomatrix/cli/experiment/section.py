@@ -23,6 +23,8 @@ HEAD: Final = (
     "# Experiments\n\nEach section was written by `embomatrix experiment` from the files of its runs; remarks below "
     "its tables are by hand.\nSections are added, none is taken away: what did not work stays.\n"
 )
+NOTHING: Final = "–"
+"""Where no task was held out."""
 CURVES: Final = (
     ("success", "success of training plans"),
     ("dead_groups", "groups without signal"),
@@ -103,9 +105,8 @@ def _success_rows(arm: ArmFindings) -> Iterable[tuple[str, ...]]:
             str(told.steps),
             f"{told.rollouts:,}",
             str(told.lost),
-            f"{bootstrap(list(then.values())).value:.1%}",
-            f"{bootstrap(list(now.values())).value:.1%}",
-            gain.as_percent(),
+            *(f"{bootstrap(list(rates.values())).value:.1%}" if rates else NOTHING for rates in (then, now)),
+            gain.as_percent() if now else NOTHING,
         )
     if len(arm.runs) > 1:
         yield (
