@@ -8,7 +8,7 @@ PIP_FLAGS := $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX),)
 BIN := $(VENV)/bin
 ARGS ?=
 
-.PHONY: run test test-slow lint types contracts proto proto-check check compose-check pictures clean
+.PHONY: run test test-slow lint types contracts proto proto-check check site compose-check pictures clean
 
 run: $(VENV)/.runtime
 	$(BIN)/embomatrix demo $(ARGS)
@@ -38,6 +38,10 @@ proto-check: $(VENV)/.dev
 	proto/check.sh $(BIN)/buf
 
 check: lint types contracts proto-check
+
+# The documentation site, in build/site. `make site ARGS=serve` shows it while it is written.
+site: $(VENV)/.dev
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs $(if $(ARGS),$(ARGS),build --strict)
 
 compose-check: $(VENV)/.dev
 	deploy/docker/local_bases.sh
