@@ -144,6 +144,7 @@ def import_(
     except OSError as error:
         _fail(f"{error.filename or out} can't be written ({error.strerror}): name another folder with --out")
     _tell(imported, path)
+    Console(soft_wrap=True).print(_stands_in(imported.asset.asset_id), highlight=False)
 
 
 def _tell(imported: Imported, path: Path) -> None:
@@ -163,6 +164,25 @@ def _tell(imported: Imported, path: Path) -> None:
             "another --model may be more like it",
             highlight=False,
         )
+
+
+def _stands_in(asset_id: str) -> str:
+    """In which base scenes `scene build --assets` makes a difference."""
+    catalog = Catalog.load()
+    listing = [
+        scene_id
+        for scene_id in catalog.scene_ids
+        if any(
+            f"{category}-{model}" == asset_id
+            for room in catalog.inventory(scene_id).rooms
+            for category, model, _ in room.items
+        )
+    ]
+    return (
+        f"it stands in {', '.join(listing)}"
+        if listing
+        else "it stands in no base scene: give a --model that one lists"
+    )
 
 
 def _is_worth_a_look(catalog: Catalog, name: str) -> bool:

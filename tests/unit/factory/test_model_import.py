@@ -340,6 +340,18 @@ def test_the_command_writes_an_asset_or_one_line_that_says_why_not(tmp_path: Pat
         assert "Traceback" not in refused.output
 
 
+@pytest.mark.parametrize(("model", "words"), [("bamfsz", " Rs_int,"), ("songes", "in no base scene")])
+def test_the_command_tells_which_scenes_the_model_stands_in(tmp_path: Path, model: str, words: str) -> None:
+    path = tmp_path / "cupboard.obj"
+    path.write_text(obj_text(CUPBOARD))
+    said = ["--creator", "A. Maker", "--licence", "CC0-1.0", "--out", str(tmp_path), "--cut", "components"]
+    done = CliRunner().invoke(
+        app, ["import", str(path), "--category", "bottom_cabinet", "--model", model, *said]
+    )
+    assert done.exit_code == 0, done.output
+    assert words in done.output
+
+
 def sample(tmp_path: Path, name: str) -> Path:
     if not SAMPLES.is_file():
         pytest.skip("the sample of Sweet Home 3D's models is not here")

@@ -22,7 +22,7 @@ NOTHING = boxes(())
 
 def written(image: Image.Image) -> np.ndarray:
     """Where the picture is not grey any more: (height, width)."""
-    return np.any(np.asarray(image) != 128, axis=2)
+    return np.asarray(np.any(np.asarray(image) != 128, axis=2))
 
 
 def grey() -> Image.Image:

@@ -163,6 +163,7 @@ def test_check_writes_a_report_and_names_what_is_missing(tmp_path: Path) -> None
     (entry,) = json.loads(path.read_text())
     assert entry["scene_id"] == SMALL
     assert entry["problems"] == []
+    assert ("what is listed and not placed" in result.output) == bool(entry["left_out"])
 
 
 @pytest.mark.parametrize(

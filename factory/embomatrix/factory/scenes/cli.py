@@ -76,6 +76,7 @@ Assets = Annotated[
     typer.Option(help="Folder of imported assets, which take the place of the generated ones."),
 ]
 CORES = os.cpu_count() or 1
+LEFT_OUT = "what is listed and not placed, and why: `embomatrix scene show NAME`, or --report FILE"
 
 
 @app.command("list")
@@ -252,6 +253,8 @@ def _tell(reports: Sequence[SceneReport], path: Path | None) -> None:
     Console(width=max(console.width, TABLE_COLUMNS)).print(report_table(reports))
     for line in problem_lines(reports):
         console.print(line, highlight=False, markup=False, soft_wrap=True)
+    if any(report.left_out for report in reports):
+        console.print(LEFT_OUT, highlight=False, soft_wrap=True)
     if path is not None:
         _write(path, (json.dumps([r.to_json() for r in reports], indent=1) + "\n").encode("utf-8"))
         console.print(str(path), highlight=False)
