@@ -9,6 +9,7 @@ from typer.testing import CliRunner
 
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.fidelity.compare import PlanKind, Trial
+from embomatrix.sim.fidelity.records import trial_from_json, trial_to_json
 from embomatrix.sim.fidelity.sampler import SKILLS
 from embomatrix.skills.parse import parse_plan
 from embomatrix.worker.bench_cli import app
@@ -77,6 +78,19 @@ def test_a_suite_that_was_cut_short_goes_on_where_it_was(suite, dataset, tmp_pat
     assert [item.cached.atoms for item in again.comparisons] == [
         item.cached.atoms for item in outcome.comparisons
     ]
+
+
+def test_a_trial_that_was_lost_is_tried_again_when_the_suite_goes_on(suite, dataset, tmp_path):
+    folder, outcome = suite
+    for name in (PLANS_FILE, "settings.json"):
+        (tmp_path / name).write_text((folder / name).read_text())
+    *lines, last = (folder / RESULTS_FILE).read_text().splitlines()
+    gone = {**trial_to_json(trial_from_json(json.loads(last))), LOST: "no answer in 180 s"}
+    (tmp_path / RESULTS_FILE).write_text("\n".join([*lines, json.dumps(gone)]) + "\n")
+    modes = Modes(Simulator, clumsy)
+    assert len(run_fidelity(dataset, SMALL, tmp_path, 0, modes, QUIET).lost) == 1
+    again = run_fidelity(dataset, SMALL, tmp_path, 1, modes, QUIET)
+    assert (len(again.comparisons), again.lost) == (len(outcome.comparisons), ())
 
 
 def test_without_processes_the_results_so_far_are_summed_up(suite, dataset, tmp_path):

@@ -88,7 +88,8 @@ def run_fidelity(
 ) -> Outcome:
     """Write the trials, or read them; execute those without a result; save the disagreements.
 
-    Without processes nothing is executed: the outcome is that of the results so far.
+    Trials that were lost before, as a machine was halted in their midst, are tried again. Without processes nothing is
+    executed: the outcome is that of the results so far.
 
     Raises BenchError when the folder holds a suite of other settings or can't be read, DatasetError and EngineError.
     """
@@ -97,7 +98,8 @@ def run_fidelity(
         trials = _trials(dataset, settings, folder, modes, progress)
         path = folder / RESULTS_FILE
         done = {value["trial"]: value for value in _lines(path)}
-        jobs = _jobs(trial for trial in trials if trial.trial_id not in done)
+        lost = {name for name, value in done.items() if LOST in value}
+        jobs = _jobs(trial for trial in trials if trial.trial_id in lost or trial.trial_id not in done)
         if processes:
             with _appending(path, done.values()) as append:
 

@@ -47,6 +47,8 @@ FOLLOWED: Final = (1.0, 0.5, 0.0)
 TILTS: Final = (0.0, 40.0, -40.0)
 """Degrees by which the hand comes from above, or from below."""
 OFF_M: Final = 0.08
+LEAST_OFF: Final = 0.3
+"""Where the ways back and off a leaf are nearly opposite, so that their sum is shorter, the hand goes back."""
 PULL: Final = 0.4
 """Share of full speed at which a leaf is led."""
 WAYPOINTS: Final = 7
@@ -352,7 +354,11 @@ def _track(
         course = course / np.linalg.norm(course)
         rotations.append(facing(course, 0.0 if abs(edge[2]) < 0.5 else math.pi / 2, edge))
         positions.append(point)
-    first, last = grips(start, along, spot)[1], -rotations[-1][:, 2]
+    first, back = grips(start, along, spot)[1], -rotations[-1][:, 2]
+    # A hand that did not turn with the leaf lies along it in the end: straight back its fingers would stay at it.
+    last = back + grips(float(fractions[-1]), along, spot)[1]
+    far = float(np.linalg.norm(last))
+    last = last / far if far > LEAST_OFF else back
     positions = [
         positions[0] + OFF_M * first,
         positions[0] + 0.01 * first,
