@@ -15,7 +15,17 @@ from embomatrix.factory.assets_cli import app as assets_app
 from embomatrix.factory.evaluate.cli import app as evaluate_app
 from embomatrix.factory.export import card, encoded, export_rows
 from embomatrix.factory.inspection.cli import app as inspect_app
-from embomatrix.factory.layout_cli import agent, lay
+from embomatrix.factory.layout_cli import (
+    Forms,
+    Key,
+    Llm,
+    Model,
+    Tape,
+    agent,
+    lay,
+    modelled_agents,
+    modelled_names,
+)
 from embomatrix.factory.pipeline.build import Check, Summary, build_dataset
 from embomatrix.factory.pipeline.cluster import ClusterJudge
 from embomatrix.factory.pipeline.corpus_cli import app as corpus_app
@@ -29,6 +39,8 @@ from embomatrix.world.task import TaskCategory
 from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:
+    from embomatrix.factory.layout.doors import AgentName
+    from embomatrix.factory.layout.jobs import LayoutAgents
     from embomatrix.factory.writer.tasks import TaskWriter
     from embomatrix.llm.ledger import Ledger
 
@@ -75,10 +87,23 @@ def build(
     scenes: Scenes = None,
     jobs: Jobs = None,
     look_ahead: LookAhead = True,
+    forms: Forms = None,
+    llm: Llm = "",
+    model: Model = "",
+    key: Key = "",
+    cassette: Tape = None,
 ) -> None:
     """Write tasks over base scenes, keep those that the oracle solves, and save them with their scenes."""
-    settings = BuildSettings(train, heldout, seed, scene_ids(scenes), look_ahead=look_ahead)
-    _make(out, settings, jobs=jobs)
+    modelled = modelled_names(forms or [])
+    if (llm or cassette) and not modelled:
+        fail("--llm and --cassette are for layout agents here: say which, as --agent room-organizer=llm")
+    settings = BuildSettings(
+        train, heldout, seed, scene_ids(scenes), look_ahead=look_ahead, modelled=tuple(sorted(modelled))
+    )
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(mended(out))
+        layout = _layout(stack, modelled, llm, model, key, cassette)
+        _make(out, settings, jobs=jobs, layout=layout)
 
 
 @app.command()
@@ -90,15 +115,16 @@ def generate(
     scenes: Scenes = None,
     jobs: Jobs = None,
     look_ahead: LookAhead = True,
+    forms: Forms = None,
     llm: Annotated[
-        str, typer.Option(help="Base URL of an OpenAI-compatible endpoint, such as http://127.0.0.1:8000/v1.")
+        str,
+        typer.Option(
+            help="Base URL of an OpenAI-compatible endpoint, such as http://127.0.0.1:8000/v1: the social agents are its model."
+        ),
     ] = "",
-    model: Annotated[str, typer.Option(help="Name of the model there.")] = "",
-    key: Annotated[str, typer.Option("--llm-key", envvar="EMBOMATRIX_LLM_KEY", help="Its key.")] = "",
-    cassette: Annotated[
-        Path | None,
-        typer.Option(help="File of recorded answers: read where it has them, added to where not."),
-    ] = None,
+    model: Model = "",
+    key: Key = "",
+    cassette: Tape = None,
     price: Annotated[
         tuple[float, float], typer.Option(help="Of a million tokens, in and out, for the account.")
     ] = (0.0, 0.0),
@@ -114,20 +140,36 @@ def generate(
     kind = WriterKind.MODEL if llm or cassette is not None else WriterKind.SOCIAL
     if llm and not model:
         fail("--llm needs the name of a model there: give --model")
-    settings = BuildSettings(tasks, heldout, seed, names, kind, look_ahead)
+    modelled = modelled_names(forms or [])
+    settings = BuildSettings(tasks, heldout, seed, names, kind, look_ahead, tuple(sorted(modelled)))
     with contextlib.ExitStack() as stack:
         stack.enter_context(mended(out))
         check: Check | None = None
         if manager:
             trusted = ca.read_bytes() if ca is not None else b""
             check = stack.enter_context(ClusterJudge(manager, token, trusted)).check
+        layout = _layout(stack, modelled, llm, model, key, cassette)
         if kind is WriterKind.SOCIAL:
-            _make(out, settings, jobs=jobs, check=check)
+            _make(out, settings, jobs=jobs, check=check, layout=layout)
             return
         asked = Asked(llm, model, key, cassette, Price(*price), out / "ledger.jsonl")
         writer, ledger = stack.enter_context(asked_writer(asked))
-        _make(out, settings, writer, check=check)
+        _make(out, settings, writer, check=check, layout=layout)
         _print_account(ledger)
+
+
+def _layout(
+    stack: contextlib.ExitStack,
+    names: frozenset[AgentName],
+    url: str,
+    model: str,
+    key: str,
+    cassette: Path | None,
+) -> LayoutAgents | None:
+    """Layout agents of which these are a language model; None where all are rules."""
+    if not names:
+        return None
+    return stack.enter_context(modelled_agents(url, model, key, cassette)).agents(names)
 
 
 def _print_account(ledger: Ledger) -> None:
@@ -151,6 +193,7 @@ def _make(
     writer: TaskWriter | None = None,
     jobs: int | None = None,
     check: Check | None = None,
+    layout: LayoutAgents | None = None,
 ) -> None:
     """A data set in the folder, with progress and a summary."""
     console = Console()
@@ -167,6 +210,7 @@ def _make(
             writer,
             jobs or min(MOST_JOBS, len(os.sched_getaffinity(0))),
             check,
+            layout,
         )
         for split, bar in tasks.items():
             bars.update(bar, completed=summary.total(split))

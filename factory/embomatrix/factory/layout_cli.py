@@ -36,6 +36,10 @@ if TYPE_CHECKING:
     from embomatrix.llm.values import ChatModel
 
 METHODS = ("tree", "random", "poses")
+Forms = Annotated[
+    list[str] | None,
+    typer.Option("--agent", help="Layout agent, NAME=llm or NAME=rules; give it again for more."),
+]
 Llm = Annotated[
     str, typer.Option(help="Base URL of an OpenAI-compatible endpoint for agents that are models.")
 ]
@@ -76,7 +80,7 @@ def agent(
             _fail(
                 f"{name} has no form with a language model: leave out --llm; {', '.join(sorted(MODELLED))} have one"
             )
-        with _modelled(llm, model, key, cassette) as agents:
+        with modelled_agents(llm, model, key, cassette) as agents:
             answers: dict[AgentName, Callable[[Any], Any]] = {
                 AgentName.DISTRIBUTOR: agents.distribute,
                 AgentName.ORGANIZER: lambda value: tuple(agents.organize(value).branches()),
@@ -92,9 +96,7 @@ def lay(
     method: Annotated[
         str, typer.Option(help="tree, or one that it is compared with: random, poses.")
     ] = "tree",
-    forms: Annotated[
-        list[str] | None, typer.Option("--agent", help="NAME=llm or NAME=rules; give it again for more.")
-    ] = None,
+    forms: Forms = None,
     seed: Annotated[int, typer.Option(min=0, help="Equal seeds give equal scenes.")] = 0,
     out: Annotated[
         Path | None, typer.Option(help="Folder for the plan's picture and for what each agent was told.")
@@ -105,7 +107,7 @@ def lay(
     cassette: Tape = None,
 ) -> None:
     """Lay one task out in a base scene and show its trees; nothing is executed."""
-    modelled = _modelled_agents(forms or [])
+    names = modelled_names(forms or [])
     if method not in METHODS:
         _fail(f"there is no method {method!r}: expected one of {', '.join(METHODS)}")
     if (bddl is None) is (not activity):
@@ -113,8 +115,8 @@ def lay(
     with _mended(), contextlib.ExitStack() as stack:
         source = read_file(bddl) if bddl is not None else read_activity(activity)
         agents = LayoutAgents()
-        if modelled:
-            agents = stack.enter_context(_modelled(llm, model, key, cassette)).agents(modelled)
+        if names:
+            agents = stack.enter_context(modelled_agents(llm, model, key, cassette)).agents(names)
         kept: list[Layout] = []
 
         def laying(editor: SceneEditor, items: Sequence[Item], seed: int) -> Layout:
@@ -161,7 +163,7 @@ def _write_briefs(out: Path, record: Record) -> None:
         path.write_bytes(DOORS[name].brief.dump_json(brief, indent=1))
 
 
-def _modelled_agents(forms: list[str]) -> frozenset[AgentName]:
+def modelled_names(forms: list[str]) -> frozenset[AgentName]:
     """Agents that are to be a language model, of NAME=llm and NAME=rules."""
     found = set()
     for form in forms:
@@ -176,7 +178,7 @@ def _modelled_agents(forms: list[str]) -> frozenset[AgentName]:
 
 
 @contextlib.contextmanager
-def _modelled(url: str, model: str, key: str, cassette: Path | None) -> Iterator[ModelLayoutAgents]:
+def modelled_agents(url: str, model: str, key: str, cassette: Path | None) -> Iterator[ModelLayoutAgents]:
     """Agents on an endpoint, on a recording, or on both."""
     if url and not model:
         _fail("--llm needs the name of a model there: give --model")

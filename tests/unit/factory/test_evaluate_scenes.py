@@ -10,9 +10,18 @@ from embomatrix.factory.assets.library import build_asset
 from embomatrix.factory.editor import SceneEditor
 from embomatrix.factory.evaluate.figures import EvaluationError
 from embomatrix.factory.evaluate.scene_geometry import Flaw, flaws_of
-from embomatrix.factory.evaluate.scenes import LIST, Method, Outcome, evaluation_of, fixed_tasks
+from embomatrix.factory.evaluate.scene_runs import OutcomeLog, evaluate_scenes
+from embomatrix.factory.evaluate.scenes import (
+    LIST,
+    Method,
+    Outcome,
+    SceneTask,
+    evaluation_of,
+    fixed_tasks,
+)
 from embomatrix.factory.layout.generator import lay
 from embomatrix.factory.layout.jobs import Item
+from embomatrix.factory.task_import.sources import SourceText
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.geometry import Pose
 from embomatrix.world.state import Relation
@@ -89,3 +98,58 @@ def test_rates_are_shares_and_only_the_tree_has_goals() -> None:
     assert evaluation.figure("verification_pass_rate").goal == 99.0
     assert evaluation.figure("generation_rate random").goal is None
     assert "does_not_fit 1" in evaluation.notes[0]
+
+
+KNOWN = [
+    Outcome("known", "Rs_int", method, True, True, True, "", 1.0, (0.01, 0.02), 8.0) for method in Method
+]
+UNICORN = """(define (problem unicorn)
+    (:domain omnigibson)
+    (:objects unicorn.n.01_1 - unicorn.n.01 floor.n.01_1 - floor.n.01)
+    (:init (inroom floor.n.01_1 kitchen) (ontop unicorn.n.01_1 floor.n.01_1))
+    (:goal (not (ontop unicorn.n.01_1 floor.n.01_1)))
+)"""
+
+
+def test_a_run_that_was_stopped_makes_only_what_is_missing_and_keeps_it(tmp_path: "Path") -> None:
+    path = tmp_path / "outcomes.jsonl"
+    log = OutcomeLog.open(path, 0)
+    for outcome in KNOWN:
+        log.add(outcome)
+    tasks = [SceneTask(SourceText(name, UNICORN, "embomatrix"), "Rs_int") for name in ("known", "new")]
+    told: list[int] = []
+    _, outcomes = evaluate_scenes(tasks, list(Method), 0, 1, told.append, OutcomeLog.open(path, 0))
+    assert outcomes[:3] == KNOWN
+    assert [(each.task, each.method) for each in outcomes[3:]] == [("new", method) for method in Method]
+    assert all("unicorn" in each.reason for each in outcomes[3:])
+    assert told == [3, 4, 5, 6]
+    assert OutcomeLog.open(path, 0).outcomes == outcomes
+
+
+def test_a_last_line_that_was_cut_short_is_made_anew(tmp_path: "Path") -> None:
+    path = tmp_path / "outcomes.jsonl"
+    log = OutcomeLog.open(path, 0)
+    for outcome in KNOWN[:2]:
+        log.add(outcome)
+    whole = path.read_text(encoding="utf-8")
+    path.write_text(whole[:-30], encoding="utf-8")
+    taken_up = OutcomeLog.open(path, 0)
+    assert taken_up.outcomes == KNOWN[:1]
+    taken_up.add(KNOWN[1])
+    assert path.read_text(encoding="utf-8") == whole
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ('{"seed": 1}\n', r"of \{'seed': 1\}, not of seed 0: name another file"),
+        ("", "no file of outcomes"),
+        ('{"seed": 0}\n{"task": 3}\n{}\n', "line 2, is no outcome"),
+    ],
+)
+def test_outcomes_of_another_run_are_left_alone(tmp_path: "Path", content: str, message: str) -> None:
+    path = tmp_path / "outcomes.jsonl"
+    path.write_text(content, encoding="utf-8")
+    with pytest.raises(EvaluationError, match=message):
+        OutcomeLog.open(path, 0)
+    assert path.read_text(encoding="utf-8") == content

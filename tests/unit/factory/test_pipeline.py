@@ -3,13 +3,19 @@
 import json
 import shutil
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
 
 from embomatrix.factory.cli import app
+from embomatrix.factory.layout.jobs import LayoutAgents
+from embomatrix.factory.layout.organization import organize
+from embomatrix.factory.layout.tree import LayoutTree
+from embomatrix.factory.layout.values import RoomBrief
 from embomatrix.factory.pipeline.build import Summary, build_dataset, split_rooms
 from embomatrix.factory.pipeline.cluster import admitted_by
 from embomatrix.factory.pipeline.settings import BuildSettings, WriterKind
@@ -117,6 +123,47 @@ def test_build_file_without_settings_is_damaged(tmp_path: Path, content: str) ->
         BuildStore.open(tmp_path, {"seed": 2})
 
 
+def test_every_task_has_its_layout_tree_and_the_page_shows_it(
+    folder: Path, dataset: Dataset, tmp_path: Path
+) -> None:
+    for record in dataset.records:
+        tree = json.loads((folder / "trees" / f"{record.task.task_id}.json").read_text(encoding="utf-8"))
+        assert set(tree) <= set(record.rooms)
+        known = dataset.bundle(record.bundle_digest).scene.by_name
+        assert _things_in(tree.values()) <= set(known)
+    told = next(record for record in dataset.records if "ontop" in record.signature).task
+    page = tmp_path / "task.html"
+    code, _ = run("inspect", told.task_id, "--dataset", str(folder), "--out", str(page), "--no-picture")
+    assert code == 0
+    assert 'id="layout-tree"' in page.read_text(encoding="utf-8")
+
+
+def _things_in(nodes: Iterable[dict[str, dict[str, Any]]]) -> set[str]:
+    """Names of the objects below some nodes; relations stand between them."""
+    found: set[str] = set()
+    for node in nodes:
+        for things in node.values():
+            found |= set(things) | _things_in(things.values())
+    return found
+
+
+def test_who_lays_things_out_is_chosen_and_is_part_of_the_settings(tmp_path: Path) -> None:
+    settings = BuildSettings(
+        train=1, heldout=0, seed=4, scenes=("Rs_int",), look_ahead=False, modelled=("room-organizer",)
+    )
+    asked: list[str] = []
+
+    def organizer(brief: RoomBrief) -> LayoutTree:
+        asked.append(brief.room.name)
+        return organize(brief)
+
+    build_dataset(tmp_path, settings, layout=LayoutAgents(organize=organizer))
+    assert set(asked) <= {room.name for room in build_base_scene("Rs_int", seed=4).rooms}
+    assert asked
+    with pytest.raises(DatasetError, match=r"modelled \['room-organizer'\], now \[\]"):
+        BuildStore.open(tmp_path, asdict(replace(settings, modelled=())))
+
+
 def test_the_ledger_has_a_line_for_every_attempt_and_its_reason(folder: Path, summary: Summary) -> None:
     lines = [json.loads(line) for line in (folder / "attempts.jsonl").read_text().splitlines()]
     outcomes = Counter(line["outcome"] for line in lines)
@@ -220,6 +267,13 @@ def test_bad_bddl_is_one_sentence_and_exit_2(tmp_path: Path, old: str, new: str,
         (["list", "OUT/none"], "no dataset"),
         (["generate", "--out", "OUT/a", "--llm", "http://127.0.0.1:9/v1"], "needs the name of a model"),
         (["generate", "--out", "OUT/a", "--cassette", "OUT/none.jsonl"], "record one first"),
+        (["build", "--out", "OUT/a", "--agent", "room-organiser=llm"], "NAME one of scene-distributor"),
+        (
+            ["build", "--out", "OUT/a", "--cassette", "OUT/a.jsonl"],
+            "say which, as --agent room-organizer=llm",
+        ),
+        (["build", "--out", "OUT/a", "--agent", "object-sampler=llm"], "no form with a language model"),
+        (["build", "--out", "OUT/a", "--agent", "room-organizer=llm"], "give --llm URL and --model NAME"),
     ],
 )
 def test_unknown_names_are_one_sentence_and_exit_2(

@@ -24,7 +24,7 @@ from embomatrix.factory.evaluate.figures import (
 from embomatrix.factory.evaluate.judge import judged
 from embomatrix.factory.evaluate.measure import evaluate_aesthetics, evaluate_tasks, written_for
 from embomatrix.factory.evaluate.page import with_factory
-from embomatrix.factory.evaluate.scene_runs import evaluate_scenes
+from embomatrix.factory.evaluate.scene_runs import OutcomeLog, evaluate_scenes
 from embomatrix.factory.evaluate.scenes import Method, fixed_tasks
 from embomatrix.factory.evaluate.tasks import panel, people_of
 from embomatrix.factory.pipeline.corpus import training_scenes
@@ -106,21 +106,23 @@ def scenes(
     jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
     json_file: JsonFile = None,
     outcomes: Annotated[
-        Path | None, typer.Option(help="File for what came of each task, JSON lines.")
+        Path | None,
+        typer.Option(
+            help="File for what came of each task, JSON lines, written as it comes: with it a run that was stopped goes on."
+        ),
     ] = None,
 ) -> None:
     """Generation rate, verification pass rate and time of 140 fixed tasks, by layout tree and by two simpler ways."""
-    with mended():
+    kept = "; what was found is kept, and the same command goes on from there" if outcomes is not None else ""
+    with mended(outcomes, kept):
         chosen = fixed_tasks(sample)[::only]
+        told = methods or list(Method)
+        log = OutcomeLog.open(outcomes, seed) if outcomes is not None else None
         with progress(Console(stderr=True)) as bars:
-            bar = bars.add_task("tasks", total=len(chosen))
-            told = methods or list(Method)
-            evaluation, found = evaluate_scenes(
-                chosen, told, seed, jobs, lambda done: bars.update(bar, completed=done)
+            bar = bars.add_task("trials", total=len(chosen) * len(told))
+            evaluation, _ = evaluate_scenes(
+                chosen, told, seed, jobs, lambda done: bars.update(bar, completed=done), log
             )
-        if outcomes is not None:
-            with mended(outcomes):
-                write_whole(outcomes, "".join(json.dumps(asdict(each)) + "\n" for each in found).encode())
         _hand_in(evaluation, json_file)
 
 

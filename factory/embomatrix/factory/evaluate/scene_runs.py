@@ -1,21 +1,78 @@
-"""Runs of the scene evaluation: scene after scene, in this process or in several."""
+"""Runs of the scene evaluation: scene after scene, in this process or in several; stopped at any time and taken up again."""
 
 from __future__ import annotations
 
 import contextlib
+import json
 import multiprocessing
 from collections import defaultdict
 from concurrent.futures import ProcessPoolExecutor
-from typing import TYPE_CHECKING
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Any
 
+from embomatrix.factory.evaluate.figures import EvaluationError
 from embomatrix.factory.evaluate.scenes import Method, Outcome, SceneTask, evaluation_of, judge
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.sim.pose_cache import PlacementLibrary
+from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
+    from pathlib import Path
 
     from embomatrix.factory.evaluate.figures import Evaluation
+
+    Trial = tuple[SceneTask, Method]
+
+
+@dataclass
+class OutcomeLog:
+    """Outcomes as they come, on disk: the seed in the first line, an outcome in each other. Without a path, in memory alone."""
+
+    path: Path | None = None
+    outcomes: list[Outcome] = field(default_factory=list)
+
+    @staticmethod
+    def open(path: Path, seed: int) -> OutcomeLog:
+        """Start a log or take one up. A last line that was cut short is dropped. Raises EvaluationError, OSError."""
+        if not path.exists():
+            write_whole(path, (json.dumps({"seed": seed}) + "\n").encode())
+        lines = path.read_text(encoding="utf-8").splitlines()
+        found = _settings(path, lines[:1])
+        if found != {"seed": seed}:
+            raise EvaluationError(f"{path} holds outcomes of {found}, not of seed {seed}: name another file")
+        outcomes: list[Outcome] = []
+        for number, line in enumerate(lines[1:], start=2):
+            try:
+                outcomes.append(_outcome(json.loads(line)))
+            except (ValueError, TypeError, KeyError) as error:
+                if number != len(lines):
+                    raise EvaluationError(
+                        f"{path}, line {number}, is no outcome ({error}): remove the line"
+                    ) from error
+                write_whole(path, "".join(f"{kept}\n" for kept in lines[:-1]).encode())
+        return OutcomeLog(path, outcomes)
+
+    def add(self, outcome: Outcome) -> None:
+        """Keep an outcome. Raises OSError."""
+        if self.path is not None:
+            with self.path.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(asdict(outcome)) + "\n")
+        self.outcomes.append(outcome)
+
+
+def _settings(path: Path, first: Sequence[str]) -> Any:
+    try:
+        return json.loads(first[0])
+    except (ValueError, IndexError) as error:
+        raise EvaluationError(
+            f"{path} is no file of outcomes: expected the seed in its first line; name another file"
+        ) from error
+
+
+def _outcome(value: dict[str, Any]) -> Outcome:
+    told = {**value, "method": Method(value["method"]), "planar_s": tuple(value["planar_s"])}
+    return Outcome(**told)
 
 
 def evaluate_scenes(
@@ -24,27 +81,29 @@ def evaluate_scenes(
     seed: int,
     jobs: int,
     progress: Callable[[int], None] = lambda _done: None,
+    log: OutcomeLog | None = None,
 ) -> tuple[Evaluation, list[Outcome]]:
-    """Every task by every method; ``progress`` hears of the tasks that are done. Equal arguments, equal outcomes."""
-    by_scene: defaultdict[str, list[SceneTask]] = defaultdict(list)
-    for task in tasks:
-        by_scene[task.scene].append(task)
-    groups = [(group, tuple(methods), seed) for group in by_scene.values()]
-    outcomes: list[Outcome] = []
-    done = 0
+    """Every task by every method; ``progress`` hears how many trials are done. Equal arguments, equal outcomes.
+
+    Trials that the ``log`` holds are not made again; the others are added to it as they come.
+    """
+    log = log if log is not None else OutcomeLog()
+    trials = [(task, method) for task in tasks for method in methods]
+    known = {(each.task, each.scene, each.method) for each in log.outcomes}
+    by_scene: defaultdict[str, list[Trial]] = defaultdict(list)
+    for task, method in trials:
+        if (task.source.name, task.scene, method) not in known:
+            by_scene[task.scene].append((task, method))
+    progress(len(trials) - sum(map(len, by_scene.values())))
     with contextlib.ExitStack() as stack:
-        if jobs == 1:
-            made: Iterator[list[Outcome]] = map(_judged, groups)
-        else:
-            spawn = multiprocessing.get_context("spawn")
-            made = stack.enter_context(ProcessPoolExecutor(jobs, spawn)).map(_judged, groups)
-        for (group, _, _), found in zip(groups, made, strict=True):
-            outcomes += found
-            done += len(group)
-            progress(done)
+        for outcome in _made([(group, seed) for group in by_scene.values()], jobs, stack):
+            log.add(outcome)
+            progress(len(log.outcomes))
+    found = {(each.task, each.scene, each.method): each for each in log.outcomes}
+    outcomes = [found[task.source.name, task.scene, method] for task, method in trials]
     conditions = {
         "tasks": len(tasks),
-        "base scenes": len(by_scene),
+        "base scenes": len({task.scene for task in tasks}),
         "seed": seed,
         "methods": ", ".join(methods),
         "time": "CPU seconds of one task from BDDL text to scene, base scene built before, execution after",
@@ -52,8 +111,27 @@ def evaluate_scenes(
     return evaluation_of(outcomes, conditions), outcomes
 
 
-def _judged(order: tuple[Sequence[SceneTask], Sequence[Method], int]) -> list[Outcome]:
-    tasks, methods, seed = order
-    base = build_base_scene(tasks[0].scene)
+def _made(
+    orders: Sequence[tuple[Sequence[Trial], int]], jobs: int, stack: contextlib.ExitStack
+) -> Iterator[Outcome]:
+    """Outcomes, one by one in this process, scene by scene from several."""
+    if jobs == 1:
+        for order in orders:
+            yield from _judged(order)
+        return
+    spawn = multiprocessing.get_context("spawn")
+    pool = stack.enter_context(ProcessPoolExecutor(jobs, spawn))
+    for group in pool.map(_all_judged, orders):
+        yield from group
+
+
+def _all_judged(order: tuple[Sequence[Trial], int]) -> list[Outcome]:
+    return list(_judged(order))
+
+
+def _judged(order: tuple[Sequence[Trial], int]) -> Iterator[Outcome]:
+    trials, seed = order
+    base = build_base_scene(trials[0][0].scene)
     with contextlib.closing(PlacementLibrary()) as library:
-        return [judge(task, method, base, library, seed=seed) for task in tasks for method in methods]
+        for task, method in trials:
+            yield judge(task, method, base, library, seed=seed)

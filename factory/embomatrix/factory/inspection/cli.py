@@ -12,7 +12,7 @@ from rich.console import Console
 
 from embomatrix.factory.inspection.page import scene_jpeg, scene_picture, task_page
 from embomatrix.factory.inspection.playing import play_oracle
-from embomatrix.factory.pipeline.store import TRANSCRIPTS_FOLDER
+from embomatrix.factory.pipeline.store import TRANSCRIPTS_FOLDER, TREES_FOLDER
 from embomatrix.factory.terminal import mended, progress
 from embomatrix.world.dataset import Dataset, DatasetError, bundle_file
 from embomatrix.world.whole_file import check_writable, write_whole
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 PICTURES_FOLDER = "pictures"
 CARD_PX = (720, 540)
-TREES_FOLDER = "trees"
-"""Of a dataset whose scenes were laid out by tree: JSON by task."""
 
 
 @app.command()

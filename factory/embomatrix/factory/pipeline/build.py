@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
+    from embomatrix.factory.layout.jobs import LayoutAgents
     from embomatrix.factory.pipeline.makers import Make
     from embomatrix.factory.pipeline.settings import BuildSettings
     from embomatrix.factory.writer.tasks import TaskWriter
@@ -96,12 +97,14 @@ def build_dataset(
     writer: TaskWriter | None = None,
     jobs: int = 1,
     check: Check | None = None,
+    layout: LayoutAgents | None = None,
 ) -> Summary:
     """Write a data set, or go on with one that was cut short. ``progress`` hears of each split's admitted tasks.
 
     ``check`` is a second judge, who leaves of each variant what is to be kept: a cluster, say.
 
-    ``writer`` stands in for the one that the settings name, in this process; ``jobs`` is the number of processes otherwise.
+    ``writer`` stands in for the one that the settings name, ``layout`` for layout agents that are rules, in this process;
+    ``jobs`` is the number of processes otherwise.
     Raises CatalogError for an unknown scene, DatasetError when the folder holds a build of other settings, or when a
     process dies.
     """
@@ -117,7 +120,7 @@ def build_dataset(
             while orders := filler.round():
                 progress(split, filler.admitted)
                 if make is None:
-                    make = stack.enter_context(makers(settings, writer, jobs))
+                    make = stack.enter_context(makers(settings, writer, layout, jobs))
                 for made in make(orders):
                     filler.take(made if check is None else check(made))
                     progress(split, filler.admitted)
@@ -184,7 +187,10 @@ class _SplitFiller:
                 kept.append(record)
         names = {record.task.task_id for record in kept}
         transcripts = {name: text for name, text in made.transcripts.items() if name in names}
-        self._store.add(dataclasses.replace(made.result, records=tuple(kept)), made.bundle, transcripts)
+        trees = {name: tree for name, tree in made.trees.items() if name in names}
+        self._store.add(
+            dataclasses.replace(made.result, records=tuple(kept)), made.bundle, transcripts, trees
+        )
 
     def _missing(self, before: int) -> dict[TaskCategory, int]:
         """How many tasks of each category the variants before this number leave to be made."""

@@ -15,6 +15,7 @@ from embomatrix.world.dataset import DatasetError
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
+    from embomatrix.factory.layout.jobs import LayoutAgents
     from embomatrix.factory.pipeline.settings import BuildSettings
     from embomatrix.factory.writer.tasks import TaskWriter
 
@@ -23,10 +24,12 @@ if TYPE_CHECKING:
 
 
 @contextlib.contextmanager
-def makers(settings: BuildSettings, writer: TaskWriter | None, jobs: int) -> Iterator[Make]:
-    """For as long as this is held. A ``writer`` works in this process alone: it may hold a connection."""
-    if writer is not None or jobs == 1:
-        with contextlib.closing(VariantMaker(settings, writer)) as maker:
+def makers(
+    settings: BuildSettings, writer: TaskWriter | None, layout: LayoutAgents | None, jobs: int
+) -> Iterator[Make]:
+    """For as long as this is held. ``writer`` and ``layout`` work in this process alone: they may hold a connection."""
+    if writer is not None or layout is not None or jobs == 1:
+        with contextlib.closing(VariantMaker(settings, writer, layout)) as maker:
             yield lambda orders: map(maker.make, orders)
         return
     pool = ProcessPoolExecutor(

@@ -30,6 +30,8 @@ class BuildSettings:
     writer: WriterKind = WriterKind.PLAIN
     look_ahead: bool = True
     """Whether to find out what the arm can do in each variant: about 12 s of CPU for one."""
+    modelled: tuple[str, ...] = ()
+    """Layout agents that are a language model, by name."""
 
 
 EVERY_SCENE: Final = "all"

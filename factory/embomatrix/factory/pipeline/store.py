@@ -25,6 +25,8 @@ BUILD_FILE: Final = "build.jsonl"
 ATTEMPTS_FILE: Final = "attempts.jsonl"
 """The ledger: a line for every draft that was judged, with the reason where it was not admitted."""
 TRANSCRIPTS_FOLDER: Final = "transcripts"
+TREES_FOLDER: Final = "trees"
+"""Layout trees as nested JSON, a file for each task."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,15 +92,23 @@ class BuildStore:
     def records_of(self, split: str) -> list[TaskRecord]:
         return [record for result in self.results if result.split == split for record in result.records]
 
-    def add(self, result: VariantResult, bundle: bytes, transcripts: Mapping[str, str]) -> None:
-        """Keep a variant's result. Bundle and transcripts go first: a line in the file means that they are there."""
+    def add(
+        self,
+        result: VariantResult,
+        bundle: bytes,
+        transcripts: Mapping[str, str],
+        trees: Mapping[str, Mapping[str, Any]],
+    ) -> None:
+        """Keep a variant's result. What goes into files of its own is written first: a line means that it is there."""
         if result.records:
             path = self.folder / BUNDLES_FOLDER / bundle_file(result.records[0].bundle_digest)
             write_whole(path, bundle)
-        if transcripts:
-            (self.folder / TRANSCRIPTS_FOLDER).mkdir(exist_ok=True)
-        for task_id, text in transcripts.items():
-            write_whole(self.folder / TRANSCRIPTS_FOLDER / f"{task_id}.md", text.encode("utf-8"))
+        drawn = {task_id: json.dumps(tree, indent=1) + "\n" for task_id, tree in trees.items() if tree}
+        for name, suffix, texts in ((TRANSCRIPTS_FOLDER, "md", transcripts), (TREES_FOLDER, "json", drawn)):
+            if texts:
+                (self.folder / name).mkdir(exist_ok=True)
+            for task_id, text in texts.items():
+                write_whole(self.folder / name / f"{task_id}.{suffix}", text.encode("utf-8"))
         with (self.folder / BUILD_FILE).open("a", encoding="utf-8") as file:
             file.write(json.dumps(_to_json(result)) + "\n")
         self.results.append(result)

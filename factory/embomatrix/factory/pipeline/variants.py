@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import zlib
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -33,6 +33,7 @@ from embomatrix.world.task import TaskCategory
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from embomatrix.factory.layout.jobs import LayoutAgents
     from embomatrix.factory.pipeline.settings import BuildSettings
     from embomatrix.factory.writer.tasks import Draft, TaskWriter
     from embomatrix.skills.syntax import Plan
@@ -62,25 +63,32 @@ class VariantOrder:
 
 @dataclass(frozen=True, slots=True)
 class VariantYield:
-    """What came of it: records, the bundle that they run in, and transcripts by task id."""
+    """What came of it: records, the bundle that they run in, and transcripts and layout trees by task id."""
 
     result: VariantResult
     bundle: bytes
     transcripts: Mapping[str, str]
+    trees: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
 
 class VariantMaker:
     """Makes variants in this process; what one finds out about furniture and places serves the next ones.
 
-    ``writer`` stands in for the one that the settings name; with a language model only it can be given. Each answer follows
-    from settings and order alone. Close it after use.
+    ``writer`` stands in for the one that the settings name, ``layout`` for agents that are rules; with a language model only
+    they can be given. Each answer follows from settings and order alone. Close it after use.
     """
 
-    def __init__(self, settings: BuildSettings, writer: TaskWriter | None = None) -> None:
+    def __init__(
+        self,
+        settings: BuildSettings,
+        writer: TaskWriter | None = None,
+        layout: LayoutAgents | None = None,
+    ) -> None:
         if writer is None:
             writer = SocialWriter(settings.seed) if settings.writer is WriterKind.SOCIAL else PlainWriter()
         foresight = Foresight() if settings.look_ahead else None
         self._bench = _Workbench(settings, writer, PlacementLibrary(), foresight)
+        self._layout = layout
         self._bases: dict[str, Scene] = {}
 
     def make(self, order: VariantOrder) -> VariantYield:
@@ -93,7 +101,9 @@ class VariantMaker:
             np.random.SeedSequence((seed, zlib.crc32(order.split.encode()), order.number))
         )
         focus = _focus(base, order.rooms, order.missing, rng)
-        variant = build_variant(base, focus, f"{base.base}-{order.split}-{order.number:03d}", rng)
+        variant = build_variant(
+            base, focus, f"{base.base}-{order.split}-{order.number:03d}", rng, self._layout
+        )
         return _VariantJob(variant, order, self._bench).run(rng)
 
     def close(self) -> None:
@@ -158,7 +168,7 @@ class _VariantJob:
                     left[draft.task.category] -= 1
             tasks = {draft.task.task_id: draft.task for draft, _ in self._admitted}
             data = encode_bundle(prepare(Bundle(scene, tasks, poses), stage.world))
-        return VariantYield(self._result(bundle_digest(data)), data, self._transcripts())
+        return VariantYield(self._result(bundle_digest(data)), data, self._transcripts(), self._trees())
 
     def _write(
         self, missing: Mapping[TaskCategory, int], view: SceneView, rng: np.random.Generator
@@ -180,6 +190,19 @@ class _VariantJob:
     def _transcripts(self) -> dict[str, str]:
         """Of the admitted tasks that somebody talked about, by task id."""
         return {draft.task.task_id: draft.transcript for draft, _ in self._admitted if draft.transcript}
+
+    def _trees(self) -> dict[str, Mapping[str, Any]]:
+        """How what was added in the rooms of an admitted task hangs together, by task id."""
+        trees = self._variant.trees
+        return {
+            draft.task.task_id: {
+                name: node
+                for room in draft.rooms
+                if room in trees
+                for name, node in trees[room].nested().items()
+            }
+            for draft, _ in self._admitted
+        }
 
     def _is_new(self, draft: Draft) -> bool:
         """Whether the goal's kind belongs to this split, and nothing like it was asked for in these words."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.editor import SceneEditor
@@ -16,11 +16,12 @@ from embomatrix.world.catalog import Catalog
 from embomatrix.world.state import State
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     import numpy as np
 
     from embomatrix.factory.layout.jobs import LayoutAgents
+    from embomatrix.factory.layout.tree import LayoutTree
     from embomatrix.world.scene import Scene
 
 THINGS: Final = 12
@@ -34,11 +35,15 @@ ON_SHARE: Final = 0.3
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """A scene to write tasks in. ``rooms`` are those that the tasks may use; ``added`` the small things in them."""
+    """A scene to write tasks in. ``rooms`` are those that the tasks may use; ``added`` the small things in them.
+
+    ``trees`` tell by room how what was added hangs together.
+    """
 
     scene: Scene
     rooms: tuple[str, ...]
     added: tuple[str, ...]
+    trees: Mapping[str, LayoutTree] = field(default_factory=dict)
 
 
 def build_variant(
@@ -58,7 +63,8 @@ def build_variant(
             editor.remove(name)
     _set_doors_and_lights(editor, view, rooms, rng)
     added = tuple(layout.names[item.name] for item in items if layout.names.get(item.name) in editor.objects)
-    return Variant(editor.freeze(scene_id), tuple(rooms), added)
+    trees = {room: tree.pruned(added) for room, tree in layout.trees.items()}
+    return Variant(editor.freeze(scene_id), tuple(rooms), added, trees)
 
 
 def _is_in_its_place(editor: SceneEditor, name: str) -> bool:
