@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
+
+_DIGITS: Final = 3
+_MOST_DIGITS: Final = 6
 
 
 class Better(StrEnum):
@@ -43,7 +47,12 @@ class Figure:
             return ""
         if self.is_reached:
             return "reached"
-        return f"{self.value / self.goal:.3g} × the goal" if self.goal else "missed"
+        return f"{shown(self.value / self.goal, other_than=1.0)} × the goal" if self.goal else "missed"
+
+    @property
+    def told(self) -> str:
+        """The value for a person: a goal that is missed by little is not rounded to."""
+        return shown(self.value, other_than=None if self.is_reached else self.goal)
 
     @property
     def bound(self) -> str:
@@ -53,9 +62,18 @@ class Figure:
         return f"{'≤' if self.better is Better.LOWER else '≥'} {shown(self.goal)}"
 
 
-def shown(value: float) -> str:
-    """Three digits, or all of them left of the point."""
-    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+def shown(value: float, *, other_than: float | None = None) -> str:
+    """Three digits, or all of them left of the point; up to three more where it would read like ``other_than``."""
+    for digits in range(_DIGITS, _MOST_DIGITS):
+        text = _rounded(value, digits)
+        if other_than is None or text != _rounded(other_than, digits):
+            return text
+    return _rounded(value, _MOST_DIGITS)
+
+
+def _rounded(value: float, digits: int) -> str:
+    whole = len(f"{abs(value):.0f}")
+    return f"{value:,.{max(0, digits - whole)}f}" if whole > _DIGITS else f"{value:.{digits}g}"
 
 
 def figure_to_json(figure: Figure) -> dict[str, Any]:

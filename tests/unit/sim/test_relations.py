@@ -1,6 +1,7 @@
 """Relations: each definition at its tolerance, and who moves along with whom."""
 
 import dataclasses
+import math
 
 import pytest
 from hypothesis import given, settings
@@ -12,7 +13,7 @@ from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.footing import Enclosure, Host
 from embomatrix.sim.relations import Relations
-from embomatrix.sim.spots import is_shut, surface_under
+from embomatrix.sim.spots import EDGE_M, REST_M, is_shut, surface_under
 from embomatrix.world.asset import Interior
 from embomatrix.world.geometry import Aabb, Pose
 from embomatrix.world.state import Relation
@@ -73,6 +74,24 @@ def test_underside_within_a_centimetre_rests(engine, relations, lift_m, rests) -
 def test_centre_past_the_edge_does_not_rest(engine, relations, past_edge_m, rests) -> None:
     engine.set_pose("apple_1", Pose((2.4 + past_edge_m, 1.3, TABLE_M + APPLE_M)))
     assert relations.ontop("apple_1", "breakfast_table_1") is rests
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.floats(-3.1, 3.1), st.floats(0.0, 4.0), st.floats(0.0, 2.0))
+def test_moving_a_thing_away_ends_ontop_and_moving_it_back_restores_it(engine, yaw, away_m, up_m) -> None:
+    relations = Relations(engine)
+    table = engine.aabb("breakfast_table_1")
+    low, high = table.low_m, table.high_m
+    x, y = 2.0 + away_m * math.cos(yaw), 1.3 + away_m * math.sin(yaw)
+    over = all(a <= b <= c for a, b, c in zip(low[:2], (x, y), high[:2], strict=True))
+    off = any(b < a - EDGE_M or b > c + EDGE_M for a, b, c in zip(low[:2], (x, y), high[:2], strict=True))
+    engine.set_pose("apple_1", Pose((x, y, TABLE_M + APPLE_M + up_m)))
+    if off or up_m > REST_M + 1e-6:
+        assert not relations.ontop("apple_1", "breakfast_table_1")
+    elif over and up_m < REST_M - 1e-6:
+        assert relations.ontop("apple_1", "breakfast_table_1")
+    engine.set_pose("apple_1", Pose((2.0, 1.3, TABLE_M + APPLE_M)))
+    assert relations.ontop("apple_1", "breakfast_table_1")
 
 
 def test_thing_on_the_floor_below_the_board_is_under_the_table(engine, relations) -> None:

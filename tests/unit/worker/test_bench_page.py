@@ -40,6 +40,7 @@ def test_the_least_speed_up_is_taken_from_the_figures_of_the_two_modes(tmp_path)
         (9.0, 5.0, Better.LOWER, "1.8 × the goal"),
         (600.0, 500.0, Better.HIGHER, "reached"),
         (250.0, 500.0, Better.HIGHER, "0.5 × the goal"),
+        (0.9896, 0.99, Better.HIGHER, "0.9996 × the goal"),
         (1.0, 0.0, Better.LOWER, "missed"),
         (4.0, None, Better.LOWER, ""),
     ],
@@ -58,7 +59,15 @@ def test_quantiles_are_told_in_their_unit_and_nothing_measured_is_an_error():
 
 
 def test_numbers_are_short_where_people_read_them_and_exact_enough_in_files():
-    assert [shown(value) for value in (0.01234, 12.345, 1234.5)] == ["0.0123", "12.3", "1,234"]
+    assert [shown(value) for value in (0.01234, 12.345, 1234.5, 999.7)] == [
+        "0.0123",
+        "12.3",
+        "1,234",
+        "1,000",
+    ]
+    assert Figure("x", 0.98964, "share", Better.HIGHER, 3, 0.99).told == "0.9896"
+    assert Figure("x", 0.99036, "share", Better.HIGHER, 3, 0.99).told == "0.99"
+    assert Figure("x", 1000.3, "ms", Better.LOWER, 3, 1000.0).told == "1,000.3"
     written = result_to_json(_result(Figure("x", 1.23456789, "ms", Better.LOWER, 3)))
     assert written["figures"] == [
         {"name": "x", "value": 1.23457, "unit": "ms", "goal": None, "better": "lower", "n": 3}

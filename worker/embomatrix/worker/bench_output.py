@@ -41,9 +41,7 @@ def hand_in(result: BenchResult, json_file: Path | None) -> None:
     table.add_column("n", justify="right")
     for figure in result.figures:
         goal = "" if figure.goal is None else shown(figure.goal)
-        table.add_row(
-            figure.name, f"{shown(figure.value)} {figure.unit}", goal, figure.verdict, f"{figure.n:,}"
-        )
+        table.add_row(figure.name, f"{figure.told} {figure.unit}", goal, figure.verdict, f"{figure.n:,}")
     console.print(table)
     if is_shared(result.machine):
         console.print("The machine was busy before the bench began: the figures are worse than they need be.")

@@ -6,7 +6,6 @@ import re
 import textwrap
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.pages.figures import shown
 from embomatrix.worker.bench_ablation_page import EXPLANATION, ablation_lines
 from embomatrix.worker.bench_figures import BenchError, is_shared
 from embomatrix.worker.bench_peers_page import CONTEST, PREFIX, contest_lines
@@ -168,7 +167,7 @@ def _table(figures: Sequence[Figure]) -> list[str]:
     lines = ["| figure | value | goal | | n |", "| --- | ---: | ---: | --- | ---: |"]
     for figure in figures:
         lines.append(
-            f"| {_cell(figure.name)} | {shown(figure.value)} {figure.unit} | {figure.bound} | {figure.verdict} | {figure.n:,} |"
+            f"| {_cell(figure.name)} | {figure.told} {figure.unit} | {figure.bound} | {figure.verdict} | {figure.n:,} |"
         )
     short = [figure.name for figure in figures if figure.verdict not in ("", "reached")]
     goals = sum(figure.goal is not None for figure in figures)
