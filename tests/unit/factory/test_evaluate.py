@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from embomatrix.factory.cli import app
+from embomatrix.factory.evaluate.admissions import admitted_share
 from embomatrix.factory.evaluate.aesthetics import Calibration, auc, features_of, fit, score_room
 from embomatrix.factory.evaluate.drafts import Asked, asked_in
 from embomatrix.factory.evaluate.figures import (
@@ -226,6 +227,17 @@ def test_a_page_with_half_a_part_is_left_alone():
         with_factory("", [EVALUATION, EVALUATION])
     with pytest.raises(EvaluationError, match="there is no part 'x'"):
         with_factory("", [dataclasses.replace(EVALUATION, part="x")])
+
+
+def test_the_ledger_tells_how_many_drafts_were_admitted(tmp_path):
+    assert admitted_share(tmp_path) == ()
+    ledger = tmp_path / "attempts.jsonl"
+    ledger.write_text("".join(json.dumps({"outcome": told}) + "\n" for told in ("admitted", "no_plan") * 2))
+    (figure,) = admitted_share(tmp_path)
+    assert (figure.value, figure.n, figure.is_reached) == (50.0, 4, False)
+    ledger.write_text('{"outcome": "admitted"}\n{"outc')
+    with pytest.raises(EvaluationError, match="can't be read as a ledger"):
+        admitted_share(tmp_path)
 
 
 def test_a_judge_gives_points_of_ten():

@@ -14,6 +14,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from embomatrix.factory.evaluate.admissions import admitted_share
 from embomatrix.factory.evaluate.drafts import asked_of
 from embomatrix.factory.evaluate.figures import (
     Evaluation,
@@ -160,7 +161,7 @@ def _of_dataset(folder: Path, each: int) -> tuple[Mapping[str, Sequence[Asked]],
     groups = asked_of(Dataset.load(folder).records, each)
     if not groups:
         raise EvaluationError(f"no base scene of {folder} has {each} tasks: ask for fewer with --each")
-    figures = panel(groups, people_of(folder / TRANSCRIPTS_FOLDER))
+    figures = (*panel(groups, people_of(folder / TRANSCRIPTS_FOLDER)), *admitted_share(folder))
     conditions = {"dataset": folder.name, "scenes": len(groups), "tasks a scene": each}
     return groups, Evaluation("tasks", conditions, figures)
 
