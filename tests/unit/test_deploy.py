@@ -86,6 +86,21 @@ def test_a_slurm_task_runs_a_worker_with_its_cores_under_a_name_of_its_own(tmp_p
     assert (nameless.returncode, "set it to the HOST:PORT" in nameless.stderr) == (1, True)
 
 
+def test_the_unit_of_the_manager_is_valid_and_gives_options_that_there_are(tmp_path):
+    text = (DEPLOY / "systemd" / "embomatrix-manager.service").read_text()
+    calls = re.findall(r"^ExecStart(?:Pre)?=\S+ manager (\w+) (.*)$", text, flags=re.MULTILINE)
+    assert [command for command, _ in calls] == ["init", "serve"]
+    assert all(named(words.split()) <= options(manager_app, command) for command, words in calls)
+    analyze = shutil.which("systemd-analyze")
+    if analyze is None:
+        pytest.skip("systemd-analyze is not installed: the rest of the unit is not looked at")
+    unit = tmp_path / "embomatrix-manager.service"
+    unit.write_text(text.replace("/opt/embomatrix/bin/embomatrix", shutil.which("true")))
+    done = subprocess.run((analyze, "verify", unit), capture_output=True, text=True, check=False)
+    assert "embomatrix-manager.service" not in done.stderr, done.stderr
+    assert done.returncode == 0, done.stderr
+
+
 @pytest.mark.parametrize("name", ["prometheus/rules.yml", "grafana/dashboard.json"])
 def test_alarms_and_panels_ask_for_metrics_that_the_guide_explains(name):
     explained = set(re.findall(r"^\| `(embo_\w+)` \|", GUIDE, flags=re.MULTILINE))

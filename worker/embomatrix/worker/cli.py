@@ -19,6 +19,7 @@ from embomatrix.rpc.status import ClusterError, ManagerUnreachableError
 from embomatrix.worker.install_cli import install
 from embomatrix.worker.membership import membership_of
 from embomatrix.worker.processes import ProcessGoneError, start_root
+from embomatrix.worker.ray_cli import ray_workers
 from embomatrix.worker.resources import measure
 from embomatrix.worker.run_cli import run
 from embomatrix.worker.settings_cli import Ca, Manager, Token, check_engine, fail, parse
@@ -38,6 +39,7 @@ console = Console()
 app.command()(run)
 app.command()(status)
 app.command(context_settings={"ignore_unknown_options": True, "allow_extra_args": True})(install)
+app.command("ray", context_settings={"ignore_unknown_options": True, "allow_extra_args": True})(ray_workers)
 
 
 @app.command()
