@@ -86,7 +86,7 @@ async def test_a_lost_rollout_is_an_answer_to_try_again_and_no_number(tmp_path):
             422,
             "found the seed -1",
         ),
-        ({**asked("move 1"), "query": ["move 1"]}, 422, "query 0 does not hold its prompt"),
+        ({**asked("move 1"), "query": ["move 1"]}, 422, "the query 'move 1' does not hold its prompt"),
         (
             asked("move 1", label=RewardLabel("t", f"sha256:{'0' * 64}", Profile.PAPER, 0).text()),
             409,

@@ -46,6 +46,19 @@ class RewardLabel:
         return label
 
 
+def answer_in(query: str, prompt: str) -> str:
+    """What was written after the prompt; tokenizers may have put a mark before it. Raises InvalidRequestError.
+
+    The prompt shows a plan as an example, which must not be taken for an answer.
+    """
+    _, found, answer = query.partition(prompt)
+    if not found:
+        raise InvalidRequestError(
+            f"the query {query[:80]!r} does not hold its prompt {prompt[:80]!r}: send both as they were"
+        )
+    return answer
+
+
 def _string(value: object) -> str:
     if not isinstance(value, str) or not value:
         raise ValueError(f"expected a text, found {value!r}")

@@ -17,7 +17,7 @@ from embomatrix.manager.rest import PREFIX, answered
 from embomatrix.proto.v1 import types_pb2
 from embomatrix.reward.hierarchy import unparsable
 from embomatrix.rpc.convert import rollout_result_from_proto
-from embomatrix.rpc.reward_label import RewardLabel
+from embomatrix.rpc.reward_label import RewardLabel, answer_in
 from embomatrix.rpc.status import InvalidRequestError, UnavailableError
 from embomatrix.rpc.values import Batch, Completed, GroupPolicy, Rollout, RunTerms
 from embomatrix.skills.parse import PlanError, parse_plan
@@ -56,13 +56,6 @@ class RewardRequest(BaseModel):
                 f"{len(self.query)} queries, {len(self.prompts)} prompts and {len(self.labels)} labels: send as many of each"
             )
         return self
-
-    def answer(self, index: int) -> str:
-        """What was written after the prompt; tokenizers may have put a mark before it. Raises InvalidRequestError."""
-        _, found, answer = self.query[index].partition(self.prompts[index])
-        if not found:
-            raise InvalidRequestError(f"query {index} does not hold its prompt: send both as they were")
-        return answer
 
 
 def rewarding(runs: Runs) -> APIRouter:
@@ -108,7 +101,7 @@ async def _rewards(runs: Runs, asked: RewardRequest) -> list[RewardBreakdown]:
     rollouts: dict[int, Rollout] = {}
     for index, label in enumerate(map(RewardLabel.parse, asked.labels)):
         try:
-            plan = parse_plan(asked.answer(index), label.profile)
+            plan = parse_plan(answer_in(asked.query[index], asked.prompts[index]), label.profile)
         except PlanError:
             found[index] = unparsable()
             continue

@@ -5,14 +5,18 @@ import pickle
 import time
 
 import pytest
+from tests.fakes.datasets import write_kitchen_dataset
 from tests.fakes.symbolic_household import SymbolicCluster, make_tasks
 
+from embomatrix.rpc.reward_label import RewardLabel
 from embomatrix.skills.prompt import Codec
-from embomatrix.trainer.adapters import verl
+from embomatrix.trainer.adapters import openrlhf, rows, verl
 from embomatrix.trainer.adapters.scorer import PlanScorer, scorer_for
 from embomatrix.trainer.adapters.trl import AnnouncedSampler, ClusterLookahead, ClusterReward, text_of
+from embomatrix.trainer.data import load_tasks
 from embomatrix.trainer.errors import TrainerError
 from embomatrix.trainer.telling import plan_text
+from embomatrix.world.task import Profile
 
 TASKS = make_tasks(6, 1)
 FIRST, SECOND = TASKS.train[:2]
@@ -199,3 +203,39 @@ async def test_verl_never_sees_a_lost_plan_it_is_tried_again_and_then_given_up()
         pytest.raises(TrainerError, match="lost a plan of the task 'task-0' 3 times"),
     ):
         await verl.scored(opened, FIRST.task.task_id, oracle(FIRST))
+
+
+async def test_openrlhf_gets_tensors_and_what_was_lost_is_executed_again():
+    ids = [FIRST.task.task_id, SECOND.task.task_id, FIRST.task.task_id]
+    with scorer(SymbolicCluster(TASKS, lost=frozenset({"score-0/"}))) as opened:
+        rewards = await openrlhf.rewards_of(opened, ids, [oracle(FIRST), oracle(SECOND), "hm"])
+    told = openrlhf.told(rewards)
+    assert told["scores"].tolist() == [1.0, 1.0, 0.0]
+    assert told["rewards"].tolist() == pytest.approx([reward.total for reward in rewards])
+    assert sum(values[2].item() for values in told["extra_logs"].values()) == -1
+    with (
+        scorer(SymbolicCluster(TASKS, lose_first=True)) as opened,
+        pytest.raises(TrainerError, match="lost a plan of the task 'task-0' 3 times"),
+    ):
+        await openrlhf.rewards_of(opened, ids[:1], [oracle(FIRST)])
+
+
+def test_openrlhf_is_told_which_query_is_not_its_prompt_s_and_which_setting_is_missing():
+    label = RewardLabel("t", FIRST.bundle_digest, Profile.PAPER, 0).text()
+    with pytest.raises(TrainerError, match="does not hold its prompt 'the prompt'"):
+        openrlhf.reward_func(["move 1"], ["the prompt"], [label])
+    with pytest.raises(TrainerError, match="EMBOMATRIX_DATASET is not set"):
+        openrlhf.reward_func(["the prompt move 1"], ["the prompt"], [label])
+
+
+async def test_rows_carry_what_each_trainer_finds_the_task_by(tmp_path, cluster):
+    folder = write_kitchen_dataset(tmp_path)
+    ids = [task.task.task_id for task in load_tasks(folder).train]
+    assert [row["task_id"] for row in rows.prompt_rows(folder)] == ids
+    assert [row["reward_model"]["ground_truth"] for row in rows.verl_rows(folder)] == ids
+    labelled = openrlhf.rows(folder)
+    assert [RewardLabel.parse(row["label"]).task_id for row in labelled] == ids
+    assert "Task: " in labelled[0]["input"][1]["content"]
+    assert await openrlhf.give_bundles(folder, cluster) == 1
+    with pytest.raises(TrainerError, match="no split 'test': expected train or heldout"):
+        rows.prompt_rows(folder, "test")

@@ -78,6 +78,8 @@ class Imported:
     """The problem's objects, by their names in the scene."""
     rooms: tuple[str, ...]
     signature: str
+    instances: tuple[str, ...] = ()
+    """The same objects by the problem's own names."""
     notes: tuple[str, ...] = ()
     """What was read into the problem, and which furniture was added to the scene for it."""
 
@@ -292,7 +294,8 @@ class _Binder:
         )
         rooms = tuple(sorted({view.room(name) for name in about}))
         notes = self._notes(view, names, binding)
-        return Imported(scene, task, start, tuple(names.values()), rooms, signature_of(goal, view), notes)
+        signature = signature_of(goal, view)
+        return Imported(scene, task, start, tuple(names.values()), rooms, signature, tuple(names), notes)
 
     def _notes(self, view: SceneView, names: Mapping[str, str], binding: Binding) -> tuple[str, ...]:
         """What was done to scene and problem to bring them together, a sentence each."""

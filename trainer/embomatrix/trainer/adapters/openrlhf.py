@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import torch
 
-from embomatrix.rpc.reward_label import RewardLabel
+from embomatrix.rpc.reward_label import RewardLabel, answer_in
+from embomatrix.rpc.status import InvalidRequestError
 from embomatrix.trainer.adapters.rows import messages, tasks_of
 from embomatrix.trainer.adapters.scorer import ATTEMPTS, given_up, scorer_for
 from embomatrix.trainer.data import group_seed, load_tasks
@@ -66,8 +67,11 @@ def _scorer() -> PlanScorer:
 
 def reward_func(queries: Sequence[str], prompts: Sequence[str], labels: Sequence[str]) -> dict[str, Any]:
     """OpenRLHF's hook. The dataset and the cluster come from the environment. Raises TrainerError."""
-    answers = [query.partition(prompt)[2] for query, prompt in zip(queries, prompts, strict=True)]
-    task_ids = [RewardLabel.parse(label).task_id for label in labels]
+    try:
+        answers = [answer_in(query, prompt) for query, prompt in zip(queries, prompts, strict=True)]
+        task_ids = [RewardLabel.parse(label).task_id for label in labels]
+    except InvalidRequestError as error:
+        raise TrainerError(str(error)) from error
     return told(asyncio.run(rewards_of(_scorer(), task_ids, answers)))
 
 

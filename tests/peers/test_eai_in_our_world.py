@@ -1,0 +1,47 @@
+"""Which of EAI's hundred goals the skills of each profile can bring about, and what stands in the way of the others."""
+
+import collections
+import re
+
+import pytest
+
+from embomatrix.factory.task_import.dialects import read_problem
+from embomatrix.factory.task_import.reach import unreachable_atoms
+from embomatrix.factory.task_import.sources import read_eai
+from embomatrix.trainer.eai.environment import install
+from embomatrix.world.task import Profile
+
+WORD = re.compile(r"\((not \()?([a-z]\w*)")
+pytestmark = [pytest.mark.eai, pytest.mark.timeout(900)]
+
+
+@pytest.fixture(scope="module")
+def problems():
+    return {source.name: read_problem(source)[0] for source in read_eai(install().package_root)}
+
+
+def blocking(problems, profile):
+    """How many goals each set of predicates bars."""
+    found = {name: unreachable_atoms(problem, profile) for name, problem in problems.items()}
+    told = []
+    for atoms in filter(None, found.values()):
+        literals = WORD.findall(" ".join(atoms))
+        told.append(", ".join(sorted({"not " * bool(negated) + word for negated, word in literals})))
+    return dict(collections.Counter(told))
+
+
+def test_fifty_nine_goals_are_within_the_paper_s_skills_and_ninety_nine_within_the_household_s(problems):
+    assert blocking(problems, Profile.PAPER) == {
+        "not dusty": 11,
+        "not stained": 11,
+        "not dusty, not stained": 8,
+        "sliced": 4,
+        "not stained, soaked": 3,
+        "soaked": 2,
+        "not dusty, soaked": 1,
+        "sliced, soaked": 1,
+    }
+    assert blocking(problems, Profile.HOUSEHOLD) == {"sliced": 1}
+    assert unreachable_atoms(problems["chopping_vegetables"], Profile.HOUSEHOLD) == (
+        "(sliced ?chestnut.n.03)",
+    )

@@ -1,0 +1,100 @@
+"""E3: one plan before both judges, our simulator and EAI's graph: oracle plans, and mutants of them.
+
+The graph knows no places, so that ways are left out of what is compared. ``pytest -m eai -s`` prints the figures.
+"""
+
+import collections
+import contextlib
+
+import numpy as np
+import pytest
+from tests.fakes.two_judges import (
+    ForeignObjectError,
+    Mutant,
+    cause,
+    deeds_of,
+    in_eai,
+    mutants,
+    names_of,
+    with_ways,
+)
+
+from embomatrix.factory.scenes.build import build_base_scene
+from embomatrix.factory.task_import.batch import Verified, verify
+from embomatrix.factory.task_import.sources import read_eai
+from embomatrix.factory.task_import.task import Imported, import_problem
+from embomatrix.reward.hierarchy import score
+from embomatrix.sim.executor import Simulator
+from embomatrix.sim.pose_cache import PlacementLibrary
+from embomatrix.skills.parse import plan_from_json
+from embomatrix.trainer.eai.environment import install
+from embomatrix.trainer.eai.judge import NativeJudge
+from embomatrix.world.bundle import decode_bundle
+
+pytestmark = [pytest.mark.eai, pytest.mark.timeout(1800)]
+TASKS = {
+    "Rs_int": (
+        "assembling_gift_baskets",
+        "locking_every_door",
+        "polishing_furniture",
+        "re-shelving_library_books",
+        "sorting_books",
+    ),
+    "Benevolence_1_int": ("bringing_in_wood", "loading_the_dishwasher", "washing_dishes"),
+    "Ihlen_1_int": ("collecting_aluminum_cans", "laying_tile_floors", "putting_leftovers_away"),
+}
+ROUNDS = 3
+"""Of mutants: each has one of every kind."""
+
+
+def verified(source, base, library):
+    imported = import_problem(source, base)
+    assert isinstance(imported, Imported), imported
+    found = verify(imported, library, None)
+    assert isinstance(found, Verified), found
+    return imported, found
+
+
+def compared(imported, found, native, judge):
+    """For each plan: its kind, whether each judge calls it a success, and the cause where they disagree."""
+    record = found.record
+    table, names = record.task.table, names_of(imported, native)
+    deeds = deeds_of(plan_from_json(list(record.oracle), record.task.profile))
+    rows = [row for row, name in enumerate(table) if name in names]
+    rng = np.random.default_rng(0)
+    plans = [Mutant("whole", deeds), *(each for _ in range(ROUNDS) for each in mutants(deeds, rows, rng))]
+    with contextlib.closing(Simulator(decode_bundle(found.bundle))) as simulator:
+        for plan in plans:
+            try:
+                steps = in_eai(plan.deeds, table, names)
+            except ForeignObjectError:
+                continue
+            trace = simulator.execute(record.task, with_ways(plan.deeds), 0)
+            ours = score(record.task, trace.touched, simulator.facts).success
+            verdict = judge.judge(native.demo, steps)
+            assert verdict is not None
+            differ = ours != verdict.exact
+            yield plan.kind, ours, verdict.exact, cause(trace, verdict) if differ else "", trace, verdict
+
+
+def test_the_two_judges_agree_and_every_disagreement_has_its_cause(capsys):
+    library, rows = PlacementLibrary(), []
+    with NativeJudge(install()) as judge:
+        natives = {task.task: task for task in judge.tasks()}
+        sources = {source.name: source for source in read_eai(install().package_root)}
+        for scene, names in TASKS.items():
+            base = build_base_scene(scene)
+            for name in names:
+                imported, found = verified(sources[name], base, library)
+                rows += [(name, *row) for row in compared(imported, found, natives[name], judge)]
+    differing = [row for row in rows if row[2] != row[3]]
+    kinds = collections.Counter(row[1] for row in rows)
+    with capsys.disabled():
+        print(f"\nE3: {len(rows)} plans of {sum(map(len, TASKS.values()))} tasks: {dict(kinds)}")
+        print(f"agree {len(rows) - len(differing)}, both succeed {sum(row[2] and row[3] for row in rows)}")
+        for name, kind, ours, theirs, why, trace, verdict in differing:
+            last = trace.steps[-1].message if trace.steps else ""
+            print(f"  {name} {kind}: ours {ours}, theirs {theirs}: {why or '?'}; {last}; {verdict.errors}")
+    assert len(rows) >= 80
+    assert all(row[5] for row in differing), "a disagreement without a known cause"
+    assert len(differing) <= 0.1 * len(rows)
