@@ -355,8 +355,8 @@ def _track(
         rotations.append(facing(course, 0.0 if abs(edge[2]) < 0.5 else math.pi / 2, edge))
         positions.append(point)
     first, back = grips(start, along, spot)[1], -rotations[-1][:, 2]
-    # A hand that did not turn with the leaf lies along it in the end: straight back its fingers would stay at it.
-    last = back + grips(float(fractions[-1]), along, spot)[1]
+    # A hand that did not turn with a door lies along it in the end, and straight back it stays there; but never under a flap.
+    last = back + grips(float(fractions[-1]), along, spot)[1] * (1.0, 1.0, 0.0)
     far = float(np.linalg.norm(last))
     last = last / far if far > LEAST_OFF else back
     positions = [
