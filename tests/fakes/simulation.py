@@ -58,6 +58,8 @@ class FakeScene:
                 time.sleep(3.0 if times == 1 else 0.01)
             case "first hangs":
                 time.sleep(600 if times == 1 else 0.01)
+            case "short":
+                time.sleep(0.005)
             case "brief":
                 time.sleep(0.05)
             case "crash":

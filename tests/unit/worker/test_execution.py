@@ -1,6 +1,7 @@
 """What lies ahead in a slot's stream: it is executed without the daemon, and what becomes of its process costs it nothing."""
 
 import asyncio
+import itertools
 import random
 import time
 from collections import Counter
@@ -9,7 +10,7 @@ import pytest
 from tests.unit.worker.test_slots import running
 
 from embomatrix.rpc.convert_session import lease_from_proto, lease_to_proto
-from embomatrix.rpc.values import Completed, InfraCode, Lease, LeaseRef, Rollout
+from embomatrix.rpc.values import Completed, InfraCode, Lease, LeaseRef, ResidentState, Rollout
 
 pytestmark = pytest.mark.timeout(60)
 
@@ -22,9 +23,9 @@ def executions(tmp_path, monkeypatch):
     return lambda: Counter(path.read_text().split())
 
 
-def submit(harness, lease_id, task="ok", deadline_s=30.0):
+def submit(harness, lease_id, task="ok", deadline_s=30.0, digest="scene"):
     """As the manager's leases come: with the rollout's message, which may wait in a stream."""
-    lease = Lease(LeaseRef(lease_id, 1), Rollout(lease_id, "g", "scene", task, (), 1), deadline_s)
+    lease = Lease(LeaseRef(lease_id, 1), Rollout(lease_id, "g", digest, task, (), 1), deadline_s)
     lease = lease_from_proto(lease_to_proto(lease))
     harness.pool.submit(lease)
     return lease.ref
@@ -108,6 +109,21 @@ async def test_what_waits_behind_a_rollout_that_is_cancelled_is_executed_elsewhe
         outcomes = await harness.outcomes(4)
     assert set(outcomes) == {f"l{number}" for number in range(4)}
     assert set(executions().values()) == {1}
+
+
+async def test_a_lease_of_another_scene_is_executed_though_those_at_hand_never_end(tmp_path):
+    async with running(tmp_path, slots=1) as harness:
+        harness.pool.want(["scene", "other"])
+        await harness.until(lambda: harness.state("scene") is harness.state("other") is ResidentState.WARM)
+        await learn_pace(harness)
+        names = (f"l{number}" for number in itertools.count())
+        for name in itertools.islice(names, 8):
+            submit(harness, name, "short")
+        submit(harness, "other", digest="other")
+        while "other" not in {result.ref.lease_id for result in harness.results}:
+            for name in itertools.islice(names, max(0, 20 - len(harness.pool.held()))):
+                submit(harness, name, "short")
+            await asyncio.sleep(0.002)
 
 
 async def test_a_lease_that_is_given_again_after_it_was_cancelled_has_one_result(tmp_path):

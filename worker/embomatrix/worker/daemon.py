@@ -318,7 +318,7 @@ def signed(result: LeaseResult, name: str) -> LeaseResult:
     outcome: Completed | InfraFailure
     if isinstance(result.outcome, Completed):
         outcome = result.outcome.noted(worker_id=name)
-        logger.debug("rollout completed lease=%s reward=%.1f", result.ref.lease_id, outcome.reward.total)
+        logger.debug("rollout completed lease=%s", result.ref.lease_id)
     else:
         outcome = replace(result.outcome, worker_id=name)
         logger.warning("rollout failed lease=%s %s: %s", result.ref.lease_id, outcome.code, outcome.message)

@@ -67,10 +67,9 @@ class Ticket:
     def digest(self) -> str:
         return self.lease.rollout.bundle_digest
 
-    @property
-    def small(self) -> bool:
-        """Whether its plan may wait in a slot's stream."""
-        return 0 < len(self.lease.rollout.wire) <= LARGEST_AHEAD
+    def fits(self, digest: str) -> bool:
+        """Whether its plan may wait in the stream of a slot of this scene."""
+        return self.digest == digest and 0 < len(self.lease.rollout.wire) <= LARGEST_AHEAD
 
 
 class Shift:

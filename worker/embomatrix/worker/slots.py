@@ -38,6 +38,8 @@ logger = logging.getLogger(__name__)
 RETRY_CHECK_S: Final = 1.0
 AHEAD: Final = 2
 """Leases that wait behind each slot while others are asked for."""
+OVERTAKEN_S: Final = 0.2
+"""A lease that has waited for this long is not overtaken by one whose scene a slot has at hand."""
 
 
 class SlotPool:
@@ -229,15 +231,20 @@ class SlotPool:
         return None
 
     def _more(self, scene: Scene, count: int) -> list[Ticket]:
-        """Leases of this scene from the front of those that wait, up to a count: no more than a slot's share of them all."""
+        """Leases of this scene that wait, up to a count: no more than a slot's share of all that wait.
+
+        They may overtake those of other scenes, until one of these has waited for long.
+        """
         count = min(count, len(self._waiting) // self._limits.slots)
-        if self._resting or self._residents.warm(scene.digest) is not scene:
+        if count <= 0 or self._resting or self._residents.warm(scene.digest) is not scene:
             return []
-        fitting = itertools.takewhile(
-            lambda ticket: ticket.digest == scene.digest and ticket.small,
-            itertools.islice(self._waiting, max(0, count)),
-        )
-        return [self._waiting.popleft() for _ in list(fitting)]
+        late = time.monotonic() - self._waiting[0].taken_s > OVERTAKEN_S
+        fits = functools.partial(Ticket.fits, digest=scene.digest)
+        found = itertools.takewhile(fits, self._waiting) if late else filter(fits, self._waiting)
+        tickets = list(itertools.islice(found, count))
+        for ticket in tickets:
+            self._waiting.remove(ticket)
+        return tickets
 
     def _occupy(self, permit: int, ticket: Ticket, scene: Scene) -> Shift:
         self._clock += 1
