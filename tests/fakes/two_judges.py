@@ -120,7 +120,7 @@ LOAD = "the graph lifts a thing from under what rests on it"
 AGAIN = "the graph lets a step pass that asks for what is so already"
 HANDS = "the graph has two hands"
 PIECES = "the graph goes on with parts of what was sliced, ours with pieces of other names"
-TOOLS = "what takes stains and dust off: the graph asks for a cleaner in the hand, or a soaked one"
+TOOLS = "our sink soaks what lies in it when it is switched on; the graph asks for the step that soaks the cleaner"
 START = "the graph's start differs: what nobody mentions is shut, and stands where the problem says"
 CAUSES = {
     FailureReason.NO_FREE_POSE: GEOMETRY,
