@@ -53,13 +53,15 @@ def render_oblique(scene: Scene, *, width_px: int = 1280, height_px: int = 960) 
 def render_egocentric(
     scene: Scene, stand: StandPose | None = None, *, width_px: int = 320, height_px: int = 240
 ) -> NDArray[np.uint8]:
-    """What the robot sees from ``stand``, or from where it starts: RGB values, shape (height, width, 3).
+    """What the robot sees as it turns round at ``stand``, or where it starts: ahead, to its left, behind, to its right.
 
-    Raises EngineError where pybullet is missing.
+    Returns RGB values, shape (4, height, width, 3). Raises EngineError where pybullet is missing.
     """
+    start = stand or _start(scene)
     with Stage(scene) as stage:
         furnish_whole(stage)
-        return shoot_egocentric(stage, stand or _start(scene), width_px, height_px)
+        quarters = (replace(start, yaw=start.yaw + turns * math.pi / 2) for turns in range(4))
+        return np.stack([shoot_egocentric(stage, quarter, width_px, height_px) for quarter in quarters])
 
 
 def furnish_cutaway(stage: Stage) -> None:

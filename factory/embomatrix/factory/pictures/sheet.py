@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from embomatrix.factory.pictures.scene import FILL, PALE, footprint, is_overhead, kind_of
-from embomatrix.sim.bullet.camera import render_oblique
+from embomatrix.sim.bullet.camera import render_egocentric, render_oblique
 from embomatrix.world.geometry import Pose
 
 if TYPE_CHECKING:
@@ -21,6 +21,7 @@ _ORIGIN: Final = Pose((0.0, 0.0, 0.0))
 _MARGIN_M: Final = 0.3
 _CAPTION_PX: Final = 16
 _PANE_M: Final = 0.03
+_DIRECTIONS: Final = ("ahead", "to its left", "behind", "to its right")
 
 
 def draw_sheet(scenes: Sequence[Scene], *, columns: int = 9, cell_px: int = 200) -> Image.Image:
@@ -46,6 +47,22 @@ def draw_views(scenes: Sequence[Scene], *, width_px: int = 560) -> Image.Image:
         smooth = Image.fromarray(np.asarray(view)).resize((width_px, height_px), Image.Resampling.LANCZOS)
         row.paste(smooth, (number * width_px, 0))
     return row
+
+
+def draw_eyes(scene: Scene, *, width_px: int = 480) -> Image.Image:
+    """What the robot sees where it starts, in four directions, each ``width_px`` wide and three quarters as high.
+
+    Raises EngineError without pybullet.
+    """
+    height_px = width_px * 3 // 4
+    sheet = Image.new("RGB", (2 * width_px, 2 * (height_px + _CAPTION_PX)), "white")
+    draw = ImageDraw.Draw(sheet)
+    views = render_egocentric(scene, width_px=width_px, height_px=height_px)
+    for number, (words, view) in enumerate(zip(_DIRECTIONS, views, strict=True)):
+        x, y = number % 2 * width_px, number // 2 * (height_px + _CAPTION_PX)
+        sheet.paste(Image.fromarray(view), (x, y))
+        draw.text((x + 4, y + height_px), words, fill="black", font=ImageFont.load_default(12))
+    return sheet
 
 
 def draw_thumbnail(scene: Scene, side_px: int) -> Image.Image:

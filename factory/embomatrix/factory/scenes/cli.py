@@ -22,12 +22,12 @@ from embomatrix.factory.importers.model import ModelFileError
 from embomatrix.factory.importers.shelf import read_assets
 from embomatrix.factory.pictures.relations import draw_relations
 from embomatrix.factory.pictures.scene import draw_plan
-from embomatrix.factory.pictures.sheet import draw_sheet, draw_views
+from embomatrix.factory.pictures.sheet import draw_eyes, draw_sheet, draw_views
 from embomatrix.factory.scenes.batch import SceneJob, run_batch
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.scene_file import SUFFIX, SceneFileError, read_scene
 from embomatrix.factory.scenes.tables import TABLE_COLUMNS, problem_lines, report_table
-from embomatrix.sim.bullet.camera import render_egocentric, render_oblique
+from embomatrix.sim.bullet.camera import render_oblique
 from embomatrix.sim.engine import EngineError
 from embomatrix.world.catalog import Catalog, CatalogError
 from embomatrix.world.whole_file import check_writable, write_whole
@@ -136,7 +136,7 @@ def show(scene: SceneSource, seed: Seed = 0) -> None:
 
 @app.command()
 def render(scene: SceneSource, seed: Seed = 0, out: Out = Path()) -> None:
-    """Draw a plan from above, an oblique view, and what the robot sees where it starts, as PNG files."""
+    """Draw a plan from above, an oblique view, and what the robot sees around it where it starts, as PNG files."""
     _there([scene])
     folder = _folder(out)
     built = _built(scene, seed)
@@ -144,7 +144,7 @@ def render(scene: SceneSource, seed: Seed = 0, out: Out = Path()) -> None:
         pictures = {
             "plan": draw_plan(built),
             "view": Image.fromarray(np.asarray(render_oblique(built))),
-            "eyes": Image.fromarray(np.asarray(render_egocentric(built, width_px=640, height_px=480))),
+            "eyes": draw_eyes(built),
         }
     for kind, picture in pictures.items():
         path = folder / f"{built.scene_id}_{kind}.png"
