@@ -48,7 +48,7 @@ def test_every_command_on_the_page_exists_with_its_options(page: Path) -> None:
         if WORDS & set(words[:2]):
             continue
         command, rest = target_of(words)
-        known = {option for parameter in command.params for option in parameter.opts}
+        known = {option for each in command.params for option in (*each.opts, *each.secondary_opts)}
         given = {word.split("=")[0] for word in rest if re.match(r"--\w", word)}
         assert given - WORDS <= known, f"embomatrix {' '.join(words)}"
 
