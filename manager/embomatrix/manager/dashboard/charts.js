@@ -8,6 +8,8 @@ await Promise.all([
 ]);
 
 const DASHES = [[], [6, 3], [2, 2], [9, 3, 2, 3], [1, 4]];
+/** Steps and seconds are whole numbers. */
+const WHOLE = [1, 2, 5].flatMap(n => [0, 1, 2, 3, 4, 5, 6].map(power => n * 10 ** power)).sort((a, b) => a - b);
 const TINTS = ["c1", "c2", "c3", "c4", "c5"];
 
 /** A chart in a place of its own. `lines` are their names; `words` turns a value at the foot into text; `fill` for one line. */
@@ -19,14 +21,14 @@ export function chart(place, lines, {high = 190, words, fill = false, legend = t
     value: (_, value) => value === null || value === undefined ? "–" : Number(value.toPrecision(3)),
   }));
   const range = (_, low, top) => {
-    const least = Math.min(0, low ?? 0), most = Math.max(least + 1e-3, top ?? 1);
+    const least = Math.min(0, low ?? 0), most = top > least ? top : least + 1;
     return [least && least * 1.08, fill ? Math.max(1, most) * 1.08 : most + (most - least) * 0.08];
   };
   const box = h("div", {class: "chart"});
   place.replaceChildren(box);
   const drawn = new uPlot({
     width: box.clientWidth, height: high, legend: {show: legend}, cursor: {y: false}, scales: {x: {time: false}, y: {range}},
-    axes: [{...axis, size: 28, ...(words ? {values: (_, ticks) => ticks.map(words)} : {})}, {...axis, size: 52}],
+    axes: [{...axis, size: 28, incrs: WHOLE, ...(words ? {values: (_, ticks) => ticks.map(words)} : {})}, {...axis, size: 52}],
     series: [{label: "step", value: (_, value) => value ?? "–"}, ...series],
   }, [[], ...lines.map(() => [])], box);
   const watcher = new ResizeObserver(() => drawn.setSize({width: box.clientWidth, height: high}));
