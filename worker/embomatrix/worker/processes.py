@@ -86,6 +86,8 @@ class Peer:
             self._listen_no_more()
             await asyncio.sleep(pause_s)
             return self.arrived()
+        # However fast the process answers, others have their turn between two answers.
+        await asyncio.sleep(0)
         while not (frames := self.arrived()):
             self._listen()
             await self._news()
