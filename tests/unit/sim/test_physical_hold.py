@@ -91,6 +91,32 @@ def test_what_goes_into_a_crate_too_narrow_for_the_hand_is_dropped_in(play):
     goes_to_the_bottom(play, crate)
 
 
+@pytest.mark.parametrize(("x", "yaw", "gap"), [(2.35, 0.0, 0.1), (1.7, 0.45, 0.0), (2.35, 0.45, 0.1)])
+def test_what_goes_on_a_narrow_top_is_taken_otherwise_with_the_hand_on_the_side_from_which_it_comes(
+    play, x, yaw, gap
+):
+    # The roll can't lie across the heater, nor the hand come along it, past the lockers.
+    roll = replace(make.block("roll", "roll.n.01", (0.2, 0.063, 0.032), {}), mass_kg=0.15)
+    heater = make.block("heater", "heater.n.01", (0.084, 0.48, 1.84), {})
+    locker = make.block("locker", "locker.n.01", (0.3, 0.3, 2.2), {})
+    aside = 0.39 + gap
+    extra = [
+        (placed("heater_1", heater, "kitchen_0", upright(0.045, 2.0, 0.0, heater), fixed=True), heater),
+        (
+            placed("locker_1", locker, "kitchen_0", upright(0.15, 2.0 - aside, 0.0, locker), fixed=True),
+            locker,
+        ),
+        (
+            placed("locker_2", locker, "kitchen_0", upright(0.15, 2.0 + aside, 0.0, locker), fixed=True),
+            locker,
+        ),
+        (placed("roll_1", roll, "kitchen_0", upright(x, 1.2, TABLE_TOP_M, roll, yaw)), roll),
+    ]
+    trace, simulator = play(extra, "move roll_1; pick_up roll_1; move heater_1; place heater_1 ontop")
+    assert trace.failure is None, trace.steps[-1].message
+    assert simulator.world.relations.ontop("roll_1", "heater_1")
+
+
 def test_a_cup_taken_at_its_thin_wall_stays_where_it_is_put(play):
     cup = make.tub("cup", "cup.n.01", (0.08, 0.08, 0.08), 0.003, 0.005, mass_kg=0.1, abilities={})
     pose = upright(2.0, 1.3, TABLE_TOP_M, cup)

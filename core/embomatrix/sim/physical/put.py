@@ -88,6 +88,12 @@ class Delivery:
             tracks = list(_put_tracks(self._grip, higher))
             yield from self.reach.ways(tracks, bases_at(self._stage, *_at(higher[0])))
 
+    def may_turn(self) -> bool:
+        """Whether the thing may stand a quarter turned at one of the first poses, so that the hand may come from anywhere."""
+        found = any(True for pose in self._poses[: CHUNKS[2]] for _ in self._turned(pose, math.pi / 2))
+        self._stage.world.engine.park(self._grip.name)
+        return found
+
     def _clear_above(self, pose: Pose) -> float:
         """How far straight up from a pose the thing could come from, as far as drops go."""
         engine, name = self._stage.world.engine, self._grip.name

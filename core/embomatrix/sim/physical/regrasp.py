@@ -6,6 +6,8 @@ import itertools
 import math
 from typing import TYPE_CHECKING, Final
 
+import numpy as np
+
 from embomatrix.sim.physical.fold import fold
 from embomatrix.sim.physical.grasp import grasp_tracks
 from embomatrix.sim.physical.hands import bases_at, take_by, way_in
@@ -17,10 +19,11 @@ from embomatrix.world.geometry import Aabb, Pose
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from embomatrix.sim.physical.reach import Track
     from embomatrix.sim.physical.stage import Grip, Stage
+    from embomatrix.world.geometry import FloatArray
     from embomatrix.world.poses import StandPose
 
 HOSTS: Final = 3
@@ -34,6 +37,8 @@ LOOKED_AT: Final = 10
 """Holds that are looked at."""
 FORESEEN: Final = 4
 """Poses at the goal for which a hold is looked at."""
+ALIKE: Final = math.cos(math.radians(25.0))
+"""Cosine of the turn up to which two holds are alike: ways to take a thing are offered at headings 40 degrees apart."""
 LIFT_M: Final = 0.001
 """Above the floor, when nothing is known of how the thing stands on it."""
 
@@ -58,6 +63,7 @@ def regrasp(
     # Where exactly it will rest makes no difference to which holds lead to the goal.
     offered = grasp_tracks(asset, rests[0], engine.joints(name), home.yaw, None)
     kinds = _promising(stage, grip, offered, rests[0], poses[:FORESEEN], counts)
+    narrow = not Delivery(stage, grip, poses, counts).may_turn()
     if not kinds or put(stage, rests, _anywhere, name) is not None:
         return False
     fold(stage, home)
@@ -67,9 +73,10 @@ def regrasp(
     tracks = grasp_tracks(asset, pose, engine.joints(name), course, out_m)
     bases = bases_at(stage, pose, course, out_m)
     refusal = None
+    ranks = [_rank(track, pose, kinds, narrow=narrow) for track in tracks]
     # Where none of the holds that lead to the goal can be taken, any is better than to leave the thing there.
-    for wanted in (True, False):
-        some = [track for track in tracks if (_kind(track) in kinds) is wanted]
+    for wanted in sorted(set(ranks)):
+        some = [track for track, rank in zip(tracks, ranks, strict=True) if rank == wanted]
         refusal = take_by(stage, name, some, len(some) if out_m is not None else 0, bases)
         if refusal is None:
             break
@@ -81,10 +88,25 @@ def _anywhere() -> bool:
     return True
 
 
+def _rank(track: Track, pose: Pose, kinds: Mapping[tuple[float, float], FloatArray], *, narrow: bool) -> int:
+    """0 for a way to take a thing at a pose after which it is held as foreseen, 1 for another of a foreseen kind, else 2.
+
+    The heading tells only where it is ``narrow``, so that the thing may not be turned.
+    """
+    foreseen = kinds.get(_kind(track))
+    if foreseen is None:
+        return 2
+    if not narrow:
+        return 0
+    turn = pose.rotation.T @ track.rotation[track.key] @ foreseen.T
+    # Half a turn is as good as none: what is put may stand the other way round.
+    return 0 if abs(float(np.trace(turn)) - 1.0) >= 2.0 * ALIKE else 1
+
+
 def _kind(track: Track) -> tuple[float, float]:
     """How the hand points down and rolls at the end: ways that differ by their heading alone are of one kind.
 
-    Which of these is taken makes no difference to what follows: the thing may be turned about the vertical.
+    Which of these is taken makes no difference where the thing may be turned about the vertical. On a narrow top it may not.
     """
     rotation = track.rotation[track.key]
     return round(float(rotation[2, 2]), 2), round(abs(float(rotation[2, 1])), 2)
@@ -97,17 +119,21 @@ def _promising(
     rest: Pose,
     poses: Sequence[Pose],
     counts: Callable[[], bool],
-) -> frozenset[tuple[float, float]]:
-    """Kinds of ways to take what is held, from where it would stand, after which there is a way to one of the poses."""
-    known: dict[tuple[float, float], bool] = {}
+) -> dict[tuple[float, float], FloatArray]:
+    """Kinds of ways to take what is held, from where it would stand, after which there is a way to one of the poses.
+
+    With each comes how the tool is turned then in the thing's frame, (3, 3).
+    """
+    known: dict[tuple[float, float], FloatArray | None] = {}
     for track in offered:
         kind = _kind(track)
         if kind not in known and len(known) < LOOKED_AT:
             position = track.position[track.key]
             tool = Pose.from_rotation(tuple(position.tolist()), track.rotation[track.key])
             delivery = Delivery(stage, grip.otherwise(tool.inverse() @ rest), poses, counts)
-            known[kind] = next(delivery.ways(), None) is not None
-    return frozenset(kind for kind, good in known.items() if good)
+            leads = next(delivery.ways(), None) is not None
+            known[kind] = rest.rotation.T @ tool.rotation if leads else None
+    return {kind: turned for kind, turned in known.items() if turned is not None}
 
 
 def _rests(stage: Stage, name: str, upright: Pose) -> Iterator[Pose]:
