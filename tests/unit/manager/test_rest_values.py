@@ -75,6 +75,7 @@ SEEN = Snapshot(
     ],
     [RunView(f"r{number}", "", 0, RunStats()) for number in range(5)],
     [],
+    training=[],
 )
 
 
