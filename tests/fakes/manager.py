@@ -16,8 +16,9 @@ from embomatrix.rpc.convert_session import (
     resources_from_proto,
     worker_state_from_proto,
 )
+from embomatrix.rpc.leases import Lease, LeaseRef
 from embomatrix.rpc.status import NotFoundError, SupersededError, translate
-from embomatrix.rpc.values import Lease, LeaseRef, Rollout
+from embomatrix.rpc.values import Rollout
 from embomatrix.world.inflation import bundle_digest
 
 

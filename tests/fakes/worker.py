@@ -20,16 +20,15 @@ from embomatrix.rpc.convert_session import (
     resources_to_proto,
     worker_state_to_proto,
 )
+from embomatrix.rpc.leases import LeaseResult, WorkerState
 from embomatrix.rpc.values import (
     Completed,
     InfraCode,
     InfraFailure,
-    LeaseResult,
     Resident,
     ResidentState,
     Resources,
     Timings,
-    WorkerState,
 )
 from embomatrix.rpc.versions import PROTOCOL_VERSION
 

@@ -15,7 +15,13 @@ from tests.fakes.plans import plan_of
 from tests.fakes.scenes import kitchen_scene, kitchen_tasks
 
 from embomatrix.reward.settings import PAPER, RewardSettings
-from embomatrix.rpc.values import Completed, InfraCode, Lease, LeaseRef, ResidentState, Rollout
+from embomatrix.rpc.leases import Lease, LeaseRef
+from embomatrix.rpc.values import (
+    Completed,
+    InfraCode,
+    ResidentState,
+    Rollout,
+)
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.pose_cache import build_pose_cache
 from embomatrix.sim.prepared import prepare

@@ -26,22 +26,24 @@ from embomatrix.rpc.convert_run import (
     warmth_from_proto,
     warmth_to_proto,
 )
-from embomatrix.rpc.values import (
-    Completed,
-    InfraFailure,
+from embomatrix.rpc.leases import (
     Lease,
     LeaseClaim,
     LeaseOrigin,
     LeaseProgress,
     LeaseRef,
     LeaseResult,
+    WorkerState,
+)
+from embomatrix.rpc.values import (
+    Completed,
+    InfraFailure,
     PlanCell,
     Resident,
     ResidentState,
     Resources,
     RunInfo,
     WorkerInfo,
-    WorkerState,
 )
 
 if TYPE_CHECKING:

@@ -30,11 +30,11 @@ from embomatrix.manager.ledger import (
 from embomatrix.manager.load_failures import LoadFailures
 from embomatrix.manager.pending import PendingQueues
 from embomatrix.manager.run_book import RunBook
+from embomatrix.rpc.leases import LeaseOrigin
 from embomatrix.rpc.values import (
     Cancelled,
     InfraCode,
     InfraFailure,
-    LeaseOrigin,
     Outcome,
     RolloutResult,
 )

@@ -25,8 +25,9 @@ if TYPE_CHECKING:
 
     from embomatrix.manager.commands import DeliverResult, GiveLease
     from embomatrix.manager.ledger import LeaseRecord
+    from embomatrix.rpc.leases import LeaseResult
     from embomatrix.rpc.run_log import EventPage
-    from embomatrix.rpc.values import Batch, LeaseResult
+    from embomatrix.rpc.values import Batch
 
 logger = logging.getLogger(__name__)
 

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 from embomatrix.reward.settings import PAPER, RewardSettings
 
 if TYPE_CHECKING:
-    from embomatrix.rpc.values import LeaseOrigin, LeaseRef, Rollout, RolloutResult
+    from embomatrix.rpc.leases import LeaseOrigin, LeaseRef
+    from embomatrix.rpc.values import Rollout, RolloutResult
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,13 +11,11 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from embomatrix.manager.auditor import Repute
+    from embomatrix.rpc.leases import LeaseClaim, LeaseProgress, LeaseRef
     from embomatrix.rpc.values import (
         Batch,
         Completed,
         InfraFailure,
-        LeaseClaim,
-        LeaseProgress,
-        LeaseRef,
         LookaheadEntry,
         Resident,
         Resources,

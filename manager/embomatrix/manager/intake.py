@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     from embomatrix.manager.cluster_state import ClusterState
     from embomatrix.manager.commands import Command
     from embomatrix.manager.registry import Registry, Session
-    from embomatrix.rpc.values import LeaseProgress, LeaseRef, LeaseResult, Resources, WorkerState
+    from embomatrix.rpc.leases import LeaseProgress, LeaseRef, LeaseResult, WorkerState
+    from embomatrix.rpc.values import Resources
 
 
 TICK_S: Final = 0.1

@@ -8,14 +8,14 @@ from collections import Counter, OrderedDict
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.ledger import LeaseRecord, Phase, RolloutRecord, WorkerRecord
-from embomatrix.rpc.values import LeaseRef
+from embomatrix.rpc.leases import LeaseRef
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from embomatrix.manager.fleet import Fleet
     from embomatrix.manager.run_book import RunBook
-    from embomatrix.rpc.values import LeaseProgress
+    from embomatrix.rpc.leases import LeaseProgress
 
 STALE_MEMORY: Final = 65_536
 """Ended leases of which the book still knows the run, to count a late result where it belongs."""

@@ -13,7 +13,8 @@ from embomatrix.rpc.values import RunStats, Timings
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from embomatrix.rpc.values import LeaseRef, Rollout
+    from embomatrix.rpc.leases import LeaseRef
+    from embomatrix.rpc.values import Rollout
 
 
 AHEAD_S: Final = 0.1

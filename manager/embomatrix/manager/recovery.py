@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from embomatrix.manager.assignments import Assignments
     from embomatrix.manager.events import BatchRestored
     from embomatrix.manager.ledger import RolloutKey, RolloutRecord, WorkerRecord
-    from embomatrix.rpc.values import LeaseOrigin, LeaseRef
+    from embomatrix.rpc.leases import LeaseOrigin, LeaseRef
 
 
 class Recovery:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import dataclasses
+import functools
 import json
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
@@ -83,19 +84,7 @@ def reading(runtime: ManagerRuntime, snapshots: Snapshots) -> APIRouter:
     ) -> Response:
         """The cluster at one moment: health, figures, a page of workers, runs, look-ahead, training."""
 
-        def page(seen: Snapshot) -> SnapshotPage:
-            workers = worker_page(seen, state=state, search=search, offset=offset, limit=limit)
-            return SnapshotPage(
-                seen.at_s,
-                seen.health,
-                seen.paused,
-                seen.overview,
-                workers,
-                seen.runs,
-                seen.lookahead,
-                seen.training,
-            )
-
+        page = functools.partial(_snapshot_page, state=state, search=search, offset=offset, limit=limit)
         return packed(request, snapshots.told((state, search, offset, limit), page))
 
     @router.get("/workers", response_model=WorkerPage)
@@ -115,6 +104,20 @@ def reading(runtime: ManagerRuntime, snapshots: Snapshots) -> APIRouter:
     _training(router, runtime, snapshots)
     _stream(router, runtime)
     return router
+
+
+def _snapshot_page(seen: Snapshot, *, state: str, search: str, offset: int, limit: int) -> SnapshotPage:
+    workers = worker_page(seen, state=state, search=search, offset=offset, limit=limit)
+    return SnapshotPage(
+        seen.at_s,
+        seen.health,
+        seen.paused,
+        seen.overview,
+        workers,
+        seen.runs,
+        seen.lookahead,
+        seen.training,
+    )
 
 
 def changing(runtime: ManagerRuntime, snapshots: Snapshots, expulsion: Expulsion) -> APIRouter:

@@ -49,8 +49,9 @@ if TYPE_CHECKING:
     from embomatrix.manager.links import WorkerCommand
     from embomatrix.manager.registry import Registry, Session
     from embomatrix.manager.store.protocol import StateStore
+    from embomatrix.rpc.leases import LeaseResult, WorkerState
     from embomatrix.rpc.status import ClusterError
-    from embomatrix.rpc.values import LeaseResult, Resources, WorkerState
+    from embomatrix.rpc.values import Resources
 
 logger = logging.getLogger(__name__)
 

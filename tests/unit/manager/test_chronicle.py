@@ -8,13 +8,11 @@ from embomatrix.manager.archive import RunArchive
 from embomatrix.manager.chronicle import EVENTS_KEPT, LEAST_KEPT, Chronicle
 from embomatrix.manager.commands import GiveLease
 from embomatrix.manager.ledger import LeaseRecord, RolloutKey, RolloutRecord
+from embomatrix.rpc.leases import LeaseOrigin, LeaseRef, LeaseResult
 from embomatrix.rpc.run_log import EventKind, PhaseSummary, RunSeries, RunSummary
 from embomatrix.rpc.values import (
     InfraCode,
     InfraFailure,
-    LeaseOrigin,
-    LeaseRef,
-    LeaseResult,
     Resident,
     ResidentState,
     Rollout,

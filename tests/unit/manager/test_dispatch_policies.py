@@ -23,6 +23,7 @@ from embomatrix.manager.events import (
     WorkerSuspected,
 )
 from embomatrix.manager.shares import Share, in_turns, quotas
+from embomatrix.rpc.leases import LeaseProgress
 from embomatrix.rpc.values import (
     Batch,
     Cancelled,
@@ -30,7 +31,6 @@ from embomatrix.rpc.values import (
     GroupPolicy,
     InfraCode,
     InfraFailure,
-    LeaseProgress,
     Resident,
     ResidentState,
     Resources,

@@ -19,13 +19,13 @@ from embomatrix.manager.events import (
     WorkerRecovered,
     WorkerSuspected,
 )
+from embomatrix.rpc.leases import LeaseRef
 from embomatrix.rpc.values import (
     Batch,
     Cancelled,
     Completed,
     InfraCode,
     InfraFailure,
-    LeaseRef,
     Resources,
     Rollout,
 )

@@ -2,7 +2,8 @@
 
 from embomatrix.manager.fleet import CANDIDATES, SEEKERS, Fleet
 from embomatrix.manager.ledger import AHEAD_S, BEHIND, LeaseRecord, RolloutKey, RolloutRecord
-from embomatrix.rpc.values import LeaseRef, Rollout
+from embomatrix.rpc.leases import LeaseRef
+from embomatrix.rpc.values import Rollout
 
 MANY = 3 * CANDIDATES
 

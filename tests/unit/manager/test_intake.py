@@ -8,15 +8,14 @@ from embomatrix.manager.commands import CancelLease, GiveLease
 from embomatrix.manager.events import BatchSubmitted
 from embomatrix.manager.intake import Heartbeat, Intake
 from embomatrix.manager.registry import LivenessLimits, Registry
+from embomatrix.rpc.leases import LeaseResult, WorkerState
 from embomatrix.rpc.status import SupersededError
 from embomatrix.rpc.values import (
     Batch,
-    LeaseResult,
     Resident,
     ResidentState,
     Resources,
     Rollout,
-    WorkerState,
 )
 
 WARM = (Resident("kitchen", ResidentState.WARM, 0.1, 50.0),)

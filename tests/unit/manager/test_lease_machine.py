@@ -35,6 +35,7 @@ from embomatrix.manager.events import (
     WorkerResumed,
     WorkerSuspected,
 )
+from embomatrix.rpc.leases import LeaseProgress
 from embomatrix.rpc.values import (
     Batch,
     Cancelled,
@@ -42,7 +43,6 @@ from embomatrix.rpc.values import (
     GroupPolicy,
     InfraCode,
     InfraFailure,
-    LeaseProgress,
     LookaheadEntry,
     Resident,
     ResidentState,

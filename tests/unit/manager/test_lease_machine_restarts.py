@@ -7,7 +7,8 @@ from tests.unit.manager.test_lease_machine import LIMITS, WORKERS, LeaseMachine
 
 from embomatrix.manager.cluster_state import ClusterState
 from embomatrix.manager.events import BatchRestored, WorkerJoined, WorkerReported, WorkersExpected
-from embomatrix.rpc.values import LeaseClaim, Resources
+from embomatrix.rpc.leases import LeaseClaim
+from embomatrix.rpc.values import Resources
 
 
 class RestartedMachine(LeaseMachine):

@@ -5,7 +5,8 @@ import asyncio
 from embomatrix.manager.commands import AcknowledgeLease, CancelLease
 from embomatrix.manager.links import WorkerLink
 from embomatrix.manager.registry import LivenessLimits, Registry
-from embomatrix.rpc.values import LeaseRef, Resources
+from embomatrix.rpc.leases import LeaseRef
+from embomatrix.rpc.values import Resources
 
 FIRST, SECOND = LeaseRef("l-1", 1), LeaseRef("l-2", 2)
 

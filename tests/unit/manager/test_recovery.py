@@ -19,11 +19,9 @@ from embomatrix.manager.events import (
     WorkerReported,
     WorkersExpected,
 )
+from embomatrix.rpc.leases import LeaseClaim, LeaseOrigin, LeaseRef
 from embomatrix.rpc.values import (
     Batch,
-    LeaseClaim,
-    LeaseOrigin,
-    LeaseRef,
     Resident,
     ResidentState,
     Resources,

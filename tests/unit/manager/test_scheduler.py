@@ -23,9 +23,9 @@ from embomatrix.manager.events import (
 )
 from embomatrix.manager.placement import Need, Site, needs_of, place
 from embomatrix.manager.scheduler import ScheduleLimits, Scheduler
+from embomatrix.rpc.leases import LeaseRef
 from embomatrix.rpc.values import (
     Batch,
-    LeaseRef,
     LookaheadEntry,
     Resident,
     ResidentState,

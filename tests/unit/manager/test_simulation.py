@@ -14,19 +14,17 @@ from embomatrix.manager.simulation.line import Line
 from embomatrix.manager.simulation.run import simulate
 from embomatrix.manager.simulation.scenario import LOCAL, MIXED, Faults, Scenario, Scenes, Trainer
 from embomatrix.reward.breakdown import RewardBreakdown
+from embomatrix.rpc.leases import LeaseOrigin, LeaseRef, WorkerState
 from embomatrix.rpc.values import (
     Batch,
     Completed,
     InfraCode,
     InfraFailure,
-    LeaseOrigin,
-    LeaseRef,
     Resident,
     ResidentState,
     Rollout,
     RolloutResult,
     Timings,
-    WorkerState,
 )
 
 SMALL = Scenario(

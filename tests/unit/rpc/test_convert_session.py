@@ -8,16 +8,19 @@ from embomatrix.proto.v1 import worker_service_pb2
 from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.rpc import convert_session as convert
 from embomatrix.rpc.convert import ConvertError
-from embomatrix.rpc.values import (
-    Completed,
-    InfraCode,
-    InfraFailure,
+from embomatrix.rpc.leases import (
     Lease,
     LeaseClaim,
     LeaseOrigin,
     LeaseProgress,
     LeaseRef,
     LeaseResult,
+    WorkerState,
+)
+from embomatrix.rpc.values import (
+    Completed,
+    InfraCode,
+    InfraFailure,
     PlanCell,
     Resident,
     ResidentState,
@@ -28,7 +31,6 @@ from embomatrix.rpc.values import (
     Timings,
     Warmth,
     WorkerInfo,
-    WorkerState,
 )
 from embomatrix.skills.syntax import Skill, SkillCall
 

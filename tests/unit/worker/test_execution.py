@@ -10,7 +10,13 @@ import pytest
 from tests.unit.worker.test_slots import running
 
 from embomatrix.rpc.convert_session import lease_from_proto, lease_to_proto
-from embomatrix.rpc.values import Completed, InfraCode, Lease, LeaseRef, ResidentState, Rollout
+from embomatrix.rpc.leases import Lease, LeaseRef
+from embomatrix.rpc.values import (
+    Completed,
+    InfraCode,
+    ResidentState,
+    Rollout,
+)
 
 pytestmark = pytest.mark.timeout(60)
 

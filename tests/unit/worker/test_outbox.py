@@ -4,7 +4,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.random import default_rng
 
-from embomatrix.rpc.values import InfraCode, InfraFailure, LeaseRef, LeaseResult
+from embomatrix.rpc.leases import LeaseRef, LeaseResult
+from embomatrix.rpc.values import InfraCode, InfraFailure
 from embomatrix.worker import outbox as module
 from embomatrix.worker.backoff import Backoff
 from embomatrix.worker.outbox import Outbox

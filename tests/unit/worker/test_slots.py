@@ -13,12 +13,11 @@ import psutil
 import pytest
 from tests.fakes.simulation import PROGRAM
 
+from embomatrix.rpc.leases import Lease, LeaseRef
 from embomatrix.rpc.values import (
     Completed,
     InfraCode,
     InfraFailure,
-    Lease,
-    LeaseRef,
     ResidentState,
     Rollout,
 )

@@ -22,15 +22,13 @@ from embomatrix.rpc.convert_session import (
     lease_result_to_proto,
     worker_state_to_proto,
 )
+from embomatrix.rpc.leases import LeaseRef, LeaseResult, WorkerState
 from embomatrix.rpc.values import (
     Completed,
-    LeaseRef,
-    LeaseResult,
     Resident,
     ResidentState,
     Resources,
     Timings,
-    WorkerState,
 )
 from embomatrix.skills.trace import Step
 from embomatrix.worker.membership import Membership

@@ -20,7 +20,8 @@ from embomatrix.proto.v1 import worker_service_pb2 as pb
 from embomatrix.proto.v1 import worker_service_pb2_grpc
 from embomatrix.rpc.channel import open_channel
 from embomatrix.rpc.convert_session import worker_state_to_proto
-from embomatrix.rpc.values import Resident, ResidentState, Resources, WorkerState
+from embomatrix.rpc.leases import WorkerState
+from embomatrix.rpc.values import Resident, ResidentState, Resources
 from embomatrix.worker.bench_figures import BenchError
 from embomatrix.worker.bench_joining import wait_for
 from embomatrix.worker.bench_processes import running_process

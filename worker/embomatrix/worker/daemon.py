@@ -42,7 +42,8 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-    from embomatrix.rpc.values import InfraFailure, LeaseResult, Resources
+    from embomatrix.rpc.leases import LeaseResult
+    from embomatrix.rpc.values import InfraFailure, Resources
     from embomatrix.worker.machine import Probe
     from embomatrix.worker.session import Registration
     from embomatrix.worker.settings import WorkerSettings

@@ -23,7 +23,8 @@ from embomatrix.worker.processes import ProcessGoneError
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
-    from embomatrix.rpc.values import Completed, Lease
+    from embomatrix.rpc.leases import Lease
+    from embomatrix.rpc.values import Completed
     from embomatrix.worker.residents import Residents, Scene, Slot
 
     More = Callable[[int], Sequence["Ticket"]]

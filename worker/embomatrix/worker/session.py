@@ -23,6 +23,7 @@ from embomatrix.rpc.convert_session import (
     resources_to_proto,
     worker_state_to_proto,
 )
+from embomatrix.rpc.leases import WorkerState
 from embomatrix.rpc.status import (
     ClusterError,
     DeadlineError,
@@ -31,7 +32,7 @@ from embomatrix.rpc.status import (
     UnavailableError,
     cluster_errors,
 )
-from embomatrix.rpc.values import InfraCode, WorkerState
+from embomatrix.rpc.values import InfraCode
 from embomatrix.rpc.versions import PROTOCOL_OLDEST, PROTOCOL_VERSION
 from embomatrix.worker.residents import LoadError
 from embomatrix.world.inflation import DEFAULT_LIMITS

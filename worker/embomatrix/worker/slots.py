@@ -6,31 +6,29 @@ import asyncio
 import contextlib
 import functools
 import heapq
-import itertools
 import logging
 import time
-from collections import deque
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.rpc.leases import LeaseClaim, LeaseProgress, LeaseResult
 from embomatrix.rpc.values import (
     Completed,
     InfraCode,
     InfraFailure,
-    LeaseClaim,
-    LeaseProgress,
-    LeaseResult,
     ResidentState,
 )
 from embomatrix.worker.execution import Shift, Ticket
 from embomatrix.worker.processes import SIMULATOR_PROGRAM, ProcessGoneError
 from embomatrix.worker.progress import ProgressBoard
 from embomatrix.worker.residents import Residents
+from embomatrix.worker.waiting import WaitingLeases
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable
     from pathlib import Path
 
-    from embomatrix.rpc.values import Lease, LeaseRef, Resident
+    from embomatrix.rpc.leases import Lease, LeaseRef
+    from embomatrix.rpc.values import Resident
     from embomatrix.worker.residents import Scene, SlotLimits
 
 logger = logging.getLogger(__name__)
@@ -38,8 +36,6 @@ logger = logging.getLogger(__name__)
 RETRY_CHECK_S: Final = 1.0
 AHEAD: Final = 2
 """Leases that wait behind each slot while others are asked for."""
-OVERTAKEN_S: Final = 0.2
-"""A lease that has waited for this long is not overtaken by one whose scene a slot has at hand."""
 
 
 class SlotPool:
@@ -72,7 +68,7 @@ class SlotPool:
             board=self._board,
         )
         self._wanted: tuple[str, ...] = ()
-        self._waiting: deque[Ticket] = deque()
+        self._waiting = WaitingLeases(limits.slots, self._residents.warm)
         self._tickets: dict[LeaseRef, Ticket] = {}
         self._free = list(range(1, limits.slots + 1))
         """Permits that nobody has, as a heap: the lowest is given first, so that a little work stays on few."""
@@ -134,7 +130,7 @@ class SlotPool:
         ticket = Ticket(lease, time.monotonic(), warm)
         self._residents.retry(digest)
         self._tickets[lease.ref] = ticket
-        self._waiting.append(ticket)
+        self._waiting.add(ticket)
         if warm:
             self._start_leases()
         else:
@@ -205,8 +201,7 @@ class SlotPool:
 
     def _scene_changed(self, scene: Scene) -> None:
         if scene.state is ResidentState.FAILED:
-            for ticket in [ticket for ticket in self._waiting if ticket.digest == scene.digest]:
-                self._waiting.remove(ticket)
+            for ticket in self._waiting.take_of(scene.digest):
                 self._finish(ticket, InfraFailure(scene.code, f"scene {scene.digest}: {scene.error}"))
         self._on_change()
         self._wake.set()
@@ -221,29 +216,12 @@ class SlotPool:
             shift.task.add_done_callback(functools.partial(self._vacate, permit))
 
     def _next_lease(self) -> tuple[Ticket, Scene] | None:
-        if self._resting:
-            return None
-        for ticket in self._waiting:
-            scene = self._residents.warm(ticket.digest)
-            if scene is not None:
-                self._waiting.remove(ticket)
-                return ticket, scene
-        return None
+        return None if self._resting else self._waiting.take()
 
-    def _more(self, scene: Scene, count: int) -> list[Ticket]:
-        """Leases of this scene that wait, up to a count: no more than a slot's share of all that wait.
-
-        They may overtake those of other scenes, until one of these has waited for long.
-        """
-        count = min(count, len(self._waiting) // self._limits.slots)
-        if count <= 0 or self._resting or self._residents.warm(scene.digest) is not scene:
-            return []
-        late = time.monotonic() - self._waiting[0].taken_s > OVERTAKEN_S
-        fits = functools.partial(Ticket.fits, digest=scene.digest)
-        found = itertools.takewhile(fits, self._waiting) if late else filter(fits, self._waiting)
-        tickets = list(itertools.islice(found, count))
+    def _more_for(self, shift: Shift, count: int) -> list[Ticket]:
+        tickets = [] if self._resting else self._waiting.take_more(shift.scene, count, time.monotonic())
         for ticket in tickets:
-            self._waiting.remove(ticket)
+            shift.give(ticket)
         return tickets
 
     def _occupy(self, permit: int, ticket: Ticket, scene: Scene) -> Shift:
@@ -258,10 +236,10 @@ class SlotPool:
     def _leave(self, permit: int) -> None:
         """The shift is over; what was not begun in it waits again, in front."""
         shift = self._at_work.pop(permit)
-        for ticket in reversed(shift.given):
-            if not ticket.called_off:
-                ticket.slot = 0
-                self._waiting.appendleft(ticket)
+        unbegun = [ticket for ticket in shift.given if not ticket.called_off]
+        for ticket in unbegun:
+            ticket.slot = 0
+        self._waiting.give_back(unbegun)
         self._residents.release(shift.scene)
         if self._unsettled and not shift.scene.running:
             self._wake.set()
@@ -285,18 +263,13 @@ class SlotPool:
             shift.task = task
 
     async def _work_off(self, shift: Shift) -> None:
-        def more(count: int) -> list[Ticket]:
-            tickets = self._more(shift.scene, count)
-            for ticket in tickets:
-                shift.give(ticket)
-            return tickets
-
         try:
             slot = await shift.scene.take_slot(self._limits.fork_s)
         except ProcessGoneError as error:
             self._scene_died(shift, str(error))
             return
         try:
+            more = functools.partial(self._more_for, shift)
             await shift.work(slot, self._residents, more=more, done=self._finish)
         except Exception as error:
             if not shift.given:

@@ -17,7 +17,8 @@ from embomatrix.rpc.values import Completed
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from embomatrix.rpc.values import LeaseResult, Resources
+    from embomatrix.rpc.leases import LeaseResult
+    from embomatrix.rpc.values import Resources
     from embomatrix.worker.cache import BundleCache
     from embomatrix.worker.membership import Membership
     from embomatrix.worker.outbox import Outbox

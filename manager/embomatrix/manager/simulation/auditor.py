@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from embomatrix.manager.simulation.agenda import Agenda
-    from embomatrix.rpc.values import Batch, LeaseRef, RolloutResult, WorkerState
+    from embomatrix.rpc.leases import LeaseRef, WorkerState
+    from embomatrix.rpc.values import Batch, RolloutResult
 
 
 HEDGE_SHARE: Final = 0.05

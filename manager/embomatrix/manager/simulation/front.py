@@ -16,7 +16,7 @@ from embomatrix.manager.commands import (
 )
 from embomatrix.manager.events import BatchSubmitted, LookaheadAnnounced, RunOpened
 from embomatrix.manager.intake import TICK_S, Heartbeat
-from embomatrix.rpc.values import Lease
+from embomatrix.rpc.leases import Lease
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -27,16 +27,13 @@ if TYPE_CHECKING:
     from embomatrix.manager.simulation.agenda import Agenda
     from embomatrix.manager.simulation.auditor import Auditor
     from embomatrix.manager.simulation.gauge import Gauge
+    from embomatrix.rpc.leases import LeaseProgress, LeaseRef, LeaseResult, WorkerState
     from embomatrix.rpc.values import (
         Batch,
-        LeaseProgress,
-        LeaseRef,
-        LeaseResult,
         LookaheadEntry,
         Resources,
         RolloutResult,
         RunTerms,
-        WorkerState,
     )
 
 REPORTS: Final = {True: "first report", False: "report"}

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.reward.breakdown import RewardBreakdown
+from embomatrix.rpc.leases import LeaseProgress, LeaseResult
 from embomatrix.rpc.values import (
     Completed,
     InfraCode,
     InfraFailure,
-    LeaseProgress,
-    LeaseResult,
     Resident,
     ResidentState,
     Timings,
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
     from embomatrix.manager.simulation.gauge import Gauge
     from embomatrix.manager.simulation.machines import Machine, Setting
     from embomatrix.manager.simulation.scenario import Faults
-    from embomatrix.rpc.values import Lease, LeaseRef
+    from embomatrix.rpc.leases import Lease, LeaseRef
 
 RETRY_LOAD_S: Final = 10.0
 """A scene that failed to load is tried again after this long, as the real worker does."""

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Final, TypeVar
 from embomatrix.manager.simulation.front import Stream
 from embomatrix.manager.simulation.line import Line
 from embomatrix.manager.simulation.slots import SimulatedSlots, Surroundings
+from embomatrix.rpc.leases import WorkerState
 from embomatrix.rpc.status import SupersededError
-from embomatrix.rpc.values import Completed, WorkerState
+from embomatrix.rpc.values import Completed
 
 if TYPE_CHECKING:
     import random
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from embomatrix.manager.simulation.gauge import Gauge
     from embomatrix.manager.simulation.machines import Machine, Setting
     from embomatrix.manager.simulation.scenario import Scenario
-    from embomatrix.rpc.values import LeaseRef, LeaseResult
+    from embomatrix.rpc.leases import LeaseRef, LeaseResult
 
 ANSWER_S: Final = 2.0
 """A heartbeat or a new stream without an answer for this long is given up."""

@@ -23,37 +23,8 @@ def measure(load: dict[str, Any]) -> list[float]:
     """Processor seconds of each measured step."""
     import torch
     from datasets import Dataset
-    from tokenizers import Tokenizer, models, pre_tokenizers
-    from transformers import LlamaConfig, LlamaForCausalLM, PreTrainedTokenizerFast, TrainerCallback
-    from trl import GRPOConfig, GRPOTrainer
-
-    torch.set_num_threads(1)
-    torch.manual_seed(load["seed"])
-    words = load["words"]
-    inner = Tokenizer(models.WordLevel({word: at for at, word in enumerate(words)}, unk_token=words[0]))
-    inner.pre_tokenizer = pre_tokenizers.WhitespaceSplit()
-    words_only: Any = PreTrainedTokenizerFast  # transformers leaves it untyped
-    tokenizer = words_only(
-        tokenizer_object=inner,
-        unk_token=words[0],
-        eos_token=words[1],
-        pad_token=words[1],
-        padding_side="left",
-    )
-    model = LlamaForCausalLM(
-        LlamaConfig(
-            vocab_size=len(words),
-            hidden_size=load["width"],
-            intermediate_size=load["inner"],
-            num_hidden_layers=load["layers"],
-            num_attention_heads=load["heads"],
-            num_key_value_heads=load["heads"],
-            max_position_embeddings=2048,
-            tie_word_embeddings=True,
-            eos_token_id=1,
-            pad_token_id=1,
-        )
-    )
+    from transformers import TrainerCallback
+    from trl import GRPOTrainer
 
     class Clock(TrainerCallback):
         """Reads the processor's clock around each step."""
@@ -68,38 +39,80 @@ def measure(load: dict[str, Any]) -> list[float]:
         def on_step_end(self, *_: Any, **__: Any) -> None:
             self.spent_s.append(time.process_time() - self.began_s)
 
-    def by_length(completions: list[str], **_: Any) -> list[float]:
-        return [float(len(text)) for text in completions]
-
+    torch.set_num_threads(1)
+    torch.manual_seed(load["seed"])
     clock = Clock()
     with tempfile.TemporaryDirectory() as folder:
-        config = GRPOConfig(
-            output_dir=folder,
-            per_device_train_batch_size=load["tasks"] * load["group"],
-            num_generations=load["group"],
-            max_completion_length=load["new"],
-            max_steps=load["unmeasured"] + load["steps"],
-            loss_type="dapo",
-            beta=0.0,
-            temperature=1.0,
-            use_cpu=True,
-            bf16=False,
-            gradient_checkpointing=False,
-            save_strategy="no",
-            report_to="none",
-            disable_tqdm=True,
-            seed=load["seed"],
-        )
-        prompts = Dataset.from_list([{"prompt": prompt} for prompt in load["prompts"]])
         GRPOTrainer(
-            model=model,
-            processing_class=tokenizer,
-            reward_funcs=by_length,
-            args=config,
-            train_dataset=prompts,
+            model=_model(load),
+            processing_class=_tokenizer(load["words"]),
+            reward_funcs=_by_length,
+            args=_settings(load, folder),
+            train_dataset=Dataset.from_list([{"prompt": prompt} for prompt in load["prompts"]]),
             callbacks=[clock],
         ).train()
     return clock.spent_s[load["unmeasured"] :]
+
+
+def _by_length(completions: list[str], **_: Any) -> list[float]:
+    return [float(len(text)) for text in completions]
+
+
+def _tokenizer(words: list[str]) -> Any:
+    from tokenizers import Tokenizer, models, pre_tokenizers
+    from transformers import PreTrainedTokenizerFast
+
+    inner = Tokenizer(models.WordLevel({word: at for at, word in enumerate(words)}, unk_token=words[0]))
+    inner.pre_tokenizer = pre_tokenizers.WhitespaceSplit()
+    words_only: Any = PreTrainedTokenizerFast  # transformers leaves it untyped
+    return words_only(
+        tokenizer_object=inner,
+        unk_token=words[0],
+        eos_token=words[1],
+        pad_token=words[1],
+        padding_side="left",
+    )
+
+
+def _model(load: dict[str, Any]) -> Any:
+    from transformers import LlamaConfig, LlamaForCausalLM
+
+    return LlamaForCausalLM(
+        LlamaConfig(
+            vocab_size=len(load["words"]),
+            hidden_size=load["width"],
+            intermediate_size=load["inner"],
+            num_hidden_layers=load["layers"],
+            num_attention_heads=load["heads"],
+            num_key_value_heads=load["heads"],
+            max_position_embeddings=2048,
+            tie_word_embeddings=True,
+            eos_token_id=1,
+            pad_token_id=1,
+        )
+    )
+
+
+def _settings(load: dict[str, Any], folder: str) -> Any:
+    from trl import GRPOConfig
+
+    return GRPOConfig(
+        output_dir=folder,
+        per_device_train_batch_size=load["tasks"] * load["group"],
+        num_generations=load["group"],
+        max_completion_length=load["new"],
+        max_steps=load["unmeasured"] + load["steps"],
+        loss_type="dapo",
+        beta=0.0,
+        temperature=1.0,
+        use_cpu=True,
+        bf16=False,
+        gradient_checkpointing=False,
+        save_strategy="no",
+        report_to="none",
+        disable_tqdm=True,
+        seed=load["seed"],
+    )
 
 
 if __name__ == "__main__":
