@@ -100,9 +100,12 @@ class Obstacles:
                 continue
             parts = rows[mine]
             over = (parts[:, 0] <= x) & (x <= parts[:, 2]) & (parts[:, 1] <= y) & (y <= parts[:, 3])
-            if (over & (parts[:, 4] >= top)).any():
+            stiff = ~self.leaves[
+                mine
+            ]  # under a lid the arm reaches from above: shut, it is in the way otherwise
+            if (over & stiff & (parts[:, 4] >= top)).any():
                 beside = (parts[:, 4] < top - SLACK_M) & (parts[:, 5] > low + SLACK_M)
-                barring[mine] = beside & ~self.leaves[mine]
+                barring[mine] = beside & stiff
         return np.ascontiguousarray(rows[barring, :4].T)
 
     def _chosen(self, rows: BoolArray) -> Obstacles:

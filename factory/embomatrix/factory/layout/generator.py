@@ -7,10 +7,8 @@ arranged together. Object: a continuous pose, free, in reach, at rest. What fail
 from __future__ import annotations
 
 import contextlib
-import math
 import time
-from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -23,6 +21,7 @@ from embomatrix.factory.layout.jobs import Layout, LayoutAgents, Record, kind_of
 from embomatrix.factory.layout.planes import brief_for, company_on, planes_of, pose_at
 from embomatrix.factory.layout.rest import settle
 from embomatrix.factory.layout.sampling import ObjectSampler
+from embomatrix.factory.layout.seating import Seat, Seating
 from embomatrix.factory.layout.tree import LayoutTree
 from embomatrix.factory.layout.values import (
     Arrangement,
@@ -50,10 +49,6 @@ if TYPE_CHECKING:
 
 ROUNDS: Final = 24
 """Trees that are asked for one room at most."""
-RESIGNED: Final = 2
-"""After so many places where no clear way leads to a thing, one is taken as it is: verification tells."""
-CLEARED: Final = 3
-"""Things of the base scene that are taken away from a full host, for what the task puts there."""
 SURFACES: Final = 4
 """Surfaces of one piece of furniture that are arranged; beyond them the sampler looks alone."""
 SHIFT_M: Final = 0.008
@@ -79,13 +74,15 @@ def lay(editor: SceneEditor, items: Sequence[Item], seed: int, agents: LayoutAge
         failures = [item.failure(item.host, LayoutReason.NO_HOST, str(error)) for item in items]
         return Layout({}, {}, tuple(failures), record)
     left: list[Failure] = []
+    out_of_hand: list[Failure] = []
     for number, room in enumerate(dict.fromkeys(rooms.values())):
         mine = [item for item in items if rooms[item.name] == room]
         job = _RoomJob(editor, agents, editor.rooms[room], mine, seed * 1009 + number, record)
         left += job.run()
         names |= job.names
+        out_of_hand += job.out_of_hand
         trees[room] = job.tree()
-    return Layout(names, trees, tuple(left), record)
+    return Layout(names, trees, tuple(left), record, tuple(out_of_hand))
 
 
 def _distributed(
@@ -114,27 +111,6 @@ def _with_carrier(editor: SceneEditor, thing: Thing) -> Thing:
     return replace(thing, relation=LayoutRelation.INSIDE if inside else LayoutRelation.ONTOP, host=other.host)
 
 
-@dataclass(slots=True)
-class _Waiting:
-    """An item without a place: which of its models is tried, and why it has none yet."""
-
-    item: Item
-    asset: Asset
-    choice: int = 0
-    cleared: int = 0
-    last: Failure | None = None
-
-    def failure(self, room: str) -> Failure:
-        """Why it found no place in a room."""
-        if self.last is not None:
-            return self.last
-        size = " x ".join(f"{extent:.2f}" for extent in self.asset.size_m)
-        detail = (
-            f"nothing in {room} takes {self.asset.asset_id}, {size} m: try another room or a smaller model"
-        )
-        return self.item.failure(self.item.host or room, LayoutReason.NO_HOST, detail)
-
-
 class _RoomJob:
     """The items of one room, tree after tree until each has a place or nothing is left to try."""
 
@@ -147,7 +123,6 @@ class _RoomJob:
         seed: int,
         record: Record,
     ) -> None:
-        self.names: dict[str, str] = {}
         self._editor = editor
         self._agents = agents
         self._room = room
@@ -157,29 +132,36 @@ class _RoomJob:
         self._rng = np.random.default_rng((seed, 3))
         self._sampler = ObjectSampler(editor, self._rng)
         self._hanger = Hanger(editor, room, self._rng)
-        self._waiting = {item.name: _Waiting(item, item.asset(0)) for item in items}
-        self._placed: dict[str, _Waiting] = {}
-        self._failures: list[Failure] = []
-        self._given_up: list[Failure] = []
+        self._seating = Seating(editor, room.name, items)
+
+    @property
+    def names(self) -> dict[str, str]:
+        """Of the placed items, in the scene."""
+        return self._seating.names
+
+    @property
+    def out_of_hand(self) -> list[Failure]:
+        """Placed items that were taken as they are, and what was wrong with their places."""
+        return [guest.last for guest in self._seating.placed.values() if guest.is_resigned and guest.last]
 
     def run(self) -> list[Failure]:
         """Lay the room out; what is left out."""
+        seating = self._seating
         for number in range(ROUNDS):
-            if not self._waiting:
+            if not seating.waiting:
                 break
             self._round = number
             brief = self._brief()
             tree = self._agents.organize(brief)
             self._record.rooms.append((brief, tree))
             hung = {branch.child for branch in tree.branches()}
-            for name in [name for name in self._waiting if name not in hung]:
-                self._next_model(name)
+            for name in [name for name in seating.waiting if name not in hung]:
+                seating.next_model(name)
             before = set(self.names)
             self._realise(tree)
             self._settle([name for name in self.names if name not in before])
-        for waiting in self._waiting.values():
-            self._given_up.append(waiting.failure(self._room.name))
-        return self._given_up
+        left = [guest.failure(self._room.name) for guest in seating.waiting.values()]
+        return [*seating.given_up, *left]
 
     def tree(self) -> LayoutTree:
         """How the room's objects hang together in the end, in the scene's names: what was laid, and what that stands on."""
@@ -193,73 +175,20 @@ class _RoomJob:
         return whole.pruned(self.names.values())
 
     def _brief(self) -> RoomBrief:
-        things = tuple(_with_carrier(self._editor, self._thing(name)) for name in self._waiting)
+        things = tuple(_with_carrier(self._editor, self._thing(name)) for name in self._seating.waiting)
         named = {thing.host for thing in things if thing.host in self._editor.objects}
         hosts = hosts_in(self._editor, self._room.name, named)
         room = next(room for room in rooms_of(self._editor) if room.name == self._room.name)
-        return RoomBrief(room, hosts, things, tuple(self._failures), self._seed * 31 + self._round)
-
-    def _next_model(self, name: str) -> None:
-        """Try the item with its next model, as if nothing had been tried; give it up after the last."""
-        waiting = self._waiting[name]
-        if waiting.choice + 1 < len(waiting.item.models):
-            waiting.choice += 1
-            waiting.asset = waiting.item.asset(waiting.choice)
-            self._failures = [failure for failure in self._failures if failure.thing != name]
-        elif self._waiting.keys() & {waiting.item.host, *waiting.item.beside}:
-            return  # what it is to stand at has no place yet
-        elif not (self._exchange(waiting.item.host) or self._make_room(waiting)):
-            del self._waiting[name]
-            self._given_up.append(waiting.failure(self._room.name))
-
-    def _exchange(self, host: str) -> bool:
-        """Take out what an item was to stand at, with all on it, to try that with its next model; False where there is none."""
-        placed = self._placed.get(host)
-        if placed is None or host not in self.names or placed.choice + 1 >= len(placed.item.models):
-            return False
-        self._take_out(self.names[host])
-        self._failures = [failure for failure in self._failures if failure.thing not in self._waiting]
-        for each in self._waiting.values():
-            if each.item.name != host:
-                each.choice, each.asset = 0, each.item.asset(0)
-        self._next_model(host)
-        return True
-
-    def _make_room(self, waiting: _Waiting) -> bool:
-        """Take the largest loose thing that is not the task's from a full host that the task demands; False without one."""
-        host = self.names.get(waiting.item.host, waiting.item.host)
-        full = waiting.last is not None and waiting.last.reason is LayoutReason.NO_FREE_SPOT
-        if not full or waiting.cleared == CLEARED:
-            return False
-        loose = [
-            name
-            for name, item in self._editor.objects.items()
-            if item.host == host and not item.fixed and self._editor.is_spare(name)
-        ]
-        if not loose:
-            return False
-        self._editor.remove(max(loose, key=lambda name: math.prod(self._editor.box_of(name).size_m)))
-        waiting.cleared += 1
-        waiting.choice, waiting.asset = 0, waiting.item.asset(0)
-        self._failures = [failure for failure in self._failures if failure.thing != waiting.item.name]
-        return True
-
-    def _take_out(self, scene_name: str) -> None:
-        """Remove an object of this job from the scene, with all that rests on it: they wait again."""
-        owners = {there: name for name, there in self.names.items()}
-        for gone in self._editor.remove(scene_name):
-            name = owners[gone]
-            del self.names[name]
-            self._waiting[name] = self._placed.pop(name)
+        return RoomBrief(room, hosts, things, tuple(self._seating.failures), self._seed * 31 + self._round)
 
     def _realise(self, tree: LayoutTree) -> None:
         """Place what the tree says, parents before their children; what stands on one thing together."""
         groups: dict[tuple[str, LayoutRelation], list[str]] = {}
         for branch in tree.branches():
-            if branch.child in self._waiting:
+            if branch.child in self._seating.waiting:
                 groups.setdefault((branch.parent, branch.relation), []).append(branch.child)
         for (parent, relation), children in groups.items():
-            if parent in self._waiting:
+            if parent in self._seating.waiting:
                 continue  # it found no place itself
             host = self.names.get(parent, parent)
             if relation is LayoutRelation.ONTOP:
@@ -282,10 +211,12 @@ class _RoomJob:
         wishes = self._wishes(planes[0], children) if planes else {}
         left = children
         for plane in planes[:SURFACES]:
-            fitting = [name for name in left if self._waiting[name].asset.size_m[2] < plane.clearance_m]
+            fitting = [
+                name for name in left if self._seating.waiting[name].asset.size_m[2] < plane.clearance_m
+            ]
             if fitting:
                 self._arrange(plane, fitting, wishes)
-            left = [name for name in left if name in self._waiting]
+            left = [name for name in left if name in self._seating.waiting]
         for name in left:
             beside = next((w.other for w in wishes.get(name, ()) if w.required), "")
             if beside:
@@ -308,11 +239,11 @@ class _RoomJob:
         return answer.of
 
     def _thing(self, name: str) -> Thing:
-        waiting = self._waiting[name]
+        waiting = self._seating.waiting[name]
         return thing_of(waiting.item, waiting.asset, self.names)
 
     def _arrange(self, plane: Plane, children: Sequence[str], wishes: dict[str, tuple[Wish, ...]]) -> None:
-        things = [(self._thing(name), self._waiting[name].asset) for name in children]
+        things = [(self._thing(name), self._seating.waiting[name].asset) for name in children]
         brief = brief_for(self._editor, plane, things, wishes, self._seed * 31 + self._round)
         began = time.process_time()
         found = self._agents.arrange(brief)
@@ -320,11 +251,14 @@ class _RoomJob:
         spent[self._room.name] = spent.get(self._room.name, 0.0) + time.process_time() - began
         self._record.planes.append((brief, found))
         for spot in found[0].spots:
-            asset = self._waiting[spot.thing].asset
+            asset = self._seating.waiting[spot.thing].asset
             others = [other for way in found[1:] for other in way.spots if other.thing == spot.thing]
             with contextlib.suppress(PlacementError):
                 pose = self._sampler.first_free(asset, self._near(plane, asset, (spot, *others)), plane.host)
-                self._insert(spot.thing, pose, Relation.ONTOP if plane.host else None, plane.host)
+                relation = Relation.ONTOP if plane.host else None
+                self._insert(
+                    spot.thing, pose, (relation, plane.host), Seat(relation, plane.host or plane.room)
+                )
 
     def _near(self, plane: Plane, asset: Asset, spots: Iterable[Spot]) -> Iterator[Pose]:
         """Poses at and around spots: off the grid first where nothing aligns the thing."""
@@ -337,47 +271,61 @@ class _RoomJob:
     def _sample(self, name: str, relation: Relation | None, target: str, host: str = "") -> None:
         """Let the sampler look for a pose alone; ``host`` is what the tree said, where the target is a neighbour."""
         try:
-            pose = self._sampler.find(self._waiting[name].asset, relation, target)
+            pose = self._sampler.find(self._seating.waiting[name].asset, relation, target)
         except PlacementError as error:
             known = relation in (Relation.INSIDE, Relation.UNDER)
             level = LayoutRelation(relation.value) if relation and known else LayoutRelation.ONTOP
             self._failed(name, level, host or target, error)
         else:
-            self._insert(name, pose, *self._sampler.rests(relation, target))
+            self._insert(name, pose, self._sampler.rests(relation, target), Seat(relation, target))
 
     def _hang(self, name: str) -> None:
-        asset = self._waiting[name].asset
+        asset = self._seating.waiting[name].asset
         overhead = kind_of(asset) is Kind.OVERHEAD
         try:
             pose = self._hanger.under_ceiling(asset) if overhead else self._hanger.on_wall(asset)
         except PlacementError as error:
             self._failed(name, LayoutRelation.ATTACHED, self._room.name, error)
         else:
-            self._insert(name, pose, None, "")
-            self._editor.fasten(self.names[name])
+            at = Seat(None, self._room.name)
+            self._editor.fasten(self._insert(name, pose, (None, ""), at))
 
-    def _insert(self, name: str, pose: Pose, relation: Relation | None, host: str) -> None:
-        waiting = self._placed[name] = self._waiting.pop(name)
-        self.names[name] = self._editor.insert(waiting.asset, pose, relation, host, self._room.name)
+    def _insert(self, name: str, pose: Pose, rests: tuple[Relation | None, str], at: Seat) -> str:
+        return self._seating.seat(name, pose, rests, at)
 
     def _failed(self, name: str, relation: LayoutRelation, host: str, error: PlacementError) -> None:
-        failure = Failure(name, relation, host, error.reason, str(error))
-        self._waiting[name].last = failure
-        self._failures.append(failure)
+        self._seating.refuse(name, relation, host, error.reason, str(error))
 
     def _settle(self, fresh: Sequence[str]) -> None:
-        """Let go of what geometry does not prove to be at rest; what does not stay has failed, with all on it."""
-        tried = Counter(item.thing for item in self._failures if item.reason is LayoutReason.NOT_AT_HAND)
-        resigned = {self.names[name] for name in fresh if tried[name] >= RESIGNED}
-        outcome = settle(self._editor, [self.names[name] for name in fresh], resigned)
+        """Let go of what geometry does not prove to be at rest; what does not stay has failed, with all on it.
+
+        So has what the robot doesn't get at, unless it was so elsewhere as well. What the task wants it at is put elsewhere.
+        """
+        seating = self._seating
+        outcome = settle(self._editor, [self.names[name] for name in fresh], self._elsewhere)
         self._record.settled += outcome.dropped
-        owners = {scene_name: name for name, scene_name in self.names.items()}
-        for scene_name, (reason, detail) in outcome.wrong.items():
-            if scene_name not in self._editor.objects:
-                continue  # it went with what it stood on
-            item = self._editor.objects[scene_name]
-            relation = LayoutRelation(item.relation.value) if item.relation else LayoutRelation.ONTOP
-            self._take_out(scene_name)
-            failure = Failure(owners[scene_name], relation, item.host or self._room.name, reason, detail)
-            self._waiting[owners[scene_name]].last = failure
-            self._failures.append(failure)
+        wrong = {name: (LayoutReason.NOT_AT_HAND, detail) for name, detail in outcome.unreached.items()}
+        wrong |= {name: (LayoutReason.UNSTABLE, detail) for name, detail in outcome.unstable.items()}
+        for scene_name, (reason, detail) in wrong.items():
+            name = seating.owners().get(scene_name, "")
+            guest = seating.placed.get(name)
+            far = reason is LayoutReason.NOT_AT_HAND
+            if guest is None or (far and guest.is_resigned):
+                continue  # it went with what it stood on, or is taken as it is
+            seating.unseat(name, reason, detail)
+            if far and not seating.offer_another(guest):
+                guest.unreached += 1
+
+    def _elsewhere(self, scene_name: str) -> Iterator[Pose]:
+        """Other free poses for a thing at what it is at; none for what bears others."""
+        editor = self._editor
+        guest = self._seating.placed[self._seating.owners()[scene_name]]
+        borne = any(item.host == scene_name for item in editor.objects.values())
+        if guest.seat is None or borne or editor.known(scene_name).fixed:
+            return
+        relation, host = guest.seat.relation, guest.seat.host
+        target = host if host in editor.objects else ""
+        with contextlib.suppress(PlacementError):
+            for pose in self._sampler.poses(guest.asset, relation, host):
+                if editor.objection(guest.asset, pose, target) is None:
+                    yield pose

@@ -127,9 +127,13 @@ class Record:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """What came of a layout: names in the scene by item, trees by room in those names, and a failure for each item left out."""
+    """What came of a layout: names in the scene by item, trees by room in those names, and a failure for each item left out.
+
+    ``out_of_hand`` tells of items that were given a place at which the robot does not get at them, as no better one was found.
+    """
 
     names: Mapping[str, str]
     trees: Mapping[str, LayoutTree]
     failures: tuple[Failure, ...]
     record: Record
+    out_of_hand: tuple[Failure, ...] = ()

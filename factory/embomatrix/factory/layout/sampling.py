@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 
 TRIES: Final = 64
 FLOOR_TRIES: Final = 200
+PEEPING: Final = 24
+PEEPING_SHARE: Final = 0.15
+"""Poses under the edges of a carrier that are looked at, and how much of a thing's width its middle is behind the edge."""
 BARRED: Final = 16
 """Poses that would bar the robot's way after which a search ends: each costs a look at all ways."""
 MODELS: Final = 8
@@ -88,10 +91,10 @@ class ObjectSampler:
             yield from self._beside(asset, target)
             return
         carrier = editor.asset_of(host)
-        found = [
-            target.pose_world_asset @ local
-            for local in candidates(asset, carrier, relation, self._shift(), TRIES)
-        ]
+        local = list(candidates(asset, carrier, relation, self._shift(), TRIES))
+        if relation is Relation.UNDER:
+            local += self._peeping(asset, carrier)
+        found = [target.pose_world_asset @ pose for pose in local]
         if not found:
             reason = LayoutReason.TOO_LARGE if carrier.supports else LayoutReason.NO_SURFACE
             raise PlacementError(
@@ -124,6 +127,17 @@ class ObjectSampler:
             if tally.reached == BARRED:
                 break
         raise _none_of(tally, asset, target or "the floor")
+
+    def _peeping(self, asset: Asset, carrier: Asset) -> Iterator[Pose]:
+        """Poses in a carrier's frame under its edges, a good third of the thing in the open: so shoes stand under a bed."""
+        x, y, z = carrier.size_m
+        for _ in range(PEEPING):
+            side, along = int(self._rng.integers(4)), float(self._rng.uniform(-0.4, 0.4))
+            turned = float(self._rng.integers(2)) * math.pi / 2
+            depth = asset.size_m[(side >= 2) != (turned > 0)] * PEEPING_SHARE
+            px = (x / 2 - depth) * (1, -1)[side] if side < 2 else along * x
+            py = (y / 2 - depth) * (1, -1)[side - 2] if side >= 2 else along * y
+            yield Pose.from_xyz_yaw(px, py, (asset.size_m[2] - z) / 2 + LIFT_M, turned)
 
     def _on_floor(self, asset: Asset, room: Room) -> Iterator[Pose]:
         (x0, y0), (x1, y1) = room.low_m, room.high_m

@@ -15,17 +15,17 @@ from embomatrix.factory.assets.library import build_asset
 from embomatrix.factory.editor import SceneEditor, add_floor
 from embomatrix.factory.layout.generator import lay
 from embomatrix.factory.layout.jobs import Item
-from embomatrix.factory.layout.values import Failure, LayoutRelation
+from embomatrix.factory.layout.values import LayoutRelation
 from embomatrix.factory.refusal import Refusal, RefusalReason, RefusedError
 from embomatrix.factory.task_import.binding import bind
 from embomatrix.factory.task_import.dialects import read_problem
 from embomatrix.factory.task_import.expressible import AGENT, FLOORS
+from embomatrix.factory.task_import.models import models_for
 from embomatrix.factory.task_import.reach import FUTURE, INSOURCE, REAL, pieces_of, profile_for
 from embomatrix.factory.task_import.scene import with_robot_in, with_states
-from embomatrix.factory.task_import.search import serves
 from embomatrix.factory.task_import.thermal import sources_for
 from embomatrix.factory.writer.tasks import object_table
-from embomatrix.factory.writer.view import SceneView, is_liftable
+from embomatrix.factory.writer.view import SceneView
 from embomatrix.world.bddl import ROOM_TYPES, Literal, is_room_instance
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.evaluate import atoms_of, objects_of, render, substitute, types_of
@@ -41,7 +41,6 @@ if TYPE_CHECKING:
     from embomatrix.factory.task_import.binding import Addition, Binding
     from embomatrix.factory.task_import.sources import SourceText
     from embomatrix.world.bddl import Problem
-    from embomatrix.world.catalog import Model
     from embomatrix.world.geometry import Vec3
     from embomatrix.world.goal import Formula
     from embomatrix.world.scene import Scene
@@ -58,8 +57,6 @@ class Lay(Protocol):
     def __call__(self, editor: SceneEditor, items: Sequence[Item], seed: int) -> Layout: ...
 
 
-MODEL_TRIES: Final = 5
-"""Models of a type that are tried before it counts as not fitting its place."""
 SHUNNED: Final = 3
 """Pieces of furniture that are given up for a problem at most, because they can't hold what it puts there."""
 KITCHEN: Final = frozenset({State.COOKED, State.FROZEN, State.HOT, State.SLICED, REAL})
@@ -148,9 +145,13 @@ class _Binder:
         return self._task(scene, names, binding, start)
 
     def _bound(self) -> tuple[Binding, SceneEditor, dict[str, str]]:
-        """The problem bound and laid out; furniture of the scene that can't hold what it must is left for other furniture."""
+        """The problem bound and laid out; furniture of the scene that can't hold what it must is left for other furniture.
+
+        So is furniture at which the robot does not get at what it must hold, as long as there is other.
+        """
         manner, shunned = self._manner, set[str]()
         first: RefusedError | None = None
+        resort: tuple[Binding, SceneEditor, dict[str, str]] | None = None
         while True:
             try:
                 binding = bind(
@@ -163,18 +164,26 @@ class _Binder:
                     shunned=shunned,
                 )
             except RefusedError as error:
+                if resort is not None:
+                    return resort
                 raise first or error from error
             editor = SceneEditor(self._base)
-            laid = self._laid(editor, binding)
-            if isinstance(laid, dict):
-                return binding, editor, {**binding.found, **laid}
+            layout = self._laid(editor, binding)
+            if not layout.failures:
+                bound = binding, editor, {**binding.found, **layout.names}
+                if not layout.out_of_hand:
+                    return bound
+                resort = resort or bound
+            wrong = (*layout.failures, *layout.out_of_hand)[0]
             first = first or RefusedError(
                 RefusalReason.DOES_NOT_FIT,
-                f"{laid.thing!r} has no place {laid.relation} {laid.host}: {laid.detail}",
+                f"{wrong.thing!r} has no place {wrong.relation} {wrong.host}: {wrong.detail}",
             )
-            if laid.host not in binding.found.values() or len(shunned) == SHUNNED:
+            if wrong.host not in binding.found.values() or len(shunned) == SHUNNED:
+                if resort is not None:
+                    return resort
                 raise first
-            shunned.add(laid.host)
+            shunned.add(wrong.host)
 
     def _add_floor(self, editor: SceneEditor, floor: str, binding: Binding) -> str:
         if floor not in binding.floors:
@@ -194,15 +203,15 @@ class _Binder:
             if type_name in FLOORS and {name, type_name} & about
         )
 
-    def _laid(self, editor: SceneEditor, binding: Binding) -> dict[str, str] | Failure:
-        """Put all that the scene lacks into it; names in the scene, or what found no place."""
+    def _laid(self, editor: SceneEditor, binding: Binding) -> Layout:
+        """Put all that the scene lacks into it."""
         editor.keep(binding.found.values())
         items = [self._item(addition, binding) for addition in binding.additions]
-        layout = self._manner.lay(editor, items, int(self._rng.integers(2**31)))
-        return layout.failures[0] if layout.failures else dict(layout.names)
+        return self._manner.lay(editor, items, int(self._rng.integers(2**31)))
 
     def _item(self, addition: Addition, binding: Binding) -> Item:
-        models = self._models(addition)[:MODEL_TRIES]
+        holds = addition.name in self._hosts or addition.type in self._hosts
+        models = models_for(addition, self._rng, holds=holds)
         if not models:
             raise RefusedError(
                 RefusalReason.DOES_NOT_FIT, f"{addition.name!r} has no place: its type has no model"
@@ -234,33 +243,6 @@ class _Binder:
     def _size_of(self, editor: SceneEditor, name: str) -> Vec3:
         category, _, model = editor.objects[name].asset_id.rpartition("-")
         return Catalog.load().model(category, model).size_m
-
-    def _models(self, addition: Addition) -> list[Model]:
-        """Models of the type that can do what is asked, the liftable ones before furniture.
-
-        Of what can be lifted large ones come first where it must hold others, else small ones. Of furniture two of a middling
-        size come first, then the smallest: where these don't fit, none does. On other furniture only small ones go.
-        """
-        catalog = Catalog.load()
-        models = [
-            (model, catalog.category(category).mass_kg)
-            for category in catalog.categories_of(addition.type)
-            for model in catalog.models_of(category)
-        ]
-        holds = addition.name in self._hosts or addition.type in self._hosts
-        light: list[tuple[float, Model]] = []
-        heavy: list[tuple[float, Model]] = []
-        for model, mass in models:
-            volume = math.prod(model.size_m) * float(self._rng.uniform(0.7, 1.4))
-            if is_liftable(model.size_m, mass):
-                light.append((-math.prod(model.size_m) if holds else volume, model))
-            else:
-                heavy.append((volume, model))
-        order = [*_ranked(light), *(_ranked(heavy) if addition.host else _middling_first(heavy))]
-        return [model for model in order[: 4 * MODEL_TRIES] if self._serves(model, addition)]
-
-    def _serves(self, model: Model, addition: Addition) -> bool:
-        return serves(build_asset(Catalog.load(), model.category, model.model_id), addition.needs)
 
     def _task(
         self, scene: Scene, names: dict[str, str], binding: Binding, start: tuple[Literal, ...]
@@ -336,19 +318,6 @@ class _Binder:
         if atom.predicate == INSOURCE:
             return self._substances.get(atom.args[1], "") in flows_from(type_name)
         return atom.predicate in (REAL, FUTURE) and is_substance(type_name)
-
-
-def _ranked(models: Sequence[tuple[float, Model]]) -> list[Model]:
-    """Models by a number, the least first."""
-    return [model for _, model in sorted(models, key=lambda item: item[0])]
-
-
-def _middling_first(models: Sequence[tuple[float, Model]]) -> list[Model]:
-    """Models by volume, the least first, after two from the middle."""
-    order = _ranked(models)
-    middle = len(order) // 2
-    first = order[max(0, middle - 1) : middle + 1]
-    return [*reversed(first), *(model for model in order if model not in first)]
 
 
 def _renamed(literal: Literal, names: dict[str, str]) -> Atom:

@@ -1,0 +1,77 @@
+"""Which models of a type are tried for an object that a problem brings, the best first."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.factory.assets.library import build_asset
+from embomatrix.factory.task_import.search import serves
+from embomatrix.factory.writer.view import is_liftable
+from embomatrix.world.catalog import Catalog
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import numpy as np
+
+    from embomatrix.factory.task_import.binding import Addition
+    from embomatrix.world.catalog import Model
+
+MODEL_TRIES: Final = 5
+"""Models of a type that are tried before it counts as not fitting its place."""
+LOOKED_AT: Final = 4 * MODEL_TRIES
+"""Models of which it is asked whether they can do what they must."""
+
+
+def models_for(addition: Addition, rng: np.random.Generator, *, holds: bool) -> list[Model]:
+    """At most five models of the type that can do what is asked, the liftable ones before furniture.
+
+    Of what can be lifted large ones come first where it ``holds`` others, else small ones; what holds others and stands on
+    or in something itself is tried in all sizes. Of furniture two of a middling size come first, then the smallest: where
+    these don't fit, none does. On other furniture only small ones go.
+    """
+    catalog = Catalog.load()
+    models = [
+        (model, catalog.category(category).mass_kg)
+        for category in catalog.categories_of(addition.type)
+        for model in catalog.models_of(category)
+    ]
+    light: list[tuple[float, Model]] = []
+    heavy: list[tuple[float, Model]] = []
+    for model, mass in models:
+        volume = math.prod(model.size_m) * float(rng.uniform(0.7, 1.4))
+        if is_liftable(model.size_m, mass):
+            light.append((-math.prod(model.size_m) if holds else volume, model))
+        else:
+            heavy.append((volume, model))
+    liftable = _ranked(light)
+    if holds and addition.host:
+        able = [model for model in _spread(liftable, LOOKED_AT) if _serves(model, addition)]
+        liftable = _spread(able, MODEL_TRIES)
+    order = [*liftable, *(_ranked(heavy) if addition.host else _middling_first(heavy))]
+    return [model for model in order[:LOOKED_AT] if _serves(model, addition)][:MODEL_TRIES]
+
+
+def _serves(model: Model, addition: Addition) -> bool:
+    return serves(build_asset(Catalog.load(), model.category, model.model_id), addition.needs)
+
+
+def _ranked(models: Sequence[tuple[float, Model]]) -> list[Model]:
+    """Models by a number, the least first."""
+    return [model for _, model in sorted(models, key=lambda item: item[0])]
+
+
+def _spread(models: Sequence[Model], most: int) -> list[Model]:
+    """At most so many of the models, in their order, evenly from the first to the last."""
+    if len(models) <= most:
+        return list(models)
+    return [models[round(number * (len(models) - 1) / (most - 1))] for number in range(most)]
+
+
+def _middling_first(models: Sequence[tuple[float, Model]]) -> list[Model]:
+    """Models by volume, the least first, after two from the middle."""
+    order = _ranked(models)
+    middle = len(order) // 2
+    first = order[max(0, middle - 1) : middle + 1]
+    return [*reversed(first), *(model for model in order if model not in first)]

@@ -1,0 +1,134 @@
+"""What the robot has to get at is put where it does: by the runtime's own standing poses, not by a guess."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from embomatrix.factory.editor import SceneEditor
+from embomatrix.factory.layout.generator import lay
+from embomatrix.factory.layout.jobs import Item
+from embomatrix.factory.layout.seating import MOVES, Seat, Seating
+from embomatrix.factory.layout.values import Failure, LayoutReason, LayoutRelation
+from embomatrix.factory.task_import.binding import Addition
+from embomatrix.factory.task_import.models import MODEL_TRIES, models_for
+from embomatrix.factory.task_import.sources import SourceText
+from embomatrix.factory.task_import.task import Imported, Manner, import_problem
+from embomatrix.factory.writer.rehearsal import Rehearsal
+from embomatrix.world.catalog import Catalog
+from embomatrix.world.geometry import Pose
+from embomatrix.world.scene import Scene
+from embomatrix.world.state import Relation
+
+ON, IN, UNDER = LayoutRelation.ONTOP, LayoutRelation.INSIDE, LayoutRelation.UNDER
+FLOOR = Seat(None, "living_room_0")
+
+
+def models(category: str) -> tuple[tuple[str, str], ...]:
+    return tuple((category, model.model_id) for model in Catalog.load().models_of(category))
+
+
+def named(scene: Scene, category: str) -> str:
+    return next(item.name for item in scene.objects if item.name.startswith(category))
+
+
+@pytest.fixture
+def seating(flat: Scene) -> Seating:
+    bowls = sorted(models("bowl"), key=lambda each: -Catalog.load().model(*each).size_m[0])
+    items = [
+        Item("backpack", models("backpack")[:1]),
+        Item("book", models("hardback")[:1], IN, "backpack"),
+        Item("wide", (bowls[0], bowls[-1]), IN, "cabinet_1"),
+        Item("other", bowls[:1], IN, "cabinet_1"),
+    ]
+    return Seating(SceneEditor(flat), "living_room_0", items)
+
+
+def test_shoes_under_a_bed_and_food_in_a_box_with_a_lid_are_at_hand(flat: Scene) -> None:
+    editor = SceneEditor(flat)
+    layout = lay(
+        editor,
+        [
+            Item("shoe", models("sandal"), UNDER, named(flat, "bed")),
+            Item("box", (("carton", "cdmmwy"),), ON, "living_room_0"),
+            Item("apple", models("apple")[:3], IN, "box"),
+        ],
+        0,
+    )
+    assert (layout.failures, layout.out_of_hand) == ((), ())
+    with Rehearsal(editor.freeze("laid")) as robot:
+        assert robot.fetches(layout.names["shoe"])
+        assert robot.fetches(layout.names["apple"])
+
+
+def test_what_holds_a_thing_that_nobody_reaches_is_put_elsewhere_a_few_times(seating: Seating) -> None:
+    for _ in range(MOVES):
+        seating.seat("backpack", Pose((0.0, 0.0, 1.0)), (None, ""), FLOOR)
+        seating.refuse("book", IN, "backpack_1", LayoutReason.NOT_AT_HAND, "too deep")
+        assert seating.offer_another(seating.waiting["book"])
+        failure = seating.failures[-1]
+        assert (failure.thing, failure.host, failure.reason) == (
+            "backpack",
+            "living_room_0",
+            LayoutReason.NOT_AT_HAND,
+        )
+        assert "backpack" in seating.waiting
+        assert "backpack" not in seating.names
+    seating.seat("backpack", Pose((0.0, 0.0, 1.0)), (None, ""), FLOOR)
+    seating.refuse("book", IN, "backpack_3", LayoutReason.NOT_AT_HAND, "too deep")
+    assert not seating.offer_another(seating.waiting["book"])
+
+
+def test_a_wide_thing_makes_way_for_another_at_the_host_that_both_need(seating: Seating) -> None:
+    seating.seat("wide", Pose((0.0, 0.0, 1.0)), (None, ""), Seat(Relation.INSIDE, "cabinet_1"))
+    before = seating.placed["wide"].asset.size_m[0]
+    seating.refuse("other", IN, "cabinet_1", LayoutReason.NO_FREE_SPOT, "full")
+    seating.next_model("other")
+    assert seating.waiting["wide"].asset.size_m[0] < before
+    assert not seating.given_up
+    assert not seating.failures
+    seating.seat("wide", Pose((0.0, 0.0, 1.0)), (None, ""), Seat(Relation.INSIDE, "cabinet_1"))
+    seating.refuse("other", IN, "cabinet_1", LayoutReason.NO_FREE_SPOT, "full")
+    seating.next_model("other")
+    assert [failure.thing for failure in seating.given_up] == ["other"]
+
+
+def test_what_holds_things_and_stands_in_furniture_is_tried_in_all_sizes() -> None:
+    addition = Addition("bowl.n.01_1", "bowl.n.01", Relation.INSIDE, "cabinet", "")
+    widths = [max(model.size_m[:2]) for model in models_for(addition, np.random.default_rng(0), holds=True)]
+    assert len(widths) == MODEL_TRIES
+    assert widths[0] > 0.4
+    assert widths[-1] < 0.2
+
+
+SHOE = """(define (problem shoes-0) (:domain omnigibson)
+  (:objects sandal.n.01_1 - sandal.n.01 chair.n.01_1 - chair.n.01 floor.n.01_1 - floor.n.01 agent.n.01_1 - agent.n.01)
+  (:init (ontop sandal.n.01_1 chair.n.01_1) (inroom chair.n.01_1 living_room_0)
+         (inroom floor.n.01_1 living_room_0) (ontop agent.n.01_1 floor.n.01_1))
+  (:goal (and (ontop sandal.n.01_1 floor.n.01_1))))"""
+
+
+def test_furniture_at_which_nobody_reaches_a_thing_is_left_for_other_and_kept_as_the_last_resort(
+    flat: Scene,
+) -> None:
+    asked: list[str] = []
+
+    def out_of_hand_at(bad: int):
+        def method(editor, items, seed):
+            asked.append(next((item.host for item in items if item.name.startswith("sandal")), ""))
+            layout = lay(editor, items, seed)
+            wrong = Failure("sandal.n.01_1", ON, asked[-1], LayoutReason.NOT_AT_HAND, "too far")
+            return replace(layout, out_of_hand=(wrong,)) if len(asked) <= bad else layout
+
+        return method
+
+    text = SourceText("shoes", SHOE, "embomatrix")
+    second = import_problem(text, flat, manner=Manner(out_of_hand_at(1), reachable=False))
+    assert isinstance(second, Imported)
+    assert len(asked) == 2
+    assert asked[0] != asked[1]
+    asked.clear()
+    assert isinstance(
+        import_problem(text, flat, manner=Manner(out_of_hand_at(99), reachable=False)), Imported
+    )
+    assert len(asked) > 1
