@@ -7,6 +7,7 @@ arranged together. Object: a continuous pose, free, in reach, at rest. What fail
 from __future__ import annotations
 
 import contextlib
+import itertools
 import time
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
@@ -49,6 +50,8 @@ if TYPE_CHECKING:
 
 ROUNDS: Final = 24
 """Trees that are asked for one room at most."""
+ELSEWHERE: Final = 96
+"""Other poses at its host that are looked at for a thing which the robot does not get at."""
 SURFACES: Final = 4
 """Surfaces of one piece of furniture that are arranged; beyond them the sampler looks alone."""
 SHIFT_M: Final = 0.008
@@ -256,7 +259,7 @@ class _RoomJob:
             with contextlib.suppress(PlacementError):
                 pose = self._sampler.first_free(asset, self._near(plane, asset, (spot, *others)), plane.host)
                 relation = Relation.ONTOP if plane.host else None
-                self._insert(
+                self._seating.seat(
                     spot.thing, pose, (relation, plane.host), Seat(relation, plane.host or plane.room)
                 )
 
@@ -277,7 +280,7 @@ class _RoomJob:
             level = LayoutRelation(relation.value) if relation and known else LayoutRelation.ONTOP
             self._failed(name, level, host or target, error)
         else:
-            self._insert(name, pose, self._sampler.rests(relation, target), Seat(relation, target))
+            self._seating.seat(name, pose, self._sampler.rests(relation, target), Seat(relation, target))
 
     def _hang(self, name: str) -> None:
         asset = self._seating.waiting[name].asset
@@ -288,10 +291,7 @@ class _RoomJob:
             self._failed(name, LayoutRelation.ATTACHED, self._room.name, error)
         else:
             at = Seat(None, self._room.name)
-            self._editor.fasten(self._insert(name, pose, (None, ""), at))
-
-    def _insert(self, name: str, pose: Pose, rests: tuple[Relation | None, str], at: Seat) -> str:
-        return self._seating.seat(name, pose, rests, at)
+            self._editor.fasten(self._seating.seat(name, pose, (None, ""), at))
 
     def _failed(self, name: str, relation: LayoutRelation, host: str, error: PlacementError) -> None:
         self._seating.refuse(name, relation, host, error.reason, str(error))
@@ -326,6 +326,6 @@ class _RoomJob:
         relation, host = guest.seat.relation, guest.seat.host
         target = host if host in editor.objects else ""
         with contextlib.suppress(PlacementError):
-            for pose in self._sampler.poses(guest.asset, relation, host):
+            for pose in itertools.islice(self._sampler.poses(guest.asset, relation, host), ELSEWHERE):
                 if editor.objection(guest.asset, pose, target) is None:
                     yield pose
