@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from embomatrix.factory.editor import SceneEditor
@@ -10,8 +9,6 @@ from embomatrix.factory.layout.generator import lay
 from embomatrix.factory.layout.jobs import Item
 from embomatrix.factory.layout.seating import MOVES, Seat, Seating
 from embomatrix.factory.layout.values import Failure, LayoutReason, LayoutRelation
-from embomatrix.factory.task_import.binding import Addition
-from embomatrix.factory.task_import.models import MODEL_TRIES, models_for
 from embomatrix.factory.task_import.sources import SourceText
 from embomatrix.factory.task_import.task import Imported, Manner, import_problem
 from embomatrix.factory.writer.rehearsal import Rehearsal
@@ -91,14 +88,6 @@ def test_a_wide_thing_makes_way_for_another_at_the_host_that_both_need(seating: 
     seating.refuse("other", IN, "cabinet_1", LayoutReason.NO_FREE_SPOT, "full")
     seating.next_model("other")
     assert [failure.thing for failure in seating.given_up] == ["other"]
-
-
-def test_what_holds_things_and_stands_in_furniture_is_tried_in_all_sizes() -> None:
-    addition = Addition("bowl.n.01_1", "bowl.n.01", Relation.INSIDE, "cabinet", "")
-    widths = [max(model.size_m[:2]) for model in models_for(addition, np.random.default_rng(0), holds=True)]
-    assert len(widths) == MODEL_TRIES
-    assert widths[0] > 0.4
-    assert widths[-1] < 0.2
 
 
 SHOE = """(define (problem shoes-0) (:domain omnigibson)

@@ -27,9 +27,8 @@ LOOKED_AT: Final = 4 * MODEL_TRIES
 def models_for(addition: Addition, rng: np.random.Generator, *, holds: bool) -> list[Model]:
     """At most five models of the type that can do what is asked, the liftable ones before furniture.
 
-    Of what can be lifted large ones come first where it ``holds`` others, else small ones; what holds others and stands on
-    or in something itself is tried in all sizes. Of furniture two of a middling size come first, then the smallest: where
-    these don't fit, none does. On other furniture only small ones go.
+    Of what can be lifted large ones come first where it ``holds`` others, else small ones. Of furniture two of a middling
+    size come first, then the smallest: where these don't fit, none does. On other furniture only small ones go.
     """
     catalog = Catalog.load()
     models = [
@@ -45,11 +44,7 @@ def models_for(addition: Addition, rng: np.random.Generator, *, holds: bool) -> 
             light.append((-math.prod(model.size_m) if holds else volume, model))
         else:
             heavy.append((volume, model))
-    liftable = _ranked(light)
-    if holds and addition.host:
-        able = [model for model in _spread(liftable, LOOKED_AT) if _serves(model, addition)]
-        liftable = _spread(able, MODEL_TRIES)
-    order = [*liftable, *(_ranked(heavy) if addition.host else _middling_first(heavy))]
+    order = [*_ranked(light), *(_ranked(heavy) if addition.host else _middling_first(heavy))]
     return [model for model in order[:LOOKED_AT] if _serves(model, addition)][:MODEL_TRIES]
 
 
@@ -60,13 +55,6 @@ def _serves(model: Model, addition: Addition) -> bool:
 def _ranked(models: Sequence[tuple[float, Model]]) -> list[Model]:
     """Models by a number, the least first."""
     return [model for _, model in sorted(models, key=lambda item: item[0])]
-
-
-def _spread(models: Sequence[Model], most: int) -> list[Model]:
-    """At most so many of the models, in their order, evenly from the first to the last."""
-    if len(models) <= most:
-        return list(models)
-    return [models[round(number * (len(models) - 1) / (most - 1))] for number in range(most)]
 
 
 def _middling_first(models: Sequence[tuple[float, Model]]) -> list[Model]:
