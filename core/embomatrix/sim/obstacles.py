@@ -100,9 +100,8 @@ class Obstacles:
                 continue
             parts = rows[mine]
             over = (parts[:, 0] <= x) & (x <= parts[:, 2]) & (parts[:, 1] <= y) & (y <= parts[:, 3])
-            stiff = ~self.leaves[
-                mine
-            ]  # under a lid the arm reaches from above: shut, it is in the way otherwise
+            # Under a lid the arm reaches from above; shut, it is in the way otherwise.
+            stiff = ~self.leaves[mine]
             if (over & stiff & (parts[:, 4] >= top)).any():
                 beside = (parts[:, 4] < top - SLACK_M) & (parts[:, 5] > low + SLACK_M)
                 barring[mine] = beside & stiff
