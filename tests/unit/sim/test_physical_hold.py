@@ -117,6 +117,23 @@ def test_what_goes_on_a_narrow_top_is_taken_otherwise_with_the_hand_on_the_side_
     assert simulator.world.relations.ontop("roll_1", "heater_1")
 
 
+@pytest.mark.parametrize(("wide_m", "yaw"), [(0.4, 0.0), (0.36, np.pi / 2)])
+def test_what_fits_a_board_one_way_only_is_taken_at_the_side_that_will_be_outside(play, wide_m, yaw):
+    # The book lies across the board, as long as that is wide, and is put down for the while with an end to the robot.
+    book = replace(make.block("book", "book.n.01", (0.32, 0.22, 0.02), {}), mass_kg=0.4)
+    size = (0.26 + make.PANEL_M, wide_m + 2 * make.PANEL_M, 0.32)
+    rack = make.open_shelf("rack", "rack.n.01", size, 2)
+    stand = make.block("stand", "stand.n.01", (0.5, 0.5, 0.5), {})
+    extra = [
+        (placed("rack_1", rack, "kitchen_0", upright(0.25, 2.0, 0.7, rack), fixed=True), rack),
+        (placed("stand_1", stand, "kitchen_0", upright(0.6, 2.85, 0.0, stand, yaw), fixed=True), stand),
+        (placed("book_1", book, "kitchen_0", upright(2.4, 1.3, TABLE_TOP_M, book)), book),
+    ]
+    trace, simulator = play(extra, "move book_1; pick_up book_1; move rack_1; place rack_1 inside")
+    assert trace.failure is None, trace.steps[-1].message
+    assert simulator.world.relations.inside("book_1", "rack_1")
+
+
 def test_a_cup_taken_at_its_thin_wall_stays_where_it_is_put(play):
     cup = make.tub("cup", "cup.n.01", (0.08, 0.08, 0.08), 0.003, 0.005, mass_kg=0.1, abilities={})
     pose = upright(2.0, 1.3, TABLE_TOP_M, cup)

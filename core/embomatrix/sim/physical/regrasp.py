@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from enum import Enum, auto
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -34,13 +35,21 @@ RING_M: Final = (0.6, 0.75)
 RING_DEGREES: Final = (0.0, 40.0, -40.0, 80.0, -80.0, 130.0, -130.0, 180.0)
 """Places on the floor around the robot."""
 LOOKED_AT: Final = 10
-"""Holds that are looked at."""
+"""Kinds of holds that are looked at with the hand at one side of the thing, before all are at every side."""
 FORESEEN: Final = 4
 """Poses at the goal for which a hold is looked at."""
 ALIKE: Final = math.cos(math.radians(25.0))
 """Cosine of the turn up to which two holds are alike: ways to take a thing are offered at headings 40 degrees apart."""
 LIFT_M: Final = 0.001
 """Above the floor, when nothing is known of how the thing stands on it."""
+
+
+class Turns(Enum):
+    """By which turns about the vertical a hold may differ from another and be as good: the thing is put turned by as much."""
+
+    ANY = auto()
+    HALF = auto()
+    NONE = auto()
 
 
 def regrasp(
@@ -62,9 +71,8 @@ def regrasp(
         return False
     # Where exactly it will rest makes no difference to which holds lead to the goal.
     offered = grasp_tracks(asset, rests[0], engine.joints(name), home.yaw, None)
-    kinds = _promising(stage, grip, offered, rests[0], poses[:FORESEEN], counts)
-    narrow = not Delivery(stage, grip, poses, counts).may_turn()
-    if not kinds or put(stage, rests, _anywhere, name) is not None:
+    foreseen, turns = _foresee(stage, grip, offered, rests[0], poses, counts)
+    if not foreseen or put(stage, rests, _anywhere, name) is not None:
         return False
     fold(stage, home)
     stage.settle()
@@ -73,7 +81,7 @@ def regrasp(
     tracks = grasp_tracks(asset, pose, engine.joints(name), course, out_m)
     bases = bases_at(stage, pose, course, out_m)
     refusal = None
-    ranks = [_rank(track, pose, kinds, narrow=narrow) for track in tracks]
+    ranks = [_rank(track, pose, foreseen, turns) for track in tracks]
     # Where none of the holds that lead to the goal can be taken, any is better than to leave the thing there.
     for wanted in sorted(set(ranks)):
         some = [track for track, rank in zip(tracks, ranks, strict=True) if rank == wanted]
@@ -88,19 +96,20 @@ def _anywhere() -> bool:
     return True
 
 
-def _rank(track: Track, pose: Pose, kinds: Mapping[tuple[float, float], FloatArray], *, narrow: bool) -> int:
-    """0 for a way to take a thing at a pose after which it is held as foreseen, 1 for another of a foreseen kind, else 2.
-
-    The heading tells only where it is ``narrow``, so that the thing may not be turned.
-    """
-    foreseen = kinds.get(_kind(track))
-    if foreseen is None:
+def _rank(
+    track: Track, pose: Pose, foreseen: Mapping[tuple[float, float], Sequence[FloatArray]], turns: Turns
+) -> int:
+    """0 for a way to take a thing at a pose after which it is held as foreseen, 1 for another of a foreseen kind, else 2."""
+    holds = foreseen.get(_kind(track), ())
+    if not holds:
         return 2
-    if not narrow:
+    if turns is Turns.ANY:
         return 0
-    turn = pose.rotation.T @ track.rotation[track.key] @ foreseen.T
-    # Half a turn is as good as none: what is put may stand the other way round.
-    return 0 if abs(float(np.trace(turn)) - 1.0) >= 2.0 * ALIKE else 1
+    now = pose.rotation.T @ track.rotation[track.key]
+    cosines = [(float(np.trace(now @ hold.T)) - 1.0) / 2.0 for hold in holds]
+    if turns is Turns.HALF:
+        cosines = [abs(cosine) for cosine in cosines]
+    return 0 if max(cosines) >= ALIKE else 1
 
 
 def _kind(track: Track) -> tuple[float, float]:
@@ -112,28 +121,52 @@ def _kind(track: Track) -> tuple[float, float]:
     return round(float(rotation[2, 2]), 2), round(abs(float(rotation[2, 1])), 2)
 
 
-def _promising(
+def _kinds(offered: Sequence[Track], *, by_heading: bool = False) -> list[Track]:
+    """The first way of each kind, the preferred ones first; ``by_heading`` of each kind and heading."""
+    first: dict[tuple[float, ...], Track] = {}
+    for track in offered:
+        x, y, _ = track.rotation[track.key][:, 2].tolist()
+        first.setdefault((*_kind(track), round(math.atan2(y, x), 1) if by_heading else 0.0), track)
+    return list(first.values())
+
+
+def _foresee(
     stage: Stage,
     grip: Grip,
     offered: Sequence[Track],
     rest: Pose,
     poses: Sequence[Pose],
     counts: Callable[[], bool],
-) -> dict[tuple[float, float], FloatArray]:
+) -> tuple[dict[tuple[float, float], list[FloatArray]], Turns]:
+    """Holds that lead to a goal, as ``_leading`` tells them, and by which turns about the vertical others may differ."""
+    goals = poses[:FORESEEN]
+    found = _leading(stage, grip, _kinds(offered)[:LOOKED_AT], rest, goals, counts)
+    if found:
+        return found, Turns.ANY if Delivery(stage, grip, poses, counts).may_turn() else Turns.HALF
+    # Where the thing hardly fits, the hand may have to be at one certain side of it.
+    return _leading(stage, grip, _kinds(offered, by_heading=True), rest, goals, counts), Turns.NONE
+
+
+def _leading(
+    stage: Stage,
+    grip: Grip,
+    offered: Sequence[Track],
+    rest: Pose,
+    poses: Sequence[Pose],
+    counts: Callable[[], bool],
+) -> dict[tuple[float, float], list[FloatArray]]:
     """Kinds of ways to take what is held, from where it would stand, after which there is a way to one of the poses.
 
-    With each comes how the tool is turned then in the thing's frame, (3, 3).
+    With each come the turns of the tool in the thing's frame with which there is, (3, 3) each.
     """
-    known: dict[tuple[float, float], FloatArray | None] = {}
+    found: dict[tuple[float, float], list[FloatArray]] = {}
     for track in offered:
-        kind = _kind(track)
-        if kind not in known and len(known) < LOOKED_AT:
-            position = track.position[track.key]
-            tool = Pose.from_rotation(tuple(position.tolist()), track.rotation[track.key])
-            delivery = Delivery(stage, grip.otherwise(tool.inverse() @ rest), poses, counts)
-            leads = next(delivery.ways(), None) is not None
-            known[kind] = rest.rotation.T @ tool.rotation if leads else None
-    return {kind: turned for kind, turned in known.items() if turned is not None}
+        position = track.position[track.key]
+        tool = Pose.from_rotation(tuple(position.tolist()), track.rotation[track.key])
+        delivery = Delivery(stage, grip.otherwise(tool.inverse() @ rest), poses, counts)
+        if next(delivery.ways(), None) is not None:
+            found.setdefault(_kind(track), []).append(rest.rotation.T @ tool.rotation)
+    return found
 
 
 def _rests(stage: Stage, name: str, upright: Pose) -> Iterator[Pose]:
