@@ -5,6 +5,7 @@ import io
 
 import pytest
 from rich.console import Console
+from tests.fakes.commands import run
 from tests.fakes.worker import FakeWorker
 from tests.integration.test_manager_service import manager
 
@@ -94,8 +95,7 @@ async def test_both_commands_show_a_real_manager(tmp_path, capsys):
     assert "w1" in live
 
 
-def test_a_manager_that_is_not_there_is_told_in_a_sentence(capsys):
-    for command, name in ((status, "status"), (top, "top")):
-        with pytest.raises(SystemExit, match="2"):
-            command("127.0.0.1:1")
-        assert capsys.readouterr().err.startswith(f"embomatrix {name}: no manager answers")
+@pytest.mark.parametrize("name", ["status", "top"])
+def test_a_manager_that_is_not_there_is_told_in_a_sentence(name):
+    told = run(name, "--manager=127.0.0.1:1")
+    assert (told.status, told.text.startswith(f"embomatrix {name}: no manager answers")) == (2, True)
