@@ -31,7 +31,7 @@ CHARACTERS: Final = string.printable
 LONGEST_TEXT: Final = 32_768
 
 
-class HouseholdEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):  # type: ignore[misc]  # untyped where it is not installed
+class HouseholdEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):
     """Tasks of a dataset, one an episode: ``reset(seed=…)`` draws one, ``options={"task_id": …}`` names it.
 
     *Action*, a dict: ``skill`` (in the order of ``SKILLS``), ``object`` and ``source`` (rows of the object table), ``relation``
@@ -45,7 +45,7 @@ class HouseholdEnv(gymnasium.Env[dict[str, Any], dict[str, Any]]):  # type: igno
     failed call changes nothing.
     """
 
-    metadata: Final = {"render_modes": ["ansi"], "render_fps": 1}
+    metadata: dict[str, Any] = {"render_modes": ["ansi"], "render_fps": 1}  # noqa: RUF012  # declared so by gymnasium
 
     def __init__(self, dataset: str | Path, split: str = "train", render_mode: str | None = None) -> None:
         if split not in SPLITS:

@@ -27,13 +27,13 @@ SESSIONS: Final = 4
 """Episodes at a time. Each has simulators of its own: some 100 MB a scene."""
 
 
-class PlanAction(Action):  # type: ignore[misc]  # untyped where it is not installed
+class PlanAction(Action):
     """``text``: calls as a plan writes them, ``move 3`` or JSON. They are executed up to the first that fails."""
 
     text: str
 
 
-class HouseholdObservation(Observation):  # type: ignore[misc]
+class HouseholdObservation(Observation):
     """``task`` is the prompt, ``state`` a line for each object, ``messages`` what became of each call."""
 
     task: str
@@ -41,7 +41,7 @@ class HouseholdObservation(Observation):  # type: ignore[misc]
     messages: list[str] = []  # noqa: RUF012  # pydantic copies it
 
 
-class HouseholdState(State):  # type: ignore[misc]
+class HouseholdState(State):
     """Which task it is, and how the reward is made up so far."""
 
     task_id: str = ""
@@ -51,7 +51,7 @@ class HouseholdState(State):  # type: ignore[misc]
     goal: float = 0.0
 
 
-class HouseholdEnvironment(Environment[PlanAction, HouseholdObservation, HouseholdState]):  # type: ignore[misc]
+class HouseholdEnvironment(Environment[PlanAction, HouseholdObservation, HouseholdState]):
     """Tasks of a dataset. ``reset(seed=…)`` draws one, ``reset(task_id=…)`` names it.
 
     The reward of a step is what its calls added to the plan's; a text that is no plan changes nothing and gets −1. Done at

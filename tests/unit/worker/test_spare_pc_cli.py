@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import typer
+from tests.fakes.systemd import assert_valid_unit, needs_systemd
 from typer.testing import CliRunner
 
 from embomatrix.worker.cli import app
@@ -154,17 +155,9 @@ def test_words_of_a_command_are_taken_literally():
     ]
 
 
-@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="needs systemd-analyze")
+@needs_systemd
 @pytest.mark.parametrize("system", [False, True])
 def test_systemd_finds_nothing_wrong_with_the_unit(tmp_path, system):
     path = tmp_path / "embomatrix-worker.service"
     path.write_text(unit_text([str(Path(shutil.which("true")))], ["--hours", "18:00-08:00"], system=system))
-    scope = [] if system else ["--user"]
-    result = subprocess.run(
-        ["systemd-analyze", "verify", "--man=no", *scope, str(path)],
-        capture_output=True,
-        text=True,
-        check=False,
-        env={**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)},
-    )
-    assert (result.returncode, result.stderr) == (0, "")
+    assert_valid_unit(path, system=system)
