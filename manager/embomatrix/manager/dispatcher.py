@@ -247,6 +247,8 @@ class Dispatcher:
         """
         fleet = self._desk.fleet
         forgiven = fleet.forgive() if fleet.live <= 1 else []
+        if not self._desk.pending.scenes and not fleet.backlogged:
+            return  # nobody waits, neither for a lease nor behind a busy slot
         self._desk.fill([*forgiven, *fleet.seekers(), *fleet.lags])
 
     def _expire(self, lease: LeaseRecord) -> None:

@@ -192,6 +192,11 @@ class Fleet:
         """Ids of workers with a free slot."""
         return frozenset(self._idle)
 
+    @property
+    def backlogged(self) -> bool:
+        """Whether leases wait behind a busy slot somewhere."""
+        return bool(self._backlogged)
+
     def seekers(self) -> list[str]:
         """Some workers with a free slot, each time others: what was not for them before may be now."""
         some = list(islice(self._idle, SEEKERS))
