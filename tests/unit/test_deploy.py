@@ -29,6 +29,10 @@ PODS = {
     for item in OBJECTS
     if "template" in item.get("spec", {})
 }
+PROMETHEUS = DEPLOY / "prometheus"
+needs_promtool = pytest.mark.skipif(
+    shutil.which("promtool") is None, reason="needs promtool, which Debian's package prometheus brings"
+)
 METRIC = re.compile(r"\bembo_\w+")
 
 
@@ -129,6 +133,28 @@ def test_every_alarm_says_what_to_do():
         assert rule["labels"]["severity"] in ("warning", "critical")
 
 
-@pytest.mark.skipif(shutil.which("promtool") is None, reason="promtool is not installed")
-def test_prometheus_reads_the_rules():
-    subprocess.run(("promtool", "check", "rules", str(DEPLOY / "prometheus" / "rules.yml")), check=True)
+def test_every_alarm_is_tested_for_what_it_says_and_for_keeping_quiet():
+    (group,) = yaml.safe_load((PROMETHEUS / "rules.yml").read_text())["groups"]
+    quiet, idle, *loud = [
+        {case["alertname"]: case.get("exp_alerts") for case in test["alert_rule_test"]}
+        for test in yaml.safe_load((PROMETHEUS / "rules_test.yml").read_text())["tests"]
+    ]
+    alarms = {rule["alert"] for rule in group["rules"]}
+    assert set(quiet) == set(idle) == alarms
+    assert not any([*quiet.values(), *idle.values()])
+    assert {name for test in loud for name, said in test.items() if said} == alarms
+
+
+@needs_promtool
+@pytest.mark.parametrize(
+    "asked",
+    [
+        ("check", "rules", "rules.yml"),
+        ("check", "config", "--syntax-only", "prometheus.yml"),
+        ("test", "rules", "rules_test.yml"),
+    ],
+    ids=" ".join,
+)
+def test_prometheus_reads_the_rules_and_sounds_each_alarm(asked):
+    ran = subprocess.run(("promtool", *asked), cwd=PROMETHEUS, capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stdout + ran.stderr

@@ -134,6 +134,13 @@ def test_the_page_is_made_of_figures_that_were_measured_before(tmp_path):
     assert "commit `def`" in fidelity
 
 
+@pytest.mark.parametrize("bench", ["engine", "fidelity", "rollout", "cluster", "trainer", "operations"])
+def test_every_bench_has_its_place_on_the_page_with_what_was_measured_and_how(bench):
+    page = render_page([replace(_result(Figure("it_s", 2.0, "s", Better.LOWER, 1, 3.0)), bench=bench)], "")
+    assert f"`embomatrix bench {bench}" in page
+    assert "| it_s | 2 s | ≤ 3 | reached | 1 |" in page
+
+
 def test_parts_of_a_bench_make_one_result_when_they_are_of_one_commit():
     old, new, other = (
         Figure(name, value, "ms", Better.LOWER, 1) for name, value in (("x", 1.0), ("x", 2.0), ("y", 3.0))

@@ -81,6 +81,15 @@ TITLES: Final[Mapping[str, tuple[str, str]]] = {
         "waited for simulation, and in which it neither sampled nor learnt. *eval_s* is from the command's start to its end, "
         "random plans for 100 tasks.",
     ),
+    "operations": (
+        "Operations",
+        "`embomatrix bench operations --json FILE`, in a checkout on a machine with Docker and Chromium. "
+        "*compose_first_rollout_s* is from `docker compose up`, with images that are built and volumes that are new, to the "
+        "first result. Images are counted with their base. *join_s* is from `embomatrix worker run --join` to the worker's "
+        "registration, by TLS, with a credential of its own. *dashboard_cpu_share* is what ten viewers of 1,000 workers add "
+        "to the manager's processor time, of one core; *dashboard_paint_s* the median of five, from the address to the rows "
+        "of workers, nothing cached.",
+    ),
 }
 """Heading and explanation of each bench, in the order of the page."""
 INTRODUCTION: Final = (
