@@ -8,7 +8,7 @@ PIP_FLAGS := $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX),)
 BIN := $(VENV)/bin
 ARGS ?=
 
-.PHONY: run test test-slow lint types contracts proto proto-check check site compose-check pictures clean
+.PHONY: run test test-slow lint types contracts proto proto-check check site diagrams compose-check pictures clean
 
 run: $(VENV)/.runtime
 	$(BIN)/embomatrix demo $(ARGS)
@@ -42,6 +42,11 @@ check: lint types contracts proto-check
 # The documentation site, in build/site. `make site ARGS=serve` shows it while it is written.
 site: $(VENV)/.dev
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs $(if $(ARGS),$(ARGS),build --strict)
+
+# Needs npm and Chromium; only after a diagram was changed. What it draws is committed.
+diagrams:
+	mkdir -p build/mermaid && cd build/mermaid && npm pack --silent mermaid@11.17.2 && tar -xf mermaid-*.tgz package/dist/mermaid.min.js
+	$(PYTHON) deploy/site/diagrams.py docs build/mermaid/package/dist/mermaid.min.js
 
 compose-check: $(VENV)/.dev
 	deploy/docker/local_bases.sh

@@ -1,6 +1,7 @@
-"""A hook of MkDocs: links from the pages to files of the repository, which are no pages of the site.
+"""Hooks of MkDocs that make the site stand alone.
 
-They become the file's path in words, for the site stands alone.
+Links from the pages to files of the repository, which are no pages of the site, become the file's path in words. A page that
+would load anything from another site is refused.
 """
 
 from __future__ import annotations
@@ -14,6 +15,13 @@ if TYPE_CHECKING:
     from mkdocs.structure.files import Files
     from mkdocs.structure.pages import Page
 
+FETCHED: Final = re.compile(
+    r"""<(?:script|img|iframe|video|source|link)\b[^>]*?\b(?:src|href)=["']?((?:https?:)?//[^"'\s>]+)""",
+    re.IGNORECASE,
+)
+"""What a browser asks for by itself; a link that a person may follow is none of it."""
+SCRIPTED: Final = 'class="mermaid"'
+"""The theme answers to it with a script from elsewhere."""
 LINK: Final = re.compile(r"(?<!!)\[([^\]]+)\]\(([^)#\s]+)(?:#[^)]*)?\)")
 
 
@@ -33,6 +41,17 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
         return f"`{told}`" if words.strip("`") in (told, path.name) else f"{words} (`{told}`)"
 
     return LINK.sub(replaced, markdown)
+
+
+def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
+    """The page as it is. Raises ValueError for one that would make a browser ask another site."""
+    found = FETCHED.findall(output)
+    if found or SCRIPTED in output:
+        raise ValueError(
+            f"{page.file.src_uri} would load {found[0] if found else 'a script for its diagram'} from another site: "
+            "put a copy beside the pages"
+        )
+    return output
 
 
 def _uri(path: Path, docs: Path) -> str:
