@@ -108,3 +108,16 @@ def test_start_that_is_not_as_the_source_says_is_turned_away() -> None:
     assert isinstance(verdict, Refusal)
     assert verdict.reason is RefusalReason.INIT_NOT_MET
     assert "(not (open box_1))" in verdict.sentence
+
+
+def test_of_a_benchmark_more_than_half_may_hold_at_the_start_and_never_all() -> None:
+    goal = task("(and (open box_1) (open box_2) (open box_3))")
+    held = Boxes("box_1", "box_2")
+    opened = oracle(SkillCall(Skill.OPEN, object_index=goal.index_of["box_3"]))
+    usual = admit(held, goal, opened)
+    assert isinstance(usual, Refusal)
+    assert "2 of 3 atoms hold at the start, at most 50% may" in usual.sentence
+    assert isinstance(admit(held, goal, opened, most_held=1.0), Admitted)
+    done = admit(Boxes("box_1", "box_2", "box_3"), goal, opened, most_held=1.0)
+    assert isinstance(done, Refusal)
+    assert done.reason is RefusalReason.GOAL_HOLDS

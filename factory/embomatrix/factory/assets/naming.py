@@ -34,7 +34,7 @@ _NAMES: Final[Mapping[Family, str]] = {
     "pencil_case pizza_box suitcase kayak skiff wheelbarrow dish_rack tupperware birdcage stroller "
     "shoulder_bag briefcase outline_tray drying_rack roasting_pan ice_bucket mop_bucket burlap_bag "
     "cash_register sandbox soap_dish dustpan waffle_maker toaster french_fry_holder knife_block "
-    "umbrella_rack first_aid_kit deep_fryer shoe_box pet_bed shower terrarium",
+    "umbrella_rack first_aid_kit deep_fryer shoe_box pet_bed shower terrarium christmas_stocking",
     Family.TABLE: "breakfast_table coffee_table conference_table console_table garden_coffee_table pool_table booth "
     "gaming_table ironing_board farm_stand massage_bed trampoline",
     Family.DESK: "desk lab_table",

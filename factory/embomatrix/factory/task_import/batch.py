@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from embomatrix.factory.admission import Admitted, admit
+from embomatrix.factory.admission import MOST_HELD, Admitted, admit
 from embomatrix.factory.pipeline.poses import Needs, SceneSurvey, cache_poses
 from embomatrix.factory.refusal import Refusal, RefusalReason
+from embomatrix.factory.task_import.sources import EAI
 from embomatrix.factory.task_import.task import Imported, Manner, import_problem
 from embomatrix.factory.writer.view import SceneView
 from embomatrix.sim.executor import Simulator
@@ -38,6 +40,12 @@ OF_THE_PROBLEM: Final = frozenset(
     }
 )
 """Reasons that are the same in every scene."""
+DRAWS: Final = 3
+"""Ways to lay a problem out in its first scene, from seeds of their own, before another scene is looked at."""
+MOST_UNSOLVED: Final = 6
+"""Scenes in which a problem is laid out and not solved before it is given up: what stops it is then no scene's fault."""
+STRIDE: Final = 1_000_003
+"""Between the seeds of two draws: no other problem is imported with such a one."""
 MOST_MISFITS: Final = 12
 """Scenes with all rooms and furniture in which a problem's things find no place, before the next way is tried: laying out forty
 things takes seconds.
@@ -57,26 +65,36 @@ def bind_first(
 ) -> Imported | Refusal:
     """The problem in the first scene that it can be bound to, else the refusal that came furthest. Raises BddlError.
 
-    Scenes that have all furniture come before those that lack some.
+    The scene that it was written for comes first, then those that have all furniture, then those that lack some.
     """
     return _first(imports(source, bases, seed=seed, manner=manner or Manner()))
 
 
 def imports(
-    source: SourceText, bases: Sequence[Scene], *, seed: int, manner: Manner
+    source: SourceText, bases: Sequence[Scene], *, seed: int, manner: Manner, draws: int = 1
 ) -> Iterator[Imported | Refusal]:
     """The problem in each scene as it is, then, where the manner says so, in each with the furniture that it lacks.
 
-    Last come the same scenes with their rooms counted otherwise. The scene that it was written for comes first; once no scene
-    would do, none is looked at further.
+    Last come the same scenes with their rooms counted otherwise. The scene that it was written for comes before all that,
+    in both ways, ``draws`` times; once no scene would do, none is looked at further.
     """
-    order = sorted(bases, key=lambda base: base.base != source.scene)
-    furnished = [replace(manner, furnishing=False)]
+    own = [base for base in bases if base.base == source.scene]
+    others = [base for base in bases if base.base != source.scene]
+    as_it_is = replace(manner, furnishing=False)
+    for draw, base in itertools.product(range(draws), own):
+        drawn = seed + draw * STRIDE
+        outcome = import_problem(source, base, seed=drawn, manner=as_it_is)
+        yield outcome
+        if isinstance(outcome, Refusal) and outcome.reason in OF_THE_PROBLEM:
+            return
+        if isinstance(outcome, Refusal) and manner.furnishing:
+            yield import_problem(source, base, seed=drawn, manner=manner)
+    rounds = [(as_it_is, others)]
     if manner.furnishing:
-        furnished += [manner, replace(manner, renumbering=True)]
-    for tried in furnished:
+        rounds += [(manner, others), (replace(manner, renumbering=True), [*own, *others])]
+    for tried, scenes in rounds:
         misfits = 0
-        for base in order:
+        for base in scenes:
             outcome = import_problem(source, base, seed=seed, manner=tried)
             yield outcome
             if not isinstance(outcome, Refusal):
@@ -99,12 +117,21 @@ def verify_first(
 ) -> Verified | Refusal:
     """The problem in the first scene in which it is admitted, else the refusal that came furthest. Raises BddlError.
 
-    Scenes that have all furniture come before those that lack some.
+    The scene that it was written for comes first, then those that have all furniture, then those that lack some.
     """
-    return _first(
-        imported if isinstance(imported, Refusal) else verify(imported, library, foresight, seed=seed)
-        for imported in imports(source, bases, seed=seed, manner=manner or Manner())
-    )
+
+    def judged() -> Iterator[Verified | Refusal]:
+        unsolved = 0
+        for imported in imports(source, bases, seed=seed, manner=manner or Manner(), draws=DRAWS):
+            if isinstance(imported, Refusal):
+                yield imported
+                continue
+            yield verify(imported, library, foresight, seed=seed)
+            unsolved += 1
+            if unsolved == MOST_UNSOLVED:
+                return
+
+    return _first(judged())
 
 
 T = TypeVar("T", Imported, Verified)
@@ -130,7 +157,9 @@ def verify(
     with SceneSurvey(imported.scene, foresight) as survey:
         poses = cache_poses(SceneView(imported.scene), [needs], library, survey, seed)
     with contextlib.closing(Simulator(Bundle(imported.scene, {}, poses))) as stage:
-        verdict = admit(stage, imported.task, find_plan, imported.init)
+        given = imported.task.source == EAI  # an examination's questions are as they are
+        most = 1.0 if given else MOST_HELD
+        verdict = admit(stage, imported.task, find_plan, imported.init, most_held=most)
         if not isinstance(verdict, Admitted):
             return verdict
         bundle = Bundle(imported.scene, {imported.task.task_id: imported.task}, poses)

@@ -6,6 +6,7 @@ import math
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.assets.library import build_asset
+from embomatrix.factory.task_import.demands import room_for
 from embomatrix.factory.task_import.search import serves
 from embomatrix.factory.writer.view import is_liftable
 from embomatrix.world.catalog import Catalog
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
     import numpy as np
 
     from embomatrix.factory.task_import.binding import Addition
+    from embomatrix.factory.task_import.demands import Demand, Room
+    from embomatrix.world.asset import Asset
     from embomatrix.world.catalog import Model
 
 MODEL_TRIES: Final = 5
@@ -24,11 +27,12 @@ LOOKED_AT: Final = 4 * MODEL_TRIES
 """Models of which it is asked whether they can do what they must."""
 
 
-def models_for(addition: Addition, rng: np.random.Generator, *, holds: bool) -> list[Model]:
+def models_for(addition: Addition, rng: np.random.Generator, demand: Demand) -> list[Model]:
     """At most five models of the type that can do what is asked, the liftable ones before furniture.
 
-    Of what can be lifted large ones come first where it ``holds`` others, else small ones. Of furniture two of a middling
-    size come first, then the smallest: where these don't fit, none does. On other furniture only small ones go.
+    Of what can be lifted large ones come first where it bears others, else small ones. Of furniture two of a middling
+    size come first, then the smallest: where these don't fit, none does. On other furniture only small ones go. Where none
+    that can be lifted takes all that goes in, what does so comes first, unless the thing is to be carried.
     """
     catalog = Catalog.load()
     models = [
@@ -41,15 +45,24 @@ def models_for(addition: Addition, rng: np.random.Generator, *, holds: bool) -> 
     for model, mass in models:
         volume = math.prod(model.size_m) * float(rng.uniform(0.7, 1.4))
         if is_liftable(model.size_m, mass):
-            light.append((-math.prod(model.size_m) if holds else volume, model))
+            light.append((-math.prod(model.size_m) if demand.bears else volume, model))
         else:
             heavy.append((volume, model))
     order = [*_ranked(light), *(_ranked(heavy) if addition.host else _middling_first(heavy))]
-    return [model for model in order[:LOOKED_AT] if _serves(model, addition)][:MODEL_TRIES]
+    able = [model for model in order[:LOOKED_AT] if serves(_asset(model), addition.needs)]
+    if demand.contents:
+        # A sort that keeps the order: among those that take everything, and among the others.
+        carried = [model for _, model in light] if demand.carried else []
+        able.sort(key=lambda model: (bool(carried) and model not in carried, _room(model, demand)))
+    return able[:MODEL_TRIES]
 
 
-def _serves(model: Model, addition: Addition) -> bool:
-    return serves(build_asset(Catalog.load(), model.category, model.model_id), addition.needs)
+def _room(model: Model, demand: Demand) -> Room:
+    return room_for(_asset(model), demand.contents)
+
+
+def _asset(model: Model) -> Asset:
+    return build_asset(Catalog.load(), model.category, model.model_id)
 
 
 def _ranked(models: Sequence[tuple[float, Model]]) -> list[Model]:

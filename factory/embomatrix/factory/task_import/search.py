@@ -8,6 +8,7 @@ from collections import defaultdict
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.refusal import RefusalReason, RefusedError
+from embomatrix.factory.task_import.demands import demand_on, demands_of, room_for
 from embomatrix.factory.writer.view import is_liftable
 from embomatrix.world.bddl import is_room_instance
 from embomatrix.world.catalog import Catalog, CatalogError
@@ -161,9 +162,11 @@ def _domains(
         for item in problem.init
         if item.positive and item.atom.predicate in {Relation.ONTOP, Relation.INSIDE}
     }
+    demands = demands_of(problem)
     domains: dict[str, list[str]] = {}
     missing: list[str] = []
     for name, room in wanted.items():
+        contents = demand_on(demands, name, problem.objects[name]).contents
         categories = set(catalog.categories_of(problem.objects[name]))
         fits = [
             other
@@ -174,9 +177,11 @@ def _domains(
         ]
         if fits:
             order = [str(other) for other in rng.permutation(fits)]
-            domains[name] = (
-                sorted(order, key=lambda other: -_spare_m2(view, other)) if name in hosts else order
-            )
+            if name in hosts:
+                order.sort(key=lambda other: -_spare_m2(view, other))
+            if contents:
+                order.sort(key=lambda other: room_for(view.asset(other), contents))
+            domains[name] = order
         elif not any(_liftable(category) for category in categories):
             missing.append(name)
     return domains, missing

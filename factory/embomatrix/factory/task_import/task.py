@@ -18,12 +18,13 @@ from embomatrix.factory.layout.jobs import Item
 from embomatrix.factory.layout.values import LayoutRelation
 from embomatrix.factory.refusal import Refusal, RefusalReason, RefusedError
 from embomatrix.factory.task_import.binding import bind
+from embomatrix.factory.task_import.demands import demand_on, demands_of
 from embomatrix.factory.task_import.dialects import read_problem
 from embomatrix.factory.task_import.expressible import AGENT, FLOORS
 from embomatrix.factory.task_import.models import models_for
 from embomatrix.factory.task_import.reach import FUTURE, INSOURCE, REAL, pieces_of, profile_for
 from embomatrix.factory.task_import.scene import with_robot_in, with_states
-from embomatrix.factory.task_import.thermal import sources_for
+from embomatrix.factory.task_import.thermal import sources_for, taps_for
 from embomatrix.factory.writer.tasks import object_table
 from embomatrix.factory.writer.view import SceneView
 from embomatrix.world.bddl import ROOM_TYPES, Literal, is_room_instance
@@ -126,12 +127,7 @@ class _Binder:
         self._rng = rng
         self._manner = manner
         self._scene_id = f"{base.base}-{_slug(source.name)}-{key}"
-        self._hosts = {
-            atom.args[1].lstrip("?")
-            for atom in (*atoms_of(problem.goal), *(item.atom for item in problem.init))
-            if atom.predicate in {Relation.INSIDE, Relation.ONTOP}
-        }
-        """Objects, and types that variables range over, on or in which something is or is to be."""
+        self._demands = demands_of(problem)
 
     def imported(self) -> Imported:
         binding, editor, names = self._bound()
@@ -210,8 +206,7 @@ class _Binder:
         return self._manner.lay(editor, items, int(self._rng.integers(2**31)))
 
     def _item(self, addition: Addition, binding: Binding) -> Item:
-        holds = addition.name in self._hosts or addition.type in self._hosts
-        models = models_for(addition, self._rng, holds=holds)
+        models = models_for(addition, self._rng, demand_on(self._demands, addition.name, addition.type))
         if not models:
             raise RefusedError(
                 RefusalReason.DOES_NOT_FIT, f"{addition.name!r} has no place: its type has no model"
@@ -254,7 +249,8 @@ class _Binder:
         }
         goal = substitute(self._problem.goal, {**names, **self._substances, **binding.rooms})
         about = objects_of(goal, types)
-        needed = dict.fromkeys((*names.values(), *sources_for(view, goal, types, names.values())))
+        known = tuple(names.values())
+        needed = dict.fromkeys((*known, *sources_for(view, goal, types, known), *taps_for(view, goal, known)))
         table = object_table(view, tuple(needed), self._rng)
         missing = about - set(table)
         if missing:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import itertools
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.skills.household import liquids_given
 from embomatrix.world.evaluate import atoms_of
 from embomatrix.world.state import State
+from embomatrix.world.substances import WATER
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -43,3 +45,23 @@ def sources_for(
                 and view.opens(item.name)
             )
             yield from itertools.islice(able, 1)
+
+
+def taps_for(view: SceneView, goal: Formula, known: Iterable[str]) -> Iterator[str]:
+    """A tap of the scene where the goal asks for something wet, or clean, and no object of the problem gives water.
+
+    EAI's tasks soak things in a teapot, which is empty in our world.
+    """
+    asked = {atom.predicate for atom in atoms_of(goal)}
+    if not asked & {State.SOAKED, State.STAINED}:
+        return
+    rooms = {view.room(name) for name in known}
+    if any(_gives_water(view, name) for name in known):
+        return
+    taps = [item.name for item in view.scene.objects if item.fixed and _gives_water(view, item.name)]
+    taps.sort(key=lambda name: view.room(name) not in rooms)
+    yield from itertools.islice(taps, 1)
+
+
+def _gives_water(view: SceneView, name: str) -> bool:
+    return WATER in liquids_given(view.asset(name), view.item(name).substances, on=True)

@@ -1,0 +1,102 @@
+"""Of several models a problem's things are given those that do what the problem is about."""
+
+import numpy as np
+import pytest
+from tests.fakes.problems import PROBLEM, source
+
+from embomatrix.factory.assets.library import build_asset
+from embomatrix.factory.refusal import Refusal, RefusalReason
+from embomatrix.factory.task_import import batch
+from embomatrix.factory.task_import.binding import Addition
+from embomatrix.factory.task_import.demands import Demand, Room, demand_on, demands_of, room_for, smallest_m
+from embomatrix.factory.task_import.models import models_for
+from embomatrix.factory.task_import.task import Imported, Manner, import_problem
+from embomatrix.factory.writer.view import is_liftable
+from embomatrix.world.bddl import parse_problem
+from embomatrix.world.catalog import Catalog
+from embomatrix.world.scene import Scene
+
+BOXES = """(define (problem p) (:domain igibson)
+    (:objects book.n.02_1 book.n.02_2 book.n.02_3 - book.n.02 carton.n.02_1 carton.n.02_2 - carton.n.02
+        table.n.02_1 - table.n.02 floor.n.01_1 - floor.n.01)
+    (:init (ontop book.n.02_1 table.n.02_1) (ontop book.n.02_2 table.n.02_1) (ontop book.n.02_3 table.n.02_1)
+        (ontop carton.n.02_1 floor.n.01_1) (ontop carton.n.02_2 floor.n.01_1))
+    (:goal (and (forall (?book.n.02 - book.n.02) (exists (?carton.n.02 - carton.n.02) (inside ?book.n.02 ?carton.n.02)))
+        (forall (?carton.n.02 - carton.n.02) (ontop ?carton.n.02 floor.n.01_1)))))"""
+CARTON = Addition("carton", "carton.n.02", None, "", "kitchen_0")
+
+
+def model_of(demand: Demand, addition: Addition = CARTON):
+    return models_for(addition, np.random.default_rng(0), demand)[0]
+
+
+def asset_of(model):
+    return build_asset(Catalog.load(), model.category, model.model_id)
+
+
+def test_what_goes_in_is_shared_by_all_containers_and_what_stays_is_not_carried() -> None:
+    demands = demands_of(parse_problem(BOXES))
+    assert demand_on(demands, "carton.n.02_1", "carton.n.02") == Demand(
+        bears=True, contents=("book.n.02",) * 2
+    )
+    assert demand_on(demands, "book.n.02_1", "book.n.02") == Demand(carried=True)
+    assert demand_on(demands, "table.n.02_1", "table.n.02") == Demand(bears=True)
+
+
+def test_a_container_has_floor_for_all_that_goes_in() -> None:
+    plates = ("plate.n.04",) * 4
+    model = model_of(Demand(bears=True, contents=plates))
+    assert room_for(asset_of(model), plates) is Room.FOR_ALL
+    small = asset_of(model_of(Demand(bears=True)))
+    assert room_for(small, plates) > Room.FOR_ALL
+
+
+def test_a_container_that_is_carried_can_be_lifted_whatever_goes_in() -> None:
+    model = model_of(Demand(bears=True, contents=("plate.n.04",) * 9, carried=True))
+    assert is_liftable(model.size_m, Catalog.load().category(model.category).mass_kg)
+
+
+@pytest.mark.parametrize(
+    ("contents", "room"),
+    [((), Room.FOR_ALL), (("rag.n.01",), Room.FOR_SOME), (("apple.n.01",) * 30, Room.FOR_EACH)],
+)
+def test_room_is_told_by_footprints(contents: tuple[str, ...], room: Room) -> None:
+    catalog = Catalog.load()
+    bucket = min(catalog.models_of("bucket"), key=lambda model: model.size_m)
+    assert room_for(build_asset(catalog, "bucket", bucket.model_id), contents) is room
+
+
+def test_of_a_type_without_models_nothing_is_known() -> None:
+    assert smallest_m("dust.n.01") is None
+    assert smallest_m("no_such_thing.n.01") is None
+
+
+def test_the_scene_of_a_problem_comes_first_with_other_draws(home: Scene, flat: Scene) -> None:
+    item = source(PROBLEM)
+    at_home = type(item)(item.name, item.text, item.source, item.request, scene=home.base)
+    asked = list(batch.imports(at_home, [flat, home], seed=0, manner=Manner(), draws=2))
+    first = [found.scene.base for found in asked[:2] if isinstance(found, Imported)]
+    assert first == [home.base] * 2
+    one, other = (found.scene for found in asked[:2])
+    assert one.scene_id != other.scene_id
+
+
+def test_what_no_skill_reaches_is_tried_in_no_further_scene(home: Scene, flat: Scene) -> None:
+    text = PROBLEM.replace(
+        "(not (open ?electric_refrigerator.n.01_1))", "(sliced ?electric_refrigerator.n.01_1)"
+    )
+    item = source(text)
+    at_home = type(item)(item.name, item.text, item.source, item.request, scene=home.base)
+    (only,) = batch.imports(at_home, [flat, home], seed=0, manner=Manner(), draws=3)
+    assert isinstance(only, Refusal)
+    assert only.reason is RefusalReason.INEXPRESSIBLE
+
+
+def test_a_tap_joins_the_table_where_something_must_be_wet(home: Scene) -> None:
+    text = PROBLEM.replace("(not (open ?electric_refrigerator.n.01_1))", "(soaked ?apple.n.01_1)")
+    wet = import_problem(source(text.replace("apple.n.01", "rag.n.01")), home)
+    dry = import_problem(source(PROBLEM.replace("apple.n.01", "rag.n.01")), home)
+    assert isinstance(wet, Imported)
+    assert isinstance(dry, Imported)
+    assert not any("sink" in name for name in dry.about)
+    assert any("sink" in name for name in wet.task.table)
