@@ -120,9 +120,15 @@ def test_the_section_tells_configuration_success_curves_and_times():
     assert "| without-relevance | `grpo.relevance = 0.0` |" in text
     assert "| with-relevance | all |  |  |  | 35.0%" in text
     assert "| with-relevance | 1 | groups without signal | 0.50 |" in text
-    assert "| with-relevance | 0 | 5.00 | 40.0% | 50.0% | 4.0% | 10.0% |" in text
+    assert "| with-relevance | 0 | 5.00 | 40.0% | 50.0% | 4.0% | 10.0% | – |" in text
     widths = {line.count("|") for line in text.splitlines() if line.startswith("| with-relevance | 0 | s")}
     assert widths == {14}
+
+
+def test_the_section_tells_the_memory_of_a_run_that_kept_it():
+    told = run(0, "a", (), ())
+    found = findings_of("a", [replace(told, outcome=replace(told.outcome, peak_mb=2345.6))])
+    assert "| 10.0% | 2,346 MB |" in learning_section(DESIGN, [found], MACHINE, "abc", TODAY)
 
 
 def test_where_no_task_is_held_out_there_is_no_success_to_tell():

@@ -104,6 +104,7 @@ def test_a_run_leaves_report_metrics_samples_and_the_newest_checkpoints(tmp_path
     told = read_outcome(tmp_path)
     assert (told.steps, told.rollouts, len(told.before), len(told.after)) == (6, 96, 4, 4)
     assert 0 <= told.wait_share <= told.overhead < 1
+    assert told.peak_mb > 50, "torch alone takes more"
 
 
 def test_the_window_of_every_step_is_announced_with_the_steps_ahead(tmp_path):

@@ -7,7 +7,7 @@ import pytest
 from tests.fakes.symbolic_household import SymbolicCluster, make_tasks
 
 from embomatrix.reward.settings import RewardSettings
-from embomatrix.rpc.status import ManagerUnreachableError
+from embomatrix.rpc.status import DeadlineError, ManagerUnreachableError, UnavailableError
 from embomatrix.rpc.values import RunTerms
 from embomatrix.skills.prompt import Codec, plan_in_names
 from embomatrix.trainer.data import Schedule, group_seed
@@ -76,6 +76,35 @@ def test_a_bundle_is_sent_once_and_before_its_first_rollout():
         until(lambda: cluster.announced)
     assert cluster.sent == {task.bundle_digest for task in (*TASKS.train[:4], TASK)}
     assert cluster.announced == [(1, [1, 1, 2, 2])]
+
+
+class Away(SymbolicCluster):
+    """Does not answer the first times that it is given a scene."""
+
+    refused = 0
+
+    async def put_bundles(self, bundles):
+        if self.refused < 3:
+            self.refused += 1
+            raise (UnavailableError, DeadlineError)[self.refused % 2]("the manager is away")
+        return await super().put_bundles(bundles)
+
+
+def test_a_scene_waits_for_a_manager_that_is_away_and_nothing_is_lost():
+    cluster = Away(TASKS)
+    (found,) = outcomes(cluster, ORACLE)
+    assert found.success
+    assert (cluster.refused, cluster.sent) == (3, {TASK.bundle_digest})
+
+
+def test_leaving_does_not_wait_for_a_manager_that_is_away():
+    cluster = Away(TASKS)
+    cluster.refused = -1_000_000
+    with gateway(cluster) as gate:
+        gate.submit("b", 1, TASK, TASK.situation, [ORACLE], Codec.NAMES)
+        until(lambda: cluster.refused > -1_000_000)
+    assert cluster.closed
+    assert cluster.sent == set()
 
 
 def test_leaving_closes_the_run_with_work_under_way():

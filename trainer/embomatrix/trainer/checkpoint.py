@@ -37,7 +37,7 @@ class Progress:
     """Where a run stands. ``cursor`` is the schedule's, ``reserve_cursor`` that of the reserve.
 
     ``prepared``: imitation and the evaluation after it are done, and the reference is kept. Seconds are of GRPO and, by
-    activity, of the whole run.
+    activity, of the whole run. ``dataset`` is a digest of the tasks that the run began with; "": nobody kept it.
     """
 
     step: int = 0
@@ -50,6 +50,7 @@ class Progress:
     grpo_s: float = 0.0
     spent_s: dict[str, float] = field(default_factory=dict)
     before: list[dict[str, Any]] = field(default_factory=list)
+    dataset: str = ""
 
 
 class CheckpointStore:

@@ -110,7 +110,8 @@ def train(
         from embomatrix.trainer.starting import resumed, started
 
         new = functools.partial(started, dataset, out, model, settings_file, changes)
-        start = resumed(dataset, out, changes) if resume else new()
+        again = functools.partial(resumed, dataset, out, changes, model=model, settings_file=settings_file)
+        start = again() if resume else new()
         _show_summary(_run(start, connect, out))
 
 
@@ -148,7 +149,8 @@ def imitate(
         from embomatrix.trainer.starting import resumed, started
 
         new = functools.partial(started, dataset, out, model, settings_file, changes)
-        start = resumed(dataset, out, changes) if resume else new()
+        again = functools.partial(resumed, dataset, out, changes, model=model, settings_file=settings_file)
+        start = again() if resume else new()
         _show_imitation(_imitated(start, out), out)
 
 
@@ -215,7 +217,7 @@ def _run(start: Start, connect: Connect, out: Path) -> Summary:
     from embomatrix.trainer.trackers import trackers_of
 
     settings, tasks, policy = start.settings, start.tasks, start.policy
-    prepared = start.progress is not None and start.progress.prepared
+    prepared = start.progress.prepared
     reference = saved_policy(out / REFERENCE, settings).frozen_copy() if prepared else None
     with (
         _gateway(tasks, connect, out.name, settings, settings.grpo.on_lost) as gateway,
@@ -227,14 +229,14 @@ def _run(start: Start, connect: Connect, out: Path) -> Summary:
 
 
 def _imitated(start: Start, out: Path) -> ImitationState:
-    from embomatrix.trainer.checkpoint import Progress, whole_folder
+    from embomatrix.trainer.checkpoint import whole_folder
     from embomatrix.trainer.loop import REFERENCE
     from embomatrix.trainer.progress import display_for
     from embomatrix.trainer.recorder import Recorder
     from embomatrix.trainer.trackers import trackers_of
     from embomatrix.trainer.warm_up import warm_up
 
-    progress = start.progress or Progress()
+    progress = start.progress
     if progress.prepared:
         raise TrainerError(
             f"{out} holds a run that is past its imitation: go on with `embomatrix train --resume`"
@@ -284,7 +286,8 @@ def _show_summary(summary: Summary) -> None:
     console.print(
         f"{summary.imitation_steps} imitation steps, {summary.steps} GRPO steps, {summary.rollouts} rollouts, "
         f"{summary.lost} lost and masked; {stats.redispatched} re-dispatched, "
-        f"{stats.warm_starts} warm and {stats.cold_starts} cold starts, prewarm hits {prewarm_share(stats):.0%}",
+        f"{stats.warm_starts} warm and {stats.cold_starts} cold starts, prewarm hits {prewarm_share(stats):.0%}; "
+        f"{summary.peak_mb:,.0f} MB of memory at most",
         highlight=False,
     )
     console.print(f"report      {summary.report}\ncheckpoint  {summary.checkpoint}", highlight=False)

@@ -6,6 +6,7 @@ import functools
 import logging
 import os
 import platform
+import resource
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -257,6 +258,7 @@ class TrainingRun:
             stats=self._parts.gateway.close_run(),
             checkpoint=checkpoint,
             report=self._out / REPORT,
+            peak_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,  # Linux counts in kB
         )
 
 

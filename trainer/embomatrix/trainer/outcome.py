@@ -32,7 +32,8 @@ class TaskRate:
 class RunOutcome:
     """Numbers of one run. ``before`` and ``after`` GRPO are empty where nothing was held out.
 
-    ``spent_s`` are seconds by activity of the whole run, ``grpo_s`` those of GRPO's steps alone.
+    ``spent_s`` are seconds by activity of the whole run, ``grpo_s`` those of GRPO's steps alone. ``peak_mb`` is the most memory
+    that the trainer's process held at once, since it was last resumed; 0 where nobody looked.
     """
 
     model: str
@@ -45,6 +46,7 @@ class RunOutcome:
     spent_s: Mapping[str, float]
     before: tuple[TaskRate, ...]
     after: tuple[TaskRate, ...]
+    peak_mb: float = 0.0
 
     @property
     def wait_share(self) -> float:

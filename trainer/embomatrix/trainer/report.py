@@ -44,6 +44,7 @@ class Summary:
     stats: RunStats
     checkpoint: Path
     report: Path
+    peak_mb: float = 0.0
 
 
 def time_rows(summary: Summary) -> list[tuple[str, float, float]]:
@@ -85,6 +86,7 @@ def outcome_of(summary: Summary) -> RunOutcome:
         spent_s=dict(summary.spent_s),
         before=_rates(summary.before),
         after=_rates(summary.after),
+        peak_mb=summary.peak_mb,
     )
 
 

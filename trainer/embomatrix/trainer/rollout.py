@@ -42,6 +42,11 @@ T = TypeVar("T")
 DEFAULT_TERMS: Final = RunTerms()
 REPORTS_KEPT: Final = 64
 """That wait for a manager which is away: those of the last steps."""
+AWAY_S: Final = 600.0
+"""For which a scene waits for a manager that is away: as long as a batch waits for its results."""
+AWAY_FIRST_S: Final = 0.1
+AWAY_LONGEST_S: Final = 5.0
+"""Wait before a scene is sent again: doubled from the first to the longest."""
 
 
 class Cluster(Protocol):
@@ -221,7 +226,19 @@ class Gateway:
         await asyncio.shield(task)
 
     async def _send_bundle(self, digest: str) -> None:
-        await self._cluster.put_bundles({digest: self._bundle_bytes(digest)})
+        bundle = {digest: self._bundle_bytes(digest)}
+        until_s, wait_s = self._loop.time() + AWAY_S, AWAY_FIRST_S
+        while True:
+            try:
+                await self._cluster.put_bundles(bundle)
+            except (UnavailableError, DeadlineError) as error:
+                if self._loop.time() + wait_s > until_s:
+                    raise
+                logger.warning("scene %s: sending it again after: %s", digest, error)
+            else:
+                return
+            await asyncio.sleep(wait_s)
+            wait_s = min(2 * wait_s, AWAY_LONGEST_S)
 
     def report(self, report: TrainingReport) -> None:
         """Tell people who watch how training goes. Waits for nobody: what can't be told is dropped, and logged."""

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import torch
 
@@ -12,7 +13,7 @@ from embomatrix.trainer.augment import Variation
 from embomatrix.trainer.checkpoint import CHECKPOINTS, CheckpointStore, Progress, read_state
 from embomatrix.trainer.data import load_tasks
 from embomatrix.trainer.errors import TrainerError, reason_of
-from embomatrix.trainer.policy.choice import is_tiny, new_policy, saved_policy
+from embomatrix.trainer.policy.choice import TINY, is_tiny, new_policy, saved_policy
 from embomatrix.trainer.settings import LANGUAGE_MODEL_DEFAULTS, read_settings, with_changes
 from embomatrix.trainer.telling import Teller
 
@@ -25,6 +26,17 @@ if TYPE_CHECKING:
     from embomatrix.trainer.settings import TrainSettings
 
 
+MAY_CHANGE: Final = frozenset(
+    {
+        *("device", "threads", "track", "checkpoint_every", "keep_checkpoints", "samples_every"),
+        *("grpo.minutes", "grpo.steps", "imitation.seconds", "imitation.steps"),
+    }
+)
+"""Settings that may differ when a run goes on: how long it takes, where it runs and what is told of it."""
+LATER: Final = ("grpo.", "reward.", "evaluation.")
+"""Settings of what comes after imitation: until then they may change too."""
+
+
 @dataclass(frozen=True)
 class Start:
     """``progress`` is a checkpoint's when a run goes on."""
@@ -32,7 +44,7 @@ class Start:
     settings: TrainSettings
     tasks: TaskSet
     policy: Policy
-    progress: Progress | None = None
+    progress: Progress
 
     @property
     def teller(self) -> Teller:
@@ -56,20 +68,65 @@ def started(
         raise TrainerError(
             f"the folder {out} can't be made ({error.strerror}): pass another --out"
         ) from error
-    return Start(settings, tasks, policy)
+    return Start(settings, tasks, policy, Progress(dataset=digest_of(tasks)))
 
 
-def resumed(dataset: Path, out: Path, changes: Mapping[str, Any]) -> Start:
-    """The run in ``out``, from its newest checkpoint. Raises TrainerError where there is none."""
+def resumed(
+    dataset: Path,
+    out: Path,
+    changes: Mapping[str, Any],
+    *,
+    model: str = TINY,
+    settings_file: Path | None = None,
+) -> Start:
+    """The run in ``out``, from its newest checkpoint.
+
+    Raises TrainerError where there is none, or where it was begun with other tasks or with settings that may not change.
+    """
     newest = CheckpointStore(out / CHECKPOINTS, keep=1).latest()
     if newest is None:
         raise TrainerError(
             f"there is no checkpoint in {out} to resume from: leave out --resume, or pass its --out"
         )
-    progress, settings = read_state(newest)
-    settings = with_changes(settings.model_dump(), changes)
+    progress, begun = read_state(newest)
+    told = _flat(read_settings(settings_file, {}).model_dump(exclude_unset=True))
+    told |= {key: value for key, value in changes.items() if value is not None}
+    told |= {} if model == TINY else {"model": model}
+    settings = with_changes(begun.model_dump(), told)
+    _check_unchanged(out, begun, settings, prepared=progress.prepared)
     tasks = loaded(dataset, settings)
+    if progress.dataset not in ("", digest_of(tasks)):
+        raise TrainerError(
+            f"the run in {out} was begun with other tasks than those of {dataset}: pass the --dataset that it was begun with, "
+            "or begin a new run with another --out"
+        )
     return Start(settings, tasks, saved_policy(newest / "policy", settings), progress)
+
+
+def _check_unchanged(out: Path, begun: TrainSettings, now: TrainSettings, *, prepared: bool) -> None:
+    """Raises TrainerError for the first setting that differs and decides what is learnt."""
+    before, after = _flat(begun.model_dump()), _flat(now.model_dump())
+    for key, value in after.items():
+        free = key in MAY_CHANGE or (not prepared and key.startswith(LATER))
+        if value != before[key] and not free:
+            raise TrainerError(
+                f"the run in {out} was begun with {key} = {before[key]!r}, and is to go on with {value!r}: leave that out, or "
+                "begin a new run with another --out"
+            )
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings by dotted key."""
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return flat
+
+
+def digest_of(tasks: TaskSet) -> str:
+    """Names all tasks of a dataset, and the scenes that they are in."""
+    lines = (f"{task.task.task_id} {task.bundle_digest}" for task in (*tasks.train, *tasks.heldout))
+    return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16]
 
 
 def has_checkpoint(out: Path) -> bool:

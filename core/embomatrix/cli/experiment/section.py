@@ -60,10 +60,11 @@ def learning_section(
                 [row for arm in arms for run in arm.runs for row in _curve_rows(run)],
             ),
             "",
-            "Where the time of GRPO's steps went; *overhead* is all but sampling and update.",
+            "Where the time of GRPO's steps went; *overhead* is all but sampling and update. *memory* is the most that the",
+            "trainer's process held.",
             "",
             *_table(
-                ("arm", "seed", "seconds a step", "sampling", "update", "waiting", "overhead"),
+                ("arm", "seed", "seconds a step", "sampling", "update", "waiting", "overhead", "memory"),
                 [_time_row(run) for arm in arms for run in arm.runs],
             ),
             "",
@@ -137,6 +138,7 @@ def _time_row(run: Run) -> tuple[str, ...]:
         f"{total / max(1, told.steps):.2f}",
         *(f"{share:.1%}" for share in shares),
         f"{told.overhead:.1%}",
+        f"{told.peak_mb:,.0f} MB" if told.peak_mb else "–",
     )
 
 

@@ -1,0 +1,87 @@
+"""A run goes on as it began, or says what is otherwise."""
+
+import json
+
+import pytest
+from tests.fakes.datasets import write_kitchen_dataset
+
+from embomatrix.trainer.checkpoint import CHECKPOINTS, CheckpointStore
+from embomatrix.trainer.errors import TrainerError
+from embomatrix.trainer.starting import resumed, started
+
+SMALL = {"tiny.layers": 1, "tiny.width": 16, "tiny.heads": 2, "tiny.inner": 16, "threads": 1}
+
+
+@pytest.fixture(scope="module")
+def kitchen(tmp_path_factory):
+    return write_kitchen_dataset(tmp_path_factory.mktemp("kitchen"))
+
+
+@pytest.fixture
+def begun(kitchen, tmp_path):
+    """Saves the checkpoint of a run that took one step of imitation, and of GRPO once it is ``prepared``."""
+
+    def begin(*, prepared=False):
+        start = started(kitchen, tmp_path, "tiny", None, SMALL)
+        start.progress.prepared = prepared
+        start.progress.imitation.step = start.progress.step = 1
+        store = CheckpointStore(tmp_path / CHECKPOINTS, keep=1)
+        return store.save(start.policy, {}, start.progress, start.settings)
+
+    return begin
+
+
+@pytest.mark.parametrize("changes", [{"grpo.steps": 9, "threads": 1}, {"seed": 0}, {"seed": None}])
+def test_a_run_goes_on_for_longer_and_with_what_it_began_with(kitchen, tmp_path, begun, changes):
+    begun(prepared=True)
+    start = resumed(kitchen, tmp_path, changes)
+    assert start.progress.step == 1
+    assert start.settings.grpo.steps == changes.get("grpo.steps")
+
+
+@pytest.mark.parametrize(
+    ("changes", "model", "written", "told"),
+    [
+        (
+            {"seed": 7},
+            "tiny",
+            "",
+            "begun with seed = 0, and is to go on with 7: leave that out, or begin a new",
+        ),
+        ({}, "runs/other", "", "begun with model = 'tiny', and is to go on with 'runs/other'"),
+        ({"reward.goal": "10"}, "tiny", "", r"begun with reward\.goal = 30\.0, and is to go on with 10\.0"),
+        ({}, "tiny", "[grpo]\ngroup = 4\n", r"begun with grpo\.group = 8, and is to go on with 4"),
+        ({}, "tiny", "[grpo]\ngruop = 4\n", r"there is no setting 'grpo\.gruop'"),
+    ],
+)
+def test_a_run_does_not_go_on_with_other_settings(kitchen, tmp_path, begun, changes, model, written, told):
+    begun(prepared=True)
+    file = tmp_path / "settings.toml"
+    file.write_text(written)
+    with pytest.raises(TrainerError, match=told):
+        resumed(kitchen, tmp_path, changes, model=model, settings_file=file)
+
+
+def test_until_imitation_ends_what_comes_after_it_may_change(kitchen, tmp_path, begun):
+    begun()
+    assert resumed(kitchen, tmp_path, {"reward.goal": "10"}).settings.reward.goal == 10.0
+    with pytest.raises(TrainerError, match=r"begun with imitation\.patience = 0"):
+        resumed(kitchen, tmp_path, {"imitation.patience": 3})
+
+
+def test_a_run_does_not_go_on_with_other_tasks(kitchen, tmp_path, begun):
+    begun()
+    other = write_kitchen_dataset(tmp_path / "other")
+    tasks = (other / "tasks.jsonl").read_text().splitlines(keepends=True)
+    (other / "tasks.jsonl").write_text("".join(tasks[:-1]))
+    with pytest.raises(
+        TrainerError, match=r"begun with other tasks than those of .*other: pass the --dataset"
+    ):
+        resumed(other, tmp_path, {})
+
+
+def test_a_checkpoint_of_another_version_is_told(kitchen, tmp_path, begun):
+    state = begun() / "state.json"
+    state.write_text(json.dumps({**json.loads(state.read_text()), "schema": 2}))
+    with pytest.raises(TrainerError, match="has schema 2, this version reads 3: start a new run"):
+        resumed(kitchen, tmp_path, {})
