@@ -10,6 +10,7 @@ from embomatrix.factory.task_import import batch
 from embomatrix.factory.task_import.binding import Addition
 from embomatrix.factory.task_import.demands import Demand, Room, demand_on, demands_of, room_for, smallest_m
 from embomatrix.factory.task_import.models import models_for
+from embomatrix.factory.task_import.sources import NAMESAKES, activity_names
 from embomatrix.factory.task_import.task import Imported, Manner, import_problem
 from embomatrix.factory.writer.view import is_liftable
 from embomatrix.world.bddl import parse_problem
@@ -100,3 +101,24 @@ def test_a_tap_joins_the_table_where_something_must_be_wet(home: Scene) -> None:
     assert isinstance(dry, Imported)
     assert not any("sink" in name for name in dry.about)
     assert any("sink" in name for name in wet.task.table)
+
+
+@pytest.mark.parametrize(
+    ("name", "origin", "examines"),
+    [
+        ("toys", "eai", True),
+        ("re-shelving_library_books", "embomatrix", True),
+        ("cleaning_oven", "behavior-1k", True),
+        ("cook_a_turkey", "behavior-1k", False),
+    ],
+)
+def test_what_examines_is_not_trained_on(home: Scene, name: str, origin: str, examines: bool) -> None:
+    item = type(source())(name, PROBLEM, origin)
+    imported = import_problem(item, home)
+    assert isinstance(imported, Imported)
+    assert imported.examines is examines
+
+
+def test_the_namesakes_are_activities_of_the_package() -> None:
+    assert len(NAMESAKES) == 67
+    assert {name.replace("-", "_") for name in activity_names()} >= NAMESAKES

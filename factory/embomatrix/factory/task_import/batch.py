@@ -167,7 +167,7 @@ def verify(
     record = TaskRecord(
         task=imported.task,
         bundle_digest=bundle_digest(data),
-        split="train",
+        split="heldout" if imported.examines else "train",
         oracle=tuple(plan_to_json(verdict.plan)),
         rooms=imported.rooms,
         signature=imported.signature,

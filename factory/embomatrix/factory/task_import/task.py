@@ -80,6 +80,8 @@ class Imported:
     """The same objects by the problem's own names."""
     notes: tuple[str, ...] = ()
     """What was read into the problem, and which furniture was added to the scene for it."""
+    examines: bool = False
+    """Whether the task is kept for examinations."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +105,7 @@ def import_problem(
     rng = np.random.default_rng(np.random.SeedSequence(list(digest[:8])))
     try:
         imported = _Binder(source, problem, base, rng, digest.hex()[:6], manner or Manner()).imported()
-        return dataclasses.replace(imported, notes=(*notes, *imported.notes))
+        return dataclasses.replace(imported, notes=(*notes, *imported.notes), examines=source.examines)
     except RefusedError as error:
         return error.refusal
 
