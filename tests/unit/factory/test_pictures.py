@@ -4,17 +4,22 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from PIL import ImageColor
 from typer.testing import CliRunner
 
-from embomatrix.factory.pictures.scene import draw_plan
+from embomatrix.factory.pictures.scene import FILL, draw_plan
 from embomatrix.factory.pictures.sheet import draw_sheet, draw_views
 from embomatrix.factory.scenes.cli import app
 from embomatrix.sim.bullet.camera import render_oblique
+from embomatrix.world.asset import Asset, Link
+from embomatrix.world.geometry import Part, Pose, Shape
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from embomatrix.world.scene import Scene
+
+HERE = Pose((0.0, 0.0, 0.0))
 
 
 def test_the_plan_shows_more_than_walls(flat: Scene) -> None:
@@ -38,6 +43,24 @@ def test_a_plan_shows_its_windows(flat: Scene) -> None:
     blue = (0x6F, 0xC3, 0xE8)
     assert (lit == blue).all(axis=2).any()
     assert not (walled == blue).all(axis=2).any()
+
+
+def test_a_crown_hides_nothing_that_stands_under_it(home: Scene) -> None:
+    fridge = next(item for item in home.objects if home.assets[item.asset_id].category == "fridge")
+    box = home.box_of(fridge.name)
+    size = tuple(2 * extent for extent in box.size_m)
+    tree = Asset(
+        "tree-crown", "tree", "tree.n.01", size, 10.0, (Link("base", (Part(Shape.BOX, HERE, size),)),)
+    )
+    crown = replace(
+        fridge, name="tree_1", asset_id="tree-crown", joints=(), pose_world_asset=Pose(box.center_m)
+    )
+    bare = replace(home, objects=(fridge,))
+    grown = replace(bare, objects=(fridge, crown), assets={**home.assets, "tree-crown": tree})
+    orange, green = (ImageColor.getrgb(FILL[kind]) for kind in ("opens", "plant"))
+    shown, alone = (np.asarray(draw_plan(scene)) for scene in (grown, bare))
+    assert (shown == green).all(axis=2).sum() > 1.5 * (alone == green).all(axis=2).sum()
+    assert (shown == orange).all(axis=2).sum() > 0.8 * (alone == orange).all(axis=2).sum()
 
 
 def test_a_sheet_holds_a_plan_in_every_cell(flat: Scene) -> None:

@@ -44,6 +44,21 @@ def test_a_name_stays_within_its_box(box: tuple[int, int, int, int]) -> None:
     assert rows.max() < box[3]
 
 
+def test_the_size_of_a_room_stands_below_its_name_where_one_line_is_too_long() -> None:
+    def one_line_of(words: str) -> np.ndarray:
+        image = grey()
+        assert Labels(image).inside(words, (5, 5, 195, 115), "black", NOTHING)
+        rows, columns = np.nonzero(written(image))
+        return np.array([np.ptp(rows), np.ptp(columns)]) + 1
+
+    image = grey()
+    assert Labels(image).inside("storage_room_0  1.6 x 1.2 m", (20, 20, 130, 70), "black", NOTHING)
+    rows, columns = np.nonzero(written(image))
+    name, size = one_line_of("storage_room_0"), one_line_of("1.6 x 1.2 m")
+    assert abs(np.ptp(columns) + 1 - max(name[1], size[1])) <= 2, "the name is whole on a line of its own"
+    assert np.ptp(rows) + 1 > 1.5 * name[0]
+
+
 def test_a_name_that_could_not_be_read_is_not_written() -> None:
     image = grey()
     assert not Labels(image).inside("straight_chair_1", (20, 20, 50, 50), "black", NOTHING)

@@ -28,6 +28,8 @@ _NUMBER_SIZE: Final = 11
 _GAPS_PX: Final = (4, 10, 18)
 """How far from a point its number may stand: near, unless others are there."""
 _LINES: Final = 3
+GAP: Final = "  "
+"""Between a name and what is told of it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,8 +127,11 @@ def _places(setting: _Setting, box: Box) -> Iterator[tuple[int, int]]:
 
 
 @lru_cache(maxsize=4096)
-def _broken(name: str) -> tuple[str, ...]:
-    """The name on one line, and on two and three as even as its underscores allow."""
+def _broken(words: str) -> tuple[str, ...]:
+    """Words on one line, and on two and three as even as their underscores allow; what follows a gap has a line of its own."""
+    name, gap, rest = words.partition(GAP)
+    if gap:
+        return (words, *(f"{way}\n{rest}" for way in _broken(name)))
     parts = [f"{part}_" for part in name.split("_")]
     parts[-1] = parts[-1][:-1]
     ways = [name]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from PIL import Image, ImageDraw
 
-from embomatrix.factory.pictures.labels import Labels, boxes
+from embomatrix.factory.pictures.labels import GAP, Labels, boxes
 from embomatrix.factory.pictures.legend import counted, draw_legend, in_order
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.geometry import Aabb, Pose
@@ -122,7 +122,7 @@ class _Plan:
         self._named: list[tuple[SceneObject, Box, str]] = []
         """Furniture with the box that its name may stand in, and its colour."""
         self._marks: list[Box] = []
-        """What words had better not cover: dots and fronts."""
+        """What words had better not cover: dots, fronts, lights, the robot."""
 
     def rooms(self) -> None:
         for number, room in enumerate(self._scene.rooms):
@@ -150,7 +150,7 @@ class _Plan:
 
     def furniture(self) -> None:
         shown = [o for o in self._scene.objects if not self._is_small(o)]
-        for item in sorted(shown, key=lambda o: footprint(self._scene, o).low_m[2]):
+        for item in sorted(shown, key=self._layer):
             box = footprint(self._scene, item)
             if is_overhead(box):
                 self._ceiling(box)
@@ -174,7 +174,9 @@ class _Plan:
         start = self._scene.robot
         x, y = self._px(start.x_m, start.y_m)
         r = ROBOT.radius_m * self._scale
-        self._draw.ellipse((x - r, y - r, x + r, y + r), outline="#d02020", width=2)
+        around = (int(x - r), int(y - r), int(x + r), int(y + r))
+        self._draw.ellipse(around, outline="#d02020", width=2)
+        self._marks.append(around)
         tip = (x + r * math.cos(start.yaw), y - r * math.sin(start.yaw))
         self._draw.line((x, y, *tip), fill="#d02020", width=2)
 
@@ -203,13 +205,13 @@ class _Plan:
         return [*lines, *([""] if groups else []), *groups]
 
     def _label_rooms(self, labels: Labels) -> None:
-        standing = boxes(box for _, box, _ in self._named)
+        standing = boxes([*(box for _, box, _ in self._named), *self._marks])
         for room in self._scene.rooms:
             box = _ordered([self._px(*room.low_m), self._px(*room.high_m)])
             size = f"{room.size_m[0]:.1f} x {room.size_m[1]:.1f} m"
             if not any(
                 labels.inside(words, box, _ROOM_COLOR, standing)
-                for words in (f"{room.name}  {size}", room.name)
+                for words in (f"{room.name}{GAP}{size}", room.name)
             ):
                 labels.beside(room.name, _middle(box), _ROOM_COLOR, standing)
         x, y = self._px(self._scene.robot.x_m, self._scene.robot.y_m)
@@ -235,9 +237,18 @@ class _Plan:
         x, y, _ = box.size_m
         return (max(x, y) < _SMALL_M or bool(item.host and not item.fixed)) and not is_overhead(box)
 
+    def _layer(self, item: SceneObject) -> tuple[int, float]:
+        """Rugs lie under everything, and a crown would hide what stands under its tree; then the lower before the higher."""
+        box = footprint(self._scene, item)
+        kind = kind_of(self._scene, item, box)
+        rank = 2 if item.host else {"rug": 0, "plant": 1}.get(kind, 2)
+        return rank, box.low_m[2]
+
     def _ceiling(self, box: Aabb) -> None:
         x, y = self._px(*box.center_m[:2])
-        self._draw.ellipse((x - 6, y - 6, x + 6, y + 6), outline="#c9a227", width=2)
+        around = (x - 6, y - 6, x + 6, y + 6)
+        self._draw.ellipse(around, outline="#c9a227", width=2)
+        self._marks.append(around)
 
     def _front(self, item: SceneObject, color: str) -> None:
         """A triangle at the middle of the front edge, pointing to the room."""
