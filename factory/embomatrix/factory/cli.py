@@ -33,6 +33,7 @@ from embomatrix.factory.pipeline.settings import BuildSettings, WriterKind, scen
 from embomatrix.factory.social.asking import Asked, asked_writer
 from embomatrix.factory.task_import.cli import app as import_app
 from embomatrix.factory.terminal import fail, mended, progress
+from embomatrix.factory.verification.cli import app as verify_app
 from embomatrix.llm.ledger import Price
 from embomatrix.world.dataset import Dataset
 from embomatrix.world.task import TaskCategory
@@ -54,6 +55,7 @@ app.command()(lay)
 app.add_typer(import_app)
 app.add_typer(inspect_app)
 app.add_typer(corpus_app)
+app.add_typer(verify_app)
 MOST_JOBS = 8
 """Each holds some scenes: a few hundred MB."""
 

@@ -62,6 +62,8 @@ class SceneEditor:
         self._unreached = {problem.names for problem in reach_problems(scene)}
         self.unserved = frozenset(name for names in self._unreached for name in names)
         """Objects of the base scene that the robot could not get at to begin with."""
+        self.given_up: set[str] = set()
+        """Objects of the base scene that what is to come may bar the robot from."""
         self._counts = Counter(self._assets[item.asset_id].category for item in scene.objects)
 
     @property
@@ -238,7 +240,8 @@ class SceneEditor:
         item = SceneObject("candidate", asset.asset_id, room, pose, fixed=False)
         assets = {**self._assets, asset.asset_id: asset}
         trial = replace(self.base, objects=(*self._objects.values(), item), assets=assets)
-        return {problem.names for problem in reach_problems(trial)} <= self._unreached
+        known = self._unreached | {(name,) for name in self.given_up}
+        return {problem.names for problem in reach_problems(trial)} <= known
 
 
 def box_at(asset: Asset, pose: Pose) -> Aabb:

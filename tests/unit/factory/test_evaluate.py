@@ -220,6 +220,15 @@ def test_the_page_keeps_all_but_the_factorys_part():
     assert again.count(BEGIN) == again.count(END) == 1
 
 
+def test_files_of_one_part_are_put_together_on_the_page():
+    other = dataclasses.replace(
+        EVALUATION, figures=(dataclasses.replace(EVALUATION.figures[0], name="distinct1"),)
+    )
+    page = with_factory("", [EVALUATION, other])
+    assert page.count("### Diversity of tasks") == page.count("Measured:") == 1
+    assert "| distinct1 | 0.3 | ≤ 0.35 | reached | 450 |" in page
+
+
 def test_a_page_with_half_a_part_is_left_alone():
     with pytest.raises(EvaluationError, match="put it back"):
         with_factory(f"# Benchmarks\n{BEGIN}\ntext\n", [EVALUATION])

@@ -9,13 +9,22 @@ from tests.fakes.problems import PROBLEM, source
 
 from embomatrix.factory.refusal import Refusal, RefusalReason
 from embomatrix.factory.task_import.batch import bind_first
-from embomatrix.factory.task_import.dialects import GROUPS, RENAMED, in_catalog_words, said_whole
+from embomatrix.factory.task_import.dialects import (
+    GROUPS,
+    LAMPS,
+    RENAMED,
+    in_catalog_words,
+    read_problem,
+    said_whole,
+)
 from embomatrix.factory.task_import.reach import unreachable_atoms
 from embomatrix.factory.task_import.report import (
+    Outcome,
     evaluation_of,
     outcome_of,
     report_to_json,
     report_to_markdown,
+    solved_of,
 )
 from embomatrix.factory.task_import.sources import (
     EAI_INSTRUCTIONS,
@@ -47,9 +56,31 @@ def test_a_group_stands_for_a_type_that_the_problem_does_not_name_already() -> N
     )
 
 
+def test_a_light_that_is_switched_is_read_as_a_lamp_and_one_that_hangs_is_not() -> None:
+    text = PROBLEM.replace("breakfast_table.n.01", "room_light.n.01")
+    problem, notes = read_problem(source(text))
+    assert problem.objects["room_light.n.01_1"] == "room_light.n.01"
+    assert notes == ()
+    problem, notes = read_problem(source(text.replace("(and\n", "(and (toggled_on ?room_light.n.01_1)\n")))
+    assert problem.objects["room_light.n.01_1"] == "floor_lamp.n.01"
+    assert notes == ("room_light.n.01 is read as floor_lamp.n.01",)
+
+
+def test_a_driveway_is_ground_that_things_stand_on(home: Scene) -> None:
+    text = PROBLEM.replace("floor.n.01_1 - floor.n.01", "driveway.n.01_1 - driveway.n.01").replace(
+        "floor.n.01_1", "driveway.n.01_1"
+    )
+    imported = import_problem(
+        source(text.replace("apple.n.01_2 breakfast_table.n.01_1", "apple.n.01_2 driveway.n.01_1")), home
+    )
+    assert isinstance(imported, Imported)
+    apple = imported.scene.by_name[imported.about[imported.instances.index("apple.n.01_2")]]
+    assert (apple.room, apple.host) == ("kitchen_0", "")
+
+
 def test_every_word_is_read_as_types_that_have_models() -> None:
     catalog = Catalog.load()
-    for options in GROUPS.values():
+    for options in (*GROUPS.values(), *LAMPS.values()):
         for name in options:
             assert catalog.has_synset(name), name
             assert catalog.categories_of(name), name
@@ -144,6 +175,19 @@ def test_the_report_counts_refusals_and_lists_what_no_skill_reaches(eai: Path, f
     assert "## Goals that the profile `paper` does not reach: 2" in text
     rate = evaluation_of([bound, refused], 0).figure("import_rate_eai")
     assert (rate.value, rate.goal, rate.n) == (0.5, 1.0, 2)
+
+
+def test_solved_are_counted_among_the_goals_that_a_profile_reaches() -> None:
+    solved, stuck, beyond = (
+        Outcome(name, "behavior-1k", "", reason, "", {"paper": atoms, "household": ()}, ())
+        for name, reason, atoms in (("a", "", ()), ("b", "no_plan", ()), ("c", "", ("(cut apple)",)))
+    )
+    evaluation = solved_of([solved, stuck, beyond], 0)
+    told = [(figure.name, figure.value, figure.goal, figure.n) for figure in evaluation.figures]
+    assert told == [
+        ("oracle_solved_behavior of what paper reaches", 1 / 2, 0.95, 2),
+        ("oracle_solved_behavior of what household reaches", 2 / 3, None, 3),
+    ]
 
 
 def test_a_folder_without_eai_s_files_is_one_sentence(tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from embomatrix.world.state import Relation
 
 ON, IN, UNDER = LayoutRelation.ONTOP, LayoutRelation.INSIDE, LayoutRelation.UNDER
 FLOOR = Seat(None, "living_room_0")
+BASKET = (("wicker_basket", "jqfftz"),)
 
 
 def models(category: str) -> tuple[tuple[str, str], ...]:
@@ -88,6 +89,41 @@ def test_a_wide_thing_makes_way_for_another_at_the_host_that_both_need(seating: 
     seating.refuse("other", IN, "cabinet_1", LayoutReason.NO_FREE_SPOT, "full")
     seating.next_model("other")
     assert [failure.thing for failure in seating.given_up] == ["other"]
+
+
+def test_what_a_task_puts_into_a_full_room_makes_furniture_of_the_room_go(flat: Scene) -> None:
+    editor = SceneEditor(flat)
+    seating = Seating(editor, "living_room_0", [Item("bed", models("bed")[:1], rooms=("living_room_0",))])
+    before = [item for item in flat.objects if item.room == "living_room_0" and item.fixed]
+    seating.refuse("bed", ON, "living_room_0", LayoutReason.NO_FREE_SPOT, "full")
+    seating.next_model("bed")
+    gone = [item for item in before if item.name not in editor.objects]
+    assert len([item for item in gone if not item.host]) == 1
+    assert seating.waiting["bed"].last is not None
+    assert not seating.failures
+
+
+def test_furniture_that_the_task_is_about_stays_reachable_when_the_rest_may_be_barred(flat: Scene) -> None:
+    editor = SceneEditor(flat)
+    editor.keep([named(flat, "fridge")])
+    kitchen = editor.objects[named(flat, "fridge")].room
+    seating = Seating(editor, kitchen, [Item("booth", models("booth"), ON, kitchen)])
+    stove = next(
+        name for name, item in editor.objects.items() if item.room == kitchen and editor.is_spare(name)
+    )
+    seating.refuse("booth", ON, kitchen, LayoutReason.BARS_THE_WAY, "narrow")
+    seating.next_model("booth")
+    assert "booth" in seating.waiting
+    assert stove in editor.given_up
+    assert named(flat, "fridge") not in editor.given_up
+
+
+def test_many_things_for_one_basket_are_packed(flat: Scene) -> None:
+    """Four oranges of 8.5 cm in a basket whose floor is 20 cm wide: only beside one another they fit."""
+    oranges = [Item(f"orange_{number}", (("orange", "ucstpm"),), IN, "basket") for number in range(4)]
+    basket = Item("basket", BASKET, ON, "living_room_0")
+    layout = lay(SceneEditor(flat), [basket, *oranges], 0)
+    assert layout.failures == ()
 
 
 SHOE = """(define (problem shoes-0) (:domain omnigibson)

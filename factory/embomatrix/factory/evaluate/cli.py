@@ -12,18 +12,17 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import typer
 from rich.console import Console
-from rich.table import Table
 
 from embomatrix.factory.evaluate.admissions import admitted_share
 from embomatrix.factory.evaluate.drafts import asked_of
 from embomatrix.factory.evaluate.figures import (
     Evaluation,
     EvaluationError,
-    evaluation_to_json,
     read_evaluation,
 )
 from embomatrix.factory.evaluate.judge import judged
 from embomatrix.factory.evaluate.measure import evaluate_aesthetics, evaluate_tasks, written_for
+from embomatrix.factory.evaluate.output import hand_in
 from embomatrix.factory.evaluate.page import with_factory
 from embomatrix.factory.evaluate.scene_runs import OutcomeLog, evaluate_scenes
 from embomatrix.factory.evaluate.scenes import Method, fixed_tasks
@@ -89,7 +88,7 @@ def tasks(
         if llm or cassette is not None:
             verdicts = asyncio.run(_judged(groups, llm, model, key, cassette, seed))
             evaluation = replace(evaluation, figures=(*evaluation.figures, *verdicts))
-        _hand_in(evaluation, json_file)
+        hand_in(evaluation, json_file)
 
 
 @app.command()
@@ -127,7 +126,7 @@ def scenes(
         if only > 1:
             taken = {"taken": f"one in {only} of the fixed tasks", **evaluation.conditions}
             evaluation = replace(evaluation, conditions=taken)
-        _hand_in(evaluation, json_file)
+        hand_in(evaluation, json_file)
 
 
 @app.command()
@@ -144,7 +143,7 @@ def aesthetics(
         evaluation, fitted = evaluate_aesthetics(rooms, seed)
         if calibration is not None:
             write_whole(calibration, (json.dumps(asdict(fitted), indent=1) + "\n").encode("ascii"))
-        _hand_in(evaluation, json_file)
+        hand_in(evaluation, json_file)
 
 
 @app.command()
@@ -193,20 +192,3 @@ async def _judged(
         )
         for name in ("variety", "characters", "overall")
     )
-
-
-def _hand_in(evaluation: Evaluation, json_file: Path | None) -> None:
-    table = Table("figure", "value", "goal", "", "n")
-    for figure in evaluation.figures:
-        verdict = "" if figure.goal is None else "reached" if figure.is_reached else "short"
-        table.add_row(
-            figure.name, f"{figure.value:.3g} {figure.unit}".strip(), figure.bound, verdict, str(figure.n)
-        )
-    Console().print(table)
-    for note in evaluation.notes:
-        Console().print(note, highlight=False, markup=False)
-    if json_file is not None:
-        with mended(json_file):
-            write_whole(
-                json_file, (json.dumps(evaluation_to_json(evaluation), indent=1) + "\n").encode("ascii")
-            )

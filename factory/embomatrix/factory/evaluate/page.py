@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import textwrap
+from collections import Counter
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.evaluate.figures import EvaluationError
@@ -31,7 +32,13 @@ PARTS: Final[Mapping[str, tuple[str, str]]] = {
         "`embomatrix factory import … --instantiate --json FILE`: a problem counts when a base scene was built with all that "
         "it names where its start puts it, and its goal can be told true or false; whether the start holds in physics is "
         "looked at only where a task is verified. *Reached* are goals of which each literal can be made to hold by a skill "
-        "of the profile.",
+        "of the profile; *solved*, measured without `--instantiate`, are those of them that the oracle solves in a scene.",
+    ),
+    "verification": (
+        "Tasks verified again",
+        "`embomatrix factory verify DATASET --physical`: admitted tasks, judged anew in two other processes. *oracle_cached* "
+        "are those admitted again, *reverified_bit_equal* those whose plans are the dataset's and whose poses and states are "
+        "the same to the bit after every step; in *oracle_physical* a robot carries the dataset's plan out in stepped physics.",
     ),
     "aesthetics": (
         "Aesthetics",
@@ -63,25 +70,39 @@ def with_factory(page: str, evaluations: Sequence[Evaluation]) -> str:
 
 
 def render(evaluations: Sequence[Evaluation]) -> str:
-    """The part in Markdown, in the order of `PARTS`. Raises EvaluationError for an unknown part or one given twice."""
-    order = [*PARTS]
-    given = [evaluation.part for evaluation in evaluations]
-    for part in given:
-        if part not in PARTS:
-            raise EvaluationError(f"there is no part {part!r}: expected {', '.join(order)}")
-        if given.count(part) > 1:
-            raise EvaluationError(f"part {part!r} is given twice: give one file of each part")
+    """The part in Markdown, in the order of `PARTS`; files of one part are put together.
+
+    Raises EvaluationError for an unknown part, or a figure that two files of a part give.
+    """
     lines = ["## Factory", "", "Written by `embomatrix factory evaluate page FILE...`.", ""]
-    for evaluation in sorted(evaluations, key=lambda evaluation: order.index(evaluation.part)):
-        heading, words = PARTS[evaluation.part]
+    for part, mine in _by_part(evaluations).items():
+        heading, words = PARTS[part]
         lines += [f"### {heading}", "", _paragraph(words), ""]
-        measured = "; ".join(
-            f"{name.replace('_', ' ')} {value}" for name, value in evaluation.conditions.items()
+        measured = dict.fromkeys(
+            "; ".join(f"{name.replace('_', ' ')} {value}" for name, value in each.conditions.items())
+            for each in mine
         )
-        lines += [_paragraph(f"Measured: {measured}."), "", *_table(evaluation.figures), ""]
-        for note in evaluation.notes:
+        lines += [_paragraph(f"Measured: {text}.") for text in measured]
+        lines += ["", *_table([figure for each in mine for figure in each.figures]), ""]
+        for note in (note for each in mine for note in each.notes):
             lines += [_paragraph(note), ""]
     return "\n".join(lines).rstrip() + "\n"
+
+
+def _by_part(evaluations: Sequence[Evaluation]) -> dict[str, list[Evaluation]]:
+    """Evaluations by part, in the order of the page. Raises EvaluationError."""
+    for evaluation in evaluations:
+        if evaluation.part not in PARTS:
+            raise EvaluationError(f"there is no part {evaluation.part!r}: expected {', '.join(PARTS)}")
+    found = {part: [each for each in evaluations if each.part == part] for part in PARTS}
+    for part, mine in found.items():
+        counts = Counter(figure.name for each in mine for figure in each.figures)
+        twice = next((name for name, count in counts.items() if count > 1), "")
+        if twice:
+            raise EvaluationError(
+                f"{twice!r} of part {part!r} is given twice: give one file of each measurement"
+            )
+    return {part: mine for part, mine in found.items() if mine}
 
 
 def _table(figures: Sequence[Figure]) -> list[str]:

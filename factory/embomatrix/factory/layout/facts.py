@@ -9,6 +9,7 @@ from embomatrix.factory.layout.organization import HIGHEST_M, LOWEST_M
 from embomatrix.factory.layout.values import HostFacts, HostOffer, LayoutRelation, RoomFacts
 from embomatrix.factory.writer.tables import HOST_GROUPS
 from embomatrix.sim.candidates import EDGE_M, surfaces_for
+from embomatrix.skills.limits import ROBOT
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
@@ -68,7 +69,8 @@ def _hosts(
 
 
 def _offers(asset: Asset, base_m: float, *, asked: bool) -> tuple[HostOffer, ...]:
-    found = (_offer(asset, relation, base_m) for relation in OFFERED)
+    highest_m = ROBOT.reach_high_m if asked else HIGHEST_M
+    found = (_offer(asset, relation, base_m, highest_m) for relation in OFFERED)
     return tuple(
         offer
         for offer in found
@@ -90,12 +92,12 @@ def _spaces(asset: Asset, relation: LayoutRelation) -> tuple[tuple[float, float,
     )
 
 
-def _offer(asset: Asset, relation: LayoutRelation, base_m: float) -> HostOffer | None:
+def _offer(asset: Asset, relation: LayoutRelation, base_m: float, highest_m: float) -> HostOffer | None:
     spaces = _spaces(asset, relation)
     if relation is LayoutRelation.UNDER and _skirt_m(asset) < LOW_SKIRT_M:
         return None
     reachable = [
-        space for space in spaces if relation is LayoutRelation.UNDER or base_m + space[3] <= HIGHEST_M
+        space for space in spaces if relation is LayoutRelation.UNDER or base_m + space[3] <= highest_m
     ]
     if not reachable:
         return None

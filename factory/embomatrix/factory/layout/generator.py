@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import math
 import time
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
@@ -57,6 +58,8 @@ SURFACES: Final = 4
 SHIFT_M: Final = 0.008
 TURN_RAD: Final = 0.15
 """How far a thing that nothing aligns is moved off the grid, and turned: people don't put things down on a raster."""
+PACKED: Final = 3
+"""So many things that one basket or box must take are packed from a corner on, the largest first."""
 SQUARE: Final = frozenset(
     {Arrangement.CENTER_ALIGNED, Arrangement.FACE_TO, Arrangement.NEXT_TO, Arrangement.EDGE}
 )
@@ -199,9 +202,20 @@ class _RoomJob:
             elif relation is LayoutRelation.ATTACHED:
                 for child in children:
                     self._hang(child)
+            elif relation is LayoutRelation.INSIDE and self._is_packed(host, children):
+                for child in sorted(children, key=self._volume_m3, reverse=True):
+                    self._sample(child, Relation.INSIDE, host, packed=True)
             else:
                 for child in children:
                     self._sample(child, Relation(relation.value), host)
+
+    def _is_packed(self, host: str, children: Sequence[str]) -> bool:
+        """Baskets and boxes are filled from a corner on; what stands on the shelves of furniture is to be in reach."""
+        item = self._editor.objects.get(host)
+        return item is not None and not item.fixed and len(children) >= PACKED
+
+    def _volume_m3(self, name: str) -> float:
+        return math.prod(self._seating.waiting[name].asset.size_m)
 
     def _onto(self, host: str, children: list[str]) -> None:
         """Arrange things on the surfaces of one host, the best first; what none takes is left to the sampler."""
@@ -271,10 +285,13 @@ class _RoomJob:
                 yield pose_at(plane, asset, spot, (SHIFT_M * dx, SHIFT_M * dy), TURN_RAD * turn)
             yield pose_at(plane, asset, spot)
 
-    def _sample(self, name: str, relation: Relation | None, target: str, host: str = "") -> None:
+    def _sample(
+        self, name: str, relation: Relation | None, target: str, host: str = "", *, packed: bool = False
+    ) -> None:
         """Let the sampler look for a pose alone; ``host`` is what the tree said, where the target is a neighbour."""
+        sampler, asset = self._sampler, self._seating.waiting[name].asset
         try:
-            pose = self._sampler.find(self._seating.waiting[name].asset, relation, target)
+            pose = sampler.pack(asset, target) if packed else sampler.find(asset, relation, target)
         except PlacementError as error:
             known = relation in (Relation.INSIDE, Relation.UNDER)
             level = LayoutRelation(relation.value) if relation and known else LayoutRelation.ONTOP

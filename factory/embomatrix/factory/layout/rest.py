@@ -72,10 +72,25 @@ def settle(editor: SceneEditor, names: Sequence[str], elsewhere: Elsewhere = lam
                 rested[name] = settled.pose
             else:
                 unstable[name] = f"let go, it moves by {settled.moved_m:.3f} m: try a flatter place"
+        unstable |= _leaning(editor, Relations(engine), [name for name in names if name not in unstable])
     editor.move(rested)
     shut_in = [name for name in names if name not in unstable.keys() | unreached.keys()]
     unreached |= dict.fromkeys(_not_fetched(editor, shut_in), NOT_FETCHED)
     return Settling(len(loose), unstable, unreached)
+
+
+def _leaning(editor: SceneEditor, relations: Relations, names: Sequence[str]) -> dict[str, str]:
+    """Those of some things that lie on another loose thing than they are to be on, with the sentence against it.
+
+    What is packed into a basket comes to lie on what is in there already, which nobody could then take out.
+    """
+    found = {}
+    for name in names:
+        host = relations.host_of(name)
+        if host is None or host.name == editor.known(name).host or editor.known(host.name).fixed:
+            continue
+        found[name] = f"it comes to lie on {host.name}: try a place beside it"
+    return found
 
 
 class _Hands:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
@@ -9,7 +10,8 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.factory.assets.library import build_asset
 from embomatrix.factory.editor import PlacementError
 from embomatrix.factory.layout.values import LayoutReason
-from embomatrix.sim.candidates import candidates
+from embomatrix.sim.bounds import bounds_of
+from embomatrix.sim.candidates import candidates, patches, stands_in
 from embomatrix.world.catalog import Catalog, CatalogError
 from embomatrix.world.geometry import Pose
 from embomatrix.world.state import Relation
@@ -24,6 +26,8 @@ if TYPE_CHECKING:
     from embomatrix.world.scene import Room, SceneObject
 
 TRIES: Final = 64
+PACKING_GAP_M: Final = 0.004
+"""Between things that are packed side by side."""
 FLOOR_TRIES: Final = 200
 PEEPING: Final = 24
 PEEPING_SHARE: Final = 0.15
@@ -74,6 +78,46 @@ class ObjectSampler:
         """A pose at which nothing stands against the thing. Raises PlacementError with the rule that did the most."""
         target = host if relation in (Relation.ONTOP, Relation.INSIDE, Relation.UNDER) else ""
         return self.first_free(asset, self.poses(asset, relation, host), target)
+
+    def pack(self, asset: Asset, host: str) -> Pose:
+        """A pose in a container, in a corner of it or of what is left between things that lie there. Raises PlacementError.
+
+        Where no corner takes the thing, any free pose.
+        """
+        target = self._editor.known(host)
+        for local in self._corners(asset, target):
+            pose = target.pose_world_asset @ local
+            if self._editor.objection(asset, pose, host) is None:
+                return pose
+        return self.find(asset, Relation.INSIDE, host)
+
+    def _corners(self, asset: Asset, target: SceneObject) -> Iterator[Pose]:
+        """Poses in the container's frame, row after row from one corner on, at the walls and at what lies there."""
+        editor, bounds = self._editor, bounds_of(asset)
+        carrier = editor.asset_of(target.name)
+        inverse = target.pose_world_asset.inverse()
+        lying = [
+            bounds_of(editor.asset_of(name)).box(inverse @ item.pose_world_asset)
+            for name, item in editor.objects.items()
+            if item.host == target.name
+        ]
+        for patch in patches(bounds, carrier, Relation.INSIDE):
+            box = bounds.box(Pose.from_xyz_yaw(0.0, 0.0, 0.0, patch.yaw))
+            lines = [
+                sorted(
+                    place
+                    for place in (
+                        middle - room,
+                        *(other.high_m[axis] + PACKING_GAP_M - box.low_m[axis] for other in lying),
+                    )
+                    if abs(place - middle) <= room + 1e-9
+                )
+                for axis, (middle, room) in enumerate(zip(patch.center_m[:2], patch.room_m, strict=True))
+            ]
+            for x, y in itertools.product(*lines):
+                pose = Pose.from_xyz_yaw(x, y, patch.center_m[2], patch.yaw)
+                if stands_in(asset, pose, carrier, Relation.INSIDE):
+                    yield pose
 
     def poses(self, asset: Asset, relation: Relation | None, host: str) -> Iterator[Pose]:
         """Poses in the relation to a host, in random order, looked at by nobody. Raises PlacementError where there is none."""

@@ -10,7 +10,9 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.layout.values import Failure, LayoutReason, LayoutRelation
+from embomatrix.factory.furnish.roles import Role, role_of
+from embomatrix.factory.layout.jobs import kind_of
+from embomatrix.factory.layout.values import Failure, Kind, LayoutReason, LayoutRelation
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
@@ -27,7 +29,13 @@ MOVES: Final = 2
 """Times that a thing is put elsewhere because the robot does not get at what is on or in it."""
 RESIGNED: Final = 2
 """After so many places at which the robot does not get at a thing, one is taken as it is: verification tells."""
+STANDS_M: Final = 0.05
+"""What begins below this stands on the floor."""
+MOVABLE: Final = frozenset({Role.SEAT, Role.LOW_TABLE, Role.TABLE, Role.CORNER, Role.BACKED, Role.OPEN})
+PLUMBED: Final = frozenset({"toilet", "urinal", "pedestal_sink"})
+"""Furniture of these roles people would carry out of a room to make place for other, but for what a bathroom needs."""
 FULL: Final = frozenset({LayoutReason.NO_FREE_SPOT, LayoutReason.TOO_LARGE})
+CROWDED: Final = frozenset({LayoutReason.NO_FREE_SPOT, LayoutReason.BARS_THE_WAY})
 FAR: Final = frozenset({LayoutReason.OUT_OF_REACH, LayoutReason.NOT_AT_HAND})
 
 
@@ -49,6 +57,7 @@ class Guest:
     cleared: int = 0
     moved: int = 0
     unreached: int = 0
+    crowded: bool = False
     seat: Seat | None = None
     last: Failure | None = None
 
@@ -90,6 +99,7 @@ class Seating:
         self.given_up: list[Failure] = []
         self._editor = editor
         self._room = room
+        self._barring = False
 
     def owners(self) -> dict[str, str]:
         """Placed items by their names in the scene."""
@@ -107,7 +117,9 @@ class Seating:
     ) -> None:
         """Keep why a waiting item can't be at a host."""
         failure = Failure(name, relation, host, reason, detail)
-        self.waiting[name].last = failure
+        guest = self.waiting[name]
+        guest.last = failure
+        guest.crowded |= reason in CROWDED
         self.failures.append(failure)
 
     def unseat(self, name: str, reason: LayoutReason, detail: str) -> None:
@@ -129,7 +141,7 @@ class Seating:
             self._forget((name,))
         elif self.waiting.keys() & {guest.item.host, *guest.item.beside}:
             return  # what it is to stand at has no place yet
-        elif not (self.offer_another(guest) or self._narrow(guest) or self._make_room(guest)):
+        elif not any(way(guest) for way in (self.offer_another, self._narrow, self._bar, self._make_room)):
             del self.waiting[name]
             self.given_up.append(guest.failure(self._room))
 
@@ -181,23 +193,58 @@ class Seating:
         return True
 
     def _make_room(self, guest: Guest) -> bool:
-        """Take the largest loose thing that is not the task's from a full host that the task demands; False without one."""
+        """Take the largest spare thing from a full host that the task demands, or from a full floor; False without one."""
         host = self.names.get(guest.item.host, guest.item.host)
-        full = guest.last is not None and guest.last.reason is LayoutReason.NO_FREE_SPOT
-        if not full or guest.cleared == CLEARED:
+        if not guest.crowded or guest.cleared == CLEARED:
             return False
-        loose = [
-            name
-            for name, item in self._editor.objects.items()
-            if item.host == host and not item.fixed and self._editor.is_spare(name)
-        ]
-        if not loose:
+        on_floor = host in self._editor.rooms or (not host and kind_of(guest.asset) is Kind.FURNITURE)
+        spare = self._furniture() if on_floor else self._loose_on(host) if host else []
+        if not spare:
             return False
-        self._editor.remove(max(loose, key=lambda name: math.prod(self._editor.box_of(name).size_m)))
+        self._editor.remove(max(spare, key=lambda name: math.prod(self._editor.box_of(name).size_m)))
         guest.cleared += 1
-        guest.choose(0)
-        self._forget((guest.item.name,))
+        self._try_again(guest)
         return True
+
+    def _loose_on(self, host: str) -> list[str]:
+        """Loose things at a host that the task is not about."""
+        editor = self._editor
+        return [
+            name
+            for name, item in editor.objects.items()
+            if item.host == host and not item.fixed and editor.is_spare(name)
+        ]
+
+    def _furniture(self) -> list[str]:
+        """What stands on the room's floor, with nothing on or over it that the task is about, and is not built in."""
+        editor = self._editor
+        return [
+            name
+            for name, item in editor.objects.items()
+            if item.room == self._room
+            and not item.host
+            and editor.is_spare(name)
+            and editor.box_of(name).low_m[2] < STANDS_M
+            and _is_movable(editor.asset_of(name))
+        ]
+
+    def _bar(self, guest: Guest) -> bool:
+        """Let what must stand on a narrow floor bar the robot's way to what the task is not about; False once it may."""
+        if guest.last is None or guest.last.reason is not LayoutReason.BARS_THE_WAY or self._barring:
+            return False
+        self._barring = True
+        editor = self._editor
+        editor.given_up.update(
+            name for name, item in editor.objects.items() if item.room == self._room and editor.is_spare(name)
+        )
+        self._try_again(guest)
+        return True
+
+    def _try_again(self, guest: Guest) -> None:
+        """With its first model, as if nothing had been tried."""
+        guest.choose(0)
+        guest.crowded = False
+        self._forget((guest.item.name,))
 
     def _take_out(self, name: str) -> None:
         """Remove an item from the scene, with all that rests on it: they wait again."""
@@ -209,3 +256,7 @@ class Seating:
 
     def _forget(self, names: Sequence[str]) -> None:
         self.failures = [failure for failure in self.failures if failure.thing not in names]
+
+
+def _is_movable(asset: Asset) -> bool:
+    return role_of(asset.category, asset.size_m, asset.mass_kg) in MOVABLE and asset.category not in PLUMBED

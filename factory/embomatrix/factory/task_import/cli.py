@@ -19,12 +19,14 @@ from embomatrix.factory.refusal import Refusal
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.task_import.batch import Verified, bind_first, verify_first
 from embomatrix.factory.task_import.dialects import read_problem
+from embomatrix.factory.task_import.reach import unreachable_atoms
 from embomatrix.factory.task_import.report import (
     Outcome,
     evaluation_of,
     outcome_of,
     report_to_json,
     report_to_markdown,
+    solved_of,
 )
 from embomatrix.factory.task_import.sources import (
     SourceError,
@@ -41,11 +43,13 @@ from embomatrix.sim.physical.survey import Foresight
 from embomatrix.sim.pose_cache import PlacementLibrary
 from embomatrix.world.bddl import BddlError
 from embomatrix.world.dataset import TASKS_FILE, write_dataset
+from embomatrix.world.task import Profile
 from embomatrix.world.whole_file import check_writable, write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+    from embomatrix.factory.evaluate.figures import Evaluation
     from embomatrix.factory.task_import.task import Imported
     from embomatrix.world.scene import Scene
 
@@ -65,6 +69,9 @@ Report = Annotated[
     Path | None, typer.Option(help="File for what became of each problem, in JSON; beside it in Markdown.")
 ]
 Rates = Annotated[Path | None, typer.Option("--json", help="File for the import rates.")]
+ReachedBy = Annotated[
+    Profile | None, typer.Option(help="Leave out problems with goals that no skill of this profile reaches.")
+]
 Scenes = Annotated[
     list[str] | None,
     typer.Option("--scenes", "--scene", help="Base scene, or 'all'; give it again for more."),
@@ -86,6 +93,7 @@ def import_(
     instantiate: Annotated[
         bool, typer.Option("--instantiate", help="Bind goals as well that no skill reaches; no verification.")
     ] = False,
+    reached_by: ReachedBy = None,
     look_ahead: Annotated[
         bool, typer.Option(help="Find out what the robot's arm can do in each scene.")
     ] = True,
@@ -101,6 +109,8 @@ def import_(
         if out is not None:
             _check_free(out, depth)
         sources = [_parsed(source) for source in _sources(bddl, activity, jsonl, eai)]
+        if reached_by is not None:
+            sources = _reached(sources, reached_by)
         bases = [build_base_scene(scene_id) for scene_id in scene_ids(scenes)]
         judged = _judged(console, sources, bases, seed, depth, Foresight() if look_ahead else None)
         verified = [item for item in judged if isinstance(item, Verified)]
@@ -111,7 +121,8 @@ def import_(
                 {item.record.bundle_digest: item.bundle for item in verified},
             )
         outcomes = [outcome_of(source, item) for source, item in zip(sources, judged, strict=True)]
-        _write(outcomes, seed, report, json_file)
+        evaluation = (solved_of if depth is Depth.VERIFY else evaluation_of)(outcomes, seed)
+        _write(outcomes, evaluation, report, json_file)
     if len(sources) == 1:
         _print_one(console, sources[0], judged[0])
         return
@@ -120,12 +131,23 @@ def import_(
         fail(f"no problem was admitted, so {out} was not written: `--bind-only` shows which could be bound")
 
 
-def _write(outcomes: Sequence[Outcome], seed: int, report: Path | None, json_file: Path | None) -> None:
+def _reached(sources: Sequence[SourceText], profile: Profile) -> list[SourceText]:
+    """Those with goals that the profile's skills reach. Raises SourceError where there is none."""
+    found = [source for source in sources if not unreachable_atoms(read_problem(source)[0], profile)]
+    if not found:
+        raise SourceError(
+            f"no goal of {len(sources)} problems is reached by the profile {profile.value!r}: leave out --reached-by"
+        )
+    return found
+
+
+def _write(
+    outcomes: Sequence[Outcome], evaluation: Evaluation, report: Path | None, json_file: Path | None
+) -> None:
     if report is not None:
         write_whole(report, (json.dumps(report_to_json(outcomes), indent=1) + "\n").encode("ascii"))
         write_whole(report.with_suffix(".md"), report_to_markdown(outcomes).encode("utf-8"))
     if json_file is not None:
-        evaluation = evaluation_of(outcomes, seed)
         write_whole(json_file, (json.dumps(evaluation_to_json(evaluation), indent=1) + "\n").encode("ascii"))
 
 

@@ -136,15 +136,25 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
 A thing whose models don't do what these tasks are about is another of its kind: the catalog's only backpack is wider than a
 hand opens, its shirt is spread out, its package has no lid and its alarm clock no switch.
 """
+LAMPS: Final[Mapping[str, tuple[str, ...]]] = {"room_light.n.01": ("floor_lamp.n.01",)}
+"""What stands for a light that is switched: those under ceilings have no switch in the catalog, and hang out of reach."""
 _TYPE: Final = re.compile(r"(?<![\w.])([a-z_\-]+\.n\.\d+)(?![\d_])", re.IGNORECASE)
+_SWITCHED: Final = re.compile(r"\(\s*toggled_on\s+\??([a-z_\-]+\.n\.\d+)", re.IGNORECASE)
 
 
 @functools.lru_cache(maxsize=16)
 def read_problem(source: SourceText) -> tuple[Problem, tuple[str, ...]]:
     """The problem of a source in the words of the catalog, whole, and what was read into it. Raises BddlError."""
-    text, replaced = in_catalog_words(source.text, GROUPS if source.source == EAI else RENAMED)
+    words = GROUPS if source.source == EAI else RENAMED
+    text, replaced = in_catalog_words(source.text, {**words, **_lamps_for(source.text)})
     problem, added = said_whole(parse_problem(text))
     return problem, (*replaced, *added)
+
+
+def _lamps_for(text: str) -> dict[str, tuple[str, ...]]:
+    """Lights that start or goal switch, and the lamps that stand for them."""
+    switched = {name.lower() for name in _SWITCHED.findall(text)}
+    return {name: lamps for name, lamps in LAMPS.items() if name in switched}
 
 
 def in_catalog_words(text: str, words: Mapping[str, tuple[str, ...]]) -> tuple[str, tuple[str, ...]]:

@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     from embomatrix.world.bddl import Problem
     from embomatrix.world.goal import Atom
 
-FLOORS: Final = frozenset({"floor.n.01"})
+FLOORS: Final = frozenset({"floor.n.01", "driveway.n.01", "lawn.n.01"})
+"""What things stand on where nothing else is said: a garden is one plane here, its lawn and its driveway are its floor."""
 AGENT: Final = "agent.n.01"
 
 

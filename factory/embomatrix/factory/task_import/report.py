@@ -27,6 +27,7 @@ FIGURES: Final[Mapping[str, tuple[str, float]]] = {
     "eai": ("import_rate_eai", 1.0),
 }
 """Figure and goal by source."""
+SOLVED_GOAL: Final = 0.95
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,4 +114,20 @@ def evaluation_of(outcomes: Sequence[Outcome], seed: int) -> Evaluation:
         for profile in Profile:
             reached = sum(not each.unreachable[profile.value] for each in mine)
             figures.append(Figure(f"{name} reached by {profile.value}", reached / n, "", Better.NEITHER, n))
+    return Evaluation("imports", {"seed": seed}, tuple(figures))
+
+
+def solved_of(outcomes: Sequence[Outcome], seed: int) -> Evaluation:
+    """By source, how many of the goals that a profile reaches the oracle solved in a scene: of problems that were verified."""
+    figures: list[Figure] = []
+    for source, (name, _) in FIGURES.items():
+        for profile in Profile:
+            mine = [
+                each for each in outcomes if each.source == source and not each.unreachable[profile.value]
+            ]
+            if mine:
+                told = f"{name.replace('import_rate', 'oracle_solved')} of what {profile.value} reaches"
+                goal = SOLVED_GOAL if profile is Profile.PAPER else None
+                share = sum(each.is_bound for each in mine) / len(mine)
+                figures.append(Figure(told, share, "", Better.HIGHER, len(mine), goal))
     return Evaluation("imports", {"seed": seed}, tuple(figures))

@@ -289,7 +289,12 @@ class _Binder:
             for word, room in binding.rooms.items()
             if is_room_instance(word) and word != room
         )
-        return (*added, *moved)
+        gone = tuple(
+            f"{item.name} was taken out of {item.room}: its place was needed"
+            for item in self._base.objects
+            if item.fixed and item.name not in view.scene.by_name
+        )
+        return (*added, *moved, *gone)
 
     def _start(self, names: dict[str, str], binding: Binding) -> tuple[Literal, ...]:
         """``:init`` in the scene's names, without the floors that are no objects, the robot, and what is not the case.

@@ -1,0 +1,171 @@
+"""Admitted tasks judged again, by processes that had no part in admitting them.
+
+Each task is judged in two processes that share nothing: both find a plan anew and execute it, and both must come to the same
+traces, to the bit. Where asked for, a robot carries the dataset's own plan out in stepped physics as well.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import signal
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from embomatrix.factory.admission import SEED, Admitted, admit
+from embomatrix.reward.hierarchy import score
+from embomatrix.sim.executor import Simulator
+from embomatrix.sim.physical.actor import physical_simulator
+from embomatrix.sim.planner.oracle import find_plan
+from embomatrix.skills.parse import plan_from_json, plan_to_json
+from embomatrix.world.dataset import Dataset, DatasetError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+    from pathlib import Path
+
+    from embomatrix.skills.trace import Trace
+    from embomatrix.world.bundle import Bundle
+    from embomatrix.world.dataset import TaskRecord
+
+SUCCESS: Final = ""
+"""Instead of a sentence against a task."""
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """What one process found. ``cached`` and ``physical`` are sentences against the task, None where it was not asked.
+
+    ``digest`` is of every pose and state after every step of the plan found; ``same_plan``: it is the dataset's own.
+    """
+
+    task: str
+    cached: str
+    digest: str
+    same_plan: bool
+    physical: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What became of a task: the sentences of both modes, and whether two processes agree with each other and the dataset."""
+
+    task: str
+    cached: str
+    equal: bool
+    physical: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class _Order:
+    folder: Path
+    bundle_digest: str
+    tasks: tuple[str, ...]
+    physical: bool
+
+
+def sampled(records: Sequence[TaskRecord], most: int | None, seed: int) -> list[TaskRecord]:
+    """At most so many records, drawn by the seed, in the order of the dataset; all of them without a number."""
+    if most is None or most >= len(records):
+        return list(records)
+    chosen = np.random.default_rng((seed, len(records))).permutation(len(records))[:most]
+    return [records[int(at)] for at in sorted(chosen)]
+
+
+def verify_again(
+    folder: Path,
+    records: Sequence[TaskRecord],
+    *,
+    physical: bool,
+    jobs: int,
+    progress: Callable[[int], None] = lambda _done: None,
+) -> list[Verdict]:
+    """Judge records of a dataset, in their order; ``progress`` hears how many looks are done, two for each task.
+
+    Raises DatasetError where a bundle can't be read, or a process dies.
+    """
+    by_bundle: dict[str, list[str]] = {}
+    for record in records:
+        by_bundle.setdefault(record.bundle_digest, []).append(record.task.task_id)
+    found: list[dict[str, Look]] = []
+    done = 0
+    # A pool each: no process of the second look has seen what the first one did.
+    for in_physics in (False, physical):
+        looks: dict[str, Look] = {}
+        orders = [_Order(folder, digest, tuple(tasks), in_physics) for digest, tasks in by_bundle.items()]
+        for group in _looked(orders, jobs):
+            looks |= {look.task: look for look in group}
+            done += len(group)
+            progress(done)
+        found.append(looks)
+    first, second = found
+    return [verdict_of(first[task], second[task]) for task in (record.task.task_id for record in records)]
+
+
+def verdict_of(first: Look, second: Look) -> Verdict:
+    """What two looks at one task come to."""
+    same = (first.cached, first.digest) == (second.cached, second.digest)
+    equal = same and first.same_plan and second.same_plan
+    return Verdict(first.task, first.cached or second.cached, equal, second.physical)
+
+
+def _looked(orders: Sequence[_Order], jobs: int) -> Iterator[list[Look]]:
+    pool = ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), initializer=_begin)
+    try:
+        yield from pool.map(_look_at, orders)
+    except BrokenProcessPool as error:
+        raise DatasetError(
+            "a process that verifies tasks died, perhaps for want of memory: call the command again, with fewer --jobs"
+        ) from error
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _begin() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt is the parent's to answer
+
+
+def _look_at(order: _Order) -> list[Look]:
+    """All looks at the tasks of one bundle."""
+    dataset = Dataset.load(order.folder)
+    bundle = dataset.read_bundle(order.bundle_digest)
+    records = [dataset.find(task) for task in order.tasks]
+    with contextlib.closing(Simulator(bundle)) as stage:
+        looks = [_cached(stage, record) for record in records]
+    if not order.physical:
+        return looks
+    return [
+        Look(look.task, look.cached, look.digest, look.same_plan, _physical(bundle, record))
+        for look, record in zip(looks, records, strict=True)
+    ]
+
+
+def _cached(stage: Simulator, record: TaskRecord) -> Look:
+    """Judge a task as admission does, and execute the plan that is found."""
+    verdict = admit(stage, record.task, find_plan)
+    if not isinstance(verdict, Admitted):
+        return Look(record.task.task_id, f"{verdict.reason}: {verdict.sentence}", "", same_plan=False)
+    trace = stage.execute(record.task, verdict.plan, SEED)
+    same = plan_to_json(verdict.plan) == [dict(call) for call in record.oracle]
+    return Look(record.task.task_id, SUCCESS, trace.digest, same)
+
+
+def _physical(bundle: Bundle, record: TaskRecord) -> str:
+    """What is against the dataset's plan when a robot carries it out in physics; empty where it reaches the goal."""
+    plan = plan_from_json(list(record.oracle), record.task.profile)
+    with contextlib.closing(physical_simulator(bundle)) as stage:
+        trace = stage.execute(record.task, plan, SEED)
+        if trace.failure is None and score(record.task, trace.touched, stage.facts).success:
+            return SUCCESS
+        return _objection(trace)
+
+
+def _objection(trace: Trace) -> str:
+    last = trace.steps[-1]
+    if last.failure is None:
+        return "goal_missed: every step succeeds, and the goal does not hold in the end"
+    return f"{last.failure}: step {len(trace.steps)}, {last.call.skill}: {last.message}"

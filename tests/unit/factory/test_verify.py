@@ -1,0 +1,80 @@
+"""Admitted tasks are judged again by other processes: what differs, is refused or fails in physics is told."""
+
+import dataclasses
+import json
+from typing import TYPE_CHECKING
+
+import pytest
+from tests.fakes.datasets import write_kitchen_dataset
+from typer.testing import CliRunner
+
+from embomatrix.factory.cli import app
+from embomatrix.factory.verification.again import Look, sampled, verdict_of
+from embomatrix.factory.verification.figures import evaluation_of, objections
+from embomatrix.world.dataset import Dataset, write_dataset
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+FINE = Look("fetch", "", "sha256:1", same_plan=True)
+
+
+@pytest.fixture(scope="module")
+def kitchen(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return Dataset.load(write_kitchen_dataset(tmp_path_factory.mktemp("kitchen")))
+
+
+def test_two_looks_that_agree_with_the_dataset_are_equal() -> None:
+    assert verdict_of(FINE, FINE).equal
+    assert not verdict_of(FINE, dataclasses.replace(FINE, digest="sha256:2")).equal
+    assert not verdict_of(FINE, dataclasses.replace(FINE, same_plan=False)).equal
+    refused = dataclasses.replace(FINE, cached="no_plan: none", digest="")
+    assert verdict_of(FINE, refused).cached == "no_plan: none"
+
+
+def test_shares_are_of_what_was_asked_and_objections_name_the_task() -> None:
+    verdicts = [
+        verdict_of(FINE, dataclasses.replace(FINE, physical="")),
+        verdict_of(FINE, dataclasses.replace(FINE, physical="grasp_slipped: step 2, pick_up: it fell")),
+    ]
+    evaluation = evaluation_of(verdicts, {})
+    assert evaluation.figure("oracle_cached").value == 100
+    assert (evaluation.figure("oracle_physical").value, evaluation.figure("oracle_physical").n) == (50, 2)
+    assert evaluation.notes == ("Against plans in physics: grasp_slipped 1.",)
+    assert list(objections(verdicts)) == ["fetch, in physics: grasp_slipped: step 2, pick_up: it fell"]
+    without = evaluation_of([verdict_of(FINE, FINE)], {})
+    assert [figure.name for figure in without.figures] == ["oracle_cached", "reverified_bit_equal"]
+
+
+def test_a_sample_is_drawn_by_its_seed_in_the_order_of_the_dataset(kitchen: Dataset) -> None:
+    chosen = sampled(kitchen.records, 2, 3)
+    assert chosen == sampled(kitchen.records, 2, 3)
+    places = [kitchen.records.index(record) for record in chosen]
+    assert places == sorted(set(places))
+    assert sampled(kitchen.records, None, 0) == list(kitchen.records)
+
+
+def test_the_command_judges_tasks_in_other_processes_and_in_physics(
+    tmp_path: "Path", kitchen: Dataset
+) -> None:
+    """The first task is as it was admitted; the other holds a plan that the oracle does not find."""
+    first, other = kitchen.records[0], kitchen.records[1]
+    other = dataclasses.replace(other, oracle=first.oracle)
+    folder = tmp_path / "tasks"
+    bundles = {record.bundle_digest: kitchen.bundle_bytes(record.bundle_digest) for record in (first, other)}
+    write_dataset(folder, [first, other], bundles)
+    file = tmp_path / "verified.json"
+    result = CliRunner().invoke(
+        app, ["verify", str(folder), "--physical", "--jobs", "1", "--json", str(file)]
+    )
+    assert result.exit_code == 1
+    assert f"{other.task.task_id}: two processes, or one of them and the dataset, differ" in result.output
+    figures = {each["name"]: each["value"] for each in json.loads(file.read_text())["figures"]}
+    assert figures == {"oracle_cached": 100, "reverified_bit_equal": 50, "oracle_physical": 50}
+
+
+def test_a_dataset_without_tasks_is_told(tmp_path: "Path") -> None:
+    write_dataset(tmp_path, [], {})
+    result = CliRunner().invoke(app, ["verify", str(tmp_path)])
+    assert result.exit_code == 2
+    assert "holds no task" in result.output
