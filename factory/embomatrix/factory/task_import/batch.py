@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from embomatrix.sim.physical.survey import Foresight
     from embomatrix.sim.pose_cache import PlacementLibrary
     from embomatrix.world.scene import Scene
+    from embomatrix.world.task import Task
 
 
 OF_THE_PROBLEM: Final = frozenset(
@@ -157,9 +158,7 @@ def verify(
     with SceneSurvey(imported.scene, foresight) as survey:
         poses = cache_poses(SceneView(imported.scene), [needs], library, survey, seed)
     with contextlib.closing(Simulator(Bundle(imported.scene, {}, poses))) as stage:
-        given = imported.task.source == EAI  # an examination's questions are as they are
-        most = 1.0 if given else MOST_HELD
-        verdict = admit(stage, imported.task, find_plan, imported.init, most_held=most)
+        verdict = admit(stage, imported.task, find_plan, imported.init, most_held=most_held_in(imported.task))
         if not isinstance(verdict, Admitted):
             return verdict
         bundle = Bundle(imported.scene, {imported.task.task_id: imported.task}, poses)
@@ -173,3 +172,8 @@ def verify(
         signature=imported.signature,
     )
     return Verified(record, data)
+
+
+def most_held_in(task: Task) -> float:
+    """Share of a task's atoms that may hold at the start: an examination's questions are as they are."""
+    return 1.0 if task.source == EAI else MOST_HELD

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.factory.admission import SEED, Admitted, admit
+from embomatrix.factory.task_import.batch import most_held_in
 from embomatrix.reward.hierarchy import score
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.physical.actor import physical_simulator
@@ -146,7 +147,7 @@ def _look_at(order: _Order) -> list[Look]:
 
 def _cached(stage: Simulator, record: TaskRecord) -> Look:
     """Judge a task as admission does, and execute the plan that is found."""
-    verdict = admit(stage, record.task, find_plan)
+    verdict = admit(stage, record.task, find_plan, most_held=most_held_in(record.task))
     if not isinstance(verdict, Admitted):
         return Look(record.task.task_id, f"{verdict.reason}: {verdict.sentence}", "", same_plan=False)
     trace = stage.execute(record.task, verdict.plan, SEED)
