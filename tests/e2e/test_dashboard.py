@@ -88,7 +88,7 @@ async def test_page_of_training_shows_curves_and_plans_and_runs_no_script_of_a_m
         await client.report_training(run_id, before)
         page = await asyncio.to_thread(shown, browser, f"{at.status_url}#training", tmp_path)
     assert (page.words["step"], page.words["reward"], page.words["solved"]) == ("3", "20.00", "25 %")
-    assert page.words["success"] == "step – all – compound –"
+    assert page.words["success"] == "step 3 all 0.25 compound 0.5"
     assert page.words["spent"].startswith("activity share time update 75 % 30 s sampling 25 % 10 s")
     assert page.words["heldout"] == "tasks before GRPO after GRPO all tasks 21 % –"
     assert page.words["which"] == "that differ most in step 3: Tidy <b>up</b>"

@@ -8,11 +8,12 @@ from importlib.resources import files
 import httpx
 import pytest
 from tests.fakes.worker import FakeWorker
-from tests.integration.test_manager_service import batch, manager, open_run, outcomes
+from tests.integration.test_manager_service import BEDROOM, KITCHEN, batch, manager, open_run, outcomes
 
 from embomatrix.manager.rest import PREFIX
 from embomatrix.rpc.status import NotFoundError
 from embomatrix.rpc.training import RewardTiers, SampledPlan, TrainingReport
+from embomatrix.rpc.values import LookaheadEntry
 
 pytestmark = pytest.mark.timeout(60)
 
@@ -37,6 +38,48 @@ async def test_every_list_tells_the_same_moment(tmp_path):
     assert seen["at_s"] == workers["at_s"] == runs["at_s"]
     assert seen["overview"]["outcomes"] == {"completed": 10}
     assert sum(row["completed"] for row in workers["items"]) == 10
+
+
+async def seen_until(http, true):
+    """The first snapshot of which this is true."""
+    for _ in range(300):
+        seen = (await http.get(f"{PREFIX}/snapshot")).json()
+        if true(seen):
+            return seen
+        await asyncio.sleep(0.1)
+    raise AssertionError(seen)
+
+
+async def test_a_scene_that_no_worker_can_hold_is_told_with_its_reason(tmp_path):
+    async with (
+        manager(tmp_path) as at,
+        open_run(at.address) as client,
+        FakeWorker(at.address, broken={BEDROOM}),
+        http_at(at) as http,
+    ):
+        await client.announce_lookahead(
+            "r1", 1, [LookaheadEntry(5, KITCHEN, 8), LookaheadEntry(6, BEDROOM, 4)]
+        )
+        seen = await seen_until(http, lambda seen: seen["overview"]["unplaceable"])
+    assert seen["health"]["sentence"] == "No worker can hold 1 announced scene: the look-ahead page says why."
+    (fine,), (stuck,) = [step["cells"] for step in seen["lookahead"]]
+    assert (fine["problem"], stuck["warmth"]) == ("", "unplaceable")
+    assert stuck["problem"] == f"scene {BEDROOM} fails to load: the mesh has no triangles"
+
+
+async def test_what_a_lost_worker_completed_is_still_counted(tmp_path):
+    async with (
+        manager(tmp_path) as at,
+        open_run(at.address) as client,
+        FakeWorker(at.address, "w1") as gone,
+        http_at(at) as http,
+    ):
+        await outcomes(client, batch(10))
+        await gone.kill()
+        seen = await seen_until(http, lambda seen: "lost" in seen["overview"]["workers"])
+    (worker,) = seen["workers"]["items"]
+    assert (worker["state"], worker["completed"]) == ("lost", 10)
+    assert seen["overview"]["outcomes"] == {"completed": 10}
 
 
 async def test_an_operator_steers_by_rest_as_by_grpc(tmp_path):

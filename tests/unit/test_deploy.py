@@ -5,6 +5,7 @@ import os
 import re
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import kubernetes_validate
@@ -105,6 +106,17 @@ def test_systemd_finds_nothing_wrong_with_the_unit_of_the_manager(tmp_path):
     unit = tmp_path / MANAGER_UNIT.name
     unit.write_text(MANAGER_UNIT.read_text().replace("/opt/embomatrix/bin/embomatrix", shutil.which("true")))
     assert_valid_unit(unit, system=True)
+
+
+def test_what_the_manager_s_image_imports_needs_no_package_that_it_lacks():
+    built = (DEPLOY / "docker" / "Dockerfile").read_text()
+    (lacked,) = re.findall(r"pyproject\.toml manager \| grep -v \^(\w+)", built)
+    (modules,) = re.findall(r"slim\.py (.*embomatrix\.manager\.app.*)", built)
+    asked = f"import importlib, sys\nsys.modules[{lacked!r}] = None\nfor name in sys.argv[1:]: importlib.import_module(name)"
+    ran = subprocess.run(
+        (sys.executable, "-c", asked, *modules.split()), capture_output=True, text=True, check=False
+    )
+    assert ran.returncode == 0, ran.stderr
 
 
 @pytest.mark.parametrize("name", ["prometheus/rules.yml", "grafana/dashboard.json"])

@@ -20,10 +20,13 @@ if TYPE_CHECKING:
     from embomatrix.manager.expulsion import Expulsion
     from embomatrix.manager.gallery import Gallery
     from embomatrix.manager.http_rules import HttpRules
+    from embomatrix.manager.no_gallery import NoGallery
     from embomatrix.manager.runtime import ManagerRuntime
 
 
-def build_api(runtime: ManagerRuntime, rules: HttpRules, expulsion: Expulsion, gallery: Gallery) -> FastAPI:
+def build_api(
+    runtime: ManagerRuntime, rules: HttpRules, expulsion: Expulsion, gallery: Gallery | NoGallery
+) -> FastAPI:
     """The application. With tokens, everything but the page's own files and the health check asks for one."""
     app = FastAPI(
         title="EmboMatrix manager",

@@ -22,11 +22,11 @@ from embomatrix.manager.auditor import AuditRules
 from embomatrix.manager.bundles import BundleStore
 from embomatrix.manager.cluster_state import ClusterState
 from embomatrix.manager.expulsion import Expulsion
-from embomatrix.manager.gallery import Gallery
 from embomatrix.manager.garbage import only_young
 from embomatrix.manager.http_rules import HttpRules, allowed_hosts
 from embomatrix.manager.leadership import Leadership
 from embomatrix.manager.listen import bound_socket
+from embomatrix.manager.no_gallery import NoGallery
 from embomatrix.manager.registry import LivenessLimits, Registry
 from embomatrix.manager.runtime import ManagerRuntime
 from embomatrix.manager.scheduler import ScheduleLimits
@@ -38,12 +38,14 @@ from embomatrix.manager.store.url import open_store
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterator
+    from pathlib import Path
 
     import grpc
     from fastapi import FastAPI
     from starlette.types import Receive, Scope, Send
 
     from embomatrix.manager.access.protection import Tls
+    from embomatrix.manager.gallery import Gallery
     from embomatrix.manager.settings import ManagerSettings
     from embomatrix.manager.store.protocol import StateStore
 
@@ -127,8 +129,7 @@ async def running(
         await gate.open(protection.first)
         server, port = await build_server(runtime, gate, protection.tls, settings)
         rules = HttpRules(gate, hosts=allowed_hosts(settings.http_host, protection.tls))
-        gallery = Gallery(settings.dataset)
-        http.show(build_api(runtime, rules, Expulsion(runtime, gate), gallery))
+        http.show(build_api(runtime, rules, Expulsion(runtime, gate), _gallery(settings.dataset)))
         group.create_task(leadership.keep())
         group.create_task(runtime.serve())
         await server.start()
@@ -136,6 +137,15 @@ async def running(
         page = f"{settings.http_host}:{http_socket.getsockname()[1]}"
         scheme = "http" if protection.tls is None else "https"
         yield Endpoints(f"{settings.host}:{port}", f"{scheme}://{page}/")
+
+
+def _gallery(dataset: Path | None) -> Gallery | NoGallery:
+    if dataset is None:
+        return NoGallery()
+    # What reads scenes comes with numpy, and only where scenes are to be shown.
+    from embomatrix.manager.gallery import Gallery
+
+    return Gallery(dataset)
 
 
 def _candidate(settings: ManagerSettings) -> Candidate:

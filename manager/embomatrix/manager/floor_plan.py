@@ -4,15 +4,17 @@ The manager has no physics. What a call moves is put where the call says, in the
 with ``embomatrix factory inspect``.
 """
 
-# Pydantic reads annotations of these values for the OpenAPI page: what they name must be there at run time.
-from dataclasses import dataclass, field
+from __future__ import annotations
+
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.manager.gallery_values import FloorPlan, Moment
 from embomatrix.skills.describe import call_in_words
 from embomatrix.skills.syntax import Skill
 from embomatrix.world.geometry import Pose
 
 if TYPE_CHECKING:
+    from embomatrix.manager.gallery_values import Box
     from embomatrix.skills.syntax import Plan, SkillCall
     from embomatrix.world.geometry import Vec2, Vec3
     from embomatrix.world.scene import Scene
@@ -27,34 +29,8 @@ SKIRTING_M: Final = 0.1
 PIECES: Final = 1500
 _ORIGIN: Final = Pose((0.0, 0.0, 0.0))
 
-Box = tuple[str, float, float, float, float]
-"""A name, and west, south, east and north in metres."""
 
-
-@dataclass(frozen=True, slots=True)
-class FloorPlan:
-    """Rooms, walls and what stands about, as boxes in the world's xy plane."""
-
-    rooms: list[Box]
-    walls: list[Box]
-    pieces: list[Box]
-    robot: list[float]
-
-
-@dataclass(frozen=True, slots=True)
-class Moment:
-    """After a call; the first is the start. ``things`` are those that are elsewhere than at the start, ``active`` what the plan
-    opened or switched on. Metres in the world's xy plane.
-    """
-
-    call: str
-    robot: list[float]
-    held: list[str] = field(default_factory=list)
-    things: dict[str, list[float]] = field(default_factory=dict)
-    active: list[str] = field(default_factory=list)
-
-
-def floor_plan(scene: "Scene") -> FloorPlan:
+def floor_plan(scene: Scene) -> FloorPlan:
     """The whole scene, from above."""
     walls = [wall.aabb(_ORIGIN) for wall in scene.walls]
     boxes = [(item, scene.box_of(item.name)) for item in scene.objects if not item.absent]
@@ -71,13 +47,13 @@ def floor_plan(scene: "Scene") -> FloorPlan:
     )
 
 
-def small_things(scene: "Scene", task: "Task") -> dict[str, list[float]]:
+def small_things(scene: Scene, task: Task) -> dict[str, list[float]]:
     """Things of the task's table that a robot may carry, and where they are at the start."""
     found = [scene.by_name[name] for name in task.table if name in scene.by_name]
     return {item.name: _middle(scene, item.name) for item in found if not item.fixed and not item.absent}
 
 
-def played(scene: "Scene", task: "Task", plan: "Plan") -> list[Moment]:
+def played(scene: Scene, task: Task, plan: Plan) -> list[Moment]:
     """The plan call by call, each as if it did what it says."""
     moments = [Moment("", _rounded(scene.robot.x_m, scene.robot.y_m))]
     for call in plan:
@@ -85,7 +61,7 @@ def played(scene: "Scene", task: "Task", plan: "Plan") -> list[Moment]:
     return moments
 
 
-def _after(scene: "Scene", task: "Task", call: "SkillCall", before: Moment) -> Moment:
+def _after(scene: Scene, task: Task, call: SkillCall, before: Moment) -> Moment:
     target = _named(scene, task, call.object_index)
     robot, held, things, active = before.robot, [*before.held], {**before.things}, [*before.active]
     match call.skill:
@@ -108,7 +84,7 @@ def _after(scene: "Scene", task: "Task", call: "SkillCall", before: Moment) -> M
     return Moment(call_in_words(call, task.table), robot, held, things, active)
 
 
-def _beside(scene: "Scene", name: str, at: list[float] | None, robot: list[float]) -> list[float]:
+def _beside(scene: Scene, name: str, at: list[float] | None, robot: list[float]) -> list[float]:
     """Before the object, on the side that the robot comes from."""
     if at is not None:
         return at
@@ -118,17 +94,17 @@ def _beside(scene: "Scene", name: str, at: list[float] | None, robot: list[float
     return _rounded(*inside)
 
 
-def _named(scene: "Scene", task: "Task", row: int | None) -> str:
+def _named(scene: Scene, task: Task, row: int | None) -> str:
     """Name of the object in that row; empty where the table or the scene has none."""
     name = task.table[row] if row is not None and 0 <= row < len(task.table) else ""
     return name if name in scene.by_name else ""
 
 
-def _middle(scene: "Scene", name: str) -> list[float]:
+def _middle(scene: Scene, name: str) -> list[float]:
     return _rounded(*scene.box_of(name).center_m[:2])
 
 
-def _box(name: str, low_m: "Vec2 | Vec3", high_m: "Vec2 | Vec3") -> Box:
+def _box(name: str, low_m: Vec2 | Vec3, high_m: Vec2 | Vec3) -> Box:
     return (name, round(low_m[0], 2), round(low_m[1], 2), round(high_m[0], 2), round(high_m[1], 2))
 
 

@@ -23,7 +23,7 @@ from embomatrix.world.whole_file import read_whole
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from embomatrix.manager.floor_plan import FloorPlan, Moment
+    from embomatrix.manager.gallery_values import FloorPlan, Moment
     from embomatrix.world.dataset import TaskRecord
     from embomatrix.world.scene import Scene
 
@@ -36,15 +36,14 @@ SCENES_KEPT: Final = 8
 """Decoded: a few tens of MB at most."""
 PLANS_KEPT: Final = 256
 PICTURES_FOLDER: Final = "pictures"
-NO_DATASET: Final = "no dataset is shown: start the manager with --dataset FOLDER"
 _PLAIN: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,199}")
 _JPEG: Final = b"\xff\xd8\xff"
 
 
 class Gallery:
-    """Of the dataset in ``folder``; None: of none. Reading happens in a thread, one reader at a time."""
+    """Of the dataset in ``folder``. Reading happens in a thread, one reader at a time."""
 
-    def __init__(self, folder: Path | None) -> None:
+    def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._reading = asyncio.Lock()
         self._stamp: tuple[int, int] | None = None
@@ -55,8 +54,6 @@ class Gallery:
 
     async def page(self, *, search: str, scene: str, category: str, offset: int, limit: int) -> TaskPage:
         """Tasks with the text in their instruction or id, in the order of the file. UnavailableError for a damaged dataset."""
-        if self._folder is None:
-            return TaskPage(0, offset, [], [], [], NO_DATASET)
         records = list((await self._loaded()).values())
         words = search.lower().split()
         found = [
@@ -113,8 +110,6 @@ class Gallery:
             return await asyncio.to_thread(self._load)
 
     def _load(self) -> dict[str, TaskRecord]:
-        if self._folder is None:
-            raise NotFoundError(NO_DATASET)
         file = self._folder / TASKS_FILE
         try:
             known = file.stat()
@@ -206,7 +201,7 @@ class Gallery:
 
     def _path(self, folder: str, name: str) -> Path | None:
         """Of a file that is there, with a plain name, and truly within the dataset's folder."""
-        if self._folder is None or not _PLAIN.fullmatch(name):
+        if not _PLAIN.fullmatch(name):
             return None
         path = self._folder / folder / name
         inside = path.is_file() and path.resolve().is_relative_to(self._folder.resolve())

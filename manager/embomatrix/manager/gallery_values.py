@@ -3,7 +3,31 @@
 from dataclasses import dataclass, field
 from typing import Any
 
-from embomatrix.manager.floor_plan import FloorPlan, Moment
+Box = tuple[str, float, float, float, float]
+"""A name, and west, south, east and north in metres."""
+
+
+@dataclass(frozen=True, slots=True)
+class FloorPlan:
+    """Rooms, walls and what stands about, as boxes in the world's xy plane."""
+
+    rooms: list[Box]
+    walls: list[Box]
+    pieces: list[Box]
+    robot: list[float]
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """After a call; the first is the start. ``things`` are those that are elsewhere than at the start, ``active`` what the plan
+    opened or switched on. Metres in the world's xy plane.
+    """
+
+    call: str
+    robot: list[float]
+    held: list[str] = field(default_factory=list)
+    things: dict[str, list[float]] = field(default_factory=dict)
+    active: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True, slots=True)

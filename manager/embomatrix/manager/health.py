@@ -47,12 +47,19 @@ def health(seen: Overview, *, paused: bool, now_s: float) -> Health:
     if recent:
         # The meter keeps no more of them.
         count = f"{len(recent)} or more" if len(recent) == FAILURES_KEPT else f"{len(recent)}"
+        were = "rollout was" if len(recent) == 1 else "rollouts were"
         return Health(
             Mood.WARNING,
-            f"{count} rollouts were given up in the last {RECENT_S / 60:.0f} minutes, the last for {recent[0].code}.",
+            f"{count} {were} given up in the last {RECENT_S / 60:.0f} minutes, the last for {recent[0].code}.",
         )
+    if stuck := seen.unplaceable:
+        what = "1 announced scene" if stuck == 1 else f"{stuck} announced scenes"
+        return Health(Mood.WARNING, f"No worker can hold {what}: the look-ahead page says why.")
     if lost := seen.workers.get("lost", 0):
-        return Health(Mood.WARNING, f"{_workers(lost)} lost a moment ago; what they held went to others.")
+        return Health(
+            Mood.WARNING,
+            f"{_workers(lost)} lost a moment ago; what {'it' if lost == 1 else 'they'} held went to others.",
+        )
     if seen.queued and not seen.leased:
         return Health(Mood.WARNING, f"{seen.queued} rollouts wait and none runs: no scene is warm yet.")
     if not seen.runs:

@@ -27,6 +27,8 @@ class Holder:
     residents: dict[str, Resident] = field(default_factory=dict)
     warm_since_s: dict[str, float] = field(default_factory=dict)
     failed_s: dict[str, float] = field(default_factory=dict)
+    failed_words: dict[str, str] = field(default_factory=dict)
+    """What it said of each scene that failed there, also when it no longer tells of the scene."""
     desired: tuple[str, ...] | None = None
     reported: bool = False
     suspect: bool = False
@@ -82,12 +84,17 @@ class Holder:
         match resident.state:
             case ResidentState.WARM:
                 self.warm_since_s.setdefault(scene, now_s)
-                self.failed_s.pop(scene, None)
+                self._forgive(scene)
             case ResidentState.FAILED:
                 self.failed_s.setdefault(scene, now_s)
+                self.failed_words[scene] = resident.error
             case ResidentState.LOADING:
                 self.loading_since_s.setdefault(scene, now_s)
-                self.failed_s.pop(scene, None)
+                self._forgive(scene)
+
+    def _forgive(self, scene: str) -> None:
+        self.failed_s.pop(scene, None)
+        self.failed_words.pop(scene, None)
 
     def will_have(self, scene: str, now_s: float, overdue_s: float) -> bool:
         """Whether it is worth waiting for this load: the worker is not plainly slow, and the load not overdue."""

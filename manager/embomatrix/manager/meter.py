@@ -17,6 +17,8 @@ WINDOW_S: Final = 120
 """Length of the throughput's history."""
 SAMPLES: Final = 2048
 FAILURES_KEPT: Final = 50
+WORKERS_KEPT: Final = 20_000
+"""Names of workers whose results are counted; those that were seen first make room."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,14 +38,19 @@ class Meter:
 
     def __init__(self) -> None:
         self.outcomes: Counter[str] = Counter()
+        self.completed_by: Counter[str] = Counter()
+        """By worker, whether it is still there or not."""
         self.failures: deque[FailureNote] = deque(maxlen=FAILURES_KEPT)
         self._latency_s: deque[float] = deque(maxlen=SAMPLES)
         self._per_second: deque[tuple[int, int]] = deque(maxlen=WINDOW_S)
 
     def observe(self, run_id: str, result: RolloutResult, now_s: float) -> None:
         match result.outcome:
-            case Completed(timings=timings):
+            case Completed(timings=timings, worker_id=worker_id):
                 self.outcomes["completed"] += 1
+                self.completed_by[worker_id] += 1
+                if len(self.completed_by) > WORKERS_KEPT:
+                    del self.completed_by[next(iter(self.completed_by))]
                 lease_s = timings.lease_s + timings.load_s + timings.execute_s
                 self._latency_s.append(timings.queued_s + lease_s)
                 self._count(int(now_s))

@@ -72,10 +72,10 @@ class Outlook:
 
 def why_not(holders: Holders, scene: str, size_mb: float, *, renders: bool, scored: bool) -> str:
     """Why no worker takes the scene, in words."""
-    failing = (holders.by_id[name] for name in sorted(holders.failing))
-    errors = [holder.residents[scene].error for holder in failing if scene in holder.residents]
-    if any(errors):
-        return f"scene {scene} fails to load: {next(filter(None, errors))}"
+    failing = (holders.by_id[name].failed_words for name in sorted(holders.failing))
+    errors = [words[scene] for words in failing if scene in words]
+    if errors:
+        return f"scene {scene} fails to load: {next(filter(None, errors), 'no reason given')}"
     if renders and not any(holder.renders for holder in holders.by_id.values()):
         return f"scene {scene} needs slots that render on a GPU, and no worker has any"
     if scored and not any(holder.scores for holder in holders.by_id.values()):

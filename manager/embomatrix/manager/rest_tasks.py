@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import JSONResponse
 
-from embomatrix.manager.floor_plan import FloorPlan
-from embomatrix.manager.gallery_values import TaskDetail, TaskPage
+from embomatrix.manager.gallery_values import FloorPlan, TaskDetail, TaskPage
 from embomatrix.manager.packing import packed
 from embomatrix.manager.rest import PREFIX, Limit, Offset, answered
 
 if TYPE_CHECKING:
     from embomatrix.manager.gallery import Gallery
+    from embomatrix.manager.no_gallery import NoGallery
 
 CARDS = 24
 Words = Annotated[str, Query(max_length=200, description="Only tasks with these words.")]
@@ -23,7 +23,7 @@ Scene = Annotated[str, Query(max_length=256, description="Only tasks in this sce
 Category = Annotated[str, Query(max_length=64, description="Only tasks of this category.")]
 
 
-def showing(gallery: Gallery) -> APIRouter:
+def showing(gallery: Gallery | NoGallery) -> APIRouter:
     """What a viewer may ask about tasks."""
     router = APIRouter(prefix=PREFIX, tags=["tasks"])
 

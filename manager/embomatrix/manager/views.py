@@ -11,7 +11,7 @@ from embomatrix.manager.meter import FailureNote  # noqa: TC001  # the OpenAPI p
 from embomatrix.manager.registry import Standing
 from embomatrix.manager.window import Window
 from embomatrix.rpc.status import NotFoundError
-from embomatrix.rpc.values import Resident, ResidentState, RunInfo, RunStats, WorkerInfo
+from embomatrix.rpc.values import Resident, ResidentState, RunInfo, RunStats, Warmth, WorkerInfo
 
 if TYPE_CHECKING:
     from embomatrix.manager.registry import Session
@@ -47,6 +47,8 @@ class Overview:
     failures: list[FailureNote]
     notice: str = ""
     """What an operator should know."""
+    unplaceable: int = 0
+    """Announced scenes that no worker can hold."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +84,8 @@ class LookaheadCell:
     warmth: str
     worker_ids: list[str]
     """Those that hold the scene, or load it."""
+    problem: str = ""
+    """Why no worker can hold it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,6 +133,7 @@ def overview(runtime: ManagerRuntime) -> Overview:
         stale_results=totals.stale_results,
         failures=list(meter.failures),
         notice=UNAUDITED if cluster.dispatcher.auditor.lone else "",
+        unplaceable=len(cluster.scheduler.unplaceable),
     )
 
 
@@ -145,8 +150,11 @@ def runs(runtime: ManagerRuntime) -> list[RunView]:
 def lookahead(runtime: ManagerRuntime) -> list[LookaheadStep]:
     """The grid: steps by scenes, with how far each scene is."""
     steps: dict[tuple[str, int], list[LookaheadCell]] = {}
+    problems = runtime.cluster.scheduler.unplaceable
     for cell in plan(runtime):
-        found = LookaheadCell(cell.bundle_digest, cell.count, cell.warmth.value, list(cell.worker_ids))
+        problem = problems.get(cell.bundle_digest, "") if cell.warmth is Warmth.UNPLACEABLE else ""
+        held = list(cell.worker_ids)
+        found = LookaheadCell(cell.bundle_digest, cell.count, cell.warmth.value, held, problem)
         steps.setdefault((cell.run_id, cell.step), []).append(found)
     return [LookaheadStep(run_id, step, cells) for (run_id, step), cells in sorted(steps.items())]
 
@@ -188,8 +196,9 @@ def run_infos(runtime: ManagerRuntime) -> list[RunInfo]:
 
 
 def standing_counts(runtime: ManagerRuntime) -> Counter[str]:
-    """How many workers are in each state."""
-    return Counter(_standing(runtime, session).value for session in runtime.registry.sessions.values())
+    """How many workers are in each state, in the order of the states."""
+    found = Counter(_standing(runtime, session) for session in runtime.registry.sessions.values())
+    return Counter({standing.value: found[standing] for standing in Standing if found[standing]})
 
 
 def _standing(runtime: ManagerRuntime, session: Session) -> Standing:
@@ -219,7 +228,7 @@ def _worker(runtime: ManagerRuntime, worker_id: str) -> WorkerView:
         slots=session.resources.slots,
         busy=min(held, record.slots) if record else 0,
         waiting=max(0, held - record.slots) if record else 0,
-        completed=record.completed if record else 0,
+        completed=runtime.meter.completed_by[worker_id],
         cores=session.resources.cores,
         memory_mb=session.resources.memory_mb,
         memory_used_mb=session.memory_used_mb,

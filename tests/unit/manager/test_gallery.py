@@ -7,7 +7,8 @@ import pytest
 from tests.fakes.scenes import kitchen_scene, kitchen_tasks
 
 from embomatrix.manager.floor_plan import floor_plan, played, small_things
-from embomatrix.manager.gallery import NO_DATASET, Gallery
+from embomatrix.manager.gallery import Gallery
+from embomatrix.manager.no_gallery import NO_DATASET, NoGallery
 from embomatrix.rpc.status import NotFoundError, UnavailableError
 from embomatrix.skills.parse import parse_plan, plan_to_json
 from embomatrix.world.bundle import Bundle, encode_bundle
@@ -96,7 +97,7 @@ async def test_a_picture_is_a_jpeg_or_none(folder):
 
 
 async def test_a_dataset_that_is_not_there_or_damaged_is_told_in_a_sentence(folder, tmp_path):
-    assert (await Gallery(None).page(**EVERY)).notice == NO_DATASET
+    assert (await NoGallery().page(**EVERY)).notice == NO_DATASET
     with pytest.raises(UnavailableError, match="--dataset"):
         await Gallery(tmp_path / "nowhere").page(**EVERY)
     gallery = Gallery(folder)

@@ -173,6 +173,7 @@ def test_the_meter_counts_outcomes_and_keeps_reasons():
     for cursor, outcome in enumerate([completed(), completed(), failure, Cancelled()]):
         meter.observe("r1", RolloutResult(f"x{cursor}", "g", cursor, 1, outcome), 10.5)
     assert meter.outcomes == {"completed": 2, "slot_crashed": 1, "cancelled": 1}
+    assert sum(meter.completed_by.values()) == 2
     assert meter.throughput(11.0)[-1] == 2
     assert meter.throughput(12.0)[-2:] == [2, 0]
     assert meter.latency_s(0.5) == pytest.approx(0.001)

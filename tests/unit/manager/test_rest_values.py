@@ -46,14 +46,18 @@ def test_health_says_first_what_matters_most():
     assert mood(workers={"lost": 2, "paused": 1}) == (Mood.BAD, "None of 3 workers works.")
     assert mood(workers={"ready": 1, "quarantined": 1})[0] is Mood.BAD
     assert mood(workers={"ready": 1, "lost": 1})[1].startswith("1 worker lost a moment ago")
+    assert mood(workers={"ready": 1, "lost": 2})[1].endswith("what they held went to others.")
+    assert mood(unplaceable=1, workers={"ready": 1, "lost": 1}) == (
+        Mood.WARNING,
+        "No worker can hold 1 announced scene: the look-ahead page says why.",
+    )
     assert mood(leased=0)[1] == "3 rollouts wait and none runs: no scene is warm yet."
     assert mood(paused=True, workers={})[1].startswith("Dispatch is paused")
 
 
 def test_failures_are_news_for_five_minutes():
     assert (
-        mood(failures=[NOTE])[1]
-        == "1 rollouts were given up in the last 5 minutes, the last for slot_crashed."
+        mood(failures=[NOTE])[1] == "1 rollout was given up in the last 5 minutes, the last for slot_crashed."
     )
     assert mood(failures=[NOTE] * FAILURES_KEPT)[1].startswith(f"{FAILURES_KEPT} or more rollouts")
     assert mood(failures=[NOTE], now_s=2000.0) == (Mood.GOOD, "All is well.")

@@ -236,7 +236,7 @@ class Session:
                         text = f"the bundle has more than {DEFAULT_LIMITS.compressed_bytes} bytes"
                         raise LoadError(InfraCode.BUNDLE_CORRUPT, text)
         except NotFoundError as error:
-            raise LoadError(InfraCode.SCENE_LOAD_FAILED, f"the manager lacks the bundle: {error}") from error
+            raise LoadError(InfraCode.SCENE_LOAD_FAILED, str(error)) from error
         return bytes(data)
 
     async def _talk(self, channel: grpc.aio.Channel) -> None:

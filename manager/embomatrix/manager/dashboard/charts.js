@@ -12,6 +12,11 @@ const DASHES = [[], [6, 3], [2, 2], [9, 3, 2, 3], [1, 4]];
 const WHOLE = [1, 2, 5].flatMap(n => [0, 1, 2, 3, 4, 5, 6].map(power => n * 10 ** power)).sort((a, b) => a - b);
 const TINTS = ["c1", "c2", "c3", "c4", "c5"];
 
+function latest(drawn) {
+  const last = drawn.data[0].length - 1;
+  if (drawn.cursor.idx == null && last >= 0) drawn.setLegend({idx: last});
+}
+
 /** A chart in a place of its own. `lines` are their names; `words` turns a value at the foot into text; `fill` for one line. */
 export function chart(place, lines, {high = 190, words, fill = false, legend = true} = {}) {
   const axis = {stroke: () => colour("faint"), grid: {stroke: () => colour("line"), width: 1}, ticks: {show: false}, font: "11px system-ui"};
@@ -30,12 +35,14 @@ export function chart(place, lines, {high = 190, words, fill = false, legend = t
     width: box.clientWidth, height: high, legend: {show: legend}, cursor: {y: false}, scales: {x: {time: false}, y: {range}},
     axes: [{...axis, size: 28, incrs: WHOLE, ...(words ? {values: (_, ticks) => ticks.map(words)} : {})}, {...axis, size: 52}],
     series: [{label: "step", value: (_, value) => value ?? "–"}, ...series],
+    // Where nobody points, the legend tells the latest values.
+    hooks: {setCursor: [latest]},
   }, [[], ...lines.map(() => [])], box);
   const watcher = new ResizeObserver(() => drawn.setSize({width: box.clientWidth, height: high}));
   watcher.observe(box);
   return {
     lines,
-    draw(at, columns) { drawn.setData([at, ...columns]); },
+    draw(at, columns) { drawn.setData([at, ...columns]); latest(drawn); },
     close() { watcher.disconnect(); drawn.destroy(); },
   };
 }

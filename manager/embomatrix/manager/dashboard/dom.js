@@ -35,14 +35,14 @@ export function seconds(s) {
   return s < 7200 ? `${Math.round(s / 60)} min` : `${(s / 3600).toFixed(1)} h`;
 }
 
-/** A table of rows that are lists of cells; a heading is its text, or [text, class]. */
-export function table(headings, rows, caption) {
+/** A table of rows; a heading is its text, or [text, class]. One of the kind "loose" flows on a narrow page. */
+export function table(headings, rows, caption, kind = "") {
   const head = headings.map(heading => {
     const [text, kind] = Array.isArray(heading) ? heading : [heading, ""];
     return h("th", {class: kind, scope: "col"}, text);
   });
   return h("div", {class: "scroll", tabindex: "0", role: "region", "aria-label": caption},
-    h("table", {}, h("thead", {}, h("tr", {}, head)), h("tbody", {}, rows)));
+    h("table", {class: kind || false}, h("thead", {}, h("tr", {}, head)), h("tbody", {}, rows)));
 }
 
 const last = new WeakMap();

@@ -5,40 +5,53 @@ import {at, brief, clock, count, h, none, put, table} from "./dom.js";
 const BAD = ["failed", "worker_lost", "scene_failed"];
 const KEPT = 200;
 const LOOK_EVERY = 3;
-let log = [], after = 0, looks = 0;
+let log = [], after = 0, looks = 0, lost = [];
 
 export function open(main) {
-  log = []; after = 0; looks = 0;
+  log = []; after = 0; looks = 0; lost = [];
   main.replaceChildren(
     h("section", {class: "half"}, h("h2", {}, "By reason"), h("div", {id: "reasons"})),
     h("section", {class: "half"}, h("h2", {}, "By worker"), h("div", {id: "blamed"})),
     h("section", {}, h("h2", {}, "Rollouts that were given up ", h("small", {}, "never scored as a reward")), h("div", {id: "failures"})),
-    h("section", {}, h("h2", {}, "Attempts and workers that were lost ", h("small", {}, "their rollouts were given to others")), h("div", {id: "attempts"})));
+    h("section", {}, h("h2", {}, "What was lost on the way ", h("small", {}, "attempts, scenes and workers: their rollouts were given to others")), h("div", {id: "attempts"})));
 }
 
 export async function show({overview, runs}) {
   const given = overview.failures;
-  put(at("reasons"), tally(given.map(note => note.code), "reason"));
-  put(at("blamed"), tally(given.map(note => note.worker_id || "none"), "worker"));
+  if (looks++ % LOOK_EVERY === 0) lost = await look(runs);
+  put(at("reasons"), tally("reason", given.map(note => note.code), lost.map(event => event.code || event.kind)));
+  put(at("blamed"), tally("worker", given.map(note => note.worker_id || "none"), lost.map(event => event.worker_id || "none")));
   const rows = given.map(note => h("tr", {}, h("td", {class: "muted fit"}, clock(note.at_s)), h("td", {class: "fit"}, h("code", {class: "bad"}, note.code)), h("td", {class: "fit"}, note.worker_id || "–"), h("td", {class: "fit"}, note.rollout_id), h("td", {class: "message"}, note.message)));
-  put(at("failures"), rows.length ? table(["when", "reason", "worker", "rollout", "what it said"], rows, "failures") : none("None. Lost rollouts are executed again before they count as failed."));
-  if (looks++ % LOOK_EVERY === 0) await look(runs);
+  put(at("failures"), rows.length ? table(["when", "reason", "worker", "rollout", "what it said"], rows, "failures", "loose") : none("None. Lost rollouts are executed again before they count as failed."));
+  const folded = fold(lost).map(({event, times}) =>
+    h("tr", {}, h("td", {class: "muted fit"}, clock(event.at_s)), h("td", {class: "fit"}, h("code", {class: "bad"}, event.code || event.kind), times > 1 && ` × ${count(times)}`), h("td", {class: "fit"}, event.worker_id || "–"),
+      h("td", {class: "fit"}, event.bundle_digest ? h("code", {title: event.bundle_digest}, brief(event.bundle_digest)) : "–"), h("td", {class: "fit n", "data-name": event.attempt ? "attempt" : false}, event.attempt || ""), h("td", {class: "message"}, event.message || "")));
+  put(at("attempts"), folded.length ? table(["latest", "reason", "worker", "scene", ["attempt", "n"], "what it said"], folded, "attempts that failed", "loose") : none("None."));
 }
 
+/** The latest events of the cluster and of the latest runs, newest first. */
 async function look(runs) {
   const pages = [await ask(`events?after=${after}`), ...await Promise.all(runs.slice(-3).map(run => ask(`runs/${encodeURIComponent(run.run_id)}`).then(told => ({events: told.failures}))))];
   const fleet = pages[0].events;
   if (fleet.length) after = fleet.at(-1).sequence;
   log = [...log, ...fleet.filter(event => BAD.includes(event.kind))].slice(-KEPT);
-  const rows = [...log, ...pages.slice(1).flatMap(page => page.events)].sort((a, b) => b.at_s - a.at_s).slice(0, KEPT).map(event =>
-    h("tr", {}, h("td", {class: "muted fit"}, clock(event.at_s)), h("td", {class: "fit"}, h("code", {class: "bad"}, event.code || event.kind)), h("td", {class: "fit"}, event.worker_id || "–"),
-      h("td", {class: "fit"}, event.bundle_digest ? h("code", {title: event.bundle_digest}, brief(event.bundle_digest)) : "–"), h("td", {class: "fit n"}, event.attempt || ""), h("td", {class: "message"}, event.message || "")));
-  put(at("attempts"), rows.length ? table(["when", "reason", "worker", "scene", ["attempt", "n"], "what it said"], rows, "attempts that failed") : none("None."));
+  return [...log, ...pages.slice(1).flatMap(page => page.events)].sort((a, b) => b.at_s - a.at_s).slice(0, KEPT);
 }
 
-function tally(names, heading) {
+/** What a worker says again and again is one row. */
+function fold(events) {
+  const rows = new Map();
+  for (const event of events) {
+    const said = JSON.stringify([event.code || event.kind, event.worker_id, event.bundle_digest, event.attempt, event.message]);
+    if (rows.has(said)) rows.get(said).times += 1;
+    else rows.set(said, {event, times: 1});
+  }
+  return [...rows.values()];
+}
+
+function tally(heading, given, lost) {
   const counts = {};
-  for (const name of names) counts[name] = (counts[name] || 0) + 1;
-  const rows = Object.entries(counts).sort((a, b) => b[1] - a[1]).map(([name, n]) => h("tr", {}, h("td", {}, h("code", {}, name)), h("td", {class: "n"}, count(n))));
-  return rows.length ? table([heading, ["of the latest 50", "n"]], rows, `failures by ${heading}`) : none("None.");
+  for (const [i, names] of [given, lost].entries()) for (const name of names) (counts[name] ??= [0, 0])[i] += 1;
+  const rows = Object.entries(counts).sort(([, a], [, b]) => b[0] - a[0] || b[1] - a[1]).map(([name, numbers]) => h("tr", {}, h("td", {}, h("code", {}, name)), numbers.map(n => h("td", {class: "n"}, count(n)))));
+  return rows.length ? table([heading, ["given up", "n"], ["on the way", "n"]], rows, `latest failures by ${heading}`) : none("None.");
 }

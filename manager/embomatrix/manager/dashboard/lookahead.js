@@ -3,7 +3,7 @@ import {at, brief, count, h, none, put} from "./dom.js";
 
 const STEPS = 24;
 const COLUMNS = 60;
-const KINDS = [["warm", "warm"], ["warming", "warming"], ["queued", "cold"], ["unplaceable", "no room"]];
+const KINDS = [["warm", "warm"], ["warming", "warming"], ["queued", "cold"], ["unplaceable", "no worker can hold it"]];
 const SWATCH = {warm: "warm", warming: "warming", queued: "queued", unplaceable: "bad"};
 
 export function open(main) {
@@ -17,8 +17,13 @@ export function show({lookahead, runs}) {
   at("sum").textContent = cells.length ? `${warm} of ${cells.length} scenes are warm` : "";
   const names = Object.fromEntries(runs.map(run => [run.run_id, run.name || run.run_id]));
   const byRun = Map.groupBy ? Map.groupBy(lookahead, step => step.run_id) : new Map([["", lookahead]]);
-  const parts = [...byRun].map(([run, steps]) => [h("h3", {}, names[run] ?? run), grid(steps)]);
+  const parts = [...byRun].map(([run, steps]) => [h("h3", {}, names[run] ?? run), grid(steps), problems(steps)]);
   put(at("ahead"), parts.length && lookahead.length ? parts : none("Nothing announced. A trainer announces the scenes of its coming steps."));
+}
+
+function problems(steps) {
+  const told = new Map(steps.flatMap(step => step.cells.filter(cell => cell.problem).map(cell => [cell.bundle_digest, cell.problem])));
+  return [...told].map(([scene, problem]) => h("p", {class: "bad message"}, h("code", {}, brief(scene).slice(0, 4)), ` ${problem}`));
 }
 
 function grid(steps) {

@@ -25,7 +25,7 @@ export function open(main) {
 
 export async function show({runs}) {
   const known = runs.map(r => r.run_id);
-  if (!run) run = known.at(-1) ?? "";
+  if (!run) run = (runs.findLast(r => r.pending || r.stats.delivered) ?? runs.at(-1))?.run_id ?? "";
   put(at("run"), (known.includes(run) || !run ? known : [run, ...known]).map(id => h("option", {value: id, selected: id === run}, runs.find(r => r.run_id === id)?.name || id)));
   if (!run) { put(at("tracks"), none("No open run. A closed one: embomatrix cluster report RUN")); return; }
   if (!live && told) return;

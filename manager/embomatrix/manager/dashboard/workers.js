@@ -33,7 +33,7 @@ export function show({workers, paused}) {
   at("dispatch").onclick = () => steer(`dispatch/${paused ? "resume" : "pause"}`);
   const headings = ["worker", "state", "slots", "scenes", ["scene memory", "wideonly"], ["completed", "n"], ["cores", "n wideonly"], ["heard", "n wideonly"], ""];
   const nobody = wish.state || wish.search ? "No worker is like that." : "No workers yet. Lend a machine: embomatrix worker run";
-  put(at("workers"), workers.items.length ? table(headings, workers.items.map(row), "workers") : none(nobody));
+  put(at("workers"), workers.items.length ? table(headings, workers.items.map(row), "workers", "loose") : none(nobody));
   for (const button of at("workers").querySelectorAll("button")) button.onclick = () => steer(button.dataset.path);
 }
 
@@ -42,11 +42,11 @@ function row(w) {
   const away = w.state === "draining";
   return h("tr", {},
     h("td", {class: "fit"}, w.worker_id, w.gpu && h("span", {class: "muted"}, ` ${w.gpu}`)),
-    h("td", {class: w.reason ? "" : "fit"}, h("span", {class: `dot ${w.state}`}), w.state, w.reason && h("span", {class: "muted"}, ` ${w.reason}`)),
+    h("td", {class: w.reason ? "why" : "fit"}, h("span", {class: `dot ${w.state}`}), w.state, w.reason && h("span", {class: "muted"}, ` ${w.reason}`)),
     h("td", {class: "fit"}, slots(w)),
     h("td", {}, scenes(w)),
     h("td", {class: "wideonly"}, h("meter", {min: 0, max: Math.max(1, w.memory_mb), value: used, title: `${Math.round(used)} of ${w.memory_mb} MB`, "aria-label": "memory of scenes"})),
-    h("td", {class: "n"}, count(w.completed)), h("td", {class: "n wideonly"}, w.cores),
+    h("td", {class: "n", "data-name": "completed"}, count(w.completed)), h("td", {class: "n wideonly"}, w.cores),
     h("td", {class: "n muted wideonly"}, w.silent_s < 5 ? "now" : `${seconds(Math.round(w.silent_s))} ago`),
     h("td", {class: "fit"}, w.state !== "lost" && h("button", {class: "small", type: "button", "data-path": `workers/${encodeURIComponent(w.worker_id)}/${away ? "resume" : "drain"}`, "aria-label": `${away ? "resume" : "drain"} ${w.worker_id}`}, away ? "Resume" : "Drain")));
 }
