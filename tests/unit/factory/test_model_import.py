@@ -291,16 +291,21 @@ def test_models_of_sweet_home_3d_become_assets(tmp_path: Path, name: str, catego
 
 
 @pytest.mark.slow
-def test_coacd_hollows_out_what_one_hull_would_fill(tmp_path: Path) -> None:
+def test_a_cup_is_cut_by_coacd_once_holds_a_probe_and_keeps_its_maker(tmp_path: Path) -> None:
     pytest.importorskip("coacd", reason="needs embomatrix[importers]")
-    raw = read_model(sample(tmp_path, "dustbin"))
-    cutter = Coacd(tmp_path / "cache")
-    asset = import_model(CATALOG, raw, "trash_can", "", CREDIT, cutter).asset
+    wall = [(0.0, 0.0), (4.0, 0.0), (4.0, 9.0), (3.5, 9.0), (3.5, 0.5), (0.0, 0.5)]
+    cup: Any = trimesh.creation.revolve(wall, sections=24)
+    path = tmp_path / "cup.stl"
+    path.write_bytes(cup.export(file_type="stl"))
+    raw, cutter = read_model(path), Coacd(tmp_path / "cache")
+    asset = import_model(CATALOG, raw, "mug", "", CREDIT, cutter).asset
     assert 4 <= len(asset.links[0].parts) <= MAX_HULLS
-    (inside,) = asset.interiors
-    assert min(inside.size_m) > 0.1
-    assert import_model(CATALOG, raw, "trash_can", "", CREDIT, cutter).asset == asset
-    assert len(list((tmp_path / "cache").glob("*.json"))) == 1
+    assert not check_asset(CATALOG, asset), "it is fillable: a ball of 3 cm rests in it"
+    assert asset.credit == CREDIT
+    (kept,) = (tmp_path / "cache").glob("*.json")
+    written = kept.stat().st_mtime_ns
+    assert import_model(CATALOG, raw, "mug", "", CREDIT, cutter).asset == asset
+    assert kept.stat().st_mtime_ns == written
 
 
 def test_a_scene_is_built_with_the_imported_asset_in_place_of_the_generated_one(tmp_path: Path) -> None:
