@@ -121,6 +121,8 @@ AGAIN = "the graph lets a step pass that asks for what is so already"
 HANDS = "the graph has two hands"
 PIECES = "the graph goes on with parts of what was sliced, ours with pieces of other names"
 TOOLS = "our sink soaks what lies in it when it is switched on; the graph asks for the step that soaks the cleaner"
+LIDS = "the graph's cartons stand open from the start"
+RUNNING = "ours cleans with a machine only while it runs; the graph takes any"
 START = "the graph's start differs: what nobody mentions is shut, and stands where the problem says"
 CAUSES = {
     FailureReason.NO_FREE_POSE: GEOMETRY,
@@ -141,6 +143,8 @@ CAUSES = {
     FailureReason.ALREADY_ON: AGAIN,
     FailureReason.ALREADY_OFF: AGAIN,
     FailureReason.HAND_FULL: HANDS,
+    FailureReason.SOURCE_OFF: RUNNING,
+    FailureReason.CONTAINER_CLOSED: LIDS,
 }
 WORDS = {"sliced": PIECES, "CLEAN": TOOLS, "not open": START, "open": START}
 

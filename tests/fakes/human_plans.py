@@ -1,0 +1,137 @@
+"""EAI's human plans in our world's words: for two hands and a graph without places there, for one arm here."""
+
+from __future__ import annotations
+
+import json
+
+from embomatrix.skills.syntax import PlaceRelation, Skill, SkillCall
+
+RELATIONS = {
+    "PLACE_INSIDE": PlaceRelation.INSIDE,
+    "PLACE_ONTOP": PlaceRelation.ONTOP,
+    "PLACE_UNDER": PlaceRelation.UNDER,
+}
+FLOOR = "room_floor"
+STATES = {"OPEN": Skill.OPEN, "TOGGLE_ON": Skill.TOGGLE_ON, "TOGGLE_OFF": Skill.TOGGLE_OFF}
+
+
+class UntoldError(Exception):
+    """A step has no word in our skills; the message is the step's."""
+
+
+class OneArm:
+    """Reads a plan step by step. What two hands take is picked up when it is put down or used, one after the other.
+
+    Doors are closed once nothing is left to be picked up from behind them.
+    """
+
+    def __init__(self, table, ours, homes):
+        self._row = {name: at for at, name in enumerate(table)}
+        self._ours = ours
+        self._hands = {"LEFT": "", "RIGHT": ""}
+        self._arm = ""
+        self._home = dict(homes)
+        self._shut = []
+        self.deeds = []
+
+    def read(self, action, told):
+        hand, _, deed = action.partition("_")
+        if hand not in self._hands:
+            hand, deed = "", action
+        if told.startswith(FLOOR) and told not in self._ours:
+            deed = "RELEASE"  # a floor that no goal is about is none of our objects: just somewhere to leave things
+        names = [] if deed == "RELEASE" else [self._name(name) for name in told.split(", ")]
+        match deed:
+            case "GRASP":
+                self._hands[hand] = names[0]
+            case "RELEASE":
+                self._lay_down()
+                self._hands[hand] = ""
+            case "PLACE_NEXTTO_ONTOP":
+                self._place(hand, names[1], PlaceRelation.ONTOP)
+            case _ if deed in RELATIONS:
+                self._place(hand, names[0], RELATIONS[deed])
+            case "CLOSE":
+                self._shut.append(names[0])
+            case _ if deed in STATES:
+                self._lay_down()
+                self._say(STATES[deed], names[0])
+            case "SLICE" | "CLEAN":
+                self._use(Skill.SLICE if deed == "SLICE" else Skill.CLEAN, names[0])
+            case "SOAK":
+                self._soak(names[0])
+            case "UNFREEZE":
+                pass  # none of our skills thaws, and no goal of these tasks asks for it
+            case _:
+                raise UntoldError(action)
+        self._close_what_is_done()
+
+    def end(self):
+        self._hands = dict.fromkeys(self._hands, "")
+        self._close_what_is_done()
+        return tuple(self.deeds)
+
+    def _name(self, theirs):
+        if theirs not in self._ours:
+            raise UntoldError(theirs)
+        return self._ours[theirs]
+
+    def _say(self, skill, name, source="", relation=None):
+        at = self._row[source] if source else None
+        self.deeds.append(SkillCall(skill, object_index=self._row[name], source_index=at, relation=relation))
+
+    def _take(self, name):
+        if self._arm != name:
+            self._lay_down()
+            self._say(Skill.PICK_UP, name)
+            self._arm = name
+
+    def _lay_down(self):
+        """Put what the arm holds back to where it was last; on the first step that is where it came from."""
+        if self._arm:
+            host, relation = self._home.get(self._arm, ("", None))
+            if not host:
+                raise UntoldError("nowhere to lay a tool down")
+            self._say(Skill.PLACE, host, relation=relation)
+            self._arm = ""
+
+    def _place(self, hand, target, relation):
+        name = self._hands[hand]
+        if not name:
+            raise UntoldError("an empty hand")
+        self._take(name)
+        self._say(Skill.PLACE, target, relation=relation)
+        self._home[name] = (target, relation)
+        self._hands[hand] = self._arm = ""
+
+    def _use(self, skill, name):
+        tool = next((held for held in self._hands.values() if held not in ("", name)), "")
+        if not tool:
+            raise UntoldError("a tool that lies in a sink")
+        self._take(tool)
+        self._say(skill, name, source=tool)
+
+    def _soak(self, name):
+        source = self._home.get(name, ("", None))[0]
+        if not source:
+            raise UntoldError("SOAK outside of a sink")
+        self._take(name)
+        self._say(Skill.SOAK, name, source=source)
+
+    def _close_what_is_done(self):
+        if not any(self._hands.values()):
+            for name in self._shut:
+                self._lay_down()
+                self._say(Skill.CLOSE, name)
+            self._shut = []
+
+
+def from_eai(text, table, names, homes):
+    """A human plan's deeds in our skills. ``names``: EAI's names by ours; ``homes``: what things rest on or in at the start.
+
+    Raises UntoldError for a step that our skills have no word for: to put something next to something, above all.
+    """
+    arm = OneArm(table, {theirs: ours for ours, theirs in names.items()}, homes)
+    for step in json.loads(text):
+        arm.read(step["action"], step["object"])
+    return arm.end()
