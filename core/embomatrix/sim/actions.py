@@ -6,7 +6,7 @@ import itertools
 import math
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.sim.barriers import no_way_for_arm, no_way_into, no_way_to
+from embomatrix.sim.barriers import no_way_for_arm, no_way_into, no_way_to, no_way_to_place
 from embomatrix.sim.household import clean, cut, soak
 from embomatrix.sim.leaves import Leaves
 from embomatrix.sim.swings import SWING
@@ -100,10 +100,14 @@ def _pick_up(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Ref
 def _place(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
     assert call.relation is not None
     target, held = target_of(world, call), world.carried[0]
+    relation = Relation(call.relation.value)
+    refusal = no_way_to_place(world, held, target, relation)
+    if refusal is not None:
+        return refusal
     fails = FailureReason.NO_FREE_POSE
     tried: tuple[StandPose, ...] = ()
     for stand in itertools.chain((world.robot,), other_stands(world, target)):
-        found = world.placer.find(held, target, Relation(call.relation.value), stand, rng, tried)
+        found = world.placer.find(held, target, relation, stand, rng, tried)
         if isinstance(found, Pose) and world.hand.let_go(found):
             world.robot = stand
             world.navigator.refresh()

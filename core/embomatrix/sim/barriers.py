@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from embomatrix.skills.view import Refusal
     from embomatrix.world.geometry import FloatArray, Vec2
     from embomatrix.world.poses import Handling
+    from embomatrix.world.state import Relation
 
 SAME_M: Final = 1e-6
 RASTER_M: Final = 0.1
@@ -30,13 +31,25 @@ WALL: Final = "a wall"
 def no_way_for_arm(world: LiveWorld, handling: Handling, target: str) -> Refusal | None:
     """Refusal when the scene's analysis found no way of the arm to do this; while all stays where it was."""
     other = world.barred.get(handling, {}).get(target, "")
-    if not other or not all(
-        world.navigator.is_as_loaded(name) or _is_led_out(world, name)
-        for name in (target, other)
-        if name in world.scene.by_name
-    ):
+    if not other or not _are_as_loaded(world, target, other):
         return None
     return refuse(FailureReason.ARM_BLOCKED, target=target, other=other)
+
+
+def no_way_to_place(world: LiveWorld, held: str, target: str, relation: Relation) -> Refusal | None:
+    """Refusal when the scene's analysis found that the arm gets nowhere with this there; while all stays where it was."""
+    other = world.barred_places.get(relation, {}).get(held, {}).get(target, "")
+    if not other or not _are_as_loaded(world, target, other):
+        return None
+    return refuse(FailureReason.ARM_BLOCKED, target=f"a place for {held}", other=other)
+
+
+def _are_as_loaded(world: LiveWorld, *names: str) -> bool:
+    return all(
+        world.navigator.is_as_loaded(name) or _is_led_out(world, name)
+        for name in names
+        if name in world.scene.by_name
+    )
 
 
 def _is_led_out(world: LiveWorld, name: str) -> bool:

@@ -47,6 +47,8 @@ class LiveWorld:
         self.placer = Placer(engine, self.relations, bundle.poses)
         self.barred = bundle.poses.barred
         """What the arm finds no way to in the scene as it was loaded."""
+        self.barred_places = bundle.poses.barred_places
+        """To which places it finds none with what."""
         self.states: Symbols[State] = Symbols()
         self.substances: Symbols[SubstanceFact] = Symbols()
         self._future = frozenset(item.name for item in self.scene.objects if item.absent)

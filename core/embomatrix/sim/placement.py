@@ -69,6 +69,7 @@ class Placer:
         self._relations = relations
         self._scene = engine.scene
         self._repertoire = Repertoire(engine.scene, cache)
+        self._reached = cache.reached
 
     def complete(self) -> Iterator[None]:
         """Find out what everything stands on, and where the parts of what it may be put on are, one asset at a step.
@@ -137,25 +138,70 @@ class Placer:
             return found
         return FailureReason.NO_FREE_POSE if self._fits(held, target, relation) else fails
 
+    def knows(self, held: str, target: str, relation: Relation) -> bool:
+        """Whether any pose was verified for the one on, in or under the other."""
+        return held != target and any(map(len, self._repertoire.verified(held, target, relation)))
+
+    def verified(
+        self, held: str, target: str, relation: Relation, robot: StandPose, most: int
+    ) -> tuple[tuple[int, Pose], ...]:
+        """As ``choices``, but only of the first set of verified poses that is not empty, with their numbers in that set."""
+        errand = Errand(held, target, relation, robot)
+        sets = (spots for spots in self._repertoire.verified(held, target, relation) if len(spots))
+        spots = next(sets, None)
+        if spots is None or held == target or not is_upright(self._engine.pose(target)):
+            return ()
+        before = self._engine.pose(held)
+        try:
+            found = self._accepted(errand, spots, self._frames(errand), range(len(spots)))
+            return tuple(itertools.islice(found, most))
+        finally:
+            self._engine.set_pose(held, before)
+            self._engine.park(held)
+
     def _fits(self, held: str, target: str, relation: Relation) -> bool:
         """Whether there is any pose for the one on, in or under the other when nothing else is there."""
-        if any(map(len, self._repertoire.verified(held, target, relation))):
+        if self.knows(held, target, relation):
             return True
         one, other = self._scene.asset_of(held), self._scene.asset_of(target)
         return any(True for _ in candidates(one, other, relation, (0.5, 0.5), LIVE_TRIES))
 
     def _search(self, errand: Errand, rng: np.random.Generator | None) -> Iterator[Pose]:
-        """Good poses: of those verified for the pair, then for the footprint's class, then of fresh ones."""
+        """Good poses: of those verified for the pair, then for the footprint's class, then of fresh ones.
+
+        Of the first set those come first at which the arm was seen to get, while the target is where the scene has it.
+        """
         frames = self._frames(errand)
+        reached = self._reached_in_set(errand)
         for spots in self._repertoire.verified(errand.held, errand.target, errand.relation):
             if not len(spots):
                 continue
             order = range(len(spots)) if rng is None else rng.permutation(len(spots)).tolist()
-            for number, nearest in self._roomy_first(errand, spots, frames, order):
-                found = self._accept_verified(errand, spots.pose(number, frames), nearest)
-                if found is not None:
-                    yield found
+            some = [number for number in order if number in reached] if reached else []
+            others = [number for number in order if number not in reached] if some else order
+            for _, pose in itertools.chain(
+                self._accepted(errand, spots, frames, some), self._accepted(errand, spots, frames, others)
+            ):
+                yield pose
+            reached = ()
         yield from self._fresh(errand, frames, rng)
+
+    def _reached_in_set(self, errand: Errand) -> tuple[int, ...]:
+        """Numbers of the poses at which the arm was seen to get, in the first set that is not empty."""
+        if not self._reached:
+            return ()
+        found = self._reached.get(errand.relation, {}).get(errand.held, {}).get(errand.target, ())
+        before = self._scene.by_name[errand.target].pose_world_asset
+        return found if found and self._engine.pose(errand.target) == before else ()
+
+    def _accepted(
+        self, errand: Errand, spots: Spots, frames: dict[str, Pose], order: Sequence[int]
+    ) -> Iterator[tuple[int, Pose]]:
+        """Good ones of a set's poses, each with its number."""
+        for number, nearest in self._roomy_first(errand, spots, frames, order):
+            found = self._accept_verified(errand, spots.pose(number, frames), nearest)
+            if found is not None:
+                yield number, found
 
     def _fresh(
         self, errand: Errand, frames: dict[str, Pose], rng: np.random.Generator | None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from embomatrix.world.bddl import BddlError, parse_formula
 from embomatrix.world.codec_asset import pose_from_field, pose_to_json
@@ -14,12 +14,16 @@ from embomatrix.world.state import Relation
 from embomatrix.world.task import MAX_TABLE, Profile, Task, TaskCategory
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     from embomatrix.world.goal import Formula
     from embomatrix.world.tables import Tables, TableWriter
 
     Json = dict[str, Any]
+
+T = TypeVar("T")
+ARM: Final = ("barred", "barred_places", "reached")
+"""What a bundle may tell about the arm."""
 
 
 def task_to_json(task: Task) -> Json:
@@ -88,7 +92,7 @@ def poses_to_json(poses: PoseCache, tables: TableWriter | None = None) -> Json:
     if tables is not None:
         names, sets, spots = flattened(poses.placements)
         tables.placements(sets, spots)
-        return {"placements": names, "stands": stands, **_barred_to_json(poses)}
+        return {"placements": names, "stands": stands, **_arm_to_json(poses)}
     placements = [
         {
             "asset_id": key.asset_id,
@@ -98,16 +102,19 @@ def poses_to_json(poses: PoseCache, tables: TableWriter | None = None) -> Json:
         }
         for key, found in poses.placements.items()
     ]
-    return {"placements": placements, "stands": stands, **_barred_to_json(poses)}
+    return {"placements": placements, "stands": stands, **_arm_to_json(poses)}
 
 
 def poses_from_json(value: object, tables: Tables | None = None) -> PoseCache:
     """A pose cache; ``tables`` hold the rows that it was written with. Raises SceneInvalidError."""
-    fields = Field(value, "poses", tables=tables).record("placements", "stands", optional=("barred",))
+    fields = Field(value, "poses", tables=tables).record("placements", "stands", optional=ARM)
     barred = _barred_from_json(fields["barred"]) if "barred" in fields else {}
+    reached = _placings_from_json(fields["reached"], _numbers) if "reached" in fields else {}
+    places = _placings_from_json(fields["barred_places"], Field.name) if "barred_places" in fields else {}
     if tables is not None:
         names = [item.name() for item in fields["placements"].items()]
-        return PoseCache(tables.placements(names), tables.stands(fields["stands"]), barred)
+        stands_by_name = tables.stands(fields["stands"])
+        return PoseCache(tables.placements(names), stands_by_name, barred, reached, places)
     stands = {
         name: tuple(StandPose(*stand.vec3()) for stand in found.items())
         for name, found in fields["stands"].entries()
@@ -121,13 +128,25 @@ def poses_from_json(value: object, tables: Tables | None = None) -> PoseCache:
         if key in placements:
             item.fail("the same placement stands in the cache twice")
         placements[key] = tuple(pose_from_field(pose) for pose in entry["poses"].items())
-    return PoseCache(placements, stands, barred)
+    return PoseCache(placements, stands, barred, reached, places)
 
 
-def _barred_to_json(poses: PoseCache) -> dict[str, Json]:
-    """One entry by handling, none where nothing is barred."""
-    barred: Json = {handling.value: dict(found) for handling, found in poses.barred.items() if found}
-    return {"barred": barred} if barred else {}
+def _arm_to_json(poses: PoseCache) -> Json:
+    """What is known of the arm, an entry for each kind of knowledge that there is any of."""
+    known: Json = {
+        "barred": {handling.value: dict(found) for handling, found in poses.barred.items() if found},
+        "barred_places": _by_placing(poses.barred_places),
+        "reached": _by_placing(poses.reached),
+    }
+    return {key: found for key, found in known.items() if found}
+
+
+def _by_placing(known: Mapping[Relation, Mapping[str, Mapping[str, Any]]]) -> Json:
+    return {
+        relation.value: {held: dict(targets) for held, targets in found.items()}
+        for relation, found in known.items()
+        if found
+    }
 
 
 def _barred_from_json(field: Field) -> dict[Handling, dict[str, str]]:
@@ -136,6 +155,26 @@ def _barred_from_json(field: Field) -> dict[Handling, dict[str, str]]:
         Handling(kind): {name: other.name() for name, other in found.entries()}
         for kind, found in kinds.items()
     }
+
+
+def _placings_from_json(field: Field, read: Callable[[Field], T]) -> dict[Relation, dict[str, dict[str, T]]]:
+    """What is known by relation, by what is held and by its target."""
+    relations = field.record(optional=tuple(Relation))
+    return {
+        Relation(relation): {
+            held: {target: read(item) for target, item in targets.entries()}
+            for held, targets in found.entries()
+        }
+        for relation, found in relations.items()
+    }
+
+
+def _numbers(field: Field) -> tuple[int, ...]:
+    """Numbers of poses."""
+    value = field.value
+    if not isinstance(value, list) or set(map(type, value)) - {int} or min(value, default=0) < 0:
+        field.fail(f"found {str(value)[:40]}: expected a list of whole numbers from 0")
+    return tuple(value)
 
 
 def _stands_to_json(stands: tuple[StandPose, ...], tables: TableWriter | None) -> Any:

@@ -145,16 +145,17 @@ class Stage:
 
     def take(self, name: str) -> None:
         """The hand holds what it touches."""
-        pose_hand_object = self.dynamic.robot.hand_pose().inverse() @ self.dynamic.bodies.pose(name)
-        local = TOOL.inverse() @ pose_hand_object
-        centres, radii = self._balls(name, local)
-        up = (
-            local.rotation @ self.dynamic.bodies.pose(name).rotation[2]
-            if len(self.world.cargo(name)) > 1
-            else None
+        self.grip = self.grip_with(
+            self.dynamic.robot.hand_pose() @ TOOL, self.dynamic.bodies.pose(name), name
         )
-        self.grip = Grip(name, local, Held(centres, radii, up))
         self.dynamic.grasp(name)
+
+    def grip_with(self, pose_tool: Pose, pose_object: Pose, name: str) -> Grip:
+        """What it is to hold an object with the tool and the object at these poses in the world."""
+        local = pose_tool.inverse() @ pose_object
+        centres, radii = self._balls(name, local)
+        up = local.rotation @ pose_object.rotation[2] if len(self.world.cargo(name)) > 1 else None
+        return Grip(name, local, Held(centres, radii, up))
 
     def _balls(self, name: str, pose_tool_object: Pose) -> tuple[FloatArray, FloatArray]:
         """Balls of an object and of all that lies in it, in the tool's frame."""

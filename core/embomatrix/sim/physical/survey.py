@@ -6,6 +6,7 @@ looked for once, in the scene as it was loaded, by the same search by which phys
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import itertools
 from dataclasses import replace
@@ -21,6 +22,7 @@ from embomatrix.sim.physical.doors import STRETCHES, close_all, in_turn, leading
 from embomatrix.sim.physical.fold import WAYS, approach
 from embomatrix.sim.physical.hands import ways_to
 from embomatrix.sim.physical.press import pressing
+from embomatrix.sim.physical.prospects import Prospects
 from embomatrix.sim.physical.stage import AROUND_M, Stage, tucked
 from embomatrix.sim.physical.travel import SOMETHING
 from embomatrix.sim.swings import SWING
@@ -32,6 +34,7 @@ if TYPE_CHECKING:
 
     from embomatrix.sim.live_world import LiveWorld
     from embomatrix.sim.physical.doors import Leaf
+    from embomatrix.sim.physical.prospects import Placing
     from embomatrix.sim.physical.reach import Reach, Way
     from embomatrix.skills.view import Refusal
     from embomatrix.world.asset import Asset
@@ -64,15 +67,34 @@ class Foresight:
 
         ``world`` is at the start of its scene, and is left there. The answer follows from the arguments alone.
         """
-        dynamic = DynamicWorld(world.scene)
-        try:
-            surveyor = _Surveyor(Stage(world, dynamic, _idle), self._known, self._contents)
+        with _staged(world) as stage:
+            surveyor = _Surveyor(stage, self._known, self._contents)
             return surveyor.surveyed(poses, tuple(dict.fromkeys(names)))
-        finally:
-            dynamic.close()
-            world.engine.reset()
-            world.navigator.refresh()
-            world.robot = world.navigator.start
+
+
+def prospects(world: LiveWorld, poses: PoseCache, placings: Iterable[Placing]) -> PoseCache:
+    """The cache with at which poses the arm gets with what is placed, the first of these placings as far as looks last.
+
+    ``poses`` hold placements and standing poses. ``world`` is at the start of its scene, and is left there.
+    """
+    with _staged(world) as stage:
+        return Prospects(stage, poses).seen(placings)
+
+
+@contextlib.contextmanager
+def _staged(world: LiveWorld) -> Iterator[Stage]:
+    """A robot in a world at the start of its scene, which is there again in the end."""
+    dynamic = DynamicWorld(world.scene)
+    try:
+        stage = Stage(world, dynamic, _idle)
+        stage.begin()
+        yield stage
+    finally:
+        dynamic.close()
+        world.hand.forget()
+        world.engine.reset()
+        world.navigator.refresh()
+        world.robot = world.navigator.start
 
 
 def _idle() -> None:
@@ -100,7 +122,6 @@ class _Surveyor:
         self._world = stage.world
         self._known = known
         self._contents = contents
-        stage.begin()
 
     def surveyed(self, poses: PoseCache, names: tuple[str, ...]) -> PoseCache:
         """The cache with what was found out about these objects."""

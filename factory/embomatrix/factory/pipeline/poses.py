@@ -5,12 +5,15 @@ Other pairs are left to the executor's live search: a plan that goes its own way
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Self
 
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.live_world import LiveWorld
-from embomatrix.sim.pose_cache import footprint_placements, standing_poses
+from embomatrix.sim.physical.prospects import Placing
+from embomatrix.sim.physical.survey import prospects
+from embomatrix.sim.pose_cache import PLACE_RELATIONS, footprint_placements, standing_poses
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.poses import Handling, PlacementKey, PoseCache
 from embomatrix.world.state import Relation
@@ -70,6 +73,10 @@ class SceneSurvey:
         }
         return PoseCache({}, {name: self._stands[name] for name in wanted}, barred)
 
+    def prospects(self, poses: PoseCache, placings: Iterable[Placing]) -> PoseCache:
+        """A cache of placements and standing poses, with at which of its poses the arm gets with what is placed."""
+        return poses if self._foresight is None else prospects(self._world, poses, placings)
+
     def _look_at(self, names: Iterable[str]) -> None:
         fresh = [name for name in dict.fromkeys(names) if name not in self._stands]
         if not fresh:
@@ -93,9 +100,12 @@ def cache_poses(
     scene = view.scene
     placements: dict[PlacementKey, tuple[Pose, ...]] = {}
     rows: dict[str, None] = {}
+    wanted: dict[Placing, None] = {}
+    others: dict[Placing, None] = {}
     for task in tasks:
         rows.update(dict.fromkeys(task.table))
         for thing, host, relation in _pairs(view, task.about):
+            wanted[Placing(thing, host, relation)] = None
             key = PlacementKey(view.item(thing).asset_id, view.item(host).asset_id, relation)
             if key not in placements:
                 placements[key] = library.poses(view.asset(thing), view.asset(host), relation, seed)
@@ -106,8 +116,11 @@ def cache_poses(
             if view.is_surface(name) or view.is_container(name) or view.is_basket(name)
         ]
         placements.update(footprint_placements(scene, portable, holders, library, seed))
+        others.update(
+            (Placing(*each), None) for each in itertools.product(portable, holders, PLACE_RELATIONS)
+        )
     kept = {key: poses for key, poses in placements.items() if poses}
-    return replace(survey.poses(rows), placements=kept)
+    return survey.prospects(replace(survey.poses(rows), placements=kept), wanted | others)
 
 
 def _pairs(view: SceneView, about: tuple[str, ...]) -> Iterator[tuple[str, str, Relation]]:

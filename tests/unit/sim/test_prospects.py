@@ -1,0 +1,144 @@
+"""What is found out offline about placing: at which verified poses the arm gets, and that both modes then prefer these."""
+
+import contextlib
+
+import numpy as np
+import pytest
+from tests.fakes import furniture as make
+from tests.fakes.plans import executed, with_objects
+from tests.fakes.scenes import kitchen_scene, placed, upright
+
+from embomatrix.sim.bullet.engine import BulletEngine
+from embomatrix.sim.executor import Simulator
+from embomatrix.sim.live_world import LiveWorld
+from embomatrix.sim.physical.prospects import WANTED, Placing
+from embomatrix.sim.physical.survey import prospects
+from embomatrix.sim.pose_cache import build_pose_cache
+from embomatrix.skills.failure import FailureReason
+from embomatrix.world.bundle import Bundle, decode_bundle, encode_bundle
+from embomatrix.world.codec_task import poses_from_json, poses_to_json
+from embomatrix.world.field import SceneInvalidError
+from embomatrix.world.geometry import Pose
+from embomatrix.world.poses import PoseCache
+from embomatrix.world.state import Relation
+
+ON_COUNTER = Placing("apple_1", "countertop_1", Relation.ONTOP)
+INTO_BOWL = Placing("apple_1", "bowl_1", Relation.INSIDE)
+SEEDS = range(6)
+
+
+def looked_ahead(scene, placings):
+    """A cache for these placings, with what the arm was asked about them; the world is the same before and after."""
+    with contextlib.closing(BulletEngine(scene)) as engine:
+        held, targets = ([*{getattr(each, key): None for each in placings}] for key in ("held", "target"))
+        poses = build_pose_cache(scene, held, targets, seed=0, engine=engine)
+        world = LiveWorld(Bundle(scene, {}, poses), engine)
+        before = world.state_bytes()
+        found = prospects(world, poses, placings)
+        assert world.state_bytes() == before
+        return found
+
+
+@pytest.fixture(scope="module")
+def known():
+    return looked_ahead(kitchen_scene(), (ON_COUNTER, INTO_BOWL))
+
+
+def chosen(poses, placing, seed, moved=None):
+    """The pose that is chosen for a thing from the first standing pose, with the target moved or not."""
+    scene = kitchen_scene()
+    with contextlib.closing(BulletEngine(scene)) as engine:
+        world = LiveWorld(Bundle(scene, {}, poses), engine)
+        if moved is not None:
+            engine.set_pose(placing.target, moved @ engine.pose(placing.target))
+        stand = world.navigator.stands(placing.target, world.robot)[0]
+        engine.park(placing.held)
+        rng = np.random.default_rng(seed)
+        return world.placer.find(placing.held, placing.target, placing.relation, stand, rng)
+
+
+def without_prospects(poses):
+    return PoseCache(poses.placements, poses.stands)
+
+
+def test_the_arm_is_seen_to_get_at_some_poses_on_an_open_counter(known):
+    numbers = known.reached[Relation.ONTOP]["apple_1"]["countertop_1"]
+    assert 0 < len(numbers) <= WANTED
+    assert known.barred_places == {}
+
+
+def test_poses_that_the_arm_gets_at_come_first_whatever_the_seed(known):
+    preferred = {chosen(known, ON_COUNTER, seed) for seed in SEEDS}
+    assert 0 < len(preferred) <= WANTED
+    assert len({chosen(without_prospects(known), ON_COUNTER, seed) for seed in SEEDS}) > WANTED
+
+
+def test_a_target_that_was_moved_is_served_as_if_the_arm_had_not_been_asked(known):
+    aside = Pose((0.05, 0.0, 0.0))
+    for seed in SEEDS:
+        pose = chosen(known, INTO_BOWL, seed, aside)
+        assert pose == chosen(without_prospects(known), INTO_BOWL, seed, aside)
+
+
+def test_equal_questions_have_equal_answers(known):
+    again = looked_ahead(kitchen_scene(), (ON_COUNTER, INTO_BOWL))
+    assert (again.reached, again.barred_places) == (known.reached, known.barred_places)
+
+
+def boxed_in():
+    """The flat with a low stand on its table, in a box that is closed all round and high enough for a slice of bread."""
+    x, y, top, high, wide = 1.9, 1.6, 0.75, 0.11, 0.2
+    stand = make.block("stand", "board.n.01", (0.12, 0.12, 0.04), {})
+    slice_of = make.block("slice", "bread.n.01", (0.05, 0.05, 0.03), {})
+    side = make.block("side", "board.n.01", (0.02, wide + 0.02, high), {})
+    lid = make.block("lid", "board.n.01", (wide + 0.04, wide + 0.04, 0.02), {})
+    away, turn = wide / 2 + 0.01, 1.5707963267948966
+    at = ((away, 0.0, 0.0), (-away, 0.0, 0.0), (0.0, away, turn), (0.0, -away, turn))
+    sides = [
+        (placed(f"side_{n}", side, "kitchen_0", upright(x + dx, y + dy, top, side, yaw), fixed=True), side)
+        for n, (dx, dy, yaw) in enumerate(at, start=1)
+    ]
+    boxed = [
+        (placed("stand_1", stand, "kitchen_0", upright(x, y, top, stand), fixed=True), stand),
+        (placed("lid_1", lid, "kitchen_0", upright(x, y, top + high, lid), fixed=True), lid),
+    ]
+    free = placed("slice_1", slice_of, "kitchen_0", upright(x + 0.3, y, top, slice_of))
+    return with_objects(kitchen_scene(), [*sides, *boxed, (free, slice_of)])
+
+
+def test_where_nothing_could_be_taken_from_nothing_is_placed():
+    placing = Placing("slice_1", "stand_1", Relation.ONTOP)
+    scene = boxed_in()
+    poses = looked_ahead(scene, (placing,))
+    other = poses.barred_places[Relation.ONTOP]["slice_1"]["stand_1"]
+    assert other.startswith(("side", "lid", "stand"))
+    trace = execute(scene, poses, "move slice_1; pick_up slice_1; move stand_1; place stand_1 ontop")
+    assert trace.failure is FailureReason.ARM_BLOCKED
+    assert trace.steps[-1].message == f"the arm finds no free way to a place for slice_1: {other} bars it"
+
+
+def test_a_place_is_free_again_when_what_barred_it_is_taken_away():
+    poses = PoseCache(barred_places={Relation.ONTOP: {"apple_1": {"coffee_table_1": "mug_1"}}})
+    brings = "move apple_1; pick_up apple_1; move coffee_table_1; place coffee_table_1 ontop"
+    clears = "move mug_1; pick_up mug_1; move countertop_1; place countertop_1 ontop"
+    assert execute(kitchen_scene(), poses, brings).failure is FailureReason.ARM_BLOCKED
+    assert execute(kitchen_scene(), poses, f"{clears}; {brings}").failure is None
+
+
+def execute(scene, poses, text):
+    with contextlib.closing(Simulator(Bundle(scene, {}, poses))) as simulator:
+        return executed(simulator, text)
+
+
+def test_what_the_arm_gets_at_travels_in_the_bundle(known):
+    poses = PoseCache(reached=known.reached, barred_places={Relation.INSIDE: {"mug_1": {"sink_1": "wall"}}})
+    found = decode_bundle(encode_bundle(Bundle(kitchen_scene(), {}, poses))).poses
+    assert (found.reached, found.barred_places) == (poses.reached, poses.barred_places)
+
+
+@pytest.mark.parametrize("numbers", ["3", [-1], [0.5], [True], None])
+def test_numbers_of_poses_that_are_none_are_refused_by_name(numbers):
+    value = poses_to_json(PoseCache(reached={Relation.ONTOP: {"mug_1": {"sink_1": (1,)}}}))
+    value["reached"]["ontop"]["mug_1"]["sink_1"] = numbers
+    with pytest.raises(SceneInvalidError, match="sink_1"):
+        poses_from_json(value)
