@@ -169,7 +169,7 @@ class Placer:
     def _search(self, errand: Errand, rng: np.random.Generator | None) -> Iterator[Pose]:
         """Good poses: of those verified for the pair, then for the footprint's class, then of fresh ones.
 
-        Of the first set those come first at which the arm was seen to get, while the target is where the scene has it.
+        Of the first set that comes first which the arm was seen to get at, while the target is where the scene has it.
         """
         frames = self._frames(errand)
         reached = self._reached_in_set(errand)
@@ -177,22 +177,22 @@ class Placer:
             if not len(spots):
                 continue
             order = range(len(spots)) if rng is None else rng.permutation(len(spots)).tolist()
-            some = [number for number in order if number in reached] if reached else []
-            others = [number for number in order if number not in reached] if some else order
-            for _, pose in itertools.chain(
-                self._accepted(errand, spots, frames, some), self._accepted(errand, spots, frames, others)
-            ):
+            if reached is not None and reached < len(spots):
+                yield from (pose for _, pose in self._accepted(errand, spots, frames, [reached]))
+                order = [number for number in order if number != reached]
+            for _, pose in self._accepted(errand, spots, frames, order):
                 yield pose
-            reached = ()
+            reached = None
         yield from self._fresh(errand, frames, rng)
 
-    def _reached_in_set(self, errand: Errand) -> tuple[int, ...]:
-        """Numbers of the poses at which the arm was seen to get, in the first set that is not empty."""
+    def _reached_in_set(self, errand: Errand) -> int | None:
+        """Number of the pose that the arm was seen to get at, in the first set that is not empty."""
         if not self._reached:
-            return ()
-        found = self._reached.get(errand.relation, {}).get(errand.held, {}).get(errand.target, ())
+            return None
         before = self._scene.by_name[errand.target].pose_world_asset
-        return found if found and self._engine.pose(errand.target) == before else ()
+        if self._engine.pose(errand.target) != before:
+            return None
+        return self._reached.get(errand.relation, {}).get(errand.held, {}).get(errand.target)
 
     def _accepted(
         self, errand: Errand, spots: Spots, frames: dict[str, Pose], order: Sequence[int]

@@ -109,7 +109,7 @@ def poses_from_json(value: object, tables: Tables | None = None) -> PoseCache:
     """A pose cache; ``tables`` hold the rows that it was written with. Raises SceneInvalidError."""
     fields = Field(value, "poses", tables=tables).record("placements", "stands", optional=ARM)
     barred = _barred_from_json(fields["barred"]) if "barred" in fields else {}
-    reached = _placings_from_json(fields["reached"], _numbers) if "reached" in fields else {}
+    reached = _placings_from_json(fields["reached"], _pose_number) if "reached" in fields else {}
     places = _placings_from_json(fields["barred_places"], Field.name) if "barred_places" in fields else {}
     if tables is not None:
         names = [item.name() for item in fields["placements"].items()]
@@ -169,12 +169,11 @@ def _placings_from_json(field: Field, read: Callable[[Field], T]) -> dict[Relati
     }
 
 
-def _numbers(field: Field) -> tuple[int, ...]:
-    """Numbers of poses."""
-    value = field.value
-    if not isinstance(value, list) or set(map(type, value)) - {int} or min(value, default=0) < 0:
-        field.fail(f"found {str(value)[:40]}: expected a list of whole numbers from 0")
-    return tuple(value)
+def _pose_number(field: Field) -> int:
+    number = field.integer()
+    if number < 0:
+        field.fail(f"found {number}: expected the number of a pose, from 0")
+    return number
 
 
 def _stands_to_json(stands: tuple[StandPose, ...], tables: TableWriter | None) -> Any:

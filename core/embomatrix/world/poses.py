@@ -45,12 +45,12 @@ class PoseCache:
     """``placements``: poses of the placed asset in the *support's* asset frame, each verified by settling in physics.
     ``stands``: standing poses per object name, in the world, best first.
     ``barred``: by object name what bars the arm's way where there is none, in the scene as it was loaded.
-    ``reached``: by relation, by what is held and by its target, numbers of poses that the arm was seen to get at, of the set
-    of ``placements`` that is looked at first. ``barred_places``: in the same way what bars the arm's way to all of them.
+    ``reached``: by relation, by what is held and by its target, the number of a pose that the arm was seen to get at, of the
+    set of ``placements`` that is looked at first. ``barred_places``: in the same way what bars the arm's way to all of them.
     """
 
     placements: Mapping[PlacementKey, tuple[Pose, ...]] = field(default_factory=dict)
     stands: Mapping[str, tuple[StandPose, ...]] = field(default_factory=dict)
     barred: Mapping[Handling, Mapping[str, str]] = field(default_factory=dict)
-    reached: Mapping[Relation, Mapping[str, Mapping[str, tuple[int, ...]]]] = field(default_factory=dict)
+    reached: Mapping[Relation, Mapping[str, Mapping[str, int]]] = field(default_factory=dict)
     barred_places: Mapping[Relation, Mapping[str, Mapping[str, str]]] = field(default_factory=dict)

@@ -1,6 +1,7 @@
 """What is found out offline about placing: at which verified poses the arm gets, and that both modes then prefer these."""
 
 import contextlib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from tests.fakes.scenes import kitchen_scene, placed, upright
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.live_world import LiveWorld
-from embomatrix.sim.physical.prospects import WANTED, Placing
+from embomatrix.sim.physical.prospects import Placing
 from embomatrix.sim.physical.survey import prospects
 from embomatrix.sim.pose_cache import build_pose_cache
 from embomatrix.skills.failure import FailureReason
@@ -24,7 +25,6 @@ from embomatrix.world.state import Relation
 
 ON_COUNTER = Placing("apple_1", "countertop_1", Relation.ONTOP)
 INTO_BOWL = Placing("apple_1", "bowl_1", Relation.INSIDE)
-SEEDS = range(6)
 
 
 def looked_ahead(scene, placings):
@@ -44,8 +44,8 @@ def known():
     return looked_ahead(kitchen_scene(), (ON_COUNTER, INTO_BOWL))
 
 
-def chosen(poses, placing, seed, moved=None):
-    """The pose that is chosen for a thing from the first standing pose, with the target moved or not."""
+def chosen(poses, placing, moved=None):
+    """The poses that seeds choose for a thing from the first standing pose, with the target moved or not."""
     scene = kitchen_scene()
     with contextlib.closing(BulletEngine(scene)) as engine:
         world = LiveWorld(Bundle(scene, {}, poses), engine)
@@ -53,31 +53,27 @@ def chosen(poses, placing, seed, moved=None):
             engine.set_pose(placing.target, moved @ engine.pose(placing.target))
         stand = world.navigator.stands(placing.target, world.robot)[0]
         engine.park(placing.held)
-        rng = np.random.default_rng(seed)
-        return world.placer.find(placing.held, placing.target, placing.relation, stand, rng)
+        rngs = map(np.random.default_rng, range(6))
+        return [world.placer.find(placing.held, placing.target, placing.relation, stand, rng) for rng in rngs]
 
 
 def without_prospects(poses):
     return PoseCache(poses.placements, poses.stands)
 
 
-def test_the_arm_is_seen_to_get_at_some_poses_on_an_open_counter(known):
-    numbers = known.reached[Relation.ONTOP]["apple_1"]["countertop_1"]
-    assert 0 < len(numbers) <= WANTED
+def test_the_arm_is_seen_to_get_at_a_pose_on_an_open_counter(known):
+    assert known.reached[Relation.ONTOP]["apple_1"]["countertop_1"] >= 0
     assert known.barred_places == {}
 
 
-def test_poses_that_the_arm_gets_at_come_first_whatever_the_seed(known):
-    preferred = {chosen(known, ON_COUNTER, seed) for seed in SEEDS}
-    assert 0 < len(preferred) <= WANTED
-    assert len({chosen(without_prospects(known), ON_COUNTER, seed) for seed in SEEDS}) > WANTED
+def test_a_pose_that_the_arm_gets_at_comes_first_whatever_the_seed(known):
+    assert len(set(chosen(known, ON_COUNTER))) == 1
+    assert len(set(chosen(without_prospects(known), ON_COUNTER))) > 1
 
 
 def test_a_target_that_was_moved_is_served_as_if_the_arm_had_not_been_asked(known):
     aside = Pose((0.05, 0.0, 0.0))
-    for seed in SEEDS:
-        pose = chosen(known, INTO_BOWL, seed, aside)
-        assert pose == chosen(without_prospects(known), INTO_BOWL, seed, aside)
+    assert chosen(known, INTO_BOWL, aside) == chosen(without_prospects(known), INTO_BOWL, aside)
 
 
 def test_equal_questions_have_equal_answers(known):
@@ -87,9 +83,9 @@ def test_equal_questions_have_equal_answers(known):
 
 def boxed_in():
     """The flat with a low stand on its table, in a box that is closed all round and high enough for a slice of bread."""
-    x, y, top, high, wide = 1.9, 1.6, 0.75, 0.11, 0.2
-    stand = make.block("stand", "board.n.01", (0.12, 0.12, 0.04), {})
-    slice_of = make.block("slice", "bread.n.01", (0.05, 0.05, 0.03), {})
+    x, y, top, high, wide = 1.9, 1.3, 0.75, 0.11, 0.2
+    stand = make.block("stand", "board.n.01", (0.06, 0.06, 0.04), {})
+    slice_of = replace(make.block("slice", "bread.n.01", (0.05, 0.05, 0.03), {}), mass_kg=0.1)
     side = make.block("side", "board.n.01", (0.02, wide + 0.02, high), {})
     lid = make.block("lid", "board.n.01", (wide + 0.04, wide + 0.04, 0.02), {})
     away, turn = wide / 2 + 0.01, 1.5707963267948966
@@ -136,9 +132,9 @@ def test_what_the_arm_gets_at_travels_in_the_bundle(known):
     assert (found.reached, found.barred_places) == (poses.reached, poses.barred_places)
 
 
-@pytest.mark.parametrize("numbers", ["3", [-1], [0.5], [True], None])
-def test_numbers_of_poses_that_are_none_are_refused_by_name(numbers):
-    value = poses_to_json(PoseCache(reached={Relation.ONTOP: {"mug_1": {"sink_1": (1,)}}}))
-    value["reached"]["ontop"]["mug_1"]["sink_1"] = numbers
+@pytest.mark.parametrize("number", ["3", -1, 0.5, True, None])
+def test_a_number_of_a_pose_that_is_none_is_refused_by_name(number):
+    value = poses_to_json(PoseCache(reached={Relation.ONTOP: {"mug_1": {"sink_1": 1}}}))
+    value["reached"]["ontop"]["mug_1"]["sink_1"] = number
     with pytest.raises(SceneInvalidError, match="sink_1"):
         poses_from_json(value)

@@ -7,6 +7,7 @@ place in both.
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
@@ -24,17 +25,18 @@ from embomatrix.world.state import Relation
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
+    from embomatrix.sim.physical.reach import Way
     from embomatrix.sim.physical.stage import Grip, Stage
     from embomatrix.world.poses import PoseCache, StandPose
 
-LOOKS: Final = 6
+LOOKS: Final = 16
 """Poses of one thing at one target that are looked at."""
-WANTED: Final = 2
-"""So many that the arm gets at are enough."""
-MOST_LOOKS: Final = 400
-"""Looks in one scene: the first targets that are asked about get them."""
-TRIALS: Final = 12
-"""Targets that look out of reach of which it is made sure that no hold and no other pose leads there."""
+MOST_LOOKS: Final = 2000
+"""Poses that are looked at in one scene: the first targets that are asked about get them."""
+FEW: Final = 6
+"""Of a target with no more free places than these it is made sure that no hold leads to any, where none was seen to."""
+APART_M: Final = 0.02
+"""Poses nearer than this are at one place: on what is hardly wider than a thing that has no other."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,36 +59,33 @@ class Prospects:
         self._placer = Placer(stage.world.engine, stage.world.relations, poses)
         self._grips: dict[str, Grip | None] = {}
         self._looks = 0
-        self._trials = 0
 
     def seen(self, placings: Iterable[Placing]) -> PoseCache:
         """The poses with what was found out about placing these, the first of them as long as it lasts."""
-        reached: dict[Relation, dict[str, dict[str, tuple[int, ...]]]] = {}
+        reached: dict[Relation, dict[str, dict[str, int]]] = {}
         barred: dict[Relation, dict[str, dict[str, str]]] = {}
-        for placing in placings:
+        for placing in dict.fromkeys(placings):
             if self._looks >= MOST_LOOKS:
                 break
-            numbers, other = self._look(placing)
-            if numbers:
-                reached.setdefault(placing.relation, {}).setdefault(placing.held, {})[placing.target] = (
-                    numbers
-                )
+            number, other = self._look(placing)
+            if number is not None:
+                reached.setdefault(placing.relation, {}).setdefault(placing.held, {})[placing.target] = number
             if other:
                 barred.setdefault(placing.relation, {}).setdefault(placing.held, {})[placing.target] = other
         return replace(self._poses, reached=reached, barred_places=barred)
 
-    def _look(self, placing: Placing) -> tuple[tuple[int, ...], str]:
-        """Numbers of poses that the arm gets at, and what bars the way to all when it is sure that it gets at none."""
+    def _look(self, placing: Placing) -> tuple[int | None, str]:
+        """Number of the first pose that the arm gets at, and what bars the way to all when it is sure that it gets at none."""
         stands = self._poses.stands.get(placing.target, ())
         if not stands or not self._placer.knows(placing.held, placing.target, placing.relation):
-            return (), ""
+            return None, ""
         grip = self._grip(placing.held)
         if grip is None:
-            return (), ""
+            return None, ""
         self._make_ready(placing)
         poses = self._placer.verified(placing.held, placing.target, placing.relation, stands[0], LOOKS)
         if not poses:
-            return (), ""
+            return None, ""
         self._stand_at(stands[0])
         self._stage.grip = grip
 
@@ -94,36 +93,29 @@ class Prospects:
             return self._world.relations.holds(placing.relation, placing.held, placing.target)
 
         delivery = Delivery(self._stage, grip, [pose for _, pose in poses], counts)
-        found = self._reached(poses, delivery.reaches) or self._reached(poses, delivery.reaches_turned)
-        other = "" if found else self._bars(placing, grip, stands[0], counts)
+        way = next(delivery.ways(), None)
+        index = len(poses) - 1
+        if way is not None:
+            index = _nearest([pose for _, pose in poses], _end_of(way) @ grip.pose_tool_object)
+        self._looks += index + 1
+        other = "" if way is not None else self._bars(placing, grip, stands[0], counts)
         self._stage.grip = None
-        return found, other
-
-    def _reached(self, poses: Sequence[tuple[int, Pose]], reaches: Callable[[Pose], bool]) -> tuple[int, ...]:
-        """Numbers of the first poses that the arm gets at, as many as are wanted."""
-        found: list[int] = []
-        for number, pose in poses:
-            self._looks += 1
-            if reaches(pose):
-                found.append(number)
-            if len(found) == WANTED:
-                break
-        return tuple(found)
+        return None if way is None else poses[index][0], other
 
     def _bars(self, placing: Placing, grip: Grip, stand: StandPose, counts: Callable[[], bool]) -> str:
-        """What bars the way to every pose; "" when one may lead there with some hold, or too much was tried already.
+        """What bars the way to every pose; "" when one may lead there with some hold, or there are too many to ask about all.
 
-        Where the hand could not take a thing from it can't put it, however it holds it, nor can it let it fall from above.
+        Where the hand could not take a thing from it can't put it, however it holds it, unless it lets it fall from above.
         """
-        if self._trials == TRIALS:
-            return ""
-        self._trials += 1
         held = placing.held
         poses = self._placer.choices(held, placing.target, placing.relation, stand, most=PLACES)
         if isinstance(poses, FailureReason):
             return ""
+        places = _apart(poses)
+        if len(places) > FEW:
+            return ""
         delivery = Delivery(self._stage, grip, poses, counts)
-        if any(self._could_take(held, pose) for pose in poses):
+        if any(self._could_take(held, pose) for pose in places):
             return ""
         if any(True for _ in itertools.chain(delivery.drops(), delivery.ways())):
             return ""
@@ -158,9 +150,7 @@ class Prospects:
         way = next(stage.reach(stage.boxes(), name).ways(tracks, bases), None)
         if way is None:
             return None
-        key = way.track.key
-        tool = Pose.from_rotation(tuple(way.track.position[key].tolist()), way.track.rotation[key])
-        return stage.grip_with(tool, world.engine.pose(name), name)
+        return stage.grip_with(_end_of(way), world.engine.pose(name), name)
 
     def _make_ready(self, placing: Placing) -> None:
         """The scene as it was loaded, with the thing in the hand and the target open to it."""
@@ -186,3 +176,23 @@ class Prospects:
     def _stand_at(self, stand: StandPose) -> None:
         self._world.robot = self._stage.told = stand
         self._stage.dynamic.robot.appear(tucked(stand))
+
+
+def _end_of(way: Way) -> Pose:
+    """Where a way brings the tool."""
+    track = way.track
+    return Pose.from_rotation(tuple(track.position[track.key].tolist()), track.rotation[track.key])
+
+
+def _nearest(poses: Sequence[Pose], there: Pose) -> int:
+    """Which of some poses is the nearest to another."""
+    return min(range(len(poses)), key=lambda index: math.dist(poses[index].position_m, there.position_m))
+
+
+def _apart(poses: Sequence[Pose]) -> list[Pose]:
+    """The first pose at each place."""
+    found: list[Pose] = []
+    for pose in poses:
+        if all(math.dist(pose.position_m, other.position_m) > APART_M for other in found):
+            found.append(pose)
+    return found

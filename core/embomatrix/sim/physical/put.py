@@ -73,21 +73,6 @@ class Delivery:
                 tracks = list(_put_tracks(self._grip, fits))
                 yield from self.reach.ways(tracks, bases_at(self._stage, *_at(fits[0])))
 
-    def reaches(self, pose: Pose) -> bool:
-        """Whether there is a way to a pose, with the thing as it was found good there or the other way round."""
-        return self._leads_to(self._fits(pose)[0])
-
-    def reaches_turned(self, pose: Pose) -> bool:
-        """Whether there is a way to a pose with the thing turned there as the hand comes best."""
-        return self._leads_to(self._fits(pose)[1])
-
-    def _leads_to(self, fits: list[Fit]) -> bool:
-        if not fits:
-            return False
-        lot = _offered(fits)
-        ways = self.reach.ways(list(_put_tracks(self._grip, lot)), bases_at(self._stage, *_at(lot[0])))
-        return next(ways, None) is not None
-
     def drops(self) -> Iterator[Way]:
         """Ways to let it fall from no higher than must be, as into a crate that is too narrow for the hand."""
         fits = [fit for pose in self._poses[: CHUNKS[2]] for some in self._fits(pose) for fit in some]
@@ -128,7 +113,10 @@ class Delivery:
             as_found = [fit for fits, _ in some for fit in fits]
             turned = [fit for _, fits in some for fit in fits]
             lots = (as_found, turned) if first == 0 else (as_found + turned,)
-            yield from map(_offered, lots)
+            for fits in lots:
+                fits.sort(key=lambda fit: fit.out_m or 0.0)
+                roofed = [Fit(fit.pose, fit.course, None) for fit in fits if fit.out_m is not None]
+                yield [*fits[:FITS], *roofed[:FITS]]
 
     def _fits(self, pose: Pose) -> tuple[list[Fit], list[Fit]]:
         """A pose as it is and the other way round, as far as the hand can come so; then turned to where the hand comes from."""
@@ -161,13 +149,6 @@ class Delivery:
         engine.set_pose(name, turned)
         if not engine.penetrates(name) and self._counts():
             yield turned
-
-
-def _offered(fits: list[Fit]) -> list[Fit]:
-    """Those in the open first, then the less deep ones; in the end those under a roof as if there were none: it may be high."""
-    fits = sorted(fits, key=lambda fit: fit.out_m or 0.0)
-    roofed = [Fit(fit.pose, fit.course, None) for fit in fits if fit.out_m is not None]
-    return [*fits[:FITS], *roofed[:FITS]]
 
 
 def _at(fit: Fit) -> tuple[Pose, float, float | None]:

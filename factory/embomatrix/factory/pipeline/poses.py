@@ -14,6 +14,7 @@ from embomatrix.sim.live_world import LiveWorld
 from embomatrix.sim.physical.prospects import Placing
 from embomatrix.sim.physical.survey import prospects
 from embomatrix.sim.pose_cache import PLACE_RELATIONS, footprint_placements, standing_poses
+from embomatrix.skills.appliance import cold_source, heat_source
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.poses import Handling, PlacementKey, PoseCache
 from embomatrix.world.state import Relation
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from embomatrix.factory.writer.view import SceneView
     from embomatrix.sim.physical.survey import Foresight
     from embomatrix.sim.pose_cache import PlacementLibrary
+    from embomatrix.world.asset import Asset
     from embomatrix.world.geometry import Pose
     from embomatrix.world.poses import StandPose
     from embomatrix.world.scene import Scene
@@ -97,30 +99,47 @@ def cache_poses(
     What a goal brings together has poses of its own; for all other rows of a task's table there are those of their
     footprints.
     """
-    scene = view.scene
+    scene, tasks = view.scene, tuple(tasks)
     placements: dict[PlacementKey, tuple[Pose, ...]] = {}
     rows: dict[str, None] = {}
-    wanted: dict[Placing, None] = {}
-    others: dict[Placing, None] = {}
     for task in tasks:
         rows.update(dict.fromkeys(task.table))
         for thing, host, relation in _pairs(view, task.about):
-            wanted[Placing(thing, host, relation)] = None
             key = PlacementKey(view.item(thing).asset_id, view.item(host).asset_id, relation)
             if key not in placements:
                 placements[key] = library.poses(view.asset(thing), view.asset(host), relation, seed)
-        portable = [name for name in task.table if view.is_portable(name)]
-        holders = [
-            name
-            for name in task.table
-            if view.is_surface(name) or view.is_container(name) or view.is_basket(name)
-        ]
-        placements.update(footprint_placements(scene, portable, holders, library, seed))
-        others.update(
-            (Placing(*each), None) for each in itertools.product(portable, holders, PLACE_RELATIONS)
-        )
+        placements.update(footprint_placements(scene, *_portable_and_holders(view, task), library, seed))
     kept = {key: poses for key, poses in placements.items() if poses}
-    return survey.prospects(replace(survey.poses(rows), placements=kept), wanted | others)
+    return survey.prospects(replace(survey.poses(rows), placements=kept), _placings(view, tasks))
+
+
+def _placings(view: SceneView, tasks: Sequence[Needs]) -> Iterator[Placing]:
+    """What may be placed where: what a goal brings together first, then what is heated or cooled, then the rest."""
+    for task in tasks:
+        yield from itertools.starmap(Placing, _pairs(view, task.about))
+    pairs = [
+        (thing, host)
+        for task in tasks
+        for thing, host in itertools.product(*_portable_and_holders(view, task))
+    ]
+    pairs.sort(key=lambda pair: not _is_source(view.asset(pair[1])))
+    for (thing, host), relation in itertools.product(pairs, PLACE_RELATIONS):
+        yield Placing(thing, host, relation)
+
+
+def _is_source(asset: Asset) -> bool:
+    return heat_source(asset) is not None or cold_source(asset) is not None
+
+
+def _portable_and_holders(view: SceneView, task: Needs) -> tuple[list[str], list[str]]:
+    """Rows of a task that can be carried, and those in or on which something can be put."""
+    portable = [name for name in task.table if view.is_portable(name)]
+    holders = [
+        name
+        for name in task.table
+        if view.is_surface(name) or view.is_container(name) or view.is_basket(name)
+    ]
+    return portable, holders
 
 
 def _pairs(view: SceneView, about: tuple[str, ...]) -> Iterator[tuple[str, str, Relation]]:
