@@ -29,9 +29,9 @@ if TYPE_CHECKING:
     from embomatrix.sim.physical.stage import Grip, Stage
     from embomatrix.world.poses import PoseCache, StandPose
 
-LOOKS: Final = 16
+LOOKS: Final = 9
 """Poses of one thing at one target that are looked at."""
-MOST_LOOKS: Final = 2000
+MOST_LOOKS: Final = 500
 """Poses that are looked at in one scene: the first targets that are asked about get them."""
 FEW: Final = 6
 """Of a target with no more free places than these it is made sure that no hold leads to any, where none was seen to."""
