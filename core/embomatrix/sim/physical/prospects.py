@@ -83,10 +83,12 @@ class Prospects:
         if grip is None:
             return None, ""
         self._make_ready(placing)
-        poses = self._placer.verified(placing.held, placing.target, placing.relation, stands[0], LOOKS)
+        # Who opened the target has stepped aside from its leaves.
+        stand = self._world.navigator.aside(placing.target, stands[0])
+        poses = self._placer.verified(placing.held, placing.target, placing.relation, stand, LOOKS)
         if not poses:
             return None, ""
-        self._stand_at(stands[0])
+        self._stand_at(stand)
         self._stage.grip = grip
 
         def counts() -> bool:
@@ -98,7 +100,7 @@ class Prospects:
         if way is not None:
             index = _nearest([pose for _, pose in poses], _end_of(way) @ grip.pose_tool_object)
         self._looks += index + 1
-        other = "" if way is not None else self._bars(placing, grip, stands[0], counts)
+        other = "" if way is not None else self._bars(placing, grip, stand, counts)
         self._stage.grip = None
         return None if way is None else poses[index][0], other
 
