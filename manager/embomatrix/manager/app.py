@@ -23,6 +23,7 @@ from embomatrix.manager.bundles import BundleStore
 from embomatrix.manager.cluster_state import ClusterState
 from embomatrix.manager.expulsion import Expulsion
 from embomatrix.manager.garbage import only_young
+from embomatrix.manager.http_connections import BoundedConnections, allow_files
 from embomatrix.manager.http_rules import HttpRules, allowed_hosts
 from embomatrix.manager.leadership import Leadership
 from embomatrix.manager.listen import bound_socket
@@ -74,6 +75,7 @@ async def serve(
 
     ``on_standby`` hears the leader's address while another manager leads.
     """
+    allow_files()
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -238,6 +240,7 @@ class _HttpServer:
         config = uvicorn.Config(
             self._answer,
             interface="asgi3",
+            http=BoundedConnections,
             # Its lines go where ours go, in the same form.
             log_config=None,
             log_level="warning",
