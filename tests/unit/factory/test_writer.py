@@ -200,5 +200,8 @@ def test_a_person_puts_food_in_the_fridge_and_not_on_the_bed() -> None:
     assert not suits("apple", "bed")
     assert not suits("teddy_bear", "microwave")
     assert not any(suits(name, "toilet") for members in MEMBERS.values() for name in members)
-    assert "fire_alarm" in NEVER_SWITCHED
+    assert suits("steak", "oven")
+    assert not suits("banana", "oven")
+    assert not suits("bar_soap", "treadmill")
+    assert {"fire_alarm", "fire_extinguisher"} <= NEVER_SWITCHED
     assert HOST_GROUPS["fridge"] >= HOST_GROUPS["microwave"] - {Group.TABLEWARE}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.social.occasions import Occasion, Theme, occasion_of
-from embomatrix.factory.writer.tables import MEMBERS, Group
+from embomatrix.factory.writer.tables import FOR_DRINKS, MEMBERS, Group
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -111,8 +111,6 @@ _INTO_BASINS: Final = frozenset(
     }
 )
 _PANS: Final = frozenset({"frying_pan", "saucepan"})
-FOR_DRINKS: Final = frozenset({"coffee_maker", "espresso_machine"})
-"""They are hot, and nobody cooks with them."""
 NOT_COOKED: Final = frozenset({"avocado", "lemon", "orange", "bagel", "croissant"})
 
 SWITCHES: Final[Mapping[str, frozenset[Theme]]] = {

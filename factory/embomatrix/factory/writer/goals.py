@@ -6,7 +6,7 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.writer.tables import suits
+from embomatrix.factory.writer.tables import FOR_DRINKS, suits
 from embomatrix.factory.writer.words import PHRASES, Voice, phrase, refer, spoken
 from embomatrix.world.goal import And, Atom, Exists, Formula, Not
 from embomatrix.world.state import Relation
@@ -207,7 +207,9 @@ def thermal_piece(shop: Workshop) -> Piece | None:
     view, rng = shop.view, shop.rng
     foods = [name for name in shop.things() if view.asset(name).can("cookable")]
     food = shop.pick(foods, view.robot.fetches)
-    source = shop.pick(shop.fixtures(view.is_source))
+    source = shop.pick(
+        shop.fixtures(lambda name: view.is_source(name) and view.category(name) not in FOR_DRINKS)
+    )
     if food is None or source is None or source in view.hosts(food):
         return None
     effects = [

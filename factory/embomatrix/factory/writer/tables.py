@@ -88,6 +88,7 @@ _KITCHEN_GOODS: Final = frozenset({Group.FOOD, Group.FRUIT, Group.TABLEWARE, Gro
 _SOFT_GOODS: Final = frozenset({Group.BOOKS, Group.TOYS, Group.DEVICES, Group.OFFICE, Group.DECORATION})
 _WASHABLE: Final = frozenset({Group.FRUIT, Group.FOOD, Group.TABLEWARE, Group.TOILETRIES})
 _COOKING: Final = frozenset({Group.FOOD, Group.FRUIT, Group.TABLEWARE})
+_ROASTED: Final = frozenset({Group.FOOD, Group.TABLEWARE})
 _NOTHING: Final[frozenset[Group]] = frozenset()
 
 HOST_GROUPS: Final[Mapping[str, frozenset[Group]]] = {
@@ -99,7 +100,8 @@ HOST_GROUPS: Final[Mapping[str, frozenset[Group]]] = {
         _SOFT_GOODS,
     ),
     **dict.fromkeys(("furniture_sink", "pedestal_sink", "commercial_kitchen_sink", "sink"), _WASHABLE),
-    **dict.fromkeys(("stove", "flat_top_grill", "microwave", "oven", "toaster_oven"), _COOKING),
+    **dict.fromkeys(("stove", "flat_top_grill", "oven", "toaster_oven"), _ROASTED),
+    "microwave": _COOKING,
     **dict.fromkeys(("fridge", "freezer", "cooler", "wine_fridge"), _KITCHEN_GOODS),
     "dishwasher": frozenset({Group.TABLEWARE}),
     **dict.fromkeys(MEMBERS[Group.TABLEWARE], frozenset({Group.FOOD, Group.FRUIT})),
@@ -110,7 +112,7 @@ HOST_GROUPS: Final[Mapping[str, frozenset[Group]]] = {
             "loudspeaker", "standing_loudspeaker", "laptop", "standing_tv", "wall_mounted_tv", "jukebox", "pay_phone",
             "grandfather_clock", "table_lamp", "floor_lamp", "towel_rack", "range_hood", "public_trash_can",
             "trash_can", "electric_switch", "picture", "mirror", "fire_extinguisher", "beer_tap", "cash_register",
-            "washer", "clothes_dryer", "hat", "cap", "ceiling_rack", "coatrack",
+            "washer", "clothes_dryer", "hat", "cap", "ceiling_rack", "coatrack", "treadmill", "exercise_bike",
         ),
         _NOTHING,
     ),
@@ -120,10 +122,12 @@ HOST_GROUPS: Final[Mapping[str, frozenset[Group]]] = {
 NEVER_SWITCHED: Final = frozenset(
     {
         "electric_switch", "fire_alarm", "ceiling_fan", "room_light", "downlight", "square_light", "wall_mounted_light",
-        "room_ventilator", "hand_dryer",
+        "room_ventilator", "hand_dryer", "fire_extinguisher",
     }
 )  # fmt: skip
-"""Things with a switch that no task asks for: out of reach, or no words tell one from another."""
+"""Things with a switch that no task asks for: out of reach, for an emergency, or no words tell one from another."""
+FOR_DRINKS: Final = frozenset({"coffee_maker", "espresso_machine"})
+"""What heats drinks, and no food."""
 
 BASKETS: Final = ("wicker_basket", "storage_box")
 """Open containers that a variant may put on the floor or on a table."""
