@@ -20,8 +20,8 @@ from embomatrix.proto.v1 import (
 from embomatrix.rpc.capabilities import capabilities_of
 from embomatrix.rpc.channel import open_channel
 from embomatrix.rpc.client import ClusterClient
-from embomatrix.rpc.convert import rollout_result_from_proto
 from embomatrix.rpc.convert_batch import batch_to_proto
+from embomatrix.rpc.convert_outcome import rollout_result_from_proto
 from embomatrix.rpc.status import PreconditionError, cluster_errors
 from embomatrix.rpc.values import Batch, Completed, Resources, Rollout
 from embomatrix.rpc.versions import SPOKEN, VersionRange, agree

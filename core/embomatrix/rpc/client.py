@@ -19,12 +19,9 @@ from embomatrix.proto.v1 import (
 )
 from embomatrix.rpc.capabilities import version_with
 from embomatrix.rpc.channel import DEFAULT_ADDRESS, chunks_of
-from embomatrix.rpc.convert import (
-    each,
-    inside,
-    rollout_result_from_proto,
-)
+from embomatrix.rpc.convert import each, inside
 from embomatrix.rpc.convert_batch import batch_to_proto
+from embomatrix.rpc.convert_outcome import rollout_result_from_proto
 from embomatrix.rpc.convert_run import (
     group_done_from_proto,
     lookahead_answer_from_proto,

@@ -1,23 +1,16 @@
-"""Values to wire messages and back. A malformed message is a ``ConvertError`` that names the field."""
+"""Plans and rollouts to wire messages and back. A malformed message is a ``ConvertError`` that names the field."""
 
 from __future__ import annotations
 
 import functools
 import math
+import operator
 from typing import TYPE_CHECKING, Final, Literal, TypeVar
 
 from embomatrix.proto.v1 import types_pb2
-from embomatrix.reward.breakdown import AtomResult, RewardBreakdown
 from embomatrix.rpc.values import (
-    Cancelled,
-    Completed,
-    InfraCode,
-    InfraFailure,
     Rollout,
-    RolloutResult,
-    Timings,
 )
-from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.syntax import (
     MAX_PLAN_BYTES,
     MAX_ROOM_NAME,
@@ -29,12 +22,10 @@ from embomatrix.skills.syntax import (
     Skill,
     SkillCall,
 )
-from embomatrix.skills.trace import Step
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
-    from embomatrix.rpc.values import Outcome
 
 ArgField = Literal["object_index", "source_index", "relation", "yaw", "distance", "room_name"]
 WireT = TypeVar("WireT")
@@ -62,15 +53,12 @@ MAX_ROLLOUT_BYTES: Final = MAX_PLAN_BYTES + 4096
 """On the wire: the largest plan, and its names."""
 KNOWN: Final = 65_536
 """Calls and steps that a process remembers by their bytes: plans of one model repeat them, and so do the results."""
+_BYTES: Final = operator.methodcaller("SerializeToString")
 _SKILLS: Final = {kind: skill for skill, kind in SKILL_KINDS.items()}
 _FIELDS: Final[Mapping[Skill, tuple[tuple[ArgField, bool], ...]]] = {
     skill: tuple((arg.value, arg in taken) for arg in Arg) for skill, taken in SIGNATURES.items()
 }
 """For each skill the fields of a call, in order, and whether the skill takes them."""
-_INFRA_CODES: Final[Mapping[InfraCode, types_pb2.InfraCode.ValueType]] = {
-    code: types_pb2.InfraCode.Value(f"INFRA_CODE_{code.name}") for code in InfraCode
-}
-_INFRA_VALUES: Final = {number: code for code, number in _INFRA_CODES.items()}
 
 
 class ConvertError(ValueError):
@@ -97,6 +85,14 @@ def each(
         except ConvertError as error:
             raise error.under(f"{field}[{index}]") from None
     return tuple(values)
+
+
+def each_known(field: str, known: Callable[[bytes], ValueT], messages: Iterable[WireT]) -> tuple[ValueT, ...]:
+    """``each`` for messages that are looked up by their bytes: no line of Python for any of them, unless one is wrong."""
+    try:
+        return tuple(map(known, map(_BYTES, messages)))
+    except ConvertError:
+        return each(field, lambda message: known(_BYTES(message)), messages)
 
 
 def inside(field: str, convert: Callable[[WireT], ValueT], message: WireT) -> ValueT:
@@ -134,12 +130,12 @@ def skill_call_to_proto(call: SkillCall) -> types_pb2.SkillCall:
 
 
 def skill_call_from_proto(message: types_pb2.SkillCall) -> SkillCall:
-    """The call, with exactly the arguments that its skill takes; any other set is a ``ConvertError``."""
     return _call_of(message.SerializeToString())
 
 
 @functools.lru_cache(KNOWN)
 def _call_of(data: bytes) -> SkillCall:
+    """The call, with exactly the arguments that its skill takes; any other set is a ``ConvertError``."""
     message = types_pb2.SkillCall.FromString(data)
     skill = _SKILLS.get(message.skill)
     if skill is None:
@@ -181,21 +177,27 @@ def plan_from_proto(messages: Iterable[types_pb2.SkillCall]) -> Plan:
     calls = tuple(messages)
     if len(calls) > MAX_STEPS:
         raise ConvertError("plan", f"has {len(calls)} steps: at most {MAX_STEPS} are executed")
-    return each("plan", skill_call_from_proto, calls)
+    return each_known("plan", _call_of, calls)
 
 
 def rollout_to_proto(rollout: Rollout) -> types_pb2.Rollout:
+    message = types_pb2.Rollout()
+    write_rollout(rollout, message)
+    return message
+
+
+def write_rollout(rollout: Rollout, message: types_pb2.Rollout) -> None:
+    """Fill an empty message. What came as a message is passed on as it came."""
     if rollout.wire:
-        return types_pb2.Rollout.FromString(rollout.wire)
-    return types_pb2.Rollout(
-        rollout_id=rollout.rollout_id,
-        group_id=rollout.group_id,
-        bundle_digest=rollout.bundle_digest,
-        task_id=rollout.task_id,
-        plan=plan_to_proto(rollout.plan),
-        seed=rollout.seed,
-        render=rollout.render,
-    )
+        message.MergeFromString(rollout.wire)
+        return
+    message.rollout_id = rollout.rollout_id
+    message.group_id = rollout.group_id
+    message.bundle_digest = rollout.bundle_digest
+    message.task_id = rollout.task_id
+    message.plan.extend(plan_to_proto(rollout.plan))
+    message.seed = rollout.seed
+    message.render = rollout.render
 
 
 def rollout_from_proto(message: types_pb2.Rollout) -> Rollout:
@@ -233,152 +235,3 @@ def _rollout_fields(wire: bytes) -> Mapping[str, object]:
         name: getattr(rollout, name)
         for name in ("rollout_id", "group_id", "task_id", "plan", "seed", "render")
     }
-
-
-def reward_to_proto(reward: RewardBreakdown) -> types_pb2.Reward:
-    return types_pb2.Reward(
-        format=reward.format,
-        relevance=reward.relevance,
-        goal=reward.goal,
-        atoms=[types_pb2.AtomResult(text=atom.text, holds=atom.holds) for atom in reward.atoms],
-        success=reward.success,
-    )
-
-
-def reward_from_proto(message: types_pb2.Reward) -> RewardBreakdown:
-    return RewardBreakdown(
-        format=finite("format", message.format),
-        relevance=finite("relevance", message.relevance),
-        goal=finite("goal", message.goal),
-        atoms=tuple(AtomResult(atom.text, atom.holds) for atom in message.atoms),
-        success=message.success,
-    )
-
-
-def step_to_proto(step: Step) -> types_pb2.StepResult:
-    failure = "" if step.failure is None else step.failure.value
-    return types_pb2.StepResult(call=skill_call_to_proto(step.call), failure=failure, message=step.message)
-
-
-def step_from_proto(message: types_pb2.StepResult) -> Step:
-    return _step_of(message.SerializeToString())
-
-
-@functools.lru_cache(KNOWN)
-def _step_of(data: bytes) -> Step:
-    message = types_pb2.StepResult.FromString(data)
-    call = inside("call", skill_call_from_proto, message.call)
-    return Step(call, _failure_reason(message.failure), message.message)
-
-
-def _failure_reason(text: str) -> FailureReason | None:
-    if not text:
-        return None
-    try:
-        return FailureReason(text)
-    except ValueError:
-        raise ConvertError("failure", f"{text!r} is no known failure reason") from None
-
-
-def timings_to_proto(timings: Timings) -> types_pb2.Timings:
-    return types_pb2.Timings(**{name: getattr(timings, name) for name in Timings.__slots__})
-
-
-def timings_from_proto(message: types_pb2.Timings) -> Timings:
-    return Timings(**{name: finite(name, getattr(message, name)) for name in Timings.__slots__})
-
-
-def completed_to_proto(completed: Completed) -> types_pb2.Completed:
-    message = types_pb2.Completed()
-    write_completed(completed, message)
-    return message
-
-
-def write_completed(completed: Completed, message: types_pb2.Completed) -> None:
-    """Fill an empty message. What came as a message is passed on as it came, but for what was noted on its way."""
-    if completed.wire:
-        message.MergeFromString(completed.wire)
-    else:
-        message.reward.CopyFrom(reward_to_proto(completed.reward))
-        message.steps.extend(step_to_proto(step) for step in completed.steps)
-        message.final_state.extend(completed.final)
-        message.trace_digest = completed.trace_digest
-    message.worker_id = completed.worker_id
-    message.timings.CopyFrom(timings_to_proto(completed.timings))
-    message.warm = completed.warm
-
-
-def completed_from_proto(message: types_pb2.Completed) -> Completed:
-    """The result. A missing reward is a ``ConvertError``, for it is no reward of 0."""
-    if not message.HasField("reward"):
-        raise ConvertError("reward", "is missing: a completed rollout has one")
-    completed = Completed(
-        reward=inside("reward", reward_from_proto, message.reward),
-        steps=each("steps", step_from_proto, message.steps),
-        final=tuple(message.final_state),
-        trace_digest=message.trace_digest,
-        worker_id=message.worker_id,
-        timings=inside("timings", timings_from_proto, message.timings),
-        warm=message.warm,
-    )
-    object.__setattr__(completed, "wire", message.SerializeToString())
-    return completed
-
-
-def unread_completed(wire: bytes, *, timings: Timings, warm: bool) -> Completed:
-    """The result in this message for whoever only passes it on: what else it says is found when it is read."""
-    return Completed.unread(wire, _completed_fields, timings=timings, warm=warm)
-
-
-def _completed_fields(wire: bytes) -> Mapping[str, object]:
-    completed = completed_from_proto(types_pb2.Completed.FromString(wire))
-    return {name: getattr(completed, name) for name in ("reward", "steps", "final", "trace_digest")}
-
-
-def infra_failure_to_proto(failure: InfraFailure) -> types_pb2.InfraFailure:
-    return types_pb2.InfraFailure(
-        code=_INFRA_CODES[failure.code], message=failure.message, worker_id=failure.worker_id
-    )
-
-
-def infra_failure_from_proto(message: types_pb2.InfraFailure) -> InfraFailure:
-    code = _INFRA_VALUES.get(message.code)
-    if code is None:
-        raise ConvertError("code", f"{message.code} is no known code: is the sender newer than this side?")
-    return InfraFailure(code, message.message, message.worker_id)
-
-
-def rollout_result_to_proto(result: RolloutResult) -> types_pb2.RolloutResult:
-    message = types_pb2.RolloutResult(
-        rollout_id=result.rollout_id, group_id=result.group_id, cursor=result.cursor, attempt=result.attempt
-    )
-    match result.outcome:
-        case Completed() as completed:
-            write_completed(completed, message.completed)
-        case InfraFailure() as failure:
-            message.infra_failure.CopyFrom(infra_failure_to_proto(failure))
-        case Cancelled() as cancelled:
-            message.cancelled.CopyFrom(types_pb2.Cancelled(reason=cancelled.reason))
-    return message
-
-
-def rollout_result_from_proto(message: types_pb2.RolloutResult) -> RolloutResult:
-    return RolloutResult(
-        rollout_id=required("rollout_id", message.rollout_id),
-        group_id=message.group_id,
-        cursor=message.cursor,
-        attempt=message.attempt,
-        outcome=_outcome(message),
-    )
-
-
-def _outcome(message: types_pb2.RolloutResult) -> Outcome:
-    match message.WhichOneof("outcome"):
-        case "completed":
-            return inside("completed", completed_from_proto, message.completed)
-        case "infra_failure":
-            return inside("infra_failure", infra_failure_from_proto, message.infra_failure)
-        case "cancelled":
-            return Cancelled(message.cancelled.reason)
-        case None:
-            raise ConvertError("outcome", "is missing: a result has exactly one")

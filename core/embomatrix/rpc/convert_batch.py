@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from embomatrix.proto.v1 import rollout_service_pb2
-from embomatrix.rpc.convert import ConvertError, each, required, rollout_from_proto, rollout_to_proto
+from embomatrix.rpc.convert import ConvertError, each, required, rollout_from_proto, write_rollout
 from embomatrix.rpc.values import Batch
 
 if TYPE_CHECKING:
@@ -13,12 +13,12 @@ if TYPE_CHECKING:
 
 
 def batch_to_proto(batch: Batch) -> rollout_service_pb2.ExecuteRequest:
-    return rollout_service_pb2.ExecuteRequest(
-        run_id=batch.run_id,
-        batch_id=batch.batch_id,
-        step=batch.step,
-        rollouts=[rollout_to_proto(rollout) for rollout in batch.rollouts],
+    message = rollout_service_pb2.ExecuteRequest(
+        run_id=batch.run_id, batch_id=batch.batch_id, step=batch.step
     )
+    for rollout in batch.rollouts:
+        write_rollout(rollout, message.rollouts.add())
+    return message
 
 
 def batch_from_proto(message: rollout_service_pb2.ExecuteRequest) -> Batch:

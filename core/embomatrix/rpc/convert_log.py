@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.proto.v1 import admin_service_pb2 as pb
-from embomatrix.rpc.convert import ConvertError, each, finite, inside, timings_from_proto, timings_to_proto
+from embomatrix.rpc.convert import ConvertError, each, finite, inside
+from embomatrix.rpc.convert_outcome import timings_from_proto, timings_to_proto
 from embomatrix.rpc.convert_session import run_info_from_proto, run_info_to_proto
 from embomatrix.rpc.run_log import (
     EventKind,

@@ -5,17 +5,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.proto.v1 import admin_service_pb2, types_pb2, worker_service_pb2
-from embomatrix.rpc.convert import (
-    ConvertError,
-    completed_from_proto,
-    each,
-    finite,
+from embomatrix.rpc.convert import ConvertError, each, finite, inside, required, unread_rollout, write_rollout
+from embomatrix.rpc.convert_outcome import (
+    checked_completed,
     infra_failure_from_proto,
     infra_failure_to_proto,
-    inside,
-    required,
-    rollout_to_proto,
-    unread_rollout,
     write_completed,
 )
 from embomatrix.rpc.convert_run import (
@@ -159,13 +153,24 @@ def lease_claim_from_proto(message: worker_service_pb2.LeaseClaim) -> LeaseClaim
 
 
 def lease_to_proto(lease: Lease) -> worker_service_pb2.Lease:
-    return worker_service_pb2.Lease(
-        ref=lease_ref_to_proto(lease.ref),
-        rollout=rollout_to_proto(lease.rollout),
-        deadline_s=lease.deadline_s,
-        origin=None if lease.origin is None else lease_origin_to_proto(lease.origin),
-        reward=reward_settings_to_proto(lease.reward),
-    )
+    message = worker_service_pb2.Lease()
+    write_lease(lease, message)
+    return message
+
+
+def write_lease(lease: Lease, message: worker_service_pb2.Lease) -> None:
+    """Fill an empty message, such as one that was just added to a longer one: that spares a copy."""
+    ref = message.ref
+    ref.lease_id, ref.lease_epoch = lease.ref.lease_id, lease.ref.lease_epoch
+    write_rollout(lease.rollout, message.rollout)
+    message.deadline_s = lease.deadline_s
+    if lease.origin is not None:
+        told, origin = message.origin, lease.origin
+        told.run_id, told.batch_id = origin.run_id, origin.batch_id
+        told.rollout_id, told.attempt = origin.rollout_id, origin.attempt
+    own = reward_settings_to_proto(lease.reward)
+    if own is not None:
+        message.reward.CopyFrom(own)
 
 
 def lease_from_proto(message: worker_service_pb2.Lease) -> Lease:
@@ -186,15 +191,21 @@ def lease_from_proto(message: worker_service_pb2.Lease) -> Lease:
 
 
 def lease_result_to_proto(result: LeaseResult) -> worker_service_pb2.LeaseResult:
-    message = worker_service_pb2.LeaseResult(
-        lease=lease_ref_to_proto(result.ref), slot=result.slot, held_s=result.held_s
-    )
+    message = worker_service_pb2.LeaseResult()
+    write_lease_result(result, message)
+    return message
+
+
+def write_lease_result(result: LeaseResult, message: worker_service_pb2.LeaseResult) -> None:
+    """Fill an empty message, as ``write_lease`` does."""
+    ref = message.lease
+    ref.lease_id, ref.lease_epoch = result.ref.lease_id, result.ref.lease_epoch
+    message.slot, message.held_s = result.slot, result.held_s
     match result.outcome:
         case Completed() as completed:
             write_completed(completed, message.completed)
         case InfraFailure() as failure:
             message.infra_failure.CopyFrom(infra_failure_to_proto(failure))
-    return message
 
 
 def lease_result_from_proto(message: worker_service_pb2.LeaseResult) -> LeaseResult:
@@ -202,7 +213,7 @@ def lease_result_from_proto(message: worker_service_pb2.LeaseResult) -> LeaseRes
     outcome: Completed | InfraFailure
     match message.WhichOneof("outcome"):
         case "completed":
-            outcome = inside("completed", completed_from_proto, message.completed)
+            outcome = inside("completed", checked_completed, message.completed)
         case "infra_failure":
             outcome = inside("infra_failure", infra_failure_from_proto, message.infra_failure)
         case None:

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
-from embomatrix.proto.v1 import rollout_service_pb2
+from embomatrix.rpc.values import Cancelled, Completed, GroupDone, InfraFailure
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from embomatrix.proto.v1 import types_pb2
-    from embomatrix.rpc.values import Batch
+    from embomatrix.manager.store.protocol import ResultRow
+    from embomatrix.rpc.values import Batch, Outcome
+
+_PLACE: Final[Mapping[type[Outcome], int]] = {Completed: 0, InfraFailure: 1, Cancelled: 2}
+"""Where each kind of outcome stands among the counts of a group, in the order of `GroupDone`."""
 
 
 def group_sizes(batch: Batch) -> dict[str, int]:
@@ -27,24 +30,21 @@ class GroupEnds:
 
     def __init__(self, sizes: Mapping[str, int]) -> None:
         self._sizes = sizes
-        self._counts: dict[str, rollout_service_pb2.GroupDone] = {}
+        self._counts: dict[str, list[int]] = {}
+        """Of the groups that have begun and not ended."""
+        self._ended: dict[int, GroupDone] = {}
+        """By the cursor of the result that ended each."""
 
-    def take(self, results: Iterable[types_pb2.RolloutResult]) -> list[rollout_service_pb2.GroupDone]:
+    def take(self, cursor: int, group_id: str, outcome: type[Outcome]) -> None:
+        """The next result in the order of cursors."""
+        counts = self._counts.get(group_id)
+        if counts is None:
+            counts = self._counts[group_id] = [0, 0, 0]
+        counts[_PLACE[outcome]] += 1
+        if sum(counts) == self._sizes.get(group_id):
+            del self._counts[group_id]
+            self._ended[cursor] = GroupDone(group_id, *counts)
+
+    def among(self, rows: Iterable[ResultRow]) -> list[GroupDone]:
         """The groups that end with these results."""
-        ended: list[rollout_service_pb2.GroupDone] = []
-        for result in results:
-            group = self._counts.get(result.group_id)
-            if group is None:
-                group = self._counts[result.group_id] = rollout_service_pb2.GroupDone(
-                    group_id=result.group_id
-                )
-            match result.WhichOneof("outcome"):
-                case "completed":
-                    group.completed += 1
-                case "infra_failure":
-                    group.infra_failures += 1
-                case "cancelled":
-                    group.cancelled += 1
-            if group.completed + group.infra_failures + group.cancelled == self._sizes.get(result.group_id):
-                ended.append(group)
-        return ended
+        return [self._ended[row.cursor] for row in rows if row.cursor in self._ended]

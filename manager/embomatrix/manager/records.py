@@ -4,21 +4,35 @@ from __future__ import annotations
 
 import hashlib
 import json
+import struct
 from dataclasses import asdict
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.auditor import Repute
 from embomatrix.manager.store.protocol import BatchRow, ResultRow, ShelfRow
 from embomatrix.proto.v1 import rollout_service_pb2, types_pb2
-from embomatrix.rpc.convert import rollout_result_to_proto
 from embomatrix.rpc.convert_batch import batch_from_proto, batch_to_proto
+from embomatrix.rpc.convert_outcome import rollout_result_to_proto
 from embomatrix.rpc.convert_run import run_terms_from_proto, run_terms_to_proto
+from embomatrix.rpc.values import Cancelled, Completed, InfraFailure
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
 
     from embomatrix.manager.store.protocol import RunRow
-    from embomatrix.rpc.values import Batch, RolloutResult, RunTerms
+    from embomatrix.rpc.values import Batch, Outcome, RolloutResult, RunTerms
+
+_KINDS: Final[Mapping[str, type[Outcome]]] = {
+    "completed": Completed,
+    "infra_failure": InfraFailure,
+    "cancelled": Cancelled,
+}
+"""By the name of the field that has it."""
+_DOUBLE: Final = struct.Struct("<d")
+_DELIVERED: Final = types_pb2.RolloutResult(
+    completed=types_pb2.Completed(timings=types_pb2.Timings(deliver_s=1.0))
+).SerializeToString()[: -_DOUBLE.size]
+"""What stands before the number in a message that tells nothing but how long a delivery took."""
 
 
 def batch_row(batch: Batch) -> BatchRow:
@@ -41,15 +55,19 @@ def result_row(result: RolloutResult) -> ResultRow:
     return ResultRow(result.cursor, result.rollout_id, rollout_result_to_proto(result).SerializeToString())
 
 
+def group_and_kind(row: ResultRow) -> tuple[str, type[Outcome]]:
+    """Of which group the rollout was, and what kind of outcome it had."""
+    message = types_pb2.RolloutResult.FromString(row.payload)
+    return message.group_id, _KINDS[message.WhichOneof("outcome") or "cancelled"]
+
+
 def timed_row(row: ResultRow, deliver_s: float) -> ResultRow:
     """A completed rollout's row with how long its way into the log took: known only then, so the store's row lacks it.
 
     Bytes of the same message that follow one another are one message (protobuf, "last one wins", merging nested ones),
     so a row of kilobytes isn't parsed for one number.
     """
-    timed = types_pb2.Completed(timings=types_pb2.Timings(deliver_s=deliver_s))
-    told = types_pb2.RolloutResult(completed=timed).SerializeToString()
-    return ResultRow(row.cursor, row.rollout_id, row.payload + told)
+    return ResultRow(row.cursor, row.rollout_id, row.payload + _DELIVERED + _DOUBLE.pack(deliver_s))
 
 
 def repute_row(worker_id: str, repute: Repute) -> ShelfRow:

@@ -7,6 +7,8 @@ import bisect
 import contextlib
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.manager.group_ends import GroupEnds
+
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
@@ -32,12 +34,13 @@ class BatchLog:
         rows: Sequence[ResultRow] = (),
         groups: Mapping[str, int] | None = None,
     ) -> None:
+        """``groups`` tells how many rollouts each has."""
         self.run_id = run_id
         self.batch_id = batch_id
         self.digest = digest
         self.rows = list(rows)
-        self.groups = groups or {}
-        """How many rollouts each group has."""
+        self.ends = GroupEnds(groups or {})
+        """Told of each result before it is appended."""
         self.finished_s: float | None = None
         """When every rollout had its outcome; None before."""
         self.dropped = False
@@ -81,10 +84,6 @@ class BatchLog:
     def last_cursor(self) -> int:
         """Of the newest result; 0 before the first."""
         return self.rows[-1].cursor if self.rows else 0
-
-    def until(self, cursor: int) -> Sequence[ResultRow]:
-        """The results up to the cursor and with it."""
-        return self.rows[: self._position(cursor)]
 
     def _position(self, cursor: int) -> int:
         return bisect.bisect_right(self.rows, cursor, key=lambda row: row.cursor)

@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from embomatrix.manager.rest import PREFIX, answered
 from embomatrix.proto.v1 import types_pb2
 from embomatrix.reward.hierarchy import unparsable
-from embomatrix.rpc.convert import rollout_result_from_proto
+from embomatrix.rpc.convert_outcome import rollout_result_from_proto
 from embomatrix.rpc.reward_label import RewardLabel, answer_in
 from embomatrix.rpc.status import InvalidRequestError, UnavailableError
 from embomatrix.rpc.values import Batch, Completed, GroupPolicy, Rollout, RunTerms

@@ -18,7 +18,14 @@ from embomatrix.manager.events import (
     WorkersExpected,
 )
 from embomatrix.manager.group_ends import group_sizes
-from embomatrix.manager.records import batch_of, batch_row, failed_rows, terms_of, terms_payload
+from embomatrix.manager.records import (
+    batch_of,
+    batch_row,
+    failed_rows,
+    group_and_kind,
+    terms_of,
+    terms_payload,
+)
 from embomatrix.manager.results import BatchLog
 from embomatrix.manager.store.protocol import PutOutcome, RunRow, StateError, StateFullError
 from embomatrix.manager.submissions import Submissions
@@ -109,6 +116,8 @@ class Runs:
                 while page := await self._store.results_after(
                     run.run_id, row.batch_id, log.last_cursor, PAGE
                 ):
+                    for result in page:
+                        log.ends.take(result.cursor, *group_and_kind(result))
                     log.append(page)
                 self._logs.add(log)
                 delivered = {result.rollout_id: result.cursor for result in log.rows}

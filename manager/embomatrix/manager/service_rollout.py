@@ -6,12 +6,12 @@ import asyncio
 import time
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.manager.group_ends import GroupEnds
 from embomatrix.proto.v1 import rollout_service_pb2 as pb
-from embomatrix.proto.v1 import rollout_service_pb2_grpc, types_pb2
+from embomatrix.proto.v1 import rollout_service_pb2_grpc
 from embomatrix.rpc.convert import each, rollout_from_proto
 from embomatrix.rpc.convert_batch import batch_with
 from embomatrix.rpc.convert_run import (
+    group_done_to_proto,
     lookahead_answer_to_proto,
     lookahead_entry_from_proto,
     run_stats_to_proto,
@@ -86,9 +86,11 @@ class RolloutServicer(rollout_service_pb2_grpc.RolloutServiceServicer):
             bind("run", request.run_id)
             bind("batch", request.batch_id)
             log = await self._runs.submit(await _batch(request))
-            async for results, groups in _results(log, 0):
+            async for rows in _results(log, 0):
                 self._gate.caller_of(context)  # a token that was revoked meanwhile reads nothing more
-                yield pb.ExecuteResponse(results=results, groups=groups)
+                message = pb.ExecuteResponse()
+                _tell(log, rows, message)
+                yield message
 
     async def WaitExecution(
         self, request: pb.WaitExecutionRequest, context: grpc.aio.ServicerContext
@@ -97,9 +99,11 @@ class RolloutServicer(rollout_service_pb2_grpc.RolloutServiceServicer):
             bind("run", request.run_id)
             bind("batch", request.batch_id)
             log = self._runs.log_of(request.run_id, request.batch_id)
-            async for results, groups in _results(log, request.after_cursor):
+            async for rows in _results(log, request.after_cursor):
                 self._gate.caller_of(context)
-                yield pb.WaitExecutionResponse(results=results, groups=groups)
+                message = pb.WaitExecutionResponse()
+                _tell(log, rows, message)
+                yield message
 
     async def CancelBatch(
         self, request: pb.CancelBatchRequest, context: grpc.aio.ServicerContext
@@ -140,23 +144,23 @@ async def _batch(request: pb.ExecuteRequest) -> Batch:
     return batch_with(request, tuple(rollouts))
 
 
-async def _results(
-    log: BatchLog, cursor: int
-) -> AsyncIterator[tuple[list[types_pb2.RolloutResult], list[pb.GroupDone]]]:
-    """All results beyond the cursor, as they come, to the end of the batch, and the groups that end with each."""
+async def _results(log: BatchLog, cursor: int) -> AsyncIterator[list[ResultRow]]:
+    """All results beyond the cursor, as they come, to the end of the batch."""
     if cursor > log.last_cursor and log.ended:
         raise TrimmedError(
             f"batch {log.batch_id!r} ends at cursor {log.last_cursor}: {cursor} lies beyond it"
         )
-    ends = GroupEnds(log.groups)
-    ends.take(_messages(log.until(cursor)))
     while rows := await log.after(cursor):
         cursor = rows[-1].cursor
-        results = _messages(rows)
-        yield results, ends.take(results)
+        yield rows
     if log.dropped:
         raise NotFoundError(f"batch {log.batch_id!r} is no longer kept: its run was closed")
 
 
-def _messages(rows: Sequence[ResultRow]) -> list[types_pb2.RolloutResult]:
-    return [types_pb2.RolloutResult.FromString(row.payload) for row in rows]
+def _tell(
+    log: BatchLog, rows: Sequence[ResultRow], message: pb.ExecuteResponse | pb.WaitExecutionResponse
+) -> None:
+    """Fill an empty message with these results, as they are kept, and with the groups that end among them."""
+    for row in rows:
+        message.results.add().MergeFromString(row.payload)
+    message.groups.extend(map(group_done_to_proto, log.ends.among(rows)))

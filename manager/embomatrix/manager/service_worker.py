@@ -13,11 +13,10 @@ from embomatrix.rpc.convert import each, inside
 from embomatrix.rpc.convert_session import (
     lease_progress_from_proto,
     lease_ref_from_proto,
-    lease_ref_to_proto,
     lease_result_from_proto,
-    lease_to_proto,
     resources_from_proto,
     worker_state_from_proto,
+    write_lease,
 )
 from embomatrix.rpc.logs import bind
 from embomatrix.rpc.status import (
@@ -30,13 +29,14 @@ from embomatrix.rpc.status import (
 from embomatrix.rpc.versions import SPOKEN, VersionRange, agree
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Coroutine
+    from collections.abc import AsyncIterator, Coroutine, Sequence
 
     import grpc
 
     from embomatrix.manager.access.gate import Gate
     from embomatrix.manager.links import Outbox, WorkerLink
     from embomatrix.manager.runtime import ManagerRuntime
+    from embomatrix.rpc.leases import Lease
 
 FIRST_STATE_S: Final = 10.0
 """A session stream must begin with the worker's state within this time."""
@@ -153,22 +153,25 @@ async def _speak(link: WorkerLink, context: grpc.aio.ServicerContext) -> None:
 
 def _messages(outbox: Outbox) -> list[pb.SessionResponse]:
     """The outbox in messages of bounded size: leases carry plans."""
-    head = pb.SessionResponse(
-        leases=[lease_to_proto(lease) for lease in outbox.leases[:LEASES_PER_MESSAGE]],
-        acknowledged=[lease_ref_to_proto(ref) for ref in outbox.acknowledged],
-        cancelled=[lease_ref_to_proto(ref) for ref in outbox.cancelled],
-        drain=outbox.drain,
-        resume=outbox.resume,
-    )
+    leases = outbox.leases
+    parts = [leases[at : at + LEASES_PER_MESSAGE] for at in range(0, len(leases), LEASES_PER_MESSAGE)]
+    messages = [_with_leases(part) for part in parts] or [pb.SessionResponse()]
+    head = messages[0]
+    for ref in outbox.acknowledged:
+        head.acknowledged.add(lease_id=ref.lease_id, lease_epoch=ref.lease_epoch)
+    for ref in outbox.cancelled:
+        head.cancelled.add(lease_id=ref.lease_id, lease_epoch=ref.lease_epoch)
+    head.drain, head.resume = outbox.drain, outbox.resume
     if outbox.desired is not None:
         head.desired.CopyFrom(pb.DesiredResidents(bundle_digests=outbox.desired))
-    rest = outbox.leases[LEASES_PER_MESSAGE:]
-    return [head] + [
-        pb.SessionResponse(
-            leases=[lease_to_proto(lease) for lease in rest[start : start + LEASES_PER_MESSAGE]]
-        )
-        for start in range(0, len(rest), LEASES_PER_MESSAGE)
-    ]
+    return messages
+
+
+def _with_leases(leases: Sequence[Lease]) -> pb.SessionResponse:
+    message = pb.SessionResponse()
+    for lease in leases:
+        write_lease(lease, message.leases.add())
+    return message
 
 
 async def _first_state(requests: AsyncIterator[pb.SessionRequest]) -> pb.SessionRequest:

@@ -1,6 +1,7 @@
 """What the manager keeps: result logs, bundles, figures; and the settings it is started with."""
 
 import asyncio
+import dataclasses
 import hashlib
 import os
 import zlib
@@ -14,11 +15,14 @@ from typer.testing import CliRunner
 from embomatrix.manager.bundles import BundleStore
 from embomatrix.manager.cli import app
 from embomatrix.manager.meter import Meter, quantile
+from embomatrix.manager.records import group_and_kind, result_row, timed_row
 from embomatrix.manager.results import PER_MESSAGE, BatchLog, ResultLogs
 from embomatrix.manager.settings import ManagerSettings
 from embomatrix.manager.store.protocol import ResultRow
+from embomatrix.proto.v1.types_pb2 import RolloutResult as RolloutResultMessage
+from embomatrix.rpc.convert_outcome import rollout_result_from_proto
 from embomatrix.rpc.status import InvalidRequestError, NotFoundError, OverloadedError
-from embomatrix.rpc.values import Cancelled, InfraCode, InfraFailure, RolloutResult
+from embomatrix.rpc.values import Cancelled, Completed, GroupDone, InfraCode, InfraFailure, RolloutResult
 from embomatrix.world.bundle import decode_bundle
 from embomatrix.world.inflation import BundleError
 
@@ -62,6 +66,25 @@ async def test_a_message_takes_what_came_while_it_lingered_and_no_more_than_it_c
     log.append(rows(2, PER_MESSAGE + 100))
     assert [row.cursor for row in await reader] == list(range(1, PER_MESSAGE + 1))
     assert len(await log.after(PER_MESSAGE + 90)) == 10
+
+
+def test_a_group_ends_with_its_last_result_from_whatever_cursor_one_reads():
+    log = BatchLog("r1", "b1", "d", groups={"g1": 3, "g2": 1})
+    outcomes = (("g1", Completed), ("g2", Cancelled), ("g1", InfraFailure), ("g1", Completed))
+    for cursor, (group_id, kind) in enumerate(outcomes, start=1):
+        log.ends.take(cursor, group_id, kind)
+    assert log.ends.among(rows(1, 4)) == [GroupDone("g2", cancelled=1), GroupDone("g1", 2, 1)]
+    assert log.ends.among(rows(3, 4)) == [GroupDone("g1", 2, 1)]
+    assert log.ends.among(rows(3, 3)) == []
+
+
+def test_a_row_tells_how_long_its_delivery_took_beside_what_it_told():
+    result = RolloutResult("x1", "g1", 1, 1, completed())
+    row = timed_row(result_row(result), 0.25)
+    told = rollout_result_from_proto(RolloutResultMessage.FromString(row.payload))
+    timings = dataclasses.replace(result.outcome.timings, deliver_s=0.25)
+    assert told == dataclasses.replace(result, outcome=dataclasses.replace(result.outcome, timings=timings))
+    assert group_and_kind(row) == ("g1", Completed)
 
 
 async def test_a_dropped_log_lets_its_readers_go():

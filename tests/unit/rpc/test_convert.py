@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from embomatrix.proto.v1 import rollout_service_pb2, types_pb2
 from embomatrix.reward.breakdown import AtomResult, RewardBreakdown
-from embomatrix.rpc import convert, convert_batch, convert_run, convert_session
+from embomatrix.rpc import convert, convert_batch, convert_outcome, convert_run, convert_session
 from embomatrix.rpc.convert import ConvertError
 from embomatrix.rpc.values import (
     Batch,
@@ -121,17 +121,17 @@ def test_a_batch_comes_back_equal(rollouts, name, step):
 
 @given(RESULTS)
 def test_a_result_comes_back_equal_whatever_its_outcome(result):
-    message = _over_the_wire(convert.rollout_result_to_proto(result))
-    assert convert.rollout_result_from_proto(message) == result
+    message = _over_the_wire(convert_outcome.rollout_result_to_proto(result))
+    assert convert_outcome.rollout_result_from_proto(message) == result
 
 
 @given(COMPLETED, NUMBERS, NAMES, st.booleans())
 def test_a_result_that_is_passed_on_says_what_was_noted_on_its_way(completed, queued_s, worker_id, warm):
-    message = _over_the_wire(convert.completed_to_proto(completed))
+    message = _over_the_wire(convert_outcome.completed_to_proto(completed))
     timings = Timings(queued_s, completed.timings.load_s, completed.timings.execute_s)
-    came = convert.completed_from_proto(message)
+    came = convert_outcome.completed_from_proto(message)
     noted = came.noted(timings=timings, worker_id=worker_id, warm=warm)
-    passed = convert.completed_from_proto(_over_the_wire(convert.completed_to_proto(noted)))
+    passed = convert_outcome.completed_from_proto(_over_the_wire(convert_outcome.completed_to_proto(noted)))
     assert passed == noted == dataclasses.replace(completed, timings=timings, worker_id=worker_id, warm=warm)
 
 
@@ -139,12 +139,14 @@ def test_a_result_that_is_passed_on_says_what_was_noted_on_its_way(completed, qu
 def test_a_result_that_nobody_looked_at_is_passed_on_like_one_that_was_read(
     completed, load_s, worker_id, warm
 ):
-    message = convert.completed_to_proto(completed)
+    message = convert_outcome.completed_to_proto(completed)
     timings = Timings(load_s=load_s)
-    unread = convert.unread_completed(message.SerializeToString(), timings=timings, warm=not warm)
+    unread = convert_outcome.unread_completed(message.SerializeToString(), timings=timings, warm=not warm)
     noted = unread.noted(worker_id=worker_id, warm=warm)
-    read = convert.completed_from_proto(message).noted(timings=timings, worker_id=worker_id, warm=warm)
-    assert convert.completed_to_proto(noted) == convert.completed_to_proto(read)
+    read = convert_outcome.completed_from_proto(message).noted(
+        timings=timings, worker_id=worker_id, warm=warm
+    )
+    assert convert_outcome.completed_to_proto(noted) == convert_outcome.completed_to_proto(read)
     assert (noted.timings, noted.worker_id, noted.warm) == (timings, worker_id, warm)
     assert noted == read  # and now it was looked at
 
@@ -160,7 +162,7 @@ def test_a_rollout_that_nobody_looked_at_is_passed_on_like_one_that_was_read(rol
 
 
 def test_what_can_not_be_read_is_told_when_somebody_looks():
-    unread = convert.unread_completed(
+    unread = convert_outcome.unread_completed(
         types_pb2.Completed(trace_digest="t").SerializeToString(), timings=Timings(), warm=True
     )
     with pytest.raises(ConvertError, match="reward: is missing"):
@@ -289,19 +291,56 @@ def test_two_rollouts_of_one_id_are_refused():
 
 def test_a_result_without_an_outcome_is_refused():
     with pytest.raises(ConvertError, match="outcome: is missing"):
-        convert.rollout_result_from_proto(types_pb2.RolloutResult(rollout_id="r"))
+        convert_outcome.rollout_result_from_proto(types_pb2.RolloutResult(rollout_id="r"))
 
 
 def test_a_completed_rollout_without_a_reward_is_refused_instead_of_scored_zero():
     message = types_pb2.RolloutResult(rollout_id="r", completed=types_pb2.Completed(trace_digest="x"))
     with pytest.raises(ConvertError, match=r"completed\.reward: is missing"):
-        convert.rollout_result_from_proto(message)
+        convert_outcome.rollout_result_from_proto(message)
 
 
-def test_an_unknown_failure_reason_is_refused():
-    message = types_pb2.StepResult(call=MOVE, failure="gave_up")
-    with pytest.raises(ConvertError, match="failure: 'gave_up' is no known failure reason"):
-        convert.step_from_proto(message)
+def whole(**changed):
+    fields = {"reward": types_pb2.Reward(format=0.5), "steps": [types_pb2.StepResult(call=MOVE)], **changed}
+    return types_pb2.Completed(**fields)
+
+
+@pytest.mark.parametrize("read", [convert_outcome.completed_from_proto, convert_outcome.checked_completed])
+@pytest.mark.parametrize(
+    ("message", "problem"),
+    [
+        (whole(reward=None), "reward: is missing"),
+        (whole(reward=types_pb2.Reward(goal=math.nan)), "reward.goal: is nan"),
+        (whole(timings=types_pb2.Timings(load_s=math.inf)), "timings.load_s: is inf"),
+        (
+            whole(timings=types_pb2.Timings(load_s=-math.inf, lease_s=math.inf)),
+            "timings.load_s: is -inf",
+        ),
+        (
+            whole(
+                steps=[types_pb2.StepResult(call=MOVE), types_pb2.StepResult(call=MOVE, failure="gave_up")]
+            ),
+            r"steps\[1\].failure: 'gave_up' is no known failure reason",
+        ),
+        (whole(steps=[types_pb2.StepResult()]), r"steps\[0\].call.skill: 0 is no known skill"),
+    ],
+)
+def test_a_malformed_result_is_refused_by_whoever_reads_it_and_by_whoever_passes_it_on(
+    read, message, problem
+):
+    with pytest.raises(ConvertError, match=problem):
+        read(message)
+
+
+def test_timings_of_which_only_the_sum_is_too_large_are_taken():
+    timings = types_pb2.Timings(queued_s=1.7e308, execute_s=1.7e308)
+    assert convert_outcome.timings_from_proto(timings) == Timings(queued_s=1.7e308, execute_s=1.7e308)
+
+
+@given(COMPLETED)
+def test_a_result_that_was_only_checked_says_the_same_when_somebody_looks(completed):
+    message = convert_outcome.completed_to_proto(completed)
+    assert convert_outcome.checked_completed(message) == completed
 
 
 def test_a_worker_without_slots_is_refused():

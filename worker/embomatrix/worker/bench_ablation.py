@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.pages.figures import Better, Figure
-from embomatrix.worker.bench_cpu import cpu_use
+from embomatrix.worker.bench_cpu import CpuWatch
 from embomatrix.worker.bench_one_process import cached_s, naive
 from embomatrix.worker.bench_processes import bench_cluster
 from embomatrix.worker.bench_stepping import Stepping, take_steps
@@ -139,9 +139,9 @@ def _round(work: Work, sizes: AblationSizes) -> tuple[Pushed, CpuUse, Pushed]:
             async with trainer_on(cluster, work.bundles, deadline_s - time.monotonic()) as trainer:
                 await trainer.warm_up(work.rollouts)
                 await trainer.push(work.first(sizes.warm).rollouts)
-                before = cpu_use(cluster)
+                watch = CpuWatch(cluster)
                 pushed = await trainer.push(work.after(sizes.warm).rollouts)
-                used = cpu_use(cluster).since(before)
+                used = watch.used()
                 return pushed, used, await trainer.push_singly(work.sample(sizes.singly))
 
         return asyncio.run(measure())

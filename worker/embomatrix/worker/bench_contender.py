@@ -9,7 +9,8 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from embomatrix.proto.v1 import types_pb2
-from embomatrix.rpc.convert import completed_from_proto, rollout_to_proto
+from embomatrix.rpc.convert import rollout_to_proto
+from embomatrix.rpc.convert_outcome import completed_from_proto
 from embomatrix.worker.bench_figures import BenchError
 
 if TYPE_CHECKING:

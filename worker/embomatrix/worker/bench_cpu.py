@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -23,7 +25,7 @@ SLOT_DEPTH: Final = 3
 
 @dataclass(frozen=True, slots=True)
 class CpuUse:
-    """Seconds of processor time since the processes began."""
+    """Seconds of processor time."""
 
     slots_s: float
     manager_s: float
@@ -32,15 +34,6 @@ class CpuUse:
     trainer_s: float
     """Of this process, which submits and takes the results."""
 
-    def since(self, before: CpuUse) -> CpuUse:
-        """What was used between two readings."""
-        return CpuUse(
-            self.slots_s - before.slots_s,
-            self.manager_s - before.manager_s,
-            self.daemons_s - before.daemons_s,
-            self.trainer_s - before.trainer_s,
-        )
-
     @property
     def overhead(self) -> float:
         """Share of all processor time that was spent outside the slots."""
@@ -48,47 +41,69 @@ class CpuUse:
         return outside_s / (outside_s + self.slots_s)
 
 
-def cpu_use(cluster: BenchCluster) -> CpuUse:
-    """Read it now. Slots that have ended are not counted: none ends while undisturbed work goes on."""
-    manager, *daemons = (psutil.Process(process.child.pid) for process in cluster.processes)
+class CpuWatch:
+    """Processor time from its making on. What looking costs this process is left out: it takes as much as hundreds of results.
+
+    Slots that have ended are not counted: none ends while undisturbed work goes on.
+    """
+
+    def __init__(self, cluster: BenchCluster) -> None:
+        self._cluster = cluster
+        self._before = _others_s(cluster)
+        self._own_s = time.process_time()
+
+    def used(self) -> CpuUse:
+        """Until now."""
+        own_s = time.process_time() - self._own_s
+        others_s = zip(_others_s(self._cluster), self._before, strict=True)
+        slots_s, manager_s, daemons_s = (after_s - before_s for after_s, before_s in others_s)
+        return CpuUse(slots_s, manager_s, daemons_s, own_s)
+
+
+def descendants_cpu_s() -> float:
+    """Processor time of all that descend from this process and live, in seconds."""
+    return sum(_seconds(process) for process, depth in _tree(os.getpid()) if depth)
+
+
+def _others_s(cluster: BenchCluster) -> tuple[float, float, float]:
+    """Seconds of slots, manager, and daemons."""
+    manager, *daemons = (process.child.pid for process in cluster.processes)
     slots_s = daemons_s = 0.0
     for daemon in daemons:
-        for process, depth in _tree(daemon, 0):
-            with contextlib.suppress(psutil.Error):
-                if depth >= SLOT_DEPTH:
-                    slots_s += _seconds(process)
-                else:
-                    daemons_s += _seconds(process)
-    return CpuUse(slots_s, _seconds(manager), daemons_s, _seconds(psutil.Process()))
-
-
-def family_cpu_s() -> float:
-    """Processor time of this process and of all that descend from it and live, in seconds."""
-    used_s = 0.0
-    for process, _ in _tree(psutil.Process(), 0):
-        with contextlib.suppress(psutil.Error):
-            used_s += _seconds(process)
-    return used_s
+        for process, depth in _tree(daemon):
+            if depth >= SLOT_DEPTH:
+                slots_s += _seconds(process)
+            else:
+                daemons_s += _seconds(process)
+    return slots_s, _seconds(psutil.Process(manager)), daemons_s
 
 
 def running_slot(cluster: BenchCluster) -> int:
     """Process id of a slot that executes now. Raises BenchError when there is none."""
     for _ in range(TRIES):
         for worker in cluster.processes[1:]:
-            for process, depth in _tree(psutil.Process(worker.child.pid), 0):
+            for process, depth in _tree(worker.child.pid):
                 with contextlib.suppress(psutil.Error):
                     if depth >= SLOT_DEPTH and process.status() == psutil.STATUS_RUNNING:
                         return int(process.pid)
     raise BenchError("no slot is at work that could be killed: expected one that executes")
 
 
-def _tree(process: psutil.Process, depth: int) -> Iterator[tuple[psutil.Process, int]]:
-    yield process, depth
-    with contextlib.suppress(psutil.Error):
-        for child in process.children():
-            yield from _tree(child, depth + 1)
+def _tree(root: int) -> Iterator[tuple[psutil.Process, int]]:
+    """A process and all that descend from it, each with how far: by one look at the system's processes."""
+    children: dict[int, list[psutil.Process]] = {}
+    for process in psutil.process_iter(["ppid"]):
+        children.setdefault(process.info["ppid"], []).append(process)
+    found = [(psutil.Process(root), 0)]
+    while found:
+        process, depth = found.pop()
+        yield process, depth
+        found += [(child, depth + 1) for child in children.get(process.pid, ())]
 
 
 def _seconds(process: psutil.Process) -> float:
-    times = process.cpu_times()
-    return float(times.user + times.system)
+    """0 of one that has ended."""
+    with contextlib.suppress(psutil.Error):
+        times = process.cpu_times()
+        return float(times.user + times.system)
+    return 0.0

@@ -19,7 +19,7 @@ import psutil
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.convert import rollout_from_proto, rollout_to_proto
-from embomatrix.worker.bench_cpu import cpu_use
+from embomatrix.worker.bench_cpu import CpuWatch
 from embomatrix.worker.bench_figures import quantile
 from embomatrix.worker.bench_hollow import hollow_worker
 from embomatrix.worker.bench_processes import bench_cluster
@@ -85,11 +85,12 @@ async def _measure(
         await trainer.warm_up(work.rollouts)
         await trainer.push(_repeated(work, sizes.in_flight // 4))
         on_step(f"{sizes.in_flight} rollouts in flight")
-        before, first = cpu_use(cluster), len(worker.waits_s)
-        started_s = time.perf_counter()
-        count = await _flow(trainer, [_repeated(work, sizes.in_flight)] * sizes.batches)
-        wall_s, used = time.perf_counter() - started_s, cpu_use(cluster).since(before)
-        waits_s = tuple(worker.waits_s[first:])
+        batches = [_repeated(work, sizes.in_flight)] * sizes.batches
+        worker.begin()
+        watch, started_s = CpuWatch(cluster), time.perf_counter()
+        count = await _flow(trainer, batches)
+        wall_s, used = time.perf_counter() - started_s, watch.used()
+        waits_s = tuple(worker.waits_s)
         worker.answering.clear()
         rss_mb = await _memory(cluster, trainer, work, sizes, on_step)
     return Flow(count, wall_s, used.manager_s, waits_s, rss_mb)

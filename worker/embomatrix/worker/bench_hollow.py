@@ -15,7 +15,7 @@ from embomatrix.proto.v1 import worker_service_pb2 as pb
 from embomatrix.proto.v1 import worker_service_pb2_grpc
 from embomatrix.reward.breakdown import AtomResult, RewardBreakdown
 from embomatrix.rpc.channel import open_channel
-from embomatrix.rpc.convert import completed_from_proto, completed_to_proto
+from embomatrix.rpc.convert_outcome import completed_from_proto, completed_to_proto
 from embomatrix.rpc.convert_session import (
     lease_ref_from_proto,
     lease_ref_to_proto,
@@ -56,6 +56,13 @@ class HollowWorker:
     answered: int = 0
     waits_s: list[float] = field(default_factory=list)
     """From each message with results to the next one with leases: its slots could be idle for so long."""
+    sent_s: float | None = None
+    """When results went that no leases have followed."""
+
+    def begin(self) -> None:
+        """Forget the waits: while nothing is submitted, nothing can be leased."""
+        self.waits_s.clear()
+        self.sent_s = None
 
 
 @contextlib.asynccontextmanager
@@ -90,7 +97,6 @@ class _HollowSession:
         self._outgoing: asyncio.Queue[pb.SessionRequest] = asyncio.Queue()
         self._held: list[LeaseRef] = []
         self._given = asyncio.Event()
-        self._sent_s: float | None = None
 
     async def talk(self, stub: worker_service_pb2_grpc.WorkerServiceAsyncStub) -> None:
         self._outgoing.put_nowait(self._request(()))
@@ -98,9 +104,9 @@ class _HollowSession:
             if response.HasField("desired"):
                 self._outgoing.put_nowait(self._request(response.desired.bundle_digests))
             if response.leases:
-                if self._sent_s is not None:
-                    self._worker.waits_s.append(time.perf_counter() - self._sent_s)
-                    self._sent_s = None
+                if self._worker.sent_s is not None:
+                    self._worker.waits_s.append(time.perf_counter() - self._worker.sent_s)
+                    self._worker.sent_s = None
                 self._held += [lease_ref_from_proto(lease.ref) for lease in response.leases]
                 self._given.set()
 
@@ -117,7 +123,7 @@ class _HollowSession:
             )
             self._worker.answered += len(self._held)
             self._held.clear()
-            self._sent_s = time.perf_counter()
+            self._worker.sent_s = time.perf_counter()
             self._outgoing.put_nowait(message)
 
     async def beat(self, stub: worker_service_pb2_grpc.WorkerServiceAsyncStub, interval_s: float) -> None:

@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.proto.v1 import types_pb2
 from embomatrix.reward.hierarchy import score
-from embomatrix.rpc.convert import completed_to_proto, rollout_from_proto
+from embomatrix.rpc.convert import rollout_from_proto
+from embomatrix.rpc.convert_outcome import completed_to_proto
 from embomatrix.rpc.values import Completed, Timings
 from embomatrix.sim.executor import Simulator
 from embomatrix.worker.physics import Physics

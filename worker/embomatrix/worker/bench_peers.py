@@ -13,6 +13,7 @@ import logging
 import os
 import signal
 import tempfile
+import time
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
@@ -20,7 +21,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.worker.bench_apart import apart
 from embomatrix.worker.bench_contender import Chunk, Mode, Pass, Setup, execute, greet
-from embomatrix.worker.bench_cpu import family_cpu_s
+from embomatrix.worker.bench_cpu import descendants_cpu_s
 from embomatrix.worker.bench_peer_engine import executed_twice, forget_executions, write_bundles
 from embomatrix.worker.bench_peer_own import own_cluster
 
@@ -177,9 +178,10 @@ def measure_peer(peer: Peer, work: Work, sizes: PeerSizes) -> PeerOutcome:
 def _tuned(contender: Contender, setup: Setup, work: Work, sizes: PeerSizes) -> Tuned:
     execute(contender, chunks_of(work.first(sizes.warm).rollouts, sizes.chunk, setup.lanes), sizes.limit_s)
     chunks = chunks_of(work.after(sizes.warm).rollouts, sizes.chunk, setup.lanes)
-    before_s = family_cpu_s()
+    before_s, own_s = descendants_cpu_s(), time.process_time()
     all_at_once = execute(contender, chunks, sizes.limit_s)
-    cpu_s = family_cpu_s() - before_s
+    own_s = time.process_time() - own_s
+    cpu_s = own_s + descendants_cpu_s() - before_s
     alone = Pass()
     for rollout in work.sample(sizes.alone):
         alone.latency_s += execute(contender, singles((rollout,)), sizes.limit_s).latency_s

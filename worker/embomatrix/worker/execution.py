@@ -15,7 +15,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from embomatrix.reward.settings import PAPER
-from embomatrix.rpc.convert import rollout_to_proto, unread_completed
+from embomatrix.rpc.convert import rollout_to_proto
+from embomatrix.rpc.convert_outcome import unread_completed
 from embomatrix.rpc.values import InfraCode, InfraFailure, Timings
 from embomatrix.sim.zygote import Frame
 from embomatrix.worker.processes import ProcessGoneError

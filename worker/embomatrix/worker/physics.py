@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.reward.hierarchy import score
 from embomatrix.reward.settings import PAPER, RewardSettings
-from embomatrix.rpc.convert import completed_to_proto, rollout_from_proto, rollout_to_proto
+from embomatrix.rpc.convert import rollout_from_proto, rollout_to_proto
+from embomatrix.rpc.convert_outcome import completed_to_proto
 from embomatrix.rpc.values import Completed, Rollout, Timings
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine

@@ -19,9 +19,9 @@ from embomatrix.rpc.convert_session import (
     lease_progress_to_proto,
     lease_ref_from_proto,
     lease_ref_to_proto,
-    lease_result_to_proto,
     resources_to_proto,
     worker_state_to_proto,
+    write_lease_result,
 )
 from embomatrix.rpc.leases import WorkerState
 from embomatrix.rpc.status import (
@@ -276,7 +276,8 @@ class Session:
             while not self._resync_due and (self._state_due or self._outbox.has_unsent):
                 results = self._outbox.take_unsent(RESULTS_PER_MESSAGE)
                 message = self._request(state=self._state() if self._state_due else None)
-                message.results.extend(lease_result_to_proto(result) for result in results)
+                for result in results:
+                    write_lease_result(result, message.results.add())
                 if results:
                     self._sent_s = asyncio.get_running_loop().time()
                 self._state_due = False

@@ -20,7 +20,8 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from embomatrix.proto.v1 import types_pb2
 from embomatrix.reward.settings import PAPER, RewardSettings
-from embomatrix.rpc.convert import completed_to_proto, rollout_from_proto
+from embomatrix.rpc.convert import rollout_from_proto
+from embomatrix.rpc.convert_outcome import completed_to_proto
 from embomatrix.rpc.values import InfraCode
 from embomatrix.sim.zygote import (
     Frame,
