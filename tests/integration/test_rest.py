@@ -10,7 +10,7 @@ import pytest
 from tests.fakes.worker import FakeWorker
 from tests.integration.test_manager_service import BEDROOM, KITCHEN, batch, manager, open_run, outcomes
 
-from embomatrix.manager.rest import PREFIX
+from embomatrix.manager.rest import PREFIX, VIEWERS
 from embomatrix.rpc.status import NotFoundError
 from embomatrix.rpc.training import RewardTiers, SampledPlan, TrainingReport
 from embomatrix.rpc.values import LookaheadEntry
@@ -165,6 +165,35 @@ async def test_events_stream_as_they_come_and_can_be_taken_up_again(tmp_path):
         assert (await http.get(f"{PREFIX}/events/stream", params={"run": "nobody"})).status_code == 404
     numbers = [event["sequence"] for event in (*first, *rest)]
     assert numbers == sorted(set(numbers))
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+async def test_viewers_that_never_read_their_streams_hold_up_nobody(tmp_path):
+    async with (
+        manager(tmp_path) as at,
+        open_run(at.address) as client,
+        FakeWorker(at.address, slots=2),
+        http_at(at, **{"accept-encoding": "identity"}) as http,
+    ):
+        port = httpx.URL(at.status_url).port
+        mute = [await asyncio.open_connection("127.0.0.1", port, limit=64) for _ in range(VIEWERS)]
+        for _, writer in mute:
+            writer.write(f"GET {PREFIX}/events/stream?run=r1 HTTP/1.1\r\nhost: 127.0.0.1\r\n\r\n".encode())
+        for reader, _ in mute:
+            assert b"200" in await reader.readline()
+        refused = await http.get(f"{PREFIX}/events/stream?run=r1")
+        assert (refused.status_code, "streams are open" in refused.text) == (503, True)
+        assert len(await outcomes(client, batch(200))) == 200
+        assert (await http.get(f"{PREFIX}/snapshot")).json()["overview"]["outcomes"] == {"completed": 200}
+        for _, writer in mute:
+            writer.transport.abort()
+        for _ in range(300):
+            async with http.stream("GET", f"{PREFIX}/events/stream?run=r1") as again:
+                if again.status_code == 200:
+                    break
+            await asyncio.sleep(0.1)
+        assert again.status_code == 200
 
 
 def named_in(text):
