@@ -148,7 +148,7 @@ def import_(
 
 
 def _tell(imported: Imported, path: Path) -> None:
-    """What the asset has, and what it lacks of what its category's things do."""
+    """What the asset has, what it lacks of what its category's things do, and which rule of `assets check` it breaks."""
     asset, console = imported.asset, Console(soft_wrap=True)
     parts = sum(len(link.parts) for link in asset.links)
     console.print(
@@ -158,6 +158,10 @@ def _tell(imported: Imported, path: Path) -> None:
     )
     for lack in imported.lacks:
         console.print(lack, highlight=False)
+    for finding in check_asset(Catalog.load(), asset):
+        # What is not there at all was told above.
+        if not finding.excused and not imported.lacks:
+            console.print(f"{finding.rule.value}: {finding.detail}", highlight=False)
     if imported.stretch > WORTH_TELLING:
         console.print(
             f"its proportions are changed by a factor of {imported.stretch:.2f} to fit {asset.size_m} m: "

@@ -258,6 +258,18 @@ def test_the_command_writes_an_asset_or_one_line_that_says_why_not(tmp_path: Pat
         assert "Traceback" not in refused.output
 
 
+def test_the_command_tells_of_a_mug_that_is_too_narrow_for_a_probe(tmp_path: Path) -> None:
+    sides = (("left", (0, 10, 0), (36, 100, 100)), ("right", (64, 10, 0), (100, 100, 100)))
+    ends = (("back", (36, 10, 0), (64, 100, 36)), ("front", (36, 10, 64), (64, 100, 100)))
+    path = tmp_path / "mug.obj"
+    path.write_text(obj_text((("floor", (0, 0, 0), (100, 10, 100)), *sides, *ends)))
+    said = ["--creator", "A. Maker", "--licence", "CC0-1.0", "--out", str(tmp_path), "--cut", "components"]
+    done = CliRunner().invoke(app, ["import", str(path), "--category", "mug", *said])
+    assert done.exit_code == 0, done.output
+    assert "1 cavities" in done.output
+    assert "fillable: its largest cavity is 0.0" in done.output
+
+
 @pytest.mark.parametrize(("model", "words"), [("bamfsz", " Rs_int,"), ("songes", "in no base scene")])
 def test_the_command_tells_which_scenes_the_model_stands_in(tmp_path: Path, model: str, words: str) -> None:
     path = tmp_path / "cupboard.obj"
