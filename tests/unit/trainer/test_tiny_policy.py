@@ -46,7 +46,8 @@ def test_sampler_and_update_agree_on_log_probabilities():
     samples = draw(made, told)
     scored = made.logprobs(told, samples.tokens, samples.mask, 4, 1.3)
     assert torch.allclose(scored.logprobs, samples.logprobs * samples.mask, atol=1e-5)
-    assert (scored.entropy[samples.mask] > 0).all()
+    assert (scored.entropy[samples.mask] >= 0).all()  # 0 where one word alone may follow
+    assert (scored.entropy[samples.mask] > 0).any()
 
 
 def test_padding_and_sharing_the_prompt_change_neither_value_nor_gradient():

@@ -1,15 +1,17 @@
 """One task, told in many ways: what must not matter to a policy is varied, in the prompt and in the plan alike.
 
-Row order, instance numbers, the choice of bystanders, and the names of categories. A category is renamed only to one
-*of the same kind* (same abilities, fixed or not), so that what the plan does stays right for what the prompt says.
-Held-out tasks lend their category words, never their instructions, goals or plans.
+Row order, instance numbers, the choice of bystanders, and the names of categories. What the instruction names may get the
+name of anything at all: its words say what to do with it, and the table tells its doors and switches, so that a policy
+learns to go by them and not by what it mostly does with a thing of that name. What the instruction doesn't name may be meant
+all the same ("cook the steak"): it is renamed only to one *of its kind* (same abilities, fixed or not), so that what the plan
+does stays right for what the prompt says. Held-out tasks lend their category words, never their instructions, goals or plans.
 """
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from embomatrix.skills.prompt import subset
 
@@ -20,6 +22,12 @@ if TYPE_CHECKING:
 
     from embomatrix.skills.prompt import Situation
     from embomatrix.skills.syntax import Plan
+
+_WORD: Final = re.compile(r"[a-z0-9_]+", re.IGNORECASE)
+_LONGEST: Final = 6
+"""Words of a category's name at most."""
+_KEPT: Final = 0.2
+"""Share of categories that keep their word in a telling with other words."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,17 +84,14 @@ def _renumbered(situation: Situation, rng: np.random.Generator) -> Situation:
 def _renamed(
     situation: Situation, kinds: Mapping[str, tuple[str, ...]], rng: np.random.Generator
 ) -> Situation:
-    """Give categories the words of others of their kind, each word to one category at most.
-
-    A category that the instruction does not name keeps its word while it may be meant by another one ("the oven" for a
-    stove): only a word found in the instruction, or a bystander's, is exchanged.
-    """
+    """Give categories the words of others, each word to one category at most; no word that the instruction holds."""
     taken = {row.category for row in situation.rows}
+    spoken = _phrases(situation.instruction)
     new: dict[str, str] = {}
     for category in dict.fromkeys(row.category for row in situation.rows):
-        free = [word for word in kinds.get(category, ()) if word not in taken]
-        free = [word for word in free if not _phrase(word).search(situation.instruction.lower())]
-        if not free or rng.random() < 0.2:
+        choices = kinds if _spoken(category) in spoken else kinds.get(category, ())
+        free = [word for word in choices if word not in taken and _spoken(word) not in spoken]
+        if not free or rng.random() < _KEPT:
             continue
         new[category] = free[int(rng.integers(len(free)))]
         taken.add(new[category])
@@ -121,14 +126,35 @@ def _replaced(text: str, words: Mapping[str, str]) -> str:
 
     Spoken words stay spoken ("pen" becomes "chicken leg") and names stay names ("pen_1" becomes "chicken_leg_1").
     """
-    spoken = {old.replace("_", " "): new.replace("_", " ") for old, new in words.items()}
-    changes = {**words, **spoken}
-    if not changes:
-        return text
-    choices = "|".join(re.escape(old) for old in sorted(changes, key=len, reverse=True))
-    pattern = re.compile(rf"(?<![a-z0-9_])({choices})(?![a-z0-9_])", re.IGNORECASE)
-    return pattern.sub(lambda match: changes[match[1].lower()], text)
+    changes = {**words, **{_spoken(old): _spoken(new) for old, new in words.items()}}
+    longest = max((phrase.count(" ") + 1 for phrase in changes), default=0)
+    spans = [match.span() for match in _WORD.finditer(text)]
+    parts: list[str] = []
+    at = told = 0
+    while at < len(spans):
+        for size in range(min(longest, len(spans) - at), 0, -1):
+            begin, end = spans[at][0], spans[at + size - 1][1]
+            new = changes.get(text[begin:end].lower())
+            if new is not None:
+                parts += [text[told:begin], new]
+                told = end
+                break
+        else:
+            size = 1
+        at += size
+    return "".join([*parts, text[told:]])
 
 
-def _phrase(word: str) -> re.Pattern[str]:
-    return re.compile(rf"(?<![a-z0-9_]){re.escape(word.replace('_', ' '))}(?![a-z0-9_])")
+def _spoken(word: str) -> str:
+    return word.replace("_", " ")
+
+
+def _phrases(text: str) -> frozenset[str]:
+    """Every run of up to ``_LONGEST`` words of a text, as it stands there in small letters."""
+    text = text.lower()
+    spans = [match.span() for match in _WORD.finditer(text)]
+    return frozenset(
+        text[spans[begin][0] : spans[end][1]]
+        for begin in range(len(spans))
+        for end in range(begin, min(begin + _LONGEST, len(spans)))
+    )

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from embomatrix.trainer.errors import TrainerError
+from embomatrix.trainer.optimisers import ImitationOptimiser
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -74,12 +75,7 @@ class Imitation:
         self._settings = settings
         self._seed = seed
         self._lessons, self._aside = _parted(tasks, settings, seed)
-        self._optimiser = torch.optim.AdamW(
-            policy.parameters(),
-            lr=settings.learning_rate,
-            betas=(0.9, 0.95),
-            weight_decay=settings.weight_decay,
-        )
+        self._optimiser = ImitationOptimiser(policy.module, settings)
         self._best: dict[str, Tensor] = {}
 
     def tensors(self) -> dict[str, Any]:
@@ -126,16 +122,13 @@ class Imitation:
     def _step(self, share: float) -> float:
         settings = self._settings
         rng = np.random.default_rng(np.random.SeedSequence((self._seed, 1, self.state.step)))
-        rate = settings.learning_rate * _shape(share, self.state.step, settings.warmup_steps)
-        for group in self._optimiser.param_groups:
-            group["lr"] = rate
         chosen = rng.integers(len(self._lessons), size=settings.batch)
         lessons = [self._teller.lesson(self._lessons[int(at)], rng) for at in chosen]
         loss = _total_loss(self._policy, lessons) / sum(len(plan) for _, plan in lessons)
-        self._optimiser.zero_grad(set_to_none=True)
+        self._optimiser.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         torch.nn.utils.clip_grad_norm_(self._policy.parameters(), 1.0)
-        self._optimiser.step()
+        self._optimiser.step(_shape(share, self.state.step, settings.warmup_steps))
         return float(loss.detach())
 
     @torch.no_grad()

@@ -34,6 +34,13 @@ class TrackerKind(StrEnum):
     TRACKIO = "trackio"
 
 
+class OptimiserKind(StrEnum):
+    """What imitation moves weights by."""
+
+    ADAMW = "adamw"
+    MUON = "muon"  # for the matrices of linear layers, and AdamW for everything else
+
+
 class OnLost(StrEnum):
     """What becomes of a group of which the infrastructure lost a rollout."""
 
@@ -70,8 +77,8 @@ class PromptSettings(_Frozen):
 
     rows: int = Field(default=16, ge=1)
     """Rows told at most: those that the instruction names come first."""
-    rename_share: float = Field(default=0.5, ge=0, le=1)
-    """Share of examples in which categories are called by those of other things of the same kind (tiny policy only)."""
+    rename_share: float = Field(default=0.8, ge=0, le=1)
+    """Share of examples in which categories are called by the names of others (tiny policy only)."""
     drop_share: float = Field(default=0.7, ge=0, le=1)
     """During imitation: up to this share of the rows that the oracle does not use is left untold."""
 
@@ -83,7 +90,11 @@ class ImitationSettings(_Frozen):
     steps: int | None = Field(default=None, ge=0)
     """A number of steps in place of the seconds."""
     batch: int = Field(default=32, ge=1)
+    optimiser: OptimiserKind = OptimiserKind.MUON
     learning_rate: float = Field(default=2e-3, gt=0)
+    """AdamW's."""
+    matrix_learning_rate: float = Field(default=0.02, gt=0)
+    """Muon's."""
     warmup_steps: int = Field(default=20, ge=0)
     weight_decay: float = Field(default=0.01, ge=0)
     patience: int = Field(default=0, ge=0)
@@ -124,6 +135,9 @@ class GrpoSettings(_Frozen):
     kl_coef: float = Field(default=0.02, ge=0)
     """Weight of the KL to the policy as imitation left it: the paper's beta."""
     entropy_coef: float = Field(default=0.0, ge=0)
+    spread_floor: float = Field(default=1e-4, gt=0)
+    """Added to the spread of a group's rewards, in units of reward, before they are divided by it. At 1, a group whose plans
+    differ by a touched object only weighs a tenth of one in which some reach the goal; near 0 it weighs as much."""
     max_grad_norm: float = Field(default=1.0, gt=0)
     lookahead: int = Field(default=3, ge=0)
     """Steps announced ahead."""
@@ -204,6 +218,7 @@ LANGUAGE_MODEL_DEFAULTS: Final[Mapping[str, Any]] = {
     "prompt.rows": 28,
     "prompt.rename_share": 0.0,
     "imitation.batch": 4,
+    "imitation.optimiser": "adamw",
     "imitation.learning_rate": 5e-5,
     "grpo.tasks_per_step": 4,
     "grpo.chunk": 1,

@@ -175,7 +175,7 @@ class Updater:
         )  # (tasks, G)
         if self._settings.on_lost is OnLost.GROUP:
             rewards[torch.isnan(rewards).any(dim=1)] = math.nan
-        advantages = group_advantages(rewards)
+        advantages = group_advantages(rewards, self._settings.spread_floor)
         live = [row for row, dead in enumerate(advantages.dead.tolist()) if not dead]
         work.gradients.add(chunk.part, lambda: self._backward(chunk, live, rewards, advantages.values, work))
         return [

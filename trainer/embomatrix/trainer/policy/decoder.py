@@ -1,4 +1,4 @@
-"""A small causal transformer in plain torch, whose prompt runs once for all samples of its group.
+"""A small transformer in plain torch, whose prompt is read at once and runs once for all samples of its group.
 
 Llama-like: RMS norms, rotary positions, gated feed-forward, tied embedding. The last layer may also *point*: a part of the
 probability goes to words of the prompt by attention (pointer networks; See et al. 2017, eq. 9). Naming an object that the
@@ -132,16 +132,16 @@ class Decoder(nn.Module):
         nn.init.zeros_(self.point_share.bias)
 
     def scores(self, states: Tensor, prompt: PromptMemory, barred: Tensor) -> Tensor:
-        """Log-probabilities (Q * G, T, V) after hidden states (Q * G, T, C); words in ``barred`` (V,) get none."""
+        """Log-probabilities (Q * G, T, V) after hidden states (Q * G, T, C); words in ``barred``, of that shape, get none."""
         rows, length, width = states.shape
         prompts, prompt_length = prompt.tokens.shape
         x = self.norm(states)
         generated = torch.softmax((x @ self.embedding.weight.t()).masked_fill(barred, _HIDDEN_KEY), dim=-1)
         asked = self.point_from(x).view(prompts, -1, width)  # (Q, G T, C)
         looked = asked @ self.point_to(self.norm(prompt.states)).transpose(1, 2) * width**-0.5  # (Q, G T, P)
-        nowhere = (prompt.hidden | barred[prompt.tokens])[:, None]  # (Q, 1, P)
-        attention = torch.softmax(looked.masked_fill(nowhere, _HIDDEN_KEY), dim=-1)
         index = prompt.tokens[:, None].expand(prompts, asked.shape[1], prompt_length)
+        nowhere = prompt.hidden[:, None] | barred.view(prompts, asked.shape[1], -1).gather(2, index)
+        attention = torch.softmax(looked.masked_fill(nowhere, _HIDDEN_KEY), dim=-1)
         empty = attention.new_zeros(prompts, asked.shape[1], generated.shape[-1])
         pointed = empty.scatter_add(2, index, attention).view(rows, length, -1)  # (Q G, T, V)
         share = torch.sigmoid(self.point_share(x))  # (Q G, T, 1)
@@ -157,10 +157,9 @@ class Decoder(nn.Module):
         lengths = (~hidden).sum(dim=1)
         positions = ((~hidden).cumsum(dim=1) - 1).clamp(min=0)
         rope = self._rope(positions)
-        size = tokens.shape[1]
-        later = torch.ones(size, size, dtype=torch.bool, device=tokens.device).triu(1)
-        barred = later[None] | hidden[:, None, :]  # (Q, P, P)
-        bias = torch.zeros(barred.shape, device=tokens.device).masked_fill(barred, _HIDDEN_KEY)[:, None]
+        bias = (hidden.float() * _HIDDEN_KEY)[
+            :, None, None, :
+        ]  # (Q, 1, 1, P): every token sees the whole prompt
         x = self.embedding(tokens)
         memories = []
         for block in self.blocks:

@@ -12,6 +12,7 @@ from torch.nn import functional
 from embomatrix.skills.prompt import Codec
 from embomatrix.trainer.policy.decoder import Decoder, DecoderShape
 from embomatrix.trainer.policy.drawing import draw
+from embomatrix.trainer.policy.grammar import PlanGrammar
 from embomatrix.trainer.policy.protocol import Samples, Scored
 from embomatrix.trainer.policy.words import END, GO, PAD, Vocabulary
 
@@ -42,6 +43,7 @@ class TinyPolicy:
         self.vocabulary = vocabulary
         self.network = Decoder(shape, torch.Generator().manual_seed(seed)).to(device)
         self.device = torch.device(device)
+        self._grammar = PlanGrammar(vocabulary, self.device)
 
     @property
     def name(self) -> str:
@@ -77,6 +79,10 @@ class TinyPolicy:
         generator: torch.Generator,
     ) -> Samples:
         memory = self.network.read(*self._padded(prompts))
+        names = self._grammar.names(memory.tokens).of_rows(
+            torch.arange(len(prompts), device=self.device).repeat_interleave(group)
+        )
+        cursor = self._grammar.start(len(prompts) * group)
         rows = torch.arange(len(prompts) * group, device=self.device)  # those that go on
         state = memory.states[:, -1:].repeat_interleave(group, dim=0)  # (rows, 1, C)
         own: tuple[LayerMemory, ...] | None = None
@@ -86,7 +92,10 @@ class TinyPolicy:
         going = torch.ones(len(rows), dtype=torch.bool, device=self.device)
         length = 0
         for at in range(max_new):
-            choice, logprob = draw(self._scores(state, memory)[:, 0], temperature, generator)
+            barred = self._grammar.barred(cursor, names)[:, None]
+            scores = self.network.scores(state, memory, barred)[:, 0]
+            choice, logprob = draw(scores, temperature, generator)
+            cursor = self._grammar.advanced(cursor, choice)
             tokens[rows, at] = torch.where(going, choice, PAD)
             logprobs[rows, at] = torch.where(going, logprob, 0.0)
             mask[rows, at] = going
@@ -99,6 +108,7 @@ class TinyPolicy:
                 kept = going.nonzero()[:, 0]
                 memory = memory.of_rows(kept * len(memory.lengths) // len(going))
                 own = tuple(layer.of_rows(kept) for layer in own) if own else None
+                names, cursor = names.of_rows(kept), cursor.of_rows(kept)
                 rows, choice, going = rows[kept], choice[kept], going[kept]
             state, own = self.network.extend(memory, choice[:, None], own, at)
         drawn = tokens[:, :length]
@@ -128,22 +138,17 @@ class TinyPolicy:
     ) -> tuple[Tensor, Tensor]:
         """Log-probability and entropy (rows, T) of each token (rows, T), after the prompts with these indices (rows,)."""
         memory = memory.of_rows(prompts)
+        barred = self._grammar.barred_along(tokens, self._grammar.names(memory.tokens))  # (rows, T, V)
         states = memory.states[:, -1:]  # (rows, 1, C)
         if tokens.shape[1] > 1:
             rest, _ = self.network.extend(memory, tokens[:, :-1], None, 0)
             states = torch.cat([states, rest], dim=1)  # (rows, T, C)
         scores = torch.log_softmax(
-            self._scores(states, memory) / (temperature or 1.0), dim=-1
+            self.network.scores(states, memory, barred) / (temperature or 1.0), dim=-1
         )  # (rows, T, V)
         chosen = scores.gather(-1, tokens[..., None])[..., 0]
         entropy = -(scores.exp() * scores.clamp(min=-1e4)).sum(dim=-1)
         return chosen, entropy
-
-    def _scores(self, states: Tensor, memory: PromptMemory) -> Tensor:
-        """Log-probabilities without padding and prompt marks: tokens that no plan holds."""
-        barred = torch.zeros(len(self.vocabulary), dtype=torch.bool, device=self.device)
-        barred[[PAD, GO]] = True
-        return self.network.scores(states, memory, barred)
 
     def _padded(self, prompts: Sequence[Tokens]) -> tuple[Tensor, Tensor]:
         longest = max(len(prompt) for prompt in prompts)
@@ -162,7 +167,12 @@ class TinyPolicy:
     def save(self, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         torch.save(self.network.state_dict(), folder / _WEIGHTS)
-        described = {"shape": self.network.shape.as_dict(), "words": self.vocabulary.words}
+        described = {
+            "shape": self.network.shape.as_dict(),
+            "words": self.vocabulary.words,
+            "things": self.vocabulary.thing_words,
+            "rooms": self.vocabulary.room_words,
+        }
         (folder / _DESCRIPTION).write_text(json.dumps(described))
 
     @classmethod
@@ -170,7 +180,8 @@ class TinyPolicy:
         """Read what ``save`` wrote. Raises OSError, ValueError or RuntimeError where it is not that."""
         described = json.loads((folder / _DESCRIPTION).read_text())
         shape = DecoderShape(**described["shape"])
-        policy = cls(Vocabulary(tuple(described["words"])), shape, seed=0, device=device)
+        words, things, rooms = (tuple(described[part]) for part in ("words", "things", "rooms"))
+        policy = cls(Vocabulary(words, things, rooms), shape, seed=0, device=device)
         policy.network.load_state_dict(torch.load(folder / _WEIGHTS, map_location=device, weights_only=True))
         return policy
 

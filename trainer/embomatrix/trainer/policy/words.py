@@ -25,12 +25,14 @@ END: Final = 1
 GO: Final = 2
 UNKNOWN: Final = 3
 SPECIAL: Final = ("<pad>", "<end>", "<go>", "<unknown>")
-_BREAK: Final = "\n"
+BREAK: Final = "\n"
 _NUMBERED: Final = re.compile(r"(.+?)(_\d+)")
 _WORD: Final = re.compile(r"\n|-?\d+\.\d+|[a-z0-9_]+(?:-[a-z][a-z0-9_]*)*|-\d+")
+_NUMBER: Final = re.compile(r"_\d+")
+_QUANTITY: Final = re.compile(r"-?\d+(?:\.\d+)?")
 _LONGEST_PHRASE: Final = 4
 _FIXED_WORDS: Final = (
-    _BREAK,
+    BREAK,
     *(skill.value for skill in PROFILES[Profile.PAPER]),
     *(relation.value for relation in PlaceRelation),
     *(state.value for state in State),
@@ -44,21 +46,24 @@ def build_vocabulary(
 ) -> Vocabulary:
     """Vocabulary for tasks whose tables are told by ``situations``; ``instructions`` are those of training."""
     words: dict[str, None] = dict.fromkeys(_FIXED_WORDS)
+    things: dict[str, None] = {}
+    rooms: dict[str, None] = {}
     numbers = {0}
     for situation in situations:
-        names = [*situation.rooms, *(row.name for row in situation.rows)]
-        words |= dict.fromkeys(row.category for row in situation.rows)
         words |= dict.fromkeys(skill.value for skill in PROFILES[situation.profile])
         words |= dict.fromkeys(state for row in situation.rows for state in row.states)
-        for name in names:
-            stem, number = _split_number(name)
-            words.setdefault(stem)
-            numbers |= {int(number[1:])} if number else set()
+        things |= dict.fromkeys(row.category for row in situation.rows)
+        for stems, names in ((things, [row.name for row in situation.rows]), (rooms, situation.rooms)):
+            for name in names:
+                stem, number = _split_number(name)
+                stems.setdefault(stem)
+                numbers |= {int(number[1:])} if number else set()
     counts = Counter(word for text in instructions for word in _WORD.findall(text.lower()))
     frequent = sorted(word for word, count in counts.items() if count >= min_count)
     words |= dict.fromkeys(frequent)
+    words |= things | rooms
     words |= dict.fromkeys(f"_{number}" for number in range(max(numbers) + 1))
-    return Vocabulary((*SPECIAL, *words))
+    return Vocabulary((*SPECIAL, *words), tuple(things), tuple(rooms))
 
 
 def _split_number(name: str) -> tuple[str, str]:
@@ -68,13 +73,36 @@ def _split_number(name: str) -> tuple[str, str]:
 
 @dataclass(frozen=True)
 class Vocabulary:
-    """Words by token id. Text that it can't spell becomes ``<unknown>``; decoding never fails."""
+    """Words by token id. Text that it can't spell becomes ``<unknown>``; decoding never fails.
+
+    ``thing_words`` and ``room_words`` are those that a name of the object table or of a room begins with.
+    """
 
     words: tuple[str, ...]
+    thing_words: tuple[str, ...]
+    room_words: tuple[str, ...]
     index: Mapping[str, int] = field(init=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "index", {word: token for token, word in enumerate(self.words)})
+
+    @property
+    def things(self) -> tuple[int, ...]:
+        return tuple(self.index[word] for word in self.thing_words)
+
+    @property
+    def rooms(self) -> tuple[int, ...]:
+        return tuple(self.index[word] for word in self.room_words)
+
+    @property
+    def numbers(self) -> tuple[int, ...]:
+        """Words that end a name: ``_0``, ``_1`` and so on."""
+        return tuple(token for token, word in enumerate(self.words) if _NUMBER.fullmatch(word))
+
+    @property
+    def quantities(self) -> tuple[int, ...]:
+        """Words that are angles and distances."""
+        return tuple(token for token, word in enumerate(self.words) if _QUANTITY.fullmatch(word))
 
     def __len__(self) -> int:
         return len(self.words)
@@ -93,7 +121,7 @@ class Vocabulary:
     def _longest(self, words: Sequence[str]) -> tuple[int, list[int]]:
         for size in range(len(words), 1, -1):
             phrase = "_".join(words[:size])
-            if _BREAK not in words[:size] and phrase in self.index:
+            if BREAK not in words[:size] and phrase in self.index:
                 return size, [self.index[phrase]]
         return 1, self._word(words[0])
 
@@ -113,6 +141,6 @@ class Vocabulary:
             if token == END:
                 break
             word = self.words[token]
-            joined = word == _BREAK or word.startswith("_") or not parts or parts[-1] == _BREAK
+            joined = word == BREAK or word.startswith("_") or not parts or parts[-1] == BREAK
             parts += [word] if joined else [" ", word]
         return "".join(parts)

@@ -1,0 +1,130 @@
+"""A policy that is held to the grammar writes plans, and calls only what its prompt tells."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from tests.fakes.symbolic_household import make_tasks
+
+from embomatrix.skills.prompt import Codec, Row, plan_in_names, prompt_for
+from embomatrix.skills.syntax import PROFILES
+from embomatrix.trainer.policy.decoder import DecoderShape
+from embomatrix.trainer.policy.grammar import PlanGrammar
+from embomatrix.trainer.policy.tiny import TinyPolicy
+from embomatrix.trainer.policy.words import END, build_vocabulary
+from embomatrix.trainer.rollout import parsed
+from embomatrix.world.task import Profile
+
+TASKS = make_tasks(12, 3)
+
+
+def twins(situation):
+    """A situation with two more things of one category, so that names need numbers."""
+    first = situation.rows[0]
+    more = [Row(100 + at, f"{first.category}_{at}", first.category, first.room) for at in (7, 3)]
+    return replace(situation, rows=(*situation.rows[1:], *more), table_size=102)
+
+
+TWINS = twins(TASKS.train[0].situation)
+WORDS = build_vocabulary(
+    [
+        *(replace(task.situation, profile=Profile.HOUSEHOLD) for task in TASKS.train),
+        *(task.situation for task in TASKS.heldout),
+        TWINS,
+    ],
+    [task.task.instruction for task in TASKS.train],
+)
+GRAMMAR = PlanGrammar(WORDS, torch.device("cpu"))
+POLICY = TinyPolicy(WORDS, DecoderShape(len(WORDS), layers=1, width=16, heads=2, inner=16), seed=0)
+
+
+def prompt_of(situation):
+    return POLICY.encode(prompt_for(situation, Codec.NAMES))
+
+
+def next_words(situation, written):
+    """Words that may follow what is written, in its prompt."""
+    names = GRAMMAR.names(torch.tensor([prompt_of(situation)]))
+    cursor = GRAMMAR.start(1)
+    for token in WORDS.encode(written):
+        cursor = GRAMMAR.advanced(cursor, torch.tensor([token]))
+    barred = GRAMMAR.barred(cursor, names)[0]
+    return {WORDS.words[token] for token in (~barred).nonzero()[:, 0].tolist()}
+
+
+@pytest.mark.parametrize("task", TASKS.train, ids=lambda task: task.task.task_id)
+def test_a_policy_that_knows_nothing_still_writes_plans_that_call_what_is_told(task):
+    samples = POLICY.sample(
+        [prompt_of(task.situation)], 40, 2.0, 60, torch.Generator().manual_seed(len(task.oracle))
+    )
+    ended = (samples.tokens == END).any(dim=1).tolist()
+    assert sum(ended) >= 20
+    told = {row.index for row in task.situation.rows}
+    for text in (text for text, whole in zip(samples.texts, ended, strict=True) if whole):
+        for call in parsed(text, replace(task.situation, profile=Profile.HOUSEHOLD), Codec.NAMES):
+            assert {call.object_index, call.source_index} - {None} <= told
+            assert call.room_name is None or call.room_name in task.situation.rooms
+
+
+@pytest.mark.parametrize("task", TASKS.train, ids=lambda task: task.task.task_id)
+def test_no_word_of_an_oracle_s_plan_is_barred(task):
+    text = plan_in_names(task.oracle, task.situation)
+    tokens = torch.tensor([POLICY.encode_plan(text)])
+    names = GRAMMAR.names(torch.tensor([prompt_of(task.situation)]))
+    cursor = GRAMMAR.start(1)
+    for token in tokens[0]:
+        assert not GRAMMAR.barred(cursor, names)[0, token]
+        cursor = GRAMMAR.advanced(cursor, token[None])
+
+
+def test_every_skill_may_begin_a_call_and_nothing_else():
+    skills = {skill.value for skill in PROFILES[Profile.HOUSEHOLD]}
+    assert next_words(TASKS.train[0].situation, "") == skills
+
+
+def test_a_name_of_two_things_needs_the_number_of_one_of_them():
+    situation = TWINS
+    category = situation.rows[-1].category
+    assert next_words(situation, f"open {category}") == {"_3", "_7"}
+    assert next_words(situation, f"open {category}_3") == {"\n", "<end>"}
+
+
+def test_a_name_that_stands_alone_gets_no_number():
+    situation = TASKS.train[0].situation
+    assert next_words(situation, f"open {situation.rows[0].category}") == {"\n", "<end>"}
+
+
+def test_what_only_the_instruction_names_can_not_be_called():
+    situation = TASKS.train[0].situation
+    gone = situation.rows[0].category
+    without = replace(situation, rows=situation.rows[1:], instruction=f"bring the {gone.replace('_', ' ')}")
+    assert gone in next_words(situation, "move")
+    assert gone not in next_words(without, "move")
+
+
+def test_calls_take_a_relation_a_second_thing_a_room_or_an_angle_where_their_skill_does():
+    situation = TASKS.train[0].situation
+    thing = situation.rows[0].category
+    assert next_words(situation, f"place {thing}") == {"ontop", "inside", "under"}
+    assert thing in next_words(situation, f"heat_object_with_source {thing}")
+    assert "1.57" in next_words(situation, "turn")
+    assert next_words(situation, "turn 1.57") == {"\n", "<end>"}
+    room = next(iter(next_words(situation, "go_to_room")))
+    assert any(name.startswith(room) for name in situation.rooms)
+
+
+@given(st.lists(st.integers(0, len(WORDS) - 1), min_size=1, max_size=12))
+def test_a_plan_that_breaks_the_grammar_has_a_likelihood_all_the_same(written):
+    tokens = torch.tensor([written])
+    scored = POLICY.logprobs(
+        [prompt_of(TASKS.train[0].situation)], tokens, torch.ones_like(tokens) > 0, 1, 1.0
+    )
+    assert torch.isfinite(scored.logprobs).all()
+    assert (scored.logprobs > -1e6).all()
+
+
+def test_a_prompt_that_tells_nothing_leaves_the_end():
+    situation = replace(TASKS.train[0].situation, rows=(), rooms=())
+    assert next_words(situation, "move") == {"<end>"}
