@@ -58,7 +58,7 @@ SURFACES: Final = 4
 SHIFT_M: Final = 0.008
 TURN_RAD: Final = 0.15
 """How far a thing that nothing aligns is moved off the grid, and turned: people don't put things down on a raster."""
-PACKED: Final = 3
+PACKED: Final = 2
 """So many things that one basket or box must take are packed from a corner on, the largest first."""
 SQUARE: Final = frozenset(
     {Arrangement.CENTER_ALIGNED, Arrangement.FACE_TO, Arrangement.NEXT_TO, Arrangement.EDGE}
