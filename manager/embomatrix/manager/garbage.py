@@ -9,7 +9,7 @@ YOUNG: Final = 5_000
 """Objects that are made before the youngest are looked at: two milliseconds."""
 MIDDLE: Final = 0
 """Every second look takes in those that outlived the one before, and what outlives that as well is left alone. After more looks
-there would be more to go through at once: twenty milliseconds after four of twice the size, and nothing else is done meanwhile."""
+there would be more to go through at once: 20 ms after four of twice the size, and nothing else is done meanwhile."""
 NEVER: Final = 1_000_000
 LONGEST_S: Final = 600.0
 """Without a quiet moment everything is looked at this often all the same."""
