@@ -12,13 +12,15 @@ import math
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.sim.bullet.client import ClientPool, pybullet
+from embomatrix.sim.bullet.contacts import near_contacts
 from embomatrix.sim.bullet.dynamic_bodies import DynamicBodies, differ
 from embomatrix.sim.bullet.mini_world import GRAVITY_M_S2
+from embomatrix.sim.bullet.passage import Passage
 from embomatrix.sim.bullet.robot import Posture, RobotBody
 from embomatrix.world.geometry import Pose
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
 
     from embomatrix.sim.bullet.dynamic_bodies import BodyState
     from embomatrix.world.scene import Scene
@@ -58,8 +60,9 @@ class DynamicWorld:
         bullet.setGravity(0, 0, GRAVITY_M_S2, physicsClientId=client)
         bullet.setPhysicsEngineParameter(solverResidualThreshold=CONVERGED, physicsClientId=client)
         self._held, self.steps = "", 0
-        self.bodies.fill(poses, joints)
-        self.robot = RobotBody(client, posture)
+        with near_contacts(client):
+            self.bodies.fill(poses, joints)
+            self.robot = RobotBody(client, posture)
         # What is put to sleep falls for one step, until its contacts are known.
         self.rest()
         self.step(1)
@@ -70,8 +73,9 @@ class DynamicWorld:
 
     def step(self, steps: int) -> None:
         """Let time pass."""
-        for _ in range(steps):
-            self._bullet.stepSimulation(physicsClientId=self._client)
+        with near_contacts(self._client):
+            for _ in range(steps):
+                self._bullet.stepSimulation(physicsClientId=self._client)
         self.steps += steps
 
     def go(self, posture: Posture, steps: int) -> None:
@@ -86,10 +90,17 @@ class DynamicWorld:
         bullet.setTimeStep(each * STEP_S, physicsClientId=client)
         # A motor's force becomes an impulse by the length that a step has when it is steered.
         self.robot.steer(posture)
-        for _ in range(0, steps, each):
-            bullet.stepSimulation(physicsClientId=client)
+        with near_contacts(client):
+            for _ in range(0, steps, each):
+                bullet.stepSimulation(physicsClientId=client)
         bullet.setTimeStep(STEP_S, physicsClientId=client)
         self.steps += steps
+
+    def passage(self) -> Passage | None:
+        """A motion from where the robot is; None while anything moves of itself, as time must pass for that."""
+        if self._stirs(self.bodies.moving):
+            return None
+        return Passage(self._client, self.robot, self.bodies, self._held)
 
     def disturbed(self) -> tuple[str, ...]:
         """Objects that moved, or whose joints did, since the last call, in scene order. What the hand holds is left out."""
@@ -106,13 +117,15 @@ class DynamicWorld:
         quiet = False
         for _ in range(limit // chunk):
             self.step(chunk)
-            quiet = not any(
-                name != self._held and self.bodies.is_in_motion(name) for name in self.bodies.movable
-            )
+            quiet = not self._stirs(self.bodies.movable)
             if quiet:
                 break
         self.rest()
         return quiet
+
+    def _stirs(self, names: Iterable[str]) -> bool:
+        """Whether any of some objects is in motion but what the hand holds."""
+        return any(name != self._held and self.bodies.is_in_motion(name) for name in names)
 
     def rest(self) -> None:
         """Put everything to sleep but the robot and what it holds."""

@@ -140,8 +140,12 @@ class DynamicBodies:
         return pose.position_m, pose.quat_xyzw
 
     def is_in_motion(self, name: str) -> bool:
-        """Whether a movable object moves faster than what rests."""
-        linear, angular = self._bullet.getBaseVelocity(self._bodies[name], physicsClientId=self._client)
+        """Whether a movable object, or any leaf of furniture, moves faster than what rests."""
+        bullet, client, body = self._bullet, self._client, self._bodies[name]
+        if name in self._joints:
+            states = bullet.getJointStates(body, self._joints[name], physicsClientId=client)
+            return any(abs(state[1]) > SLOW_M_S for state in states)
+        linear, angular = bullet.getBaseVelocity(body, physicsClientId=client)
         return math.hypot(*linear) > SLOW_M_S or math.hypot(*angular) > SLOW_RAD_S
 
     def still_sleep(self) -> None:

@@ -33,6 +33,8 @@ GRIP_N: Final = 400.0
 GAIN: Final = 0.3
 """Share of the way to its target that a motor takes in a step, as far as its force lets it."""
 FINGERS_OPEN_M: Final = 0.02
+SAG: Final = 1e-3
+"""Metres, or radians, by which loads bend joints over their limits."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +78,7 @@ class RobotBody:
         self.tips = frozenset((self.hand, *(joints[name] for name in FINGER_JOINTS)))
         self.base = links["base"]
         self._driven = [joints[name] for name in (*BASE_JOINTS, *LIFT_JOINTS, *ARM_JOINTS, *FINGER_JOINTS)]
+        self._limits = [infos[joint][8:10] for joint in self._driven]
         self._forces = [BASE_N] * 2 + [BASE_NM] + [LIFT_N] * 2
         self._forces += [SHOULDER_EFFORT_NM] * 4 + [WRIST_EFFORT_NM] * 3 + [FINGER_N] * 2
         self._inertial = Pose(tuple(bullet.getDynamicsInfo(self.body, self.hand, physicsClientId=client)[3]))
@@ -83,10 +86,27 @@ class RobotBody:
         self.appear(posture)
 
     def appear(self, posture: Posture) -> None:
-        """Be in a posture at once, whatever is there."""
-        for joint, value in zip(self._driven, spread(posture), strict=True):
-            self._bullet.resetJointState(self.body, joint, value, physicsClientId=self._client)
+        """Be in a posture at once, whatever is there, and stay."""
+        self.stand(posture)
         self.steer(posture)
+
+    def stand(self, posture: Posture) -> None:
+        """Be in a posture at once, at rest. The motors keep their targets."""
+        values = spread(posture)
+        self._bullet.resetJointStatesMultiDof(
+            self.body,
+            self._driven,
+            [(value,) for value in values],
+            [(0.0,)] * len(values),
+            physicsClientId=self._client,
+        )
+
+    def can_stand(self, posture: Posture) -> bool:
+        """Whether every joint is within its limits in a posture, or not measurably beyond. What turns freely has none."""
+        return all(
+            low > high or low - SAG <= value <= high + SAG
+            for (low, high), value in zip(self._limits, spread(posture), strict=True)
+        )
 
     @property
     def posture(self) -> Posture:

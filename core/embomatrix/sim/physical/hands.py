@@ -107,7 +107,7 @@ def take_by(
 def _touch(stage: Stage, way: Way, target: str) -> Refusal | None:
     """Go along a way until the hand touches the target, and hold it."""
     stage.wake_around(stage.world.engine.aabb(target))
-    hit = stage.mover.follow(way.postures[1:-2]) if len(way.postures) > 3 else None
+    hit = stage.mover.advance(way.postures[1:-2]) if len(way.postures) > 3 else None
     if hit is None:
         hit = stage.mover.follow(way.postures[-2:], GENTLE, lambda: stage.dynamic.gap(target) < TOUCH_M)
     if stage.dynamic.gap(target) > TOUCH_M * 2:
@@ -123,7 +123,7 @@ def _lift(stage: Stage, way: Way, target: str, by_m: float) -> Refusal | None:
     world.navigator.refresh()
     hit = stage.mover.follow(raised(stage.mover.posture[None], by_m), 0.5)
     if hit is None:
-        stage.mover.follow(raised(way.postures[-3::-1], by_m))
+        stage.mover.advance(raised(way.postures[-3::-1], by_m))
     if stage.has_slipped():
         stage.release()
         world.hand.let_go(stage.dynamic.bodies.pose(target))

@@ -7,13 +7,18 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.sim.bullet.robot import Posture
+from embomatrix.sim.physical import body
 from embomatrix.sim.physical.body import ARM, LIFT, YAW
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from numpy.typing import NDArray
+
     from embomatrix.sim.bullet.dynamic import DynamicWorld
     from embomatrix.world.geometry import FloatArray
+
+    IntArray = NDArray[np.int_]
 
 SPEED: Final = np.array([1.0, 1.0, 2.5, 0.5, 2.1, 2.1, 2.1, 2.1, 2.6, 2.6, 2.6])
 """Metres, and radians, a second: the arm's are the Panda's own limits."""
@@ -24,6 +29,12 @@ LAG: Final = np.array([0.08, 0.08, 0.15, 0.06, 0.3, 0.3, 0.3, 0.3, 0.4, 0.4, 0.4
 """A joint that falls this far behind is held up by something."""
 _LAGS: Final = tuple(LAG.tolist())
 ARRIVAL_STEPS: Final = 12
+APART_M: Final = 0.035
+LOAD_APART_M: Final = 0.02
+"""So far no point of the arm goes between two postures at which a passage is looked at, with an empty hand and with a load.
+
+Fingers are 28 mm thick and may come no nearer than 5 mm to anything: nothing is so thin that it is passed unseen.
+"""
 LEAST_COMMANDS: Final = 3
 SHARP_RAD: Final = 1.2
 WINDOW: Final = 8
@@ -52,20 +63,44 @@ class Mover:
 
         None when the end is reached or ``until`` says so, else the name of what holds the robot up, "" when unknown.
         """
-        return self._along(postures, pace, self._world.go, until)
+        commands = _commands(np.concatenate([self.posture[None], postures]), pace)
+        return self._pursue(commands, self._world.go, until)
 
     def sweep(self, postures: FloatArray) -> str | None:
-        """Move through postures, as ``follow`` does, where nothing is to be touched: time passes in coarser steps."""
-        return self._along(postures, 1.0, self._world.glide, None)
+        """Move through postures, as ``follow`` does, where nothing is to be touched.
 
-    def _along(
+        Where nothing is near the motion is made at once; else time passes in coarser steps.
+        """
+        commands = _commands(np.concatenate([self.posture[None], postures]), 1.0)
+        return None if self._passes(commands) else self._pursue(commands, self._world.glide, None)
+
+    def advance(self, postures: FloatArray, pace: float = 1.0) -> str | None:
+        """Move through postures, as ``follow`` does, beside things that may be touched: at once where nothing is near."""
+        commands = _commands(np.concatenate([self.posture[None], postures]), pace)
+        return None if self._passes(commands) else self._pursue(commands, self._world.go, None)
+
+    def _passes(self, commands: FloatArray) -> bool:
+        """Whether the robot went through commands, (n, 11), without coming near anything: then it is where they end."""
+        passage = self._world.passage()
+        if passage is None:
+            return False
+        chosen = _spaced(self.posture, commands, LOAD_APART_M if passage.is_loaded else APART_M)
+        samples = [Posture.of(command) for command in commands[chosen].tolist()]
+        if not passage.is_clear(samples):
+            return False
+        for sample, commanded in zip(samples, np.diff(chosen, prepend=-1).tolist(), strict=True):
+            passage.stand(sample)
+            self._world.steps += commanded * STEERED
+            self._watch()
+        self._world.robot.steer(samples[-1])
+        return True
+
+    def _pursue(
         self,
-        postures: FloatArray,
-        pace: float,
+        commands: FloatArray,
         pursue: Callable[[Posture, int], None],
         until: Callable[[], bool] | None,
     ) -> str | None:
-        commands = _commands(np.concatenate([self.posture[None], postures]), pace)
         for command in commands.tolist():
             pursue(Posture.of(command), STEERED)
             self._watch()
@@ -113,6 +148,20 @@ def _commands(postures: FloatArray, pace: float) -> FloatArray:
     )
     columns = [np.interp(times, marks, postures[:, column]) for column in range(postures.shape[1])]
     return _smoothed(np.stack(columns, axis=1), postures[0])
+
+
+def _spaced(start: FloatArray, commands: FloatArray, apart_m: float) -> IntArray:
+    """Numbers of so many commands, (n, 11), that no point of the arm goes farther from one to the next, the last among them."""
+    places = body.balls(np.concatenate([start[None], commands]))
+    ways = np.linalg.norm(np.diff(places, axis=0), axis=2).max(axis=1)  # (n,)
+    # Each command is at most as far from the one chosen before it as the ways in between sum up to.
+    chosen, gone = [], 0.0
+    for number, way in enumerate(ways.tolist()):
+        if number and gone + way > apart_m:
+            chosen.append(number - 1)
+            gone = 0.0
+        gone += way
+    return np.array([*chosen, len(commands) - 1])
 
 
 def _smoothed(commands: FloatArray, start: FloatArray) -> FloatArray:

@@ -217,7 +217,7 @@ def _set_down(stage: Stage, way: Way) -> Refusal | None:
     assert grip is not None
     name = grip.name
     key = way.track.key
-    hit = stage.mover.follow(way.postures[1:key])
+    hit = stage.mover.advance(way.postures[1:key])
     if hit is not None or stage.has_slipped():
         reason = FailureReason.SLIPPED if stage.has_slipped() else FailureReason.ARM_BLOCKED
         return refuse(reason, target=name, other=hit or SOMETHING)
@@ -229,7 +229,7 @@ def _set_down(stage: Stage, way: Way) -> Refusal | None:
     stage.loosen()
     stage.mover.wait(16)
     _let_go(stage)
-    stage.mover.follow(way.postures[key + 1 :], 0.5)
+    stage.mover.advance(way.postures[key + 1 :], 0.5)
     stage.dynamic.part_from(name)
     return None
 

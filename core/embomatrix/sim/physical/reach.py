@@ -73,7 +73,7 @@ class Held:
     def placed(self, postures: FloatArray) -> FloatArray:
         """Centres in the world, (n, k, 3)."""
         rotation, position = body.tools(postures)
-        return np.asarray(position[:, None] + np.einsum("nij,kj->nki", rotation, self.centres))
+        return np.asarray(position[:, None] + self.centres @ rotation.transpose(0, 2, 1))
 
     def is_level(self, postures: FloatArray) -> BoolArray:
         """Whether nothing falls out of what is held, (n,)."""

@@ -199,18 +199,6 @@ def struck(boxes: Boxes, balls: FloatArray, radii: FloatArray, margin_m: float) 
     return found
 
 
-def clearance(boxes: Boxes, balls: FloatArray, radii: FloatArray) -> FloatArray:
-    """Smallest gap between each of n sets of balls, (n, b, 3), and all boxes, shape (n,): infinite without boxes."""
-    count, each, _ = balls.shape
-    found = np.full(count, np.inf)
-    rows = max(1, CHUNK // (each * max(1, len(boxes.owners))))
-    for start in range(0, count if boxes.owners else 0, rows):
-        part = balls[start : start + rows]
-        gaps = boxes.gaps(part.reshape(-1, 3)).min(axis=1).reshape(len(part), each) - radii
-        found[start : start + rows] = gaps.min(axis=1)
-    return found
-
-
 def _count(half_m: float, radius: float) -> int:
     return 1 if half_m <= radius * 1.2 else min(9, int(np.ceil((half_m - radius) / (radius * 1.5))) + 1)
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.sim.physical import body
-from embomatrix.sim.physical.space import clearance
+from embomatrix.sim.physical.space import struck
 from embomatrix.sim.physical.stage import compact
 from embomatrix.sim.placement import in_reach
 from embomatrix.skills.failure import FailureReason
@@ -196,7 +196,14 @@ def _cost_at(stage: Stage, start: FloatArray, bases: FloatArray) -> FloatArray:
         radii = np.concatenate([radii, stage.grip.held.radii])
     far = np.linalg.norm(centres[0, :, :2] - rows[0, :2], axis=1) + radii > 0.2
     centres, radii = centres[:, far], radii[far]
-    low, high = centres.min(axis=(0, 1)) - 0.1, centres.max(axis=(0, 1)) + 0.1
-    gaps = clearance(stage.boxes_within(low, high), centres, radii)
-    cost = np.where(gaps < STRUCK_M, BLOCKED_COST, np.where(gaps < BESIDE_M, BESIDE_COST, 0.0))
-    return np.asarray(cost)
+    wide = float(radii.max()) + BESIDE_M
+    boxes = stage.boxes_within(centres.min(axis=(0, 1)) - wide, centres.max(axis=(0, 1)) + wide)
+    cost = np.zeros(len(bases))
+    # A few at a time: of what is along the whole way, little is near any place of it.
+    for first in range(0, len(bases), HEADINGS):
+        some = centres[first : first + HEADINGS]
+        close = boxes.near(some.min(axis=(0, 1)) - wide, some.max(axis=(0, 1)) + wide)
+        beside = first + np.flatnonzero(struck(close, some, radii, BESIDE_M))
+        cost[beside] = BESIDE_COST
+        cost[beside[struck(close, centres[beside], radii, STRUCK_M)]] = BLOCKED_COST
+    return cost
