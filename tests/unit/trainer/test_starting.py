@@ -85,3 +85,11 @@ def test_a_checkpoint_of_another_version_is_told(kitchen, tmp_path, begun):
     state.write_text(json.dumps({**json.loads(state.read_text()), "schema": 2}))
     with pytest.raises(TrainerError, match="has schema 2, this version reads 3: start a new run"):
         resumed(kitchen, tmp_path, {})
+
+
+def test_a_run_from_a_saved_policy_goes_on_with_that_policy_named_again(kitchen, tmp_path, begun):
+    policy, arm = str(begun() / "policy"), tmp_path / "arm"
+    start = started(kitchen, arm, policy, None, SMALL)
+    start.progress.prepared = True
+    CheckpointStore(arm / CHECKPOINTS, keep=1).save(start.policy, {}, start.progress, start.settings)
+    assert resumed(kitchen, arm, {"imitation.seconds": 0.0}, model=policy).settings.model == policy
