@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Self
 
 import torch
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
     from embomatrix.skills.prompt import Prompt
     from embomatrix.trainer.policy.decoder import LayerMemory, PromptMemory
+    from embomatrix.trainer.policy.grammar import Cursor, Names
     from embomatrix.trainer.policy.protocol import Tokens
 
 _COMPACT_SHARE = 0.6
@@ -32,6 +34,33 @@ _LENGTH_CLASSES = 4
 """Plans are scored in this many batches of like length, each padded to its own longest."""
 _WEIGHTS = "weights.pt"
 _DESCRIPTION = "tiny.json"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Writing:
+    """Plans under way: their rows in the result, which of them go on, and what the next word of each follows from."""
+
+    rows: Tensor
+    going: Tensor
+    memory: PromptMemory
+    names: Names
+    cursor: Cursor
+    own: tuple[LayerMemory, ...] | None
+
+    def after(self, choice: Tensor, grammar: PlanGrammar) -> _Writing:
+        """With one more word of each plan (rows,)."""
+        return replace(self, going=self.going & (choice != END), cursor=grammar.advanced(self.cursor, choice))
+
+    def of_rows(self, kept: Tensor) -> _Writing:
+        """The plans with these indices alone."""
+        return _Writing(
+            self.rows[kept],
+            self.going[kept],
+            self.memory.of_rows(kept * len(self.memory.lengths) // len(self.going)),
+            self.names.of_rows(kept),
+            self.cursor.of_rows(kept),
+            tuple(layer.of_rows(kept) for layer in self.own) if self.own else None,
+        )
 
 
 class TinyPolicy:
@@ -78,42 +107,42 @@ class TinyPolicy:
         max_new: int,
         generator: torch.Generator,
     ) -> Samples:
-        memory = self.network.read(*self._padded(prompts))
-        names = self._grammar.names(memory.tokens).of_rows(
-            torch.arange(len(prompts), device=self.device).repeat_interleave(group)
-        )
-        cursor = self._grammar.start(len(prompts) * group)
-        rows = torch.arange(len(prompts) * group, device=self.device)  # those that go on
-        state = memory.states[:, -1:].repeat_interleave(group, dim=0)  # (rows, 1, C)
-        own: tuple[LayerMemory, ...] | None = None
-        tokens = torch.full((len(rows), max_new), PAD, device=self.device)
-        logprobs = torch.zeros(len(rows), max_new, device=self.device)
-        mask = torch.zeros(len(rows), max_new, dtype=torch.bool, device=self.device)
-        going = torch.ones(len(rows), dtype=torch.bool, device=self.device)
+        writing = self._begun(prompts, group)
+        state = writing.memory.states[:, -1:].repeat_interleave(group, dim=0)  # (rows, 1, C)
+        count = len(writing.rows)
+        tokens = torch.full((count, max_new), PAD, device=self.device)
+        logprobs = torch.zeros(count, max_new, device=self.device)
+        mask = torch.zeros(count, max_new, dtype=torch.bool, device=self.device)
         length = 0
         for at in range(max_new):
-            barred = self._grammar.barred(cursor, names)[:, None]
-            scores = self.network.scores(state, memory, barred)[:, 0]
+            barred = self._grammar.barred(writing.cursor, writing.names)[:, None]
+            scores = self.network.scores(state, writing.memory, barred)[:, 0]
             choice, logprob = draw(scores, temperature, generator)
-            cursor = self._grammar.advanced(cursor, choice)
+            rows, going = writing.rows, writing.going
             tokens[rows, at] = torch.where(going, choice, PAD)
             logprobs[rows, at] = torch.where(going, logprob, 0.0)
             mask[rows, at] = going
             length = at + 1
-            going = going & (choice != END)
-            left = int(going.sum())
+            writing = writing.after(choice, self._grammar)
+            left = int(writing.going.sum())
             if left == 0:
                 break
-            if left <= _COMPACT_SHARE * len(going):
-                kept = going.nonzero()[:, 0]
-                memory = memory.of_rows(kept * len(memory.lengths) // len(going))
-                own = tuple(layer.of_rows(kept) for layer in own) if own else None
-                names, cursor = names.of_rows(kept), cursor.of_rows(kept)
-                rows, choice, going = rows[kept], choice[kept], going[kept]
-            state, own = self.network.extend(memory, choice[:, None], own, at)
+            if left <= _COMPACT_SHARE * len(writing.going):
+                kept = writing.going.nonzero()[:, 0]
+                writing, choice = writing.of_rows(kept), choice[kept]
+            state, own = self.network.extend(writing.memory, choice[:, None], writing.own, at)
+            writing = replace(writing, own=own)
         drawn = tokens[:, :length]
         texts = tuple(self.vocabulary.decode(row) for row in drawn.tolist())
         return Samples(drawn, mask[:, :length], logprobs[:, :length], texts)
+
+    def _begun(self, prompts: Sequence[Tokens], group: int) -> _Writing:
+        """``group`` plans of each prompt, of which nothing is written."""
+        memory = self.network.read(*self._padded(prompts))
+        rows = torch.arange(len(prompts) * group, device=self.device)
+        names = self._grammar.names(memory.tokens).of_rows(rows // group)
+        going = torch.ones(len(rows), dtype=torch.bool, device=self.device)
+        return _Writing(rows, going, memory, names, self._grammar.start(len(rows)), None)
 
     def logprobs(
         self, prompts: Sequence[Tokens], tokens: Tensor, mask: Tensor, group: int, temperature: float
