@@ -3,26 +3,22 @@
 from __future__ import annotations
 
 import itertools
-import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.sim.bounds import IDENTITY, bounds_of, parts_of
 from embomatrix.sim.candidates import candidates
-from embomatrix.sim.engine import FLOOR, TOLERANCE_M
 from embomatrix.sim.lineup import Neighbours
 from embomatrix.sim.navigation import has_front
 from embomatrix.sim.past_leaves import behind_leaves
 from embomatrix.sim.repertoire import Repertoire
 from embomatrix.sim.spots import is_shut, is_upright, link_frame, links_with_spots
-from embomatrix.sim.statics import is_level, rest_pose
+from embomatrix.sim.trial import NEAR_M, Errand, Trial
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.limits import ROBOT
-from embomatrix.world.geometry import Pose
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     import numpy as np
 
@@ -30,30 +26,15 @@ if TYPE_CHECKING:
     from embomatrix.sim.lineup import BoolArray, Lineup
     from embomatrix.sim.relations import Relations
     from embomatrix.sim.repertoire import Spots
-    from embomatrix.world.geometry import Aabb
+    from embomatrix.world.geometry import Pose
     from embomatrix.world.poses import PoseCache, StandPose
 
-UNDISTURBED_M: Final = 0.005
-"""A pose that was verified offline is settled again when anything but its support is this near."""
-NEAR_M: Final = UNDISTURBED_M + TOLERANCE_M
-"""The margin of a question after what is that near: one about penetration forgives the tolerance."""
 LIVE_TRIES: Final = 64
 """Candidates looked at beyond the cached ones."""
 LIVE_SETTLES: Final = 8
 """How many of them are simulated at most."""
 HIGH_RIM_M: Final = ROBOT.reach_high_m - ROBOT.extent_m / 2
 """Over a rim that is no higher than this the arm lifts whatever it can hold."""
-
-
-@dataclass(frozen=True, slots=True)
-class Errand:
-    """What is to be placed where, and from which standing pose it must be in reach."""
-
-    held: str
-    target: str
-    relation: Relation
-    robot: StandPose
-    passed_over: tuple[StandPose, ...] = ()
 
 
 class Placer:
@@ -66,9 +47,9 @@ class Placer:
 
     def __init__(self, engine: PhysicsEngine, relations: Relations, cache: PoseCache) -> None:
         self._engine = engine
-        self._relations = relations
         self._scene = engine.scene
         self._repertoire = Repertoire(engine.scene, cache)
+        self._trial = Trial(engine, relations, self._repertoire)
         self._reached = cache.reached
 
     def complete(self) -> Iterator[None]:
@@ -199,7 +180,7 @@ class Placer:
     ) -> Iterator[tuple[int, Pose]]:
         """Good ones of a set's poses, each with its number."""
         for number, nearest in self._roomy_first(errand, spots, frames, order):
-            found = self._accept_verified(errand, spots.pose(number, frames), nearest)
+            found = self._trial.verified(errand, spots.pose(number, frames), nearest)
             if found is not None:
                 yield number, found
 
@@ -213,37 +194,18 @@ class Placer:
         for number, nearest in self._roomy_first(errand, spots, frames, range(len(spots))):
             if settles == LIVE_SETTLES:
                 return
-            proved = self._prove(errand, spots, number, frames)
+            proved = self._trial.proved(errand, spots, number, frames)
             if proved is not None:
                 yield proved
                 continue
-            if not self._is_free(errand, spots.pose(number, frames), nearest) or not self._holds(errand):
+            if not self._trial.is_free(errand, spots.pose(number, frames), nearest) or not self._trial.holds(
+                errand
+            ):
                 continue
             settles += 1
-            settled = self._accept_settled(errand)
+            settled = self._trial.settled(errand)
             if settled is not None:
                 yield settled
-
-    def _prove(self, errand: Errand, spots: Spots, number: int, frames: Mapping[str, Pose]) -> Pose | None:
-        """Where the thing rests for certain, with nothing but its support within 5 mm; None when it takes a settle to tell."""
-        engine, held, target = self._engine, errand.held, errand.target
-        one, other = self._scene.asset_of(held), self._scene.asset_of(target)
-        base = self._repertoire.base(one)
-        link, local = spots.ride(number)
-        if base is None or not is_level(frames[link]):
-            return None
-        fractions = engine.joints(target)
-        rest = rest_pose(one, base, link_frame(other, IDENTITY, fractions, link) @ local, other, fractions)
-        if rest is None:
-            return None
-        pose = engine.pose(target) @ rest
-        x, y, z = pose.position_m
-        # Looked at a margin higher up, where what lies below its underside, as the table under a sheet, is far enough away.
-        engine.set_pose(held, Pose((x, y, z + NEAR_M), pose.quat_xyzw))
-        if engine.penetrates(held, NEAR_M, frozenset((target, FLOOR))):
-            return None
-        engine.set_pose(held, pose)
-        return pose if self._holds(errand) and self._reaches(errand) else None
 
     def _roomy_first(
         self, errand: Errand, spots: Spots, frames: dict[str, Pose], order: Sequence[int]
@@ -307,53 +269,6 @@ class Placer:
         links = ({""} | links_with_spots(asset)) - shut
         return {link: link_frame(asset, pose, fractions, link) for link in sorted(links)}
 
-    def _accept_verified(self, errand: Errand, pose: Pose, nearest: str) -> Pose | None:
-        """A pose that was verified with nothing but its support around; it is settled where anything else is near."""
-        engine, held, target = self._engine, errand.held, errand.target
-        engine.set_pose(held, pose)
-        if nearest and self._is_deep(held, nearest):
-            return None
-        other = engine.penetrates(held, NEAR_M, frozenset((target, FLOOR)))
-        if other in self._scene.by_name and self._is_deep(held, other):
-            return None
-        if other:
-            return None if engine.penetrates(held) else self._accept_settled(errand)
-        # It was verified with both their joints shut: while they are, it is as free of the support as it was then.
-        if any((*engine.joints(target), *engine.joints(held))) and self._is_deep(held, target):
-            return None
-        return pose if self._holds(errand) else self._accept_settled(errand)
-
-    def _is_deep(self, held: str, other: str) -> bool:
-        gap_m = self._engine.gap(held, other, 0.0)
-        return gap_m is not None and gap_m < -TOLERANCE_M
-
-    def _accept_settled(self, errand: Errand) -> Pose | None:
-        """Let the object go where it is and take the pose where it comes to rest, if all still holds there."""
-        settled = self._engine.settle(errand.held)
-        if not settled.stable or not self._is_free(errand, settled.pose, "") or not self._reaches(errand):
-            return None
-        return settled.pose if self._holds(errand) else None
-
-    def _holds(self, errand: Errand) -> bool:
-        """Whether the relation holds where the object is being tried."""
-        match errand.relation:
-            case Relation.ONTOP:
-                return self._relations.footings.would_be_on(errand.held, errand.target)
-            case Relation.INSIDE:
-                return self._relations.footings.would_be_in(errand.held, errand.target)
-            case _:
-                return self._relations.holds(errand.relation, errand.held, errand.target)
-
-    def _is_free(self, errand: Errand, pose: Pose, nearest: str) -> bool:
-        """Put the object at the pose and tell whether it penetrates nothing there, ``nearest`` the least."""
-        self._engine.set_pose(errand.held, pose)
-        if nearest and self._is_deep(errand.held, nearest):
-            return False
-        return not self._engine.penetrates(errand.held)
-
-    def _reaches(self, errand: Errand) -> bool:
-        return in_reach(self._engine.aabb(errand.held), errand.robot)
-
 
 def _neighbours(engine: PhysicsEngine, names: Sequence[str]) -> Neighbours:
     items = [engine.scene.by_name[name] for name in names]
@@ -363,11 +278,3 @@ def _neighbours(engine: PhysicsEngine, names: Sequence[str]) -> Neighbours:
         [len(chain) == 1 and len(chain[0].parts) == 1 for chain in links],
         [not item.fixed for item in items],
     )
-
-
-def in_reach(box: Aabb, robot: StandPose) -> bool:
-    """Whether the arm reaches the nearest point of a box in the plane, and its middle's height."""
-    dx = max(box.low_m[0] - robot.x_m, robot.x_m - box.high_m[0], 0.0)
-    dy = max(box.low_m[1] - robot.y_m, robot.y_m - box.high_m[1], 0.0)
-    height = box.center_m[2]
-    return math.hypot(dx, dy) <= ROBOT.reach_m and ROBOT.reach_low_m <= height <= ROBOT.reach_high_m

@@ -9,9 +9,10 @@ from tests.fakes.scenes import kitchen_scene
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.navigation import Navigator
-from embomatrix.sim.placement import Placer, in_reach
+from embomatrix.sim.placement import Placer
 from embomatrix.sim.pose_cache import build_pose_cache
 from embomatrix.sim.relations import Relations
+from embomatrix.sim.trial import in_reach
 from embomatrix.skills.failure import FailureReason
 from embomatrix.world.geometry import Aabb, Pose
 from embomatrix.world.poses import PoseCache, StandPose
