@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.factory.furnish.halls import hall_groups, mat_rows, planting_groups
 from embomatrix.factory.furnish.hung import ceiling_groups, hung_groups, on_wall, rug_groups
 from embomatrix.factory.furnish.kitchen import COOKERS, SINKS, basin, run_groups, worktop
-from embomatrix.factory.furnish.pieces import CORNER_SOFA_M, Group, Member, Rows, Style, stacked, top_of
+from embomatrix.factory.furnish.pieces import (
+    CORNER_SOFA_M,
+    Group,
+    Member,
+    Rows,
+    Style,
+    around_table,
+    stacked,
+    top_of,
+)
 from embomatrix.factory.furnish.pool import Pool, worth
 from embomatrix.factory.furnish.roles import Role
 from embomatrix.factory.furnish.tables import table_groups, work_groups
@@ -20,6 +29,7 @@ if TYPE_CHECKING:
     from embomatrix.factory.furnish.pieces import Piece
 
 _COFFEE_GAP_M: Final = 0.38
+_PAIR: Final = 2
 _CORNER_SEAT_M: Final = 0.95
 """Depth of a corner sofa's two seats; its table stands in the nook between them."""
 _TV_STANDS: Final = ("console_table", "bottom_cabinet", "bookcase", "coffee_table", "breakfast_table")
@@ -176,7 +186,17 @@ def _sofas(pool: Pool) -> list[Group]:
         style = Style.NOOK if nook else Style.CENTERED
         screens = ("standing_tv", "wall_mounted_tv")
         groups.append(Group(tuple(members), style, worth(members), faces=screens, spread=("sofa",)))
-    return groups
+    return groups if sofas else _armchairs(pool, armchairs)
+
+
+def _armchairs(pool: Pool, armchairs: Sequence[Piece]) -> list[Group]:
+    """Where there is no sofa, armchairs face one another over a coffee table."""
+    tables = pool.of("coffee_table", "garden_coffee_table")
+    if len(armchairs) < _PAIR or not tables:
+        return []
+    members = around_table(tables[0], armchairs[:_PAIR], _COFFEE_GAP_M)
+    pool.take(m.piece for m in members)
+    return [Group(members, Style.FREE, worth(members), clear_m=_CLEAR_M / 2)]
 
 
 def _singles(pool: Pool) -> list[Group]:

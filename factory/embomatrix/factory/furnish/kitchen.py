@@ -5,7 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.furnish.pieces import REST_GAP_M, Group, Member, Style, stacked, top_of
+from embomatrix.factory.furnish.pieces import (
+    REST_GAP_M,
+    Group,
+    Member,
+    Style,
+    before_table,
+    stacked,
+    top_of,
+)
 from embomatrix.factory.furnish.roles import Role
 
 if TYPE_CHECKING:
@@ -60,6 +68,7 @@ def run_groups(pool: Pool, left_out: list[Unplaced]) -> list[Group]:
     """Everything that stands in lines along the walls, in the order of a kitchen: cold, wet, work, hot, and the rest."""
     counters = _counters(pool, left_out)
     _fit(pool, counters)
+    counters = [_with_chair(pool, group) for group in counters]
     basins = [basin(p) for p in pool.take(p for p in pool.of(*FITTED) if p.category != "burner")]
     for burner in pool.take(pool.of("burner")):
         left_out.append((burner, "no counter is left to carry it"))
@@ -233,6 +242,15 @@ def _evened(group: Group) -> Group:
 def worktop(slab: Piece) -> Group:
     """A slab without cabinets under it, on brackets at the wall."""
     return Group((Member(slab, bottom=_WORKTOP_M),), Style.RUN, 0.0, near=SINKS)
+
+
+def _with_chair(pool: Pool, group: Group) -> Group:
+    """A worktop on brackets is a desk where a swivel chair has none; a conference needs its chairs itself."""
+    slab = group.members[0]
+    if len(group.members) > 1 or slab.piece.role is not Role.COUNTERTOP or pool.of("conference_table"):
+        return group
+    _, *chairs = before_table(slab.piece, pool.take(pool.of("swivel_chair")[:1]))
+    return replace(group, members=(slab, *chairs))
 
 
 def basin(piece: Piece) -> Group:

@@ -175,13 +175,14 @@ class Group:
 class Rows:
     """Equal groups that stand in rows and columns, all looking one way; ``gap_m`` is free floor behind and beside each.
 
-    They spread over the room up to ``stretch`` times their closest pitch.
+    They spread over the room up to ``stretch`` times their closest pitch; ``clear_m`` is free floor to what stands already.
     """
 
     groups: tuple[Group, ...]
     importance: float
     gap_m: tuple[float, float]
     stretch: float = 1.35
+    clear_m: float = 0.0
 
 
 _FRONTED_NAMES: Final = (

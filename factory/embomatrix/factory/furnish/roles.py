@@ -86,6 +86,7 @@ _IMPORTANCE: Final[Mapping[str, float]] = {
     "urinal": 9, "grocery_shelf": 9, "checkout_counter": 10, "reception_desk": 10, "lab_table": 8,
     "hospital_bed": 12, "commercial_kitchen_table": 9, "bathtub": 8, "shower_stall": 8, "washer": 8,
     "microwave": 8, "countertop": 6, "bottom_cabinet": 6, "bookcase": 6, "top_cabinet": 5, "wardrobe": 6,
+    "wall_mounted_sink": 12, "multi_station_wall_mounted_sink": 12,
 }  # fmt: skip
 
 _WALL_HEIGHT: Final[Mapping[str, float]] = {

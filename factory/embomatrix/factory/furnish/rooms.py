@@ -50,7 +50,8 @@ _CAPS: Final[Mapping[Role, int]] = {
 _ABOVE_FLOOR_M: Final = 0.1
 _PAST_M: Final = 2 * ROBOT.radius_m + 0.1
 _LIGHT_LOSSES: Final = frozenset((Role.WALL, Role.CEILING, Role.RUG, Role.PLANTING))
-"""What finds no place of these is no reason to start again with it."""
+"""What finds no place of these is no reason to start again with it, unless the room is none without it: a basin."""
+_WEIGHTY: Final = 10.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,7 +170,7 @@ def _best_arrangement(
     for attempt in range(attempts):
         tried = _arrange(room, plan, pieces, rng, first, wobble=0.4 + 0.2 * attempt)
         # What found no place comes first the next time.
-        lost = [p for p in tried.dropped if p.role not in _LIGHT_LOSSES]
+        lost = [p for p in tried.dropped if _matters(p)]
         first |= {p.number for p in lost}
         if best is None or tried.loss < best.loss:
             best = tried
@@ -220,6 +221,11 @@ def _place_all(
                 # The last member is the least important one: a chair, a stool, the coffee table.
                 remaining = replace(remaining, members=remaining.members[:-1])
     return dropped
+
+
+def _matters(piece: Piece) -> bool:
+    """Whether it is a reason to arrange the room anew that the piece found no place."""
+    return piece.role not in _LIGHT_LOSSES or importance_of(piece.category, piece.role) >= _WEIGHTY
 
 
 def _signature(group: Group) -> tuple[str, ...]:

@@ -60,7 +60,7 @@ def _all_free(
 ) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
     """Nodes where the largest group stands free: what fits it, fits all."""
     largest = max(rows.groups, key=lambda g: len(g.members))
-    return solver.free(replace(largest, clear_m=0.0), nodes)
+    return solver.free(replace(largest, clear_m=rows.clear_m), nodes)
 
 
 def _unit(groups: Sequence[Group]) -> Rect4:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from embomatrix.factory.furnish.boxes import BoolArray, Box, FloatArray
-    from embomatrix.factory.furnish.pieces import Group, Member
+    from embomatrix.factory.furnish.pieces import Group, Member, Piece
     from embomatrix.factory.furnish.space import RoomSpace
 
 TRIES: Final = 12
@@ -29,6 +29,9 @@ TRIES: Final = 12
 _ACCESS_TOP_M: Final = 1.35
 _CHUNK: Final = 256
 _FLAT_M: Final = 0.25
+_RUG_SEEN_M: Final = 0.6
+"""Over a rug nothing is lower than this: one under a sofa is seen by nobody."""
+_CLEAR_SHARES: Final = (1.0, 0.5, 0.0)
 _APART_M: Final = 0.12
 """A candidate this close to one that failed fails for the same reason; the distance grows with every failure."""
 
@@ -46,11 +49,10 @@ class RoomSolver:
         """Place the group at its best free candidate; False when none leaves the room passable.
 
         ``wobble`` scales the noise on the costs: more of it makes attempts differ more. Where no place has the clearance that
-        the group asks for, it does with less.
+        the group asks for, it does with half of it, then with none.
         """
-        if self._place(group, wobble):
-            return True
-        return group.clear_m > 0 and self._place(replace(group, clear_m=0.0), wobble)
+        shares = _CLEAR_SHARES if group.clear_m else (0.0,)
+        return any(self._place(replace(group, clear_m=share * group.clear_m), wobble) for share in shares)
 
     def _place(self, group: Group, wobble: float) -> bool:
         options = candidates_of(group, self.space, self._around)
@@ -74,7 +76,7 @@ class RoomSolver:
     def place_at(self, group: Group, x: float, y: float, turns: int) -> bool:
         """Place the group in a frame known to be free, unless that takes something out of the robot's reach."""
         items = self._items(group, x, y, turns)
-        boxes = [box for item in items for box in item.boxes]
+        boxes = [_with_knee_room(item, box) for item in items for box in item.boxes]
         targets, zones, fronts = _access(items)
         bars_no_way = not targets and all(box[2] >= ROBOT.height_m or box[5] <= LOW_M for box in boxes)
         if not bars_no_way and not self.space.reachable(boxes, targets):
@@ -123,7 +125,7 @@ class RoomSolver:
         free = np.ones(len(options), dtype=bool)
         for member in group.members:
             for boxes in _boxes(member, options):
-                free &= ~self.space.collides(_grown(boxes, group.clear_m))
+                free &= ~self.space.collides(_grown(_seen(member, boxes), group.clear_m))
                 if _hangs(member):
                     free &= ~self.space.hangs_in_zone(boxes)
                 elif len(boxes) and boxes[0, 5] > LOW_M:
@@ -198,6 +200,23 @@ def _yaw(turns: int) -> float:
     return (0.0, math.pi / 2, math.pi, -math.pi / 2)[turns % 4]
 
 
+def _on_brackets(piece: Piece, host: int) -> bool:
+    """Whether it is a worktop on brackets, with room for knees under it rather than for other furniture."""
+    return piece.role is Role.COUNTERTOP and host < 0
+
+
+def _with_knee_room(item: Placed, box: Box) -> Box:
+    """The box down to the floor, where nothing shall stand under the piece."""
+    return (*box[:2], 0.0, *box[3:]) if _on_brackets(item.piece, item.host) else box
+
+
+def _seen(member: Member, boxes: FloatArray) -> FloatArray:
+    """The boxes with the space over a rug that keeps it in sight."""
+    if member.piece.role is not Role.RUG:
+        return boxes
+    return np.concatenate([boxes[:, :5], np.maximum(boxes[:, 5:], _RUG_SEEN_M)], axis=1)
+
+
 def _grown(boxes: FloatArray, by_m: float) -> FloatArray:
     return boxes + np.array([-by_m, -by_m, 0.0, by_m, by_m, 0.0]) if by_m else boxes
 
@@ -206,7 +225,8 @@ def _boxes(member: Member, options: Candidates) -> Iterator[FloatArray]:
     """World boxes of the member's blocks for every candidate, each (n, 6)."""
     x, y, yaw = _frames(member, options)
     for x0, y0, z0, x1, y1, z1 in member.piece.blocks:
-        yield _turned(x, y, yaw, (x0, y0, x1, y1), (member.bottom + z0, member.bottom + z1))
+        low = 0.0 if _on_brackets(member.piece, member.on) else member.bottom + z0
+        yield _turned(x, y, yaw, (x0, y0, x1, y1), (low, member.bottom + z1))
 
 
 def _front(member: Member, options: Candidates) -> FloatArray | None:

@@ -31,6 +31,8 @@ _SPACING_M: Final = np.array([0.01, 0.01, 0.0])
 _HIGHEST_M: Final = 1.75
 _TALL_M: Final = 1.3
 """The top of a higher cabinet is no place to put things down, its boards are."""
+_HEAD_SHARE: Final = 0.3
+"""Pillows keep to this share of a bed's free length, at its head."""
 _SAME_KIND: Final = 2.0
 """Equal things stand together: a surface that holds one already goes this many ranks before others."""
 
@@ -128,7 +130,7 @@ class SurfacePlacer:
         # Screens and machines look where their host looks; loose things lie as they were put down.
         square = max(piece.size_m[:2]) > 0.3 or bool(hosts_of(piece.category) and piece.asset.joints)
         turn = np.zeros(_SAMPLES) if square else self._rng.uniform(-0.6, 0.6, _SAMPLES)
-        x, y, half, fits = self._spots(piece, surface, host.yaw + turn)
+        x, y, half, fits = self._spots(piece, surface, host, host.yaw + turn)
         bottom = surface.z + REST_GAP_M
         low = np.column_stack([x - half[:, 0], y - half[:, 1], np.full(_SAMPLES, bottom)])
         high = np.column_stack([x + half[:, 0], y + half[:, 1], np.full(_SAMPLES, bottom + piece.size_m[2])])
@@ -155,7 +157,7 @@ class SurfacePlacer:
         return True
 
     def _spots(
-        self, piece: Piece, surface: Surface, yaw: FloatArray
+        self, piece: Piece, surface: Surface, host: Placed, yaw: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
         """Random middles on the surface, the half extents there (n, 2), and which of them keep to its edges."""
         overhang = 0.2 if piece.category == "standing_tv" else 0.0
@@ -165,7 +167,10 @@ class SurfacePlacer:
         room = np.array([surface.x1 - surface.x0, surface.y1 - surface.y0])
         slack = room - 2 * half * (1 - 2 * overhang) - 2 * _EDGE_M  # (n, 2)
         middle = np.array([surface.x0 + surface.x1, surface.y0 + surface.y1]) / 2
-        spots = middle + self._rng.uniform(-0.5, 0.5, (len(yaw), 2)) * slack
+        shares = self._rng.uniform(-0.5, 0.5, (len(yaw), 2))
+        if (piece.category, host.piece.category) == ("pillow", "bed"):
+            _to_head(shares, host.yaw)
+        spots = middle + shares * slack
         return spots[:, 0], spots[:, 1], half, np.asarray(slack.min(axis=1) >= 0)
 
     def _hits(self, low: FloatArray, high: FloatArray, host: int) -> NDArray[np.bool_]:
@@ -188,3 +193,10 @@ class SurfacePlacer:
         self.placed.append(item)
         self._boxes.extend([item.box])
         self._used[item.host] += 1
+
+
+def _to_head(shares: FloatArray, yaw: float) -> None:
+    """Move places on a bed, (n, 2) in shares of its free length and width from its middle, to its head: its back."""
+    axis = int(abs(math.sin(yaw)) > 0.5)
+    back = -math.copysign(0.5, (math.cos(yaw), math.sin(yaw))[axis])
+    shares[: len(shares) // 2, axis] = back + _HEAD_SHARE * (shares[: len(shares) // 2, axis] - back)

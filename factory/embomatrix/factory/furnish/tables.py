@@ -43,6 +43,8 @@ _SET_CLEAR_M: Final = 0.5
 _WALK_M: Final = 0.8
 _ROW_M: Final = 0.3
 """Floor behind the chairs of a class: one gets there by the aisle beside them."""
+_SEAT_M: Final = 0.45
+"""Floor between the chairs of two tables."""
 _BESIDE_DESK_M: Final = 0.65
 
 
@@ -146,9 +148,10 @@ def _in_rows(groups: Sequence[Group], pool: Pool) -> list[Group | Rows]:
         if len(equal) < ROW_OF or len(equal[0].members) < 2:
             found += equal
             continue
-        beside = 0.05 if equal[0].members[0].piece.category in _WORK else 0.45
-        gap = (_ROW_M, _WALK_M) if pool.room_type in _FACING else (_WALK_M, beside)
-        found.append(Rows(tuple(equal), max(g.importance for g in equal), gap))
+        work = equal[0].members[0].piece.category in _WORK
+        gap = (_ROW_M, _WALK_M) if pool.room_type in _FACING else (_WALK_M, 0.05 if work else _SEAT_M)
+        clear = 0.0 if work else min(gap)
+        found.append(Rows(tuple(equal), max(g.importance for g in equal), gap, clear_m=clear))
     return found
 
 
