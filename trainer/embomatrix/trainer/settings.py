@@ -78,7 +78,9 @@ class PromptSettings(_Frozen):
     rows: int = Field(default=16, ge=1)
     """Rows told at most: those that the instruction names come first."""
     rename_share: float = Field(default=0.8, ge=0, le=1)
-    """Share of examples in which categories are called by the names of others (tiny policy only)."""
+    """Share of imitation's examples in which categories are called by the names of others (tiny policy only)."""
+    practice_rename_share: float = Field(default=0.0, ge=0, le=1)
+    """The same for GRPO's: by default it practises in the words of its tasks."""
     drop_share: float = Field(default=0.7, ge=0, le=1)
     """During imitation: up to this share of the rows that the oracle does not use is left untold."""
 
@@ -119,7 +121,7 @@ class GrpoSettings(_Frozen):
     """Plans per task: G."""
     chunk: int = Field(default=8, ge=1)
     """Tasks sampled together: their plans go to the cluster while the next chunk is sampled."""
-    learning_rate: float = Field(default=2e-4, gt=0)
+    learning_rate: float = Field(default=4e-4, gt=0)
     warmup_steps: int = Field(default=20, ge=0)
     """Adam's first steps have the full length of the rate whatever the gradient: unless it rises slowly, the first few small
     batches undo what imitation taught."""
@@ -135,9 +137,9 @@ class GrpoSettings(_Frozen):
     kl_coef: float = Field(default=0.02, ge=0)
     """Weight of the KL to the policy as imitation left it: the paper's beta."""
     entropy_coef: float = Field(default=0.0, ge=0)
-    spread_floor: float = Field(default=1e-4, gt=0)
+    spread_floor: float = Field(default=1.0, gt=0)
     """Added to the spread of a group's rewards, in units of reward, before they are divided by it. At 1, a group whose plans
-    differ by a touched object only weighs a tenth of one in which some reach the goal; near 0 it weighs as much."""
+    differ by a touched object only weighs a tenth of one in which some reach the goal; near 0, as in the paper, as much."""
     max_grad_norm: float = Field(default=1.0, gt=0)
     lookahead: int = Field(default=3, ge=0)
     """Steps announced ahead."""

@@ -149,4 +149,5 @@ def loaded(dataset: Path, settings: TrainSettings) -> TaskSet:
 def teller_for(policy: Policy, tasks: TaskSet, settings: TrainSettings) -> Teller:
     """Tells those tasks to that policy, as the settings say."""
     told = settings.prompt
-    return Teller(policy, told.rows, Variation(tasks.kinds, told.rename_share, told.drop_share))
+    variation = Variation(tasks.kinds, told.rename_share, told.drop_share)
+    return Teller(policy, told.rows, variation, told.practice_rename_share)

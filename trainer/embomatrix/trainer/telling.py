@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from embomatrix.skills.parse import plan_to_json, plan_to_lines
@@ -29,11 +29,16 @@ class Told:
 
 @dataclass(frozen=True, slots=True)
 class Teller:
-    """Tells tasks to one policy; ``rows`` at most, varied during training only."""
+    """Tells tasks to one policy; ``rows`` at most, varied during training only.
+
+    GRPO has a share of renaming of its own: where imitation is to learn to go by what is said of a thing, GRPO practises what
+    it will be examined in.
+    """
 
     policy: Policy
     rows: int
     variation: Variation
+    practice_rename: float = 0.0
 
     def plainly(self, task: TrainingTask) -> Told:
         """The task as it is: evaluation."""
@@ -41,7 +46,8 @@ class Teller:
 
     def anew(self, task: TrainingTask, rng: np.random.Generator) -> Told:
         """The task in one of its many tellings: GRPO. One telling serves a whole group."""
-        return self._told(varied(limited(task.situation, self.rows), self.variation, rng))
+        variation = replace(self.variation, rename=self.practice_rename)
+        return self._told(varied(limited(task.situation, self.rows), variation, rng))
 
     def lesson(self, task: TrainingTask, rng: np.random.Generator) -> tuple[Tokens, Tokens]:
         """Prompt and oracle's plan of one telling: imitation."""
