@@ -58,7 +58,8 @@ def test_a_reserve_that_is_not_needed_changes_nothing(tmp_path, kind):
         "grpo__chunk": 1,
         "grpo__steps": 2,
         "grpo__temperature": 1.5,
-        "seed": 5,
+        "grpo__group": 10,  # so many plans of a task hardly ever earn all the same
+        "seed": 7,
     }
     _, plain = trained(tmp_path / "plain", **changes)
     _, reserved = trained(tmp_path / "reserved", grpo__reserve=1, **changes)
