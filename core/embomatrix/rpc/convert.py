@@ -8,9 +8,7 @@ import operator
 from typing import TYPE_CHECKING, Final, Literal, TypeVar
 
 from embomatrix.proto.v1 import types_pb2
-from embomatrix.rpc.values import (
-    Rollout,
-)
+from embomatrix.rpc.values import Rollout
 from embomatrix.skills.syntax import (
     MAX_PLAN_BYTES,
     MAX_ROOM_NAME,
@@ -25,7 +23,6 @@ from embomatrix.skills.syntax import (
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
-
 
 ArgField = Literal["object_index", "source_index", "relation", "yaw", "distance", "room_name"]
 WireT = TypeVar("WireT")
@@ -130,12 +127,12 @@ def skill_call_to_proto(call: SkillCall) -> types_pb2.SkillCall:
 
 
 def skill_call_from_proto(message: types_pb2.SkillCall) -> SkillCall:
+    """The call, with exactly the arguments that its skill takes; any other set is a ``ConvertError``."""
     return _call_of(message.SerializeToString())
 
 
 @functools.lru_cache(KNOWN)
 def _call_of(data: bytes) -> SkillCall:
-    """The call, with exactly the arguments that its skill takes; any other set is a ``ConvertError``."""
     message = types_pb2.SkillCall.FromString(data)
     skill = _SKILLS.get(message.skill)
     if skill is None:

@@ -109,7 +109,14 @@ def resident_from_proto(message: worker_service_pb2.Resident) -> Resident:
 
 
 def lease_ref_to_proto(ref: LeaseRef) -> worker_service_pb2.LeaseRef:
-    return worker_service_pb2.LeaseRef(lease_id=ref.lease_id, lease_epoch=ref.lease_epoch)
+    message = worker_service_pb2.LeaseRef()
+    write_lease_ref(ref, message)
+    return message
+
+
+def write_lease_ref(ref: LeaseRef, message: worker_service_pb2.LeaseRef) -> None:
+    """Fill an empty message, such as one that was just added to a longer one: that spares a copy."""
+    message.lease_id, message.lease_epoch = ref.lease_id, ref.lease_epoch
 
 
 def lease_ref_from_proto(message: worker_service_pb2.LeaseRef) -> LeaseRef:
@@ -125,9 +132,15 @@ def lease_progress_from_proto(message: worker_service_pb2.LeaseProgress) -> Leas
 
 
 def lease_origin_to_proto(origin: LeaseOrigin) -> worker_service_pb2.LeaseOrigin:
-    return worker_service_pb2.LeaseOrigin(
-        run_id=origin.run_id, batch_id=origin.batch_id, rollout_id=origin.rollout_id, attempt=origin.attempt
-    )
+    message = worker_service_pb2.LeaseOrigin()
+    write_lease_origin(origin, message)
+    return message
+
+
+def write_lease_origin(origin: LeaseOrigin, message: worker_service_pb2.LeaseOrigin) -> None:
+    """Fill an empty message, as ``write_lease_ref`` does."""
+    message.run_id, message.batch_id = origin.run_id, origin.batch_id
+    message.rollout_id, message.attempt = origin.rollout_id, origin.attempt
 
 
 def lease_origin_from_proto(message: worker_service_pb2.LeaseOrigin) -> LeaseOrigin:
@@ -159,15 +172,12 @@ def lease_to_proto(lease: Lease) -> worker_service_pb2.Lease:
 
 
 def write_lease(lease: Lease, message: worker_service_pb2.Lease) -> None:
-    """Fill an empty message, such as one that was just added to a longer one: that spares a copy."""
-    ref = message.ref
-    ref.lease_id, ref.lease_epoch = lease.ref.lease_id, lease.ref.lease_epoch
+    """Fill an empty message, as ``write_lease_ref`` does."""
+    write_lease_ref(lease.ref, message.ref)
     write_rollout(lease.rollout, message.rollout)
     message.deadline_s = lease.deadline_s
     if lease.origin is not None:
-        told, origin = message.origin, lease.origin
-        told.run_id, told.batch_id = origin.run_id, origin.batch_id
-        told.rollout_id, told.attempt = origin.rollout_id, origin.attempt
+        write_lease_origin(lease.origin, message.origin)
     own = reward_settings_to_proto(lease.reward)
     if own is not None:
         message.reward.CopyFrom(own)
@@ -197,9 +207,8 @@ def lease_result_to_proto(result: LeaseResult) -> worker_service_pb2.LeaseResult
 
 
 def write_lease_result(result: LeaseResult, message: worker_service_pb2.LeaseResult) -> None:
-    """Fill an empty message, as ``write_lease`` does."""
-    ref = message.lease
-    ref.lease_id, ref.lease_epoch = result.ref.lease_id, result.ref.lease_epoch
+    """Fill an empty message, as ``write_lease_ref`` does."""
+    write_lease_ref(result.ref, message.lease)
     message.slot, message.held_s = result.slot, result.held_s
     match result.outcome:
         case Completed() as completed:

@@ -34,6 +34,11 @@ class Rider:
     pose_link_object: Pose
 
 
+def swing_leaves(engine: PhysicsEngine, relations: Relations, name: str, shares: Sequence[float]) -> None:
+    """Lead all leaves of an object through shares of their travel, with what rides on them, as far as there is room."""
+    Leaves(engine, relations, name).swing([(share,) * len(engine.joints(name)) for share in shares])
+
+
 class Leaves:
     """The moving links of one object, with all that rests on or lies in them."""
 

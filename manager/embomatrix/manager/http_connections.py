@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import resource
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, cast
 
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
@@ -37,10 +37,11 @@ class BoundedConnections(H11Protocol):
         super().__init__(config, server_state, app_state, _loop)
         self._patience: asyncio.TimerHandle | None = None
 
-    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        super().connection_made(transport)
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        # A protocol takes any transport; uvicorn's takes a stream's alone, which is what a server opens.
+        super().connection_made(cast("asyncio.Transport", transport))
         if len(self.connections) > self.most:
-            transport.abort()
+            self.transport.abort()
         else:
             self._patience = self.loop.call_later(self.silent_s, self._close_silent)
 

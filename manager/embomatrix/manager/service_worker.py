@@ -17,6 +17,7 @@ from embomatrix.rpc.convert_session import (
     resources_from_proto,
     worker_state_from_proto,
     write_lease,
+    write_lease_ref,
 )
 from embomatrix.rpc.logs import bind
 from embomatrix.rpc.status import (
@@ -158,9 +159,9 @@ def _messages(outbox: Outbox) -> list[pb.SessionResponse]:
     messages = [_with_leases(part) for part in parts] or [pb.SessionResponse()]
     head = messages[0]
     for ref in outbox.acknowledged:
-        head.acknowledged.add(lease_id=ref.lease_id, lease_epoch=ref.lease_epoch)
+        write_lease_ref(ref, head.acknowledged.add())
     for ref in outbox.cancelled:
-        head.cancelled.add(lease_id=ref.lease_id, lease_epoch=ref.lease_epoch)
+        write_lease_ref(ref, head.cancelled.add())
     head.drain, head.resume = outbox.drain, outbox.resume
     if outbox.desired is not None:
         head.desired.CopyFrom(pb.DesiredResidents(bundle_digests=outbox.desired))

@@ -11,6 +11,7 @@ from tests.fakes.simulation import PROGRAM
 
 from embomatrix.rpc.status import ManagerUnreachableError, SupersededError
 from embomatrix.rpc.values import Completed, InfraCode, ResidentState, Resources
+from embomatrix.worker import session
 from embomatrix.worker.daemon import Daemon
 from embomatrix.worker.settings import WorkerSettings
 
@@ -85,7 +86,9 @@ async def test_many_leases_are_executed_once_each(tmp_path):
     assert sorted(_done(manager)) == sorted(f"l{number}" for number in range(200))
 
 
-async def test_results_travel_together_while_enough_waits_behind_the_slots(tmp_path):
+async def test_results_travel_together_while_enough_waits_behind_the_slots(tmp_path, monkeypatch):
+    # So long that what is counted does not depend on the machine's speed.
+    monkeypatch.setattr(session, "LINGER_S", 60.0)
     manager = FakeManager()
     digest = manager.bundle(b"ok")
     async with joined(manager, tmp_path):
@@ -93,8 +96,7 @@ async def test_results_travel_together_while_enough_waits_behind_the_slots(tmp_p
         for number in range(200):
             manager.lease(f"l{number}", digest)
         await _until(lambda: len(manager.results) >= 200)
-    # Some 20 on a machine of one's own; on a busy one what comes late travels alone.
-    assert manager.deliveries < 160
+    assert manager.deliveries < 100
 
 
 async def test_a_broken_stream_is_opened_again_and_unacknowledged_results_come_again(tmp_path):

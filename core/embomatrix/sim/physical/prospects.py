@@ -11,22 +11,20 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.sim.leaves import Leaves
+from embomatrix.sim.leaves import swing_leaves
 from embomatrix.sim.physical.hands import ways_to
 from embomatrix.sim.physical.place import PLACES
 from embomatrix.sim.physical.put import Delivery
-from embomatrix.sim.physical.stage import tucked
 from embomatrix.sim.placement import Placer
 from embomatrix.sim.swings import SWING
 from embomatrix.skills.failure import FailureReason
-from embomatrix.world.geometry import Pose
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
-    from embomatrix.sim.physical.reach import Way
     from embomatrix.sim.physical.stage import Grip, Stage
+    from embomatrix.world.geometry import Pose
     from embomatrix.world.poses import PoseCache, StandPose
 
 LOOKS: Final = 9
@@ -88,7 +86,7 @@ class Prospects:
         poses = self._placer.verified(placing.held, placing.target, placing.relation, stand, LOOKS)
         if not poses:
             return None, ""
-        self._stand_at(stand)
+        self._stage.stand_at(stand)
         self._stage.grip = grip
 
         def counts() -> bool:
@@ -98,7 +96,7 @@ class Prospects:
         way = next(delivery.ways(), None)
         index = len(poses) - 1
         if way is not None:
-            index = _nearest([pose for _, pose in poses], _end_of(way) @ grip.pose_tool_object)
+            index = _nearest([pose for _, pose in poses], way.track.key_pose @ grip.pose_tool_object)
         self._looks += index + 1
         other = "" if way is not None else self._bars(placing, grip, stand, counts)
         self._stage.grip = None
@@ -147,12 +145,12 @@ class Prospects:
             return None
         world.engine.reset()
         self._open_around(name)
-        self._stand_at(stands[0])
+        stage.stand_at(stands[0])
         tracks, _, bases = ways_to(stage, name)
         way = next(stage.reach(stage.boxes(), name).ways(tracks, bases), None)
         if way is None:
             return None
-        return stage.grip_with(_end_of(way), world.engine.pose(name), name)
+        return stage.grip_with(way.track.key_pose, world.engine.pose(name), name)
 
     def _make_ready(self, placing: Placing) -> None:
         """The scene as it was loaded, with the thing in the hand and the target open to it."""
@@ -161,29 +159,15 @@ class Prospects:
         world.hand.take(world.cargo(placing.held))
         self._open_around(placing.target)
         if placing.relation is Relation.INSIDE:
-            self._open(placing.target)
+            swing_leaves(world.engine, world.relations, placing.target, SWING)
         world.navigator.refresh()
 
     def _open_around(self, name: str) -> None:
-        for enclosure in self._world.relations.enclosing(name):
+        world = self._world
+        for enclosure in world.relations.enclosing(name):
             if enclosure.closed:
-                self._open(enclosure.name)
-        self._world.navigator.refresh()
-
-    def _open(self, name: str) -> None:
-        engine = self._world.engine
-        leaves = Leaves(engine, self._world.relations, name)
-        leaves.swing([(share,) * len(engine.joints(name)) for share in SWING])
-
-    def _stand_at(self, stand: StandPose) -> None:
-        self._world.robot = self._stage.told = stand
-        self._stage.dynamic.robot.appear(tucked(stand))
-
-
-def _end_of(way: Way) -> Pose:
-    """Where a way brings the tool."""
-    track = way.track
-    return Pose.from_rotation(tuple(track.position[track.key].tolist()), track.rotation[track.key])
+                swing_leaves(world.engine, world.relations, enclosure.name, SWING)
+        world.navigator.refresh()
 
 
 def _nearest(poses: Sequence[Pose], there: Pose) -> int:

@@ -16,6 +16,7 @@ from embomatrix.sim.physical import arm, body
 from embomatrix.sim.physical.roadmap import way_between
 from embomatrix.sim.physical.space import Boxes, strikes, struck
 from embomatrix.sim.robot_dimensions import LIFT_M, SHOULDER_LOW_M
+from embomatrix.world.geometry import Pose
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -94,6 +95,11 @@ class Track:
     position: FloatArray
     loaded: BoolArray
     key: int
+
+    @property
+    def key_pose(self) -> Pose:
+        """Where the tool is at the key, in the world."""
+        return Pose.from_rotation(tuple(self.position[self.key].tolist()), self.rotation[self.key])
 
 
 @dataclass(frozen=True, slots=True)

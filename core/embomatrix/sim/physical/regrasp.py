@@ -161,8 +161,7 @@ def _leading(
     """
     found: dict[tuple[float, float], list[FloatArray]] = {}
     for track in offered:
-        position = track.position[track.key]
-        tool = Pose.from_rotation(tuple(position.tolist()), track.rotation[track.key])
+        tool = track.key_pose
         delivery = Delivery(stage, grip.otherwise(tool.inverse() @ rest), poses, counts)
         if next(delivery.ways(), None) is not None:
             found.setdefault(_kind(track), []).append(rest.rotation.T @ tool.rotation)

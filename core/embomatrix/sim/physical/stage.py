@@ -88,6 +88,11 @@ class Stage:
         self.dynamic.build(poses, joints, tucked(robot))
         self.grip, self.told = None, robot
 
+    def stand_at(self, stand: StandPose) -> None:
+        """Put the robot somewhere with its arm tucked, in both worlds. Nothing is asked about the way there."""
+        self.world.robot = self.told = stand
+        self.dynamic.robot.appear(tucked(stand))
+
     def boxes(self) -> Boxes:
         """Parts of things around the robot, without what it holds."""
         x, y, _ = self.mover.posture[:3]

@@ -17,13 +17,13 @@ import numpy as np
 from embomatrix.sim.bounds import IDENTITY
 from embomatrix.sim.bullet.dynamic import DynamicWorld
 from embomatrix.sim.contents import Contents
-from embomatrix.sim.leaves import Leaves
+from embomatrix.sim.leaves import Leaves, swing_leaves
 from embomatrix.sim.physical.doors import STRETCHES, close_all, in_turn, leading, open_all
 from embomatrix.sim.physical.fold import WAYS, approach
 from embomatrix.sim.physical.hands import ways_to
 from embomatrix.sim.physical.press import pressing
 from embomatrix.sim.physical.prospects import Prospects
-from embomatrix.sim.physical.stage import AROUND_M, Stage, tucked
+from embomatrix.sim.physical.stage import AROUND_M, Stage
 from embomatrix.sim.physical.travel import SOMETHING
 from embomatrix.sim.swings import SWING
 from embomatrix.skills.limits import ROBOT
@@ -157,8 +157,7 @@ class _Surveyor:
         for number, stand in enumerate(stands):
             if number:
                 self._make_ready(name, handling)
-            self._world.robot = self._stage.told = stand
-            self._stage.dynamic.robot.appear(tucked(stand))
+            self._stage.stand_at(stand)
             other = self._bars(name, handling)
             if not other:
                 return number, ""
@@ -186,11 +185,12 @@ class _Surveyor:
                 for item in world.scene.objects:
                     if not item.fixed and item.name != name and world.relations.host_of(item.name):
                         world.engine.park(item.name)
-                self._swing(name, *(SWING if handling is Handling.CLOSE else (0.0,)))
+                shares = SWING if handling is Handling.CLOSE else (0.0,)
+                swing_leaves(world.engine, world.relations, name, shares)
             case Handling.TAKE | Handling.PRESS:
                 for enclosure in world.relations.enclosing(name):
                     if enclosure.closed:
-                        self._swing(enclosure.name, *SWING)
+                        swing_leaves(world.engine, world.relations, enclosure.name, SWING)
         world.navigator.refresh()
 
     def _surroundings(self, name: str, handling: Handling, stands: Sequence[StandPose]) -> bytes:
@@ -203,11 +203,6 @@ class _Surveyor:
         ]
         walls = [(wall.pose, wall.size_m) for wall in scene.walls if wall.aabb(IDENTITY).overlaps(window)]
         return hashlib.sha256(repr((handling, rows, walls, stands)).encode()).digest()
-
-    def _swing(self, name: str, *shares: float) -> None:
-        """Lead all leaves of an object through shares of their travel, with what rides on them, as far as there is room."""
-        leaves = Leaves(self._world.engine, self._world.relations, name)
-        leaves.swing([(share,) * len(self._world.engine.joints(name)) for share in shares])
 
     def _bars(self, name: str, handling: Handling) -> str:
         """What bars the way of the arm from where the robot stands; "" when nothing does."""
