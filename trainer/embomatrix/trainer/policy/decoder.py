@@ -157,9 +157,7 @@ class Decoder(nn.Module):
         lengths = (~hidden).sum(dim=1)
         positions = ((~hidden).cumsum(dim=1) - 1).clamp(min=0)
         rope = self._rope(positions)
-        bias = (hidden.float() * _HIDDEN_KEY)[
-            :, None, None, :
-        ]  # (Q, 1, 1, P): every token sees the whole prompt
+        bias = (hidden.float() * _HIDDEN_KEY)[:, None, None]  # (Q, 1, 1, P): a token sees the whole prompt
         x = self.embedding(tokens)
         memories = []
         for block in self.blocks:
