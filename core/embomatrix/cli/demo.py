@@ -21,21 +21,30 @@ DEFAULT_OUT: Final = Path("runs/demo")
 console = Console()
 
 
+_Out = Annotated[
+    Path | None,
+    typer.Option(help=f"Folder for everything that the run writes; else {DEFAULT_OUT}, or -2, -3 ..."),
+]
+_Dataset = Annotated[Path, typer.Option(help="Dataset folder; built first when it is missing.")]
+_Workers = Annotated[int, typer.Option(min=1, max=64, help="Worker daemons on this machine.")]
+_Slots = Annotated[int, typer.Option(min=1, max=64, help="Slots of each worker.")]
+_Minutes = Annotated[float, typer.Option(min=0.1, help="Minutes of GRPO.")]
+_ImitateSeconds = Annotated[float, typer.Option(min=0.0, help="Seconds of imitation before it.")]
+_Model = Annotated[str, typer.Option(help="`tiny`, or a Hugging Face name or folder.")]
+_Seed = Annotated[int, typer.Option(help="Seed of tasks, policy and sampling.")]
+_Threads = Annotated[int, typer.Option(min=0, help="Threads of torch; 0: one a core.")]
+
+
 def demo(
-    out: Annotated[
-        Path | None,
-        typer.Option(help=f"Folder for everything that the run writes; else {DEFAULT_OUT}, or -2, -3 ..."),
-    ] = None,
-    dataset: Annotated[Path, typer.Option(help="Dataset folder; built first when it is missing.")] = Path(
-        "build/dataset"
-    ),
-    workers: Annotated[int, typer.Option(min=1, max=64, help="Worker daemons on this machine.")] = 2,
-    slots: Annotated[int, typer.Option(min=1, max=64, help="Slots of each worker.")] = 1,
-    minutes: Annotated[float, typer.Option(min=0.1, help="Minutes of GRPO.")] = 6.0,
-    imitate_seconds: Annotated[float, typer.Option(min=0.0, help="Seconds of imitation before it.")] = 180.0,
-    model: Annotated[str, typer.Option(help="`tiny`, or a Hugging Face name or folder.")] = "tiny",
-    seed: Annotated[int, typer.Option(help="Seed of tasks, policy and sampling.")] = 0,
-    threads: Annotated[int, typer.Option(min=0, help="Threads of torch; 0: one a core.")] = 0,
+    out: _Out = None,
+    dataset: _Dataset = Path("build/dataset"),
+    workers: _Workers = 2,
+    slots: _Slots = 1,
+    minutes: _Minutes = 6.0,
+    imitate_seconds: _ImitateSeconds = 180.0,
+    model: _Model = "tiny",
+    seed: _Seed = 0,
+    threads: _Threads = 0,
 ) -> None:
     """Bring up a local cluster and train on real tasks, from nothing to a report."""
     logging.basicConfig(level=logging.WARNING, format="%(message)s", handlers=[RichHandler(show_path=False)])
@@ -43,38 +52,45 @@ def demo(
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     folder = _folder(out)
     started_s = time.monotonic()
-    if not (dataset / "tasks.jsonl").exists():
-        console.rule("tasks")
-        # A run to look at: what the arm of physical mode could not do after all is not looked for.
-        run_command(
-            "demo", no_problem, "factory", "build", f"--out={dataset}", f"--seed={seed}", "--no-look-ahead"
-        )
+    _ensure_tasks(dataset, seed)
     built_s = time.monotonic()
     cluster = local_cluster(folder / "cluster", workers=workers, slots=slots)
     with cluster.supervisor:
-        console.rule("training")
-        console.print(
-            f"manager at {cluster.address}, {workers} workers of {slots} slot, dashboard at {cluster.dashboard}",
-            highlight=False,
-        )
-        run_command(
-            "demo",
-            lambda: cluster_problem(cluster),
-            "train",
-            f"--dataset={dataset}",
-            f"--manager={cluster.address}",
+        _announce(cluster, slots)
+        how = [
             f"--model={model}",
             f"--minutes={minutes}",
             f"--imitate-seconds={imitate_seconds}",
-            f"--out={folder}",
             f"--seed={seed}",
-            # The workers are niced and far from busy: the trainer may have every core.
-            f"--threads={threads or os.cpu_count() or 1}",
-        )
+        ]
+        # The workers are niced and far from busy: the trainer may have every core.
+        how.append(f"--threads={threads or os.cpu_count() or 1}")
+        where = [f"--dataset={dataset}", f"--manager={cluster.address}", f"--out={folder}"]
+        run_command("demo", lambda: cluster_problem(cluster), "train", *where, *how)
         _report_restarts(cluster)
     ended_s = time.monotonic()
     console.print(
         f"tasks {built_s - started_s:.0f} s, training {ended_s - built_s:.0f} s, logs in {folder / 'cluster' / 'logs'}",
+        highlight=False,
+    )
+
+
+def _ensure_tasks(dataset: Path, seed: int) -> None:
+    """Build the dataset where there is none."""
+    if (dataset / "tasks.jsonl").exists():
+        return
+    console.rule("tasks")
+    # A run to look at: what the arm of physical mode could not do after all is not looked for.
+    run_command(
+        "demo", no_problem, "factory", "build", f"--out={dataset}", f"--seed={seed}", "--no-look-ahead"
+    )
+
+
+def _announce(cluster: LocalCluster, slots: int) -> None:
+    console.rule("training")
+    workers = f"{len(cluster.workers)} workers of {slots} slot{'s' * (slots > 1)}"
+    console.print(
+        f"manager at {cluster.address}, {workers}, dashboard at {cluster.dashboard}",
         highlight=False,
     )
 

@@ -20,8 +20,8 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from embomatrix.cli.examinee import Chosen, Questions, asked_of
 from embomatrix.cli.failure import INTERRUPTED, fail
-from embomatrix.skills.parse import plan_to_json
 from embomatrix.skills.prompt import Codec
 from embomatrix.trainer.eai.exam import CODEC as EAI_CODEC
 from embomatrix.trainer.eai.exam import NAME as NATIVE
@@ -36,23 +36,21 @@ from embomatrix.trainer.evaluation.answers import (
     ordered,
     read_answers,
 )
-from embomatrix.trainer.evaluation.asking import EndpointAsker, PolicyAsker, WriterAsker, questions_digest
-from embomatrix.trainer.evaluation.baselines import BaselineName, baseline_for
+from embomatrix.trainer.evaluation.asking import questions_digest
+from embomatrix.trainer.evaluation.baselines import BaselineName
 from embomatrix.trainer.evaluation.benchmark import find_benchmark
 from embomatrix.trainer.evaluation.cluster import ClusterExecutor
 from embomatrix.trainer.evaluation.exam import WorldExam
 from embomatrix.trainer.evaluation.page import evaluation_page
 from embomatrix.trainer.evaluation.table import read_row, report_of, text_report
-from embomatrix.world.task import MAX_TABLE, Profile
+from embomatrix.world.task import Profile
 from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    import numpy as np
-
+    from embomatrix.cli.examinee import Asked
     from embomatrix.trainer.evaluation.answers import Answer
-    from embomatrix.trainer.evaluation.asking import Asker
     from embomatrix.trainer.evaluation.benchmark import Benchmark
     from embomatrix.trainer.evaluation.exam import Exam
     from embomatrix.trainer.evaluation.judging import Executor
@@ -61,45 +59,7 @@ if TYPE_CHECKING:
 DEFAULT_BENCH: Final = "build/dataset"
 DEFAULT_OUT: Final = Path("runs/eval")
 DEFAULT_SAMPLES: Final = 10
-ENDPOINT_TOKENS: Final = 1024
-"""A plan of 64 steps in JSON, and some reasoning before it."""
 console = Console(highlight=False, markup=False, soft_wrap=True)
-
-
-@dataclass(frozen=True, slots=True)
-class Questions:
-    """How tasks are asked. ``max_tokens``: None where the asked one's own default is wanted."""
-
-    samples: int
-    temperature: float
-    seed: int
-    max_tokens: int | None
-    codec: Codec
-    profile: Profile
-
-
-@dataclass(frozen=True, slots=True)
-class Chosen:
-    """Who is to be asked, as a person says it; one of the first three is given."""
-
-    model: str
-    endpoint: str
-    baseline: BaselineName | None
-    model_name: str
-    key: str
-    concurrent: int
-    attempts: int
-
-
-@dataclass(frozen=True, slots=True)
-class Asked:
-    """Who is asked, and what its setup says of it."""
-
-    asker: Asker
-    label: str
-    codec: Codec
-    rows: int
-    max_tokens: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,25 +164,33 @@ def evaluate(
 
     Answers are kept as they come: the same command goes on where an earlier one ended.
     """
+    place = Place(manager, token, ca, jobs)
     with _problems_shown():
-        if sum(map(bool, (model, endpoint, baseline, answers))) != 1:
-            raise TrainerError(
-                "expected one of --model, --endpoint, --baseline and --answers: give one of them"
-            )
-        if bench == NATIVE and (split or tasks):
-            raise TrainerError(f"{NATIVE} is measured as a whole: leave out --split and --tasks")
-        place = Place(manager, token, ca, jobs)
+        _check((model, endpoint, baseline, answers), bench, in_part=bool(split or tasks))
         if answers is not None:
             _judge_stored(answers, bench, out, place, beside or [])
             return
-        chosen = Chosen(model, endpoint, baseline, model_name, key, concurrent, attempts)
+        chosen = Chosen(model, endpoint, baseline, model_name, key, concurrent, attempts, threads, device)
         how = Questions(samples, temperature, seed, max_tokens, codec, profile)
         with _exam(place, bench or DEFAULT_BENCH, split, tasks, profile) as exam:
-            label = model or model_name or str(baseline)
-            folder = out or DEFAULT_OUT / _file_name(f"{Path(exam.name).name}-{label}")
-            rows = [read_row(path, exam.digest) for path in beside or []]
-            setup, given = _ask(exam, _asked(exam, chosen, how, threads, device, folder), how, folder)
-            _judge(exam, setup, given, folder, rows)
+            _measure(exam, chosen, how, out, beside or [])
+
+
+def _check(asked: Sequence[object], bench: str, *, in_part: bool) -> None:
+    """Raises TrainerError unless exactly one may answer, and what is measured in part may be."""
+    if sum(map(bool, asked)) != 1:
+        raise TrainerError("expected one of --model, --endpoint, --baseline and --answers: give one of them")
+    if bench == NATIVE and in_part:
+        raise TrainerError(f"{NATIVE} is measured as a whole: leave out --split and --tasks")
+
+
+def _measure(exam: Exam, chosen: Chosen, how: Questions, out: Path | None, beside: Sequence[Path]) -> None:
+    """Ask, judge, and write the report."""
+    label = chosen.model or chosen.model_name or str(chosen.baseline)
+    folder = out or DEFAULT_OUT / _file_name(f"{Path(exam.name).name}-{label}")
+    rows = [read_row(path, exam.digest) for path in beside]
+    setup, given = _ask(exam, asked_of(exam, chosen, how, folder), how, folder)
+    _judge(exam, setup, given, folder, rows)
 
 
 @contextlib.contextmanager
@@ -256,56 +224,6 @@ def _exam(place: Place, named: str, split: str, limit: int | None, profile: Prof
         return
     bench = find_benchmark(named, split, limit, profile)
     yield WorldExam(bench, place.executor(bench))
-
-
-def _asked(
-    exam: Exam, chosen: Chosen, questions: Questions, threads: int | None, device: str, folder: Path
-) -> Asked:
-    if chosen.model:
-        from embomatrix.trainer.evaluation.models import load_model
-
-        loaded = load_model(chosen.model, questions.codec, threads=threads, device=device)
-        if isinstance(exam, NativeExam) and loaded.policy.codec is Codec.NAMES:
-            raise TrainerError(
-                f"{chosen.model} is a word-level policy and can't read the prompts of {NATIVE}"
-            )
-        tokens = questions.max_tokens or loaded.max_tokens
-        return Asked(PolicyAsker(loaded.policy), chosen.model, loaded.policy.codec, loaded.rows, tokens)
-    if chosen.endpoint:
-        return _endpoint(chosen, questions, folder)
-    name = chosen.baseline or BaselineName.ORACLE
-    return Asked(WriterAsker(_writer(exam, name)), name.value, Codec.JSON, MAX_TABLE, 1)
-
-
-def _writer(exam: Exam, name: BaselineName) -> Callable[[str, np.random.Generator], str]:
-    """How a baseline answers: in our world by its plans, in EAI's by the published human ones."""
-    if isinstance(exam, NativeExam):
-        if name is not BaselineName.HUMAN:
-            raise TrainerError(
-                f"the baseline `{name}` writes plans of our world: on {NATIVE} pass --baseline human"
-            )
-        return lambda task_id, rng: exam.human(task_id)
-    if name is BaselineName.HUMAN or not isinstance(exam, WorldExam):
-        raise TrainerError(f"the human plans are of {NATIVE}: pass --bench {NATIVE}, or --baseline oracle")
-    plan, tasks = baseline_for(name), exam.bench.tasks
-    return lambda task_id, rng: json.dumps(plan_to_json(plan(tasks[task_id], rng)))
-
-
-def _endpoint(chosen: Chosen, questions: Questions, folder: Path) -> Asked:
-    if not chosen.model_name:
-        raise TrainerError("the endpoint's model has no name: pass --model-name as the endpoint calls it")
-    if questions.codec is Codec.NAMES:
-        raise TrainerError("the codec `names` is for word-level policies: pass --codec json or lines")
-    from embomatrix.llm.endpoint import Endpoint, EndpointLimits
-
-    limits = EndpointLimits(attempts=chosen.attempts, concurrent=chosen.concurrent)
-    opened = functools.partial(
-        Endpoint, chosen.endpoint, chosen.model_name, api_key=chosen.key, limits=limits
-    )
-    tokens = questions.max_tokens or ENDPOINT_TOKENS
-    return Asked(
-        EndpointAsker(opened, folder / "ledger.jsonl"), chosen.model_name, questions.codec, MAX_TABLE, tokens
-    )
 
 
 def _ask(exam: Exam, asked: Asked, how: Questions, folder: Path) -> tuple[Setup, tuple[Answer, ...]]:
