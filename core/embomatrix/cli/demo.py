@@ -54,7 +54,7 @@ def demo(
     started_s = time.monotonic()
     _ensure_tasks(dataset, seed)
     built_s = time.monotonic()
-    cluster = local_cluster(folder / "cluster", workers=workers, slots=slots)
+    cluster = local_cluster(folder / "cluster", workers=workers, slots=slots, dataset=dataset)
     with cluster.supervisor:
         _announce(cluster, slots)
         how = [

@@ -26,9 +26,10 @@ class LocalCluster:
     workers: tuple[str, ...]
 
 
-def local_cluster(folder: Path, *, workers: int, slots: int) -> LocalCluster:
+def local_cluster(folder: Path, *, workers: int, slots: int, dataset: Path | None = None) -> LocalCluster:
     """Describe a cluster that keeps state, bundles and logs below ``folder``; its supervisor starts it on entry.
 
+    Its dashboard shows the tasks of ``dataset``, if there is one.
     The ports are free ones of the loopback interface, so that several clusters live side by side.
     """
     port, http_port = free_port(), free_port()
@@ -44,6 +45,7 @@ def local_cluster(folder: Path, *, workers: int, slots: int) -> LocalCluster:
             f"--http-port={http_port}",
             f"--state=sqlite:{folder / 'manager.sqlite'}",
             f"--data-dir={folder / 'bundles'}",
+            *([] if dataset is None else [f"--dataset={dataset}"]),
         ),
         environment,
     )

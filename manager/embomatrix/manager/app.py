@@ -32,6 +32,7 @@ from embomatrix.manager.registry import LivenessLimits, Registry
 from embomatrix.manager.runtime import ManagerRuntime
 from embomatrix.manager.scheduler import ScheduleLimits
 from embomatrix.manager.server import build_server
+from embomatrix.manager.settings import is_every_address, is_loopback
 from embomatrix.manager.shared_folder import note_folder, warn_of_another_folder
 from embomatrix.manager.standby import Standby
 from embomatrix.manager.store.protocol import Candidate, StateError
@@ -136,9 +137,16 @@ async def running(
         group.create_task(runtime.serve())
         await server.start()
         stack.push_async_callback(server.stop, STOP_GRACE_S)
-        page = f"{settings.http_host}:{http_socket.getsockname()[1]}"
-        scheme = "http" if protection.tls is None else "https"
-        yield Endpoints(f"{settings.host}:{port}", f"{scheme}://{page}/")
+        page_url = _page_url(settings.http_host, http_socket.getsockname()[1], protection.tls)
+        yield Endpoints(f"{settings.host}:{port}", page_url)
+
+
+def _page_url(host: str, port: int, tls: Tls | None) -> str:
+    """What a person opens: served on every address, it goes by a name in the certificate, else by this machine's."""
+    if is_every_address(host):
+        names = () if tls is None else tls.names
+        host = next((name for name in names if not is_loopback(name)), socket.gethostname())
+    return f"{'http' if tls is None else 'https'}://{host}:{port}/"
 
 
 def _gallery(dataset: Path | None) -> Gallery | NoGallery:

@@ -13,7 +13,14 @@ from collections import Counter, OrderedDict
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.floor_plan import floor_plan, played, small_things
-from embomatrix.manager.gallery_values import ObjectRow, SceneCount, TaskCard, TaskDetail, TaskPage
+from embomatrix.manager.gallery_values import (
+    ObjectRow,
+    SceneCount,
+    SceneName,
+    TaskCard,
+    TaskDetail,
+    TaskPage,
+)
 from embomatrix.rpc.status import NotFoundError, UnavailableError
 from embomatrix.skills.parse import PlanError, plan_from_json
 from embomatrix.world.dataset import TASKS_FILE, Dataset, DatasetError
@@ -36,6 +43,8 @@ SCENES_KEPT: Final = 8
 """Decoded: a few tens of MB at most."""
 PLANS_KEPT: Final = 256
 PICTURES_FOLDER: Final = "pictures"
+HANGS_M: Final = 0.05
+"""What begins higher, and rests on nothing, hangs."""
 _PLAIN: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,199}")
 _JPEG: Final = b"\xff\xd8\xff"
 
@@ -71,6 +80,12 @@ class Gallery:
             [SceneCount(name, number) for name, number in sorted(scenes.items())],
             sorted({record.task.category.value for record in records}),
         )
+
+    async def scenes(self, *, offset: int, limit: int) -> list[SceneName]:
+        """The scene of each bundle, in the order of the tasks. UnavailableError for a damaged dataset."""
+        records = (await self._loaded()).values()
+        names = {record.bundle_digest: record.task.scene_id for record in records}
+        return [SceneName(digest, name) for digest, name in names.items()][offset : offset + limit]
 
     async def detail(self, task_id: str) -> TaskDetail:
         """Everything of one task. NotFoundError, or UnavailableError for a damaged dataset."""
@@ -210,11 +225,20 @@ class Gallery:
 
 def _row(scene: Scene, name: str, about: frozenset[str]) -> ObjectRow:
     item, asset = scene.by_name[name], scene.asset_of(name)
-    where = f"{item.relation.value} {item.host}" if item.host and item.relation else "on the floor"
     told = sorted(state.value for state in item.states)
     told += ["open"] if any(share > 0 for share in item.joints) else []
     size = [round(extent, 2) for extent in asset.size_m]
-    return ObjectRow(name, item.room, where, size, round(asset.mass_kg, 1), ", ".join(told), name in about)
+    return ObjectRow(
+        name, item.room, _where(scene, name), size, round(asset.mass_kg, 1), ", ".join(told), name in about
+    )
+
+
+def _where(scene: Scene, name: str) -> str:
+    """What it rests on or in; by itself it stands on the floor or hangs on a wall."""
+    item = scene.by_name[name]
+    if item.host and item.relation:
+        return f"{item.relation.value} {item.host}"
+    return "on the wall" if scene.box_of(name).low_m[2] > HANGS_M else "on the floor"
 
 
 def _rooms(scene: Scene, record: TaskRecord, moments: list[Moment]) -> list[str]:

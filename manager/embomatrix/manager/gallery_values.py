@@ -55,6 +55,14 @@ class SceneCount:
 
 
 @dataclass(frozen=True, slots=True)
+class SceneName:
+    """What the scene in a bundle is called."""
+
+    bundle_digest: str
+    scene_id: str
+
+
+@dataclass(frozen=True, slots=True)
 class TaskPage:
     """Tasks from ``offset``, of ``total`` that fit what was asked for, with all scenes and categories that there are.
 

@@ -11,7 +11,7 @@ from embomatrix.manager.gallery_values import TaskPage
 from embomatrix.rpc.status import NotFoundError
 
 if TYPE_CHECKING:
-    from embomatrix.manager.gallery_values import FloorPlan, TaskDetail
+    from embomatrix.manager.gallery_values import FloorPlan, SceneName, TaskDetail
 
 NO_DATASET: Final = "no dataset is shown: start the manager with --dataset FOLDER"
 
@@ -22,6 +22,10 @@ class NoGallery:
     async def page(self, *, search: str, scene: str, category: str, offset: int, limit: int) -> TaskPage:
         """An empty one with the reason."""
         return TaskPage(0, offset, [], [], [], NO_DATASET)
+
+    async def scenes(self, *, offset: int, limit: int) -> list[SceneName]:
+        """None: bundles go by their digests."""
+        return []
 
     async def detail(self, task_id: str) -> TaskDetail:
         raise NotFoundError(NO_DATASET)

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import JSONResponse
 
-from embomatrix.manager.gallery_values import FloorPlan, TaskDetail, TaskPage
+from embomatrix.manager.gallery_values import FloorPlan, SceneName, TaskDetail, TaskPage
 from embomatrix.manager.packing import packed
 from embomatrix.manager.rest import PREFIX, Limit, Offset, answered
+from embomatrix.manager.rest_values import PAGE
 
 if TYPE_CHECKING:
     from embomatrix.manager.gallery import Gallery
@@ -47,6 +48,14 @@ def showing(gallery: Gallery | NoGallery) -> APIRouter:
         """One task: what is asked, its objects, and the oracle's plan on the plan view."""
         with answered():
             return _json(request, await gallery.detail(task_id))
+
+    @router.get("/scenes", response_model=list[SceneName])
+    async def scenes(request: Request, offset: Offset = 0, limit: Limit = PAGE) -> Response:
+        """What the scenes of the dataset are called, by the digests of their bundles."""
+        with answered():
+            found = await gallery.scenes(offset=offset, limit=limit)
+        told = [dataclasses.asdict(name) for name in found]
+        return packed(request, json.dumps(told, separators=(",", ":")).encode())
 
     @router.get("/scenes/{digest}/floor", response_model=FloorPlan)
     async def floor(request: Request, digest: str) -> Response:

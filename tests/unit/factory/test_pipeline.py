@@ -189,6 +189,13 @@ def test_a_build_that_trains_on_nothing_holds_every_room_out(tmp_path: Path) -> 
     assert set(rooms["heldout"]["Rs_int"]) == {room.name for room in build_base_scene("Rs_int").rooms}
 
 
+def test_scenes_without_a_room_to_hold_out_are_refused_before_anything_is_written(tmp_path: Path) -> None:
+    folder = tmp_path / "dataset"
+    with pytest.raises(DatasetError, match=r"no room of Rs_int can be held out.*--heldout 0"):
+        build_dataset(folder, BuildSettings(train=1, heldout=1, scenes=("Rs_int",)))
+    assert not folder.exists()
+
+
 def test_what_a_second_judge_refuses_is_not_kept(tmp_path: Path) -> None:
     settings = BuildSettings(train=2, heldout=0, seed=4, scenes=("Rs_int",), look_ahead=False)
     asked: list[str] = []

@@ -8,6 +8,7 @@ from tests.fakes.scenes import kitchen_scene, kitchen_tasks
 
 from embomatrix.manager.floor_plan import floor_plan, played, small_things
 from embomatrix.manager.gallery import Gallery
+from embomatrix.manager.gallery_values import SceneName
 from embomatrix.manager.no_gallery import NO_DATASET, NoGallery
 from embomatrix.rpc.status import NotFoundError, UnavailableError
 from embomatrix.skills.parse import parse_plan, plan_to_json
@@ -52,6 +53,13 @@ async def test_tasks_are_found_by_words_and_scene_and_come_in_pages(folder):
     second = await gallery.page(**{**EVERY, "offset": 1, "limit": 1})
     assert (second.total, [card.task_id for card in second.items]) == (3, [".."])
     assert (await gallery.page(**{**EVERY, "scene": "elsewhere"})).total == 0
+
+
+async def test_bundles_are_called_by_their_scenes_where_there_is_a_dataset(folder):
+    gallery = Gallery(folder)
+    assert await gallery.scenes(offset=0, limit=9) == [SceneName(digest_of(folder), SCENE.scene_id)]
+    assert await gallery.scenes(offset=1, limit=9) == []
+    assert await NoGallery().scenes(offset=0, limit=9) == []
 
 
 async def test_a_task_is_shown_with_its_objects_what_was_said_and_its_tree(folder):

@@ -19,7 +19,7 @@ from embomatrix.factory.pipeline.variants import TASKS_EACH, VariantOrder, Varia
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.writer.view import SceneView
 from embomatrix.world.catalog import Catalog
-from embomatrix.world.dataset import write_dataset
+from embomatrix.world.dataset import DatasetError, write_dataset
 from embomatrix.world.task import TaskCategory
 
 if TYPE_CHECKING:
@@ -84,6 +84,17 @@ def split_rooms(scenes: Sequence[Scene], seed: int) -> dict[str, dict[str, tuple
     }
 
 
+def _check_rooms(settings: BuildSettings) -> None:
+    """Raises CatalogError for an unknown scene, DatasetError where tasks are to be held out and no room can be."""
+    catalog = Catalog.load()
+    types = Counter(room.type for scene_id in settings.scenes for room in catalog.inventory(scene_id).rooms)
+    if settings.train and settings.heldout and max(types.values(), default=0) < 2:
+        raise DatasetError(
+            f"no room of {', '.join(settings.scenes)} can be held out, each is the only one of its type: give a further "
+            "--scene, or --heldout 0"
+        )
+
+
 def _all_held_out(scenes: Sequence[Scene]) -> dict[str, dict[str, tuple[str, ...]]]:
     """Rooms by split and scene, where nothing is trained on: training sees none of them."""
     everything = {scene.base: tuple(room.name for room in scene.rooms) for scene in scenes}
@@ -105,11 +116,10 @@ def build_dataset(
 
     ``writer`` stands in for the one that the settings name, ``layout`` for layout agents that are rules, in this process;
     ``jobs`` is the number of processes otherwise.
-    Raises CatalogError for an unknown scene, DatasetError when the folder holds a build of other settings, or when a
-    process dies.
+    Raises CatalogError for an unknown scene, DatasetError when the scenes have no room to hold out, when the folder holds a
+    build of other settings, or when a process dies.
     """
-    for scene_id in settings.scenes:
-        Catalog.load().inventory(scene_id)  # a wrong name shall leave no folder behind
+    _check_rooms(settings)  # before anything is written: what is wrong shall leave no folder behind
     store = BuildStore.open(folder, dataclasses.asdict(settings))
     bases = [build_base_scene(scene_id, seed=settings.seed) for scene_id in settings.scenes]
     rooms = split_rooms(bases, settings.seed) if settings.train else _all_held_out(bases)

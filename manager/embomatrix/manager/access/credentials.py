@@ -33,7 +33,8 @@ REMEMBERED_S: Final = 30 * 86_400.0
 LIMIT: Final = 100_000
 LABEL_LENGTH: Final = 200
 NO_TOKEN: Final = (
-    "no token, or a wrong one: pass --token, or set EMBOMATRIX_TOKEN to the token of this manager"
+    "no token, or a wrong one: pass --token, or set EMBOMATRIX_TOKEN to the token of this manager; for a worker that is to "
+    "join, ask the operator for another string (`embomatrix manager token issue --role join`)"
 )
 _REPLACED: Final = "its worker asked for another before it had shown it"
 _NOTHING: Final = hashlib.sha256(b"").hexdigest()

@@ -1,6 +1,7 @@
 // The dashboard: one snapshot a second feeds whichever page is shown.
 import {ask} from "./ask.js";
 import {at, seconds} from "./dom.js";
+import {learn} from "./names.js";
 
 // A page's code comes when it is opened, and the first snapshot with it: nobody waits for what isn't shown.
 const PAGES = {
@@ -51,6 +52,7 @@ async function refresh(first = null) {
       say(told);
       await page.show(told);
       at("dot").className = "dot ready";
+      learn(); // what is shown first waits for no names
     }
   } catch (error) {
     at("dot").className = "dot lost";

@@ -1,5 +1,5 @@
 // Lines over steps or seconds, by the one library of charts: colours follow the theme, the width follows the page.
-import {colour, h} from "./dom.js";
+import {colour, h, signed} from "./dom.js";
 
 /** The library is no module: it comes when the first page with a chart does. */
 await Promise.all([
@@ -21,9 +21,11 @@ function latest(drawn) {
 export function chart(place, lines, {high = 190, words, fill = false, legend = true} = {}) {
   const axis = {stroke: () => colour("faint"), grid: {stroke: () => colour("line"), width: 1}, ticks: {show: false}, font: "11px system-ui"};
   const series = lines.map((label, i) => ({
-    label, width: 1.6, dash: DASHES[Math.floor(i / TINTS.length) % DASHES.length], points: {show: false}, spanGaps: true,
+    label, width: 1.6, dash: DASHES[Math.floor(i / TINTS.length) % DASHES.length], spanGaps: true,
+    // One value makes no line.
+    points: {show: (drawn, number) => drawn.data[number].filter(value => value !== null && value !== undefined).length === 1, size: 6},
     stroke: () => colour(TINTS[i % TINTS.length]), ...(fill ? {fill: () => `${colour(TINTS[i])}22`} : {}),
-    value: (_, value) => value === null || value === undefined ? "–" : Number(value.toPrecision(3)),
+    value: (_, value) => value === null || value === undefined ? "–" : signed(Number(value.toPrecision(3))),
   }));
   const range = (_, low, top) => {
     const least = Math.min(0, low ?? 0), most = top > least ? top : least + 1;

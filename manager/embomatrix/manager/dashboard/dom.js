@@ -25,6 +25,8 @@ export const brief = digest => digest.replace(/^sha256:/, "").slice(0, 8);
 export const count = number => Number(number).toLocaleString("en");
 export const share = (part, all) => all ? `${Math.round(100 * part / all)} %` : "–";
 export const clock = seconds => new Date(seconds * 1000).toLocaleTimeString();
+/** With a true minus: a hyphen would stand for a dash. */
+export const signed = text => String(text).replace("-", "\u2212");
 export const none = text => h("div", {class: "none"}, text);
 export const colour = name => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
 
@@ -33,6 +35,13 @@ export function seconds(s) {
   if (s < 1) return `${Math.round(s * 1000)} ms`;
   if (s < 120) return `${s.toFixed(s < 10 ? 1 : 0)} s`;
   return s < 7200 ? `${Math.round(s / 60)} min` : `${(s / 3600).toFixed(1)} h`;
+}
+
+/** How full something is. */
+export function gauge(used, all, label) {
+  const part = Math.min(100, 100 * used / Math.max(1, all));
+  return h("span", {class: "gauge", role: "meter", "aria-valuemin": 0, "aria-valuemax": all, "aria-valuenow": Math.round(used), "aria-label": label, title: label},
+    h("span", {style: `width:${part.toFixed(1)}%`}));
 }
 
 /** A table of rows; a heading is its text, or [text, class]. One of the kind "loose" flows on a narrow page. */

@@ -1,6 +1,7 @@
 // What the infrastructure lost: reason, worker, scene, attempt, and the worker's own words.
 import {ask} from "./ask.js";
-import {at, brief, clock, count, h, none, put, table} from "./dom.js";
+import {at, clock, count, h, none, put, table} from "./dom.js";
+import {named} from "./names.js";
 
 const BAD = ["failed", "worker_lost", "scene_failed"];
 const KEPT = 200;
@@ -21,17 +22,17 @@ export async function show({overview, runs}) {
   if (looks++ % LOOK_EVERY === 0) lost = await look(runs);
   put(at("reasons"), tally("reason", given.map(note => note.code), lost.map(event => event.code || event.kind)));
   put(at("blamed"), tally("worker", given.map(note => note.worker_id || "none"), lost.map(event => event.worker_id || "none")));
-  const rows = given.map(note => h("tr", {}, h("td", {class: "muted fit"}, clock(note.at_s)), h("td", {class: "fit"}, h("code", {class: "bad"}, note.code)), h("td", {class: "fit"}, note.worker_id || "–"), h("td", {class: "fit"}, note.rollout_id), h("td", {class: "message"}, note.message)));
+  const rows = given.map(note => h("tr", {}, h("td", {class: "muted fit"}, clock(note.at_s)), h("td", {class: "fit"}, h("code", {class: "bad"}, note.code)), h("td", {class: "named"}, note.worker_id), h("td", {class: "named"}, note.rollout_id), h("td", {class: "message"}, note.message)));
   put(at("failures"), rows.length ? table(["when", "reason", "worker", "rollout", "what it said"], rows, "failures", "loose") : none("None. Lost rollouts are executed again before they count as failed."));
   const folded = fold(lost).map(({event, times}) =>
-    h("tr", {}, h("td", {class: "muted fit"}, clock(event.at_s)), h("td", {class: "fit"}, h("code", {class: "bad"}, event.code || event.kind), times > 1 && ` × ${count(times)}`), h("td", {class: "fit"}, event.worker_id || "–"),
-      h("td", {class: "fit"}, event.bundle_digest ? h("code", {title: event.bundle_digest}, brief(event.bundle_digest)) : "–"), h("td", {class: "fit n", "data-name": event.attempt ? "attempt" : false}, event.attempt || ""), h("td", {class: "message"}, event.message || "")));
+    h("tr", {}, h("td", {class: "muted fit"}, clock(event.at_s)), h("td", {class: "fit"}, h("code", {class: "bad"}, event.code || event.kind), times > 1 && ` × ${count(times)}`), h("td", {class: "named"}, event.worker_id),
+      h("td", {class: "named"}, event.bundle_digest && h("code", {title: event.bundle_digest}, named(event.bundle_digest))), h("td", {class: "fit n", "data-name": event.attempt ? "attempt" : false}, event.attempt || ""), h("td", {class: "message"}, event.message || "")));
   put(at("attempts"), folded.length ? table(["latest", "reason", "worker", "scene", ["attempt", "n"], "what it said"], folded, "attempts that failed", "loose") : none("None."));
 }
 
 /** The latest events of the cluster and of the latest runs, newest first. */
 async function look(runs) {
-  const pages = [await ask(`events?after=${after}`), ...await Promise.all(runs.slice(-3).map(run => ask(`runs/${encodeURIComponent(run.run_id)}`).then(told => ({events: told.failures}))))];
+  const pages = [await ask(`events?after=${after}`), ...await Promise.all(runs.slice(-3).map(run => ask(`runs/${encodeURIComponent(run.run_id)}`).then(told => ({events: told.failures.filter(event => event.kind === "failed")}))))];
   const fleet = pages[0].events;
   if (fleet.length) after = fleet.at(-1).sequence;
   log = [...log, ...fleet.filter(event => BAD.includes(event.kind))].slice(-KEPT);
@@ -52,6 +53,6 @@ function fold(events) {
 function tally(heading, given, lost) {
   const counts = {};
   for (const [i, names] of [given, lost].entries()) for (const name of names) (counts[name] ??= [0, 0])[i] += 1;
-  const rows = Object.entries(counts).sort(([, a], [, b]) => b[0] - a[0] || b[1] - a[1]).map(([name, numbers]) => h("tr", {}, h("td", {}, h("code", {}, name)), numbers.map(n => h("td", {class: "n"}, count(n)))));
+  const rows = Object.entries(counts).sort(([, a], [, b]) => b[0] - a[0] || b[1] - a[1]).map(([name, numbers]) => h("tr", {}, h("td", {class: "named"}, h("code", {}, name)), numbers.map(n => h("td", {class: "n"}, count(n)))));
   return rows.length ? table([heading, ["given up", "n"], ["on the way", "n"]], rows, `latest failures by ${heading}`) : none("None.");
 }

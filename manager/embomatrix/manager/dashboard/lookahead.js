@@ -1,5 +1,6 @@
 // Coming steps by scenes: how far each scene is, and who holds it.
-import {at, brief, count, h, none, put} from "./dom.js";
+import {at, count, h, none, put} from "./dom.js";
+import {named} from "./names.js";
 
 const STEPS = 24;
 const COLUMNS = 60;
@@ -23,7 +24,7 @@ export function show({lookahead, runs}) {
 
 function problems(steps) {
   const told = new Map(steps.flatMap(step => step.cells.filter(cell => cell.problem).map(cell => [cell.bundle_digest, cell.problem])));
-  return [...told].map(([scene, problem]) => h("p", {class: "bad message"}, h("code", {}, brief(scene).slice(0, 4)), ` ${problem}`));
+  return [...told].map(([scene, problem]) => h("p", {class: "bad message"}, h("code", {}, named(scene)), ` ${problem}`));
 }
 
 function grid(steps) {
@@ -32,13 +33,13 @@ function grid(steps) {
     const of = Object.fromEntries(step.cells.map(cell => [cell.bundle_digest, cell]));
     return h("tr", {}, h("th", {scope: "row"}, `step ${step.step}`), scenes.map(scene => h("td", {}, of[scene] && box(of[scene]))));
   });
-  const heads = scenes.map(scene => h("th", {scope: "col", title: scene}, brief(scene).slice(0, 4)));
+  const heads = scenes.map(scene => h("th", {scope: "col", title: scene}, h("span", {}, named(scene))));
   return h("div", {class: "scroll", tabindex: "0", role: "region", "aria-label": "steps by scenes"},
     h("table", {class: "grid"}, h("thead", {}, h("tr", {}, h("td"), heads)), h("tbody", {}, rows)));
 }
 
 function box(cell) {
   const held = cell.worker_ids.length ? `on ${cell.worker_ids.join(", ")}` : "on no worker";
-  const words = `${cell.bundle_digest}: ${count(cell.count)} rollouts, ${cell.warmth}, ${held}`;
+  const words = `${named(cell.bundle_digest)}: ${count(cell.count)} rollouts, ${cell.warmth}, ${held}`;
   return h("span", {class: `cell ${cell.warmth}`, title: words, "aria-label": words}, `${cell.count}${cell.worker_ids.length > 1 ? ` ×${cell.worker_ids.length}` : ""}`);
 }

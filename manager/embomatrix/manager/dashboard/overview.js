@@ -1,6 +1,6 @@
 // How the cluster does: throughput, latency, hits, failures, runs.
 import {chart} from "./charts.js";
-import {at, count, h, none, put, seconds, share, table} from "./dom.js";
+import {at, count, h, none, put, seconds, share, signed, table} from "./dom.js";
 
 const TILES = [
   ["rate", "Throughput", "rollouts/s, mean of 10 s"], ["p50", "Latency p50", "submitted to result"], ["p95", "Latency p95", "latest 2,048 rollouts"],
@@ -15,7 +15,7 @@ export function open(main) {
     h("section", {class: "third"}, h("h2", {}, "Runs"), h("div", {id: "runs"})),
     h("section", {}, h("h2", {}, "Outcomes ", h("small", {}, "of all rollouts since the manager started")), h("div", {id: "outcomes"})),
   );
-  drawn = chart(at("chart"), ["rollouts/s"], {fill: true, legend: false, words: tick => tick === 0 ? "now" : `${tick} s`});
+  drawn = chart(at("chart"), ["rollouts/s"], {fill: true, legend: false, words: tick => tick === 0 ? "now" : signed(`${tick} s`)});
 }
 
 export function close() {
@@ -43,7 +43,7 @@ export function show({overview: o, runs}) {
 
 function run(r) {
   return h("tr", {},
-    h("td", {title: r.run_id}, h("a", {href: `#timeline?${encodeURIComponent(r.run_id)}`}, r.name || r.run_id)),
+    h("td", {class: "named", title: `${r.name} ${r.run_id}`}, h("a", {href: `#timeline?${encodeURIComponent(r.run_id)}`}, r.name || r.run_id)),
     h("td", {class: "n"}, count(r.stats.delivered)), h("td", {class: "n"}, count(r.pending)),
     h("td", {class: "n"}, share(r.stats.warm_starts, r.stats.warm_starts + r.stats.cold_starts)),
     h("td", {class: r.stats.infra_failures ? "n bad" : "n"}, count(r.stats.infra_failures)));

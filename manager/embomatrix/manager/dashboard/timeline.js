@@ -1,10 +1,11 @@
 // What each slot did: load, execute, deliver, idle; zoom to one rollout.
 import {ask} from "./ask.js";
-import {at, brief, colour, h, none, put, seconds} from "./dom.js";
+import {at, colour, h, none, put, seconds, signed} from "./dom.js";
+import {named} from "./names.js";
 
 const ROW = 20, LEFT = 150, HEAD = 22, GRIP = 5, LEAST_PX = 1, LEAST_S = 0.1;
 const SPANS = [10, 60, 300, 1800];
-const KINDS = [["execute", "warm"], ["load", "warming"], ["deliver", "queued"], ["failed", "bad"]];
+const KINDS = [["execute", "warm"], ["load", "warming"], ["deliver", "queued"], ["failed", "bad"], ["idle", "chip"]];
 let run = "", told = null, view = null, live = true, span = 60, painted = [], grabbed = null;
 
 export function open(main) {
@@ -18,8 +19,8 @@ export function open(main) {
       h("select", {"aria-label": "how far back", onchange: event => { span = Number(event.target.value); live = true; view = null; dispatchEvent(new Event("embomatrix-changed")); }}, SPANS.map(s => h("option", {value: s, selected: s === span}, `last ${seconds(s)}`))),
       h("button", {type: "button", onclick: () => zoom(0.5, live ? 1 : 0.5)}, "Zoom in"), h("button", {type: "button", onclick: () => zoom(2, live ? 1 : 0.5)}, "Zoom out"),
       h("button", {type: "button", onclick: () => pan(-0.25)}, "Earlier"), h("button", {type: "button", onclick: () => pan(0.25)}, "Later"),
-      h("button", {type: "button", id: "live", onclick: () => { live = true; view = null; dispatchEvent(new Event("embomatrix-changed")); }}, "Follow")),
-    h("p", {id: "one", class: "muted", role: "status"}, "Point at a span, or zoom in."),
+      h("button", {type: "button", id: "live", onclick: follow}, "Follow")),
+    h("p", {id: "one", class: "muted", role: "status"}),
     h("div", {id: "tracks"})));
 }
 
@@ -40,7 +41,8 @@ export async function show({runs}) {
 function draw() {
   const place = at("tracks");
   if (!place || !told) return;
-  if (!told.tracks.length) { put(place, none("Nothing was executed in this time.")); return; }
+  if (!told.tracks.length) { put(place, none("Nothing was executed in this time.")); at("one").textContent = ""; return; }
+  if (!at("one").textContent) at("one").textContent = "Point at a span, or zoom in: by the buttons, or plus, minus and the arrows. Escape follows again.";
   let canvas = place.querySelector("canvas");
   if (!canvas) {
     canvas = h("canvas", {class: "gantt", tabindex: "0", role: "img", onwheel: wheel, onpointermove: point, onpointerdown: grab, ondblclick: nearer, onkeydown: key});
@@ -85,9 +87,16 @@ function scale(pen, tint, x, wide, high) {
   pen.font = "11px system-ui"; pen.strokeStyle = tint.line;
   for (let tick = Math.ceil((view.from - told.until_s) / step) * step; tick <= view.until - told.until_s + 1e-9; tick += step) {
     const left = x(told.until_s + tick);
-    pen.fillStyle = tint.soft; pen.fillText(Math.abs(tick) < step / 2 ? "now" : `${Number(tick.toPrecision(6))} s`, left + 3, 13);
+    pen.fillStyle = tint.soft; pen.fillText(Math.abs(tick) < step / 2 ? "now" : signed(`${Number(tick.toPrecision(6))} s`), left + 3, 13);
     pen.beginPath(); pen.moveTo(left, 0); pen.lineTo(left, high); pen.stroke();
   }
+}
+
+/** Back to the latest, and on with it. */
+function follow() {
+  live = true;
+  view = null;
+  dispatchEvent(new Event("embomatrix-changed"));
 }
 
 const short = name => name.length > 20 ? `${name.slice(0, 9)}…${name.slice(-9)}` : name;
@@ -116,7 +125,7 @@ function wheel(event) {
 }
 
 function key(event) {
-  const moves = {ArrowLeft: () => pan(-0.1), ArrowRight: () => pan(0.1), "+": () => zoom(0.5, live ? 1 : 0.5), "-": () => zoom(2, live ? 1 : 0.5)};
+  const moves = {ArrowLeft: () => pan(-0.1), ArrowRight: () => pan(0.1), "+": () => zoom(0.5, live ? 1 : 0.5), "-": () => zoom(2, live ? 1 : 0.5), Escape: follow};
   if (moves[event.key]) { event.preventDefault(); moves[event.key](); }
 }
 
@@ -151,5 +160,5 @@ function nearer(event) {
 
 function describe({one, track}) {
   const long = seconds(one.end_s - one.begin_s), load = one.load_s ? `, loading ${seconds(one.load_s)}` : "";
-  return `${one.rollout_id} on ${track.worker_id} slot ${track.slot}: ${one.outcome}, executing ${long}${load}, scene ${brief(one.bundle_digest)}, attempt ${one.attempt || 1}`;
+  return `${one.rollout_id} on ${track.worker_id} slot ${track.slot}: ${one.outcome}, executing ${long}${load}, scene ${named(one.bundle_digest)}, attempt ${one.attempt || 1}`;
 }

@@ -1,7 +1,7 @@
 // How a policy learns: reward by tier, success, what carries no signal, where the time goes, and plans with what became of them.
 import {ask} from "./ask.js";
 import {chart} from "./charts.js";
-import {at, clock, count, h, none, put, seconds, share, table} from "./dom.js";
+import {at, clock, count, h, none, put, seconds, share, signed, table} from "./dom.js";
 
 const CHARTS = [
   ["tiers", "Reward by tier", "mean of a step", {reward: "all", reward_goal: "goal", reward_relevance: "relevance", reward_format: "form"}],
@@ -110,12 +110,14 @@ function heldout(named) {
   const groups = [...new Set(told.flatMap(figures => Object.keys(figures ?? {})))].sort((a, b) => (b === "all") - (a === "all") || a.localeCompare(b));
   const cell = (figures, group) => figures?.[group]?.at(-1) === undefined ? "–" : share(figures[group].at(-1), 1);
   const rows = groups.map(group => h("tr", {}, h("td", {}, group === "all" ? "all tasks" : group.replaceAll("_", " ")), told.map(figures => h("td", {class: "n"}, cell(figures, group)))));
-  put(at("heldout"), rows.length ? table(["tasks", ...times.map(when => [when, "n"])], rows, "held-out success") : none("Not evaluated yet: that is done before the first step and after the last."));
+  put(at("heldout"), rows.length ? table(["tasks", ...times.map(when => [when, "n"])], rows, "held-out success") : none("Not evaluated: that is done before the first step and after the last, where the dataset holds tasks out."));
 }
+
+const points = number => signed(number.toFixed(2));
 
 function plan({text, reward, advantage, problem, steps, task_id}) {
   const verdict = reward ? [h("b", {class: reward.success ? "reached" : ""}, reward.success ? "reached the goal" : "did not reach the goal"),
-    ` · reward ${(reward.format + reward.relevance + reward.goal).toFixed(2)} (form ${reward.format.toFixed(2)}, relevance ${reward.relevance.toFixed(2)}, goal ${reward.goal.toFixed(2)}) · advantage ${advantage.toFixed(2)}`] : h("b", {class: "bad"}, "lost, not judged");
+    ` · reward ${points(reward.format + reward.relevance + reward.goal)} (form ${points(reward.format)}, relevance ${points(reward.relevance)}, goal ${points(reward.goal)}) · advantage ${points(advantage)}`] : h("b", {class: "bad"}, "lost, not judged");
   return h("div", {class: "plan"}, h("p", {}, verdict, h("span", {class: "muted"}, ` · ${task_id}`)), problem && h("p", {class: "bad message"}, problem), h("pre", {tabindex: "0"}, text || "(nothing)"),
     steps.length > 0 && h("ol", {class: "steps"}, steps.map(step => h("li", {}, h("code", {class: step.ok ? "reached" : "bad"}, step.skill), ` ${step.message || (step.ok ? "done" : "failed")}`))));
 }

@@ -1,6 +1,7 @@
 // Every worker: what it holds, what it does, and why it doesn't; drain and resume for who may.
 import {Refused, change} from "./ask.js";
-import {at, brief, count, h, none, put, seconds, table} from "./dom.js";
+import {at, count, gauge, h, none, put, seconds, table} from "./dom.js";
+import {named} from "./names.js";
 
 const ROWS = 50;
 const STATES = ["", "ready", "paused", "draining", "suspect", "lost", "quarantined"];
@@ -41,11 +42,11 @@ function row(w) {
   const used = w.residents.reduce((sum, r) => sum + r.memory_mb, 0);
   const away = w.state === "draining";
   return h("tr", {},
-    h("td", {class: "fit"}, w.worker_id, w.gpu && h("span", {class: "muted"}, ` ${w.gpu}`)),
+    h("td", {class: "named"}, w.worker_id, w.gpu && h("span", {class: "muted"}, ` ${w.gpu}`)),
     h("td", {class: w.reason ? "why" : "fit"}, h("span", {class: `dot ${w.state}`}), w.state, w.reason && h("span", {class: "muted"}, ` ${w.reason}`)),
     h("td", {class: "fit"}, slots(w)),
     h("td", {}, scenes(w)),
-    h("td", {class: "wideonly"}, h("meter", {min: 0, max: Math.max(1, w.memory_mb), value: used, title: `${Math.round(used)} of ${w.memory_mb} MB`, "aria-label": "memory of scenes"})),
+    h("td", {class: "wideonly"}, gauge(used, w.memory_mb, `${count(Math.round(used))} of ${count(w.memory_mb)} MB`)),
     h("td", {class: "n", "data-name": "completed"}, count(w.completed)), h("td", {class: "n wideonly"}, w.cores),
     h("td", {class: "n muted wideonly"}, w.silent_s < 5 ? "now" : `${seconds(Math.round(w.silent_s))} ago`),
     h("td", {class: "fit"}, w.state !== "lost" && h("button", {class: "small", type: "button", "data-path": `workers/${encodeURIComponent(w.worker_id)}/${away ? "resume" : "drain"}`, "aria-label": `${away ? "resume" : "drain"} ${w.worker_id}`}, away ? "Resume" : "Drain")));
@@ -62,8 +63,8 @@ function scenes(w) {
   for (const r of w.residents) states[r.state] = (states[r.state] || 0) + 1;
   if (w.loads.length) states["on the way"] = w.loads.length;
   const chips = [
-    ...w.residents.map(r => h("span", {class: `chip ${r.state}`, title: r.error ? `${r.bundle_digest}: ${r.error}` : r.bundle_digest}, `${brief(r.bundle_digest)}${r.load_s ? ` ${seconds(r.load_s)}` : ""}`)),
-    ...w.loads.map(digest => h("span", {class: "chip", title: digest}, brief(digest))),
+    ...w.residents.map(r => h("span", {class: `chip ${r.state}`, title: r.error ? `${r.bundle_digest}: ${r.error}` : r.bundle_digest}, `${named(r.bundle_digest)}${r.load_s ? ` ${seconds(r.load_s)}` : ""}`)),
+    ...w.loads.map(digest => h("span", {class: "chip", title: digest}, named(digest))),
   ];
   if (!chips.length) return h("span", {class: "muted"}, "none");
   const told = Object.entries(states).map(([state, n]) => `${n} ${state}`).join(", ");

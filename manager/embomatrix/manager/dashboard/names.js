@@ -1,0 +1,17 @@
+// What scenes are called: where the manager shows a dataset, by its names, else by the first letters of their digests.
+import {ask} from "./ask.js";
+import {brief} from "./dom.js";
+
+const AGAIN_MS = 60_000, MOST = 1000;
+let known = {}, due = 0;
+
+export const named = digest => known[digest] ?? brief(digest);
+
+/** Ask for names, and again now and then: a dataset may grow. */
+export async function learn() {
+  if (performance.now() < due) return;
+  due = performance.now() + AGAIN_MS;
+  try {
+    known = Object.fromEntries((await ask(`scenes?limit=${MOST}`)).map(scene => [scene.bundle_digest, scene.scene_id]));
+  } catch { /* digests will do until then */ }
+}
