@@ -24,7 +24,7 @@ export function show({lookahead, runs}) {
 
 function problems(steps) {
   const told = new Map(steps.flatMap(step => step.cells.filter(cell => cell.problem).map(cell => [cell.bundle_digest, cell.problem])));
-  return [...told].map(([scene, problem]) => h("p", {class: "bad message"}, h("code", {}, named(scene)), ` ${problem}`));
+  return [...told].map(([scene, problem]) => h("p", {class: "bad message"}, h("code", {}, named(scene)), ` ${problem.replace(`scene ${scene} `, "")}`));
 }
 
 function grid(steps) {
