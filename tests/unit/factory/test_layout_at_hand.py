@@ -10,7 +10,7 @@ from embomatrix.factory.layout.jobs import Item
 from embomatrix.factory.layout.seating import MOVES, Seat, Seating
 from embomatrix.factory.layout.values import Failure, LayoutReason, LayoutRelation
 from embomatrix.factory.task_import.sources import SourceText
-from embomatrix.factory.task_import.task import Imported, Manner, import_problem
+from embomatrix.factory.task_import.task import REDRAWN, Imported, Manner, import_problem
 from embomatrix.factory.writer.rehearsal import Rehearsal
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.geometry import Pose
@@ -103,6 +103,26 @@ def test_what_a_task_puts_into_a_full_room_makes_furniture_of_the_room_go(flat: 
     assert not seating.failures
 
 
+def test_furniture_goes_for_what_the_robot_does_not_get_at_on_a_full_floor_but_not_for_what_stands_on_other(
+    flat: Scene,
+) -> None:
+    editor = SceneEditor(flat)
+    table = next(name for name, item in editor.objects.items() if item.room == "living_room_0" and item.fixed)
+    items = [
+        Item("bag", models("backpack")[:1], ON, "living_room_0"),
+        Item("cup", models("mug")[:1], ON, table),
+    ]
+    seating = Seating(editor, "living_room_0", items)
+    before = len(editor.objects)
+    seating.refuse("cup", ON, table, LayoutReason.NOT_AT_HAND, "too far")
+    assert not seating.make_way(seating.waiting["cup"])
+    assert len(editor.objects) == before
+    seating.refuse("bag", ON, "living_room_0", LayoutReason.NOT_AT_HAND, "behind a sofa")
+    assert seating.make_way(seating.waiting["bag"])
+    assert len(editor.objects) < before
+    assert [failure.thing for failure in seating.failures] == ["cup"]
+
+
 def test_furniture_that_the_task_is_about_stays_reachable_when_the_rest_may_be_barred(flat: Scene) -> None:
     editor = SceneEditor(flat)
     editor.keep([named(flat, "fridge")])
@@ -131,6 +151,12 @@ SHOE = """(define (problem shoes-0) (:domain omnigibson)
   (:init (ontop sandal.n.01_1 chair.n.01_1) (inroom chair.n.01_1 living_room_0)
          (inroom floor.n.01_1 living_room_0) (ontop agent.n.01_1 floor.n.01_1))
   (:goal (and (ontop sandal.n.01_1 floor.n.01_1))))"""
+ONTO = "(ontop sandal.n.01_1 {})"
+SHOE_ON_FLOOR = (
+    SHOE.replace(ONTO.format("chair.n.01_1"), "START")
+    .replace(ONTO.format("floor.n.01_1"), ONTO.format("chair.n.01_1"))
+    .replace("START", ONTO.format("floor.n.01_1"))
+)
 
 
 def test_furniture_at_which_nobody_reaches_a_thing_is_left_for_other_and_kept_as_the_last_resort(
@@ -157,3 +183,23 @@ def test_furniture_at_which_nobody_reaches_a_thing_is_left_for_other_and_kept_as
         import_problem(text, flat, manner=Manner(out_of_hand_at(99), reachable=False)), Imported
     )
     assert len(asked) > 1
+
+
+def test_a_layout_in_which_something_stays_out_of_hand_is_drawn_anew_and_the_best_is_taken(
+    flat: Scene,
+) -> None:
+    drawn: list[Pose] = []
+
+    def worst_at_first(editor, items, seed):
+        layout = lay(editor, items, seed)
+        drawn.append(editor.objects[layout.names["sandal.n.01_1"]].pose_world_asset)
+        wrong = Failure("sandal.n.01_1", ON, "living_room_0", LayoutReason.NOT_AT_HAND, "behind a sofa")
+        return replace(layout, out_of_hand=(wrong,) * (2 if len(drawn) == 1 else 1))
+
+    imported = import_problem(
+        SourceText("shoes", SHOE_ON_FLOOR, "embomatrix"), flat, manner=Manner(worst_at_first)
+    )
+    assert isinstance(imported, Imported)
+    assert len(drawn) == len(set(drawn)) == 1 + REDRAWN
+    sandal = dict(zip(imported.instances, imported.about, strict=True))["sandal.n.01_1"]
+    assert imported.scene.by_name[sandal].pose_world_asset == drawn[1]

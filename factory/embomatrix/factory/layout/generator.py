@@ -24,10 +24,9 @@ from embomatrix.factory.layout.planes import brief_for, company_on, planes_of, p
 from embomatrix.factory.layout.rest import settle
 from embomatrix.factory.layout.sampling import ObjectSampler
 from embomatrix.factory.layout.seating import Seat, Seating
-from embomatrix.factory.layout.tree import LayoutTree
+from embomatrix.factory.layout.tree import tree_in
 from embomatrix.factory.layout.values import (
     Arrangement,
-    Branch,
     DistributionBrief,
     Failure,
     Kind,
@@ -44,6 +43,7 @@ if TYPE_CHECKING:
     from embomatrix.factory.editor import SceneEditor
     from embomatrix.factory.layout.jobs import Item
     from embomatrix.factory.layout.planes import Plane
+    from embomatrix.factory.layout.tree import LayoutTree
     from embomatrix.factory.layout.values import Spot, Thing, Wish
     from embomatrix.world.asset import Asset
     from embomatrix.world.geometry import Pose
@@ -155,7 +155,10 @@ class _RoomJob:
         seating = self._seating
         for number in range(ROUNDS):
             if not seating.waiting:
-                break
+                if number > 1:
+                    self._settle(list(self.names))  # what came last may stand in the way to what came first
+                if not seating.waiting:
+                    break
             self._round = number
             brief = self._brief()
             tree = self._agents.organize(brief)
@@ -171,14 +174,7 @@ class _RoomJob:
 
     def tree(self) -> LayoutTree:
         """How the room's objects hang together in the end, in the scene's names: what was laid, and what that stands on."""
-        branches = []
-        for name, item in self._editor.objects.items():
-            if item.room == self._room.name and not item.absent:
-                relation = LayoutRelation(item.relation.value) if item.relation else LayoutRelation.ONTOP
-                branches.append(Branch(item.host or self._room.name, relation, name))
-        known = {branch.child for branch in branches} | {self._room.name}
-        whole = LayoutTree.of(self._room.name, [branch for branch in branches if branch.parent in known])
-        return whole.pruned(self.names.values())
+        return tree_in(self._editor.objects.values(), self._room.name, self.names.values())
 
     def _brief(self) -> RoomBrief:
         things = tuple(_with_carrier(self._editor, self._thing(name)) for name in self._seating.waiting)
@@ -330,7 +326,7 @@ class _RoomJob:
             if guest is None or (far and guest.is_resigned):
                 continue  # it went with what it stood on, or is taken as it is
             seating.unseat(name, reason, detail)
-            if far and not seating.offer_another(guest):
+            if far and not (seating.offer_another(guest) or seating.make_way(guest)):
                 guest.unreached += 1
 
     def _elsewhere(self, scene_name: str) -> Iterator[Pose]:

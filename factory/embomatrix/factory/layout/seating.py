@@ -192,19 +192,30 @@ class Seating:
         self._forget((guest.item.name, widest.item.name))
         return True
 
+    def make_way(self, guest: Guest) -> bool:
+        """Take the largest spare piece of furniture off a floor where the robot does not get at an item; False without one."""
+        if not self._is_on_floor(guest):
+            return False
+        guest.crowded = True
+        return self._make_room(guest)
+
     def _make_room(self, guest: Guest) -> bool:
         """Take the largest spare thing from a full host that the task demands, or from a full floor; False without one."""
         host = self.names.get(guest.item.host, guest.item.host)
         if not guest.crowded or guest.cleared == CLEARED:
             return False
-        on_floor = host in self._editor.rooms or (not host and kind_of(guest.asset) is Kind.FURNITURE)
-        spare = self._furniture() if on_floor else self._loose_on(host) if host else []
+        spare = self._furniture() if self._is_on_floor(guest) else self._loose_on(host) if host else []
         if not spare:
             return False
         self._editor.remove(max(spare, key=lambda name: math.prod(self._editor.box_of(name).size_m)))
         guest.cleared += 1
         self._try_again(guest)
         return True
+
+    def _is_on_floor(self, guest: Guest) -> bool:
+        """Whether an item is to stand on the room's floor."""
+        host = guest.item.host
+        return host in self._editor.rooms or (not host and kind_of(guest.asset) is Kind.FURNITURE)
 
     def _loose_on(self, host: str) -> list[str]:
         """Loose things at a host that the task is not about."""

@@ -11,6 +11,8 @@ from embomatrix.factory.layout.values import Branch, LayoutRelation
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
+    from embomatrix.world.scene import SceneObject
+
 
 class TreeError(ValueError):
     """Branches that make no tree; the sentence says which and what to do."""
@@ -114,6 +116,21 @@ class LayoutTree:
 
         add(self.root, "  ")
         return "\n".join(lines)
+
+
+def tree_in(objects: Iterable[SceneObject], room: str, names: Iterable[str]) -> LayoutTree:
+    """How some objects of a scene's room hang together with what they are on, in or under."""
+    branches = [
+        Branch(
+            item.host or room,
+            LayoutRelation(item.relation.value) if item.relation else LayoutRelation.ONTOP,
+            item.name,
+        )
+        for item in objects
+        if item.room == room and not item.absent
+    ]
+    known = {branch.child for branch in branches} | {room}
+    return LayoutTree.of(room, [branch for branch in branches if branch.parent in known]).pruned(names)
 
 
 def _nested(node: ObjectNode) -> dict[str, Any]:

@@ -60,6 +60,8 @@ class Lay(Protocol):
 
 SHUNNED: Final = 3
 """Pieces of furniture that are given up for a problem at most, because they can't hold what it puts there."""
+REDRAWN: Final = 3
+"""Layouts that are drawn anew at most, where the robot does not get at all that was laid out."""
 KITCHEN: Final = frozenset({State.COOKED, State.FROZEN, State.HOT, State.SLICED, REAL})
 SWITCHED: Final = frozenset({State.OPEN, State.TOGGLED_ON})
 CLEANED: Final = frozenset((*MEANINGS, *SubstanceRelation))
@@ -145,11 +147,13 @@ class _Binder:
     def _bound(self) -> tuple[Binding, SceneEditor, dict[str, str]]:
         """The problem bound and laid out; furniture of the scene that can't hold what it must is left for other furniture.
 
-        So is furniture at which the robot does not get at what it must hold, as long as there is other.
+        So is furniture at which the robot does not get at what it must hold, as long as there is other; then the layout is
+        drawn anew, and of those in which something stays out of hand the best is taken.
         """
-        manner, shunned = self._manner, set[str]()
+        manner, shunned, redrawn = self._manner, set[str](), 0
         first: RefusedError | None = None
         resort: tuple[Binding, SceneEditor, dict[str, str]] | None = None
+        least = math.inf
         while True:
             try:
                 binding = bind(
@@ -171,17 +175,21 @@ class _Binder:
                 bound = binding, editor, {**binding.found, **layout.names}
                 if not layout.out_of_hand:
                     return bound
-                resort = resort or bound
+                if len(layout.out_of_hand) < least:
+                    least, resort = len(layout.out_of_hand), bound
             wrong = (*layout.failures, *layout.out_of_hand)[0]
             first = first or RefusedError(
                 RefusalReason.DOES_NOT_FIT,
                 f"{wrong.thing!r} has no place {wrong.relation} {wrong.host}: {wrong.detail}",
             )
-            if wrong.host not in binding.found.values() or len(shunned) == SHUNNED:
-                if resort is not None:
-                    return resort
+            if wrong.host in binding.found.values() and len(shunned) < SHUNNED:
+                shunned.add(wrong.host)
+            elif not layout.failures and redrawn < REDRAWN:
+                redrawn += 1
+            elif resort is not None:
+                return resort
+            else:
                 raise first
-            shunned.add(wrong.host)
 
     def _add_floor(self, editor: SceneEditor, floor: str, binding: Binding) -> str:
         if floor not in binding.floors:
