@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+from collections import Counter
 from itertools import pairwise
 
 import numpy as np
@@ -15,12 +16,13 @@ from embomatrix.factory.social.casting import GrammarRolePlayer
 from embomatrix.factory.social.fitting import is_plausible, why_of
 from embomatrix.factory.social.milieus import HOBBIES, NAMES
 from embomatrix.factory.social.occasions import Theme, occasion_of, occasions
-from embomatrix.factory.social.phrases import CLAUSES, TURNS
+from embomatrix.factory.social.phrases import CLAUSES, MANNERS, MATTERS, NOUNS, TURNS, called
 from embomatrix.factory.social.values import ROBOT, Act, Cast, DaySlot, Person
 from embomatrix.factory.social.writer import SocialWriter
 from embomatrix.factory.writer.variant import build_variant
 from embomatrix.factory.writer.view import SceneView
 from embomatrix.factory.writer.words import PHRASES
+from embomatrix.world.catalog import Catalog
 from embomatrix.world.task import TaskCategory
 
 SCENE = build_base_scene("Rs_int", seed=0)
@@ -47,6 +49,21 @@ def test_every_room_sees_somebody_and_ties_go_both_ways(seed):
         for other in person.ties:
             assert person.name in cast.of(other).ties
     assert all(earlier.time <= later.time for earlier, later in pairwise(cast.day))
+
+
+@settings(max_examples=50)
+@given(st.integers(0, 2**32))
+def test_parents_are_a_generation_older_and_a_home_is_called_after_who_lives_in_it(seed):
+    cast = GrammarRolePlayer().cast(SCENE, np.random.default_rng(seed))
+    first = cast.people[0]
+    ties = {tie for person in cast.people[1:] for tie in person.ties.values()}
+    for person in cast.people[1:]:
+        if person.ties[first.name] == "child":
+            assert first.age - person.age >= 18
+        if person.ties[first.name] == "parent":
+            assert person.age - first.age >= 18
+    assert ("lodger" in cast.setting) <= ("lodger" in ties)
+    assert ("generations" in cast.setting) == ({"parent", "child"} <= ties)
 
 
 @pytest.mark.parametrize(
@@ -104,6 +121,22 @@ def test_every_way_to_ask_of_the_plain_writer_has_its_own_here():
     assert set(TURNS) == set(Act)
     assert len(set(NAMES)) == len(NAMES)
     assert len(set(HOBBIES)) >= 5
+
+
+def test_people_call_a_category_by_a_name_that_no_other_has():
+    names = Counter(called(name) for name in Catalog.load().category_names)
+    assert {called(name): names[called(name)] for name in NOUNS if names[called(name)] > 1} == {}
+    assert set(NOUNS) <= set(Catalog.load().category_names)
+
+
+def test_taps_are_turned_and_drawers_pulled_out(drafts):
+    assert {key.rpartition(" ")[0] for key in MANNERS} <= set(CLAUSES)
+    assert set(MANNERS) <= set(MATTERS)
+    found, _ = drafts
+    for draft in found:
+        assert not re.search(r"sinks? (over )?(in [\w ]+ )?(switched )?(on|off)\b", draft.task.instruction)
+        assert "bottom cabinet" not in draft.task.instruction
+    assert any("tap" in draft.task.instruction or "water" in draft.task.instruction for draft in found)
 
 
 ANN = Person(name="Ann", age=40, job="nurse", hobby="chess")

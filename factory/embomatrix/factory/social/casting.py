@@ -38,27 +38,33 @@ class GrammarRolePlayer:
         roles = [milieu.roles[0], *(milieu.roles[1 + int(at)] for at in sorted(others))]
         names = [str(name) for name in rng.permutation(NAMES)[:count]]
         hobbies = [str(hobby) for hobby in rng.permutation(HOBBIES)[:count]]
-        people = [
-            _person(role, name, hobby, names[0], scene.rooms, rng)
-            for role, name, hobby in zip(roles, names, hobbies, strict=True)
-        ]
+        people: list[Person] = []
+        for role, name, hobby in zip(roles, names, hobbies, strict=True):
+            people.append(_person(role, name, hobby, people[0] if people else None, scene.rooms, rng))
         people[0] = people[0].model_copy(
             update={"ties": {name: role.back for role, name in zip(roles[1:], names[1:], strict=True)}}
         )
-        setting = milieu.setting[int(rng.integers(len(milieu.setting)))]
+        ties = {role.tie for role in roles[1:]}
+        told = [each.words for each in milieu.households if each.ties <= ties][:1] or milieu.setting
+        setting = told[int(rng.integers(len(told)))]
         return Cast(setting=setting, people=tuple(people), day=_day(people, scene.rooms, milieu, rng))
 
 
 def _person(
-    role: Role, name: str, hobby: str, first: str, rooms: Sequence[Room], rng: np.random.Generator
+    role: Role, name: str, hobby: str, first: Person | None, rooms: Sequence[Room], rng: np.random.Generator
 ) -> Person:
+    low, high = role.age
+    if first is not None and role.apart > 0:
+        low = max(low, first.age + role.apart)
+    elif first is not None and role.apart < 0:
+        high = min(high, first.age + role.apart)
     return Person(
         name=name,
-        age=int(rng.integers(role.age[0], role.age[1] + 1)),
+        age=int(rng.integers(low, high + 1)),
         job=role.job[int(rng.integers(len(role.job)))],
         hobby=hobby,
         rooms=tuple(room.name for room in rooms if room.type in role.rooms),
-        ties={} if name == first else {first: role.tie},
+        ties={} if first is None else {first.name: role.tie},
     )
 
 

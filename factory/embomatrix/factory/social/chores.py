@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.writer.words import spoken
+from embomatrix.factory.social.phrases import called
 from embomatrix.skills.limits import ROBOT
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ def impossible_chore(view: SceneView, room: str, rng: np.random.Generator) -> tu
     options = [*_ANYWHERE, *_BY_ROOM.get(types.get(room, ""), ())]
     options += [
         (
-            f"push the {spoken(view.category(name))} to the other wall",
+            f"push the {called(view.category(name))} to the other wall",
             f"it weighs more than the {ROBOT.mass_kg:g} kg that my arm lifts",
         )
         for name in view.in_room.get(room, ())

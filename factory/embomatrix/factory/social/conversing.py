@@ -72,7 +72,8 @@ class GrammarConversation:
 
     def _open(self, first: Piece) -> None:
         sign = "place" if first.kind == "place" else first.signs[0].partition("(")[0]
-        matter = filled(self._voice.choose(MATTERS[sign]), thing=first.thing)
+        matters = MATTERS.get(f"{sign} {first.manner}", MATTERS[sign])
+        matter = filled(self._voice.choose(matters), thing=first.thing)
         slot = self._scenario.slot
         self._say(slot.person, Act.NEED, activity=slot.activity, matter=matter, why=self._scenario.why)
         question = filled(self._voice.choose(QUESTIONS[first.kind]), thing=first.thing)

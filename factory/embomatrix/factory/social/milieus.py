@@ -10,8 +10,19 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
+class Household:
+    """A setting for a cast in which all of some ties to the first one are found."""
+
+    words: str
+    ties: frozenset[str]
+
+
+@dataclass(frozen=True, slots=True)
 class Role:
-    """A part that a person can play. ``tie`` is what they are to the first of the cast, ``back`` what that one is to them."""
+    """A part that a person can play. ``tie`` is what they are to the first of the cast, ``back`` what that one is to them.
+
+    ``apart`` is how many years older they are than the first at least, younger where it is negative; 0: any.
+    """
 
     job: tuple[str, ...]
     age: tuple[int, int]
@@ -19,32 +30,44 @@ class Role:
     back: str
     rooms: tuple[str, ...] = ()
     """Types of rooms that are theirs, as far as the scene has them."""
+    apart: int = 0
 
 
 @dataclass(frozen=True, slots=True)
 class Milieu:
-    """The first role is always played; others are drawn."""
+    """The first role is always played; others are drawn. The first household whose ties a cast has is its setting."""
 
     setting: tuple[str, ...]
     roles: tuple[Role, ...]
     lived_in: bool = False
     """Whether people sleep and wash there."""
+    households: tuple[Household, ...] = ()
 
 
+GENERATION: Final = 20
+"""Years between parents and children at least."""
 _OFFICES: Final = ("private_office", "shared_office", "meeting_room", "break_room", "copy_room", "phone_room")
 _HOME: Final = Milieu(
-    ("a family home", "a shared house", "a house with three generations under one roof"),
+    ("a home",),
     (
-        Role(("nurse", "architect", "bus driver", "tax adviser", "carpenter"), (32, 55), "partner", "partner",
+        Role(("nurse", "architect", "bus driver", "tax adviser", "carpenter"), (36, 55), "partner", "partner",
              ("bedroom", "kitchen", "private_office")),
         Role(("teacher", "cook", "translator", "electrician", "librarian"), (30, 58), "partner", "partner",
              ("bedroom", "living_room", "garden")),
-        Role(("pupil",), (6, 12), "child", "parent", ("childs_room", "playroom", "bedroom")),
-        Role(("student", "apprentice"), (16, 22), "child", "parent", ("childs_room", "bedroom", "television_room")),
-        Role(("pensioner",), (66, 84), "parent", "grown-up child", ("bedroom", "living_room", "garden")),
+        Role(("pupil",), (6, 12), "child", "parent", ("childs_room", "playroom", "bedroom"), -GENERATION),
+        Role(("student", "apprentice"), (16, 22), "child", "parent", ("childs_room", "bedroom", "television_room"),
+             -GENERATION),
+        Role(("pensioner",), (66, 84), "parent", "grown-up child", ("bedroom", "living_room", "garden"), GENERATION),
         Role(("student", "musician", "paramedic"), (21, 34), "lodger", "landlord", ("bedroom", "bathroom")),
     ),
     lived_in=True,
+    households=(
+        Household("a home that three generations share", frozenset({"parent", "child"})),
+        Household("a family home", frozenset({"child"})),
+        Household("a home that somebody shares with a parent", frozenset({"parent"})),
+        Household("a house with a lodger", frozenset({"lodger"})),
+        Household("a home that two people share", frozenset({"partner"})),
+    ),
 )  # fmt: skip
 _RESTAURANT: Final = Milieu(
     (

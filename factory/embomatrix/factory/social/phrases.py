@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.social.values import Act
+from embomatrix.factory.writer.words import spoken
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -83,6 +84,61 @@ CLAUSES: Final[Mapping[str, tuple[str, ...]]] = {
 }
 """Ways to ask for an atom. ``place`` is the host or the source."""
 
+MANNERS: Final[Mapping[str, tuple[str, ...]]] = {
+    "toggled_on tap": (
+        "turn on the tap of {thing}",
+        "let the water run in {thing}",
+        "get the water in {thing} running",
+        "leave the tap of {thing} running",
+    ),
+    "not toggled_on tap": (
+        "turn off the tap of {thing}",
+        "stop the water in {thing}",
+        "see to it that the tap of {thing} is off",
+        "leave the tap of {thing} turned off",
+    ),
+    "open drawers": (
+        "pull out a drawer of {thing}",
+        "open a drawer of {thing}",
+        "leave a drawer of {thing} standing open",
+        "get a drawer of {thing} open",
+    ),
+    "not open drawers": (
+        "push the drawers of {thing} in",
+        "shut the drawers of {thing} properly",
+        "see to it that no drawer of {thing} is open",
+        "leave the drawers of {thing} closed",
+    ),
+}
+"""Ways to ask for an atom about a thing that has a tap, or drawers and no door."""
+
+NOUNS: Final[Mapping[str, str]] = {
+    "bottom_cabinet": "low cabinet",
+    "bottom_cabinet_no_top": "base cabinet",
+    "metal_bottom_cabinet": "low metal cabinet",
+    "top_cabinet": "wall cabinet",
+    "furniture_sink": "vanity sink",
+    "multi_station_furniture_sink": "long vanity sink",
+    "multi_station_tabletop_sink": "long sink",
+    "multi_station_wall_mounted_sink": "long wash trough",
+    "wall_mounted_sink": "wall sink",
+    "drop_in_sink": "built-in sink",
+    "tabletop_sink": "washbowl",
+    "commercial_kitchen_sink": "kitchen sink",
+    "commercial_kitchen_table": "steel worktable",
+    "commercial_kitchen_shelf": "kitchen shelf",
+    "wall_mounted_tv": "TV on the wall",
+    "hardback": "hardback book",
+    "carpet": "rug",
+    "tablefork": "fork",
+    "public_trash_can": "rubbish bin",
+    "trash_can": "waste bin",
+    "clothes_dryer": "tumble dryer",
+    "washer": "washing machine",
+    "pot_plant": "potted plant",
+}
+"""What people call a category whose name is a catalog's. Two never share a name."""
+
 TURNS: Final[Mapping[Act, tuple[str, ...]]] = {
     Act.NEED: (
         "I am {activity}, and {why}. Now {matter}.",
@@ -160,8 +216,12 @@ MATTERS: Final[Mapping[str, tuple[str, ...]]] = {
     "not open": ("somebody left {thing} standing open", "everybody walks into {thing}, open as it is"),
     "toggled_on": ("{thing} is off", "nobody has thought of {thing}"),
     "not toggled_on": ("{thing} is running for nobody", "somebody left {thing} on"),
+    "toggled_on tap": ("I need water from {thing}", "nobody has thought of {thing}"),
+    "not toggled_on tap": ("the water in {thing} is running for nobody", "I hear {thing} dripping"),
+    "open drawers": ("{thing} is shut, and I have no hand free", "I need something out of {thing}"),
+    "not open drawers": ("everybody bumps into the drawers of {thing}", "a drawer of {thing} sticks out"),
 }
-"""What is the matter, by what is wished for."""
+"""What is the matter, by what is wished for, and by manner."""
 
 QUESTIONS: Final[Mapping[str, tuple[str, ...]]] = {
     "place": (
@@ -213,6 +273,11 @@ JOINS: Final = (
 
 WHERE: Final = ("in {room}", "over in {room}")
 """Ways to say in which room a thing is."""
+
+
+def called(category: str) -> str:
+    """A category as people call it."""
+    return NOUNS.get(category, spoken(category))
 
 
 def filled(template: str, **words: str) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import zlib
 from collections import Counter
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -12,7 +13,7 @@ import numpy as np
 from embomatrix.factory.social.casting import GrammarRolePlayer
 from embomatrix.factory.social.conversing import GrammarConversation, Scenario
 from embomatrix.factory.social.fitting import best_slot, why_of
-from embomatrix.factory.social.phrases import CLAUSES, WHERE
+from embomatrix.factory.social.phrases import CLAUSES, MANNERS, NOUNS, WHERE
 from embomatrix.factory.social.summary import instruction_of
 from embomatrix.factory.social.transcript import transcript_of
 from embomatrix.factory.writer.goals import Workshop
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from embomatrix.factory.social.casting import RolePlayingAgent
-    from embomatrix.factory.social.values import Cast, DaySlot
+    from embomatrix.factory.social.values import Cast, Conversation, DaySlot
     from embomatrix.factory.writer.goals import Piece
     from embomatrix.factory.writer.variant import Variant
     from embomatrix.factory.writer.view import SceneView
@@ -34,6 +35,16 @@ SAME_WISHES: Final = 2
 """Wishes of one kind in one variant: a third person who wants a sink running is one too many."""
 GOALS_TRIED: Final = 10
 """Goals that are looked at for one task: somebody must want it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Talked:
+    """A conversation with what led to it; ``shop`` and ``voice`` are for what is still to be said."""
+
+    scenario: Scenario
+    conversation: Conversation
+    shop: Workshop
+    voice: FreshVoice
 
 
 class SocialWriter:
@@ -67,10 +78,24 @@ class SocialWriter:
         rng: np.random.Generator,
     ) -> Draft | None:
         """What somebody who is in one of the variant's rooms on this day comes to ask for."""
+        talked = self.talk(variant, view, category, rng)
+        if talked is None:
+            return None
+        shop, cast, talk = talked.shop, talked.scenario.cast, talked.conversation
+        pieces = talked.scenario.pieces
+        instruction = instruction_of(talk, cast, view, talked.voice, talked.scenario.why)
+        transcript = transcript_of(cast, talk, instruction, pieces)
+        return draft_of(shop, category, task_id, pieces, instruction, transcript)
+
+    def talk(
+        self, variant: Variant, view: SceneView, category: TaskCategory, rng: np.random.Generator
+    ) -> Talked | None:
+        """A conversation that comes to a wish of this category; None where nobody would have one."""
         cast = self.cast_of(variant.scene)
         said = self._said_in(variant)
         voice = FreshVoice(rng, said)
-        shop = Workshop(view, variant, rng, phrases=CLAUSES, where=WHERE, voice=voice)
+        phrases = {**CLAUSES, **MANNERS}
+        shop = Workshop(view, variant, rng, phrases=phrases, where=WHERE, nouns=NOUNS, voice=voice)
         chosen = _scenario(cast, shop, category, said)
         if chosen is None:
             return None
@@ -78,9 +103,7 @@ class SocialWriter:
         said.update((slot.person, slot.activity, _wish_of(pieces)))
         used = frozenset(name for piece in pieces for name in piece.objects)
         talk = GrammarConversation(chosen, dataclasses.replace(shop, used=used), voice).run()
-        instruction = instruction_of(talk, cast, view, voice, chosen.why)
-        transcript = transcript_of(cast, talk, instruction, pieces)
-        return draft_of(shop, category, task_id, pieces, instruction, transcript)
+        return Talked(chosen, talk, shop, voice)
 
 
 def _wish_of(pieces: Sequence[Piece]) -> str:

@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.writer.tables import FOR_DRINKS, suits
 from embomatrix.factory.writer.words import PHRASES, Voice, phrase, refer, spoken
+from embomatrix.world.asset import JointKind
 from embomatrix.world.goal import And, Atom, Exists, Formula, Not
 from embomatrix.world.state import Relation
+from embomatrix.world.substances import flows_from
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -19,6 +21,8 @@ if TYPE_CHECKING:
     from embomatrix.factory.writer.variant import Variant
     from embomatrix.factory.writer.view import SceneView
 
+TAP: Final = "tap"
+DRAWERS: Final = "drawers"
 MAX_ALIKE: Final = 4
 """Furniture of one category in one room, of which a goal may mean any."""
 PICKS: Final = 4
@@ -29,7 +33,8 @@ PICKS: Final = 4
 class Piece:
     """One conjunct of a goal. ``objects`` are all that it is about, ``signs`` its part of the goal's signature.
 
-    ``clause`` asks for it; ``thing`` is what it is about, in words; ``kind`` is "place", "switch" or "thermal".
+    ``clause`` asks for it; ``thing`` is what it is about, in words; ``kind`` is "place", "switch" or "thermal"; ``manner``
+    tells how a thing is switched that people have other words for: by its tap, or its drawers.
     """
 
     goal: Formula
@@ -39,14 +44,16 @@ class Piece:
     kind: str
     thing: str
     types: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    manner: str = ""
 
 
 @dataclass(frozen=True)
 class Workshop:
     """What the makers of pieces draw from. ``used`` are objects that earlier pieces of the same goal are about.
 
-    ``phrases`` are the ways to ask for an atom, by predicate, ``where`` those to say in which room a thing is; ``voice``
-    chooses among them, equally where none is given.
+    ``phrases`` are the ways to ask for an atom, by predicate, or by predicate and manner where they know some; ``where`` those
+    to say in which room a thing is, ``nouns`` what categories are called, where not by their names; ``voice`` chooses among
+    them, equally where none is given.
     """
 
     view: SceneView
@@ -55,15 +62,22 @@ class Workshop:
     used: frozenset[str] = frozenset()
     phrases: Mapping[str, tuple[str, ...]] = field(default_factory=lambda: PHRASES)
     where: tuple[str, ...] = ("in {room}",)
+    nouns: Mapping[str, str] = field(default_factory=dict)
     voice: Voice | None = None
 
-    def phrase(self, kind: str, *, thing: str, place: str = "") -> str:
+    def phrase(self, kind: str, *, thing: str, place: str = "", manner: str = "") -> str:
         """One imperative clause."""
-        return phrase(self.phrases[kind], self._voice, thing=thing, place=place)
+        options = self.phrases.get(f"{kind} {manner}", self.phrases[kind])
+        return phrase(options, self._voice, thing=thing, place=place)
 
     def refer(self, name: str) -> str:
         """A noun phrase for an object."""
-        return refer(self.view, name, self._voice, self.where)
+        return refer(self.view, name, self._voice, self.where, self.noun(name))
+
+    def noun(self, name: str) -> str:
+        """What an object is called."""
+        category = self.view.category(name)
+        return self.nouns.get(category, spoken(category))
 
     @property
     def _voice(self) -> Voice:
@@ -187,15 +201,25 @@ def switch_piece(shop: Workshop) -> Piece | None:
         return Not(Atom(predicate, (target,))) if holds else Atom(predicate, (target,))
 
     goal, types, objects, words = _one_of(shop, name, atom)
+    manner = _manner(view, name, predicate)
     return Piece(
         goal=goal,
-        clause=shop.phrase(kind, thing=words),
+        clause=shop.phrase(kind, thing=words, manner=manner),
         objects=objects,
         signs=(f"{kind}({view.category(name)})",),
         kind="switch",
         thing=words,
         types=types,
+        manner=manner,
     )
+
+
+def _manner(view: SceneView, name: str, predicate: str) -> str:
+    """What of a thing is switched or opened, where that is neither a button nor a door."""
+    asset = view.asset(name)
+    if predicate == "toggled_on":
+        return TAP if flows_from(asset.synset) else ""
+    return DRAWERS if all(joint.kind is JointKind.PRISMATIC for _, joint in asset.joints) else ""
 
 
 def _holds(view: SceneView, predicate: str, name: str) -> bool:
@@ -232,7 +256,7 @@ def _thermal(shop: Workshop, food: str, source: str, predicate: str) -> Piece:
         goal = And((goal, Atom("inside", (food, source))))
         objects = (food, source)
         signs = (*signs, f"inside({view.category(food)},{view.category(source)})")
-        clause += f" and leave it in the {spoken(view.category(source))}"
+        clause += f" and leave it in the {shop.noun(source)}"
     return Piece(goal, clause, (*objects, *(view.alike(source))), signs, "thermal", called)
 
 

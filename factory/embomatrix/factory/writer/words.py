@@ -82,12 +82,15 @@ class FreshVoice(Voice):
         return chosen
 
 
-def refer(view: SceneView, name: str, voice: Voice, where: Sequence[str] = ("in {room}",)) -> str:
+def refer(
+    view: SceneView, name: str, voice: Voice, where: Sequence[str] = ("in {room}",), noun: str = ""
+) -> str:
     """A noun phrase for an object, or for any of those of its category in its room.
 
-    The room is named, in one of the ways of ``where``, if the category does not tell which one is meant.
+    The room is named, in one of the ways of ``where``, if the category does not tell which one is meant. ``noun`` is what the
+    category is called, where that is not its name.
     """
-    noun = spoken(view.category(name))
+    noun = noun or spoken(view.category(name))
     article = "the" if len(view.alike(name)) == 1 else "an" if noun[0] in "aeiou" else "a"
     words = f"{article} {noun}"
     ambiguous = len(view.rooms_with(view.category(name))) > 1
