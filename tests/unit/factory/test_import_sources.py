@@ -6,8 +6,11 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
+from click.testing import Result
 from tests.fakes.problems import PROBLEM
+from typer.testing import CliRunner
 
+from embomatrix.factory.cli import app
 from embomatrix.factory.refusal import Refusal, RefusedError
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.task_import.batch import bind_first
@@ -87,3 +90,29 @@ def test_activities_of_behavior_1k_are_bound_or_refused() -> None:
     for item in bound:
         assert item.task.source == "behavior-1k"
         assert set(item.task.table) <= set(item.scene.by_name)
+
+
+def test_an_import_that_was_stopped_goes_on_and_tells_the_same_in_the_end(tmp_path: Path) -> None:
+    unknown = PROBLEM.replace("apple.n.01", "unicorn.n.01")
+    jsonl, outcomes = tmp_path / "problems.jsonl", tmp_path / "outcomes.jsonl"
+    # two problems may have one name
+    lines = [json.dumps({"name": name, "bddl": unknown}) for name in ("a", "b", "b")]
+    jsonl.write_text("\n".join(lines))
+
+    def imported(*more: str) -> Result:
+        command = ["import", "--jsonl", str(jsonl), "--scene", "Rs_int", "--bind-only"]
+        return CliRunner().invoke(app, [*command, "--outcomes", str(outcomes), *more])
+
+    assert "unknown_type" in imported().output
+    whole = outcomes.read_text()
+    assert len(whole.splitlines()) == 4
+    outcomes.write_text("".join(whole.splitlines(keepends=True)[:3])[:-20])
+    report = tmp_path / "report.json"
+    assert imported("--report", str(report)).exit_code == 0
+    assert outcomes.read_text() == whole
+    assert [each["name"] for each in json.loads(report.read_text())["outcomes"]] == ["a", "b", "b"]
+    assert "holds outcomes of" in " ".join(imported("--seed", "1").output.split())
+    jsonl.write_text("\n".join(reversed(lines)))
+    other = imported()
+    assert other.exit_code == 2
+    assert "tells of other problems" in " ".join(other.output.split())

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import multiprocessing
 from collections import defaultdict
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from embomatrix.factory.evaluate.figures import EvaluationError
 from embomatrix.factory.evaluate.scenes import Method, Outcome, SceneTask, evaluation_of, judge
+from embomatrix.factory.outcome_log import LineLog
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.sim.pose_cache import PlacementLibrary
-from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -25,49 +22,15 @@ if TYPE_CHECKING:
     Trial = tuple[SceneTask, Method]
 
 
-@dataclass
-class OutcomeLog:
-    """Outcomes as they come, on disk: the seed in the first line, an outcome in each other. Without a path, in memory alone."""
-
-    path: Path | None = None
-    outcomes: list[Outcome] = field(default_factory=list)
+class OutcomeLog(LineLog[Outcome]):
+    """Outcomes of trials; their seed decides them."""
 
     @staticmethod
     def open(path: Path, seed: int) -> OutcomeLog:
         """Start a log or take one up. A last line that was cut short is dropped. Raises EvaluationError, OSError."""
-        if not path.exists():
-            write_whole(path, (json.dumps({"seed": seed}) + "\n").encode())
-        lines = path.read_text(encoding="utf-8").splitlines()
-        found = _settings(path, lines[:1])
-        if found != {"seed": seed}:
-            raise EvaluationError(f"{path} holds outcomes of {found}, not of seed {seed}: name another file")
-        outcomes: list[Outcome] = []
-        for number, line in enumerate(lines[1:], start=2):
-            try:
-                outcomes.append(_outcome(json.loads(line)))
-            except (ValueError, TypeError, KeyError) as error:
-                if number != len(lines):
-                    raise EvaluationError(
-                        f"{path}, line {number}, is no outcome ({error}): remove the line"
-                    ) from error
-                write_whole(path, "".join(f"{kept}\n" for kept in lines[:-1]).encode())
-        return OutcomeLog(path, outcomes)
-
-    def add(self, outcome: Outcome) -> None:
-        """Keep an outcome. Raises OSError."""
-        if self.path is not None:
-            with self.path.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(asdict(outcome)) + "\n")
-        self.outcomes.append(outcome)
-
-
-def _settings(path: Path, first: Sequence[str]) -> Any:
-    try:
-        return json.loads(first[0])
-    except (ValueError, IndexError) as error:
-        raise EvaluationError(
-            f"{path} is no file of outcomes: expected the seed in its first line; name another file"
-        ) from error
+        log = OutcomeLog(path)
+        log.take_up({"seed": seed}, _outcome)
+        return log
 
 
 def _outcome(value: dict[str, Any]) -> Outcome:

@@ -13,7 +13,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from embomatrix.factory.evaluate.figures import evaluation_to_json
+from embomatrix.factory.evaluate.figures import EvaluationError, evaluation_to_json
+from embomatrix.factory.outcome_log import LineLog
 from embomatrix.factory.pipeline.settings import scene_ids
 from embomatrix.factory.refusal import Refusal
 from embomatrix.factory.scenes.build import build_base_scene
@@ -23,6 +24,7 @@ from embomatrix.factory.task_import.reach import unreachable_atoms
 from embomatrix.factory.task_import.report import (
     Outcome,
     evaluation_of,
+    outcome_from_json,
     outcome_of,
     report_to_json,
     report_to_markdown,
@@ -69,6 +71,13 @@ Report = Annotated[
     Path | None, typer.Option(help="File for what became of each problem, in JSON; beside it in Markdown.")
 ]
 Rates = Annotated[Path | None, typer.Option("--json", help="File for the import rates.")]
+Kept = Annotated[
+    Path | None,
+    typer.Option(
+        "--outcomes",
+        help="File for what became of each problem, JSON lines, as it comes: with it an import that was stopped goes on.",
+    ),
+]
 ReachedBy = Annotated[
     Profile | None, typer.Option(help="Leave out problems with goals that no skill of this profile reaches.")
 ]
@@ -99,36 +108,59 @@ def import_(
     ] = True,
     report: Report = None,
     json_file: Rates = None,
+    outcomes: Kept = None,
 ) -> None:
     """Bind BDDL problems to base scenes and verify them, or say why not."""
     console = Console()
     depth = Depth.INSTANTIATE if instantiate else Depth.BIND if bind_only else Depth.VERIFY
-    with mended(out):
+    kept = "; what was found is kept, and the same command goes on from there" if outcomes is not None else ""
+    with mended(out or outcomes, kept):
         for file in filter(None, (report, json_file)):
             check_writable(file)
         if out is not None:
-            _check_free(out, depth)
+            _check_free(out, depth, outcomes)
         sources = [_parsed(source) for source in _sources(bddl, activity, jsonl, eai)]
         if reached_by is not None:
             sources = _reached(sources, reached_by)
         bases = [build_base_scene(scene_id) for scene_id in scene_ids(scenes)]
-        judged = _judged(console, sources, bases, seed, depth, Foresight() if look_ahead else None)
-        verified = [item for item in judged if isinstance(item, Verified)]
+        foresight = Foresight() if look_ahead else None
+        log = _taken_up(outcomes, sources, bases, seed, depth, foresight)
+        made = _judged(console, sources[len(log.outcomes) :], bases, seed, depth, foresight, log)
+        verified = [item for item in made if isinstance(item, Verified)]
         if out is not None and verified:
             write_dataset(
                 out,
                 [item.record for item in verified],
                 {item.record.bundle_digest: item.bundle for item in verified},
             )
-        outcomes = [outcome_of(source, item) for source, item in zip(sources, judged, strict=True)]
-        evaluation = (solved_of if depth is Depth.VERIFY else evaluation_of)(outcomes, seed)
-        _write(outcomes, evaluation, report, json_file)
-    if len(sources) == 1:
-        _print_one(console, sources[0], judged[0])
+        told = log.outcomes
+        evaluation = (solved_of if depth is Depth.VERIFY else evaluation_of)(told, seed)
+        _write(told, evaluation, report, json_file)
+    if len(sources) == len(made) == 1:
+        _print_one(console, sources[0], made[0])
         return
-    _print_outcomes(console, judged)
+    _print_outcomes(console, told, depth)
     if out is not None and not verified:
         fail(f"no problem was admitted, so {out} was not written: `--bind-only` shows which could be bound")
+
+
+def _taken_up(
+    path: Path | None,
+    sources: Sequence[SourceText],
+    bases: Sequence[Scene],
+    seed: int,
+    depth: Depth,
+    foresight: Foresight | None,
+) -> LineLog[Outcome]:
+    """What is known already of the first of the problems. Raises EvaluationError where a file tells of others."""
+    log = LineLog[Outcome](path)
+    scenes = [base.base for base in bases]
+    told = {"seed": seed, "depth": depth, "scenes": scenes, "look_ahead": foresight is not None}
+    log.take_up(told, outcome_from_json)
+    known = [outcome.name for outcome in log.outcomes]
+    if known != [source.name for source in sources[: len(known)]]:
+        raise EvaluationError(f"{path} tells of other problems than are to be imported: name another file")
+    return log
 
 
 def _reached(sources: Sequence[SourceText], profile: Profile) -> list[SourceText]:
@@ -151,12 +183,14 @@ def _write(
         write_whole(json_file, (json.dumps(evaluation_to_json(evaluation), indent=1) + "\n").encode("ascii"))
 
 
-def _check_free(out: Path, depth: Depth) -> None:
+def _check_free(out: Path, depth: Depth, outcomes: Path | None) -> None:
     """Nothing that is already there is overwritten, and nothing that could not be written is begun."""
     if depth is not Depth.VERIFY:
         raise SourceError(
             f"to {depth.value} admits no task that could be written: leave out --out, or --bind-only and --instantiate"
         )
+    if outcomes is not None:
+        raise SourceError("an import into a dataset is not taken up again: leave out --out, or --outcomes")
     if (out / TASKS_FILE).exists():
         raise SourceError(f"{out} holds a dataset already: name another folder with --out")
     out.mkdir(parents=True, exist_ok=True)
@@ -196,20 +230,26 @@ def _judged(
     seed: int,
     depth: Depth,
     foresight: Foresight | None,
+    log: LineLog[Outcome],
 ) -> list[Imported | Verified | Refusal]:
-    outcomes: list[Imported | Verified | Refusal] = []
+    """What becomes of these problems; each is added to the log."""
+    made: list[Imported | Verified | Refusal] = []
+    done = len(log.outcomes)
     with progress(console) as bars, contextlib.closing(PlacementLibrary()) as library:
-        bar = bars.add_task("problems", total=len(sources))
+        bar = bars.add_task("problems", total=done + len(sources), completed=done)
         for source in sources:
+            item: Imported | Verified | Refusal
             match depth:
                 case Depth.INSTANTIATE:
-                    outcomes.append(bind_first(source, bases, seed=seed, manner=Manner(reachable=False)))
+                    item = bind_first(source, bases, seed=seed, manner=Manner(reachable=False))
                 case Depth.BIND:
-                    outcomes.append(bind_first(source, bases, seed=seed))
+                    item = bind_first(source, bases, seed=seed)
                 case Depth.VERIFY:
-                    outcomes.append(verify_first(source, bases, library, foresight, seed=seed))
+                    item = verify_first(source, bases, library, foresight, seed=seed)
+            log.add(outcome_of(source, item))
+            made.append(item)
             bars.advance(bar)
-    return outcomes
+    return made
 
 
 def _print_one(console: Console, source: SourceText, outcome: Imported | Verified | Refusal) -> None:
@@ -227,11 +267,9 @@ def _print_one(console: Console, source: SourceText, outcome: Imported | Verifie
             console.print("  " + " ".join(map(str, call.values())), highlight=False, markup=False)
 
 
-def _print_outcomes(console: Console, outcomes: list[Imported | Verified | Refusal]) -> None:
-    counts = Counter(
-        f"refused: {item.reason}" if isinstance(item, Refusal) else type(item).__name__.lower()
-        for item in outcomes
-    )
+def _print_outcomes(console: Console, outcomes: Sequence[Outcome], depth: Depth) -> None:
+    done = "verified" if depth is Depth.VERIFY else "imported"
+    counts = Counter(f"refused: {each.reason}" if each.reason else done for each in outcomes)
     table = Table("outcome", "problems")
     for outcome, count in counts.most_common():
         table.add_row(outcome, str(count))

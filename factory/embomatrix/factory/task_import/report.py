@@ -50,6 +50,12 @@ class Outcome:
         return not self.reason
 
 
+def outcome_from_json(value: dict[str, Any]) -> Outcome:
+    """What `dataclasses.asdict` made of an outcome, read back from JSON. Raises KeyError, TypeError."""
+    unreachable = {profile: tuple(atoms) for profile, atoms in value["unreachable"].items()}
+    return Outcome(**{**value, "unreachable": unreachable, "notes": tuple(value["notes"])})
+
+
 def outcome_of(source: SourceText, judged: Imported | Verified | Refusal) -> Outcome:
     """What is told of a problem. Raises BddlError where the source is no BDDL."""
     problem, notes = read_problem(source)
