@@ -11,6 +11,7 @@ import typer
 from rich.console import Console
 from rich.table import Column, Table
 
+from embomatrix.factory.agents_cli import agent
 from embomatrix.factory.assets_cli import app as assets_app
 from embomatrix.factory.evaluate.cli import app as evaluate_app
 from embomatrix.factory.export import card, encoded, export_rows
@@ -21,7 +22,6 @@ from embomatrix.factory.layout_cli import (
     Llm,
     Model,
     Tape,
-    agent,
     lay,
     modelled_agents,
     modelled_names,
@@ -29,7 +29,7 @@ from embomatrix.factory.layout_cli import (
 from embomatrix.factory.pipeline.build import Check, Summary, build_dataset
 from embomatrix.factory.pipeline.cluster import ClusterJudge
 from embomatrix.factory.pipeline.corpus_cli import app as corpus_app
-from embomatrix.factory.pipeline.settings import BuildSettings, WriterKind, scene_ids
+from embomatrix.factory.pipeline.settings import SCENE_EXTRACTOR, BuildSettings, WriterKind, scene_ids
 from embomatrix.factory.social.asking import Asked, asked_writer
 from embomatrix.factory.task_import.cli import app as import_app
 from embomatrix.factory.terminal import fail, mended, progress
@@ -134,6 +134,12 @@ def generate(
         str,
         typer.Option(help="HOST:PORT of a manager, on whose slots the oracle's plans are executed as well."),
     ] = "",
+    look: Annotated[
+        bool,
+        typer.Option(
+            "--look", help="Show the model a plan and views of each scene first: for models that see."
+        ),
+    ] = False,
     token: Annotated[str, typer.Option(envvar="EMBOMATRIX_TOKEN", help="Token for it.")] = "",
     ca: Annotated[Path | None, typer.Option(envvar="EMBOMATRIX_CA", help="Its ca.pem.")] = None,
 ) -> None:
@@ -142,8 +148,11 @@ def generate(
     kind = WriterKind.MODEL if llm or cassette is not None else WriterKind.SOCIAL
     if llm and not model:
         fail("--llm needs the name of a model there: give --model")
+    if look and kind is WriterKind.SOCIAL:
+        fail("--look shows scenes to a language model: give --llm URL and --model NAME, or --cassette FILE")
     modelled = modelled_names(forms or [])
-    settings = BuildSettings(tasks, heldout, seed, names, kind, look_ahead, tuple(sorted(modelled)))
+    told = sorted([*modelled, *[SCENE_EXTRACTOR] * look])
+    settings = BuildSettings(tasks, heldout, seed, names, kind, look_ahead, tuple(told))
     with contextlib.ExitStack() as stack:
         stack.enter_context(mended(out))
         check: Check | None = None
@@ -154,7 +163,7 @@ def generate(
         if kind is WriterKind.SOCIAL:
             _make(out, settings, jobs=jobs, check=check, layout=layout)
             return
-        asked = Asked(llm, model, key, cassette, Price(*price), out / "ledger.jsonl")
+        asked = Asked(llm, model, key, cassette, Price(*price), out / "ledger.jsonl", look)
         writer, ledger = stack.enter_context(asked_writer(asked))
         _make(out, settings, writer, check=check, layout=layout)
         _print_account(ledger)

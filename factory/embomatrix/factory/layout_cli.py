@@ -1,12 +1,10 @@
-"""``embomatrix factory agent`` and ``factory lay``: the layout agents one by one, and all of them on one task."""
+"""``embomatrix factory lay``: all layout agents on one task, and which of them are a language model."""
 
 from __future__ import annotations
 
 import contextlib
-import json
-import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 from rich.console import Console
@@ -29,7 +27,7 @@ from embomatrix.world.bddl import BddlError
 from embomatrix.world.catalog import CatalogError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Iterator, Sequence
 
     from embomatrix.factory.editor import SceneEditor
     from embomatrix.factory.layout.jobs import Item, Layout, Record
@@ -49,44 +47,6 @@ Tape = Annotated[
     Path | None,
     typer.Option("--cassette", help="Recorded answers: read where it has them, added to where not."),
 ]
-
-
-def agent(
-    name: Annotated[AgentName, typer.Argument(help="Which agent.")],
-    brief: Annotated[
-        Path | None, typer.Option("--in", help="File with its brief as JSON; '-' reads standard input.")
-    ] = None,
-    schema: Annotated[bool, typer.Option("--schema", help="Print the JSON schema of its brief.")] = False,
-    llm: Llm = "",
-    model: Model = "",
-    key: Key = "",
-    cassette: Tape = None,
-) -> None:
-    """Run one agent of the scene layout alone: a brief in, its answer out, by rules or by a language model."""
-    door = DOORS[name]
-    if schema:
-        typer.echo(json.dumps(door.brief.json_schema(), indent=1))
-        return
-    if brief is None:
-        _fail(
-            f"{name}, {door.about}, needs a brief: give --in FILE; `factory lay --out` writes some, `--schema` tells the form"
-        )
-    with _mended():
-        asked = door.read(sys.stdin.read() if str(brief) == "-" else brief.read_text(encoding="utf-8"))
-        if not llm and cassette is None:
-            typer.echo(door.written(door.rules(asked)))
-            return
-        if name not in MODELLED:
-            _fail(
-                f"{name} has no form with a language model: leave out --llm; {', '.join(sorted(MODELLED))} have one"
-            )
-        with modelled_agents(llm, model, key, cassette) as agents:
-            answers: dict[AgentName, Callable[[Any], Any]] = {
-                AgentName.DISTRIBUTOR: agents.distribute,
-                AgentName.ORGANIZER: lambda value: tuple(agents.organize(value).branches()),
-                AgentName.PLANNER: agents.wish,
-            }
-            typer.echo(door.written(answers[name](asked)))
 
 
 def lay(
@@ -112,7 +72,7 @@ def lay(
         _fail(f"there is no method {method!r}: expected one of {', '.join(METHODS)}")
     if (bddl is None) is (not activity):
         _fail("expected exactly one of --bddl FILE and --activity NAME")
-    with _mended(), contextlib.ExitStack() as stack:
+    with mended_layout(), contextlib.ExitStack() as stack:
         source = read_file(bddl) if bddl is not None else read_activity(activity)
         agents = LayoutAgents()
         if names:
@@ -194,7 +154,7 @@ def modelled_agents(url: str, model: str, key: str, cassette: Path | None) -> It
 
 
 @contextlib.contextmanager
-def _mended() -> Iterator[None]:
+def mended_layout() -> Iterator[None]:
     """What a person can mend is one sentence and exit status 2."""
     try:
         yield

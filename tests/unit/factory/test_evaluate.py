@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from embomatrix.factory.cli import app
-from embomatrix.factory.evaluate.admissions import admitted_share
+from embomatrix.factory.evaluate.admissions import admitted_share, evaluate_admissions
 from embomatrix.factory.evaluate.aesthetics import Calibration, auc, features_of, fit, score_room
 from embomatrix.factory.evaluate.drafts import Asked, asked_in
 from embomatrix.factory.evaluate.figures import (
@@ -247,6 +247,53 @@ def test_the_ledger_tells_how_many_drafts_were_admitted(tmp_path):
     ledger.write_text('{"outcome": "admitted"}\n{"outc')
     with pytest.raises(EvaluationError, match="can't be read as a ledger"):
         admitted_share(tmp_path)
+
+
+def a_build(folder, writer, times):
+    """A build of two variants with three admitted tasks and one refused, and what its file of times holds."""
+    settings = {"settings": {"writer": writer, "look_ahead": True}}
+    drafts = [(0, "admitted"), (0, "admitted"), (0, "no_plan"), (1, "admitted")]
+    lines = [
+        {"split": "train", "variant": number, "scene": "Rs_int-train-000", "outcome": outcome}
+        for number, outcome in drafts
+    ]
+    (folder / "build.jsonl").write_text(json.dumps(settings) + "\n")
+    (folder / "attempts.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    (folder / "times.jsonl").write_text("".join(json.dumps(line) + "\n" for line in times))
+
+
+def test_the_pace_of_admission_is_by_the_time_of_variants_that_is_known_and_of_all_base_scenes(tmp_path):
+    known = [
+        {"base_scenes": 1, "cpu_s": 2.0},
+        {"split": "train", "variant": 0, "cpu_s": 5.0},
+        {"base_scenes": 1, "cpu_s": 1.0},
+    ]
+    a_build(tmp_path, "social", known)
+    with (tmp_path / "times.jsonl").open("a") as file:
+        file.write('{"split": "train", "vari')
+    found = evaluate_admissions(tmp_path)
+    assert found.figure("admitted_share").value == 75.0
+    pace = found.figure("admitted_per_hour")
+    assert (pace.value, pace.n, pace.is_reached) == (2 * 3600 * 2 / 8.0, 2, True)
+    assert found.notes == ("Against drafts: no_plan 1.",)
+    assert found.conditions["look ahead"] == "yes"
+    assert "| admitted_per_hour |" in with_factory("", [found])
+
+
+def test_the_plain_writer_s_admissions_have_its_name_and_no_goals_and_an_untimed_build_no_pace(tmp_path):
+    a_build(tmp_path, "plain", [])
+    found = evaluate_admissions(tmp_path)
+    assert [(figure.name, figure.goal) for figure in found.figures] == [("admitted_share plain", None)]
+
+
+def test_what_is_no_build_is_told_in_a_sentence(tmp_path):
+    answer = CliRunner().invoke(app, ["evaluate", "admissions", str(tmp_path)])
+    assert answer.exit_code == 2
+    assert "has no ledger of drafts" in answer.output
+    a_build(tmp_path, "social", [])
+    (tmp_path / "build.jsonl").write_text("{}\n")
+    with pytest.raises(EvaluationError, match="does not tell the settings"):
+        evaluate_admissions(tmp_path)
 
 
 def test_a_judge_gives_points_of_ten():

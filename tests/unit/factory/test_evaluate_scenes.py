@@ -1,6 +1,7 @@
 """Scenes are judged by eyes of their own: each flaw is seen, sound scenes have none, and rates are what they say."""
 
 import json
+from dataclasses import replace
 from importlib import resources
 from typing import TYPE_CHECKING
 
@@ -98,6 +99,16 @@ def test_rates_are_shares_and_only_the_tree_has_goals() -> None:
     assert evaluation.figure("verification_pass_rate").goal == 99.0
     assert evaluation.figure("generation_rate random").goal is None
     assert "does_not_fit 1" in evaluation.notes[0]
+
+
+def test_aesthetics_are_compared_over_the_tasks_that_every_method_laid_out() -> None:
+    crowded = replace(outcome(Method.TREE), task="crowded", aesthetics=6.0)
+    failed = replace(outcome(Method.RANDOM, "does_not_fit", generated=False), task="crowded", aesthetics=None)
+    found = evaluation_of([outcome(Method.TREE), outcome(Method.RANDOM), crowded, failed], {})
+    assert found.figure("aesthetics").value == 7.0
+    assert found.figure("aesthetics_shared").value == 8.0
+    assert found.figure("aesthetics_shared random").n == 1
+    assert "aesthetics_shared" not in {each.name for each in evaluation_of([crowded], {}).figures}
 
 
 KNOWN = [

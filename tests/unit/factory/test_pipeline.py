@@ -12,6 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from embomatrix.factory.cli import app
+from embomatrix.factory.evaluate.admissions import evaluate_admissions
 from embomatrix.factory.layout.jobs import LayoutAgents
 from embomatrix.factory.layout.organization import organize
 from embomatrix.factory.layout.tree import LayoutTree
@@ -101,6 +102,20 @@ def test_build_that_was_cut_short_goes_on_to_the_same_end(
     build_dataset(copy, SETTINGS)
     assert (copy / "tasks.jsonl").read_bytes() == (folder / "tasks.jsonl").read_bytes()
     assert (copy / "build.jsonl").read_bytes() == (folder / "build.jsonl").read_bytes()
+
+
+def test_a_build_keeps_the_processor_time_of_every_variant_beside_the_data_set(
+    folder: Path, dataset: Dataset
+) -> None:
+    times = [json.loads(line) for line in (folder / "times.jsonl").read_text().splitlines()]
+    made = BuildStore.open(folder, asdict(SETTINGS)).results
+    assert [(line["split"], line["variant"]) for line in times if "variant" in line] == [
+        (result.split, result.number) for result in made
+    ]
+    assert next(line["base_scenes"] for line in times if "base_scenes" in line) == len(SETTINGS.scenes)
+    assert all(line["cpu_s"] > 0.0 for line in times)
+    pace = evaluate_admissions(folder).figure("admitted_per_hour plain")
+    assert pace.n == len(dataset.records)
 
 
 def test_folder_of_another_build_is_left_alone(folder: Path, dataset: Dataset) -> None:

@@ -1,32 +1,112 @@
-"""How many of the drafts that a build judged were admitted, by its ledger."""
+"""What a build's ledger tells: how many drafts were admitted, why the others were not, and how many an hour gives."""
 
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Final
+from collections import Counter
+from typing import TYPE_CHECKING, Any, Final
 
-from embomatrix.factory.evaluate.figures import EvaluationError
-from embomatrix.factory.pipeline.store import ATTEMPTS_FILE
+from embomatrix.factory.evaluate.figures import Evaluation, EvaluationError
+from embomatrix.factory.pipeline.settings import WriterKind
+from embomatrix.factory.pipeline.store import ATTEMPTS_FILE, BUILD_FILE, TIMES_FILE
 from embomatrix.pages.figures import Better, Figure
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
 GOAL_PERCENT: Final = 90.0
+GOAL_PER_HOUR: Final = 1000.0
+CORES: Final = 2
+"""On so many cores that do nothing else, the goal is counted."""
+ADMITTED: Final = "admitted"
 
 
-def admitted_share(folder: Path) -> tuple[Figure, ...]:
+def admitted_share(folder: Path, label: str = "") -> tuple[Figure, ...]:
     """The one figure, in percent of drafts; none for a dataset without ledger. Raises EvaluationError for a damaged one."""
+    attempts = _attempts(folder)
+    if not attempts:
+        return ()
+    share = 100 * sum(each["outcome"] == ADMITTED for each in attempts) / len(attempts)
+    name, goal = _named("admitted_share", label), None if label else GOAL_PERCENT
+    return (Figure(name, share, "%", Better.HIGHER, len(attempts), goal),)
+
+
+def evaluate_admissions(folder: Path) -> Evaluation:
+    """Share and pace of what a build admitted, with the reasons against the rest. Raises EvaluationError."""
+    attempts = _attempts(folder)
+    if not attempts:
+        raise EvaluationError(
+            f"{folder} has no ledger of drafts: expected {ATTEMPTS_FILE}, which `factory build`, `generate` and `corpus` write"
+        )
+    settings = _settings(folder)
+    label = WriterKind.PLAIN.value if settings["writer"] == WriterKind.PLAIN else ""
+    figures = (*admitted_share(folder, label), *_per_hour(folder, attempts, label))
+    reasons = Counter(each["outcome"] for each in attempts if each["outcome"] != ADMITTED)
+    told = ", ".join(f"{reason} {count}" for reason, count in reasons.most_common()) or "nothing"
+    conditions = {
+        "dataset": folder.name,
+        "scenes": len({each["scene"].split("-")[0] for each in attempts}),
+        "look ahead": "yes" if settings["look_ahead"] else "no",
+    }
+    return Evaluation(
+        "admission", conditions, figures, (f"Against drafts{f' of {label}' if label else ''}: {told}.",)
+    )
+
+
+def _per_hour(folder: Path, attempts: Sequence[dict[str, Any]], label: str) -> tuple[Figure, ...]:
+    """Admitted tasks in an hour of two cores, by processor time; of variants of which it is known, with all base scenes."""
+    lines = list(_times(folder / TIMES_FILE))
+    timed = {(line["split"], line["variant"]) for line in lines if "variant" in line}
+    spent_s = sum(line["cpu_s"] for line in lines)
+    admitted = sum(
+        each["outcome"] == ADMITTED and (each["split"], each["variant"]) in timed for each in attempts
+    )
+    if not spent_s or not timed:
+        return ()
+    pace = CORES * 3600 * admitted / spent_s
+    name, goal = _named("admitted_per_hour", label), None if label else GOAL_PER_HOUR
+    return (Figure(name, pace, "tasks", Better.HIGHER, admitted, goal),)
+
+
+def _times(path: Path) -> Iterator[dict[str, Any]]:
+    """Lines of the file of times. One that was cut short is left out: what it told of was made again."""
+    if not path.is_file():
+        return
+    for line in path.read_text(encoding="utf-8").splitlines():
+        try:
+            value = json.loads(line)
+        except ValueError:
+            continue
+        if isinstance(value, dict) and isinstance(value.get("cpu_s"), int | float):
+            yield value
+
+
+def _attempts(folder: Path) -> list[dict[str, Any]]:
     path = folder / ATTEMPTS_FILE
     if not path.is_file():
-        return ()
+        return []
     try:
-        outcomes = [json.loads(line)["outcome"] for line in path.read_text(encoding="utf-8").splitlines()]
+        lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+        return [{**line, "outcome": line["outcome"]} for line in lines]
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise EvaluationError(
             f"{path} can't be read as a ledger ({error}): call the build again, which writes it anew"
         ) from error
-    if not outcomes:
-        return ()
-    share = 100 * outcomes.count("admitted") / len(outcomes)
-    return (Figure("admitted_share", share, "%", Better.HIGHER, len(outcomes), GOAL_PERCENT),)
+
+
+def _settings(folder: Path) -> dict[str, Any]:
+    path = folder / BUILD_FILE
+    try:
+        with path.open(encoding="utf-8") as file:
+            value = json.loads(file.readline())["settings"]
+        return {"writer": value["writer"], "look_ahead": value["look_ahead"]}
+    except (OSError, ValueError, LookupError, TypeError) as error:
+        raise EvaluationError(
+            f"{path} does not tell the settings of a build ({error}): name a folder that `factory build`, `generate` or "
+            "`corpus` wrote"
+        ) from error
+
+
+def _named(name: str, label: str) -> str:
+    return f"{name} {label}".strip()

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import json
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import numpy as np
 import typer
 from rich.console import Console
 
-from embomatrix.factory.evaluate.admissions import admitted_share
+from embomatrix.factory.asked_model import chat_model
+from embomatrix.factory.evaluate.admissions import admitted_share, evaluate_admissions
 from embomatrix.factory.evaluate.drafts import asked_of
 from embomatrix.factory.evaluate.figures import (
     Evaluation,
@@ -21,23 +21,23 @@ from embomatrix.factory.evaluate.figures import (
     read_evaluation,
 )
 from embomatrix.factory.evaluate.judge import judged
+from embomatrix.factory.evaluate.looks import evaluate_looks
 from embomatrix.factory.evaluate.measure import evaluate_aesthetics, evaluate_tasks, written_for
 from embomatrix.factory.evaluate.output import hand_in
 from embomatrix.factory.evaluate.page import with_factory
 from embomatrix.factory.evaluate.scene_runs import OutcomeLog, evaluate_scenes
 from embomatrix.factory.evaluate.scenes import Method, fixed_tasks
+from embomatrix.factory.evaluate.side_by_side import draw_side_by_side, named
 from embomatrix.factory.evaluate.tasks import panel, people_of
 from embomatrix.factory.pipeline.corpus import training_scenes
 from embomatrix.factory.pipeline.store import TRANSCRIPTS_FOLDER
 from embomatrix.factory.terminal import mended, progress
-from embomatrix.llm.cassette import Cassette, CassetteMode
-from embomatrix.llm.endpoint import Endpoint
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.world.dataset import Dataset
 from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Awaitable, Callable, Mapping, Sequence
 
     from embomatrix.factory.evaluate.drafts import Asked
     from embomatrix.llm.values import ChatModel
@@ -51,6 +51,16 @@ app = typer.Typer(
 PAGE = Path("docs/benchmarks.md")
 JsonFile = Annotated[Path | None, typer.Option("--json", help="File for the figures.")]
 Seed = Annotated[int, typer.Option(min=0, help="Equal seeds give equal figures.")]
+Methods = Annotated[
+    list[Method] | None,
+    typer.Option("--method", help="One of them; give it again for more. Default: all."),
+]
+Only = Annotated[int, typer.Option(min=1, help="Every so manieth task of the 140, for a quick look.")]
+Key = Annotated[str, typer.Option("--llm-key", envvar="EMBOMATRIX_LLM_KEY", help="Its key.")]
+Tape = Annotated[
+    Path | None, typer.Option(help="Recorded answers: read where it has them, added to where not.")
+]
+T = TypeVar("T")
 
 
 @app.command()
@@ -68,10 +78,8 @@ def tasks(
     json_file: JsonFile = None,
     llm: Annotated[str, typer.Option(help="Endpoint whose model scores each scene's tasks as well.")] = "",
     model: Annotated[str, typer.Option(help="Name of the model there.")] = "",
-    key: Annotated[str, typer.Option("--llm-key", envvar="EMBOMATRIX_LLM_KEY", help="Its key.")] = "",
-    cassette: Annotated[
-        Path | None, typer.Option(help="Recorded answers: read where it has them, added to where not.")
-    ] = None,
+    key: Key = "",
+    cassette: Tape = None,
 ) -> None:
     """Diversity of instructions and goals, with and without social simulation."""
     with mended():
@@ -86,7 +94,9 @@ def tasks(
                 written = written_for(chosen, each, seed, lambda done: bars.update(bar, completed=done))
             groups, evaluation = written.social, evaluate_tasks(written, each, seed)
         if llm or cassette is not None:
-            verdicts = asyncio.run(_judged(groups, llm, model, key, cassette, seed))
+            verdicts = asyncio.run(
+                _asked(lambda judge: _judged(judge, groups, seed), llm, model, key, cassette)
+            )
             evaluation = replace(evaluation, figures=(*evaluation.figures, *verdicts))
         hand_in(evaluation, json_file)
 
@@ -97,11 +107,8 @@ def scenes(
         Path,
         typer.Option(help="The sample of the paper's tasks, JSON lines: half of the fixed tasks are in it."),
     ],
-    methods: Annotated[
-        list[Method] | None,
-        typer.Option("--method", help="One of them; give it again for more. Default: all."),
-    ] = None,
-    only: Annotated[int, typer.Option(min=1, help="Every so manieth task of the 140, for a quick look.")] = 1,
+    methods: Methods = None,
+    only: Only = 1,
     seed: Seed = 0,
     jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
     json_file: JsonFile = None,
@@ -127,6 +134,58 @@ def scenes(
             taken = {"taken": f"one in {only} of the fixed tasks", **evaluation.conditions}
             evaluation = replace(evaluation, conditions=taken)
         hand_in(evaluation, json_file)
+
+
+@app.command()
+def picture(
+    task: Annotated[str, typer.Argument(help="Name of one of the 140 fixed tasks.")],
+    sample: Annotated[Path, typer.Option(help="The paper's sample of tasks, JSON lines.")],
+    seed: Seed = 0,
+    out: Annotated[Path, typer.Option(help="PNG file to write.")] = Path("side_by_side.png"),
+) -> None:
+    """Draw one fixed task as the three methods lay it out, side by side."""
+    with mended(out):
+        drawn = draw_side_by_side(named(fixed_tasks(sample), task), seed)
+        drawn.save(out)
+    Console().print(f"picture: {out}", highlight=False, markup=False)
+
+
+@app.command()
+def looks(
+    sample: Annotated[Path, typer.Option(help="The paper's sample of tasks, JSON lines.")],
+    methods: Methods = None,
+    only: Only = 1,
+    seed: Seed = 0,
+    json_file: JsonFile = None,
+    llm: Annotated[str, typer.Option(help="Endpoint with a model that sees.")] = "",
+    model: Annotated[str, typer.Option(help="Name of the model there.")] = "",
+    key: Key = "",
+    cassette: Tape = None,
+) -> None:
+    """The paper's judge of aesthetics: a language model that is shown the plan of each laid out room, with its tree."""
+    with mended():
+        chosen, told = fixed_tasks(sample)[::only], methods or list(Method)
+
+        async def looked(judge: ChatModel) -> Evaluation:
+            with progress(Console(stderr=True)) as bars:
+                bar = bars.add_task("trials", total=len(chosen) * len(told))
+                return await evaluate_looks(
+                    judge, chosen, told, seed, lambda done: bars.update(bar, completed=done)
+                )
+
+        evaluation = asyncio.run(_asked(looked, llm, model, key, cassette))
+    hand_in(evaluation, json_file)
+
+
+@app.command()
+def admissions(
+    folder: Annotated[Path, typer.Argument(help="Folder that `build`, `generate` or `corpus` wrote.")],
+    json_file: JsonFile = None,
+) -> None:
+    """How many drafts of a build were admitted, how many in an hour of two cores, and why the rest was not."""
+    with mended():
+        evaluation = evaluate_admissions(folder)
+    hand_in(evaluation, json_file)
 
 
 @app.command()
@@ -168,20 +227,19 @@ def _of_dataset(folder: Path, each: int) -> tuple[Mapping[str, Sequence[Asked]],
     return groups, Evaluation("tasks", conditions, figures)
 
 
-async def _judged(
-    groups: Mapping[str, Sequence[Asked]], url: str, model: str, key: str, cassette: Path | None, seed: int
-) -> tuple[Figure, ...]:
+async def _asked(
+    question: Callable[[ChatModel], Awaitable[T]], url: str, model: str, key: str, cassette: Path | None
+) -> T:
+    """What comes of a question to an endpoint, to a recording, or to both."""
+    async with chat_model(url, model, key, cassette) as judge:
+        return await question(judge)
+
+
+async def _judged(judge: ChatModel, groups: Mapping[str, Sequence[Asked]], seed: int) -> tuple[Figure, ...]:
     """Mean scores of a language model over the scenes."""
-    async with contextlib.AsyncExitStack() as stack:
-        judge: ChatModel | None = None
-        if url:
-            judge = await stack.enter_async_context(Endpoint(url, model, api_key=key))
-        if cassette is not None:
-            judge = Cassette(cassette, CassetteMode.AUTO if judge else CassetteMode.REPLAY, judge)
-        assert judge is not None  # the caller gave a URL or a cassette
-        verdicts = [
-            await judged(judge, [asked.instruction for asked in group], seed) for group in groups.values()
-        ]
+    verdicts = [
+        await judged(judge, [asked.instruction for asked in group], seed) for group in groups.values()
+    ]
     return tuple(
         Figure(
             f"judge {name}",

@@ -27,6 +27,12 @@ PARTS: Final[Mapping[str, tuple[str, str]]] = {
         "shares of the largest possible. *plain* is the writer without social simulation. Figures grow or shrink with the "
         "number of instructions, so compare equal ones only; none is on the scale of the paper's judge.",
     ),
+    "admission": (
+        "Admission",
+        "`embomatrix factory evaluate admissions DATASET`: by the ledger of a build. *admitted_per_hour* is by processor time, "
+        "on two cores that do nothing else: writing, layout, look-ahead and judging of all drafts, and the base scenes. "
+        "*plain* is the writer without social simulation.",
+    ),
     "imports": (
         "Imports",
         "`embomatrix factory import … --instantiate --json FILE`: a problem counts when a base scene was built with all that "
@@ -46,10 +52,16 @@ PARTS: Final[Mapping[str, tuple[str, str]]] = {
         "score high and the same rooms with shifted, swapped or dropped furniture score low. *auc* is the chance that a "
         "hand-made room which the fit did not see scores above a spoilt one; it is not on the scale of the paper's judge.",
     ),
+    "looks": (
+        "Scenes, as a model sees them",
+        "`embomatrix factory evaluate looks`: points of 10 that a language model gives for labelled plans, with the paper's "
+        "prompt. Its scale is the model's own.",
+    ),
     "scenes": (
         "Scenes for tasks",
         "`embomatrix factory evaluate scenes`: the same tasks laid out by three methods, each scene judged by code that "
-        "no method calls.",
+        "no method calls. *aesthetics* is of what a method laid out, *aesthetics_shared* of the tasks that all of them did: "
+        "simple ones fail at crowded rooms, which score low. The score is of whole rooms, most of which no method touches.",
     ),
 }
 """Heading and explanation of each part, in the order of the page."""

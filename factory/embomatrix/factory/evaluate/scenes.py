@@ -12,7 +12,7 @@ import contextlib
 import json
 import math
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from dataclasses import dataclass
 from enum import StrEnum
 from importlib import resources
@@ -197,15 +197,33 @@ def evaluation_of(outcomes: Sequence[Outcome], conditions: Mapping[str, Any]) ->
         mine = [outcome for outcome in outcomes if outcome.method is method]
         if mine:
             figures += _figures(mine, method)
+            figures += _shared_aesthetics(outcomes, method)
             reasons = Counter(outcome.reason.split(":")[0] for outcome in mine if outcome.reason)
             told = ", ".join(f"{reason} {count}" for reason, count in reasons.most_common(5)) or "none"
             notes.append(f"Commonest reasons against a scene, {method}: {told}.")
     return Evaluation("scenes", conditions, tuple(figures), tuple(notes))
 
 
+def _shared_aesthetics(outcomes: Sequence[Outcome], method: Method) -> Iterable[Figure]:
+    """Over the tasks that every measured method laid out: what a method fails at is what is hard to lay out well."""
+    scores: defaultdict[tuple[str, str], dict[Method, float]] = defaultdict(dict)
+    for each in outcomes:
+        if each.aesthetics is not None:
+            scores[each.task, each.scene][each.method] = each.aesthetics
+    measured = {each.method for each in outcomes}
+    shared = [found[method] for found in scores.values() if measured <= found.keys()]
+    if len(measured) > 1 and shared:
+        name = f"aesthetics_shared{_label(method)}"
+        yield Figure(name, float(np.mean(shared)), "of 10", Better.HIGHER, len(shared))
+
+
+def _label(method: Method) -> str:
+    return "" if method is Method.TREE else f" {method}"
+
+
 def _figures(outcomes: Sequence[Outcome], method: Method) -> Iterable[Figure]:
     goals = method is Method.TREE
-    label = "" if goals else f" {method}"
+    label = _label(method)
     generated = [outcome for outcome in outcomes if outcome.generated]
     planar = [second for outcome in outcomes for second in outcome.planar_s]
     verified = sum(outcome.verified for outcome in generated)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import time
 from collections import Counter, defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -121,7 +122,9 @@ def build_dataset(
     """
     _check_rooms(settings)  # before anything is written: what is wrong shall leave no folder behind
     store = BuildStore.open(folder, dataclasses.asdict(settings))
+    began = time.process_time()
     bases = [build_base_scene(scene_id, seed=settings.seed) for scene_id in settings.scenes]
+    store.spent_on_scenes(len(bases), time.process_time() - began)
     rooms = split_rooms(bases, settings.seed) if settings.train else _all_held_out(bases)
     with contextlib.ExitStack() as stack:
         make: Make | None = None
@@ -199,7 +202,7 @@ class _SplitFiller:
         transcripts = {name: text for name, text in made.transcripts.items() if name in names}
         trees = {name: tree for name, tree in made.trees.items() if name in names}
         self._store.add(
-            dataclasses.replace(made.result, records=tuple(kept)), made.bundle, transcripts, trees
+            dataclasses.replace(made.result, records=tuple(kept)), made.bundle, transcripts, trees, made.cpu_s
         )
 
     def _missing(self, before: int) -> dict[TaskCategory, int]:

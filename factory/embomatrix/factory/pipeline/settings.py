@@ -31,9 +31,11 @@ class BuildSettings:
     look_ahead: bool = True
     """Whether to find out what the arm can do in each variant: about 12 s of CPU for one."""
     modelled: tuple[str, ...] = ()
-    """Layout agents that are a language model, by name."""
+    """Agents that are a language model besides the writer's, by name: those of the layout, and what looks at scenes."""
 
 
+SCENE_EXTRACTOR: Final = "scene-extractor"
+"""Scene information extraction, in `modelled` where a model that sees does it."""
 EVERY_SCENE: Final = "all"
 
 

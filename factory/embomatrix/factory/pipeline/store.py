@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 BUILD_FILE: Final = "build.jsonl"
 ATTEMPTS_FILE: Final = "attempts.jsonl"
 """The ledger: a line for every draft that was judged, with the reason where it was not admitted."""
+TIMES_FILE: Final = "times.jsonl"
+"""Seconds of processor time, a line for each variant and one for the base scenes of each call: no part of the dataset."""
 TRANSCRIPTS_FOLDER: Final = "transcripts"
 TREES_FOLDER: Final = "trees"
 """Layout trees as nested JSON, a file for each task."""
@@ -98,8 +100,10 @@ class BuildStore:
         bundle: bytes,
         transcripts: Mapping[str, str],
         trees: Mapping[str, Mapping[str, Any]],
+        cpu_s: float,
     ) -> None:
         """Keep a variant's result. What goes into files of its own is written first: a line means that it is there."""
+        self._spent({"split": result.split, "variant": result.number, "cpu_s": round(cpu_s, 3)})
         if result.records:
             path = self.folder / BUNDLES_FOLDER / bundle_file(result.records[0].bundle_digest)
             write_whole(path, bundle)
@@ -114,6 +118,14 @@ class BuildStore:
         self.results.append(result)
         with (self.folder / ATTEMPTS_FILE).open("a", encoding="utf-8") as file:
             file.write(_attempt_lines(result))
+
+    def spent_on_scenes(self, scenes: int, cpu_s: float) -> None:
+        """Keep how long the base scenes of one call took. Raises OSError."""
+        self._spent({"base_scenes": scenes, "cpu_s": round(cpu_s, 3)})
+
+    def _spent(self, line: Mapping[str, str | int | float]) -> None:
+        with (self.folder / TIMES_FILE).open("a", encoding="utf-8") as file:
+            file.write(json.dumps(line) + "\n")
 
     def _write_attempts(self) -> None:
         """The whole ledger, from what is known: a build that was cut short may lack its last lines."""

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import time
 import zlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -63,12 +64,16 @@ class VariantOrder:
 
 @dataclass(frozen=True, slots=True)
 class VariantYield:
-    """What came of it: records, the bundle that they run in, and transcripts and layout trees by task id."""
+    """What came of it: records, the bundle that they run in, and transcripts and layout trees by task id.
+
+    ``cpu_s`` is the processor time that it took, no part of what the variant is.
+    """
 
     result: VariantResult
     bundle: bytes
     transcripts: Mapping[str, str]
     trees: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    cpu_s: float = field(default=0.0, compare=False)
 
 
 class VariantMaker:
@@ -93,6 +98,7 @@ class VariantMaker:
 
     def make(self, order: VariantOrder) -> VariantYield:
         """Write and judge the tasks of one variant."""
+        began = time.process_time()
         seed = self._bench.settings.seed
         if order.base not in self._bases:
             self._bases[order.base] = build_base_scene(order.base, seed=seed)
@@ -104,7 +110,8 @@ class VariantMaker:
         variant = build_variant(
             base, focus, f"{base.base}-{order.split}-{order.number:03d}", rng, self._layout
         )
-        return _VariantJob(variant, order, self._bench).run(rng)
+        made = _VariantJob(variant, order, self._bench).run(rng)
+        return replace(made, cpu_s=time.process_time() - began)
 
     def close(self) -> None:
         self._bench.library.close()

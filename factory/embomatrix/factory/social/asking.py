@@ -6,6 +6,7 @@ import contextlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from embomatrix.factory.pictures.sights import sights_of
 from embomatrix.factory.social.model_agents import ModelAgents
 from embomatrix.factory.social.model_writer import ModelWriter
 from embomatrix.llm.cassette import Cassette, CassetteMode
@@ -21,7 +22,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """Whom to ask. Without a ``url`` only the cassette answers; without a cassette nothing is recorded."""
+    """Whom to ask. Without a ``url`` only the cassette answers; without a cassette nothing is recorded.
+
+    ``looks`` tells that it is shown pictures of the scenes.
+    """
 
     url: str
     model: str
@@ -29,17 +33,19 @@ class Asked:
     cassette: Path | None
     price: Price
     accounts: Path
+    looks: bool = False
 
 
 @contextlib.contextmanager
 def asked_writer(asked: Asked) -> Iterator[tuple[ModelWriter, Ledger]]:
     """A writer and what it costs. Raises CassetteError where only a cassette is given and it can't be read."""
+    look = sights_of if asked.looks else None
     if not asked.url:
         if asked.cassette is None:
             raise ValueError("neither an endpoint nor a cassette is given: nobody can be asked")
         tape = Cassette(asked.cassette, CassetteMode.REPLAY)
         ledger = Ledger(tape)
-        with ModelWriter(ModelAgents(ledger)) as writer:
+        with ModelWriter(ModelAgents(ledger), look=look) as writer:
             yield writer, ledger
         return
     endpoint = Endpoint(asked.url, asked.model, api_key=asked.key)
@@ -48,5 +54,5 @@ def asked_writer(asked: Asked) -> Iterator[tuple[ModelWriter, Ledger]]:
     model: ChatModel = (
         ledger if asked.cassette is None else Cassette(asked.cassette, CassetteMode.AUTO, ledger)
     )
-    with ModelWriter(ModelAgents(model), endpoint) as writer:
+    with ModelWriter(ModelAgents(model), endpoint, look) as writer:
         yield writer, ledger

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.writer.words import spoken
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from embomatrix.factory.writer.view import SceneView
 
@@ -36,6 +36,8 @@ class RoomFacts:
     area_m2: float
     things: tuple[Thing, ...]
     left_out: int
+    sight: str = ""
+    """What it looks like, in words, where a model has seen it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +70,11 @@ def facts_of(view: SceneView, rooms: Sequence[str]) -> SceneFacts:
     return SceneFacts(view.scene.base, tuple(found))
 
 
+def with_sights(facts: SceneFacts, sights: Mapping[str, str]) -> SceneFacts:
+    """The facts, with what the rooms look like, by name."""
+    return replace(facts, rooms=tuple(replace(room, sight=sights.get(room.name, "")) for room in facts.rooms))
+
+
 def _thing(view: SceneView, name: str) -> Thing:
     item = view.item(name)
     rests = (
@@ -92,6 +99,7 @@ def _abilities(view: SceneView, name: str) -> tuple[str, ...]:
 
 def _room_lines(room: RoomFacts) -> str:
     lines = [f"[{room.name}] {spoken(room.type)}, {room.area_m2:.0f} m²"]
+    lines += [f"  {room.sight}"] * bool(room.sight)
     lines += [
         f"- {thing.name} ({spoken(thing.category)}, {thing.rests}): {', '.join(thing.abilities) or 'decoration'}"
         for thing in room.things

@@ -6,7 +6,7 @@ stands between the marks of a scene's description is data: a name in it that rea
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -15,6 +15,8 @@ from embomatrix.factory.social.prompts import (
     CAST_USER,
     CATEGORY_HINTS,
     ROBOT_LIMITS,
+    SIGHT_SYSTEM,
+    SIGHT_USER,
     SUMMARY_SYSTEM,
     SUMMARY_USER,
     TALK_SYSTEM,
@@ -32,10 +34,19 @@ if TYPE_CHECKING:
     from embomatrix.llm.values import ChatModel
     from embomatrix.world.task import TaskCategory
 
+SIGHT: Final = "scene information extraction"
 CAST: Final = "role-playing agent"
 TALK: Final = "social simulation agent"
 SUMMARY: Final = "summarization agent"
 """Who asks, for ledgers and errors."""
+
+
+class Sight(BaseModel):
+    """What a model that sees says of each room."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    rooms: dict[str, Annotated[str, Field(min_length=10, max_length=300, pattern=r"^[^\n<>]*$")]]
 
 
 class Talk(BaseModel):
@@ -58,6 +69,21 @@ class ModelAgents:
         self._temperature = temperature
         self._attempts = attempts
         self._max_tokens = max_tokens
+
+    async def describe(self, facts: SceneFacts, pictures: tuple[bytes, ...], seed: int) -> Sight:
+        """Scene information extraction: what rooms look like, from pictures of them as PNG files. Raises LlmError."""
+        rooms = [room.name for room in facts.rooms]
+
+        def check(sight: Sight) -> None:
+            if unknown := sorted(set(sight.rooms) - set(rooms)):
+                raise ValueError(f"there is no room {unknown[0]!r}: the rooms are {', '.join(rooms)}")
+            if missing := [room for room in rooms if room not in sight.rooms]:
+                raise ValueError(f"nothing is said of {', '.join(missing)}: give each room a sentence")
+
+        user = Message(Speaker.USER, SIGHT_USER.format(scene=facts.described()), pictures)
+        messages = (Message(Speaker.SYSTEM, SIGHT_SYSTEM), user)
+        request = ChatRequest(SIGHT, messages, self._max_tokens, 0.2, seed)
+        return (await ask(self._model, request, Sight, check=check, attempts=self._attempts)).value
 
     async def cast(self, facts: SceneFacts, seed: int) -> Cast:
         """People who fit the scene and are found in every room of it. Raises LlmError."""

@@ -6,6 +6,8 @@ from enum import StrEnum
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from embomatrix.world.task import TaskCategory
+
 ROBOT = "robot"
 """Who answers the people."""
 
@@ -114,3 +116,35 @@ class Conversation(_Value):
     def changed(self) -> bool:
         """Whether what was asked for at last is not what was asked for first."""
         return self.last_wishes != (self.first_wish,)
+
+
+class SceneBrief(_Value):
+    """A base scene by its name."""
+
+    scene: str
+    seed: int = 0
+
+
+class TalkBrief(_Value):
+    """Who lives in a scene, and which kind of wish somebody is to come to."""
+
+    scene: str
+    cast: Cast
+    category: TaskCategory = TaskCategory.PICK_AND_PLACE
+    seed: int = 0
+
+
+class SummaryBrief(_Value):
+    """What was said."""
+
+    scene: str
+    cast: Cast
+    conversation: Conversation
+    seed: int = 0
+
+
+class Summary(_Value):
+    """One instruction, and what it asks for: clauses of the conversation, or a model's wishes as JSON."""
+
+    instruction: str
+    wishes: tuple[str, ...]

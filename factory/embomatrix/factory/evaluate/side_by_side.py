@@ -1,0 +1,71 @@
+"""One fixed task laid out by every method, side by side in a picture: what the figures of the scene evaluation are about."""
+
+from __future__ import annotations
+
+import textwrap
+from typing import TYPE_CHECKING, Final
+
+from PIL import Image, ImageDraw, ImageFont
+
+from embomatrix.factory.evaluate.figures import EvaluationError
+from embomatrix.factory.evaluate.scenes import METHODS
+from embomatrix.factory.pictures.scene import draw_plan
+from embomatrix.factory.pictures.sights import alone
+from embomatrix.factory.refusal import Refusal
+from embomatrix.factory.scenes.build import build_base_scene
+from embomatrix.factory.task_import.task import Manner, import_problem
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from embomatrix.factory.evaluate.scenes import SceneTask
+
+CAPTION_PX: Final = 26
+LEAST_PX: Final = 420
+"""Width of the panel of a method that laid nothing out."""
+WIDTH: Final = 48
+"""Letters of a reason in one line there."""
+
+
+def named(tasks: Sequence[SceneTask], name: str) -> SceneTask:
+    """The fixed task of this name. Raises EvaluationError."""
+    for task in tasks:
+        if task.source.name == name:
+            return task
+    raise EvaluationError(
+        f"{name!r} is none of the {len(tasks)} fixed tasks, such as {tasks[0].source.name!r}"
+    )
+
+
+def draw_side_by_side(task: SceneTask, seed: int) -> Image.Image:
+    """Plans of the first room that the goal is about, a panel for each method, or why one laid nothing out. An RGB image."""
+    base = build_base_scene(task.scene)
+    panels = []
+    for method, lay in METHODS.items():
+        imported = import_problem(task.source, base, seed=seed, manner=Manner(lay))
+        if isinstance(imported, Refusal):
+            panels.append(_reason(method, imported))
+        else:
+            panels.append(_captioned(method, draw_plan(alone(imported.scene, imported.rooms[0]))))
+    whole = Image.new(
+        "RGB", (sum(each.width for each in panels), max(each.height for each in panels)), "white"
+    )
+    x = 0
+    for panel in panels:
+        whole.paste(panel, (x, 0))
+        x += panel.width
+    return whole
+
+
+def _captioned(words: str, picture: Image.Image) -> Image.Image:
+    panel = Image.new("RGB", (picture.width, picture.height + CAPTION_PX), "white")
+    panel.paste(picture, (0, CAPTION_PX))
+    ImageDraw.Draw(panel).text((8, 4), words, fill="black", font=ImageFont.load_default(16))
+    return panel
+
+
+def _reason(method: str, refusal: Refusal) -> Image.Image:
+    panel = Image.new("RGB", (LEAST_PX, LEAST_PX), "white")
+    words = "\n".join(textwrap.wrap(f"{refusal.reason}: {refusal.sentence}", WIDTH))
+    ImageDraw.Draw(panel).text((8, CAPTION_PX), words, fill="#b03030", font=ImageFont.load_default(14))
+    return _captioned(method, panel)

@@ -1,0 +1,57 @@
+"""Pictures for language models that see: a scene from above and by the robot's eyes, and one of its rooms, as PNG files."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.factory.pictures.scene import draw_plan
+from embomatrix.factory.pictures.sheet import draw_eyes
+from embomatrix.world.geometry import Pose
+
+if TYPE_CHECKING:
+    from PIL import Image
+
+    from embomatrix.world.geometry import Aabb
+    from embomatrix.world.scene import Room, Scene
+
+WALL_M: Final = 0.3
+"""What begins this near to a room is its wall, or an opening in it."""
+_ORIGIN: Final = Pose((0.0, 0.0, 0.0))
+
+
+def sights_of(scene: Scene) -> tuple[bytes, bytes]:
+    """The labelled plan, and what the robot sees in four directions where it starts. Raises EngineError without pybullet."""
+    return _png(draw_plan(scene)), _png(draw_eyes(scene))
+
+
+def sight_of_room(scene: Scene, room: str) -> bytes:
+    """The labelled plan of one room alone. Raises KeyError for an unknown room."""
+    return _png(draw_plan(alone(scene, room)))
+
+
+def alone(scene: Scene, name: str) -> Scene:
+    """The scene without its other rooms and what belongs to them. Raises KeyError for an unknown room."""
+    room = {each.name: each for each in scene.rooms}[name]
+    return replace(
+        scene,
+        rooms=(room,),
+        walls=tuple(wall for wall in scene.walls if _is_at(room, wall.aabb(_ORIGIN))),
+        doorways=tuple(door for door in scene.doorways if name in door.rooms),
+        windows=tuple(window for window in scene.windows if name in window.rooms),
+        objects=tuple(item for item in scene.objects if item.room == name),
+    )
+
+
+def _is_at(room: Room, box: Aabb) -> bool:
+    return all(
+        box.low_m[axis] < room.high_m[axis] + WALL_M and box.high_m[axis] > room.low_m[axis] - WALL_M
+        for axis in (0, 1)
+    )
+
+
+def _png(image: Image.Image) -> bytes:
+    data = io.BytesIO()
+    image.save(data, "PNG")
+    return data.getvalue()

@@ -1,0 +1,121 @@
+"""The paper's judge of scenes: a model sees a labelled plan of each room that something was added to, with the tree."""
+
+import base64
+import io
+import json
+from importlib import resources
+
+import pytest
+from PIL import Image
+from tests.fakes.chat_server import ChatServer
+from typer.testing import CliRunner
+
+from embomatrix.factory.cli import app
+from embomatrix.factory.editor import SceneEditor
+from embomatrix.factory.evaluate.figures import EvaluationError
+from embomatrix.factory.evaluate.looks import Impression, evaluate_looks, impression_of
+from embomatrix.factory.evaluate.page import with_factory
+from embomatrix.factory.evaluate.scenes import LIST, Method, SceneTask
+from embomatrix.factory.evaluate.side_by_side import LEAST_PX, draw_side_by_side, named
+from embomatrix.factory.layout.generator import lay
+from embomatrix.factory.layout.jobs import Item
+from embomatrix.factory.pictures.sights import alone
+from embomatrix.factory.task_import.sources import SourceText
+from embomatrix.llm.endpoint import Endpoint
+from embomatrix.llm.values import UnusableReplyError
+from embomatrix.world.catalog import Catalog
+from embomatrix.world.scene import Scene
+
+MUG = Item("mug", (("mug", Catalog.load().models_of("mug")[0].model_id),), rooms=("living_room_0",))
+POINTS = {"correspondence": 0, "clutter": 1, "placement": 0.5, "explanation": "tidy, but for the corner"}
+APPLE = """(define (problem apple)
+    (:domain omnigibson)
+    (:objects apple.n.01_1 - apple.n.01 breakfast_table.n.01_1 - breakfast_table.n.01)
+    (:init (ontop apple.n.01_1 breakfast_table.n.01_1) (inroom breakfast_table.n.01_1 living_room_0))
+    (:goal (not (ontop apple.n.01_1 breakfast_table.n.01_1)))
+)"""
+
+
+@pytest.fixture(scope="module")
+def laid(flat: Scene) -> tuple[Scene, tuple[str, ...]]:
+    editor = SceneEditor(flat)
+    names = tuple(lay(editor, [MUG], 0).names.values())
+    return editor.freeze("laid"), names
+
+
+async def asked(laid: tuple[Scene, tuple[str, ...]], *script: str) -> tuple[Impression, ChatServer]:
+    server = ChatServer(*script)
+    with server.serving() as url:
+        async with Endpoint(url, "sees-1") as endpoint:
+            return await impression_of(endpoint, *laid, seed=0), server
+
+
+async def test_the_judge_sees_the_room_and_reads_the_tree(laid) -> None:
+    impression, server = await asked(laid, json.dumps(POINTS))
+    assert impression.score == 8.5
+    words, picture = server.requests[0]["messages"][0]["content"]
+    scene, (mug,) = laid
+    assert f'"{scene.by_name[mug].host}": {{"ontop": {{"{mug}": {{}}}}}}' in words["text"]
+    data = base64.b64decode(picture["image_url"]["url"].partition(",")[2])
+    assert Image.open(io.BytesIO(data)).format == "PNG"
+
+
+async def test_points_beyond_the_rubric_are_sent_back_and_a_judge_that_insists_gives_none(laid) -> None:
+    wrong = json.dumps({**POINTS, "clutter": 5})
+    _, server = await asked(laid, wrong, json.dumps(POINTS))
+    assert "clutter: input should be less than or equal to 4" in server.requests[1]["messages"][-1]["content"]
+    with pytest.raises(UnusableReplyError, match="scene judge"):
+        await asked(laid, wrong)
+
+
+def test_a_room_alone_keeps_its_own_things_and_walls(flat: Scene) -> None:
+    room = alone(flat, "living_room_0")
+    assert [each.name for each in room.rooms] == ["living_room_0"]
+    assert {item.room for item in room.objects} == {"living_room_0"}
+    assert 0 < len(room.walls) < len(flat.walls)
+    with pytest.raises(KeyError):
+        alone(flat, "moon_0")
+
+
+async def test_every_method_has_its_mean_and_unusable_answers_are_counted() -> None:
+    server = ChatServer(json.dumps(POINTS), *["no"] * 3)
+    task = SceneTask(SourceText("apple", APPLE, "embomatrix"), "Rs_int")
+    done: list[int] = []
+    with server.serving() as url:
+        async with Endpoint(url, "sees-1") as endpoint:
+            found = await evaluate_looks(endpoint, [task], [Method.TREE, Method.RANDOM], 0, done.append)
+    assert found.figure("judge tree").value == 8.5
+    assert found.notes == ("1 scenes got no usable answer.",)
+    assert done == [1, 2]
+    assert "| judge tree | 8.5 of 10 |" in with_factory("", [found])
+
+
+def test_a_task_is_drawn_by_every_method_side_by_side_with_the_reason_where_one_fails() -> None:
+    huge = APPLE.replace("breakfast_table", "unicorn")
+    one, none = (
+        draw_side_by_side(SceneTask(SourceText("apple", text, "embomatrix"), "Rs_int"), 0)
+        for text in (APPLE, huge)
+    )
+    assert none.width == LEAST_PX * len(Method)
+    assert one.width > none.width
+    assert len(none.getcolors(1 << 16)) > 1
+    with pytest.raises(EvaluationError, match="none of the 1 fixed tasks"):
+        named([SceneTask(SourceText("apple", APPLE, "embomatrix"), "Rs_int")], "pear")
+
+
+def _fixed() -> list[tuple[str, str]]:
+    text = (resources.files("embomatrix.factory.evaluate") / LIST).read_text(encoding="utf-8")
+    return list(json.loads(text)["sample"])
+
+
+def test_without_a_model_nobody_looks(tmp_path) -> None:
+    sample = tmp_path / "sample.jsonl"
+    lines = [json.dumps({"name": name, "bddl": APPLE}) for name, _ in _fixed()]
+    sample.write_text("\n".join(lines))
+    for command in (
+        ["evaluate", "looks", "--sample", str(sample)],
+        ["generate", "--out", str(tmp_path), "--look"],
+    ):
+        answer = CliRunner().invoke(app, command)
+        assert answer.exit_code == 2
+        assert "give --llm URL and --model NAME" in " ".join(answer.output.split())

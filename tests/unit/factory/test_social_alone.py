@@ -1,0 +1,67 @@
+"""Each agent of the social simulation can be run alone; what one answers, the next one reads."""
+
+import json
+from pathlib import Path
+
+import pytest
+from tests.fakes.chat_server import ChatServer
+from typer.testing import CliRunner
+
+from embomatrix.factory.agents_cli import EVERY
+from embomatrix.factory.cli import app
+from embomatrix.factory.layout.doors import AgentName
+from embomatrix.factory.social.doors import SOCIAL_DOORS, SocialAgent
+from embomatrix.factory.social.values import SummaryBrief, TalkBrief
+
+BRIEF = '{"scene": "Rs_int", "seed": 1}'
+
+
+def run(name: str, brief: str, *more: str) -> str:
+    answer = CliRunner().invoke(app, ["agent", name, "--in", "-", *more], input=brief)
+    assert answer.exit_code == 0, answer.output
+    return answer.output
+
+
+def test_every_agent_has_a_name_of_its_own() -> None:
+    assert set(EVERY) == {*SocialAgent, *AgentName}
+    assert len(EVERY) == len(SocialAgent) + len(AgentName)
+
+
+def test_from_a_scene_to_its_people_to_a_conversation_to_an_instruction() -> None:
+    people = run("role-player", BRIEF)
+    talk = run("social-simulator", people)
+    told = SOCIAL_DOORS[SocialAgent.SUMMARIZER].read(talk)
+    assert isinstance(told, SummaryBrief)
+    assert told.cast == SOCIAL_DOORS[SocialAgent.SIMULATOR].read(people).cast
+    summary = json.loads(run("summarizer", talk))
+    assert summary["wishes"] == [*told.conversation.last_wishes]
+    assert any(name in summary["instruction"] for name in told.cast.names)
+    assert run("social-simulator", people) == talk
+
+
+def test_a_scene_is_told_room_by_room() -> None:
+    facts = json.loads(run("scene-extractor", BRIEF))
+    assert facts["base"] == "Rs_int"
+    assert {room["name"] for room in facts["rooms"]} >= {"kitchen_0", "living_room_0"}
+
+
+def test_a_language_model_plays_the_people_when_it_is_asked(tmp_path: Path) -> None:
+    cast = SOCIAL_DOORS[SocialAgent.SIMULATOR].read(run("role-player", BRIEF)).cast
+    with ChatServer("no", cast.model_dump_json()).serving() as url:
+        found = run("role-player", BRIEF, "--llm", url, "--model", "small-1")
+    assert SOCIAL_DOORS[SocialAgent.SIMULATOR].read(found) == TalkBrief(scene="Rs_int", cast=cast, seed=1)
+
+
+@pytest.mark.parametrize(
+    ("name", "brief", "sentence"),
+    [
+        ("role-playe", BRIEF, "there is no agent"),
+        ("role-player", '{"seed": 1}', "scene: field required"),
+        ("role-player", '{"scene": "Atlantis"}', "Atlantis"),
+        ("social-simulator", BRIEF, "cast: field required"),
+    ],
+)
+def test_what_is_wrong_with_a_brief_is_told_in_a_sentence(name: str, brief: str, sentence: str) -> None:
+    answer = CliRunner().invoke(app, ["agent", name, "--in", "-"], input=brief)
+    assert answer.exit_code == 2
+    assert sentence in " ".join(answer.output.split())
