@@ -17,6 +17,7 @@ from embomatrix.manager.settings import ManagerSettings
 from embomatrix.manager.store.protocol import Candidate, FencedError
 from embomatrix.manager.store.sqlite import SqliteStore
 from embomatrix.proto.v1 import scene_service_pb2, scene_service_pb2_grpc
+from embomatrix.rpc.admin import AdminClient
 from embomatrix.rpc.channel import open_channel
 from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.status import (
@@ -228,6 +229,22 @@ async def test_a_restarted_manager_goes_on_where_the_former_one_stopped(tmp_path
         assert fresh.executed == []
         assert len(await outcomes(client, unfinished)) == 4
         assert len(fresh.executed) == 4
+
+
+async def test_a_restarted_manager_loads_ahead_what_was_announced_to_the_former_one(tmp_path):
+    state = f"sqlite:{tmp_path / 'state.sqlite'}"
+    async with manager(tmp_path, state=state) as at, open_run(at.address) as client, FakeWorker(at.address):
+        window = [LookaheadEntry(1, KITCHEN, 4), LookaheadEntry(2, BEDROOM, 8)]
+        await client.announce_lookahead("r1", 7, window)
+        await outcomes(client, batch(4))
+    async with manager(tmp_path, state=state) as at, FakeWorker(at.address) as worker:
+        await until(lambda: list(worker.residents) == [BEDROOM])
+        async with AdminClient(at.address) as admin:
+            assert [(cell.step, cell.bundle_digest) for cell in await admin.plan("r1")] == [(2, BEDROOM)]
+        async with ClusterClient(at.address) as client:
+            await client.close_run("r1")
+    async with manager(tmp_path, state=state) as at, open_run(at.address), AdminClient(at.address) as admin:
+        assert await admin.plan("r1") == ()
 
 
 async def test_a_manager_whose_state_was_taken_over_stops(tmp_path):

@@ -89,7 +89,15 @@ def _failure_reason(text: str) -> FailureReason | None:
 
 
 def timings_to_proto(timings: Timings) -> types_pb2.Timings:
-    return types_pb2.Timings(**{name: getattr(timings, name) for name in Timings.__slots__})
+    message = types_pb2.Timings()
+    _write_timings(timings, message)
+    return message
+
+
+def _write_timings(timings: Timings, message: types_pb2.Timings) -> None:
+    """Replace what the message told."""
+    message.queued_s, message.load_s, message.execute_s = timings.queued_s, timings.load_s, timings.execute_s
+    message.lease_s, message.deliver_s = timings.lease_s, timings.deliver_s
 
 
 def timings_from_proto(message: types_pb2.Timings) -> Timings:
@@ -116,7 +124,8 @@ def write_completed(completed: Completed, message: types_pb2.Completed) -> None:
         message.final_state.extend(completed.final)
         message.trace_digest = completed.trace_digest
     message.worker_id = completed.worker_id
-    message.timings.CopyFrom(timings_to_proto(completed.timings))
+    message.timings.SetInParent()
+    _write_timings(completed.timings, message.timings)
     message.warm = completed.warm
 
 

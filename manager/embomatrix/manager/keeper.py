@@ -1,4 +1,6 @@
-"""What a manager notes for those that come after it: who is there, what is known of them, and whether dispatch is paused."""
+"""What a manager notes for those that come after it: who is there, what is known of them, what runs announced, and whether
+dispatch is paused.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +10,12 @@ import logging
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.events import ReputesKnown
-from embomatrix.manager.records import repute_of, repute_row
+from embomatrix.manager.records import repute_of, repute_row, window_row
 from embomatrix.manager.store.protocol import Shelf, ShelfRow, StateError
 from embomatrix.rpc.status import UnavailableError
 
 if TYPE_CHECKING:
-    from embomatrix.manager.dispatcher import Dispatcher
+    from embomatrix.manager.cluster_state import ClusterState
     from embomatrix.manager.registry import Registry
     from embomatrix.manager.store.protocol import StateStore
 
@@ -29,10 +31,13 @@ _PAUSED: Final = b"paused"
 class Keeper:
     """Writes beside the decisions, and never holds them up. What the store could not take is written when it is back."""
 
-    def __init__(self, store: StateStore, registry: Registry, dispatcher: Dispatcher) -> None:
+    def __init__(self, store: StateStore, registry: Registry, cluster: ClusterState) -> None:
         self._store = store
         self._registry = registry
-        self._dispatcher = dispatcher
+        self._dispatcher = cluster.dispatcher
+        self._windows = cluster.scheduler.windows
+        self._announced: dict[str, int] = {}
+        """Of each run the version of the window that was noted."""
         self._present: frozenset[str] | None = None
         self._written = asyncio.Event()
         """Set when the workers that are there have been noted next."""
@@ -83,8 +88,10 @@ class Keeper:
                 self._urgent.clear()
                 await self._note_present()
                 await self._note_reputes()
+                await self._note_windows()
         finally:
             await self._note_reputes()
+            await self._note_windows()
 
     async def _note_present(self) -> None:
         """For the manager that comes after this one: whom it waits for."""
@@ -95,6 +102,20 @@ class Keeper:
                 self._present = present
                 self._written.set()
                 self._written = asyncio.Event()
+
+    async def _note_windows(self) -> None:
+        """What runs announced since the last time: scenes go on being loaded ahead though their trainers say nothing anew."""
+        now = {run_id: window.version for run_id, window in self._windows.items()}
+        rows = [
+            window_row(run_id, self._windows[run_id])
+            for run_id, version in now.items()
+            if self._announced.get(run_id) != version
+        ]
+        if not rows:
+            return
+        with contextlib.suppress(StateError):
+            await self._store.put_rows(Shelf.WINDOWS, rows)
+            self._announced = now
 
     async def _note_reputes(self) -> None:
         auditor = self._dispatcher.auditor

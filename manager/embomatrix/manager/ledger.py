@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from embomatrix.rpc.values import Rollout
 
 
-AHEAD_S: Final = 0.1
+AHEAD_S: Final = 0.2
 """A worker holds leases for this long ahead: its slots go on while results and new leases travel many to a message."""
-BEHIND: Final = 32
+BEHIND: Final = 64
 """Leases that wait behind a slot at most, however fast it is."""
 PACE_WEIGHT: Final = 0.1
 """Of the latest rollout in what a worker is taken to need for one."""

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from embomatrix.rpc.leases import LeaseRef
     from embomatrix.rpc.status import ClusterError
 
-ACKNOWLEDGE_S: Final = 0.1
+ACKNOWLEDGE_S: Final = 0.2
 """An acknowledgement waits for this long for something else to say: the worker only forgets a result with it. While work goes
 on, the next leases come sooner, and a message less is a wake-up less at both ends."""
 

@@ -1,4 +1,6 @@
-"""Batches, results and reputes as bytes: what the store keeps, and what a result's stream sends without converting it again."""
+"""Batches, results, windows and reputes as bytes: what the store keeps, and what a result's stream sends without converting it
+again.
+"""
 
 from __future__ import annotations
 
@@ -9,17 +11,25 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.auditor import Repute
+from embomatrix.manager.events import LookaheadAnnounced
 from embomatrix.manager.store.protocol import BatchRow, ResultRow, ShelfRow
 from embomatrix.proto.v1 import rollout_service_pb2, types_pb2
+from embomatrix.rpc.convert import each
 from embomatrix.rpc.convert_batch import batch_from_proto, batch_to_proto
 from embomatrix.rpc.convert_outcome import rollout_result_to_proto
-from embomatrix.rpc.convert_run import run_terms_from_proto, run_terms_to_proto
+from embomatrix.rpc.convert_run import (
+    lookahead_entry_from_proto,
+    lookahead_entry_to_proto,
+    run_terms_from_proto,
+    run_terms_to_proto,
+)
 from embomatrix.rpc.values import Cancelled, Completed, InfraFailure
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from embomatrix.manager.store.protocol import RunRow
+    from embomatrix.manager.window import Window
     from embomatrix.rpc.values import Batch, Outcome, RolloutResult, RunTerms
 
 _KINDS: Final[Mapping[str, type[Outcome]]] = {
@@ -79,6 +89,20 @@ def repute_row(worker_id: str, repute: Repute) -> ShelfRow:
 def repute_of(row: ShelfRow) -> Repute:
     """What `repute_row` wrote."""
     return Repute(**json.loads(row.payload))
+
+
+def window_row(run_id: str, window: Window) -> ShelfRow:
+    """What the run announced last, as far as it has not come."""
+    entries = [lookahead_entry_to_proto(entry) for entry in window.entries]
+    message = rollout_service_pb2.AnnounceLookaheadRequest(version=window.version, entries=entries)
+    return ShelfRow(run_id, message.SerializeToString())
+
+
+def announced_in(row: ShelfRow) -> LookaheadAnnounced:
+    """What `window_row` wrote, as it was announced."""
+    message = rollout_service_pb2.AnnounceLookaheadRequest.FromString(row.payload)
+    entries = each("entries", lookahead_entry_from_proto, message.entries)
+    return LookaheadAnnounced(row.key, message.version, entries)
 
 
 def terms_payload(terms: RunTerms) -> bytes:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import bisect
 import contextlib
+import time
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.group_ends import GroupEnds
@@ -15,9 +16,9 @@ if TYPE_CHECKING:
     from embomatrix.manager.store.protocol import ResultRow
 
 PER_MESSAGE: Final = 256
-LINGER_S: Final = 0.04
-"""Results are sent at once when a message is full or the batch at its end, else after this: a batch that trickles shall not
-send one by one."""
+LINGER_S: Final = 0.1
+"""Results are sent at once when a message is full or the batch at its end, else one message in this time: a batch that
+trickles shall not send one by one."""
 
 
 class BatchLog:
@@ -66,16 +67,18 @@ class BatchLog:
     def ended(self) -> bool:
         return self.dropped or self.finished_s is not None
 
-    async def after(self, cursor: int) -> list[ResultRow]:
+    async def after(self, cursor: int, due_s: float | None = None) -> list[ResultRow]:
         """Waits for results beyond the cursor; returns some of them, or nothing when the batch is at its end.
 
-        The wait ends with the batch, whose rollouts have deadlines, or with the caller's own.
+        Others are waited for until ``due_s`` on the monotonic clock, by default as long as results linger. The wait ends
+        with the batch, whose rollouts have deadlines, or with the caller's own.
         """
         while self.last_cursor <= cursor and not self.ended:
             await self._changed.wait()
-        if self.last_cursor - cursor < PER_MESSAGE and not self.ended:
+        left_s = LINGER_S if due_s is None else due_s - time.monotonic()
+        if left_s > 0 and self.last_cursor - cursor < PER_MESSAGE and not self.ended:
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(LINGER_S):
+                async with asyncio.timeout(left_s):
                     await self._over.wait()
         start = self._position(cursor)
         return self.rows[start : start + PER_MESSAGE]

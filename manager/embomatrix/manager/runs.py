@@ -19,6 +19,7 @@ from embomatrix.manager.events import (
 )
 from embomatrix.manager.group_ends import group_sizes
 from embomatrix.manager.records import (
+    announced_in,
     batch_of,
     batch_row,
     failed_rows,
@@ -27,7 +28,7 @@ from embomatrix.manager.records import (
     terms_payload,
 )
 from embomatrix.manager.results import BatchLog
-from embomatrix.manager.store.protocol import PutOutcome, RunRow, StateError, StateFullError
+from embomatrix.manager.store.protocol import PutOutcome, RunRow, Shelf, StateError, StateFullError
 from embomatrix.manager.submissions import Submissions
 from embomatrix.reward.settings import PAPER
 from embomatrix.rpc.status import (
@@ -104,12 +105,15 @@ class Runs:
 
     async def restore(self) -> None:
         """Take up what a former manager left. Its open batches go on at once, whether their trainer asks for them or not."""
+        announced = {row.key: announced_in(row) for row in await self._store.rows(Shelf.WINDOWS)}
         for run in await self._store.runs():
             self._runs[run.run_id] = run
             terms = terms_of(run)
             self._feed(RunOpened(run.run_id, terms))
             self._history.opened(run.run_id, run.name, terms.reward)
             self._heard_s[run.run_id] = time.monotonic()
+            if run.run_id in announced:
+                self._feed(announced[run.run_id])
             for row in await self._store.batches(run.run_id):
                 batch = batch_of(row)
                 log = BatchLog(run.run_id, row.batch_id, row.digest, groups=group_sizes(batch))

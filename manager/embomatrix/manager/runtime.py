@@ -99,7 +99,7 @@ class ManagerRuntime:
         self.history = RunHistory(self.chronicle, archive, cluster)
         self.runs = Runs(cluster, store, bundles, logs, self._carry_out, limits or RunLimits(), self.history)
         self._intake = Intake(cluster, registry)
-        self._keeper = Keeper(store, registry, cluster.dispatcher)
+        self._keeper = Keeper(store, registry, cluster)
         self._delivery = Delivery(store, logs, self._say, self.chronicle.in_log)
         self._links: dict[str, WorkerLink] = {}
         self._lapsed_s = lapsed_s

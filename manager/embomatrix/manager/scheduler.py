@@ -40,7 +40,7 @@ from embomatrix.manager.scene_costs import SceneCosts
 from embomatrix.manager.shares import Share
 from embomatrix.manager.window import Window, announcers
 from embomatrix.reward.settings import PAPER
-from embomatrix.rpc.values import Completed, Resident, RunTerms
+from embomatrix.rpc.values import Batch, Completed, Resident, RunTerms
 from embomatrix.rpc.versions import SCORES_SINCE
 
 DEFAULT_TERMS: Final = RunTerms()
@@ -108,7 +108,8 @@ class Scheduler:
                 return Urgency.NOW
             case BatchSubmitted():
                 return self._on_submitted(event)
-            case BatchRestored():
+            case BatchRestored(batch):
+                self._come(batch)
                 return Urgency.LATER
             case RunOpened(run_id, terms):
                 self._terms[run_id] = terms
@@ -190,10 +191,13 @@ class Scheduler:
             self.prewarm.demanded(batch.run_id, self._warm_since(scene), self._now_s)
             if not self._holders.having(scene):
                 urgency = Urgency.NOW
+        self._come(batch)
+        return urgency
+
+    def _come(self, batch: Batch) -> None:
         window = self.windows.get(batch.run_id)
         if window is not None:
             window.come(batch)
-        return urgency
 
     def _on_presence(self, event: WorkerJoined | WorkerLost) -> Urgency:
         self.prewarm.lost(event.worker_id)

@@ -1,7 +1,7 @@
 """`bench cluster`, part flow: what the manager costs while thousands of rollouts are in flight.
 
-A real manager with its embedded store, this process as the trainer, and a worker that executes nothing: so nothing but the
-manager limits the flow, and a rollout costs it what it costs with real slots.
+A real manager with its embedded store, this process as the trainer, and in another a worker that executes nothing: so
+nothing but the manager limits the flow, and a rollout costs it what it costs with real slots.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.convert import rollout_from_proto, rollout_to_proto
 from embomatrix.worker.bench_cpu import CpuWatch
 from embomatrix.worker.bench_figures import quantile
-from embomatrix.worker.bench_hollow import hollow_worker
+from embomatrix.worker.bench_hollow import Order, hollow_worker
 from embomatrix.worker.bench_processes import bench_cluster
 from embomatrix.worker.bench_trainer import trainer_on
 
@@ -86,12 +86,11 @@ async def _measure(
         await trainer.push(_repeated(work, sizes.in_flight // 4))
         on_step(f"{sizes.in_flight} rollouts in flight")
         batches = [_repeated(work, sizes.in_flight)] * sizes.batches
-        worker.begin()
+        await worker.tell(Order.BEGIN)
         watch, started_s = CpuWatch(cluster), time.perf_counter()
         count = await _flow(trainer, batches)
         wall_s, used = time.perf_counter() - started_s, watch.used()
-        waits_s = tuple(worker.waits_s)
-        worker.answering.clear()
+        waits_s = await worker.tell(Order.KEEP)
         rss_mb = await _memory(cluster, trainer, work, sizes, on_step)
     return Flow(count, wall_s, used.manager_s, waits_s, rss_mb)
 
@@ -143,7 +142,7 @@ async def _pending(viewer: ClusterClient, count: int) -> None:
 def _repeated(work: Work, count: int) -> tuple[Rollout, ...]:
     """So many of the workload's rollouts, over and over, each with an id of its own.
 
-    They are written as messages here: doing it when they are submitted would hold up the worker, which shares this process.
+    They are written as messages here, so that it takes no time of the flow.
     """
     plans = itertools.islice(itertools.cycle(work.sample(len(work.rollouts))), count)
     named = (replace(rollout, rollout_id=f"{n}", group_id=f"{n}") for n, rollout in enumerate(plans))

@@ -34,15 +34,15 @@ if TYPE_CHECKING:
 ROLLOUTS_PER_SLOT: Final = 5_000
 GROWTH_MB: Final = 128.0
 """A slot's process is replaced after this many rollouts, or when it has grown by this much."""
-AHEAD_S: Final = 0.03
+AHEAD_S: Final = 0.06
 """Leases that wait in a slot's stream can't be given to another, nor taken back: they last about this long."""
-MOST_AHEAD: Final = 16
+MOST_AHEAD: Final = 24
 LARGEST_AHEAD: Final = 4096
 """Bytes of a plan that may wait in a stream: its buffer holds all of them, and nobody waits to write."""
-GATHER_S: Final = 0.01
-"""Answers are taken together that come within this time …"""
+GATHER_S: Final = 0.025
+"""Answers are taken at multiples of this time, of all slots at once: each time the daemon takes a core from a slot …"""
 GATHER_SHARE: Final = 0.5
-"""… or within this share of the time that the leases ahead will last, if that is less."""
+"""… or after this share of the time that the leases ahead will last, if that is less."""
 LEAST_GATHER_S: Final = 0.002
 RECENT: Final = 0.1
 """Weight of the last execution in the mean of those before it."""
@@ -175,8 +175,11 @@ class Shift:
 
     def _pause_s(self) -> float:
         """For how long the answers may lie in the stream."""
-        pause_s = min(GATHER_S, GATHER_SHARE * self.scene.pace_s * (len(self.given) - 1))
-        return pause_s if pause_s >= LEAST_GATHER_S else 0.0
+        longest_s = GATHER_SHARE * self.scene.pace_s * (len(self.given) - 1)
+        if longest_s < LEAST_GATHER_S:
+            return 0.0
+        common_s = GATHER_S - (time.monotonic() + LEAST_GATHER_S) % GATHER_S + LEAST_GATHER_S
+        return min(common_s, longest_s)
 
     def _completed(self, ticket: Ticket, answer: Frame) -> Completed:
         scene, execute_s = self.scene, float(answer.header["execute_s"])

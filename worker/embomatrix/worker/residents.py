@@ -91,6 +91,11 @@ class Scene:
     running: int = 0
     idle: list[Slot] = field(default_factory=list)
 
+    @property
+    def at_hand(self) -> bool:
+        """Whether a slot waits for a rollout, or none is at work: nothing must be forked beside another."""
+        return bool(self.idle) or not self.running
+
     async def take_slot(self, fork_s: float) -> Slot:
         """An idle slot, or a new fork of the scene, which may take ``fork_s`` seconds.
 

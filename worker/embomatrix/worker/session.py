@@ -56,7 +56,7 @@ FETCH_S: Final = 30.0
 HEARTBEATS_MISSED: Final = 3
 """So many heartbeats in a row without an answer mean that the connection is dead."""
 RESULTS_PER_MESSAGE: Final = 256
-LINGER_S: Final = 0.04
+LINGER_S: Final = 0.09
 """A message costs more than what it carries: while every slot has enough ahead, there is one in this time at most …"""
 SPACING_S: Final = 0.003
 """… and in this time while slots run short: whoever comes first goes at once."""

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 RETRY_CHECK_S: Final = 1.0
-AHEAD: Final = 2
+AHEAD: Final = 4
 """Leases that wait behind each slot while others are asked for."""
 
 
@@ -216,7 +216,7 @@ class SlotPool:
             shift.task.add_done_callback(functools.partial(self._vacate, permit))
 
     def _next_lease(self) -> tuple[Ticket, Scene] | None:
-        return None if self._resting else self._waiting.take()
+        return None if self._resting else self._waiting.take(time.monotonic())
 
     def _more_for(self, shift: Shift, count: int) -> list[Ticket]:
         tickets = [] if self._resting else self._waiting.take_more(shift.scene, count, time.monotonic())

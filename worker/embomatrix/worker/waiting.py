@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from embomatrix.worker.residents import Scene
 
-OVERTAKEN_S: Final = 0.2
+OVERTAKEN_S: Final = 0.5
 """A lease that has waited for this long is not overtaken by one whose scene a slot has at hand."""
 
 
@@ -45,14 +45,24 @@ class WaitingLeases:
         """All of one scene wait no longer."""
         return self._take([ticket for ticket in self._tickets if ticket.digest == digest])
 
-    def take(self) -> tuple[Ticket, Scene] | None:
-        """The first whose scene is warm, with this."""
-        for ticket in self._tickets:
-            scene = self._warm(ticket.digest)
-            if scene is not None:
-                self._tickets.remove(ticket)
-                return ticket, scene
-        return None
+    def take(self, now_s: float) -> tuple[Ticket, Scene] | None:
+        """One whose scene is warm, with this.
+
+        It is the first, or, until that has waited for long, the first for which no process must be forked beside one that is
+        at work: what a process needs is copied and found out in its first rollouts, so few processes with many rollouts each
+        spend less on it than many with few.
+        """
+        warm = (
+            (ticket, scene) for ticket in self._tickets if (scene := self._warm(ticket.digest)) is not None
+        )
+        first = next(warm, None)
+        if first is None:
+            return None
+        found = first
+        if not first[1].at_hand and now_s - first[0].taken_s <= OVERTAKEN_S:
+            found = next((pair for pair in warm if pair[1].at_hand), first)
+        self._tickets.remove(found[0])
+        return found
 
     def take_more(self, scene: Scene, count: int, now_s: float) -> list[Ticket]:
         """Leases of this scene, up to a count, while it is warm: no more than a slot's share of all that wait.

@@ -65,6 +65,7 @@ class MemoryStore:
     async def close_run(self, run_id: str) -> None:
         self._check()
         self._state.runs.pop(run_id, None)
+        self._state.shelves[Shelf.WINDOWS].pop(run_id, None)
         for key in [key for key in self._state.batches if key[0] == run_id]:
             await self.drop_batch(*key)
 

@@ -104,6 +104,8 @@ class Shelf(StrEnum):
     """What is known of workers' honesty, by their ids."""
     SWITCHES = "switches"
     """What operators turned on or off."""
+    WINDOWS = "windows"
+    """What open runs announced last, by their ids; a run takes it along when it is closed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +132,7 @@ class StateStore(Protocol):
         """Note a run; the same id again keeps the first name and terms."""
 
     async def close_run(self, run_id: str) -> None:
-        """Forget the run with its batches and results; unknown ids are no error."""
+        """Forget the run with its batches, results and window; unknown ids are no error."""
 
     async def put_batch(self, batch: BatchRow) -> PutOutcome:
         """Note a batch, if its run is open and its id is free."""

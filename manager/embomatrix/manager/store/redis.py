@@ -132,6 +132,7 @@ redis.call('HDEL', KEYS[2], ARGV[2])
 redis.call('LREM', KEYS[3], 0, ARGV[2])
 redis.call('DEL', KEYS[4])
 redis.call('HDEL', KEYS[5], ARGV[2])
+redis.call('HDEL', KEYS[6], ARGV[2])
 return 1
 """
 )
@@ -184,7 +185,8 @@ class RedisStore:
     async def close_run(self, run_id: str) -> None:
         for batch_id in await self._batch_ids(run_id):
             await self.drop_batch(run_id, batch_id)
-        await self._script(_CLOSE_RUN, ("runs", "run_order", f"batches:{run_id}", "run_terms"), run_id)
+        keys = ("runs", "run_order", f"batches:{run_id}", "run_terms", Shelf.WINDOWS.value)
+        await self._script(_CLOSE_RUN, keys, run_id)
 
     async def put_batch(self, batch: BatchRow) -> PutOutcome:
         keys = ("runs", f"batch:{batch.run_id}:{batch.batch_id}", f"batches:{batch.run_id}")

@@ -118,6 +118,7 @@ class SqliteStore:
         def delete() -> None:
             for table in ("result", "batch", "run"):
                 self._db.execute(f"DELETE FROM {table} WHERE run_id = ?", (run_id,))
+            self._db.execute("DELETE FROM shelf WHERE shelf = ? AND key = ?", (Shelf.WINDOWS.value, run_id))
 
         await self._run(delete)
 
