@@ -58,6 +58,12 @@ class FakeManager(worker_service_pb2_grpc.WorkerServiceServicer):
         self.outgoing.put_nowait(pb.SessionResponse(leases=[lease_to_proto(lease)]))
         return lease.ref
 
+    def leases(self, count, digest):
+        """So many in one message."""
+        rollouts = (Rollout(f"l{number}", "g", digest, "ok", (), 1) for number in range(count))
+        leases = (Lease(LeaseRef(one.rollout_id, self.epoch), one, 60.0) for one in rollouts)
+        self.outgoing.put_nowait(pb.SessionResponse(leases=list(map(lease_to_proto, leases))))
+
     def cancel(self, ref):
         self.outgoing.put_nowait(pb.SessionResponse(cancelled=[lease_ref_to_proto(ref)]))
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.manager.group_ends import GroupEnds
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
 
     from embomatrix.manager.store.protocol import ResultRow
 
@@ -66,6 +66,14 @@ class BatchLog:
     @property
     def ended(self) -> bool:
         return self.dropped or self.finished_s is not None
+
+    async def messages(self, cursor: int) -> AsyncIterator[list[ResultRow]]:
+        """All results beyond the cursor, to the end of the batch: the first at once, then as ``LINGER_S`` allows."""
+        due_s = 0.0
+        while rows := await self.after(cursor, due_s):
+            cursor = rows[-1].cursor
+            due_s = time.monotonic() + LINGER_S
+            yield rows
 
     async def after(self, cursor: int, due_s: float | None = None) -> list[ResultRow]:
         """Waits for results beyond the cursor; returns some of them, or nothing when the batch is at its end.

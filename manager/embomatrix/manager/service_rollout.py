@@ -6,7 +6,6 @@ import asyncio
 import time
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.manager.results import LINGER_S
 from embomatrix.proto.v1 import rollout_service_pb2 as pb
 from embomatrix.proto.v1 import rollout_service_pb2_grpc
 from embomatrix.rpc.convert import each, rollout_from_proto
@@ -151,10 +150,7 @@ async def _results(log: BatchLog, cursor: int) -> AsyncIterator[list[ResultRow]]
         raise TrimmedError(
             f"batch {log.batch_id!r} ends at cursor {log.last_cursor}: {cursor} lies beyond it"
         )
-    due_s = 0.0  # whoever comes first goes at once
-    while rows := await log.after(cursor, due_s):
-        cursor = rows[-1].cursor
-        due_s = time.monotonic() + LINGER_S
+    async for rows in log.messages(cursor):
         yield rows
     if log.dropped:
         raise NotFoundError(f"batch {log.batch_id!r} is no longer kept: its run was closed")

@@ -4,6 +4,7 @@ import asyncio
 import dataclasses
 import hashlib
 import os
+import time
 import zlib
 from pathlib import Path
 
@@ -57,6 +58,26 @@ async def test_a_reader_waits_for_results_and_ends_with_the_batch():
     assert await reader == rows(1, 2)
     log.finish(0.0)
     assert await log.after(2) == []
+
+
+async def test_results_that_are_due_wait_for_no_others():
+    log = BatchLog("r1", "b1", "d", rows(1, 2))
+    sent = []
+    async for message in log.messages(0):
+        sent.append(message)
+        if len(sent) == 1:
+            log.append(rows(3, 3))
+            log.append(rows(4, 4))
+            log.finish(0.0)
+    assert sent == [rows(1, 2), rows(3, 4)]
+    open_log = BatchLog("r1", "b2", "d", rows(1, 1))
+    assert await anext(open_log.messages(0)) == rows(1, 1)
+    reader = asyncio.create_task(open_log.after(0, time.monotonic() + 3600.0))
+    for _ in range(10):
+        await asyncio.sleep(0)
+    assert not reader.done()
+    open_log.finish(0.0)
+    assert await reader == rows(1, 1)
 
 
 async def test_a_message_takes_what_came_while_it_lingered_and_no_more_than_it_can_hold():

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 RETRY_CHECK_S: Final = 1.0
-AHEAD: Final = 4
+AHEAD: Final = 2
 """Leases that wait behind each slot while others are asked for."""
 
 
