@@ -13,6 +13,10 @@ if TYPE_CHECKING:
 
 RECENT_S: Final = 300.0
 """A failure concerns an operator for so long."""
+MANY: Final = 0.2
+"""More than this share of the workers lost comes before all that follows from it: the bound of the alarm, too …"""
+FEWEST: Final = 3
+"""… from so many on."""
 
 
 class Mood(StrEnum):
@@ -43,6 +47,16 @@ def health(seen: Overview, *, paused: bool, now_s: float) -> Health:
         return Health(Mood.BAD, f"None of {sum(seen.workers.values())} workers works.")
     if lost := seen.workers.get("quarantined", 0):
         return Health(Mood.BAD, f"{_workers(lost)} in quarantine: results did not agree with others'.")
+    every, gone = sum(seen.workers.values()), seen.workers.get("lost", 0)
+    if gone >= FEWEST and gone > MANY * every:
+        return Health(
+            Mood.BAD, f"{gone} of {every} workers were lost a moment ago; what they held went to others."
+        )
+    return _of_work(seen, working, now_s)
+
+
+def _of_work(seen: Overview, working: int, now_s: float) -> Health:
+    """Where most workers are well: what goes wrong with rollouts, or that nothing does."""
     recent = [note for note in seen.failures if now_s - note.at_s < RECENT_S]
     if recent:
         # The meter keeps no more of them.

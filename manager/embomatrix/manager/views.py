@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.meter import FailureNote  # noqa: TC001  # the OpenAPI page is made of annotations
 from embomatrix.manager.registry import Standing
+from embomatrix.manager.run_figures import summary_of
 from embomatrix.manager.window import Window
+from embomatrix.rpc.run_log import PhaseSummary  # noqa: TC001  # the OpenAPI page is made of annotations
 from embomatrix.rpc.status import NotFoundError
 from embomatrix.rpc.values import Resident, ResidentState, RunInfo, RunStats, Warmth, WorkerInfo
 
@@ -49,6 +51,10 @@ class Overview:
     """What an operator should know."""
     unplaceable: int = 0
     """Announced scenes that no worker can hold."""
+    phases: dict[str, PhaseSummary] = field(default_factory=dict)
+    """Where the time of completed rollouts went, in the order in which it goes there."""
+    overhead: float = 0.0
+    """The manager's share of the CPU time that it and the slots used in the last minute."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,6 +140,8 @@ def overview(runtime: ManagerRuntime) -> Overview:
         failures=list(meter.failures),
         notice=UNAUDITED if cluster.dispatcher.auditor.lone else "",
         unplaceable=len(cluster.scheduler.unplaceable),
+        phases={phase.value: summary_of(found) for phase, found in runtime.chronicle.phases().items()},
+        overhead=runtime.effort.overhead(),
     )
 
 

@@ -51,6 +51,11 @@ def test_health_says_first_what_matters_most():
         Mood.WARNING,
         "No worker can hold 1 announced scene: the look-ahead page says why.",
     )
+    assert mood(workers={"ready": 7, "lost": 3}, failures=[NOTE]) == (
+        Mood.BAD,
+        "3 of 10 workers were lost a moment ago; what they held went to others.",
+    )
+    assert "slot_crashed" in mood(workers={"ready": 12, "lost": 3}, failures=[NOTE])[1]
     assert mood(leased=0)[1] == "3 rollouts wait and none runs: no scene is warm yet."
     assert mood(paused=True, workers={})[1].startswith("Dispatch is paused")
 

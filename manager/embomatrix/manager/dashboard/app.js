@@ -25,7 +25,7 @@ async function open() {
     code = await PAGES[name]();
   } catch {
     at("dot").className = "dot lost";
-    at("link").textContent = "a part of the page did not come: load it again";
+    tell("a part of the page did not come: load it again");
     return;
   }
   if (turn !== opened) return;
@@ -56,16 +56,22 @@ async function refresh(first = null) {
     }
   } catch (error) {
     at("dot").className = "dot lost";
-    at("link").textContent = error.name === "TimeoutError" || error instanceof TypeError ? "the manager does not answer; trying again" : error.message;
+    tell(error.name === "TimeoutError" || error instanceof TypeError ? "the manager does not answer; trying again" : error.message);
   }
   clearTimeout(waiting);
   // A page that nobody sees asks for nothing.
   waiting = setTimeout(refresh, document.hidden ? 10 * REFRESH_MS : REFRESH_MS);
 }
 
+/** Screen readers hear the words when they change; how long it is up changes every second, and is left out of that. */
+function tell(words, up = "") {
+  at("up").textContent = up;
+  if (at("states").textContent !== words) at("states").textContent = words;
+}
+
 function say(told) {
   const states = Object.entries(told.overview.workers).map(([state, n]) => `${n} ${state}`).join(", ") || "no workers";
-  at("link").textContent = `up ${seconds(told.overview.uptime_s)} · ${states}`;
+  tell(states, `up ${seconds(told.overview.uptime_s)} · `);
   at("health").hidden = false;
   at("health").className = `health ${told.health.mood}`;
   const words = told.overview.notice ? `${told.health.sentence} Note: ${told.overview.notice}.` : told.health.sentence;
@@ -77,6 +83,8 @@ at("ask").addEventListener("submit", event => {
   sessionStorage.setItem("token", at("token").value);
   refresh();
 });
+// The address names the page: a jump within it must not.
+at("skip").addEventListener("click", event => { event.preventDefault(); at("main").focus(); });
 addEventListener("hashchange", open);
 addEventListener("embomatrix-changed", () => refresh());
 document.addEventListener("visibilitychange", () => { if (!document.hidden) refresh(); });

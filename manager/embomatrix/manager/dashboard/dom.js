@@ -55,12 +55,27 @@ export function table(headings, rows, caption, kind = "") {
 }
 
 const last = new WeakMap();
+const nameOf = part => part.getAttribute("aria-label") ?? part.getAttribute("href") ?? part.textContent;
 
-/** What the page shows in a place, replaced only when it differs: selections and focus outlive a refresh. */
+/** What somebody has in hand in a place: gives the focus, and how far its parts are scrolled, to what comes after it. */
+function held(place) {
+  const parts = [...place.querySelectorAll("a, button, [tabindex]")], focused = parts.indexOf(document.activeElement);
+  const name = focused < 0 ? "" : nameOf(parts[focused]), ways = [...place.querySelectorAll(".scroll, pre")].map(part => [part.scrollLeft, part.scrollTop]);
+  return () => {
+    place.querySelectorAll(".scroll, pre").forEach((part, i) => { if (ways[i]) [part.scrollLeft, part.scrollTop] = ways[i]; });
+    if (focused < 0) return;
+    const now = [...place.querySelectorAll("a, button, [tabindex]")];
+    (now.find(part => nameOf(part) === name) ?? now[Math.min(focused, now.length - 1)])?.focus({preventScroll: true});
+  };
+}
+
+/** What the page shows in a place, replaced only when it differs: selections outlive a refresh, the focus a change too. */
 export function put(place, ...children) {
   const fresh = h("div", {}, ...children), told = fresh.innerHTML;
   const before = last.get(place);
   if (before?.told === told && before.first === place.firstChild) return;
   last.set(place, {told, first: fresh.firstChild});
+  const giveBack = held(place);
   place.replaceChildren(...fresh.childNodes);
+  giveBack();
 }

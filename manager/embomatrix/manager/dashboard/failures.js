@@ -5,6 +5,7 @@ import {named} from "./names.js";
 
 const BAD = ["failed", "worker_lost", "scene_failed"];
 const KEPT = 200;
+const ROWS = 50;
 const LOOK_EVERY = 3;
 let log = [], after = 0, looks = 0, lost = [];
 
@@ -24,10 +25,12 @@ export async function show({overview, runs}) {
   put(at("blamed"), tally("worker", given.map(note => note.worker_id || "none"), lost.map(event => event.worker_id || "none")));
   const rows = given.map(note => h("tr", {}, h("td", {class: "muted fit"}, clock(note.at_s)), h("td", {class: "fit"}, h("code", {class: "bad"}, note.code)), h("td", {class: "named"}, note.worker_id), h("td", {class: "named"}, note.rollout_id), h("td", {class: "message"}, note.message)));
   put(at("failures"), rows.length ? table(["when", "reason", "worker", "rollout", "what it said"], rows, "failures", "loose") : none("None. Lost rollouts are executed again before they count as failed."));
-  const folded = fold(lost).map(({event, times}) =>
+  const every = fold(lost);
+  const folded = every.slice(0, ROWS).map(({event, times}) =>
     h("tr", {}, h("td", {class: "muted fit"}, clock(event.at_s)), h("td", {class: "fit"}, h("code", {class: "bad"}, event.code || event.kind), times > 1 && ` × ${count(times)}`), h("td", {class: "named"}, event.worker_id),
       h("td", {class: "named"}, event.bundle_digest && h("code", {title: event.bundle_digest}, named(event.bundle_digest))), h("td", {class: "fit n", "data-name": event.attempt ? "attempt" : false}, event.attempt || ""), h("td", {class: "message"}, event.message || "")));
-  put(at("attempts"), folded.length ? table(["latest", "reason", "worker", "scene", ["attempt", "n"], "what it said"], folded, "attempts that failed", "loose") : none("None."));
+  put(at("attempts"), folded.length ? table(["latest", "reason", "worker", "scene", ["attempt", "n"], "what it said"], folded, "attempts that failed", "loose") : none("None."),
+    every.length > ROWS ? none(`${count(every.length - ROWS)} more of the latest ${count(KEPT)}; all of them: embomatrix cluster events`) : "");
 }
 
 /** The latest events of the cluster and of the latest runs, newest first. */

@@ -3,9 +3,10 @@ import {chart} from "./charts.js";
 import {at, count, h, none, put, seconds, share, signed, table} from "./dom.js";
 
 const TILES = [
-  ["rate", "Throughput", "rollouts/s, mean of 10 s"], ["p50", "Latency p50", "submitted to result"], ["p95", "Latency p95", "latest 2,048 rollouts"],
-  ["hits", "Prewarm hits", ""], ["slots", "Slots busy", ""], ["bad", "Failures", ""],
+  ["rate", "Throughput", "rollouts/s, mean of 10 s"], ["p50", "Latency", ""], ["hits", "Prewarm hits", ""],
+  ["slots", "Slots busy", ""], ["overhead", "Overhead", "the manager's share of CPU time"], ["bad", "Failures", ""],
 ];
+const PHASES = {queue: "waits for a lease", lease: "on the way, and behind another", load: "its scene is loaded", execute: "its plan is executed", deliver: "into the log"};
 let drawn = null;
 
 export function open(main) {
@@ -13,7 +14,8 @@ export function open(main) {
     ...TILES.map(([id, title, note]) => h("section", {class: "tile"}, h("h2", {}, title), h("b", {id}, "–"), h("span", {id: `${id}note`}, note))),
     h("section", {class: "most"}, h("h2", {}, "Completed rollouts per second ", h("small", {id: "peak"})), h("div", {id: "chart", role: "img", "aria-label": "rollouts per second over two minutes"})),
     h("section", {class: "third"}, h("h2", {}, "Runs"), h("div", {id: "runs"})),
-    h("section", {}, h("h2", {}, "Outcomes ", h("small", {}, "of all rollouts since the manager started")), h("div", {id: "outcomes"})),
+    h("section", {class: "most"}, h("h2", {}, "Latency by phase ", h("small", {}, "of completed rollouts since the manager started")), h("div", {id: "phases"})),
+    h("section", {class: "third"}, h("h2", {}, "Outcomes"), h("div", {id: "outcomes"})),
   );
   drawn = chart(at("chart"), ["rollouts/s"], {fill: true, legend: false, words: tick => tick === 0 ? "now" : signed(`${tick} s`)});
 }
@@ -27,7 +29,8 @@ export function show({overview: o, runs}) {
   const recent = o.throughput.slice(-10), mean = recent.reduce((a, b) => a + b, 0) / recent.length;
   const failed = Object.entries(o.outcomes).filter(([name]) => name !== "completed" && name !== "cancelled").reduce((sum, [, n]) => sum + n, 0);
   const told = {
-    rate: mean >= 100 ? count(Math.round(mean)) : mean.toFixed(1), p50: seconds(o.latency_p50_s), p95: seconds(o.latency_p95_s),
+    rate: mean >= 100 ? count(Math.round(mean)) : mean.toFixed(1), p50: seconds(o.latency_p50_s), p50note: `median; 95 % within ${seconds(o.latency_p95_s)}`,
+    overhead: o.overhead ? `${(100 * o.overhead).toFixed(o.overhead < 0.1 ? 1 : 0)} %` : "–",
     hits: share(o.prewarm_hits, o.prewarm_hits + o.prewarm_misses), hitsnote: `lead ${seconds(o.prewarm_lead_s)}, ${count(o.prewarm_wasted)} wasted`,
     slots: `${o.slots_busy}/${o.slots}`, slotsnote: `${count(o.queued)} rollouts waiting`,
     bad: count(failed), badnote: `${count(o.redispatched)} given again, ${count(o.stale_results)} late`,
@@ -37,8 +40,18 @@ export function show({overview: o, runs}) {
   at("bad").className = failed ? "bad" : "";
   drawn.draw(o.throughput.map((_, i) => i - o.throughput.length + 1), [o.throughput]);
   put(at("runs"), runs.length ? table(["run", ["done", "n"], ["open", "n"], ["warm", "n"], ["failed", "n"]], runs.slice(-8).reverse().map(run), "open runs") : none("No open runs."));
+  put(at("phases"), phases(o.phases));
   const rows = Object.entries(o.outcomes).sort((a, b) => b[1] - a[1]).map(([name, n]) => h("tr", {}, h("td", {}, h("code", {}, name)), h("td", {class: "n"}, count(n))));
   put(at("outcomes"), rows.length ? table(["outcome", ["rollouts", "n"]], rows, "outcomes") : none("Nothing has been executed yet."));
+}
+
+function phases(told) {
+  const all = Object.values(told).reduce((sum, one) => sum + one.sum_s, 0);
+  if (!all) return none("Nothing has been executed yet.");
+  const rows = Object.entries(told).map(([name, one]) => h("tr", {}, h("td", {class: "fit"}, name, h("span", {class: "muted wideonly"}, ` ${PHASES[name] ?? ""}`)),
+    h("td", {}, h("span", {class: "share", style: `width:${(100 * one.sum_s / all).toFixed(1)}%`})), h("td", {class: "n fit"}, share(one.sum_s, all)),
+    h("td", {class: "n fit"}, seconds(one.p50_s)), h("td", {class: "n fit"}, seconds(one.p95_s)), h("td", {class: "n fit"}, seconds(one.p99_s))));
+  return table(["phase", "", ["share", "n"], ["median", "n"], ["95 %", "n"], ["99 %", "n"]], rows, "latency by phase");
 }
 
 function run(r) {

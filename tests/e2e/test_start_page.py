@@ -1,0 +1,131 @@
+"""The commands of the start page, typed one after the other in a fresh folder by somebody who has read nothing else."""
+
+import contextlib
+import os
+import re
+import shlex
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from tests.fakes.commands import environment
+
+from embomatrix.cli.local_cluster import free_port
+
+PAGE = Path(__file__).parents[2] / "docs" / "index.md"
+LIMIT_S = 600.0
+SERVES = {"manager serve": "status page", "worker run": "registered with the manager"}
+"""Commands that go on, and what they say once they are of use."""
+SHORT = {"embomatrix train": " --imitate-seconds 1 --steps 1", "worker run": " --slots 1"}
+"""What the test adds, to be done soon."""
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
+
+
+def lines_below(heading):
+    """The lines of the code blocks of a section, without their comments."""
+    section = PAGE.read_text(encoding="utf-8").split(f"\n## {heading}\n")[1].split("\n## ")[0]
+    blocks = re.findall(r"^```\n(.*?)^```", section, re.MULTILINE | re.DOTALL)
+    return [line.split("  #")[0].strip() for block in blocks for line in block.splitlines()]
+
+
+class Shell:
+    """A person's terminals on one machine: a folder and a home of their own, and ports that nobody else has."""
+
+    def __init__(self, folder):
+        self.folder = folder
+        self.port, self.page_port = free_port(), free_port()
+        self._services = contextlib.ExitStack()
+        self._assigned = []
+        home, tools = folder / "home", folder / "bin"
+        home.mkdir()
+        tools.mkdir()
+        command = tools / "embomatrix"
+        command.write_text(f'#!/bin/sh\nexec {shlex.quote(sys.executable)} -m embomatrix.cli "$@"\n')
+        command.chmod(0o755)
+        self._environment = environment(
+            HOME=str(home), PATH=f"{tools}:{os.environ['PATH']}", EMBOMATRIX_MANAGER=f"127.0.0.1:{self.port}"
+        )
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self._services.close()
+
+    def type(self, line):
+        """What the line says in the end. One that goes on, goes on until the terminals are closed."""
+        line = line.replace("HOST:50070", f"localhost:{self.port}").replace("HOST", "localhost")
+        for part, options in SHORT.items():
+            line += options if part in line else ""
+        if "manager serve" in line:
+            line += f" --port {self.port} --http-port {self.page_port}"
+        if re.match(r"[A-Z]+=", line):
+            self._assigned.append(line)
+            return ""
+        told = next((words for part, words in SERVES.items() if part in line), None)
+        return self._ended(line) if told is None else self._serving(line, told)
+
+    def close_terminals(self):
+        """Ctrl-C in all that serve."""
+        self._services.close()
+
+    def _ended(self, line):
+        result = self._run(line, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+        said, _ = result.communicate(timeout=LIMIT_S)
+        assert result.returncode == 0, f"{line}\n{said.decode()}"
+        return said.decode()
+
+    def _serving(self, line, told):
+        log = self.folder / f"{time.monotonic_ns()}.log"
+        with log.open("wb") as file:
+            process = self._run(f"exec {line}", stdout=file, stderr=subprocess.STDOUT)
+        self._services.callback(_stop, process)
+        ends_s = time.monotonic() + LIMIT_S
+        while told not in log.read_text():
+            assert process.poll() is None, f"{line}\n{log.read_text()}"
+            assert time.monotonic() < ends_s, f"{line}\n{log.read_text()}"
+            time.sleep(0.1)
+        return log.read_text()
+
+    def _run(self, line, **streams):
+        script = "\n".join([*self._assigned, line])
+        return subprocess.Popen(
+            ["bash", "-c", script],
+            cwd=self.folder,
+            env=self._environment,
+            stdin=subprocess.DEVNULL,
+            **streams,
+        )
+
+
+def _stop(process):
+    process.terminate()
+    process.wait(timeout=60)
+
+
+def test_every_command_of_the_start_page_does_what_it_says(tmp_path):
+    with Shell(tmp_path) as shell:
+        _, build, *looks = lines_below("A plan in a scene")
+        shell.type(build)
+        task = re.search(r"Rs_int-\w+-\d+-\d+", shell.type(looks[0]))[0]
+        assert "success" in shell.type(looks[1].replace("TASK", task))
+        shell.type(looks[2].replace("TASK", task))
+        assert task in (tmp_path / f"{task}.html").read_text()
+
+        *trained, closed, report, doctor = lines_below("A cluster of your own")
+        for line in trained:
+            shell.type(line)
+        run = re.search(r"run-\w+", shell.type(closed))[0]
+        shell.type(report.replace("RUN", run))
+        assert "first" in (tmp_path / "report.html").read_text()
+        assert "0 of" not in shell.type(doctor)
+        shell.close_terminals()
+
+        *opened, joining, status = lines_below("A second PC")
+        invitation = [shell.type(line) for line in opened][-1].splitlines()[0]
+        # The other PC knows nothing of this cluster but the string.
+        join = joining.replace("TOKEN@HOST:50070", invitation)
+        assert "joined the manager" in shell.type(f"env -u EMBOMATRIX_MANAGER {join}")
+        assert "waiting for work" in shell.type(status)
