@@ -1,6 +1,7 @@
 """A build is balanced, verified, split by rooms and kinds of goal, equal for equal seeds, and goes on where it stopped."""
 
 import json
+import resource
 import shutil
 from collections import Counter
 from collections.abc import Iterable
@@ -20,7 +21,7 @@ from embomatrix.factory.layout.values import RoomBrief
 from embomatrix.factory.pipeline.build import Summary, build_dataset, split_rooms
 from embomatrix.factory.pipeline.cluster import admitted_by
 from embomatrix.factory.pipeline.settings import BuildSettings, WriterKind
-from embomatrix.factory.pipeline.store import BuildStore
+from embomatrix.factory.pipeline.store import BuildStore, VariantResult
 from embomatrix.factory.pipeline.variants import VariantYield
 from embomatrix.factory.refusal import RefusalReason
 from embomatrix.factory.scenes.build import build_base_scene
@@ -116,6 +117,22 @@ def test_a_build_keeps_the_processor_time_of_every_variant_beside_the_data_set(
     assert all(line["cpu_s"] > 0.0 for line in times)
     pace = evaluate_admissions(folder).figure("admitted_per_hour plain")
     assert pace.n == len(dataset.records)
+
+
+def test_a_disk_that_is_full_in_the_middle_of_a_line_costs_that_variant_alone(tmp_path: Path) -> None:
+    store = BuildStore.open(tmp_path, {"seed": 1})
+    store.add(VariantResult("train", 0, (), ()), b"", {}, {}, 1.0)
+    kept, before = [*store.results], (tmp_path / "build.jsonl").read_bytes()
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) + 40, hard))
+    try:
+        with pytest.raises(OSError, match="too large"):
+            store.add(VariantResult("train", 1, (), ()), b"", {}, {}, 1.0)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert len((tmp_path / "build.jsonl").read_bytes()) == len(before) + 40
+    assert BuildStore.open(tmp_path, {"seed": 1}).results == kept
+    assert (tmp_path / "build.jsonl").read_bytes() == before
 
 
 def test_folder_of_another_build_is_left_alone(folder: Path, dataset: Dataset) -> None:

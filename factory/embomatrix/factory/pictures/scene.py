@@ -135,8 +135,13 @@ class _Plan:
             thin = min(part.size_m[:2]) < 0.1
             if box.low_m[2] > 0.1:
                 continue
-            corners = [self._px(*box.low_m[:2]), self._px(*box.high_m[:2])]
-            self._draw.rectangle(_ordered(corners), fill="#b5522b" if thin else "#3a3a3a")
+            # of one room alone, walls are drawn no further than the room goes
+            low, high = (
+                np.clip(each[:2], self._low, self._high).tolist() for each in (box.low_m, box.high_m)
+            )
+            self._draw.rectangle(
+                _ordered([self._px(*low), self._px(*high)]), fill="#b5522b" if thin else "#3a3a3a"
+            )
         for door in self._scene.doorways:
             a, b = (door.width_m / 2, 0.0) if door.along == "x" else (0.0, door.width_m / 2)
             x, y = door.center_m
