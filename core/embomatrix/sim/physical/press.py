@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.sim.physical import arm
+from embomatrix.sim.physical import arm, body
 from embomatrix.sim.physical.fold import arrivals, fold
 from embomatrix.sim.physical.grasp import facing, surface_point
 from embomatrix.sim.physical.hands import GENTLE, TOUCH_M
 from embomatrix.sim.physical.reach import Track
-from embomatrix.sim.physical.space import part_boxes
+from embomatrix.sim.physical.space import part_boxes, struck
 from embomatrix.sim.physical.travel import SOMETHING
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.view import refuse
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from embomatrix.sim.physical.reach import Reach, Way
     from embomatrix.sim.physical.stage import Stage
     from embomatrix.skills.view import Refusal
+    from embomatrix.world.geometry import FloatArray
 
 HEIGHTS: Final = (0.85, 0.97, 0.65, 0.45, 0.25)
 """Shares of the thing's height at which it is pressed, the first that the arm reaches."""
@@ -58,8 +59,18 @@ def _press(stage: Stage, target: str) -> Refusal | None:
 
 
 def pressing(stage: Stage, target: str) -> tuple[Reach, Iterator[Way]]:
-    """Free ways to touch a thing, and what judges them."""
-    reach = stage.reach(stage.boxes(), target)
+    """Free ways to touch a thing, and what judges them.
+
+    Nothing but the hand may meet it: an arm that leant on it would keep the hand off.
+    """
+    boxes = stage.boxes()
+    own = boxes.where(np.array([owner == target for owner in boxes.owners], dtype=np.bool_))
+
+    def leans_not(postures: FloatArray) -> bool:
+        arms = body.balls(postures)[:, ~body.HAND_BALLS]
+        return not struck(own, arms, body.RADII[~body.HAND_BALLS], 0.0).any()
+
+    reach = stage.reach(boxes, target, leans_not)
     point = np.array(stage.world.relations.body(target).center_m)
     return reach, reach.ways(_tracks(stage, target), stage.bases(point))
 

@@ -103,10 +103,12 @@ class Stage:
         window = ((float(low[0]), float(low[1])), (float(high[0]), float(high[1])))
         return boxes_around(self.world.engine, *window).near(low, high)
 
-    def reach(self, boxes: Boxes, target: str = "") -> Reach:
-        """Ways of the hand as it is, among boxes; it may touch the target."""
+    def reach(
+        self, boxes: Boxes, target: str = "", also: Callable[[FloatArray], bool] | None = None
+    ) -> Reach:
+        """Ways of the hand as it is, among boxes; it may touch the target. ``also`` has a say in which of them are free."""
         held = self.grip.held if self.grip is not None else None
-        return Reach(boxes, boxes.without((target,)) if target else boxes, held)
+        return Reach(boxes, boxes.without((target,)) if target else boxes, held, also)
 
     def bases(
         self,

@@ -1,0 +1,53 @@
+"""How the hand presses: nothing else of the arm may meet what it presses, or it would keep the hand off."""
+
+import contextlib
+import itertools
+
+import numpy as np
+import pytest
+from tests.fakes.scenes import kitchen_scene
+
+from embomatrix.sim.bullet.dynamic import DynamicWorld
+from embomatrix.sim.bullet.engine import BulletEngine
+from embomatrix.sim.live_world import LiveWorld
+from embomatrix.sim.physical import body
+from embomatrix.sim.physical.fold import WAYS
+from embomatrix.sim.physical.press import press, pressing
+from embomatrix.sim.physical.space import struck
+from embomatrix.sim.physical.stage import Stage
+from embomatrix.sim.pose_cache import standing_poses
+from embomatrix.world.bundle import Bundle
+from embomatrix.world.poses import PoseCache
+
+PRESSED = ("microwave_1", "stove_1", "table_lamp_1")
+
+
+@pytest.fixture(scope="module")
+def stage():
+    scene = kitchen_scene()
+    with contextlib.closing(BulletEngine(scene)) as engine:
+        poses = PoseCache({}, standing_poses(engine, PRESSED))
+        world = LiveWorld(Bundle(scene, {}, poses), engine)
+        with contextlib.closing(DynamicWorld(scene)) as dynamic:
+            found = Stage(world, dynamic, lambda: None)
+            found.begin()
+            yield found
+
+
+@pytest.mark.parametrize("name", PRESSED)
+def test_no_way_to_press_a_thing_leads_the_arm_through_it(stage, name):
+    boxes = stage.boxes_within(np.full(3, -9.0), np.full(3, 20.0))
+    own = boxes.where(np.array([owner == name for owner in boxes.owners]))
+    for stand in stage.world.navigator.stands(name, stage.world.navigator.start)[:4]:
+        stage.stand_at(stand)
+        ways = list(itertools.islice(pressing(stage, name)[1], WAYS))
+        assert ways
+        arms = body.balls(np.concatenate([way.postures for way in ways]))[:, ~body.HAND_BALLS]
+        assert not struck(own, arms, body.RADII[~body.HAND_BALLS], 0.0).any()
+
+
+@pytest.mark.parametrize("name", PRESSED)
+def test_the_hand_gets_at_a_switch_from_the_first_place_to_stand(stage, name):
+    stage.world.robot = stage.world.navigator.stands(name, stage.world.navigator.start)[0]
+    stage.begin()
+    assert press(stage, name) is None
