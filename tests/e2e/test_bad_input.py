@@ -225,7 +225,10 @@ def test_unknown_setting_of_a_training_is_named(kitchen, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("factory", "build", "--scene=Rs_int", "--out=OUT"), "can't be written (Not a directory)"),
+        (
+            ("factory", "build", "--scene=Rs_int", "--heldout=0", "--out=OUT"),
+            "can't be written (Not a directory)",
+        ),
         (("scene", "build", "Rs_int", "--out=OUT"), "can't be written (Not a directory)"),
         (("manager", "serve", "--port=0", "--data-dir=OUT"), "pass another --data-dir"),
         (("worker", "run", "--cache-dir=OUT"), "name another folder with --cache-dir"),

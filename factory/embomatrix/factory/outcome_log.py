@@ -39,7 +39,7 @@ class LineLog(Generic[T]):
         found = _settings(self.path, lines[:1])
         if found != wanted:
             raise EvaluationError(
-                f"{self.path} holds outcomes of {found}, not of {wanted}: name another file"
+                f"{self.path} holds outcomes of {_told(found)}, not of {_told(wanted)}: name another file"
             )
         for number, line in enumerate(lines[1:], start=2):
             try:
@@ -57,6 +57,13 @@ class LineLog(Generic[T]):
             with self.path.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(asdict(outcome)) + "\n")
         self.outcomes.append(outcome)
+
+
+def _told(settings: object) -> str:
+    """Settings in words: seed 0, method tree."""
+    if not isinstance(settings, dict):
+        return repr(settings)
+    return ", ".join(f"{name} {value}" for name, value in settings.items())
 
 
 def _settings(path: Path, first: Sequence[str]) -> Any:

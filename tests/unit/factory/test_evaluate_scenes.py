@@ -153,7 +153,7 @@ def test_a_last_line_that_was_cut_short_is_made_anew(tmp_path: "Path") -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ('{"seed": 1}\n', r"of \{'seed': 1\}, not of seed 0: name another file"),
+        ('{"seed": 1}\n', "of seed 1, not of seed 0: name another file"),
         ("", "no file of outcomes"),
         ('{"seed": 0}\n{"task": 3}\n{}\n', "line 2, is no outcome"),
     ],
