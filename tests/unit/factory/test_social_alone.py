@@ -19,7 +19,7 @@ BRIEF = '{"scene": "Rs_int", "seed": 1}'
 def run(name: str, brief: str, *more: str) -> str:
     answer = CliRunner().invoke(app, ["agent", name, "--in", "-", *more], input=brief)
     assert answer.exit_code == 0, answer.output
-    return answer.output
+    return answer.stdout
 
 
 def test_every_agent_has_a_name_of_its_own() -> None:
