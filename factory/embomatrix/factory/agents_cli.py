@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from embomatrix.factory.asked_model import chat_model
+from embomatrix.factory.asked_model import Key, Tape, chat_model
 from embomatrix.factory.layout.doors import DOORS, MODELLED, AgentName
-from embomatrix.factory.layout_cli import Key, Llm, Model, Tape, mended_layout, modelled_agents
+from embomatrix.factory.layout_cli import Llm, Model, mended_layout, modelled_agents
 from embomatrix.factory.social.doors import SOCIAL_DOORS, SocialAgent, asked
 from embomatrix.factory.social.model_agents import ModelAgents
 from embomatrix.factory.terminal import fail

@@ -12,16 +12,15 @@ from rich.console import Console
 from rich.table import Column, Table
 
 from embomatrix.factory.agents_cli import agent
+from embomatrix.factory.asked_model import Key, Tape  # noqa: TC001  typer reads the annotations when a command runs
 from embomatrix.factory.assets_cli import app as assets_app
 from embomatrix.factory.evaluate.cli import app as evaluate_app
 from embomatrix.factory.export import card, encoded, export_rows
 from embomatrix.factory.inspection.cli import app as inspect_app
 from embomatrix.factory.layout_cli import (
     Forms,
-    Key,
     Llm,
     Model,
-    Tape,
     lay,
     modelled_agents,
     modelled_names,

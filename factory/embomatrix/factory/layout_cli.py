@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-from pathlib import Path
+from pathlib import Path  # noqa: TC003  typer reads the annotations when a command runs
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 from rich.console import Console
 
+from embomatrix.factory.asked_model import Key, Tape, model_asked
 from embomatrix.factory.layout.baselines import lay_at_random, lay_by_poses
 from embomatrix.factory.layout.distribution import DistributionError
 from embomatrix.factory.layout.doors import DOORS, MODELLED, AgentName, BriefError
@@ -20,8 +21,6 @@ from embomatrix.factory.refusal import Refusal
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.task_import.sources import SourceError, read_activity, read_file
 from embomatrix.factory.task_import.task import Manner, import_problem
-from embomatrix.llm.cassette import Cassette, CassetteMode
-from embomatrix.llm.endpoint import Endpoint
 from embomatrix.llm.values import LlmError
 from embomatrix.world.bddl import BddlError
 from embomatrix.world.catalog import CatalogError
@@ -31,7 +30,6 @@ if TYPE_CHECKING:
 
     from embomatrix.factory.editor import SceneEditor
     from embomatrix.factory.layout.jobs import Item, Layout, Record
-    from embomatrix.llm.values import ChatModel
 
 METHODS = ("tree", "random", "poses")
 Forms = Annotated[
@@ -42,11 +40,6 @@ Llm = Annotated[
     str, typer.Option(help="Base URL of an OpenAI-compatible endpoint for agents that are models.")
 ]
 Model = Annotated[str, typer.Option(help="Name of the model there.")]
-Key = Annotated[str, typer.Option("--llm-key", envvar="EMBOMATRIX_LLM_KEY", help="Its key.")]
-Tape = Annotated[
-    Path | None,
-    typer.Option("--cassette", help="Recorded answers: read where it has them, added to where not."),
-]
 
 
 def lay(
@@ -139,16 +132,8 @@ def modelled_names(forms: list[str]) -> frozenset[AgentName]:
 
 @contextlib.contextmanager
 def modelled_agents(url: str, model: str, key: str, cassette: Path | None) -> Iterator[ModelLayoutAgents]:
-    """Agents on an endpoint, on a recording, or on both."""
-    if url and not model:
-        _fail("--llm needs the name of a model there: give --model")
-    if not url and cassette is None:
-        _fail("an agent is to be a language model: give --llm URL and --model NAME, or --cassette FILE")
-    endpoint = Endpoint(url, model, api_key=key) if url else None
-    asked: ChatModel | None = endpoint
-    if cassette is not None:
-        asked = Cassette(cassette, CassetteMode.AUTO if asked else CassetteMode.REPLAY, asked)
-    assert asked is not None  # one of the two was given
+    """Agents on an endpoint, on a recording, or on both. Raises LlmError."""
+    asked, endpoint = model_asked(url, model, key, cassette)
     with ModelLayoutAgents(asked, endpoint) as agents:
         yield agents
 

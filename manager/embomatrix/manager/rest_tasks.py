@@ -53,9 +53,7 @@ def showing(gallery: Gallery | NoGallery) -> APIRouter:
     async def scenes(request: Request, offset: Offset = 0, limit: Limit = PAGE) -> Response:
         """What the scenes of the dataset are called, by the digests of their bundles."""
         with answered():
-            found = await gallery.scenes(offset=offset, limit=limit)
-        told = [dataclasses.asdict(name) for name in found]
-        return packed(request, json.dumps(told, separators=(",", ":")).encode())
+            return _json(request, await gallery.scenes(offset=offset, limit=limit))
 
     @router.get("/scenes/{digest}/floor", response_model=FloorPlan)
     async def floor(request: Request, digest: str) -> Response:
@@ -72,5 +70,6 @@ def showing(gallery: Gallery | NoGallery) -> APIRouter:
     return router
 
 
-def _json(request: Request, value: TaskDetail | FloorPlan) -> Response:
-    return packed(request, json.dumps(dataclasses.asdict(value), separators=(",", ":")).encode())
+def _json(request: Request, value: TaskDetail | FloorPlan | list[SceneName]) -> Response:
+    told = json.dumps(value, default=dataclasses.asdict, separators=(",", ":"))
+    return packed(request, told.encode())

@@ -37,7 +37,7 @@ def stage():
 @pytest.mark.parametrize("name", PRESSED)
 def test_no_way_to_press_a_thing_leads_the_arm_through_it(stage, name):
     boxes = stage.boxes_within(np.full(3, -9.0), np.full(3, 20.0))
-    own = boxes.where(np.array([owner == name for owner in boxes.owners]))
+    own = boxes.only(name)
     for stand in stage.world.navigator.stands(name, stage.world.navigator.start)[:4]:
         stage.stand_at(stand)
         ways = list(itertools.islice(pressing(stage, name)[1], WAYS))

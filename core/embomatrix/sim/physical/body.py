@@ -136,6 +136,11 @@ def balls(postures: FloatArray) -> FloatArray:
     return np.asarray(place[:, None] + local @ turn.transpose(0, 2, 1))
 
 
+def forearm_balls(postures: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Centres (n, balls, 3) and radii (balls,) of the arm without its hand: what must not meet what the hand works at."""
+    return balls(postures)[:, ~HAND_BALLS], RADII[~HAND_BALLS]
+
+
 def trunk_balls(postures: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Centres (n, balls, 3) and radii (balls,) of the base, the mast, the carriage and the arm's foot."""
     centres = np.einsum("nij,bj->nbi", arm.about_z(postures[:, YAW] + ASKEW_RAD), _TRUNK)

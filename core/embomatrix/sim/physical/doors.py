@@ -237,10 +237,9 @@ def leading(stage: Stage, leaf: Leaf, start: float, goal: float) -> tuple[Reach,
 
     def clear(postures: FloatArray) -> bool:
         """Whether arm and trunk, but not the hand, keep clear of the leaf as it moves."""
-        arms = body.balls(postures)[:, ~body.HAND_BALLS]
-        trunk, sizes = body.trunk_balls(postures)
-        points = np.concatenate([arms, trunk], axis=1)
-        radii = np.concatenate([body.RADII[~body.HAND_BALLS], sizes])
+        parts = (body.forearm_balls(postures), body.trunk_balls(postures))
+        points = np.concatenate([centres for centres, _ in parts], axis=1)
+        radii = np.concatenate([sizes for _, sizes in parts])
         return not any(
             struck(moving[number], points[row : row + 1], radii, PRESS_M)[0]
             for row, number in enumerate(course.tolist())

@@ -64,11 +64,10 @@ def pressing(stage: Stage, target: str) -> tuple[Reach, Iterator[Way]]:
     Nothing but the hand may meet it: an arm that leant on it would keep the hand off.
     """
     boxes = stage.boxes()
-    own = boxes.where(np.array([owner == target for owner in boxes.owners], dtype=np.bool_))
+    own = boxes.only(target)
 
     def leans_not(postures: FloatArray) -> bool:
-        arms = body.balls(postures)[:, ~body.HAND_BALLS]
-        return not struck(own, arms, body.RADII[~body.HAND_BALLS], 0.0).any()
+        return not struck(own, *body.forearm_balls(postures), 0.0).any()
 
     reach = stage.reach(boxes, target, leans_not)
     point = np.array(stage.world.relations.body(target).center_m)

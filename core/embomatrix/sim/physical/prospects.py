@@ -144,7 +144,8 @@ class Prospects:
         if not stands or world.burden(name):
             return None
         world.engine.reset()
-        self._open_around(name)
+        stage.open_around(name)
+        world.navigator.refresh()
         stage.stand_at(stands[0])
         tracks, _, bases = ways_to(stage, name)
         way = next(stage.reach(stage.boxes(), name).ways(tracks, bases), None)
@@ -157,16 +158,9 @@ class Prospects:
         world = self._world
         world.engine.reset()
         world.hand.take(world.cargo(placing.held))
-        self._open_around(placing.target)
+        self._stage.open_around(placing.target)
         if placing.relation is Relation.INSIDE:
             swing_leaves(world.engine, world.relations, placing.target, SWING)
-        world.navigator.refresh()
-
-    def _open_around(self, name: str) -> None:
-        world = self._world
-        for enclosure in world.relations.enclosing(name):
-            if enclosure.closed:
-                swing_leaves(world.engine, world.relations, enclosure.name, SWING)
         world.navigator.refresh()
 
 

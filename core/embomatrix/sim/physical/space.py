@@ -47,6 +47,10 @@ class Boxes:
         keep = np.array([owner not in left_out for owner in self.owners], dtype=np.bool_)
         return self.where(keep)
 
+    def only(self, name: str) -> Boxes:
+        """Those of one object."""
+        return self.where(np.array([owner == name for owner in self.owners], dtype=np.bool_))
+
     def where(self, keep: BoolArray) -> Boxes:
         """Those that a mask, shape (m,), keeps."""
         owners = tuple(owner for owner, kept in zip(self.owners, keep, strict=True) if kept)

@@ -12,11 +12,13 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.sim.bullet.robot import Posture
+from embomatrix.sim.leaves import swing_leaves
 from embomatrix.sim.physical import arm, body
 from embomatrix.sim.physical.floor import Floor
 from embomatrix.sim.physical.motion import Mover
 from embomatrix.sim.physical.reach import Held, Reach
 from embomatrix.sim.physical.space import boxes_around, object_balls
+from embomatrix.sim.swings import SWING
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.geometry import Aabb, Pose
 from embomatrix.world.poses import StandPose
@@ -92,6 +94,13 @@ class Stage:
         """Put the robot somewhere with its arm tucked, in both worlds. Nothing is asked about the way there."""
         self.world.robot = self.told = stand
         self.dynamic.robot.appear(tucked(stand))
+
+    def open_around(self, name: str) -> None:
+        """Open in the planning scene whatever is shut around an object, as far as there is room."""
+        world = self.world
+        for enclosure in world.relations.enclosing(name):
+            if enclosure.closed:
+                swing_leaves(world.engine, world.relations, enclosure.name, SWING)
 
     def boxes(self) -> Boxes:
         """Parts of things around the robot, without what it holds."""

@@ -188,9 +188,7 @@ class _Surveyor:
                 shares = SWING if handling is Handling.CLOSE else (0.0,)
                 swing_leaves(world.engine, world.relations, name, shares)
             case Handling.TAKE | Handling.PRESS:
-                for enclosure in world.relations.enclosing(name):
-                    if enclosure.closed:
-                        swing_leaves(world.engine, world.relations, enclosure.name, SWING)
+                self._stage.open_around(name)
         world.navigator.refresh()
 
     def _surroundings(self, name: str, handling: Handling, stands: Sequence[StandPose]) -> bytes:

@@ -12,7 +12,7 @@ import numpy as np
 import typer
 from rich.console import Console
 
-from embomatrix.factory.asked_model import chat_model
+from embomatrix.factory.asked_model import Key, Tape, chat_model
 from embomatrix.factory.evaluate.admissions import admitted_share, evaluate_admissions
 from embomatrix.factory.evaluate.drafts import asked_of
 from embomatrix.factory.evaluate.figures import (
@@ -56,10 +56,6 @@ Methods = Annotated[
     typer.Option("--method", help="One of them; give it again for more. Default: all."),
 ]
 Only = Annotated[int, typer.Option(min=1, help="Every so manieth task of the 140, for a quick look.")]
-Key = Annotated[str, typer.Option("--llm-key", envvar="EMBOMATRIX_LLM_KEY", help="Its key.")]
-Tape = Annotated[
-    Path | None, typer.Option(help="Recorded answers: read where it has them, added to where not.")
-]
 T = TypeVar("T")
 
 

@@ -61,8 +61,7 @@ class _SameCast:
 
 def extract(brief: SceneBrief) -> SceneFacts:
     """Scene information extraction from the inventory. Raises CatalogError."""
-    scene = build_base_scene(brief.scene, seed=brief.seed)
-    return facts_of(SceneView(scene), [room.name for room in scene.rooms])
+    return _facts(build_base_scene(brief.scene, seed=brief.seed))
 
 
 def play(brief: SceneBrief) -> TalkBrief:
@@ -100,14 +99,14 @@ def summarise(brief: SummaryBrief) -> Summary:
 
 async def asked(agents: ModelAgents, name: SocialAgent, brief: Any) -> Any:
     """The same of a language model. Raises LlmError, CatalogError."""
-    rng = _rng(brief.scene, brief.seed)
     if name in (SocialAgent.EXTRACTOR, SocialAgent.PLAYER):
-        facts = extract(brief)
+        scene = build_base_scene(brief.scene, seed=brief.seed)
+        facts = _facts(scene)
         if name is SocialAgent.PLAYER:
             cast = await agents.cast(facts, brief.seed)
             return TalkBrief(scene=brief.scene, cast=cast, seed=brief.seed)
-        pictures = sights_of(build_base_scene(brief.scene, seed=brief.seed))
-        return with_sights(facts, (await agents.describe(facts, pictures, brief.seed)).rooms)
+        return with_sights(facts, (await agents.describe(facts, sights_of(scene), brief.seed)).rooms)
+    rng = _rng(brief.scene, brief.seed)
     variant = _variant(brief.scene, brief.seed, rng)
     view = SceneView(variant.scene)
     facts = facts_of(view, variant.rooms)
@@ -118,6 +117,10 @@ async def asked(agents: ModelAgents, name: SocialAgent, brief: Any) -> Any:
     request = await agents.summarise(facts, view, brief.conversation, brief.seed)
     wishes = tuple(wish.model_dump_json() for wish in request.wishes)
     return Summary(instruction=request.instruction, wishes=wishes)
+
+
+def _facts(scene: Scene) -> SceneFacts:
+    return facts_of(SceneView(scene), [room.name for room in scene.rooms])
 
 
 def _rng(scene: str, seed: int) -> np.random.Generator:

@@ -27,6 +27,7 @@ export const share = (part, all) => all ? `${Math.round(100 * part / all)} %` : 
 export const clock = seconds => new Date(seconds * 1000).toLocaleTimeString();
 /** With a true minus: a hyphen would stand for a dash. */
 export const signed = text => String(text).replace("-", "\u2212");
+export const splitWords = split => split === "heldout" ? "held out" : split;
 export const none = text => h("div", {class: "none"}, text);
 export const colour = name => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
 

@@ -1,6 +1,6 @@
 // One task: what is asked, its objects, who said what, and the oracle's plan played on the plan view.
 import {ask, picture} from "./ask.js";
-import {at, h, put, table} from "./dom.js";
+import {at, h, put, splitWords, table} from "./dom.js";
 import {drawn} from "./plan.js";
 
 const STEP_MS = 1200;
@@ -16,7 +16,7 @@ export async function open(place, task_id) {
   const told = await ask(`tasks/${encodeURIComponent(task_id)}`), {card} = told, about = new Set(told.objects.filter(row => row.goal).map(row => row.name));
   ({moments} = told);
   view = drawn(told.floor, {rooms: told.rooms, about, things: told.things, label: `plan view of ${card.scene_id}`});
-  const facts = [["scene", card.scene_id], ["category", card.category.replaceAll("_", " ")], ["split", card.split === "heldout" ? "held out" : card.split], ["source", told.source], ["profile", told.profile], ["kind of goal", told.signature]];
+  const facts = [["scene", card.scene_id], ["category", card.category.replaceAll("_", " ")], ["split", splitWords(card.split)], ["source", told.source], ["profile", told.profile], ["kind of goal", told.signature]];
   const steps = moments.map((moment, i) => h("li", {}, h("button", {type: "button", class: "step", onclick: () => { close(); go(i); }}, moment.call || "the start")));
   const button = (id, words, act) => h("button", {type: "button", id, onclick: act}, words);
   place.replaceChildren(

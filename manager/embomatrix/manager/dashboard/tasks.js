@@ -1,6 +1,6 @@
 // The dataset's tasks: a gallery with pictures of their scenes, and one of them.
 import {Refused, ask, picture} from "./ask.js";
-import {at, count, h, none, put} from "./dom.js";
+import {at, count, h, none, put, splitWords} from "./dom.js";
 import {drawn} from "./plan.js";
 import * as task from "./task.js";
 
@@ -65,7 +65,7 @@ function choices(id, every, pairs) {
 
 function card(one) {
   return h("a", {class: "card", href: `#tasks?${encodeURIComponent(one.task_id)}`}, h("span", {class: "thumb", "data-digest": one.bundle_digest, "data-picture": String(one.picture), "data-scene": one.scene_id}),
-    h("span", {class: "instruction"}, one.instruction), h("span", {class: "muted facts"}, [one.category.replaceAll("_", " "), one.scene_id, `${one.steps} steps`, one.split === "heldout" ? "held out" : one.split].map(fact => h("span", {}, fact))));
+    h("span", {class: "instruction"}, one.instruction), h("span", {class: "muted facts"}, [one.category.replaceAll("_", " "), one.scene_id, `${one.steps} steps`, splitWords(one.split)].map(fact => h("span", {}, fact))));
 }
 
 async function look(place) {
