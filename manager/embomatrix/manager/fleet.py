@@ -175,14 +175,19 @@ class Fleet:
         return best
 
     def waiting_behind(self, thief: WorkerRecord, before_s: float, now_s: float) -> LeaseRecord | None:
-        """A lease, given before that time, that waits behind a busy slot and that the thief, with its scene warm, may take."""
+        """A lease, given before that time, that waits behind a busy slot and that the thief, with its scene warm, may take.
+
+        One that is about to begin where it is would be executed twice.
+        """
         for worker_id in islice(self._backlogged, VICTIMS):
-            lease = next(reversed(self.workers[worker_id].held.values()))
+            victim = self.workers[worker_id]
+            lease = next(reversed(victim.held.values()))
             if (
                 worker_id != thief.worker_id
                 and lease.record.scene in thief.warm
                 and lease.given_s <= before_s
                 and thief.takes(lease.record, now_s)
+                and not victim.begins_soon(now_s)
             ):
                 return lease
         return None

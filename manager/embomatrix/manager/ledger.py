@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from enum import Enum, auto
+from itertools import islice
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from embomatrix.reward.settings import PAPER, RewardSettings
@@ -23,7 +24,10 @@ BEHIND: Final = 64
 """Leases that wait behind a slot at most, however fast it is."""
 PACE_WEIGHT: Final = 0.1
 """Of the latest rollout in what a worker is taken to need for one."""
-
+BEGINS_S: Final = 0.1
+LATE_S: Final = 0.2
+"""What waits behind a slot is left to it from so long before its pace has it begin until so long after: the slot's process
+has it by then, and what has ended lies in streams for a while before the manager hears of it."""
 
 LAG_WEIGHT: Final = 0.2
 """Weight of the latest of a worker's leases, in the mean of the logarithms: one odd lease makes nobody slow."""
@@ -196,6 +200,15 @@ class WorkerRecord:
         self.pace_s += weight * (execute_s - self.pace_s)
         behind = math.ceil(AHEAD_S / self.pace_s) if self.pace_s * BEHIND > AHEAD_S else BEHIND
         self.credits = self.slots * (1 + behind)
+
+    def begins_soon(self, now_s: float) -> bool:
+        """Whether the last of its leases, which waits behind a slot, is about to begin or has just begun, by its pace."""
+        running = islice(self.held.values(), self.slots)
+        began_s = max(
+            (lease.started_s for lease in running if lease.started_s is not None), default=-math.inf
+        )
+        in_s = began_s + self.pace_s * math.ceil(len(self.held) / self.slots - 1) - now_s
+        return self.completed > 0 and -LATE_S < in_s < BEGINS_S
 
     def takes(self, record: RolloutRecord, now_s: float) -> bool:
         """Whether this rollout may go here, as far as it is not a question of credits or of the scene."""

@@ -1,5 +1,7 @@
 """Workers in a large cluster: found by scene, by free slots and by backlog, without looking at all of them."""
 
+import pytest
+
 from embomatrix.manager.fleet import CANDIDATES, SEEKERS, Fleet
 from embomatrix.manager.ledger import AHEAD_S, BEHIND, LeaseRecord, RolloutKey, RolloutRecord
 from embomatrix.rpc.leases import LeaseRef
@@ -54,6 +56,30 @@ def test_an_idle_worker_finds_a_lease_behind_a_busy_slot():
     assert fleet.seekers() == ["w0001"]
     assert fleet.waiting_behind(thief, before_s=0.5, now_s=2.0) is None
     assert fleet.waiting_behind(thief, before_s=1.0, now_s=2.0).ref.lease_id == "w0000.1"
+
+
+@pytest.mark.parametrize(
+    ("now_s", "left_alone"),
+    # Three rollouts of 0.1 s each, of which the first began at 1 s: the last begins at 1.2 s.
+    [(1.05, False), (1.15, True), (1.2, True), (1.39, True), (1.41, False)],
+)
+def test_a_lease_that_is_about_to_begin_behind_its_slot_is_left_to_it(now_s, left_alone):
+    fleet = fleet_of(2)
+    fleet.workers["w0000"].note_completed(0.1)
+    load(fleet, "w0000", 3, given_s=1.0)
+    found = fleet.waiting_behind(fleet.workers["w0001"], before_s=1.0, now_s=now_s)
+    assert (found is None) == left_alone
+
+
+def test_of_two_slots_the_one_that_began_last_tells_when_the_next_lease_begins():
+    fleet = fleet_of(1)
+    thief, victim = fleet.workers["w0000"], fleet.join("twice", 2)
+    victim.note_completed(0.1)
+    load(fleet, "twice", 1, given_s=1.0)
+    load(fleet, "twice", 2, given_s=3.0)
+    victim.reported = True
+    assert fleet.waiting_behind(thief, before_s=3.0, now_s=3.1) is None
+    assert fleet.waiting_behind(thief, before_s=3.0, now_s=3.5).ref.lease_id == "twice.2"
 
 
 def test_different_idle_workers_look_each_time():
