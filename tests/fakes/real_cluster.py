@@ -86,6 +86,10 @@ class RealCluster:
         cache = f"--cache-dir={self.folder / name}"
         self._start(name, "-m", "embomatrix.cli", "worker", "run", *arguments, cache)
 
+    def start_program(self, name, *command):
+        """A worker in another language, at the first manager: the address and its name follow the command."""
+        self._run(name, *map(str, command), self.address, name)
+
     def start_trainer(self, name, batch, task, out):
         """A trainer that submits or asks for the batch, and notes in the file ``out`` what it read."""
         arguments = (self.address, batch.run_id, str(len(batch.rollouts)), task, str(out))
@@ -120,13 +124,14 @@ class RealCluster:
         return ClusterClient(self.address, **{"limits": LIMITS, **options})
 
     def _start(self, name, *arguments):
+        self._run(name, sys.executable, *arguments)
+
+    def _run(self, name, *command):
         root = str(Path(__file__).parents[2])
         paths = os.pathsep.join(filter(None, (os.environ.get("PYTHONPATH"), root)))
         environment = {**os.environ, "FAKE_EXECUTIONS": str(self.executions), "PYTHONPATH": paths}
         with (self.folder / f"{name}.log").open("ab") as log:
-            self.processes[name] = subprocess.Popen(
-                [sys.executable, *arguments], stdout=log, stderr=log, env=environment
-            )
+            self.processes[name] = subprocess.Popen(command, stdout=log, stderr=log, env=environment)
 
 
 async def connected(client, *names, limit_s=60.0):

@@ -248,7 +248,9 @@ class WorkerState(google.protobuf.message.Message):
     @property
     def residents(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___Resident]: ...
     @property
-    def running(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___LeaseRef]: ...
+    def running(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___LeaseRef]:
+        """Every lease that has no result yet, whether it runs or waits for a slot."""
+
     @property
     def finished(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___LeaseResult]: ...
     @property
@@ -462,7 +464,9 @@ class HeartbeatRequest(google.protobuf.message.Message):
     load: builtins.float
     memory_used_mb: builtins.int
     @property
-    def running(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___LeaseRef]: ...
+    def running(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___LeaseRef]:
+        """Those to renew: every lease that runs or waits for a slot."""
+
     @property
     def progress(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___LeaseProgress]: ...
     def __init__(
