@@ -7,7 +7,7 @@ from tests.integration.test_manager_service import manager as a_manager
 
 from embomatrix.cli.doctor.findings import Finding, Level, verdict
 from embomatrix.cli.doctor.machine import NEEDED, disk, machine, memory, parts, port, python
-from embomatrix.cli.doctor.manager import Visit, certificate, clock, manager, versions
+from embomatrix.cli.doctor.manager import Visit, certificate, clock, manager, ports_held, versions
 from embomatrix.manager.access.folder import prepare
 from embomatrix.rpc.capabilities import Capabilities
 from embomatrix.rpc.versions import PROTOCOL_VERSION, VersionRange
@@ -94,6 +94,20 @@ async def test_a_manager_in_the_clear_is_fine(tmp_path):
         found = await manager(Visit(endpoints.address, page_port=page_port))
     assert [finding.thing for finding in found] == ["manager", "TLS", "versions", "token", "clock"]
     assert {finding.level for finding in found} == {Level.FINE}
+
+
+async def test_ports_that_a_manager_on_this_machine_holds_are_no_reason_for_a_note(tmp_path):
+    async with a_manager(tmp_path) as endpoints:
+        page_port = int(endpoints.status_url.rstrip("/").rpartition(":")[2])
+        here = Visit(endpoints.address, page_port=page_port)
+        found = await manager(here)
+        pageless = await manager(Visit(endpoints.address, page_port=1))
+    assert ports_held(here, found) == {here.port, page_port}
+    assert ports_held(here, pageless) == {here.port}
+    assert ports_held(Visit("10.0.0.9:50070"), found) == frozenset()
+    assert ports_held(here, await manager(here)) == frozenset()
+    held = port("port of the status page", page_port, free=False, ours=True)
+    assert (held.level, held.remedy) == (Level.FINE, "")
 
 
 async def test_a_guarded_manager_says_what_is_missing_step_by_step(tmp_path):

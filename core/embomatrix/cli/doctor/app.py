@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
@@ -14,7 +15,7 @@ from embomatrix.cli.cluster.tables import show_json
 from embomatrix.cli.connection import Ca, Token  # noqa: TC001  typer reads the annotations when a command runs
 from embomatrix.cli.doctor.findings import Level, verdict
 from embomatrix.cli.doctor.machine import machine
-from embomatrix.cli.doctor.manager import Visit, manager
+from embomatrix.cli.doctor.manager import Visit, manager, ports_held
 from embomatrix.cli.failure import MENDABLE, fail
 from embomatrix.rpc.channel import DEFAULT_ADDRESS
 from embomatrix.rpc.managers import addresses_of
@@ -56,7 +57,9 @@ def doctor(
     except ClusterError as error:
         fail("doctor", str(error))
     visits = [Visit(address, secret, trusted, page_port, expected=bool(manager)) for address in addresses]
-    findings = [*machine(), *asyncio.run(_visit(visits))]
+    told = asyncio.run(_visit(visits))
+    held = frozenset().union(*(ports_held(visit, found) for visit, found in zip(visits, told, strict=True)))
+    findings = [*machine(held), *itertools.chain.from_iterable(told)]
     if as_json:
         show_json(findings)
     else:
@@ -65,10 +68,9 @@ def doctor(
         raise SystemExit(MENDABLE)
 
 
-async def _visit(visits: Sequence[Visit]) -> list[Finding]:
-    """All managers at the same time."""
-    found = await asyncio.gather(*(manager(visit) for visit in visits))
-    return [finding for findings in found for finding in findings]
+async def _visit(visits: Sequence[Visit]) -> list[list[Finding]]:
+    """What each manager is found to be; all are visited at the same time."""
+    return await asyncio.gather(*(manager(visit) for visit in visits))
 
 
 def _show(findings: Sequence[Finding]) -> None:

@@ -34,14 +34,17 @@ DISK_GOOD_MB: Final = 2048
 MEGABYTE: Final = 1_000_000
 
 
-def machine() -> list[Finding]:
-    """Look at this machine."""
+def machine(managers: Collection[int] = ()) -> list[Finding]:
+    """Look at this machine. ``managers`` are ports of its own at which a manager was found."""
     installed = {name for names in NEEDED.values() for name in names if importlib.util.find_spec(name)}
-    free = {name: _is_free(port) for name, port in PORTS.items()}
+    free_ports = {name: _is_free(port) for name, port in PORTS.items()}
     return [
         python(sys.version_info[:2], platform.system(), platform.machine()),
         *parts(installed),
-        *(port(name, PORTS[name], free=is_free) for name, is_free in free.items()),
+        *(
+            port(name, PORTS[name], free=free, ours=PORTS[name] in managers)
+            for name, free in free_ports.items()
+        ),
         memory(_free_memory_mb()),
         disk(Path.home(), shutil.disk_usage(Path.home()).free / MEGABYTE),
     ]
@@ -71,11 +74,13 @@ def parts(installed: Collection[str]) -> list[Finding]:
     return findings
 
 
-def port(name: str, number: int, *, free: bool) -> Finding:
-    """A port of loopback that a manager takes by default."""
+def port(name: str, number: int, *, free: bool, ours: bool = False) -> Finding:
+    """A port of loopback that a manager takes by default; ``ours`` if one answers there."""
     if free:
         return Finding(name, Level.FINE, f"{number} is free")
-    remedy = "it is a manager's, or another program's: a second manager takes --port and --http-port"
+    if ours:
+        return Finding(name, Level.FINE, f"{number} is this machine's manager's")
+    remedy = "no manager answers there that doctor could speak to: a manager takes others by --port and --http-port"
     return Finding(name, Level.NOTE, f"{number} is taken", remedy)
 
 

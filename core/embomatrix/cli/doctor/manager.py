@@ -10,7 +10,7 @@ import ssl
 import time
 from dataclasses import dataclass, field
 from email.utils import parsedate_to_datetime
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from embomatrix.cli.doctor.findings import Finding, Level
 from embomatrix.proto.v1 import rollout_service_pb2_grpc
@@ -20,12 +20,16 @@ from embomatrix.rpc.channel import open_channel
 from embomatrix.rpc.status import ClusterError, NotAllowedError, PreconditionError
 from embomatrix.rpc.versions import SPOKEN, agree, software_version
 
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
 KNOCK_S: Final = 1.0
 """Limit for each of the questions, of which there are four: a doctor is quick."""
 CERTIFICATE_DAYS: Final = 30
 """`manager init` renews a certificate with less than this left."""
 CLOCK_S: Final = 60.0
 DAY_S: Final = 86400.0
+LOOPBACK: Final = ("127.0.0.1", "localhost", "::1")
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +51,11 @@ class Visit:
     def port(self) -> int:
         return int(self.address.rpartition(":")[2])
 
+    @property
+    def is_here(self) -> bool:
+        """On this machine's loopback interface."""
+        return self.host in LOOPBACK
+
 
 async def manager(visit: Visit) -> list[Finding]:
     """Knock, and go on for as long as there is an answer."""
@@ -63,6 +72,13 @@ async def manager(visit: Visit) -> list[Finding]:
     if offset_s is not None:
         findings.append(clock(offset_s))
     return findings
+
+
+def ports_held(visit: Visit, findings: Sequence[Finding]) -> frozenset[int]:
+    """Ports of this machine that the manager was found to serve at."""
+    well = {finding.thing for finding in findings if finding.level is not Level.WRONG}
+    served = {"versions": visit.port, "clock": visit.page_port}
+    return frozenset(port for thing, port in served.items() if visit.is_here and thing in well)
 
 
 def certificate(days_left: float) -> Finding:
