@@ -107,6 +107,17 @@ def test_a_run_leaves_report_metrics_samples_and_the_newest_checkpoints(tmp_path
     assert told.peak_mb > 50, "torch alone takes more"
 
 
+def test_a_step_that_ends_after_the_minutes_do_leaves_no_more_than_all_of_them_spent(tmp_path):
+    told = []
+
+    class Listener(LineDisplay):
+        def stepped(self, record, share, rollouts_per_s):
+            told.append(share)
+
+    run(tmp_path, display=Listener(Console(quiet=True)), grpo__steps=None, grpo__minutes=1e-6)
+    assert told == [1.0]
+
+
 def test_the_window_of_every_step_is_announced_with_the_steps_ahead(tmp_path):
     cluster = SymbolicCluster(TASKS)
     run(tmp_path, cluster, grpo__lookahead=2)

@@ -190,11 +190,11 @@ class TrainingRun:
         return np.random.default_rng(np.random.SeedSequence((self._settings.seed, 2, step)))
 
     def _share(self) -> float:
-        """Share of the GRPO budget that is spent."""
+        """Share of the GRPO budget that is spent; the last step may end after the minutes do."""
         settings = self._settings.grpo
         if settings.steps is not None:
             return self._progress.step / settings.steps if settings.steps else 1.0
-        return self._progress.grpo_s / (60 * settings.minutes) if settings.minutes else 1.0
+        return min(1.0, self._progress.grpo_s / (60 * settings.minutes)) if settings.minutes else 1.0
 
     def _rate_factor(self, share: float) -> float:
         """Of the learning rate: a linear rise over the warm-up, then a linear fall with the budget."""
