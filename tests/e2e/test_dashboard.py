@@ -116,7 +116,7 @@ async def test_pages_of_tasks_show_a_gallery_and_the_oracle_s_plan_on_the_plan_v
         one = await asyncio.to_thread(shown, browser, chosen, tmp_path)
         none = await asyncio.to_thread(shown, browser, f"{at.status_url}#tasks?nothing", tmp_path)
     every = len(dataset.records)
-    assert page.words["total"] == f"1 to {every} of {every} tasks, 1 scenes"
+    assert page.words["total"] == f"1 to {every} of {every} tasks, 1 scene"
     assert record.task.instruction in page.words["cards"]
     assert page.classes.count("card") == every
     assert page.classes.count("floor") > 0

@@ -71,6 +71,7 @@ class FakeWorker:
     lies: bool = False
     """It says that plans reached nothing of their goal."""
     resumed: bool = False
+    labels: dict = field(default_factory=dict)
 
     async def __aenter__(self):
         self._channel = self.through(open_channel(self.address, self.token, self.ca))
@@ -84,7 +85,9 @@ class FakeWorker:
                 boot_id=self.boot_id,
                 protocol_version=self.protocol,
                 join_token=self.join_token,
-                resources=resources_to_proto(Resources(self.slots, self.slots, self.memory_mb)),
+                resources=resources_to_proto(
+                    Resources(self.slots, self.slots, self.memory_mb, labels=self.labels)
+                ),
             ),
             timeout=5,
         )

@@ -61,10 +61,10 @@ def _of_work(seen: Overview, working: int, now_s: float) -> Health:
     if recent:
         # The meter keeps no more of them.
         count = f"{len(recent)} or more" if len(recent) == FAILURES_KEPT else f"{len(recent)}"
-        were = "rollout was" if len(recent) == 1 else "rollouts were"
+        were, of = ("rollout was", "") if len(recent) == 1 else ("rollouts were", "the last ")
         return Health(
             Mood.WARNING,
-            f"{count} {were} given up in the last {RECENT_S / 60:.0f} minutes, the last for {recent[0].code}.",
+            f"{count} {were} given up in the last {RECENT_S / 60:.0f} minutes, {of}for {recent[0].code}.",
         )
     if stuck := seen.unplaceable:
         what = "1 announced scene" if stuck == 1 else f"{stuck} announced scenes"

@@ -65,7 +65,10 @@ LONGEST_S: Final = 3600.0
 Offset = Annotated[int, Query(ge=0, description="Rows to leave out.")]
 Limit = Annotated[int, Query(ge=1, le=LARGEST_PAGE, description="Rows at most.")]
 State = Annotated[str, Query(max_length=32, description="Only workers in this state.", examples=["ready"])]
-Search = Annotated[str, Query(max_length=64, description="Only workers with this in their name.")]
+Search = Annotated[
+    str,
+    Query(max_length=64, description="Only workers with this in their name; in lists, or in a label."),
+]
 Run = Annotated[str, Query(max_length=256, description="A run's id; empty: the log of workers and scenes.")]
 After = Annotated[int, Query(ge=0, description="Only events beyond this sequence.")]
 Seconds = Annotated[float, Query(gt=0, le=LONGEST_S, description="How far back to look.")]
@@ -186,10 +189,11 @@ def _logs(router: APIRouter, runtime: ManagerRuntime) -> None:
         return JSONResponse({**told, "failures": [_event(event) for event in summary.failures]})
 
     @router.get("/runs/{run_id}/timeline", response_model=Timeline)
-    async def tracks(run_id: str, seconds: Seconds = 60.0) -> Response:
-        """What each slot did in the last seconds of a run."""
+    async def tracks(run_id: str, seconds: Seconds = 60.0, search: Search = "") -> Response:
+        """What each slot did in the last seconds of a run, on workers with the text in their name."""
         with answered():
-            return _json(timeline(run_id, await history.latest(run_id, seconds), seconds=seconds))
+            latest = await history.latest(run_id, seconds)
+            return _json(timeline(run_id, latest, seconds=seconds, search=search))
 
     @router.get("/events")
     async def events(run: Run = "", after: After = 0) -> Response:

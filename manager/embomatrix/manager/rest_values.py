@@ -81,12 +81,16 @@ class SlotTrack:
 
 @dataclass(frozen=True, slots=True)
 class Timeline:
-    """What each slot did between two moments, by the event log. ``dropped`` events made room for later ones."""
+    """What each slot did between two moments, by the event log. ``dropped`` events made room for later ones.
+
+    ``slots`` is how many did anything, of which the tracks are the first.
+    """
 
     run_id: str
     from_s: float
     until_s: float
     dropped: int
+    slots: int
     tracks: list[SlotTrack]
 
 
@@ -101,11 +105,9 @@ class Changed:
 def worker_page(
     seen: "Snapshot", *, state: str = "", search: str = "", offset: int = 0, limit: int = PAGE
 ) -> WorkerPage:
-    """Those in the state, or with the text in their name; who doesn't work comes first."""
+    """Those in the state, or with the text in their name or a label; who doesn't work comes first."""
     found = [
-        worker
-        for worker in seen.workers
-        if state in ("", worker.state) and search.lower() in worker.worker_id.lower()
+        worker for worker in seen.workers if state in ("", worker.state) and search.lower() in _words(worker)
     ]
     found.sort(key=_urgency)
     return WorkerPage(seen.at_s, len(found), offset, found[offset : offset + limit])
@@ -115,6 +117,11 @@ def run_page(seen: "Snapshot", *, offset: int = 0, limit: int = PAGE) -> RunPage
     """Open runs, the one opened last first."""
     newest: Sequence[RunView] = seen.runs[::-1]
     return RunPage(seen.at_s, len(newest), offset, list(newest[offset : offset + limit]))
+
+
+def _words(worker: WorkerView) -> str:
+    """What a search looks in."""
+    return " ".join([worker.worker_id, *(f"{name}={value}" for name, value in worker.labels.items())]).lower()
 
 
 def _urgency(worker: WorkerView) -> tuple[int, str]:

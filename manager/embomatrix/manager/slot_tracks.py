@@ -15,17 +15,17 @@ TRACKS: Final = 200
 """More slots than a person can look at; the first of them by name."""
 
 
-def timeline(run_id: str, page: EventPage, *, seconds: float) -> Timeline:
-    """The last so many seconds before the latest event of the page."""
+def timeline(run_id: str, page: EventPage, *, seconds: float, search: str = "") -> Timeline:
+    """The last so many seconds before the latest event of the page, of workers with the text in their name."""
     until_s = max((event.at_s for event in page.events), default=0.0)
     from_s = until_s - seconds
     tracks = [
         SlotTrack(key.worker_id, key.slot, [_span(span) for span in spans if span.end_s >= from_s])
         for key, spans in slot_spans(page.events).items()
+        if search.lower() in key.worker_id.lower()
     ]
-    return Timeline(
-        run_id, from_s, until_s, page.dropped, [track for track in tracks if track.spans][:TRACKS]
-    )
+    busy = [track for track in tracks if track.spans]
+    return Timeline(run_id, from_s, until_s, page.dropped, len(busy), busy[:TRACKS])
 
 
 def _span(span: Span) -> SlotSpan:

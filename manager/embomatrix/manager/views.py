@@ -79,6 +79,8 @@ class WorkerView:
     loads: list[str]
     audited: int = 0
     audit_mismatches: int = 0
+    labels: dict[str, str] = field(default_factory=dict)
+    """As its owner calls it, in the order of their names."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,4 +248,5 @@ def _worker(runtime: ManagerRuntime, worker_id: str) -> WorkerView:
         silent_s=time.monotonic() - session.last_seen_s,
         residents=list(residents),
         loads=[scene for scene in scheduler.desired(worker_id) if scene not in here],
+        labels=dict(sorted(session.resources.labels.items())),
     )

@@ -5,7 +5,7 @@ from dataclasses import replace
 from embomatrix.manager.health import Mood, health
 from embomatrix.manager.meter import FAILURES_KEPT, FailureNote
 from embomatrix.manager.rest_values import run_page, worker_page
-from embomatrix.manager.slot_tracks import timeline
+from embomatrix.manager.slot_tracks import TRACKS, timeline
 from embomatrix.manager.snapshot import Snapshot
 from embomatrix.manager.views import Overview, RunView, WorkerView
 from embomatrix.rpc.run_log import EventKind, EventPage, RunEvent
@@ -61,9 +61,7 @@ def test_health_says_first_what_matters_most():
 
 
 def test_failures_are_news_for_five_minutes():
-    assert (
-        mood(failures=[NOTE])[1] == "1 rollout was given up in the last 5 minutes, the last for slot_crashed."
-    )
+    assert mood(failures=[NOTE])[1] == "1 rollout was given up in the last 5 minutes, for slot_crashed."
     assert mood(failures=[NOTE] * FAILURES_KEPT)[1].startswith(f"{FAILURES_KEPT} or more rollouts")
     assert mood(failures=[NOTE], now_s=2000.0) == (Mood.GOOD, "All is well.")
 
@@ -100,6 +98,9 @@ def test_pages_of_a_list_hold_every_row_once_and_trouble_comes_first():
 def test_a_page_is_of_those_that_were_asked_for():
     assert [row.worker_id for row in worker_page(SEEN, state="lost").items] == ["Zoe"]
     assert worker_page(SEEN, search="W000", limit=3).total == 10
+    attic = replace(SEEN.workers[0], worker_id="by-label", labels={"room": "Attic"})
+    labelled = replace(SEEN, workers=[*SEEN.workers, attic])
+    assert [row.worker_id for row in worker_page(labelled, search="room=attic").items] == ["by-label"]
     beyond = worker_page(SEEN, offset=5000)
     assert (beyond.total, beyond.items) == (1002, [])
 
@@ -123,3 +124,18 @@ def test_the_timeline_shows_the_last_seconds_of_each_slot():
     first = track.spans[0]
     assert (first.begin_s, first.end_s, first.load_s, first.deliver_s) == (98.5, 99.0, 0.25, 0.125)
     assert timeline("r1", EventPage((), 0), seconds=5.0).tracks == []
+
+
+def test_the_timeline_tells_how_many_slots_did_anything_and_shows_those_of_one_worker():
+    def done(number):
+        timings = Timings(execute_s=0.5)
+        worker = f"desk-{number:03}"
+        return RunEvent(
+            number, 100.0, EventKind.COMPLETED, "r1", "b", f"x{number}", worker, "", 1, timings=timings
+        )
+
+    page = EventPage(tuple(map(done, range(TRACKS + 30))), 0)
+    told = timeline("r1", page, seconds=5.0)
+    assert (told.slots, len(told.tracks)) == (TRACKS + 30, TRACKS)
+    of_one = timeline("r1", page, seconds=5.0, search="Desk-21")
+    assert [track.worker_id for track in of_one.tracks] == [f"desk-21{digit}" for digit in range(10)]

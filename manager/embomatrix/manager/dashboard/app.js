@@ -1,6 +1,6 @@
 // The dashboard: one snapshot a second feeds whichever page is shown.
 import {ask} from "./ask.js";
-import {at, seconds} from "./dom.js";
+import {at, clock, seconds} from "./dom.js";
 import {learn} from "./names.js";
 
 // A page's code comes when it is opened, and the first snapshot with it: nobody waits for what isn't shown.
@@ -11,7 +11,7 @@ const PAGES = {
 const REFRESH_MS = 1000;
 /** Rows of workers that the page shows at once; the others show none. */
 const ROWS = {workers: 50};
-let page = null;
+let page = null, told_s = 0;
 let waiting = 0;
 let opened = 0;
 
@@ -52,11 +52,13 @@ async function refresh(first = null) {
       say(told);
       await page.show(told);
       at("dot").className = "dot ready";
+      at("main").classList.remove("old");
       learn(); // what is shown first waits for no names
     }
   } catch (error) {
     at("dot").className = "dot lost";
     tell(error.name === "TimeoutError" || error instanceof TypeError ? "the manager does not answer; trying again" : error.message);
+    age();
   }
   clearTimeout(waiting);
   // A page that nobody sees asks for nothing.
@@ -69,7 +71,17 @@ function tell(words, up = "") {
   if (at("states").textContent !== words) at("states").textContent = words;
 }
 
+/** What stands there is no longer so: it says from when it is. */
+function age() {
+  if (!told_s) return;
+  at("main").classList.add("old");
+  at("health").className = "health bad";
+  const words = `What stands here is of ${clock(told_s)}: the manager has told nothing since.`;
+  if (at("health").textContent !== words) at("health").textContent = words;
+}
+
 function say(told) {
+  told_s = told.at_s;
   const states = Object.entries(told.overview.workers).map(([state, n]) => `${n} ${state}`).join(", ") || "no workers";
   tell(states, `up ${seconds(told.overview.uptime_s)} · `);
   at("health").hidden = false;

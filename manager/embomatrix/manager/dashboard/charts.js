@@ -10,6 +10,8 @@ await Promise.all([
 const DASHES = [[], [6, 3], [2, 2], [9, 3, 2, 3], [1, 4]];
 /** Steps and seconds are whole numbers. */
 const WHOLE = [1, 2, 5].flatMap(n => [0, 1, 2, 3, 4, 5, 6].map(power => n * 10 ** power)).sort((a, b) => a - b);
+/** What is smaller is nothing: the difference of two sums. */
+const LEAST = 1e-6;
 const TINTS = ["c1", "c2", "c3", "c4", "c5"];
 
 function latest(drawn) {
@@ -25,7 +27,7 @@ export function chart(place, lines, {high = 190, words, fill = false, legend = t
     // One value makes no line.
     points: {show: (drawn, number) => drawn.data[number].filter(value => value !== null && value !== undefined).length === 1, size: 6},
     stroke: () => colour(TINTS[i % TINTS.length]), ...(fill ? {fill: () => `${colour(TINTS[i])}22`} : {}),
-    value: (_, value) => value === null || value === undefined ? "–" : signed(Number(value.toPrecision(3))),
+    value: (_, value) => value === null || value === undefined ? "–" : signed(Math.abs(value) < LEAST ? 0 : Number(value.toPrecision(3))),
   }));
   const range = (_, low, top) => {
     const least = Math.min(0, low ?? 0), most = top > least ? top : least + 1;

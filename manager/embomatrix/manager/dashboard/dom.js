@@ -23,8 +23,15 @@ export function shape(tag, attributes = {}, ...children) {
 export const at = id => document.getElementById(id);
 export const brief = digest => digest.replace(/^sha256:/, "").slice(0, 8);
 export const count = number => Number(number).toLocaleString("en");
-export const share = (part, all) => all ? `${Math.round(100 * part / all)} %` : "–";
-export const clock = seconds => new Date(seconds * 1000).toLocaleTimeString();
+/** A number and its unit never part at the end of a line. */
+const unit = (number, of) => `${number}\u00a0${of}`;
+export const share = (part, all) => all ? unit(Math.round(100 * part / all), "%") : "–";
+export const counted = (number, thing) => `${count(number)} ${thing}${number === 1 ? "" : "s"}`;
+/** A time of today; of another day with its date. */
+export function clock(seconds) {
+  const moment = new Date(seconds * 1000), today = moment.toDateString() === new Date().toDateString();
+  return today ? moment.toLocaleTimeString() : moment.toLocaleString([], {month: "short", day: "numeric", hour: "2-digit", minute: "2-digit"});
+}
 /** With a true minus: a hyphen would stand for a dash. */
 export const signed = text => String(text).replace("-", "\u2212");
 export const splitWords = split => split === "heldout" ? "held out" : split;
@@ -33,9 +40,10 @@ export const colour = name => getComputedStyle(document.documentElement).getProp
 
 export function seconds(s) {
   if (s === 0) return "–";
-  if (s < 1) return `${Math.round(s * 1000)} ms`;
-  if (s < 120) return `${s.toFixed(s < 10 ? 1 : 0)} s`;
-  return s < 7200 ? `${Math.round(s / 60)} min` : `${(s / 3600).toFixed(1)} h`;
+  if (s < 1) return unit((s * 1000).toFixed(s < 0.01 ? 1 : 0), "ms");
+  if (s < 120) return unit(s.toFixed(s < 10 ? 1 : 0), "s");
+  if (s < 7200) return unit(Math.round(s / 60), "min");
+  return s < 172800 ? unit((s / 3600).toFixed(1), "h") : unit(Math.round(s / 86400), "days");
 }
 
 /** How full something is. */

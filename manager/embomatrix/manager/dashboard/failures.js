@@ -1,7 +1,7 @@
 // What the infrastructure lost: reason, worker, scene, attempt, and the worker's own words.
 import {ask} from "./ask.js";
 import {at, clock, count, h, none, put, table} from "./dom.js";
-import {named} from "./names.js";
+import {named, worded} from "./names.js";
 
 const BAD = ["failed", "worker_lost", "scene_failed"];
 const KEPT = 200;
@@ -23,12 +23,12 @@ export async function show({overview, runs}) {
   if (looks++ % LOOK_EVERY === 0) lost = await look(runs);
   put(at("reasons"), tally("reason", given.map(note => note.code), lost.map(event => event.code || event.kind)));
   put(at("blamed"), tally("worker", given.map(note => note.worker_id || "none"), lost.map(event => event.worker_id || "none")));
-  const rows = given.map(note => h("tr", {}, h("td", {class: "muted fit"}, clock(note.at_s)), h("td", {class: "fit"}, h("code", {class: "bad"}, note.code)), h("td", {class: "named"}, note.worker_id), h("td", {class: "named"}, note.rollout_id), h("td", {class: "message"}, note.message)));
+  const rows = given.map(note => h("tr", {}, h("td", {class: "muted fit"}, clock(note.at_s)), h("td", {class: "fit"}, h("code", {class: "bad"}, note.code)), h("td", {class: "named"}, note.worker_id), h("td", {class: "named"}, note.rollout_id), h("td", {class: "message"}, worded(note.message))));
   put(at("failures"), rows.length ? table(["when", "reason", "worker", "rollout", "what it said"], rows, "failures", "loose") : none("None. Lost rollouts are executed again before they count as failed."));
   const every = fold(lost);
   const folded = every.slice(0, ROWS).map(({event, times}) =>
     h("tr", {}, h("td", {class: "muted fit"}, clock(event.at_s)), h("td", {class: "fit"}, h("code", {class: "bad"}, event.code || event.kind), times > 1 && ` × ${count(times)}`), h("td", {class: "named"}, event.worker_id),
-      h("td", {class: "named"}, event.bundle_digest && h("code", {title: event.bundle_digest}, named(event.bundle_digest))), h("td", {class: "fit n", "data-name": event.attempt ? "attempt" : false}, event.attempt || ""), h("td", {class: "message"}, event.message || "")));
+      h("td", {class: "named"}, event.bundle_digest && h("code", {title: event.bundle_digest}, named(event.bundle_digest))), h("td", {class: "fit n", "data-name": event.attempt ? "attempt" : false}, event.attempt || ""), h("td", {class: "message"}, worded(event.message ?? ""))));
   put(at("attempts"), folded.length ? table(["latest", "reason", "worker", "scene", ["attempt", "n"], "what it said"], folded, "attempts that failed", "loose") : none("None."),
     every.length > ROWS ? none(`${count(every.length - ROWS)} more of the latest ${count(KEPT)}; all of them: embomatrix cluster events`) : "");
 }

@@ -1,45 +1,82 @@
-// Coming steps by scenes: how far each scene is, and who holds it.
-import {at, count, h, none, put} from "./dom.js";
-import {named} from "./names.js";
+// Coming steps by scenes: how far each scene is, and who holds it. A cell that somebody points at, taps or walks to says so in words.
+import {at, counted, h, none, put} from "./dom.js";
+import {named, worded} from "./names.js";
 
 const STEPS = 24;
 const COLUMNS = 60;
 const KINDS = [["warm", "warm"], ["warming", "warming"], ["queued", "cold"], ["unplaceable", "no worker can hold it"]];
+const WORDS = Object.fromEntries(KINDS);
 const SWATCH = {warm: "warm", warming: "warming", queued: "queued", unplaceable: "bad"};
 
+const HINT = "Each cell: rollouts, and ×2 where two workers hold the scene. Point at one, or walk there by Tab and the arrows, to see which.";
+const MOVES = {ArrowLeft: [0, -1], ArrowRight: [0, 1], ArrowUp: [-1, 0], ArrowDown: [1, 0]};
+let chosen = "", told = {};
+
 export function open(main) {
+  chosen = "";
   const legend = KINDS.map(([kind, word]) => [h("i", {style: `background:var(--${SWATCH[kind]})`}), word]);
   main.replaceChildren(
-    h("section", {}, h("h2", {}, "What coming steps need ", h("small", {id: "sum"}), h("span", {class: "legend"}, legend)), h("div", {id: "ahead"})));
+    h("section", {}, h("h2", {}, "What coming steps need ", h("small", {id: "sum"}), h("span", {class: "legend"}, legend)), h("p", {id: "cell", class: "muted", role: "status"}), h("div", {id: "ahead"})));
+  at("ahead").addEventListener("keydown", walk);
+  for (const kind of ["pointerover", "click", "focusin"]) at("ahead").addEventListener(kind, choose);
 }
 
 export function show({lookahead, runs}) {
   const cells = lookahead.flatMap(step => step.cells), warm = cells.filter(cell => cell.warmth === "warm").length;
-  at("sum").textContent = cells.length ? `${warm} of ${cells.length} scenes are warm` : "";
+  at("sum").textContent = cells.length ? `${warm} of ${counted(cells.length, "cell")} warm` : "";
   const names = Object.fromEntries(runs.map(run => [run.run_id, run.name || run.run_id]));
   const byRun = Map.groupBy ? Map.groupBy(lookahead, step => step.run_id) : new Map([["", lookahead]]);
-  const parts = [...byRun].map(([run, steps]) => [h("h3", {}, names[run] ?? run), grid(steps), problems(steps)]);
+  told = {};
+  const parts = [...byRun].map(([run, steps]) => [h("h3", {}, names[run] ?? run), grid(run, steps), problems(steps)]);
   put(at("ahead"), parts.length && lookahead.length ? parts : none("Nothing announced. A trainer announces the scenes of its coming steps."));
+  say(lookahead.length > 0);
+}
+
+function choose(event) {
+  const key = event.target.dataset?.key;
+  if (!key) return;
+  chosen = key;
+  say(true);
+}
+
+function say(any) {
+  const words = any ? told[chosen] ?? HINT : "";
+  if (at("cell").textContent !== words) at("cell").textContent = words;
+}
+
+/** The arrows go from cell to cell; Tab enters a grid once. */
+function walk(event) {
+  const place = event.target.closest("td"), move = MOVES[event.key];
+  if (!place || !move) return;
+  event.preventDefault();
+  const rows = [...place.closest("tbody").rows], [down, right] = move;
+  let row = rows.indexOf(place.parentNode), column = place.cellIndex;
+  do { row += down; column += right; } while (rows[row]?.cells[column] && !rows[row].cells[column].querySelector("button"));
+  rows[row]?.cells[column]?.querySelector("button")?.focus();
 }
 
 function problems(steps) {
   const told = new Map(steps.flatMap(step => step.cells.filter(cell => cell.problem).map(cell => [cell.bundle_digest, cell.problem])));
-  return [...told].map(([scene, problem]) => h("p", {class: "bad message"}, h("code", {}, named(scene)), ` ${problem.replace(`scene ${scene} `, "")}`));
+  return [...told].map(([scene, problem]) => h("p", {class: "bad message"}, h("code", {}, named(scene)), ` ${worded(problem.replace(`scene ${scene} `, ""))}`));
 }
 
-function grid(steps) {
-  const scenes = [...new Set(steps.flatMap(step => step.cells.map(cell => cell.bundle_digest)))].slice(0, COLUMNS);
+function grid(run, steps) {
+  const every = [...new Set(steps.flatMap(step => step.cells.map(cell => cell.bundle_digest)))], scenes = every.slice(0, COLUMNS);
+  const left = [[steps.length - STEPS, "later step"], [every.length - COLUMNS, "more scene"]].filter(([n]) => n > 0).map(([n, thing]) => counted(n, thing));
+  let entry = 0;
   const rows = steps.slice(0, STEPS).map(step => {
     const of = Object.fromEntries(step.cells.map(cell => [cell.bundle_digest, cell]));
-    return h("tr", {}, h("th", {scope: "row"}, `step ${step.step}`), scenes.map(scene => h("td", {}, of[scene] && box(of[scene]))));
+    return h("tr", {}, h("th", {scope: "row"}, `step ${step.step}`), scenes.map(scene => h("td", {}, of[scene] && box(`${run} ${step.step} ${scene}`, of[scene], step.step, entry++ > 0))));
   });
   const heads = scenes.map(scene => h("th", {scope: "col", title: scene}, h("span", {}, named(scene))));
   return h("div", {class: "scroll", tabindex: "0", role: "region", "aria-label": "steps by scenes"},
-    h("table", {class: "grid"}, h("thead", {}, h("tr", {}, h("td"), heads)), h("tbody", {}, rows)));
+    h("table", {class: "grid"}, h("thead", {}, h("tr", {}, h("td"), heads)), h("tbody", {}, rows)),
+    left.length > 0 && none(`Not shown: ${left.join(", ")}.`));
 }
 
-function box(cell) {
+function box(key, cell, step, inner) {
   const held = cell.worker_ids.length ? `on ${cell.worker_ids.join(", ")}` : "on no worker";
-  const words = `${named(cell.bundle_digest)}: ${count(cell.count)} rollouts, ${cell.warmth}, ${held}`;
-  return h("span", {class: `cell ${cell.warmth}`, title: words, "aria-label": words}, `${cell.count}${cell.worker_ids.length > 1 ? ` ×${cell.worker_ids.length}` : ""}`);
+  told[key] = `Step ${step}, ${named(cell.bundle_digest)}: ${counted(cell.count, "rollout")}, ${WORDS[cell.warmth]}, ${held}`;
+  return h("button", {type: "button", class: `cell ${cell.warmth}`, "data-key": key, "aria-label": told[key], title: told[key], tabindex: inner && "-1"},
+    `${cell.count}${cell.worker_ids.length > 1 ? `\u00a0×${cell.worker_ids.length}` : ""}`);
 }

@@ -6,6 +6,8 @@ const AGAIN_MS = 60_000, MOST = 1000;
 let known = {}, due = 0;
 
 export const named = digest => known[digest] ?? brief(digest);
+/** A sentence of a worker's or the manager's, with scenes by their names. */
+export const worded = text => text.replace(/sha256:[0-9a-f]{64}/g, named);
 
 /** Ask for names, and again now and then: a dataset may grow. */
 export async function learn() {

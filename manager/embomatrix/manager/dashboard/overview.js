@@ -3,7 +3,7 @@ import {chart} from "./charts.js";
 import {at, count, h, none, put, seconds, share, signed, table} from "./dom.js";
 
 const TILES = [
-  ["rate", "Throughput", "rollouts/s, mean of 10 s"], ["p50", "Latency", ""], ["hits", "Prewarm hits", ""],
+  ["rate", "Throughput", "rollouts/s, mean of 10\u00a0s"], ["p50", "Latency", ""], ["hits", "Prewarm hits", ""],
   ["slots", "Slots busy", ""], ["overhead", "Overhead", "the manager's share of CPU time"], ["bad", "Failures", ""],
 ];
 const PHASES = {queue: "waits for a lease", lease: "on the way, and behind another", load: "its scene is loaded", execute: "its plan is executed", deliver: "into the log"};
@@ -30,7 +30,7 @@ export function show({overview: o, runs}) {
   const failed = Object.entries(o.outcomes).filter(([name]) => name !== "completed" && name !== "cancelled").reduce((sum, [, n]) => sum + n, 0);
   const told = {
     rate: mean >= 100 ? count(Math.round(mean)) : mean.toFixed(1), p50: seconds(o.latency_p50_s), p50note: `median; 95 % within ${seconds(o.latency_p95_s)}`,
-    overhead: o.overhead ? `${(100 * o.overhead).toFixed(o.overhead < 0.1 ? 1 : 0)} %` : "–",
+    overhead: o.overhead ? `${(100 * o.overhead).toFixed(o.overhead < 0.1 ? 1 : 0)}\u00a0%` : "–",
     hits: share(o.prewarm_hits, o.prewarm_hits + o.prewarm_misses), hitsnote: `lead ${seconds(o.prewarm_lead_s)}, ${count(o.prewarm_wasted)} wasted`,
     slots: `${o.slots_busy}/${o.slots}`, slotsnote: `${count(o.queued)} rollouts waiting`,
     bad: count(failed), badnote: `${count(o.redispatched)} given again, ${count(o.stale_results)} late`,
@@ -38,7 +38,8 @@ export function show({overview: o, runs}) {
   };
   for (const [id, text] of Object.entries(told)) at(id).textContent = text;
   at("bad").className = failed ? "bad" : "";
-  drawn.draw(o.throughput.map((_, i) => i - o.throughput.length + 1), [o.throughput]);
+  const ago = o.throughput.map((_, i) => i - o.throughput.length + 1);
+  drawn.draw(ago, [o.throughput.map((done, i) => -ago[i] > o.uptime_s ? null : done)]);
   put(at("runs"), runs.length ? table(["run", ["done", "n"], ["open", "n"], ["warm", "n"], ["failed", "n"]], runs.slice(-8).reverse().map(run), "open runs") : none("No open runs."));
   put(at("phases"), phases(o.phases));
   const rows = Object.entries(o.outcomes).sort((a, b) => b[1] - a[1]).map(([name, n]) => h("tr", {}, h("td", {}, h("code", {}, name)), h("td", {class: "n"}, count(n))));
@@ -50,7 +51,7 @@ function phases(told) {
   if (!all) return none("Nothing has been executed yet.");
   const rows = Object.entries(told).map(([name, one]) => h("tr", {}, h("td", {class: "fit"}, name, h("span", {class: "muted wideonly"}, ` ${PHASES[name] ?? ""}`)),
     h("td", {}, h("span", {class: "share", style: `width:${(100 * one.sum_s / all).toFixed(1)}%`})), h("td", {class: "n fit"}, share(one.sum_s, all)),
-    h("td", {class: "n fit"}, seconds(one.p50_s)), h("td", {class: "n fit"}, seconds(one.p95_s)), h("td", {class: "n fit"}, seconds(one.p99_s))));
+    [one.p50_s, one.p95_s, one.p99_s].map(s => h("td", {class: "n fit"}, s ? seconds(s) : "0\u00a0ms"))));
   return table(["phase", "", ["share", "n"], ["median", "n"], ["95 %", "n"], ["99 %", "n"]], rows, "latency by phase");
 }
 

@@ -1,6 +1,7 @@
 // A scene from above, north up, and what a plan does in it.
-import {shape} from "./dom.js";
+import {h, shape} from "./dom.js";
 
+const KEY = [["robot", "robot"], ["way", "its way"], ["goal", "the goal is about it"], ["thing", "other small things"], ["held", "held"], ["active", "open or on"]];
 const MARGIN_M = 0.3, UNIT = 100, ROBOT_M = 0.22, DOT_M = 0.09;
 
 /** A picture of the rooms named, or of all. `about` are names that the goal is about, `things` small ones with their places. */
@@ -22,14 +23,17 @@ export function drawn(floor, {rooms, about = new Set(), things = {}, label: word
   const robot = shape("circle", {class: "robot", r: ROBOT_M * UNIT}, shape("title", {}, "robot")), way = shape("polyline", {class: "way"});
   const dots = Object.fromEntries(Object.keys(things).map(name => [name, shape("circle", {class: about.has(name) ? "thing goal" : "thing", r: DOT_M * UNIT}, shape("title", {}, name))]));
   const names = new Set(Object.keys(things)), large = Math.round(Math.max(x(east), y(south)) / 45);
-  const picture = shape("svg", {class: "floor", viewBox: `0 0 ${x(east)} ${y(south)}`, role: "img", "aria-label": words},
+  const picture = shape("svg", {class: "floor", style: `--wide:${(x(east) / y(south)).toFixed(3)}`, viewBox: `0 0 ${x(east)} ${y(south)}`, role: "img", "aria-label": words},
     seen.map(room => box("room", room)), floor.pieces.filter(piece => within(piece) && !names.has(piece[0])).map(piece => box(about.has(piece[0]) ? "piece goal" : "piece", piece)),
     floor.walls.filter(within).map(wall => box("wall", wall)),
     rooms ? seen.map(room => label(room)) : [],
     rooms ? [way, robot, ...Object.values(dots)] : []);
+  const key = rooms ? h("p", {class: "legend"}, KEY.map(([mark, words]) => [h("i", {class: `key ${mark}`}), words])) : null;
   const put = (mark, [east_m, north_m]) => { mark.setAttribute("cx", x(east_m)); mark.setAttribute("cy", y(north_m)); };
   return {
     picture,
+    /** What its marks mean. */
+    key,
     /** The plan up to that moment. */
     show(moments, number) {
       const moment = moments[number];

@@ -22,7 +22,7 @@ export async function open(place, task_id) {
   place.replaceChildren(
     h("section", {}, h("h2", {}, h("a", {href: "#tasks"}, "All tasks"), h("small", {}, card.task_id)), h("p", {class: "instruction"}, card.instruction),
       h("dl", {class: "facts"}, facts.filter(([, value]) => value).map(([name, value]) => h("div", {}, h("dt", {}, name), h("dd", {}, value))))),
-    h("section", {class: "most"}, h("h2", {}, "The oracle's plan ", h("small", {}, "things are drawn where a call puts them, not at their verified poses")), view.picture,
+    h("section", {class: "most"}, h("h2", {}, "The oracle's plan ", h("small", {}, "things are drawn where a call puts them, not at their verified poses")), view.picture, view.key,
       h("div", {class: "bar"}, button("first", "Start", () => { close(); go(0); }), button("back", "Back", () => { close(); go(number - 1); }), button("play", "Play", play), button("next", "Next", () => { close(); go(number + 1); }),
         h("span", {id: "said", role: "status"}))),
     h("section", {class: "third"}, h("h2", {}, "Steps ", h("small", {}, told.problem)), h("ol", {class: "calls", start: "0", onkeydown: key}, steps)),

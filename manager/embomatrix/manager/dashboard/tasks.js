@@ -1,6 +1,6 @@
 // The dataset's tasks: a gallery with pictures of their scenes, and one of them.
 import {Refused, ask, picture} from "./ask.js";
-import {at, count, h, none, put, splitWords} from "./dom.js";
+import {at, count, counted, h, none, put, splitWords} from "./dom.js";
 import {drawn} from "./plan.js";
 import * as task from "./task.js";
 
@@ -50,7 +50,7 @@ async function turn(changes) {
 function list(page) {
   ({total} = page);
   const last = page.offset + page.items.length;
-  at("total").textContent = total ? `${count(page.offset + 1)} to ${count(last)} of ${count(total)} tasks, ${count(page.scenes.length)} scenes` : "";
+  at("total").textContent = total ? `${count(page.offset + 1)} to ${count(last)} of ${counted(total, "task")}, ${counted(page.scenes.length, "scene")}` : "";
   at("before").disabled = page.offset === 0;
   at("after").disabled = last >= total;
   choices("scene", "every scene", page.scenes.map(one => [one.scene_id, `${one.scene_id} (${count(one.tasks)})`]));

@@ -1,12 +1,12 @@
 // What each slot did: load, execute, deliver, idle; zoom to one rollout.
 import {ask} from "./ask.js";
-import {at, colour, h, none, put, seconds, signed} from "./dom.js";
+import {at, colour, count, h, none, put, seconds, signed} from "./dom.js";
 import {named} from "./names.js";
 
-const ROW = 20, LEFT = 150, HEAD = 22, GRIP = 5, LEAST_PX = 1, LEAST_S = 0.1;
+const ROW = 20, NAMES = 150, NAMES_SHARE = 0.28, TYPING_MS = 250, HEAD = 22, GRIP = 5, LEAST_PX = 1, LEAST_S = 0.1;
 const SPANS = [10, 60, 300, 1800];
 const KINDS = [["execute", "warm"], ["load", "warming"], ["deliver", "queued"], ["failed", "bad"], ["idle", "chip"]];
-let run = "", told = null, view = null, live = true, span = 60, painted = [], grabbed = null;
+let run = "", told = null, view = null, live = true, span = 60, painted = [], grabbed = null, edge = NAMES, search = "", typed = 0;
 
 export function open(main) {
   run = decodeURIComponent(location.hash.split("?")[1] ?? "");
@@ -16,6 +16,7 @@ export function open(main) {
     h("h2", {}, "Slots ", h("small", {id: "range"}), h("span", {class: "legend"}, legend)),
     h("div", {class: "bar"},
       h("select", {id: "run", "aria-label": "run", onchange: event => { run = event.target.value; told = view = null; live = true; dispatchEvent(new Event("embomatrix-changed")); }}),
+      h("input", {type: "search", placeholder: "worker", "aria-label": "search by worker", value: search, oninput: event => { clearTimeout(typed); typed = setTimeout(() => { search = event.target.value; follow(); }, TYPING_MS); }}),
       h("select", {"aria-label": "how far back", onchange: event => { span = Number(event.target.value); live = true; view = null; dispatchEvent(new Event("embomatrix-changed")); }}, SPANS.map(s => h("option", {value: s, selected: s === span}, `last ${seconds(s)}`))),
       h("button", {type: "button", onclick: () => zoom(0.5, live ? 1 : 0.5)}, "Zoom in"), h("button", {type: "button", onclick: () => zoom(2, live ? 1 : 0.5)}, "Zoom out"),
       h("button", {type: "button", onclick: () => pan(-0.25)}, "Earlier"), h("button", {type: "button", onclick: () => pan(0.25)}, "Later"),
@@ -30,7 +31,7 @@ export async function show({runs}) {
   put(at("run"), (known.includes(run) || !run ? known : [run, ...known]).map(id => h("option", {value: id, selected: id === run}, runs.find(r => r.run_id === id)?.name || id)));
   if (!run) { put(at("tracks"), none("No open run. A closed one: embomatrix cluster report RUN")); return; }
   if (!live && told) return;
-  told = await ask(`runs/${encodeURIComponent(run)}/timeline?seconds=${span}`);
+  told = await ask(`runs/${encodeURIComponent(run)}/timeline?${new URLSearchParams({seconds: span, search})}`);
   if (live) {
     const first = Math.min(...told.tracks.flatMap(track => track.spans.map(one => one.begin_s - one.load_s)));
     view = {from: Math.min(told.until_s - LEAST_S, Math.max(told.until_s - span, first)), until: told.until_s};
@@ -41,25 +42,27 @@ export async function show({runs}) {
 function draw() {
   const place = at("tracks");
   if (!place || !told) return;
-  if (!told.tracks.length) { put(place, none("Nothing was executed in this time.")); at("one").textContent = ""; return; }
-  if (!at("one").textContent) at("one").textContent = "Point at a span, or zoom in: by the buttons, or plus, minus and the arrows. Escape follows again.";
+  if (!told.tracks.length) { put(place, none(search ? "No worker of that name executed anything in this time." : "Nothing was executed in this time.")); at("one").textContent = ""; return; }
+  if (!at("one").textContent) at("one").textContent = "Point at a span, or zoom in: by the buttons, or by plus, minus and the arrows. Escape follows the latest again.";
   let canvas = place.querySelector("canvas");
   if (!canvas) {
     canvas = h("canvas", {class: "gantt", tabindex: "0", role: "img", onwheel: wheel, onpointermove: point, onpointerdown: grab, ondblclick: nearer, onkeydown: key});
     place.replaceChildren(canvas);
   }
-  const wide = place.clientWidth, high = HEAD + told.tracks.length * ROW, dense = devicePixelRatio || 1;
+  const wide = place.clientWidth;
+  edge = Math.min(NAMES, Math.round(wide * NAMES_SHARE));
+  const high = HEAD + told.tracks.length * ROW, dense = devicePixelRatio || 1;
   canvas.width = wide * dense; canvas.height = high * dense; canvas.style.height = `${high}px`;
   canvas.setAttribute("aria-label", `${told.tracks.length} slots, ${told.tracks.reduce((sum, track) => sum + track.spans.length, 0)} rollouts`);
   const pen = canvas.getContext("2d");
   pen.scale(dense, dense);
   const tint = Object.fromEntries(["ink", "soft", "line", "chip", "warm", "warming", "queued", "bad"].map(name => [name, colour(name)]));
-  const x = at_s => LEFT + (at_s - view.from) / (view.until - view.from) * (wide - LEFT);
+  const x = at_s => edge + (at_s - view.from) / (view.until - view.from) * (wide - edge);
   scale(pen, tint, x, wide, high);
   painted = [];
   told.tracks.forEach((track, number) => {
     const top = HEAD + number * ROW;
-    pen.fillStyle = tint.chip; pen.fillRect(LEFT, top + 2, wide - LEFT, ROW - 4);
+    pen.fillStyle = tint.chip; pen.fillRect(edge, top + 2, wide - edge, ROW - 4);
     for (const one of track.spans) {
       if (one.end_s + one.deliver_s < view.from || one.begin_s - one.load_s > view.until) continue;
       const failed = one.outcome !== "completed";
@@ -68,13 +71,14 @@ function draw() {
       bar(pen, x, one.begin_s, one.end_s, top, failed ? tint.bad : tint.warm, true);
       painted.push({left: x(one.begin_s - one.load_s), right: Math.max(x(one.end_s + one.deliver_s), x(one.begin_s) + GRIP), top, one, track});
     }
-    pen.fillStyle = tint.soft; pen.fillText(`${short(track.worker_id)} ${track.slot}`, 0, top + ROW / 2 + 4, LEFT - 8);
+    pen.fillStyle = tint.soft; pen.fillText(`${short(pen, track.worker_id, edge - 28)} ${track.slot}`, 0, top + ROW / 2 + 4, edge - 8);
   });
-  at("range").textContent = `${seconds(view.until - view.from)}${told.dropped ? `; ${told.dropped} older events were dropped` : ""}`;
+  const more = told.slots > told.tracks.length ? `; the first ${count(told.tracks.length)} of ${count(told.slots)} slots` : "";
+  at("range").textContent = `${seconds(view.until - view.from)} shown${more}${told.dropped ? `; ${told.dropped} older events were dropped` : ""}`;
 }
 
 function bar(pen, x, begin, end, top, fill, always) {
-  const left = Math.max(LEFT, x(begin)), wide = x(end) - left;
+  const left = Math.max(edge, x(begin)), wide = x(end) - left;
   if (wide <= 0 && !always) return;
   pen.fillStyle = fill;
   // A hair's breadth between neighbours, where there is room for it.
@@ -82,12 +86,13 @@ function bar(pen, x, begin, end, top, fill, always) {
 }
 
 function scale(pen, tint, x, wide, high) {
-  const rough = (view.until - view.from) / Math.max(2, (wide - LEFT) / 110), power = 10 ** Math.floor(Math.log10(rough));
+  const rough = (view.until - view.from) / Math.max(2, (wide - edge) / 110), power = 10 ** Math.floor(Math.log10(rough));
   const step = [1, 2, 5, 10].map(n => n * power).find(n => n >= rough);
   pen.font = "11px system-ui"; pen.strokeStyle = tint.line;
   for (let tick = Math.ceil((view.from - told.until_s) / step) * step; tick <= view.until - told.until_s + 1e-9; tick += step) {
     const left = x(told.until_s + tick);
-    pen.fillStyle = tint.soft; pen.fillText(Math.abs(tick) < step / 2 ? "now" : signed(`${Number(tick.toPrecision(6))} s`), left + 3, 13);
+    const words = Math.abs(tick) < step / 2 ? "now" : signed(`${Number(tick.toPrecision(6))} s`), space = pen.measureText(words).width + 3;
+    pen.fillStyle = tint.soft; pen.fillText(words, left + space > wide ? left - space : left + 3, 13);
     pen.beginPath(); pen.moveTo(left, 0); pen.lineTo(left, high); pen.stroke();
   }
 }
@@ -99,7 +104,13 @@ function follow() {
   dispatchEvent(new Event("embomatrix-changed"));
 }
 
-const short = name => name.length > 20 ? `${name.slice(0, 9)}…${name.slice(-9)}` : name;
+/** A worker's name as far as there is room for it: both its ends, which tell it from others. */
+function short(pen, name, room) {
+  if (pen.measureText(name).width <= room) return name;
+  let kept = Math.floor(name.length / 2);
+  while (kept > 1 && pen.measureText(`${name.slice(0, kept)}…${name.slice(-kept)}`).width > room) kept -= 1;
+  return `${name.slice(0, kept)}…${name.slice(-kept)}`;
+}
 
 function zoom(factor, middle = 0.5) {
   if (!view) return;
@@ -121,7 +132,7 @@ function wheel(event) {
   if (!event.ctrlKey && !event.shiftKey) return;
   event.preventDefault();
   const box = event.target.getBoundingClientRect();
-  zoom(event.deltaY > 0 ? 1.25 : 0.8, Math.min(1, Math.max(0, (event.clientX - box.left - LEFT) / (box.width - LEFT))));
+  zoom(event.deltaY > 0 ? 1.25 : 0.8, Math.min(1, Math.max(0, (event.clientX - box.left - edge) / (box.width - edge))));
 }
 
 function key(event) {
@@ -138,7 +149,7 @@ function point(event) {
   const found = hit(event);
   if (found) at("one").textContent = describe(found);
   if (event.buttons && grabbed !== null) {
-    const wide = event.target.getBoundingClientRect().width - LEFT;
+    const wide = event.target.getBoundingClientRect().width - edge;
     pan((grabbed - event.clientX) / wide);
     grabbed = event.clientX;
   }

@@ -57,7 +57,7 @@ function draw({run: view, phases, plans, plans_step}) {
   for (const section of at("main").querySelectorAll("section[hidden]")) section.hidden = false;
   const named = Object.fromEntries(phases.map(phase => [phase.phase, phase]));
   const grpo = named.grpo ?? {steps: [], figures: {}};
-  at("when").textContent = `${view.phase}, step ${count(view.step)}, told at ${clock(view.reported_s)}`;
+  at("when").textContent = `${view.phase.replace("grpo", "GRPO")}, step ${count(view.step)}, told at ${clock(view.reported_s)}`;
   tiles(grpo);
   for (const [id, , , names, prefix] of CHARTS) {
     const phase = id === "loss" ? named.imitation : grpo;

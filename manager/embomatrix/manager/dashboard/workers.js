@@ -1,9 +1,9 @@
 // Every worker: what it holds, what it does, and why it doesn't; drain and resume for who may.
 import {Refused, change} from "./ask.js";
 import {at, count, gauge, h, none, put, seconds, table} from "./dom.js";
-import {named} from "./names.js";
+import {named, worded} from "./names.js";
 
-const ROWS = 50;
+const ROWS = 50, CHIPS = 6;
 const STATES = ["", "ready", "paused", "draining", "suspect", "lost", "quarantined"];
 const wish = {state: "", search: "", offset: 0, limit: ROWS};
 
@@ -16,7 +16,7 @@ export function open(main) {
   main.replaceChildren(h("section", {},
     h("h2", {}, "Workers ", h("small", {id: "total"})),
     h("div", {class: "bar"},
-      h("input", {type: "search", placeholder: "name", "aria-label": "search by name", value: wish.search, oninput: event => ask({search: event.target.value})}),
+      h("input", {type: "search", placeholder: "name or label", "aria-label": "search by name or label", value: wish.search, oninput: event => ask({search: event.target.value})}),
       h("select", {"aria-label": "state", onchange: event => ask({state: event.target.value})}, options),
       h("button", {id: "before", type: "button", onclick: () => ask({offset: Math.max(0, wish.offset - ROWS)})}, "Before"),
       h("button", {id: "after", type: "button", onclick: () => ask({offset: wish.offset + ROWS})}, "After"),
@@ -40,16 +40,16 @@ export function show({workers, paused}) {
 
 function row(w) {
   const used = w.residents.reduce((sum, r) => sum + r.memory_mb, 0);
-  const away = w.state === "draining";
+  const away = w.state === "draining", labels = Object.entries(w.labels).map(([name, value]) => `${name} ${value}`);
   return h("tr", {},
-    h("td", {class: "named"}, w.worker_id, w.gpu && h("span", {class: "muted"}, ` ${w.gpu}`)),
+    h("td", {class: "named"}, w.worker_id, w.gpu && h("span", {class: "muted"}, ` ${w.gpu}`), labels.length > 0 && h("div", {class: "muted labels"}, labels.join(", "))),
     h("td", {class: w.reason ? "why" : "fit"}, h("span", {class: `dot ${w.state}`}), w.state, w.reason && h("span", {class: "muted"}, ` ${w.reason}`)),
     h("td", {class: "fit"}, slots(w)),
-    h("td", {}, scenes(w)),
+    h("td", {"data-name": w.residents.length || w.loads.length ? false : "scenes"}, scenes(w)),
     h("td", {class: "wideonly"}, gauge(used, w.memory_mb, `${count(Math.round(used))} of ${count(w.memory_mb)} MB`)),
     h("td", {class: "n", "data-name": "completed"}, count(w.completed)), h("td", {class: "n wideonly"}, w.cores),
     h("td", {class: "n muted wideonly"}, w.silent_s < 5 ? "now" : `${seconds(Math.round(w.silent_s))} ago`),
-    h("td", {class: "fit"}, w.state !== "lost" && h("button", {class: "small", type: "button", "data-path": `workers/${encodeURIComponent(w.worker_id)}/${away ? "resume" : "drain"}`, "aria-label": `${away ? "resume" : "drain"} ${w.worker_id}`}, away ? "Resume" : "Drain")));
+    h("td", {class: "fit act"}, w.state !== "lost" && h("button", {class: "small", type: "button", "data-path": `workers/${encodeURIComponent(w.worker_id)}/${away ? "resume" : "drain"}`, "aria-label": `${away ? "resume" : "drain"} ${w.worker_id}`}, away ? "Resume" : "Drain")));
 }
 
 function slots(w) {
@@ -63,13 +63,13 @@ function scenes(w) {
   for (const r of w.residents) states[r.state] = (states[r.state] || 0) + 1;
   if (w.loads.length) states["on the way"] = w.loads.length;
   const chips = [
-    ...w.residents.map(r => h("span", {class: `chip ${r.state}`, title: r.error ? `${r.bundle_digest}: ${r.error}` : r.bundle_digest}, `${named(r.bundle_digest)}${r.load_s ? ` ${seconds(r.load_s)}` : ""}`)),
+    ...w.residents.map(r => h("span", {class: `chip ${r.state}`, title: r.error ? `${r.bundle_digest}: ${r.error}` : `${r.bundle_digest}, loaded in ${seconds(r.load_s)}`}, `${named(r.bundle_digest)}${r.load_s ? ` ${seconds(r.load_s)}` : ""}`)),
     ...w.loads.map(digest => h("span", {class: "chip", title: digest}, named(digest))),
   ];
   if (!chips.length) return h("span", {class: "muted"}, "none");
   const told = Object.entries(states).map(([state, n]) => `${n} ${state}`).join(", ");
   const broken = w.residents.find(r => r.error);
-  return [`${told} `, chips.slice(0, 6), chips.length > 6 && "…", broken && h("div", {class: "bad message"}, broken.error)];
+  return [`${told} `, chips.slice(0, CHIPS), chips.length > CHIPS && h("span", {class: "muted wideonly"}, `and ${count(chips.length - CHIPS)} more`), broken && h("div", {class: "bad message"}, worded(broken.error))];
 }
 
 function ask(changes) {
