@@ -99,7 +99,7 @@ class LeaseRecord:
     expires_s: float
     limit_s: float
     charged_s: float = 0.0
-    """Slot time that its run was charged in advance."""
+    """What its run was charged in advance: slot time over weight."""
     started_s: float | None = None
     """When a slot became free for it, as the manager reckons: the first leases of a worker run, the others wait behind."""
     steps: int = -1

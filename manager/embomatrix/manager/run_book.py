@@ -2,7 +2,8 @@
 
 Slot time is shared by start-time fair queueing (Goyal, Vin and Cheng 1996): a run's *turn* grows by the slot time that its
 leases take, divided by its weight, and whoever is behind goes first. A run that had nothing waiting begins where the others
-are, so that it is neither punished nor paid for having been idle.
+are, so that it is neither punished nor paid for having been idle. Where they are tells what they have paid for: what leases
+that live are charged in advance is a guess, and may be many times too much.
 """
 
 from __future__ import annotations
@@ -61,6 +62,13 @@ class RunRecord:
     counters: RunCounters = field(default_factory=RunCounters)
     submitted: int = 0
     turn_s: float = 0.0
+    ahead_s: float = 0.0
+    """Of its turn, what leases that live were charged in advance."""
+
+    @property
+    def paid_s(self) -> float:
+        """Its turn, as far as it is known what that took."""
+        return self.turn_s - self.ahead_s
 
 
 class RunBook:
@@ -73,7 +81,7 @@ class RunBook:
         self._known_after = known_after
         self._runs: dict[str, RunRecord] = {}
         self._served_s: dict[int, float] = {}
-        """By priority: the turn at which a lease was given last."""
+        """By priority: what the runs that were given leases had paid by then, the most of it."""
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._runs)
@@ -112,13 +120,15 @@ class RunBook:
         """The run has one lease more: it is charged what one takes as a rule, and the rest when it ends."""
         run = self.of(lease.record.key.run_id)
         served_s = self._served_s.get(run.terms.priority, 0.0)
-        self._served_s[run.terms.priority] = max(served_s, run.turn_s)
-        lease.charged_s = run.times.mean_s
-        run.turn_s += lease.charged_s / run.terms.weight
+        self._served_s[run.terms.priority] = max(served_s, run.paid_s)
+        lease.charged_s = run.times.mean_s / run.terms.weight
+        run.turn_s += lease.charged_s
+        run.ahead_s += lease.charged_s
 
     def settle(self, lease: LeaseRecord, now_s: float) -> None:
         """The lease is over: the run pays for the slot time that it took, whatever became of it."""
         run = self._runs.get(lease.record.key.run_id)
         if run is not None:
             took_s = 0.0 if lease.started_s is None else now_s - lease.started_s
-            run.turn_s += (took_s - lease.charged_s) / run.terms.weight
+            run.turn_s += took_s / run.terms.weight - lease.charged_s
+            run.ahead_s -= lease.charged_s

@@ -356,6 +356,21 @@ def test_a_late_run_gets_the_next_free_slot_beside_a_large_batch(desk):
     assert "small.0.0" in desk.held
 
 
+@pytest.mark.parametrize(("weight", "share"), [(1.0, 0.5), (3.0, 0.25)])
+def test_a_run_that_comes_when_nobody_knows_how_short_rollouts_are_has_its_share_at_once(desk, weight, share):
+    desk.worker("w1")
+    desk.submit(1, run_id="before", batch_id="before")
+    # From here on the worker is given many leases ahead, and each run's are charged as if they took a second.
+    desk.finish("before.0.0", after_s=0.001)
+    desk.tell(RunOpened("first", RunTerms(weight=weight)))
+    desk.submit(800, run_id="first", batch_id="first")
+    desk.submit(800, run_id="second", batch_id="second")
+    for _ in range(600):
+        desk.finish(next(name for name, leases in desk.held.items() if leases), after_s=0.001)
+    done = [name.partition(".")[0] for name in desk.results]
+    assert done.count("second") / len(done) == pytest.approx(share, abs=0.05)
+
+
 @given(
     st.lists(st.tuples(st.sampled_from("abc"), st.integers(0, 2), st.floats(1.0, 9.0)), max_size=30),
     st.fixed_dictionaries({run: st.sampled_from([0.5, 1.0, 4.0]) for run in "abc"}),
