@@ -25,6 +25,7 @@ from embomatrix.manager.settings import ManagerSettings
 from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.roles import Role
 from embomatrix.rpc.status import (
+    NotFoundError,
     NotSignedInError,
     PreconditionError,
     StandbyError,
@@ -53,6 +54,18 @@ async def test_a_revoked_worker_ends_at_once_and_its_rollouts_go_elsewhere(tmp_p
         assert caught.value.code() is grpc.StatusCode.UNAUTHENTICATED
         assert "its results were wrong" in caught.value.details()
     assert all(isinstance(result.outcome, Completed) for result in results)
+
+
+async def test_a_name_that_nobody_knows_is_not_revoked_and_those_that_are_there_are_named(tmp_path):
+    async with guarded(tmp_path) as at, await joined(at, "office") as spare, at.operator() as operator:
+        with pytest.raises(NotFoundError, match=r"no worker 'offcie'.*connected are office;"):
+            await operator.revoke_worker("offcie", "its results were wrong")
+        await spare.kill()
+        # One that is away and has a credential can be kept from coming back.
+        await operator.revoke_worker("office", "sold")
+        with pytest.raises(grpc.aio.AioRpcError) as caught:
+            await worker(at, "office", token=spare.token).__aenter__()
+        assert "sold" in caught.value.details()
 
 
 async def test_a_worker_whose_token_is_revoked_ends_as_well(tmp_path):
@@ -105,7 +118,7 @@ async def test_tokens_and_credentials_outlive_the_manager_and_what_was_revoked_s
 async def test_who_takes_a_cluster_over_knows_its_tokens(tmp_path):
     """Two managers on one Redis: what the first handed out and took back holds at the second, which stood by with TLS too."""
     with RedisServer(tmp_path / "redis", free_port()) as redis:
-        options = {"state": redis.url, "leader_ttl_s": 1.0}
+        options = {"state": redis.url, "leader_ttl_s": 4.0}
         standby = free_port()
         over = asyncio.Event()
 

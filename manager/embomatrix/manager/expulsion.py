@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from embomatrix.rpc.status import NotSignedInError
+from embomatrix.manager.registry import listed
+from embomatrix.rpc.status import NotFoundError, NotSignedInError
 
 if TYPE_CHECKING:
     from embomatrix.manager.access.gate import Gate
@@ -19,7 +20,16 @@ class Expulsion:
         self._gate = gate
 
     async def revoke_worker(self, worker_id: str, reason: str) -> None:
-        """Its credential is void, its name barred until it joins anew, and its session ends."""
+        """Its credential is void, its name barred until it joins anew, and its session ends.
+
+        Raises NotFoundError for a name that nobody knows: what was mistyped would go on working.
+        """
+        registry = self._sessions.registry
+        if not self._gate.knows_worker(worker_id) and worker_id not in registry.sessions:
+            raise NotFoundError(
+                f"there is no worker {worker_id!r}, so none was revoked: connected are {listed(registry.present)}; "
+                "`embomatrix manager token list` shows whose credentials there are"
+            )
         await self._gate.revoke_worker(worker_id, reason)
         self._end(worker_id, reason)
 

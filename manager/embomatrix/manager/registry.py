@@ -8,7 +8,7 @@ import secrets
 from collections import OrderedDict
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.events import (
     Event,
@@ -23,9 +23,13 @@ from embomatrix.rpc.status import NotFoundError, SupersededError, UnknownSession
 from embomatrix.rpc.versions import PROTOCOL_VERSION
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterable, Mapping
 
     from embomatrix.rpc.values import Resources
+
+
+LISTED: Final = 10
+"""Names that a sentence takes."""
 
 
 class Standing(StrEnum):
@@ -255,8 +259,7 @@ class Registry:
     def _there(self, worker_id: str) -> Session:
         session = self._sessions.get(worker_id)
         if session is None or session.standing is Standing.LOST:
-            known = ", ".join(sorted(self._sessions)) or "none"
-            raise NotFoundError(f"there is no worker {worker_id!r}: connected are {known}")
+            raise NotFoundError(f"there is no worker {worker_id!r}: connected are {listed(self.present)}")
         return session
 
     def _note(self, session: Session, now_s: float) -> None:
@@ -285,3 +288,10 @@ class Registry:
         self._detached.pop(session.worker_id, None)
         self._lost[session.worker_id] = session
         return WorkerLost(session.worker_id, reason)
+
+
+def listed(worker_ids: Iterable[str]) -> str:
+    """The names in a sentence; of very many the first, and how many more there are."""
+    names = sorted(worker_ids)
+    more = f" and {len(names) - LISTED} more" if len(names) > LISTED else ""
+    return (", ".join(names[:LISTED]) or "none") + more

@@ -12,6 +12,7 @@ from pydantic import ValidationError
 from rich.console import Console
 
 from embomatrix.rpc.channel import DEFAULT_ADDRESS
+from embomatrix.worker.preferences import Preferences
 from embomatrix.worker.settings import WorkerSettings
 
 if TYPE_CHECKING:
@@ -53,6 +54,10 @@ def parse(values: dict[str, Any]) -> WorkerSettings:
     except ValidationError as error:
         first = error.errors()[0]
         name = str(first["loc"][-1])
+        if first["type"] == "extra_forbidden":
+            fields = Preferences if first["loc"][0] == "preferences" else WorkerSettings
+            key, known = ".".join(map(str, first["loc"])), ", ".join(sorted(fields.model_fields))
+            fail(f"--config: {key} is no setting: expected one of {known}")
         if name in {"token", "join"}:
             # What was found stays untold: it may be nearly the secret.
             fail(f"--{name}: expected visible ASCII characters without spaces")

@@ -217,6 +217,10 @@ class CredentialBook:
             return tuple(replace(c, revoked=reason) for c in own)
         return (Credential(self._make_id(), Role.WORKER, _NOTHING, worker_id=worker_id, revoked=reason),)
 
+    def knows_worker(self, worker_id: str) -> bool:
+        """Whether a credential belongs to this name, be it void."""
+        return worker_id in self._of_worker
+
     def infos(self, *, now_s: float) -> tuple[TokenInfo, ...]:
         """The tokens that are valid: not expired, not revoked, and not used up."""
         return tuple(

@@ -171,6 +171,11 @@ class Gate:
             await self._keep(self._book.revoke(token_id, "by the operator"))
         logger.info("token revoked token=%s", token_id)
 
+    def knows_worker(self, worker_id: str) -> bool:
+        """Whether a credential was ever given to a worker of this name, or the name is barred."""
+        self._need_guard()
+        return self._book.knows_worker(worker_id)
+
     async def revoke_worker(self, worker_id: str, reason: str) -> None:
         self._need_guard()
         async with self._lock:
