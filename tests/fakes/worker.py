@@ -64,6 +64,8 @@ class FakeWorker:
     executed: list = field(default_factory=list)
     desired: tuple = ()
     leases: dict = field(default_factory=dict)
+    portions: list = field(default_factory=list)
+    """How many leases came in each message that brought some."""
     acknowledged: list = field(default_factory=list)
     cancelled: list = field(default_factory=list)
     residents: dict = field(default_factory=dict)
@@ -98,8 +100,8 @@ class FakeWorker:
             self._channel = open_channel(self.address, self.token, self.ca)
             self._stub = worker_service_pb2_grpc.WorkerServiceStub(self._channel)
         self._send(state=self._state())
-        self._start(self._talk())
-        self._start(self._beat(answer.heartbeat_interval_s))
+        self._start(self._talk)
+        self._start(self._beat, answer.heartbeat_interval_s)
         return self
 
     async def __aexit__(self, *_):
@@ -116,19 +118,26 @@ class FakeWorker:
         """Send a result, whatever became of its lease."""
         self._send(results=[LeaseResult(ref, outcome)])
 
+    def finish_all(self):
+        """Send a result of each lease it holds, in one message; returns how many."""
+        held, self.leases = self.leases, {}
+        if held:
+            self._send(results=[LeaseResult(lease.ref, completed(self.worker_id)) for lease in held.values()])
+        return len(held)
+
     def pause(self, reason):
         """Take nothing new from now on, or again with an empty reason."""
         self.paused = reason
         self._send(state=self._state())
 
-    def _start(self, coroutine):
-        task = asyncio.create_task(self._until_the_manager_goes(coroutine))
+    def _start(self, work, *given):
+        task = asyncio.create_task(self._until_the_manager_goes(work, *given))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
-    async def _until_the_manager_goes(self, coroutine):
+    async def _until_the_manager_goes(self, work, *given):
         with contextlib.suppress(grpc.aio.AioRpcError):
-            await coroutine
+            await work(*given)
 
     def _state(self):
         held = tuple(lease.ref for lease in self.leases.values())
@@ -151,10 +160,12 @@ class FakeWorker:
             if response.HasField("desired"):
                 self._want(tuple(response.desired.bundle_digests))
             self.resumed = self.resumed or response.resume
+            if response.leases:
+                self.portions.append(len(response.leases))
             for message in response.leases:
                 lease = lease_from_proto(message)
                 self.leases[lease.ref.lease_id] = lease
-                self._start(self._execute(lease))
+                self._start(self._execute, lease)
             self.acknowledged += map(lease_ref_from_proto, response.acknowledged)
             for message in response.cancelled:
                 self.cancelled.append(lease_ref_from_proto(message))
@@ -167,7 +178,7 @@ class FakeWorker:
         for digest in digests:
             if digest not in self.residents:
                 self.residents[digest] = Resident(digest, ResidentState.LOADING, 0.0, self.scene_mb)
-                self._start(self._load(digest))
+                self._start(self._load, digest)
         self._send(state=self._state())
 
     async def _load(self, digest):

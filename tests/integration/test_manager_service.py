@@ -100,6 +100,27 @@ async def test_every_rollout_of_a_batch_comes_back_with_its_reward(tmp_path):
         assert (stats.delivered, stats.infra_failures, stats.cold_starts) == (100, 0, 100)
 
 
+async def test_a_message_with_many_results_holds_up_no_leases(tmp_path):
+    async with (
+        manager(tmp_path) as at,
+        open_run(at.address) as client,
+        FakeWorker(at.address, slots=4, stuck={"t"}) as worker,
+    ):
+        execution = asyncio.create_task(outcomes(client, batch(1000)))
+        await until(lambda: len(worker.leases) == 8)
+        worker.finish_all()  # so fast a worker is given many leases ahead
+        await until(lambda: len(worker.leases) >= 200)
+        worker.portions.clear()
+        finished = worker.finish_all()
+        await until(lambda: sum(worker.portions) >= finished)
+        # What the first of the results freed is given away before the last of them is heard.
+        assert max(worker.portions) < finished / 2
+        while not execution.done():
+            worker.finish_all()
+            await asyncio.sleep(0.01)
+        assert len(execution.result()) == 1000
+
+
 async def test_an_announced_scene_is_warm_before_its_batch_comes(tmp_path):
     async with manager(tmp_path) as at, open_run(at.address) as client, FakeWorker(at.address) as worker:
         first = await client.announce_lookahead("r1", 1, [LookaheadEntry(1, KITCHEN, 8)])

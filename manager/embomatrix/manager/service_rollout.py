@@ -137,10 +137,9 @@ async def _batch(request: pb.ExecuteRequest) -> Batch:
     """The batch of a request. A large one takes longer than workers may wait: others have their turn meanwhile."""
     rollouts: list[Rollout] = []
     for start in range(0, len(request.rollouts), SLICE):
-        if start:
-            await asyncio.sleep(0)
         part = request.rollouts[start : start + SLICE]
         rollouts += each("rollouts", rollout_from_proto, part, first=start)
+        await asyncio.sleep(0)
     return batch_with(request, tuple(rollouts))
 
 

@@ -37,13 +37,16 @@ if TYPE_CHECKING:
     from embomatrix.manager.access.gate import Gate
     from embomatrix.manager.links import Outbox, WorkerLink
     from embomatrix.manager.runtime import ManagerRuntime
-    from embomatrix.rpc.leases import Lease
+    from embomatrix.rpc.leases import Lease, LeaseResult
 
 FIRST_STATE_S: Final = 10.0
 """A session stream must begin with the worker's state within this time."""
 SESSION_SHOWN: Final = 6
 """Letters of an id in log lines: whoever knows all of a session's could speak for its worker."""
 LEASES_PER_MESSAGE: Final = 256
+RESULTS_AT_ONCE: Final = 32
+"""A message's results are heard in slices, and what a slice freed is given away before the next: hearing one takes 0.1 ms, and
+a message that carries hundreds would hold up the leases of every worker."""
 _WORKER_ID: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._:@-]{0,127}")
 
 
@@ -93,7 +96,7 @@ class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
             bind("worker", session.worker_id)
             bind("session", session.session_id[:SESSION_SHOWN])
             with self._runtime.attached(session) as link:
-                self._take(link, first, resync=True)
+                await self._take(link, first, resync=True)
                 await _until_one_ends(self._listen(link, request_iterator), _speak(link, context))
 
     async def Heartbeat(
@@ -138,12 +141,19 @@ class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
 
     async def _listen(self, link: WorkerLink, requests: AsyncIterator[pb.SessionRequest]) -> None:
         async for request in requests:
-            self._take(link, request, resync=False)
+            await self._take(link, request, resync=False)
 
-    def _take(self, link: WorkerLink, request: pb.SessionRequest, *, resync: bool) -> None:
+    async def _take(self, link: WorkerLink, request: pb.SessionRequest, *, resync: bool) -> None:
         state = inside("state", worker_state_from_proto, request.state) if request.HasField("state") else None
-        results = each("results", lease_result_from_proto, request.results)
-        self._runtime.take_report(link, state, results, resync=resync)
+        self._runtime.take_report(link, state, _results(request, 0), resync=resync)
+        for first in range(RESULTS_AT_ONCE, len(request.results), RESULTS_AT_ONCE):
+            await asyncio.sleep(0)  # what was given meanwhile is sent, and others are heard
+            self._runtime.take_report(link, None, _results(request, first), resync=False)
+
+
+def _results(request: pb.SessionRequest, first: int) -> tuple[LeaseResult, ...]:
+    part = request.results[first : first + RESULTS_AT_ONCE]
+    return each("results", lease_result_from_proto, part, first=first)
 
 
 async def _speak(link: WorkerLink, context: grpc.aio.ServicerContext) -> None:
