@@ -82,7 +82,7 @@ async def test_a_daemon_joins_once_and_shows_its_credential_from_then_on(tmp_pat
             await serving
             # It said that it leaves: nobody waits for the minute after which it would be missed.
             async with asyncio.timeout(20):
-                while [w.state for w in await viewer.list_workers()] != ["lost"]:  # noqa: ASYNC110
+                while [w.state for w in await viewer.list_workers()] != ["left"]:  # noqa: ASYNC110
                     await asyncio.sleep(0.05)
     [kept] = (tmp_path / "pc" / "state").glob("member-*.json")
     assert stat.S_IMODE(kept.stat().st_mode) == 0o600

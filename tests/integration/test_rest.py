@@ -104,7 +104,7 @@ async def test_an_operator_steers_by_rest_as_by_grpc(tmp_path):
         assert len(await waiting) == 2
         assert (await http.post(f"{PREFIX}/workers/w1/drain")).json()["state"] == "draining"
         first = (await http.get(f"{PREFIX}/workers")).json()["items"][0]
-        assert (first["worker_id"], first["state"] in ("draining", "lost")) == ("w1", True)
+        assert (first["worker_id"], first["state"] in ("draining", "left")) == ("w1", True)
         unknown = await http.post(f"{PREFIX}/workers/nobody/drain")
         assert (unknown.status_code, "nobody" in unknown.json()["detail"]) == (404, True)
         assert (await http.post(f"{PREFIX}/workers/w2/revoke", json={})).status_code == 422

@@ -79,7 +79,7 @@ async def test_it_executes_through_a_death_of_the_manager_and_leaves_when_it_is_
             cluster.signal("w1", signal.SIGTERM)
             assert await asyncio.to_thread(cluster.processes["w1"].wait, 20) == 0, cluster.log("w1")
             (gone,) = await client.list_workers()
-            assert (gone.state, gone.reason) == ("lost", "it left")
+            assert (gone.state, gone.reason) == ("left", "it left")
         counted = tally(batch, results, reward=0.5)
         tell("a worker in JavaScript", counted, redispatched=run.stats.redispatched)
         assert counted.clean

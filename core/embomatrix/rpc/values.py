@@ -331,7 +331,7 @@ class Resident:
 
 @dataclass(frozen=True, slots=True)
 class WorkerInfo:
-    """A worker as the manager sees it. ``state`` is "ready", "paused", "suspect", "lost", "draining" or "quarantined"."""
+    """A worker as the manager sees it. ``state`` is "ready", "paused", "suspect", "lost", "draining", "quarantined", "left"."""
 
     worker_id: str
     state: str

@@ -41,18 +41,26 @@ def health(seen: Overview, *, paused: bool, now_s: float) -> Health:
     working = seen.workers.get("ready", 0) + seen.workers.get("suspect", 0)
     if paused:
         return Health(Mood.WARNING, "Dispatch is paused: nothing new is executed until somebody resumes it.")
-    if not seen.workers:
-        return Health(Mood.IDLE, "No worker has joined yet.")
+    # Who left in order is nobody's trouble, unless nobody else is there.
+    every = sum(seen.workers.values()) - seen.workers.get("left", 0)
+    if not every:
+        return _deserted(seen)
     if not working:
-        return Health(Mood.BAD, f"None of {sum(seen.workers.values())} workers works.")
+        return Health(Mood.BAD, f"None of {every} workers works.")
     if lost := seen.workers.get("quarantined", 0):
         return Health(Mood.BAD, f"{_workers(lost)} in quarantine: results did not agree with others'.")
-    every, gone = sum(seen.workers.values()), seen.workers.get("lost", 0)
+    gone = seen.workers.get("lost", 0)
     if gone >= FEWEST and gone > MANY * every:
         return Health(
             Mood.BAD, f"{gone} of {every} workers were lost a moment ago; what they held went to others."
         )
     return _of_work(seen, working, now_s)
+
+
+def _deserted(seen: Overview) -> Health:
+    if seen.queued:
+        return Health(Mood.BAD, f"{seen.queued} rollouts wait, and no worker is there.")
+    return Health(Mood.IDLE, "Every worker has left." if seen.workers else "No worker has joined yet.")
 
 
 def _of_work(seen: Overview, working: int, now_s: float) -> Health:

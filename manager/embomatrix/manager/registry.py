@@ -41,6 +41,12 @@ class Standing(StrEnum):
     DRAINING = "draining"
     PAUSED = "paused"
     QUARANTINED = "quarantined"
+    LEFT = "left"
+
+    @property
+    def is_gone(self) -> bool:
+        """It was here, and nothing is to be had of it any more."""
+        return self in (Standing.LOST, Standing.LEFT)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +82,7 @@ class Session:
     attached: bool = False
     detached_s: float | None = None
     reason: str = ""
-    """Why it was lost, or is paused."""
+    """Why it was lost, left, or is paused."""
     drained: bool = False
     """An operator takes it out."""
     load: float = 0.0
@@ -126,7 +132,7 @@ class Registry:
 
     @property
     def present(self) -> frozenset[str]:
-        """Ids of the workers that are not lost."""
+        """Ids of the workers that are neither lost nor left."""
         return frozenset(self._by_silence)
 
     def register(
@@ -140,7 +146,7 @@ class Registry:
     ) -> tuple[Session, list[Event]]:
         """Open a session; an older one of the same worker ends. The same process keeps its leases, another one loses them."""
         before = self._sessions.get(worker_id)
-        alive = before is not None and before.standing is not Standing.LOST
+        alive = before is not None and not before.standing.is_gone
         self._epoch += 1
         session = Session(
             worker_id=worker_id,
@@ -180,7 +186,7 @@ class Registry:
             raise SupersededError(
                 "this session is not known or was superseded by a newer one: register again"
             )
-        if session.standing is Standing.LOST:
+        if session.standing.is_gone:
             raise SupersededError(f"worker {worker_id} was given up ({session.reason}): register again")
         return session
 
@@ -189,11 +195,11 @@ class Registry:
         session = self._sessions.get(self._worker_of.get(session_id, ""))
         return self.find(session_id, session.epoch if session is not None else 0)
 
-    def end(self, session: Session, reason: str) -> list[Event]:
+    def end(self, session: Session, reason: str, standing: Standing = Standing.LOST) -> list[Event]:
         """The session is over at once, whatever its worker does; what it held goes to others."""
-        if session.standing is Standing.LOST or self._sessions.get(session.worker_id) is not session:
+        if session.standing.is_gone or self._sessions.get(session.worker_id) is not session:
             return []
-        return [self._lose(session, reason)]
+        return [self._lose(session, reason, standing)]
 
     def attach(self, session: Session, *, now_s: float) -> None:
         """The worker's stream is open. A suspect gets nothing before its first state was heard on it."""
@@ -251,15 +257,20 @@ class Registry:
                 events.append(WorkerSuspected(session.worker_id))
         for session in list(self._detached.values()):
             if session.detached_s is not None and now_s - session.detached_s >= self._limits.stream_grace_s:
-                left = session.standing is Standing.DRAINING
-                reason = "it drained and left" if left else "its connection broke and it did not come back"
-                events.append(self._lose(session, reason))
+                if session.standing is Standing.DRAINING:
+                    events.append(self._lose(session, "it drained and left", Standing.LEFT))
+                else:
+                    events.append(self._lose(session, "its connection broke and it did not come back"))
         return events
 
     def _there(self, worker_id: str) -> Session:
         session = self._sessions.get(worker_id)
-        if session is None or session.standing is Standing.LOST:
+        if session is None:
             raise NotFoundError(f"there is no worker {worker_id!r}: connected are {listed(self.present)}")
+        if session.standing.is_gone:
+            raise NotFoundError(
+                f"worker {worker_id!r} is gone ({session.reason}): start it again at its machine"
+            )
         return session
 
     def _note(self, session: Session, now_s: float) -> None:
@@ -281,8 +292,8 @@ class Registry:
             del self._lost[session.worker_id], self._sessions[session.worker_id]
             self._worker_of.pop(session.session_id, None)
 
-    def _lose(self, session: Session, reason: str) -> WorkerLost:
-        session.standing = Standing.LOST
+    def _lose(self, session: Session, reason: str, standing: Standing = Standing.LOST) -> WorkerLost:
+        session.standing = standing
         session.reason = reason
         del self._by_silence[session.worker_id]
         self._detached.pop(session.worker_id, None)

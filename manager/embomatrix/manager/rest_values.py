@@ -19,7 +19,7 @@ PAGE: Final = 100
 """Rows of a page, unless another number is asked for."""
 LARGEST_PAGE: Final = 1000
 TROUBLE: Final = ("quarantined", "lost", "suspect", "draining", "paused")
-"""States in the order in which an operator wants to see them; all others come after."""
+"""States in the order in which an operator wants to see them; all others come after, and who left comes last."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,4 +126,4 @@ def _words(worker: WorkerView) -> str:
 
 def _urgency(worker: WorkerView) -> tuple[int, str]:
     order = TROUBLE.index(worker.state) if worker.state in TROUBLE else len(TROUBLE)
-    return order, worker.worker_id
+    return order + (worker.state == "left"), worker.worker_id

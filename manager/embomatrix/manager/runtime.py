@@ -32,6 +32,7 @@ from embomatrix.manager.intake import TICK_S, Heartbeat, Intake
 from embomatrix.manager.keeper import Keeper
 from embomatrix.manager.links import WorkerLink
 from embomatrix.manager.meter import Meter
+from embomatrix.manager.registry import Standing
 from embomatrix.manager.results import ResultLogs
 from embomatrix.manager.runs import RunLimits, Runs
 from embomatrix.manager.store.timed import timed_store
@@ -180,9 +181,11 @@ class ManagerRuntime:
         self._carry_out(commands)
         return interval_s
 
-    def end_session(self, session: Session, reason: str, error: ClusterError) -> None:
+    def end_session(
+        self, session: Session, reason: str, error: ClusterError, standing: Standing = Standing.LOST
+    ) -> None:
         """The session is over at once: its stream ends with the error, and what it held goes to others."""
-        events = self.registry.end(session, reason)
+        events = self.registry.end(session, reason, standing)
         if events:
             logger.info("session ended worker=%s: %s", session.worker_id, reason)
             self._carry_out(self._intake.feed(*events, now_s=time.monotonic()))

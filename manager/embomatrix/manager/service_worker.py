@@ -7,6 +7,7 @@ import re
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.intake import Heartbeat
+from embomatrix.manager.registry import Standing
 from embomatrix.proto.v1 import worker_service_pb2 as pb
 from embomatrix.proto.v1 import worker_service_pb2_grpc
 from embomatrix.rpc.convert import each, inside
@@ -136,7 +137,7 @@ class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
             session = self._runtime.registry.find(request.session_id, request.session_epoch)
             self._gate.check_session(context, session)
             left = SupersededError(f"worker {session.worker_id} said that it leaves: its session is over")
-            self._runtime.end_session(session, "it left", left)
+            self._runtime.end_session(session, "it left", left, Standing.LEFT)
         return pb.DeregisterResponse()
 
     async def _listen(self, link: WorkerLink, requests: AsyncIterator[pb.SessionRequest]) -> None:

@@ -213,8 +213,8 @@ def standing_counts(runtime: ManagerRuntime) -> Counter[str]:
 
 def _standing(runtime: ManagerRuntime, session: Session) -> Standing:
     """As people shall see it: what was decided about a worker comes before what it says itself."""
-    if session.standing is Standing.LOST:
-        return Standing.LOST
+    if session.standing.is_gone:
+        return session.standing
     if runtime.cluster.dispatcher.auditor.quarantined(session.worker_id):
         return Standing.QUARANTINED
     record = runtime.cluster.dispatcher.workers.get(session.worker_id)

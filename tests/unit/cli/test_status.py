@@ -58,6 +58,15 @@ def test_words_tell_what_runs_what_is_warm_and_who_does_not_work():
     ]
 
 
+def test_who_left_in_order_is_counted_and_no_trouble():
+    told = sentences((worker(), worker("w2", "left", reason="it left")), (), ())
+    assert told == [
+        "The cluster is ready, and no run is open.",
+        "Workers: 1 ready, 1 left; 0 of 2 slots run a rollout; 0 scenes are in memory.",
+    ]
+    assert sentences((worker(state="left"),), (), ())[0].startswith("No workers: start one")
+
+
 def test_words_of_a_thousand_workers_fit_on_a_screen():
     assert len(sentences([worker(f"w{n}", "lost") for n in range(1000)], (), ())) < 16
 

@@ -104,6 +104,25 @@ def test_a_lost_worker_is_remembered_for_a_while(registry):
     assert not registry.sessions
 
 
+def test_a_worker_that_leaves_in_order_is_not_counted_as_lost(registry):
+    said, _ = join(registry, "said")
+    drained, _ = join(registry, "drained")
+    assert registry.end(said, "it left", Standing.LEFT) == [WorkerLost("said", "it left")]
+    registry.attach(drained, now_s=0.0)
+    registry.drain("drained")
+    registry.detach(drained, now_s=0.1)
+    assert registry.tick(now_s=2.9) == [WorkerLost("drained", "it drained and left")]
+    assert {session.standing for session in registry.sessions.values()} == {Standing.LEFT}
+    with pytest.raises(SupersededError, match="it left"):
+        registry.find(said.session_id, said.epoch)
+    with pytest.raises(NotFoundError, match=r"'said' is gone .it left.: start it again"):
+        registry.resume("said")
+    with pytest.raises(NotFoundError, match="no worker 'nobody': connected are none"):
+        registry.resume("nobody")
+    registry.tick(now_s=61.0)
+    assert not registry.sessions
+
+
 def test_a_lost_worker_may_register_again(registry):
     join(registry)
     registry.tick(now_s=10.0)

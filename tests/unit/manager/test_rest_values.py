@@ -42,8 +42,11 @@ def mood(*, paused=False, now_s=1010.0, **changes):
 def test_health_says_first_what_matters_most():
     assert mood() == (Mood.GOOD, "All is well.")
     assert mood(runs=0, queued=0) == (Mood.IDLE, "Ready: 2 workers wait for a run.")
-    assert mood(workers={}) == (Mood.IDLE, "No worker has joined yet.")
-    assert mood(workers={"lost": 2, "paused": 1}) == (Mood.BAD, "None of 3 workers works.")
+    assert mood(workers={}, queued=0) == (Mood.IDLE, "No worker has joined yet.")
+    assert mood(workers={"left": 4}, queued=0) == (Mood.IDLE, "Every worker has left.")
+    assert mood(workers={"left": 4}) == (Mood.BAD, "3 rollouts wait, and no worker is there.")
+    assert mood(workers={"ready": 1, "left": 9}) == (Mood.GOOD, "All is well.")
+    assert mood(workers={"lost": 2, "paused": 1, "left": 1}) == (Mood.BAD, "None of 3 workers works.")
     assert mood(workers={"ready": 1, "quarantined": 1})[0] is Mood.BAD
     assert mood(workers={"ready": 1, "lost": 1})[1].startswith("1 worker lost a moment ago")
     assert mood(workers={"ready": 1, "lost": 2})[1].endswith("what they held went to others.")

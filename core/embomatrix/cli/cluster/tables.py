@@ -20,7 +20,12 @@ if TYPE_CHECKING:
 
     from embomatrix.rpc.values import PlanCell, RunInfo, WorkerInfo
 
-STATE_STYLES: Final[Mapping[str, str]] = {"ready": "green", "lost": "red", "quarantined": "red"}
+STATE_STYLES: Final[Mapping[str, str]] = {
+    "ready": "green",
+    "lost": "red",
+    "quarantined": "red",
+    "left": "dim",
+}
 WARMTH_STYLES: Final[Mapping[Warmth, str]] = {
     Warmth.WARM: "green",
     Warmth.WARMING: "yellow",

@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from embomatrix.rpc.values import PlanCell, RunInfo, WorkerInfo
 
 WORKING: Final = frozenset(("ready", "suspect"))
+LEFT: Final = "left"
+"""In order: nobody's trouble."""
 """States in which a worker may hold rollouts that go on."""
 NAMED: Final = 8
 """Workers and runs that are named; there may be thousands."""
@@ -31,7 +33,7 @@ def sentences(workers: Sequence[WorkerInfo], runs: Sequence[RunInfo], plan: Sequ
 
 def _verdict(workers: Sequence[WorkerInfo], runs: Sequence[RunInfo]) -> str:
     waiting = sum(run.pending for run in runs)
-    if not workers:
+    if all(worker.state == LEFT for worker in workers):
         return "No workers: start one with `embomatrix worker run`, here or on any machine that reaches the manager."
     if not any(worker.state in WORKING for worker in workers):
         return f"No worker works, and {waiting} rollouts wait: see below why."
@@ -79,7 +81,7 @@ def _ahead(plan: Sequence[PlanCell]) -> list[str]:
 
 def _idlers(workers: Sequence[WorkerInfo]) -> list[str]:
     """Who doesn't work, and why."""
-    idle = [worker for worker in workers if worker.state != "ready"]
+    idle = [worker for worker in workers if worker.state not in ("ready", LEFT)]
     told = [
         f"{worker.worker_id} is {worker.state}{f': {worker.reason}' if worker.reason else ''}."
         for worker in idle[:NAMED]

@@ -4,7 +4,8 @@ import {at, count, gauge, h, none, put, seconds, table} from "./dom.js";
 import {named, worded} from "./names.js";
 
 const ROWS = 50, CHIPS = 6;
-const STATES = ["", "ready", "paused", "draining", "suspect", "lost", "quarantined"];
+const STATES = ["", "ready", "paused", "draining", "suspect", "lost", "quarantined", "left"];
+const GONE = ["lost", "left"];
 const wish = {state: "", search: "", offset: 0, limit: ROWS};
 
 export const query = () => wish;
@@ -49,7 +50,7 @@ function row(w) {
     h("td", {class: "wideonly"}, gauge(used, w.memory_mb, `${count(Math.round(used))} of ${count(w.memory_mb)} MB`)),
     h("td", {class: "n", "data-name": "completed"}, count(w.completed)), h("td", {class: "n wideonly"}, w.cores),
     h("td", {class: "n muted wideonly"}, w.silent_s < 5 ? "now" : `${seconds(Math.round(w.silent_s))} ago`),
-    h("td", {class: "fit act"}, w.state !== "lost" && h("button", {class: "small", type: "button", "data-path": `workers/${encodeURIComponent(w.worker_id)}/${away ? "resume" : "drain"}`, "aria-label": `${away ? "resume" : "drain"} ${w.worker_id}`}, away ? "Resume" : "Drain")));
+    h("td", {class: "fit act"}, !GONE.includes(w.state) && h("button", {class: "small", type: "button", "data-path": `workers/${encodeURIComponent(w.worker_id)}/${away ? "resume" : "drain"}`, "aria-label": `${away ? "resume" : "drain"} ${w.worker_id}`}, away ? "Resume" : "Drain")));
 }
 
 function slots(w) {
