@@ -13,16 +13,27 @@ from pydantic import ValidationError
 
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.social.casting import GrammarRolePlayer
-from embomatrix.factory.social.fitting import is_plausible, why_of
+from embomatrix.factory.social.fitting import is_plausible, themes_of, why_of
 from embomatrix.factory.social.milieus import HOBBIES, NAMES
-from embomatrix.factory.social.occasions import Theme, occasion_of, occasions
-from embomatrix.factory.social.phrases import CLAUSES, MANNERS, MATTERS, NOUNS, TURNS, called
+from embomatrix.factory.social.occasions import Theme, occasion_of, occasions, occasions_in
+from embomatrix.factory.social.phrases import (
+    CLAUSES,
+    MANNERS,
+    MATTERS,
+    NOUNS,
+    TURNS,
+    called,
+    room_called,
+    said_once,
+)
 from embomatrix.factory.social.values import ROBOT, Act, Cast, DaySlot, Person
 from embomatrix.factory.social.writer import SocialWriter
+from embomatrix.factory.writer.goals import Piece
 from embomatrix.factory.writer.variant import build_variant
 from embomatrix.factory.writer.view import SceneView
 from embomatrix.factory.writer.words import PHRASES
 from embomatrix.world.catalog import Catalog
+from embomatrix.world.goal import And, Atom
 from embomatrix.world.task import TaskCategory
 
 SCENE = build_base_scene("Rs_int", seed=0)
@@ -49,6 +60,17 @@ def test_every_room_sees_somebody_and_ties_go_both_ways(seed):
         for other in person.ties:
             assert person.name in cast.of(other).ties
     assert all(earlier.time <= later.time for earlier, later in pairwise(cast.day))
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 2**32))
+def test_all_that_is_done_in_a_room_somebody_does_there(seed):
+    cast = GrammarRolePlayer().cast(SCENE, np.random.default_rng(seed))
+    done = {(slot.room, slot.activity) for slot in cast.day}
+    for room in SCENE.rooms:
+        for occasion in occasions_in(room.type):
+            suited = any(occasion.suits(person) for person in cast.people)
+            assert ((room.name, occasion.doing) in done) == suited
 
 
 @settings(max_examples=50)
@@ -214,6 +236,14 @@ def test_wishes_fit_what_the_person_does(drafts):
         ("mug", "oven", "kitchen", True),
         ("wineglass", "fridge", "kitchen", True),
         ("cell_phone", "swivel_chair", "private_office", False),
+        ("tablefork", "console_table", "corridor", False),
+        ("radio", "top_cabinet", "bathroom", True),
+        ("teddy_bear", "shelf", "bathroom", False),
+        ("apple", "bookcase", "living_room", True),
+        ("pear", "microwave", "kitchen", False),
+        ("envelope", "printer", "private_office", False),
+        ("vase", "eames_chair", "break_room", False),
+        ("broccoli", "dish_rack_cart", "kitchen", True),
     ],
 )
 def test_nobody_puts_such_things_there(thing, host, room, inside):
@@ -225,6 +255,73 @@ def test_people_put_things_where_they_belong():
     assert is_plausible("teddy_bear", "bed", "bedroom", inside=False)
     assert is_plausible("carton_of_milk", "fridge", "kitchen", inside=True)
     assert is_plausible("mug", "desk", "private_office", inside=False)
+    assert is_plausible("carton_of_milk", "microwave", "kitchen", inside=False)
+
+
+@dataclasses.dataclass(frozen=True)
+class Flat:
+    """A view of a scene in which each thing is called after its category and stands in the kitchen."""
+
+    scene = dataclasses.replace(SCENE, rooms=tuple(room for room in SCENE.rooms if room.type == "kitchen"))
+
+    def category(self, name):
+        return name
+
+    def room(self, _name):
+        return self.scene.rooms[0].name
+
+
+@pytest.mark.parametrize(("thing", "wanted"), [("salt_shaker", False), ("blender", True), ("urinal", False)])
+def test_nobody_has_a_salt_shaker_switched_on(thing, wanted):
+    piece = Piece(Atom("toggled_on", (thing,)), "", (thing,), (f"toggled_on({thing})",), "switch", "it")
+    assert bool(themes_of(piece, Flat())) == wanted
+
+
+@pytest.mark.parametrize(
+    ("state", "relation", "host", "wanted"),
+    [
+        ("cooked", "inside", "bottom_cabinet", False),
+        ("hot", "inside", "wicker_basket", False),
+        ("hot", "inside", "microwave", True),
+        ("cooked", "ontop", "countertop", True),
+        ("frozen", "inside", "microwave", False),
+        ("frozen", "inside", "freezer", True),
+    ],
+)
+def test_hot_food_is_served_and_frozen_food_kept_cold(state, relation, host, wanted):
+    goal = And((Atom(state, ("potato",)), Atom(relation, ("potato", host))))
+    signs = (f"{state}(potato)", f"{relation}(potato,{host})")
+    piece = Piece(goal, "", ("potato", "stove", host), signs, "thermal", "the potato")
+    assert bool(themes_of(piece, Flat())) == wanted
+
+
+def test_rooms_are_called_as_people_call_them_and_once_in_a_clause():
+    two = dataclasses.replace(
+        SCENE, rooms=(*SCENE.rooms, dataclasses.replace(SCENE.rooms[0], name="bedroom_1", type="bedroom"))
+    )
+    view = SceneView(two)
+    rooms = {room_called(view, room.name) for room in two.rooms}
+    assert {"bedroom 0", "bedroom 1", "the kitchen"} <= rooms
+    for text, once in (
+        (
+            "As Ann rests in the kitchen, open the oven in the kitchen.",
+            "As Ann rests in the kitchen, open the oven there.",
+        ),
+        ("Put the mug from bedroom 1 over in bedroom 1.", "Put the mug from bedroom 1 over there."),
+        (
+            "Leave bedroom 0, put the mug from bedroom 0 in the box in bedroom 0.",
+            "Leave bedroom 0, put the mug from there in the box.",
+        ),
+        (
+            "Open a door in bedroom 0, then one in bedroom 1.",
+            "Open a door in bedroom 0, then one in bedroom 1.",
+        ),
+        (
+            "The lamp in bedroom 1; then the one in bedroom 10.",
+            "The lamp in bedroom 1; then the one in bedroom 10.",
+        ),
+    ):
+        assert said_once(text, view) == once
 
 
 def test_the_grammar_gives_no_reasons_for_what_it_did_not_make_up():

@@ -71,18 +71,21 @@ def _person(
 def _day(
     people: Sequence[Person], rooms: Sequence[Room], milieu: Milieu, rng: np.random.Generator
 ) -> tuple[DaySlot, ...]:
-    """Everyone's own rooms first; then each room that nobody came to gets somebody."""
+    """Everyone's own rooms first; then somebody for all else that is done in each room, and for rooms that nobody came to."""
     types = {room.name: _done_in(room.type, milieu) for room in rooms}
     slots = []
     for person in people:
         own = person.rooms or tuple(types)
         for _ in range(SLOTS_EACH):
             slots.append(_slot(person, own[int(rng.integers(len(own)))], types, rng))
-    for room in types:
+    for room, done in types.items():
+        for occasion in done:
+            able = [person for person in people if occasion.suits(person)]
+            owners = [person for person in able if room in person.rooms] or able
+            if owners and (room, occasion.doing) not in {(slot.room, slot.activity) for slot in slots}:
+                slots.append(_at(occasion, owners[int(rng.integers(len(owners)))], room, rng))
         if not any(slot.room == room for slot in slots):
-            able = [person for person in people if any(each.suits(person) for each in types[room])]
-            owners = [person for person in able if room in person.rooms] or able or list(people)
-            slots.append(_slot(owners[int(rng.integers(len(owners)))], room, types, rng))
+            slots.append(_slot(people[int(rng.integers(len(people)))], room, types, rng))
     return tuple(sorted(dict.fromkeys(slots), key=lambda slot: (slot.time, slot.person, slot.room)))
 
 
@@ -96,8 +99,12 @@ def _slot(
 ) -> DaySlot:
     """Something that such a person does there; who does nothing of what the room is for passes through."""
     options = [each for each in types[room] if each.suits(person)] or occasions_in(ELSEWHERE)
-    chosen = options[int(rng.integers(len(options)))]
+    return _at(options[int(rng.integers(len(options)))], person, room, rng)
+
+
+def _at(occasion: Occasion, person: Person, room: str, rng: np.random.Generator) -> DaySlot:
+    """The occasion in its hour."""
     minute = 15 * int(rng.integers(4))
     return DaySlot(
-        time=f"{chosen.hour:02d}:{minute:02d}", person=person.name, room=room, activity=chosen.doing
+        time=f"{occasion.hour:02d}:{minute:02d}", person=person.name, room=room, activity=occasion.doing
     )

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.social.chores import impossible_chore
 from embomatrix.factory.social.fitting import themes_of
-from embomatrix.factory.social.phrases import AGREEMENTS, JOINS, MATTERS, QUESTIONS, TURNS, filled
+from embomatrix.factory.social.phrases import AGREEMENTS, JOINS, MATTERS, QUESTIONS, TURNS, filled, said_once
 from embomatrix.factory.social.values import ROBOT, Act, Conversation, Turn
 from embomatrix.factory.writer.goals import placed_elsewhere
 
@@ -124,9 +124,8 @@ class GrammarConversation:
         return text
 
     def _say(self, speaker: str, act: Act, **words: str) -> None:
-        self._turns.append(
-            Turn(speaker=speaker, act=act, text=filled(self._voice.choose(TURNS[act]), **words))
-        )
+        text = said_once(filled(self._voice.choose(TURNS[act]), **words), self._shop.view)
+        self._turns.append(Turn(speaker=speaker, act=act, text=text))
 
 
 def starting_slots(cast: Cast, rooms: Sequence[str], rng: np.random.Generator) -> list[DaySlot]:

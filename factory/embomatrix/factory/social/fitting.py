@@ -26,7 +26,7 @@ def _themes(words: str) -> frozenset[Theme]:
 GROUP_THEMES: Final[Mapping[Group, frozenset[Theme]]] = {
     Group.FOOD: _themes("cooking meals stock guests"),
     Group.FRUIT: _themes("cooking meals stock guests"),
-    Group.TABLEWARE: _themes("cooking meals guests"),
+    Group.TABLEWARE: _themes("cooking meals guests tidying"),
     Group.PACKAGES: _themes("cooking meals stock guests screens"),
     Group.BOOKS: _themes("reading papers sleep tidying"),
     Group.TOYS: _themes("play tidying"),
@@ -55,13 +55,24 @@ _WASHING: Final = frozenset(
         "gym",
     }
 )
+_WORKING: Final = frozenset({"private_office", "shared_office", "meeting_room", "lobby"})
 GROUP_ROOMS: Final[Mapping[Group, frozenset[str]]] = {
     Group.FOOD: _EATING,
-    Group.FRUIT: _EATING | {"private_office", "shared_office", "meeting_room", "lobby"},
-    Group.PACKAGES: _EATING | {"storage_room", "private_office", "shared_office", "meeting_room", "lobby"},
+    Group.FRUIT: _EATING | _WORKING,
+    Group.PACKAGES: _EATING | _WORKING | {"storage_room"},
+    Group.TABLEWARE: _EATING | _WORKING | {"storage_room"},
     Group.TOILETRIES: _WASHING,
 }
-"""Types of rooms that people take things of a group to; of the groups that are not listed, to any."""
+"""Types of rooms that people take things of a group to; of the groups that are not listed, to any but those of `NOT_IN`."""
+_WET: Final = frozenset({"bathroom", "spa", "hammam", "sauna", "locker_room"})
+NOT_IN: Final[Mapping[Group, frozenset[str]]] = {
+    **dict.fromkeys((Group.DEVICES, Group.OFFICE, Group.TOYS), _WET),
+    Group.BOOKS: frozenset({"hammam", "sauna"}),
+}
+"""Types of rooms that nobody takes things of a group to."""
+FOR_DISHES: Final = frozenset({"dishwasher", "dish_rack", "dish_rack_cart"})
+FOR_BOOKS: Final = frozenset({"bookcase", "bookshelf"})
+_EATEN: Final = frozenset({Group.FOOD, Group.FRUIT, Group.PACKAGES})
 ONLY_IN_KITCHENS: Final = frozenset({"chopping_board", "frying_pan", "saucepan"})
 NOT_NAMED: Final = frozenset({"eyeglasses"})
 """Words that take a plural verb, which the sentences have not."""
@@ -93,6 +104,10 @@ NO_HOSTS: Final = frozenset(
         "wood_fireplace",
         "gas_fireplace",
         "charcoal_grill",
+        "drink_dispenser",
+        "espresso_machine",
+        "photocopier",
+        "printer",
     }
 )
 COLD: Final = frozenset({"fridge", "freezer", "cooler", "wine_fridge", "display_fridge", "grocery_fridge"})
@@ -110,8 +125,9 @@ _INTO_BASINS: Final = frozenset(
         "potato",
     }
 )
+_ON_OVENS: Final = frozenset({Group.PACKAGES, Group.TABLEWARE})
 _PANS: Final = frozenset({"frying_pan", "saucepan"})
-NOT_COOKED: Final = frozenset({"avocado", "lemon", "orange", "bagel", "croissant"})
+NOT_COOKED: Final = frozenset({"avocado", "banana", "lemon", "orange", "bagel", "croissant"})
 
 SWITCHES: Final[Mapping[str, frozenset[Theme]]] = {
     **dict.fromkeys(
@@ -132,9 +148,9 @@ SWITCHES: Final[Mapping[str, frozenset[Theme]]] = {
     ),
     **dict.fromkeys(BASINS | {"bathtub", "shower_stall"}, _themes("washing cooking laundry")),
     **dict.fromkeys(
-        (*OVENS, *HOBS, "range_hood", "coffee_maker", "dishwasher", "toaster", "deep_fryer"),
-        _themes("cooking meals"),
+        (*OVENS, *HOBS, "range_hood", "coffee_maker", "toaster", "deep_fryer"), _themes("cooking meals")
     ),
+    "dishwasher": _themes("cooking meals tidying"),
     **dict.fromkeys((*COLD, "popcorn_machine", "espresso_machine"), _themes("cooking meals stock guests")),
     **dict.fromkeys(
         ("table_lamp", "floor_lamp", "desk_lamp"), _themes("reading sleep papers leaving guests")
@@ -144,8 +160,9 @@ SWITCHES: Final[Mapping[str, frozenset[Theme]]] = {
         ("printer", "photocopier", "desk_phone", "calculator", "shredder", "cell_phone"),
         _themes("papers leaving"),
     ),
-    **dict.fromkeys(("digital_camera", "electric_fan", "air_conditioner"), _themes("guests leaving sleep")),
+    **dict.fromkeys(("electric_fan", "air_conditioner"), _themes("guests leaving sleep")),
     **dict.fromkeys(("wardrobe", "locker", "suitcase"), _themes("leaving tidying laundry")),
+    "digital_camera": _themes("guests"),
     "checkout_counter": _themes("stock"),
     "grandfather_clock": _themes("guests"),
 }
@@ -167,7 +184,8 @@ NEVER: Final = frozenset(
         "water_cooler",
     }
 )
-"""Nobody asks a robot to open or to switch these."""
+_NEVER_ENDINGS: Final = ("_shaker", "_atomizer", "_bottle", "_grinder", "_dispenser", "_can")
+"""Nobody asks a robot to open or to switch these, nor what ends so: in the catalog a salt shaker has a switch."""
 STORAGE_THEMES: Final[Mapping[str, frozenset[Theme]]] = {
     **dict.fromkeys(_KITCHEN, _themes("cooking meals tidying stock guests")),
     **dict.fromkeys(
@@ -193,10 +211,11 @@ def themes_of(piece: Piece, view: SceneView) -> frozenset[Theme]:
     if piece.kind == "thermal":
         warmed = any(sign.startswith(("cooked", "hot")) for sign in piece.signs)
         by_coffee = any(view.category(name) in FOR_DRINKS for name in piece.objects)
-        return frozenset() if by_coffee or (warmed and thing in NOT_COOKED) else _themes("cooking meals")
+        odd = by_coffee or (warmed and thing in NOT_COOKED) or not _is_served_well(piece, view, warmed=warmed)
+        return frozenset() if odd else _themes("cooking meals")
     room_type = _room_type(view, piece.objects[0])
     if piece.kind == "switch":
-        if thing in NEVER:
+        if thing in NEVER or thing.endswith(_NEVER_ENDINGS):
             return frozenset()
         return SWITCHES.get(thing, STORAGE_THEMES.get(room_type, _PLAIN))
     places = piece.objects[1:]
@@ -208,15 +227,37 @@ def themes_of(piece: Piece, view: SceneView) -> frozenset[Theme]:
     return GROUP_THEMES.get(_GROUP_OF[thing], _PLAIN) if thing in _GROUP_OF else _PLAIN
 
 
+def _is_served_well(piece: Piece, view: SceneView, *, warmed: bool) -> bool:
+    """Whether food that was heated, cooked or frozen ends up where a person would want it; true where nobody says where."""
+    for sign in piece.signs:
+        relation, _, names = sign.rstrip(")").partition("(")
+        food, _, host = names.partition(",")
+        if not host:
+            continue
+        inside = relation == "inside"
+        if inside and host not in (OVENS if warmed else COLD):
+            return False
+        room = next(_room_type(view, name) for name in piece.objects if view.category(name) == host)
+        if not is_plausible(food, host, room, inside=inside):
+            return False
+    return True
+
+
 def is_plausible(thing: str, host: str, room_type: str, *, inside: bool) -> bool:
     """Whether a person would put a thing of the category on or in such a host in such a room."""
     group = _GROUP_OF.get(thing)
-    if group is not None and room_type not in GROUP_ROOMS.get(group, {room_type}):
+    if group is not None and (
+        room_type not in GROUP_ROOMS.get(group, {room_type}) or room_type in NOT_IN.get(group, ())
+    ):
+        return False
+    if host in FOR_BOOKS and group in _EATEN:
         return False
     if thing in ONLY_IN_KITCHENS and room_type not in _KITCHEN:
         return False
-    if host in SEATS or host in SOFT:
+    if host in SEATS or host in SOFT or host.endswith("_chair"):
         return host in SOFT and group not in NOT_ON_SOFT
+    if host in FOR_DISHES:
+        return group is Group.TABLEWARE
     if host in NO_HOSTS:
         return False
     if host in BASINS or host.endswith("_sink"):
@@ -224,7 +265,7 @@ def is_plausible(thing: str, host: str, room_type: str, *, inside: bool) -> bool
     if host in COLD:
         return not inside or group in {Group.FOOD, Group.FRUIT, Group.PACKAGES}
     if host in OVENS:
-        return not inside or group is Group.FOOD or thing in _PANS
+        return group is Group.FOOD or thing in _PANS if inside else group in _ON_OVENS
     return host not in HOBS or thing in _PANS
 
 

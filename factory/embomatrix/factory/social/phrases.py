@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.social.values import Act
-from embomatrix.factory.writer.words import spoken
+from embomatrix.factory.writer.words import room_words, spoken
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
+    from embomatrix.factory.writer.view import SceneView
 
 
 CLAUSES: Final[Mapping[str, tuple[str, ...]]] = {
     "ontop": (
         "put {thing} on {place}",
-        "lay {thing} on {place}",
+        "drop {thing} off on {place}",
         "set {thing} down on {place}",
         "carry {thing} across and leave it on {place}",
         "find {thing} and place it on top of {place}",
@@ -32,7 +35,7 @@ CLAUSES: Final[Mapping[str, tuple[str, ...]]] = {
         "find {thing} and store it in {place}",
         "see to it that {thing} ends up inside {place}",
         "let {thing} disappear into {place}",
-        "find a corner for {thing} in {place}",
+        "find a corner in {place} for {thing}",
     ),
     "open": (
         "open {thing}",
@@ -117,8 +120,8 @@ NOUNS: Final[Mapping[str, str]] = {
     "bottom_cabinet_no_top": "base cabinet",
     "metal_bottom_cabinet": "low metal cabinet",
     "top_cabinet": "wall cabinet",
-    "furniture_sink": "vanity sink",
-    "multi_station_furniture_sink": "long vanity sink",
+    "furniture_sink": "cabinet sink",
+    "multi_station_furniture_sink": "long cabinet sink",
     "multi_station_tabletop_sink": "long sink",
     "multi_station_wall_mounted_sink": "long wash trough",
     "wall_mounted_sink": "wall sink",
@@ -128,6 +131,7 @@ NOUNS: Final[Mapping[str, str]] = {
     "commercial_kitchen_table": "steel worktable",
     "commercial_kitchen_shelf": "kitchen shelf",
     "wall_mounted_tv": "TV on the wall",
+    "wall_mounted_loudspeaker": "loudspeaker on the wall",
     "hardback": "hardback book",
     "carpet": "rug",
     "tablefork": "fork",
@@ -237,7 +241,7 @@ INSTRUCTIONS: Final = (
     "{Who} is {activity}, and {why}: {what}.",
     "{Why}, says {who}, who is {activity}. So {what}.",
     "It is {time} and {who} is {activity}. Could you {what}?",
-    "Lend {who} a hand, who is {activity}: {what}. {Why}.",
+    "Lend a hand to {who}, who is {activity}: {what}. {Why}.",
     "{Who} asks you to {what}, for {why}.",
     "For {who}, the {job}: {what}.",
     "While {who} is {activity}, {what}.",
@@ -248,11 +252,11 @@ INSTRUCTIONS: Final = (
     "As {who} is {activity} in {room}, {what}.",
     "{Other} says you should {what}, for {who}.",
     "You promised {who} to {what}.",
-    "{Who} loves {hobby} and wants to get back to it: {what}.",
+    "{Who} would rather have time for {hobby}: {what}.",
     "{What}, so that {who} has one thing less to think of.",
     "On behalf of {who}, {what}: {why}.",
     "{Who} has asked twice already, because {why}. Now {what}.",
-    "Next on the list of {who}: {what}.",
+    "Next on {who}'s list: {what}.",
     "{Who} would be glad if you were to {what}.",
     "{Time}, {room}: {who} is {activity} and needs somebody to {what}.",
     "Help {who} out. {Why}, so {what}.",
@@ -273,11 +277,40 @@ JOINS: Final = (
 
 WHERE: Final = ("in {room}", "over in {room}")
 """Ways to say in which room a thing is."""
+WHENCE: Final = ("from {room}",)
+"""The same of a thing that is to be taken away."""
+_PAUSE: Final = re.compile(r"[,;:.?]")
 
 
 def called(category: str) -> str:
     """A category as people call it."""
     return NOUNS.get(category, spoken(category))
+
+
+def room_called(view: SceneView, room: str) -> str:
+    """A room as people call it: ``the kitchen``, or ``bedroom 1`` where there are several."""
+    return spoken(room_words(view, room)).replace("childs", "child's")
+
+
+def said_once(text: str, view: SceneView) -> str:
+    """The text with ``there`` for a room that was the last one to be named, once in a clause."""
+    rooms = sorted((room_called(view, room.name) for room in view.scene.rooms), key=len, reverse=True)
+    named = re.compile(
+        rf"(?:(?P<way> from| over in| in) )?\b(?P<room>{'|'.join(map(re.escape, rooms))})\b", re.IGNORECASE
+    )
+    last, there = "", 0
+
+    def shown(found: re.Match[str]) -> str:
+        nonlocal last, there
+        room, way = found["room"].lower(), found["way"]
+        repeated, last = room == last, room
+        if not repeated or not way:
+            return found[0]
+        said = there and not _PAUSE.search(text, there, found.start())
+        there = found.end()
+        return f"{way.removesuffix('in').rstrip()} there" if way == " from" or not said else ""
+
+    return named.sub(shown, text)
 
 
 def filled(template: str, **words: str) -> str:

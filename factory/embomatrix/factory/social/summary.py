@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from embomatrix.factory.social.phrases import INSTRUCTIONS, JOINS, filled
-from embomatrix.factory.writer.words import room_words
+from embomatrix.factory.social.phrases import INSTRUCTIONS, JOINS, filled, room_called, said_once
 
 if TYPE_CHECKING:
     from embomatrix.factory.social.values import Cast, Conversation
@@ -21,16 +20,17 @@ def instruction_of(conversation: Conversation, cast: Cast, view: SceneView, voic
     what = conversation.last_wishes[0]
     for clause in conversation.last_wishes[1:]:
         what += voice.choose(JOINS) + clause
-    return filled(
+    text = filled(
         voice.choose(INSTRUCTIONS),
         who=who.name,
         other=others[int(voice.rng.integers(len(others)))],
         what=what,
         activity=slot.activity,
         time=slot.time,
-        room=room_words(view, slot.room),
+        room=room_called(view, slot.room),
         job=who.job,
         age=str(who.age),
         hobby=who.hobby,
         why=why,
     )
+    return said_once(text, view)

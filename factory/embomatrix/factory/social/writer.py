@@ -13,7 +13,7 @@ import numpy as np
 from embomatrix.factory.social.casting import GrammarRolePlayer
 from embomatrix.factory.social.conversing import GrammarConversation, Scenario
 from embomatrix.factory.social.fitting import best_slot, why_of
-from embomatrix.factory.social.phrases import CLAUSES, MANNERS, NOUNS, WHERE
+from embomatrix.factory.social.phrases import CLAUSES, MANNERS, NOUNS, WHENCE, WHERE, room_called
 from embomatrix.factory.social.summary import instruction_of
 from embomatrix.factory.social.transcript import transcript_of
 from embomatrix.factory.writer.goals import Workshop
@@ -95,7 +95,17 @@ class SocialWriter:
         said = self._said_in(variant)
         voice = FreshVoice(rng, said)
         phrases = {**CLAUSES, **MANNERS}
-        shop = Workshop(view, variant, rng, phrases=phrases, where=WHERE, nouns=NOUNS, voice=voice)
+        shop = Workshop(
+            view,
+            variant,
+            rng,
+            phrases=phrases,
+            where=WHERE,
+            whence=WHENCE,
+            nouns=NOUNS,
+            room_called=room_called,
+            voice=voice,
+        )
         chosen = _scenario(cast, shop, category, said)
         if chosen is None:
             return None

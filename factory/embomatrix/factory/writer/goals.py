@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.writer.tables import FOR_DRINKS, suits
-from embomatrix.factory.writer.words import PHRASES, Voice, phrase, refer, spoken
+from embomatrix.factory.writer.words import PHRASES, Voice, phrase, refer, room_words, spoken
 from embomatrix.world.asset import JointKind
 from embomatrix.world.goal import And, Atom, Exists, Formula, Not
 from embomatrix.world.state import Relation
@@ -52,8 +52,8 @@ class Workshop:
     """What the makers of pieces draw from. ``used`` are objects that earlier pieces of the same goal are about.
 
     ``phrases`` are the ways to ask for an atom, by predicate, or by predicate and manner where they know some; ``where`` those
-    to say in which room a thing is, ``nouns`` what categories are called, where not by their names; ``voice`` chooses among
-    them, equally where none is given.
+    to say in which room a thing is, ``whence`` the same of what is to be taken away, ``room_called`` what a room is called,
+    ``nouns`` what categories are, where not by their names; ``voice`` chooses among them, equally where none is given.
     """
 
     view: SceneView
@@ -62,7 +62,9 @@ class Workshop:
     used: frozenset[str] = frozenset()
     phrases: Mapping[str, tuple[str, ...]] = field(default_factory=lambda: PHRASES)
     where: tuple[str, ...] = ("in {room}",)
+    whence: tuple[str, ...] = ("in {room}",)
     nouns: Mapping[str, str] = field(default_factory=dict)
+    room_called: Callable[[SceneView, str], str] = room_words
     voice: Voice | None = None
 
     def phrase(self, kind: str, *, thing: str, place: str = "", manner: str = "") -> str:
@@ -72,7 +74,14 @@ class Workshop:
 
     def refer(self, name: str) -> str:
         """A noun phrase for an object."""
-        return refer(self.view, name, self._voice, self.where, self.noun(name))
+        return self._referred(name, self.where)
+
+    def refer_taken(self, name: str) -> str:
+        """A noun phrase for an object that is to be taken away."""
+        return self._referred(name, self.whence)
+
+    def _referred(self, name: str, where: Sequence[str]) -> str:
+        return refer(self.view, name, self._voice, where, self.noun(name), self.room_called)
 
     def noun(self, name: str) -> str:
         """What an object is called."""
@@ -111,7 +120,7 @@ def place_piece(shop: Workshop) -> Piece | None:
     )
     if thing is None:
         return None
-    return _placed(shop, thing, shop.refer(thing))
+    return _placed(shop, thing, shop.refer_taken(thing))
 
 
 def _placed(shop: Workshop, thing: str, called: str) -> Piece | None:
@@ -250,7 +259,7 @@ def _thermal(shop: Workshop, food: str, source: str, predicate: str) -> Piece:
     goal: Formula = Atom(predicate, (food,))
     objects: tuple[str, ...] = (food,)
     signs: tuple[str, ...] = (f"{predicate}({view.category(food)})",)
-    called = shop.refer(food)
+    called = shop.refer_taken(food)
     clause = shop.phrase(predicate, thing=called, place=place)
     if view.is_container(source) and len(view.alike(source)) == 1 and rng.random() < 0.35:
         goal = And((goal, Atom("inside", (food, source))))

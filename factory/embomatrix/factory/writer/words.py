@@ -8,7 +8,7 @@ from embomatrix.world.bddl import is_room_instance
 
 if TYPE_CHECKING:
     from collections import Counter
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     import numpy as np
 
@@ -83,19 +83,24 @@ class FreshVoice(Voice):
 
 
 def refer(
-    view: SceneView, name: str, voice: Voice, where: Sequence[str] = ("in {room}",), noun: str = ""
+    view: SceneView,
+    name: str,
+    voice: Voice,
+    where: Sequence[str] = ("in {room}",),
+    noun: str = "",
+    room_called: Callable[[SceneView, str], str] = room_words,
 ) -> str:
     """A noun phrase for an object, or for any of those of its category in its room.
 
-    The room is named, in one of the ways of ``where``, if the category does not tell which one is meant. ``noun`` is what the
-    category is called, where that is not its name.
+    The room is named, in one of the ways of ``where`` and as ``room_called`` says, if the category does not tell which one is
+    meant. ``noun`` is what the category is called, where that is not its name.
     """
     noun = noun or spoken(view.category(name))
     article = "the" if len(view.alike(name)) == 1 else "an" if noun[0] in "aeiou" else "a"
     words = f"{article} {noun}"
     ambiguous = len(view.rooms_with(view.category(name))) > 1
     if ambiguous or voice.rng.random() < 0.35:
-        words += " " + voice.choose(where).format(room=room_words(view, view.room(name)))
+        words += " " + voice.choose(where).format(room=room_called(view, view.room(name)))
     return words
 
 
