@@ -34,6 +34,7 @@ from embomatrix.factory.task_import.cli import app as import_app
 from embomatrix.factory.terminal import fail, mended, progress
 from embomatrix.factory.verification.cli import app as verify_app
 from embomatrix.llm.ledger import Price
+from embomatrix.llm.patience import Patience
 from embomatrix.world.dataset import Dataset
 from embomatrix.world.task import TaskCategory
 from embomatrix.world.whole_file import write_whole
@@ -179,7 +180,7 @@ def _layout(
     """Layout agents of which these are a language model; None where all are rules."""
     if not names:
         return None
-    return stack.enter_context(modelled_agents(url, model, key, cassette)).agents(names)
+    return stack.enter_context(modelled_agents(url, model, key, cassette, Patience())).agents(names)
 
 
 def _print_account(ledger: Ledger) -> None:

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
     from embomatrix.factory.editor import SceneEditor
     from embomatrix.factory.layout.jobs import Item, Layout, Record
+    from embomatrix.llm.patience import Patience
 
 METHODS = ("tree", "random", "poses")
 Forms = Annotated[
@@ -131,10 +132,12 @@ def modelled_names(forms: list[str]) -> frozenset[AgentName]:
 
 
 @contextlib.contextmanager
-def modelled_agents(url: str, model: str, key: str, cassette: Path | None) -> Iterator[ModelLayoutAgents]:
+def modelled_agents(
+    url: str, model: str, key: str, cassette: Path | None, patience: Patience | None = None
+) -> Iterator[ModelLayoutAgents]:
     """Agents on an endpoint, on a recording, or on both. Raises LlmError."""
     asked, endpoint = model_asked(url, model, key, cassette)
-    with ModelLayoutAgents(asked, endpoint) as agents:
+    with ModelLayoutAgents(asked, endpoint, patience=patience) as agents:
         yield agents
 
 

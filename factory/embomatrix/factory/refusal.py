@@ -7,8 +7,10 @@ from enum import StrEnum
 
 
 class RefusalReason(StrEnum):
-    """In the order in which they are looked for: the first ten stop a binding, the others an admission."""
+    """In the order in which they are looked for: the first two stop a draft, then ten a binding, the others an admission."""
 
+    NO_ANSWER = "no_answer"
+    UNUSABLE_ANSWER = "unusable_answer"
     UNKNOWN_TYPE = "unknown_type"
     SUBSTANCE = "substance"
     INEXPRESSIBLE = "inexpressible"

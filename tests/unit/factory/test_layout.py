@@ -30,6 +30,8 @@ from embomatrix.factory.layout.values import (
 )
 from embomatrix.factory.scenes.check import check_scene
 from embomatrix.llm.endpoint import Endpoint, EndpointLimits
+from embomatrix.llm.patience import Patience
+from embomatrix.llm.values import EndpointError
 from embomatrix.world.catalog import Catalog
 
 if TYPE_CHECKING:
@@ -172,13 +174,13 @@ def test_a_brief_goes_through_its_door_unchanged():
     assert json.loads(door.written(door.rules(brief)))[-1]["child"] == "plate_1"
 
 
-def organized(*script: str) -> tuple[LayoutTree, ChatServer]:
+def organized(*script: object, patience: Patience | None = None) -> tuple[LayoutTree, ChatServer]:
     server = ChatServer(*script)
     with server.serving() as url:
         endpoint = Endpoint(
             url, "small-1", limits=EndpointLimits(attempts=2, first_wait_s=0.01, timeout_s=5.0)
         )
-        with ModelLayoutAgents(endpoint, endpoint) as agents:
+        with ModelLayoutAgents(endpoint, endpoint, patience=patience) as agents:
             return agents.organize(RoomBrief(KITCHEN, (TABLE, FRIDGE), (PLATE,))), server
 
 
@@ -201,6 +203,15 @@ def test_rules_stand_in_for_a_model_that_stays_wrong():
     tree, server = organized("no", "no", "no")
     assert tree.parent_of("plate_1") == Branch("breakfast_table_1", ON, "plate_1")
     assert len(server.requests) == 3
+
+
+def test_a_dead_endpoint_is_told_of_and_where_patience_is_had_rules_stand_in():
+    broken = (500, {}, "broken", 0.0)
+    with pytest.raises(EndpointError, match=r"room-organizer: the endpoint .* answered 500"):
+        organized(broken)
+    tree, server = organized(broken, patience=Patience(most=2))
+    assert tree.parent_of("plate_1") == Branch("breakfast_table_1", ON, "plate_1")
+    assert len(server.requests) == 2
 
 
 def test_a_model_s_tree_is_taken_when_it_is_allowed():

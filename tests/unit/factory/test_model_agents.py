@@ -8,12 +8,14 @@ import pytest
 from tests.fakes.chat_server import ChatServer
 
 from embomatrix.factory.pictures.sights import sight_of_room
+from embomatrix.factory.refusal import RefusalReason
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.social.facts import MOST_IN_ROOM, facts_of
 from embomatrix.factory.social.model_agents import ModelAgents
 from embomatrix.factory.social.model_writer import ModelWriter
 from embomatrix.factory.social.requests import TaskRequest, Wanted, Wish, check_request, piece_of
 from embomatrix.factory.social.values import DaySlot
+from embomatrix.factory.writer.tasks import Draft
 from embomatrix.factory.writer.variant import build_variant
 from embomatrix.factory.writer.view import SceneView
 from embomatrix.llm.endpoint import Endpoint, EndpointLimits
@@ -125,15 +127,44 @@ def test_nonsense_half_a_json_a_wrong_schema_and_a_thing_that_is_not_there_are_a
     assert "wish 1, ontop: there is no 'unicorn_1': use a name from the list" in objections[6]
 
 
-def test_a_model_that_stays_wrong_costs_its_draft_and_no_more():
+def test_a_model_that_stays_wrong_costs_its_draft_and_the_reason_is_told():
     draft, server = written(CAST, TALK, "no")
-    assert draft is None
+    assert draft.reason is RefusalReason.UNUSABLE_ANSWER
+    assert (
+        "3 answers of scripted-1, none usable, the last because it holds no complete JSON value"
+        in draft.sentence
+    )
     assert len(server.requests) == 5
 
 
-def test_an_endpoint_that_is_gone_ends_the_writing():
+BROKEN = (500, {}, "broken", 0.0)
+
+
+def in_a_row(*script, drafts):
+    """What comes of so many drafts that are asked of one model, until it raises."""
+    server, found = ChatServer(*script), []
+    limits = EndpointLimits(attempts=2, first_wait_s=0.01, timeout_s=5.0)
+    with server.serving() as url, ModelWriter(ModelAgents(Endpoint(url, "small-1", limits=limits))) as writer:
+        for number in range(drafts):
+            rng = np.random.default_rng(number)
+            found.append(writer.write(VARIANT, VIEW, TaskCategory.PICK_AND_PLACE, "t", rng))
+            yield found[-1]
+
+
+def test_a_question_that_nobody_answers_costs_its_draft_and_the_next_one_is_asked_for():
+    # Two attempts at each question: the second and the fourth draft find nobody.
+    script = (CAST, TALK, GOOD, BROKEN, BROKEN, TALK, GOOD, BROKEN, BROKEN, TALK, GOOD)
+    lost, *others = sorted(in_a_row(*script, drafts=5), key=lambda draft: isinstance(draft, Draft))
+    assert [isinstance(draft, Draft) for draft in others] == [False, True, True, True]
+    assert lost.reason is RefusalReason.NO_ANSWER
+    assert "answered 500 (broken), 2 times" in lost.sentence
+
+
+def test_an_endpoint_that_stays_dead_ends_the_writing():
+    drafts = in_a_row(BROKEN, drafts=10)
+    assert [next(drafts).reason, next(drafts).reason] == [RefusalReason.NO_ANSWER] * 2
     with pytest.raises(EndpointError, match=r"role-playing agent: the endpoint .* answered 500"):
-        written((500, {}, "broken", 0.0))
+        next(drafts)
 
 
 async def test_a_cast_that_leaves_a_room_empty_is_sent_back():

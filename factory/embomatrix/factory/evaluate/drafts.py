@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from embomatrix.factory.writer.tasks import Draft
 from embomatrix.factory.writer.variant import build_variant
 from embomatrix.factory.writer.view import SceneView
 from embomatrix.world.task import TaskCategory
@@ -15,7 +16,7 @@ from embomatrix.world.task import TaskCategory
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from embomatrix.factory.writer.tasks import Draft, TaskWriter
+    from embomatrix.factory.writer.tasks import TaskWriter
     from embomatrix.world.dataset import TaskRecord
     from embomatrix.world.scene import Scene
 
@@ -58,7 +59,7 @@ def _drafts(base: Scene, writer: TaskWriter, number: int, seed: int) -> Iterator
     for attempt in range(TRIES * EACH_VARIANT):
         category = categories[(number + attempt) % len(categories)]
         draft = writer.write(variant, view, category, f"{variant.scene.scene_id}-{attempt:02d}", rng)
-        if draft is not None:
+        if isinstance(draft, Draft):
             yield draft
             given += 1
         if given == EACH_VARIANT:

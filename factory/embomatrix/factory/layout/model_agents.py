@@ -28,8 +28,9 @@ from embomatrix.factory.layout.values import (
 )
 from embomatrix.factory.layout.wishes import wish
 from embomatrix.llm.loop import OnOneLoop
+from embomatrix.llm.patience import Patience
 from embomatrix.llm.structured import ask
-from embomatrix.llm.values import ChatRequest, Message, Speaker, UnusableReplyError
+from embomatrix.llm.values import ChatRequest, EndpointError, Message, Speaker, UnusableReplyError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
@@ -78,7 +79,9 @@ class WishesAnswer(_Answer):
 
 
 class ModelLayoutAgents(OnOneLoop):
-    """Asks one model for all agents."""
+    """Asks one model for all agents. What it gives no usable answer to, rules answer, and as far as ``patience`` goes what
+    nobody answers: not at all, where none is given.
+    """
 
     def __init__(
         self,
@@ -86,10 +89,12 @@ class ModelLayoutAgents(OnOneLoop):
         endpoint: AbstractAsyncContextManager[object] | None = None,
         *,
         attempts: int = 3,
+        patience: Patience | None = None,
     ) -> None:
         super().__init__(endpoint)
         self._model = model
         self._attempts = attempts
+        self._patience = patience or Patience(most=1)
 
     def agents(self, modelled: Collection[AgentName]) -> LayoutAgents:
         """Agents of which these are the model and the others rules."""
@@ -191,7 +196,7 @@ class ModelLayoutAgents(OnOneLoop):
         seed: int,
         history: str = "",
     ) -> T | None:
-        """A checked answer, None where the model gave none that can be used."""
+        """A checked answer, None where the model gave none that can be used. Raises EndpointError where it seems dead."""
         text = USER.format(brief=DOORS[name].brief.dump_json(brief).decode())
         if history:
             text += f"\nWhat has failed so far:\n{history}"
@@ -200,8 +205,14 @@ class ModelLayoutAgents(OnOneLoop):
         try:
             answer = self._runner.run(ask(self._model, request, shape, check=check, attempts=self._attempts))
         except UnusableReplyError as error:
+            self._patience.answered()
             logger.warning("the rules stand in: %s", error)
             return None
+        except EndpointError as error:
+            self._patience.unanswered(error)
+            logger.warning("the rules stand in: %s", error)
+            return None
+        self._patience.answered()
         return answer.value
 
 

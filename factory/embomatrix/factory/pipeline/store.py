@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 BUILD_FILE: Final = "build.jsonl"
 ATTEMPTS_FILE: Final = "attempts.jsonl"
-"""The ledger: a line for every draft that was judged, with the reason where it was not admitted."""
+"""The ledger: a line for every draft, with the reason where it was not admitted."""
 TIMES_FILE: Final = "times.jsonl"
 """Seconds of processor time, a line for each variant and one for the base scenes of each call: no part of the dataset."""
 TRANSCRIPTS_FOLDER: Final = "transcripts"
@@ -33,7 +33,7 @@ TREES_FOLDER: Final = "trees"
 
 @dataclass(frozen=True, slots=True)
 class Rejection:
-    """A draft that was not admitted."""
+    """A draft that was not admitted; ``instruction`` and ``goal`` are empty where nobody gave one."""
 
     scene: str
     category: str

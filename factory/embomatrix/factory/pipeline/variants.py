@@ -14,6 +14,7 @@ from embomatrix.factory.admission import Admitted, admit
 from embomatrix.factory.pipeline.poses import Needs, SceneSurvey, cache_poses
 from embomatrix.factory.pipeline.settings import WriterKind
 from embomatrix.factory.pipeline.store import Rejection, VariantResult
+from embomatrix.factory.refusal import Refusal
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.social.writer import SocialWriter
 from embomatrix.factory.writer.rehearsal import Rehearsal
@@ -189,7 +190,9 @@ class _VariantJob:
             task_id = f"{self._variant.scene.scene_id}-{len(drafts):02d}"
             category = wanted[attempt % len(wanted)]
             draft = self._writer.write(self._variant, view, category, task_id, rng)
-            if draft is not None and self._is_new(draft):
+            if isinstance(draft, Refusal):
+                self._reject(category, draft)
+            elif draft is not None and self._is_new(draft):
                 drafts.append(draft)
                 self._known.add(key_of(draft.signature, draft.task.instruction))
         return drafts
@@ -222,17 +225,22 @@ class _VariantJob:
         if isinstance(verdict, Admitted):
             self._admitted.append((draft, verdict.plan))
             return True
+        self._reject(draft.task.category, verdict, draft.task.instruction, draft.task.goal_bddl)
+        return False
+
+    def _reject(
+        self, category: TaskCategory, refusal: Refusal, instruction: str = "", goal: str = ""
+    ) -> None:
         self._rejections.append(
             Rejection(
                 scene=self._variant.scene.scene_id,
-                category=draft.task.category.value,
-                instruction=draft.task.instruction,
-                goal=draft.task.goal_bddl,
-                reason=verdict.reason,
-                sentence=verdict.sentence,
+                category=category.value,
+                instruction=instruction,
+                goal=goal,
+                reason=refusal.reason,
+                sentence=refusal.sentence,
             )
         )
-        return False
 
     def _result(self, digest: str) -> VariantResult:
         records = tuple(

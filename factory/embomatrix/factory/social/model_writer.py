@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING
 
+from embomatrix.factory.refusal import Refusal, RefusalReason
 from embomatrix.factory.social.conversing import starting_slots
 from embomatrix.factory.social.facts import facts_of, with_sights
 from embomatrix.factory.social.requests import piece_of
@@ -12,7 +13,8 @@ from embomatrix.factory.social.transcript import transcript_of
 from embomatrix.factory.writer.goals import Workshop
 from embomatrix.factory.writer.tasks import Draft, draft_of
 from embomatrix.llm.loop import OnOneLoop
-from embomatrix.llm.values import UnusableReplyError
+from embomatrix.llm.patience import Patience
+from embomatrix.llm.values import EndpointError, UnusableReplyError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
     from embomatrix.factory.social.values import Cast
     from embomatrix.factory.writer.variant import Variant
     from embomatrix.factory.writer.view import SceneView
+    from embomatrix.llm.values import LlmError
     from embomatrix.world.scene import Scene
     from embomatrix.world.task import TaskCategory
 
@@ -33,7 +36,7 @@ SEEDS = 2**31
 
 
 class ModelWriter(OnOneLoop):
-    """Writes drafts by what the agents answer. An answer that stays unusable costs its draft and no more.
+    """Writes drafts by what the agents answer. An answer that stays unusable, or does not come, costs its draft and no more.
 
     ``look`` gives pictures of a scene, for a model that sees: then each base scene is looked at once, before anything is asked.
     """
@@ -47,6 +50,7 @@ class ModelWriter(OnOneLoop):
         super().__init__(endpoint)
         self._agents = agents
         self._look = look
+        self._patience = Patience()
         self._casts: dict[str, Cast] = {}
         self._sights: dict[str, Mapping[str, str]] = {}
 
@@ -57,13 +61,18 @@ class ModelWriter(OnOneLoop):
         category: TaskCategory,
         task_id: str,
         rng: np.random.Generator,
-    ) -> Draft | None:
-        """A draft, None where the model gave nothing usable. Raises EndpointError where nobody answers."""
+    ) -> Draft | Refusal:
+        """A draft, or why the model gave none. Raises EndpointError where nobody answered a few times in a row."""
         try:
-            return self._runner.run(self._write(variant, view, category, task_id, rng))
+            draft = self._runner.run(self._write(variant, view, category, task_id, rng))
         except UnusableReplyError as error:
-            logger.warning("no draft %s: %s", task_id, error)
-            return None
+            self._patience.answered()
+            return _refused(task_id, RefusalReason.UNUSABLE_ANSWER, error)
+        except EndpointError as error:
+            self._patience.unanswered(error)
+            return _refused(task_id, RefusalReason.NO_ANSWER, error)
+        self._patience.answered()
+        return draft
 
     async def _write(
         self,
@@ -97,3 +106,8 @@ class ModelWriter(OnOneLoop):
         except UnusableReplyError as error:
             logger.warning("%s is told of by its inventory alone: %s", scene.base, error)
             return {}
+
+
+def _refused(task_id: str, reason: RefusalReason, error: LlmError) -> Refusal:
+    logger.warning("no draft %s: %s", task_id, error)
+    return Refusal(reason, str(error))

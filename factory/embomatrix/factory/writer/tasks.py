@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
     import numpy as np
 
+    from embomatrix.factory.refusal import Refusal
     from embomatrix.factory.writer.variant import Variant
     from embomatrix.factory.writer.view import SceneView
 
@@ -85,8 +86,11 @@ class TaskWriter(Protocol):
         category: TaskCategory,
         task_id: str,
         rng: np.random.Generator,
-    ) -> Draft | None:
-        """A task of the category, None when the variant's rooms hold nothing for one. The generator decides all."""
+    ) -> Draft | Refusal | None:
+        """A task of the category, None when the variant's rooms hold nothing for one. The generator decides all.
+
+        A refusal tells why whoever was asked for a task gave none.
+        """
         ...
 
 
