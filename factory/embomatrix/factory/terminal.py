@@ -46,20 +46,20 @@ def progress(console: Console) -> Progress:
 def mended(out: Path | None = None, kept: str = "") -> Iterator[None]:
     """What a person can mend is one sentence and exit status 2, an interrupt one and 130.
 
-    ``out`` is what is written, ``kept`` what an interrupt leaves in it.
+    ``out`` is what is written, ``kept`` what is left in it by an interrupt, a full disk, or others who answer no more.
     """
     try:
         yield
     except (
         CatalogError,
-        ClusterError,
         DatasetError,
         EngineMissingError,
         EvaluationError,
-        LlmError,
         SourceError,
     ) as error:
         fail(str(error))
+    except (ClusterError, LlmError) as error:
+        fail(f"{error}{kept}")
     except OSError as error:
         if out is None:
             raise
