@@ -80,6 +80,24 @@ LookAhead = Annotated[
 ]
 
 
+SocialLlm = Annotated[
+    str,
+    typer.Option(
+        help="Base URL of an OpenAI-compatible endpoint, such as http://127.0.0.1:8000/v1: the social agents are its model."
+    ),
+]
+PriceOfTokens = Annotated[
+    tuple[float, float], typer.Option(help="Of a million tokens, in and out, for the account.")
+]
+ManagerAt = Annotated[
+    str, typer.Option(help="HOST:PORT of a manager, on whose slots the oracle's plans are executed as well.")
+]
+Look = Annotated[
+    bool,
+    typer.Option("--look", help="Show the model a plan and views of each scene first: for models that see."),
+]
+
+
 @app.command()
 def build(
     out: Out,
@@ -118,33 +136,17 @@ def generate(
     jobs: Jobs = None,
     look_ahead: LookAhead = True,
     forms: Forms = None,
-    llm: Annotated[
-        str,
-        typer.Option(
-            help="Base URL of an OpenAI-compatible endpoint, such as http://127.0.0.1:8000/v1: the social agents are its model."
-        ),
-    ] = "",
+    llm: SocialLlm = "",
     model: Model = "",
     key: Key = "",
     cassette: Tape = None,
-    price: Annotated[
-        tuple[float, float], typer.Option(help="Of a million tokens, in and out, for the account.")
-    ] = (0.0, 0.0),
-    manager: Annotated[
-        str,
-        typer.Option(help="HOST:PORT of a manager, on whose slots the oracle's plans are executed as well."),
-    ] = "",
-    look: Annotated[
-        bool,
-        typer.Option(
-            "--look", help="Show the model a plan and views of each scene first: for models that see."
-        ),
-    ] = False,
+    price: PriceOfTokens = (0.0, 0.0),
+    manager: ManagerAt = "",
+    look: Look = False,
     token: Annotated[str, typer.Option(envvar="EMBOMATRIX_TOKEN", help="Token for it.")] = "",
     ca: Annotated[Path | None, typer.Option(envvar="EMBOMATRIX_CA", help="Its ca.pem.")] = None,
 ) -> None:
     """Play the people of each scene, and make tasks of what they come to ask the robot for; keep what they said."""
-    names = scene_ids(scenes)
     kind = WriterKind.MODEL if llm or cassette is not None else WriterKind.SOCIAL
     if llm and not model:
         fail("--llm needs the name of a model there: give --model")
@@ -152,13 +154,10 @@ def generate(
         fail("--look shows scenes to a language model: give --llm URL and --model NAME, or --cassette FILE")
     modelled = modelled_names(forms or [])
     told = sorted([*modelled, *[SCENE_EXTRACTOR] * look])
-    settings = BuildSettings(tasks, heldout, seed, names, kind, look_ahead, tuple(told))
+    settings = BuildSettings(tasks, heldout, seed, scene_ids(scenes), kind, look_ahead, tuple(told))
     with contextlib.ExitStack() as stack:
         stack.enter_context(mended(out))
-        check: Check | None = None
-        if manager:
-            trusted = ca.read_bytes() if ca is not None else b""
-            check = stack.enter_context(ClusterJudge(manager, token, trusted)).check
+        check = _second_judge(stack, manager, token, ca)
         layout = _layout(stack, modelled, llm, model, key, cassette)
         if kind is WriterKind.SOCIAL:
             _make(out, settings, jobs=jobs, check=check, layout=layout)
@@ -167,6 +166,14 @@ def generate(
         writer, ledger = stack.enter_context(asked_writer(asked))
         _make(out, settings, writer, check=check, layout=layout)
         _print_account(ledger)
+
+
+def _second_judge(stack: contextlib.ExitStack, manager: str, token: str, ca: Path | None) -> Check | None:
+    """The cluster behind a manager, open as long as the stack is; None where there is none. Raises ClusterError, OSError."""
+    if not manager:
+        return None
+    trusted = ca.read_bytes() if ca is not None else b""
+    return stack.enter_context(ClusterJudge(manager, token, trusted)).check
 
 
 def _layout(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from pathlib import Path  # noqa: TC003  typer reads the annotations when a command runs
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
@@ -41,20 +41,20 @@ Llm = Annotated[
     str, typer.Option(help="Base URL of an OpenAI-compatible endpoint for agents that are models.")
 ]
 Model = Annotated[str, typer.Option(help="Name of the model there.")]
+MethodName = Annotated[str, typer.Option(help="tree, or one that it is compared with: random, poses.")]
+Told = Annotated[
+    Path | None, typer.Option(help="Folder for the plan's picture and for what each agent was told.")
+]
 
 
 def lay(
     scene: Annotated[str, typer.Option(help="Base scene.")],
     bddl: Annotated[Path | None, typer.Option(help="A BDDL problem file.")] = None,
     activity: Annotated[str, typer.Option(help="An activity of the bddl package.")] = "",
-    method: Annotated[
-        str, typer.Option(help="tree, or one that it is compared with: random, poses.")
-    ] = "tree",
+    method: MethodName = "tree",
     forms: Forms = None,
     seed: Annotated[int, typer.Option(min=0, help="Equal seeds give equal scenes.")] = 0,
-    out: Annotated[
-        Path | None, typer.Option(help="Folder for the plan's picture and for what each agent was told.")
-    ] = None,
+    out: Told = None,
     llm: Llm = "",
     model: Model = "",
     key: Key = "",
@@ -80,16 +80,22 @@ def lay(
             return kept[-1]
 
         imported = import_problem(source, build_base_scene(scene), seed=seed, manner=Manner(laying))
-        for layout in kept:
-            _show(layout)
-            if out is not None:
-                _write_briefs(out, layout.record)
+        _hand_out(kept, out)
         if isinstance(imported, Refusal):
             _fail(f"{source.name} is refused ({imported.reason}): {imported.sentence}")
         if out is not None:
-            out.mkdir(parents=True, exist_ok=True)
             draw_plan(imported.scene).save(out / "plan.png")
             Console().print(f"pictures and briefs: {out}", highlight=False)
+
+
+def _hand_out(layouts: Sequence[Layout], out: Path | None) -> None:
+    """The trees on the screen, and in the folder what each agent was told."""
+    for layout in layouts:
+        _show(layout)
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        for layout in layouts:
+            _write_briefs(out, layout.record)
 
 
 def _show(layout: Layout) -> None:
@@ -104,7 +110,6 @@ def _show(layout: Layout) -> None:
 
 def _write_briefs(out: Path, record: Record) -> None:
     """Every brief as the file that ``factory agent NAME --in`` takes."""
-    out.mkdir(parents=True, exist_ok=True)
     told = [(AgentName.DISTRIBUTOR, record.distribution[0])] if record.distribution else []
     briefs: list[tuple[AgentName, object]] = [
         *told,

@@ -7,6 +7,7 @@ from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.check import reach_problems
 from embomatrix.factory.scenes.floor import ReachableFloor, box_of
 from embomatrix.factory.scenes.solids import Solids, placed_parts
+from embomatrix.factory.writer.tables import BASKETS, belongs
 from embomatrix.factory.writer.variant import build_variant
 from embomatrix.world.scene import Scene
 
@@ -37,3 +38,32 @@ def test_doors_that_stand_open_at_the_start_bar_no_way_and_no_other_door(base: S
         if asset.can("openable") and asset.joints and item.name not in ajar:
             wide = placed_parts(asset, item.pose_world_asset, [1.0] * len(asset.joints))
             assert not solids.overlaps(wide), item.name
+
+
+def test_small_things_are_where_such_things_are_found() -> None:
+    office = build_base_scene("office_cubicles_right", seed=0)
+    rooms = [room.name for room in office.rooms if room.type in {"private_office", "bathroom", "break_room"}]
+    types = {room.name: room.type for room in office.rooms}
+    for seed in range(3):
+        variant = build_variant(office, rooms[-3:], "tidy", np.random.default_rng(seed))
+        things = [name for name in variant.added if variant.scene.by_name[name].host]
+        assert things
+        for name in things:
+            item = variant.scene.by_name[name]
+            category = variant.scene.asset_of(name).category
+            assert category in BASKETS or belongs(category, types[item.room]), (name, item.room)
+
+
+@pytest.mark.parametrize(
+    ("category", "room_type", "found"),
+    [
+        ("saucepan", "private_office", False),
+        ("saucepan", "kitchen", True),
+        ("mug", "private_office", True),
+        ("toilet_paper", "dining_room", False),
+        ("chopping_board", "classroom", False),
+        ("vase", "corridor", True),
+    ],
+)
+def test_each_kind_of_room_has_its_small_things(category: str, room_type: str, found: bool) -> None:
+    assert belongs(category, room_type) == found

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.social.occasions import Occasion, Theme, occasion_of
-from embomatrix.factory.writer.tables import FOR_DRINKS, MEMBERS, Group
+from embomatrix.factory.writer.tables import FOR_DRINKS, KITCHENWARE, MEMBERS, Group
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -73,7 +73,6 @@ NOT_IN: Final[Mapping[Group, frozenset[str]]] = {
 FOR_DISHES: Final = frozenset({"dishwasher", "dish_rack", "dish_rack_cart"})
 FOR_BOOKS: Final = frozenset({"bookcase", "bookshelf"})
 _EATEN: Final = frozenset({Group.FOOD, Group.FRUIT, Group.PACKAGES})
-ONLY_IN_KITCHENS: Final = frozenset({"chopping_board", "frying_pan", "saucepan"})
 NOT_NAMED: Final = frozenset({"eyeglasses"})
 """Words that take a plural verb, which the sentences have not."""
 NOT_ON_SOFT: Final = frozenset(
@@ -252,7 +251,7 @@ def is_plausible(thing: str, host: str, room_type: str, *, inside: bool) -> bool
         return False
     if host in FOR_BOOKS and group in _EATEN:
         return False
-    if thing in ONLY_IN_KITCHENS and room_type not in _KITCHEN:
+    if thing in KITCHENWARE and room_type not in _KITCHEN:
         return False
     if host in SEATS or host in SOFT or host.endswith("_chair"):
         return host in SOFT and group not in NOT_ON_SOFT

@@ -70,6 +70,11 @@ class Depth(StrEnum):
 Report = Annotated[
     Path | None, typer.Option(help="File for what became of each problem, in JSON; beside it in Markdown.")
 ]
+Eai = Annotated[Path | None, typer.Option(help="Folder of the unpacked wheel of eai-eval: its 100 tasks.")]
+Instantiate = Annotated[
+    bool, typer.Option("--instantiate", help="Bind goals as well that no skill reaches; no verification.")
+]
+LookAhead = Annotated[bool, typer.Option(help="Find out what the robot's arm can do in each scene.")]
 Rates = Annotated[Path | None, typer.Option("--json", help="File for the import rates.")]
 Kept = Annotated[
     Path | None,
@@ -92,20 +97,14 @@ def import_(
     bddl: Annotated[Path | None, typer.Option(help="A BDDL problem file.")] = None,
     activity: Annotated[str, typer.Option(help="An activity of the bddl package, or 'all'.")] = "",
     jsonl: Annotated[Path | None, typer.Option(help="Records with 'name' and 'bddl'.")] = None,
-    eai: Annotated[
-        Path | None, typer.Option(help="Folder of the unpacked wheel of eai-eval: its 100 tasks.")
-    ] = None,
+    eai: Eai = None,
     scenes: Scenes = None,
     seed: Annotated[int, typer.Option(min=0, help="Equal seeds give equal datasets.")] = 0,
     out: Annotated[Path | None, typer.Option(help="Folder for the admitted tasks.")] = None,
     bind_only: Annotated[bool, typer.Option("--bind-only", help="Leave out the verification.")] = False,
-    instantiate: Annotated[
-        bool, typer.Option("--instantiate", help="Bind goals as well that no skill reaches; no verification.")
-    ] = False,
+    instantiate: Instantiate = False,
     reached_by: ReachedBy = None,
-    look_ahead: Annotated[
-        bool, typer.Option(help="Find out what the robot's arm can do in each scene.")
-    ] = True,
+    look_ahead: LookAhead = True,
     report: Report = None,
     json_file: Rates = None,
     outcomes: Kept = None,
@@ -119,20 +118,12 @@ def import_(
             check_writable(file)
         if out is not None:
             _check_free(out, depth, outcomes)
-        sources = [_parsed(source) for source in _sources(bddl, activity, jsonl, eai)]
-        if reached_by is not None:
-            sources = _reached(sources, reached_by)
+        sources = _sources(bddl, activity, jsonl, eai, reached_by)
         bases = [build_base_scene(scene_id) for scene_id in scene_ids(scenes)]
         foresight = Foresight() if look_ahead else None
         log = _taken_up(outcomes, sources, bases, seed, depth, foresight)
         made = _judged(console, sources[len(log.outcomes) :], bases, seed, depth, foresight, log)
-        verified = [item for item in made if isinstance(item, Verified)]
-        if out is not None and verified:
-            write_dataset(
-                out,
-                [item.record for item in verified],
-                {item.record.bundle_digest: item.bundle for item in verified},
-            )
+        admitted = out is None or _written(out, made)
         told = log.outcomes
         evaluation = (solved_of if depth is Depth.VERIFY else evaluation_of)(told, seed)
         _write(told, evaluation, report, json_file)
@@ -140,8 +131,17 @@ def import_(
         _print_one(console, sources[0], made[0])
         return
     _print_outcomes(console, told, depth)
-    if out is not None and not verified:
+    if not admitted:
         fail(f"no problem was admitted, so {out} was not written: `--bind-only` shows which could be bound")
+
+
+def _written(out: Path, made: Sequence[Imported | Verified | Refusal]) -> bool:
+    """Whether there was any task to put into the dataset."""
+    verified = [item for item in made if isinstance(item, Verified)]
+    if verified:
+        bundles = {item.record.bundle_digest: item.bundle for item in verified}
+        write_dataset(out, [item.record for item in verified], bundles)
+    return bool(verified)
 
 
 def _taken_up(
@@ -205,7 +205,15 @@ def _parsed(source: SourceText) -> SourceText:
     return source
 
 
-def _sources(bddl: Path | None, activity: str, jsonl: Path | None, eai: Path | None) -> Iterator[SourceText]:
+def _sources(
+    bddl: Path | None, activity: str, jsonl: Path | None, eai: Path | None, reached_by: Profile | None
+) -> list[SourceText]:
+    """The problems that are to be imported, all of which are BDDL. Raises SourceError."""
+    sources = [_parsed(source) for source in _given(bddl, activity, jsonl, eai)]
+    return sources if reached_by is None else _reached(sources, reached_by)
+
+
+def _given(bddl: Path | None, activity: str, jsonl: Path | None, eai: Path | None) -> Iterator[SourceText]:
     given = sum(map(bool, (bddl, activity, jsonl, eai)))
     if given != 1:
         raise SourceError(

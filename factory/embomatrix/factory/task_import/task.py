@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from embomatrix.factory.layout.jobs import Layout
+    from embomatrix.factory.layout.values import Failure
     from embomatrix.factory.task_import.binding import Addition, Binding
     from embomatrix.factory.task_import.sources import SourceText
     from embomatrix.world.bddl import Problem
@@ -150,21 +151,13 @@ class _Binder:
         So is furniture at which the robot does not get at what it must hold, as long as there is other; then the layout is
         drawn anew, and of those in which something stays out of hand the best is taken.
         """
-        manner, shunned, redrawn = self._manner, set[str](), 0
+        shunned, redrawn = set[str](), 0
         first: RefusedError | None = None
         resort: tuple[Binding, SceneEditor, dict[str, str]] | None = None
         least = math.inf
         while True:
             try:
-                binding = bind(
-                    self._problem,
-                    self._base,
-                    self._rng,
-                    furnishing=manner.furnishing,
-                    reachable=manner.reachable,
-                    renumbering=manner.renumbering,
-                    shunned=shunned,
-                )
+                binding = self._bound_to_furniture(shunned)
             except RefusedError as error:
                 if resort is not None:
                     return resort
@@ -178,10 +171,7 @@ class _Binder:
                 if len(layout.out_of_hand) < least:
                     least, resort = len(layout.out_of_hand), bound
             wrong = (*layout.failures, *layout.out_of_hand)[0]
-            first = first or RefusedError(
-                RefusalReason.DOES_NOT_FIT,
-                f"{wrong.thing!r} has no place {wrong.relation} {wrong.host}: {wrong.detail}",
-            )
+            first = first or _misfit(wrong)
             if wrong.host in binding.found.values() and len(shunned) < SHUNNED:
                 shunned.add(wrong.host)
             elif not layout.failures and redrawn < REDRAWN:
@@ -190,6 +180,19 @@ class _Binder:
                 return resort
             else:
                 raise first
+
+    def _bound_to_furniture(self, shunned: set[str]) -> Binding:
+        """The problem bound to other furniture of the scene than is shunned. Raises RefusedError."""
+        manner = self._manner
+        return bind(
+            self._problem,
+            self._base,
+            self._rng,
+            furnishing=manner.furnishing,
+            reachable=manner.reachable,
+            renumbering=manner.renumbering,
+            shunned=shunned,
+        )
 
     def _add_floor(self, editor: SceneEditor, floor: str, binding: Binding) -> str:
         if floor not in binding.floors:
@@ -372,6 +375,13 @@ def signature_of(goal: Formula, view: SceneView) -> str:
         args = (view.category(arg) if arg in view.scene.by_name else arg.lstrip("?") for arg in atom.args)
         signs.append(f"{atom.predicate}({','.join(args)})")
     return " ".join(sorted(signs))
+
+
+def _misfit(wrong: Failure) -> RefusedError:
+    return RefusedError(
+        RefusalReason.DOES_NOT_FIT,
+        f"{wrong.thing!r} has no place {wrong.relation} {wrong.host}: {wrong.detail}",
+    )
 
 
 def _slug(name: str) -> str:

@@ -20,24 +20,22 @@ app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 MOST_JOBS = 8
 """Each process holds a scene."""
 
+Physical = Annotated[
+    bool,
+    typer.Option("--physical", help="Let a robot carry the oracle's plans out in stepped physics as well."),
+]
+Sample = Annotated[int | None, typer.Option(min=1, help="So many tasks, drawn by the seed. Default: all.")]
+Figures = Annotated[Path | None, typer.Option("--json", help="File for the figures, for `evaluate page`.")]
+
 
 @app.command()
 def verify(
     folder: Annotated[Path, typer.Argument(help="Folder of a dataset.")] = Path("build/dataset"),
-    physical: Annotated[
-        bool,
-        typer.Option(
-            "--physical", help="Let a robot carry the oracle's plans out in stepped physics as well."
-        ),
-    ] = False,
-    sample: Annotated[
-        int | None, typer.Option(min=1, help="So many tasks, drawn by the seed. Default: all.")
-    ] = None,
+    physical: Physical = False,
+    sample: Sample = None,
     seed: Annotated[int, typer.Option(min=0, help="Equal seeds draw equal tasks.")] = 0,
     jobs: Annotated[int | None, typer.Option(min=1, help="Processes.")] = None,
-    json_file: Annotated[
-        Path | None, typer.Option("--json", help="File for the figures, for `evaluate page`.")
-    ] = None,
+    json_file: Figures = None,
 ) -> None:
     """Judge admitted tasks again, each in two other processes, which must agree to the bit.
 

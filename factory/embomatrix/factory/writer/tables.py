@@ -129,6 +129,8 @@ NEVER_SWITCHED: Final = frozenset(
 FOR_DRINKS: Final = frozenset({"coffee_maker", "espresso_machine"})
 """What heats drinks, and no food."""
 
+KITCHENWARE: Final = frozenset({"chopping_board", "frying_pan", "saucepan"})
+"""Tableware that leaves no kitchen."""
 BASKETS: Final = ("wicker_basket", "storage_box")
 """Open containers that a variant may put on the floor or on a table."""
 
@@ -136,6 +138,13 @@ BASKETS: Final = ("wicker_basket", "storage_box")
 def groups_for(room_type: str) -> tuple[Group, ...]:
     """Groups of small things that suit a room; the first are the most likely."""
     return ROOM_GROUPS.get(room_type, DEFAULT_GROUPS)
+
+
+def belongs(category: str, room_type: str) -> bool:
+    """Whether a small thing is found in such a room."""
+    if category in KITCHENWARE and groups_for(room_type) != _KITCHEN:
+        return False
+    return any(category in MEMBERS[group] for group in groups_for(room_type))
 
 
 def suits(category: str, host_category: str) -> bool:

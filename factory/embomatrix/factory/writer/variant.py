@@ -10,7 +10,7 @@ from embomatrix.factory.editor import SceneEditor
 from embomatrix.factory.layout.generator import lay
 from embomatrix.factory.layout.jobs import Item
 from embomatrix.factory.writer.starts import OpenStarts
-from embomatrix.factory.writer.tables import BASKETS, MEMBERS, Group, groups_for
+from embomatrix.factory.writer.tables import BASKETS, MEMBERS, Group, belongs, groups_for
 from embomatrix.factory.writer.view import SceneView, is_liftable
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.state import State
@@ -75,7 +75,7 @@ def _is_in_its_place(editor: SceneEditor, name: str) -> bool:
 def _things(view: SceneView, rooms: Sequence[str], rng: np.random.Generator) -> list[Item]:
     """What goes into the rooms: a basket now and then, and things that suit them, each of another category than what is there.
 
-    So words can tell them apart. Which of the rooms a thing goes to is not decided here.
+    So words can tell them apart. Which of the rooms that suit a thing it goes to is not decided here.
     """
     types = {room.name: room.type for room in view.scene.rooms}
     present = {view.category(name) for room in rooms for name in view.in_room[room]}
@@ -85,7 +85,8 @@ def _things(view: SceneView, rooms: Sequence[str], rng: np.random.Generator) -> 
             chosen.setdefault(BASKETS[int(rng.integers(len(BASKETS)))], (room,))
         share = max(4, round(THINGS / len(rooms)))
         fresh = (name for name in _categories(types[room], rng) if name not in present | chosen.keys())
-        chosen |= dict.fromkeys(itertools.islice(fresh, share), tuple(rooms))
+        for name in itertools.islice(fresh, share):
+            chosen[name] = tuple(each for each in rooms if belongs(name, types[each]))
     return [Item(name, _models(name, rng), rooms=where) for name, where in chosen.items()]
 
 
@@ -100,7 +101,7 @@ def _categories(room_type: str, rng: np.random.Generator) -> list[str]:
         group = groups[int(rng.integers(len(groups)))]
         if pools[group]:
             order.append(pools[group].pop())
-    return order
+    return [name for name in order if belongs(name, room_type)]
 
 
 def _models(category: str, rng: np.random.Generator) -> tuple[tuple[str, str], ...]:
