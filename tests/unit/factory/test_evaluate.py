@@ -220,6 +220,16 @@ def test_the_page_keeps_all_but_the_factorys_part():
     assert again.count(BEGIN) == again.count(END) == 1
 
 
+def test_what_was_not_measured_anew_stays_on_the_page():
+    rooms = dataclasses.replace(EVALUATION, part="aesthetics", notes=("Of rooms.",))
+    page = with_factory("# Benchmarks\n", [EVALUATION, rooms])
+    assert page.index("### Diversity of tasks") < page.index("### Aesthetics")
+    worse = dataclasses.replace(EVALUATION.figures[0], value=0.4)
+    again = with_factory(page, [dataclasses.replace(EVALUATION, figures=(worse, *EVALUATION.figures[1:]))])
+    assert again == page.replace("| 0.3 | ≤ 0.35 | reached |", "| 0.4 | ≤ 0.35 | short |", 1)
+    assert with_factory(page, [rooms]) == page
+
+
 def test_files_of_one_part_are_put_together_on_the_page():
     other = dataclasses.replace(
         EVALUATION, figures=(dataclasses.replace(EVALUATION.figures[0], name="distinct1"),)

@@ -1,4 +1,7 @@
-"""The factory's part of the page of benchmarks: tables of evaluations between two marks, all else left as it is."""
+"""The factory's part of the page of benchmarks: tables of evaluations between two marks, all else left as it is.
+
+What was measured anew takes the place of what stood under the same heading; the other headings stay.
+"""
 
 from __future__ import annotations
 
@@ -19,6 +22,7 @@ WIDTH: Final = 128
 BEGIN: Final = "<!-- by hand: factory -->"
 """The page of benches keeps what stands between its marks, whoever wrote it."""
 END: Final = "<!-- end by hand -->"
+_HEADING: Final = "\n### "
 PARTS: Final[Mapping[str, tuple[str, str]]] = {
     "tasks": (
         "Diversity of tasks",
@@ -68,8 +72,12 @@ PARTS: Final[Mapping[str, tuple[str, str]]] = {
 
 
 def with_factory(page: str, evaluations: Sequence[Evaluation]) -> str:
-    """The page with the factory's part replaced, or added at its end. Raises EvaluationError where a mark lacks its other."""
-    text = f"{BEGIN}\n{render(evaluations)}\n{END}"
+    """The page with these evaluations in the factory's part, which is added at the end where it is not there yet.
+
+    Raises EvaluationError where a mark lacks its other, for an unknown part, or a figure that two files of a part give.
+    """
+    there = _there(page.partition(BEGIN)[2].partition(END)[0])
+    text = f"{BEGIN}\n{_render({**there, **_measured(evaluations)})}\n{END}"
     if BEGIN not in page:
         return f"{page.rstrip()}\n\n{text}\n" if page.strip() else f"{text}\n"
     before, _, rest = page.partition(BEGIN)
@@ -81,15 +89,31 @@ def with_factory(page: str, evaluations: Sequence[Evaluation]) -> str:
     return f"{before}{text}{after}"
 
 
-def render(evaluations: Sequence[Evaluation]) -> str:
-    """The part in Markdown, in the order of `PARTS`; files of one part are put together.
+def _there(text: str) -> dict[str, str]:
+    """What stands under the heading of each part."""
+    headings = {heading: part for part, (heading, _) in PARTS.items()}
+    found = {}
+    for section in text.split(_HEADING)[1:]:
+        heading, _, rest = section.partition("\n")
+        if heading in headings:
+            found[headings[heading]] = rest.strip()
+    return found
 
-    Raises EvaluationError for an unknown part, or a figure that two files of a part give.
-    """
-    lines = ["## Factory", "", "Written by `embomatrix factory evaluate page FILE...`.", ""]
+
+def _render(sections: Mapping[str, str]) -> str:
+    """The whole of it in Markdown, in the order of `PARTS`."""
+    lines = ["## Factory", "", "Written by `embomatrix factory evaluate page FILE...`."]
+    for part, (heading, _) in PARTS.items():
+        if part in sections:
+            lines += [f"{_HEADING}{heading}", "", sections[part]]
+    return "\n".join(lines) + "\n"
+
+
+def _measured(evaluations: Sequence[Evaluation]) -> dict[str, str]:
+    """What stands under the headings of these evaluations; files of one part are put together."""
+    sections = {}
     for part, mine in _by_part(evaluations).items():
-        heading, words = PARTS[part]
-        lines += [f"### {heading}", "", _paragraph(words), ""]
+        lines = [_paragraph(PARTS[part][1]), ""]
         measured = dict.fromkeys(
             "; ".join(f"{name.replace('_', ' ')} {value}" for name, value in each.conditions.items())
             for each in mine
@@ -98,7 +122,8 @@ def render(evaluations: Sequence[Evaluation]) -> str:
         lines += ["", *_table([figure for each in mine for figure in each.figures]), ""]
         for note in (note for each in mine for note in each.notes):
             lines += [_paragraph(note), ""]
-    return "\n".join(lines).rstrip() + "\n"
+        sections[part] = "\n".join(lines).strip()
+    return sections
 
 
 def _by_part(evaluations: Sequence[Evaluation]) -> dict[str, list[Evaluation]]:
