@@ -326,6 +326,21 @@ async def test_a_full_disk_is_told_and_what_was_written_before_is_still_there(tm
     await store.close()
 
 
+async def test_what_the_file_takes_back_by_itself_is_told_with_its_own_reason(tmp_path):
+    store = SqliteStore(tmp_path / "state.sqlite")
+    await store.claim(FIRST)
+    other = sqlite3.connect(tmp_path / "state.sqlite", isolation_level=None)
+    # As SQLite does on a full disk.
+    other.execute("CREATE TRIGGER full BEFORE INSERT ON run BEGIN SELECT RAISE(ROLLBACK, 'no room'); END")
+    with pytest.raises(StateError, match="no room"):
+        await store.open_run(RunRow("r1", ""))
+    other.execute("DROP TRIGGER full")
+    await store.open_run(RunRow("r1", ""))
+    assert [run.run_id for run in await store.runs()] == ["r1"]
+    other.close()
+    await store.close()
+
+
 async def test_a_write_waits_while_another_process_writes_to_the_file(tmp_path):
     store = SqliteStore(tmp_path / "state.sqlite")
     await store.claim(FIRST)

@@ -3,10 +3,12 @@
 import asyncio
 import resource
 
+import httpx
 import psutil
 import pytest
 from tests.fakes.real_cluster import RealCluster, batch_of, connected, opened, outcomes, tally, tell, until
 
+from embomatrix.cli.local_cluster import free_port
 from embomatrix.rpc.status import OverloadedError
 
 pytestmark = [pytest.mark.timeout(240), pytest.mark.slow]
@@ -14,7 +16,8 @@ pytestmark = [pytest.mark.timeout(240), pytest.mark.slow]
 
 async def test_results_wait_for_room_on_the_disk_and_new_runs_are_refused_with_the_remedy(tmp_path):
     with RealCluster(tmp_path) as cluster:
-        cluster.start_manager()
+        page_port = free_port()
+        cluster.start_manager(http_port=page_port)
         cluster.start_worker("w1")
         async with cluster.client() as client:
             await connected(client, "w1")
@@ -29,6 +32,9 @@ async def test_results_wait_for_room_on_the_disk_and_new_runs_are_refused_with_t
             with pytest.raises(OverloadedError, match="make room on its disk"):
                 await client.open_run("another")
             waited_at = len(seen)
+            asked = f"http://127.0.0.1:{page_port}/api/v1/snapshot"
+            told = await asyncio.to_thread(httpx.get, asked)
+            assert "make room on its disk" in told.json()["health"]["sentence"]
             await asyncio.sleep(2.0)
             assert len(seen) == waited_at, "a result was shown that is not written down"
             manager.rlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))

@@ -50,6 +50,8 @@ class Delivery:
         self._waiting: list[_Waiting] = []
         self._acknowledgements: list[AcknowledgeLease] = []
         self._fresh = asyncio.Event()
+        self.problem = ""
+        """Why results wait for the store, while they do."""
 
     def put(self, command: DeliverResult | FinishBatch) -> None:
         """Queue a result, or the end of a batch. There are never more than there are rollouts in the cluster."""
@@ -91,12 +93,14 @@ class Delivery:
         while parts := [page.part for page in pages if page.rows and not page.log.dropped]:
             try:
                 await self._store.append_results(parts)
-                return
+                break
             except FencedError:
                 raise
             except StateError as error:
+                self.problem = str(error)
                 logger.warning("results wait for the store: %s", error)
                 await asyncio.sleep(STORE_RETRY_S)
+        self.problem = ""
 
     def _show(self, page: _Page) -> None:
         now_s = time.monotonic()

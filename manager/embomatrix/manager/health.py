@@ -39,6 +39,8 @@ class Health:
 def health(seen: Overview, *, paused: bool, now_s: float) -> Health:
     """What an operator would want to hear first. ``now_s`` is wall time, as that of the failures."""
     working = seen.workers.get("ready", 0) + seen.workers.get("suspect", 0)
+    if seen.store:
+        return Health(Mood.BAD, f"Nothing can be written down, so nothing goes on: {seen.store}.")
     if paused:
         return Health(Mood.WARNING, "Dispatch is paused: nothing new is executed until somebody resumes it.")
     # Who left in order is nobody's trouble, unless nobody else is there.

@@ -209,6 +209,11 @@ class ManagerRuntime:
         """Whether an operator stopped dispatch."""
         return self._paused
 
+    @property
+    def store_problem(self) -> str:
+        """Why nothing can be written down, while that is so."""
+        return self._delivery.problem or ("the state store is away" if self._suspended else "")
+
     async def pause_dispatch(self) -> None:
         """No new leases are given, also by the managers that come after this one; what runs goes on.
 

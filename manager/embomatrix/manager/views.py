@@ -53,6 +53,8 @@ class Overview:
     """Announced scenes that no worker can hold."""
     phases: dict[str, PhaseSummary] = field(default_factory=dict)
     """Where the time of completed rollouts went, in the order in which it goes there."""
+    store: str = ""
+    """Why results can't be written down, while that is so."""
     overhead: float = 0.0
     """The manager's share of the CPU time that it and the slots used in the last minute."""
 
@@ -143,6 +145,7 @@ def overview(runtime: ManagerRuntime) -> Overview:
         notice=UNAUDITED if cluster.dispatcher.auditor.lone else "",
         unplaceable=len(cluster.scheduler.unplaceable),
         phases={phase.value: summary_of(found) for phase, found in runtime.chronicle.phases().items()},
+        store=runtime.store_problem,
         overhead=runtime.effort.overhead(),
     )
 

@@ -60,6 +60,11 @@ def test_health_says_first_what_matters_most():
     )
     assert "slot_crashed" in mood(workers={"ready": 12, "lost": 3}, failures=[NOTE])[1]
     assert mood(leased=0)[1] == "3 rollouts wait and none runs: no scene is warm yet."
+    full = "the state file can't be written: make room on its disk"
+    assert mood(store=full, paused=True) == (
+        Mood.BAD,
+        f"Nothing can be written down, so nothing goes on: {full}.",
+    )
     assert mood(paused=True, workers={})[1].startswith("Dispatch is paused")
 
 

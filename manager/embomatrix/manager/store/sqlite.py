@@ -285,10 +285,12 @@ class SqliteStore:
             if fenced and self._known_epoch() != self._epoch:
                 raise FencedError(f"another manager took over the state file {self._path}: stop this one")
             answer = work()
+            self._db.execute("COMMIT")
         except BaseException:
-            self._db.execute("ROLLBACK")
+            # On a full disk SQLite takes it back by itself.
+            if self._db.in_transaction:
+                self._db.execute("ROLLBACK")
             raise
-        self._db.execute("COMMIT")
         return answer
 
 
