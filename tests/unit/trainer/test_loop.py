@@ -195,7 +195,7 @@ def test_grpo_raises_held_out_success(tmp_path):
     summary, _ = run(
         tmp_path,
         tasks=replace(tasks),
-        imitation__steps=250,
+        imitation__steps=150,
         imitation__batch=24,
         imitation__learning_rate=5e-3,
         grpo__steps=150,

@@ -3,6 +3,7 @@
 import json
 
 import pytest
+import torch
 from tests.fakes.datasets import write_kitchen_dataset
 
 from embomatrix.trainer.checkpoint import CHECKPOINTS, CheckpointStore
@@ -93,3 +94,16 @@ def test_a_run_from_a_saved_policy_goes_on_with_that_policy_named_again(kitchen,
     start.progress.prepared = True
     CheckpointStore(arm / CHECKPOINTS, keep=1).save(start.policy, {}, start.progress, start.settings)
     assert resumed(kitchen, arm, {"imitation.seconds": 0.0}, model=policy).settings.model == policy
+
+
+@pytest.mark.parametrize(("able", "products"), [(True, torch.bfloat16), (False, torch.float32)])
+def test_the_small_policy_multiplies_in_half_the_bits_where_the_processor_has_instructions_for_it(
+    kitchen, tmp_path, monkeypatch, able, products
+):
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": able})
+    assert (
+        started(kitchen, tmp_path / "auto", "tiny", None, SMALL).policy.module.blocks[0].qkv.products
+        is products
+    )
+    whole = started(kitchen, tmp_path / "whole", "tiny", None, {**SMALL, "tiny.products": "float32"})
+    assert whole.policy.module.blocks[0].qkv.products is torch.float32

@@ -24,8 +24,8 @@ WORDS = build_vocabulary(
 SHAPE = DecoderShape(len(WORDS), layers=2, width=32, heads=2, inner=64)
 
 
-def policy(seed=0):
-    made = TinyPolicy(WORDS, SHAPE, seed=seed)
+def policy(seed=0, products=torch.float32):
+    made = TinyPolicy(WORDS, SHAPE, seed=seed, products=products)
     with torch.no_grad():
         for parameter in made.parameters():  # far from uniform, so that differences would show
             parameter.mul_(4 if parameter.dim() > 1 else 1)
@@ -72,6 +72,32 @@ def test_padding_and_sharing_the_prompt_change_neither_value_nor_gradient():
     )
     assert torch.allclose(together, alone, atol=1e-5)
     assert torch.allclose(shared, gradient(alone), atol=1e-3, rtol=1e-3)
+
+
+def test_products_of_half_the_bits_are_close_and_leave_weights_and_gradients_whole():
+    whole, half = policy(), policy(products=torch.bfloat16)
+    told = prompts(whole)
+    samples = draw(half, told)
+    scored = half.logprobs(told, samples.tokens, samples.mask, 4, 1.3)
+    apart = (scored.logprobs - whole.logprobs(told, samples.tokens, samples.mask, 4, 1.3).logprobs).abs()
+    assert 0 < apart.max() < 0.2  # of log-probabilities that differ by ten and more
+    assert torch.allclose(scored.logprobs, samples.logprobs * samples.mask, atol=0.1)
+    scored.logprobs.sum().backward()
+    assert {parameter.dtype for parameter in half.parameters()} == {torch.float32}
+    assert {parameter.grad.dtype for parameter in half.parameters()} == {torch.float32}
+
+
+@pytest.mark.parametrize("products", [torch.float32, torch.bfloat16])
+def test_what_was_learnt_between_two_samplings_shows_in_the_second(products):
+    made = policy(products=products)
+    before = draw(made, prompts(made))
+    with torch.no_grad():
+        for parameter in made.parameters():
+            parameter.neg_()
+    after = draw(made, prompts(made))
+    scored = made.logprobs(prompts(made), after.tokens, after.mask, 4, 1.3)
+    assert after.texts != before.texts
+    assert torch.allclose(scored.logprobs, after.logprobs * after.mask, atol=0.1)
 
 
 def test_samples_depend_on_the_generator_alone():

@@ -41,6 +41,14 @@ class OptimiserKind(StrEnum):
     MUON = "muon"  # for the matrices of linear layers, and AdamW for everything else
 
 
+class Products(StrEnum):
+    """The type in which the from-scratch policy multiplies matrices; weights, sums and attention are of 32 bits always."""
+
+    AUTO = "auto"  # bfloat16 where the processor has instructions for it
+    BFLOAT16 = "bfloat16"
+    FLOAT32 = "float32"
+
+
 class OnLost(StrEnum):
     """What becomes of a group of which the infrastructure lost a rollout."""
 
@@ -53,12 +61,16 @@ class _Frozen(BaseModel):
 
 
 class TinySettings(_Frozen):
-    """Shape of the from-scratch policy."""
+    """The from-scratch policy: its shape, and how it computes."""
 
     layers: int = Field(default=4, ge=1)
     width: int = Field(default=128, ge=16)
     heads: int = Field(default=4, ge=1)
     inner: int = Field(default=384, ge=16)
+    products: Products = Products.AUTO
+
+    def shape(self) -> dict[str, int]:
+        return self.model_dump(exclude={"products"})
 
 
 class LoraSettings(_Frozen):

@@ -9,6 +9,7 @@ Shapes: Q prompts, G samples of each, P prompt tokens, T new tokens, H heads of 
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,8 @@ from torch import nn
 from torch.nn import functional
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from torch import Tensor
 
 _HIDDEN_KEY = -1e9
@@ -51,46 +54,64 @@ class LayerMemory:
 
 @dataclass(frozen=True, slots=True)
 class PromptMemory:
-    """A batch of prompts, run. ``tokens`` (Q, P); ``hidden`` (Q, P) is true on padding; ``lengths`` (Q,); ``states``
-    (Q, P, C) of the last layer."""
+    """A batch of prompts, run. ``tokens`` (Q, P); ``hidden`` (Q, P) is true on padding; ``lengths`` (Q,); ``last`` (Q, 1, C),
+    the last layer's state after the last token; ``pointers`` (Q, P, C), what a word is pointed at by."""
 
     layers: tuple[LayerMemory, ...]
     tokens: Tensor
     hidden: Tensor
     lengths: Tensor
-    states: Tensor
+    last: Tensor
+    pointers: Tensor
 
     def of_rows(self, prompts: Tensor) -> PromptMemory:
-        """The prompts with these indices (rows,), each as often as it is named: a memory for groups of one.
+        """The prompts with these indices (rows,), each as often as it is named.
 
-        Rows that end at different lengths can then be run apart, without the padding of the longest.
+        Rows that end at different lengths can then be run apart, as groups of one, without the padding of the longest.
         """
         return PromptMemory(
             tuple(layer.of_rows(prompts) for layer in self.layers),
             self.tokens[prompts],
             self.hidden[prompts],
             self.lengths[prompts],
-            self.states[prompts],
+            self.last[prompts],
+            self.pointers[prompts],
         )
 
 
+class _Product(nn.Linear):
+    """A matrix product in a type of its own; the weight stays in 32 bits, and its gradient comes in them."""
+
+    def __init__(self, inside: int, outside: int, products: torch.dtype) -> None:
+        super().__init__(inside, outside, bias=False)
+        self.products = products
+        self.converted: Tensor | None = None
+        """The weight as it is multiplied, while it is known not to change."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        """The result is of the product's type."""
+        weight = self.weight.to(self.products) if self.converted is None else self.converted
+        return functional.linear(x.to(self.products), weight)
+
+
 class _Block(nn.Module):
-    def __init__(self, shape: DecoderShape) -> None:
+    def __init__(self, shape: DecoderShape, products: torch.dtype) -> None:
         super().__init__()
         self.heads = shape.heads
         self.before_attention = nn.RMSNorm(shape.width)
-        self.qkv = nn.Linear(shape.width, 3 * shape.width, bias=False)
-        self.out = nn.Linear(shape.width, shape.width, bias=False)
+        self.qkv = _Product(shape.width, 3 * shape.width, products)
+        self.out = _Product(shape.width, shape.width, products)
         self.before_inner = nn.RMSNorm(shape.width)
-        self.gate_up = nn.Linear(shape.width, 2 * shape.inner, bias=False)
-        self.down = nn.Linear(shape.inner, shape.width, bias=False)
+        self.gate_up = _Product(shape.width, 2 * shape.inner, products)
+        self.down = _Product(shape.inner, shape.width, products)
 
     def project(self, x: Tensor, rope: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
         """Queries, keys and values (rows, H, T, D) of x (rows, T, C)."""
         rows, length, width = x.shape
-        split = self.qkv(self.before_attention(x)).view(rows, length, 3, self.heads, width // self.heads)
-        q, k, v = split.permute(2, 0, 3, 1, 4)  # each (rows, H, T, D)
-        return _rotated(q, rope), _rotated(k, rope), v
+        product = self.qkv(self.before_attention(x)).to(x.dtype)
+        split = product.view(rows, length, 3, self.heads, width // self.heads).permute(2, 0, 3, 1, 4)
+        q, k = _rotated(split[:2], rope)  # each (rows, H, T, D)
+        return q, k, split[2]
 
     def finish(self, x: Tensor, attended: Tensor) -> Tensor:
         """Add attention's result (rows, H, T, D) and the feed-forward to x (rows, T, C)."""
@@ -111,11 +132,13 @@ class Decoder(nn.Module):
     cos: Tensor
     sin: Tensor
 
-    def __init__(self, shape: DecoderShape, generator: torch.Generator) -> None:
+    def __init__(
+        self, shape: DecoderShape, generator: torch.Generator, products: torch.dtype = torch.float32
+    ) -> None:
         super().__init__()
         self.shape = shape
         self.embedding = nn.Embedding(shape.vocabulary, shape.width)
-        self.blocks = nn.ModuleList(_Block(shape) for _ in range(shape.layers))
+        self.blocks = nn.ModuleList(_Block(shape, products) for _ in range(shape.layers))
         self.norm = nn.RMSNorm(shape.width)
         self.point_from = nn.Linear(shape.width, shape.width, bias=False)
         self.point_to = nn.Linear(shape.width, shape.width, bias=False)
@@ -137,8 +160,8 @@ class Decoder(nn.Module):
         prompts, prompt_length = prompt.tokens.shape
         x = self.norm(states)
         generated = torch.softmax((x @ self.embedding.weight.t()).masked_fill(barred, _HIDDEN_KEY), dim=-1)
-        asked = self.point_from(x).view(prompts, -1, width)  # (Q, G T, C)
-        looked = asked @ self.point_to(self.norm(prompt.states)).transpose(1, 2) * width**-0.5  # (Q, G T, P)
+        asked = self.point_from(x).view(prompts, -1, width) * width**-0.5  # (Q, G T, C)
+        looked = asked @ prompt.pointers.transpose(1, 2)  # (Q, G T, P)
         index = prompt.tokens[:, None].expand(prompts, asked.shape[1], prompt_length)
         nowhere = prompt.hidden[:, None] | barred.view(prompts, asked.shape[1], -1).gather(2, index)
         attention = torch.softmax(looked.masked_fill(nowhere, _HIDDEN_KEY), dim=-1)
@@ -147,6 +170,18 @@ class Decoder(nn.Module):
         share = torch.sigmoid(self.point_share(x))  # (Q G, T, 1)
         mixed = torch.lerp(generated, pointed, share)
         return mixed.clamp(min=_LEAST).log().masked_fill(barred, _HIDDEN_KEY)
+
+    @contextlib.contextmanager
+    def unchanged(self) -> Iterator[None]:
+        """For many words in a row: no weight changes or learns meanwhile, so that each is converted once."""
+        layers = [layer for layer in self.modules() if isinstance(layer, _Product)]
+        try:
+            for layer in layers:
+                layer.converted = layer.weight.detach().to(layer.products)
+            yield
+        finally:
+            for layer in layers:
+                layer.converted = None
 
     def _rope(self, positions: Tensor) -> tuple[Tensor, Tensor]:
         """positions: (rows, T)."""
@@ -165,7 +200,8 @@ class Decoder(nn.Module):
             attended = functional.scaled_dot_product_attention(q, k, v, attn_mask=bias)
             x = block.finish(x, attended)  # type: ignore[operator]
             memories.append(LayerMemory(k, v))
-        return PromptMemory(tuple(memories), tokens, hidden, lengths, x)
+        pointers = self.point_to(self.norm(x))
+        return PromptMemory(tuple(memories), tokens, hidden, lengths, x[:, -1:], pointers)
 
     def extend(
         self, prompt: PromptMemory, tokens: Tensor, past: tuple[LayerMemory, ...] | None, start: int

@@ -51,12 +51,22 @@ class _Writing:
         """With one more word of each plan (rows,)."""
         return replace(self, going=self.going & (choice != END), cursor=grammar.advanced(self.cursor, choice))
 
+    def kept(self) -> Tensor:
+        """Indices of the plans that go on, with ended ones among them so that every prompt left has as many."""
+        going = self.going.view(len(self.memory.lengths), -1)  # (Q, G)
+        left = going.sum(dim=1)
+        prompts = left.nonzero()[:, 0]
+        first = going[prompts].argsort(dim=1, descending=True, stable=True)[:, : int(left.max())]
+        return (prompts[:, None] * going.shape[1] + first).flatten()
+
     def of_rows(self, kept: Tensor) -> _Writing:
-        """The plans with these indices alone."""
+        """The plans that ``kept`` named alone."""
+        of_prompt = kept * len(self.memory.lengths) // len(self.going)
+        prompts = torch.unique(of_prompt)
         return _Writing(
             self.rows[kept],
             self.going[kept],
-            self.memory.of_rows(kept * len(self.memory.lengths) // len(self.going)),
+            self.memory if len(prompts) == len(self.memory.lengths) else self.memory.of_rows(prompts),
             self.names.of_rows(kept),
             self.cursor.of_rows(kept),
             tuple(layer.of_rows(kept) for layer in self.own) if self.own else None,
@@ -64,13 +74,19 @@ class _Writing:
 
 
 class TinyPolicy:
-    """A ``Decoder`` over a ``Vocabulary``; plans are written in the ``names`` codec."""
+    """A ``Decoder`` over a ``Vocabulary``, which multiplies in ``products``; plans are written in the ``names`` codec."""
 
     def __init__(
-        self, vocabulary: Vocabulary, shape: DecoderShape, *, seed: int, device: str = "cpu"
+        self,
+        vocabulary: Vocabulary,
+        shape: DecoderShape,
+        *,
+        seed: int,
+        device: str = "cpu",
+        products: torch.dtype = torch.float32,
     ) -> None:
         self.vocabulary = vocabulary
-        self.network = Decoder(shape, torch.Generator().manual_seed(seed)).to(device)
+        self.network = Decoder(shape, torch.Generator().manual_seed(seed), products).to(device)
         self.device = torch.device(device)
         self._grammar = PlanGrammar(vocabulary, self.device)
 
@@ -108,30 +124,30 @@ class TinyPolicy:
         generator: torch.Generator,
     ) -> Samples:
         writing = self._begun(prompts, group)
-        state = writing.memory.states[:, -1:].repeat_interleave(group, dim=0)  # (rows, 1, C)
+        state = writing.memory.last.repeat_interleave(group, dim=0)  # (rows, 1, C)
         count = len(writing.rows)
         tokens = torch.full((count, max_new), PAD, device=self.device)
         logprobs = torch.zeros(count, max_new, device=self.device)
         mask = torch.zeros(count, max_new, dtype=torch.bool, device=self.device)
         length = 0
-        for at in range(max_new):
-            barred = self._grammar.barred(writing.cursor, writing.names)[:, None]
-            scores = self.network.scores(state, writing.memory, barred)[:, 0]
-            choice, logprob = draw(scores, temperature, generator)
-            rows, going = writing.rows, writing.going
-            tokens[rows, at] = torch.where(going, choice, PAD)
-            logprobs[rows, at] = torch.where(going, logprob, 0.0)
-            mask[rows, at] = going
-            length = at + 1
-            writing = writing.after(choice, self._grammar)
-            left = int(writing.going.sum())
-            if left == 0:
-                break
-            if left <= _COMPACT_SHARE * len(writing.going):
-                kept = writing.going.nonzero()[:, 0]
-                writing, choice = writing.of_rows(kept), choice[kept]
-            state, own = self.network.extend(writing.memory, choice[:, None], writing.own, at)
-            writing = replace(writing, own=own)
+        with self.network.unchanged():
+            for at in range(max_new):
+                barred = self._grammar.barred(writing.cursor, writing.names)[:, None]
+                scores = self.network.scores(state, writing.memory, barred)[:, 0]
+                choice, logprob = draw(scores, temperature, generator)
+                rows, going = writing.rows, writing.going
+                tokens[rows, at] = torch.where(going, choice, PAD)
+                logprobs[rows, at] = torch.where(going, logprob, 0.0)
+                mask[rows, at] = going
+                length = at + 1
+                writing = writing.after(choice, self._grammar)
+                kept = writing.kept()
+                if len(kept) == 0:
+                    break
+                if len(kept) <= _COMPACT_SHARE * len(writing.going):
+                    writing, choice = writing.of_rows(kept), choice[kept]
+                state, own = self.network.extend(writing.memory, choice[:, None], writing.own, at)
+                writing = replace(writing, own=own)
         drawn = tokens[:, :length]
         texts = tuple(self.vocabulary.decode(row) for row in drawn.tolist())
         return Samples(drawn, mask[:, :length], logprobs[:, :length], texts)
@@ -148,27 +164,30 @@ class TinyPolicy:
         self, prompts: Sequence[Tokens], tokens: Tensor, mask: Tensor, group: int, temperature: float
     ) -> Scored:
         memory = self.network.read(*self._padded(prompts))
+        of_prompt = torch.arange(len(tokens), device=self.device) // group
+        barred = self._grammar.barred_along(
+            tokens, self._grammar.names(memory.tokens).of_rows(of_prompt)
+        )  # (rows, T, V)
         lengths = mask.sum(dim=1)
         order = torch.argsort(lengths, stable=True)
-        parts = [
-            self._scored(memory, tokens[rows, : max(1, int(lengths[rows].max()))], rows // group, temperature)
-            for rows in order.tensor_split(min(_LENGTH_CLASSES, len(order)))
-        ]
+        scored = []
+        for rows in order.tensor_split(min(_LENGTH_CLASSES, len(order))):
+            size = max(1, int(lengths[rows].max()))
+            apart = memory.of_rows(of_prompt[rows])
+            scored.append(self._scored(apart, tokens[rows, :size], barred[rows, :size], temperature))
         back = torch.argsort(order)
         size = tokens.shape[1]
         chosen, entropy = (
             torch.cat([functional.pad(part, (0, size - part.shape[1])) for part in column])[back]
-            for column in zip(*parts, strict=True)
+            for column in zip(*scored, strict=True)
         )
         return Scored(chosen * mask, entropy * mask)
 
     def _scored(
-        self, memory: PromptMemory, tokens: Tensor, prompts: Tensor, temperature: float
+        self, memory: PromptMemory, tokens: Tensor, barred: Tensor, temperature: float
     ) -> tuple[Tensor, Tensor]:
-        """Log-probability and entropy (rows, T) of each token (rows, T), after the prompts with these indices (rows,)."""
-        memory = memory.of_rows(prompts)
-        barred = self._grammar.barred_along(tokens, self._grammar.names(memory.tokens))  # (rows, T, V)
-        states = memory.states[:, -1:]  # (rows, 1, C)
+        """Log-probability and entropy (rows, T) of each token (rows, T), where ``barred`` words (rows, T, V) get none."""
+        states = memory.last  # (rows, 1, C)
         if tokens.shape[1] > 1:
             rest, _ = self.network.extend(memory, tokens[:, :-1], None, 0)
             states = torch.cat([states, rest], dim=1)  # (rows, T, C)
@@ -205,12 +224,12 @@ class TinyPolicy:
         (folder / _DESCRIPTION).write_text(json.dumps(described))
 
     @classmethod
-    def load(cls, folder: Path, *, device: str = "cpu") -> Self:
+    def load(cls, folder: Path, *, device: str = "cpu", products: torch.dtype = torch.float32) -> Self:
         """Read what ``save`` wrote. Raises OSError, ValueError or RuntimeError where it is not that."""
         described = json.loads((folder / _DESCRIPTION).read_text())
         shape = DecoderShape(**described["shape"])
         words, things, rooms = (tuple(described[part]) for part in ("words", "things", "rooms"))
-        policy = cls(Vocabulary(words, things, rooms), shape, seed=0, device=device)
+        policy = cls(Vocabulary(words, things, rooms), shape, seed=0, device=device, products=products)
         policy.network.load_state_dict(torch.load(folder / _WEIGHTS, map_location=device, weights_only=True))
         return policy
 
