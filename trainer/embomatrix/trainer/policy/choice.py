@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import torch
 
@@ -16,6 +16,8 @@ from embomatrix.trainer.policy.words import build_vocabulary
 from embomatrix.trainer.settings import Products
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
     from embomatrix.trainer.data import TaskSet
     from embomatrix.trainer.policy.protocol import Policy
     from embomatrix.trainer.settings import TrainSettings
@@ -74,7 +76,8 @@ def _products(settings: TrainSettings) -> torch.dtype:
     """Half as many bits where the processor multiplies them in one instruction: products take a quarter of the time there."""
     asked = settings.tiny.products
     if asked is Products.AUTO:
-        told = getattr(torch.cpu, "get_capabilities", dict)()  # not in every torch that will do
+        tell: Callable[[], Mapping[str, Any]] = getattr(torch.cpu, "get_capabilities", dict)
+        told = tell()  # nothing, in torches before it could be asked
         able = settings.device == "cpu" and told.get("avx512_bf16", False)
         asked = Products.BFLOAT16 if able else Products.FLOAT32
     return torch.bfloat16 if asked is Products.BFLOAT16 else torch.float32
