@@ -63,3 +63,5 @@ def test_the_command_draws_the_pictures_and_hands_in_figures(tmp_path):
     assert found["sim_hit_rate, k=2"] >= 0.95
     for name in ("simulated_cluster.svg", "simulated_manager.svg"):
         assert "own network" in texts((out / name).read_text())
+    assert "150 µs a rollout" in texts((out / "simulated_saturation.svg").read_text())
+    assert found["sim_slots_at_work, 150 µs a rollout, 80 slots"] >= 0.9

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from embomatrix.manager.simulation.charts import Panel, page
 from embomatrix.manager.simulation.run import Report, simulate
+from embomatrix.manager.simulation.saturation import saturated, saturation_figures, saturation_panels
 from embomatrix.manager.simulation.sweeps import in_flight, loaded_slowly, sweeps
 
 if TYPE_CHECKING:
@@ -64,7 +65,9 @@ class _Bench:
 def bench_simulated_cluster(
     out: Path, most_workers: int, on_step: Callable[[str], None]
 ) -> list[dict[str, Any]]:
-    """Writes ``simulated_cluster.svg`` and ``simulated_manager.svg`` into the folder; returns figures as `bench` writes them.
+    """Writes ``simulated_cluster.svg``, ``simulated_manager.svg`` and ``simulated_saturation.svg`` into the folder.
+
+    Returns figures as `bench` writes them.
 
     Raises BrokenInvariantError when the manager breaks a promise, with what happened.
     """
@@ -76,14 +79,20 @@ def bench_simulated_cluster(
         if workers <= max(most_workers, min(FLIGHTS.values()))
     }
     ahead = {k: bench.run(f"A13 with k = {k}", loaded_slowly(k)) for k in LOOKAHEADS}
+    full = saturated(bench.run, most_workers)
     out.mkdir(parents=True, exist_ok=True)
     (out / "simulated_cluster.svg").write_text(_cluster_page(swept), encoding="utf-8")
     workers = swept[0][1]
     (out / "simulated_manager.svg").write_text(_manager_page(workers, flights), encoding="utf-8")
+    panels = saturation_panels(full)
+    (out / "simulated_saturation.svg").write_text(
+        page("Where one manager is full", [panels]), encoding="utf-8"
+    )
     return [
         *_flight_figures(flights),
         *_worker_figures(workers["own network"]),
         *_saturation_figures(workers["own network"]),
+        *saturation_figures(full),
         *_lookahead_figures(ahead),
         _figure("sim_simulations", bench.simulations, "count", "higher", bench.simulations),
         _figure("sim_rollouts", bench.rollouts, "count", "higher", bench.simulations),

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from embomatrix.manager.simulation.agenda import Agenda
     from embomatrix.manager.simulation.auditor import Auditor
     from embomatrix.manager.simulation.gauge import Gauge
+    from embomatrix.manager.simulation.scenario import ManagerPace
     from embomatrix.rpc.leases import LeaseProgress, LeaseRef, LeaseResult, WorkerState
     from embomatrix.rpc.values import (
         Batch,
@@ -59,15 +60,35 @@ class Stream:
 
 
 class Front:
-    """Calls arrive here in simulated time and are answered at once; deciding costs real CPU, which the gauge notes."""
+    """Calls arrive here in simulated time; deciding costs real CPU, which the gauge notes.
 
-    def __init__(self, agenda: Agenda, intake: Intake, auditor: Auditor, gauge: Gauge) -> None:
+    They are answered at once, or, by a manager that takes time, one after the other.
+    """
+
+    def __init__(
+        self, agenda: Agenda, intake: Intake, auditor: Auditor, gauge: Gauge, pace: ManagerPace
+    ) -> None:
         self._agenda = agenda
+        self._pace = pace
+        self._free_s = 0.0
+        """When the manager has dealt with all that came so far."""
         self._intake = intake
         self._auditor = auditor
         self._gauge = gauge
         self._streams: dict[str, Stream] = {}
         self._trainers: dict[str, Callable[[Sequence[RolloutResult]], None]] = {}
+
+    def hear(self, call: Callable[[], None], *, results: int = 0) -> None:
+        """A message of a worker has come, with so many results: the call is made when the manager has dealt with it."""
+        takes_s = results * self._pace.rollout_s or self._pace.message_s
+        if not takes_s:
+            call()
+            return
+        now_s = self._agenda.now_s
+        begins_s = max(now_s, self._free_s)
+        self._free_s = begins_s + takes_s
+        self._gauge.lags_s.append(begins_s - now_s)
+        self._agenda.after(self._free_s - now_s, call)
 
     def keep_time(self) -> None:
         """Tick, for as long as the simulation runs."""

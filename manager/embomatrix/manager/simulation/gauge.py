@@ -52,6 +52,8 @@ class Gauge:
         self.detected_s: list[float] = []
         """From each death of a worker to the manager's knowing of it."""
         self.counts: Counter[str] = Counter()
+        self.lags_s: list[float] = []
+        """How long each message waited until the manager had dealt with all before it; of a manager that takes time."""
         self.caught: dict[str, int] = {}
         """Workers in quarantine, and how many executions of each had been compared by then."""
 

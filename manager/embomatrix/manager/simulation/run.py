@@ -72,6 +72,8 @@ class Report:
     """From the submission of each group to its last result, by run."""
     shares: Mapping[str, float]
     """What each run had of the slots at work, while every run wanted all of them; empty if that never was."""
+    lag_p99_s: float
+    """How long messages waited for a manager that takes time; 0 of one that answers at once."""
     costs: Mapping[str, Cost]
     counts: Mapping[str, int]
     caught: Mapping[str, int]
@@ -105,7 +107,8 @@ class Simulation:
         self._cluster = ClusterState(scenario.dispatch, scenario.schedule, boot_id="simulated")
         numbers = iter(range(1 << 62))
         registry = Registry(scenario.liveness, new_id=lambda: f"session-{next(numbers)}")
-        self.front = Front(self.agenda, Intake(self._cluster, registry), self._auditor, self._gauge)
+        intake = Intake(self._cluster, registry)
+        self.front = Front(self.agenda, intake, self._auditor, self._gauge, scenario.manager)
         self.workers = self._hire()
         self._trainers = [
             SimulatedTrainer(
@@ -207,6 +210,7 @@ class Simulation:
             first_result_s=max(trainer.first_result_s for trainer in self._trainers),
             groups_s={trainer.plan.name: tuple(trainer.groups_s) for trainer in self._trainers},
             shares={run: count / gauge.shared.total() for run, count in sorted(gauge.shared.items())},
+            lag_p99_s=quantile(sorted(gauge.lags_s), 0.99),
             costs=gauge.costs,
             counts=gauge.counts,
             caught=gauge.caught,

@@ -110,6 +110,16 @@ class Faults:
 
 
 @dataclass(frozen=True, slots=True)
+class ManagerPace:
+    """How long the manager's one thread is taken by what it hears; by default by nothing, and it answers at once."""
+
+    rollout_s: float = 0.0
+    """By a rollout, all in all: charged when its result comes."""
+    message_s: float = 0.0
+    """By any other message of a worker."""
+
+
+@dataclass(frozen=True, slots=True)
 class Scenario:
     """All that a simulation depends on: equal scenarios give equal histories."""
 
@@ -125,6 +135,7 @@ class Scenario:
     dispatch: DispatchLimits = field(default_factory=DispatchLimits)
     schedule: ScheduleLimits = field(default_factory=ScheduleLimits)
     liveness: LivenessLimits = field(default_factory=LivenessLimits)
+    manager: ManagerPace = ManagerPace()
     join_s: float = 2.0
     """Workers start within this time."""
     limit_s: float = 3600.0

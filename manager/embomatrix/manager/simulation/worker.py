@@ -200,7 +200,7 @@ class SimulatedWorker:
             else:
                 self._line.down(lambda: take(answer))
 
-        self._line.up(arrive)
+        self._line.up(lambda: self._front.hear(arrive))
         self._later(limit_s, give_up)
 
     def _reconnect(self) -> None:
@@ -226,7 +226,7 @@ class SimulatedWorker:
         self._line.hang_up()
         self._stream = None
         if session is not None and stream is not None and not silent:
-            self._line.up(lambda: self._front.detach(session, stream))
+            self._line.up(lambda: self._front.hear(lambda: self._front.detach(session, stream)))
 
     def _superseded(self, stream: Stream | None) -> None:
         """The manager gave this session up: what it leased is void."""
@@ -279,4 +279,4 @@ class SimulatedWorker:
             except SupersededError:
                 self._line.down(lambda: self._superseded(stream))
 
-        self._line.up(arrive)
+        self._line.up(lambda: self._front.hear(arrive, results=len(results)))
