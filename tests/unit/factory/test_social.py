@@ -240,6 +240,7 @@ def test_wishes_fit_what_the_person_does(drafts):
         ("radio", "top_cabinet", "bathroom", True),
         ("teddy_bear", "shelf", "bathroom", False),
         ("apple", "bookcase", "living_room", True),
+        ("potato", "piano", "living_room", False),
         ("pear", "microwave", "kitchen", False),
         ("envelope", "printer", "private_office", False),
         ("vase", "eames_chair", "break_room", False),
@@ -275,6 +276,15 @@ class Flat:
 def test_nobody_has_a_salt_shaker_switched_on(thing, wanted):
     piece = Piece(Atom("toggled_on", (thing,)), "", (thing,), (f"toggled_on({thing})",), "switch", "it")
     assert bool(themes_of(piece, Flat())) == wanted
+
+
+def test_nobody_wants_the_water_to_run_who_only_tidies_up():
+    sinks = [name for name in Catalog.load().used_categories if name.endswith("_sink")]
+    assert sinks
+    for sink in sinks:
+        sign = f"toggled_on({sink})"
+        piece = Piece(Atom("toggled_on", (sink,)), "", (sink,), (sign,), "switch", "it", manner="tap")
+        assert Theme.TIDYING not in themes_of(piece, Flat()), sink
 
 
 @pytest.mark.parametrize(

@@ -71,7 +71,7 @@ NOT_IN: Final[Mapping[Group, frozenset[str]]] = {
 }
 """Types of rooms that nobody takes things of a group to."""
 FOR_DISHES: Final = frozenset({"dishwasher", "dish_rack", "dish_rack_cart"})
-FOR_BOOKS: Final = frozenset({"bookcase", "bookshelf"})
+NOT_FOR_FOOD: Final = frozenset({"bookcase", "bookshelf", "piano"})
 _EATEN: Final = frozenset({Group.FOOD, Group.FRUIT, Group.PACKAGES})
 NOT_NAMED: Final = frozenset({"eyeglasses"})
 """Words that take a plural verb, which the sentences have not."""
@@ -91,6 +91,9 @@ BASINS: Final = frozenset(
         "wall_mounted_sink",
         "drop_in_sink",
         "tabletop_sink",
+        "multi_station_furniture_sink",
+        "multi_station_tabletop_sink",
+        "multi_station_wall_mounted_sink",
     }
 )
 NO_HOSTS: Final = frozenset(
@@ -249,7 +252,7 @@ def is_plausible(thing: str, host: str, room_type: str, *, inside: bool) -> bool
         room_type not in GROUP_ROOMS.get(group, {room_type}) or room_type in NOT_IN.get(group, ())
     ):
         return False
-    if host in FOR_BOOKS and group in _EATEN:
+    if host in NOT_FOR_FOOD and group in _EATEN:
         return False
     if thing in KITCHENWARE and room_type not in _KITCHEN:
         return False
