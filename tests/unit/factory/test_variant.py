@@ -7,7 +7,7 @@ from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.check import reach_problems
 from embomatrix.factory.scenes.floor import ReachableFloor, box_of
 from embomatrix.factory.scenes.solids import Solids, placed_parts
-from embomatrix.factory.writer.tables import BASKETS, belongs
+from embomatrix.factory.writer.tables import BASKETS, belongs, is_left_on
 from embomatrix.factory.writer.variant import build_variant
 from embomatrix.world.scene import Scene
 
@@ -52,6 +52,36 @@ def test_small_things_are_where_such_things_are_found() -> None:
             item = variant.scene.by_name[name]
             category = variant.scene.asset_of(name).category
             assert category in BASKETS or belongs(category, types[item.room]), (name, item.room)
+
+
+def test_no_food_is_left_on_a_chair() -> None:
+    office = build_base_scene("office_bike", seed=0)
+    rooms = [room.name for room in office.rooms if room.type == "break_room"]
+    found = []
+    for seed in range(3):
+        scene = (variant := build_variant(office, rooms, "seats", np.random.default_rng(seed))).scene
+        hosts = {name: scene.by_name[name].host for name in variant.added}
+        found += [
+            (scene.asset_of(name).category, scene.asset_of(host).category)
+            for name, host in hosts.items()
+            if host
+        ]
+    assert found
+    assert [(thing, host) for thing, host in found if not is_left_on(thing, host)] == []
+
+
+@pytest.mark.parametrize(
+    ("category", "host", "left"),
+    [
+        ("potato", "rocking_chair", False),
+        ("teacup", "bar_stool", False),
+        ("magazine", "rocking_chair", True),
+        ("potato", "breakfast_table", True),
+        ("vase", "coffee_maker", False),
+    ],
+)
+def test_things_lie_where_people_leave_them(category: str, host: str, left: bool) -> None:
+    assert is_left_on(category, host) == left
 
 
 @pytest.mark.parametrize(

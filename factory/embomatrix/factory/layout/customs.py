@@ -6,7 +6,7 @@ import functools
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.furnish.hosts import NO_HOSTS, hosts_of
-from embomatrix.factory.writer.tables import HOST_GROUPS, MEMBERS, Group, groups_for, suits
+from embomatrix.factory.writer.tables import HOST_GROUPS, MEMBERS, Group, suits
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -24,8 +24,6 @@ _BY_GROUP: Final[Mapping[Group, str]] = {
     Group.TOILETRIES: "countertop furniture_sink pedestal_sink shelf bottom_cabinet multi_station_furniture_sink",
     Group.DECORATION: f"console_table bookcase nightstand coffee_table bottom_cabinet shelf desk {_TABLES}",
 }
-_COOKWARE: Final = frozenset(("frying_pan", "saucepan", "saucepot", "stockpot", "wok", "chopping_board"))
-_KITCHENS: Final = frozenset(("kitchen", "break_room", "bar"))
 _APPLIANCES: Final = frozenset(
     (
         "oven", "microwave", "toaster_oven", "fridge", "freezer", "wine_fridge", "display_fridge", "grocery_fridge",
@@ -41,13 +39,6 @@ def likes(category: str) -> tuple[str, ...]:
     found = hosts_of(category)
     group = next((group for group, members in MEMBERS.items() if category in members), None)
     return tuple(dict.fromkeys((*found, *_BY_GROUP[group].split()))) if group else found
-
-
-def suits_room(category: str, room_type: str) -> bool:
-    """Whether people keep such a thing in such a room."""
-    if category in _COOKWARE:
-        return room_type in _KITCHENS
-    return any(category in MEMBERS[group] for group in groups_for(room_type))
 
 
 def may_hold(host: str, category: str) -> bool:

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.factory.layout.customs import likes, may_hold, suits_room
+from embomatrix.factory.layout.customs import likes, may_hold
 from embomatrix.factory.layout.values import Distribution, Kind
+from embomatrix.factory.writer.tables import belongs
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -107,7 +108,7 @@ def _allowed(
 
 def _score(family: Sequence[Thing], room: RoomFacts, given: int) -> float:
     liking = sum(
-        FUNCTION * suits_room(thing.category, room.type) + HOST * _welcome(thing, room) for thing in family
+        FUNCTION * belongs(thing.category, room.type) + HOST * _welcome(thing, room) for thing in family
     )
     return liking / len(family) + SIZE * math.log(max(room.area_m2, 1.0)) - CROWD * given
 
@@ -127,6 +128,6 @@ def _because(thing: Thing, room: RoomFacts) -> str:
     liked = next((host for host in likes(thing.category) if host in room.furniture), "")
     if liked:
         return f"{room.name} has a {liked}"
-    if suits_room(thing.category, room.type):
+    if belongs(thing.category, room.type):
         return f"such things belong in a {room.type}"
     return f"{room.name} has room: {room.area_m2:.0f} m2"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.social.occasions import Occasion, Theme, occasion_of
-from embomatrix.factory.writer.tables import FOR_DRINKS, KITCHENWARE, MEMBERS, Group
+from embomatrix.factory.writer.tables import COOKWARE, FOR_DRINKS, MEMBERS, Group
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -254,7 +254,7 @@ def is_plausible(thing: str, host: str, room_type: str, *, inside: bool) -> bool
         return False
     if host in NOT_FOR_FOOD and group in _EATEN:
         return False
-    if thing in KITCHENWARE and room_type not in _KITCHEN:
+    if thing in COOKWARE and room_type not in _KITCHEN:
         return False
     if host in SEATS or host in SOFT or host.endswith("_chair"):
         return host in SOFT and group not in NOT_ON_SOFT

@@ -129,8 +129,11 @@ NEVER_SWITCHED: Final = frozenset(
 FOR_DRINKS: Final = frozenset({"coffee_maker", "espresso_machine"})
 """What heats drinks, and no food."""
 
-KITCHENWARE: Final = frozenset({"chopping_board", "frying_pan", "saucepan"})
-"""Tableware that leaves no kitchen."""
+COOKWARE: Final = frozenset({"frying_pan", "saucepan", "saucepot", "stockpot", "wok", "chopping_board"})
+"""What leaves no kitchen."""
+KITCHENS: Final = frozenset({"kitchen", "break_room", "bar"})
+SEATS: Final = ("chair", "stool")
+"""Names of furniture to sit on end so."""
 BASKETS: Final = ("wicker_basket", "storage_box")
 """Open containers that a variant may put on the floor or on a table."""
 
@@ -142,8 +145,8 @@ def groups_for(room_type: str) -> tuple[Group, ...]:
 
 def belongs(category: str, room_type: str) -> bool:
     """Whether a small thing is found in such a room."""
-    if category in KITCHENWARE and groups_for(room_type) != _KITCHEN:
-        return False
+    if category in COOKWARE:
+        return room_type in KITCHENS
     return any(category in MEMBERS[group] for group in groups_for(room_type))
 
 
@@ -151,3 +154,9 @@ def suits(category: str, host_category: str) -> bool:
     """Whether a person would put a thing of the category on or in such a host."""
     allowed = HOST_GROUPS.get(host_category)
     return allowed is None or any(category in MEMBERS[group] for group in allowed)
+
+
+def is_left_on(category: str, host_category: str) -> bool:
+    """Whether a thing that is lying about lies there: on seats neither food nor tableware."""
+    soft = any(category in MEMBERS[group] for group in _SOFT_GOODS)
+    return suits(category, host_category) and (soft or not host_category.endswith(SEATS))

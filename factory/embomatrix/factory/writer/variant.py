@@ -10,7 +10,7 @@ from embomatrix.factory.editor import SceneEditor
 from embomatrix.factory.layout.generator import lay
 from embomatrix.factory.layout.jobs import Item
 from embomatrix.factory.writer.starts import OpenStarts
-from embomatrix.factory.writer.tables import BASKETS, MEMBERS, Group, belongs, groups_for
+from embomatrix.factory.writer.tables import BASKETS, MEMBERS, Group, belongs, groups_for, is_left_on
 from embomatrix.factory.writer.view import SceneView, is_liftable
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.state import State
@@ -68,8 +68,11 @@ def build_variant(
 
 
 def _is_in_its_place(editor: SceneEditor, name: str) -> bool:
-    """Whether an added thing stands on or in something, or is one that people put on the floor."""
-    return bool(editor.objects[name].host) or editor.asset_of(name).category in BASKETS
+    """Whether an added thing stands where people leave such things, or is one that they put on the floor."""
+    category, host = editor.asset_of(name).category, editor.objects[name].host
+    if category in BASKETS:
+        return True
+    return bool(host) and is_left_on(category, editor.asset_of(host).category)
 
 
 def _things(view: SceneView, rooms: Sequence[str], rng: np.random.Generator) -> list[Item]:
