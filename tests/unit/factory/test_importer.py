@@ -86,6 +86,15 @@ def test_what_can_t_be_bound_is_refused_for_its_reason(home: Scene, reason: Refu
     assert len(outcome.sentence) > 25
 
 
+def test_furniture_of_which_no_model_can_do_what_is_asked_is_refused_with_what_that_is(home: Scene) -> None:
+    outcome = import_problem(source(PROBLEM.replace("electric_refrigerator", "sofa")), home)
+    assert isinstance(outcome, Refusal)
+    assert outcome.reason is RefusalReason.DOES_NOT_FIT
+    assert outcome.sentence == (
+        "'sofa.n.01_1' has no place: its type has no model that can do what the task asks of it: container, openable"
+    )
+
+
 def test_misspelt_type_suggests_the_right_one(home: Scene) -> None:
     outcome = refusal(PROBLEM.replace("breakfast_table.n.01", "breakfast_tabel.n.01"), home)
     assert "did you mean breakfast_table.n.01" in outcome.sentence

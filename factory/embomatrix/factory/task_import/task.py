@@ -221,8 +221,10 @@ class _Binder:
     def _item(self, addition: Addition, binding: Binding) -> Item:
         models = models_for(addition, self._rng, demand_on(self._demands, addition.name, addition.type))
         if not models:
+            asked = f" that can do what the task asks of it: {', '.join(sorted(addition.needs))}"
             raise RefusedError(
-                RefusalReason.DOES_NOT_FIT, f"{addition.name!r} has no place: its type has no model"
+                RefusalReason.DOES_NOT_FIT,
+                f"{addition.name!r} has no place: its type has no model{asked if addition.needs else ''}",
             )
         rooms = (addition.room,) if addition.room else tuple(dict.fromkeys(binding.rooms.values()))
         demanded = addition.relation is not None
