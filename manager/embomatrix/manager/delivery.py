@@ -56,12 +56,15 @@ class Delivery:
     def put(self, command: DeliverResult | FinishBatch) -> None:
         """Queue a result, or the end of a batch. There are never more than there are rollouts in the cluster."""
         self._waiting.append(_Waiting(command, time.monotonic()))
-        self._fresh.set()
 
     def put_acknowledgement(self, command: AcknowledgeLease) -> None:
         """Queue what a worker may forget; said once everything that was queued before is written."""
         self._acknowledgements.append(command)
-        self._fresh.set()
+
+    def hurry(self) -> None:
+        """Nothing more comes with what is queued: have it written."""
+        if self._waiting or self._acknowledgements:
+            self._fresh.set()
 
     async def serve(self) -> None:
         """Write until cancelled; ends with ``FencedError`` when another manager took the store over."""

@@ -166,14 +166,18 @@ class ManagerRuntime:
     def take_report(
         self, link: WorkerLink, state: WorkerState | None, results: Sequence[LeaseResult], *, resync: bool
     ) -> None:
-        """What a worker says on its stream; ``resync`` for the first message of a stream."""
+        """What a worker says on its stream, or a part of it; ``deliver`` follows the last. ``resync`` for the first of all."""
         now_s, worker_id = time.monotonic(), link.session.worker_id
         ended = (*state.finished, *results) if state is not None else results
         self.chronicle.reported(worker_id, ended, self.cluster.dispatcher.live_leases, now_s=now_s)
         commands = self._intake.report(link.session, state, results, resync=resync, now_s=now_s)
         if state is not None:
             self.chronicle.fleet.residents(worker_id, state.residents, now_s=now_s)
-        self._carry_out(commands)
+        self._carry_out(commands, more=True)
+
+    def deliver(self) -> None:
+        """A worker's message is heard to its end: results go on their way, in one transaction for all that it brought."""
+        self._delivery.hurry()
 
     def take_heartbeat(self, session_id: str, epoch: int, beat: Heartbeat) -> float:
         """Renew the leases that the worker names; returns the seconds until the next heartbeat."""
@@ -233,7 +237,7 @@ class ManagerRuntime:
         event = DispatchPaused() if self._paused or self._suspended else DispatchResumed()
         self._carry_out(self._intake.feed(event, now_s=time.monotonic()))
 
-    def _carry_out(self, commands: Sequence[Command]) -> None:
+    def _carry_out(self, commands: Sequence[Command], *, more: bool = False) -> None:
         now_s = time.monotonic()
         for command in commands:
             match command:
@@ -254,6 +258,8 @@ class ManagerRuntime:
                 case QuarantineWorker():
                     logger.error("worker quarantined worker=%s: %s", command.worker_id, command.reason)
                     self._keeper.hurry()
+        if not more:
+            self._delivery.hurry()
 
     def _say(self, command: WorkerCommand) -> None:
         """Without a stream the command is lost; the worker's next full state shows that, and it is given again."""

@@ -146,10 +146,13 @@ class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
 
     async def _take(self, link: WorkerLink, request: pb.SessionRequest, *, resync: bool) -> None:
         state = inside("state", worker_state_from_proto, request.state) if request.HasField("state") else None
-        self._runtime.take_report(link, state, _results(request, 0), resync=resync)
-        for first in range(RESULTS_AT_ONCE, len(request.results), RESULTS_AT_ONCE):
-            await asyncio.sleep(0)  # what was given meanwhile is sent, and others are heard
-            self._runtime.take_report(link, None, _results(request, first), resync=False)
+        try:
+            self._runtime.take_report(link, state, _results(request, 0), resync=resync)
+            for first in range(RESULTS_AT_ONCE, len(request.results), RESULTS_AT_ONCE):
+                await asyncio.sleep(0)  # what was given meanwhile is sent, and others are heard
+                self._runtime.take_report(link, None, _results(request, first), resync=False)
+        finally:
+            self._runtime.deliver()
 
 
 def _results(request: pb.SessionRequest, first: int) -> tuple[LeaseResult, ...]:
