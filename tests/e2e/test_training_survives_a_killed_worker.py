@@ -117,6 +117,14 @@ def _stopped_with_work(pids, dashboard):
     return False
 
 
+def _wait_for_answer(address, limit_s=60.0):
+    """A trainer that comes before its manager is told so, and ends."""
+    asked = embomatrix_command("status", f"--manager={address}")
+    deadline = time.monotonic() + limit_s
+    while subprocess.run(asked, capture_output=True, check=False).returncode:
+        assert time.monotonic() < deadline, f"the manager did not answer within {limit_s:g} s"
+
+
 def _until(condition, process, limit_s=180.0):
     deadline = time.monotonic() + limit_s
     while not condition():
