@@ -40,6 +40,7 @@ def run(tmp_path_factory):
     _run("factory", "build", f"--out={dataset}", "--train=16", "--heldout=4", "--no-look-ahead")
     cluster = local_cluster(folder / "cluster", workers=2, slots=1)
     with cluster.supervisor as children:
+        _wait_for_answer(cluster.address)
         trainer = subprocess.Popen(
             _training(dataset, cluster.address, out), text=True, stdout=subprocess.PIPE
         )
