@@ -146,6 +146,18 @@ async def connected(client, *names, limit_s=60.0):
             await asyncio.sleep(0.05)
 
 
+@contextlib.asynccontextmanager
+async def two_workers(folder, **settings):
+    """A cluster with the workers ``w1`` and ``w2`` ready, and a client of it."""
+    with RealCluster(folder, **settings) as cluster:
+        cluster.start_manager()
+        for name in ("w1", "w2"):
+            cluster.start_worker(name)
+        async with cluster.client() as client:
+            await connected(client, "w1", "w2")
+            yield cluster, client
+
+
 async def until(condition, limit_s=60.0):
     """Wait for what other processes and tasks bring about."""
     async with asyncio.timeout(limit_s):

@@ -4,35 +4,40 @@ import asyncio
 import time
 
 import pytest
-from tests.fakes.real_cluster import RealCluster, batch_of, connected, opened, outcomes, tally, tell, until
+from tests.fakes.real_cluster import (
+    RealCluster,
+    batch_of,
+    connected,
+    opened,
+    outcomes,
+    tally,
+    tell,
+    two_workers,
+    until,
+)
 
 pytestmark = pytest.mark.timeout(240)
 
 
 async def killed_in_the_middle(folder, *, count, task, kill_at, away_s, grace_s):
     """A manager killed after ``kill_at`` results and started again ``away_s`` later."""
-    with RealCluster(folder, restart_grace_s=grace_s) as cluster:
+    async with two_workers(folder, restart_grace_s=grace_s) as (cluster, client):
+        batch = batch_of(await opened(client), count, task)
+        times = {}
+
+        def kill(seen):
+            times.setdefault(seen, time.monotonic())
+            if seen == kill_at:
+                cluster.signal("manager")
+
+        running = asyncio.create_task(outcomes(client, batch, then=kill))
+        await until(lambda: "manager" not in cluster.processes or running.done())
+        await asyncio.sleep(away_s)
+        began_s, wall_s = time.monotonic(), time.time()
         cluster.start_manager()
-        for name in ("w1", "w2"):
-            cluster.start_worker(name)
-        async with cluster.client() as client:
-            await connected(client, "w1", "w2")
-            batch = batch_of(await opened(client), count, task)
-            times = {}
-
-            def kill(seen):
-                times.setdefault(seen, time.monotonic())
-                if seen == kill_at:
-                    cluster.signal("manager")
-
-            running = asyncio.create_task(outcomes(client, batch, then=kill))
-            await until(lambda: "manager" not in cluster.processes or running.done())
-            await asyncio.sleep(away_s)
-            began_s, wall_s = time.monotonic(), time.time()
-            cluster.start_manager()
-            await connected(client, "w1", "w2")
-            results = await running
-            stats = await client.close_run(batch.run_id)
+        await connected(client, "w1", "w2")
+        results = await running
+        stats = await client.close_run(batch.run_id)
         counted = tally(batch, results)
         again = sum(times - 1 for times in cluster.executed().values())
         serves_s = cluster.logged_s("manager", "leading under epoch", wall_s)

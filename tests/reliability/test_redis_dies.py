@@ -4,7 +4,17 @@ import asyncio
 import time
 
 import pytest
-from tests.fakes.real_cluster import RealCluster, batch_of, connected, opened, outcomes, tally, tell, until
+from tests.fakes.real_cluster import (
+    RealCluster,
+    batch_of,
+    connected,
+    opened,
+    outcomes,
+    tally,
+    tell,
+    two_workers,
+    until,
+)
 from tests.fakes.redis_server import RedisServer
 from tests.fakes.simulation import graded_total
 
@@ -18,15 +28,8 @@ pytestmark = [pytest.mark.timeout(240), pytest.mark.slow]
 async def test_dispatch_goes_on_when_redis_is_back_and_the_outcomes_are_those_of_a_quiet_run(
     tmp_path, end, away_s
 ):
-    with (
-        RedisServer(tmp_path / "redis", free_port()) as redis,
-        RealCluster(tmp_path, state=redis.url, leader_ttl_s=3.0) as cluster,
-    ):
-        cluster.start_manager()
-        for name in ("w1", "w2"):
-            cluster.start_worker(name)
-        async with cluster.client() as client:
-            await connected(client, "w1", "w2")
+    with RedisServer(tmp_path / "redis", free_port()) as redis:
+        async with two_workers(tmp_path, state=redis.url, leader_ttl_s=3.0) as (_, client):
             run_id = await opened(client)
             times = []
             quiet = await outcomes(client, batch_of(run_id, 200, "graded", "quiet"))
@@ -42,13 +45,13 @@ async def test_dispatch_goes_on_when_redis_is_back_and_the_outcomes_are_those_of
             back_s = time.monotonic()
             results = await running
             later = await outcomes(client, batch_of(run_id, 20, "graded", "later"))
-        counted = tally(batch, results, graded_total)
-        recovery_s = min(at_s for at_s in times if at_s > back_s) - back_s
-        tell(f"A5 {end} {away_s:g} s", counted, recovery_s=recovery_s)
-        assert counted.clean
-        assert tally(batch_of(run_id, 200, "graded", "quiet"), quiet, graded_total).clean
-        assert len(later) == 20
-        assert recovery_s < 20
+            counted = tally(batch, results, graded_total)
+            recovery_s = min(at_s for at_s in times if at_s > back_s) - back_s
+            tell(f"A5 {end} {away_s:g} s", counted, recovery_s=recovery_s)
+            assert counted.clean
+            assert tally(batch_of(run_id, 200, "graded", "quiet"), quiet, graded_total).clean
+            assert len(later) == 20
+            assert recovery_s < 20
 
 
 async def test_what_redis_lost_with_its_last_second_comes_again_and_nothing_comes_twice(tmp_path):

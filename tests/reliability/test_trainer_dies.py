@@ -10,6 +10,7 @@ from tests.fakes.real_cluster import (
     outcomes,
     tally,
     tell,
+    two_workers,
     until,
 )
 from tests.fakes.simulation import graded_total
@@ -46,26 +47,21 @@ async def test_a_trainer_that_was_killed_is_replaced_and_reads_everything_withou
 
 
 async def test_advantages_of_complete_groups_are_those_of_a_run_without_faults(tmp_path):
-    with RealCluster(tmp_path, restart_grace_s=8.0) as cluster:
-        cluster.start_manager()
-        for name in ("w1", "w2"):
-            cluster.start_worker(name)
-        async with cluster.client() as client:
-            await connected(client, "w1", "w2")
-            await opened(client, "quiet")
-            await opened(client, "faulty")
-            quiet = await outcomes(client, batch_of("quiet", 800, "graded"))
+    async with two_workers(tmp_path, restart_grace_s=8.0) as (cluster, client):
+        await opened(client, "quiet")
+        await opened(client, "faulty")
+        quiet = await outcomes(client, batch_of("quiet", 800, "graded"))
 
-            def fault(seen):
-                if seen == 100:
-                    cluster.signal("w1")
-                    cluster.start_worker("w1")
-                if seen == 300:
-                    cluster.signal("manager")
-                    cluster.start_manager()
+        def fault(seen):
+            if seen == 100:
+                cluster.signal("w1")
+                cluster.start_worker("w1")
+            if seen == 300:
+                cluster.signal("manager")
+                cluster.start_manager()
 
-            faulty = await outcomes(client, batch_of("faulty", 800, "graded"), then=fault)
-            await connected(client, "w1", "w2")
+        faulty = await outcomes(client, batch_of("faulty", 800, "graded"), then=fault)
+        await connected(client, "w1", "w2")
         counted = tally(batch_of("faulty", 800, "graded"), faulty, graded_total)
         expected, found = advantages(quiet), advantages(faulty)
         tell("A16", counted, groups=len(found))

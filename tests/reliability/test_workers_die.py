@@ -6,7 +6,16 @@ import random
 import time
 
 import pytest
-from tests.fakes.real_cluster import RealCluster, batch_of, connected, opened, outcomes, tally, tell
+from tests.fakes.real_cluster import (
+    RealCluster,
+    batch_of,
+    connected,
+    opened,
+    outcomes,
+    tally,
+    tell,
+    two_workers,
+)
 from tests.fakes.worker import completed
 
 from embomatrix.rpc.values import Completed
@@ -19,18 +28,13 @@ ROLLOUTS = 20_000
 
 async def test_where_nothing_dies_hardly_anything_is_executed_twice(tmp_path):
     batches, size = 20, 43
-    with RealCluster(tmp_path) as cluster:
-        cluster.start_manager()
-        for name in ("w1", "w2"):
-            cluster.start_worker(name)
-        async with cluster.client() as client:
-            await connected(client, "w1", "w2")
-            run_id = await opened(client)
-            for number in range(batches):
-                # At the end of each, slots of one worker are free while leases wait behind those of the other.
-                batch = batch_of(run_id, size, "short", batch_id=f"b{number}")
-                counted = tally(batch, await outcomes(client, batch))
-                assert counted.clean
+    async with two_workers(tmp_path) as (cluster, client):
+        run_id = await opened(client)
+        for number in range(batches):
+            # At the end of each, slots of one worker are free while leases wait behind those of the other.
+            batch = batch_of(run_id, size, "short", batch_id=f"b{number}")
+            counted = tally(batch, await outcomes(client, batch))
+            assert counted.clean
         again = sum(times - 1 for times in cluster.executed().values())
         tell("A1 short batches", counted, batches=batches, executed_again=again)
         # A machine that stops a worker for some time makes its leases late.

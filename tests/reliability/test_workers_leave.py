@@ -13,6 +13,7 @@ from tests.fakes.real_cluster import (
     outcomes,
     tally,
     tell,
+    two_workers,
     until,
 )
 
@@ -45,22 +46,17 @@ async def test_of_two_workers_of_one_name_the_older_stops_and_no_rollout_comes_t
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 async def test_a_worker_that_is_told_to_leave_finishes_what_it_runs(tmp_path, number):
-    with RealCluster(tmp_path) as cluster:
-        cluster.start_manager()
-        for name in ("w1", "w2"):
-            cluster.start_worker(name)
-        async with cluster.client() as client:
-            await connected(client, "w1", "w2")
-            batch = batch_of(await opened(client), 40, "slow")
-            running = asyncio.create_task(outcomes(client, batch))
-            await until(lambda: len(cluster.executed()) >= 8)
-            process = cluster.processes["w1"]
-            cluster.signal("w1", number)
-            began_s = time.monotonic()
-            status = await asyncio.to_thread(process.wait, 60)
-            left_s = time.monotonic() - began_s
-            results = await running
-            stats = await client.close_run(batch.run_id)
+    async with two_workers(tmp_path) as (cluster, client):
+        batch = batch_of(await opened(client), 40, "slow")
+        running = asyncio.create_task(outcomes(client, batch))
+        await until(lambda: len(cluster.executed()) >= 8)
+        process = cluster.processes["w1"]
+        cluster.signal("w1", number)
+        began_s = time.monotonic()
+        status = await asyncio.to_thread(process.wait, 60)
+        left_s = time.monotonic() - began_s
+        results = await running
+        stats = await client.close_run(batch.run_id)
         counted = tally(batch, results)
         tell(f"A11 {number.name}", counted, left_s=left_s, redispatched=stats.redispatched)
         assert counted.clean
