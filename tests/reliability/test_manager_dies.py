@@ -1,6 +1,7 @@
 """A4: the manager is killed in the middle of a batch. Nothing is lost, nothing comes twice, nothing alive runs twice."""
 
 import asyncio
+import signal
 import time
 
 import pytest
@@ -83,3 +84,22 @@ async def test_a_batch_goes_on_though_its_trainer_does_not_ask(tmp_path):
         counted = tally(batch, results)
         tell("A4 without its trainer", counted, executed=sum(cluster.executed().values()))
         assert counted.clean
+
+
+async def test_a_manager_that_stood_still_gives_no_worker_up_for_its_own_silence(tmp_path):
+    async with two_workers(tmp_path, lost_after_s=2.0) as (cluster, client):
+        batch = batch_of(await opened(client), 40, "slow")
+        running = asyncio.create_task(outcomes(client, batch))
+        await until(lambda: len(cluster.executed()) >= 4)
+        cluster.signal("manager", signal.SIGSTOP)
+        await asyncio.sleep(5.0)
+        cluster.signal("manager", signal.SIGCONT)
+        results = await running
+        stats = await client.close_run(batch.run_id)
+        counted = tally(batch, results)
+        tell("A4 stands still 5 s", counted, redispatched=stats.redispatched)
+        assert counted.clean
+        # What the manager gave on a connection that was broken by then never came to a worker, and is given again.
+        assert set(cluster.executed().values()) == {1}
+        assert {result.attempt for result in results} == {1}
+        assert "worker lost" not in cluster.log("manager")

@@ -243,6 +243,14 @@ class Registry:
             session.standing = Standing.PAUSED if paused else Standing.READY
         session.reason = paused
 
+    def stood_still(self, seconds: float, *, now_s: float) -> None:
+        """For so long, until now, the manager itself did not run and heard nobody: that is no silence of theirs."""
+        for session in self._by_silence.values():
+            session.last_seen_s = min(session.last_seen_s + seconds, now_s)
+        for session in self._detached.values():
+            if session.detached_s is not None:
+                session.detached_s = min(session.detached_s + seconds, now_s)
+
     def tick(self, *, now_s: float) -> list[Event]:
         """Suspect the silent, give up the lost, forget the long gone."""
         self._forget_lost(now_s)

@@ -57,6 +57,8 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 CLEANUP_S: Final = 5.0
+STOOD_STILL_S: Final = 1.0
+"""A tick that comes so late says that nobody was heard meanwhile."""
 LET_GO_S: Final = 30.0
 """A manager that is cut off from its store for so long has its workers turn to another. As long as a lease lives."""
 STORE_AWAY: Final = (
@@ -294,7 +296,13 @@ class ManagerRuntime:
         while True:
             due_s = time.monotonic() + TICK_S
             await asyncio.sleep(TICK_S)
-            self.effort.lag.observe(time.monotonic() - due_s)
+            late_s = time.monotonic() - due_s
+            self.effort.lag.observe(late_s)
+            if late_s >= STOOD_STILL_S:
+                logger.warning(
+                    "the manager stood still for %.1f s: is its machine paused, or short of memory?", late_s
+                )
+                self.registry.stood_still(late_s, now_s=time.monotonic())
             self._watch_the_lead()
             self._say_what_is_not_audited()
             lost, commands = self._intake.tick(now_s=time.monotonic())

@@ -89,6 +89,21 @@ def test_a_stream_that_comes_back_in_time_costs_nothing(registry):
     assert registry.tick(now_s=2.5) == []
 
 
+def test_silence_while_the_manager_itself_stood_still_counts_against_nobody(registry):
+    session, _ = join(registry)
+    registry.attach(session, now_s=0.0)
+    left, _ = join(registry, "w2")
+    registry.attach(left, now_s=0.0)
+    registry.detach(left, now_s=1.0)
+    registry.heard(session, now_s=1.5)
+    registry.stood_still(30.0, now_s=31.6)
+    assert registry.tick(now_s=31.6) == []
+    assert [event.worker_id for event in registry.tick(now_s=32.0)] == ["w2"]
+    assert registry.tick(now_s=34.6) == [WorkerSuspected("w1")]
+    registry.stood_still(30.0, now_s=35.0)
+    assert session.last_seen_s == 35.0, "nobody was heard in the future"
+
+
 def test_heartbeats_slow_down_in_a_large_cluster(registry):
     assert registry.interval_s == 1.0
     for index in range(400):
