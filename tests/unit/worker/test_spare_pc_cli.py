@@ -8,31 +8,17 @@ from dataclasses import asdict
 from pathlib import Path
 
 import pytest
-import typer
 from tests.fakes.systemd import assert_valid_unit, needs_systemd
 from typer.testing import CliRunner
 
 from embomatrix.worker.cli import app
-from embomatrix.worker.install_cli import quote, unit_text
-from embomatrix.worker.run_cli import run, values_of
-from embomatrix.worker.settings_cli import parse
+from embomatrix.worker.install_cli import closed_to_others, quote, unit_text
+from embomatrix.worker.run_cli import settings_of
 from embomatrix.worker.status import StatusFile, WorkerStatus, running_daemons
 from embomatrix.worker.status_cli import describe, spell
 
+DEPLOY = Path(__file__).parents[3] / "deploy"
 STATUS = WorkerStatus("w1", os.getpid(), time.time(), slots=4, memory_mb=2000, cache_mb=1024)
-
-
-def _settings(*arguments):
-    """The settings that `worker run` makes of these arguments, without running it."""
-    command = typer.main.get_command(_only_run())
-    context = command.make_context("run", list(arguments))
-    return parse(values_of(context, context.params["config"], context.params["labels"] or []))
-
-
-def _only_run():
-    parser = typer.Typer()
-    parser.command()(run)
-    return parser
 
 
 def test_options_go_before_the_file_and_the_file_before_defaults(tmp_path):
@@ -41,7 +27,7 @@ def test_options_go_before_the_file_and_the_file_before_defaults(tmp_path):
         'name = "attic"\nslots = 3\ncache_mb = 77\n[labels]\nroom = "attic"\n'
         '[preferences]\nhours = "18:00-08:00"\nidle_s = 300\nmains_only = true\n'
     )
-    settings = _settings("--config", str(config), "--slots=2", "--idle-s=60", "--label=owner=ann")
+    settings = settings_of(["--config", str(config), "--slots=2", "--idle-s=60", "--label=owner=ann"])
     assert (settings.name, settings.slots, settings.cache_mb, settings.nice) == ("attic", 2, 77, 10)
     assert settings.labels == {"room": "attic", "owner": "ann"}
     wishes = settings.preferences
@@ -137,20 +123,86 @@ def test_durations_are_told_in_their_two_largest_units(seconds, said):
 
 
 def test_a_unit_is_written_and_the_next_steps_are_said(tmp_path):
-    result = CliRunner().invoke(
-        app, ["install", f"--folder={tmp_path}", "--", "--hours", "18:00-08:00", "--config", "/a b%.toml"]
-    )
+    config = tmp_path / "a b%.toml"
+    config.write_text('join = "secret.of.mine@host:1"\n')
+    result = _install(tmp_path, "--hours", "18:00-08:00", f"--config={config}")
     assert result.exit_code == 0, result.stderr
     assert "systemctl --user enable --now embomatrix-worker.service" in result.stdout
-    text = (tmp_path / "embomatrix-worker.service").read_text()
-    assert 'worker run --hours 18:00-08:00 --config "/a b%%.toml"\n' in text
+    assert f'worker run --hours 18:00-08:00 --config "{tmp_path}/a b%%.toml"\n' in _unit(tmp_path)
 
 
-def test_a_token_is_not_written_into_a_unit(tmp_path):
-    result = CliRunner().invoke(app, ["install", f"--folder={tmp_path}", "--", "--join", "secret@host:1"])
+def test_paths_of_a_unit_are_those_that_were_meant_where_it_was_installed(tmp_path, monkeypatch):
+    (tmp_path / "spare.toml").write_text("slots = 2\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", "/home/ann")
+    result = _install(tmp_path, "--config", "spare.toml", "--cache-dir=~/cache", "--token", "@worker.token")
+    assert result.exit_code == 0, result.stderr
+    said = f"--config {tmp_path}/spare.toml --cache-dir /home/ann/cache --token @{tmp_path}/worker.token\n"
+    assert said in _unit(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--join", "secret@host:1"], "a token in a unit is for everyone to read"),
+        (["--token=secret"], "a token in a unit is for everyone to read"),
+        (["--config=/nowhere.toml"], "--config /nowhere.toml: No such file or directory"),
+        (["--hours=nights"], "--hours 'nights': expected HH:MM-HH:MM"),
+        (["--slotz=3"], "No such option: --slotz"),
+    ],
+)
+def test_what_would_end_a_worker_in_the_background_is_told_before_its_unit_is_written(tmp_path, words, said):
+    result = _install(tmp_path, *words)
     assert result.exit_code == 2
+    assert said in " ".join(result.stderr.split())
     assert "secret" not in result.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_unit_of_the_whole_machine_writes_where_it_may(tmp_path):
+    result = _install(tmp_path, "--cache-dir=/var/cache/mine", system=True)
+    assert result.exit_code == 2
+    assert "writes below /var/lib/embomatrix-worker alone: leave --cache-dir out" in " ".join(
+        result.stderr.split()
+    )
+
+
+def test_a_unit_without_rights_is_handed_the_files_that_root_alone_may_read():
+    words = ["--config", "/etc/embomatrix/100%.toml", "--nice", "5", "--token", "@/etc/embomatrix/token"]
+    text = unit_text(["/opt/embomatrix"], words, system=True)
+    assert (
+        "LoadCredential=config:/etc/embomatrix/100%%.toml\nLoadCredential=token:/etc/embomatrix/token\n"
+        in text
+    )
+    handed = "--config ${CREDENTIALS_DIRECTORY}/config --nice 5 --token @${CREDENTIALS_DIRECTORY}/token"
+    assert f"ExecStart=/opt/embomatrix worker run {handed}\n" in text
+
+
+def test_worker_and_manager_of_a_machine_keep_their_files_apart():
+    """Each runs as a user of its own, and systemd gives a folder of state to the one that started last."""
+    manager = (DEPLOY / "systemd" / "embomatrix-manager.service").read_text()
+    folders = [
+        line
+        for text in (manager, unit_text(["/opt/embomatrix"], [], system=True))
+        for line in text.splitlines()
+        if line.startswith("StateDirectory=")
+    ]
+    assert len(folders) == len(set(folders)) == 2
+
+
+def test_a_folder_that_only_its_owner_may_pass_is_found(tmp_path):
+    tmp_path.chmod(0o700)
+    assert closed_to_others(tmp_path / "venv" / "bin" / "embomatrix") is not None
+    assert closed_to_others(Path("/usr/bin/env")) is None
+
+
+def _install(folder, *words, system=False):
+    kind = ["--system"] if system else []
+    return CliRunner().invoke(app, ["install", f"--folder={folder}", *kind, "--", *words])
+
+
+def _unit(folder):
+    return (folder / "embomatrix-worker.service").read_text()
 
 
 def test_words_of_a_command_are_taken_literally():
@@ -166,5 +218,9 @@ def test_words_of_a_command_are_taken_literally():
 @pytest.mark.parametrize("system", [False, True])
 def test_systemd_finds_nothing_wrong_with_the_unit(tmp_path, system):
     path = tmp_path / "embomatrix-worker.service"
-    path.write_text(unit_text([str(Path(shutil.which("true")))], ["--hours", "18:00-08:00"], system=system))
+    path.write_text(
+        unit_text(
+            [shutil.which("true")], ["--hours", "18:00-08:00", "--config", "/etc/w.toml"], system=system
+        )
+    )
     assert_valid_unit(path, system=system)

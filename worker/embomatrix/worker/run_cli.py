@@ -10,7 +10,7 @@ import signal
 import sys
 import tomllib
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final, Protocol
 
 import numpy as np
 import psutil
@@ -29,6 +29,9 @@ from embomatrix.worker.settings_cli import Ca, Manager, StateDir, Token, check_e
 from embomatrix.worker.status import daemon_pids
 
 if TYPE_CHECKING:
+    import enum
+    from collections.abc import Sequence
+
     from embomatrix.worker.settings import WorkerSettings
 
 logger = logging.getLogger(__name__)
@@ -112,7 +115,23 @@ def run(
         fail(f"{where} can't be used ({error.strerror or error}): name another folder with --cache-dir")
 
 
-def values_of(context: typer.Context, config: Path | None, labels: list[str]) -> dict[str, Any]:
+class CommandLine(Protocol):
+    """What was typed: values by the names of options, and where each of them comes from."""
+
+    params: dict[str, Any]
+
+    def get_parameter_source(self, name: str, /) -> enum.Enum | None: ...
+
+
+def settings_of(words: Sequence[str]) -> WorkerSettings:
+    """What `worker run` makes of these words; where one is wrong, the program ends with a sentence."""
+    parser = typer.Typer()
+    parser.command()(run)
+    context = typer.main.get_command(parser).make_context("embomatrix worker run", list(words))
+    return parse(values_of(context, context.params["config"], context.params["labels"] or []))
+
+
+def values_of(context: CommandLine, config: Path | None, labels: list[str]) -> dict[str, Any]:
     """What the file says, and over it what was given as an option or in the environment."""
     values = read_config(config) if config is not None else {}
     wishes = values.setdefault("preferences", {})
