@@ -12,6 +12,7 @@ from embomatrix.rpc.convert_session import run_info_from_proto, worker_info_from
 from embomatrix.rpc.leader_client import LeaderClient
 from embomatrix.rpc.managers import PATIENCE_S, of_the_leader
 from embomatrix.rpc.status import cluster_errors
+from embomatrix.rpc.values import Fleet
 
 if TYPE_CHECKING:
     from embomatrix.rpc.values import RunInfo, WorkerInfo
@@ -39,12 +40,16 @@ class FleetClient(LeaderClient):
     def _admin(self) -> admin_service_pb2_grpc.AdminServiceAsyncStub:
         return admin_service_pb2_grpc.AdminServiceStub(self._channel)
 
-    @of_the_leader
     async def list_workers(self) -> tuple[WorkerInfo, ...]:
         """The workers that the manager knows, also those that it lost a moment ago."""
+        return (await self.fleet()).workers
+
+    @of_the_leader
+    async def fleet(self) -> Fleet:
+        """The same, and how the cluster does."""
         with cluster_errors(self._address):
             answer = await self._admin.ListWorkers(pb.ListWorkersRequest(), timeout=self._call_s)
-            return each("workers", worker_info_from_proto, answer.workers)
+            return Fleet(each("workers", worker_info_from_proto, answer.workers), answer.health, answer.mood)
 
     @of_the_leader
     async def list_runs(self, *, closed: bool = False) -> tuple[RunInfo, ...]:

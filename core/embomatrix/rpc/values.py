@@ -349,6 +349,18 @@ class WorkerInfo:
 
 
 @dataclass(frozen=True, slots=True)
+class Fleet:
+    """The workers, and how the cluster does, in the manager's own sentence; a manager of an earlier release says nothing.
+
+    ``mood`` is how much somebody should care: good, idle, warning or bad.
+    """
+
+    workers: tuple[WorkerInfo, ...]
+    health: str = ""
+    mood: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class RunInfo:
     """A run: its counters so far, and how many of its rollouts have no outcome yet.
 

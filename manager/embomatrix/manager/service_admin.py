@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import time
 from typing import TYPE_CHECKING
 
+from embomatrix.manager.health import health
 from embomatrix.manager.service_tokens import TokenMethods
-from embomatrix.manager.views import plan, run_infos, worker_infos
+from embomatrix.manager.views import overview, plan, run_infos, worker_infos
 from embomatrix.proto.v1 import admin_service_pb2 as pb
 from embomatrix.rpc.convert_log import event_page_to_proto, run_summary_to_proto
 from embomatrix.rpc.convert_session import plan_cell_to_proto, run_info_to_proto, worker_info_to_proto
@@ -29,7 +31,8 @@ class AdminServicer(TokenMethods):
     ) -> pb.ListWorkersResponse:
         async with translate(context):
             workers = [worker_info_to_proto(info) for info in worker_infos(self._runtime)]
-        return pb.ListWorkersResponse(workers=workers)
+            told = health(overview(self._runtime), paused=self._runtime.paused, now_s=time.time())
+        return pb.ListWorkersResponse(workers=workers, health=told.sentence, mood=told.mood)
 
     async def ListRuns(
         self, request: pb.ListRunsRequest, context: grpc.aio.ServicerContext

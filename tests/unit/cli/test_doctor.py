@@ -7,9 +7,11 @@ from tests.integration.test_manager_service import manager as a_manager
 
 from embomatrix.cli.doctor.findings import Finding, Level, verdict
 from embomatrix.cli.doctor.machine import NEEDED, disk, machine, memory, parts, port, python
-from embomatrix.cli.doctor.manager import Visit, certificate, clock, manager, ports_held, versions
+from embomatrix.cli.doctor.manager import Visit, certificate, clock, cluster, manager, ports_held, versions
 from embomatrix.manager.access.folder import prepare
+from embomatrix.rpc.admin import AdminClient
 from embomatrix.rpc.capabilities import Capabilities
+from embomatrix.rpc.values import Fleet
 from embomatrix.rpc.versions import PROTOCOL_VERSION, VersionRange
 
 
@@ -72,8 +74,8 @@ def test_a_manager_that_speaks_no_common_version_is_wrong_and_another_release_is
 def test_the_verdict_names_what_is_wrong():
     fine, note, wrong = (Finding(level.value, level, "") for level in Level)
     assert verdict([fine]) == "all is well"
-    assert verdict([fine, note]) == "nothing is wrong; 1 of 2 things are worth a look"
-    assert verdict([fine, wrong, note]) == "1 of 3 things are wrong: wrong"
+    assert verdict([fine, note]) == "nothing is wrong; 1 of 2 things is worth a look"
+    assert verdict([fine, wrong, note]) == "1 of 3 things is wrong: wrong"
 
 
 def test_this_machine_can_run_its_own_tests():
@@ -92,8 +94,26 @@ async def test_a_manager_in_the_clear_is_fine(tmp_path):
     async with a_manager(tmp_path) as endpoints:
         page_port = int(endpoints.status_url.rstrip("/").rpartition(":")[2])
         found = await manager(Visit(endpoints.address, page_port=page_port))
-    assert [finding.thing for finding in found] == ["manager", "TLS", "versions", "token", "clock"]
+    assert [finding.thing for finding in found] == ["manager", "TLS", "versions", "token", "cluster", "clock"]
     assert {finding.level for finding in found} == {Level.FINE}
+
+
+async def test_a_cluster_that_stands_still_is_worth_a_look_and_no_fault_of_this_machine(tmp_path):
+    async with a_manager(tmp_path) as endpoints:
+        async with AdminClient(endpoints.address) as client:
+            await client.pause_dispatch()
+        found = await manager(Visit(endpoints.address, page_port=1))
+    assert levels(found)["cluster"] is Level.NOTE
+    assert "Dispatch is paused" in next(f.found for f in found if f.thing == "cluster")
+    assert cluster(Fleet(())) == [], "a manager of an earlier release says nothing of it"
+
+
+async def test_a_port_of_another_kind_is_told_once(tmp_path):
+    async with a_manager(tmp_path) as endpoints:
+        page_port = int(endpoints.status_url.rstrip("/").rpartition(":")[2])
+        found = await manager(Visit(f"127.0.0.1:{page_port}", page_port=page_port))
+    assert [finding.thing for finding in found] == ["manager", "TLS", "versions"]
+    assert (found[-1].level, "is this the port" in found[-1].remedy) == (Level.WRONG, True)
 
 
 async def test_ports_that_a_manager_on_this_machine_holds_are_no_reason_for_a_note(tmp_path):

@@ -12,7 +12,9 @@ from tests.integration.test_manager_service import manager
 from embomatrix.cli.status.app import status, top
 from embomatrix.cli.status.live import Glance, earliest, rate, screen
 from embomatrix.cli.status.words import sentences
+from embomatrix.rpc.admin import AdminClient
 from embomatrix.rpc.values import (
+    Fleet,
     PlanCell,
     Resident,
     ResidentState,
@@ -30,12 +32,21 @@ def worker(name="w1", state="ready", *, running=0, completed=0, reason="", resid
 
 def test_words_begin_with_the_verdict():
     run_info = RunInfo("r1", "evening", RunStats(), pending=3)
-    assert sentences((), (), ())[0].startswith("No workers: start one")
-    assert sentences((worker(),), (), ())[0] == "The cluster is ready, and no run is open."
-    assert sentences((worker(),), (run_info,), ())[0] == "The cluster works."
-    assert sentences((worker(state="paused"),), (run_info,), ())[0].startswith(
+    nobody = sentences(Fleet(()), (), ())
+    assert nobody[0] == "No worker is there."
+    assert nobody[1].startswith("Start a worker with `embomatrix worker run`")
+    assert sentences(Fleet((worker(),)), (), ())[0] == "The cluster is ready, and no run is open."
+    assert sentences(Fleet((worker(),)), (run_info,), ())[0] == "The cluster works."
+    assert sentences(Fleet((worker(state="paused"),)), (run_info,), ())[0].startswith(
         "No worker works, and 3 rollouts wait"
     )
+
+
+def test_what_the_manager_says_of_itself_is_the_verdict():
+    full = "Nothing can be written down, so nothing goes on: no space left on device."
+    assert sentences(Fleet((worker(),), full), (), ())[0] == full
+    assert sentences(Fleet((), full), (), ())[0] == full, "also where nobody is there"
+    assert full in "\n".join(drawn(Glance(0.0, Fleet((worker(),), full), ()), 24))
 
 
 def test_words_tell_what_runs_what_is_warm_and_who_does_not_work():
@@ -46,29 +57,29 @@ def test_words_tell_what_runs_what_is_warm_and_who_does_not_work():
         PlanCell("r1", 7, "sha256:bb", 8, Warmth.UNPLACEABLE),
     ]
     told = sentences(
-        (worker(running=1, residents=(warm,)), worker("w2", "paused", reason="somebody uses it")),
+        Fleet((worker(running=1, residents=(warm,)), worker("w2", "paused", reason="somebody uses it"))),
         (RunInfo("r1", "evening", stats, pending=3),),
         plan,
     )
     assert told[1:] == [
-        "Workers: 1 ready, 1 paused; 1 of 2 slots run a rollout; 1 scenes are in memory.",
+        "Workers: 1 ready, 1 paused; 1 of 2 slots busy; 1 scene is in memory.",
         "Run evening: 40 rollouts done, 75% of them in warm scenes; 2 lost by the infrastructure, 5 given again; 3 under way.",
-        "Look-ahead: 1 of 2 scenes of the next 1 steps are warm; 1 find no room: give workers memory, or start more.",
+        "Look-ahead: 1 of 2 scenes of the next step warm; 1 without room: give workers memory, or start more.",
         "w2 is paused: somebody uses it.",
     ]
 
 
 def test_who_left_in_order_is_counted_and_no_trouble():
-    told = sentences((worker(), worker("w2", "left", reason="it left")), (), ())
+    told = sentences(Fleet((worker(), worker("w2", "left", reason="it left"))), (), ())
     assert told == [
         "The cluster is ready, and no run is open.",
-        "Workers: 1 ready, 1 left; 0 of 2 slots run a rollout; 0 scenes are in memory.",
+        "Workers: 1 ready, 1 left; 0 of 2 slots busy; 0 scenes are in memory.",
     ]
-    assert sentences((worker(state="left"),), (), ())[0].startswith("No workers: start one")
+    assert sentences(Fleet((worker(state="left"),)), (), ())[0] == "No worker is there."
 
 
 def test_words_of_a_thousand_workers_fit_on_a_screen():
-    assert len(sentences([worker(f"w{n}", "lost") for n in range(1000)], (), ())) < 16
+    assert len(sentences(Fleet(tuple(worker(f"w{n}", "lost") for n in range(1000))), (), ())) < 16
 
 
 def drawn(now, lines):
@@ -79,17 +90,22 @@ def drawn(now, lines):
 
 def test_the_screen_shows_those_that_do_not_work_first_and_no_more_than_fits():
     crowd = (*(worker(f"w{n:04}", running=n % 3) for n in range(1000)), worker("broken", "lost"))
-    lines = drawn(Glance(0.0, crowd, ()), 24)
+    lines = drawn(Glance(0.0, Fleet(crowd, "All is well."), ()), 24)
     assert len(lines) <= 24
     (first,) = [line for line in lines if line.startswith("broken")]
     assert lines.index(first) < min(n for n, line in enumerate(lines) if line.startswith("w0"))
     assert lines[-1].startswith("and 9")
 
 
+def test_who_left_has_no_slots_on_the_screen():
+    (head, *_) = drawn(Glance(0.0, Fleet((worker(running=1), worker("w2", "left"))), ()), 24)
+    assert head.split("   ")[1:] == ["1 of 2 slots busy", "1 of 2 workers at work", "0 runs"]
+
+
 def test_throughput_is_that_of_the_last_seconds_and_never_negative():
-    glances = [Glance(float(at_s), (worker(completed=100 * at_s),), ()) for at_s in range(10)]
+    glances = [Glance(float(at_s), Fleet((worker(completed=100 * at_s),)), ()) for at_s in range(10)]
     assert rate(earliest(glances, 5.0), glances[-1]) == 100.0
-    assert rate(glances[-1], Glance(10.0, (), ())) == 0.0
+    assert rate(glances[-1], Glance(10.0, Fleet(()), ())) == 0.0
     assert rate(glances[-1], glances[-1]) == 0.0
 
 
@@ -99,7 +115,13 @@ async def test_both_commands_show_a_real_manager(tmp_path, capsys):
         words = capsys.readouterr().out
         await asyncio.to_thread(top, endpoints.address, rounds=1)
         live = capsys.readouterr().out
+        async with AdminClient(endpoints.address) as client:
+            await client.pause_dispatch()
+        await asyncio.to_thread(status, endpoints.address)
+        paused = capsys.readouterr().out
     assert "Workers: 1 ready" in words
+    assert words.startswith("Ready: 1 worker waits for a run.")
+    assert paused.startswith("Dispatch is paused: nothing new is executed")
     assert "0 rollouts/s" in live
     assert "w1" in live
 

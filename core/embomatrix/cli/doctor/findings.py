@@ -33,10 +33,14 @@ def verdict(findings: Sequence[Finding]) -> str:
     """All of them in one sentence."""
     wrong = [finding.thing for finding in findings if finding.level is Level.WRONG]
     if wrong:
-        return f"{len(wrong)} of {len(findings)} things are wrong: {', '.join(wrong)}"
+        return f"{len(wrong)} of {len(findings)} things {_are(len(wrong))} wrong: {', '.join(wrong)}"
     notes = sum(finding.level is Level.NOTE for finding in findings)
     return (
         "all is well"
         if not notes
-        else f"nothing is wrong; {notes} of {len(findings)} things are worth a look"
+        else f"nothing is wrong; {notes} of {len(findings)} things {_are(notes)} worth a look"
     )
+
+
+def _are(number: int) -> str:
+    return "is" if number == 1 else "are"

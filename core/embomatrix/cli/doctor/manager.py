@@ -23,12 +23,16 @@ from embomatrix.rpc.versions import SPOKEN, agree, software_version
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from embomatrix.rpc.values import Fleet
+
 KNOCK_S: Final = 1.0
 """Limit for each of the questions, of which there are four: a doctor is quick."""
 CERTIFICATE_DAYS: Final = 30
 """`manager init` renews a certificate with less than this left."""
 CLOCK_S: Final = 60.0
 DAY_S: Final = 86400.0
+CALM: Final = frozenset({"good", "idle"})
+"""Moods of a cluster that nobody needs to care about."""
 LOOPBACK: Final = ("127.0.0.1", "localhost", "::1")
 
 
@@ -63,11 +67,15 @@ async def manager(visit: Visit) -> list[Finding]:
     findings = [reached]
     if reached.level is not Level.FINE:
         return findings
-    findings.append(await asyncio.to_thread(_tls, visit))
-    if findings[-1].level is Level.WRONG:
+    secured = await asyncio.to_thread(_tls, visit)
+    findings.append(secured)
+    if secured.level is Level.WRONG:
         return findings
-    findings.append(await _versions(visit))
-    findings.append(await _token(visit))
+    spoken = await _versions(visit)
+    findings.append(spoken)
+    if spoken.level is Level.WRONG:
+        return findings
+    findings += await _token(visit)
     offset_s = await asyncio.to_thread(_clock_offset_s, visit)
     if offset_s is not None:
         findings.append(clock(offset_s))
@@ -171,20 +179,31 @@ async def _versions(visit: Visit) -> Finding:
         return Finding("versions", Level.WRONG, str(error), "is this the port of a manager's gRPC services?")
 
 
-async def _token(visit: Visit) -> Finding:
+async def _token(visit: Visit) -> list[Finding]:
+    """What becomes of who shows it, and what the manager says of the cluster then."""
     try:
         async with AdminClient(
             visit.address, visit.token, ca=visit.ca, call_s=KNOCK_S, patience_s=0
         ) as client:
-            ready = sum(worker.state == "ready" for worker in await client.list_workers())
+            fleet = await client.fleet()
     except NotAllowedError as error:
-        return Finding("token", Level.FINE, f"is known; {error}")
+        return [Finding("token", Level.FINE, f"is known; {error}")]
     except ClusterError as error:
-        return Finding(
-            "token", Level.WRONG, str(error), "tokens are made by `embomatrix manager token issue`"
-        )
-    found = "is known" if visit.token else "none is asked for"
-    return Finding("token", Level.FINE, f"{found}; {ready} workers are ready")
+        remedy = "tokens are made by `embomatrix manager token issue`"
+        return [Finding("token", Level.WRONG, str(error), remedy)]
+    found = Finding("token", Level.FINE, "is known" if visit.token else "none is asked for")
+    return [found, *cluster(fleet)]
+
+
+def cluster(fleet: Fleet) -> list[Finding]:
+    """How the cluster does, if its manager says so. It is no fault of this machine: never worse than a note."""
+    if not fleet.health:
+        return []
+    ready = sum(worker.state == "ready" for worker in fleet.workers)
+    found = f"{fleet.health} Workers that are ready: {ready}"
+    if fleet.mood in CALM:
+        return [Finding("cluster", Level.FINE, found)]
+    return [Finding("cluster", Level.NOTE, found, "`embomatrix status` and the dashboard say more")]
 
 
 def _clock_offset_s(visit: Visit) -> float | None:

@@ -43,12 +43,10 @@ def status(
 
     async def ask() -> None:
         async with _client(manager, token, ca) as client:
-            workers, runs, plan = await asyncio.gather(
-                client.list_workers(), client.list_runs(), client.plan()
-            )
-        told = sentences(workers, runs, plan)
+            fleet, runs, plan = await asyncio.gather(client.fleet(), client.list_runs(), client.plan())
+        told = sentences(fleet, runs, plan)
         if as_json:
-            show_json({"sentences": told, "workers": workers, "runs": runs, "plan": plan})
+            show_json({"sentences": told, "workers": fleet.workers, "runs": runs, "plan": plan})
             return
         console = Console(highlight=False)
         for sentence in told:
@@ -89,8 +87,8 @@ def top(
 
 
 async def _look(client: AdminClient) -> Glance:
-    workers, runs = await asyncio.gather(client.list_workers(), client.list_runs())
-    return Glance(time.monotonic(), workers, runs)
+    fleet, runs = await asyncio.gather(client.fleet(), client.list_runs())
+    return Glance(time.monotonic(), fleet, runs)
 
 
 def _client(manager: str, token: str, ca: Path | None) -> AdminClient:

@@ -9,16 +9,17 @@ from rich.console import Group
 from rich.text import Text
 
 from embomatrix.cli.cluster.tables import run_table, worker_table
+from embomatrix.cli.status.words import WORKING, counted
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from rich.console import RenderableType
 
-    from embomatrix.rpc.values import RunInfo, WorkerInfo
+    from embomatrix.rpc.values import Fleet, RunInfo, WorkerInfo
 
-OTHER_LINES: Final = 6
-"""Lines that are no run's and no worker's: the head, two empty ones, the heads of two tables, how many more there are."""
+OTHER_LINES: Final = 7
+"""Lines that are no run's and no worker's: two of the head, two empty ones, the heads of two tables, how many more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,8 +27,12 @@ class Glance:
     """The cluster at one moment. ``at_s`` is on a clock that only goes forward."""
 
     at_s: float
-    workers: tuple[WorkerInfo, ...]
+    fleet: Fleet
     runs: tuple[RunInfo, ...]
+
+    @property
+    def workers(self) -> tuple[WorkerInfo, ...]:
+        return self.fleet.workers
 
     @property
     def completed(self) -> int:
@@ -43,12 +48,16 @@ def rate(before: Glance, now: Glance) -> float:
 
 def screen(before: Glance, now: Glance, *, lines: int) -> RenderableType:
     """What fits in so many lines: the runs, and of the workers the busiest, after those that don't work."""
-    slots, busy = sum(worker.resources.slots for worker in now.workers), sum(w.running for w in now.workers)
+    there = [worker for worker in now.workers if worker.state in WORKING]
+    slots, busy = sum(worker.resources.slots for worker in there), sum(worker.running for worker in there)
     head = Text(f"{rate(before, now):,.0f} rollouts/s", style="bold")
     head.append(
-        f"   {busy} of {slots} slots busy   {len(now.workers)} workers   {len(now.runs)} runs",
+        f"   {busy} of {counted(slots, 'slot')} busy   {len(there)} of {counted(len(now.workers), 'worker')} at work"
+        f"   {counted(len(now.runs), 'run')}",
         style="default",
     )
+    if now.fleet.health:
+        head.append(f"\n{now.fleet.health}", style="default")
     runs = now.runs[-max(1, lines // 3) :]
     room = max(1, lines - OTHER_LINES - len(runs))
     shown = sorted(now.workers, key=_order)[:room]

@@ -433,14 +433,22 @@ class ListWorkersResponse(google.protobuf.message.Message):
     DESCRIPTOR: google.protobuf.descriptor.Descriptor
 
     WORKERS_FIELD_NUMBER: builtins.int
+    HEALTH_FIELD_NUMBER: builtins.int
+    MOOD_FIELD_NUMBER: builtins.int
+    health: builtins.str
+    """How the cluster does, in one sentence: the first thing that is wrong, or that all is well."""
+    mood: builtins.str
+    """"good", "idle", "warning" or "bad": how much somebody should care."""
     @property
     def workers(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[Global___WorkerInfo]: ...
     def __init__(
         self,
         *,
         workers: collections.abc.Iterable[Global___WorkerInfo] | None = ...,
+        health: builtins.str = ...,
+        mood: builtins.str = ...,
     ) -> None: ...
-    def ClearField(self, field_name: typing.Literal["workers", b"workers"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["health", b"health", "mood", b"mood", "workers", b"workers"]) -> None: ...
 
 Global___ListWorkersResponse: typing_extensions.TypeAlias = ListWorkersResponse
 
