@@ -162,6 +162,67 @@ async def test_the_look_ahead_is_read_by_keyboard(browser, tmp_path):
         assert await opened.page.evaluate("document.activeElement.dataset.key.includes(' 8 ')")
 
 
+async def _slots_shown_s(opened, pattern="shown"):
+    """How long the part of the timeline is that is shown, once its words fit."""
+    number, unit = (await opened.until("#range", pattern)).split()[:2]
+    return float(number) * {"ms": 0.001, "s": 1, "min": 60}[unit]
+
+
+async def _point_at_a_rollout(opened):
+    """Where on the page the mouse found one."""
+    await opened.page.locator("canvas.gantt").wait_for()
+    box = await opened.page.locator("canvas.gantt").bounding_box()
+    for left in range(int(box["x"]) + 160, int(box["x"] + box["width"]), 6):
+        await opened.page.mouse.move(left, box["y"] + 30)
+        if "on office slot 1: completed" in await opened.words("#one"):
+            return left, box["y"] + 30
+    raise AssertionError("no rollout is on the timeline")
+
+
+async def test_the_timeline_is_zoomed_and_drawn_along_by_the_mouse(browser, tmp_path):
+    async with (
+        manager(tmp_path) as at,
+        FakeWorker(at.address, "office", slots=1, execute_s=0.3),
+        open_run(at.address) as client,
+        window(browser, at.status_url) as opened,
+    ):
+        assert len([result async for result in client.execute(batch(4), deadline_s=60)]) == 4
+        await opened.open("timeline")
+        left, top = await _point_at_a_rollout(opened)
+        whole_s = await _slots_shown_s(opened)
+        await opened.page.mouse.dblclick(left, top)
+        one_s = await _slots_shown_s(opened)
+        assert 0.3 <= one_s < min(3.0, whole_s)
+        for key, times in (("Control", 1), ("Shift", 1), ("Control", -1), ("Shift", -1)):
+            before_s = await _slots_shown_s(opened)
+            async with _held_down(opened.page, key):
+                # With Shift a wheel turns sideways.
+                await opened.page.mouse.wheel(*((120 * times, 0) if key == "Shift" else (0, 120 * times)))
+            await opened.page.wait_for_timeout(100)
+            longer = await _slots_shown_s(opened) > before_s
+            assert longer == (times > 0), f"{key} and the wheel by {times}"
+        await opened.page.mouse.move(left, top)
+        told = await opened.words("#one")
+        await opened.page.mouse.down()
+        await opened.page.mouse.move(left + 400, top, steps=8)
+        await opened.page.mouse.up()
+        assert (await opened.words("#one")) == told, "what was grabbed stays under the mouse"
+        await opened.page.wait_for_timeout(1200)
+        assert await _slots_shown_s(opened) == pytest.approx(one_s, rel=0.1), "a refresh takes no view away"
+        await opened.page.locator("canvas.gantt").focus()
+        await opened.page.keyboard.press("Escape")
+        await opened.page.wait_for_timeout(300)
+        assert await _slots_shown_s(opened) >= whole_s
+        assert opened.wrong == []
+
+
+@contextlib.asynccontextmanager
+async def _held_down(page, key):
+    await page.keyboard.down(key)
+    yield
+    await page.keyboard.up(key)
+
+
 async def test_a_page_without_its_manager_says_from_when_it_is_and_goes_on_with_the_next(browser, tmp_path):
     port = free_port()
     serve = (

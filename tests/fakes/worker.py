@@ -79,7 +79,9 @@ class FakeWorker:
         self._channel = self.through(open_channel(self.address, self.token, self.ca))
         self._stub = worker_service_pb2_grpc.WorkerServiceStub(self._channel)
         self._outgoing = asyncio.Queue()
-        self._permits = asyncio.Semaphore(self.slots)
+        self._free = asyncio.Queue()
+        for slot in range(1, self.slots + 1):
+            self._free.put_nowait(slot)
         self._tasks = set()
         answer = await self._stub.Register(
             pb.RegisterRequest(
@@ -114,9 +116,9 @@ class FakeWorker:
         await asyncio.gather(*self._tasks, return_exceptions=True)
         await self._channel.close()
 
-    def report(self, ref, outcome):
-        """Send a result, whatever became of its lease."""
-        self._send(results=[LeaseResult(ref, outcome)])
+    def report(self, ref, outcome, slot=0):
+        """Send a result, whatever became of its lease; of no slot, as of one that never ran."""
+        self._send(results=[LeaseResult(ref, outcome, slot=slot, held_s=self.execute_s if slot else 0.0)])
 
     def finish_all(self):
         """Send a result of each lease it holds, in one message; returns how many."""
@@ -196,20 +198,27 @@ class FakeWorker:
         self._send(state=self._state())
 
     async def _execute(self, lease):
-        async with self._permits:
-            if lease.ref.lease_id not in self.leases:
-                return
-            self.executed.append(lease.rollout.rollout_id)
-            if lease.rollout.task_id in self.stuck:
-                await asyncio.Event().wait()
-            await asyncio.sleep(self.execute_s)
-            if self.leases.pop(lease.ref.lease_id, None) is None:
-                return
-            if lease.rollout.task_id in self.poison:
-                self.report(lease.ref, InfraFailure(InfraCode.SLOT_CRASHED, "signal 11", self.worker_id))
-            else:
-                reward = dataclasses.replace(lease.reward, goal=0.0) if self.lies else lease.reward
-                self.report(lease.ref, completed(self.worker_id, reward))
+        slot = await self._free.get()
+        try:
+            await self._execute_in(slot, lease)
+        finally:
+            self._free.put_nowait(slot)
+
+    async def _execute_in(self, slot, lease):
+        if lease.ref.lease_id not in self.leases:
+            return
+        self.executed.append(lease.rollout.rollout_id)
+        if lease.rollout.task_id in self.stuck:
+            await asyncio.Event().wait()
+        await asyncio.sleep(self.execute_s)
+        if self.leases.pop(lease.ref.lease_id, None) is None:
+            return
+        if lease.rollout.task_id in self.poison:
+            crashed = InfraFailure(InfraCode.SLOT_CRASHED, "signal 11", self.worker_id)
+            self.report(lease.ref, crashed, slot)
+        else:
+            reward = dataclasses.replace(lease.reward, goal=0.0) if self.lies else lease.reward
+            self.report(lease.ref, completed(self.worker_id, reward), slot)
 
     async def _beat(self, interval_s):
         while True:

@@ -3,7 +3,7 @@ import {ask} from "./ask.js";
 import {at, colour, count, h, none, put, seconds, signed} from "./dom.js";
 import {named} from "./names.js";
 
-const ROW = 20, NAMES = 150, NAMES_SHARE = 0.28, TYPING_MS = 250, HEAD = 22, GRIP = 5, LEAST_PX = 1, LEAST_S = 0.1;
+const ROW = 20, NAMES = 150, NAMES_SHARE = 0.28, TYPING_MS = 250, HEAD = 22, GRIP = 5, LEAST_PX = 1, LEAST_S = 0.1, LEAST_VIEW_S = 0.001;
 const SPANS = [10, 60, 300, 1800];
 const KINDS = [["execute", "warm"], ["load", "warming"], ["deliver", "queued"], ["failed", "bad"], ["idle", "chip"]];
 let run = "", told = null, view = null, live = true, span = 60, painted = [], grabbed = null, edge = NAMES, search = "", typed = 0;
@@ -30,7 +30,7 @@ export async function show({runs}) {
   if (!run) run = (runs.findLast(r => r.pending || r.stats.delivered) ?? runs.at(-1))?.run_id ?? "";
   put(at("run"), (known.includes(run) || !run ? known : [run, ...known]).map(id => h("option", {value: id, selected: id === run}, runs.find(r => r.run_id === id)?.name || id)));
   if (!run) { put(at("tracks"), none("No open run. A closed one: embomatrix cluster report RUN")); return; }
-  if (!live && told) return;
+  if (!live && told) { draw(); return; } // the window or the theme may be another by now
   told = await ask(`runs/${encodeURIComponent(run)}/timeline?${new URLSearchParams({seconds: span, search})}`);
   if (live) {
     const first = Math.min(...told.tracks.flatMap(track => track.spans.map(one => one.begin_s - one.load_s)));
@@ -43,10 +43,10 @@ function draw() {
   const place = at("tracks");
   if (!place || !told) return;
   if (!told.tracks.length) { put(place, none(search ? "No worker of that name executed anything in this time." : "Nothing was executed in this time.")); at("one").textContent = ""; return; }
-  if (!at("one").textContent) at("one").textContent = "Point at a span, or zoom in: by the buttons, or by plus, minus and the arrows. Escape follows the latest again.";
+  if (!at("one").textContent) at("one").textContent = "Point at a span. Zoom by Ctrl and the wheel, by a double click on a rollout, or by plus and minus; drag, or press the arrows, to go along; Escape follows the latest again.";
   let canvas = place.querySelector("canvas");
   if (!canvas) {
-    canvas = h("canvas", {class: "gantt", tabindex: "0", role: "img", onwheel: wheel, onpointermove: point, onpointerdown: grab, ondblclick: nearer, onkeydown: key});
+    canvas = h("canvas", {class: "gantt", tabindex: "0", role: "img", onwheel: wheel, onpointermove: point, onpointerdown: grab, onpointerup: release, onpointercancel: release, ondblclick: nearer, onkeydown: key});
     place.replaceChildren(canvas);
   }
   const wide = place.clientWidth;
@@ -91,7 +91,7 @@ function scale(pen, tint, x, wide, high) {
   pen.font = "11px system-ui"; pen.strokeStyle = tint.line;
   for (let tick = Math.ceil((view.from - told.until_s) / step) * step; tick <= view.until - told.until_s + 1e-9; tick += step) {
     const left = x(told.until_s + tick);
-    const words = Math.abs(tick) < step / 2 ? "now" : signed(`${Number(tick.toPrecision(6))} s`), space = pen.measureText(words).width + 3;
+    const words = Math.abs(tick) < step / 2 ? "latest" : signed(`${Number(tick.toPrecision(6))} s`), space = pen.measureText(words).width + 3;
     pen.fillStyle = tint.soft; pen.fillText(words, left + space > wide ? left - space : left + 3, 13);
     pen.beginPath(); pen.moveTo(left, 0); pen.lineTo(left, high); pen.stroke();
   }
@@ -112,27 +112,32 @@ function short(pen, name, room) {
   return `${name.slice(0, kept)}…${name.slice(-kept)}`;
 }
 
+/** Show this part of what was asked for; before and after it nothing is known. */
+function look(from, until) {
+  const long = Math.min(span, Math.max(LEAST_VIEW_S, until - from)), begin = Math.max(told.until_s - span, Math.min(from, told.until_s - long));
+  live = false;
+  view = {from: begin, until: begin + long};
+  draw();
+}
+
 function zoom(factor, middle = 0.5) {
   if (!view) return;
-  const long = view.until - view.from, centre = view.from + long * middle, next = Math.min(span * 4, Math.max(0.001, long * factor));
-  live = false;
-  view = {from: centre - next * middle, until: centre + next * (1 - middle)};
-  draw();
+  const long = view.until - view.from, centre = view.from + long * middle;
+  look(centre - long * factor * middle, centre + long * factor * (1 - middle));
 }
 
 function pan(share) {
   if (!view) return;
   const move = (view.until - view.from) * share;
-  live = false;
-  view = {from: view.from + move, until: view.until + move};
-  draw();
+  look(view.from + move, view.until + move);
 }
 
 function wheel(event) {
   if (!event.ctrlKey && !event.shiftKey) return;
   event.preventDefault();
   const box = event.target.getBoundingClientRect();
-  zoom(event.deltaY > 0 ? 1.25 : 0.8, Math.min(1, Math.max(0, (event.clientX - box.left - edge) / (box.width - edge))));
+  // With Shift the wheel turns sideways.
+  zoom((event.deltaY || event.deltaX) > 0 ? 1.25 : 0.8, Math.min(1, Math.max(0, (event.clientX - box.left - edge) / (box.width - edge))));
 }
 
 function key(event) {
@@ -148,7 +153,7 @@ function hit(event) {
 function point(event) {
   const found = hit(event);
   if (found) at("one").textContent = describe(found);
-  if (event.buttons && grabbed !== null) {
+  if (grabbed !== null) {
     const wide = event.target.getBoundingClientRect().width - edge;
     pan((grabbed - event.clientX) / wide);
     grabbed = event.clientX;
@@ -157,6 +162,11 @@ function point(event) {
 
 function grab(event) {
   grabbed = event.clientX;
+  event.target.setPointerCapture(event.pointerId);
+}
+
+function release() {
+  grabbed = null;
 }
 
 /** One rollout, and as much again on both sides of it. */
@@ -164,9 +174,7 @@ function nearer(event) {
   const found = hit(event);
   if (!found) return;
   const {one} = found, long = Math.max(0.002, one.end_s + one.deliver_s - one.begin_s + one.load_s);
-  live = false;
-  view = {from: one.begin_s - one.load_s - long, until: one.end_s + one.deliver_s + long};
-  draw();
+  look(one.begin_s - one.load_s - long, one.end_s + one.deliver_s + long);
 }
 
 function describe({one, track}) {
