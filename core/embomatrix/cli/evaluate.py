@@ -164,15 +164,14 @@ def evaluate(
 
     Answers are kept as they come: the same command goes on where an earlier one ended.
     """
-    place = Place(manager, token, ca, jobs)
     with _problems_shown():
         _check((model, endpoint, baseline, answers), bench, in_part=bool(split or tasks))
         if answers is not None:
-            _judge_stored(answers, bench, out, place, beside or [])
+            _judge_stored(answers, bench, out, Place(manager, token, ca, jobs), beside or [])
             return
         chosen = Chosen(model, endpoint, baseline, model_name, key, concurrent, attempts, threads, device)
         how = Questions(samples, temperature, seed, max_tokens, codec, profile)
-        with _exam(place, bench or DEFAULT_BENCH, split, tasks, profile) as exam:
+        with _exam(Place(manager, token, ca, jobs), bench or DEFAULT_BENCH, split, tasks, profile) as exam:
             _measure(exam, chosen, how, out, beside or [])
 
 

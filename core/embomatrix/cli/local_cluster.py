@@ -36,37 +36,20 @@ def local_cluster(folder: Path, *, workers: int, slots: int, dataset: Path | Non
     address = f"127.0.0.1:{port}"
     # One thread per process: BLAS and OpenMP pools of idle daemons would only take the trainer's cores.
     environment = {**without_membership(os.environ), "OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"}
-    manager = ChildSpec(
-        "manager",
-        embomatrix_command(
-            "manager",
-            "serve",
-            f"--port={port}",
-            f"--http-port={http_port}",
-            f"--state=sqlite:{folder / 'manager.sqlite'}",
-            f"--data-dir={folder / 'bundles'}",
-            *([] if dataset is None else [f"--dataset={dataset}"]),
-        ),
-        environment,
-    )
+    serve = [f"--state=sqlite:{folder / 'manager.sqlite'}", f"--data-dir={folder / 'bundles'}"]
+    if dataset is not None:
+        serve.append(f"--dataset={dataset}")
+    command = embomatrix_command("manager", "serve", f"--port={port}", f"--http-port={http_port}", *serve)
+    manager = ChildSpec("manager", command, environment)
     names = tuple(f"worker-{number}" for number in range(1, workers + 1))
-    daemons = tuple(
-        ChildSpec(
-            name,
-            embomatrix_command(
-                "worker",
-                "run",
-                f"--manager={address}",
-                f"--slots={slots}",
-                f"--name={name}",
-                f"--cache-dir={folder / 'cache' / name}",
-            ),
-            environment,
-        )
-        for name in names
-    )
+    daemons = tuple(ChildSpec(name, _worker(name, address, slots, folder), environment) for name in names)
     supervisor = Supervisor((manager, *daemons), folder / "logs")
     return LocalCluster(address, f"http://127.0.0.1:{http_port}", supervisor, names)
+
+
+def _worker(name: str, address: str, slots: int, folder: Path) -> tuple[str, ...]:
+    own = [f"--slots={slots}", f"--name={name}", f"--cache-dir={folder / 'cache' / name}"]
+    return embomatrix_command("worker", "run", f"--manager={address}", *own)
 
 
 def without_membership(environment: Mapping[str, str]) -> dict[str, str]:

@@ -49,6 +49,11 @@ def showing(gallery: Gallery | NoGallery) -> APIRouter:
         with answered():
             return _json(request, await gallery.detail(task_id))
 
+    _scenes(router, gallery)
+    return router
+
+
+def _scenes(router: APIRouter, gallery: Gallery | NoGallery) -> None:
     @router.get("/scenes", response_model=list[SceneName])
     async def scenes(request: Request, offset: Offset = 0, limit: Limit = PAGE) -> Response:
         """What the scenes of the dataset are called, by the digests of their bundles."""
@@ -66,8 +71,6 @@ def showing(gallery: Gallery | NoGallery) -> APIRouter:
         """A scene at an angle, as a JPEG."""
         with answered():
             return Response(await gallery.picture(digest), media_type="image/jpeg")
-
-    return router
 
 
 def _json(request: Request, value: TaskDetail | FloorPlan | list[SceneName]) -> Response:

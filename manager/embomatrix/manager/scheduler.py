@@ -101,11 +101,8 @@ class Scheduler:
         match event:
             case DemandObserved():
                 self._on_demand(event)
-            case LookaheadAnnounced(run_id, version, entries):
-                if run_id in self.windows and version <= self.windows[run_id].version:
-                    return Urgency.NONE
-                self.windows[run_id] = Window(version, entries)
-                return Urgency.NOW
+            case LookaheadAnnounced():
+                return self._on_announced(event)
             case BatchSubmitted():
                 return self._on_submitted(event)
             case BatchRestored(batch):
@@ -184,6 +181,12 @@ class Scheduler:
         # By its peak and not by what is left: a scene's copies shall not come and go while a batch runs down.
         self._peaks = {scene: max(count, self._peaks.get(scene, 0)) for scene, count in event.pending.items()}
         self._copies = {scene: self._copies[scene] for scene in event.pending if scene in self._copies}
+
+    def _on_announced(self, event: LookaheadAnnounced) -> Urgency:
+        if event.run_id in self.windows and event.version <= self.windows[event.run_id].version:
+            return Urgency.NONE
+        self.windows[event.run_id] = Window(event.version, event.entries)
+        return Urgency.NOW
 
     def _on_submitted(self, event: BatchSubmitted) -> Urgency:
         batch, urgency = event.batch, Urgency.LATER
