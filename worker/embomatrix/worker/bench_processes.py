@@ -62,10 +62,17 @@ class BenchCluster:
 
 @contextlib.contextmanager
 def bench_cluster(
-    folder: Path, *, workers: int, slots: int, deadline_s: float, load_delay_s: float = 0.0
+    folder: Path,
+    *,
+    workers: int,
+    slots: int,
+    deadline_s: float,
+    load_delay_s: float = 0.0,
+    state: str = "",
 ) -> Iterator[BenchCluster]:
     """Start the processes, with state and logs below ``folder``; end them at the end, whatever happens.
 
+    ``state`` is the URL of the manager's store, by default the embedded one.
     The workers may still be connecting. With ``load_delay_s`` they load every scene so many seconds later.
     ``deadline_s`` is on the monotonic clock: raises BenchError when the manager does not serve by then, or ends.
     """
@@ -75,7 +82,7 @@ def bench_cluster(
                 folder,
                 "manager",
                 *("embomatrix.cli", "manager", "serve", "--port=0", "--http-port=0"),
-                *(f"--state=sqlite:{folder / 'state.sqlite'}", f"--data-dir={folder / 'manager'}"),
+                *(f"--state={state or f'sqlite:{folder}/state.sqlite'}", f"--data-dir={folder / 'manager'}"),
             )
         )
         address = _address_of(manager, deadline_s)
@@ -100,13 +107,18 @@ def _worker_command(
     return (*worker, f"--cache-dir={cache}", "--nice=0")
 
 
-@contextlib.contextmanager
-def running_process(folder: Path, name: str, *arguments: str) -> Iterator[Process]:
+def running_process(folder: Path, name: str, *arguments: str) -> contextlib.AbstractContextManager[Process]:
     """A module of this interpreter with its arguments, in the background."""
+    return running_program(folder, name, sys.executable, "-m", *arguments)
+
+
+@contextlib.contextmanager
+def running_program(folder: Path, name: str, *command: str) -> Iterator[Process]:
+    """The program, in the background, with a log below ``folder``."""
     log = folder / f"{name}.log"
     with log.open("wb") as file:
         child = subprocess.Popen(
-            (sys.executable, "-m", *arguments),
+            command,
             env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"},
             stdin=subprocess.DEVNULL,
             stdout=file,
