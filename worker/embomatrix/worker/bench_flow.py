@@ -45,7 +45,10 @@ REDIS_OPTIONS: Final = ("--appendonly", "yes", "--maxmemory-policy", "noeviction
 
 @dataclass(frozen=True, slots=True)
 class FlowSizes:
-    """Batches of ``in_flight`` rollouts, the next submitted before the last is done; ``most``, if any, to learn the manager's memory."""
+    """Batches of ``in_flight`` rollouts, the next submitted before the last is done.
+
+    With ``most`` of them at once the manager's memory is learnt; 0: not at all.
+    """
 
     slots: int = 2
     in_flight: int = 4_096
