@@ -10,6 +10,7 @@ from tests.fakes.symbolic_household import make_tasks
 from embomatrix.trainer.augment import Variation
 from embomatrix.trainer.checkpoint import CHECKPOINTS, CheckpointStore, Progress, read_state
 from embomatrix.trainer.errors import TrainerError
+from embomatrix.trainer.imitate import Imitation
 from embomatrix.trainer.policy.choice import new_policy, saved_policy
 from embomatrix.trainer.progress import LineDisplay, LiveDisplay
 from embomatrix.trainer.recorder import IMITATION, Recorder
@@ -85,9 +86,32 @@ def test_policy_is_put_back_to_where_it_was_best_on_tasks_set_aside(tmp_path):
     assert state.done
     assert state.step < 400
     assert state.best_loss == min(measured.values()) == measured[state.best_step]
-    assert state.step == state.best_step + 3 * 2
+    losses = list(measured.values())
+    assert state.step >= state.best_step + 3 * 2
+    assert sum(losses[-3:]) >= sum(losses[-6:-3])
+    assert sum(losses[-4:-1]) < sum(losses[-7:-4]) or state.step == state.best_step + 3 * 2, (
+        "not a step too many"
+    )
     newest = CheckpointStore(tmp_path / CHECKPOINTS, keep=9).latest()
     assert torch.equal(weights(saved_policy(newest / "policy", ruin)), weights(policy))
+
+
+@pytest.mark.parametrize(
+    ("losses", "taken"),
+    [
+        # Three without a lower loss, and no better than those before them on average.
+        ([0.5, 0.4, 0.3, 0.3, 0.3, 0.3, 0.3, 0.3, 0.3], 8),
+        # 0.2 was luck: the others go on falling for a while.
+        ([0.5, 0.4, 0.2, 0.3, 0.25, 0.22, 0.21, 0.22, 0.23, 0.24, 0.25, 0.26], 10),
+        ([0.5, 0.6, 0.7, 0.8, 0.9], 4),
+    ],
+)
+def test_one_lucky_measurement_does_not_stop_what_goes_on_falling(tmp_path, monkeypatch, losses, taken):
+    told = iter(losses)
+    monkeypatch.setattr(Imitation, "_loss_aside", lambda _: next(told))
+    settings = settings_of(imitation__steps=len(losses), imitation__patience=3, imitation__validate_every=1)
+    _, state, steps = imitate(tmp_path, settings)
+    assert (len(steps), state.best_loss) == (taken, min(losses[:taken]))
 
 
 def test_finished_imitation_is_not_repeated(tmp_path):

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -29,14 +30,15 @@ if TYPE_CHECKING:
 
 @dataclass
 class ImitationState:
-    """Where imitation stands. ``best_loss`` is the lowest on tasks set aside, found at ``best_step``, ``strikes``
-    measurements ago."""
+    """Where imitation stands. ``losses`` are those on tasks set aside; ``best_loss`` is the lowest, found at ``best_step``,
+    ``strikes`` measurements ago."""
 
     step: int = 0
     seconds: float = 0.0
     best_loss: float | None = None
     best_step: int = 0
     strikes: int = 0
+    losses: list[float] = field(default_factory=list)
     done: bool = False
 
 
@@ -109,7 +111,12 @@ class Imitation:
         return state.seconds / settings.seconds if settings.seconds else 1.0
 
     def _gave_up(self) -> bool:
-        return 0 < self._settings.patience <= self.state.strikes
+        """One lucky measurement is no reason to stop while the others go on falling: their means must have stopped as well."""
+        patience, losses = self._settings.patience, self.state.losses
+        if not 0 < patience <= self.state.strikes:
+            return False
+        before, last = losses[-2 * patience : -patience], losses[-patience:]
+        return not before or fmean(last) >= fmean(before)
 
     def _finish(self) -> None:
         """The policy as it was when it was best, where that was measured."""
@@ -131,22 +138,26 @@ class Imitation:
         self._optimiser.step(_shape(share, self.state.step, settings.warmup_steps))
         return float(loss.detach())
 
-    @torch.no_grad()
     def _measure(self) -> float:
-        """Mean loss per plan token on the tasks set aside; the policy is kept where it is the lowest so far."""
-        batch = self._settings.batch
-        lessons = [self._teller.plain_lesson(task) for task in self._aside]
-        total = sum(
-            float(_total_loss(self._policy, lessons[at : at + batch])) for at in range(0, len(lessons), batch)
-        )
-        loss = total / sum(len(plan) for _, plan in lessons)
-        state = self.state
+        """The loss on the tasks set aside; the policy is kept where it is the lowest so far."""
+        loss, state = self._loss_aside(), self.state
+        state.losses.append(loss)
         if state.best_loss is None or loss < state.best_loss:
             state.best_loss, state.best_step, state.strikes = loss, state.step, 0
             self._best = {name: value.clone() for name, value in self._policy.module.state_dict().items()}
         else:
             state.strikes += 1
         return loss
+
+    @torch.no_grad()
+    def _loss_aside(self) -> float:
+        """Mean loss per plan token on the tasks set aside."""
+        batch = self._settings.batch
+        lessons = [self._teller.plain_lesson(task) for task in self._aside]
+        total = sum(
+            float(_total_loss(self._policy, lessons[at : at + batch])) for at in range(0, len(lessons), batch)
+        )
+        return total / sum(len(plan) for _, plan in lessons)
 
 
 def _parted(

@@ -112,8 +112,9 @@ class ImitationSettings(_Frozen):
     warmup_steps: int = Field(default=20, ge=0)
     weight_decay: float = Field(default=0.01, ge=0)
     patience: int = Field(default=0, ge=0)
-    """Early stopping: so many measurements in a row without a lower loss on tasks set aside end imitation, and the policy is
-    put back to where that loss was lowest. 0: every task is taught, for the whole budget."""
+    """Early stopping: so many measurements in a row without a lower loss on tasks set aside end imitation, once their mean is
+    not below that of as many before them. The policy is put back to where that loss was lowest. 0: every task is taught, for
+    the whole budget."""
     validation_share: float = Field(default=0.05, gt=0, lt=1)
     """Share of the training tasks that are set aside for it."""
     validate_every: int = Field(default=100, ge=1)
