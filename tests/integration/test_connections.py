@@ -3,12 +3,15 @@
 import asyncio
 import contextlib
 import socket
+import ssl
 
 import httpx
 import pytest
 import uvicorn
 
-from embomatrix.manager.http_connections import BoundedConnections
+from embomatrix.manager.access.folder import prepare
+from embomatrix.manager.door import Door
+from embomatrix.manager.http_connections import BoundedConnections, connections_through
 
 pytestmark = pytest.mark.timeout(120)
 MOST = 8
@@ -24,23 +27,46 @@ class Patient(BoundedConnections):
     silent_s = 60.0
 
 
+class NarrowDoor(Door):
+    most = MOST
+    patience_s = 0.5
+
+
+class PatientDoor(Door):
+    most = MOST
+    patience_s = 60.0
+
+
 async def answer(scope, receive, send):
     await send({"type": "http.response.start", "status": 200, "headers": []})
     await send({"type": "http.response.body", "body": b"here"})
 
 
 @contextlib.asynccontextmanager
-async def serving(kind):
+async def serving(kind, bound=None, **options):
     """Yields the port of a server with connections of this kind."""
-    server = uvicorn.Server(uvicorn.Config(answer, http=kind, lifespan="off", log_config=None))
+    server = uvicorn.Server(uvicorn.Config(answer, http=kind, lifespan="off", log_config=None, **options))
     server.capture_signals = contextlib.nullcontext
-    bound = socket.create_server(("127.0.0.1", 0))
+    bound = bound or socket.create_server(("127.0.0.1", 0))
     task = asyncio.create_task(server.serve(sockets=[bound]))
     try:
         yield bound.getsockname()[1]
     finally:
         server.should_exit = True
         await task
+
+
+@contextlib.asynccontextmanager
+async def serving_by_tls(kind, folder):
+    """Yields the port of such a server behind this kind of door, and what trusts it."""
+    prepare(folder, sans=())
+    access = folder / "access"
+    files = {"ssl_certfile": access / "server.pem", "ssl_keyfile": access / "server.key"}
+    door = kind(socket.AF_INET, socket.SOCK_STREAM)
+    door.bind(("127.0.0.1", 0))
+    door.listen()
+    async with serving(connections_through(door), door, **files) as port:
+        yield port, ssl.create_default_context(cafile=access / "ca.pem")
 
 
 async def ended(reader):
@@ -72,3 +98,36 @@ async def test_connections_that_say_nothing_or_never_end_their_request_make_room
             assert (await http.get(f"http://127.0.0.1:{port}/")).text == "here"
         for _, writer in silent:
             writer.close()
+
+
+async def test_connections_that_never_shake_hands_are_few_and_cost_nobody_his_place(tmp_path):
+    async with serving_by_tls(PatientDoor, tmp_path) as (port, trusting):
+        asking = await asyncio.open_connection("127.0.0.1", port, ssl=trusting)
+        silent = [await asyncio.open_connection("127.0.0.1", port) for _ in range(MOST)]
+        more = [await asyncio.open_connection("127.0.0.1", port) for _ in range(40 * MOST)]
+        assert await asyncio.gather(*(ended(reader) for reader, _ in more)) == [True] * len(more)
+        asking[1].write(b"GET / HTTP/1.1\r\nhost: here\r\n\r\n")
+        assert b"200" in await asking[0].readline(), "who shook hands before is served on"
+        silent[0][1].close()
+        await silent[0][1].wait_closed()
+        again = await _shaking_hands(port, trusting)
+        for _, writer in [asking, again, *silent, *more]:
+            writer.close()
+
+
+async def test_a_door_lets_go_of_those_that_never_shake_hands(tmp_path):
+    async with serving_by_tls(NarrowDoor, tmp_path) as (port, trusting):
+        silent = [await asyncio.open_connection("127.0.0.1", port) for _ in range(MOST)]
+        assert await asyncio.gather(*(ended(reader) for reader, _ in silent)) == [True] * MOST
+        _, writer = await _shaking_hands(port, trusting)
+        for _, ending in [(None, writer), *silent]:
+            ending.close()
+
+
+async def _shaking_hands(port, trusting):
+    """A connection, as soon as there is a place."""
+    async with asyncio.timeout(20):
+        while True:
+            with contextlib.suppress(OSError):
+                return await asyncio.open_connection("127.0.0.1", port, ssl=trusting)
+            await asyncio.sleep(0.05)

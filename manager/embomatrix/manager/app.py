@@ -23,7 +23,7 @@ from embomatrix.manager.bundles import BundleStore
 from embomatrix.manager.cluster_state import ClusterState
 from embomatrix.manager.expulsion import Expulsion
 from embomatrix.manager.garbage import only_young
-from embomatrix.manager.http_connections import BoundedConnections, allow_files
+from embomatrix.manager.http_connections import allow_files, connections_through
 from embomatrix.manager.http_rules import HttpRules, allowed_hosts
 from embomatrix.manager.leadership import Leadership
 from embomatrix.manager.listen import bound_socket
@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from starlette.types import Receive, Scope, Send
 
     from embomatrix.manager.access.protection import Tls
+    from embomatrix.manager.door import Door
     from embomatrix.manager.gallery import Gallery
     from embomatrix.manager.settings import ManagerSettings
     from embomatrix.manager.store.protocol import StateStore
@@ -234,6 +235,7 @@ async def _start_runtime(
         archive,
         results_ttl_s=settings.results_ttl_s,
         lapsed_s=leadership.lapsed_s,
+        unrenewed=leadership.problem,
     )
     await runtime.start()
     return runtime
@@ -242,13 +244,13 @@ async def _start_runtime(
 class _HttpServer:
     """Uvicorn on a socket that is bound already, without its signal handlers: the manager has its own."""
 
-    def __init__(self, app: FastAPI, bound: socket.socket, tls: Tls | None) -> None:
+    def __init__(self, app: FastAPI, bound: Door, tls: Tls | None) -> None:
         self._socket = bound
         self._app = app
         config = uvicorn.Config(
             self._answer,
             interface="asgi3",
-            http=BoundedConnections,
+            http=connections_through(bound),
             # Its lines go where ours go, in the same form.
             log_config=None,
             log_level="warning",

@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from uvicorn import Config
     from uvicorn.server import ServerState
 
+    from embomatrix.manager.door import Door
+
 CONNECTIONS: Final = 2048
 """At most. A page opens six, a stream of events holds one."""
 SILENT_S: Final = 10.0
@@ -26,6 +28,8 @@ class BoundedConnections(H11Protocol):
 
     most = CONNECTIONS
     silent_s = SILENT_S
+    door: Door | None = None
+    """Through which they come."""
 
     def __init__(
         self,
@@ -40,6 +44,8 @@ class BoundedConnections(H11Protocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         # A protocol takes any transport; uvicorn's takes a stream's alone, which is what a server opens.
         super().connection_made(cast("asyncio.Transport", transport))
+        if self.door is not None:
+            self.door.entered(transport.get_extra_info("peername"))
         if len(self.connections) > self.most:
             self.transport.abort()
         else:
@@ -54,6 +60,11 @@ class BoundedConnections(H11Protocol):
         # The first whole request makes it.
         if self.cycle is None:
             self.transport.abort()
+
+
+def connections_through(door: Door) -> type[BoundedConnections]:
+    """Those of a server that listens at this door."""
+    return type("ConnectionsThroughADoor", (BoundedConnections,), {"door": door})
 
 
 def allow_files() -> None:
