@@ -7,10 +7,12 @@ from importlib.resources import files
 
 import httpx
 import pytest
+from tests.contract.test_state_store import no_file_grows
 from tests.fakes.worker import FakeWorker
 from tests.integration.test_manager_service import BEDROOM, KITCHEN, batch, manager, open_run, outcomes
 
 from embomatrix.manager.rest import PREFIX, VIEWERS
+from embomatrix.rpc.admin import AdminClient
 from embomatrix.rpc.status import NotFoundError
 from embomatrix.rpc.training import RewardTiers, SampledPlan, TrainingReport
 from embomatrix.rpc.values import LookaheadEntry
@@ -65,6 +67,26 @@ async def test_a_scene_that_no_worker_can_hold_is_told_with_its_reason(tmp_path)
     (fine,), (stuck,) = [step["cells"] for step in seen["lookahead"]]
     assert (fine["problem"], stuck["warmth"]) == ("", "unplaceable")
     assert stuck["problem"] == f"scene {BEDROOM} fails to load: the mesh has no triangles"
+
+
+async def test_a_full_disk_is_told_by_its_name_though_nothing_runs(tmp_path):
+    state = tmp_path / "state.sqlite"
+    async with (
+        manager(tmp_path, state=f"sqlite:{state}", leader_ttl_s=0.6) as at,
+        AdminClient(at.address) as client,
+    ):
+        with no_file_grows(state.with_name(f"{state.name}-wal").stat().st_size):
+            await _hear(client, "make room on its disk")
+        await _hear(client, "No worker has joined yet")
+
+
+async def _hear(client, words):
+    """Until the manager says so of itself."""
+    async with asyncio.timeout(30):
+        while True:
+            if words in (await client.fleet()).health:
+                return
+            await asyncio.sleep(0.05)
 
 
 async def test_what_a_lost_worker_completed_is_still_counted(tmp_path):

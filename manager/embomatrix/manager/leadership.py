@@ -28,10 +28,15 @@ class Leadership:
         self._store = store
         self._candidate = candidate
         self._renewed_s = -float("inf")
+        self._problem = ""
 
     def lapsed_s(self) -> float:
         """For how long another manager may have had the lead, since this one could not renew it; 0 while it leads."""
         return max(0.0, time.monotonic() - self._renewed_s - self._candidate.ttl_s)
+
+    def problem(self) -> str:
+        """Why the lead could not be renewed the last time; empty where it was."""
+        return self._problem
 
     async def win(self, on_standby: Callable[[str], Awaitable[None]]) -> int:
         """Wait until this manager leads; returns its epoch. ``on_standby`` hears the address of whoever leads until then.
@@ -67,6 +72,7 @@ class Leadership:
             except FencedError:
                 raise
             except StateError as error:
+                self._problem = str(error)
                 logger.warning("the lead could not be renewed: %s", error)
             else:
-                self._renewed_s = asked_s
+                self._renewed_s, self._problem = asked_s, ""

@@ -71,7 +71,7 @@ class ManagerRuntime:
     """What the services call. ``start`` before the first call, ``serve`` for as long as it shall work.
 
     Results are kept for ``results_ttl_s`` after their batch ended, and at most ``results_kept`` of them. ``lapsed_s`` tells
-    for how long another manager may have had the lead: nothing is dispatched meanwhile.
+    for how long another manager may have had the lead, and ``unrenewed`` why: nothing is dispatched meanwhile.
     """
 
     def __init__(
@@ -86,6 +86,7 @@ class ManagerRuntime:
         results_ttl_s: float = 3600.0,
         results_kept: int = 500_000,
         lapsed_s: Callable[[], float] = lambda: 0.0,
+        unrenewed: Callable[[], str] = str,
     ) -> None:
         logs = ResultLogs(ttl_s=results_ttl_s, limit=results_kept)
         self.cluster = cluster
@@ -106,6 +107,7 @@ class ManagerRuntime:
         self._delivery = Delivery(store, logs, self._say, self.chronicle.in_log)
         self._links: dict[str, WorkerLink] = {}
         self._lapsed_s = lapsed_s
+        self._unrenewed = unrenewed
         self._suspended = False
         self._paused = False
         self._said_unaudited = False
@@ -218,7 +220,9 @@ class ManagerRuntime:
     @property
     def store_problem(self) -> str:
         """Why nothing can be written down, while that is so."""
-        return self._delivery.problem or ("the state store is away" if self._suspended else "")
+        if self._suspended and not self._delivery.problem:
+            return self._unrenewed() or "the state store is away"
+        return self._delivery.problem
 
     async def pause_dispatch(self) -> None:
         """No new leases are given, also by the managers that come after this one; what runs goes on.

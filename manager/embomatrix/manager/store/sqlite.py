@@ -85,8 +85,10 @@ class SqliteStore:
             self._db = sqlite3.connect(path, timeout=0.0, check_same_thread=False, isolation_level=None)
             self._patiently(self._prepare)
         except (sqlite3.Error, OSError) as error:
+            full = getattr(error, "sqlite_errorcode", None) in _FULL
+            remedy = "make room on its disk" if full else "check its folder's permissions"
             raise StateError(
-                f"the state file {path} can't be used ({error}): check its folder's permissions, or pass --state"
+                f"the state file {path} can't be used ({error}): {remedy}, or pass --state"
             ) from error
 
     def _prepare(self) -> None:
