@@ -7,7 +7,16 @@ from tests.integration.test_manager_service import manager as a_manager
 
 from embomatrix.cli.doctor.findings import Finding, Level, verdict
 from embomatrix.cli.doctor.machine import NEEDED, disk, machine, memory, parts, port, python
-from embomatrix.cli.doctor.manager import Visit, certificate, clock, cluster, manager, ports_held, versions
+from embomatrix.cli.doctor.manager import (
+    Visit,
+    certificate,
+    clock,
+    cluster,
+    manager,
+    mistrust,
+    ports_held,
+    versions,
+)
 from embomatrix.manager.access.folder import prepare
 from embomatrix.rpc.admin import AdminClient
 from embomatrix.rpc.capabilities import Capabilities
@@ -61,6 +70,12 @@ def test_a_certificate_near_its_end_and_a_clock_an_hour_off_are_told():
         Level.NOTE,
     ]
     assert "behind" in clock(-3600.0).found
+
+
+def test_a_certificate_that_does_not_hold_yet_may_be_the_fault_of_the_clock():
+    assert "clock" in mistrust(9, "certificate is not yet valid").remedy
+    assert "clock" in mistrust(10, "certificate has expired").remedy
+    assert "--ca" in mistrust(20, "unable to get local issuer certificate").remedy
 
 
 def test_a_manager_that_speaks_no_common_version_is_wrong_and_another_release_is_not():

@@ -30,6 +30,8 @@ KNOCK_S: Final = 1.0
 CERTIFICATE_DAYS: Final = 30
 """`manager init` renews a certificate with less than this left."""
 CLOCK_S: Final = 60.0
+OUT_OF_TIME: Final = frozenset({9, 10})
+"""X509_V_ERR_CERT_NOT_YET_VALID and X509_V_ERR_CERT_HAS_EXPIRED."""
 DAY_S: Final = 86400.0
 CALM: Final = frozenset({"good", "idle"})
 """Moods of a cluster that nobody needs to care about."""
@@ -99,6 +101,14 @@ def certificate(days_left: float) -> Finding:
     return Finding("TLS", Level.FINE, found)
 
 
+def mistrust(code: int, message: str) -> Finding:
+    """Why the manager's certificate was refused, by OpenSSL's code."""
+    remedy = "pass the ca.pem of this manager with --ca; a name that it lacks is added by `manager init --san NAME`"
+    if code in OUT_OF_TIME:
+        remedy = "is this machine's clock right? If so, run `embomatrix manager init` there again: it makes a new certificate"
+    return Finding("TLS", Level.WRONG, message, remedy)
+
+
 def versions(found: Capabilities) -> Finding:
     """Whether both sides speak one protocol; other releases than our own are told."""
     try:
@@ -149,8 +159,7 @@ def _tls(visit: Visit) -> Finding:
         ):
             shown = tls.getpeercert()
     except ssl.SSLCertVerificationError as error:
-        remedy = "pass the ca.pem of this manager with --ca; a name that it lacks is added by `manager init --san NAME`"
-        return Finding("TLS", Level.WRONG, error.verify_message, remedy)
+        return mistrust(error.verify_code, error.verify_message)
     except OSError:
         if visit.ca:
             return Finding("TLS", Level.WRONG, "it does not speak TLS", "leave --ca and EMBOMATRIX_CA out")
