@@ -229,7 +229,13 @@ def _row(scene: Scene, name: str, about: frozenset[str]) -> ObjectRow:
     told += ["open"] if any(share > 0 for share in item.joints) else []
     size = [round(extent, 2) for extent in asset.size_m]
     return ObjectRow(
-        name, item.room, _where(scene, name), size, round(asset.mass_kg, 1), ", ".join(told), name in about
+        name,
+        item.room,
+        _where(scene, name),
+        size,
+        float(f"{asset.mass_kg:.3g}"),
+        ", ".join(told),
+        name in about,
     )
 
 

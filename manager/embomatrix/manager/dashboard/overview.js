@@ -29,9 +29,9 @@ export function show({overview: o, runs}) {
   const recent = o.throughput.slice(-10), mean = recent.reduce((a, b) => a + b, 0) / recent.length;
   const failed = Object.entries(o.outcomes).filter(([name]) => name !== "completed" && name !== "cancelled").reduce((sum, [, n]) => sum + n, 0);
   const told = {
-    rate: mean >= 100 ? count(Math.round(mean)) : mean.toFixed(1), p50: seconds(o.latency_p50_s), p50note: `median; 95 % within ${seconds(o.latency_p95_s)}`,
+    rate: mean >= 100 ? count(Math.round(mean)) : mean.toFixed(1), p50: seconds(o.latency_p50_s), p50note: o.latency_p95_s ? `median; 95 % within ${seconds(o.latency_p95_s)}` : "submitted to result",
     overhead: o.overhead ? `${(100 * o.overhead).toFixed(o.overhead < 0.1 ? 1 : 0)}\u00a0%` : "–",
-    hits: share(o.prewarm_hits, o.prewarm_hits + o.prewarm_misses), hitsnote: `lead ${seconds(o.prewarm_lead_s)}, ${count(o.prewarm_wasted)} wasted`,
+    hits: share(o.prewarm_hits, o.prewarm_hits + o.prewarm_misses), hitsnote: o.prewarm_hits ? `lead ${seconds(o.prewarm_lead_s)}, ${count(o.prewarm_wasted)} wasted` : "of announced scenes",
     slots: `${o.slots_busy}/${o.slots}`, slotsnote: `${count(o.queued)} rollouts waiting`,
     bad: count(failed), badnote: `${count(o.redispatched)} given again, ${count(o.stale_results)} late`,
     peak: `peak ${count(Math.max(...o.throughput))}, ${count(o.outcomes.completed || 0)} in all`,

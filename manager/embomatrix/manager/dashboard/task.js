@@ -64,7 +64,7 @@ function key(event) {
 
 function objects(rows) {
   return table([["row", "n"], "name", "room", "where", ["size (m)", "wideonly"], ["mass (kg)", "n wideonly"], "state"], rows.map((row, i) => h("tr", {class: row.goal ? "goal" : ""},
-    h("td", {class: "n fit"}, i), h("td", {}, row.name), h("td", {}, row.room), h("td", {}, row.where), h("td", {class: "wideonly"}, row.size_m.map(m => m.toFixed(2)).join(" × ")), h("td", {class: "n wideonly"}, row.mass_kg), h("td", {}, row.states))), "objects of the task");
+    h("td", {class: "n fit"}, i), h("td", {}, row.name), h("td", {}, row.room), h("td", {}, row.where), h("td", {class: "wideonly"}, row.size_m.map(m => m.toFixed(2)).join(" × ")), h("td", {class: "n wideonly"}, row.mass_kg), h("td", {}, row.states))), "objects of the task", "loose");
 }
 
 /** Markdown as the social agents leave it: headings, lists, strong words; anything else stays text. */

@@ -3,7 +3,7 @@ import {ask} from "./ask.js";
 import {at, colour, count, h, none, put, seconds, signed} from "./dom.js";
 import {named} from "./names.js";
 
-const ROW = 20, NAMES = 150, NAMES_SHARE = 0.28, TYPING_MS = 250, HEAD = 22, GRIP = 5, LEAST_PX = 1, LEAST_S = 0.1, LEAST_VIEW_S = 0.001;
+const ROW = 20, NAMES = 150, NAMES_SHARE = 0.28, TYPING_MS = 250, HEAD = 22, GRIP = 5, LEAST_PX = 1, LEAST_S = 0.1, LEAST_VIEW_S = 0.001, TICK = 80;
 const SPANS = [10, 60, 300, 1800];
 const KINDS = [["execute", "warm"], ["load", "warming"], ["deliver", "queued"], ["failed", "bad"], ["idle", "chip"]];
 let run = "", told = null, view = null, live = true, span = 60, painted = [], grabbed = null, edge = NAMES, search = "", typed = 0;
@@ -43,7 +43,8 @@ function draw() {
   const place = at("tracks");
   if (!place || !told) return;
   if (!told.tracks.length) { put(place, none(search ? "No worker of that name executed anything in this time." : "Nothing was executed in this time.")); at("one").textContent = ""; return; }
-  if (!at("one").textContent) at("one").textContent = "Point at a span. Zoom by Ctrl and the wheel, by a double click on a rollout, or by plus and minus; drag, or press the arrows, to go along; Escape follows the latest again.";
+  if (!at("one").textContent) at("one").textContent = matchMedia("(pointer: coarse)").matches ? "Tap a span to see what it was; drag to go along." :
+    "Point at a span. Zoom by Ctrl and the wheel, by a double click on a rollout, or by plus and minus; drag, or press the arrows, to go along; Escape follows the latest again.";
   let canvas = place.querySelector("canvas");
   if (!canvas) {
     canvas = h("canvas", {class: "gantt", tabindex: "0", role: "img", onwheel: wheel, onpointermove: point, onpointerdown: grab, onpointerup: release, onpointercancel: release, ondblclick: nearer, onkeydown: key});
@@ -86,7 +87,7 @@ function bar(pen, x, begin, end, top, fill, always) {
 }
 
 function scale(pen, tint, x, wide, high) {
-  const rough = (view.until - view.from) / Math.max(2, (wide - edge) / 110), power = 10 ** Math.floor(Math.log10(rough));
+  const rough = (view.until - view.from) / Math.max(2, (wide - edge) / TICK), power = 10 ** Math.floor(Math.log10(rough));
   const step = [1, 2, 5, 10].map(n => n * power).find(n => n >= rough);
   pen.font = "11px system-ui"; pen.strokeStyle = tint.line;
   for (let tick = Math.ceil((view.from - told.until_s) / step) * step; tick <= view.until - told.until_s + 1e-9; tick += step) {
