@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-import operator
 from typing import TYPE_CHECKING, Final, Literal, TypeVar
 
 from embomatrix.proto.v1 import types_pb2
@@ -22,7 +21,7 @@ from embomatrix.skills.syntax import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
 ArgField = Literal["object_index", "source_index", "relation", "yaw", "distance", "room_name"]
 WireT = TypeVar("WireT")
@@ -50,7 +49,6 @@ MAX_ROLLOUT_BYTES: Final = MAX_PLAN_BYTES + 4096
 """On the wire: the largest plan, and its names."""
 KNOWN: Final = 65_536
 """Calls and steps that a process remembers by their bytes: plans of one model repeat them, and so do the results."""
-_BYTES: Final = operator.methodcaller("SerializeToString")
 _SKILLS: Final = {kind: skill for skill, kind in SKILL_KINDS.items()}
 _FIELDS: Final[Mapping[Skill, tuple[tuple[ArgField, bool], ...]]] = {
     skill: tuple((arg.value, arg in taken) for arg in Arg) for skill, taken in SIGNATURES.items()
@@ -84,12 +82,12 @@ def each(
     return tuple(values)
 
 
-def each_known(field: str, known: Callable[[bytes], ValueT], messages: Iterable[WireT]) -> tuple[ValueT, ...]:
+def each_known(field: str, known: Callable[[bytes], ValueT], messages: Sequence[bytes]) -> tuple[ValueT, ...]:
     """``each`` for messages that are looked up by their bytes: no line of Python for any of them, unless one is wrong."""
     try:
-        return tuple(map(known, map(_BYTES, messages)))
+        return tuple(map(known, messages))
     except ConvertError:
-        return each(field, lambda message: known(_BYTES(message)), messages)
+        return each(field, known, messages)
 
 
 def inside(field: str, convert: Callable[[WireT], ValueT], message: WireT) -> ValueT:
@@ -171,7 +169,10 @@ def plan_to_proto(plan: Plan) -> list[types_pb2.SkillCall]:
 
 
 def plan_from_proto(messages: Iterable[types_pb2.SkillCall]) -> Plan:
-    calls = tuple(messages)
+    return _plan_from([message.SerializeToString() for message in messages])
+
+
+def _plan_from(calls: Sequence[bytes]) -> Plan:
     if len(calls) > MAX_STEPS:
         raise ConvertError("plan", f"has {len(calls)} steps: at most {MAX_STEPS} are executed")
     return each_known("plan", _call_of, calls)
@@ -209,7 +210,7 @@ def rollout_from_proto(message: types_pb2.Rollout) -> Rollout:
         group_id=required("group_id", message.group_id),
         bundle_digest=required("bundle_digest", message.bundle_digest),
         task_id=required("task_id", message.task_id),
-        plan=plan_from_proto(message.plan),
+        plan=_plan_from(types_pb2.RolloutCalls.FromString(wire).plan),
         seed=message.seed,
         render=message.render,
     )

@@ -131,30 +131,36 @@ def write_completed(completed: Completed, message: types_pb2.Completed) -> None:
 
 def completed_from_proto(message: types_pb2.Completed) -> Completed:
     """The result. A missing reward is a ``ConvertError``, for it is no reward of 0."""
+    wire = message.SerializeToString()
     completed = Completed(
         reward=inside("reward", reward_from_proto, _reward_in(message)),
-        steps=each_known("steps", _step_of, message.steps),
+        steps=_steps_in(wire),
         final=tuple(message.final_state),
         trace_digest=message.trace_digest,
         worker_id=message.worker_id,
         timings=inside("timings", timings_from_proto, message.timings),
         warm=message.warm,
     )
-    object.__setattr__(completed, "wire", message.SerializeToString())
+    object.__setattr__(completed, "wire", wire)
     return completed
 
 
 def checked_completed(message: types_pb2.Completed) -> Completed:
     """The same for whoever only passes it on: what would be refused is refused, but values are made when they are asked for."""
     inside("reward", _check_reward, _reward_in(message))
-    each_known("steps", _step_of, message.steps)
+    wire = message.SerializeToString()
+    _steps_in(wire)
     return Completed.unread(
-        message.SerializeToString(),
+        wire,
         _completed_fields,
         timings=inside("timings", timings_from_proto, message.timings),
         warm=message.warm,
         worker_id=message.worker_id,
     )
+
+
+def _steps_in(wire: bytes) -> tuple[Step, ...]:
+    return each_known("steps", _step_of, types_pb2.CompletedSteps.FromString(wire).steps)
 
 
 def _reward_in(message: types_pb2.Completed) -> types_pb2.Reward:

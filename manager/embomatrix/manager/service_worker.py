@@ -45,7 +45,7 @@ FIRST_STATE_S: Final = 10.0
 SESSION_SHOWN: Final = 6
 """Letters of an id in log lines: whoever knows all of a session's could speak for its worker."""
 LEASES_PER_MESSAGE: Final = 256
-RESULTS_AT_ONCE: Final = 32
+RESULTS_AT_ONCE: Final = 16
 """A message's results are heard in slices, and what a slice freed is given away before the next: hearing one takes 0.1 ms, and
 a message that carries hundreds would hold up the leases of every worker."""
 _WORKER_ID: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._:@-]{0,127}")

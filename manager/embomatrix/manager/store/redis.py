@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 _FENCED: Final = "FENCED"
+_NO_MEMORY: Final = "OOM command not allowed"
 _GUARD: Final = f"""
 if redis.call('GET', KEYS[1]) ~= ARGV[1] then return redis.error_reply('{_FENCED}') end
 """
@@ -285,7 +286,8 @@ class RedisStore:
                 raise FencedError(
                     f"another manager took over the state in {self._shown}: stop this one"
                 ) from error
-            if isinstance(error, OutOfMemoryError):
+            # Redis 6.2 tells of it inside another error, when it was a script that found no memory.
+            if isinstance(error, OutOfMemoryError) or _NO_MEMORY in str(error):
                 raise StateFullError(
                     f"Redis at {self._shown} has no memory left ({error}): raise its maxmemory"
                 ) from error

@@ -358,6 +358,42 @@ class Completed(google.protobuf.message.Message):
 Global___Completed: typing_extensions.TypeAlias = Completed
 
 @typing.final
+class RolloutCalls(google.protobuf.message.Message):
+    """The bytes of a Rollout, read for its calls alone: each as it stands there."""
+
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    PLAN_FIELD_NUMBER: builtins.int
+    @property
+    def plan(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.bytes]: ...
+    def __init__(
+        self,
+        *,
+        plan: collections.abc.Iterable[builtins.bytes] | None = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["plan", b"plan"]) -> None: ...
+
+Global___RolloutCalls: typing_extensions.TypeAlias = RolloutCalls
+
+@typing.final
+class CompletedSteps(google.protobuf.message.Message):
+    """The bytes of a Completed, read for its steps alone: each as it stands there."""
+
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    STEPS_FIELD_NUMBER: builtins.int
+    @property
+    def steps(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.bytes]: ...
+    def __init__(
+        self,
+        *,
+        steps: collections.abc.Iterable[builtins.bytes] | None = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["steps", b"steps"]) -> None: ...
+
+Global___CompletedSteps: typing_extensions.TypeAlias = CompletedSteps
+
+@typing.final
 class InfraFailure(google.protobuf.message.Message):
     """The infrastructure failed: there is no result, and no field for a reward."""
 
