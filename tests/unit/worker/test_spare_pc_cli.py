@@ -41,6 +41,7 @@ def test_options_go_before_the_file_and_the_file_before_defaults(tmp_path):
         (["--max-load=7"], "--max-load 7.0: input should be less than or equal to 1"),
         (["--label=attic"], "--label 'attic': expected KEY=VALUE, as in room=lab"),
         (["--config=/nowhere.toml"], "--config /nowhere.toml: No such file or directory"),
+        (["--join", ""], "--join is empty, perhaps a variable that is not set: expected TOKEN@HOST:PORT"),
         (["--cache-mb=0"], "--cache-mb 0: input should be greater than or equal to 1"),
     ],
 )

@@ -139,6 +139,10 @@ def values_of(context: CommandLine, config: Path | None, labels: list[str]) -> d
         source = context.get_parameter_source(name)
         if name in NOT_SETTINGS or source is None or source.name.startswith("DEFAULT"):
             continue
+        if name == "join" and not value:
+            fail(
+                "--join is empty, perhaps a variable that is not set: expected TOKEN@HOST:PORT, as the operator gave it"
+            )
         (wishes if name in PREFERENCES else values)[name] = value
     if labels:
         values["labels"] = {**values.get("labels", {}), **dict(map(split_label, labels))}
