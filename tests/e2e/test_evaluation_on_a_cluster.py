@@ -1,11 +1,8 @@
 """Plans of an evaluation on a manager with a worker: the same bytes come out as from processes of one machine."""
 
-import contextlib
-import socket
-import time
-
 import pytest
 from tests.fakes.commands import run
+from tests.fakes.listening import until_listening
 
 from embomatrix.cli.local_cluster import local_cluster
 
@@ -20,20 +17,9 @@ def test_cluster_and_local_processes_give_the_same_report(kitchen, tmp_path):
     assert told.status == 0, told.text
     cluster = local_cluster(tmp_path / "cluster", workers=1, slots=1)
     with cluster.supervisor:
-        _wait_for(cluster.address)
+        until_listening(cluster.address)
         told = run(
             "eval", f"--answers={here / 'answers.jsonl'}", f"--manager={cluster.address}", f"--out={there}"
         )
     assert told.status == 0, told.text
     assert [(here / name).read_bytes() for name in FILES] == [(there / name).read_bytes() for name in FILES]
-
-
-def _wait_for(address):
-    """Until somebody listens there."""
-    host, _, port = address.partition(":")
-    deadline = time.monotonic() + 60
-    while time.monotonic() < deadline:
-        with contextlib.suppress(OSError), socket.create_connection((host, int(port)), timeout=1):
-            return
-        time.sleep(0.1)
-    pytest.fail(f"no manager listens at {address}")

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from tests.fakes.listening import until_listening
 
 from embomatrix.cli.local_cluster import local_cluster
 from embomatrix.cli.supervisor import embomatrix_command
@@ -20,6 +21,8 @@ HOLD_S = 2.8
 """Shorter than the silence after which the manager gives a worker nothing."""
 TOLD_S = 1.5
 """What the manager tells by then is of a look after the workers were stopped."""
+NOTICED_S = 1.5
+"""A worker whose connection broke is given up after a second."""
 pytestmark = pytest.mark.timeout(1200)
 
 
@@ -30,8 +33,6 @@ class Run:
     told: str
     out: Path
     metrics: list[dict[str, float]]
-    elsewhere: int
-    """Rollouts that a second worker executed: given again after the kill, or before it as stragglers."""
     restarts: dict[str, int]
 
 
@@ -42,7 +43,7 @@ def run(tmp_path_factory):
     _run("factory", "build", f"--out={dataset}", "--train=16", "--heldout=4", "--no-look-ahead")
     cluster = local_cluster(folder / "cluster", workers=2, slots=1)
     with cluster.supervisor as children:
-        _wait_for_answer(cluster.address)
+        until_listening(cluster.address)
         trainer = subprocess.Popen(
             _training(dataset, cluster.address, out), text=True, stdout=subprocess.PIPE
         )
@@ -52,12 +53,13 @@ def run(tmp_path_factory):
         both = [children.pid("worker-1"), children.pid("worker-2")]
         _until(lambda: _stopped_with_work(both, cluster.dashboard), trainer)
         os.kill(both[0], signal.SIGKILL)
+        # Until the manager knows: the other one would take from the dead what waits behind what it ran.
+        time.sleep(NOTICED_S)
         os.kill(both[1], signal.SIGCONT)
         told, _ = trainer.communicate(timeout=600)
         assert trainer.returncode == 0, told
-        elsewhere = _executed_elsewhere(cluster.dashboard)
         restarts = {name: children.restarts(name) for name in ("manager", *cluster.workers)}
-    return Run(told, out, _metrics(out), elsewhere, restarts)
+    return Run(told, out, _metrics(out), restarts)
 
 
 def test_rollouts_of_a_killed_worker_are_executed_elsewhere_and_none_is_lost(run):
@@ -66,7 +68,7 @@ def test_rollouts_of_a_killed_worker_are_executed_elsewhere_and_none_is_lost(run
     assert sum(line["lost"] for line in run.metrics) == 0, "a rollout without a result"
     assert _counted("rollouts, ", run.told) == sum(line["rollouts"] for line in run.metrics)
     assert _counted("lost and masked", run.told) == 0
-    assert run.elsewhere >= 1, "the kill hit no rollout: the test shows nothing"
+    assert _counted("re-dispatched", run.told) >= 1, "the kill hit no rollout: the test shows nothing"
 
 
 def test_equal_plans_of_a_group_have_equal_rewards_on_any_worker(run):
@@ -105,7 +107,10 @@ def _metrics(out):
 
 
 def _stopped_with_work(pids, dashboard):
-    """Stop the workers for a while: whether the manager gave the first one something to do. Else they go on."""
+    """Stop the workers for a while: whether the manager gave the first one more than it runs. Else they go on.
+
+    What it runs may be hedged as a straggler's; what waits behind it nobody else has.
+    """
     for pid in pids:
         os.kill(pid, signal.SIGSTOP)
     ends_s = time.monotonic() + HOLD_S
@@ -113,27 +118,12 @@ def _stopped_with_work(pids, dashboard):
     while time.monotonic() < ends_s:
         with urllib.request.urlopen(f"{dashboard}/api/v1/workers", timeout=10) as answer:
             workers = json.load(answer)["items"]
-        if any(worker["worker_id"].startswith("worker-1") and worker["busy"] for worker in workers):
+        if any(worker["worker_id"].startswith("worker-1") and worker["waiting"] for worker in workers):
             return True
         time.sleep(0.05)
     for pid in pids:
         os.kill(pid, signal.SIGCONT)
     return False
-
-
-def _executed_elsewhere(dashboard):
-    with urllib.request.urlopen(f"{dashboard}/metrics", timeout=10) as answer:
-        metrics = answer.read().decode()
-    counters = (r"embo_redispatched_total", r'embo_hedges_total\{won="true"\}')
-    return sum(int(float(re.search(rf"^{name} (\S+)$", metrics, re.M)[1])) for name in counters)
-
-
-def _wait_for_answer(address, limit_s=60.0):
-    """A trainer that comes before its manager is told so, and ends."""
-    asked = embomatrix_command("status", f"--manager={address}")
-    deadline = time.monotonic() + limit_s
-    while subprocess.run(asked, capture_output=True, check=False).returncode:
-        assert time.monotonic() < deadline, f"the manager did not answer within {limit_s:g} s"
 
 
 def _until(condition, process, limit_s=180.0):

@@ -62,7 +62,7 @@ class CpuWatch:
 
 def descendants_cpu_s() -> float:
     """Processor time of all that descend from this process and live, in seconds."""
-    return sum(_seconds(process) for process, depth in _tree(os.getpid()) if depth)
+    return sum(cpu_s(process) for process, depth in _tree(os.getpid()) if depth)
 
 
 def _others_s(cluster: BenchCluster) -> tuple[float, float, float]:
@@ -72,10 +72,10 @@ def _others_s(cluster: BenchCluster) -> tuple[float, float, float]:
     for daemon in daemons:
         for process, depth in _tree(daemon):
             if depth >= SLOT_DEPTH:
-                slots_s += _seconds(process)
+                slots_s += cpu_s(process)
             else:
-                daemons_s += _seconds(process)
-    return slots_s, _seconds(psutil.Process(manager)), daemons_s
+                daemons_s += cpu_s(process)
+    return slots_s, cpu_s(psutil.Process(manager)), daemons_s
 
 
 def running_slot(cluster: BenchCluster) -> int:
@@ -101,8 +101,8 @@ def _tree(root: int) -> Iterator[tuple[psutil.Process, int]]:
         found += [(child, depth + 1) for child in children.get(process.pid, ())]
 
 
-def _seconds(process: psutil.Process) -> float:
-    """0 of one that has ended."""
+def cpu_s(process: psutil.Process) -> float:
+    """Its processor time, in seconds; 0 of one that has ended."""
     with contextlib.suppress(psutil.Error):
         times = process.cpu_times()
         return float(times.user + times.system)

@@ -19,7 +19,7 @@ import psutil
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.convert import rollout_from_proto, rollout_to_proto
-from embomatrix.worker.bench_cpu import CpuWatch
+from embomatrix.worker.bench_cpu import CpuWatch, cpu_s
 from embomatrix.worker.bench_figures import quantile
 from embomatrix.worker.bench_hollow import Order, hollow_worker
 from embomatrix.worker.bench_processes import bench_cluster
@@ -100,7 +100,7 @@ def _measured(
 ) -> Flow:
     deadline_s = time.monotonic() + sizes.limit_s
     state = redis.url if redis else ""
-    store = psutil.Process(redis.process.child.pid) if redis else None
+    store = None if redis is None else psutil.Process(redis.process.child.pid)
     with bench_cluster(folder, workers=0, slots=sizes.slots, deadline_s=deadline_s, state=state) as cluster:
         return asyncio.run(_measure(cluster, work, sizes, on_step, deadline_s, store))
 
@@ -124,20 +124,13 @@ async def _measure(
         on_step(f"{sizes.in_flight} rollouts in flight")
         batches = [_repeated(work, sizes.in_flight)] * sizes.batches
         await worker.tell(Order.BEGIN)
-        watch, started_s, store_s = CpuWatch(cluster), time.perf_counter(), _cpu_s(store)
+        watch, started_s, store_s = CpuWatch(cluster), time.perf_counter(), cpu_s(store) if store else 0.0
         count = await _flow(trainer, batches)
         wall_s, used = time.perf_counter() - started_s, watch.used()
-        store_s = _cpu_s(store) - store_s
+        store_s = cpu_s(store) - store_s if store else 0.0
         waits_s = await worker.tell(Order.KEEP)
         rss_mb = await _memory(cluster, trainer, work, sizes, on_step) if sizes.most else {}
     return Flow(count, wall_s, used.manager_s, waits_s, rss_mb, store_s)
-
-
-def _cpu_s(process: psutil.Process | None) -> float:
-    if process is None:
-        return 0.0
-    times = process.cpu_times()
-    return float(times.user + times.system)
 
 
 async def _flow(trainer: BenchTrainer, batches: Sequence[Sequence[Rollout]]) -> int:
@@ -195,22 +188,10 @@ def _repeated(work: Work, count: int) -> tuple[Rollout, ...]:
 
 
 def _figures(flow: Flow) -> tuple[Figure, ...]:
-    count = flow.rollouts
     (few, few_mb), (most, most_mb) = sorted(flow.rss_mb.items())
     each_kb = (most_mb - few_mb) / (most - few) * 1e3
     return (
-        Figure(
-            "manager_cpu_us", flow.manager_s / count * 1e6, "µs", Better.LOWER, count, goal=MANAGER_GOAL_US
-        ),
-        Figure(
-            "dispatch_p99_ms",
-            quantile(flow.waits_s, 0.99) * 1e3,
-            "ms",
-            Better.LOWER,
-            len(flow.waits_s),
-            goal=DISPATCH_GOAL_MS,
-        ),
-        Figure("rollouts that the manager lets through", count / flow.wall_s, "1/s", Better.HIGHER, count),
+        *_speed(flow, "", MANAGER_GOAL_US, DISPATCH_GOAL_MS),
         Figure("manager_rss_mb_16k", most_mb, "MB", Better.LOWER, most),
         Figure(f"manager's memory, {few} rollouts in flight", few_mb, "MB", Better.LOWER, few),
         Figure("manager's memory for each more in flight", each_kb, "kB", Better.LOWER, most - few),
@@ -218,22 +199,21 @@ def _figures(flow: Flow) -> tuple[Figure, ...]:
 
 
 def _redis_figures(flow: Flow) -> tuple[Figure, ...]:
-    count = flow.rollouts
+    cpu_us = flow.store_s / flow.rollouts * 1e6
+    server = Figure("CPU of redis-server for a rollout", cpu_us, "µs", Better.LOWER, flow.rollouts)
+    cost, *others = _speed(flow, ", with Redis")
+    return (cost, server, *others)
+
+
+def _speed(
+    flow: Flow, store: str, cost_goal_us: float | None = None, wait_goal_ms: float | None = None
+) -> tuple[Figure, ...]:
+    """What a rollout costs the manager, how long slots wait for leases, and how many rollouts go through."""
+    count, waits = flow.rollouts, flow.waits_s
+    cost_us, wait_ms = flow.manager_s / count * 1e6, quantile(waits, 0.99) * 1e3
+    through = f"rollouts that the manager lets through{store}"
     return (
-        Figure("manager_cpu_us, with Redis", flow.manager_s / count * 1e6, "µs", Better.LOWER, count),
-        Figure("CPU of redis-server for a rollout", flow.store_s / count * 1e6, "µs", Better.LOWER, count),
-        Figure(
-            "dispatch_p99_ms, with Redis",
-            quantile(flow.waits_s, 0.99) * 1e3,
-            "ms",
-            Better.LOWER,
-            len(flow.waits_s),
-        ),
-        Figure(
-            "rollouts that the manager lets through, with Redis",
-            count / flow.wall_s,
-            "1/s",
-            Better.HIGHER,
-            count,
-        ),
+        Figure(f"manager_cpu_us{store}", cost_us, "µs", Better.LOWER, count, goal=cost_goal_us),
+        Figure(f"dispatch_p99_ms{store}", wait_ms, "ms", Better.LOWER, len(waits), goal=wait_goal_ms),
+        Figure(through, count / flow.wall_s, "1/s", Better.HIGHER, count),
     )

@@ -1,0 +1,18 @@
+"""Waiting for a process that is to serve."""
+
+import contextlib
+import socket
+import time
+
+import pytest
+
+
+def until_listening(address, limit_s=60.0):
+    """Until somebody listens at HOST:PORT."""
+    host, _, port = address.partition(":")
+    deadline = time.monotonic() + limit_s
+    while time.monotonic() < deadline:
+        with contextlib.suppress(OSError), socket.create_connection((host, int(port)), timeout=1):
+            return
+        time.sleep(0.1)
+    pytest.fail(f"nobody listens at {address}")
