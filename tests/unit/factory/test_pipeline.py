@@ -4,7 +4,7 @@ import json
 import resource
 import shutil
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -26,12 +26,14 @@ from embomatrix.factory.pipeline.variants import VariantYield
 from embomatrix.factory.refusal import RefusalReason
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.writer.tasks import is_heldout_signature
+from embomatrix.factory.writer.view import SceneView
 from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.reward.hierarchy import score
 from embomatrix.rpc.values import Completed, InfraCode, InfraFailure, Outcome, RolloutResult, Timings
 from embomatrix.sim.executor import Simulator
 from embomatrix.skills.parse import plan_from_json
 from embomatrix.world.dataset import Dataset, DatasetError
+from embomatrix.world.scene import Room, Scene
 from embomatrix.world.task import TaskCategory
 
 SETTINGS = BuildSettings(train=8, heldout=4, seed=0, scenes=("Rs_int", "Wainscott_0_int"), look_ahead=False)
@@ -254,6 +256,22 @@ def test_every_room_is_on_one_side_and_every_kind_with_two_rooms_on_both() -> No
         assert sides["train"] | sides["heldout"] == set(types)
         for kind in ("kitchen", "bathroom", "bedroom", "living_room"):
             assert all(any(types[room] == kind for room in side) for side in sides.values())
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_home_that_loses_rooms_keeps_some_to_train_on(seed: int) -> None:
+    scenes = [build_base_scene(name) for name in ("Benevolence_0_int", "Pomaria_2_int", "Rs_int")]
+    kept = split_rooms(scenes, seed)["train"]
+    for scene in scenes:
+        assert _furniture(scene, scene.rooms) >= 3
+        assert _furniture(scene, [room for room in scene.rooms if room.name in kept[scene.base]]) >= 3
+
+
+def _furniture(scene: Scene, rooms: Sequence[Room]) -> int:
+    view = SceneView(scene)
+    return sum(
+        view.is_surface(name) or view.is_container(name) for room in rooms for name in view.in_room[room.name]
+    )
 
 
 def run(*arguments: str) -> tuple[int, str]:

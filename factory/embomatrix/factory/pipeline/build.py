@@ -38,6 +38,8 @@ Check = Callable[[VariantYield], VariantYield]
 """A second judge: leaves of a variant what is to be kept, and adds its refusals."""
 ROUND: Final = 6
 """Variants of a round, at most."""
+HOME: Final = 3
+"""Pieces of furniture with a surface or a cavity that a scene's rooms must hold for tasks to be written about them."""
 VARIANTS_FOR: Final = 4
 """Variants at most, for each one that would do if every draft were admitted."""
 
@@ -61,28 +63,60 @@ def split_rooms(scenes: Sequence[Scene], seed: int) -> dict[str, dict[str, tuple
     """Held-out rooms, and those for training, by split and scene.
 
     Of each type of room, one in three is held out, at least one where there are two: every kind of room is on both
-    sides. Which one turns with the seed and the type, so that they lie in several scenes.
+    sides. Which one turns with the seed and the type, so that they lie in several scenes; rooms without which a scene
+    would have nothing left to train on come last.
     """
     by_type: defaultdict[str, list[tuple[str, str]]] = defaultdict(list)
     for scene in scenes:
         for room in scene.rooms:
             by_type[room.type].append((scene.base, room.name))
-    heldout: set[tuple[str, str]] = set()
+    spared = _Spared(scenes)
     for rank, (_, rooms) in enumerate(sorted(by_type.items())):
         if len(rooms) > 1:
             first = (rank + seed) % len(rooms)
-            heldout |= {rooms[(first + step) % len(rooms)] for step in range(max(1, len(rooms) // 3))}
+            spared.hold_out(rooms[first:] + rooms[:first], max(1, len(rooms) // 3))
     return {
         split: {
             scene.base: tuple(
                 room.name
                 for room in scene.rooms
-                if ((scene.base, room.name) in heldout) is (split == "heldout")
+                if ((scene.base, room.name) in spared.heldout) is (split == "heldout")
             )
             for scene in scenes
         }
         for split in ("train", "heldout")
     }
+
+
+class _Spared:
+    """Rooms that are held out, and how much each scene keeps to train on."""
+
+    def __init__(self, scenes: Sequence[Scene]) -> None:
+        self.heldout: set[tuple[str, str]] = set()
+        self._worth = {scene.base: _worth(scene) for scene in scenes}
+        self._left = {base: sum(worth.values()) for base, worth in self._worth.items()}
+
+    def hold_out(self, rooms: Sequence[tuple[str, str]], count: int) -> None:
+        """So many of the rooms, in their order; those that their scene needs only where no others are left."""
+        kept: list[tuple[str, str]] = []
+        wanted = count
+        for room in rooms:
+            if wanted and self._can_go(*room):
+                self._take(*room)
+                wanted -= 1
+            else:
+                kept.append(room)
+        for room in kept[:wanted]:
+            self._take(*room)
+
+    def _can_go(self, base: str, room: str) -> bool:
+        """A scene that has too little anyhow loses nothing."""
+        left, worth = self._left[base], self._worth[base][room]
+        return left < HOME or left - worth >= HOME
+
+    def _take(self, base: str, room: str) -> None:
+        self.heldout.add((base, room))
+        self._left[base] -= self._worth[base][room]
 
 
 def _check_rooms(settings: BuildSettings) -> None:
@@ -225,11 +259,17 @@ def _key(record: TaskRecord) -> str:
 
 def _is_home(base: Scene, rooms: Sequence[str]) -> bool:
     """Whether the rooms hold enough furniture to write tasks about: empty corridors and storage rooms do not."""
+    worth = _worth(base)
+    return sum(worth[room] for room in rooms) >= HOME
+
+
+def _worth(base: Scene) -> dict[str, int]:
+    """Furniture to write tasks about, by room: what has a surface or holds things."""
     view = SceneView(base)
-    return (
-        sum(view.is_surface(name) or view.is_container(name) for room in rooms for name in view.in_room[room])
-        >= 3
-    )
+    return {
+        room.name: sum(view.is_surface(name) or view.is_container(name) for name in view.in_room[room.name])
+        for room in base.rooms
+    }
 
 
 def _share(target: int, index: int) -> int:
