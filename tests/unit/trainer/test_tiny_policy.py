@@ -1,5 +1,6 @@
 """The word-level policy: shared prompts change nothing, names survive the round trip, files bring it back."""
 
+import json
 from dataclasses import replace
 
 import pytest
@@ -10,6 +11,7 @@ from tests.fakes.symbolic_household import make_tasks
 
 from embomatrix.skills.prompt import Codec, plan_in_names, prompt_for
 from embomatrix.skills.syntax import PROFILES
+from embomatrix.trainer.errors import TrainerError
 from embomatrix.trainer.policy.decoder import DecoderShape
 from embomatrix.trainer.policy.tiny import TinyPolicy
 from embomatrix.trainer.policy.words import END, UNKNOWN, build_vocabulary
@@ -151,6 +153,14 @@ def test_saved_policy_comes_back_equal(tmp_path):
     assert TinyPolicy.is_saved_in(tmp_path)
     back = TinyPolicy.load(tmp_path)
     assert draw(back, prompts(back)).texts == draw(made, prompts(made)).texts
+
+
+def test_weights_of_another_network_are_told_from_damage(tmp_path):
+    policy().save(tmp_path)
+    described = json.loads((tmp_path / "tiny.json").read_text())
+    (tmp_path / "tiny.json").write_text(json.dumps(described | {"network": 1}))
+    with pytest.raises(TrainerError, match="is a network of version 1, this program runs 2: imitate anew"):
+        TinyPolicy.load(tmp_path)
 
 
 def test_reference_stays_when_the_policy_moves():

@@ -1,8 +1,10 @@
 """A small transformer in plain torch, whose prompt is read at once and runs once for all samples of its group.
 
-Llama-like: RMS norms, rotary positions, gated feed-forward, tied embedding. The last layer may also *point*: a part of the
-probability goes to words of the prompt by attention (pointer networks; See et al. 2017, eq. 9). Naming an object that the
-instruction names is then a matter of looking, for words seldom met as for frequent ones.
+Llama-like: RMS norms, rotary positions, gated feed-forward, tied embedding; queries and keys are normed before they meet (Henry
+et al. 2020). A word comes in with a share of the word before it, so that already the first layer can look for what follows an
+equal word. The last layer may also *point*: a part of the probability goes to words of the prompt by attention (pointer
+networks; See et al. 2017, eq. 9). Naming an object that the instruction names is then a matter of looking, for words seldom met
+as for frequent ones.
 
 Shapes: Q prompts, G samples of each, P prompt tokens, T new tokens, H heads of width D, C = H * D.
 """
@@ -24,6 +26,8 @@ if TYPE_CHECKING:
 
 _HIDDEN_KEY = -1e9
 _LEAST = 1e-9
+_OF_BEFORE = 0.3
+"""The share of the word before a word, at first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +83,17 @@ class PromptMemory:
         )
 
 
+@dataclass(frozen=True, slots=True)
+class Written:
+    """Plans as far as they are run: what each layer keeps of them, and the last word of each, (rows,)."""
+
+    layers: tuple[LayerMemory, ...]
+    last: Tensor
+
+    def of_rows(self, rows: Tensor) -> Written:
+        return Written(tuple(layer.of_rows(rows) for layer in self.layers), self.last[rows])
+
+
 class _Product(nn.Linear):
     """A matrix product in a type of its own; the weight stays in 32 bits, and its gradient comes in them."""
 
@@ -100,6 +115,8 @@ class _Block(nn.Module):
         self.heads = shape.heads
         self.before_attention = nn.RMSNorm(shape.width)
         self.qkv = _Product(shape.width, 3 * shape.width, products)
+        self.of_query = nn.RMSNorm(shape.width // shape.heads)
+        self.of_key = nn.RMSNorm(shape.width // shape.heads)
         self.out = _Product(shape.width, shape.width, products)
         self.before_inner = nn.RMSNorm(shape.width)
         self.gate_up = _Product(shape.width, 2 * shape.inner, products)
@@ -110,7 +127,8 @@ class _Block(nn.Module):
         rows, length, width = x.shape
         product = self.qkv(self.before_attention(x)).to(x.dtype)
         split = product.view(rows, length, 3, self.heads, width // self.heads).permute(2, 0, 3, 1, 4)
-        q, k = _rotated(split[:2], rope)  # each (rows, H, T, D)
+        normed = torch.stack([self.of_query(split[0]), self.of_key(split[1])])
+        q, k = _rotated(normed, rope)  # each (rows, H, T, D)
         return q, k, split[2]
 
     def finish(self, x: Tensor, attended: Tensor) -> Tensor:
@@ -138,6 +156,7 @@ class Decoder(nn.Module):
         super().__init__()
         self.shape = shape
         self.embedding = nn.Embedding(shape.vocabulary, shape.width)
+        self.of_before = nn.Parameter(torch.full((shape.width,), _OF_BEFORE))
         self.blocks = nn.ModuleList(_Block(shape, products) for _ in range(shape.layers))
         self.norm = nn.RMSNorm(shape.width)
         self.point_from = nn.Linear(shape.width, shape.width, bias=False)
@@ -187,13 +206,18 @@ class Decoder(nn.Module):
         """positions: (rows, T)."""
         return self.cos[positions][:, None], self.sin[positions][:, None]
 
+    def _in_line(self, words: Tensor, before: Tensor) -> Tensor:
+        """What comes in (rows, T, C) of words, of that shape, where the first of each row follows ``before`` (rows, 1, C)."""
+        return words + self.of_before * torch.cat([before, words[:, :-1]], dim=1)
+
     def read(self, tokens: Tensor, hidden: Tensor) -> PromptMemory:
         """tokens (Q, P), padded on the left; hidden (Q, P) is true on the padding."""
         lengths = (~hidden).sum(dim=1)
         positions = ((~hidden).cumsum(dim=1) - 1).clamp(min=0)
         rope = self._rope(positions)
         bias = (hidden.float() * _HIDDEN_KEY)[:, None, None]  # (Q, 1, 1, P): a token sees the whole prompt
-        x = self.embedding(tokens)
+        words = self.embedding(tokens).masked_fill(hidden[..., None], 0.0)
+        x = self._in_line(words, torch.zeros_like(words[:, :1]))
         memories = []
         for block in self.blocks:
             q, k, v = block.project(x, rope)  # type: ignore[operator]
@@ -204,11 +228,11 @@ class Decoder(nn.Module):
         return PromptMemory(tuple(memories), tokens, hidden, lengths, x[:, -1:], pointers)
 
     def extend(
-        self, prompt: PromptMemory, tokens: Tensor, past: tuple[LayerMemory, ...] | None, start: int
-    ) -> tuple[Tensor, tuple[LayerMemory, ...]]:
+        self, prompt: PromptMemory, tokens: Tensor, written: Written | None, start: int
+    ) -> tuple[Tensor, Written]:
         """Hidden states (Q * G, T, C) of tokens (Q * G, T) that stand ``start`` tokens after their prompts.
 
-        ``past`` is the memory of the samples' own earlier tokens, None at the first.
+        ``written`` is what ``extend`` gave for the samples' own earlier tokens, None at the first.
         """
         rows, length = tokens.shape
         group = rows // prompt.lengths.shape[0]
@@ -216,17 +240,18 @@ class Decoder(nn.Module):
         rope = self._rope(begin + torch.arange(length, device=tokens.device))
         bias = prompt.hidden[:, None, None, None, :].float() * _HIDDEN_KEY
         later = torch.ones(length, length, dtype=torch.bool, device=tokens.device).triu(1)
-        x = self.embedding(tokens)
+        last = written.last if written else prompt.tokens[:, -1].repeat_interleave(group)
+        x = self._in_line(self.embedding(tokens), self.embedding(last)[:, None])
         memories = []
         for index, (block, shared) in enumerate(zip(self.blocks, prompt.layers, strict=True)):
-            own = past[index] if past else None
             q, k, v = block.project(x, rope)  # type: ignore[operator]
-            if own:
+            if written:
+                own = written.layers[index]
                 k, v = torch.cat([own.keys, k], dim=2), torch.cat([own.values, v], dim=2)
             attended = _attend(q, shared, k, v, bias, later)
             x = block.finish(x, attended)  # type: ignore[operator]
             memories.append(LayerMemory(k, v))
-        return x, tuple(memories)
+        return x, Written(tuple(memories), tokens[:, -1])
 
 
 def _attend(

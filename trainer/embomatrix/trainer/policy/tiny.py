@@ -11,6 +11,7 @@ import torch
 from torch.nn import functional
 
 from embomatrix.skills.prompt import Codec
+from embomatrix.trainer.errors import TrainerError
 from embomatrix.trainer.policy.decoder import Decoder, DecoderShape
 from embomatrix.trainer.policy.drawing import draw
 from embomatrix.trainer.policy.grammar import PlanGrammar
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from torch import Tensor, nn
 
     from embomatrix.skills.prompt import Prompt
-    from embomatrix.trainer.policy.decoder import LayerMemory, PromptMemory
+    from embomatrix.trainer.policy.decoder import PromptMemory, Written
     from embomatrix.trainer.policy.grammar import Cursor, Names
     from embomatrix.trainer.policy.protocol import Tokens
 
@@ -32,6 +33,10 @@ _COMPACT_SHARE = 0.6
 """Rows that have ended are dropped from the sampling loop once so few go on: most plans are much shorter than the longest."""
 _LENGTH_CLASSES = 4
 """Plans are scored in this many batches of like length, each padded to its own longest."""
+NETWORK = 2
+"""Version of the network: weights of another one mean something else."""
+_UNLIKELY = -80.0
+"""Log-probabilities below this add nothing to an entropy, and their exponentials take twenty times as long."""
 _WEIGHTS = "weights.pt"
 _DESCRIPTION = "tiny.json"
 
@@ -45,7 +50,7 @@ class _Writing:
     memory: PromptMemory
     names: Names
     cursor: Cursor
-    own: tuple[LayerMemory, ...] | None
+    own: Written | None
 
     def after(self, choice: Tensor, grammar: PlanGrammar) -> _Writing:
         """With one more word of each plan (rows,)."""
@@ -69,7 +74,7 @@ class _Writing:
             self.memory if len(prompts) == len(self.memory.lengths) else self.memory.of_rows(prompts),
             self.names.of_rows(kept),
             self.cursor.of_rows(kept),
-            tuple(layer.of_rows(kept) for layer in self.own) if self.own else None,
+            self.own.of_rows(kept) if self.own else None,
         )
 
 
@@ -195,7 +200,8 @@ class TinyPolicy:
             self.network.scores(states, memory, barred) / (temperature or 1.0), dim=-1
         )  # (rows, T, V)
         chosen = scores.gather(-1, tokens[..., None])[..., 0]
-        entropy = -(scores.exp() * scores.clamp(min=-1e4)).sum(dim=-1)
+        likely = scores.clamp(min=_UNLIKELY)
+        entropy = -(likely.exp() * likely).sum(dim=-1)
         return chosen, entropy
 
     def _padded(self, prompts: Sequence[Tokens]) -> tuple[Tensor, Tensor]:
@@ -216,6 +222,7 @@ class TinyPolicy:
         folder.mkdir(parents=True, exist_ok=True)
         torch.save(self.network.state_dict(), folder / _WEIGHTS)
         described = {
+            "network": NETWORK,
             "shape": self.network.shape.as_dict(),
             "words": self.vocabulary.words,
             "things": self.vocabulary.thing_words,
@@ -225,8 +232,15 @@ class TinyPolicy:
 
     @classmethod
     def load(cls, folder: Path, *, device: str = "cpu", products: torch.dtype = torch.float32) -> Self:
-        """Read what ``save`` wrote. Raises OSError, ValueError or RuntimeError where it is not that."""
+        """Read what ``save`` wrote. Raises TrainerError where another version did, OSError, ValueError or RuntimeError where it
+        is not that."""
         described = json.loads((folder / _DESCRIPTION).read_text())
+        found = described.get("network", 1)
+        if found != NETWORK:
+            raise TrainerError(
+                f"the policy in {folder} is a network of version {found}, this program runs {NETWORK}: imitate anew, or "
+                "use the version of embomatrix that wrote it"
+            )
         shape = DecoderShape(**described["shape"])
         words, things, rooms = (tuple(described[part]) for part in ("words", "things", "rooms"))
         policy = cls(Vocabulary(words, things, rooms), shape, seed=0, device=device, products=products)
