@@ -195,7 +195,7 @@ def test_grpo_raises_held_out_success(tmp_path):
     summary, _ = run(
         tmp_path,
         tasks=replace(tasks),
-        imitation__steps=150,
+        imitation__steps=50,
         imitation__batch=24,
         imitation__learning_rate=5e-3,
         grpo__steps=150,
@@ -208,4 +208,4 @@ def test_grpo_raises_held_out_success(tmp_path):
         evaluation__samples=10,
     )
     rows = success_rows(summary)
-    assert summary.after.success().value > summary.before.success().value + 0.05, rows
+    assert summary.after.success().value > summary.before.success().value + 0.1, rows

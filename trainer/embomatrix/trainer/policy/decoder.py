@@ -2,9 +2,9 @@
 
 Llama-like: RMS norms, rotary positions, gated feed-forward, tied embedding; queries and keys are normed before they meet (Henry
 et al. 2020). A word comes in with a share of the word before it, so that already the first layer can look for what follows an
-equal word. The last layer may also *point*: a part of the probability goes to words of the prompt by attention (pointer
-networks; See et al. 2017, eq. 9). Naming an object that the instruction names is then a matter of looking, for words seldom met
-as for frequent ones.
+equal word. The last layer may also *point*: a part of the probability goes to words of the prompt, and to those of the plan so
+far, by attention (pointer networks; See et al. 2017, eq. 9). Naming an object that the instruction names, or the one that the
+plan went to, is then a matter of looking, for words seldom met as for frequent ones.
 
 Shapes: Q prompts, G samples of each, P prompt tokens, T new tokens, H heads of width D, C = H * D.
 """
@@ -85,13 +85,16 @@ class PromptMemory:
 
 @dataclass(frozen=True, slots=True)
 class Written:
-    """Plans as far as they are run: what each layer keeps of them, and the last word of each, (rows,)."""
+    """Plans as far as they are run: what each layer keeps of them; ``tokens`` (rows, S); ``pointers`` (rows, S, C), what their
+    words are pointed at by."""
 
     layers: tuple[LayerMemory, ...]
-    last: Tensor
+    tokens: Tensor
+    pointers: Tensor
 
     def of_rows(self, rows: Tensor) -> Written:
-        return Written(tuple(layer.of_rows(rows) for layer in self.layers), self.last[rows])
+        layers = tuple(layer.of_rows(rows) for layer in self.layers)
+        return Written(layers, self.tokens[rows], self.pointers[rows])
 
 
 class _Product(nn.Linear):
@@ -173,22 +176,42 @@ class Decoder(nn.Module):
                 parameter.data /= (2 * shape.layers) ** 0.5
         nn.init.zeros_(self.point_share.bias)
 
-    def scores(self, states: Tensor, prompt: PromptMemory, barred: Tensor) -> Tensor:
-        """Log-probabilities (Q * G, T, V) after hidden states (Q * G, T, C); words in ``barred``, of that shape, get none."""
-        rows, length, width = states.shape
-        prompts, prompt_length = prompt.tokens.shape
+    def scores(self, states: Tensor, prompt: PromptMemory, written: Written | None, barred: Tensor) -> Tensor:
+        """Scores (Q * G, T, V), whose softmax says what comes after hidden states (Q * G, T, C); words in ``barred``, of that
+        shape, get none.
+
+        The states are the last T of those after the prompt and after each word that is ``written``.
+        """
         x = self.norm(states)
         generated = torch.softmax((x @ self.embedding.weight.t()).masked_fill(barred, _HIDDEN_KEY), dim=-1)
-        asked = self.point_from(x).view(prompts, -1, width) * width**-0.5  # (Q, G T, C)
-        looked = asked @ prompt.pointers.transpose(1, 2)  # (Q, G T, P)
-        index = prompt.tokens[:, None].expand(prompts, asked.shape[1], prompt_length)
-        nowhere = prompt.hidden[:, None] | barred.view(prompts, asked.shape[1], -1).gather(2, index)
-        attention = torch.softmax(looked.masked_fill(nowhere, _HIDDEN_KEY), dim=-1)
-        empty = attention.new_zeros(prompts, asked.shape[1], generated.shape[-1])
-        pointed = empty.scatter_add(2, index, attention).view(rows, length, -1)  # (Q G, T, V)
+        attention, words = self._pointed(x, prompt, written, barred)
+        pointed = torch.zeros_like(generated).scatter_add(2, words, attention)
         share = torch.sigmoid(self.point_share(x))  # (Q G, T, 1)
         mixed = torch.lerp(generated, pointed, share)
         return mixed.clamp(min=_LEAST).log().masked_fill(barred, _HIDDEN_KEY)
+
+    def _pointed(
+        self, x: Tensor, prompt: PromptMemory, written: Written | None, barred: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Where normed states point: probabilities of places, those of the prompt first, and the words there; both
+        (Q * G, T, P + S). Where all words are barred, nowhere."""
+        rows, length, width = x.shape
+        prompts, prompt_length = prompt.tokens.shape
+        asked = self.point_from(x) * width**-0.5  # (Q G, T, C)
+        looked = (asked.view(prompts, -1, width) @ prompt.pointers.transpose(1, 2)).view(rows, length, -1)
+        group = rows // prompts
+        words = prompt.tokens.repeat_interleave(group, dim=0)[:, None].expand(rows, length, prompt_length)
+        hidden = prompt.hidden.repeat_interleave(group, dim=0)[:, None].expand(rows, length, prompt_length)
+        if written:
+            count = written.tokens.shape[1]
+            later = torch.ones(length, count, dtype=torch.bool, device=x.device).triu(count - length + 1)
+            looked = torch.cat([looked, asked @ written.pointers.transpose(1, 2)], dim=2)
+            words = torch.cat([words, written.tokens[:, None].expand(rows, length, count)], dim=2)
+            hidden = torch.cat([hidden, later.expand(rows, length, count)], dim=2)
+        nowhere = hidden | barred.gather(2, words)
+        # Nothing, rather than everything alike, where no place is left: the softmax of the scores makes up for it.
+        attention = torch.softmax(looked.masked_fill(nowhere, _HIDDEN_KEY), dim=-1)
+        return attention.masked_fill(nowhere, 0.0), words
 
     @contextlib.contextmanager
     def unchanged(self) -> Iterator[None]:
@@ -240,7 +263,7 @@ class Decoder(nn.Module):
         rope = self._rope(begin + torch.arange(length, device=tokens.device))
         bias = prompt.hidden[:, None, None, None, :].float() * _HIDDEN_KEY
         later = torch.ones(length, length, dtype=torch.bool, device=tokens.device).triu(1)
-        last = written.last if written else prompt.tokens[:, -1].repeat_interleave(group)
+        last = written.tokens[:, -1] if written else prompt.tokens[:, -1].repeat_interleave(group)
         x = self._in_line(self.embedding(tokens), self.embedding(last)[:, None])
         memories = []
         for index, (block, shared) in enumerate(zip(self.blocks, prompt.layers, strict=True)):
@@ -251,7 +274,11 @@ class Decoder(nn.Module):
             attended = _attend(q, shared, k, v, bias, later)
             x = block.finish(x, attended)  # type: ignore[operator]
             memories.append(LayerMemory(k, v))
-        return x, Written(tuple(memories), tokens[:, -1])
+        pointers = self.point_to(self.norm(x))
+        if written:
+            tokens = torch.cat([written.tokens, tokens], dim=1)
+            pointers = torch.cat([written.pointers, pointers], dim=1)
+        return x, Written(tuple(memories), tokens, pointers)
 
 
 def _attend(

@@ -138,7 +138,7 @@ class TinyPolicy:
         with self.network.unchanged():
             for at in range(max_new):
                 barred = self._grammar.barred(writing.cursor, writing.names)[:, None]
-                scores = self.network.scores(state, writing.memory, barred)[:, 0]
+                scores = self.network.scores(state, writing.memory, writing.own, barred)[:, 0]
                 choice, logprob = draw(scores, temperature, generator)
                 rows, going = writing.rows, writing.going
                 tokens[rows, at] = torch.where(going, choice, PAD)
@@ -192,12 +192,12 @@ class TinyPolicy:
         self, memory: PromptMemory, tokens: Tensor, barred: Tensor, temperature: float
     ) -> tuple[Tensor, Tensor]:
         """Log-probability and entropy (rows, T) of each token (rows, T), where ``barred`` words (rows, T, V) get none."""
-        states = memory.last  # (rows, 1, C)
+        states, written = memory.last, None  # (rows, 1, C)
         if tokens.shape[1] > 1:
-            rest, _ = self.network.extend(memory, tokens[:, :-1], None, 0)
+            rest, written = self.network.extend(memory, tokens[:, :-1], None, 0)
             states = torch.cat([states, rest], dim=1)  # (rows, T, C)
         scores = torch.log_softmax(
-            self.network.scores(states, memory, barred) / (temperature or 1.0), dim=-1
+            self.network.scores(states, memory, written, barred) / (temperature or 1.0), dim=-1
         )  # (rows, T, V)
         chosen = scores.gather(-1, tokens[..., None])[..., 0]
         likely = scores.clamp(min=_UNLIKELY)
