@@ -1,6 +1,7 @@
 """`embomatrix experiment`: what it refuses, what it takes as done, and what it makes of finished runs."""
 
 import json
+import math
 from dataclasses import replace
 from datetime import date
 
@@ -110,6 +111,16 @@ def test_a_curve_has_ten_stretches_or_as_many_as_there_are_steps():
     assert curve(long, "success") == pytest.approx([(2 * at + 0.5) / 20 for at in range(10)])
     assert len(curve(replace(long, metrics=long.metrics[:3]), "success")) == 3
     assert curve(replace(long, metrics=[]), "success") == ()
+
+
+def test_steps_without_a_metric_count_in_no_stretch_and_a_stretch_of_them_is_told_as_none():
+    told = run(0, "a", (0.0,), (0.0,))
+    metrics = [
+        dict(row, entropy=None if step in (1, 18, 19) else 0.3) for step, row in enumerate(told.metrics)
+    ]
+    values = curve(replace(told, metrics=metrics), "entropy")
+    assert values[:9] == pytest.approx([0.3] * 9)
+    assert math.isnan(values[9])
 
 
 def test_the_section_tells_configuration_success_curves_and_times():

@@ -50,6 +50,15 @@ def test_groups_without_signal_are_replaced_from_the_reserve(tmp_path):
     assert sum(row["rollouts"] for row in rows) > without.rollouts
 
 
+def test_a_step_in_which_no_group_has_a_signal_tells_no_mean_over_its_tokens(tmp_path):
+    before = trained(tmp_path / "none", grpo__steps=0)[1]
+    _, policy = trained(tmp_path / "all", grpo__temperature=1e-4)  # all plans of a group are equal
+    rows = read_metrics(tmp_path / "all")
+    assert [row["dead_groups"] for row in rows] == [1.0] * 4
+    assert [row[name] for row in rows for name in ("entropy", "kl", "kl_to_old", "clipped")] == [None] * 16
+    assert torch.equal(weights(before), weights(policy))
+
+
 @pytest.mark.parametrize("kind", [LossKind.DAPO, LossKind.BNPO, LossKind.GRPO])
 def test_a_reserve_that_is_not_needed_changes_nothing(tmp_path, kind):
     changes = {

@@ -69,7 +69,7 @@ class LineDisplay:
     def stepped(self, record: StepRecord, share: float, rollouts_per_s: float) -> None:
         self._say(
             f"GRPO {share:.0%}: step {record.step}, reward {record.reward:.2f}, success {record.success:.0%}, "
-            f"{rollouts_per_s:.0f} rollouts/s, warm starts {record.warm:.0%}, entropy {record.entropy:.2f}, "
+            f"{rollouts_per_s:.0f} rollouts/s, warm starts {record.warm:.0%}, entropy {_told(record.entropy)}, "
             f"dead groups {record.dead_groups:.0%}"
         )
 
@@ -117,7 +117,7 @@ class LiveDisplay:
             "success": f"{self._smoothed('success', record.success):.0%}",
             "rollouts/s": f"{self._smoothed('rate', rollouts_per_s):.0f}",
             "warm starts": f"{self._smoothed('warm', record.warm):.0%}",
-            "entropy": f"{record.entropy:.2f}",
+            "entropy": _told(record.entropy),
             "dead groups": f"{self._smoothed('dead', record.dead_groups):.0%}",
             "left": _minutes(self._left_s(share)),
         }
@@ -137,6 +137,10 @@ class LiveDisplay:
         table.add_row(*figures.values())
         bar = ProgressBar(total=1.0, completed=min(1.0, share), width=60)
         self._live.update(Group(Text(f"{title}  {min(1.0, share):.0%}", style="bold"), bar, table))
+
+
+def _told(value: float | None) -> str:
+    return "–" if value is None else f"{value:.2f}"
 
 
 def _minutes(seconds: float) -> str:

@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class StepRecord:
-    """What one step did. Rates are over rollouts that have a result; token means over the plans that moved the policy.
+    """What one step did. Rates are over rollouts that have a result; token means over the plans that moved the policy, None
+    where none did.
 
     ``reward_format``, ``reward_relevance`` and ``reward_goal`` are the tiers' means, which add up to ``reward``;
     ``success_by_category`` holds the categories that came up.
@@ -34,10 +35,10 @@ class StepRecord:
     plan_steps: float
     dead_groups: float
     groups: int
-    entropy: float
-    kl: float
-    kl_to_old: float
-    clipped: float
+    entropy: float | None
+    kl: float | None
+    kl_to_old: float | None
+    clipped: float | None
     gradient_norm: float
     learning_rate: float
     rollouts: int
@@ -63,9 +64,11 @@ def record_of(
     known = [outcome for outcome in outcomes if outcome.reward is not None]
     rewards = [outcome.reward for outcome in known if outcome.reward is not None]
     executed = [outcome.outcome for outcome in known if isinstance(outcome.outcome, Completed)]
-    weight = sum(part.weight for part in metrics) or 1
+    weight = sum(part.weight for part in metrics)
 
-    def over_tokens(name: str) -> float:
+    def over_tokens(name: str) -> float | None:
+        if not weight:
+            return None
         return float(sum(getattr(part, name) * part.weight for part in metrics) / weight)
 
     return StepRecord(

@@ -119,7 +119,7 @@ def write_report(summary: Summary, metrics: Sequence[Mapping[str, Any]], machine
         or "<p>The data set holds no task out.</p>",
         "<p>95 % intervals, bootstrap over tasks.</p>",
         "<h2>Learning curves</h2>",
-        *(_curve([float(row[key]) for row in metrics], title, colour) for key, title, colour in _CURVES),
+        *(_curve([row[key] for row in metrics], title, colour) for key, title, colour in _CURVES),
         "<h2>Where the time went</h2>",
         _table(
             ("activity", "seconds", "share"),
@@ -147,8 +147,10 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return f"<table><tr>{cells}</tr>{body}</table>"
 
 
-def _curve(values: Sequence[float], title: str, colour: str) -> str:
-    """Raw values thin, a moving mean bold, as inline SVG."""
+def _curve(told: Sequence[float | None], title: str, colour: str) -> str:
+    """Raw values thin, a moving mean bold, as inline SVG; steps without a value are passed over."""
+    places = [at for at, value in enumerate(told) if value is not None]
+    values = [value for value in told if value is not None]
     if not values:
         return ""
     low, high = min(*values, 0.0), max(values)
@@ -157,11 +159,11 @@ def _curve(values: Sequence[float], title: str, colour: str) -> str:
     means = [sum(values[max(0, at - window + 1) : at + 1]) / min(at + 1, window) for at in range(len(values))]
 
     def points(line: Sequence[float]) -> str:
-        across = (_WIDTH - 2 * _MARGIN) / max(1, len(line) - 1)
+        across = (_WIDTH - 2 * _MARGIN) / max(1, len(told) - 1)
         up = (_HEIGHT - 2 * _MARGIN) / (high - low)
         return " ".join(
             f"{_MARGIN + at * across:.1f},{_HEIGHT - _MARGIN - (value - low) * up:.1f}"
-            for at, value in enumerate(line)
+            for at, value in zip(places, line, strict=True)
         )
 
     text = 'font-size="12" fill="#555"'
@@ -171,7 +173,7 @@ def _curve(values: Sequence[float], title: str, colour: str) -> str:
         f'<path d="M{_MARGIN} {_MARGIN}V{_HEIGHT - _MARGIN}H{_WIDTH - _MARGIN}" fill="none" stroke="#999"/>'
         f'<text x="4" y="{_MARGIN + 4}" {text}>{high:.3g}</text>'
         f'<text x="4" y="{_HEIGHT - _MARGIN}" {text}>{low:.3g}</text>'
-        f'<text x="{_WIDTH - _MARGIN}" y="{_HEIGHT - _MARGIN + 16}" {text} text-anchor="end">step {len(values)}</text>'
+        f'<text x="{_WIDTH - _MARGIN}" y="{_HEIGHT - _MARGIN + 16}" {text} text-anchor="end">step {len(told)}</text>'
         f'<polyline points="{points(values)}" fill="none" stroke="{colour}" stroke-opacity=".3"/>'
         f'<polyline points="{points(means)}" fill="none" stroke="{colour}" stroke-width="2"/></svg>'
     )

@@ -81,10 +81,10 @@ def _over_seeds(rates: Sequence[Mapping[str, float]]) -> list[float]:
 
 
 def curve(run: Run, key: str) -> tuple[float, ...]:
-    """Means of a metric over ``BINS`` stretches of a run; fewer where it has fewer steps."""
-    values = np.array([float(row[key]) for row in run.metrics])
+    """Means of a metric over ``BINS`` stretches of a run; fewer where it has fewer steps. NaN where no step has the metric."""
+    values = np.array([math.nan if row[key] is None else float(row[key]) for row in run.metrics])
     parts = np.array_split(values, max(1, min(BINS, len(values))))
-    return tuple(float(part.mean()) for part in parts if part.size)
+    return tuple(_mean(list(part[~np.isnan(part)])) for part in parts if part.size)
 
 
 def figures_of(arms: Sequence[ArmFindings]) -> tuple[Figure, ...]:

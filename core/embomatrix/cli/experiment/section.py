@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import textwrap
 from typing import TYPE_CHECKING, Final
 
@@ -24,7 +25,7 @@ HEAD: Final = (
     "its tables are by hand.\nSections are added, none is taken away: what did not work stays.\n"
 )
 NOTHING: Final = "–"
-"""Where no task was held out."""
+"""Where no task was held out, or no step has the metric."""
 CURVES: Final = (
     ("success", "success of training plans"),
     ("dead_groups", "groups without signal"),
@@ -122,7 +123,7 @@ def _success_rows(arm: ArmFindings) -> Iterable[tuple[str, ...]]:
 
 def _curve_rows(run: Run) -> Iterable[tuple[str, ...]]:
     for key, title in CURVES:
-        values = [f"{value:.2f}" for value in curve(run, key)]
+        values = [NOTHING if math.isnan(value) else f"{value:.2f}" for value in curve(run, key)]
         yield (run.arm, str(run.seed), title, *values, *("",) * (BINS - len(values)))
 
 
