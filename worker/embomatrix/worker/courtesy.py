@@ -5,9 +5,10 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from embomatrix.worker.pausing import WORKING, judge
+from embomatrix.worker.spare_memory import SCARCE_MEMORY
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -18,9 +19,6 @@ if TYPE_CHECKING:
     from embomatrix.worker.slots import SlotPool
 
 logger = logging.getLogger(__name__)
-
-SCARCE_MEMORY: Final = 0.1
-"""With less of the memory available than this share, a paused worker gives up its scenes."""
 
 
 class Courtesy:

@@ -34,6 +34,7 @@ from embomatrix.worker.processes import SIMULATOR_PROGRAM
 from embomatrix.worker.residents import LoadError, SlotLimits
 from embomatrix.worker.session import Session, register
 from embomatrix.worker.slots import SlotPool
+from embomatrix.worker.spare_memory import SpareMemory
 from embomatrix.worker.status import StatusReport, daemon_pids
 from embomatrix.worker.takeovers import Takeovers
 
@@ -152,6 +153,7 @@ class Daemon:
             self._stay_connected(),
             self._fence(),
             self._courtesy.run(),
+            SpareMemory(self._pool).run(),
             self._report.run(),
             self._until_left(),
         )

@@ -173,14 +173,13 @@ class Residents:
             await self._root.end()
         await asyncio.gather(*self._ending)
 
-    def settle(self, wanted: Sequence[str], tasks: asyncio.TaskGroup) -> None:
-        """Evict what is too much, and begin to load what is wanted: as many at a time as there are slots."""
+    def settle(self, wanted: Sequence[str], tasks: asyncio.TaskGroup, *, budget_mb: float) -> None:
+        """Evict what is more than ``budget_mb``, and begin to load what is wanted: as many at a time as there are slots."""
         now_s = time.monotonic()
         for scene in list(self._scenes.values()):
             over = scene.digest not in wanted or now_s - scene.failed_s > RETRY_LOAD_S
             if scene.state is ResidentState.FAILED and over:
                 del self._scenes[scene.digest]
-        budget_mb = self._limits.memory_mb
         for digest in surplus(wanted, self._held(), budget_mb=budget_mb):
             self._evict(digest)
         while self._loading() < self._limits.slots:

@@ -67,6 +67,8 @@ class SlotPool:
             program=program,
             board=self._board,
         )
+        self._budget_mb = limits.memory_mb
+        """What scenes may hold now: the limit, or less while memory is scarce."""
         self._wanted: tuple[str, ...] = ()
         self._waiting = WaitingLeases(limits.slots, self._residents.warm)
         self._tickets: dict[LeaseRef, Ticket] = {}
@@ -159,6 +161,16 @@ class SlotPool:
         self._start_leases()
         self._wake.set()
 
+    def allow(self, memory_mb: float) -> None:
+        """Scenes may hold so much from now on, and what the limits say at most: what is more is evicted, the most urgent
+        one excepted, and what then fits is loaded."""
+        before, self._budget_mb = self._budget_mb, min(memory_mb, self._limits.memory_mb)
+        over = self._residents.memory_used_mb > self._budget_mb
+        if over and self._residents.memory_used_mb <= before:
+            logger.info("memory is scarce: scenes may hold %d MB now", self._budget_mb)
+        if over or self._unsettled:
+            self._wake.set()
+
     def shed(self) -> None:
         """Give up the scenes in which nothing runs, for the memory that they hold."""
         self._residents.shed()
@@ -195,8 +207,8 @@ class SlotPool:
             return
         # Scenes of leases that wait come before those that are only announced.
         wanted = tuple(dict.fromkeys((*(ticket.digest for ticket in self._waiting), *self._wanted)))
-        self._residents.settle(wanted, tasks)
-        over = self._residents.memory_used_mb > self._limits.memory_mb
+        self._residents.settle(wanted, tasks, budget_mb=self._budget_mb)
+        over = self._residents.memory_used_mb > self._budget_mb
         self._unsettled = over or any(self._residents.warm(digest) is None for digest in wanted)
 
     def _scene_changed(self, scene: Scene) -> None:
