@@ -21,7 +21,8 @@ STOP_S: Final = 60.0
 
 
 def run_command(command: str, problem: Callable[[], str], *arguments: str) -> None:
-    """Run one `embomatrix` command for ``command``; its failure is ours, with its own message and status.
+    """Run one `embomatrix` command for ``command``; its failure is ours, with its own message and status, or with one of ours
+    where a signal left it none.
 
     It is stopped when there is a ``problem``. An interrupt is handed on to it once, whoever it was sent to, so that it can
     write what it keeps.
@@ -41,8 +42,18 @@ def run_command(command: str, problem: Callable[[], str], *arguments: str) -> No
             child.send_signal(signal.SIGINT)
             _end(child)
             raise SystemExit(INTERRUPTED) from None
+    if status < 0:
+        fail(command, _ended_by(-status, arguments[0]))
     if status:
         raise SystemExit(status)
+
+
+def _ended_by(number: int, command: str) -> str:
+    reason = ", as the system does when memory runs out" if number == signal.SIGKILL else ""
+    return (
+        f"`embomatrix {command}` was ended from outside by signal {number} ({signal.strsignal(number)}){reason}: "
+        "what it had saved is kept, give the same command again"
+    )
 
 
 def cluster_problem(cluster: LocalCluster) -> str:

@@ -1,0 +1,43 @@
+"""A command that another one runs: its failure is told, also where it could say nothing itself."""
+
+import pytest
+
+from embomatrix.cli import foreground
+from embomatrix.cli.foreground import no_problem, run_command
+
+
+def leave_by(monkeypatch, script):
+    monkeypatch.setattr(foreground, "embomatrix_command", lambda *_: ["sh", "-c", script])
+
+
+@pytest.mark.parametrize(
+    ("number", "told"),
+    [
+        (
+            9,
+            "signal 9 (Killed), as the system does when memory runs out: what it had saved is kept, give the",
+        ),
+        (15, "signal 15 (Terminated): what it had saved is kept"),
+    ],
+)
+def test_a_command_that_a_signal_ended_is_told(monkeypatch, capsys, number, told):
+    leave_by(monkeypatch, f"kill -{number} $$")
+    with pytest.raises(SystemExit) as left:
+        run_command("experiment", no_problem, "train", "--seed=0")
+    assert left.value.code == 2
+    said = capsys.readouterr().err
+    assert "embomatrix experiment: `embomatrix train` was ended from outside by" in said
+    assert told in said
+
+
+def test_a_command_that_failed_has_told_why_and_its_status_is_ours(monkeypatch, capsys):
+    leave_by(monkeypatch, "exit 7")
+    with pytest.raises(SystemExit) as left:
+        run_command("experiment", no_problem, "train")
+    assert left.value.code == 7
+    assert capsys.readouterr().err == ""
+
+
+def test_a_command_that_succeeds_is_gone_on_from(monkeypatch):
+    leave_by(monkeypatch, "exit 0")
+    run_command("experiment", no_problem, "train")
