@@ -6,6 +6,7 @@ import contextlib
 import numpy as np
 import psutil
 from tests.fakes.manager import FakeManager, serving
+from tests.fakes.real_cluster import until
 from tests.fakes.simulation import PROGRAM
 from tests.unit.worker.test_slots import running
 
@@ -36,12 +37,6 @@ async def watched(folder):
             yield harness, machine
         finally:
             watch.cancel()
-
-
-async def until(condition, limit_s=30.0):
-    async with asyncio.timeout(limit_s):
-        while not condition():  # noqa: ASYNC110  # what is watched belongs to the daemon
-            await asyncio.sleep(0.01)
 
 
 def warm(harness):

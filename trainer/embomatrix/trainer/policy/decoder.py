@@ -250,14 +250,13 @@ class Decoder(nn.Module):
         pointers = self.point_to(self.norm(x))
         return PromptMemory(tuple(memories), tokens, hidden, lengths, x[:, -1:], pointers)
 
-    def extend(
-        self, prompt: PromptMemory, tokens: Tensor, written: Written | None, start: int
-    ) -> tuple[Tensor, Written]:
-        """Hidden states (Q * G, T, C) of tokens (Q * G, T) that stand ``start`` tokens after their prompts.
+    def extend(self, prompt: PromptMemory, tokens: Tensor, written: Written | None) -> tuple[Tensor, Written]:
+        """Hidden states (Q * G, T, C) of tokens (Q * G, T) that follow what is ``written`` after their prompts.
 
         ``written`` is what ``extend`` gave for the samples' own earlier tokens, None at the first.
         """
         rows, length = tokens.shape
+        start = written.tokens.shape[1] if written else 0
         group = rows // prompt.lengths.shape[0]
         begin = prompt.lengths.repeat_interleave(group)[:, None] + start
         rope = self._rope(begin + torch.arange(length, device=tokens.device))

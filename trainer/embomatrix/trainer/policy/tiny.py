@@ -36,7 +36,7 @@ _LENGTH_CLASSES = 4
 NETWORK = 2
 """Version of the network: weights of another one mean something else."""
 _UNLIKELY = -80.0
-"""Log-probabilities below this add nothing to an entropy, and their exponentials take twenty times as long."""
+"""Log-probabilities below this add nothing to an entropy, and their exponentials take ten times as long."""
 _WEIGHTS = "weights.pt"
 _DESCRIPTION = "tiny.json"
 
@@ -151,7 +151,7 @@ class TinyPolicy:
                     break
                 if len(kept) <= _COMPACT_SHARE * len(writing.going):
                     writing, choice = writing.of_rows(kept), choice[kept]
-                state, own = self.network.extend(writing.memory, choice[:, None], writing.own, at)
+                state, own = self.network.extend(writing.memory, choice[:, None], writing.own)
                 writing = replace(writing, own=own)
         drawn = tokens[:, :length]
         texts = tuple(self.vocabulary.decode(row) for row in drawn.tolist())
@@ -194,7 +194,7 @@ class TinyPolicy:
         """Log-probability and entropy (rows, T) of each token (rows, T), where ``barred`` words (rows, T, V) get none."""
         states, written = memory.last, None  # (rows, 1, C)
         if tokens.shape[1] > 1:
-            rest, written = self.network.extend(memory, tokens[:, :-1], None, 0)
+            rest, written = self.network.extend(memory, tokens[:, :-1], None)
             states = torch.cat([states, rest], dim=1)  # (rows, T, C)
         scores = torch.log_softmax(
             self.network.scores(states, memory, written, barred) / (temperature or 1.0), dim=-1
