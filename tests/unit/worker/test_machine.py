@@ -137,6 +137,31 @@ def test_groups_of_the_first_version_count_too(tmp_path):
     assert find_limits(mount, membership) == Limits(1.5, 1024.0)
 
 
+@pytest.mark.parametrize(
+    ("membership", "files"),
+    [
+        (
+            "0::/w\n",
+            {"memory__max": str(1 << 30), "memory__current": str(3 << 28), "memory__stat": "inactive_file"},
+        ),
+        (
+            "5:memory:/w\n",
+            {
+                "memory__limit_in_bytes": str(1 << 30),
+                "memory__usage_in_bytes": str(3 << 28),
+                "memory__stat": "total_inactive_file",
+            },
+        ),
+    ],
+)
+def test_files_that_were_read_long_ago_leave_their_memory_to_others(tmp_path, membership, files):
+    (tmp_path / "membership").write_text(membership)
+    account = f"anon 5\n{files['memory__stat']} {1 << 28}\nfile 7"
+    group = "w" if membership.startswith("0") else "memory/w"
+    _group(tmp_path / "cgroup", group, **files | {"memory__stat": account})
+    assert find_limits(tmp_path / "cgroup", tmp_path / "membership").memory_mb == 512.0
+
+
 def test_without_groups_nothing_is_limited(tmp_path):
     assert find_limits(tmp_path, tmp_path / "none") == Limits()
 
