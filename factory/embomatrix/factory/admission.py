@@ -1,7 +1,8 @@
 """Admission: a task enters a data set only when the simulator says so.
 
 Its goal must not hold at the start, at most half of its atoms may (in a benchmark of others, more), and the oracle planner must
-find a plan that earns full success when it is executed. What is turned away is a value with a reason.
+find a plan that earns full success when it is executed; where asked for, also by a robot in stepped physics. What is turned
+away is a value with a reason.
 """
 
 from __future__ import annotations
@@ -57,10 +58,12 @@ def admit(
     init: Sequence[Literal] = (),
     *,
     most_held: float = MOST_HELD,
+    physics: Stage | None = None,
 ) -> Admitted | Refusal:
     """Judge a task by execution. ``init`` are atoms that must hold at the start, as the task's source says.
 
-    No more than the share ``most_held`` of the goal's atoms may hold then; 1: all but one.
+    No more than the share ``most_held`` of the goal's atoms may hold then; 1: all but one. In ``physics``, where there is one,
+    the plan found must reach the goal as well.
     """
     stage.execute(task, (), SEED)
     for literal in init:
@@ -84,4 +87,17 @@ def admit(
     if trace.failure is not None or not reward.success:
         last = trace.steps[-1].message if trace.steps else "it is empty"
         return Refusal(RefusalReason.ORACLE_FAILED, f"the oracle's plan earns {reward.total:.1f}: {last}")
+    against = objection(physics, task, plan) if physics is not None else ""
+    if against:
+        return Refusal(RefusalReason.PHYSICS_FAILED, f"the oracle's plan fails in stepped physics: {against}")
     return Admitted(plan, held)
+
+
+def objection(stage: Stage, task: Task, plan: Plan) -> str:
+    """What speaks against a plan when it is executed on a stage; empty where it reaches the goal."""
+    trace = stage.execute(task, plan, SEED)
+    if trace.failure is None:
+        reached = score(task, trace.touched, stage.facts).success
+        return "" if reached else "goal_missed: every step succeeds, and the goal does not hold in the end"
+    last = trace.steps[-1]
+    return f"{last.failure}: step {len(trace.steps)}, {last.call.skill}: {last.message}"

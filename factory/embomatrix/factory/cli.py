@@ -78,7 +78,13 @@ LookAhead = Annotated[
         help="Find out what the robot's arm can do in each scene, so that rollouts promise no more: three quarters of the time."
     ),
 ]
-
+Physical = Annotated[
+    bool | None,
+    typer.Option(
+        "--physical/--no-physical",
+        help="Have a robot carry each plan out in stepped physics before its task is admitted. Default: with --look-ahead.",
+    ),
+]
 
 SocialLlm = Annotated[
     str,
@@ -107,6 +113,7 @@ def build(
     scenes: Scenes = None,
     jobs: Jobs = None,
     look_ahead: LookAhead = True,
+    physical: Physical = None,
     forms: Forms = None,
     llm: Llm = "",
     model: Model = "",
@@ -118,7 +125,13 @@ def build(
     if (llm or cassette) and not modelled:
         fail("--llm and --cassette are for layout agents here: say which, as --agent room-organizer=llm")
     settings = BuildSettings(
-        train, heldout, seed, scene_ids(scenes), look_ahead=look_ahead, modelled=tuple(sorted(modelled))
+        train,
+        heldout,
+        seed,
+        scene_ids(scenes),
+        look_ahead=look_ahead,
+        physical=look_ahead if physical is None else physical,
+        modelled=tuple(sorted(modelled)),
     )
     with contextlib.ExitStack() as stack:
         stack.enter_context(mended(out))
@@ -135,6 +148,7 @@ def generate(
     scenes: Scenes = None,
     jobs: Jobs = None,
     look_ahead: LookAhead = True,
+    physical: Physical = None,
     forms: Forms = None,
     llm: SocialLlm = "",
     model: Model = "",
@@ -154,7 +168,8 @@ def generate(
         fail("--look shows scenes to a language model: give --llm URL and --model NAME, or --cassette FILE")
     modelled = modelled_names(forms or [])
     told = sorted([*modelled, *[SCENE_EXTRACTOR] * look])
-    settings = BuildSettings(tasks, heldout, seed, scene_ids(scenes), kind, look_ahead, tuple(told))
+    proof = look_ahead if physical is None else physical
+    settings = BuildSettings(tasks, heldout, seed, scene_ids(scenes), kind, look_ahead, proof, tuple(told))
     with contextlib.ExitStack() as stack:
         stack.enter_context(mended(out))
         check = _second_judge(stack, manager, token, ca)

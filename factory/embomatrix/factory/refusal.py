@@ -26,6 +26,7 @@ class RefusalReason(StrEnum):
     MOSTLY_DONE = "mostly_done"
     NO_PLAN = "no_plan"
     ORACLE_FAILED = "oracle_failed"
+    PHYSICS_FAILED = "physics_failed"
 
 
 @dataclass(frozen=True, slots=True)

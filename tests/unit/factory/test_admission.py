@@ -49,6 +49,19 @@ class Boxes:
         return Trace(plan, tuple(steps), frozenset(self._open), (), "")
 
 
+class Stuck(Boxes):
+    """Boxes that a robot can't get open; it may take them to be open all the same."""
+
+    def __init__(self, *, says_so: bool = True) -> None:
+        super().__init__()
+        self._failure = FailureReason.ARM_BLOCKED if says_so else None
+
+    def execute(self, task: Task, plan: Plan, seed: int) -> Trace:
+        self._open = set()
+        steps = tuple(Step(call, self._failure, "box_2 bars it") for call in plan[:1])
+        return Trace(plan, steps, frozenset(), (), "")
+
+
 def oracle(*plan: SkillCall):
     return lambda _stage, _task: plan
 
@@ -91,6 +104,19 @@ def test_task_is_turned_away_for_one_reason(
     assert isinstance(verdict, Refusal)
     assert verdict.reason is reason
     assert len(verdict.sentence) > 20
+
+
+def test_plan_that_a_robot_can_not_carry_out_in_physics_is_turned_away_with_what_stopped_it() -> None:
+    goal = task("(open box_1)")
+    assert isinstance(admit(Boxes(), goal, oracle(OPEN_1), physics=Boxes()), Admitted)
+    verdict = admit(Boxes(), goal, oracle(OPEN_1), physics=Stuck())
+    assert verdict == Refusal(
+        RefusalReason.PHYSICS_FAILED,
+        "the oracle's plan fails in stepped physics: arm_blocked: step 1, open: box_2 bars it",
+    )
+    unmoved = admit(Boxes(), goal, oracle(OPEN_1), physics=Stuck(says_so=False))
+    assert isinstance(unmoved, Refusal)
+    assert "the goal does not hold in the end" in unmoved.sentence
 
 
 def test_planner_s_own_reason_is_passed_on() -> None:

@@ -36,7 +36,8 @@ from embomatrix.world.dataset import Dataset, DatasetError
 from embomatrix.world.scene import Room, Scene
 from embomatrix.world.task import TaskCategory
 
-SETTINGS = BuildSettings(train=8, heldout=4, seed=0, scenes=("Rs_int", "Wainscott_0_int"), look_ahead=False)
+QUICK = {"look_ahead": False, "physical": False}
+SETTINGS = BuildSettings(train=8, heldout=4, seed=0, scenes=("Rs_int", "Wainscott_0_int"), **QUICK)
 
 BDDL = """(define (problem Put_the_apple_in_the_fridge)
     (:domain omnigibson)
@@ -183,7 +184,7 @@ def _things_in(nodes: Iterable[dict[str, dict[str, Any]]]) -> set[str]:
 
 def test_who_lays_things_out_is_chosen_and_is_part_of_the_settings(tmp_path: Path) -> None:
     settings = BuildSettings(
-        train=1, heldout=0, seed=4, scenes=("Rs_int",), look_ahead=False, modelled=("room-organizer",)
+        train=1, heldout=0, seed=4, scenes=("Rs_int",), modelled=("room-organizer",), **QUICK
     )
     asked: list[str] = []
 
@@ -217,7 +218,7 @@ def test_a_ledger_that_lost_its_end_is_whole_again_when_the_build_is_taken_up(
 
 
 def test_a_build_that_trains_on_nothing_holds_every_room_out(tmp_path: Path) -> None:
-    settings = BuildSettings(train=0, heldout=0, scenes=("Rs_int",), look_ahead=False)
+    settings = BuildSettings(train=0, heldout=0, scenes=("Rs_int",), **QUICK)
     rooms = build_dataset(tmp_path, settings).rooms
     assert rooms["train"] == {"Rs_int": ()}
     assert set(rooms["heldout"]["Rs_int"]) == {room.name for room in build_base_scene("Rs_int").rooms}
@@ -231,7 +232,7 @@ def test_scenes_without_a_room_to_hold_out_are_refused_before_anything_is_writte
 
 
 def test_what_a_second_judge_refuses_is_not_kept(tmp_path: Path) -> None:
-    settings = BuildSettings(train=2, heldout=0, seed=4, scenes=("Rs_int",), look_ahead=False)
+    settings = BuildSettings(train=2, heldout=0, seed=4, scenes=("Rs_int",), **QUICK)
     asked: list[str] = []
 
     def strict(made: VariantYield) -> VariantYield:
@@ -344,7 +345,7 @@ def test_unknown_names_are_one_sentence_and_exit_2(
 
 def test_tasks_of_conversations_are_verified_and_their_transcripts_kept(tmp_path):
     settings = BuildSettings(
-        train=4, heldout=0, seed=1, scenes=("Rs_int",), writer=WriterKind.SOCIAL, look_ahead=False
+        train=4, heldout=0, seed=1, scenes=("Rs_int",), writer=WriterKind.SOCIAL, **QUICK
     )
     summary = build_dataset(tmp_path, settings)
     dataset = Dataset.load(tmp_path)

@@ -48,6 +48,7 @@ def evaluate_admissions(folder: Path) -> Evaluation:
         "dataset": folder.name,
         "scenes": len({each["scene"].split("-")[0] for each in attempts}),
         "look ahead": "yes" if settings["look_ahead"] else "no",
+        "in physics": "yes" if settings["physical"] else "no",
     }
     return Evaluation(
         "admission", conditions, figures, (f"Against drafts{f' of {label}' if label else ''}: {told}.",)
@@ -100,7 +101,7 @@ def _settings(folder: Path) -> dict[str, Any]:
     try:
         with path.open(encoding="utf-8") as file:
             value = json.loads(file.readline())["settings"]
-        return {"writer": value["writer"], "look_ahead": value["look_ahead"]}
+        return {name: value[name] for name in ("writer", "look_ahead", "physical")}
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise EvaluationError(
             f"{path} does not tell the settings of a build ({error}): name a folder that `factory build`, `generate` or "

@@ -50,15 +50,16 @@ class CorpusSettings:
     scenes: tuple[str, ...] = ()
     unseen: tuple[str, ...] = HELDOUT_SCENES
     look_ahead: bool = True
+    physical: bool = True
 
     def builds(self) -> dict[str, BuildSettings]:
         """The builds of the corpus by folder."""
         away = round(self.heldout * UNSEEN_SHARE)
         scenes = self.scenes or training_scenes()
-        social = WriterKind.SOCIAL
+        how = (WriterKind.SOCIAL, self.look_ahead, self.physical)
         return {
-            TRAIN: BuildSettings(self.train, self.heldout - away, self.seed, scenes, social, self.look_ahead),
-            UNSEEN: BuildSettings(0, away, self.seed, self.unseen, social, self.look_ahead),
+            TRAIN: BuildSettings(self.train, self.heldout - away, self.seed, scenes, *how),
+            UNSEEN: BuildSettings(0, away, self.seed, self.unseen, *how),
         }
 
 

@@ -35,6 +35,13 @@ def corpus(
     ] = None,
     jobs: Annotated[int | None, typer.Option(min=1, help="Processes.")] = None,
     look_ahead: Annotated[bool, typer.Option(help="Find out what the arm can do in each scene.")] = True,
+    physical: Annotated[
+        bool | None,
+        typer.Option(
+            "--physical/--no-physical",
+            help="Have a robot carry each plan out in stepped physics before its task is admitted. Default: with --look-ahead.",
+        ),
+    ] = None,
     check: Annotated[
         bool, typer.Option("--check", help="Make nothing: tell whether the corpus is as it was frozen.")
     ] = False,
@@ -47,7 +54,8 @@ def corpus(
             frozen = check_frozen(out)
         else:
             chosen, others = tuple(scenes or ()), tuple(unseen or HELDOUT_SCENES)
-            settings = CorpusSettings(train, heldout, seed, chosen, others, look_ahead)
+            proof = look_ahead if physical is None else physical
+            settings = CorpusSettings(train, heldout, seed, chosen, others, look_ahead, proof)
             _make(console, out, settings, jobs or min(MOST_JOBS, len(os.sched_getaffinity(0))))
             frozen = freeze(out)
     console.print(

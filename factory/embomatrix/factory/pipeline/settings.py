@@ -30,6 +30,8 @@ class BuildSettings:
     writer: WriterKind = WriterKind.PLAIN
     look_ahead: bool = True
     """Whether to find out what the arm can do in each variant: about 12 s of CPU for one."""
+    physical: bool = True
+    """Whether a robot must carry each plan out in stepped physics before its task is admitted: about 1 s of CPU for one."""
     modelled: tuple[str, ...] = ()
     """Agents that are a language model besides the writer's, by name: those of the layout, and what looks at scenes."""
 

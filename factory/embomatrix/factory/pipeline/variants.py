@@ -22,6 +22,7 @@ from embomatrix.factory.writer.tasks import PlainWriter, is_heldout_signature
 from embomatrix.factory.writer.variant import Variant, build_variant
 from embomatrix.factory.writer.view import SceneView
 from embomatrix.sim.executor import Simulator
+from embomatrix.sim.physical.actor import physical_simulator
 from embomatrix.sim.physical.survey import Foresight
 from embomatrix.sim.planner.oracle import find_plan
 from embomatrix.sim.pose_cache import PlacementLibrary
@@ -154,6 +155,7 @@ class _VariantJob:
         self._writer = bench.writer
         self._library = bench.library
         self._foresight = bench.foresight
+        self._physical = bench.settings.physical
         self._known = set(order.known)
         self._admitted: list[tuple[Draft, Plan]] = []
         self._rejections: list[Rejection] = []
@@ -163,16 +165,23 @@ class _VariantJob:
         missing = self._order.missing
         scene = self._variant.scene
         with SceneSurvey(scene, self._foresight) as survey:
-            with Rehearsal(scene, survey.bars) as robot:
-                drafts = self._write(missing, SceneView(scene, robot), rng)
+            with Rehearsal(scene, survey.bars) as rehearsal:
+                drafts = self._write(missing, SceneView(scene, rehearsal), rng)
             needs = [Needs(draft.about, draft.task.table) for draft in drafts]
             poses = cache_poses(SceneView(scene), needs, self._library, survey, self._seed)
         left = dict(missing)
-        with contextlib.closing(Simulator(Bundle(scene, {}, poses))) as stage:
+        bundle = Bundle(scene, {}, poses)
+        with contextlib.ExitStack() as stack:
+            stage = stack.enter_context(contextlib.closing(Simulator(bundle)))
+            robot = (
+                stack.enter_context(contextlib.closing(physical_simulator(bundle)))
+                if self._physical
+                else None
+            )
             for draft in drafts:
                 if len(self._admitted) == TASKS_EACH:
                     break
-                if left[draft.task.category] > 0 and self._judge(stage, draft):
+                if left[draft.task.category] > 0 and self._judge(stage, robot, draft):
                     left[draft.task.category] -= 1
             tasks = {draft.task.task_id: draft.task for draft, _ in self._admitted}
             data = encode_bundle(prepare(Bundle(scene, tasks, poses), stage.world))
@@ -220,8 +229,8 @@ class _VariantJob:
         mine = is_heldout_signature(draft.signature, self._seed) is (self._order.split == "heldout")
         return mine and key not in self._known
 
-    def _judge(self, stage: Simulator, draft: Draft) -> bool:
-        verdict = admit(stage, draft.task, find_plan)
+    def _judge(self, stage: Simulator, robot: Simulator | None, draft: Draft) -> bool:
+        verdict = admit(stage, draft.task, find_plan, physics=robot)
         if isinstance(verdict, Admitted):
             self._admitted.append((draft, verdict.plan))
             return True

@@ -16,9 +16,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.factory.admission import SEED, Admitted, admit
+from embomatrix.factory.admission import SEED, Admitted, admit, objection
 from embomatrix.factory.task_import.batch import most_held_in
-from embomatrix.reward.hierarchy import score
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.physical.actor import physical_simulator
 from embomatrix.sim.planner.oracle import find_plan
@@ -29,7 +28,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
-    from embomatrix.skills.trace import Trace
     from embomatrix.world.bundle import Bundle
     from embomatrix.world.dataset import TaskRecord
 
@@ -159,14 +157,4 @@ def _physical(bundle: Bundle, record: TaskRecord) -> str:
     """What is against the dataset's plan when a robot carries it out in physics; empty where it reaches the goal."""
     plan = plan_from_json(list(record.oracle), record.task.profile)
     with contextlib.closing(physical_simulator(bundle)) as stage:
-        trace = stage.execute(record.task, plan, SEED)
-        if trace.failure is None and score(record.task, trace.touched, stage.facts).success:
-            return SUCCESS
-        return _objection(trace)
-
-
-def _objection(trace: Trace) -> str:
-    last = trace.steps[-1]
-    if last.failure is None:
-        return "goal_missed: every step succeeds, and the goal does not hold in the end"
-    return f"{last.failure}: step {len(trace.steps)}, {last.call.skill}: {last.message}"
+        return objection(stage, record.task, plan)
