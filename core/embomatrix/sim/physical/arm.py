@@ -148,6 +148,12 @@ def _about_z_then_tilted(angles: FloatArray) -> FloatArray:
     return found
 
 
+def strain(angles: FloatArray) -> FloatArray:
+    """How far joints, (n, 7), are from the middle of their travel, (n,)."""
+    middle, half = (HIGH_RAD + LOW_RAD) / 2, (HIGH_RAD - LOW_RAD) / 2
+    return np.asarray((((angles - middle) / half) ** 4).sum(axis=1))
+
+
 def about_z(angles: FloatArray) -> FloatArray:
     """Rotations about z, shape (n, 3, 3)."""
     found = np.zeros((len(angles), 3, 3))

@@ -14,7 +14,7 @@ import numpy as np
 
 from embomatrix.sim.physical import arm, body
 from embomatrix.sim.physical.roadmap import way_between
-from embomatrix.sim.physical.space import Boxes, strikes, struck
+from embomatrix.sim.physical.space import Boxes, Struck, struck
 from embomatrix.sim.robot_dimensions import LIFT_M, SHOULDER_LOW_M
 from embomatrix.world.geometry import Pose
 
@@ -41,6 +41,8 @@ RANK: Final = 0.2
 """What a place further down the list of tracks weighs against the strain of joints."""
 FOLLOWED: Final = 40
 """Solutions whose ways are worked out at once: one way costs nearly as much as many do."""
+LOTS: Final = (0, 4, FOLLOWED)
+"""Of those, the first few are compared with what is around before the others: they often do."""
 OFFERED: Final = 3
 """Ways of one batch that are offered."""
 BATCH: Final = 12
@@ -130,15 +132,12 @@ class Reach:
         self._standing = boxes.without(("floor",))
         self._at_work = at_work
         self._held = held
-        self._struck: tuple[Boxes, FloatArray, FloatArray, float] | None = None
+        self._struck: Struck | None = None
 
     @property
     def hindrance(self) -> str:
         """Owner of the box that barred the last way that was not free; "" when none did."""
-        if self._struck is None:
-            return ""
-        number = int(strikes(*self._struck)[0])
-        return self._struck[0].owners[number] if number >= 0 else ""
+        return self._struck.owner if self._struck is not None else ""
 
     def ways(self, tracks: Iterable[Track], places: Sequence[FloatArray]) -> Iterator[Way]:
         """Free ways along any of the tracks, the preferred tracks first, from any base of groups of them, (b, 3) each.
@@ -205,7 +204,7 @@ class Reach:
         rows, branches = np.nonzero(~np.isnan(found[:, :, -1]))
         if not len(rows):
             return []
-        comfort = _strain(found[rows, branches]) + RANK * track[rows]
+        comfort = arm.strain(found[rows, branches][:, body.ARM]) + RANK * track[rows]
         for fore, end in itertools.pairwise(LOOKED_AT):
             best = _best_of_each(base[rows], comfort, _share(fore, bases), _share(end, bases))
             some = best[self._free(found[rows[best], branches[best]], self._at_work, None, TOUCH_M)]
@@ -230,42 +229,76 @@ class Reach:
         for start in range(0, len(tracks), FOLLOWED):
             some = slice(start, start + FOLLOWED)
             followed = _followed(tracks[some], *(values[some] for values in starts))
-            for number, track, postures in zip(numbers[some], tracks[some], followed, strict=True):
-                if postures is None or any(_alike(postures[0], way.postures[0]) for way in ways):
-                    continue
-                if self._passes(track, postures):
-                    ways.append(Way(postures, number, track))
-                    if len(ways) == OFFERED:
-                        return ways
+            found = [
+                Way(postures, number, track)
+                for number, track, postures in zip(numbers[some], tracks[some], followed, strict=True)
+                if postures is not None
+            ]
+            for first, last in itertools.pairwise(LOTS):
+                self._choose(found[first:last], ways)
+                if len(ways) == OFFERED:
+                    return ways
         return ways
 
-    def _passes(self, track: Track, postures: FloatArray) -> bool:
-        trunk, radii = body.trunk_balls(postures[:1])
-        if struck(self._standing, trunk, radii, TOUCH_M)[0]:
-            return False
-        for mask, held in ((~track.loaded, None), (track.loaded, self._held)):
-            if mask.any() and not self._free(postures[mask], self._at_work, held, TOUCH_M).all():
-                return False
-        return self._also is None or self._also(postures)
+    def _choose(self, offered: Sequence[Way], ways: list[Way]) -> None:
+        """Add to some ways the free ones of others that are unlike them, until there are enough."""
+        unlike = [way for way in offered if not _is_known(way, ways)]
+        if not unlike:
+            return
+        for way, (free, hit) in zip(unlike, self._looked_at(unlike), strict=True):
+            if _is_known(way, ways):
+                continue
+            if free and (self._also is None or self._also(way.postures)):
+                ways.append(way)
+                if len(ways) == OFFERED:
+                    return
+            self._struck = hit or self._struck
+
+    def _looked_at(self, ways: Sequence[Way]) -> list[tuple[bool, Struck | None]]:
+        """Whether ways are free, and what bars those that aren't as far as it isn't the robot itself."""
+        postures = np.concatenate([way.postures for way in ways])
+        loaded = np.concatenate([way.track.loaded for way in ways])
+        number = np.repeat(np.arange(len(ways)), [len(way.postures) for way in ways])
+        trunk, trunk_radii = body.trunk_balls(np.stack([way.postures[0] for way in ways]))
+        free = ~struck(self._standing, trunk, trunk_radii, TOUCH_M)
+        hits: list[Struck | None] = [None] * len(ways)
+        for mask, held in ((~loaded, None), (loaded, self._held)):
+            rows = np.flatnonzero(mask & free[number])
+            if not len(rows):
+                continue
+            clear, seen = self._compared(postures[rows], self._at_work, held, TOUCH_M)
+            if seen is not None:
+                hit = np.flatnonzero(seen.rows)
+                for way, row in zip(*np.unique(number[rows[hit]], return_index=True), strict=True):
+                    hits[way] = seen.only(hit[row])
+            free[number[rows[~clear]]] = False
+        return list(zip(free.tolist(), hits, strict=True))
 
     def _free(self, postures: FloatArray, boxes: Boxes, held: Held | None, margin_m: float) -> BoolArray:
         """Whether arm and load keep a margin from the boxes and from the robot's own trunk, shape (n,)."""
         if not len(postures):
             return np.zeros(0, dtype=np.bool_)
+        free, seen = self._compared(postures, boxes, held, margin_m)
+        if seen is not None:
+            self._struck = seen.only(int(seen.rows.argmax()))
+        return free
+
+    def _compared(
+        self, postures: FloatArray, boxes: Boxes, held: Held | None, margin_m: float
+    ) -> tuple[BoolArray, Struck | None]:
+        """As ``_free`` of at least one posture, with those that boxes bar, if there are any."""
         centres, radii = body.balls(postures), body.RADII
         if held is not None:
             centres = np.concatenate([centres, held.placed(postures)], axis=1)
             radii = np.concatenate([radii, held.radii])
         widest = float(radii.max()) + 0.05
         close = boxes.near(centres.min(axis=(0, 1)) - widest, centres.max(axis=(0, 1)) + widest)
-        free = ~struck(close, centres, radii, margin_m)
-        if not free.all():
-            first = int(free.argmin())
-            self._struck = close, centres[first : first + 1], radii, margin_m
+        barred = struck(close, centres, radii, margin_m)
+        free = ~barred
         free[free] = ~body.strikes_itself(postures[free], centres[free], radii)
         if held is not None and held.up is not None:
             free[free] = held.is_level(postures[free])
-        return np.asarray(free)
+        return np.asarray(free), Struck(close, centres, radii, margin_m, barred) if barred.any() else None
 
 
 def _share(most: int, bases: FloatArray) -> int:
@@ -279,6 +312,11 @@ def _best_of_each(base: FloatArray, cost: FloatArray, first: int, end: int) -> F
     kept = [order[base[order] == number][first:end] for number in np.unique(base)]
     chosen = np.concatenate(kept)
     return np.asarray(chosen[np.argsort(cost[chosen], kind="stable")])
+
+
+def _is_known(way: Way, ways: Iterable[Way]) -> bool:
+    """Whether a way begins like one of others."""
+    return any(_alike(way.postures[0], other.postures[0]) for other in ways)
 
 
 def _alike(one: FloatArray, other: FloatArray) -> bool:
@@ -328,12 +366,6 @@ def _followed(
         else part
         for part in parts
     ]
-
-
-def _strain(postures: FloatArray) -> FloatArray:
-    """How far the arm is from the middle of its travel, (n,)."""
-    middle, half = (arm.HIGH_RAD + arm.LOW_RAD) / 2, (arm.HIGH_RAD - arm.LOW_RAD) / 2
-    return np.asarray((((postures[:, 4:] - middle) / half) ** 4).sum(axis=1))
 
 
 def _drawn(start: FloatArray, count: int, *, level: bool) -> FloatArray:

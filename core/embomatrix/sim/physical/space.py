@@ -110,6 +110,28 @@ class Boxes:
         return outside
 
 
+@dataclass(frozen=True, slots=True)
+class Struck:
+    """Sets of balls, centres (n, b, 3) and radii (b,), among boxes. ``rows``, (n,): those that come nearer than a margin."""
+
+    boxes: Boxes
+    balls: FloatArray
+    radii: FloatArray
+    margin_m: float
+    rows: BoolArray
+
+    def only(self, row: int) -> Struck:
+        """One of the sets."""
+        one = slice(row, row + 1)
+        return Struck(self.boxes, self.balls[one], self.radii, self.margin_m, self.rows[one])
+
+    @property
+    def owner(self) -> str:
+        """Whose box the first set is deepest in; "" for none."""
+        number = int(strikes(self.boxes, self.balls, self.radii, self.margin_m)[0])
+        return self.boxes.owners[number] if number >= 0 else ""
+
+
 def boxes_around(engine: PhysicsEngine, low: tuple[float, float], high: tuple[float, float]) -> Boxes:
     """Parts of all objects, and the walls, over a rectangle of the floor, with doors and drawers as they are."""
     scene = engine.scene
