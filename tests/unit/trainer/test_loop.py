@@ -19,6 +19,7 @@ from embomatrix.trainer.recorder import read_metrics
 from embomatrix.trainer.report import success_rows, time_rows
 from embomatrix.trainer.rollout import Gateway
 from embomatrix.trainer.settings import OnLost, read_settings
+from embomatrix.trainer.stopwatch import Activity
 from embomatrix.trainer.telling import Teller
 
 TINY = {"tiny.layers": 2, "tiny.width": 32, "tiny.heads": 2, "tiny.inner": 64}
@@ -36,6 +37,7 @@ SHORT = {
     "samples_every": 1,
 }
 TASKS = make_tasks(10, 4, objects=10)
+SAMPLING, WAITING, UPDATE = Activity.SAMPLING, Activity.WAITING, Activity.UPDATE
 
 
 @pytest.fixture(autouse=True)
@@ -137,7 +139,7 @@ def test_a_group_with_a_lost_rollout_is_left_out_of_the_update(tmp_path):
     assert not torch.equal(weights(moved), weights(reference))
 
 
-def test_a_cluster_that_fails_ends_the_run_with_a_checkpoint(tmp_path):
+def test_a_step_that_is_broken_off_leaves_nothing_behind_and_is_taken_again_after_a_resume(tmp_path):
     class Failing(SymbolicCluster):
         async def execute(self, batch):
             if batch.batch_id.startswith("step-4"):
@@ -147,10 +149,16 @@ def test_a_cluster_that_fails_ends_the_run_with_a_checkpoint(tmp_path):
             async for result in super().execute(batch):
                 yield result
 
+    _, whole = run(tmp_path / "whole", grpo__chunk=4)
     with pytest.raises(TrainerError, match="queue is full"):
-        run(tmp_path, Failing(TASKS))
-    progress, _ = read_state(CheckpointStore(tmp_path / CHECKPOINTS, keep=9).latest())
-    assert progress.step in (3, 4)
+        run(tmp_path / "broken", Failing(TASKS), grpo__chunk=4)
+    progress, _ = read_state(CheckpointStore(tmp_path / "broken" / CHECKPOINTS, keep=9).latest())
+    assert progress.step == 3
+    in_steps = sum(progress.spent_s.get(what, 0.0) for what in (SAMPLING, WAITING, UPDATE))
+    assert in_steps <= progress.grpo_s
+    _, resumed = run(tmp_path / "broken", resume=True)
+    assert torch.equal(weights(whole), weights(resumed))
+    assert without_time(read_metrics(tmp_path / "whole")) == without_time(read_metrics(tmp_path / "broken"))
 
 
 def test_a_live_display_draws_every_phase(tmp_path):

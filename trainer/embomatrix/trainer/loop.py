@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import logging
 import os
@@ -26,7 +27,7 @@ from embomatrix.trainer.update import StepPlan, Updater
 from embomatrix.trainer.warm_up import warm_up
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
     from typing import Any
 
@@ -163,26 +164,39 @@ class TrainingRun:
         while (share := self._share()) < 1.0:
             began_s = time.monotonic()
             self._announce(schedule, reserve, progress.step)
-            progress.step += 1
-            record, logs = updater.take_step(self._plan(schedule, reserve, share))
+            with self._whole_step():
+                record, logs = updater.take_step(self._plan(schedule, reserve, share))
             seconds = time.monotonic() - began_s
+            progress.step = record.step
             progress.cursor, progress.reserve_cursor = schedule.cursor, reserve.cursor
             progress.grpo_s += seconds
             self._note(record, logs, seconds)
             if progress.step % self._settings.checkpoint_every == 0:
                 self._save(updater)
 
+    @contextlib.contextmanager
+    def _whole_step(self) -> Iterator[None]:
+        """A step that is broken off is taken again after a resume: it leaves neither draws nor seconds behind."""
+        drawn = self._generator.get_state()
+        try:
+            with self._stopwatch.whole():
+                yield
+        except BaseException:
+            self._generator.set_state(drawn)
+            raise
+
     def _plan(self, schedule: Schedule, reserve: Schedule, share: float) -> StepPlan:
         settings = self._settings.grpo
         end = settings.relevance if settings.relevance_final is None else settings.relevance_final
+        step = self._progress.step + 1
         return StepPlan(
-            step=self._progress.step,
+            step=step,
             tasks=schedule.take(settings.tasks_per_step),
             upcoming=schedule.peek(settings.tasks_per_step),
             reserve=reserve.take(settings.reserve),
             rng=self._rng,
             generator=self._generator,
-            rate_factor=self._rate_factor(share),
+            rate_factor=self._rate_factor(step, share),
             relevance=settings.relevance + (end - settings.relevance) * share,
         )
 
@@ -196,10 +210,10 @@ class TrainingRun:
             return self._progress.step / settings.steps if settings.steps else 1.0
         return min(1.0, self._progress.grpo_s / (60 * settings.minutes)) if settings.minutes else 1.0
 
-    def _rate_factor(self, share: float) -> float:
+    def _rate_factor(self, step: int, share: float) -> float:
         """Of the learning rate: a linear rise over the warm-up, then a linear fall with the budget."""
         settings = self._settings.grpo
-        rise = min(1.0, self._progress.step / (settings.warmup_steps + 1))
+        rise = min(1.0, step / (settings.warmup_steps + 1))
         return rise * (1.0 - (1.0 - settings.final_learning_rate_share) * share)
 
     def _announce(self, schedule: Schedule, reserve: Schedule, step: int) -> None:

@@ -28,6 +28,16 @@ class Stopwatch:
         self.spent_s: dict[str, float] = {}
 
     @contextlib.contextmanager
+    def whole(self) -> Iterator[None]:
+        """Work that counts when it is done: what is spent in it is forgotten where it is broken off."""
+        before = dict(self.spent_s)
+        try:
+            yield
+        except BaseException:
+            self.spent_s = before
+            raise
+
+    @contextlib.contextmanager
     def spending(self, activity: Activity) -> Iterator[None]:
         began_s = self._clock()
         try:
