@@ -1,5 +1,6 @@
 """A build is balanced, verified, split by rooms and kinds of goal, equal for equal seeds, and goes on where it stopped."""
 
+import contextlib
 import json
 import resource
 import shutil
@@ -12,6 +13,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
+from embomatrix.factory.admission import objection
 from embomatrix.factory.cli import app
 from embomatrix.factory.evaluate.admissions import evaluate_admissions
 from embomatrix.factory.layout.jobs import LayoutAgents
@@ -31,6 +33,7 @@ from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.reward.hierarchy import score
 from embomatrix.rpc.values import Completed, InfraCode, InfraFailure, Outcome, RolloutResult, Timings
 from embomatrix.sim.executor import Simulator
+from embomatrix.sim.physical.actor import physical_simulator
 from embomatrix.skills.parse import plan_from_json
 from embomatrix.world.dataset import Dataset, DatasetError
 from embomatrix.world.scene import Room, Scene
@@ -343,17 +346,20 @@ def test_unknown_names_are_one_sentence_and_exit_2(
     assert "Traceback" not in output
 
 
-def test_tasks_of_conversations_are_verified_and_their_transcripts_kept(tmp_path):
+def test_tasks_of_conversations_are_proved_by_a_robot_in_physics_and_their_transcripts_kept(tmp_path):
     settings = BuildSettings(
-        train=4, heldout=0, seed=1, scenes=("Rs_int",), writer=WriterKind.SOCIAL, **QUICK
+        train=4, heldout=0, seed=1, scenes=("Rs_int",), writer=WriterKind.SOCIAL, look_ahead=False
     )
     summary = build_dataset(tmp_path, settings)
     dataset = Dataset.load(tmp_path)
     assert summary.total("train") == len(dataset.train) == 4
+    assert summary.rejected["physics_failed"] > 0, "a potato in a sink, say, where the arm does not get"
     for record in dataset.train:
         transcript = (tmp_path / "transcripts" / f"{record.task.task_id}.md").read_text(encoding="utf-8")
         assert transcript.startswith(f"# {record.task.instruction}\n")
-        assert record.oracle
+        plan = plan_from_json(list(record.oracle), record.task.profile)
+        with contextlib.closing(physical_simulator(dataset.read_bundle(record.bundle_digest))) as robot:
+            assert objection(robot, record.task, plan) == ""
 
 
 def test_several_processes_make_the_same_data_set_as_one(folder, dataset, tmp_path):
