@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from functools import cached_property
 from typing import TYPE_CHECKING, Final
 
@@ -48,8 +47,12 @@ class SceneView:
         return {room: tuple(names) for room, names in rooms.items()}
 
     @cached_property
-    def _counts(self) -> Counter[tuple[str, str]]:
-        return Counter((self.category(item.name), item.room) for item in self.scene.objects)
+    def _of_kind(self) -> Mapping[tuple[str, str], tuple[str, ...]]:
+        """Object names by category and room, in scene order."""
+        kinds: dict[tuple[str, str], list[str]] = {}
+        for item in self.scene.objects:
+            kinds.setdefault((self.category(item.name), item.room), []).append(item.name)
+        return {kind: tuple(names) for kind, names in kinds.items()}
 
     def item(self, name: str) -> SceneObject:
         return self.scene.by_name[name]
@@ -65,11 +68,10 @@ class SceneView:
 
     def alike(self, name: str) -> tuple[str, ...]:
         """Objects of the same category in the same room, with this one."""
-        category = self.category(name)
-        return tuple(other for other in self.in_room[self.room(name)] if self.category(other) == category)
+        return self._of_kind[self.category(name), self.room(name)]
 
     def rooms_with(self, category: str) -> tuple[str, ...]:
-        return tuple(room.name for room in self.scene.rooms if self._counts[category, room.name])
+        return tuple(room.name for room in self.scene.rooms if (category, room.name) in self._of_kind)
 
     def is_portable(self, name: str) -> bool:
         """Whether the robot can carry it."""
