@@ -204,8 +204,10 @@ def reach_problems(scene: Scene) -> Iterator[Problem]:
     for room in scene.rooms:
         if not floor.enters(room):
             yield Problem(ProblemKind.UNREACHABLE_ROOM, (room.name,), "no free floor leads into it")
-        elif floor.cut_off_m2(room) > max(CUT_OFF_M2, CUT_OFF_SHARE * room.size_m[0] * room.size_m[1]):
-            detail = f"furniture cuts off {floor.cut_off_m2(room):.1f} m2 of floor where the robot fits"
+            continue
+        cut_off_m2 = floor.cut_off_m2(room)
+        if cut_off_m2 > max(CUT_OFF_M2, CUT_OFF_SHARE * room.size_m[0] * room.size_m[1]):
+            detail = f"furniture cuts off {cut_off_m2:.1f} m2 of floor where the robot fits"
             yield Problem(ProblemKind.AISLE, (room.name,), detail)
     for item, access in unserved(scene, floor):
         where = "beside it" if access is Access.BESIDE else "before its front"

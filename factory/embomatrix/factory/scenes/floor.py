@@ -15,8 +15,12 @@ from embomatrix.world.geometry import Aabb, Pose
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
+    from numpy.typing import NDArray
+
     from embomatrix.world.geometry import FloatArray
     from embomatrix.world.scene import Room, Scene, SceneObject
+
+    BoolArray = NDArray[np.bool_]
 
 _ORIGIN: Final = Pose((0.0, 0.0, 0.0))
 _FLAT_M: Final = 0.03
@@ -75,9 +79,7 @@ class ReachableFloor:
         islands = set(np.unique(self._grid.labels).tolist()) - {0, self._label}
         centers = [self._grid.free_centers(room.low_m, room.high_m, label) for label in sorted(islands)]
         spots = np.concatenate([np.empty((0, 2)), *centers])
-        for box in self._footprints:
-            spots = spots[~((spots > box[:2]) & (spots < box[2:])).all(axis=1)]
-        return len(spots) * CELL_M**2
+        return int((~_within(spots, self._footprints)).sum()) * CELL_M**2
 
     def spots(self, box: Aabb, *, front_of: Pose | None = None) -> FloatArray:
         """Cells from which the arm reaches a box, shape (n, 2); with ``front_of`` only those before that pose's front."""
@@ -91,6 +93,26 @@ class ReachableFloor:
             cosine = delta @ np.array([math.cos(front_of.yaw), math.sin(front_of.yaw)])
             fits &= cosine >= _FRONT_COSINE * np.linalg.norm(delta, axis=1)
         return np.asarray(cells[fits])
+
+
+def _within(spots: FloatArray, boxes: FloatArray) -> BoolArray:
+    """Which middles of cells, (n, 2), lie within any of some rectangles, (m, 4): marked on a grid, as both are many."""
+    if not len(spots):
+        return np.zeros(0, dtype=np.bool_)
+    low, high = spots.min(axis=0), spots.max(axis=0)
+    cells = np.rint((spots - low) / CELL_M).astype(int)
+    shape = cells.max(axis=0) + 1
+    axes = [low[axis] + CELL_M * np.arange(shape[axis]) for axis in (0, 1)]
+    for axis in (0, 1):
+        axes[axis][cells[:, axis]] = spots[:, axis]  # to the bit, where there is a spot
+    taken = np.zeros(shape, dtype=np.bool_)
+    for box in boxes[((boxes[:, :2] < high) & (boxes[:, 2:] > low)).all(axis=1)]:
+        rows, columns = (
+            slice(np.searchsorted(line, box[axis], "right"), np.searchsorted(line, box[axis + 2], "left"))
+            for axis, line in enumerate(axes)
+        )
+        taken[rows, columns] = True
+    return np.asarray(taken[cells[:, 0], cells[:, 1]])
 
 
 def box_of(scene: Scene, item: SceneObject) -> Aabb:
