@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import multiprocessing
 from collections import defaultdict
-from concurrent.futures import ProcessPoolExecutor
 from typing import TYPE_CHECKING, Any
 
 from embomatrix.factory.evaluate.scenes import Method, Outcome, SceneTask, evaluation_of, judge
 from embomatrix.factory.outcome_log import LineLog
+from embomatrix.factory.process_pool import process_pool
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.sim.pose_cache import PlacementLibrary
 
@@ -82,8 +81,7 @@ def _made(
         for order in orders:
             yield from _judged(order)
         return
-    spawn = multiprocessing.get_context("spawn")
-    pool = stack.enter_context(ProcessPoolExecutor(jobs, spawn))
+    pool = stack.enter_context(process_pool(jobs))
     for group in pool.map(_all_judged, orders):
         yield from group
 

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import textwrap
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from embomatrix.factory.process_pool import process_pool
 from embomatrix.sim.bullet.camera import furnish_cutaway, furnish_whole, shoot_egocentric, shoot_oblique
 from embomatrix.sim.bullet.stage import Stage
 from embomatrix.sim.film import FRAMES_PER_S
@@ -65,8 +64,7 @@ def draw_film(
     rooms = _rooms_seen(film)
     chunks = [film.frames[start : start + CHUNK] for start in range(0, len(film.frames), CHUNK)]
     pictures: list[Image.Image] = []
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(processes, context, _open_stage, (film.scene, rooms)) as pool:
+    with process_pool(processes, _open_stage, film.scene, rooms) as pool:
         for chunk, drawn in zip(chunks, pool.map(_draw, chunks), strict=True):
             for frame, (room, eye) in zip(chunk, drawn, strict=True):
                 pictures.append(_page(room, eye, captions, frame.step))

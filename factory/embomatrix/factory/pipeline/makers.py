@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import contextlib
-import multiprocessing
-import signal
-from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from typing import TYPE_CHECKING
 
 from embomatrix.factory.pipeline.variants import VariantMaker, VariantOrder, VariantYield
+from embomatrix.factory.process_pool import process_pool
 from embomatrix.world.dataset import DatasetError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
+    from concurrent.futures import ProcessPoolExecutor
 
     from embomatrix.factory.layout.jobs import LayoutAgents
     from embomatrix.factory.pipeline.settings import BuildSettings
@@ -32,13 +31,8 @@ def makers(
         with contextlib.closing(VariantMaker(settings, writer, layout)) as maker:
             yield lambda orders: map(maker.make, orders)
         return
-    pool = ProcessPoolExecutor(
-        jobs, multiprocessing.get_context("spawn"), initializer=_begin, initargs=(settings,)
-    )
-    try:
+    with process_pool(jobs, _begin, settings) as pool:
         yield lambda orders: _made(pool, orders)
-    finally:
-        pool.shutdown(cancel_futures=True)
 
 
 def _made(pool: ProcessPoolExecutor, orders: Sequence[VariantOrder]) -> Iterator[VariantYield]:
@@ -57,7 +51,6 @@ _maker: VariantMaker
 
 def _begin(settings: BuildSettings) -> None:
     global _maker
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt is the parent's to answer
     _maker = VariantMaker(settings)
 
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import multiprocessing
-from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, as_completed
+from concurrent.futures import BrokenExecutor, as_completed
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from embomatrix.factory.importers.shelf import read_assets
+from embomatrix.factory.process_pool import process_pool
 from embomatrix.factory.scenes.report import SceneReport, report_on, report_on_file
 from embomatrix.factory.scenes.scene_file import write_scene
 from embomatrix.world.catalog import Catalog
@@ -43,20 +43,15 @@ def run_batch(jobs: Sequence[SceneJob], *, processes: int) -> Iterator[SceneRepo
     if len(jobs) == 1:
         yield _run(jobs[0])
         return
-    # spawned, not forked: a child shall not inherit what the parent's libraries hold
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(processes, len(jobs)), context) as pool:
+    with process_pool(min(processes, len(jobs))) as pool:
         largest_first = sorted(jobs, key=lambda job: -things[job])
         waiting = {pool.submit(_run, job): job for job in largest_first}
-        try:
-            for done in as_completed(waiting):
-                job = waiting[done]
-                try:
-                    yield done.result()
-                except BrokenExecutor:
-                    yield SceneReport(job.scene_id, job.seed, error="its process died: is memory short?")
-        finally:
-            pool.shutdown(cancel_futures=True)
+        for done in as_completed(waiting):
+            job = waiting[done]
+            try:
+                yield done.result()
+            except BrokenExecutor:
+                yield SceneReport(job.scene_id, job.seed, error="its process died: is memory short?")
 
 
 def _run(job: SceneJob) -> SceneReport:

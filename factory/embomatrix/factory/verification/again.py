@@ -7,9 +7,6 @@ traces, to the bit. Where asked for, a robot carries the dataset's own plan out 
 from __future__ import annotations
 
 import contextlib
-import multiprocessing
-import signal
-from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
@@ -17,6 +14,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.factory.admission import SEED, Admitted, admit, objection
+from embomatrix.factory.process_pool import process_pool
 from embomatrix.factory.task_import.batch import most_held_in
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.physical.actor import physical_simulator
@@ -113,19 +111,13 @@ def verdict_of(first: Look, second: Look) -> Verdict:
 
 
 def _looked(orders: Sequence[_Order], jobs: int) -> Iterator[list[Look]]:
-    pool = ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), initializer=_begin)
     try:
-        yield from pool.map(_look_at, orders)
+        with process_pool(jobs) as pool:
+            yield from pool.map(_look_at, orders)
     except BrokenProcessPool as error:
         raise DatasetError(
             "a process that verifies tasks died, perhaps for want of memory: call the command again, with fewer --jobs"
         ) from error
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-def _begin() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt is the parent's to answer
 
 
 def _look_at(order: _Order) -> list[Look]:

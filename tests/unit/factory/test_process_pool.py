@@ -1,0 +1,36 @@
+"""Processes that share the factory's work, and what becomes of them."""
+
+import os
+import subprocess
+import sys
+
+import psutil
+
+from embomatrix.factory.process_pool import process_pool
+
+SLEEPER = """
+import os, time
+from embomatrix.factory.process_pool import process_pool
+
+if __name__ == "__main__":
+    with process_pool(1) as pool:
+        print(pool.submit(os.getpid).result(), flush=True)
+        time.sleep(600)
+"""
+
+
+def test_processes_go_with_the_one_that_started_them_when_that_is_killed(tmp_path):
+    program = tmp_path / "sleeper.py"
+    program.write_text(SLEEPER)
+    with subprocess.Popen([sys.executable, program], stdout=subprocess.PIPE, text=True) as parent:
+        child = psutil.Process(int(parent.stdout.readline()))
+        assert child.is_running()
+        parent.kill()
+    _, alive = psutil.wait_procs([child], timeout=30)
+    assert alive == []
+
+
+def test_work_is_done_in_other_processes_that_began_as_they_were_told(tmp_path):
+    with process_pool(1, os.chdir, tmp_path) as pool:
+        assert pool.submit(os.getcwd).result() == str(tmp_path)
+        assert pool.submit(os.getpid).result() != os.getpid()
