@@ -261,7 +261,7 @@ def test_the_ledger_tells_how_many_drafts_were_admitted(tmp_path):
 
 def a_build(folder, writer, times):
     """A build of two variants with three admitted tasks and one refused, and what its file of times holds."""
-    settings = {"settings": {"writer": writer, "look_ahead": True, "physical": True}}
+    settings = {"settings": {"writer": writer, "look_ahead": True}}
     drafts = [(0, "admitted"), (0, "admitted"), (0, "no_plan"), (1, "admitted")]
     lines = [
         {"split": "train", "variant": number, "scene": "Rs_int-train-000", "outcome": outcome}
