@@ -102,7 +102,10 @@ def _settings(folder: Path) -> dict[str, Any]:
         with path.open(encoding="utf-8") as file:
             value = json.loads(file.readline())["settings"]
         known = {name: value[name] for name in ("writer", "look_ahead")}
-        return {**known, "physical": value.get("physical", False)}  # builds of before decision 0047 proved nothing
+        return {
+            **known,
+            "physical": value.get("physical", False),
+        }  # builds of before decision 0047 proved nothing
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise EvaluationError(
             f"{path} does not tell the settings of a build ({error}): name a folder that `factory build`, `generate` or "
