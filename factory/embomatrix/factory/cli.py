@@ -28,6 +28,7 @@ from embomatrix.factory.layout_cli import (
 from embomatrix.factory.pipeline.build import Check, Summary, build_dataset
 from embomatrix.factory.pipeline.cluster import ClusterJudge
 from embomatrix.factory.pipeline.corpus_cli import app as corpus_app
+from embomatrix.factory.pipeline.options import Physical, is_proved
 from embomatrix.factory.pipeline.settings import SCENE_EXTRACTOR, BuildSettings, WriterKind, scene_ids
 from embomatrix.factory.social.asking import Asked, asked_writer
 from embomatrix.factory.task_import.cli import app as import_app
@@ -75,14 +76,7 @@ Jobs = Annotated[
 LookAhead = Annotated[
     bool,
     typer.Option(
-        help="Find out what the robot's arm can do in each scene, so that rollouts promise no more: three quarters of the time."
-    ),
-]
-Physical = Annotated[
-    bool | None,
-    typer.Option(
-        "--physical/--no-physical",
-        help="Have a robot carry each plan out in stepped physics before its task is admitted. Default: with --look-ahead.",
+        help="Find out what the robot's arm can do in each scene, so that rollouts promise no more: most of the time."
     ),
 ]
 
@@ -130,7 +124,7 @@ def build(
         seed,
         scene_ids(scenes),
         look_ahead=look_ahead,
-        physical=look_ahead if physical is None else physical,
+        physical=is_proved(physical, look_ahead=look_ahead),
         modelled=tuple(sorted(modelled)),
     )
     with contextlib.ExitStack() as stack:
@@ -168,7 +162,7 @@ def generate(
         fail("--look shows scenes to a language model: give --llm URL and --model NAME, or --cassette FILE")
     modelled = modelled_names(forms or [])
     told = sorted([*modelled, *[SCENE_EXTRACTOR] * look])
-    proof = look_ahead if physical is None else physical
+    proof = is_proved(physical, look_ahead=look_ahead)
     settings = BuildSettings(tasks, heldout, seed, scene_ids(scenes), kind, look_ahead, proof, tuple(told))
     with contextlib.ExitStack() as stack:
         stack.enter_context(mended(out))

@@ -152,6 +152,15 @@ def test_difference_to_the_build_of_a_folder_is_told(tmp_path: Path) -> None:
         BuildStore.open(tmp_path, {"seed": 2, "train": 8})
 
 
+def test_a_build_begun_before_robots_proved_tasks_goes_on_as_one_without_proof(tmp_path: Path) -> None:
+    settings = asdict(SETTINGS)
+    old = {name: value for name, value in settings.items() if name != "physical"}
+    (tmp_path / "build.jsonl").write_text(json.dumps({"settings": old}) + "\n")
+    with pytest.raises(DatasetError, match=r"\(physical False, now True\)"):
+        BuildStore.open(tmp_path, {**settings, "physical": True})
+    assert BuildStore.open(tmp_path, settings).results == []
+
+
 @pytest.mark.parametrize("content", ["", "{}", "[1]\n", "not json"])
 def test_build_file_without_settings_is_damaged(tmp_path: Path, content: str) -> None:
     (tmp_path / "build.jsonl").write_text(content)
@@ -211,7 +220,7 @@ def test_the_ledger_has_a_line_for_every_attempt_and_its_reason(folder: Path, su
 
 
 def test_a_ledger_that_lost_its_end_is_whole_again_when_the_build_is_taken_up(
-    folder: Path, tmp_path: Path
+    folder: Path, dataset: Dataset, tmp_path: Path
 ) -> None:
     whole = (folder / "attempts.jsonl").read_text()
     shutil.copy(folder / "build.jsonl", tmp_path)

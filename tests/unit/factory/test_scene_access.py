@@ -1,11 +1,12 @@
-"""Cabinets on a wall that nobody can stand before are left out, with what lies in them, and said to be."""
+"""What leaves the robot no place to stand is left out, with what lies in it, and said to be."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from embomatrix.factory.scenes.access import unserved, without_unserved_cabinets
+from embomatrix.factory.scenes.access import unserved, with_all_served
+from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.floor import ReachableFloor
 from embomatrix.factory.scenes.report import unaccounted
 from embomatrix.world.geometry import Pose
@@ -33,13 +34,13 @@ def turned_to_the_wall(scene: Scene) -> Scene:
 
 
 def test_a_furnished_flat_loses_nothing(flat: Scene) -> None:
-    assert without_unserved_cabinets(flat) is flat
+    assert with_all_served(flat) is flat
 
 
 def test_a_cabinet_that_faces_the_wall_goes_with_what_lies_in_it(flat: Scene) -> None:
     scene = turned_to_the_wall(flat)
     assert [item.name for item, _ in unserved(scene, ReachableFloor(scene))] == [CABINET]
-    left = without_unserved_cabinets(scene)
+    left = with_all_served(scene)
     assert {item.name for item in scene.objects} - {item.name for item in left.objects} == {
         CABINET,
         "laptop_1",
@@ -50,3 +51,14 @@ def test_a_cabinet_that_faces_the_wall_goes_with_what_lies_in_it(flat: Scene) ->
     ]
     assert unaccounted(left) == ()
     assert {item.asset_id for item in left.objects} == set(left.assets)
+
+
+def test_a_chair_that_stands_where_one_gets_at_another_table_is_left_out() -> None:
+    scene = build_base_scene(
+        "grocery_store_cafe", seed=1
+    )  # four small tables with twelve chairs in one small room
+    assert not list(unserved(scene, ReachableFloor(scene)))
+    assert [note for note in scene.left_out if "where one gets at" in note] == [
+        "1 straight_chair-qnjtxe in dining_room_0: it stood where one gets at pedestal_table_3"
+    ]
+    assert unaccounted(scene) == ()

@@ -64,9 +64,8 @@ async def test_what_is_to_be_executed_is_executed_however_little_memory_there_is
 
 
 async def test_a_memory_that_grows_allows_no_more_than_the_limits(tmp_path):
-    async with running(
-        tmp_path, memory_mb=75.0
-    ) as harness:  # each takes 40 MB and what it shares with no other process
+    # Each takes 40 MB and what it shares with no other process.
+    async with running(tmp_path, memory_mb=75.0) as harness:
         harness.pool.allow(1e6)
         harness.pool.want(["large-1", "large-2", "large-3"])
         await harness.until(lambda: len(warm(harness)) == 1)

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import concurrent.futures
 import functools
-import multiprocessing
-import signal
 from concurrent.futures.process import BrokenProcessPool
 from typing import TYPE_CHECKING
 
 from embomatrix.rpc.values import InfraCode, InfraFailure
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.engine import EngineError, EngineMissingError
+from embomatrix.sim.process_pool import process_pool
 from embomatrix.worker.physics import CLIENTS_PER_SCENE, PhysicsScene
 from embomatrix.world.dataset import Dataset, DatasetError
 
@@ -58,12 +57,7 @@ class RolloutPool:
     ) -> list[list[Rollout]]:
         """Execute scenes; returns those whose process died, or that waited behind it."""
         broken: list[list[Rollout]] = []
-        spawn = multiprocessing.get_context("spawn")
-        # Ctrl-C is for the parent, which waits for the scenes under way.
-        pool = concurrent.futures.ProcessPoolExecutor(
-            processes, mp_context=spawn, initializer=signal.signal, initargs=(signal.SIGINT, signal.SIG_IGN)
-        )
-        try:
+        with process_pool(processes) as pool:
             waiting: Waiting = {pool.submit(execute_scene, self._folder, scene): scene for scene in scenes}
             for future in concurrent.futures.as_completed(waiting):
                 try:
@@ -73,8 +67,6 @@ class RolloutPool:
                     continue
                 for rollout_id, outcome in results:
                     on_result(rollout_id, outcome)
-        finally:
-            pool.shutdown(cancel_futures=True)
         return broken
 
 

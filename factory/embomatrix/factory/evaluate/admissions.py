@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from embomatrix.factory.evaluate.figures import Evaluation, EvaluationError
 from embomatrix.factory.pipeline.settings import WriterKind
-from embomatrix.factory.pipeline.store import ATTEMPTS_FILE, BUILD_FILE, TIMES_FILE
+from embomatrix.factory.pipeline.store import ATTEMPTS_FILE, BUILD_FILE, TIMES_FILE, settings_of
 from embomatrix.pages.figures import Better, Figure
 
 if TYPE_CHECKING:
@@ -100,12 +100,8 @@ def _settings(folder: Path) -> dict[str, Any]:
     path = folder / BUILD_FILE
     try:
         with path.open(encoding="utf-8") as file:
-            value = json.loads(file.readline())["settings"]
-        known = {name: value[name] for name in ("writer", "look_ahead")}
-        return {
-            **known,
-            "physical": value.get("physical", False),
-        }  # builds of before decision 0047 proved nothing
+            value = settings_of(file.readline())
+        return {name: value[name] for name in ("writer", "look_ahead", "physical")}
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise EvaluationError(
             f"{path} does not tell the settings of a build ({error}): name a folder that `factory build`, `generate` or "

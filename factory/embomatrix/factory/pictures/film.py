@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from embomatrix.factory.process_pool import process_pool
 from embomatrix.sim.bullet.camera import furnish_cutaway, furnish_whole, shoot_egocentric, shoot_oblique
 from embomatrix.sim.bullet.stage import Stage
 from embomatrix.sim.film import FRAMES_PER_S
 from embomatrix.sim.physical.stage import tucked
+from embomatrix.sim.process_pool import process_pool
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

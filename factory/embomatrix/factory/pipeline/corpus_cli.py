@@ -12,6 +12,7 @@ from rich.console import Console
 
 from embomatrix.factory.pipeline.build import build_dataset
 from embomatrix.factory.pipeline.corpus import HELDOUT_SCENES, CorpusSettings, check_frozen, freeze
+from embomatrix.factory.pipeline.options import Physical, is_proved
 from embomatrix.factory.terminal import fail, mended, progress
 
 if TYPE_CHECKING:
@@ -35,13 +36,7 @@ def corpus(
     ] = None,
     jobs: Annotated[int | None, typer.Option(min=1, help="Processes.")] = None,
     look_ahead: Annotated[bool, typer.Option(help="Find out what the arm can do in each scene.")] = True,
-    physical: Annotated[
-        bool | None,
-        typer.Option(
-            "--physical/--no-physical",
-            help="Have a robot carry each plan out in stepped physics before its task is admitted. Default: with --look-ahead.",
-        ),
-    ] = None,
+    physical: Physical = None,
     check: Annotated[
         bool, typer.Option("--check", help="Make nothing: tell whether the corpus is as it was frozen.")
     ] = False,
@@ -54,7 +49,7 @@ def corpus(
             frozen = check_frozen(out)
         else:
             chosen, others = tuple(scenes or ()), tuple(unseen or HELDOUT_SCENES)
-            proof = look_ahead if physical is None else physical
+            proof = is_proved(physical, look_ahead=look_ahead)
             settings = CorpusSettings(train, heldout, seed, chosen, others, look_ahead, proof)
             _make(console, out, settings, jobs or min(MOST_JOBS, len(os.sched_getaffinity(0))))
             frozen = freeze(out)

@@ -7,7 +7,7 @@ from concurrent.futures.process import BrokenProcessPool
 from typing import TYPE_CHECKING
 
 from embomatrix.factory.pipeline.variants import VariantMaker, VariantOrder, VariantYield
-from embomatrix.factory.process_pool import process_pool
+from embomatrix.sim.process_pool import process_pool
 from embomatrix.world.dataset import DatasetError
 
 if TYPE_CHECKING:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass, field
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
 from embomatrix.factory.refusal import RefusalReason
@@ -29,6 +30,8 @@ TIMES_FILE: Final = "times.jsonl"
 TRANSCRIPTS_FOLDER: Final = "transcripts"
 TREES_FOLDER: Final = "trees"
 """Layout trees as nested JSON, a file for each task."""
+_BEFORE_PROOFS: Final = MappingProxyType({"physical": False})
+"""What builds of before decision 0047 don't tell: robots proved nothing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,14 +66,14 @@ class BuildStore:
     @staticmethod
     def open(folder: Path, settings: Mapping[str, Any]) -> BuildStore:
         """Start a build or take one up again. Raises DatasetError when the folder holds one of other settings."""
-        wanted = json.loads(json.dumps(settings))
+        wanted = {**_BEFORE_PROOFS, **json.loads(json.dumps(settings))}
         path = folder / BUILD_FILE
         try:
             (folder / BUNDLES_FOLDER).mkdir(parents=True, exist_ok=True)
             if not path.exists():
                 write_whole(path, (json.dumps({"settings": wanted}) + "\n").encode("ascii"))
             first, *lines = path.read_text(encoding="utf-8").splitlines()
-            found = json.loads(first)["settings"]
+            found = settings_of(first)
         except OSError as error:
             raise DatasetError(
                 f"the folder {folder} can't be written ({error.strerror}): choose another one"
@@ -131,6 +134,11 @@ class BuildStore:
         """The whole ledger, from what is known: a build that was cut short may lack its last lines."""
         text = "".join(_attempt_lines(result) for result in self.results)
         write_whole(self.folder / ATTEMPTS_FILE, text.encode("utf-8"))
+
+
+def settings_of(line: str) -> dict[str, Any]:
+    """The settings in the first line of a build's file. Raises ValueError, LookupError or TypeError for another line."""
+    return {**_BEFORE_PROOFS, **json.loads(line)["settings"]}
 
 
 def _attempt_lines(result: VariantResult) -> str:

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.furnish.pieces import Access, Piece, access_of
-from embomatrix.factory.furnish.roles import role_of
+from embomatrix.factory.furnish.roles import Role, role_of
 from embomatrix.factory.scenes.floor import ReachableFloor, box_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Container, Iterator
 
     from embomatrix.world.scene import Scene, SceneObject
 
 _NO_FRONT: Final = "nobody could stand before its front"
 _NO_HOST: Final = "it lay in a cabinet that nobody could stand before"
+_AT_TABLE_M: Final = 1.0
+"""A seat further away leaves the robot room beside the table."""
 
 
 def unserved(scene: Scene, floor: ReachableFloor) -> Iterator[tuple[SceneObject, Access]]:
@@ -29,32 +32,60 @@ def unserved(scene: Scene, floor: ReachableFloor) -> Iterator[tuple[SceneObject,
             yield item, access
 
 
-def without_unserved_cabinets(scene: Scene) -> Scene:
-    """The scene without cabinets on a wall that nobody can stand before, and what lies in them, each told in ``left_out``.
+def with_all_served(scene: Scene) -> Scene:
+    """The scene without what leaves the robot no place to stand, each told in ``left_out``.
 
-    Furnishing asks for floor near them, which may lie round a corner.
+    Furnishing asks for floor near a cabinet on a wall, which may lie round a corner: the cabinet goes, with what lies in
+    it. It sees to floor beside a table before the chairs of other tables stand there: a chair goes.
     """
-    if not any(_access(scene, item) is Access.HUNG for item in scene.objects):
-        return scene
-    lost = {
-        item.name: _NO_FRONT
-        for item, access in unserved(scene, ReachableFloor(scene))
-        if access is Access.HUNG
-    }
+    lost: dict[str, str] = {}
+    for item, access in unserved(scene, ReachableFloor(scene)):
+        if access is Access.HUNG:
+            lost[item.name] = _NO_FRONT
+        elif access is Access.BESIDE and (seat := _seat_in_the_way(scene, item)):
+            lost[seat] = f"it stood where one gets at {item.name}"
     if not lost:
         return scene
     # hosts stand before what they bear: one pass finds what lies in what lies in them
     for item in scene.objects:
         if item.host in lost:
             lost[item.name] = _NO_HOST
-    left = tuple(item for item in scene.objects if item.name not in lost)
+    notes = (
+        f"1 {scene.by_name[name].asset_id} in {scene.by_name[name].room}: {why}" for name, why in lost.items()
+    )
+    left = _without(scene, lost)
+    return replace(left, left_out=(*left.left_out, *notes))
+
+
+def _seat_in_the_way(scene: Scene, table: SceneObject) -> str:
+    """The nearest empty seat without which the robot could stand beside the table; "" when no single one is in the way."""
+    box = box_of(scene, table)
+    near = box.grown(_AT_TABLE_M)
+    hosts = {item.host for item in scene.objects}
+    seats = [
+        (math.dist(box_of(scene, item).center_m, box.center_m), item.name)
+        for item in scene.objects
+        if _role(scene, item) is Role.SEAT and item.name not in hosts and box_of(scene, item).overlaps(near)
+    ]
+    for _, name in sorted(seats):
+        if len(ReachableFloor(_without(scene, {name})).spots(box)):
+            return name
+    return ""
+
+
+def _without(scene: Scene, names: Container[str]) -> Scene:
+    left = tuple(item for item in scene.objects if item.name not in names)
     used = {item.asset_id for item in left}
-    assets = {asset_id: asset for asset_id, asset in scene.assets.items() if asset_id in used}
-    gone = (scene.by_name[name] for name in lost)
-    notes = (f"1 {item.asset_id} in {item.room}: {lost[item.name]}" for item in gone)
-    return replace(scene, objects=left, assets=assets, left_out=(*scene.left_out, *notes))
+    return replace(
+        scene, objects=left, assets={each: asset for each, asset in scene.assets.items() if each in used}
+    )
 
 
 def _access(scene: Scene, item: SceneObject) -> Access:
     asset = scene.assets[item.asset_id]
-    return access_of(Piece(0, asset.category, asset, role_of(asset.category, asset.size_m, asset.mass_kg)))
+    return access_of(Piece(0, asset.category, asset, _role(scene, item)))
+
+
+def _role(scene: Scene, item: SceneObject) -> Role:
+    asset = scene.assets[item.asset_id]
+    return role_of(asset.category, asset.size_m, asset.mass_kg)

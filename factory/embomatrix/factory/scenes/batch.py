@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from embomatrix.factory.importers.shelf import read_assets
-from embomatrix.factory.process_pool import process_pool
 from embomatrix.factory.scenes.report import SceneReport, report_on, report_on_file
 from embomatrix.factory.scenes.scene_file import write_scene
+from embomatrix.sim.process_pool import process_pool
 from embomatrix.world.catalog import Catalog
 
 if TYPE_CHECKING:

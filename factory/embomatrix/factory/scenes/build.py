@@ -17,7 +17,7 @@ from embomatrix.factory.furnish.pieces import Piece
 from embomatrix.factory.furnish.roles import Role, is_portable, role_of
 from embomatrix.factory.furnish.rooms import Furnishing, furnish
 from embomatrix.factory.furnish.space import RoomSpace
-from embomatrix.factory.scenes.access import without_unserved_cabinets
+from embomatrix.factory.scenes.access import with_all_served
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.scene import RobotStart, Scene, SceneObject
 
@@ -72,7 +72,7 @@ def build_base_scene(
         left_out=(*notes, *plan.left_out, *result.left_out),
         windows=plan.windows,
     )
-    scene = without_unserved_cabinets(scene)
+    scene = with_all_served(scene)
     logger.info(
         "scene built id=%s seed=%d objects=%d left_out=%d",
         scene_id,

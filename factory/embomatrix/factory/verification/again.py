@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.factory.admission import SEED, Admitted, admit, objection
-from embomatrix.factory.process_pool import process_pool
 from embomatrix.factory.task_import.batch import most_held_in
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.physical.actor import physical_simulator
 from embomatrix.sim.planner.oracle import find_plan
+from embomatrix.sim.process_pool import process_pool
 from embomatrix.skills.parse import plan_from_json, plan_to_json
 from embomatrix.world.dataset import Dataset, DatasetError
 

@@ -6,11 +6,11 @@ import sys
 
 import psutil
 
-from embomatrix.factory.process_pool import process_pool
+from embomatrix.sim.process_pool import process_pool
 
 SLEEPER = """
 import os, time
-from embomatrix.factory.process_pool import process_pool
+from embomatrix.sim.process_pool import process_pool
 
 if __name__ == "__main__":
     with process_pool(1) as pool:
