@@ -30,6 +30,8 @@ EDGE_M: Final = 0.005
 """Free strip between an object and the edge of its surface, and below the ceiling of its space."""
 SUPPORTED_SHARE: Final = 0.6
 """A thing wider than its surface needs at least this share of its width on it."""
+BESIDE_M: Final = 0.02
+"""Gap to what a thing is put beside: less than half of what ``nextto`` allows the smallest, more than contact."""
 YAWS: Final = (0.0, math.pi / 2, math.pi, -math.pi / 2)
 """Things stand square to what they stand on."""
 
@@ -127,6 +129,39 @@ def candidates(held: Asset, support: Asset, relation: Relation, shift: Vec2, tri
     for _, pose in proposals(patches(bounds, support, relation), shift, tries):
         if _stands(bounds.box(pose), support, relation):
             yield pose
+
+
+def beside(held: Asset, support: Asset, relation: Relation, neighbour: Aabb) -> Iterator[Pose]:
+    """Poses at which the relation holds and the thing's box is a little off a box in the support's frame, along each side."""
+    bounds = bounds_of(held)
+    middle = neighbour.center_m
+    for patch in patches(bounds, support, relation):
+        if patch.link:
+            continue  # what a drawer carries moves away from what stands still
+        box = bounds.box(Pose.from_xyz_yaw(0.0, 0.0, 0.0, patch.yaw))
+        for axis, sign in itertools.product((0, 1), (1, -1)):
+            off = (neighbour.size_m[axis] + box.size_m[axis]) / 2 + BESIDE_M
+            for along in _along(neighbour.size_m[1 - axis], box.size_m[1 - axis]):
+                place = [0.0, 0.0]
+                place[axis] = middle[axis] + sign * off - box.center_m[axis]
+                place[1 - axis] = middle[1 - axis] + along - box.center_m[1 - axis]
+                pose = Pose.from_xyz_yaw(place[0], place[1], patch.center_m[2], patch.yaw)
+                if _within(patch, place) and _stands(bounds.box(pose), support, relation):
+                    yield pose
+
+
+def _along(side_m: float, extent_m: float) -> list[float]:
+    """Offsets along a side at which several things of one extent stand in a row, the middle one first."""
+    step = extent_m + BESIDE_M
+    reach = int(side_m / 2 / step)
+    return sorted((number * step for number in range(-reach, reach + 1)), key=abs)
+
+
+def _within(patch: Patch, place: Sequence[float]) -> bool:
+    return all(
+        abs(at - center) <= room + EDGE_M
+        for at, center, room in zip(place, patch.center_m[:2], patch.room_m, strict=True)
+    )
 
 
 def stands_in(held: Asset, pose_support_held: Pose, support: Asset, relation: Relation) -> bool:

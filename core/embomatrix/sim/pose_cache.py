@@ -12,7 +12,7 @@ from embomatrix.sim.bounds import IDENTITY, bounds_of
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.bullet.mini_world import MiniWorld, Still
-from embomatrix.sim.candidates import LIFT_M, candidates, stands_in, surfaces_for
+from embomatrix.sim.candidates import LIFT_M, beside, candidates, stands_in, surfaces_for
 from embomatrix.sim.contents import Contents
 from embomatrix.sim.engine import TOLERANCE_M
 from embomatrix.sim.footprints import LEVEL_FLOOR, Footprint, box_of, footprint_of
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
     from embomatrix.sim.engine import PhysicsEngine
     from embomatrix.world.asset import Asset
+    from embomatrix.world.geometry import Aabb
     from embomatrix.world.scene import Scene
 
 PLACE_RELATIONS: Final = (Relation.ONTOP, Relation.INSIDE, Relation.UNDER)
@@ -82,6 +83,12 @@ class PlacementLibrary:
             self._known[key] = tuple(level)
         return self._known[key]
 
+    def poses_beside(
+        self, held: Asset, support: Asset, relation: Relation, neighbour: Aabb
+    ) -> tuple[Pose, ...]:
+        """As ``poses``, but each right beside a box in the frame of ``support``: what may be next to what has that box."""
+        return tuple(self._stable(held, support, relation, beside(held, support, relation, neighbour), POSES))
+
     def standing(self, asset: Asset) -> Pose | None:
         """Pose in which the asset stands by itself on a level floor at height 0; None when it does not."""
         key = self._contents.of(asset)
@@ -102,8 +109,13 @@ class PlacementLibrary:
     def _verified(
         self, held: Asset, support: Asset, relation: Relation, shift: tuple[float, float], most: int
     ) -> Iterator[Pose]:
-        """At most ``most`` poses. While one is looked at, the world in which it was verified stands."""
         tries = candidates(held, support, relation, shift, max(TRIES, 2 * most))
+        return self._stable(held, support, relation, tries, most)
+
+    def _stable(
+        self, held: Asset, support: Asset, relation: Relation, tries: Iterator[Pose], most: int
+    ) -> Iterator[Pose]:
+        """At most ``most`` poses. While one is looked at, the world in which it was verified stands."""
         first = next(tries, None)
         if first is None:
             return

@@ -8,12 +8,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from embomatrix.world.geometry import Part, Vec2, Vec3
+
+FLOOR_CATEGORY: Final = "floors"
+"""Category of a room's floor, where it is an object that plans and goals can name."""
 
 
 class JointKind(StrEnum):

@@ -12,8 +12,9 @@ import difflib
 import functools
 import gzip
 import json
+import math
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import resources
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
@@ -29,6 +30,9 @@ Count = tuple[str, str, int]
 
 MIN_EXTENT_M: Final = 0.003
 """Thinner boxes (paper, glue) are grown to this: contact margins of physics engines are of the same order."""
+SHARE_MARK: Final = "@"
+LEAST_SHARE, MOST_SHARE = 0.5, 2.0
+"""Shares of its size at which a model is made at all."""
 
 
 class CatalogError(LookupError):
@@ -47,7 +51,10 @@ class Category:
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """One model of a category; ``meta_links`` say what it has: "joint", "togglebutton", "fillable", "heatsource" ..."""
+    """One model of a category; ``meta_links`` say what it has: "joint", "togglebutton", "fillable", "heatsource" ...
+
+    A ``model_id`` that ends with ``@`` and a number, ``kfeuep@0.8``, is that of a model made at this share of its size.
+    """
 
     category: str
     model_id: str
@@ -57,6 +64,11 @@ class Model:
     @property
     def asset_id(self) -> str:
         return f"{self.category}-{self.model_id}"
+
+    @property
+    def share(self) -> float:
+        """Its extents over those of the catalog's model; its mass goes with the cube."""
+        return share_of(self.model_id)
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,14 +184,14 @@ class Catalog:
 
     @functools.cache  # noqa: B019
     def model(self, category: str, model_id: str) -> Model:
-        """Size and features of one model, corrected by `SIZE_RULES`. Raises CatalogError."""
+        """Size and features of one model, corrected by `SIZE_RULES`, at the share that its id tells. Raises CatalogError."""
         models = _look_up(self._categories, category, "category")["models"]
-        x, y, z, *links = _look_up(models, model_id, f"model of {category}")
+        listed, _, share = model_id.partition(SHARE_MARK)
+        x, y, z, *links = _look_up(models, listed, f"model of {category}")
         size = (max(x, MIN_EXTENT_M), max(y, MIN_EXTENT_M), max(z, MIN_EXTENT_M))
         rule = SIZE_RULES.get(category)
-        return Model(
-            category, model_id, rule.apply(size) if rule else size, frozenset(links[0] if links else ())
-        )
+        size = rule.apply(size) if rule else size
+        return _at_share(Model(category, listed, size, frozenset(links[0] if links else ())), share)
 
     def models_of(self, category: str) -> tuple[Model, ...]:
         """All models of a category, by id. Raises CatalogError."""
@@ -258,6 +270,27 @@ def _room(name: str, entry: Json) -> RoomInventory:
         more_floors_m=tuple(more),
         floor_estimated=entry.get("floor_estimated", False),
     )
+
+
+def share_of(name: str) -> float:
+    """Share of its size at which the model of an id, or the asset of one, is made."""
+    _, mark, share = name.partition(SHARE_MARK)
+    return float(share) if mark else 1.0
+
+
+def _at_share(model: Model, share: str) -> Model:
+    if not share:
+        return model
+    try:
+        factor = float(share)
+    except ValueError:
+        factor = math.nan
+    if not LEAST_SHARE <= factor <= MOST_SHARE:
+        raise CatalogError(
+            f"{model.asset_id} at a share of {share!r} of its size: expected a number from {LEAST_SHARE} to {MOST_SHARE}"
+        )
+    x, y, z = (max(factor * extent, MIN_EXTENT_M) for extent in model.size_m)
+    return replace(model, model_id=f"{model.model_id}{SHARE_MARK}{share}", size_m=(x, y, z))
 
 
 def _counts(entries: Iterable[tuple[str, int]]) -> tuple[Count, ...]:

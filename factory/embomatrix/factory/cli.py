@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -28,7 +27,7 @@ from embomatrix.factory.layout_cli import (
 from embomatrix.factory.pipeline.build import Check, Summary, build_dataset
 from embomatrix.factory.pipeline.cluster import ClusterJudge
 from embomatrix.factory.pipeline.corpus_cli import app as corpus_app
-from embomatrix.factory.pipeline.options import Physical, is_proved
+from embomatrix.factory.pipeline.options import Jobs, Physical, is_proved, processes
 from embomatrix.factory.pipeline.settings import SCENE_EXTRACTOR, BuildSettings, WriterKind, scene_ids
 from embomatrix.factory.social.asking import Asked, asked_writer
 from embomatrix.factory.task_import.cli import app as import_app
@@ -57,7 +56,6 @@ app.add_typer(import_app)
 app.add_typer(inspect_app)
 app.add_typer(corpus_app)
 app.add_typer(verify_app)
-MOST_JOBS = 8
 """Each holds some scenes: a few hundred MB."""
 
 Out = Annotated[Path, typer.Option(help="Folder for the dataset.")]
@@ -65,13 +63,6 @@ Seed = Annotated[int, typer.Option(min=0, help="Equal seeds give equal datasets.
 Scenes = Annotated[
     list[str] | None,
     typer.Option("--scenes", "--scene", help="Base scene, or 'all'; give it again for more."),
-]
-Jobs = Annotated[
-    int | None,
-    typer.Option(
-        min=1,
-        help="Processes; the dataset is the same for any number. Default: one for each core, at most 8.",
-    ),
 ]
 LookAhead = Annotated[
     bool,
@@ -235,7 +226,7 @@ def _make(
             settings,
             lambda split, admitted: bars.update(tasks[split], completed=admitted),
             writer,
-            jobs or min(MOST_JOBS, len(os.sched_getaffinity(0))),
+            processes(jobs),
             check,
             layout,
         )

@@ -19,7 +19,7 @@ from embomatrix.factory.scenes.joints import with_joints
 from embomatrix.factory.scenes.solids import Solids, placed_parts
 from embomatrix.factory.writer.view import SceneView
 from embomatrix.skills.limits import ROBOT
-from embomatrix.world.asset import Asset, Link, SupportSurface
+from embomatrix.world.asset import FLOOR_CATEGORY, Asset, Link, SupportSurface
 from embomatrix.world.geometry import Aabb, Part, Pose, Shape
 from embomatrix.world.scene import SceneObject
 
@@ -263,7 +263,7 @@ def floor_asset(room: Room) -> Asset:
     size = (*room.size_m, _PLATE_M)
     return Asset(
         asset_id=f"floors-{room.name}",
-        category="floors",
+        category=FLOOR_CATEGORY,
         synset="floor.n.01",
         size_m=size,
         mass_kg=100.0,

@@ -16,6 +16,7 @@ from embomatrix.factory.writer.view import is_liftable
 from embomatrix.world.bddl import parse_problem
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.scene import Scene
+from embomatrix.world.state import Relation
 
 BOXES = """(define (problem p) (:domain igibson)
     (:objects book.n.02_1 book.n.02_2 book.n.02_3 - book.n.02 carton.n.02_1 carton.n.02_2 - carton.n.02
@@ -37,11 +38,14 @@ def asset_of(model):
 
 def test_what_goes_in_is_shared_by_all_containers_and_what_stays_is_not_carried() -> None:
     demands = demands_of(parse_problem(BOXES))
+    on_floor = (Relation.ONTOP, "floor.n.01_1")
     assert demand_on(demands, "carton.n.02_1", "carton.n.02") == Demand(
-        bears=True, contents=("book.n.02",) * 2
+        bears=True, contents=("book.n.02",) * 2, places=(on_floor,)
     )
-    assert demand_on(demands, "book.n.02_1", "book.n.02") == Demand(carried=True)
-    assert demand_on(demands, "table.n.02_1", "table.n.02") == Demand(bears=True)
+    assert demand_on(demands, "book.n.02_1", "book.n.02") == Demand(
+        carried=True, places=((Relation.ONTOP, "table.n.02_1"), (Relation.INSIDE, "carton.n.02_1"))
+    )
+    assert demand_on(demands, "table.n.02_1", "table.n.02") == Demand(bears=True, burden=("book.n.02",) * 3)
 
 
 def test_a_container_has_floor_for_all_that_goes_in() -> None:

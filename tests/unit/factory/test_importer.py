@@ -7,8 +7,9 @@ from tests.fakes.problems import PROBLEM, source
 from embomatrix.factory.refusal import Refusal, RefusalReason, RefusedError
 from embomatrix.factory.task_import.batch import Verified, verify
 from embomatrix.factory.task_import.binding import bind
+from embomatrix.factory.task_import.kinds import category_of, instruction_of
 from embomatrix.factory.task_import.scene import with_states
-from embomatrix.factory.task_import.task import Imported, Manner, category_of, import_problem, instruction_of
+from embomatrix.factory.task_import.task import Imported, Manner, import_problem
 from embomatrix.sim.physical.survey import Foresight
 from embomatrix.sim.pose_cache import PlacementLibrary
 from embomatrix.world.bddl import BddlError, Literal, parse_formula, parse_problem

@@ -7,12 +7,14 @@ import pytest
 from tests.fakes import furniture as make
 from tests.fakes.scenes import kitchen_scene
 
+from embomatrix.sim.bounds import bounds_of
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.bullet.mini_world import MiniWorld, Still
-from embomatrix.sim.candidates import candidates, stands_in
+from embomatrix.sim.candidates import beside, candidates, stands_in
 from embomatrix.sim.pose_cache import POSES, PlacementLibrary, build_pose_cache
-from embomatrix.world.geometry import Pose
+from embomatrix.sim.relations import Relations
+from embomatrix.world.geometry import Aabb, Pose
 from embomatrix.world.poses import PlacementKey
 from embomatrix.world.state import Relation
 
@@ -124,3 +126,39 @@ def test_relations_that_place_cannot_make_have_no_candidates() -> None:
 def test_unknown_name_is_a_key_error() -> None:
     with pytest.raises(KeyError):
         build_pose_cache(kitchen_scene(), ("unicorn_1",), SUPPORTS, seed=0)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.4])
+def test_poses_beside_a_neighbour_are_next_to_it_by_the_definition_of_nextto(pool, yaw: float) -> None:
+    scene = kitchen_scene()
+    engine = BulletEngine(scene, pool)
+    library = PlacementLibrary(pool)
+    table, lamp = scene.by_name["breakfast_table_1"].pose_world_asset, make.table_lamp()
+    x, y, z = table.position_m
+    top_m = z + scene.asset_of("breakfast_table_1").size_m[2] / 2
+    neighbour = Pose.from_xyz_yaw(x, y, top_m + lamp.size_m[2] / 2, yaw)
+    engine.set_pose("table_lamp_1", neighbour)
+    box = bounds_of(lamp).box(table.inverse() @ neighbour)
+    poses = library.poses_beside(
+        scene.asset_of("mug_1"), scene.asset_of("breakfast_table_1"), Relation.ONTOP, box
+    )
+    relations = Relations(engine)
+    for pose in poses:
+        engine.set_pose("mug_1", table @ pose)
+        assert relations.nextto("mug_1", "table_lamp_1"), pose
+        assert relations.ontop("mug_1", "breakfast_table_1"), pose
+    sides = {(round(pose.position_m[0], 2) > 0, round(pose.position_m[1], 2) > 0) for pose in poses}
+    assert len(sides) >= 3
+    engine.close()
+    library.close()
+
+
+def test_beside_what_stands_at_an_edge_nothing_hangs_over_it() -> None:
+    apple, table = make.apple(), make.kitchen_table()
+    width, depth, height = table.size_m
+    corner = Aabb((width / 2 - 0.3, depth / 2 - 0.3, height / 2), (width / 2, depth / 2, height / 2 + 0.3))
+    for pose in beside(apple, table, Relation.ONTOP, corner):
+        x, y, _ = pose.position_m
+        assert abs(x) + apple.size_m[0] / 2 <= width / 2
+        assert abs(y) + apple.size_m[1] / 2 <= depth / 2
+    assert list(beside(apple, table, Relation.ONTOP, corner))

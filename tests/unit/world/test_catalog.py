@@ -122,3 +122,21 @@ def test_unknown_name_is_answered_with_close_ones(catalog: Catalog, ask, said: s
     with pytest.raises(CatalogError, match="unknown") as caught:
         ask(catalog)
     assert said in str(caught.value)
+
+
+def test_a_model_at_a_share_of_its_size_has_its_shape_and_the_cube_of_its_mass() -> None:
+    catalog = Catalog.load()
+    (whole,) = catalog.models_of("chorizo")
+    small = catalog.model("chorizo", f"{whole.model_id}@0.8")
+    assert small.size_m == pytest.approx(tuple(0.8 * extent for extent in whole.size_m))
+    assert (small.share, whole.share) == (0.8, 1.0)
+    assert small.asset_id == f"{whole.asset_id}@0.8"
+    assert catalog.models_of("chorizo") == (whole,), "no model of its own"
+
+
+@pytest.mark.parametrize("share", ["0.1", "3", "nan", "half", "-1"])
+def test_a_share_beyond_all_sizes_is_refused(share: str) -> None:
+    catalog = Catalog.load()
+    (whole,) = catalog.models_of("chorizo")
+    with pytest.raises(CatalogError, match=r"expected a number from 0\.5 to 2\.0"):
+        catalog.model("chorizo", f"{whole.model_id}@{share}")

@@ -55,8 +55,15 @@ class PlanCalls:
             if call.skill is not Skill.MOVE or (following is not None and following.skill is not Skill.MOVE)
         )
 
-    def place(self, target: str, relation: PlaceRelation) -> Step:
-        """Place what the hand holds; when nothing is free within reach, from beside other things on the target too."""
+    def place(self, target: str, relation: PlaceRelation, near: str = "") -> Step:
+        """Place what the hand holds, from beside ``near`` where that does.
+
+        When nothing is free within reach, from beside other things on the target too.
+        """
+        if near and self._go_to(near).ok and within_reach(self._world, target) is None:
+            step = self._run(self._call(Skill.PLACE, target, relation))
+            if step.ok:
+                return step
         step = self.use(Skill.PLACE, target, relation)
         if step.failure is FailureReason.NO_FREE_POSE:
             for other in self._around(target):

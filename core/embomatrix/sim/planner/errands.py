@@ -111,7 +111,7 @@ class Errands:
         if not found:
             raise StuckError(f"{item.name} fits nowhere so that it is {item.relation.value} {item.target}")
         for carry in found[self.way % len(found)]:
-            script.transfer(carry.name, carry.target, carry.relation)
+            script.transfer(carry.name, carry.target, carry.relation, near=carry.near)
 
     def _leave(self, script: PlanScript, world: LiveWorld) -> str:
         """End the relations that must end. Returns what has to end in the hand, as there is no room for it; else "".

@@ -51,15 +51,17 @@ class PlanScript:
         """The task's object table."""
         return self._task.table
 
-    def transfer(self, name: str, target: str, relation: PlaceRelation, depth: int = 0) -> None:
-        """Carry an object to its place. What must be open is opened while the hand is empty, the target first.
+    def transfer(
+        self, name: str, target: str, relation: PlaceRelation, depth: int = 0, *, near: str = ""
+    ) -> None:
+        """Carry an object to its place, beside ``near`` if can be. What must be open is opened while the hand is empty.
 
         When there is no room, other things are taken from the place first, as long as there are any.
         """
         while True:
             self._prepare(target, relation)
             self._take(name, depth)
-            step = self._calls.place(target, relation)
+            step = self._calls.place(target, relation, near)
             if step.ok:
                 return
             burden = self._in_the_way_at(target, relation, name)

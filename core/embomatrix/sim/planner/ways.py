@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.sim.candidates import candidates
 from embomatrix.skills.syntax import PlaceRelation
+from embomatrix.world.asset import FLOOR_CATEGORY
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
@@ -27,11 +28,12 @@ class Placement:
 
 @dataclass(frozen=True, slots=True)
 class Carry:
-    """An object is placed on, in or under a target."""
+    """An object is placed on, in or under a target, by a robot that stands at ``near`` if anything is to be near."""
 
     name: str
     target: str
     relation: PlaceRelation
+    near: str = ""
 
 
 Way = tuple[Carry, ...]
@@ -71,22 +73,22 @@ def _ways(item: Placement, world: LiveWorld, rows: tuple[str, ...]) -> Iterator[
             return
 
 
-def _placed(item: Placement, world: LiveWorld, *relations: PlaceRelation) -> Iterator[Way]:
+def _placed(item: Placement, world: LiveWorld, *relations: PlaceRelation, near: str = "") -> Iterator[Way]:
     for relation in relations:
         if _fits(world, item.name, item.target, relation):
-            yield (Carry(item.name, item.target, relation),)
+            yield (Carry(item.name, item.target, relation, near),)
 
 
 def _beside(item: Placement, world: LiveWorld, rows: tuple[str, ...]) -> Iterator[Way]:
-    """On or in what either stands on or in, then both on or in anything of the table, small surfaces first."""
+    """On or in what either stands on or in, be it the floor, then both on or in anything of the table, small surfaces first."""
     one, other = item, _turned(item)
     pair = (item.name, item.target)
     for mover in (one, other):
-        host = world.relations.host_of(mover.target)
-        if host is not None and host.name not in pair:
-            yield from _placed(
-                Placement(mover.name, host.relation, host.name), world, PlaceRelation(host.relation.value)
-            )
+        for host, relation in _borne_by(mover.target, world, rows):
+            if host not in pair:
+                yield from _placed(
+                    Placement(mover.name, Relation.ONTOP, host), world, relation, near=mover.target
+                )
     surfaces = [name for name in rows if name not in pair and world.asset(name).supports]
     for host_name in sorted(surfaces, key=lambda name: _least_area_m2(world, name)):
         placed = [
@@ -96,6 +98,17 @@ def _beside(item: Placement, world: LiveWorld, rows: tuple[str, ...]) -> Iterato
         ]
         if placed and all(placed):
             yield tuple(carry for way in placed for carry in way)
+
+
+def _borne_by(name: str, world: LiveWorld, rows: tuple[str, ...]) -> Iterator[tuple[str, PlaceRelation]]:
+    """What the object stands on or in, with how; the floor of its room where that is an object of the table."""
+    host = world.relations.host_of(name)
+    if host is not None:
+        yield host.name, PlaceRelation(host.relation.value)
+        return
+    for floor in rows:
+        if world.asset(floor).category == FLOOR_CATEGORY and world.room_of(floor) == world.room_of(name):
+            yield floor, PlaceRelation.ONTOP
 
 
 def _turned(item: Placement) -> Placement:

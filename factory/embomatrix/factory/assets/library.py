@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @functools.cache
 def build_asset(catalog: Catalog, category: str, model: str) -> Asset:
-    """Asset of one model, of exactly its catalog size; the same on every call and every machine.
+    """Asset of one model, of exactly its catalog size or the share of it that the id tells; the same on every machine.
 
     Raises CatalogError for an unknown category or model.
     """
@@ -36,7 +36,7 @@ def build_asset(catalog: Catalog, category: str, model: str) -> Asset:
         category=category,
         synset=kind.synset,
         size_m=entry.size_m,
-        mass_kg=kind.mass_kg,
+        mass_kg=kind.mass_kg * entry.share**3,
         links=links,
         supports=tuple(body.supports),
         interiors=tuple(body.interiors),

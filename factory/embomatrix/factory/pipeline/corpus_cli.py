@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,14 +11,13 @@ from rich.console import Console
 
 from embomatrix.factory.pipeline.build import build_dataset
 from embomatrix.factory.pipeline.corpus import HELDOUT_SCENES, CorpusSettings, check_frozen, freeze
-from embomatrix.factory.pipeline.options import Physical, is_proved
+from embomatrix.factory.pipeline.options import Jobs, Physical, is_proved, processes
 from embomatrix.factory.terminal import fail, mended, progress
 
 if TYPE_CHECKING:
     from embomatrix.factory.pipeline.settings import BuildSettings
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-MOST_JOBS = 8
 
 
 @app.command()
@@ -34,7 +32,7 @@ def corpus(
     unseen: Annotated[
         list[str] | None, typer.Option(help="Scene that training never sees. Default: six.")
     ] = None,
-    jobs: Annotated[int | None, typer.Option(min=1, help="Processes.")] = None,
+    jobs: Jobs = None,
     look_ahead: Annotated[bool, typer.Option(help="Find out what the arm can do in each scene.")] = True,
     physical: Physical = None,
     check: Annotated[
@@ -51,7 +49,7 @@ def corpus(
             chosen, others = tuple(scenes or ()), tuple(unseen or HELDOUT_SCENES)
             proof = is_proved(physical, look_ahead=look_ahead)
             settings = CorpusSettings(train, heldout, seed, chosen, others, look_ahead, proof)
-            _make(console, out, settings, jobs or min(MOST_JOBS, len(os.sched_getaffinity(0))))
+            _make(console, out, settings, processes(jobs))
             frozen = freeze(out)
     console.print(
         f"Internal-Verified: {frozen.tasks} tasks, {frozen.unseen} in scenes that training never sees, {frozen.digest}",

@@ -9,6 +9,7 @@ import itertools
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Self
 
+from embomatrix.sim.bounds import bounds_of
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.live_world import LiveWorld
 from embomatrix.sim.physical.prospects import Placing
@@ -33,10 +34,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Needs:
-    """What one task asks of a cache: ``about`` are the objects that its goal brings together, ``table`` all its rows."""
+    """What one task asks of a cache.
+
+    ``about`` are the objects that its goal brings together, ``table`` all its rows; ``beside`` are pairs of which the goal
+    wants the first next to the second, which stays where it is.
+    """
 
     about: tuple[str, ...]
     table: tuple[str, ...]
+    beside: tuple[tuple[str, str], ...] = ()
 
 
 class SceneSurvey:
@@ -96,14 +102,15 @@ def cache_poses(
 ) -> PoseCache:
     """Poses for every thing of a task on, or in, whatever of the same task can hold it, and what the survey knows of all rows.
 
-    What a goal brings together has poses of its own; for all other rows of a task's table there are those of their
-    footprints.
+    What a goal brings together has poses of its own, beside what it must be next to; for all other rows of a task's table
+    there are those of their footprints.
     """
     scene, tasks = view.scene, tuple(tasks)
     placements: dict[PlacementKey, tuple[Pose, ...]] = {}
     rows: dict[str, None] = {}
     for task in tasks:
         rows.update(dict.fromkeys(task.table))
+        placements.update(_beside(view, task, library))
         for thing, host, relation in _pairs(view, task.about):
             key = PlacementKey(view.item(thing).asset_id, view.item(host).asset_id, relation)
             if key not in placements:
@@ -111,6 +118,22 @@ def cache_poses(
         placements.update(footprint_placements(scene, *_portable_and_holders(view, task), library, seed))
     kept = {key: poses for key, poses in placements.items() if poses}
     return survey.prospects(replace(survey.poses(rows), placements=kept), _placings(view, tasks))
+
+
+def _beside(view: SceneView, task: Needs, library: PlacementLibrary) -> dict[PlacementKey, tuple[Pose, ...]]:
+    """Poses next to what a goal wants things beside, on or in what that stands on or in: no skill aims at them otherwise."""
+    found: dict[PlacementKey, tuple[Pose, ...]] = {}
+    for thing, neighbour in task.beside:
+        near = view.item(neighbour)
+        host, relation = near.host or view.floor_of(near.room), near.relation or Relation.ONTOP
+        if not host or relation not in (Relation.ONTOP, Relation.INSIDE):
+            continue
+        frame = view.item(host).pose_world_asset.inverse() @ near.pose_world_asset
+        box = bounds_of(view.asset(neighbour)).box(frame)
+        key = PlacementKey(view.item(thing).asset_id, view.item(host).asset_id, relation)
+        poses = library.poses_beside(view.asset(thing), view.asset(host), relation, box)
+        found[key] = (*found.get(key, ()), *poses)
+    return found
 
 
 def _placings(view: SceneView, tasks: Sequence[Needs]) -> Iterator[Placing]:

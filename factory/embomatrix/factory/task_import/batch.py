@@ -10,7 +10,10 @@ from typing import TYPE_CHECKING, Final, TypeVar
 from embomatrix.factory.admission import MOST_HELD, Admitted, admit
 from embomatrix.factory.pipeline.poses import Needs, SceneSurvey, cache_poses
 from embomatrix.factory.refusal import Refusal, RefusalReason
-from embomatrix.factory.task_import.sources import EAI
+from embomatrix.factory.task_import.demands import demands_of
+from embomatrix.factory.task_import.dialects import read_problem
+from embomatrix.factory.task_import.neighbours import neighbours_of
+from embomatrix.factory.task_import.sources import BEHAVIOR, EAI
 from embomatrix.factory.task_import.task import Imported, Manner, import_problem
 from embomatrix.factory.writer.view import SceneView
 from embomatrix.sim.executor import Simulator
@@ -44,7 +47,12 @@ OF_THE_PROBLEM: Final = frozenset(
 DRAWS: Final = 3
 """Ways to lay a problem out in its first scene, from seeds of their own, before another scene is looked at."""
 MOST_UNSOLVED: Final = 6
-"""Scenes in which a problem is laid out and not solved before it is given up: what stops it is then no scene's fault."""
+"""Scenes in which a problem is laid out and not solved before it is given up: what stops it is then no scene's fault.
+
+So many more are looked at with a snug layout, where things are to share a cavity or a surface.
+"""
+MOST_ALIKE: Final = 3
+"""Such scenes in a row of which the same is told."""
 STRIDE: Final = 1_000_003
 """Between the seeds of two draws: no other problem is imported with such a one."""
 MOST_MISFITS: Final = 12
@@ -59,6 +67,8 @@ class Verified:
 
     record: TaskRecord
     bundle: bytes
+    notes: tuple[str, ...] = ()
+    """As those of the import."""
 
 
 def bind_first(
@@ -122,17 +132,31 @@ def verify_first(
     """
 
     def judged() -> Iterator[Verified | Refusal]:
-        unsolved = 0
-        for imported in imports(source, bases, seed=seed, manner=manner or Manner(), draws=DRAWS):
-            if isinstance(imported, Refusal):
-                yield imported
-                continue
-            yield verify(imported, library, foresight, seed=seed)
-            unsolved += 1
-            if unsolved == MOST_UNSOLVED:
+        given = manner or Manner()
+        for tried in (given, replace(given, snug=True)) if shares_room(source) else (given,):
+            laid_out, misfits, told = 0, 0, list[str]()
+            for imported in imports(source, bases, seed=seed, manner=tried, draws=DRAWS):
+                if isinstance(imported, Refusal):
+                    misfits += imported.reason is RefusalReason.DOES_NOT_FIT
+                    yield imported
+                    continue
+                judged = verify(imported, library, foresight, seed=seed)
+                yield judged
+                laid_out += 1
+                told.append(judged.sentence if isinstance(judged, Refusal) else "")
+                alike = told[-MOST_ALIKE:].count(told[-1])
+                if laid_out == MOST_UNSOLVED or alike == MOST_ALIKE:
+                    break
+            if not laid_out and not misfits:
                 return
 
     return _first(judged())
+
+
+def shares_room(source: SourceText) -> bool:
+    """Whether a problem has more than one thing in or on another, at the start or in the end. Raises BddlError."""
+    problem, _ = read_problem(source)
+    return any(max(len(each.contents), len(each.burden)) > 1 for each in demands_of(problem).values())
 
 
 T = TypeVar("T", Imported, Verified)
@@ -154,9 +178,10 @@ def verify(
     imported: Imported, library: PlacementLibrary, foresight: Foresight | None, *, seed: int = 0
 ) -> Verified | Refusal:
     """Judge an imported task by execution, and pack it when it is admitted. Without ``foresight`` the arm is not asked."""
-    needs = Needs(imported.about, imported.task.table)
+    view, task = SceneView(imported.scene), imported.task
+    needs = Needs(imported.about, task.table, neighbours_of(task.goal, task.types, view.is_portable))
     with SceneSurvey(imported.scene, foresight) as survey:
-        poses = cache_poses(SceneView(imported.scene), [needs], library, survey, seed)
+        poses = cache_poses(view, [needs], library, survey, seed)
     with contextlib.closing(Simulator(Bundle(imported.scene, {}, poses))) as stage:
         verdict = admit(stage, imported.task, find_plan, imported.init, most_held=most_held_in(imported.task))
         if not isinstance(verdict, Admitted):
@@ -171,9 +196,9 @@ def verify(
         rooms=imported.rooms,
         signature=imported.signature,
     )
-    return Verified(record, data)
+    return Verified(record, data, imported.notes)
 
 
 def most_held_in(task: Task) -> float:
-    """Share of a task's atoms that may hold at the start: an examination's questions are as they are."""
-    return 1.0 if task.source == EAI else MOST_HELD
+    """Share of a task's atoms that may hold at the start: the questions of published benchmarks are as they are."""
+    return 1.0 if task.source in (BEHAVIOR, EAI) else MOST_HELD

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 from collections import Counter
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,17 +13,17 @@ from rich.table import Table
 
 from embomatrix.factory.evaluate.figures import EvaluationError, evaluation_to_json
 from embomatrix.factory.outcome_log import LineLog
+from embomatrix.factory.pipeline.options import Jobs, processes
 from embomatrix.factory.pipeline.settings import scene_ids
 from embomatrix.factory.refusal import Refusal
-from embomatrix.factory.scenes.build import build_base_scene
-from embomatrix.factory.task_import.batch import Verified, bind_first, verify_first
+from embomatrix.factory.task_import.batch import Verified
 from embomatrix.factory.task_import.dialects import read_problem
+from embomatrix.factory.task_import.judges import Depth, Docket, judging
 from embomatrix.factory.task_import.reach import unreachable_atoms
 from embomatrix.factory.task_import.report import (
     Outcome,
     evaluation_of,
     outcome_from_json,
-    outcome_of,
     report_to_json,
     report_to_markdown,
     solved_of,
@@ -39,12 +37,10 @@ from embomatrix.factory.task_import.sources import (
     read_file,
     read_jsonl,
 )
-from embomatrix.factory.task_import.task import Manner
 from embomatrix.factory.terminal import fail, mended, progress
-from embomatrix.sim.physical.survey import Foresight
-from embomatrix.sim.pose_cache import PlacementLibrary
 from embomatrix.world.bddl import BddlError
 from embomatrix.world.dataset import TASKS_FILE, write_dataset
+from embomatrix.world.substances import is_substance
 from embomatrix.world.task import Profile
 from embomatrix.world.whole_file import check_writable, write_whole
 
@@ -53,18 +49,9 @@ if TYPE_CHECKING:
 
     from embomatrix.factory.evaluate.figures import Evaluation
     from embomatrix.factory.task_import.task import Imported
-    from embomatrix.world.scene import Scene
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 EVERY_ACTIVITY = "all"
-
-
-class Depth(StrEnum):
-    """How far an import goes."""
-
-    VERIFY = "verify"  # bound, and solved by the oracle in the simulator
-    BIND = "bind"  # bound to a scene, the goal within the skills' reach
-    INSTANTIATE = "instantiate"  # bound to a scene, whatever the skills can do
 
 
 Report = Annotated[
@@ -86,6 +73,7 @@ Kept = Annotated[
 ReachedBy = Annotated[
     Profile | None, typer.Option(help="Leave out problems with goals that no skill of this profile reaches.")
 ]
+Solids = Annotated[bool, typer.Option("--solids", help="Leave out problems that name a liquid or a powder.")]
 Scenes = Annotated[
     list[str] | None,
     typer.Option("--scenes", "--scene", help="Base scene, or 'all'; give it again for more."),
@@ -104,10 +92,12 @@ def import_(
     bind_only: Annotated[bool, typer.Option("--bind-only", help="Leave out the verification.")] = False,
     instantiate: Instantiate = False,
     reached_by: ReachedBy = None,
+    solids: Solids = False,
     look_ahead: LookAhead = True,
     report: Report = None,
     json_file: Rates = None,
     outcomes: Kept = None,
+    jobs: Jobs = None,
 ) -> None:
     """Bind BDDL problems to base scenes and verify them, or say why not."""
     console = Console()
@@ -118,11 +108,10 @@ def import_(
             check_writable(file)
         if out is not None:
             _check_free(out, depth, outcomes)
-        sources = _sources(bddl, activity, jsonl, eai, reached_by)
-        bases = [build_base_scene(scene_id) for scene_id in scene_ids(scenes)]
-        foresight = Foresight() if look_ahead else None
-        log = _taken_up(outcomes, sources, bases, seed, depth, foresight)
-        made = _judged(console, sources[len(log.outcomes) :], bases, seed, depth, foresight, log)
+        sources = _wanted(_sources(bddl, activity, jsonl, eai), reached_by, solids=solids)
+        docket = Docket(scene_ids(scenes), seed, depth, look_ahead)
+        log = _taken_up(outcomes, sources, docket)
+        made = _judged(console, sources[len(log.outcomes) :], docket, processes(jobs), log)
         admitted = out is None or _written(out, made)
         told = log.outcomes
         evaluation = (solved_of if depth is Depth.VERIFY else evaluation_of)(told, seed)
@@ -147,15 +136,16 @@ def _written(out: Path, made: Sequence[Imported | Verified | Refusal]) -> bool:
 def _taken_up(
     path: Path | None,
     sources: Sequence[SourceText],
-    bases: Sequence[Scene],
-    seed: int,
-    depth: Depth,
-    foresight: Foresight | None,
+    docket: Docket,
 ) -> LineLog[Outcome]:
     """What is known already of the first of the problems. Raises EvaluationError where a file tells of others."""
     log = LineLog[Outcome](path)
-    scenes = [base.base for base in bases]
-    told = {"seed": seed, "depth": depth, "scenes": scenes, "look_ahead": foresight is not None}
+    told = {
+        "seed": docket.seed,
+        "depth": docket.depth,
+        "scenes": [*docket.scenes],
+        "look_ahead": docket.look_ahead,
+    }
     log.take_up(told, outcome_from_json)
     known = [outcome.name for outcome in log.outcomes]
     if known != [source.name for source in sources[: len(known)]]:
@@ -163,13 +153,21 @@ def _taken_up(
     return log
 
 
-def _reached(sources: Sequence[SourceText], profile: Profile) -> list[SourceText]:
-    """Those with goals that the profile's skills reach. Raises SourceError where there is none."""
-    found = [source for source in sources if not unreachable_atoms(read_problem(source)[0], profile)]
-    if not found:
-        raise SourceError(
-            f"no goal of {len(sources)} problems is reached by the profile {profile.value!r}: leave out --reached-by"
-        )
+def _wanted(sources: Sequence[SourceText], profile: Profile | None, *, solids: bool) -> Sequence[SourceText]:
+    """Those with goals that a profile's skills reach, and without substances. Raises SourceError where there is none."""
+    found = sources
+    if profile is not None:
+        found = [source for source in found if not unreachable_atoms(read_problem(source)[0], profile)]
+        if not found:
+            raise SourceError(
+                f"no goal of {len(sources)} problems is reached by the profile {profile.value!r}: leave out --reached-by"
+            )
+    if solids:
+        found = [
+            source for source in found if not any(map(is_substance, read_problem(source)[0].objects.values()))
+        ]
+        if not found:
+            raise SourceError("each of the problems names a liquid or a powder: leave out --solids")
     return found
 
 
@@ -205,12 +203,9 @@ def _parsed(source: SourceText) -> SourceText:
     return source
 
 
-def _sources(
-    bddl: Path | None, activity: str, jsonl: Path | None, eai: Path | None, reached_by: Profile | None
-) -> list[SourceText]:
-    """The problems that are to be imported, all of which are BDDL. Raises SourceError."""
-    sources = [_parsed(source) for source in _given(bddl, activity, jsonl, eai)]
-    return sources if reached_by is None else _reached(sources, reached_by)
+def _sources(bddl: Path | None, activity: str, jsonl: Path | None, eai: Path | None) -> list[SourceText]:
+    """The problems that are given, all of which are BDDL. Raises SourceError."""
+    return [_parsed(source) for source in _given(bddl, activity, jsonl, eai)]
 
 
 def _given(bddl: Path | None, activity: str, jsonl: Path | None, eai: Path | None) -> Iterator[SourceText]:
@@ -234,28 +229,19 @@ def _given(bddl: Path | None, activity: str, jsonl: Path | None, eai: Path | Non
 def _judged(
     console: Console,
     sources: Sequence[SourceText],
-    bases: Sequence[Scene],
-    seed: int,
-    depth: Depth,
-    foresight: Foresight | None,
+    docket: Docket,
+    jobs: int,
     log: LineLog[Outcome],
 ) -> list[Imported | Verified | Refusal]:
-    """What becomes of these problems; each is added to the log."""
+    """What becomes of these problems, but for those that another process has bound; each is added to the log."""
     made: list[Imported | Verified | Refusal] = []
     done = len(log.outcomes)
-    with progress(console) as bars, contextlib.closing(PlacementLibrary()) as library:
+    with progress(console) as bars, judging(docket, min(jobs, len(sources) or 1)) as judge:
         bar = bars.add_task("problems", total=done + len(sources), completed=done)
-        for source in sources:
-            item: Imported | Verified | Refusal
-            match depth:
-                case Depth.INSTANTIATE:
-                    item = bind_first(source, bases, seed=seed, manner=Manner(reachable=False))
-                case Depth.BIND:
-                    item = bind_first(source, bases, seed=seed)
-                case Depth.VERIFY:
-                    item = verify_first(source, bases, library, foresight, seed=seed)
-            log.add(outcome_of(source, item))
-            made.append(item)
+        for judged in judge(sources):
+            log.add(judged.outcome)
+            if judged.item is not None:
+                made.append(judged.item)
             bars.advance(bar)
     return made
 

@@ -42,33 +42,45 @@ class Demand:
     contents: tuple[str, ...] = ()
     carried: bool = False
     """The goal wants it where it is not yet."""
+    places: tuple[tuple[Relation, str], ...] = ()
+    """What it is on or in, at the start or in the end, by name."""
+    burden: tuple[str, ...] = ()
+    """Types of what goes on top of it, one for each thing, as ``contents``."""
 
 
 def demands_of(problem: Problem) -> Mapping[str, Demand]:
     """Demands on objects, and on types that the goal's variables range over, by name."""
+    fixtures = {item.atom.args[0] for item in problem.init if item.atom.predicate == Relation.INROOM}
     bears: set[str] = set()
     carried: set[str] = set()
-    started: defaultdict[str, list[str]] = defaultdict(list)
-    ended: defaultdict[str, list[str]] = defaultdict(list)
+    started: defaultdict[tuple[str, str], list[str]] = defaultdict(list)
+    ended: defaultdict[tuple[str, str], list[str]] = defaultdict(list)
+    places: defaultdict[str, dict[tuple[Relation, str], None]] = defaultdict(dict)
     moments = (
         (started, [item.atom for item in problem.init if item.positive]),
         (ended, list(dict.fromkeys(atoms_of(problem.goal)))),
     )
-    for inside, atoms in moments:
+    for borne, atoms in moments:
         for atom in atoms:
             if atom.predicate not in PLACED:
                 continue
             thing, host = (name.lstrip("?") for name in atom.args)
-            if inside is ended and atom.predicate != Relation.NEXTTO and not _is_so(problem, atom):
-                carried.add(thing)
+            if borne is ended and not _is_so(problem, atom):
+                # of two that are to be neighbours, what the rooms don't have already
+                carried.add(host if atom.predicate == Relation.NEXTTO and thing in fixtures else thing)
             if atom.predicate in (Relation.INSIDE, Relation.ONTOP):
                 bears.add(host)
-            if atom.predicate == Relation.INSIDE:
-                inside[host] += _share(problem, thing, host)
+                places[thing][Relation(atom.predicate), problem.types.get(host, (host,))[0]] = None
+                borne[atom.predicate, host] += _share(problem, thing, host)
     found = {}
     for name in (*problem.objects, *problem.types):
-        contents = started[name] if len(started[name]) > len(ended[name]) else ended[name]
-        found[name] = Demand(name in bears, tuple(contents), name in carried)
+        contents, burden = (
+            tuple(started[relation, name])
+            if len(started[relation, name]) > len(ended[relation, name])
+            else tuple(ended[relation, name])
+            for relation in (Relation.INSIDE, Relation.ONTOP)
+        )
+        found[name] = Demand(name in bears, contents, name in carried, tuple(places[name]), burden)
     return found
 
 
@@ -79,6 +91,8 @@ def demand_on(demands: Mapping[str, Demand], name: str, type_name: str) -> Deman
         own.bears or all_alike.bears,
         max(own.contents, all_alike.contents, key=len),
         own.carried or all_alike.carried,
+        tuple(dict.fromkeys((*own.places, *all_alike.places))),
+        max(own.burden, all_alike.burden, key=len),
     )
 
 
@@ -90,14 +104,23 @@ class Room(IntEnum):
     FOR_SOME = 2  # not even that
 
 
-def room_for(asset: Asset, contents: tuple[str, ...]) -> Room:
-    """What the cavities of an asset have for some types' smallest models."""
-    floors = surfaces_for(asset, Relation.INSIDE)
+def room_for(asset: Asset, contents: tuple[str, ...], relation: Relation = Relation.INSIDE) -> Room:
+    """What the cavities of an asset, or its surfaces, have for some types' smallest models."""
+    floors = surfaces_for(asset, relation)
     sizes_m = [size_m for size_m in map(smallest_m, contents) if size_m is not None]
     if not all(any(_fits(size_m, floor) for floor in floors) for size_m in sizes_m):
         return Room.FOR_SOME
-    needed_m2 = SLACK * sum(size_m[0] * size_m[1] for size_m in sizes_m)
-    return Room.FOR_ALL if needed_m2 <= sum(math.prod(floor.size_m) for floor in floors) else Room.FOR_EACH
+    return (
+        Room.FOR_ALL
+        if floor_needed_m2(contents) <= sum(math.prod(floor.size_m) for floor in floors)
+        else Room.FOR_EACH
+    )
+
+
+def floor_needed_m2(contents: tuple[str, ...]) -> float:
+    """Floor for things of some types side by side, as they fall, by their smallest models."""
+    sizes_m = [size_m for size_m in map(smallest_m, contents) if size_m is not None]
+    return SLACK * sum(size_m[0] * size_m[1] for size_m in sizes_m)
 
 
 def _fits(size_m: Vec3, floor: SupportSurface) -> bool:

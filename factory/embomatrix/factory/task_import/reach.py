@@ -79,7 +79,7 @@ def unreachable_atoms(problem: Problem, profile: Profile) -> tuple[str, ...]:
     horizon = Horizon(problem, profile)
     found = [
         render(atom if positive else Not(atom))
-        for atom, positive, scope in _literals(problem.goal, True, {})
+        for atom, positive, scope in literals(problem.goal, True, {})
         if not any(
             horizon.possible(substitute(atom, dict(zip(scope, names, strict=True))), positive)
             for names in itertools.product(*(problem.types[type_name] for type_name in scope.values()))
@@ -88,7 +88,7 @@ def unreachable_atoms(problem: Problem, profile: Profile) -> tuple[str, ...]:
     return tuple(dict.fromkeys(found))
 
 
-def _literals(
+def literals(
     formula: Formula, positive: bool, scope: Mapping[str, str]
 ) -> Iterator[tuple[Atom, bool, Mapping[str, str]]]:
     """Atoms with their sign, and the types of the variables that they name."""
@@ -96,17 +96,17 @@ def _literals(
         case Atom(_, args):
             yield formula, positive, {name: kind for name, kind in scope.items() if name in args}
         case Not(body):
-            yield from _literals(body, not positive, scope)
+            yield from literals(body, not positive, scope)
         case And(parts) | Or(parts):
             for part in parts:
-                yield from _literals(part, positive, scope)
+                yield from literals(part, positive, scope)
         case Imply(premise, conclusion):
-            yield from _literals(premise, not positive, scope)
-            yield from _literals(conclusion, positive, scope)
+            yield from literals(premise, not positive, scope)
+            yield from literals(conclusion, positive, scope)
         case Forall(variable, kind, body) | Exists(variable, kind, body) | ForN(_, variable, kind, body):
-            yield from _literals(body, positive, {**scope, variable: kind})
+            yield from literals(body, positive, {**scope, variable: kind})
         case ForPairs(a, kind_a, b, kind_b, body) | ForNPairs(_, a, kind_a, b, kind_b, body):
-            yield from _literals(body, positive, {**scope, a: kind_a, b: kind_b})
+            yield from literals(body, positive, {**scope, a: kind_a, b: kind_b})
 
 
 class Horizon:

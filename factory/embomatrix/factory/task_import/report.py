@@ -12,6 +12,7 @@ from embomatrix.factory.refusal import Refusal
 from embomatrix.factory.task_import.batch import Verified
 from embomatrix.factory.task_import.dialects import read_problem
 from embomatrix.factory.task_import.reach import unreachable_atoms
+from embomatrix.factory.task_import.sources import BEHAVIOR, EAI
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.world.task import Profile
 
@@ -23,8 +24,8 @@ if TYPE_CHECKING:
 
 FIGURES: Final[Mapping[str, tuple[str, float]]] = {
     "embomatrix": ("import_rate_sample", 0.97),
-    "behavior-1k": ("import_rate_behavior", 0.6),
-    "eai": ("import_rate_eai", 1.0),
+    BEHAVIOR: ("import_rate_behavior", 0.6),
+    EAI: ("import_rate_eai", 1.0),
 }
 """Figure and goal by source."""
 SOLVED_GOAL: Final = 0.95
@@ -66,7 +67,7 @@ def outcome_of(source: SourceText, judged: Imported | Verified | Refusal) -> Out
         )
     if isinstance(judged, Verified):
         scene = judged.record.task.scene_id.split("-")[0]
-        return Outcome(source.name, source.source, scene, "", "", unreachable, notes)
+        return Outcome(source.name, source.source, scene, "", "", unreachable, judged.notes)
     return Outcome(source.name, source.source, judged.scene.base, "", "", unreachable, judged.notes)
 
 

@@ -18,6 +18,7 @@ MAX_PROBLEM_BYTES: Final = 1024 * 1024
 MAX_RECORDS_BYTES: Final = 256 * 1024 * 1024
 """A hundred thousand tasks as the paper's factory writes them take half of that."""
 
+BEHAVIOR: Final = "behavior-1k"
 EAI: Final = "eai"
 EAI_FOLDER: Final = "behavior_eval"
 EAI_PROBLEMS: Final = "evaluation/transition_modeling/resources/pddl_behavior"
@@ -79,7 +80,7 @@ def read_activity(name: str) -> SourceText:
         close = difflib.get_close_matches(name, activity_names(), n=3)
         hint = f"did you mean {', '.join(close)}?" if close else "see the package's activity_manifest.txt"
         raise SourceError(f"there is no activity {name!r} in the bddl package: {hint}")
-    return SourceText(name, path.read_text(encoding="utf-8"), "behavior-1k", request=name.replace("_", " "))
+    return SourceText(name, path.read_text(encoding="utf-8"), BEHAVIOR, request=name.replace("_", " "))
 
 
 def read_file(path: Path) -> SourceText:

@@ -13,6 +13,7 @@ import numpy as np
 
 from embomatrix.factory.assets.library import build_asset
 from embomatrix.factory.editor import SceneEditor, add_floor
+from embomatrix.factory.furnish.roles import is_portable
 from embomatrix.factory.layout.generator import lay
 from embomatrix.factory.layout.jobs import Item
 from embomatrix.factory.layout.values import LayoutRelation
@@ -21,19 +22,22 @@ from embomatrix.factory.task_import.binding import bind
 from embomatrix.factory.task_import.demands import demand_on, demands_of
 from embomatrix.factory.task_import.dialects import read_problem
 from embomatrix.factory.task_import.expressible import AGENT, FLOORS
+from embomatrix.factory.task_import.kinds import SWITCHED, category_of, instruction_of, signature_of
 from embomatrix.factory.task_import.models import models_for
+from embomatrix.factory.task_import.neighbours import neighbours_of
 from embomatrix.factory.task_import.reach import FUTURE, INSOURCE, REAL, pieces_of, profile_for
 from embomatrix.factory.task_import.scene import with_robot_in, with_states
+from embomatrix.factory.task_import.sizes import sized
 from embomatrix.factory.task_import.thermal import sources_for, taps_for
 from embomatrix.factory.writer.tasks import object_table
 from embomatrix.factory.writer.view import SceneView
-from embomatrix.world.bddl import ROOM_TYPES, Literal, is_room_instance
-from embomatrix.world.catalog import Catalog
+from embomatrix.world.bddl import Literal, is_room_instance
+from embomatrix.world.catalog import Catalog, share_of
 from embomatrix.world.evaluate import atoms_of, objects_of, render, substitute, types_of
 from embomatrix.world.goal import Atom
-from embomatrix.world.state import Relation, State, SubstanceRelation
-from embomatrix.world.substances import MEANINGS, flows_from, is_substance
-from embomatrix.world.task import MAX_TABLE, Task, TaskCategory
+from embomatrix.world.state import SubstanceRelation
+from embomatrix.world.substances import flows_from, is_substance
+from embomatrix.world.task import MAX_TABLE, Task
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -43,14 +47,8 @@ if TYPE_CHECKING:
     from embomatrix.factory.task_import.binding import Addition, Binding
     from embomatrix.factory.task_import.sources import SourceText
     from embomatrix.world.bddl import Problem
-    from embomatrix.world.geometry import Vec3
-    from embomatrix.world.goal import Formula
+    from embomatrix.world.catalog import Model
     from embomatrix.world.scene import Scene
-
-_ROOM_OR_TEXT: Final = re.compile(
-    rf"(?:{'|'.join(sorted(ROOM_TYPES, key=len, reverse=True))})_\d+|.+?(?=(?:{'|'.join(sorted(ROOM_TYPES))})_\d|$)",
-    re.IGNORECASE,
-)
 
 
 class Lay(Protocol):
@@ -63,9 +61,6 @@ SHUNNED: Final = 3
 """Pieces of furniture that are given up for a problem at most, because they can't hold what it puts there."""
 REDRAWN: Final = 3
 """Layouts that are drawn anew at most, where the robot does not get at all that was laid out."""
-KITCHEN: Final = frozenset({State.COOKED, State.FROZEN, State.HOT, State.SLICED, REAL})
-SWITCHED: Final = frozenset({State.OPEN, State.TOGGLED_ON})
-CLEANED: Final = frozenset((*MEANINGS, *SubstanceRelation))
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,6 +92,8 @@ class Manner:
     """Whether a goal that no skill reaches is refused; else it must only be told whether it holds."""
     renumbering: bool = False
     """Whether ``kitchen_0`` may be another kitchen: problems of other worlds count other rooms."""
+    snug: bool = False
+    """Whether what goes into one thing together is made small enough to lie there side by side."""
 
 
 def import_problem(
@@ -139,7 +136,7 @@ class _Binder:
         self._problem = binding.problem
         for whole, halves in pieces_of(self._problem).items():
             names |= zip(halves, self._add_pieces(editor, names[whole], halves), strict=True)
-        for floor in self._floors_asked_for():
+        for floor in self._floors_asked_for(editor, names, binding):
             names[floor] = self._add_floor(editor, floor, binding)
         start = self._start(names, binding)
         scene = with_states(with_robot_in(editor.freeze(self._scene_id), binding.robot_room), start)
@@ -201,31 +198,57 @@ class _Binder:
             )
         return add_floor(editor, binding.floors[floor])
 
-    def _floors_asked_for(self) -> tuple[str, ...]:
-        """Floors that the goal is about: these become objects. Others are just where things stand."""
+    def _floors_asked_for(
+        self, editor: SceneEditor, names: Mapping[str, str], binding: Binding
+    ) -> tuple[str, ...]:
+        """Floors that the goal is about, or on which it wants something beside what stands there: these become objects.
+
+        Others are just where things stand.
+        """
         about = {arg for atom in atoms_of(self._problem.goal) for arg in atom.args} | types_of(
             self._problem.goal
         )
+        pairs = neighbours_of(
+            self._problem.goal,
+            self._problem.types,
+            lambda name: self._is_portable(editor, names.get(name, "")),
+        )
+        standing = [editor.known(names[other]) for _, other in pairs if other in names]
+        beside = {item.room for item in standing if not item.host}
         return tuple(
             name
             for name, type_name in self._problem.objects.items()
-            if type_name in FLOORS and {name, type_name} & about
+            if type_name in FLOORS and ({name, type_name} & about or binding.floors.get(name) in beside)
         )
+
+    def _is_portable(self, editor: SceneEditor, name: str) -> bool:
+        return name in editor.objects and is_portable(editor.asset_of(name))
 
     def _laid(self, editor: SceneEditor, binding: Binding) -> Layout:
         """Put all that the scene lacks into it."""
         editor.keep(binding.found.values())
-        items = [self._item(addition, binding) for addition in binding.additions]
+        models = self._models(binding, editor)
+        items = [self._item(addition, binding, models[addition.name]) for addition in binding.additions]
         return self._manner.lay(editor, items, int(self._rng.integers(2**31)))
 
-    def _item(self, addition: Addition, binding: Binding) -> Item:
-        models = models_for(addition, self._rng, demand_on(self._demands, addition.name, addition.type))
-        if not models:
-            asked = f" that can do what the task asks of it: {', '.join(sorted(addition.needs))}"
-            raise RefusedError(
-                RefusalReason.DOES_NOT_FIT,
-                f"{addition.name!r} has no place: its type has no model{asked if addition.needs else ''}",
-            )
+    def _models(self, binding: Binding, editor: SceneEditor) -> Mapping[str, Sequence[Model]]:
+        """Models to try for each addition, the best first; some at another size than the catalog's."""
+        demands = {
+            name: demand_on(self._demands, name, type_name)
+            for name, type_name in self._problem.objects.items()
+        }
+        orders = {each.name: models_for(each, self._rng, demands[each.name]) for each in binding.additions}
+        for addition in binding.additions:
+            if not orders[addition.name]:
+                asked = f" that can do what the task asks of it: {', '.join(sorted(addition.needs))}"
+                raise RefusedError(
+                    RefusalReason.DOES_NOT_FIT,
+                    f"{addition.name!r} has no place: its type has no model{asked if addition.needs else ''}",
+                )
+        found = {name: editor.asset_of(there) for name, there in binding.found.items()}
+        return sized(orders, binding.additions, demands, found, snug=self._manner.snug)
+
+    def _item(self, addition: Addition, binding: Binding, models: Sequence[Model]) -> Item:
         rooms = (addition.room,) if addition.room else tuple(dict.fromkeys(binding.rooms.values()))
         demanded = addition.relation is not None
         host = binding.found.get(addition.host, addition.host) or (addition.room if demanded else "")
@@ -241,7 +264,7 @@ class _Binder:
     def _add_pieces(self, editor: SceneEditor, whole: str, halves: tuple[str, ...]) -> tuple[str, ...]:
         """The halves of a thing, of the model whose volume is nearest to half of the whole's."""
         catalog = Catalog.load()
-        half_m3 = math.prod(self._size_of(editor, whole)) / 2
+        half_m3 = math.prod(editor.asset_of(whole).size_m) / 2
         models = [
             model
             for category in catalog.categories_of(self._problem.objects[halves[0]])
@@ -249,10 +272,6 @@ class _Binder:
         ]
         model = min(models, key=lambda model: abs(math.prod(model.size_m) - half_m3))
         return editor.add_pieces(whole, build_asset(catalog, model.category, model.model_id), len(halves))
-
-    def _size_of(self, editor: SceneEditor, name: str) -> Vec3:
-        category, _, model = editor.objects[name].asset_id.rpartition("-")
-        return Catalog.load().model(category, model).size_m
 
     def _task(
         self, scene: Scene, names: dict[str, str], binding: Binding, start: tuple[Literal, ...]
@@ -307,7 +326,12 @@ class _Binder:
             for item in self._base.objects
             if item.fixed and item.name not in view.scene.by_name
         )
-        return (*added, *moved, *gone)
+        resized = tuple(
+            f"{names[each.name]} is made at {share:g} of its size: no model of its type does what is asked"
+            for each in binding.additions
+            if (share := share_of(view.item(names[each.name]).asset_id)) != 1
+        )
+        return (*added, *moved, *gone, *resized)
 
     def _start(self, names: dict[str, str], binding: Binding) -> tuple[Literal, ...]:
         """``:init`` in the scene's names, without the floors that are no objects, the robot, and what is not the case.
@@ -342,41 +366,6 @@ def _renamed(literal: Literal, names: dict[str, str]) -> Atom:
         SubstanceRelation.CONTAINS.value if predicate == INSOURCE else predicate,
         tuple(names.get(arg, arg) for arg in literal.atom.args),
     )
-
-
-def instruction_of(source: SourceText, problem: Problem) -> str:
-    """What a person asks for. The paper's tasks carry it as the problem's name, with underscores for spaces."""
-    words = source.request or problem.name
-    words = re.sub(r"-\d+$", "", words)
-    words = re.sub(r"\.n\.\d+(_\d+)?", "", words)
-    spaced = " ".join(
-        word if is_room_instance(word.lower()) else word.replace("_", " ")
-        for word in _ROOM_OR_TEXT.findall(words)
-    )
-    words = re.sub(r"\s+([.,]|$)", r"\1", re.sub(r"\s+", " ", spaced)).strip(" .")
-    return f"{words[:1].upper()}{words[1:]}."
-
-
-def category_of(goal: Formula) -> TaskCategory:
-    """Which of the paper's four kinds a goal is."""
-    predicates = {atom.predicate for atom in atoms_of(goal)}
-    moves = bool(predicates & set(Relation))
-    switches = bool(predicates & (SWITCHED | CLEANED))
-    if predicates & KITCHEN:
-        outside = {Relation.ONTOP, Relation.UNDER, Relation.NEXTTO, State.OPEN} & predicates
-        return TaskCategory.COMPOUND if outside else TaskCategory.KITCHEN_OPERATION
-    if moves and switches:
-        return TaskCategory.COMPOUND
-    return TaskCategory.APPLIANCE_USE if switches else TaskCategory.PICK_AND_PLACE
-
-
-def signature_of(goal: Formula, view: SceneView) -> str:
-    """Kind of a goal: its predicates over categories, sorted. Variables stand for their type."""
-    signs = []
-    for atom in atoms_of(goal):
-        args = (view.category(arg) if arg in view.scene.by_name else arg.lstrip("?") for arg in atom.args)
-        signs.append(f"{atom.predicate}({','.join(args)})")
-    return " ".join(sorted(signs))
 
 
 def _misfit(wrong: Failure) -> RefusedError:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Annotated
 
@@ -10,6 +9,7 @@ import typer
 from rich.console import Console
 
 from embomatrix.factory.evaluate.output import hand_in
+from embomatrix.factory.pipeline.options import Jobs, processes
 from embomatrix.factory.terminal import fail, mended, progress
 from embomatrix.factory.verification.again import sampled, verify_again
 from embomatrix.factory.verification.figures import evaluation_of, objections
@@ -17,7 +17,6 @@ from embomatrix.world.dataset import Dataset
 from embomatrix.world.whole_file import check_writable
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-MOST_JOBS = 8
 """Each process holds a scene."""
 
 Physical = Annotated[
@@ -34,7 +33,7 @@ def verify(
     physical: Physical = False,
     sample: Sample = None,
     seed: Annotated[int, typer.Option(min=0, help="Equal seeds draw equal tasks.")] = 0,
-    jobs: Annotated[int | None, typer.Option(min=1, help="Processes.")] = None,
+    jobs: Jobs = None,
     json_file: Figures = None,
 ) -> None:
     """Judge admitted tasks again, each in two other processes, which must agree to the bit.
@@ -53,7 +52,7 @@ def verify(
                 folder,
                 records,
                 physical=physical,
-                jobs=jobs or min(MOST_JOBS, len(os.sched_getaffinity(0))),
+                jobs=processes(jobs),
                 progress=lambda done: bars.update(bar, completed=done),
             )
     conditions = {"dataset": folder.name, "tasks": len(verdicts), "seed": seed}

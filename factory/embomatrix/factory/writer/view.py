@@ -12,6 +12,7 @@ from embomatrix.factory.writer.tables import NEVER_SWITCHED
 from embomatrix.sim.swings import SWING
 from embomatrix.skills.appliance import cold_source, cooks, freezes, heat_source, heats
 from embomatrix.skills.limits import ROBOT
+from embomatrix.world.asset import FLOOR_CATEGORY
 from embomatrix.world.state import OPEN_FRACTION, Relation, State
 
 if TYPE_CHECKING:
@@ -69,6 +70,12 @@ class SceneView:
     def alike(self, name: str) -> tuple[str, ...]:
         """Objects of the same category in the same room, with this one."""
         return self._of_kind[self.category(name), self.room(name)]
+
+    def floor_of(self, room: str) -> str:
+        """The floor of a room where it is an object; "" elsewhere."""
+        return next(
+            (name for name in self.in_room.get(room, ()) if self.category(name) == FLOOR_CATEGORY), ""
+        )
 
     def rooms_with(self, category: str) -> tuple[str, ...]:
         return tuple(room.name for room in self.scene.rooms if (category, room.name) in self._of_kind)

@@ -1,0 +1,116 @@
+"""Who imports problems: this process, or several."""
+
+from __future__ import annotations
+
+import contextlib
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import TYPE_CHECKING
+
+from embomatrix.factory.evaluate.figures import EvaluationError
+from embomatrix.factory.scenes.build import build_base_scene
+from embomatrix.factory.task_import.batch import Verified, bind_first, verify_first
+from embomatrix.factory.task_import.report import Outcome, outcome_of
+from embomatrix.factory.task_import.task import Imported, Manner
+from embomatrix.sim.physical.survey import Foresight
+from embomatrix.sim.pose_cache import PlacementLibrary
+from embomatrix.sim.process_pool import process_pool
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+    from concurrent.futures import ProcessPoolExecutor
+
+    from embomatrix.factory.refusal import Refusal
+    from embomatrix.factory.task_import.sources import SourceText
+
+    Judging = Callable[[Sequence[SourceText]], Iterator["Judged"]]
+    """Imports problems; what comes of them comes in their order."""
+
+
+class Depth(StrEnum):
+    """How far an import goes."""
+
+    VERIFY = "verify"  # bound, and solved by the oracle in the simulator
+    BIND = "bind"  # bound to a scene, the goal within the skills' reach
+    INSTANTIATE = "instantiate"  # bound to a scene, whatever the skills can do
+
+
+@dataclass(frozen=True, slots=True)
+class Docket:
+    """What decides the imports of one command."""
+
+    scenes: tuple[str, ...]
+    seed: int
+    depth: Depth
+    look_ahead: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """What became of a problem, as a report tells it and as a value. What was only bound stays where it was made."""
+
+    outcome: Outcome
+    item: Imported | Verified | Refusal | None
+
+
+class Judge:
+    """Imports problems one after the other. Context manager over the base scenes, and a client to settle things in."""
+
+    def __init__(self, docket: Docket) -> None:
+        self._docket = docket
+        self._bases = [build_base_scene(scene_id) for scene_id in docket.scenes]
+        self._foresight = Foresight() if docket.look_ahead else None
+        self._library = PlacementLibrary()
+
+    def judge(self, source: SourceText) -> Judged:
+        """Import one problem. Raises BddlError where it is none."""
+        item = self._imported(source)
+        return Judged(outcome_of(source, item), item)
+
+    def close(self) -> None:
+        self._library.close()
+
+    def _imported(self, source: SourceText) -> Imported | Verified | Refusal:
+        seed = self._docket.seed
+        match self._docket.depth:
+            case Depth.INSTANTIATE:
+                return bind_first(source, self._bases, seed=seed, manner=Manner(reachable=False))
+            case Depth.BIND:
+                return bind_first(source, self._bases, seed=seed)
+            case Depth.VERIFY:
+                return verify_first(source, self._bases, self._library, self._foresight, seed=seed)
+
+
+@contextlib.contextmanager
+def judging(docket: Docket, jobs: int) -> Iterator[Judging]:
+    """For as long as this is held."""
+    if jobs == 1:
+        with contextlib.closing(Judge(docket)) as judge:
+            yield lambda sources: map(judge.judge, sources)
+        return
+    with process_pool(jobs, _begin, docket) as pool:
+        yield lambda sources: _judged(pool, sources)
+
+
+def _judged(pool: ProcessPoolExecutor, sources: Sequence[SourceText]) -> Iterator[Judged]:
+    try:
+        yield from pool.map(_judge, sources)
+    except BrokenProcessPool as error:
+        raise EvaluationError(
+            "a process that imports problems died, perhaps for want of memory: call the same command with fewer --jobs"
+        ) from error
+
+
+_mine: Judge
+"""Of this process, when it is one of several."""
+
+
+def _begin(docket: Docket) -> None:
+    global _mine
+    _mine = Judge(docket)
+
+
+def _judge(source: SourceText) -> Judged:
+    judged = _mine.judge(source)
+    return Judged(judged.outcome, None) if isinstance(judged.item, Imported) else judged

@@ -1,0 +1,136 @@
+"""Sizes: where no model of a type can do what a problem asks of it, one is made smaller or larger.
+
+The catalog has one model of many types, of one size: a sausage that its box does not take, a backpack wider than the gripper
+opens. Things of such types come in sizes, so a model is made at a share of its size, within limits, before a problem is
+given up.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.factory.assets.library import build_asset
+from embomatrix.factory.furnish.roles import is_portable
+from embomatrix.factory.task_import.demands import Room, floor_needed_m2, room_for
+from embomatrix.sim.candidates import candidates, surfaces_for
+from embomatrix.sim.planner.ways import CANDIDATES, MIDDLE
+from embomatrix.world.catalog import SHARE_MARK, Catalog
+from embomatrix.world.state import Relation
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+    from embomatrix.factory.task_import.binding import Addition
+    from embomatrix.factory.task_import.demands import Demand
+    from embomatrix.world.asset import Asset
+    from embomatrix.world.catalog import Model
+
+SMALLER: Final = (0.9, 0.8, 0.7, 0.6)
+LARGER: Final = (1.2, 1.4, 1.6)
+"""Shares at which models are tried, the nearest to their own size first."""
+KEPT: Final = 2
+"""Models of another size that are tried before the catalog's own."""
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where a thing is, or is to be: in ``relation`` to a host, at most at this share of its size."""
+
+    relation: Relation
+    host: Asset
+    share: float
+
+
+def sized(
+    orders: Mapping[str, Sequence[Model]],
+    additions: Sequence[Addition],
+    demands: Mapping[str, Demand],
+    found: Mapping[str, Asset],
+    *,
+    snug: bool = False,
+) -> dict[str, list[Model]]:
+    """Models to try for each addition: those of its order that do what is asked first, else some of another size.
+
+    ``demands`` are those on each thing of the problem, ``found`` assets of the scene's objects that it is bound to. Things that
+    bear others are chosen first, so that those know what they are to be put on. When ``snug``, what shares a cavity or a
+    surface is small enough for all to lie side by side.
+    """
+    chosen = {name: list(models) for name, models in orders.items()}
+    for addition in sorted(additions, key=lambda each: not demands[each.name].bears):
+        demand = demands[addition.name] if snug else replace(demands[addition.name], burden=())
+        places = [
+            Place(relation, host, _share_of_all(host, demands[name]) if snug else math.inf)
+            for relation, name in demand.places
+            if (host := found.get(name) or _first(chosen.get(name, ()))) is not None
+        ]
+        models = _ordered(chosen[addition.name], demand, places)
+        if snug and (demand.contents or demand.burden) and not _suits(models[0], demand, places):
+            models = [*_grown(models, demand, places), *models]
+        chosen[addition.name] = models
+    return chosen
+
+
+def _share_of_all(host: Asset, demand: Demand) -> float:
+    """Share of their size at which all that goes into or onto a host has floor there; no limit where all has it."""
+    least = math.inf
+    for relation, types in ((Relation.INSIDE, demand.contents), (Relation.ONTOP, demand.burden)):
+        floor_m2 = sum(math.prod(surface.size_m) for surface in surfaces_for(host, relation))
+        needed_m2 = floor_needed_m2(types)
+        if needed_m2 > floor_m2:
+            least = min(least, math.sqrt(floor_m2 / needed_m2))
+    return least
+
+
+def _ordered(models: list[Model], demand: Demand, places: Sequence[Place]) -> list[Model]:
+    most = max(SMALLER[-1], min((place.share for place in places), default=math.inf))
+    fit = [model for model in models if model.share <= most and _suits(model, demand, places)]
+    if fit:
+        return [*fit, *(model for model in models if model not in fit)]
+    made = [
+        model for model in _resized(models, demand) if model.share <= most and _suits(model, demand, places)
+    ]
+    return [*made[:KEPT], *models]
+
+
+def _grown(models: Sequence[Model], demand: Demand, places: Sequence[Place]) -> list[Model]:
+    """The models as large as can be, for more than any has room for: what goes in is made smaller too."""
+    largest = [_at(model, LARGER[-1]) for model in models if model.share == 1]
+    less = replace(demand, contents=(), burden=())
+    return [model for model in largest if _suits(model, less, places)][:KEPT]
+
+
+def _resized(models: Sequence[Model], demand: Demand) -> Iterator[Model]:
+    """The models at other shares of their size: larger ones of what others go into, then smaller ones."""
+    for share in (*(LARGER if demand.contents or demand.burden else ()), *SMALLER):
+        for model in models:
+            yield _at(model, share)
+
+
+def _suits(model: Model, demand: Demand, places: Sequence[Place]) -> bool:
+    asset = _asset(model)
+    if demand.carried and not is_portable(asset):
+        return False
+    if demand.contents and room_for(asset, demand.contents) is not Room.FOR_ALL:
+        return False
+    if demand.burden and room_for(asset, demand.burden, Relation.ONTOP) is not Room.FOR_ALL:
+        return False
+    return all(_goes(asset, place) for place in places)
+
+
+def _goes(asset: Asset, place: Place) -> bool:
+    """Whether a thing has a pose on or in its host, by geometry alone."""
+    return next(candidates(asset, place.host, place.relation, MIDDLE, CANDIDATES), None) is not None
+
+
+def _at(model: Model, share: float) -> Model:
+    return Catalog.load().model(model.category, f"{model.model_id}{SHARE_MARK}{share}")
+
+
+def _first(models: Sequence[Model]) -> Asset | None:
+    return _asset(models[0]) if models else None
+
+
+def _asset(model: Model) -> Asset:
+    return build_asset(Catalog.load(), model.category, model.model_id)
