@@ -3,8 +3,9 @@
 from dataclasses import replace
 
 import pytest
-from tests.fakes.plans import awkward_scene, task_over, words_of
-from tests.fakes.scenes import kitchen_scene, kitchen_tasks
+from tests.fakes import furniture as make
+from tests.fakes.plans import awkward_scene, task_over, with_objects, words_of
+from tests.fakes.scenes import kitchen_scene, kitchen_tasks, placed, upright
 
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.planner.oracle import PROOF_SEEDS, PlanNotFound, find_plan
@@ -293,6 +294,27 @@ def test_two_small_things_come_next_to_each_other_on_a_surface_that_they_fill(fl
     task = task_over(flat.world.scene, atom("nextto", "apple_1", "apple_2"))
     plan = words_of(find_plan(flat, task), task)
     assert plan.count("place bowl_1") == 2
+
+
+def test_what_has_no_floor_left_in_a_box_is_put_on_what_lies_there():
+    brick = replace(make.block("brick", "brick.n.01", (0.12, 0.12, 0.05), {}), mass_kg=0.5)
+    crate = make.tub("crate", "crate.n.01", (0.18, 0.18, 0.3), 0.01, 0.01, mass_kg=1.0, abilities={})
+    table_m = 0.75
+    scene = with_objects(
+        kitchen_scene(),
+        [
+            (placed("crate_1", crate, "kitchen_0", upright(2.2, 1.7, table_m, crate)), crate),
+            (placed("brick_1", brick, "kitchen_0", upright(2.2, 1.35, table_m, brick)), brick),
+            (placed("brick_2", brick, "kitchen_0", upright(1.9, 1.6, table_m, brick)), brick),
+        ],
+    )
+    simulator = Simulator(Bundle(scene, {}, build_pose_cache(scene, (), (), seed=0)))
+    plan = oracle(
+        simulator, And((atom("inside", "brick_1", "crate_1"), atom("inside", "brick_2", "crate_1")))
+    )
+    simulator.close()
+    assert plan.endswith(("place brick_1 ontop", "place brick_2 ontop")), plan
+    assert "place crate_1 inside" in plan
 
 
 def test_food_that_must_end_cooked_and_not_hot_is_cooled_down_after_it_is_cooked(flat):

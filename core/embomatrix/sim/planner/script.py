@@ -62,13 +62,23 @@ class PlanScript:
             self._prepare(target, relation)
             self._take(name, depth)
             step = self._calls.place(target, relation, near)
-            if step.ok:
+            if step.ok or (step.failure is FailureReason.NO_FREE_POSE and self._piled(name, target, relation)):
                 return
             burden = self._in_the_way_at(target, relation, name)
             if step.failure is not FailureReason.NO_FREE_POSE or not burden or depth == DEPTH:
                 raise StuckError(_sentence(step))
             self._set_down(name, frozenset((name, target)))
             self.put_away(burden, frozenset((burden, name, target)), depth + 1)
+
+    def _piled(self, name: str, target: str, relation: PlaceRelation) -> bool:
+        """Whether what the hand holds could be put on something that lies in the target, and so lies in it as well."""
+        if relation is not PlaceRelation.INSIDE:
+            return False
+        for other in self._task.table:
+            lies_there = other != name and self._world.relations.inside(other, target)
+            if lies_there and self._calls.use(Skill.PLACE, other, PlaceRelation.ONTOP).ok:
+                return self.holds(Relation.INSIDE, name, target)
+        return False
 
     def open(self, name: str, depth: int = 0) -> None:
         """Open it, unless it is open. An appliance that must be closed while it runs is switched off first."""

@@ -48,8 +48,8 @@ CANDIDATES: Final = 16
 def ways(item: Placement, world: LiveWorld, rows: tuple[str, ...]) -> tuple[Way, ...]:
     """Ways by which the relation between two objects may come about, the surest first; none when nothing fits.
 
-    What is asked for is tried as it is asked. Then what means the same: a thing is under another that is put on it, and on
-    or in one whose open cavity it lies in. No skill aims at ``nextto``: two things that share a small surface may be.
+    What is asked for is tried as it is asked. Then what means the same: a thing is under another that is put on it, on
+    or in one whose open cavity it lies in, and in what it lies in on something else. No skill aims at ``nextto``: two things that share a small surface may be.
     """
     return tuple(dict.fromkeys(_ways(item, world, rows)))
 
@@ -60,6 +60,11 @@ def _ways(item: Placement, world: LiveWorld, rows: tuple[str, ...]) -> Iterator[
             yield from _placed(item, world, PlaceRelation.ONTOP, PlaceRelation.INSIDE)
         case Relation.INSIDE:
             yield from _placed(item, world, PlaceRelation.INSIDE, PlaceRelation.ONTOP)
+            for other in rows:
+                if other != item.name and world.relations.inside(other, item.target):
+                    yield from _placed(
+                        Placement(item.name, Relation.ONTOP, other), world, PlaceRelation.ONTOP
+                    )
         case Relation.UNDER:
             yield from _placed(item, world, PlaceRelation.UNDER)
             yield from _placed(_turned(item), world, PlaceRelation.ONTOP)

@@ -275,18 +275,21 @@ def tree(size_m: Vec3) -> Body:
 
 
 def car(size_m: Vec3) -> Body:
-    """Bonnet and cabin as blocks, and a boot behind with a lid that is hinged at the cabin."""
+    """Bonnet and cabin as blocks, and a boot with a lid that is hinged at the cabin.
+
+    The boot is at +x, where furniture has its doors: that side is served, and the bonnet is what stands to a wall.
+    """
     outer = centred(size_m)
     (x0, y0, z0), (x1, y1, z1) = outer.low_m, outer.high_m
-    waist, boot = z0 + 0.62 * size_m[2], x0 + 0.22 * size_m[0]
+    waist, boot = z0 + 0.62 * size_m[2], x1 - 0.22 * size_m[0]
     lid = 0.04
     body = Body()
     body.parts, cavity = shell(
-        Aabb((x0, y0, z0 + 0.12 * size_m[2]), (boot, y1, waist - lid)), Walls(0.1, 0.1, 0.1, 0.1, 0.15, 0.0)
+        Aabb((boot, y0, z0 + 0.12 * size_m[2]), (x1, y1, waist - lid)), Walls(0.1, 0.1, 0.1, 0.1, 0.15, 0.0)
     )
-    body.parts.append(box((boot, y0, z0), (x1, y1, waist)))
-    body.parts.append(box((boot, 0.9 * y0, waist), (x0 + 0.7 * size_m[0], 0.9 * y1, z1)))
-    panel = Aabb((x0, y0, waist - lid + FIT_M), (boot - FIT_M, y1, waist))
-    body.moving.append(hinged("boot_lid", panel, Hinge.FRONT))
+    body.parts.append(box((x0, y0, z0), (boot, y1, waist)))
+    body.parts.append(box((x1 - 0.7 * size_m[0], 0.9 * y0, waist), (boot, 0.9 * y1, z1)))
+    panel = Aabb((boot + FIT_M, y0, waist - lid + FIT_M), (x1, y1, waist))
+    body.moving.append(hinged("boot_lid", panel, Hinge.BACK))
     body.add_interior("boot", cavity, ("boot_lid",))
     return body
