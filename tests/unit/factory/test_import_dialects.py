@@ -184,6 +184,8 @@ def test_solved_are_counted_among_the_goals_that_a_profile_reaches() -> None:
     )
     evaluation = solved_of([solved, stuck, beyond], 0)
     told = [(figure.name, figure.value, figure.goal, figure.n) for figure in evaluation.figures]
+    without = solved_of([solved], 0, solids=True).figures[0].name
+    assert without == "oracle_solved_behavior of what paper reaches without liquids"
     assert told == [
         ("oracle_solved_behavior of what paper reaches", 1 / 2, 0.95, 2),
         ("oracle_solved_behavior of what household reaches", 2 / 3, None, 3),

@@ -92,6 +92,53 @@ def test_activities_of_behavior_1k_are_bound_or_refused() -> None:
         assert set(item.task.table) <= set(item.scene.by_name)
 
 
+def test_an_import_in_two_processes_tells_the_same(tmp_path: Path) -> None:
+    jsonl = tmp_path / "problems.jsonl"
+    roomy = PROBLEM.replace(
+        "(inroom breakfast_table.n.01_1 kitchen)", "(inroom breakfast_table.n.01_1 living_room)"
+    )
+    problems = {"whole": roomy, "unknown": PROBLEM.replace("apple.n.01", "unicorn.n.01")}
+    jsonl.write_text("\n".join(json.dumps({"name": name, "bddl": text}) for name, text in problems.items()))
+    told = []
+    for jobs in ("1", "2"):
+        outcomes = tmp_path / f"{jobs}.jsonl"
+        command = ["import", "--jsonl", str(jsonl), "--scene", "Rs_int", "--bind-only", "--jobs", jobs]
+        result = CliRunner().invoke(app, [*command, "--outcomes", str(outcomes)])
+        assert result.exit_code == 0, result.output
+        told.append(outcomes.read_text())
+    assert told[0] == told[1]
+    assert [json.loads(line)["reason"] for line in told[0].splitlines()[1:]] == ["", "unknown_type"]
+
+
+def test_problems_that_name_a_liquid_are_left_out_when_only_solids_are_wanted(tmp_path: Path) -> None:
+    jsonl, outcomes = tmp_path / "problems.jsonl", tmp_path / "outcomes.jsonl"
+    wet = PROBLEM.replace(
+        "floor.n.01_1 - floor.n.01\n", "floor.n.01_1 - floor.n.01\n        water.n.06_1 - water.n.06\n"
+    )
+    jsonl.write_text(
+        "\n".join(
+            json.dumps({"name": name, "bddl": text})
+            for name, text in (("dry", PROBLEM), ("wet", wet), ("arid", PROBLEM))
+        )
+    )
+    command = [
+        "import",
+        "--jsonl",
+        str(jsonl),
+        "--scene",
+        "Rs_int",
+        "--bind-only",
+        "--solids",
+        "--outcomes",
+        str(outcomes),
+    ]
+    assert CliRunner().invoke(app, command).exit_code == 0
+    assert [json.loads(line)["name"] for line in outcomes.read_text().splitlines()[1:]] == ["dry", "arid"]
+    jsonl.write_text(json.dumps({"name": "wet", "bddl": wet}))
+    refused = CliRunner().invoke(app, command[:-2])
+    assert "leave out --solids" in " ".join(refused.output.split())
+
+
 def test_an_import_that_was_stopped_goes_on_and_tells_the_same_in_the_end(tmp_path: Path) -> None:
     unknown = PROBLEM.replace("apple.n.01", "unicorn.n.01")
     jsonl, outcomes = tmp_path / "problems.jsonl", tmp_path / "outcomes.jsonl"

@@ -317,6 +317,26 @@ def test_what_has_no_floor_left_in_a_box_is_put_on_what_lies_there():
     assert "place crate_1 inside" in plan
 
 
+def test_what_does_not_open_where_it_stands_is_carried_to_where_it_does():
+    post = make.block("post", "post.n.01", (0.05, 0.3, 0.3), {})
+    casket = replace(
+        make.cupboard("casket", "casket.n.01", (0.2, 0.25, 0.2), boards=0, abilities={}), mass_kg=2.0
+    )
+    table_m = 0.75
+    scene = with_objects(
+        kitchen_scene(),
+        [
+            (placed("casket_1", casket, "kitchen_0", upright(2.1, 1.4, table_m, casket)), casket),
+            (placed("post_1", post, "kitchen_0", upright(2.27, 1.4, table_m, post), fixed=True), post),
+        ],
+    )
+    simulator = Simulator(Bundle(scene, {}, build_pose_cache(scene, (), (), seed=0)))
+    plan = oracle(simulator, atom("open", "casket_1"))
+    simulator.close()
+    assert plan.startswith("move casket_1; pick_up casket_1; move "), plan
+    assert plan.endswith("open casket_1"), plan
+
+
 def test_food_that_must_end_cooked_and_not_hot_is_cooled_down_after_it_is_cooked(flat):
     plan = oracle(flat, And((atom("cooked", "apple_1"), Not(atom("hot", "apple_1")))))
     assert (

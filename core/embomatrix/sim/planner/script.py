@@ -62,7 +62,9 @@ class PlanScript:
             self._prepare(target, relation)
             self._take(name, depth)
             step = self._calls.place(target, relation, near)
-            if step.ok or (step.failure is FailureReason.NO_FREE_POSE and self._piled(name, target, relation)):
+            if step.ok or (
+                step.failure is FailureReason.NO_FREE_POSE and self._piled(name, target, relation)
+            ):
                 return
             burden = self._in_the_way_at(target, relation, name)
             if step.failure is not FailureReason.NO_FREE_POSE or not burden or depth == DEPTH:
@@ -220,15 +222,16 @@ class PlanScript:
         self.clear_way_to(name)
 
     def _swing(self, skill: Skill, name: str, depth: int) -> None:
-        """Move a door; what can be carried away from before it is."""
+        """Move a door or a lid; what can be carried away from before it is, or else the thing itself to where it opens."""
         for _ in range(BLOCKERS):
             step = self._calls.use(skill, name)
             if step.ok:
                 return
             blocker = self._named_in(step, name) if step.failure is FailureReason.DOOR_BLOCKED else ""
-            if not blocker or self._world.is_fixed(blocker) or depth == DEPTH:
+            moved = next((item for item in (blocker, name) if item and not self._world.is_fixed(item)), "")
+            if not blocker or not moved or depth == DEPTH:
                 raise StuckError(_sentence(step))
-            self.put_away(blocker, frozenset((blocker, name)), depth + 1)
+            self.put_away(moved, frozenset((blocker, name)), depth + 1)
         self._use(skill, name)
 
     def _named_in(self, step: Step, name: str) -> str:

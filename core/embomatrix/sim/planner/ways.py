@@ -48,8 +48,9 @@ CANDIDATES: Final = 16
 def ways(item: Placement, world: LiveWorld, rows: tuple[str, ...]) -> tuple[Way, ...]:
     """Ways by which the relation between two objects may come about, the surest first; none when nothing fits.
 
-    What is asked for is tried as it is asked. Then what means the same: a thing is under another that is put on it, on
-    or in one whose open cavity it lies in, and in what it lies in on something else. No skill aims at ``nextto``: two things that share a small surface may be.
+    What is asked for is tried as it is asked. Then what means the same: a thing is under another that is put on it, on or in
+    one whose open cavity it lies in, and in what it lies in on something else. No skill aims at ``nextto``: two things that
+    share a small surface may be, and what is placed from beside another where poses beside it were found.
     """
     return tuple(dict.fromkeys(_ways(item, world, rows)))
 

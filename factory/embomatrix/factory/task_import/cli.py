@@ -114,7 +114,8 @@ def import_(
         made = _judged(console, sources[len(log.outcomes) :], docket, processes(jobs), log)
         admitted = out is None or _written(out, made)
         told = log.outcomes
-        evaluation = (solved_of if depth is Depth.VERIFY else evaluation_of)(told, seed)
+        verified = depth is Depth.VERIFY
+        evaluation = solved_of(told, seed, solids=solids) if verified else evaluation_of(told, seed)
         _write(told, evaluation, report, json_file)
     if len(sources) == len(made) == 1:
         _print_one(console, sources[0], made[0])

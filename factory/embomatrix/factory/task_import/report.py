@@ -124,8 +124,12 @@ def evaluation_of(outcomes: Sequence[Outcome], seed: int) -> Evaluation:
     return Evaluation("imports", {"seed": seed}, tuple(figures))
 
 
-def solved_of(outcomes: Sequence[Outcome], seed: int) -> Evaluation:
-    """By source, how many of the goals that a profile reaches the oracle solved in a scene: of problems that were verified."""
+def solved_of(outcomes: Sequence[Outcome], seed: int, *, solids: bool = False) -> Evaluation:
+    """By source, how many of the goals that a profile reaches the oracle solved in a scene: of problems that were verified.
+
+    ``solids`` says that those with substances were left out.
+    """
+    without = " without liquids" if solids else ""
     figures: list[Figure] = []
     for source, (name, _) in FIGURES.items():
         for profile in Profile:
@@ -133,7 +137,9 @@ def solved_of(outcomes: Sequence[Outcome], seed: int) -> Evaluation:
                 each for each in outcomes if each.source == source and not each.unreachable[profile.value]
             ]
             if mine:
-                told = f"{name.replace('import_rate', 'oracle_solved')} of what {profile.value} reaches"
+                told = (
+                    f"{name.replace('import_rate', 'oracle_solved')} of what {profile.value} reaches{without}"
+                )
                 goal = SOLVED_GOAL if profile is Profile.PAPER else None
                 share = sum(each.is_bound for each in mine) / len(mine)
                 figures.append(Figure(told, share, "", Better.HIGHER, len(mine), goal))

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from embomatrix.world.asset import Asset
     from embomatrix.world.catalog import Model
 
-SMALLER: Final = (0.9, 0.8, 0.7, 0.6)
+SMALLER: Final = (0.9, 0.8, 0.7, 0.6, 0.5)
 LARGER: Final = (1.2, 1.4, 1.6)
 """Shares at which models are tried, the nearest to their own size first."""
 KEPT: Final = 2
