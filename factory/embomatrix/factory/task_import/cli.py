@@ -250,9 +250,8 @@ def _judged(
 def _print_one(console: Console, source: SourceText, outcome: Imported | Verified | Refusal) -> None:
     if isinstance(outcome, Refusal):
         fail(f"{source.name} is refused ({outcome.reason}): {outcome.sentence}")
-    if not isinstance(outcome, Verified):
-        for note in outcome.notes:
-            console.print(note, highlight=False, markup=False)
+    for note in outcome.notes:
+        console.print(note, highlight=False, markup=False)
     task = outcome.record.task if isinstance(outcome, Verified) else outcome.task
     console.print(
         f"{task.task_id}: {task.instruction}\n  goal: {task.goal_bddl}", highlight=False, markup=False
