@@ -3,16 +3,26 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import multiprocessing
 import os
 import signal
 from concurrent.futures import ProcessPoolExecutor
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from embomatrix.sim.zygote import die_with_parent
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
+
+
+class Closes(Protocol):
+    def close(self) -> object: ...
+
+
+M = TypeVar("M", bound=Closes)
+T = TypeVar("T")
+R = TypeVar("R")
 
 
 @contextlib.contextmanager
@@ -30,6 +40,36 @@ def process_pool(
         yield pool
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+@contextlib.contextmanager
+def shared_work(
+    jobs: int, begin: Callable[..., M], work: Callable[[M, T], R], *arguments: Any
+) -> Iterator[Callable[[Iterable[T]], Iterator[R]]]:
+    """For as long as this is held, what does work on items, in their order: in this process, or in several.
+
+    Each process calls ``begin(*arguments)`` once, then ``work`` with what that gave and one item after the other; what it gave
+    in this process is closed in the end. Results raise BrokenProcessPool once a process has died.
+    """
+    if jobs == 1:
+        with contextlib.closing(begin(*arguments)) as maker:
+            yield functools.partial(map, functools.partial(work, maker))
+        return
+    with process_pool(jobs, _take_up, begin, arguments) as pool:
+        yield functools.partial(pool.map, functools.partial(_work, work))
+
+
+_maker: Any
+"""What this process works with, when it is one of several."""
+
+
+def _take_up(begin: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
+    global _maker
+    _maker = begin(*arguments)
+
+
+def _work(work: Callable[[Any, T], R], item: T) -> R:
+    return work(_maker, item)
 
 
 def _begin(parent: int, begin: Callable[..., None] | None, arguments: tuple[Any, ...]) -> None:

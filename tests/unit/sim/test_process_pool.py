@@ -5,8 +5,9 @@ import subprocess
 import sys
 
 import psutil
+import pytest
 
-from embomatrix.sim.process_pool import process_pool
+from embomatrix.sim.process_pool import process_pool, shared_work
 
 SLEEPER = """
 import os, time
@@ -34,3 +35,24 @@ def test_work_is_done_in_other_processes_that_began_as_they_were_told(tmp_path):
     with process_pool(1, os.chdir, tmp_path) as pool:
         assert pool.submit(os.getcwd).result() == str(tmp_path)
         assert pool.submit(os.getpid).result() != os.getpid()
+
+
+class Adder:
+    """Adds a number, and tells in which process."""
+
+    def __init__(self, number):
+        self.number = number
+
+    def add(self, item):
+        return self.number + item, os.getpid()
+
+    def close(self):
+        self.number = None
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_shared_work_comes_in_the_order_of_the_items_from_one_process_or_several(jobs):
+    with shared_work(jobs, Adder, Adder.add, 10) as add:
+        done = list(add(range(8)))
+    assert [value for value, _ in done] == list(range(10, 18))
+    assert (os.getpid() in {process for _, process in done}) is (jobs == 1)

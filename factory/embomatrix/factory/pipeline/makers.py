@@ -7,12 +7,11 @@ from concurrent.futures.process import BrokenProcessPool
 from typing import TYPE_CHECKING
 
 from embomatrix.factory.pipeline.variants import VariantMaker, VariantOrder, VariantYield
-from embomatrix.sim.process_pool import process_pool
+from embomatrix.sim.process_pool import shared_work
 from embomatrix.world.dataset import DatasetError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
-    from concurrent.futures import ProcessPoolExecutor
 
     from embomatrix.factory.layout.jobs import LayoutAgents
     from embomatrix.factory.pipeline.settings import BuildSettings
@@ -27,32 +26,19 @@ def makers(
     settings: BuildSettings, writer: TaskWriter | None, layout: LayoutAgents | None, jobs: int
 ) -> Iterator[Make]:
     """For as long as this is held. ``writer`` and ``layout`` work in this process alone: they may hold a connection."""
-    if writer is not None or layout is not None or jobs == 1:
+    if writer is not None or layout is not None:
         with contextlib.closing(VariantMaker(settings, writer, layout)) as maker:
             yield lambda orders: map(maker.make, orders)
         return
-    with process_pool(jobs, _begin, settings) as pool:
-        yield lambda orders: _made(pool, orders)
+    with shared_work(jobs, VariantMaker, VariantMaker.make, settings) as make:
+        yield lambda orders: _made(make, orders)
 
 
-def _made(pool: ProcessPoolExecutor, orders: Sequence[VariantOrder]) -> Iterator[VariantYield]:
+def _made(make: Make, orders: Sequence[VariantOrder]) -> Iterator[VariantYield]:
     try:
-        yield from pool.map(_make, orders)
+        yield from make(orders)
     except BrokenProcessPool as error:
         raise DatasetError(
             "a process that makes scene variants died, perhaps for want of memory: what was built is kept; call the same "
             "command again, with fewer --jobs"
         ) from error
-
-
-_maker: VariantMaker
-"""Of this process, when it is one of several."""
-
-
-def _begin(settings: BuildSettings) -> None:
-    global _maker
-    _maker = VariantMaker(settings)
-
-
-def _make(order: VariantOrder) -> VariantYield:
-    return _maker.make(order)

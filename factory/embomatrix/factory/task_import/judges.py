@@ -15,11 +15,10 @@ from embomatrix.factory.task_import.report import Outcome, outcome_of
 from embomatrix.factory.task_import.task import Imported, Manner
 from embomatrix.sim.physical.survey import Foresight
 from embomatrix.sim.pose_cache import PlacementLibrary
-from embomatrix.sim.process_pool import process_pool
+from embomatrix.sim.process_pool import shared_work
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
-    from concurrent.futures import ProcessPoolExecutor
 
     from embomatrix.factory.refusal import Refusal
     from embomatrix.factory.task_import.sources import SourceText
@@ -55,7 +54,7 @@ class Judged:
 
 
 class Judge:
-    """Imports problems one after the other. Context manager over the base scenes, and a client to settle things in."""
+    """Imports problems one after the other, with the base scenes and a client to settle things in. Close it after use."""
 
     def __init__(self, docket: Docket) -> None:
         self._docket = docket
@@ -84,33 +83,21 @@ class Judge:
 
 @contextlib.contextmanager
 def judging(docket: Docket, jobs: int) -> Iterator[Judging]:
-    """For as long as this is held."""
-    if jobs == 1:
-        with contextlib.closing(Judge(docket)) as judge:
-            yield lambda sources: map(judge.judge, sources)
-        return
-    with process_pool(jobs, _begin, docket) as pool:
-        yield lambda sources: _judged(pool, sources)
+    """For as long as this is held. Raises EvaluationError when one of several processes dies."""
+    with shared_work(jobs, Judge, Judge.judge if jobs == 1 else _sent, docket) as judge:
+        yield lambda sources: _judged(judge, sources)
 
 
-def _judged(pool: ProcessPoolExecutor, sources: Sequence[SourceText]) -> Iterator[Judged]:
+def _judged(judge: Judging, sources: Sequence[SourceText]) -> Iterator[Judged]:
     try:
-        yield from pool.map(_judge, sources)
+        yield from judge(sources)
     except BrokenProcessPool as error:
         raise EvaluationError(
             "a process that imports problems died, perhaps for want of memory: call the same command with fewer --jobs"
         ) from error
 
 
-_mine: Judge
-"""Of this process, when it is one of several."""
-
-
-def _begin(docket: Docket) -> None:
-    global _mine
-    _mine = Judge(docket)
-
-
-def _judge(source: SourceText) -> Judged:
-    judged = _mine.judge(source)
+def _sent(judge: Judge, source: SourceText) -> Judged:
+    """What another process tells."""
+    judged = judge.judge(source)
     return Judged(judged.outcome, None) if isinstance(judged.item, Imported) else judged
