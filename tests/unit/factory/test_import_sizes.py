@@ -55,6 +55,11 @@ def test_what_the_gripper_takes_keeps_its_size_and_what_it_does_not_is_made_smal
     )
 
 
+def test_what_must_be_carried_can_be_even_where_it_has_not_room_for_all() -> None:
+    demand = Demand(bears=True, carried=True, contents=("hardback.n.01",) * 40)
+    assert is_portable(asset_of(chosen({"backpack": "backpack"}, {"backpack": demand})["backpack"][0]))
+
+
 def test_what_is_only_looked_at_keeps_its_size() -> None:
     assert chosen({"backpack": "backpack"}, {})["backpack"] == list(CATALOG.models_of("backpack"))
 

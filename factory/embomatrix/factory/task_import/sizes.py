@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.assets.library import build_asset
 from embomatrix.factory.furnish.roles import is_portable
-from embomatrix.factory.task_import.demands import Room, floor_needed_m2, room_for
+from embomatrix.factory.task_import.demands import Demand, Room, floor_needed_m2, room_for
 from embomatrix.sim.candidates import candidates, surfaces_for
 from embomatrix.sim.planner.ways import CANDIDATES, MIDDLE
 from embomatrix.world.catalog import SHARE_MARK, Catalog
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from embomatrix.factory.task_import.binding import Addition
-    from embomatrix.factory.task_import.demands import Demand
     from embomatrix.world.asset import Asset
     from embomatrix.world.catalog import Model
 
@@ -91,6 +90,9 @@ def _ordered(models: list[Model], demand: Demand, places: Sequence[Place]) -> li
     made = [
         model for model in _resized(models, demand) if model.share <= most and _suits(model, demand, places)
     ]
+    if not made and demand.carried and not any(is_portable(_asset(model)) for model in models):
+        # what does not do all of it is at least to be carried
+        made = [model for model in _resized(models, Demand()) if is_portable(_asset(model))]
     return [*made[:KEPT], *models]
 
 
