@@ -8,6 +8,7 @@ import multiprocessing
 import os
 import signal
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from embomatrix.sim.zygote import die_with_parent
@@ -44,19 +45,28 @@ def process_pool(
 
 @contextlib.contextmanager
 def shared_work(
-    jobs: int, begin: Callable[..., M], work: Callable[[M, T], R], *arguments: Any
+    jobs: int, begin: Callable[..., M], work: Callable[[M, T], R], *arguments: Any, died: Exception
 ) -> Iterator[Callable[[Iterable[T]], Iterator[R]]]:
     """For as long as this is held, what does work on items, in their order: in this process, or in several.
 
     Each process calls ``begin(*arguments)`` once, then ``work`` with what that gave and one item after the other; what it gave
-    in this process is closed in the end. Results raise BrokenProcessPool once a process has died.
+    in this process is closed in the end. Results raise ``died`` once one of several processes has.
     """
     if jobs == 1:
         with contextlib.closing(begin(*arguments)) as maker:
             yield functools.partial(map, functools.partial(work, maker))
         return
     with process_pool(jobs, _take_up, begin, arguments) as pool:
-        yield functools.partial(pool.map, functools.partial(_work, work))
+        yield functools.partial(_results, pool, functools.partial(_work, work), died)
+
+
+def _results(
+    pool: ProcessPoolExecutor, work: Callable[[T], R], died: Exception, items: Iterable[T]
+) -> Iterator[R]:
+    try:
+        yield from pool.map(work, items)
+    except BrokenProcessPool as error:
+        raise died from error
 
 
 _maker: Any

@@ -56,7 +56,6 @@ app.add_typer(import_app)
 app.add_typer(inspect_app)
 app.add_typer(corpus_app)
 app.add_typer(verify_app)
-"""Each holds some scenes: a few hundred MB."""
 
 Out = Annotated[Path, typer.Option(help="Folder for the dataset.")]
 Seed = Annotated[int, typer.Option(min=0, help="Equal seeds give equal datasets.")]

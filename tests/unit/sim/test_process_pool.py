@@ -52,7 +52,20 @@ class Adder:
 
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_shared_work_comes_in_the_order_of_the_items_from_one_process_or_several(jobs):
-    with shared_work(jobs, Adder, Adder.add, 10) as add:
+    with shared_work(jobs, Adder, Adder.add, 10, died=RuntimeError()) as add:
         done = list(add(range(8)))
     assert [value for value, _ in done] == list(range(10, 18))
     assert (os.getpid() in {process for _, process in done}) is (jobs == 1)
+
+
+class Mortal(Adder):
+    def die(self, item):
+        os._exit(item)
+
+
+def test_the_death_of_one_of_several_processes_is_told_as_the_caller_says():
+    with (
+        shared_work(2, Mortal, Mortal.die, 0, died=RuntimeError("fewer jobs")) as work,
+        pytest.raises(RuntimeError, match="fewer jobs"),
+    ):
+        list(work(range(1, 5)))

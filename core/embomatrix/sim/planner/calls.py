@@ -60,17 +60,16 @@ class PlanCalls:
 
         When nothing is free within reach, from beside other things on the target too.
         """
-        if near and self._go_to(near).ok and within_reach(self._world, target) is None:
-            step = self._run(self._call(Skill.PLACE, target, relation))
-            if step.ok:
-                return step
+        call = self._call(Skill.PLACE, target, relation)
+        found = self._from_beside(near, call, target) if near else None
+        if found is not None and found.ok:
+            return found
         step = self.use(Skill.PLACE, target, relation)
         if step.failure is FailureReason.NO_FREE_POSE:
             for other in self._around(target):
-                if self._go_to(other).ok and within_reach(self._world, target) is None:
-                    again = self._run(self._call(Skill.PLACE, target, relation))
-                    if again.ok:
-                        return again
+                again = self._from_beside(other, call, target)
+                if again is not None and again.ok:
+                    return again
         return step
 
     def use(self, skill: Skill, name: str, relation: PlaceRelation | None = None) -> Step:
@@ -88,9 +87,16 @@ class PlanCalls:
         step = self._run(call) if step.ok else step
         if step.failure in OUT_OF_ARM:
             for other in self._around(name):
-                if self._go_to(other).ok and within_reach(self._world, name) is None:
-                    return self._run(call)
+                again = self._from_beside(other, call, name)
+                if again is not None:
+                    return again
         return step
+
+    def _from_beside(self, other: str, call: SkillCall, name: str) -> Step | None:
+        """A call about an object from beside another; None where the robot can't stand there, or not reach it from there."""
+        if self._go_to(other).ok and within_reach(self._world, name) is None:
+            return self._run(call)
+        return None
 
     def _around(self, name: str) -> list[str]:
         """Rows near an object, the nearest first: who stands at one of them may reach it."""

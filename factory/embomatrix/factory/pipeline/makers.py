@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-from concurrent.futures.process import BrokenProcessPool
 from typing import TYPE_CHECKING
 
 from embomatrix.factory.pipeline.variants import VariantMaker, VariantOrder, VariantYield
@@ -30,15 +29,9 @@ def makers(
         with contextlib.closing(VariantMaker(settings, writer, layout)) as maker:
             yield lambda orders: map(maker.make, orders)
         return
-    with shared_work(jobs, VariantMaker, VariantMaker.make, settings) as make:
-        yield lambda orders: _made(make, orders)
-
-
-def _made(make: Make, orders: Sequence[VariantOrder]) -> Iterator[VariantYield]:
-    try:
-        yield from make(orders)
-    except BrokenProcessPool as error:
-        raise DatasetError(
-            "a process that makes scene variants died, perhaps for want of memory: what was built is kept; call the same "
-            "command again, with fewer --jobs"
-        ) from error
+    died = DatasetError(
+        "a process that makes scene variants died, perhaps for want of memory: what was built is kept; call the same "
+        "command again, with fewer --jobs"
+    )
+    with shared_work(jobs, VariantMaker, VariantMaker.make, settings, died=died) as make:
+        yield make

@@ -15,6 +15,7 @@ Physical = Annotated[
     ),
 ]
 MOST_JOBS: Final = 8
+"""Each holds some scenes: a few hundred MB."""
 Jobs = Annotated[
     int | None,
     typer.Option(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING
@@ -84,17 +83,11 @@ class Judge:
 @contextlib.contextmanager
 def judging(docket: Docket, jobs: int) -> Iterator[Judging]:
     """For as long as this is held. Raises EvaluationError when one of several processes dies."""
-    with shared_work(jobs, Judge, Judge.judge if jobs == 1 else _sent, docket) as judge:
-        yield lambda sources: _judged(judge, sources)
-
-
-def _judged(judge: Judging, sources: Sequence[SourceText]) -> Iterator[Judged]:
-    try:
-        yield from judge(sources)
-    except BrokenProcessPool as error:
-        raise EvaluationError(
-            "a process that imports problems died, perhaps for want of memory: call the same command with fewer --jobs"
-        ) from error
+    died = EvaluationError(
+        "a process that imports problems died, perhaps for want of memory: call the same command with fewer --jobs"
+    )
+    with shared_work(jobs, Judge, Judge.judge if jobs == 1 else _sent, docket, died=died) as judge:
+        yield judge
 
 
 def _sent(judge: Judge, source: SourceText) -> Judged:

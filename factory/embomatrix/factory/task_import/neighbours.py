@@ -22,12 +22,9 @@ def neighbours_of(
     Of a statement about all or some of a type there are pairs for each of them. Where nothing of a pair can be carried, or
     what would stay is to be carried elsewhere, there is none.
     """
-    pairs = dict.fromkeys(args for predicate, args in _grounded(goal, types) if predicate == Relation.NEXTTO)
-    placed = {
-        args[0]
-        for predicate, args in _grounded(goal, types)
-        if predicate in (Relation.ONTOP, Relation.INSIDE)
-    }
+    wanted = tuple(_grounded(goal, types))
+    pairs = dict.fromkeys(args for predicate, args in wanted if predicate == Relation.NEXTTO)
+    placed = {args[0] for predicate, args in wanted if predicate in (Relation.ONTOP, Relation.INSIDE)}
     found: dict[tuple[str, str], None] = {}
     for one, other in pairs:
         for mover, neighbour in ((one, other), (other, one)):
