@@ -34,6 +34,9 @@ SHARE_MARK: Final = "@"
 LEAST_SHARE, MOST_SHARE = 0.5, 2.0
 """Shares of its size at which a model is made at all."""
 
+WITH_A_SWITCH: Final = frozenset({"fairy_light.n.01", "icicle_lights.n.01"})
+"""Strings of lights: people switch them on and off, and tasks ask for it; the table behind the catalog leaves that out."""
+
 
 class CatalogError(LookupError):
     """A scene, category, model or synset that the catalog does not hold; the message names close matches."""
@@ -223,6 +226,8 @@ class Catalog:
         the ability "substance".
         """
         raw = _look_up(self._synsets, synset, "synset").get("abilities", {})
+        if synset in WITH_A_SWITCH:
+            raw = {**raw, "toggleable": {}}
         return MappingProxyType({name: MappingProxyType(values) for name, values in raw.items()})
 
     @functools.cached_property

@@ -153,6 +153,10 @@ class SceneEditor:
         """Make an object one that never moves, as what hangs on a wall. Raises PlacementError for an unknown name."""
         self._objects[name] = replace(self.known(name), fixed=True)
 
+    def loosen(self, name: str) -> None:
+        """Make an object one that can be carried, if the arm lifts it. Raises PlacementError for an unknown name."""
+        self._objects[name] = replace(self.known(name), fixed=False)
+
     def remove(self, name: str) -> tuple[str, ...]:
         """Take an object out again, with all that rests on or in it; their names. Raises PlacementError for an unknown name."""
         self.known(name)

@@ -393,6 +393,13 @@ def test_building_takes_less_than_five_milliseconds() -> None:
     assert (time.process_time() - started) / len(ASSETS) < 0.005
 
 
+def test_a_stall_has_its_counter_where_people_work_and_a_roof_over_it() -> None:
+    stand = build_asset(CATALOG, "farm_stand", CATALOG.models_of("farm_stand")[0].model_id)
+    (counter,) = stand.supports
+    assert counter.center_m[2] + stand.size_m[2] / 2 == pytest.approx(0.9)
+    assert counter.clearance_m > 1
+
+
 def test_unknown_model_is_named() -> None:
     with pytest.raises(CatalogError, match="unknown model of fridge 'nope'"):
         build_asset(CATALOG, "fridge", "nope")

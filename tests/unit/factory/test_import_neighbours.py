@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 from tests.fakes.problems import source
 
+from embomatrix.factory.pipeline.pairs import Beside
 from embomatrix.factory.task_import.batch import Verified, verify_first
 from embomatrix.factory.task_import.neighbours import neighbours_of
 from embomatrix.sim.pose_cache import PlacementLibrary
@@ -31,15 +32,27 @@ PROBLEM = """(define (problem lay_the_money_down) (:domain omnigibson)
 @pytest.mark.parametrize(
     ("goal", "pairs"),
     [
-        ("(nextto cup_1 lamp_1)", (("cup_1", "lamp_1"),)),
-        ("(nextto stove_1 cup_1)", (("cup_1", "stove_1"),)),
+        ("(nextto cup_1 lamp_1)", (Beside("cup_1", "lamp_1"),)),
+        ("(nextto stove_1 cup_1)", (Beside("cup_1", "stove_1"),)),
         ("(not (nextto cup_1 lamp_1))", ()),
-        ("(forall (?cup - cup) (nextto ?cup stove_1))", (("cup_1", "stove_1"), ("cup_2", "stove_1"))),
-        ("(and (nextto cup_1 lamp_1) (ontop cup_1 stove_1) (ontop lamp_1 stove_1))", ()),
+        (
+            "(forall (?cup - cup) (nextto ?cup stove_1))",
+            (Beside("cup_1", "stove_1"), Beside("cup_2", "stove_1")),
+        ),
+        (
+            "(and (nextto cup_1 lamp_1) (ontop cup_1 stove_1) (ontop lamp_1 stove_1))",
+            (Beside("cup_1", "lamp_1", "stove_1"),),
+        ),
+        ("(and (nextto cup_1 lamp_1) (ontop cup_1 stove_1) (ontop lamp_1 cup_2))", ()),
+        ("(and (nextto cup_1 lamp_1) (ontop lamp_1 stove_1))", (Beside("cup_1", "lamp_1", "stove_1"),)),
+        ("(and (nextto cup_1 lamp_1) (ontop cup_1 stove_1))", (Beside("lamp_1", "cup_1", "stove_1"),)),
+        ("(and (nextto cup_1 stove_1) (ontop cup_1 lamp_1))", (Beside("cup_1", "stove_1"),)),
         ("(nextto stove_1 stove_1)", ()),
     ],
 )
-def test_what_is_carried_goes_beside_what_stays(goal: str, pairs: tuple[tuple[str, str], ...]) -> None:
+def test_what_is_carried_goes_beside_what_stays_or_goes_there_too(
+    goal: str, pairs: tuple[Beside, ...]
+) -> None:
     formula = parse_formula(goal, NAMES)
     assert neighbours_of(formula, TYPES, lambda name: not name.startswith("stove")) == pairs
 
@@ -49,8 +62,12 @@ def test_what_is_carried_goes_beside_what_stays(goal: str, pairs: tuple[tuple[st
     [
         "(forall (?money.n.01 - money.n.01) (nextto ?money.n.01 notebook.n.01_1))",
         "(nextto bucket.n.01_1 stove.n.01_1)",
+        """(and (nextto money.n.01_1 money.n.01_2)
+            (forall (?money.n.01 - money.n.01) (ontop ?money.n.01 breakfast_table.n.01_1)))""",
+        """(and (nextto money.n.01_1 notebook.n.01_1) (ontop money.n.01_1 stove.n.01_1)
+            (ontop notebook.n.01_1 stove.n.01_1))""",
     ],
-    ids=["on a table", "on the floor"],
+    ids=["on a table", "on the floor", "two alike that are carried", "two others that are carried"],
 )
 def test_a_plan_brings_things_next_to_one_another(home: Scene, goal: str) -> None:
     outcome = verify_first(source(PROBLEM.format(goal=goal)), [home], PlacementLibrary(), None)

@@ -208,6 +208,21 @@ def test_imported_task_is_verified_by_execution(home: Scene) -> None:
     assert [call["action"] for call in outcome.record.oracle][-1] == "close"
 
 
+def test_an_appliance_that_the_goal_wants_carried_is_loose_and_another_is_not(home: Scene) -> None:
+    text = """(define (problem move_the_toaster) (:domain omnigibson)
+        (:objects toaster.n.02_1 - toaster.n.02 breakfast_table.n.01_1 - breakfast_table.n.01
+            stove.n.01_1 - stove.n.01 floor.n.01_1 - floor.n.01 agent.n.01_1 - agent.n.01)
+        (:init (ontop toaster.n.02_1 stove.n.01_1) (inroom stove.n.01_1 kitchen)
+            (inroom breakfast_table.n.01_1 kitchen) (inroom floor.n.01_1 kitchen) (ontop agent.n.01_1 floor.n.01_1))
+        (:goal (ontop ?toaster.n.02_1 ?{host})))"""
+    loose = {}
+    for host in ("breakfast_table.n.01_1", "stove.n.01_1"):
+        imported = import_problem(source(text.format(host=host)), home)
+        assert isinstance(imported, Imported), imported
+        loose[host] = not imported.scene.by_name["toaster_1"].fixed
+    assert loose == {"breakfast_table.n.01_1": True, "stove.n.01_1": False}
+
+
 def test_a_wildcard_is_every_further_object_of_the_type_in_the_room(home: Scene) -> None:
     text = PROBLEM.replace("breakfast_table.n.01_1 -", "breakfast_table.n.01_1 breakfast_table.n.01_* -")
     text = text.replace("(open elec", "(inroom breakfast_table.n.01_* kitchen)\n        (open elec")

@@ -3,14 +3,18 @@
 import json
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pytest
 from tests.fakes.chat_server import ChatServer
 
+from embomatrix.factory.assets.library import build_asset
 from embomatrix.factory.editor import SceneEditor
+from embomatrix.factory.furnish.roles import wall_height_m
 from embomatrix.factory.layout.baselines import lay_at_random, lay_by_poses
 from embomatrix.factory.layout.distribution import DistributionError, distribute
 from embomatrix.factory.layout.doors import DOORS, AgentName, BriefError
 from embomatrix.factory.layout.generator import lay
+from embomatrix.factory.layout.hanging import Hanger
 from embomatrix.factory.layout.jobs import Item
 from embomatrix.factory.layout.model_agents import ModelLayoutAgents
 from embomatrix.factory.layout.organization import organize
@@ -32,6 +36,7 @@ from embomatrix.factory.scenes.check import check_scene
 from embomatrix.llm.endpoint import Endpoint, EndpointLimits
 from embomatrix.llm.patience import Patience
 from embomatrix.llm.values import EndpointError
+from embomatrix.skills.limits import ROBOT
 from embomatrix.world.catalog import Catalog
 
 if TYPE_CHECKING:
@@ -165,6 +170,14 @@ def test_every_agent_has_a_door_that_names_what_is_wrong_with_a_brief(name):
     with pytest.raises(BriefError, match="--schema"):
         DOORS[name].read('{"nonsense": 1}')
     assert DOORS[name].about
+
+
+def test_what_hangs_high_elsewhere_hangs_where_the_robot_gets_at_it(home):
+    catalog = Catalog.load()
+    camera = build_asset(catalog, "security_camera", catalog.models_of("security_camera")[0].model_id)
+    editor = SceneEditor(home)
+    pose = Hanger(editor, editor.rooms["kitchen_0"], np.random.default_rng(0)).on_wall(camera)
+    assert pose.position_m[2] < ROBOT.reach_high_m < wall_height_m("security_camera")
 
 
 def test_a_brief_goes_through_its_door_unchanged():

@@ -56,6 +56,11 @@ def test_a_conjunction_asks_for_all_of_its_parts():
     assert first(And((hot("cup_1"), Not(hot("cup_2"))))) == {"hot cup_1", "not hot cup_2"}
 
 
+def test_things_go_onto_what_stays_rather_than_onto_one_another():
+    anywhere = [Or((on(cup, "cup_1"), on(cup, "cup_2"), on(cup, "tray_1"))) for cup in TYPES["cup"]]
+    assert first(And(tuple(anywhere))) == {f"ontop {cup} tray_1" for cup in TYPES["cup"]}
+
+
 def test_of_a_disjunction_the_part_that_holds_comes_first():
     assert first(Or((hot("cup_1"), hot("cup_2"))), hot("cup_2")) == {"hot cup_2"}
 

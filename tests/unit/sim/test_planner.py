@@ -296,6 +296,13 @@ def test_two_small_things_come_next_to_each_other_on_a_surface_that_they_fill(fl
     assert plan.count("place bowl_1") == 2
 
 
+def test_a_plan_that_would_be_too_long_goes_nowhere_for_what_is_in_reach(flat, monkeypatch):
+    goal = atom("inside", "apple_1", "bowl_1")
+    assert oracle(flat, goal) == "move apple_1; pick_up apple_1; move bowl_1; place bowl_1 inside"
+    monkeypatch.setattr("embomatrix.sim.planner.calls.MAX_STEPS", 3)
+    assert oracle(flat, goal) == "move apple_1; pick_up apple_1; place bowl_1 inside"
+
+
 def test_what_has_no_floor_left_in_a_box_is_put_on_what_lies_there():
     brick = replace(make.block("brick", "brick.n.01", (0.12, 0.12, 0.05), {}), mass_kg=0.5)
     crate = make.tub("crate", "crate.n.01", (0.18, 0.18, 0.3), 0.01, 0.01, mass_kg=1.0, abilities={})

@@ -70,6 +70,11 @@ def test_abilities_carry_their_parameters(catalog: Catalog) -> None:
     assert "openable" not in catalog.category("sofa").abilities
 
 
+def test_strings_of_lights_have_a_switch(catalog: Catalog) -> None:
+    assert {"toggleable"} <= catalog.category("fairy_light").abilities.keys()
+    assert "toggleable" not in catalog.category("hanging_banners").abilities
+
+
 def test_abilities_are_read_only(catalog: Catalog) -> None:
     with pytest.raises(TypeError):
         catalog.category("apple").abilities["cookable"]["cook_temperature"] = 0.0  # type: ignore[index]

@@ -31,17 +31,23 @@ class StuckError(Exception):
     """A routine can't go on. The sentence names the call and why it failed."""
 
 
+class TooLongError(StuckError):
+    """The plan has more steps than are executed."""
+
+
 class PlanCalls:
     """The calls of one attempt at a task, from its start. A call that fails is told, and left out of the plan.
 
-    Every method raises StuckError when a call names an object outside the table, or the plan grows too long.
+    Every method raises StuckError when a call names an object outside the table, or the plan grows too long. A ``thrifty``
+    plan goes nowhere for what is in reach already.
     """
 
-    def __init__(self, simulator: Simulator, task: Task, seed: int) -> None:
+    def __init__(self, simulator: Simulator, task: Task, seed: int, *, thrifty: bool = False) -> None:
         simulator.reset(task, seed)
         self._simulator = simulator
         self._world = simulator.world
         self._task = task
+        self._thrifty = thrifty
         self._at = ""
         self._calls: list[SkillCall] = []
 
@@ -118,7 +124,11 @@ class PlanCalls:
 
     def _stands_at(self, name: str) -> bool:
         inside = self._world.relations.inside
-        sent = name == self._at or (self._at and (inside(name, self._at) or inside(self._at, name)))
+        sent = (
+            self._thrifty
+            or name == self._at
+            or (self._at and (inside(name, self._at) or inside(self._at, name)))
+        )
         return bool(sent) and within_reach(self._world, name) is None
 
     def _call(
@@ -143,5 +153,5 @@ class PlanCalls:
         if step.ok:
             self._calls.append(call)
             if len(self.plan) > MAX_STEPS:
-                raise StuckError(f"the plan needs more than {MAX_STEPS} steps")
+                raise TooLongError(f"the plan needs more than {MAX_STEPS} steps")
         return step

@@ -168,11 +168,18 @@ class _Choices:
         kept = [choice for choice in found if choice is not None]
         return sorted(kept, key=self._rank)[:WIDTH]
 
-    def _rank(self, choice: Choice) -> tuple[bool, int, int]:
-        return (any(self._judge(item)[1] for item in choice), self._cost(choice), -self._liked(choice))
+    def _rank(self, choice: Choice) -> tuple[bool, int, int, int]:
+        hopeless = any(self._judge(item)[1] for item in choice)
+        return (hopeless, self._cost(choice), _chained(choice), -self._liked(choice))
 
     def _liked(self, choice: Choice) -> int:
         return sum(self._liking(name) for item in choice for name in item.atom.args if item.positive)
+
+
+def _chained(choice: Choice) -> int:
+    """How many things go onto, or beside, what is to be carried itself."""
+    carried = {item.atom.args[0] for item in choice if item.positive and len(item.atom.args) > 1}
+    return sum(item.positive and item.atom.args[-1] in carried for item in choice if len(item.atom.args) > 1)
 
 
 def _merge(left: Choice, right: Choice) -> Choice | None:

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import functools
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.sim.planner.calls import StuckError
+from embomatrix.sim.planner.calls import StuckError, TooLongError
 from embomatrix.sim.planner.choices import choices
 from embomatrix.sim.planner.chores import chores_for, chosen, is_about_chores
 from embomatrix.sim.planner.errands import Errands, Warming
@@ -61,7 +61,7 @@ class Strategy:
 
     ``source_rank`` and ``way`` choose among sources and tools, and among ways to bring relations about; ``reverse`` turns
     the order of the placements; ``singly`` lets a source work on one thing at a time; ``seed`` decides where things come to
-    stand while the plan is written.
+    stand while the plan is written. A ``thrifty`` attempt goes nowhere for what is in reach already.
     """
 
     source_rank: int = 0
@@ -69,6 +69,7 @@ class Strategy:
     way: int = 0
     singly: bool = False
     seed: int = PROOF_SEEDS[0]
+    thrifty: bool = False
 
 
 def find_plan(simulator: Simulator, task: Task) -> Plan | PlanNotFound:
@@ -98,7 +99,7 @@ def _first_proven(simulator: Simulator, task: Task, options: Sequence[Choice]) -
     tried: set[Plan] = set()
     for choice, strategy in _attempts(options):
         try:
-            plan = _write(simulator, task, choice, strategy)
+            plan = _short_enough(simulator, task, choice, strategy)
         except StuckError as error:
             reason = reason or str(error)
             continue
@@ -154,9 +155,17 @@ def _flaw(simulator: Simulator, task: Task, plan: Plan, choice: Choice) -> str:
     return ""
 
 
+def _short_enough(simulator: Simulator, task: Task, choice: Choice, strategy: Strategy) -> Plan:
+    """A plan, a thrifty one where another would have too many steps. Raises StuckError."""
+    try:
+        return _write(simulator, task, choice, strategy)
+    except TooLongError:
+        return _write(simulator, task, choice, replace(strategy, thrifty=True))
+
+
 def _write(simulator: Simulator, task: Task, choice: Choice, strategy: Strategy) -> Plan:
     """Execute what the literals ask for, and return the calls that it took. Raises StuckError."""
-    script = PlanScript(simulator, task, strategy.seed, Wishes(choice))
+    script = PlanScript(simulator, task, strategy.seed, Wishes(choice), thrifty=strategy.thrifty)
     for _ in range(ROUNDS):
         missing = _missing(simulator, choice)
         if not missing:

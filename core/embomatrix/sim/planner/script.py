@@ -1,7 +1,8 @@
 """Plans written while they are executed: household routines that emit the skill calls which the present state needs.
 
 A routine goes to a thing before it uses it, unless the robot was just sent to that thing or to the container that it
-lies in. So whether a plan has a move follows from what the plan says, not from distances that no planner is told.
+lies in. So whether a plan has a move follows from what the plan says, not from distances that no planner is told: but for
+plans that would be too long otherwise.
 A call that fails changes nothing and is left out of the plan: where there is a remedy, the routine takes it and tries again.
 """
 
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from embomatrix.skills.trace import Step
     from embomatrix.world.task import Task
 
-DEPTH: Final = 4
+DEPTH: Final = 8
 """Things that are taken off, out of or from before one another at most before the last of them is moved."""
 SURFACES_TRIED: Final = 8
 """Surfaces that are tried for a thing that is in the way."""
@@ -35,8 +36,11 @@ BLOCKERS: Final = 3
 class PlanScript:
     """One attempt at a task, from its start. Every routine raises StuckError when a call of it fails for good."""
 
-    def __init__(self, simulator: Simulator, task: Task, seed: int, wishes: Wishes) -> None:
-        self._calls = PlanCalls(simulator, task, seed)
+    def __init__(
+        self, simulator: Simulator, task: Task, seed: int, wishes: Wishes, *, thrifty: bool = False
+    ) -> None:
+        """A ``thrifty`` attempt goes nowhere for what is in reach already."""
+        self._calls = PlanCalls(simulator, task, seed, thrifty=thrifty)
         self._world = simulator.world
         self._task = task
         self._wishes = wishes

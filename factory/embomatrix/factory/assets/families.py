@@ -100,6 +100,8 @@ class Family(StrEnum):
     FENCE = "fence"
     CANOPY = "canopy"
     BARS = "bars"
+    RUNGS = "rungs"
+    STALL = "stall"
     STAIRCASE = "staircase"
     LADDER = "ladder"
     TREADMILL = "treadmill"
@@ -203,6 +205,8 @@ GENERATORS: Final[Mapping[Family, Generator]] = {
     Family.FENCE: structures.fence,
     Family.CANOPY: structures.canopy,
     Family.BARS: structures.bars,
+    Family.RUNGS: structures.rungs,
+    Family.STALL: structures.stall,
     Family.STAIRCASE: structures.staircase,
     Family.LADDER: structures.ladder,
     Family.TREADMILL: structures.treadmill,

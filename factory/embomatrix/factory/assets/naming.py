@@ -37,7 +37,7 @@ _NAMES: Final[Mapping[Family, str]] = {
     "cash_register sandbox soap_dish dustpan waffle_maker toaster french_fry_holder knife_block "
     "umbrella_rack first_aid_kit deep_fryer shoe_box pet_bed shower terrarium christmas_stocking",
     Family.TABLE: "breakfast_table coffee_table conference_table console_table garden_coffee_table pool_table booth "
-    "gaming_table ironing_board farm_stand massage_bed trampoline",
+    "gaming_table ironing_board massage_bed trampoline",
     Family.DESK: "desk lab_table",
     Family.SHELF_TABLE: "commercial_kitchen_table serving_cart",
     Family.PEDESTAL_TABLE: "pedestal_table cake_stand garden_umbrella",
@@ -143,7 +143,9 @@ _NAMES: Final[Mapping[Family, str]] = {
     Family.PENDANT: "chandelier ceiling_fan paper_lantern room_light wind_chime ceiling_mounted_projector",
     Family.FENCE: "rail_fence railing chicken_wire volleyball_net bed_screen towel_rack",
     Family.CANOPY: "arbor pergola swing_set playground swing clothesline skeletal_frame",
-    Family.BARS: "parallel_bars bicycle_rack kayak_rack",
+    Family.BARS: "parallel_bars kayak_rack",
+    Family.RUNGS: "bicycle_rack",
+    Family.STALL: "farm_stand",
     Family.STAIRCASE: "stairs",
     Family.LADDER: "ladder",
     Family.TREADMILL: "treadmill elliptical_machine exercise_bike",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.assets.body import OPEN_ABOVE_M, Body, Walls, centred, clamp, shell
 from embomatrix.factory.assets.furniture import legs
@@ -11,6 +11,13 @@ from embomatrix.world.geometry import Aabb
 
 if TYPE_CHECKING:
     from embomatrix.world.geometry import Part, Vec3
+
+COUNTER_M: Final = 0.9
+"""Height of a stall's counter."""
+RUNG_M: Final = 0.12
+"""Distance between the rungs of a rack: near enough for what is laid across to rest on several."""
+MOST_RUNGS: Final = 10
+"""On long racks they are further apart: an object's link has 16 parts at most."""
 
 
 def post(size_m: Vec3) -> Body:
@@ -67,17 +74,53 @@ def _across(
 def canopy(size_m: Vec3) -> Body:
     """Four posts under a roof: arbours, pergolas, swings, climbing frames."""
     (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
-    roof = clamp(0.05 * size_m[2], 0.02, 0.2)
+    roof = roof_thickness(size_m)
     thick = clamp(0.05 * min(size_m[:2]), 0.02, 0.15)
     return Body(
         parts=[box((x0, y0, z1 - roof), (x1, y1, z1)), *legs((x0, y0), (x1, y1), (z0, z1 - roof), thick)]
     )
 
 
+def stall(size_m: Vec3) -> Body:
+    """A counter under a roof on four posts: market stalls, farm stands."""
+    (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
+    body = canopy(size_m)
+    z = z0 + min(COUNTER_M, 0.5 * size_m[2])
+    board = clamp(0.03 * size_m[2], 0.006, 0.04)
+    body.parts.append(box((x0, y0, z - board), (x1, y1, z)))
+    body.add_support("counter", (x0, y0), (x1, y1), z, z1 - roof_thickness(size_m) - z)
+    return body
+
+
+def rungs(size_m: Vec3) -> Body:
+    """Two bars on four posts, with rungs between them along the longer side: bicycle racks."""
+    (x0, y0, _), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
+    body = bars(size_m)
+    along = 0 if size_m[0] > size_m[1] else 1
+    thick = bar_thickness(size_m)
+    low, high = (x0, y0)[along], (x1, y1)[along]
+    count = int(clamp(round((high - low) / RUNG_M), 2, MOST_RUNGS))
+    for number in range(count):
+        start = low + (high - low - thick) * number / (count - 1)
+        body.parts.append(_across(along, (start, start + thick), (x0, y0), (x1, y1), (z1 - thick, z1)))
+    body.add_support("rungs", (x0, y0), (x1, y1), z1)
+    return body
+
+
+def bar_thickness(size_m: Vec3) -> float:
+    """Thickness of a rack's bars, in metres."""
+    return clamp(0.06 * min(size_m[:2]), 0.01, 0.08)
+
+
+def roof_thickness(size_m: Vec3) -> float:
+    """Thickness of a canopy's roof, in metres."""
+    return clamp(0.05 * size_m[2], 0.02, 0.2)
+
+
 def bars(size_m: Vec3) -> Body:
     """Two bars on four posts: parallel bars, towel stands, luggage racks."""
     (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
-    thick = clamp(0.06 * min(size_m[:2]), 0.01, 0.08)
+    thick = bar_thickness(size_m)
     rails = [box((x0, y, z1 - thick), (x1, y + thick, z1)) for y in (y0, y1 - thick)]
     return Body(parts=[*rails, *legs((x0, y0), (x1, y1), (z0, z1 - thick), thick)])
 

@@ -28,8 +28,8 @@ from embomatrix.factory.evaluate.rooms import plan_of
 from embomatrix.factory.evaluate.scene_geometry import flaws_of
 from embomatrix.factory.layout.baselines import lay_at_random, lay_by_poses
 from embomatrix.factory.layout.generator import lay
-from embomatrix.factory.pipeline.poses import Needs, SceneSurvey, cache_poses
 from embomatrix.factory.refusal import Refusal, RefusalReason
+from embomatrix.factory.task_import.batch import poses_for
 from embomatrix.factory.task_import.sources import SourceText, read_activity
 from embomatrix.factory.task_import.task import Imported, Manner, import_problem
 from embomatrix.factory.writer.view import SceneView
@@ -173,10 +173,8 @@ def _executed(
     imported: Imported, library: PlacementLibrary, seed: int
 ) -> tuple[Refusal | None, tuple[str, ...]]:
     """What speaks against a task when its oracle's plan is executed, None: nothing; and what the robot can't get at."""
-    needs = Needs(imported.about, imported.task.table)
     view = SceneView(imported.scene)
-    with SceneSurvey(imported.scene, None) as survey:
-        poses = cache_poses(view, [needs], library, survey, seed)
+    poses = poses_for(imported, view, library, None, seed)
     with contextlib.closing(Simulator(Bundle(imported.scene, {}, poses))) as stage:
         verdict = admit(stage, imported.task, find_plan, imported.init)
         lost = out_of_hand(stage, imported.task, view, imported.about)

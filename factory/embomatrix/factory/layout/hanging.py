@@ -10,6 +10,7 @@ from embomatrix.factory.floorplan.walls import WALL_HEIGHT_M
 from embomatrix.factory.furnish.roles import HUNG_BOTTOM_M, Role, role_of, wall_height_m
 from embomatrix.factory.layout.values import LayoutReason
 from embomatrix.sim.bounds import bounds_of
+from embomatrix.skills.limits import ROBOT
 from embomatrix.world.geometry import Pose
 from embomatrix.world.scene import Doorway
 
@@ -71,7 +72,7 @@ class Hanger:
         if role_of(asset.category, asset.size_m, asset.mass_kg) is Role.HUNG_CABINET:
             middle = HUNG_BOTTOM_M + height / 2
         else:
-            middle = wall_height_m(asset.category)
+            middle = min(wall_height_m(asset.category), ROBOT.reach_high_m - SPARE_M)
         z = min(max(middle, height / 2 + SPARE_M), WALL_HEIGHT_M - height / 2 - GAP_M)
         for _ in range(TRIES):
             axis, sign = int(self._rng.integers(2)), (1, -1)[int(self._rng.integers(2))]

@@ -9,7 +9,7 @@ import itertools
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Self
 
-from embomatrix.sim.bounds import bounds_of
+from embomatrix.factory.pipeline.pairs import Neighbourhoods, poses_beside
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.live_world import LiveWorld
 from embomatrix.sim.physical.prospects import Placing
@@ -23,6 +23,7 @@ from embomatrix.world.state import Relation
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
+    from embomatrix.factory.pipeline.pairs import Beside
     from embomatrix.factory.writer.view import SceneView
     from embomatrix.sim.physical.survey import Foresight
     from embomatrix.sim.pose_cache import PlacementLibrary
@@ -36,13 +37,13 @@ if TYPE_CHECKING:
 class Needs:
     """What one task asks of a cache.
 
-    ``about`` are the objects that its goal brings together, ``table`` all its rows; ``beside`` are pairs of which the goal
-    wants the first next to the second, which stays where it is.
+    ``about`` are the objects that its goal brings together, ``table`` all its rows; ``beside`` are pairs that it wants next to
+    one another.
     """
 
     about: tuple[str, ...]
     table: tuple[str, ...]
-    beside: tuple[tuple[str, str], ...] = ()
+    beside: tuple[Beside, ...] = ()
 
 
 class SceneSurvey:
@@ -110,7 +111,10 @@ def cache_poses(
     rows: dict[str, None] = {}
     for task in tasks:
         rows.update(dict.fromkeys(task.table))
-        placements.update(_beside(view, task, library))
+        placements.update(poses_beside(view, task.beside, library))
+        if any(pair.host for pair in task.beside):
+            together = Neighbourhoods(view, library, lambda name: survey.poses([name]).stands[name], seed)
+            placements.update(together.poses(task.beside))
         for thing, host, relation in _pairs(view, task.about):
             key = PlacementKey(view.item(thing).asset_id, view.item(host).asset_id, relation)
             if key not in placements:
@@ -118,22 +122,6 @@ def cache_poses(
         placements.update(footprint_placements(scene, *_portable_and_holders(view, task), library, seed))
     kept = {key: poses for key, poses in placements.items() if poses}
     return survey.prospects(replace(survey.poses(rows), placements=kept), _placings(view, tasks))
-
-
-def _beside(view: SceneView, task: Needs, library: PlacementLibrary) -> dict[PlacementKey, tuple[Pose, ...]]:
-    """Poses next to what a goal wants things beside, on or in what that stands on or in: no skill aims at them otherwise."""
-    found: dict[PlacementKey, tuple[Pose, ...]] = {}
-    for thing, neighbour in task.beside:
-        near = view.item(neighbour)
-        host, relation = near.host or view.floor_of(near.room), near.relation or Relation.ONTOP
-        if not host or relation not in (Relation.ONTOP, Relation.INSIDE):
-            continue
-        frame = view.item(host).pose_world_asset.inverse() @ near.pose_world_asset
-        box = bounds_of(view.asset(neighbour)).box(frame)
-        key = PlacementKey(view.item(thing).asset_id, view.item(host).asset_id, relation)
-        poses = library.poses_beside(view.asset(thing), view.asset(host), relation, box)
-        found[key] = (*found.get(key, ()), *poses)
-    return found
 
 
 def _placings(view: SceneView, tasks: Sequence[Needs]) -> Iterator[Placing]:

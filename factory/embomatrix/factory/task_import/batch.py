@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from embomatrix.factory.task_import.sources import SourceText
     from embomatrix.sim.physical.survey import Foresight
     from embomatrix.sim.pose_cache import PlacementLibrary
+    from embomatrix.world.poses import PoseCache
     from embomatrix.world.scene import Scene
     from embomatrix.world.task import Task
 
@@ -178,10 +179,7 @@ def verify(
     imported: Imported, library: PlacementLibrary, foresight: Foresight | None, *, seed: int = 0
 ) -> Verified | Refusal:
     """Judge an imported task by execution, and pack it when it is admitted. Without ``foresight`` the arm is not asked."""
-    view, task = SceneView(imported.scene), imported.task
-    needs = Needs(imported.about, task.table, neighbours_of(task.goal, task.types, view.is_portable))
-    with SceneSurvey(imported.scene, foresight) as survey:
-        poses = cache_poses(view, [needs], library, survey, seed)
+    poses = poses_for(imported, SceneView(imported.scene), library, foresight, seed)
     with contextlib.closing(Simulator(Bundle(imported.scene, {}, poses))) as stage:
         verdict = admit(stage, imported.task, find_plan, imported.init, most_held=most_held_in(imported.task))
         if not isinstance(verdict, Admitted):
@@ -197,6 +195,16 @@ def verify(
         signature=imported.signature,
     )
     return Verified(record, data, imported.notes)
+
+
+def poses_for(
+    imported: Imported, view: SceneView, library: PlacementLibrary, foresight: Foresight | None, seed: int
+) -> PoseCache:
+    """The pose cache of an imported task's scene."""
+    task = imported.task
+    needs = Needs(imported.about, task.table, neighbours_of(task.goal, task.types, view.is_portable))
+    with SceneSurvey(imported.scene, foresight) as survey:
+        return cache_poses(view, [needs], library, survey, seed)
 
 
 def most_held_in(task: Task) -> float:

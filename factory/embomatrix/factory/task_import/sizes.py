@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.assets.library import build_asset
-from embomatrix.factory.furnish.roles import is_portable
 from embomatrix.factory.task_import.demands import Demand, Room, floor_needed_m2, room_for
+from embomatrix.factory.writer.view import is_liftable
 from embomatrix.sim.candidates import candidates, surfaces_for
 from embomatrix.sim.planner.ways import CANDIDATES, MIDDLE
 from embomatrix.world.catalog import SHARE_MARK, Catalog
@@ -90,9 +90,9 @@ def _ordered(models: list[Model], demand: Demand, places: Sequence[Place]) -> li
     made = [
         model for model in _resized(models, demand) if model.share <= most and _suits(model, demand, places)
     ]
-    if not made and demand.carried and not any(is_portable(_asset(model)) for model in models):
+    if not made and demand.carried and not any(map(_is_liftable, models)):
         # what does not do all of it is at least to be carried
-        made = [model for model in _resized(models, Demand()) if is_portable(_asset(model))]
+        made = [model for model in _resized(models, Demand()) if _is_liftable(model)]
     return [*made[:KEPT], *models]
 
 
@@ -112,13 +112,18 @@ def _resized(models: Sequence[Model], demand: Demand) -> Iterator[Model]:
 
 def _suits(model: Model, demand: Demand, places: Sequence[Place]) -> bool:
     asset = _asset(model)
-    if demand.carried and not is_portable(asset):
+    if demand.carried and not _is_liftable(model):
         return False
     if demand.contents and room_for(asset, demand.contents) is not Room.FOR_ALL:
         return False
     if demand.burden and room_for(asset, demand.burden, Relation.ONTOP) is not Room.FOR_ALL:
         return False
     return all(_goes(asset, place) for place in places)
+
+
+def _is_liftable(model: Model) -> bool:
+    asset = _asset(model)
+    return is_liftable(asset.size_m, asset.mass_kg)
 
 
 def _goes(asset: Asset, place: Place) -> bool:

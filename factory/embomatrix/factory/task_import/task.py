@@ -30,7 +30,7 @@ from embomatrix.factory.task_import.scene import with_robot_in, with_states
 from embomatrix.factory.task_import.sizes import sized
 from embomatrix.factory.task_import.thermal import sources_for, taps_for
 from embomatrix.factory.writer.tasks import object_table
-from embomatrix.factory.writer.view import SceneView
+from embomatrix.factory.writer.view import SceneView, is_liftable
 from embomatrix.world.bddl import Literal, is_room_instance
 from embomatrix.world.catalog import Catalog, share_of
 from embomatrix.world.evaluate import atoms_of, objects_of, render, substitute, types_of
@@ -40,12 +40,13 @@ from embomatrix.world.substances import flows_from, is_substance
 from embomatrix.world.task import MAX_TABLE, Task
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from embomatrix.factory.layout.jobs import Layout
     from embomatrix.factory.layout.values import Failure
     from embomatrix.factory.task_import.binding import Addition, Binding
     from embomatrix.factory.task_import.sources import SourceText
+    from embomatrix.world.asset import Asset
     from embomatrix.world.bddl import Problem
     from embomatrix.world.catalog import Model
     from embomatrix.world.scene import Scene
@@ -136,6 +137,8 @@ class _Binder:
         self._problem = binding.problem
         for whole, halves in pieces_of(self._problem).items():
             names |= zip(halves, self._add_pieces(editor, names[whole], halves), strict=True)
+        for name in self._to_be_loose(editor, names):
+            editor.loosen(name)
         for floor in self._floors_asked_for(editor, names, binding):
             names[floor] = self._add_floor(editor, floor, binding)
         start = self._start(names, binding)
@@ -213,7 +216,9 @@ class _Binder:
             self._problem.types,
             lambda name: self._is_portable(editor, names.get(name, "")),
         )
-        standing = [editor.known(names[other]) for _, other in pairs if other in names]
+        standing = [
+            editor.known(names[pair.neighbour]) for pair in pairs if pair.neighbour in names and not pair.host
+        ]
         beside = {item.room for item in standing if not item.host}
         return tuple(
             name
@@ -222,7 +227,15 @@ class _Binder:
         )
 
     def _is_portable(self, editor: SceneEditor, name: str) -> bool:
-        return name in editor.objects and is_portable(editor.asset_of(name))
+        return name in editor.objects and not editor.known(name).fixed and _is_liftable(editor.asset_of(name))
+
+    def _to_be_loose(self, editor: SceneEditor, names: Mapping[str, str]) -> Iterator[str]:
+        """Appliances of which a scene makes fixtures, a kettle or a toaster, that this problem wants carried."""
+        for name, type_name in self._problem.objects.items():
+            if demand_on(self._demands, name, type_name).carried and name in names:
+                asset = editor.asset_of(names[name])
+                if _is_liftable(asset) and not is_portable(asset):
+                    yield names[name]
 
     def _laid(self, editor: SceneEditor, binding: Binding) -> Layout:
         """Put all that the scene lacks into it."""
@@ -358,6 +371,10 @@ class _Binder:
         if atom.predicate == INSOURCE:
             return self._substances.get(atom.args[1], "") in flows_from(type_name)
         return atom.predicate in (REAL, FUTURE) and is_substance(type_name)
+
+
+def _is_liftable(asset: Asset) -> bool:
+    return is_liftable(asset.size_m, asset.mass_kg)
 
 
 def _renamed(literal: Literal, names: dict[str, str]) -> Atom:
