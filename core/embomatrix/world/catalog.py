@@ -73,6 +73,15 @@ class Model:
         """Its extents over those of the catalog's model; its mass goes with the cube."""
         return share_of(self.model_id)
 
+    @property
+    def listed_id(self) -> str:
+        """Id of the model as the catalog lists it, at its own size."""
+        return self.model_id.partition(SHARE_MARK)[0]
+
+    def at(self, share: float) -> Model:
+        """A model of the catalog's own size made at a share of it. Raises CatalogError."""
+        return _at_share(self, str(share))
+
 
 @dataclass(frozen=True, slots=True)
 class RoomInventory:

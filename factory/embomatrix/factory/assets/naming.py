@@ -7,7 +7,6 @@ import zlib
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.assets.families import Family
-from embomatrix.world.catalog import SHARE_MARK
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -249,8 +248,7 @@ def family_of_model(catalog: Catalog, category: str, model_id: str) -> Family:
     if "joint" not in model.meta_links:
         return family
     if category in _LOW_CABINETS and model.size_m[2] <= _LOW_M:
-        listed, _, _ = model_id.partition(SHARE_MARK)
-        return _CABINETS[zlib.crc32(listed.encode()) % len(_CABINETS)]
+        return _CABINETS[zlib.crc32(model.listed_id.encode()) % len(_CABINETS)]
     return _MOVABLE_FAMILY.get(family, family)
 
 

@@ -156,20 +156,22 @@ def _taken_up(
 
 def _wanted(sources: Sequence[SourceText], profile: Profile | None, *, solids: bool) -> Sequence[SourceText]:
     """Those with goals that a profile's skills reach, and without substances. Raises SourceError where there is none."""
-    found = sources
+    found = [(source, read_problem(source)[0]) for source in sources] if profile or solids else []
     if profile is not None:
-        found = [source for source in found if not unreachable_atoms(read_problem(source)[0], profile)]
+        found = [(source, problem) for source, problem in found if not unreachable_atoms(problem, profile)]
         if not found:
             raise SourceError(
                 f"no goal of {len(sources)} problems is reached by the profile {profile.value!r}: leave out --reached-by"
             )
     if solids:
         found = [
-            source for source in found if not any(map(is_substance, read_problem(source)[0].objects.values()))
+            (source, problem)
+            for source, problem in found
+            if not any(map(is_substance, problem.objects.values()))
         ]
         if not found:
             raise SourceError("each of the problems names a liquid or a powder: leave out --solids")
-    return found
+    return [source for source, _ in found] if profile or solids else sources
 
 
 def _write(

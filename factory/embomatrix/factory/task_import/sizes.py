@@ -16,7 +16,7 @@ from embomatrix.factory.task_import.demands import Demand, Room, floor_needed_m2
 from embomatrix.factory.writer.view import is_liftable
 from embomatrix.sim.candidates import candidates, surfaces_for
 from embomatrix.sim.planner.ways import CANDIDATES, MIDDLE
-from embomatrix.world.catalog import SHARE_MARK, Catalog
+from embomatrix.world.catalog import Catalog
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
@@ -98,7 +98,7 @@ def _ordered(models: list[Model], demand: Demand, places: Sequence[Place]) -> li
 
 def _grown(models: Sequence[Model], demand: Demand, places: Sequence[Place]) -> list[Model]:
     """The models as large as can be, for more than any has room for: what goes in is made smaller too."""
-    largest = [_at(model, LARGER[-1]) for model in models if model.share == 1]
+    largest = [model.at(LARGER[-1]) for model in models if model.share == 1]
     less = replace(demand, contents=(), burden=())
     return [model for model in largest if _suits(model, less, places)][:KEPT]
 
@@ -107,7 +107,7 @@ def _resized(models: Sequence[Model], demand: Demand) -> Iterator[Model]:
     """The models at other shares of their size: larger ones of what others go into, then smaller ones."""
     for share in (*(LARGER if demand.contents or demand.burden else ()), *SMALLER):
         for model in models:
-            yield _at(model, share)
+            yield model.at(share)
 
 
 def _suits(model: Model, demand: Demand, places: Sequence[Place]) -> bool:
@@ -129,10 +129,6 @@ def _is_liftable(model: Model) -> bool:
 def _goes(asset: Asset, place: Place) -> bool:
     """Whether a thing has a pose on or in its host, by geometry alone."""
     return next(candidates(asset, place.host, place.relation, MIDDLE, CANDIDATES), None) is not None
-
-
-def _at(model: Model, share: float) -> Model:
-    return Catalog.load().model(model.category, f"{model.model_id}{SHARE_MARK}{share}")
 
 
 def _first(models: Sequence[Model]) -> Asset | None:
