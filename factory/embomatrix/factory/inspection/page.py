@@ -19,6 +19,7 @@ import numpy as np
 from PIL import Image
 
 from embomatrix.factory.inspection.plan_view import PlanView
+from embomatrix.factory.writer.view import SceneView
 from embomatrix.pages.head import page_head
 from embomatrix.sim.bullet.camera import render_oblique
 from embomatrix.world.evaluate import objects_of
@@ -128,15 +129,14 @@ def _steps(show: Show) -> str:
 
 
 def _object_rows(record: TaskRecord, scene: Scene, about: frozenset[str]) -> str:
-    rows = []
+    rows, view = [], SceneView(scene)
     for number, name in enumerate(record.task.table):
         item, asset = scene.by_name[name], scene.asset_of(name)
-        where = f"{item.relation.value} {item.host}" if item.host and item.relation else "on the floor"
         size = " × ".join(f"{extent:.2f}" for extent in asset.size_m)
         told = ", ".join(sorted(state.value for state in item.states))
         if any(share > 0 for share in item.joints):
             told = ", ".join(filter(None, (told, "open")))
-        cells = (str(number), name, item.room, where, size, f"{asset.mass_kg:.1f}", told)
+        cells = (str(number), name, item.room, view.whereabouts(name), size, f"{asset.mass_kg:.1f}", told)
         row = "".join(f"<td>{escape(cell)}</td>" for cell in cells)
         rows.append(f'<tr class="{"goal" if name in about else ""}">{row}</tr>')
     return "".join(rows)

@@ -11,6 +11,7 @@ from PIL import Image, ImageDraw
 
 from embomatrix.factory.pictures.labels import GAP, Labels, boxes
 from embomatrix.factory.pictures.legend import counted, draw_legend, in_order
+from embomatrix.factory.writer.view import SceneView
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.geometry import Aabb, Pose
 
@@ -107,6 +108,7 @@ def kind_of(scene: Scene, item: SceneObject, box: Aabb) -> str:
 class _Plan:
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
+        self._view = SceneView(scene)
         self._low = np.min([r.low_m for r in scene.rooms], axis=0) - 0.3
         self._high = np.max([r.high_m for r in scene.rooms], axis=0) + 0.3
         extent = self._high - self._low
@@ -231,11 +233,8 @@ class _Plan:
         return {where: names for where, names in told.items() if len(names) > _EACH_BY_NUMBER}
 
     def _where(self, item: SceneObject) -> str:
-        if item.relation and item.host:
-            return f"{item.relation.value} {item.host}"
-        if not self._is_small(item):
-            return ""
-        return "on the wall" if footprint(self._scene, item).low_m[2] > 0.05 else "on the floor"
+        is_told = (item.relation and item.host) or self._is_small(item)
+        return self._view.whereabouts(item.name) if is_told else ""
 
     def _is_small(self, item: SceneObject) -> bool:
         box = footprint(self._scene, item)

@@ -65,7 +65,7 @@ def facts_of(view: SceneView, rooms: Sequence[str]) -> SceneFacts:
             continue
         names = sorted(view.in_room[room.name], key=lambda name: not _abilities(view, name))
         kept = tuple(_thing(view, name) for name in names[:MOST_IN_ROOM])
-        area_m2 = room.size_m[0] * room.size_m[1]
+        area_m2 = round(room.size_m[0] * room.size_m[1], 2)
         found.append(RoomFacts(room.name, room.type, area_m2, kept, len(names) - len(kept)))
     return SceneFacts(view.scene.base, tuple(found))
 
@@ -76,11 +76,7 @@ def with_sights(facts: SceneFacts, sights: Mapping[str, str]) -> SceneFacts:
 
 
 def _thing(view: SceneView, name: str) -> Thing:
-    item = view.item(name)
-    rests = (
-        f"{item.relation.value} {item.host}" if item.host and item.relation is not None else "on the floor"
-    )
-    return Thing(name, view.category(name), item.room, rests, _abilities(view, name))
+    return Thing(name, view.category(name), view.room(name), view.whereabouts(name), _abilities(view, name))
 
 
 def _abilities(view: SceneView, name: str) -> tuple[str, ...]:

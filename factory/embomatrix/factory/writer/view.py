@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import cached_property
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.factory.furnish.roles import Role, role_of
 from embomatrix.factory.scenes.joints import bumped_into
 from embomatrix.factory.scenes.solids import Solids
 from embomatrix.factory.writer.robot import AnyRobot
@@ -28,6 +29,8 @@ MIN_CAVITY_M: Final = 0.12
 LOW_SURFACE_M: Final = 0.15
 HIGH_SURFACE_M: Final = 1.5
 """Heights above the floor between which tasks ask to put things down."""
+HUNG_M: Final = 0.05
+"""What begins higher above the floor hangs, where nothing bears it."""
 
 
 class SceneView:
@@ -79,6 +82,16 @@ class SceneView:
 
     def rooms_with(self, category: str) -> tuple[str, ...]:
         return tuple(room.name for room in self.scene.rooms if (category, room.name) in self._of_kind)
+
+    def whereabouts(self, name: str) -> str:
+        """What it is on or in, as ``ontop stove_1``, ``on the floor``, ``on the wall`` or ``under the ceiling``."""
+        item = self.item(name)
+        if item.host and item.relation is not None:
+            return f"{item.relation.value} {item.host}"
+        asset = self.asset(name)
+        if role_of(asset.category, asset.size_m, asset.mass_kg) is Role.CEILING:
+            return "under the ceiling"
+        return "on the wall" if self.scene.box_of(name).low_m[2] > HUNG_M else "on the floor"
 
     def is_portable(self, name: str) -> bool:
         """Whether the robot can carry it."""

@@ -1,0 +1,19 @@
+"""A scene as the writers of tasks see it."""
+
+from embomatrix.factory.scenes.build import build_base_scene
+from embomatrix.factory.writer.view import SceneView
+from embomatrix.world.scene import Scene
+
+
+def test_what_nothing_bears_is_on_the_floor_on_the_wall_or_under_the_ceiling() -> None:
+    view = SceneView(build_base_scene("restaurant_diner"))
+    told = {view.category(name): view.whereabouts(name) for name in view.scene.by_name}
+    assert told["fridge"] == told["booth"] == "on the floor"
+    assert told["mirror"] == "on the wall"
+    assert told["room_light"] == "under the ceiling"
+
+
+def test_what_something_bears_is_told_with_that(home: Scene) -> None:
+    view = SceneView(home)
+    borne = next(item for item in home.objects if item.host)
+    assert view.whereabouts(borne.name) == f"{borne.relation} {borne.host}"
