@@ -245,6 +245,7 @@ def test_wishes_fit_what_the_person_does(drafts):
         ("envelope", "printer", "private_office", False),
         ("vase", "eames_chair", "break_room", False),
         ("broccoli", "dish_rack_cart", "kitchen", True),
+        ("bar_soap", "sauna_heater", "sauna", False),
     ],
 )
 def test_nobody_puts_such_things_there(thing, host, room, inside):

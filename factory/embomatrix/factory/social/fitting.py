@@ -106,6 +106,7 @@ NO_HOSTS: Final = frozenset(
         "wood_fireplace",
         "gas_fireplace",
         "charcoal_grill",
+        "sauna_heater",
         "drink_dispenser",
         "espresso_machine",
         "photocopier",

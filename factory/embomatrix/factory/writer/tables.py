@@ -122,10 +122,11 @@ HOST_GROUPS: Final[Mapping[str, frozenset[Group]]] = {
 NEVER_SWITCHED: Final = frozenset(
     {
         "electric_switch", "fire_alarm", "ceiling_fan", "room_light", "downlight", "square_light", "wall_mounted_light",
-        "room_ventilator", "hand_dryer", "fire_extinguisher",
+        "room_ventilator", "hand_dryer", "fire_extinguisher", "motorcycle",
     }
 )  # fmt: skip
-"""Things with a switch that no task asks for: out of reach, for an emergency, or no words tell one from another."""
+"""Things with a switch that no task asks for: out of reach, for an emergency, not for indoors, or no words tell one from
+another."""
 FOR_DRINKS: Final = frozenset({"coffee_maker", "espresso_machine"})
 """What heats drinks, and no food."""
 
