@@ -48,6 +48,16 @@ def test_what_goes_in_is_shared_by_all_containers_and_what_stays_is_not_carried(
     assert demand_on(demands, "table.n.02_1", "table.n.02") == Demand(bears=True, burden=("book.n.02",) * 3)
 
 
+def test_what_must_not_stay_is_carried_and_what_must_not_go_in_needs_no_room() -> None:
+    text = """(define (problem p) (:domain igibson)
+        (:objects book.n.02_1 - book.n.02 carton.n.02_1 - carton.n.02 table.n.02_1 - table.n.02)
+        (:init (ontop book.n.02_1 table.n.02_1) (inroom table.n.02_1 kitchen))
+        (:goal (and (not (ontop book.n.02_1 table.n.02_1)) (not (inside book.n.02_1 carton.n.02_1)))))"""
+    demands = demands_of(parse_problem(text))
+    assert demands["book.n.02_1"] == Demand(carried=True, places=((Relation.ONTOP, "table.n.02_1"),))
+    assert demands["carton.n.02_1"] == Demand()
+
+
 def test_a_container_has_floor_for_all_that_goes_in() -> None:
     plates = ("plate.n.04",) * 4
     model = model_of(Demand(bears=True, contents=plates))

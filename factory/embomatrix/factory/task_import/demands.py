@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.factory.task_import.reach import literals
 from embomatrix.factory.writer.view import is_liftable
 from embomatrix.sim.candidates import surfaces_for
 from embomatrix.world.catalog import Catalog, CatalogError
-from embomatrix.world.evaluate import atoms_of
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
@@ -56,9 +56,13 @@ def demands_of(problem: Problem) -> Mapping[str, Demand]:
     started: defaultdict[tuple[str, str], list[str]] = defaultdict(list)
     ended: defaultdict[tuple[str, str], list[str]] = defaultdict(list)
     places: defaultdict[str, dict[tuple[Relation, str], None]] = defaultdict(dict)
+    goal = list(literals(problem.goal, True, {}))
+    for atom, positive, _ in goal:
+        if not positive and atom.predicate in PLACED and _is_so(problem, atom):
+            carried.add(atom.args[0].lstrip("?"))
     moments = (
         (started, [item.atom for item in problem.init if item.positive]),
-        (ended, list(dict.fromkeys(atoms_of(problem.goal)))),
+        (ended, list(dict.fromkeys(atom for atom, positive, _ in goal if positive))),
     )
     for borne, atoms in moments:
         for atom in atoms:

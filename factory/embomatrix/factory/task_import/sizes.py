@@ -90,9 +90,9 @@ def _ordered(models: list[Model], demand: Demand, places: Sequence[Place]) -> li
     made = [
         model for model in _resized(models, demand) if model.share <= most and _suits(model, demand, places)
     ]
-    if not made and demand.carried and not any(map(_is_liftable, models)):
+    if not made and demand.carried:
         # what does not do all of it is at least to be carried
-        made = [model for model in _resized(models, Demand()) if _is_liftable(model)]
+        made = [model for model in (*models, *_resized(models, Demand())) if _is_liftable(model)]
     return [*made[:KEPT], *models]
 
 
