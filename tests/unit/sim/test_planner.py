@@ -14,6 +14,7 @@ from embomatrix.skills.syntax import MAX_STEPS, Skill
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.evaluate import evaluate
 from embomatrix.world.goal import And, Atom, Exists, Forall, ForN, ForPairs, Imply, Not, Or
+from embomatrix.world.state import Relation
 
 FETCH_CHICKEN = "move microwave_1; open microwave_1; move fridge_1; open fridge_1; pick_up chicken_leg_1; "
 HEAT_CHICKEN = (
@@ -322,6 +323,29 @@ def test_what_has_no_floor_left_in_a_box_is_put_on_what_lies_there():
     simulator.close()
     assert plan.endswith(("place brick_1 ontop", "place brick_2 ontop")), plan
     assert "place crate_1 inside" in plan
+
+
+def test_what_would_lie_above_a_box_is_taken_back_until_there_is_room_in_it():
+    column = replace(make.block("column", "column.n.01", (0.12, 0.12, 0.27), {}), mass_kg=0.5)
+    brick = replace(make.block("brick", "brick.n.01", (0.12, 0.12, 0.2), {}), mass_kg=0.5)
+    crate = make.tub("crate", "crate.n.01", (0.18, 0.18, 0.3), 0.01, 0.01, mass_kg=1.0, abilities={})
+    table_m = 0.75
+    inside = {"host": "crate_1", "relation": Relation.INSIDE}
+    scene = with_objects(
+        kitchen_scene(),
+        [
+            (placed("crate_1", crate, "kitchen_0", upright(2.2, 1.6, table_m, crate)), crate),
+            (
+                placed("column_1", column, "kitchen_0", upright(2.2, 1.6, table_m + 0.01, column), **inside),
+                column,
+            ),
+            (placed("brick_1", brick, "kitchen_0", upright(1.9, 1.4, table_m, brick)), brick),
+        ],
+    )
+    simulator = Simulator(Bundle(scene, {}, build_pose_cache(scene, (), (), seed=0)))
+    plan = oracle(simulator, atom("inside", "brick_1", "crate_1"))
+    simulator.close()
+    assert plan.endswith("pick_up brick_1; move crate_1; place crate_1 inside"), plan
 
 
 def test_what_does_not_open_where_it_stands_is_carried_to_where_it_does():

@@ -83,7 +83,9 @@ class PlanScript:
         for other in self._task.table:
             lies_there = other != name and self._world.relations.inside(other, target)
             if lies_there and self._calls.use(Skill.PLACE, other, PlaceRelation.ONTOP).ok:
-                return self.holds(Relation.INSIDE, name, target)
+                if self.holds(Relation.INSIDE, name, target):
+                    return True
+                self._take(name, DEPTH)
         return False
 
     def open(self, name: str, depth: int = 0) -> None:
