@@ -1,21 +1,24 @@
 """A language model plays the people; whatever it answers, only what the scene holds becomes a task."""
 
 import base64
+import contextlib
 import json
 
 import numpy as np
 import pytest
-from tests.fakes.chat_server import ChatServer
+from tests.fakes.chat_server import ChatServer, completion
 
 from embomatrix.factory.pictures.sights import sight_of_room
-from embomatrix.factory.refusal import RefusalReason
+from embomatrix.factory.pipeline.settings import BuildSettings
+from embomatrix.factory.pipeline.variants import VariantMaker, VariantOrder
+from embomatrix.factory.refusal import Refusal, RefusalReason
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.social.facts import MOST_IN_ROOM, facts_of
 from embomatrix.factory.social.model_agents import ModelAgents
 from embomatrix.factory.social.model_writer import ModelWriter
 from embomatrix.factory.social.requests import TaskRequest, Wanted, Wish, check_request, piece_of
 from embomatrix.factory.social.values import DaySlot
-from embomatrix.factory.writer.tasks import Draft
+from embomatrix.factory.writer.tasks import Draft, DraftOrder, PlainWriter
 from embomatrix.factory.writer.variant import build_variant
 from embomatrix.factory.writer.view import SceneView
 from embomatrix.llm.endpoint import Endpoint, EndpointLimits
@@ -138,6 +141,55 @@ def test_a_model_that_stays_wrong_costs_its_draft_and_the_reason_is_told():
 
 
 BROKEN = (500, {}, "broken", 0.0)
+
+
+def slowly(text):
+    return (200, {}, json.dumps(completion(text)), 0.3)
+
+
+def test_drafts_are_asked_for_at_once_each_by_its_own_draw():
+    orders = [
+        DraftOrder(TaskCategory.PICK_AND_PLACE, f"t{number}", np.random.default_rng(number))
+        for number in range(4)
+    ]
+    server = ChatServer(CAST, *[slowly(TALK)] * 4, *[slowly(GOOD)] * 4)
+    with server.serving() as url, ModelWriter(ModelAgents(Endpoint(url, "small-1"))) as writer:
+        drafts = writer.write_all(VARIANT, VIEW, orders)
+    assert [draft.task.task_id for draft in drafts] == ["t0", "t1", "t2", "t3"]
+    assert server.most_at_once == 4
+    assert len({tuple(draft.task.table) for draft in drafts}) == 4
+
+
+def test_of_drafts_that_are_asked_for_at_once_one_that_fails_costs_the_others_nothing():
+    orders = [
+        DraftOrder(TaskCategory.PICK_AND_PLACE, f"t{number}", np.random.default_rng(number))
+        for number in range(2)
+    ]
+    server = ChatServer(CAST, slowly(TALK), slowly(TALK), slowly("no"), slowly(GOOD), "no")
+    with server.serving() as url, ModelWriter(ModelAgents(Endpoint(url, "small-1"))) as writer:
+        found = writer.write_all(VARIANT, VIEW, orders)
+    assert sorted(isinstance(draft, Draft) for draft in found) == [False, True]
+    assert next(each for each in found if isinstance(each, Refusal)).reason is RefusalReason.UNUSABLE_ANSWER
+
+
+def test_a_build_names_drafts_of_one_time_in_the_order_in_which_they_are_kept():
+    class Twice(PlainWriter):
+        """Gives the same draft twice, whatever it is asked for: one of the two is kept."""
+
+        at_once = 3
+
+        def write_all(self, variant, view, orders):
+            first, *_ = (self.write(variant, view, each.category, each.task_id, each.rng) for each in orders)
+            return [first, first]
+
+    order = VariantOrder("train", 0, VARIANT.scene.base, ROOMS, dict.fromkeys(TaskCategory, 2), frozenset())
+    settings = BuildSettings(
+        scenes=(VARIANT.scene.base,), seed=0, train=4, heldout=0, look_ahead=False, physical=False
+    )
+    with contextlib.closing(VariantMaker(settings, Twice())) as maker:
+        records = maker.make(order).result.records
+    names = [record.task.task_id for record in records]
+    assert len(set(names)) == len(names) > 1
 
 
 def in_a_row(*script, drafts):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import time
 import zlib
 from dataclasses import dataclass, field, replace
@@ -18,7 +19,7 @@ from embomatrix.factory.refusal import Refusal
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.social.writer import SocialWriter
 from embomatrix.factory.writer.rehearsal import Rehearsal
-from embomatrix.factory.writer.tasks import PlainWriter, is_heldout_signature
+from embomatrix.factory.writer.tasks import DraftOrder, ManyAtOnce, PlainWriter, is_heldout_signature
 from embomatrix.factory.writer.variant import Variant, build_variant
 from embomatrix.factory.writer.view import SceneView
 from embomatrix.sim.executor import Simulator
@@ -34,7 +35,7 @@ from embomatrix.world.inflation import bundle_digest
 from embomatrix.world.task import TaskCategory
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from embomatrix.factory.layout.jobs import LayoutAgents
     from embomatrix.factory.pipeline.settings import BuildSettings
@@ -193,18 +194,38 @@ class _VariantJob:
         """Drafts whose kinds of goal belong to this split, all different, the missing categories in turns."""
         wanted = [category for category, count in missing.items() if count > 0]
         drafts: list[Draft] = []
-        for attempt in range(WRITE_TRIES):
-            if len(drafts) == DRAFTS:
-                break
-            task_id = f"{self._variant.scene.scene_id}-{len(drafts):02d}"
-            category = wanted[attempt % len(wanted)]
-            draft = self._writer.write(self._variant, view, category, task_id, rng)
-            if isinstance(draft, Refusal):
-                self._reject(category, draft)
-            elif draft is not None and self._is_new(draft):
-                drafts.append(draft)
-                self._known.add(key_of(draft.signature, draft.task.instruction))
+        turns = itertools.islice(itertools.cycle(wanted), WRITE_TRIES)
+        while len(drafts) < DRAFTS and (written := self._written(turns, view, len(drafts), rng)):
+            for category, draft in written:
+                if isinstance(draft, Refusal):
+                    self._reject(category, draft)
+                elif draft is not None and self._is_new(draft):
+                    named = replace(draft.task, task_id=self._task_id(len(drafts)))
+                    drafts.append(replace(draft, task=named))
+                    self._known.add(key_of(draft.signature, draft.task.instruction))
         return drafts
+
+    def _written(
+        self, turns: Iterator[TaskCategory], view: SceneView, known: int, rng: np.random.Generator
+    ) -> list[tuple[TaskCategory, Draft | Refusal | None]]:
+        """What comes of the next turn, or of several at once where a writer waits for answers; nothing at their end."""
+        if not isinstance(self._writer, ManyAtOnce):
+            return [
+                (category, self._writer.write(self._variant, view, category, self._task_id(known), rng))
+                for category in itertools.islice(turns, 1)
+            ]
+        categories = list(itertools.islice(turns, min(self._writer.at_once, DRAFTS - known)))
+        orders = [
+            DraftOrder(category, self._task_id(known + number), each)
+            for number, (category, each) in enumerate(
+                zip(categories, rng.spawn(len(categories)), strict=True)
+            )
+        ]
+        found = self._writer.write_all(self._variant, view, orders) if orders else ()
+        return list(zip(categories, found, strict=False))
+
+    def _task_id(self, number: int) -> str:
+        return f"{self._variant.scene.scene_id}-{number:02d}"
 
     def _transcripts(self) -> dict[str, str]:
         """Of the admitted tasks that somebody talked about, by task id."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.refusal import Refusal, RefusalReason
 from embomatrix.factory.social.conversing import starting_slots
@@ -11,13 +12,13 @@ from embomatrix.factory.social.facts import facts_of, with_sights
 from embomatrix.factory.social.requests import piece_of
 from embomatrix.factory.social.transcript import transcript_of
 from embomatrix.factory.writer.goals import Workshop
-from embomatrix.factory.writer.tasks import Draft, draft_of
+from embomatrix.factory.writer.tasks import Draft, DraftOrder, draft_of
 from embomatrix.llm.loop import OnOneLoop
 from embomatrix.llm.patience import Patience
-from embomatrix.llm.values import EndpointError, UnusableReplyError
+from embomatrix.llm.values import EndpointError, LlmError, UnusableReplyError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
     from contextlib import AbstractAsyncContextManager
 
     import numpy as np
@@ -27,12 +28,13 @@ if TYPE_CHECKING:
     from embomatrix.factory.social.values import Cast
     from embomatrix.factory.writer.variant import Variant
     from embomatrix.factory.writer.view import SceneView
-    from embomatrix.llm.values import LlmError
     from embomatrix.world.scene import Scene
     from embomatrix.world.task import TaskCategory
 
 logger = logging.getLogger(__name__)
 SEEDS = 2**31
+AT_ONCE: Final = 8
+"""Drafts that are asked for at once: as many as an endpoint is asked at a time."""
 
 
 class ModelWriter(OnOneLoop):
@@ -40,6 +42,8 @@ class ModelWriter(OnOneLoop):
 
     ``look`` gives pictures of a scene, for a model that sees: then each base scene is looked at once, before anything is asked.
     """
+
+    at_once = AT_ONCE
 
     def __init__(
         self,
@@ -63,39 +67,62 @@ class ModelWriter(OnOneLoop):
         rng: np.random.Generator,
     ) -> Draft | Refusal:
         """A draft, or why the model gave none. Raises EndpointError where nobody answered a few times in a row."""
-        try:
-            draft = self._runner.run(self._write(variant, view, category, task_id, rng))
-        except UnusableReplyError as error:
-            self._patience.answered()
-            return _refused(task_id, RefusalReason.UNUSABLE_ANSWER, error)
-        except EndpointError as error:
-            self._patience.unanswered(error)
-            return _refused(task_id, RefusalReason.NO_ANSWER, error)
-        self._patience.answered()
-        return draft
+        return self.write_all(variant, view, [DraftOrder(category, task_id, rng)])[0]
 
-    async def _write(
-        self,
-        variant: Variant,
-        view: SceneView,
-        category: TaskCategory,
-        task_id: str,
-        rng: np.random.Generator,
-    ) -> Draft:
-        base, seed = variant.scene.base, int(rng.integers(SEEDS))
+    def write_all(
+        self, variant: Variant, view: SceneView, orders: Sequence[DraftOrder]
+    ) -> list[Draft | Refusal]:
+        """What comes of orders that are asked for at once; of the first alone where nobody makes up the people.
+
+        Raises EndpointError where nobody answered a few times in a row.
+        """
+        answers = self._runner.run(self._answers(variant, view, orders))
+        return [self._told(order, answer) for order, answer in zip(orders, answers, strict=False)]
+
+    def _told(self, order: DraftOrder, answer: Draft | LlmError) -> Draft | Refusal:
+        if isinstance(answer, EndpointError):
+            self._patience.unanswered(answer)
+            return _refused(order.task_id, RefusalReason.NO_ANSWER, answer)
+        self._patience.answered()
+        if isinstance(answer, LlmError):
+            return _refused(order.task_id, RefusalReason.UNUSABLE_ANSWER, answer)
+        return answer
+
+    async def _answers(
+        self, variant: Variant, view: SceneView, orders: Sequence[DraftOrder]
+    ) -> list[Draft | LlmError]:
+        seeds = [int(order.rng.integers(SEEDS)) for order in orders]
+        try:
+            cast = await self._people(variant, view, seeds[0])
+        except LlmError as error:
+            return [error]
+        return await asyncio.gather(
+            *(self._one(variant, view, order, cast, seed) for order, seed in zip(orders, seeds, strict=True))
+        )
+
+    async def _people(self, variant: Variant, view: SceneView, seed: int) -> Cast:
+        """Those of the base scene, made up once."""
+        base = variant.scene.base
         if base not in self._casts:
             everywhere = facts_of(view, [room.name for room in variant.scene.rooms])
             sights = self._sights[base] = await self._seen(variant.scene, everywhere, seed)
             self._casts[base] = await self._agents.cast(with_sights(everywhere, sights), seed)
-        cast = self._casts[base]
-        facts = with_sights(facts_of(view, variant.rooms), self._sights[base])
-        slot = starting_slots(cast, variant.rooms, rng)[0]
-        conversation = await self._agents.converse(facts, cast, slot, category, seed)
-        request = await self._agents.summarise(facts, view, conversation, seed)
+        return self._casts[base]
+
+    async def _one(
+        self, variant: Variant, view: SceneView, order: DraftOrder, cast: Cast, seed: int
+    ) -> Draft | LlmError:
+        facts = with_sights(facts_of(view, variant.rooms), self._sights[variant.scene.base])
+        slot = starting_slots(cast, variant.rooms, order.rng)[0]
+        try:
+            conversation = await self._agents.converse(facts, cast, slot, order.category, seed)
+            request = await self._agents.summarise(facts, view, conversation, seed)
+        except LlmError as error:
+            return error
         pieces = [piece_of(wish, view) for wish in request.wishes]
         transcript = transcript_of(cast, conversation, request.instruction, pieces)
-        shop = Workshop(view, variant, rng)
-        return draft_of(shop, category, task_id, pieces, request.instruction, transcript)
+        shop = Workshop(view, variant, order.rng)
+        return draft_of(shop, order.category, order.task_id, pieces, request.instruction, transcript)
 
     async def _seen(self, scene: Scene, facts: SceneFacts, seed: int) -> Mapping[str, str]:
         """What each room looks like; nothing where nobody looks, or what the model says of it can't be used."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final, Protocol, runtime_checkable
 
 from embomatrix.factory.writer.goals import (
     Piece,
@@ -76,6 +76,15 @@ class Draft:
     """How the request came about, in Markdown; empty where nobody talked."""
 
 
+@dataclass(frozen=True, slots=True)
+class DraftOrder:
+    """One draft that is asked for. The generator decides all that is drawn for it."""
+
+    category: TaskCategory
+    task_id: str
+    rng: np.random.Generator
+
+
 class TaskWriter(Protocol):
     """Writes tasks about the things of a variant."""
 
@@ -91,6 +100,20 @@ class TaskWriter(Protocol):
 
         A refusal tells why whoever was asked for a task gave none.
         """
+        ...
+
+
+@runtime_checkable
+class ManyAtOnce(Protocol):
+    """A writer that waits for somebody's answers, and so asks for several drafts at once."""
+
+    at_once: int
+    """Drafts that are worth asking for together."""
+
+    def write_all(
+        self, variant: Variant, view: SceneView, orders: Sequence[DraftOrder]
+    ) -> Sequence[Draft | Refusal]:
+        """What came of the first so many of the orders, of one at least: a draft, or why there is none."""
         ...
 
 
