@@ -133,6 +133,17 @@ async def test_a_slot_is_used_again_for_the_next_lease_of_its_scene(tmp_path):
     ]
 
 
+async def test_results_hold_a_slot_for_what_they_took_though_many_are_read_together(tmp_path):
+    async with running(tmp_path, slots=1) as harness:
+        began_s = time.monotonic()
+        for number in range(40):
+            harness.submit(f"l{number}")
+        await harness.outcomes(40)
+        took_s = time.monotonic() - began_s
+    assert all(result.held_s == result.outcome.timings.execute_s for result in harness.results)
+    assert sum(result.held_s for result in harness.results) <= took_s
+
+
 async def test_idle_processes_are_bounded_over_all_scenes(tmp_path):
     limits = SlotLimits(slots=1, memory_mb=128)
     assert limits.idle_slots == 4

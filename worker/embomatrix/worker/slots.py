@@ -306,8 +306,9 @@ class SlotPool:
         if self._tickets.get(lease.ref) is not ticket:
             return
         del self._tickets[lease.ref]
-        held_s = time.monotonic() - ticket.turn_s if ticket.slot else 0.0
         if isinstance(outcome, Completed):
-            # Of answers that came together, all but the first seem to have taken no time.
-            held_s = max(held_s, outcome.timings.execute_s)
+            # What the slot says: of answers that are read together the first would be given the time of all.
+            held_s = outcome.timings.execute_s
+        else:
+            held_s = time.monotonic() - ticket.turn_s if ticket.slot else 0.0
         self._on_result(LeaseResult(lease.ref, outcome, lease.origin, ticket.slot, held_s))
