@@ -76,7 +76,8 @@ def test_what_others_use_is_what_is_busy_and_not_ours():
 def test_processes_below_ours_count_as_ours_also_after_their_end():
     before_s = family_cpu_s(os.getpid())
     subprocess.run([sys.executable, "-c", BUSY], check=True)
-    assert family_cpu_s(os.getpid()) - before_s >= 0.4
+    # The kernel tells of whole ticks here, hundredths of a second, of which it may drop one at each end.
+    assert family_cpu_s(os.getpid()) - before_s >= 0.38
 
 
 def test_a_process_that_is_gone_used_nothing():
