@@ -1,6 +1,7 @@
 """The loop learns, can be stopped and resumed exactly, and says where its time went."""
 
 import json
+from contextlib import ExitStack
 from dataclasses import replace
 
 import pytest
@@ -107,6 +108,23 @@ def test_a_run_leaves_report_metrics_samples_and_the_newest_checkpoints(tmp_path
     assert (told.steps, told.rollouts, len(told.before), len(told.after)) == (6, 96, 4, 4)
     assert 0 <= told.wait_share <= told.overhead < 1
     assert told.peak_mb > 50, "torch alone takes more"
+
+
+def test_a_disk_that_is_full_at_a_checkpoint_ends_the_run_and_leaves_the_one_before_whole(
+    tmp_path, small_files
+):
+    whole, _ = run(tmp_path / "whole")
+
+    class Filled(LineDisplay):
+        def stepped(self, record, share, rollouts_per_s):
+            if record.step == 4:
+                room.enter_context(small_files(20_000))
+
+    with ExitStack() as room, pytest.raises(TrainerError, match=r"step-000006 can't be written .*--resume"):
+        run(tmp_path / "full", display=Filled(Console(quiet=True)))
+    assert CheckpointStore(tmp_path / "full" / CHECKPOINTS, keep=9).latest().name == "step-000003"
+    gone_on, _ = run(tmp_path / "full", resume=True)
+    assert gone_on.after == whole.after
 
 
 def test_a_step_that_ends_after_the_minutes_do_leaves_no_more_than_all_of_them_spent(tmp_path):

@@ -19,12 +19,13 @@ from embomatrix.trainer.policy.hf import HfPolicy
 from embomatrix.trainer.policy.lora import LoraShape, adapters
 from embomatrix.trainer.progress import LineDisplay
 from embomatrix.trainer.rollout import Gateway
-from embomatrix.trainer.settings import LANGUAGE_MODEL_DEFAULTS, read_settings
+from embomatrix.trainer.settings import LANGUAGE_MODEL_DEFAULTS, Products, read_settings
 from embomatrix.trainer.telling import Teller
 
 TASKS = make_tasks(6, 2, objects=8)
 SHAPE = LoraShape(rank=4, alpha=8.0)
 SHORT = {
+    "products": "float32",
     "lora.rank": 4,
     "lora.alpha": 8.0,
     "imitation.steps": 2,
@@ -125,7 +126,9 @@ def test_the_merged_model_says_what_the_adapted_one_says(tokenizer, tmp_path):
     policy.save(tmp_path)
     assert torch.equal(scored(policy).logprobs, expected)  # saving leaves the adapters where they are
     assert not torch.allclose(before, expected, atol=1e-2)
-    assert torch.allclose(scored(HfPolicy.load(tmp_path, Codec.LINES)).logprobs, expected, atol=1e-4)
+    assert torch.allclose(
+        scored(HfPolicy.load(tmp_path, Codec.LINES, products=Products.FLOAT32)).logprobs, expected, atol=1e-4
+    )
 
 
 def test_a_frozen_copy_shares_the_model_and_not_the_adapters(tokenizer):

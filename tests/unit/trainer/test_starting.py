@@ -6,7 +6,7 @@ import pytest
 import torch
 from tests.fakes.datasets import write_kitchen_dataset
 
-from embomatrix.trainer.checkpoint import CHECKPOINTS, CheckpointStore
+from embomatrix.trainer.checkpoint import CHECKPOINTS, CheckpointStore, read_state
 from embomatrix.trainer.errors import TrainerError
 from embomatrix.trainer.starting import resumed, started
 
@@ -88,6 +88,16 @@ def test_a_checkpoint_of_another_version_is_told(kitchen, tmp_path, begun):
         resumed(kitchen, tmp_path, {})
 
 
+def test_a_checkpoint_from_when_products_were_the_small_policys_alone_is_read(kitchen, tmp_path, begun):
+    folder = begun()
+    settings = read_state(folder)[1]
+    state = folder / "state.json"
+    told = json.loads(state.read_text())
+    told["settings"]["tiny"]["products"] = told["settings"].pop("products")
+    state.write_text(json.dumps(told))
+    assert resumed(kitchen, tmp_path, {}).settings == settings
+
+
 def test_a_run_from_a_saved_policy_goes_on_with_that_policy_named_again(kitchen, tmp_path, begun):
     policy, arm = str(begun() / "policy"), tmp_path / "arm"
     start = started(kitchen, arm, policy, None, SMALL)
@@ -105,5 +115,5 @@ def test_the_small_policy_multiplies_in_half_the_bits_where_the_processor_has_in
         started(kitchen, tmp_path / "auto", "tiny", None, SMALL).policy.module.blocks[0].qkv.products
         is products
     )
-    whole = started(kitchen, tmp_path / "whole", "tiny", None, {**SMALL, "tiny.products": "float32"})
+    whole = started(kitchen, tmp_path / "whole", "tiny", None, {**SMALL, "products": "float32"})
     assert whole.policy.module.blocks[0].qkv.products is torch.float32

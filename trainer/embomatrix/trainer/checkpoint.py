@@ -133,12 +133,19 @@ def read_state(folder: Path) -> tuple[Progress, TrainSettings]:
             )
         progress = Progress(**state["progress"])
         progress.imitation = ImitationState(**state["progress"]["imitation"])
-        return progress, TrainSettings.model_validate(state["settings"])
+        return progress, TrainSettings.model_validate(_of_today(state["settings"]))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise TrainerError(
             f"{folder} is no readable checkpoint ({_STATE}: {reason_of(error)}): pass a folder such as "
             "runs/NAME/checkpoints/step-000050"
         ) from error
+
+
+def _of_today(settings: dict[str, Any]) -> dict[str, Any]:
+    """Settings of a checkpoint; once `products` was the small policy's alone."""
+    tiny = dict(settings["tiny"])
+    moved = {"products": tiny.pop("products")} if "products" in tiny else {}
+    return {**settings, "tiny": tiny, **moved}
 
 
 def restore(folder: Path, put_back: Callable[[dict[str, Any]], object]) -> None:

@@ -42,7 +42,7 @@ class OptimiserKind(StrEnum):
 
 
 class Products(StrEnum):
-    """The type in which the from-scratch policy multiplies matrices; weights, sums and attention are of 32 bits always."""
+    """The type in which a policy's layers multiply on a processor; weights, sums and attention are of 32 bits always."""
 
     AUTO = "auto"  # bfloat16 where the processor has instructions for it
     BFLOAT16 = "bfloat16"
@@ -61,16 +61,12 @@ class _Frozen(BaseModel):
 
 
 class TinySettings(_Frozen):
-    """The from-scratch policy: its shape, and how it computes."""
+    """The from-scratch policy's shape."""
 
     layers: int = Field(default=4, ge=1)
     width: int = Field(default=128, ge=16)
     heads: int = Field(default=4, ge=1)
     inner: int = Field(default=384, ge=16)
-    products: Products = Products.AUTO
-
-    def shape(self) -> dict[str, int]:
-        return self.model_dump(exclude={"products"})
 
 
 class LoraSettings(_Frozen):
@@ -220,6 +216,7 @@ class TrainSettings(_Frozen):
     """Steps between two groups that are written to the sample log."""
     gradient_checkpointing: bool = False
     """Hugging Face models: keep only the inputs of layers for the way back, and compute the rest again."""
+    products: Products = Products.AUTO
     tiny: TinySettings = TinySettings()
     lora: LoraSettings = LoraSettings()
     prompt: PromptSettings = PromptSettings()

@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
-
-import torch
+from typing import TYPE_CHECKING, Final
 
 from embomatrix.trainer.errors import DAMAGE, TrainerError, reason_of
 from embomatrix.trainer.policy.decoder import DecoderShape
 from embomatrix.trainer.policy.hf import HfPolicy
 from embomatrix.trainer.policy.lora import LoraShape, has_adapters
+from embomatrix.trainer.policy.products import type_of
 from embomatrix.trainer.policy.tiny import TinyPolicy
 from embomatrix.trainer.policy.words import build_vocabulary
-from embomatrix.trainer.settings import Products
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
     from embomatrix.trainer.data import TaskSet
     from embomatrix.trainer.policy.protocol import Policy
     from embomatrix.trainer.settings import TrainSettings
@@ -42,9 +38,13 @@ def new_policy(settings: TrainSettings, tasks: TaskSet) -> Policy:
         return saved_policy(Path(settings.model), settings)
     situations = [task.situation for task in (*tasks.train, *tasks.heldout)]
     vocabulary = build_vocabulary(situations, [task.task.instruction for task in tasks.train])
-    shape = DecoderShape(len(vocabulary), **settings.tiny.shape())
+    shape = DecoderShape(len(vocabulary), **settings.tiny.model_dump())
     return TinyPolicy(
-        vocabulary, shape, seed=settings.seed, device=settings.device, products=_products(settings)
+        vocabulary,
+        shape,
+        seed=settings.seed,
+        device=settings.device,
+        products=type_of(settings.products, settings.device),
     )
 
 
@@ -52,7 +52,8 @@ def saved_policy(folder: Path, settings: TrainSettings) -> Policy:
     """A policy that was saved in a folder. Raises TrainerError where there is none."""
     try:
         if TinyPolicy.is_saved_in(folder):
-            return TinyPolicy.load(folder, device=settings.device, products=_products(settings))
+            products = type_of(settings.products, settings.device)
+            return TinyPolicy.load(folder, device=settings.device, products=products)
     except DAMAGE as error:
         raise TrainerError(
             f"the policy in {folder} is damaged ({reason_of(error)}): use another checkpoint"
@@ -64,6 +65,7 @@ def saved_policy(folder: Path, settings: TrainSettings) -> Policy:
             folder,
             settings.codec,
             device=settings.device,
+            products=settings.products,
             label=settings.model,
             recompute=settings.gradient_checkpointing,
         )
@@ -72,21 +74,14 @@ def saved_policy(folder: Path, settings: TrainSettings) -> Policy:
     )
 
 
-def _products(settings: TrainSettings) -> torch.dtype:
-    """Half as many bits where the processor multiplies them in one instruction: products take a quarter of the time there."""
-    asked = settings.tiny.products
-    if asked is Products.AUTO:
-        tell: Callable[[], Mapping[str, Any]] = getattr(torch.cpu, "get_capabilities", dict)
-        told = tell()  # nothing, in torches before it could be asked
-        able = settings.device == "cpu" and told.get("avx512_bf16", False)
-        asked = Products.BFLOAT16 if able else Products.FLOAT32
-    return torch.bfloat16 if asked is Products.BFLOAT16 else torch.float32
-
-
 def _language_model(named: str, settings: TrainSettings, adapters: Path | None = None) -> HfPolicy:
     """A Hugging Face model, with adapters where the settings want them: new ones, or those of a folder."""
     policy = HfPolicy.load(
-        named, settings.codec, device=settings.device, recompute=settings.gradient_checkpointing
+        named,
+        settings.codec,
+        device=settings.device,
+        products=settings.products,
+        recompute=settings.gradient_checkpointing,
     )
     if settings.lora.rank:
         shape = LoraShape(settings.lora.rank, settings.lora.alpha, settings.lora.targets)

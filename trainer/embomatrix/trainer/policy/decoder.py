@@ -11,7 +11,6 @@ Shapes: Q prompts, G samples of each, P prompt tokens, T new tokens, H heads of 
 
 from __future__ import annotations
 
-import contextlib
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -19,9 +18,9 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
+from embomatrix.trainer.policy.products import Product
 
+if TYPE_CHECKING:
     from torch import Tensor
 
 _HIDDEN_KEY = -1e9
@@ -97,33 +96,18 @@ class Written:
         return Written(layers, self.tokens[rows], self.pointers[rows])
 
 
-class _Product(nn.Linear):
-    """A matrix product in a type of its own; the weight stays in 32 bits, and its gradient comes in them."""
-
-    def __init__(self, inside: int, outside: int, products: torch.dtype) -> None:
-        super().__init__(inside, outside, bias=False)
-        self.products = products
-        self.converted: Tensor | None = None
-        """The weight as it is multiplied, while it is known not to change."""
-
-    def forward(self, x: Tensor) -> Tensor:
-        """The result is of the product's type."""
-        weight = self.weight.to(self.products) if self.converted is None else self.converted
-        return functional.linear(x.to(self.products), weight)
-
-
 class _Block(nn.Module):
     def __init__(self, shape: DecoderShape, products: torch.dtype) -> None:
         super().__init__()
         self.heads = shape.heads
         self.before_attention = nn.RMSNorm(shape.width)
-        self.qkv = _Product(shape.width, 3 * shape.width, products)
+        self.qkv = Product(shape.width, 3 * shape.width, products)
         self.of_query = nn.RMSNorm(shape.width // shape.heads)
         self.of_key = nn.RMSNorm(shape.width // shape.heads)
-        self.out = _Product(shape.width, shape.width, products)
+        self.out = Product(shape.width, shape.width, products)
         self.before_inner = nn.RMSNorm(shape.width)
-        self.gate_up = _Product(shape.width, 2 * shape.inner, products)
-        self.down = _Product(shape.inner, shape.width, products)
+        self.gate_up = Product(shape.width, 2 * shape.inner, products)
+        self.down = Product(shape.inner, shape.width, products)
 
     def project(self, x: Tensor, rope: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
         """Queries, keys and values (rows, H, T, D) of x (rows, T, C)."""
@@ -212,18 +196,6 @@ class Decoder(nn.Module):
         # Nothing, rather than everything alike, where no place is left: the softmax of the scores makes up for it.
         attention = torch.softmax(looked.masked_fill(nowhere, _HIDDEN_KEY), dim=-1)
         return attention.masked_fill(nowhere, 0.0), words
-
-    @contextlib.contextmanager
-    def unchanged(self) -> Iterator[None]:
-        """For many words in a row: no weight changes or learns meanwhile, so that each is converted once."""
-        layers = [layer for layer in self.modules() if isinstance(layer, _Product)]
-        try:
-            for layer in layers:
-                layer.converted = layer.weight.detach().to(layer.products)
-            yield
-        finally:
-            for layer in layers:
-                layer.converted = None
 
     def _rope(self, positions: Tensor) -> tuple[Tensor, Tensor]:
         """positions: (rows, T)."""

@@ -15,8 +15,10 @@ import torch
 from embomatrix.trainer.errors import TrainerError, reason_of
 from embomatrix.trainer.policy.drawing import draw
 from embomatrix.trainer.policy.lora import adapt, load_adapters, merged, save_adapters
+from embomatrix.trainer.policy.products import multiply_in, type_of, unchanged
 from embomatrix.trainer.policy.protocol import Samples, Scored
 from embomatrix.trainer.policy.recompute import recomputing
+from embomatrix.trainer.settings import Products
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -65,10 +67,14 @@ class HfPolicy:
         codec: Codec,
         *,
         device: str = "cpu",
+        products: Products = Products.AUTO,
         label: str = "",
         recompute: bool = False,
     ) -> HfPolicy:
-        """Read a model by name or folder. Raises TrainerError with a remedy where that fails."""
+        """Read a model by name or folder; on a processor its layers multiply in ``products``.
+
+        Raises TrainerError with a remedy where that fails.
+        """
         try:
             _look_up(str(name))
             from transformers import AutoModelForCausalLM, AutoTokenizer
@@ -84,10 +90,13 @@ class HfPolicy:
             tokenizer = AutoTokenizer.from_pretrained(str(name))
             model: Any = AutoModelForCausalLM.from_pretrained(str(name), dtype=dtype)
             model.to(device)
-        except (OSError, ValueError, KeyError) as error:
+        except Exception as error:  # the readers of weights and of tokenizers have errors of their own
             raise TrainerError(
                 f"the model {str(name)!r} can't be loaded ({reason_of(error)}): {REMEDY}"
             ) from error
+        multiplied = type_of(products, device)
+        if multiplied is not dtype and device == "cpu":
+            multiply_in(model, multiplied, model.get_output_embeddings())
         return cls(model, tokenizer, codec, label or str(name), recompute=recompute)
 
     def adapt(self, shape: LoraShape, *, seed: int, saved: Path | None = None) -> None:
@@ -134,6 +143,17 @@ class HfPolicy:
 
     @torch.no_grad()
     def sample(
+        self,
+        prompts: Sequence[Tokens],
+        group: int,
+        temperature: float,
+        max_new: int,
+        generator: torch.Generator,
+    ) -> Samples:
+        with unchanged(self._model):
+            return self._drawn(prompts, group, temperature, max_new, generator)
+
+    def _drawn(
         self,
         prompts: Sequence[Tokens],
         group: int,
@@ -249,10 +269,18 @@ class HfPolicy:
         return twin
 
     def save(self, folder: Path) -> None:
-        """The model with its adapters merged in, which anyone can load, and the adapters beside it to go on with."""
+        """The model with its adapters merged in, which anyone can load, and the adapters beside it to go on with.
+
+        Raises OSError.
+        """
+        from safetensors import SafetensorError
+
         folder.mkdir(parents=True, exist_ok=True)
-        with merged(self._model):
-            self._model.save_pretrained(folder)
+        try:
+            with merged(self._model):
+                self._model.save_pretrained(folder)
+        except SafetensorError as error:
+            raise OSError(str(error)) from error
         self._tokenizer.save_pretrained(folder)
         if self._lora is not None:
             save_adapters(self._model, self._lora, folder)

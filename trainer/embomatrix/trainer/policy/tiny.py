@@ -15,6 +15,7 @@ from embomatrix.trainer.errors import TrainerError
 from embomatrix.trainer.policy.decoder import Decoder, DecoderShape
 from embomatrix.trainer.policy.drawing import draw
 from embomatrix.trainer.policy.grammar import PlanGrammar
+from embomatrix.trainer.policy.products import unchanged
 from embomatrix.trainer.policy.protocol import Samples, Scored
 from embomatrix.trainer.policy.words import END, GO, PAD, Vocabulary
 
@@ -135,7 +136,7 @@ class TinyPolicy:
         logprobs = torch.zeros(count, max_new, device=self.device)
         mask = torch.zeros(count, max_new, dtype=torch.bool, device=self.device)
         length = 0
-        with self.network.unchanged():
+        with unchanged(self.network):
             for at in range(max_new):
                 barred = self._grammar.barred(writing.cursor, writing.names)[:, None]
                 scores = self.network.scores(state, writing.memory, writing.own, barred)[:, 0]

@@ -1,0 +1,25 @@
+"""What tests of the trainer share."""
+
+import resource
+import signal
+from contextlib import contextmanager
+
+import pytest
+
+
+@pytest.fixture
+def small_files():
+    """For a while the kernel refuses to write files larger than so many bytes, as a full disk refuses to write."""
+
+    @contextmanager
+    def limited(most_bytes):
+        soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+        handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (most_bytes, hard))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+            signal.signal(signal.SIGXFSZ, handler)
+
+    return limited
