@@ -5,6 +5,13 @@ import signal
 from contextlib import contextmanager
 
 import pytest
+import torch
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """What is compared to the bit is computed by one thread; several are no faster on networks of a test's size."""
+    torch.set_num_threads(1)
 
 
 @pytest.fixture

@@ -27,6 +27,19 @@ def test_any_order_gives_the_sum_of_the_order_of_parts(order):
     assert torch.equal(summed(order)[0], summed(range(len(PARTS)))[0])
 
 
+@given(st.permutations(range(len(PARTS))), st.sets(st.sampled_from(range(len(PARTS)))))
+def test_parts_that_were_made_elsewhere_add_up_to_the_same(order, elsewhere):
+    weights, idle = nn.Parameter(torch.zeros(3)), nn.Parameter(torch.zeros(2))
+    gradients = GradientSum([weights, idle])
+    for part in order:
+        if part in elsewhere:
+            gradients.put(part, [PARTS[part].clone(), None])
+        else:
+            gradients.add(part, lambda part=part: (weights * PARTS[part]).sum().backward())
+    assert torch.equal(weights.grad, summed(range(len(PARTS)))[0])
+    assert idle.grad is None
+
+
 def test_a_part_before_its_turn_waits_beside_the_sum():
     assert summed([0, 1, 2, 3, 4])[1] == 0
     assert summed([4, 3, 2, 1, 0])[1] == 4

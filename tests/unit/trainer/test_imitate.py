@@ -28,11 +28,6 @@ class CutError(Exception):
     """Ends a run in its midst."""
 
 
-@pytest.fixture(autouse=True)
-def one_thread():
-    torch.set_num_threads(1)
-
-
 def settings_of(**changes):
     return read_settings(None, {**TINY, **SHORT, **{k.replace("__", "."): v for k, v in changes.items()}})
 

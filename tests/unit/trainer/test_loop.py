@@ -41,11 +41,6 @@ TASKS = make_tasks(10, 4, objects=10)
 SAMPLING, WAITING, UPDATE = Activity.SAMPLING, Activity.WAITING, Activity.UPDATE
 
 
-@pytest.fixture(autouse=True)
-def one_thread():
-    torch.set_num_threads(1)
-
-
 def run(out, cluster=None, tasks=TASKS, resume=False, display=None, **changes):
     settings = read_settings(None, {**TINY, **SHORT, **{k.replace("__", "."): v for k, v in changes.items()}})
     cluster = cluster or SymbolicCluster(tasks)

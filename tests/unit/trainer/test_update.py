@@ -15,11 +15,6 @@ from embomatrix.trainer.settings import Overlap
 TASKS = make_tasks(10, 0, objects=10)
 
 
-@pytest.fixture(autouse=True)
-def one_thread():
-    torch.set_num_threads(1)
-
-
 def trained(out, **changes):
     return run(out, changes.pop("cluster", SymbolicCluster(TASKS)), TASKS, **{"grpo__steps": 4, **changes})
 

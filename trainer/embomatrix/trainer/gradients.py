@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Iterable, Sequence
 
     from torch import Tensor, nn
 
@@ -20,7 +20,7 @@ class GradientSum:
     def __init__(self, parameters: Iterable[nn.Parameter]) -> None:
         self._parameters = tuple(parameters)
         self._next = 0
-        self._aside: dict[int, list[Tensor | None]] = {}
+        self._aside: dict[int, Sequence[Tensor | None]] = {}
         for parameter in self._parameters:
             parameter.grad = None
 
@@ -48,6 +48,11 @@ class GradientSum:
         self._aside[part] = [parameter.grad for parameter in self._parameters]
         for parameter, gradient in zip(self._parameters, summed, strict=True):
             parameter.grad = gradient
+
+    def put(self, part: int, gradient: Sequence[Tensor | None] | None) -> None:
+        """Add a gradient by parameter, which was made elsewhere, as the share of ``part``; None: it has none."""
+        self._aside[part] = gradient or [None] * len(self._parameters)
+        self._add_what_waited()
 
     def scale(self, factor: float) -> None:
         """Multiply the sum, once every part is in."""

@@ -16,6 +16,8 @@ import numpy as np
 import torch
 
 from embomatrix.trainer.checkpoint import CHECKPOINTS, CheckpointStore, Progress, restore, whole_folder
+from embomatrix.trainer.crew.crew import Crew
+from embomatrix.trainer.crew.learner import Learner
 from embomatrix.trainer.data import Curriculum, Schedule
 from embomatrix.trainer.evaluate import Evaluation, evaluate_policy
 from embomatrix.trainer.outcome import write_outcome
@@ -86,28 +88,30 @@ class TrainingRun:
         began_s = time.monotonic()
         earlier_s = sum(self._progress.spent_s.values())
         reference = self._parts.reference or self._prepare()
-        updater = Updater(
-            self._parts.policy,
-            reference,
-            self._parts.teller,
-            self._parts.gateway,
-            self._settings.grpo,
-            self._stopwatch,
-        )
-        if self._restores:
-            newest = self._store.latest()
-            if newest is not None:
-                restore(newest, functools.partial(self._put_back, updater))
-        self._recorder.forget_after(self._progress.step, METRICS, SAMPLES)
-        try:
-            self._optimise(updater)
-        finally:
-            checkpoint = self._save(updater)
+        checkpoint = self._improve(reference)
         after = self._evaluate("after GRPO")
         summary = self._summary(checkpoint, after, earlier_s + time.monotonic() - began_s)
         write_report(summary, read_metrics(self._out), machine())
         write_outcome(self._out, outcome_of(summary))
         return summary
+
+    def _improve(self, reference: Policy) -> Path:
+        """GRPO, in as many processes as are wanted; returns its last checkpoint."""
+        parts, settings = self._parts, self._settings
+        own = Learner(parts.policy, reference, settings.grpo)
+        with Crew.of(own, parts.policy, settings, self._out / REFERENCE) as crew:
+            updater = Updater(
+                parts.policy, reference, parts.teller, parts.gateway, settings.grpo, self._stopwatch, crew
+            )
+            newest = self._store.latest() if self._restores else None
+            if newest is not None:
+                restore(newest, functools.partial(self._put_back, updater))
+            self._recorder.forget_after(self._progress.step, METRICS, SAMPLES)
+            try:
+                self._optimise(updater)
+            finally:
+                checkpoint = self._save(updater)
+        return checkpoint
 
     def _put_back(self, updater: Updater, tensors: Mapping[str, Any]) -> None:
         updater.optimiser.load_state_dict(tensors["optimiser"])

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 from concurrent.futures import FIRST_COMPLETED, wait
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import torch
 
@@ -17,11 +18,16 @@ if TYPE_CHECKING:
     import numpy as np
     from torch import Tensor
 
+    from embomatrix.skills.prompt import Codec
+    from embomatrix.trainer.crew.crew import Crew
+    from embomatrix.trainer.crew.learner import Sampling
     from embomatrix.trainer.data import TrainingTask
-    from embomatrix.trainer.policy.protocol import Policy, Samples
+    from embomatrix.trainer.policy.protocol import Samples
     from embomatrix.trainer.rollout import PlanOutcome, Submitting
     from embomatrix.trainer.settings import GrpoSettings
     from embomatrix.trainer.telling import Teller, Told
+
+_SEEDS: Final = 2**62
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,13 +63,13 @@ class Chunk:
 
 
 class Sampler:
-    """Samples a policy on tasks, and has its plans executed meanwhile."""
+    """Samples a policy on tasks, in all processes of a crew, and has its plans executed meanwhile."""
 
     def __init__(
-        self, policy: Policy, reference: Policy, teller: Teller, gateway: Submitting, settings: GrpoSettings
+        self, crew: Crew, codec: Codec, teller: Teller, gateway: Submitting, settings: GrpoSettings
     ) -> None:
-        self._policy = policy
-        self._reference = reference
+        self._crew = crew
+        self._codec = codec
         self._teller = teller
         self._gateway = gateway
         self._settings = settings
@@ -77,51 +83,53 @@ class Sampler:
         *,
         first_part: int = 0,
     ) -> list[Chunk]:
-        """The tasks in chunks; each is under way before the next is sampled."""
+        """The tasks in chunks; each is under way before a process samples its next.
+
+        What a chunk draws depends on its number and on ``generator`` alone, whichever process samples it.
+        """
         size = self._settings.chunk
-        chunks = [
-            self._chunk(step, first_part + number, tasks[at : at + size], rng, generator)
-            for number, at in enumerate(range(0, len(tasks), size))
-        ]
+        jobs = []
+        for part, at in enumerate(range(0, len(tasks), size), start=first_part):
+            told = [(task, self._teller.anew(task, rng)) for task in tasks[at : at + size]]
+            seed = int(torch.randint(_SEEDS, (), generator=generator, device=generator.device))
+            jobs.append((part, functools.partial(self._chunk, step, part, told, seed)))
+        chunks = self._crew.spread(jobs)
+        if not self._settings.kl_coef:
+            return chunks
         # Last, while the cluster works: it needs no reward.
-        return [self._with_reference(chunk) for chunk in chunks] if self._settings.kl_coef else chunks
+        return self._crew.spread(
+            [(chunk.part, functools.partial(_with_reference, chunk)) for chunk in chunks]
+        )
 
     def _chunk(
         self,
         step: int,
         part: int,
-        tasks: Sequence[TrainingTask],
-        rng: np.random.Generator,
-        generator: torch.Generator,
+        told: Sequence[tuple[TrainingTask, Told]],
+        seed: int,
+        learner: Sampling,
     ) -> Chunk:
-        settings = self._settings
-        told = [self._teller.anew(task, rng) for task in tasks]
-        samples = self._policy.sample(
-            [each.prompt for each in told], settings.group, settings.temperature, settings.max_new, generator
-        )
+        group = self._settings.group
+        samples = learner.sample([each.prompt for _, each in told], seed)
         futures = [
             self._gateway.submit(
                 f"step-{step}-{part}-{row}",
                 step,
                 task,
                 each.situation,
-                samples.texts[row * settings.group : (row + 1) * settings.group],
-                self._policy.codec,
+                samples.texts[row * group : (row + 1) * group],
+                self._codec,
             )
-            for row, (task, each) in enumerate(zip(tasks, told, strict=True))
+            for row, (task, each) in enumerate(told)
         ]
-        return Chunk(part, tasks, told, samples, futures, None)
+        tasks, tellings = zip(*told, strict=True)
+        return Chunk(part, tasks, tellings, samples, futures, None)
 
-    @torch.no_grad()
-    def _with_reference(self, chunk: Chunk) -> Chunk:
-        scored = self._reference.logprobs(
-            [each.prompt for each in chunk.told],
-            chunk.samples.tokens,
-            chunk.samples.mask,
-            self._settings.group,
-            self._settings.temperature,
-        )
-        return Chunk(chunk.part, chunk.tasks, chunk.told, chunk.samples, chunk.futures, scored.logprobs)
+
+def _with_reference(chunk: Chunk, learner: Sampling) -> Chunk:
+    prompts = [each.prompt for each in chunk.told]
+    scored = learner.of_reference(prompts, chunk.samples.tokens, chunk.samples.mask)
+    return Chunk(chunk.part, chunk.tasks, chunk.told, chunk.samples, chunk.futures, scored)
 
 
 def next_back(chunks: Sequence[Chunk]) -> Chunk:

@@ -206,7 +206,10 @@ class TrainSettings(_Frozen):
     """Plan form of a Hugging Face model: ``lines`` or ``json``. The tiny policy calls objects by name."""
     seed: int = 0
     threads: int = Field(default=1, ge=1)
-    """Threads of torch."""
+    """Threads of torch, in each process."""
+    processes: int = Field(default=1, ge=1)
+    """Processes that sample and back-propagate GRPO's chunks side by side, on a processor. What is learnt is the same to the
+    bit with any number; more than a step has chunks have nothing to do."""
     device: str = "cpu"
     checkpoint_every: int = Field(default=50, ge=1)
     keep_checkpoints: int = Field(default=2, ge=1)

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 MAY_CHANGE: Final = frozenset(
     {
-        *("device", "threads", "track", "checkpoint_every", "keep_checkpoints", "samples_every"),
+        *("device", "threads", "processes", "track", "checkpoint_every", "keep_checkpoints", "samples_every"),
         *("grpo.minutes", "grpo.steps", "imitation.seconds", "imitation.steps"),
     }
 )

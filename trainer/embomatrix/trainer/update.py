@@ -4,27 +4,24 @@ Chunks of tasks are sampled one after the other; each chunk's plans go to the cl
 are back-propagated as their rewards arrive, with one optimiser step at the end: the gradient is that of the whole batch,
 on-policy, summed in the order of sampling, so that it does not depend on which worker was faster. ``Overlap.AHEAD`` also
 samples the next step's plans before this step's rewards are needed, from weights that are one step old.
+
+Chunks belong to the processes of a crew; their gradients are added in the same order wherever they come from.
 """
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
 
+from embomatrix.trainer.crew.crew import Crew
+from embomatrix.trainer.crew.learner import Learner, Lesson
 from embomatrix.trainer.errors import TrainerError
 from embomatrix.trainer.gradients import GradientSum
-from embomatrix.trainer.grpo import (
-    LossKind,
-    LossMetrics,
-    Scale,
-    Terms,
-    divisor,
-    group_advantages,
-    surrogate_loss,
-)
+from embomatrix.trainer.grpo import LossKind, LossMetrics, Scale, divisor, group_advantages
 from embomatrix.trainer.records import GroupLog, StepRecord, record_of
 from embomatrix.trainer.sampling import Sampler, next_back
 from embomatrix.trainer.settings import OnLost, Overlap
@@ -32,9 +29,11 @@ from embomatrix.trainer.stopwatch import Activity
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
+    from concurrent.futures import Future
 
     import numpy as np
 
+    from embomatrix.trainer.crew.crew import RemoteLearner
     from embomatrix.trainer.data import TrainingTask
     from embomatrix.trainer.policy.protocol import Policy
     from embomatrix.trainer.rollout import PlanOutcome, Submitting
@@ -78,11 +77,13 @@ class Updater:
         gateway: Submitting,
         settings: GrpoSettings,
         stopwatch: Stopwatch,
+        crew: Crew | None = None,
     ) -> None:
         self._policy = policy
         self._settings = settings
         self._stopwatch = stopwatch
-        self._sampler = Sampler(policy, reference, teller, gateway, settings)
+        self._crew = crew or Crew(Learner(policy, reference, settings))
+        self._sampler = Sampler(self._crew, policy.codec, teller, gateway, settings)
         self._ahead: tuple[int, list[Chunk]] | None = None
         self._bad_gradients = 0
         self.optimiser = torch.optim.AdamW(
@@ -125,12 +126,29 @@ class Updater:
 
     def _learn_all(self, chunks: Sequence[Chunk], work: _Work) -> None:
         """Back-propagate every chunk, as its rewards arrive where that is wanted."""
-        waiting = list(chunks)
         if self._settings.overlap is Overlap.NONE:
             with self._stopwatch.spending(Activity.WAITING):
-                for chunk in waiting:
+                for chunk in chunks:
                     chunk.outcomes()
+        elsewhere = {
+            chunk.part: helper.run(functools.partial(self._learn_elsewhere, chunk, work))
+            for chunk in chunks
+            if (helper := self._crew.helper(chunk.part)) is not None
+        }
+        logs = self._learn_here([chunk for chunk in chunks if chunk.part not in elsewhere], work)
+        for chunk in chunks:
+            if chunk.part in elsewhere:
+                with self._stopwatch.spending(Activity.WAITING):
+                    chunk.outcomes()
+                with self._stopwatch.spending(Activity.UPDATE):
+                    logs[chunk.part] = self._taken_over(chunk.part, elsewhere[chunk.part], work)
+        for part in sorted(logs):
+            work.logs += logs[part]
+
+    def _learn_here(self, chunks: Sequence[Chunk], work: _Work) -> dict[int, list[GroupLog]]:
+        """Back-propagate this process's chunks, the first that is back first."""
         logs: dict[int, list[GroupLog]] = {}
+        waiting = list(chunks)
         while waiting:
             # The first in line waits alone once enough gradients are kept for later.
             open_ones = waiting[:1] if work.gradients.aside >= GRADIENTS_ASIDE else waiting
@@ -139,9 +157,28 @@ class Updater:
                 outcomes = chunk.outcomes()
             waiting.remove(chunk)
             with self._stopwatch.spending(Activity.UPDATE):
-                logs[chunk.part] = self._learn(chunk, outcomes, work)
-        for part in sorted(logs):
-            work.logs += logs[part]
+                lesson, logs[chunk.part] = self._lesson(chunk, outcomes, work)
+                work.gradients.add(chunk.part, functools.partial(self._learn, lesson, work))
+        return logs
+
+    def _learn(self, lesson: Lesson | None, work: _Work) -> None:
+        if lesson is not None:
+            work.count(self._crew.own.learn(lesson), len(lesson.tokens))
+
+    def _learn_elsewhere(self, chunk: Chunk, work: _Work, helper: RemoteLearner) -> _Elsewhere:
+        """A chunk's share as a helper finds it, as soon as its rewards are there."""
+        lesson, logs = self._lesson(chunk, chunk.outcomes(), work)
+        if lesson is None:
+            return _Elsewhere(logs, None, 0, None)
+        metrics, gradient = helper.learn(lesson)
+        return _Elsewhere(logs, metrics, len(lesson.tokens), gradient)
+
+    def _taken_over(self, part: int, learnt: Future[_Elsewhere], work: _Work) -> list[GroupLog]:
+        found = learnt.result()
+        work.gradients.put(part, found.gradient)
+        if found.metrics is not None:
+            work.count(found.metrics, found.plans)
+        return found.logs
 
     def _replace_dead(self, part: int, work: _Work) -> None:
         """Groups without signal are replaced from the reserve, round by round, and the sum is scaled to what carries one."""
@@ -166,10 +203,10 @@ class Updater:
             else:
                 work.gradients.scale(divisor(kind, work.scale) / divisor(kind, final))
 
-    def _learn(
+    def _lesson(
         self, chunk: Chunk, outcomes: Sequence[tuple[PlanOutcome, ...]], work: _Work
-    ) -> list[GroupLog]:
-        """Back-propagate the groups of a chunk that carry a signal."""
+    ) -> tuple[Lesson | None, list[GroupLog]]:
+        """What the groups of a chunk that carry a signal have to teach; None where none does."""
         rewards = torch.tensor(
             [[outcome.valued(work.plan.relevance) for outcome in each] for each in outcomes]
         )  # (tasks, G)
@@ -177,48 +214,40 @@ class Updater:
             rewards[torch.isnan(rewards).any(dim=1)] = math.nan
         advantages = group_advantages(rewards, self._settings.spread_floor)
         live = [row for row, dead in enumerate(advantages.dead.tolist()) if not dead]
-        work.gradients.add(chunk.part, lambda: self._backward(chunk, live, rewards, advantages.values, work))
-        return [
+        logs = [
             GroupLog(task, each, tuple(values), dead)
             for task, each, values, dead in zip(
                 chunk.tasks, outcomes, advantages.values.tolist(), advantages.dead.tolist(), strict=True
             )
         ]
+        if not live:
+            return None, logs
+        return self._lesson_of(chunk, live, rewards, advantages.values, work.scale), logs
 
-    def _backward(
+    def _lesson_of(
         self,
         chunk: Chunk,
         live: Sequence[int],
         rewards: torch.Tensor,
         advantages: torch.Tensor,
-        work: _Work,
-    ) -> None:
-        if not live:
-            return
+        scale: Scale,
+    ) -> Lesson:
+        """The groups of the rows ``live``, in which rollouts that were lost have no word."""
         group, samples = self._settings.group, chunk.samples
         device = samples.tokens.device
         rows = torch.tensor([row * group + sample for row in live for sample in range(group)], device=device)
         known = ~torch.isnan(rewards[live].view(-1)).to(device)
         length = int(samples.mask[rows].sum(dim=1).max())
         mask = samples.mask[rows, :length] & known[:, None]
-        scored = self._policy.logprobs(
-            [chunk.told[row].prompt for row in live],
-            samples.tokens[rows, :length],
-            mask,
-            group,
-            self._settings.temperature,
-        )
-        terms = Terms(
-            logprobs=scored.logprobs,
-            old_logprobs=samples.logprobs[rows, :length],
+        return Lesson(
+            prompts=[chunk.told[row].prompt for row in live],
+            tokens=samples.tokens[rows, :length],
             mask=mask,
-            advantages=advantages[live].view(-1).to(device),
+            old_logprobs=samples.logprobs[rows, :length],
             reference=None if chunk.reference is None else chunk.reference[rows, :length],
-            entropy=scored.entropy,
+            advantages=advantages[live].view(-1).to(device),
+            scale=self._scale_of(chunk, scale),
         )
-        loss, parts = surrogate_loss(terms, self._settings.objective(), self._scale_of(chunk, work.scale))
-        loss.backward()  # type: ignore[no-untyped-call]
-        work.count(parts, len(rows))
 
     def _scale_of(self, chunk: Chunk, scale: Scale) -> Scale:
         """BNPO divides by the part's own tokens, and averages over parts."""
@@ -245,6 +274,16 @@ class Updater:
                 "policy was left as it is; lower grpo.learning_rate and go on with --resume"
             )
         return norm, rate
+
+
+@dataclass(frozen=True, slots=True)
+class _Elsewhere:
+    """What came of a chunk in another process: its groups, and the share of ``plans`` with a signal, if there are any."""
+
+    logs: list[GroupLog]
+    metrics: LossMetrics | None
+    plans: int
+    gradient: Sequence[torch.Tensor | None] | None
 
 
 class _Work:

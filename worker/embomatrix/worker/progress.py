@@ -1,7 +1,7 @@
 """Steps done, one counter for each slot, in memory that the daemon shares with every process of its simulator.
 
 Counting a step is a write of eight bytes: no message, no system call, nothing that the daemon would have to wake up for.
-It imports nothing but the standard library: the simulator's root takes it before it forks.
+It needs nothing but the standard library: the simulator's root takes it before it forks.
 """
 
 from __future__ import annotations
@@ -9,9 +9,10 @@ from __future__ import annotations
 import mmap
 import os
 import struct
-import tempfile
 import weakref
 from typing import Final
+
+from embomatrix.sim.nameless import nameless_file
 
 _COUNTER: Final = struct.Struct("=Q")
 
@@ -28,13 +29,7 @@ class ProgressBoard:
     @classmethod
     def create(cls, slots: int) -> ProgressBoard:
         """A new one, in memory only where the system offers that."""
-        if hasattr(os, "memfd_create"):
-            fd = os.memfd_create("progress")
-        else:
-            with tempfile.TemporaryFile() as file:
-                fd = os.dup(file.fileno())
-        os.ftruncate(fd, (slots + 1) * _COUNTER.size)
-        return cls(fd)
+        return cls(nameless_file("progress", (slots + 1) * _COUNTER.size))
 
     def set(self, slot: int, steps: int) -> None:
         _COUNTER.pack_into(self._memory, slot * _COUNTER.size, steps)

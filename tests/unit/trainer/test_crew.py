@@ -1,0 +1,104 @@
+"""Several processes learn what one learns, to the bit; one that dies ends the run, and the checkpoints stay."""
+
+import os
+import signal
+
+import pytest
+import torch
+from rich.console import Console
+from tests.unit.trainer.test_loop import TASKS, run, weights
+
+from embomatrix.trainer.checkpoint import CHECKPOINTS, CheckpointStore
+from embomatrix.trainer.crew.crew import Crew
+from embomatrix.trainer.crew.learner import Learner
+from embomatrix.trainer.crew.shared import SharedTensors
+from embomatrix.trainer.errors import TrainerError
+from embomatrix.trainer.policy.choice import new_policy
+from embomatrix.trainer.progress import LineDisplay
+from embomatrix.trainer.recorder import read_metrics
+from embomatrix.trainer.settings import read_settings
+
+FAST = {"imitation__steps": 20, "grpo__steps": 4, "checkpoint_every": 2}
+
+
+@pytest.fixture
+def helpers(monkeypatch):
+    """The processes of every crew that is made."""
+    made = []
+    real = Crew.__init__
+
+    def noted(self, own, helpers=()):
+        made.extend(helper._process for helper in helpers)
+        real(self, own, helpers)
+
+    monkeypatch.setattr(Crew, "__init__", noted)
+    return made
+
+
+def learnt(folder, **changes):
+    return weights(run(folder, **FAST, **changes)[1])
+
+
+@pytest.mark.parametrize(
+    "changes", [{}, {"grpo__reserve": 4, "grpo__overlap": "ahead"}], ids=["plain", "all"]
+)
+def test_two_processes_learn_what_one_learns_to_the_bit(tmp_path, helpers, changes):
+    one = learnt(tmp_path / "one", **changes)
+    two = learnt(tmp_path / "two", processes=2, **changes)
+    assert len(helpers) == 1
+    assert torch.equal(one, two)
+    told = [[{**row, "seconds": 0} for row in read_metrics(tmp_path / name)] for name in ("one", "two")]
+    assert told[0] == told[1]
+
+
+def test_more_processes_than_a_step_has_chunks_change_nothing(tmp_path, helpers):
+    assert torch.equal(learnt(tmp_path / "one"), learnt(tmp_path / "three", processes=3))
+    assert len(helpers) == 2
+    assert not any(process.is_alive() for process in helpers)
+
+
+def test_a_process_that_is_killed_ends_the_run_and_one_alone_goes_on_to_the_same_end(tmp_path, helpers):
+    whole, _ = run(tmp_path / "whole", **FAST)
+
+    class Killer(LineDisplay):
+        def stepped(self, record, share, rollouts_per_s):
+            if record.step == 3:
+                os.kill(helpers[0].pid, signal.SIGKILL)
+
+    with pytest.raises(TrainerError, match=r"the process trainer-1 ended in mid-step \(exit code -9"):
+        run(tmp_path / "cut", display=Killer(Console(quiet=True)), processes=2, **FAST)
+    newest = CheckpointStore(tmp_path / "cut" / CHECKPOINTS, keep=9).latest()
+    assert newest.name == "step-000003"
+    gone_on, _ = run(tmp_path / "cut", resume=True)
+    assert gone_on.after == whole.after
+
+
+def test_a_gradient_that_no_process_can_make_is_told(tmp_path, monkeypatch):
+    settings = read_settings(None, {"processes": 2})
+    policy = new_policy(settings, TASKS)
+    policy.save(tmp_path)
+    with Crew.of(Learner(policy, policy, settings.grpo), policy, settings, tmp_path) as crew:
+        asked = crew.helper(1).run(lambda helper: helper.sample([(1, 2, 10**9)], 0))
+        with pytest.raises(TrainerError, match=r"trainer-1 can't go on \(IndexError.*go on with --resume"):
+            asked.result(timeout=60)
+
+
+def test_a_policy_on_another_device_has_no_helpers(tmp_path):
+    settings = read_settings(None, {"processes": 2})
+    policy = new_policy(settings, TASKS)
+    elsewhere = settings.model_copy(update={"device": "cuda"})
+    with pytest.raises(TrainerError, match=r"processes = 2 .* the device is cuda: leave `processes` out"):
+        Crew.of(Learner(policy, policy, settings.grpo), policy, elsewhere, tmp_path)
+
+
+def test_what_one_side_writes_the_other_reads():
+    like = [torch.zeros(3, 5), torch.zeros((), dtype=torch.float64), torch.zeros(7, dtype=torch.bfloat16)]
+    ours = SharedTensors(like)
+    theirs = SharedTensors(like, os.dup(ours.fd))
+    ours.close()
+    for at, each in enumerate(ours.tensors):
+        assert each.data_ptr() % 64 == 0
+        each.fill_(at + 1)
+    assert [each.shape for each in theirs.tensors] == [each.shape for each in like]
+    assert [each.dtype for each in theirs.tensors] == [each.dtype for each in like]
+    assert all(torch.equal(one, other) for one, other in zip(ours.tensors, theirs.tensors, strict=True))
