@@ -97,7 +97,6 @@ def _run(dataset: Path, folder: Path, on_step: Callable[[str], None]) -> list[Fi
             *embomatrix_command("train", f"--dataset={dataset}", f"--out={out}", f"--settings={settings}"),
             f"--steps={GRPO_STEPS}",
             f"--manager={cluster.address}",
-            f"--threads={os.cpu_count() or 1}",
         )
     told = read_outcome(out)
     return [

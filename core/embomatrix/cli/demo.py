@@ -32,7 +32,7 @@ _Minutes = Annotated[float, typer.Option(min=0.1, help="Minutes of GRPO.")]
 _ImitateSeconds = Annotated[float, typer.Option(min=0.0, help="Seconds of imitation before it.")]
 _Model = Annotated[str, typer.Option(help="`tiny`, or a Hugging Face name or folder.")]
 _Seed = Annotated[int, typer.Option(help="Seed of tasks, policy and sampling.")]
-_Threads = Annotated[int, typer.Option(min=0, help="Threads of torch; 0: one a core.")]
+_Threads = Annotated[int, typer.Option(min=0, help="Threads of torch in each process; 0: half of the cores.")]
 
 
 def demo(
@@ -63,8 +63,8 @@ def demo(
             f"--imitate-seconds={imitate_seconds}",
             f"--seed={seed}",
         ]
-        # The workers are niced and far from busy: the trainer may have every core.
-        how.append(f"--threads={threads or os.cpu_count() or 1}")
+        if threads:
+            how.append(f"--threads={threads}")
         where = [f"--dataset={dataset}", f"--manager={cluster.address}", f"--out={folder}"]
         run_command("demo", lambda: cluster_problem(cluster), "train", *where, *how)
         _report_restarts(cluster)

@@ -1,6 +1,7 @@
 """A run goes on as it began, or says what is otherwise."""
 
 import json
+import os
 
 import pytest
 import torch
@@ -86,6 +87,17 @@ def test_a_checkpoint_of_another_version_is_told(kitchen, tmp_path, begun):
     state.write_text(json.dumps({**json.loads(state.read_text()), "schema": 2}))
     with pytest.raises(TrainerError, match="has schema 2, this version reads 3: start a new run"):
         resumed(kitchen, tmp_path, {})
+
+
+def test_threads_and_processes_suit_the_model_unless_they_are_told(kitchen, tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "cpu_count", lambda: 8)
+    shape = {name: value for name, value in SMALL.items() if name != "threads"}
+    by_itself = started(kitchen, tmp_path / "itself", "tiny", None, shape).settings
+    assert (by_itself.threads, by_itself.processes) == (4, 2)
+    written = tmp_path / "settings.toml"
+    written.write_text("threads = 1\nprocesses = 3\n")
+    told = started(kitchen, tmp_path / "told", "tiny", written, {**shape, "threads": None}).settings
+    assert (told.threads, told.processes) == (1, 3)
 
 
 def test_a_checkpoint_from_when_products_were_the_small_policys_alone_is_read(kitchen, tmp_path, begun):

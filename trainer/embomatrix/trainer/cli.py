@@ -71,6 +71,12 @@ _REWARD = Annotated[
     ),
 ]
 _THREADS = Annotated[int | None, typer.Option(min=1, help="Threads of torch; default: half of the cores.")]
+_PROCESSES = Annotated[
+    int | None,
+    typer.Option(
+        min=1, help="Processes that sample and learn side by side; default: 2 for `tiny`, 1 for other models."
+    ),
+]
 
 
 def train(
@@ -86,6 +92,7 @@ def train(
     settings_file: _SETTINGS = None,
     reward: _REWARD = None,
     threads: _THREADS = None,
+    processes: _PROCESSES = None,
     device: _DEVICE = None,
     track: _TRACK = None,
     token: _TOKEN = "",
@@ -101,6 +108,7 @@ def train(
             "seed": seed,
             "device": device,
             "threads": threads,
+            "processes": processes,
             "grpo.minutes": minutes,
             "grpo.steps": steps,
             "imitation.seconds": imitate_seconds,

@@ -55,9 +55,7 @@ def started(
     dataset: Path, out: Path, model: str, settings_file: Path | None, changes: Mapping[str, Any]
 ) -> Start:
     """A new run in the folder ``out``, which is made. Raises TrainerError where there is one already."""
-    threads = changes.get("threads") or max(1, (os.cpu_count() or 2) // 2)
-    defaults = {} if is_tiny(model) else LANGUAGE_MODEL_DEFAULTS
-    settings = read_settings(settings_file, {**changes, "model": model, "threads": threads}, defaults)
+    settings = read_settings(settings_file, {**changes, "model": model}, _defaults(model))
     if any((out / CHECKPOINTS).glob("[!.]*")):
         raise TrainerError(f"{out} holds another run: pass --resume to go on with it, or another --out")
     tasks = loaded(dataset, settings)
@@ -69,6 +67,15 @@ def started(
             f"the folder {out} can't be made ({error.strerror}): pass another --out"
         ) from error
     return Start(settings, tasks, policy, Progress(dataset=digest_of(tasks)))
+
+
+def _defaults(model: str) -> dict[str, Any]:
+    """What suits a model on this machine: the small policy gains nothing by threads and much by a second process, a language
+    model would take a second one's memory."""
+    half = max(1, (os.cpu_count() or 2) // 2)
+    if is_tiny(model):
+        return {"threads": half, "processes": min(2, os.cpu_count() or 1)}
+    return {**LANGUAGE_MODEL_DEFAULTS, "threads": half}
 
 
 def resumed(

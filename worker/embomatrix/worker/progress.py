@@ -12,7 +12,7 @@ import struct
 import weakref
 from typing import Final
 
-from embomatrix.sim.nameless import nameless_file
+from embomatrix.rpc.nameless import nameless_file
 
 _COUNTER: Final = struct.Struct("=Q")
 

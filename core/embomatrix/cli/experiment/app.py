@@ -71,7 +71,7 @@ _Manager = Annotated[str, typer.Option(help="HOST:PORT of a manager; else a clus
 _Token = Annotated[str, typer.Option(help="@FILE that holds a token of the trainer role.")]
 _Ca = Annotated[Path | None, typer.Option(help="The ca.pem of a manager that serves by TLS.")]
 _Workers = Annotated[int, typer.Option(min=1, max=64, help="Workers of one slot in a cluster of our own.")]
-_Threads = Annotated[int, typer.Option(min=0, help="Threads of torch; 0: one a core.")]
+_Threads = Annotated[int, typer.Option(min=0, help="Threads of torch in each process; 0: half of the cores.")]
 _Json = Annotated[Path | None, typer.Option("--json", help="File for the figures.")]
 _SoFar = Annotated[bool, typer.Option("--so-far", help="Train nothing: tell what the finished runs found.")]
 _Page = Annotated[Path | None, typer.Option(help="Page to add the section to, such as docs/experiments.md.")]
@@ -246,7 +246,7 @@ def _design(
         imitation=imitation,
         patience=patience,
         grpo=grpo,
-        threads=threads or os.cpu_count() or 1,
+        threads=threads or max(1, (os.cpu_count() or 2) // 2),
         shared=parse_settings(settings or ()),
         arms=arms,
     )
