@@ -1,11 +1,13 @@
 """Several processes learn what one learns, to the bit; one that dies ends the run, and the checkpoints stay."""
 
+import asyncio
 import os
 import signal
 
 import pytest
 import torch
 from rich.console import Console
+from tests.fakes.symbolic_household import SymbolicCluster
 from tests.unit.trainer.test_loop import TASKS, run, weights
 
 from embomatrix.trainer.checkpoint import CHECKPOINTS, CheckpointStore
@@ -71,6 +73,24 @@ def test_a_process_that_is_killed_ends_the_run_and_one_alone_goes_on_to_the_same
     assert newest.name == "step-000003"
     gone_on, _ = run(tmp_path / "cut", resume=True)
     assert gone_on.after == whole.after
+
+
+def test_an_interrupt_waits_neither_for_rewards_nor_for_processes(tmp_path, helpers):
+    class Silent(SymbolicCluster):
+        """Gives no reward in the third step of GRPO, and has the trainer interrupted."""
+
+        async def execute(self, batch):
+            if batch.batch_id == "step-3-0-0":
+                asyncio.get_running_loop().call_later(0.3, os.kill, os.getpid(), signal.SIGINT)
+            if batch.batch_id.startswith("step-3-"):
+                await asyncio.Event().wait()
+            async for result in super().execute(batch):
+                yield result
+
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, Silent(TASKS), processes=2, **FAST)
+    assert not helpers[0].is_alive()
+    assert CheckpointStore(tmp_path / CHECKPOINTS, keep=9).latest().name == "step-000002"
 
 
 def test_a_gradient_that_no_process_can_make_is_told(tmp_path, monkeypatch):

@@ -117,7 +117,7 @@ def parsed(text: str, situation: Situation, codec: Codec) -> Plan:
 
 
 class Gateway:
-    """Context manager over one run of the cluster. Methods are called from the trainer's thread.
+    """Context manager over one run of the cluster. Methods are called from the trainer's thread, ``submit`` from any.
 
     ``terms`` say what becomes of the rest of a group that lost a rollout, for nobody executes what is left out anyway, and
     how plans are scored: by the worker, and here where a text is none.

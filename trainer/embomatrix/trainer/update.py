@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import functools
 import math
+import threading
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -131,7 +132,7 @@ class Updater:
                 for chunk in chunks:
                     chunk.outcomes()
         elsewhere = {
-            chunk.part: helper.run(functools.partial(self._learn_elsewhere, chunk, work))
+            chunk.part: _Sent(chunk, helper, functools.partial(self._learn_elsewhere, chunk, work))
             for chunk in chunks
             if (helper := self._crew.helper(chunk.part)) is not None
         }
@@ -141,7 +142,7 @@ class Updater:
                 with self._stopwatch.spending(Activity.WAITING):
                     chunk.outcomes()
                 with self._stopwatch.spending(Activity.UPDATE):
-                    logs[chunk.part] = self._taken_over(chunk.part, elsewhere[chunk.part], work)
+                    logs[chunk.part] = self._taken_over(chunk.part, elsewhere[chunk.part].learnt(), work)
         for part in sorted(logs):
             work.logs += logs[part]
 
@@ -166,15 +167,14 @@ class Updater:
             work.count(self._crew.own.learn(lesson), len(lesson.tokens))
 
     def _learn_elsewhere(self, chunk: Chunk, work: _Work, helper: RemoteLearner) -> _Elsewhere:
-        """A chunk's share as a helper finds it, as soon as its rewards are there."""
+        """A chunk's share, once its rewards are there, as a helper finds it."""
         lesson, logs = self._lesson(chunk, chunk.outcomes(), work)
         if lesson is None:
             return _Elsewhere(logs, None, 0, None)
         metrics, gradient = helper.learn(lesson)
         return _Elsewhere(logs, metrics, len(lesson.tokens), gradient)
 
-    def _taken_over(self, part: int, learnt: Future[_Elsewhere], work: _Work) -> list[GroupLog]:
-        found = learnt.result()
+    def _taken_over(self, part: int, found: _Elsewhere, work: _Work) -> list[GroupLog]:
         work.gradients.put(part, found.gradient)
         if found.metrics is not None:
             work.count(found.metrics, found.plans)
@@ -284,6 +284,36 @@ class _Elsewhere:
     metrics: LossMetrics | None
     plans: int
     gradient: Sequence[torch.Tensor | None] | None
+
+
+class _Sent:
+    """A chunk that goes to a helper as soon as its rewards are there, whoever sees that first."""
+
+    def __init__(
+        self, chunk: Chunk, helper: RemoteLearner, job: Callable[[RemoteLearner], _Elsewhere]
+    ) -> None:
+        self._chunk = chunk
+        self._helper = helper
+        self._job = job
+        self._lock = threading.Lock()
+        self._future: Future[_Elsewhere] | None = None
+        for future in chunk.futures:
+            future.add_done_callback(self._heard)
+
+    def _heard(self, _: Future[tuple[PlanOutcome, ...]]) -> None:
+        """In whichever thread hears of a reward; after the end of the crew nobody wants it."""
+        if self._chunk.is_back and not self._helper.closed:
+            self._begun()
+
+    def _begun(self) -> Future[_Elsewhere]:
+        with self._lock:
+            if self._future is None:
+                self._future = self._helper.run(self._job)
+            return self._future
+
+    def learnt(self) -> _Elsewhere:
+        """What came of it; its rewards are there."""
+        return self._begun().result()
 
 
 class _Work:

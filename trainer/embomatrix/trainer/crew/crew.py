@@ -44,9 +44,10 @@ class RemoteLearner:
         theirs.close()
         self._gradient.close()
         self._thread = ThreadPoolExecutor(1, thread_name_prefix=self._name)
+        self.closed = False
 
     def run(self, job: Callable[[RemoteLearner], T]) -> Future[T]:
-        """Have ``job`` work with this helper when its turn comes."""
+        """Have ``job`` work with this helper when its turn comes. It waits for nobody else: an interrupt would wait for it."""
         return self._thread.submit(job, self)
 
     def sample(self, prompts: Sequence[Tokens], seed: int) -> Samples:
@@ -79,10 +80,11 @@ class RemoteLearner:
 
     def close(self) -> None:
         """End the process, whatever it does."""
+        self.closed = True
         self._process.kill()
         self._process.join()
-        self._connection.close()
         self._thread.shutdown(wait=True, cancel_futures=True)
+        self._connection.close()
 
 
 class Crew:
