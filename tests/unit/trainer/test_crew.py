@@ -75,7 +75,15 @@ def test_a_process_that_is_killed_ends_the_run_and_one_alone_goes_on_to_the_same
     assert gone_on.after == whole.after
 
 
-def test_an_interrupt_waits_neither_for_rewards_nor_for_processes(tmp_path, helpers):
+@pytest.fixture
+def interruptible():
+    """Interrupts are heard, also where the tests were begun in the background: a shell has those ignored there."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def test_an_interrupt_waits_neither_for_rewards_nor_for_processes(tmp_path, helpers, interruptible):
     class Silent(SymbolicCluster):
         """Gives no reward in the third step of GRPO, and has the trainer interrupted."""
 

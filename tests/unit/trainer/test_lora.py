@@ -158,6 +158,13 @@ def test_four_steps_with_adapters_are_two_and_two_after_a_resume(model_folder, t
     assert torch.allclose(scored(loaded).logprobs, scored(whole).logprobs, atol=1e-4)
 
 
+def test_adapters_learn_the_same_in_two_processes(model_folder, tmp_path):
+    one, _ = train(tmp_path / "one", {"model": str(model_folder)})
+    two, _ = train(tmp_path / "two", {"model": str(model_folder), "processes": 2, "grpo.chunk": 1})
+    assert torch.equal(learnt(one), learnt(two))
+    assert learnt(one).abs().sum() > 0
+
+
 def settings_of(folder, **changes):
     return read_settings(None, {"model": str(folder), "lora.rank": 4, "lora.alpha": 8.0, **changes})
 
