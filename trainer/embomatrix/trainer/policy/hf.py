@@ -151,33 +151,23 @@ class HfPolicy:
         generator: torch.Generator,
     ) -> Samples:
         with unchanged(self._model):
-            return self._drawn(prompts, group, temperature, max_new, generator)
-
-    def _drawn(
-        self,
-        prompts: Sequence[Tokens],
-        group: int,
-        temperature: float,
-        max_new: int,
-        generator: torch.Generator,
-    ) -> Samples:
-        cache, mask, scores = self._read(prompts, group)
-        rows = scores.shape[0]
-        lengths = mask.sum(dim=1)  # (rows,)
-        end = torch.tensor(self._end, device=scores.device)
-        done = torch.zeros(rows, dtype=torch.bool, device=scores.device)
-        tokens, masks, logprobs = [], [], []
-        for at in range(max_new):
-            choice, logprob = draw(scores, temperature, generator)
-            choice = torch.where(done, self._pad, choice)
-            tokens.append(choice)
-            masks.append(~done)
-            logprobs.append(torch.where(done, 0.0, logprob))
-            done = done | torch.isin(choice, end)
-            if bool(done.all()) or at == max_new - 1:
-                break
-            mask = torch.cat([mask, mask.new_ones(rows, 1)], dim=1)
-            scores = self._extend(choice[:, None], mask, (lengths + at)[:, None], cache)[:, -1]
+            cache, mask, scores = self._read(prompts, group)
+            rows = scores.shape[0]
+            lengths = mask.sum(dim=1)  # (rows,)
+            end = torch.tensor(self._end, device=scores.device)
+            done = torch.zeros(rows, dtype=torch.bool, device=scores.device)
+            tokens, masks, logprobs = [], [], []
+            for at in range(max_new):
+                choice, logprob = draw(scores, temperature, generator)
+                choice = torch.where(done, self._pad, choice)
+                tokens.append(choice)
+                masks.append(~done)
+                logprobs.append(torch.where(done, 0.0, logprob))
+                done = done | torch.isin(choice, end)
+                if bool(done.all()) or at == max_new - 1:
+                    break
+                mask = torch.cat([mask, mask.new_ones(rows, 1)], dim=1)
+                scores = self._extend(choice[:, None], mask, (lengths + at)[:, None], cache)[:, -1]
         drawn, own = torch.stack(tokens, dim=1), torch.stack(masks, dim=1)
         return Samples(drawn, own, torch.stack(logprobs, dim=1), self._texts(drawn, own))
 
