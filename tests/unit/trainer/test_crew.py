@@ -115,7 +115,7 @@ def test_a_policy_on_another_device_has_no_helpers(tmp_path):
     settings = read_settings(None, {"processes": 2})
     policy = new_policy(settings, TASKS)
     elsewhere = settings.model_copy(update={"device": "cuda"})
-    with pytest.raises(TrainerError, match=r"processes = 2 .* the device is cuda: leave `processes` out"):
+    with pytest.raises(TrainerError, match=r"processes = 2 .* the device is cuda: pass --processes=1"):
         Crew.of(Learner(policy, policy, settings.grpo), policy, elsewhere, tmp_path)
 
 

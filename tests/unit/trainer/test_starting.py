@@ -100,6 +100,11 @@ def test_threads_and_processes_suit_the_model_unless_they_are_told(kitchen, tmp_
     assert (told.threads, told.processes) == (1, 3)
 
 
+def test_a_policy_on_another_device_has_one_process_unless_more_are_told(kitchen, tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "cpu_count", lambda: 8)
+    assert started(kitchen, tmp_path, "tiny", None, {**SMALL, "device": "meta"}).settings.processes == 1
+
+
 def test_a_checkpoint_from_when_products_were_the_small_policys_alone_is_read(kitchen, tmp_path, begun):
     folder = begun()
     settings = read_state(folder)[1]

@@ -55,7 +55,11 @@ def started(
     dataset: Path, out: Path, model: str, settings_file: Path | None, changes: Mapping[str, Any]
 ) -> Start:
     """A new run in the folder ``out``, which is made. Raises TrainerError where there is one already."""
-    settings = read_settings(settings_file, {**changes, "model": model}, _defaults(model))
+    threads = max(1, (os.cpu_count() or 2) // 2)
+    defaults = {"threads": threads, **({} if is_tiny(model) else LANGUAGE_MODEL_DEFAULTS)}
+    settings = read_settings(settings_file, {**changes, "model": model}, defaults)
+    if "processes" not in settings.model_fields_set:
+        settings = settings.model_copy(update={"processes": _processes_for(settings)})
     if any((out / CHECKPOINTS).glob("[!.]*")):
         raise TrainerError(f"{out} holds another run: pass --resume to go on with it, or another --out")
     tasks = loaded(dataset, settings)
@@ -69,13 +73,11 @@ def started(
     return Start(settings, tasks, policy, Progress(dataset=digest_of(tasks)))
 
 
-def _defaults(model: str) -> dict[str, Any]:
-    """What suits a model on this machine: the small policy gains nothing by threads and much by a second process, a language
-    model would take a second one's memory."""
-    half = max(1, (os.cpu_count() or 2) // 2)
-    if is_tiny(model):
-        return {"threads": half, "processes": min(2, os.cpu_count() or 1)}
-    return {**LANGUAGE_MODEL_DEFAULTS, "threads": half}
+def _processes_for(settings: TrainSettings) -> int:
+    """What suits a model: on a processor the small policy takes a step in half the time in two processes, a language model
+    would take a second one's memory."""
+    shared = is_tiny(settings.model) and settings.device == "cpu"
+    return min(2, os.cpu_count() or 1) if shared else 1
 
 
 def resumed(

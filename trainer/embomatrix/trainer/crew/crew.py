@@ -105,7 +105,7 @@ class Crew:
         if settings.device != "cpu":
             raise TrainerError(
                 f"processes = {settings.processes} share a policy in a processor's memory, and the device is "
-                f"{settings.device}: leave `processes` out"
+                f"{settings.device}: pass --processes=1"
             )
         learning = list(policy.parameters())
         weights = SharedTensors([parameter.data for parameter in learning])
