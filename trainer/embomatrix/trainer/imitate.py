@@ -133,7 +133,7 @@ class Imitation:
         lessons = [self._teller.lesson(self._lessons[int(at)], rng) for at in chosen]
         loss = _total_loss(self._policy, lessons) / sum(len(plan) for _, plan in lessons)
         self._optimiser.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
+        torch.autograd.backward(loss)
         torch.nn.utils.clip_grad_norm_(self._policy.parameters(), 1.0)
         self._optimiser.step(_shape(share, self.state.step, settings.warmup_steps))
         return float(loss.detach())

@@ -100,9 +100,7 @@ class TrainingRun:
         parts, settings = self._parts, self._settings
         own = Learner(parts.policy, reference, settings.grpo)
         with Crew.of(own, parts.policy, settings, self._out / REFERENCE) as crew:
-            updater = Updater(
-                parts.policy, reference, parts.teller, parts.gateway, settings.grpo, self._stopwatch, crew
-            )
+            updater = Updater(parts.policy, crew, parts.teller, parts.gateway, settings.grpo, self._stopwatch)
             newest = self._store.latest() if self._restores else None
             if newest is not None:
                 restore(newest, functools.partial(self._put_back, updater))

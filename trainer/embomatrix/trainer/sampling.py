@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from concurrent.futures import FIRST_COMPLETED, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 import torch
@@ -129,7 +129,7 @@ class Sampler:
 def _with_reference(chunk: Chunk, learner: Sampling) -> Chunk:
     prompts = [each.prompt for each in chunk.told]
     scored = learner.of_reference(prompts, chunk.samples.tokens, chunk.samples.mask)
-    return Chunk(chunk.part, chunk.tasks, chunk.told, chunk.samples, chunk.futures, scored)
+    return replace(chunk, reference=scored)
 
 
 def next_back(chunks: Sequence[Chunk]) -> Chunk:

@@ -18,8 +18,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from embomatrix.trainer.crew.crew import Crew
-from embomatrix.trainer.crew.learner import Learner, Lesson
+from embomatrix.trainer.crew.learner import Lesson
 from embomatrix.trainer.errors import TrainerError
 from embomatrix.trainer.gradients import GradientSum
 from embomatrix.trainer.grpo import LossKind, LossMetrics, Scale, divisor, group_advantages
@@ -34,7 +33,7 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-    from embomatrix.trainer.crew.crew import RemoteLearner
+    from embomatrix.trainer.crew.crew import Crew, RemoteLearner
     from embomatrix.trainer.data import TrainingTask
     from embomatrix.trainer.policy.protocol import Policy
     from embomatrix.trainer.rollout import PlanOutcome, Submitting
@@ -68,23 +67,22 @@ class StepPlan:
 
 
 class Updater:
-    """Takes steps on one policy."""
+    """Takes steps on one policy, which is that of the crew."""
 
     def __init__(
         self,
         policy: Policy,
-        reference: Policy,
+        crew: Crew,
         teller: Teller,
         gateway: Submitting,
         settings: GrpoSettings,
         stopwatch: Stopwatch,
-        crew: Crew | None = None,
     ) -> None:
         self._policy = policy
         self._settings = settings
         self._stopwatch = stopwatch
-        self._crew = crew or Crew(Learner(policy, reference, settings))
-        self._sampler = Sampler(self._crew, policy.codec, teller, gateway, settings)
+        self._crew = crew
+        self._sampler = Sampler(crew, policy.codec, teller, gateway, settings)
         self._ahead: tuple[int, list[Chunk]] | None = None
         self._bad_gradients = 0
         self.optimiser = torch.optim.AdamW(

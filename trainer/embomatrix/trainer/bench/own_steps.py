@@ -19,6 +19,8 @@ from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.skills.prompt import Codec
 from embomatrix.trainer.augment import Variation
 from embomatrix.trainer.bench.load import END, ROWS, UNKNOWN, Load, read_load
+from embomatrix.trainer.crew.crew import Crew
+from embomatrix.trainer.crew.learner import Learner
 from embomatrix.trainer.data import load_tasks
 from embomatrix.trainer.policy.hf import HfPolicy
 from embomatrix.trainer.rollout import PlanOutcome
@@ -62,7 +64,8 @@ def measure(load: Load, tasks: Sequence[TrainingTask]) -> list[float]:
         tasks_per_step=load.tasks, group=load.group, chunk=load.tasks, max_new=load.new, kl_coef=0.0
     )
     teller = Teller(policy, ROWS, Variation({}, rename=0.0, drop=0.0))
-    updater = Updater(policy, policy, teller, LengthScore(), settings, Stopwatch())
+    crew = Crew(Learner(policy, policy, settings))
+    updater = Updater(policy, crew, teller, LengthScore(), settings, Stopwatch())
     generator = torch.Generator().manual_seed(load.seed)
     spent_s = []
     for step in range(load.unmeasured + load.steps):

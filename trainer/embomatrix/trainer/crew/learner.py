@@ -81,5 +81,5 @@ class Learner:
             entropy=scored.entropy,
         )
         loss, metrics = surrogate_loss(terms, settings.objective(), lesson.scale)
-        loss.backward()  # type: ignore[no-untyped-call]
+        torch.autograd.backward(loss)
         return metrics
