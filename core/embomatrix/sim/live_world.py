@@ -44,7 +44,7 @@ class LiveWorld:
         self.relations = Relations(engine)
         self.navigator = Navigator(engine, self.relations, bundle.poses.stands, Prepared.of(bundle))
         self.swings = Swings(engine, self.relations)
-        self.placer = Placer(engine, self.relations, bundle.poses)
+        self.placer = Placer(engine, self.relations, bundle.poses, self.navigator)
         self.barred = bundle.poses.barred
         """What the arm finds no way to in the scene as it was loaded."""
         self.barred_places = bundle.poses.barred_places

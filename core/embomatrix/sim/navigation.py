@@ -20,7 +20,7 @@ from embomatrix.skills.limits import ROBOT
 from embomatrix.world.poses import StandPose
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
 
     from embomatrix.sim.engine import PhysicsEngine
     from embomatrix.sim.floor_ways import Cell
@@ -253,11 +253,14 @@ class Navigator:
     def line_is_clear(self, origin: StandPose, name: str) -> bool:
         """Whether no wall nor anything much taller than the object stands between the robot and the object's box."""
         box = self._relations.body(name)
-        (low_x, low_y, _), (high_x, high_y, _) = box.low_m, box.high_m
-        here = (origin.x_m, origin.y_m)
-        nearest = (min(max(origin.x_m, low_x), high_x), min(max(origin.y_m, low_y), high_y))
+        here, nearest = _line(origin, box)
         near = math.dist(here, nearest) <= ROBOT.reach_m
         return not crosses(here, nearest, self._blockers_of(name) if near else self._all_blockers_of(name))
+
+    def line_would_be_clear(self, origin: StandPose, box: Aabb, own: Iterable[str]) -> bool:
+        """As ``line_is_clear``, of an object that is not there yet: ``own`` are its name and those of what would bear it."""
+        numbers = [self.ground.numbers[name] for name in own]
+        return not crosses(*_line(origin, box), self.ground.obstacles.blockers(box, numbers))
 
     def is_as_loaded(self, name: str) -> bool:
         """Whether the object and what it stands on or in are where the scene has them."""
@@ -299,6 +302,13 @@ def _doors_of(scene: Scene, room: Room) -> list[tuple[float, float]]:
     """Middles of the doorways between a room and others; its own middle where there are none."""
     doors = [item.center_m for item in scene.doorways if room.name in item.rooms and all(item.rooms)]
     return doors or [room.center_m]
+
+
+def _line(origin: StandPose, box: Aabb) -> tuple[Vec2, Vec2]:
+    """Where the robot stands, and the box's nearest point to that, in the plane."""
+    (low_x, low_y, _), (high_x, high_y, _) = box.low_m, box.high_m
+    x, y = origin.x_m, origin.y_m
+    return (x, y), (min(max(x, low_x), high_x), min(max(y, low_y), high_y))
 
 
 def _within_reach(rectangles: FloatArray, box: Aabb) -> FloatArray:

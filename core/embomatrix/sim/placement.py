@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from embomatrix.sim.engine import PhysicsEngine
     from embomatrix.sim.lineup import BoolArray, Lineup
+    from embomatrix.sim.navigation import Navigator
     from embomatrix.sim.relations import Relations
     from embomatrix.sim.repertoire import Spots
     from embomatrix.world.geometry import Pose
@@ -33,6 +34,8 @@ LIVE_TRIES: Final = 64
 """Candidates looked at beyond the cached ones."""
 LIVE_SETTLES: Final = 8
 """How many of them are simulated at most."""
+LINES_LOOKED_AT: Final = 8
+"""How many poses without a line of approach are put off until others were looked at."""
 HIGH_RIM_M: Final = ROBOT.reach_high_m - ROBOT.extent_m / 2
 """Over a rim that is no higher than this the arm lifts whatever it can hold."""
 
@@ -45,8 +48,17 @@ class Placer:
     to check.
     """
 
-    def __init__(self, engine: PhysicsEngine, relations: Relations, cache: PoseCache) -> None:
+    def __init__(
+        self,
+        engine: PhysicsEngine,
+        relations: Relations,
+        cache: PoseCache,
+        navigator: Navigator | None = None,
+    ) -> None:
+        """With a ``navigator`` poses from which the robot could take the object back come before those that are cut off."""
         self._engine = engine
+        self._relations = relations
+        self._navigator = navigator
         self._scene = engine.scene
         self._repertoire = Repertoire(engine.scene, cache)
         self._trial = Trial(engine, relations, self._repertoire)
@@ -111,7 +123,7 @@ class Placer:
         before = self._engine.pose(held)
         errand = Errand(held, target, relation, robot, passed_over)
         try:
-            found = tuple(itertools.islice(self._search(errand, rng), most))
+            found = tuple(itertools.islice(self._takeable_first(errand, self._search(errand, rng)), most))
         finally:
             self._engine.set_pose(held, before)
             self._engine.park(held)
@@ -165,6 +177,26 @@ class Placer:
                 yield pose
             reached = None
         yield from self._fresh(errand, frames, rng)
+
+    def _takeable_first(self, errand: Errand, poses: Iterator[Pose]) -> Iterator[Pose]:
+        """Good poses: those that the robot has a line of approach to before some others."""
+        if self._navigator is None:
+            yield from poses
+            return
+        bounds = bounds_of(self._scene.asset_of(errand.held))
+        own = [errand.held]
+        if errand.relation is not Relation.UNDER:
+            own += [errand.target, *self._relations.hosts_of(errand.target)]
+        cut_off: list[Pose] = []
+        for pose in poses:
+            if self._navigator.line_would_be_clear(errand.robot, bounds.box(pose), own):
+                yield pose
+            else:
+                cut_off.append(pose)
+                if len(cut_off) == LINES_LOOKED_AT:
+                    break
+        yield from cut_off
+        yield from poses
 
     def _reached_in_set(self, errand: Errand) -> int | None:
         """Number of the pose that the arm was seen to get at, in the first set that is not empty."""

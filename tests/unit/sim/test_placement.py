@@ -170,3 +170,32 @@ def test_what_goes_into_an_open_bowl_must_get_over_its_rim_within_reach(rim_m, i
     assert isinstance(found, Pose) if is_found else found is FailureReason.NO_FREE_POSE
     engine.close()
     pool.close()
+
+
+@pytest.mark.parametrize("relation", [Relation.ONTOP, Relation.INSIDE])
+def test_what_is_put_on_a_shelf_goes_where_it_can_be_taken_back_from_if_there_is_such_a_place(
+    engine, relations, navigator, relation
+) -> None:
+    held, target = "apple_1", "shelf_1"
+    heedless = Placer(engine, relations, PoseCache())
+    heedful = Placer(engine, relations, PoseCache(), navigator)
+    engine.park(held)
+
+    def is_taken_back(robot: StandPose, pose: Pose) -> bool:
+        engine.set_pose(held, pose)
+        is_clear = navigator.line_is_clear(robot, held)
+        engine.park(held)
+        return is_clear
+
+    x, y, _ = engine.aabb(target).center_m
+    mattered = 0
+    for dy in (-1.05, -0.7, 0.7, 1.05):
+        robot = StandPose(x - 0.7, y + dy, 0.0)
+        drawn = heedless.choices(held, target, relation, robot, np.random.default_rng(0), most=8)
+        chosen = heedful.find(held, target, relation, robot, np.random.default_rng(0))
+        assert not isinstance(drawn, FailureReason)
+        assert isinstance(chosen, Pose)
+        clear = [is_taken_back(robot, pose) for pose in drawn]
+        assert is_taken_back(robot, chosen) is any(clear)
+        mattered += any(clear) and not clear[0]
+    assert mattered > 0

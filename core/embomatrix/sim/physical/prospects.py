@@ -54,7 +54,7 @@ class Prospects:
         self._stage = stage
         self._world = stage.world
         self._poses = poses
-        self._placer = Placer(stage.world.engine, stage.world.relations, poses)
+        self._placer = Placer(stage.world.engine, stage.world.relations, poses, stage.world.navigator)
         self._grips: dict[str, Grip | None] = {}
         self._looks = 0
 
