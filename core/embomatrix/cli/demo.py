@@ -18,6 +18,8 @@ from embomatrix.cli.foreground import cluster_problem, no_problem, run_command
 from embomatrix.cli.local_cluster import LocalCluster, local_cluster
 
 DEFAULT_OUT: Final = Path("runs/demo")
+TASKS: Final = 960
+"""Tasks to train on. Of half as many a policy learns the plans by heart before it has learnt to read."""
 console = Console()
 
 
@@ -40,8 +42,8 @@ def demo(
     dataset: _Dataset = Path("build/dataset"),
     workers: _Workers = 2,
     slots: _Slots = 1,
-    minutes: _Minutes = 6.0,
-    imitate_seconds: _ImitateSeconds = 180.0,
+    minutes: _Minutes = 5.5,
+    imitate_seconds: _ImitateSeconds = 80.0,
     model: _Model = "tiny",
     seed: _Seed = 0,
     threads: _Threads = 0,
@@ -81,9 +83,8 @@ def _ensure_tasks(dataset: Path, seed: int) -> None:
         return
     console.rule("tasks")
     # A run to look at: what the arm of physical mode could not do after all is not looked for.
-    run_command(
-        "demo", no_problem, "factory", "build", f"--out={dataset}", f"--seed={seed}", "--no-look-ahead"
-    )
+    where = [f"--out={dataset}", f"--seed={seed}"]
+    run_command("demo", no_problem, "factory", "build", *where, f"--train={TASKS}", "--no-look-ahead")
 
 
 def _announce(cluster: LocalCluster, slots: int) -> None:
