@@ -179,8 +179,8 @@ class Placer:
         yield from self._fresh(errand, frames, rng)
 
     def _takeable_first(self, errand: Errand, poses: Iterator[Pose]) -> Iterator[Pose]:
-        """Good poses: those that the robot has a line of approach to before some others."""
-        if self._navigator is None:
+        """Good poses: those that the robot has a line of approach to before some others, unless the arm was asked already."""
+        if self._navigator is None or self._reached_in_set(errand) is not None:
             yield from poses
             return
         bounds = bounds_of(self._scene.asset_of(errand.held))
