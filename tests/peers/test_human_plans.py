@@ -8,13 +8,12 @@ import contextlib
 import itertools
 
 import pytest
+from tests.fakes.eai_tasks import in_its_scene
 from tests.fakes.human_plans import UntoldError, from_eai
 from tests.fakes.two_judges import cause, names_of, with_ways
 
 from embomatrix.factory.scenes.build import build_base_scene
-from embomatrix.factory.task_import.batch import Verified, verify
 from embomatrix.factory.task_import.sources import read_eai
-from embomatrix.factory.task_import.task import Imported, import_problem
 from embomatrix.reward.hierarchy import score
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.pose_cache import PlacementLibrary
@@ -33,12 +32,12 @@ _TASKS = """
     clearing_the_table_after_dinner collecting_aluminum_cans filling_a_Christmas_stocking installing_a_fax_machine
     installing_a_modem installing_a_scanner installing_alarms laying_tile_floors loading_the_dishwasher
     locking_every_door making_tea opening_packages opening_presents packing_lunches picking_up_take-out_food
-    polishing_furniture polishing_silver preparing_salad putting_away_toys putting_leftovers_away
+    polishing_furniture polishing_silver putting_away_toys putting_leftovers_away
     re-shelving_library_books sorting_books vacuuming_floors washing_cars_or_other_vehicles washing_dishes
     watering_houseplants waxing_cars_or_other_vehicles
 """
 TASKS = frozenset(_TASKS.split())
-"""Tasks that are laid out and solved in their own scenes at the first draw."""
+"""Tasks that are laid out and solved in their own scenes."""
 UNKNOWN = "for no known reason"
 PLACES = {Relation.ONTOP: PlaceRelation.ONTOP, Relation.INSIDE: PlaceRelation.INSIDE}
 
@@ -53,10 +52,7 @@ def homes_of(scene, table):
 
 def judged(source, native, judge, base, library):
     """What becomes of a task: a word, then why."""
-    imported = import_problem(source, base)
-    assert isinstance(imported, Imported), imported
-    found = verify(imported, library, None)
-    assert isinstance(found, Verified), found
+    imported, found = in_its_scene(source, base, library)
     task, names = found.record.task, names_of(imported, native)
     bundle = decode_bundle(found.bundle)
     try:
