@@ -109,7 +109,12 @@ _Samples = Annotated[int, typer.Option(min=1, max=MOST_SAMPLES, help="Plans of e
 _Temperature = Annotated[float, typer.Option(min=0, help="0 takes the likeliest plan.")]
 _Seed = Annotated[int, typer.Option(min=0, help="Seed of sampling and of execution.")]
 _MaxTokens = Annotated[int | None, typer.Option(min=1, help="Tokens of an answer at most.")]
-_Codec = Annotated[Codec, typer.Option(help="How a language model writes plans: json or lines.")]
+_Codec = Annotated[
+    Codec | None,
+    typer.Option(
+        help="How a language model writes plans: json or lines. Default: as it was taught here, else json."
+    ),
+]
 _Concurrent = Annotated[int, typer.Option(min=1, help="Questions under way at the endpoint.")]
 _Attempts = Annotated[int, typer.Option(min=1, help="Attempts at a question, with waits between.")]
 _Manager = Annotated[
@@ -148,7 +153,7 @@ def evaluate(
     temperature: _Temperature = 1.0,
     seed: _Seed = 0,
     max_tokens: _MaxTokens = None,
-    codec: _Codec = Codec.JSON,
+    codec: _Codec = None,
     concurrent: _Concurrent = 8,
     attempts: _Attempts = 6,
     manager: _Manager = "",

@@ -36,13 +36,13 @@ ENDPOINT_TOKENS: Final = 1024
 
 @dataclass(frozen=True, slots=True)
 class Questions:
-    """How tasks are asked. ``max_tokens``: None where the asked one's own default is wanted."""
+    """How tasks are asked. ``max_tokens``, ``codec``: None where the asked one's own is wanted."""
 
     samples: int
     temperature: float
     seed: int
     max_tokens: int | None
-    codec: Codec
+    codec: Codec | None
     profile: Profile
 
 
@@ -116,6 +116,5 @@ def _endpoint(chosen: Chosen, questions: Questions, folder: Path) -> Asked:
         Endpoint, chosen.endpoint, chosen.model_name, api_key=chosen.key, limits=limits
     )
     tokens = questions.max_tokens or ENDPOINT_TOKENS
-    return Asked(
-        EndpointAsker(opened, folder / "ledger.jsonl"), chosen.model_name, questions.codec, MAX_TABLE, tokens
-    )
+    asker = EndpointAsker(opened, folder / "ledger.jsonl")
+    return Asked(asker, chosen.model_name, questions.codec or Codec.JSON, MAX_TABLE, tokens)

@@ -17,6 +17,7 @@ from embomatrix.skills.prompt import Codec, prompt_for
 from embomatrix.trainer.augment import Variation
 from embomatrix.trainer.checkpoint import CheckpointStore, Progress
 from embomatrix.trainer.errors import TrainerError
+from embomatrix.trainer.evaluation.models import load_model
 from embomatrix.trainer.import_gguf import import_gguf
 from embomatrix.trainer.loop import Parts, TrainingRun
 from embomatrix.trainer.policy.choice import saved_policy
@@ -257,3 +258,21 @@ def test_model_folder_without_a_tokenizer_is_told_what_it_lacks(tmp_path):
     (tmp_path / "config.json").write_text("{}")
     with pytest.raises(TrainerError, match=r"has no tokenizer: copy the model's tokenizer\.json"):
         HfPolicy.load(tmp_path, Codec.LINES)
+
+
+def test_a_saved_policy_is_measured_in_the_codec_that_it_was_taught_and_another_model_in_json(
+    policy, tokenizer, tmp_path
+):
+    policy.save(tmp_path / "taught")
+    model = copy.deepcopy(policy.module)
+    del model.config.embomatrix_codec
+    model.save_pretrained(tmp_path / "other")
+    tokenizer.save_pretrained(tmp_path / "other")
+
+    def codec(name, told):
+        return load_model(str(tmp_path / name), told, threads=1, device="cpu").policy.codec
+
+    assert codec("taught", None) is Codec.LINES
+    assert codec("taught", Codec.JSON) is Codec.JSON
+    assert codec("other", None) is Codec.JSON
+    assert codec("other", Codec.LINES) is Codec.LINES

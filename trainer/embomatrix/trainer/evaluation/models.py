@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from embomatrix.skills.prompt import Codec
 from embomatrix.trainer.checkpoint import read_state
 from embomatrix.trainer.errors import TrainerError, reason_of
 from embomatrix.trainer.policy.choice import saved_policy
@@ -16,7 +17,6 @@ from embomatrix.trainer.policy.tiny import TinyPolicy
 from embomatrix.trainer.settings import LANGUAGE_MODEL_DEFAULTS, LoraSettings, read_settings
 
 if TYPE_CHECKING:
-    from embomatrix.skills.prompt import Codec
     from embomatrix.trainer.policy.protocol import Policy
 
 
@@ -29,8 +29,11 @@ class LoadedModel:
     max_tokens: int
 
 
-def load_model(named: str, codec: Codec, *, threads: int | None, device: str) -> LoadedModel:
-    """A checkpoint speaks the codec that it was trained in, any other model ``codec``. Raises TrainerError."""
+def load_model(named: str, codec: Codec | None, *, threads: int | None, device: str) -> LoadedModel:
+    """A policy speaks the codec that it was trained in, any other model ``codec``, JSON for None. Raises TrainerError.
+
+    A language model that was saved outside of a checkpoint can be told another.
+    """
     folder = Path(named)
     if folder.is_dir() and (folder / "policy").is_dir():
         _, settings = read_state(folder)
@@ -49,7 +52,9 @@ def load_model(named: str, codec: Codec, *, threads: int | None, device: str) ->
         )
     settings = read_settings(None, {"device": device}, LANGUAGE_MODEL_DEFAULTS)
     return LoadedModel(
-        HfPolicy.load(named, codec, device=device), settings.prompt.rows, settings.grpo.max_new
+        HfPolicy.load(named, codec or HfPolicy.codec_in(folder) or Codec.JSON, device=device),
+        settings.prompt.rows,
+        settings.grpo.max_new,
     )
 
 

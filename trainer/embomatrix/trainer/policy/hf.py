@@ -7,11 +7,13 @@ the gradients of the plain computation at a third of the time.
 from __future__ import annotations
 
 import copy
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import torch
 
+from embomatrix.skills.prompt import Codec
 from embomatrix.trainer.errors import TrainerError, reason_of
 from embomatrix.trainer.policy.drawing import draw
 from embomatrix.trainer.policy.lora import adapt, load_adapters, merged, save_adapters
@@ -25,7 +27,7 @@ if TYPE_CHECKING:
 
     from torch import Tensor, nn
 
-    from embomatrix.skills.prompt import Codec, Prompt
+    from embomatrix.skills.prompt import Prompt
     from embomatrix.trainer.policy.lora import LoraShape
     from embomatrix.trainer.policy.protocol import Tokens
 
@@ -39,6 +41,9 @@ TOKENIZERS: Final = (
     "vocab.txt",
 )
 """Files of which a folder with a tokenizer has at least one."""
+CONFIG: Final = "config.json"
+CODEC_KEY: Final = "embomatrix_codec"
+"""What a model's configuration says of the codec that it was taught in."""
 REMEDY: Final = "pass `tiny`, a folder with config.json, or a Hugging Face name; `embomatrix model import-gguf` makes a folder"
 
 
@@ -266,6 +271,7 @@ class HfPolicy:
         from safetensors import SafetensorError
 
         folder.mkdir(parents=True, exist_ok=True)
+        setattr(self._model.config, CODEC_KEY, self._codec.value)
         try:
             with merged(self._model):
                 self._model.save_pretrained(folder)
@@ -277,7 +283,16 @@ class HfPolicy:
 
     @staticmethod
     def is_saved_in(folder: Path) -> bool:
-        return (folder / "config.json").is_file()
+        return (folder / CONFIG).is_file()
+
+    @staticmethod
+    def codec_in(folder: Path) -> Codec | None:
+        """The codec that the model of a folder was taught here; None for any other model."""
+        try:
+            config = json.loads((folder / CONFIG).read_text(encoding="utf-8"))
+            return Codec(config[CODEC_KEY])
+        except (OSError, ValueError, TypeError, KeyError):
+            return None
 
 
 def _end_tokens(model: Any, tokenizer: Any) -> list[int]:
