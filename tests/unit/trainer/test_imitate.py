@@ -1,6 +1,8 @@
 """Imitation stops when it no longer helps, goes on where it was cut short, and leaves a policy to train."""
 
+import itertools
 import json
+import signal
 
 import pytest
 import torch
@@ -11,6 +13,7 @@ from embomatrix.trainer.augment import Variation
 from embomatrix.trainer.checkpoint import CHECKPOINTS, CheckpointStore, Progress, read_state
 from embomatrix.trainer.errors import TrainerError
 from embomatrix.trainer.imitate import Imitation
+from embomatrix.trainer.optimisers import ImitationOptimiser
 from embomatrix.trainer.policy.choice import new_policy, saved_policy
 from embomatrix.trainer.progress import LineDisplay, LiveDisplay
 from embomatrix.trainer.recorder import IMITATION, Recorder
@@ -65,6 +68,24 @@ def test_twelve_steps_are_seven_and_five_after_a_resume(tmp_path, stopping):
     assert torch.equal(weights(whole), weights(resumed))
     assert (state.step, state.best_loss, state.best_step) == (again.step, again.best_loss, again.best_step)
     assert (tmp_path / "whole" / IMITATION).read_text() == (tmp_path / "halves" / IMITATION).read_text()
+
+
+def test_an_interrupt_while_the_policy_moves_waits_until_it_has(tmp_path, monkeypatch):
+    whole, _, _ = imitate(tmp_path / "whole", settings_of())
+    step, calls = ImitationOptimiser.step, itertools.count(1)
+
+    def interrupted(optimiser, factor):
+        if next(calls) == 7:
+            signal.raise_signal(signal.SIGINT)
+        step(optimiser, factor)
+
+    monkeypatch.setattr(ImitationOptimiser, "step", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        imitate(tmp_path / "halves", settings_of())
+    monkeypatch.undo()
+    resumed, _, steps = imitate(tmp_path / "halves", settings_of())
+    assert [each.step for each in steps] == [8, 9, 10, 11, 12]
+    assert torch.equal(weights(whole), weights(resumed))
 
 
 def test_policy_is_put_back_to_where_it_was_best_on_tasks_set_aside(tmp_path):

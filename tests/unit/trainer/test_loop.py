@@ -1,6 +1,7 @@
 """The loop learns, can be stopped and resumed exactly, and says where its time went."""
 
 import json
+import signal
 from contextlib import ExitStack
 from dataclasses import replace
 
@@ -22,6 +23,7 @@ from embomatrix.trainer.rollout import Gateway
 from embomatrix.trainer.settings import OnLost, read_settings
 from embomatrix.trainer.stopwatch import Activity
 from embomatrix.trainer.telling import Teller
+from embomatrix.trainer.update import Updater
 
 TINY = {"tiny.layers": 2, "tiny.width": 32, "tiny.heads": 2, "tiny.inner": 64}
 SHORT = {
@@ -172,6 +174,26 @@ def test_a_step_that_is_broken_off_leaves_nothing_behind_and_is_taken_again_afte
     _, resumed = run(tmp_path / "broken", resume=True)
     assert torch.equal(weights(whole), weights(resumed))
     assert without_time(read_metrics(tmp_path / "whole")) == without_time(read_metrics(tmp_path / "broken"))
+
+
+def test_an_interrupt_while_the_policy_moves_waits_until_the_step_is_whole(tmp_path, monkeypatch):
+    apply = Updater._apply
+
+    def interrupted(updater, work):
+        moved = apply(updater, work)
+        if work.plan.step == 4:
+            signal.raise_signal(signal.SIGINT)
+        return moved
+
+    _, whole = run(tmp_path / "whole")
+    monkeypatch.setattr(Updater, "_apply", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "halves")
+    progress, _ = read_state(CheckpointStore(tmp_path / "halves" / CHECKPOINTS, keep=9).latest())
+    assert progress.step == 4
+    _, resumed = run(tmp_path / "halves", resume=True)
+    assert torch.equal(weights(whole), weights(resumed))
+    assert without_time(read_metrics(tmp_path / "whole")) == without_time(read_metrics(tmp_path / "halves"))
 
 
 def test_a_live_display_draws_every_phase(tmp_path):

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from embomatrix.trainer.errors import TrainerError
+from embomatrix.trainer.interrupts import Interrupts
 from embomatrix.trainer.optimisers import ImitationOptimiser
 
 if TYPE_CHECKING:
@@ -90,7 +91,10 @@ class Imitation:
         self._best = dict(tensors["best"])
 
     def run(self, report: Callable[[ImitationProgress], None]) -> None:
-        """Spend the budget, or what is left of it. ``report`` hears of every step and may raise to interrupt."""
+        """Spend the budget, or what is left of it. ``report`` hears of every step and may raise.
+
+        An interrupt waits for the end of a step that moves the policy already.
+        """
         state, earlier_s, began_s = self.state, self.state.seconds, time.monotonic()
         while not state.done:
             state.seconds = earlier_s + time.monotonic() - began_s
@@ -98,11 +102,12 @@ class Imitation:
             if share >= 1.0 or self._gave_up():
                 self._finish()
                 return
-            loss = self._step(share)
-            state.step += 1
-            measured = self._aside and state.step % self._settings.validate_every == 0
-            validation = self._measure() if measured else None
-            report(ImitationProgress(state.step, share, loss, validation))
+            with Interrupts() as interrupts:
+                loss = self._step(share, interrupts)
+                state.step += 1
+                measured = self._aside and state.step % self._settings.validate_every == 0
+                validation = self._measure() if measured else None
+                report(ImitationProgress(state.step, share, loss, validation))
 
     def _share(self) -> float:
         settings, state = self._settings, self.state
@@ -122,11 +127,13 @@ class Imitation:
         """The policy as it was when it was best, where that was measured."""
         if self._aside and self.state.step % self._settings.validate_every and self.state.step:
             self._measure()
-        if self._best:
-            self._policy.module.load_state_dict(self._best)
-        self.state.done = True
+        with Interrupts() as interrupts:
+            interrupts.put_off()
+            if self._best:
+                self._policy.module.load_state_dict(self._best)
+            self.state.done = True
 
-    def _step(self, share: float) -> float:
+    def _step(self, share: float, interrupts: Interrupts) -> float:
         settings = self._settings
         rng = np.random.default_rng(np.random.SeedSequence((self._seed, 1, self.state.step)))
         chosen = rng.integers(len(self._lessons), size=settings.batch)
@@ -135,6 +142,7 @@ class Imitation:
         self._optimiser.zero_grad()
         torch.autograd.backward(loss)
         torch.nn.utils.clip_grad_norm_(self._policy.parameters(), 1.0)
+        interrupts.put_off()
         self._optimiser.step(_shape(share, self.state.step, settings.warmup_steps))
         return float(loss.detach())
 

@@ -20,6 +20,7 @@ from embomatrix.trainer.crew.crew import Crew
 from embomatrix.trainer.crew.learner import Learner
 from embomatrix.trainer.data import Curriculum, Schedule
 from embomatrix.trainer.evaluate import Evaluation, evaluate_policy
+from embomatrix.trainer.interrupts import Interrupts
 from embomatrix.trainer.outcome import write_outcome
 from embomatrix.trainer.recorder import METRICS, SAMPLES, Recorder, read_metrics
 from embomatrix.trainer.report import REPORT, Summary, outcome_of, write_report
@@ -166,13 +167,14 @@ class TrainingRun:
         while (share := self._share()) < 1.0:
             began_s = time.monotonic()
             self._announce(schedule, reserve, progress.step)
-            with self._whole_step():
-                record, logs = updater.take_step(self._plan(schedule, reserve, share))
-            seconds = time.monotonic() - began_s
-            progress.step = record.step
-            progress.cursor, progress.reserve_cursor = schedule.cursor, reserve.cursor
-            progress.grpo_s += seconds
-            self._note(record, logs, seconds)
+            with Interrupts() as interrupts:
+                with self._whole_step():
+                    record, logs = updater.take_step(self._plan(schedule, reserve, share), interrupts)
+                seconds = time.monotonic() - began_s
+                progress.step = record.step
+                progress.cursor, progress.reserve_cursor = schedule.cursor, reserve.cursor
+                progress.grpo_s += seconds
+                self._note(record, logs, seconds)
             if progress.step % self._settings.checkpoint_every == 0:
                 self._save(updater)
 

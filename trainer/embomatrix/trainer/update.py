@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
     from embomatrix.trainer.crew.crew import Crew, RemoteLearner
     from embomatrix.trainer.data import TrainingTask
+    from embomatrix.trainer.interrupts import Interrupts
     from embomatrix.trainer.policy.protocol import Policy
     from embomatrix.trainer.rollout import PlanOutcome, Submitting
     from embomatrix.trainer.sampling import Chunk
@@ -89,14 +90,21 @@ class Updater:
             policy.parameters(), lr=settings.learning_rate, betas=(0.9, 0.95), weight_decay=0.0
         )
 
-    def take_step(self, plan: StepPlan) -> tuple[StepRecord, list[GroupLog]]:
-        """Sample, execute and learn from one batch of tasks. Raises TrainerError where it can't go on."""
+    def take_step(
+        self, plan: StepPlan, interrupts: Interrupts | None = None
+    ) -> tuple[StepRecord, list[GroupLog]]:
+        """Sample, execute and learn from one batch of tasks. Raises TrainerError where it can't go on.
+
+        ``interrupts`` are put off once the policy moves.
+        """
         with self._stopwatch.spending(Activity.SAMPLING):
             chunks = self._chunks(plan)
         work = _Work(plan, self._scale(chunks), GradientSum(self._policy.parameters()))
         self._learn_all(chunks, work)
         self._replace_dead(len(chunks), work)
         with self._stopwatch.spending(Activity.UPDATE):
+            if interrupts is not None:
+                interrupts.put_off()
             norm, rate = self._apply(work)
         return record_of(plan.step, work.logs, work.metrics, norm, rate), work.logs
 
