@@ -11,33 +11,20 @@ def interrupt():
     signal.raise_signal(signal.SIGINT)
 
 
-def test_an_interrupt_that_is_put_off_comes_at_the_end():
+@pytest.mark.parametrize(("times", "is_whole"), [(1, True), (2, False)])
+def test_one_interrupt_comes_at_the_end_and_a_second_one_at_once(times, is_whole):
     done = []
 
     def whole():
         with Interrupts() as interrupts:
             interrupts.put_off()
-            interrupt()
+            for _ in range(times):
+                interrupt()
             done.append(True)
 
     with pytest.raises(KeyboardInterrupt):
         whole()
-    assert done
-
-
-def test_a_second_interrupt_comes_at_once():
-    done = []
-
-    def whole():
-        with Interrupts() as interrupts:
-            interrupts.put_off()
-            interrupt()
-            interrupt()
-            done.append(True)
-
-    with pytest.raises(KeyboardInterrupt):
-        whole()
-    assert not done
+    assert bool(done) is is_whole
 
 
 def test_nothing_is_put_off_before_it_is_said_nor_afterwards():
