@@ -6,9 +6,13 @@ import os
 import pytest
 import torch
 from tests.fakes.datasets import write_kitchen_dataset
+from tests.fakes.small_llama import random_llama, word_tokenizer
 
+from embomatrix.skills.prompt import Codec
 from embomatrix.trainer.checkpoint import CHECKPOINTS, CheckpointStore, read_state
+from embomatrix.trainer.data import load_tasks
 from embomatrix.trainer.errors import TrainerError
+from embomatrix.trainer.policy.hf import HfPolicy
 from embomatrix.trainer.starting import resumed, started
 
 SMALL = {"tiny.layers": 1, "tiny.width": 16, "tiny.heads": 2, "tiny.inner": 16, "threads": 1}
@@ -134,3 +138,14 @@ def test_the_small_policy_multiplies_in_half_the_bits_where_the_processor_has_in
     )
     whole = started(kitchen, tmp_path / "whole", "tiny", None, {**SMALL, "products": "float32"})
     assert whole.policy.module.blocks[0].qkv.products is torch.float32
+
+
+@pytest.mark.parametrize(("told", "codec"), [({}, Codec.JSON), ({"codec": "lines"}, Codec.LINES)])
+def test_a_language_model_that_was_taught_here_goes_on_in_its_codec_unless_another_is_told(
+    kitchen, tmp_path, told, codec
+):
+    pytest.importorskip("tokenizers")
+    tokenizer = word_tokenizer(load_tasks(kitchen).train)
+    HfPolicy(random_llama(tokenizer), tokenizer, Codec.JSON, "random llama").save(tmp_path / "taught")
+    start = started(kitchen, tmp_path / "run", str(tmp_path / "taught"), None, {**SMALL, **told})
+    assert start.settings.codec is start.policy.codec is codec

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import torch
@@ -14,12 +15,12 @@ from embomatrix.trainer.checkpoint import CHECKPOINTS, CheckpointStore, Progress
 from embomatrix.trainer.data import load_tasks
 from embomatrix.trainer.errors import TrainerError, reason_of
 from embomatrix.trainer.policy.choice import TINY, is_tiny, new_policy, saved_policy
+from embomatrix.trainer.policy.hf import HfPolicy
 from embomatrix.trainer.settings import LANGUAGE_MODEL_DEFAULTS, read_settings, with_changes
 from embomatrix.trainer.telling import Teller
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-    from pathlib import Path
 
     from embomatrix.trainer.data import TaskSet
     from embomatrix.trainer.policy.protocol import Policy
@@ -56,7 +57,7 @@ def started(
 ) -> Start:
     """A new run in the folder ``out``, which is made. Raises TrainerError where there is one already."""
     threads = max(1, (os.cpu_count() or 2) // 2)
-    defaults = {"threads": threads, **({} if is_tiny(model) else LANGUAGE_MODEL_DEFAULTS)}
+    defaults = {"threads": threads, **({} if is_tiny(model) else _language_defaults(model))}
     settings = read_settings(settings_file, {**changes, "model": model}, defaults)
     if "processes" not in settings.model_fields_set:
         settings = settings.model_copy(update={"processes": _processes_for(settings)})
@@ -71,6 +72,12 @@ def started(
             f"the folder {out} can't be made ({error.strerror}): pass another --out"
         ) from error
     return Start(settings, tasks, policy, Progress(dataset=digest_of(tasks)))
+
+
+def _language_defaults(model: str) -> dict[str, Any]:
+    """A model that was taught here goes on in the codec that it was taught in."""
+    codec = HfPolicy.codec_in(Path(model))
+    return {**LANGUAGE_MODEL_DEFAULTS, **({} if codec is None else {"codec": codec})}
 
 
 def _processes_for(settings: TrainSettings) -> int:
