@@ -8,7 +8,7 @@ from tests.fakes.datasets import write_kitchen_dataset
 from tests.fakes.symbolic_household import make_tasks
 from typer.testing import CliRunner
 
-from embomatrix.cli.bench_trainer import bench_trainer, seconds_told
+from embomatrix.cli.bench_trainer import Shares, bench_trainer, seconds_told
 from embomatrix.trainer.bench.load import load_of, read_load, write_load
 from embomatrix.trainer.bench.own_steps import measure, policy_of
 from embomatrix.trainer.errors import TrainerError
@@ -46,6 +46,18 @@ def test_a_program_that_tells_no_times_is_one_sentence(output):
 
 def test_times_are_on_the_last_line_whatever_a_library_says_before():
     assert seconds_told('a warning\n{"step_s": [1.5, 2]}\n') == [1.5, 2.0]
+
+
+def test_shares_are_of_the_steps_told_and_of_what_was_spent_since_the_ones_before():
+    def record(seconds, sampling, update, waiting):
+        spent_s = {"sampling": sampling, "update": update, "waiting for simulation": waiting}
+        return {"seconds": seconds, "rollouts": 6, "spent_s": spent_s}
+
+    steps = [record(4.0, 1.0, 1.0, 2.0), record(2.0, 2.0, 1.5, 2.2), record(2.0, 3.0, 2.0, 2.4)]
+    first, later = Shares.of(steps[:1], {}), Shares.of(steps[1:], steps[0]["spent_s"])
+    assert (first.steps, first.waiting, first.overhead, first.rollouts_per_s) == (1, 0.5, 0.5, 1.5)
+    assert (later.steps, later.rollouts_per_s) == (2, 3.0)
+    assert (later.waiting, later.overhead) == pytest.approx((0.1, 0.25))
 
 
 def test_a_dataset_that_is_not_there_is_one_sentence():

@@ -236,8 +236,8 @@ class TrainingRun:
     def _note(self, record: StepRecord, logs: list[GroupLog], seconds: float) -> None:
         self._progress.rollouts += record.rollouts
         self._progress.lost += record.lost
-        self._recorder.step(record, seconds)
-        self._reporter.sampled(record.step, logs, self._stopwatch.spent_s)
+        self._recorder.step(record, seconds, self._stopwatch.spent_s)
+        self._reporter.sampled(record.step, logs)
         if record.step % self._settings.samples_every == 1 or self._settings.samples_every == 1:
             self._recorder.samples(record.step, logs[0])
         logger.info(

@@ -34,9 +34,10 @@ class Recorder:
         self._trackers = tuple(trackers)
         folder.mkdir(parents=True, exist_ok=True)
 
-    def step(self, record: StepRecord, seconds: float) -> None:
-        """``seconds`` is the wall clock of the step."""
-        row = {**asdict(record), "seconds": round(seconds, 4)}
+    def step(self, record: StepRecord, seconds: float, spent_s: Mapping[str, float]) -> None:
+        """``seconds`` is the wall clock of the step, ``spent_s`` what the run has spent so far, by activity."""
+        spent = {activity: round(value, 4) for activity, value in spent_s.items()}
+        row = {**asdict(record), "seconds": round(seconds, 4), "spent_s": spent}
         self._append(METRICS, row)
         self._track("grpo", row)
 

@@ -40,11 +40,10 @@ class Reporter:
     def close(self) -> None:
         """Nothing stays open: the gateway sends what is left."""
 
-    def sampled(self, step: int, logs: Sequence[GroupLog], spent_s: Mapping[str, float]) -> None:
-        """Some plans of a step of GRPO, and the seconds that the run has spent by activity."""
-        spent = {f"spent_s/{activity}": seconds for activity, seconds in spent_s.items()}
+    def sampled(self, step: int, logs: Sequence[GroupLog]) -> None:
+        """Some plans of a step of GRPO."""
         widest = max(logs, key=_spread, default=None)
-        self._send(TrainingReport(GRPO, step, spent, () if widest is None else _plans(widest)))
+        self._send(TrainingReport(GRPO, step, {}, () if widest is None else _plans(widest)))
 
 
 def _spread(log: GroupLog) -> float:
