@@ -20,6 +20,7 @@ import numpy as np
 
 from embomatrix.cli.local_cluster import local_cluster, without_membership
 from embomatrix.cli.supervisor import embomatrix_command
+from embomatrix.host.cores import usable_cores
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.trainer.bench.load import load_of, write_load
 from embomatrix.trainer.data import load_tasks
@@ -146,7 +147,7 @@ def _evaluation(dataset: Path, folder: Path, on_step: Callable[[str], None]) -> 
         f"--samples={SAMPLES}",
         "--baseline=random",
     )
-    jobs = f"--jobs={os.cpu_count() or 1}"
+    jobs = f"--jobs={usable_cores()}"
     on_step(f"random plans for {TASKS} tasks")
     _told(*embomatrix_command("eval", *asked, jobs, f"--out={folder / 'asked'}"))
     answers = folder / "asked" / "answers.jsonl"

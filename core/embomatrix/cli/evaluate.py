@@ -9,7 +9,6 @@ import contextlib
 import functools
 import json
 import logging
-import os
 import re
 import time
 from dataclasses import dataclass
@@ -22,6 +21,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from embomatrix.cli.examinee import Chosen, Questions, asked_of
 from embomatrix.cli.failure import INTERRUPTED, fail
+from embomatrix.host.cores import usable_cores
 from embomatrix.skills.prompt import Codec
 from embomatrix.trainer.eai.exam import CODEC as EAI_CODEC
 from embomatrix.trainer.eai.exam import NAME as NATIVE
@@ -75,7 +75,7 @@ class Place:
         if not self.manager:
             from embomatrix.worker.rollout_pool import RolloutPool
 
-            return RolloutPool(bench.folder, self.jobs or os.cpu_count() or 1)
+            return RolloutPool(bench.folder, self.jobs or usable_cores())
         from embomatrix.rpc.client import ClusterClient
         from embomatrix.rpc.trust import read_ca, read_token
 

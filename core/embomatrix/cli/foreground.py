@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import signal
 import subprocess
@@ -9,7 +10,8 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.cli.failure import INTERRUPTED, fail
 from embomatrix.cli.local_cluster import without_membership
-from embomatrix.cli.supervisor import DIE_WITH_PARENT, embomatrix_command
+from embomatrix.cli.supervisor import embomatrix_command
+from embomatrix.host.parent import die_with_parent
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -30,7 +32,7 @@ def run_command(command: str, problem: Callable[[], str], *arguments: str) -> No
     with subprocess.Popen(
         embomatrix_command(*arguments),
         start_new_session=True,
-        preexec_fn=DIE_WITH_PARENT,
+        preexec_fn=functools.partial(die_with_parent, os.getpid(), signal.SIGTERM),
         env=without_membership(os.environ),
     ) as child:
         try:

@@ -3,14 +3,15 @@
 A child that ends with the status for what a person can mend is not restarted: it would only say the same again.
 
 Used for the local cluster of `embomatrix demo`. It ends only what it started, by process id, and nothing that it started
-outlives it: children die with this process even when it is killed (PR_SET_PDEATHSIG, on Linux).
+outlives it: on Linux children die with this process even when it is killed.
 """
 
 from __future__ import annotations
 
 import contextlib
-import ctypes
+import functools
 import logging
+import os
 import signal
 import subprocess
 import sys
@@ -20,6 +21,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, Self
 
 from embomatrix.cli.failure import MENDABLE
+from embomatrix.host.parent import die_with_parent
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -31,7 +33,6 @@ RESTART_DELAY_S: Final = 0.5
 MAX_RESTARTS_IN_A_ROW: Final = 5
 """A child that dies this often within ten seconds each time is given up: its log says why."""
 SHORT_LIFE_S: Final = 10.0
-_PR_SET_PDEATHSIG: Final = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +125,7 @@ class Supervisor:
                 stderr=subprocess.STDOUT,
                 # Ctrl-C in a terminal is for the command in front; what it needs ends after it, in order.
                 start_new_session=True,
-                preexec_fn=DIE_WITH_PARENT,
+                preexec_fn=functools.partial(die_with_parent, os.getpid(), signal.SIGTERM),
             )
 
     def _watch(self) -> None:
@@ -146,12 +147,3 @@ class Supervisor:
         child.process = self._start(child.spec)
         child.started_s = time.monotonic()
         child.restarts += 1
-
-
-def _die_with_parent() -> None:
-    """Ask the kernel for a SIGTERM when the parent thread's process ends, however it ends."""
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
-
-
-DIE_WITH_PARENT: Final = _die_with_parent if sys.platform == "linux" else None
-"""What a child process runs first, so that it does not outlive the one that started it."""

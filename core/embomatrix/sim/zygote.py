@@ -13,13 +13,15 @@ import json
 import os
 import resource
 import select
-import signal
 import socket
 import struct
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
+
+from embomatrix.host.cgroup import MIB
+from embomatrix.host.parent import die_with_parent
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -28,10 +30,8 @@ _PREFIX: Final = struct.Struct("!II")
 _written: Final = json.JSONEncoder(separators=(",", ":")).encode
 PREFIX_BYTES: Final = _PREFIX.size
 MAX_FRAME_BYTES: Final = 64 * 1024 * 1024
-MIB: Final = 1024 * 1024
 STATM_BYTES: Final = 256
 """More than the seven numbers of Linux's ``statm`` take."""
-_PR_SET_PDEATHSIG: Final = 1
 _PR_SET_THP_DISABLE: Final = 41
 
 
@@ -148,14 +148,6 @@ def _fork(control: socket.socket, fd: int, child: Callable[[socket.socket], None
     finally:
         sys.stderr.flush()
         os._exit(status)
-
-
-def die_with_parent(parent: int) -> None:
-    """Have the kernel kill this process when its parent's does, however that ends."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:
-        os._exit(1)
 
 
 def take_small_pages() -> None:

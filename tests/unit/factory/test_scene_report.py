@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,6 +17,7 @@ from embomatrix.factory.scenes.cli import app
 from embomatrix.factory.scenes.floor import ReachableFloor
 from embomatrix.factory.scenes.report import report_of, report_on, unaccounted
 from embomatrix.factory.scenes.tables import TABLE_COLUMNS, report_table
+from embomatrix.host.cores import usable_cores
 from embomatrix.world.catalog import Catalog, CatalogError
 from embomatrix.world.codec import scene_from_json
 from embomatrix.world.geometry import Part, Pose, Shape
@@ -192,7 +192,7 @@ def test_the_page_names_every_rule() -> None:
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_all_51_scenes_are_built_and_keep_every_rule(seed: int) -> None:
     jobs = [SceneJob(scene_id, seed) for scene_id in Catalog.load().scene_ids]
-    reports = list(run_batch(jobs, processes=os.cpu_count() or 1))
+    reports = list(run_batch(jobs, processes=usable_cores()))
     assert len(reports) == 51
     assert sum(report.rooms for report in reports) == 374
     wrong = {report.scene_id: report.error or report.problems for report in reports if not report.sound}

@@ -28,6 +28,7 @@ from embomatrix.trainer.progress import LineDisplay
 from embomatrix.trainer.recorder import read_metrics
 from embomatrix.trainer.rollout import Gateway
 from embomatrix.trainer.settings import LANGUAGE_MODEL_DEFAULTS, read_settings
+from embomatrix.trainer.starting import usual_threads
 from embomatrix.trainer.telling import Teller
 
 TASKS = make_tasks(6, 2, objects=8)
@@ -230,7 +231,7 @@ def smollm2(tmp_path_factory):
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_smollm2_takes_real_grpo_steps(smollm2, tmp_path):
-    torch.set_num_threads(max(1, (os.cpu_count() or 2) // 2))
+    torch.set_num_threads(usual_threads())
     policy = HfPolicy.load(smollm2, Codec.LINES)
     before = weights(policy)
     summary = train(

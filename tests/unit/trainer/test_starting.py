@@ -1,7 +1,6 @@
 """A run goes on as it began, or says what is otherwise."""
 
 import json
-import os
 
 import pytest
 import torch
@@ -9,6 +8,7 @@ from tests.fakes.datasets import write_kitchen_dataset
 from tests.fakes.small_llama import random_llama, word_tokenizer
 
 from embomatrix.skills.prompt import Codec
+from embomatrix.trainer import starting
 from embomatrix.trainer.checkpoint import CHECKPOINTS, CheckpointStore, read_state
 from embomatrix.trainer.data import load_tasks
 from embomatrix.trainer.errors import TrainerError
@@ -94,7 +94,7 @@ def test_a_checkpoint_of_another_version_is_told(kitchen, tmp_path, begun):
 
 
 def test_threads_and_processes_suit_the_model_unless_they_are_told(kitchen, tmp_path, monkeypatch):
-    monkeypatch.setattr(os, "cpu_count", lambda: 8)
+    monkeypatch.setattr(starting, "usable_cores", lambda: 8)
     shape = {name: value for name, value in SMALL.items() if name != "threads"}
     by_itself = started(kitchen, tmp_path / "itself", "tiny", None, shape).settings
     assert (by_itself.threads, by_itself.processes) == (4, 2)
@@ -105,7 +105,7 @@ def test_threads_and_processes_suit_the_model_unless_they_are_told(kitchen, tmp_
 
 
 def test_a_policy_on_another_device_has_one_process_unless_more_are_told(kitchen, tmp_path, monkeypatch):
-    monkeypatch.setattr(os, "cpu_count", lambda: 8)
+    monkeypatch.setattr(starting, "usable_cores", lambda: 8)
     assert started(kitchen, tmp_path, "tiny", None, {**SMALL, "device": "meta"}).settings.processes == 1
 
 

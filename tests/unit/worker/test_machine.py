@@ -5,10 +5,8 @@ import subprocess
 import sys
 import time
 
-import psutil
 import pytest
 
-from embomatrix.worker.cgroup import Limits, find_limits
 from embomatrix.worker.machine import (
     NEVER_S,
     CpuTimes,
@@ -20,7 +18,7 @@ from embomatrix.worker.machine import (
 )
 from embomatrix.worker.pausing import Observation
 from embomatrix.worker.preferences import Preferences
-from embomatrix.worker.resources import free_disk_mb, usable_cores
+from embomatrix.worker.resources import free_disk_mb
 
 BUSY = "import time\nend = time.process_time() + 0.4\nwhile time.process_time() < end: pass\n"
 
@@ -108,63 +106,6 @@ def test_a_wish_that_this_machine_cannot_heed_is_told():
     assert len(machine.blind_to(wishes, Observation(0))) == 2
     assert machine.blind_to(wishes, Observation(0, owner_idle_s=5.0, on_mains=True)) == []
     assert machine.blind_to(Preferences(), Observation(0)) == []
-
-
-def _group(mount, name, **files):
-    folder = mount / name
-    folder.mkdir(parents=True, exist_ok=True)
-    for file, text in files.items():
-        (folder / file.replace("__", ".")).write_text(text + "\n")
-
-
-def test_the_tightest_group_around_this_process_counts(tmp_path):
-    mount, membership = tmp_path / "cgroup", tmp_path / "membership"
-    membership.write_text("0::/user.slice/worker.service\n")
-    _group(mount, "user.slice/worker.service", cpu__max="max 100000", memory__max="max", memory__current="5")
-    _group(
-        mount, "user.slice", cpu__max="250000 100000", memory__max=str(3 << 30), memory__current=str(1 << 30)
-    )
-    assert find_limits(mount, membership) == Limits(2.5, 2048.0)
-    assert usable_cores(Limits(cores=0.5)) == 1
-    assert usable_cores(Limits()) == len(psutil.Process().cpu_affinity())
-
-
-def test_groups_of_the_first_version_count_too(tmp_path):
-    mount, membership = tmp_path / "cgroup", tmp_path / "membership"
-    membership.write_text("5:memory:/docker/1\n4:cpu,cpuacct:/docker/1\n")
-    _group(mount, "cpu,cpuacct/docker/1", cpu__cfs_quota_us="150000", cpu__cfs_period_us="100000")
-    _group(mount, "cpu,cpuacct", cpu__cfs_quota_us="-1", cpu__cfs_period_us="100000")
-    _group(mount, "memory", memory__limit_in_bytes=str(1 << 30), memory__usage_in_bytes="0")
-    assert find_limits(mount, membership) == Limits(1.5, 1024.0)
-
-
-@pytest.mark.parametrize(
-    ("membership", "files"),
-    [
-        (
-            "0::/w\n",
-            {"memory__max": str(1 << 30), "memory__current": str(3 << 28), "memory__stat": "inactive_file"},
-        ),
-        (
-            "5:memory:/w\n",
-            {
-                "memory__limit_in_bytes": str(1 << 30),
-                "memory__usage_in_bytes": str(3 << 28),
-                "memory__stat": "total_inactive_file",
-            },
-        ),
-    ],
-)
-def test_files_that_were_read_long_ago_leave_their_memory_to_others(tmp_path, membership, files):
-    (tmp_path / "membership").write_text(membership)
-    account = f"anon 5\n{files['memory__stat']} {1 << 28}\nfile 7"
-    group = "w" if membership.startswith("0") else "memory/w"
-    _group(tmp_path / "cgroup", group, **files | {"memory__stat": account})
-    assert find_limits(tmp_path / "cgroup", tmp_path / "membership").memory_mb == 512.0
-
-
-def test_without_groups_nothing_is_limited(tmp_path):
-    assert find_limits(tmp_path, tmp_path / "none") == Limits()
 
 
 def test_free_space_is_that_of_the_folder_or_of_what_is_there_of_it(tmp_path):

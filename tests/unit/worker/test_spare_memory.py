@@ -10,9 +10,9 @@ from tests.fakes.real_cluster import until
 from tests.fakes.simulation import PROGRAM
 from tests.unit.worker.test_slots import running
 
+from embomatrix.host.cgroup import MIB
 from embomatrix.rpc.values import Completed, ResidentState, Resources
 from embomatrix.worker import spare_memory
-from embomatrix.worker.cgroup import MIB
 from embomatrix.worker.daemon import Daemon
 from embomatrix.worker.settings import WorkerSettings
 from embomatrix.worker.spare_memory import SCARCE_MEMORY, SpareMemory, spare_memory_mb

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import functools
 import logging
-import os
 import platform
 import resource
 import time
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from embomatrix.host.cores import usable_cores
 from embomatrix.trainer.checkpoint import CHECKPOINTS, CheckpointStore, Progress, restore, whole_folder
 from embomatrix.trainer.crew.crew import Crew
 from embomatrix.trainer.crew.learner import Learner
@@ -282,4 +282,4 @@ class TrainingRun:
 
 def machine() -> str:
     """The machine in words, for reports."""
-    return f"{os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}, torch {torch.__version__}"
+    return f"{usable_cores()} cores, {platform.machine()}, Python {platform.python_version()}, torch {torch.__version__}"

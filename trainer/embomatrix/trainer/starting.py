@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import torch
 
+from embomatrix.host.cores import usable_cores
 from embomatrix.trainer.augment import Variation
 from embomatrix.trainer.checkpoint import CHECKPOINTS, CheckpointStore, Progress, read_state
 from embomatrix.trainer.data import load_tasks
@@ -56,8 +56,7 @@ def started(
     dataset: Path, out: Path, model: str, settings_file: Path | None, changes: Mapping[str, Any]
 ) -> Start:
     """A new run in the folder ``out``, which is made. Raises TrainerError where there is one already."""
-    threads = max(1, (os.cpu_count() or 2) // 2)
-    defaults = {"threads": threads, **({} if is_tiny(model) else _language_defaults(model))}
+    defaults = {"threads": usual_threads(), **({} if is_tiny(model) else _language_defaults(model))}
     settings = read_settings(settings_file, {**changes, "model": model}, defaults)
     if "processes" not in settings.model_fields_set:
         settings = settings.model_copy(update={"processes": _processes_for(settings)})
@@ -74,6 +73,11 @@ def started(
     return Start(settings, tasks, policy, Progress(dataset=digest_of(tasks)))
 
 
+def usual_threads() -> int:
+    """Half of the cores: simulation on the same machine needs the others."""
+    return max(1, usable_cores() // 2)
+
+
 def _language_defaults(model: str) -> dict[str, Any]:
     """A model that was taught here goes on in the codec that it was taught in."""
     codec = HfPolicy.codec_in(Path(model))
@@ -84,7 +88,7 @@ def _processes_for(settings: TrainSettings) -> int:
     """What suits a model: on a processor the small policy takes a step in half the time in two processes, a language model
     would take a second one's memory."""
     shared = is_tiny(settings.model) and settings.device == "cpu"
-    return min(2, os.cpu_count() or 1) if shared else 1
+    return min(2, usable_cores()) if shared else 1
 
 
 def resumed(

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import psutil
 
-from embomatrix.sim.zygote import die_with_parent
+from embomatrix.host.parent import die_with_parent
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import psutil
 
+from embomatrix.host.cgroup import MIB
+from embomatrix.host.cores import usable_cores
 from embomatrix.pages.figures import Better, Figure, figure_from_json, figure_to_json
-from embomatrix.sim.zygote import MIB
 from embomatrix.worker.gpu import find_gpu
 from embomatrix.worker.resources import measure_score, versions
 
@@ -117,7 +118,7 @@ def describe_machine() -> dict[str, Any]:
     gpu = find_gpu().name
     return {
         "cpu": _cpu_model(),
-        "cores": _cores(),
+        "cores": usable_cores(),
         "memory_gb": round(psutil.virtual_memory().total / MIB / 1024, 1),
         "gpu": gpu,
         "system": f"{platform.system()} {platform.machine()}",
@@ -156,7 +157,3 @@ def _cpu_model() -> str:
         lines = []
     models = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
     return next(models, platform.processor() or "unknown")
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

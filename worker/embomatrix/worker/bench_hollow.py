@@ -13,6 +13,7 @@ import time
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.host.parent import die_with_parent
 from embomatrix.proto.v1 import worker_service_pb2 as pb
 from embomatrix.proto.v1 import worker_service_pb2_grpc
 from embomatrix.reward.breakdown import AtomResult, RewardBreakdown
@@ -32,7 +33,6 @@ from embomatrix.rpc.values import (
     Resources,
     Timings,
 )
-from embomatrix.sim.zygote import die_with_parent
 from embomatrix.skills.trace import Step
 from embomatrix.worker.bench_figures import BenchError
 from embomatrix.worker.membership import Membership

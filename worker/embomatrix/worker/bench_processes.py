@@ -12,7 +12,7 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.sim.zygote import die_with_parent
+from embomatrix.host.parent import die_with_parent
 from embomatrix.worker.bench_figures import BenchError
 
 if TYPE_CHECKING:

@@ -12,6 +12,7 @@ import secrets
 import time
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.host.cgroup import MIB
 from embomatrix.rpc.values import InfraCode
 from embomatrix.worker.residents import LoadError
 from embomatrix.world.inflation import bundle_digest
@@ -27,7 +28,6 @@ SUFFIX: Final = ".bundle"
 PART: Final = ".part-"
 ABANDONED_S: Final = 3600.0
 """A part of a bundle that nobody has written to for so long was left by a daemon that was killed."""
-MIB: Final = 1024 * 1024
 FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
 
 

@@ -12,6 +12,7 @@ import time
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.host.cgroup import MIB
 from embomatrix.rpc.logs import bind, hide
 from embomatrix.rpc.managers import Managers
 from embomatrix.rpc.status import (
@@ -25,7 +26,7 @@ from embomatrix.rpc.status import (
 )
 from embomatrix.rpc.values import Completed, InfraCode
 from embomatrix.worker.backoff import Backoff
-from embomatrix.worker.cache import MIB, BundleCache
+from embomatrix.worker.cache import BundleCache
 from embomatrix.worker.courtesy import Courtesy
 from embomatrix.worker.machine import Machine
 from embomatrix.worker.membership import Membership, MembershipFile

@@ -8,7 +8,8 @@ import subprocess
 from dataclasses import dataclass
 from typing import Final
 
-MIB: Final = 1024 * 1024
+from embomatrix.host.cgroup import MIB
+
 QUERY_S: Final = 5.0
 RENDER_MB: Final = 2048
 """Memory of the GPU that one slot which renders is expected to take."""

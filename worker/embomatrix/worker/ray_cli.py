@@ -18,7 +18,7 @@ from typing import Annotated, Any, Final
 import typer
 from rich.console import Console
 
-from embomatrix.sim.zygote import die_with_parent
+from embomatrix.host.parent import die_with_parent
 from embomatrix.worker.settings_cli import fail
 
 DRAIN_S: Final = 90.0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import os
 import platform
 import shutil
 import time
@@ -14,15 +13,14 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 import psutil
 
+from embomatrix.host.cgroup import MIB, find_limits
+from embomatrix.host.cores import usable_cores
 from embomatrix.rpc.values import Resources
-from embomatrix.sim.zygote import MIB
-from embomatrix.worker.cgroup import find_limits
 from embomatrix.worker.gpu import find_gpu
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from embomatrix.worker.cgroup import Limits
     from embomatrix.worker.settings import WorkerSettings
 
 REFERENCE_S: Final = 0.0065
@@ -48,12 +46,6 @@ def measure(settings: WorkerSettings) -> Resources:
         disk_mb=free_disk_mb(settings.cache_dir.expanduser()),
         labels=settings.labels,
     )
-
-
-def usable_cores(limits: Limits) -> int:
-    """Cores that this process may keep busy: by its affinity, and by the quota of its control groups, rounded down."""
-    allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, int(min(allowed, limits.cores)))
 
 
 def free_disk_mb(folder: Path) -> int:

@@ -18,6 +18,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
+from embomatrix.host.parent import die_with_parent
 from embomatrix.proto.v1 import types_pb2
 from embomatrix.reward.settings import PAPER, RewardSettings
 from embomatrix.rpc.convert import rollout_from_proto
@@ -25,7 +26,6 @@ from embomatrix.rpc.convert_outcome import completed_to_proto
 from embomatrix.rpc.values import InfraCode
 from embomatrix.sim.zygote import (
     Frame,
-    die_with_parent,
     give_back_memory,
     limit_memory,
     private_mb,

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 import psutil
 
-from embomatrix.worker.cgroup import MIB, find_limits
+from embomatrix.host.cgroup import MIB, find_limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -30,10 +30,12 @@ from embomatrix.cli.experiment.findings import Run, figures_of, findings_of
 from embomatrix.cli.experiment.section import add_section, learning_section
 from embomatrix.cli.failure import fail
 from embomatrix.cli.foreground import no_problem, run_command
+from embomatrix.host.cores import usable_cores
 from embomatrix.pages.figures import figure_to_json, shown
 from embomatrix.trainer.errors import TrainerError
 from embomatrix.trainer.outcome import OUTCOME, read_outcome
 from embomatrix.trainer.recorder import read_metrics
+from embomatrix.trainer.starting import usual_threads
 from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:
@@ -195,7 +197,7 @@ def table(
         for name in bench:
             for stage in stages:
                 console.rule(f"{name}: {stage.label}")
-                where = [f"--manager={manager}"] if manager else [f"--jobs={jobs or os.cpu_count() or 1}"]
+                where = [f"--manager={manager}"] if manager else [f"--jobs={jobs or usable_cores()}"]
                 place = stage.report(run, name).parent
                 asked = (
                     f"--bench={name}",
@@ -246,7 +248,7 @@ def _design(
         imitation=imitation,
         patience=patience,
         grpo=grpo,
-        threads=threads or max(1, (os.cpu_count() or 2) // 2),
+        threads=threads or usual_threads(),
         shared=parse_settings(settings or ()),
         arms=arms,
     )

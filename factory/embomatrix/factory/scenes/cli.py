@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import io
 import json
-import os
 from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -27,6 +26,7 @@ from embomatrix.factory.scenes.batch import SceneJob, run_batch
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.scene_file import SUFFIX, SceneFileError, read_scene
 from embomatrix.factory.scenes.tables import TABLE_COLUMNS, problem_lines, report_table
+from embomatrix.host.cores import usable_cores
 from embomatrix.sim.bullet.camera import render_oblique
 from embomatrix.sim.engine import EngineError
 from embomatrix.world.catalog import Catalog, CatalogError
@@ -75,7 +75,7 @@ Assets = Annotated[
     Path | None,
     typer.Option(help="Folder of imported assets, which take the place of the generated ones."),
 ]
-CORES = os.cpu_count() or 1
+CORES = usable_cores()
 LEFT_OUT = "what is listed and not placed, and why: `embomatrix scene show NAME`, or --report FILE"
 
 
