@@ -9,6 +9,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from embomatrix.rpc.values import Cancelled, Completed, InfraFailure
+from embomatrix.trainer.trackers import GRPO_PHASE, IMITATION_PHASE
 from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:
@@ -39,7 +40,7 @@ class Recorder:
         spent = {activity: round(value, 4) for activity, value in spent_s.items()}
         row = {**asdict(record), "seconds": round(seconds, 4), "spent_s": spent}
         self._append(METRICS, row)
-        self._track("grpo", row)
+        self._track(GRPO_PHASE, row)
 
     def samples(self, step: int, log: GroupLog) -> None:
         """One task's plans: text, verdict, reward by tier, what each step did."""
@@ -55,7 +56,7 @@ class Recorder:
         """One step of imitation."""
         row = asdict(progress)
         self._append(IMITATION, row)
-        self._track("imitation", row)
+        self._track(IMITATION_PHASE, row)
 
     def evaluation(self, label: str, result: Evaluation) -> None:
         """Held-out success, which the run's own files keep in checkpoints and report."""

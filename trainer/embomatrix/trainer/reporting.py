@@ -14,6 +14,7 @@ from embomatrix.rpc.training import (
     TrainingReport,
 )
 from embomatrix.rpc.values import Cancelled, Completed, InfraFailure
+from embomatrix.trainer.trackers import GRPO_PHASE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from embomatrix.trainer.records import GroupLog
     from embomatrix.trainer.rollout import PlanOutcome
 
-GRPO: Final = "grpo"
 SHOWN: Final = 4
 """Plans of a step: of the group whose rewards differ most, from the best to the worst."""
 
@@ -43,7 +43,7 @@ class Reporter:
     def sampled(self, step: int, logs: Sequence[GroupLog]) -> None:
         """Some plans of a step of GRPO."""
         widest = max(logs, key=_spread, default=None)
-        self._send(TrainingReport(GRPO, step, {}, () if widest is None else _plans(widest)))
+        self._send(TrainingReport(GRPO_PHASE, step, {}, () if widest is None else _plans(widest)))
 
 
 def _spread(log: GroupLog) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import secrets
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from embomatrix.trainer.errors import TrainerError, reason_of
@@ -15,6 +16,9 @@ if TYPE_CHECKING:
     from embomatrix.trainer.settings import TrainSettings
 
 PROJECT: Final = "embomatrix"
+IMITATION_PHASE: Final = "imitation"
+GRPO_PHASE: Final = "grpo"
+WANDB_ID: Final = "wandb-id.txt"
 
 
 class Tracker(Protocol):
@@ -59,9 +63,17 @@ class Hosted:
 
 
 def _wandb(folder: Path, settings: TrainSettings) -> Tracker:
+    """A run that goes on is drawn on under the id that its folder keeps; each phase is drawn over its own steps."""
     import wandb
 
-    return Hosted(wandb, folder, settings, {"dir": str(folder)})
+    kept = folder / WANDB_ID
+    if not kept.exists():
+        kept.write_text(secrets.token_hex(4), encoding="utf-8")
+    going_on = {"id": kept.read_text(encoding="utf-8"), "resume": "allow"}
+    tracker = Hosted(wandb, folder, settings, {"dir": str(folder), **going_on})
+    for phase in (IMITATION_PHASE, GRPO_PHASE):
+        wandb.define_metric(f"{phase}/*", step_metric=f"{phase}/step")
+    return tracker
 
 
 def _trackio(folder: Path, settings: TrainSettings) -> Tracker:
