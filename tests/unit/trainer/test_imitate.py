@@ -15,6 +15,7 @@ from embomatrix.trainer.errors import TrainerError
 from embomatrix.trainer.imitate import Imitation
 from embomatrix.trainer.optimisers import ImitationOptimiser
 from embomatrix.trainer.policy.choice import new_policy, saved_policy
+from embomatrix.trainer.policy.tiny import TinyPolicy
 from embomatrix.trainer.progress import LineDisplay, LiveDisplay
 from embomatrix.trainer.recorder import IMITATION, Recorder
 from embomatrix.trainer.settings import read_settings
@@ -86,6 +87,29 @@ def test_an_interrupt_while_the_policy_moves_waits_until_it_has(tmp_path, monkey
     resumed, _, steps = imitate(tmp_path / "halves", settings_of())
     assert [each.step for each in steps] == [8, 9, 10, 11, 12]
     assert torch.equal(weights(whole), weights(resumed))
+
+
+@pytest.mark.parametrize(("chunk", "at_once"), [(None, [4]), (1, [1, 1, 1, 1]), (3, [3, 1])])
+def test_a_step_in_chunks_has_the_gradient_of_the_whole_and_the_memory_of_a_chunk(
+    tmp_path, monkeypatch, chunk, at_once
+):
+    def gradient(name, **changes):
+        one = settings_of(imitation__steps=1, products="float32", **changes)
+        policy, _, (step,) = imitate(tmp_path / name, one)
+        return torch.cat([each.grad.flatten() for each in policy.parameters()]), step.loss
+
+    whole, loss = gradient("whole")
+    learnt, rows = TinyPolicy.logprobs, []
+
+    def counted(policy, prompts, *rest, **named):
+        rows.append(len(prompts))
+        return learnt(policy, prompts, *rest, **named)
+
+    monkeypatch.setattr(TinyPolicy, "logprobs", counted)
+    parts, loss_of_parts = gradient("parts", imitation__chunk=chunk)
+    assert rows == at_once
+    assert torch.allclose(whole, parts, atol=1e-5)
+    assert loss_of_parts == pytest.approx(loss, rel=1e-5)
 
 
 def test_policy_is_put_back_to_where_it_was_best_on_tasks_set_aside(tmp_path):

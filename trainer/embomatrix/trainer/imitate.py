@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from embomatrix.trainer.settings import ImitationSettings
     from embomatrix.trainer.telling import Teller
 
+    Lesson = tuple[Tokens, Tokens]  # prompt and plan
+
 
 @dataclass
 class ImitationState:
@@ -138,13 +140,22 @@ class Imitation:
         rng = np.random.default_rng(np.random.SeedSequence((self._seed, 1, self.state.step)))
         chosen = rng.integers(len(self._lessons), size=settings.batch)
         lessons = [self._teller.lesson(self._lessons[int(at)], rng) for at in chosen]
-        loss = _total_loss(self._policy, lessons) / sum(len(plan) for _, plan in lessons)
         self._optimiser.zero_grad()
-        torch.autograd.backward(loss)
+        loss = self._learn(lessons)
         torch.nn.utils.clip_grad_norm_(self._policy.parameters(), 1.0)
         interrupts.put_off()
         self._optimiser.step(_shape(share, self.state.step, settings.warmup_steps))
-        return float(loss.detach())
+        return loss
+
+    def _learn(self, lessons: Sequence[Lesson]) -> float:
+        """Add the gradient of the mean loss per plan token, which is returned, chunk by chunk: one at a time is in memory."""
+        tokens, size = _tokens_in(lessons), self._settings.chunk or len(lessons)
+        total = 0.0
+        for at in range(0, len(lessons), size):
+            loss = _total_loss(self._policy, lessons[at : at + size]) / tokens
+            torch.autograd.backward(loss)
+            total += float(loss.detach())
+        return total
 
     def _measure(self) -> float:
         """The loss on the tasks set aside; the policy is kept where it is the lowest so far."""
@@ -165,7 +176,7 @@ class Imitation:
         total = sum(
             float(_total_loss(self._policy, lessons[at : at + batch])) for at in range(0, len(lessons), batch)
         )
-        return total / sum(len(plan) for _, plan in lessons)
+        return total / _tokens_in(lessons)
 
 
 def _parted(
@@ -195,7 +206,12 @@ def _shape(share: float, step: int, warmup: int) -> float:
     return rise * (0.05 + 0.95 * (1 + math.cos(math.pi * min(1.0, share))) / 2)
 
 
-def _total_loss(policy: Policy, lessons: Sequence[tuple[Tokens, Tokens]]) -> Tensor:
+def _tokens_in(lessons: Sequence[Lesson]) -> int:
+    """Tokens of their plans."""
+    return sum(len(plan) for _, plan in lessons)
+
+
+def _total_loss(policy: Policy, lessons: Sequence[Lesson]) -> Tensor:
     """Negative log-likelihood of the plans, summed over their tokens."""
     tokens, mask = padded_plans([plan for _, plan in lessons], policy)
     scored = policy.logprobs([prompt for prompt, _ in lessons], tokens, mask, group=1, temperature=1.0)

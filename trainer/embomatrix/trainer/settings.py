@@ -100,6 +100,9 @@ class ImitationSettings(_Frozen):
     steps: int | None = Field(default=None, ge=0)
     """A number of steps in place of the seconds."""
     batch: int = Field(default=32, ge=1)
+    """Plans of a step."""
+    chunk: int | None = Field(default=None, ge=1)
+    """Plans that are learnt from at once: a step's gradient is accumulated over chunks, and memory is a chunk's. None: all."""
     optimiser: OptimiserKind = OptimiserKind.MUON
     learning_rate: float = Field(default=2e-3, gt=0)
     """AdamW's."""
@@ -233,6 +236,7 @@ LANGUAGE_MODEL_DEFAULTS: Final[Mapping[str, Any]] = {
     "prompt.rows": 28,
     "prompt.rename_share": 0.0,
     "imitation.batch": 4,
+    "imitation.chunk": 1,
     "imitation.optimiser": "adamw",
     "imitation.learning_rate": 5e-5,
     "grpo.tasks_per_step": 4,
