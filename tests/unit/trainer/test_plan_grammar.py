@@ -68,6 +68,17 @@ def test_a_policy_that_knows_nothing_still_writes_plans_that_call_what_is_told(t
             assert call.room_name is None or call.room_name in task.situation.rooms
 
 
+def test_a_room_that_instructions_call_by_its_number_can_still_be_gone_to():
+    situation = TASKS.train[0].situation
+    room = situation.rooms[0]
+    words = build_vocabulary([situation], [f"Put the apple away in {room}."] * 3)
+    grammar = PlanGrammar(words, torch.device("cpu"))
+    names = grammar.names(torch.tensor([words.encode(prompt_for(situation, Codec.NAMES).user)]))
+    cursor = grammar.advanced(grammar.start(1), torch.tensor([words.index["go_to_room"]]))
+    allowed = {words.words[token] for token in (~grammar.barred(cursor, names)[0]).nonzero()[:, 0].tolist()}
+    assert allowed == {room.rpartition("_")[0] for room in situation.rooms}
+
+
 @pytest.mark.parametrize("task", TASKS.train, ids=lambda task: task.task.task_id)
 def test_no_word_of_an_oracle_s_plan_is_barred(task):
     text = plan_in_names(task.oracle, task.situation)
