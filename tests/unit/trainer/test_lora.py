@@ -104,7 +104,8 @@ def learnt(policy):
 def test_a_model_with_new_adapters_is_the_model(tokenizer):
     plain, adapted = policy_of(tokenizer), policy_of(tokenizer)
     adapted.adapt(SHAPE, seed=0)
-    assert torch.equal(scored(plain).logprobs, scored(adapted).logprobs)
+    # Where weights lie in memory decides which of two kernels multiplies: they differ by a bit.
+    assert torch.allclose(scored(plain).logprobs, scored(adapted).logprobs, atol=2e-6)
 
 
 def test_adapters_alone_learn_and_the_output_layer_has_none(tokenizer):
