@@ -243,18 +243,23 @@ def test_an_experiment_that_can_not_be_made_is_told_why_at_once(dataset, tmp_pat
     assert not (tmp_path / "out").exists()
 
 
-def test_a_bench_has_a_line_for_each_stage(tmp_path):
+@pytest.mark.parametrize(
+    ("bench", "figure"),
+    [
+        ("build/internal-verified", "internal_verified_success"),
+        ("eai", "eai_world_success"),
+        ("eai-native", "eai_native_success"),
+    ],
+)
+def test_a_bench_has_a_line_for_each_stage(tmp_path, bench, figure):
     stages = (Stage("imitation", tmp_path / "a"), Stage("GRPO", tmp_path / "b"))
     for stage, value in zip(stages, (0.25, 0.5), strict=True):
         estimate = {"value": value, "low": 0.1, "high": 0.8}
         overall = {"success": estimate, "partial": estimate, "tasks": 4}
-        path = stage.report(tmp_path, "build/internal-verified")
+        path = stage.report(tmp_path, bench)
         path.parent.mkdir(parents=True)
         path.write_text(json.dumps({"overall": overall, "categories": {}, "samples": 40}))
-    found = bench_rows(tmp_path, "build/internal-verified", stages)
-    assert [(figure.name, figure.value) for figure in found.figures] == [
-        ("internal_verified_success_before", 0.25),
-        ("internal_verified_success_after", 0.5),
-    ]
+    found = bench_rows(tmp_path, bench, stages)
+    assert [(each.name, each.value) for each in found.figures] == [(f"{figure}_before", 0.25), (figure, 0.5)]
     text = benchmark_section(tmp_path, [found], "abc", TODAY)
     assert "| GRPO | 50.0 [10.0, 80.0] |" in text
