@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import os
 import signal
 import subprocess
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.cli.failure import INTERRUPTED, fail
 from embomatrix.cli.local_cluster import without_membership
 from embomatrix.cli.supervisor import embomatrix_command
-from embomatrix.host.parent import die_with_parent
+from embomatrix.host.parent import with_this_process
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -32,7 +31,7 @@ def run_command(command: str, problem: Callable[[], str], *arguments: str) -> No
     with subprocess.Popen(
         embomatrix_command(*arguments),
         start_new_session=True,
-        preexec_fn=functools.partial(die_with_parent, os.getpid(), signal.SIGTERM),
+        preexec_fn=with_this_process(signal.SIGTERM),
         env=without_membership(os.environ),
     ) as child:
         try:

@@ -9,9 +9,7 @@ outlives it: on Linux children die with this process even when it is killed.
 from __future__ import annotations
 
 import contextlib
-import functools
 import logging
-import os
 import signal
 import subprocess
 import sys
@@ -21,7 +19,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, Self
 
 from embomatrix.cli.failure import MENDABLE
-from embomatrix.host.parent import die_with_parent
+from embomatrix.host.parent import with_this_process
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -125,7 +123,7 @@ class Supervisor:
                 stderr=subprocess.STDOUT,
                 # Ctrl-C in a terminal is for the command in front; what it needs ends after it, in order.
                 start_new_session=True,
-                preexec_fn=functools.partial(die_with_parent, os.getpid(), signal.SIGTERM),
+                preexec_fn=with_this_process(signal.SIGTERM),
             )
 
     def _watch(self) -> None:

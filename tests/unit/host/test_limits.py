@@ -74,12 +74,11 @@ def test_cores_are_those_of_the_affinity_as_far_as_the_quota_goes():
 
 
 DIES_WITH_ITS_PARENT = """
-import os, subprocess, sys, time
-from functools import partial
+import subprocess, sys, time
 from signal import SIGTERM
-from embomatrix.host.parent import die_with_parent
-before = partial(die_with_parent, os.getpid(), SIGTERM)
-print(subprocess.Popen([sys.executable, "-c", "import time; time.sleep(300)"], preexec_fn=before).pid, flush=True)
+from embomatrix.host.parent import with_this_process
+sleeper = [sys.executable, "-c", "import time; time.sleep(300)"]
+print(subprocess.Popen(sleeper, preexec_fn=with_this_process(SIGTERM)).pid, flush=True)
 time.sleep(300)
 """
 

@@ -30,10 +30,10 @@ if TYPE_CHECKING:
 MAY_CHANGE: Final = frozenset(
     {
         *("device", "threads", "processes", "track", "checkpoint_every", "keep_checkpoints", "samples_every"),
-        *("grpo.minutes", "grpo.steps", "imitation.seconds", "imitation.steps"),
+        *("grpo.minutes", "grpo.steps", "imitation.seconds", "imitation.steps", "imitation.chunk"),
     }
 )
-"""Settings that may differ when a run goes on: how long it takes, where it runs and what is told of it."""
+"""Settings that may differ when a run goes on: how long it takes, where it runs and in how much memory, what is told of it."""
 LATER: Final = ("grpo.", "reward.", "evaluation.")
 """Settings of what comes after imitation: until then they may change too."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import os
 import re
 import subprocess
@@ -12,7 +11,7 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.host.parent import die_with_parent
+from embomatrix.host.parent import with_this_process
 from embomatrix.worker.bench_figures import BenchError
 
 if TYPE_CHECKING:
@@ -123,7 +122,7 @@ def running_program(folder: Path, name: str, *command: str) -> Iterator[Process]
             stdin=subprocess.DEVNULL,
             stdout=file,
             stderr=subprocess.STDOUT,
-            preexec_fn=functools.partial(die_with_parent, os.getpid()),
+            preexec_fn=with_this_process(),
         )
     try:
         yield Process(name, child, log)

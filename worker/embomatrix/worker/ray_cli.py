@@ -6,7 +6,6 @@ affair, as with any worker.
 
 from __future__ import annotations
 
-import functools
 import importlib
 import os
 import subprocess
@@ -18,7 +17,7 @@ from typing import Annotated, Any, Final
 import typer
 from rich.console import Console
 
-from embomatrix.host.parent import die_with_parent
+from embomatrix.host.parent import with_this_process
 from embomatrix.worker.settings_cli import fail
 
 DRAIN_S: Final = 90.0
@@ -34,9 +33,7 @@ class PlacedWorker:
         folder = Path(tempfile.gettempdir()) / f"embomatrix-{os.getuid()}" / name
         command = [sys.executable, "-m", "embomatrix.cli", "worker", "run", "--name", name]
         folders = [f"--cache-dir={folder / 'cache'}", f"--state-dir={folder / 'state'}"]
-        self._child = subprocess.Popen(
-            [*command, *folders, *arguments], preexec_fn=functools.partial(die_with_parent, os.getpid())
-        )
+        self._child = subprocess.Popen([*command, *folders, *arguments], preexec_fn=with_this_process())
 
     def ended(self) -> int:
         """Exit status of the daemon, once it is over. Any other than a final one ends the actor: Ray makes it anew."""
