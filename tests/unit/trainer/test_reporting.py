@@ -49,7 +49,7 @@ def test_the_best_and_the_worst_plan_of_a_group_are_shown_and_a_lost_one_last():
     group = GroupLog(ORACLE_TASK, (bad, lost, good), (-1.0, math.nan, 1.0), dead=False)
     Reporter(told.append).sampled(4, [group])
     (report,) = told
-    assert report.step == 4
+    assert (report.step, report.figures) == (4, {})
     assert [plan.text for plan in report.plans] == [good.text, bad.text, lost.text]
     assert report.plans[1].problem
     assert (report.plans[2].reward, report.plans[2].advantage) == (None, 0.0)
