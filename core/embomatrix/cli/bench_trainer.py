@@ -26,7 +26,7 @@ from embomatrix.trainer.bench.load import load_of, write_load
 from embomatrix.trainer.data import load_tasks
 from embomatrix.trainer.errors import TrainerError
 from embomatrix.trainer.recorder import read_metrics
-from embomatrix.trainer.stopwatch import Activity
+from embomatrix.trainer.stopwatch import TimeShares
 from embomatrix.worker.bench_figures import BenchError
 
 if TYPE_CHECKING:
@@ -129,13 +129,10 @@ class Shares:
         """``earlier_s`` is what the run had spent before them, by activity."""
         seconds = float(sum(record["seconds"] for record in records))
         spent_s: Mapping[str, float] = records[-1]["spent_s"]
-
-        def share(activity: Activity) -> float:
-            return (spent_s.get(activity.value, 0.0) - earlier_s.get(activity.value, 0.0)) / seconds
-
-        overhead = 1.0 - share(Activity.SAMPLING) - share(Activity.UPDATE)
+        since = {activity: spent - earlier_s.get(activity, 0.0) for activity, spent in spent_s.items()}
+        shares = TimeShares(seconds, since)
         rollouts = sum(record["rollouts"] for record in records)
-        return cls(len(records), share(Activity.WAITING), overhead, rollouts / seconds)
+        return cls(len(records), shares.waiting, shares.overhead, rollouts / seconds)
 
 
 def _evaluation(dataset: Path, folder: Path, on_step: Callable[[str], None]) -> list[Figure]:

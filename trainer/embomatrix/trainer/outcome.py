@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from embomatrix.trainer.errors import TrainerError, reason_of
-from embomatrix.trainer.stopwatch import Activity
+from embomatrix.trainer.stopwatch import TimeShares
 from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:
@@ -51,15 +50,12 @@ class RunOutcome:
     @property
     def wait_share(self) -> float:
         """Share of GRPO's steps in which the trainer stood still for simulation; NaN without a step."""
-        return self._share_of(Activity.WAITING)
+        return TimeShares(self.grpo_s, self.spent_s).waiting
 
     @property
     def overhead(self) -> float:
         """Share of GRPO's steps in which the model neither sampled nor learnt: waiting and all that is around it."""
-        return 1.0 - self._share_of(Activity.SAMPLING) - self._share_of(Activity.UPDATE)
-
-    def _share_of(self, activity: Activity) -> float:
-        return self.spent_s.get(activity.value, 0.0) / self.grpo_s if self.grpo_s else math.nan
+        return TimeShares(self.grpo_s, self.spent_s).overhead
 
 
 def write_outcome(folder: Path, outcome: RunOutcome) -> Path:

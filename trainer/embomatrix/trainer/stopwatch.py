@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import time
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Mapping
 
 
 class Activity(StrEnum):
@@ -18,6 +20,27 @@ class Activity(StrEnum):
     WAITING = "waiting for simulation"
     UPDATE = "update"
     SAVING = "saving"
+
+
+@dataclass(frozen=True, slots=True)
+class TimeShares:
+    """Where the time of GRPO's steps went: ``seconds`` in all, of which ``spent_s`` tells parts by activity. NaN of no time."""
+
+    seconds: float
+    spent_s: Mapping[str, float]
+
+    @property
+    def waiting(self) -> float:
+        """Share in which the trainer stood still for simulation."""
+        return self._of(Activity.WAITING)
+
+    @property
+    def overhead(self) -> float:
+        """Share in which the model neither sampled nor learnt: waiting and all that is around it."""
+        return 1.0 - self._of(Activity.SAMPLING) - self._of(Activity.UPDATE)
+
+    def _of(self, activity: Activity) -> float:
+        return self.spent_s.get(activity.value, 0.0) / self.seconds if self.seconds else math.nan
 
 
 class Stopwatch:

@@ -60,9 +60,10 @@ def build_vocabulary(
                 numbers |= {int(number[1:])} if number else set()
     counts = Counter(word for text in instructions for word in _WORD.findall(text.lower()))
     frequent = sorted(word for word, count in counts.items() if count >= min_count)
+    named = things | rooms
     # An instruction that says living_room_0 is to be read as the table's names are: as a stem and a number.
-    words |= dict.fromkeys(word for word in frequent if _split_number(word)[0] not in things | rooms)
-    words |= things | rooms
+    words |= dict.fromkeys(word for word in frequent if _split_number(word)[0] not in named)
+    words |= named
     words |= dict.fromkeys(f"_{number}" for number in range(max(numbers) + 1))
     return Vocabulary((*SPECIAL, *words), tuple(things), tuple(rooms))
 
