@@ -261,6 +261,18 @@ def test_model_folder_without_a_tokenizer_is_told_what_it_lacks(tmp_path):
         HfPolicy.load(tmp_path, Codec.LINES)
 
 
+def test_without_transformers_a_folder_that_is_not_there_is_told_first(tmp_path, monkeypatch):
+    for library in ("transformers", "huggingface_hub"):
+        monkeypatch.setitem(sys.modules, library, None)
+    (tmp_path / "tokenizer.json").write_text("{}")
+    with pytest.raises(TrainerError, match=rf"the model '{tmp_path}' needs transformers: `pip install"):
+        HfPolicy.load(tmp_path, Codec.LINES)
+    with pytest.raises(
+        TrainerError, match="'runs/nowhere' is no folder here, and one by a Hugging Face name needs"
+    ):
+        HfPolicy.load("runs/nowhere", Codec.LINES)
+
+
 def test_a_saved_policy_is_measured_in_the_codec_that_it_was_taught_and_another_model_in_json(
     policy, tokenizer, tmp_path
 ):

@@ -85,8 +85,9 @@ class HfPolicy:
             from transformers import AutoModelForCausalLM, AutoTokenizer
             from transformers.utils import logging as transformers_logging
         except ImportError as error:
+            absent = "" if Path(name).is_dir() else " is no folder here, and one by a Hugging Face name"
             raise TrainerError(
-                f"the model {str(name)!r} needs transformers: `pip install 'embomatrix[hf]'`, or --model tiny"
+                f"the model {str(name)!r}{absent} needs transformers: `pip install 'embomatrix[hf]'`, or --model tiny"
             ) from error
         # Its bars would be drawn into ours.
         transformers_logging.disable_progress_bar()  # type: ignore[no-untyped-call]
