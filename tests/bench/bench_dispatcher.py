@@ -7,11 +7,17 @@ import json
 import sys
 import time
 
-from embomatrix.manager.cluster_state import ClusterState
-from embomatrix.manager.commands import DeliverResult, GiveLease, SetDesired
-from embomatrix.manager.events import BatchSubmitted, LeaseFinished, Tick, WorkerJoined, WorkerReported
+from embomatrix.manager.control.cluster_state import ClusterState
+from embomatrix.manager.control.commands import DeliverResult, GiveLease, SetDesired
+from embomatrix.manager.control.events import (
+    BatchSubmitted,
+    LeaseFinished,
+    Tick,
+    WorkerJoined,
+    WorkerReported,
+)
 from embomatrix.reward.breakdown import RewardBreakdown
-from embomatrix.rpc.values import (
+from embomatrix.rpc.wire.values import (
     Batch,
     Completed,
     Resident,

@@ -11,12 +11,12 @@ from tests.fakes.commands import background, run, run_anew
 
 from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.status import InvalidRequestError
-from embomatrix.rpc.values import Batch, Completed, Rollout
+from embomatrix.rpc.wire.values import Batch, Completed, Rollout
 from embomatrix.skills.parse import plan_from_json
-from embomatrix.trainer.checkpoint import CheckpointStore, Progress
-from embomatrix.trainer.data import load_tasks
 from embomatrix.trainer.policy.choice import new_policy
-from embomatrix.trainer.settings import read_settings
+from embomatrix.trainer.run.checkpoint import CheckpointStore, Progress
+from embomatrix.trainer.run.data import load_tasks
+from embomatrix.trainer.run.settings import read_settings
 from embomatrix.world.dataset import Dataset
 
 NOWHERE = "127.0.0.1:1"

@@ -12,7 +12,7 @@ from tests.fakes.worker import FakeWorker
 from tests.integration.test_manager_service import batch, manager, open_run, outcomes
 
 from embomatrix.rpc.client import ClusterClient
-from embomatrix.rpc.values import Batch, Completed, LookaheadEntry, Rollout
+from embomatrix.rpc.wire.values import Batch, Completed, LookaheadEntry, Rollout
 from embomatrix.skills.parse import plan_from_json
 from embomatrix.world.dataset import Dataset
 

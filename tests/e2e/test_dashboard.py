@@ -11,7 +11,7 @@ from tests.integration.test_manager_service import manager
 
 from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.training import RewardTiers, SampledPlan, SampledStep, TrainingReport
-from embomatrix.rpc.values import Batch, Completed, LookaheadEntry, Rollout
+from embomatrix.rpc.wire.values import Batch, Completed, LookaheadEntry, Rollout
 from embomatrix.skills.parse import plan_from_json
 from embomatrix.world.dataset import Dataset
 

@@ -10,7 +10,7 @@ from tests.fakes.worker import FakeWorker
 from tests.integration.test_manager_service import BEDROOM, KITCHEN, batch, manager, open_run
 
 from embomatrix.cli.local_cluster import free_port
-from embomatrix.rpc.values import LookaheadEntry
+from embomatrix.rpc.wire.values import LookaheadEntry
 
 SIZES = {"desk": (1366, 900), "phone": (390, 844)}
 PAGES = ("overview", "workers", "lookahead", "timeline", "failures", "training", "tasks")

@@ -6,7 +6,7 @@ import re
 from tests.fakes.commands import background, run
 
 from embomatrix.rpc.client import ClusterClient
-from embomatrix.rpc.values import Batch, Completed, InfraFailure, Rollout
+from embomatrix.rpc.wire.values import Batch, Completed, InfraFailure, Rollout
 from embomatrix.skills.parse import plan_from_json
 from embomatrix.world.dataset import Dataset
 

@@ -10,7 +10,7 @@ import pytest
 from tests.fakes.commands import background
 
 from embomatrix.rpc.client import ClusterClient
-from embomatrix.rpc.values import Batch, Completed, Rollout
+from embomatrix.rpc.wire.values import Batch, Completed, Rollout
 from embomatrix.skills.parse import plan_from_json
 from embomatrix.world.dataset import Dataset
 

@@ -13,10 +13,10 @@ from embomatrix.proto.v1 import (
     scene_service_pb2_grpc,
 )
 from embomatrix.rpc.channel import SERVER_OPTIONS, TOKEN_KEY
-from embomatrix.rpc.convert_batch import batch_from_proto
-from embomatrix.rpc.convert_outcome import rollout_result_to_proto
 from embomatrix.rpc.status import NotFoundError, NotSignedInError, translate
-from embomatrix.rpc.values import Cancelled, RolloutResult
+from embomatrix.rpc.wire.batch import batch_from_proto
+from embomatrix.rpc.wire.outcome import rollout_result_to_proto
+from embomatrix.rpc.wire.values import Cancelled, RolloutResult
 
 
 @dataclass

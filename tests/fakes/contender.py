@@ -1,7 +1,7 @@
 """A contender without processes: it answers at once what it is told to."""
 
-from embomatrix.rpc.values import Completed
-from embomatrix.worker.bench_contender import Done
+from embomatrix.bench.peers.contender import Done
+from embomatrix.rpc.wire.values import Completed
 
 
 class FakeContender:

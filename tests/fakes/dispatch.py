@@ -2,16 +2,16 @@
 
 from tests.fakes.worker import completed
 
-from embomatrix.manager.assignments import DispatchLimits
-from embomatrix.manager.commands import DeliverResult, GiveLease
-from embomatrix.manager.dispatcher import Dispatcher
-from embomatrix.manager.events import (
+from embomatrix.manager.control.commands import DeliverResult, GiveLease
+from embomatrix.manager.control.dispatch.assignments import DispatchLimits
+from embomatrix.manager.control.dispatch.dispatcher import Dispatcher
+from embomatrix.manager.control.events import (
     BatchSubmitted,
     LeaseFinished,
     WorkerJoined,
     WorkerReported,
 )
-from embomatrix.rpc.values import (
+from embomatrix.rpc.wire.values import (
     Batch,
     InfraCode,
     InfraFailure,

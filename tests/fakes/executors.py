@@ -1,6 +1,6 @@
 """Where an evaluation's plans are executed in tests: in this process, by the code that local processes run."""
 
-from embomatrix.worker.rollout_pool import execute_scene
+from embomatrix.worker.slots.rollout_pool import execute_scene
 
 
 class HereExecutor:

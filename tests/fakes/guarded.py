@@ -9,12 +9,12 @@ from pathlib import Path
 from tests.fakes.worker import FakeWorker
 
 from embomatrix.manager.access.folder import AccessFolder, prepare
-from embomatrix.manager.app import running
+from embomatrix.manager.runtime.app import running
 from embomatrix.manager.settings import ManagerSettings
 from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.roles import Role
 from embomatrix.rpc.token_client import TokenClient
-from embomatrix.rpc.values import Batch, Rollout
+from embomatrix.rpc.wire.values import Batch, Rollout
 from embomatrix.world.inflation import bundle_digest
 
 

@@ -9,16 +9,16 @@ import grpc
 from embomatrix.proto.v1 import worker_service_pb2 as pb
 from embomatrix.proto.v1 import worker_service_pb2_grpc
 from embomatrix.rpc.channel import SERVER_OPTIONS, chunks_of
-from embomatrix.rpc.convert_session import (
+from embomatrix.rpc.leases import Lease, LeaseRef
+from embomatrix.rpc.status import NotFoundError, SupersededError, translate
+from embomatrix.rpc.wire.session import (
     lease_ref_to_proto,
     lease_result_from_proto,
     lease_to_proto,
     resources_from_proto,
     worker_state_from_proto,
 )
-from embomatrix.rpc.leases import Lease, LeaseRef
-from embomatrix.rpc.status import NotFoundError, SupersededError, translate
-from embomatrix.rpc.values import Rollout
+from embomatrix.rpc.wire.values import Rollout
 from embomatrix.world.inflation import bundle_digest
 
 

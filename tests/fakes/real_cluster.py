@@ -17,7 +17,7 @@ from pathlib import Path
 from embomatrix.cli.local_cluster import free_port
 from embomatrix.rpc.client import ClientLimits, ClusterClient
 from embomatrix.rpc.status import ClusterError
-from embomatrix.rpc.values import Batch, Completed, InfraFailure, Rollout
+from embomatrix.rpc.wire.values import Batch, Completed, InfraFailure, Rollout
 from embomatrix.world.inflation import bundle_digest
 
 FAKES = Path(__file__).parent

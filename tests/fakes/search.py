@@ -18,8 +18,8 @@ from tests.fakes.plans import task_over, words_of
 from tests.fakes.scenes import NORTH, SOUTH, WEST, placed, scene_of, upright
 
 from embomatrix.sim.executor import Simulator
+from embomatrix.sim.placing.pose_cache import build_pose_cache
 from embomatrix.sim.planner.oracle import PROOF_SEEDS, PlanNotFound, find_plan
-from embomatrix.sim.pose_cache import build_pose_cache
 from embomatrix.skills.check import check
 from embomatrix.skills.syntax import PlaceRelation, Skill, SkillCall
 from embomatrix.world.bundle import Bundle

@@ -11,8 +11,8 @@ import time
 import zlib
 
 from embomatrix.reward.breakdown import AtomResult, RewardBreakdown
-from embomatrix.rpc.values import Completed, Timings
-from embomatrix.worker.slot_program import BundleCorruptError, run_program
+from embomatrix.rpc.wire.values import Completed, Timings
+from embomatrix.worker.slots.slot_program import BundleCorruptError, run_program
 
 PROGRAM = (sys.executable, __file__)
 

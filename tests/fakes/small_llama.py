@@ -3,7 +3,7 @@
 import torch
 
 from embomatrix.skills.prompt import Codec, prompt_for
-from embomatrix.trainer.telling import plan_text
+from embomatrix.trainer.policy.prompts import plan_text
 
 
 def word_tokenizer(tasks):

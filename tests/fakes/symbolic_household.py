@@ -13,7 +13,7 @@ import numpy as np
 
 from embomatrix.reward.hierarchy import score
 from embomatrix.reward.settings import PAPER, RewardSettings
-from embomatrix.rpc.values import (
+from embomatrix.rpc.wire.values import (
     Completed,
     InfraCode,
     InfraFailure,
@@ -26,7 +26,7 @@ from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.prompt import Row, Situation
 from embomatrix.skills.syntax import PlaceRelation, Skill, SkillCall
 from embomatrix.skills.trace import Step
-from embomatrix.trainer.data import TaskSet, TrainingTask
+from embomatrix.trainer.run.data import TaskSet, TrainingTask
 from embomatrix.world.goal import And, Atom, Not
 from embomatrix.world.state import Relation
 from embomatrix.world.task import Task, TaskCategory

@@ -12,7 +12,9 @@ from embomatrix.proto.v1 import worker_service_pb2_grpc
 from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.reward.settings import PAPER
 from embomatrix.rpc.channel import open_channel
-from embomatrix.rpc.convert_session import (
+from embomatrix.rpc.leases import LeaseResult, WorkerState
+from embomatrix.rpc.versions import PROTOCOL_VERSION
+from embomatrix.rpc.wire.session import (
     lease_from_proto,
     lease_ref_from_proto,
     lease_ref_to_proto,
@@ -20,8 +22,7 @@ from embomatrix.rpc.convert_session import (
     resources_to_proto,
     worker_state_to_proto,
 )
-from embomatrix.rpc.leases import LeaseResult, WorkerState
-from embomatrix.rpc.values import (
+from embomatrix.rpc.wire.values import (
     Completed,
     InfraCode,
     InfraFailure,
@@ -30,7 +31,6 @@ from embomatrix.rpc.values import (
     Resources,
     Timings,
 )
-from embomatrix.rpc.versions import PROTOCOL_VERSION
 
 
 def completed(worker_id="w1", reward=PAPER):

@@ -16,11 +16,11 @@ from pathlib import Path
 
 import numpy as np
 
-from embomatrix.rpc.values import Resources
-from embomatrix.worker.daemon import Daemon, serve
-from embomatrix.worker.machine import Machine, Owner
-from embomatrix.worker.preferences import Preferences
-from embomatrix.worker.settings import WorkerSettings
+from embomatrix.rpc.wire.values import Resources
+from embomatrix.worker.host.machine import Machine, Owner
+from embomatrix.worker.host.preferences import Preferences
+from embomatrix.worker.host.settings import WorkerSettings
+from embomatrix.worker.link.daemon import Daemon, serve
 
 SIMULATION = Path(__file__).with_name("simulation.py")
 

@@ -10,8 +10,8 @@ import pytest
 import uvicorn
 
 from embomatrix.manager.access.folder import prepare
-from embomatrix.manager.door import Door
-from embomatrix.manager.http_connections import BoundedConnections, connections_through
+from embomatrix.manager.web.door import Door
+from embomatrix.manager.web.http_connections import BoundedConnections, connections_through
 
 pytestmark = pytest.mark.timeout(120)
 MOST = 8

@@ -9,7 +9,7 @@ from tests.fakes.worker import FakeWorker
 from tests.integration.test_manager_service import KITCHEN, manager, open_run
 from tests.integration.test_rest import http_at
 
-from embomatrix.manager.rewards import REWARDS, RUN_ID
+from embomatrix.manager.web.rewards import REWARDS, RUN_ID
 from embomatrix.rpc.reward_label import RewardLabel
 from embomatrix.rpc.roles import Role
 from embomatrix.world.task import Profile

@@ -17,10 +17,10 @@ from tests.fakes.guarded import (
 from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.roles import Role
 from embomatrix.rpc.trust import Invitation, fingerprint_of
-from embomatrix.rpc.values import Resources
-from embomatrix.worker.daemon import Daemon
-from embomatrix.worker.membership import membership_of
-from embomatrix.worker.settings import WorkerSettings
+from embomatrix.rpc.wire.values import Resources
+from embomatrix.worker.host.settings import WorkerSettings
+from embomatrix.worker.link.daemon import Daemon
+from embomatrix.worker.link.membership import membership_of
 
 pytestmark = pytest.mark.timeout(120)
 

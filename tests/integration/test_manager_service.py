@@ -12,7 +12,7 @@ import httpx
 import pytest
 from tests.fakes.worker import FakeWorker, completed
 
-from embomatrix.manager.app import running
+from embomatrix.manager.runtime.app import running
 from embomatrix.manager.settings import ManagerSettings
 from embomatrix.manager.store.protocol import Candidate, FencedError
 from embomatrix.manager.store.sqlite import SqliteStore
@@ -29,7 +29,7 @@ from embomatrix.rpc.status import (
     SupersededError,
     cluster_error,
 )
-from embomatrix.rpc.values import (
+from embomatrix.rpc.wire.values import (
     Batch,
     Cancelled,
     Completed,

@@ -10,7 +10,7 @@ from tests.fakes.worker import FakeWorker
 from tests.integration.test_manager_service import KITCHEN, batch, manager, open_run, outcomes, until
 
 from embomatrix.rpc.run_log import Phase
-from embomatrix.rpc.values import Batch, LookaheadEntry, Warmth
+from embomatrix.rpc.wire.values import Batch, LookaheadEntry, Warmth
 
 pytestmark = pytest.mark.timeout(60)
 

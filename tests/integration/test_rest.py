@@ -11,11 +11,11 @@ from tests.contract.test_state_store import no_file_grows
 from tests.fakes.worker import FakeWorker
 from tests.integration.test_manager_service import BEDROOM, KITCHEN, batch, manager, open_run, outcomes
 
-from embomatrix.manager.rest import PREFIX, VIEWERS
+from embomatrix.manager.web.rest import PREFIX, VIEWERS
 from embomatrix.rpc.admin import AdminClient
 from embomatrix.rpc.status import NotFoundError
 from embomatrix.rpc.training import RewardTiers, SampledPlan, TrainingReport
-from embomatrix.rpc.values import LookaheadEntry
+from embomatrix.rpc.wire.values import LookaheadEntry
 
 pytestmark = pytest.mark.timeout(60)
 
@@ -254,7 +254,7 @@ async def test_the_page_loads_nothing_from_elsewhere_and_no_file_but_its_own(tmp
     assert "http" not in page.text.replace("http://www.w3.org", "")
     assert {told.status_code for told in texts.values()} == {200}
     scripts = {path.removeprefix("/static/") for path in texts if path.endswith(".js")}
-    shipped = files("embomatrix.manager") / "dashboard"
+    shipped = files("embomatrix.manager.web") / "dashboard"
     assert scripts == {item.name for item in shipped.iterdir() if item.name.endswith(".js")} | {
         "vendor/uPlot.iife.min.js"
     }

@@ -7,7 +7,7 @@ from tests.integration.test_manager_service import KITCHEN, batch, manager, open
 from embomatrix.rpc.admin import AdminClient
 from embomatrix.rpc.run_log import EventKind, Phase
 from embomatrix.rpc.status import NotFoundError
-from embomatrix.rpc.values import Batch, LookaheadEntry
+from embomatrix.rpc.wire.values import Batch, LookaheadEntry
 
 pytestmark = pytest.mark.timeout(60)
 

@@ -14,7 +14,7 @@ from embomatrix.rpc.admin import AdminClient
 from embomatrix.rpc.channel import open_channel
 from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.status import ConflictError, InvalidRequestError, PreconditionError, cluster_errors
-from embomatrix.rpc.values import Completed, GroupPolicy, InfraFailure, LookaheadEntry, RunTerms, Warmth
+from embomatrix.rpc.wire.values import Completed, GroupPolicy, InfraFailure, LookaheadEntry, RunTerms, Warmth
 
 pytestmark = pytest.mark.timeout(60)
 OWN = RewardSettings(unparsable=-2.0, format=1.0, relevance_per_object=0.0, relevance_limit=0.0, goal=8.0)

@@ -7,13 +7,13 @@ import pytest
 from tests.fakes.guarded import packed
 from tests.fakes.worker import FakeWorker
 
-from embomatrix.manager.app import running
+from embomatrix.manager.runtime.app import running
 from embomatrix.manager.settings import ManagerSettings
 from embomatrix.proto.v1 import rollout_service_pb2 as pb
 from embomatrix.rpc.admin import AdminClient
 from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.status import NotFoundError
-from embomatrix.rpc.values import (
+from embomatrix.rpc.wire.values import (
     Batch,
     Cancelled,
     Completed,

@@ -22,7 +22,6 @@ from tests.fakes.worker import completed
 
 from embomatrix.proto.v1 import admin_service_pb2, rollout_service_pb2, types_pb2, worker_service_pb2
 from embomatrix.rpc.client import ClientLimits, ClusterClient
-from embomatrix.rpc.convert_session import lease_result_to_proto
 from embomatrix.rpc.leases import LeaseRef, LeaseResult
 from embomatrix.rpc.roles import Role
 from embomatrix.rpc.status import (
@@ -32,7 +31,8 @@ from embomatrix.rpc.status import (
     NotAllowedError,
 )
 from embomatrix.rpc.trust import Invitation, fetch_ca, fingerprint_of
-from embomatrix.rpc.values import Batch, Completed
+from embomatrix.rpc.wire.session import lease_result_to_proto
+from embomatrix.rpc.wire.values import Batch, Completed
 from embomatrix.world.inflation import bundle_digest
 
 pytestmark = pytest.mark.timeout(120)

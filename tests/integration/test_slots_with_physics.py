@@ -16,19 +16,19 @@ from tests.fakes.scenes import kitchen_scene, kitchen_tasks
 
 from embomatrix.reward.settings import PAPER, RewardSettings
 from embomatrix.rpc.leases import Lease, LeaseRef
-from embomatrix.rpc.values import (
+from embomatrix.rpc.wire.values import (
     Completed,
     InfraCode,
     ResidentState,
     Rollout,
 )
 from embomatrix.sim.executor import Simulator
-from embomatrix.sim.pose_cache import build_pose_cache
-from embomatrix.sim.prepared import prepare
+from embomatrix.sim.floor.prepared import prepare
+from embomatrix.sim.placing.pose_cache import build_pose_cache
 from embomatrix.sim.zygote import private_mb
 from embomatrix.skills.syntax import MAX_STEPS
-from embomatrix.worker.residents import SlotLimits
-from embomatrix.worker.slots import SlotPool
+from embomatrix.worker.slots.pool import SlotPool
+from embomatrix.worker.slots.residents import SlotLimits
 from embomatrix.world.bundle import Bundle, encode_bundle
 from embomatrix.world.inflation import bundle_digest
 

@@ -20,7 +20,7 @@ from tests.fakes.guarded import (
 from tests.fakes.redis_server import RedisServer
 
 from embomatrix.cli.local_cluster import free_port
-from embomatrix.manager.app import running
+from embomatrix.manager.runtime.app import running
 from embomatrix.manager.settings import ManagerSettings
 from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.roles import Role
@@ -31,7 +31,7 @@ from embomatrix.rpc.status import (
     StandbyError,
 )
 from embomatrix.rpc.token_client import TokenClient
-from embomatrix.rpc.values import Batch, Completed
+from embomatrix.rpc.wire.values import Batch, Completed
 
 pytestmark = pytest.mark.timeout(120)
 

@@ -20,13 +20,13 @@ from embomatrix.proto.v1 import (
 from embomatrix.rpc.capabilities import capabilities_of
 from embomatrix.rpc.channel import open_channel
 from embomatrix.rpc.client import ClusterClient
-from embomatrix.rpc.convert_batch import batch_to_proto
-from embomatrix.rpc.convert_outcome import rollout_result_from_proto
 from embomatrix.rpc.status import PreconditionError, cluster_errors
-from embomatrix.rpc.values import Batch, Completed, Resources, Rollout
 from embomatrix.rpc.versions import SPOKEN, VersionRange, agree
-from embomatrix.worker.daemon import Daemon
-from embomatrix.worker.settings import WorkerSettings
+from embomatrix.rpc.wire.batch import batch_to_proto
+from embomatrix.rpc.wire.outcome import rollout_result_from_proto
+from embomatrix.rpc.wire.values import Batch, Completed, Resources, Rollout
+from embomatrix.worker.host.settings import WorkerSettings
+from embomatrix.worker.link.daemon import Daemon
 
 pytestmark = pytest.mark.timeout(60)
 

@@ -13,9 +13,9 @@ from embomatrix.manager.store.url import open_store
 from embomatrix.rpc.admin import AdminClient
 from embomatrix.rpc.client import ClusterClient
 from embomatrix.rpc.status import UnavailableError
-from embomatrix.rpc.values import Completed, GroupPolicy, Resources, RunTerms
-from embomatrix.worker.membership import Membership
-from embomatrix.worker.session import register
+from embomatrix.rpc.wire.values import Completed, GroupPolicy, Resources, RunTerms
+from embomatrix.worker.link.membership import Membership
+from embomatrix.worker.link.session import register
 
 pytestmark = pytest.mark.timeout(60)
 VERIFIED = RunTerms(GroupPolicy.PARTIAL, verified=True)

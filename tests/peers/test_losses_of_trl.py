@@ -9,7 +9,7 @@ import itertools
 import pytest
 import torch
 
-from embomatrix.trainer.grpo import (
+from embomatrix.trainer.grpo.objective import (
     LossKind,
     Objective,
     RatioLevel,

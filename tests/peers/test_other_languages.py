@@ -12,7 +12,7 @@ from tests.fakes.peers import EXAMPLES, ROOT
 from tests.fakes.real_cluster import RealCluster, connected, outcomes, tally, tell, until
 from tests.fakes.scenes import kitchen_scene, kitchen_tasks
 
-from embomatrix.rpc.values import Batch, Completed, InfraCode, Rollout
+from embomatrix.rpc.wire.values import Batch, Completed, InfraCode, Rollout
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.syntax import Skill, SkillCall
 from embomatrix.world.bundle import Bundle, encode_bundle

@@ -9,10 +9,10 @@ pytestmark = [pytest.mark.peers, pytest.mark.timeout(900)]
 TELL = """
 import sys
 from pathlib import Path
-from embomatrix.trainer.imitate import ImitationProgress
-from embomatrix.trainer.recorder import Recorder
-from embomatrix.trainer.settings import read_settings
-from embomatrix.trainer.trackers import trackers_of
+from embomatrix.trainer.imitation.imitate import ImitationProgress
+from embomatrix.trainer.logging.recorder import Recorder
+from embomatrix.trainer.run.settings import read_settings
+from embomatrix.trainer.logging.trackers import trackers_of
 folder, step = Path(sys.argv[1]), int(sys.argv[2])
 with trackers_of(read_settings(None, {"track": ["wandb", "trackio"]}), folder) as trackers:
     Recorder(folder, trackers).imitation(ImitationProgress(step, 0.5, 3.0))

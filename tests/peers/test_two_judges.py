@@ -24,7 +24,7 @@ from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.task_import.sources import read_eai
 from embomatrix.reward.hierarchy import score
 from embomatrix.sim.executor import Simulator
-from embomatrix.sim.pose_cache import PlacementLibrary
+from embomatrix.sim.placing.pose_cache import PlacementLibrary
 from embomatrix.skills.parse import plan_from_json
 from embomatrix.trainer.eai.environment import install
 from embomatrix.trainer.eai.judge import NativeJudge

@@ -9,7 +9,7 @@ import time
 import pytest
 from tests.fakes.real_cluster import DIGEST, RealCluster, connected, opened, outcomes, tally, tell
 
-from embomatrix.rpc.values import Batch, Completed, InfraCode, Rollout
+from embomatrix.rpc.wire.values import Batch, Completed, InfraCode, Rollout
 
 pytestmark = [pytest.mark.timeout(240), pytest.mark.slow]
 

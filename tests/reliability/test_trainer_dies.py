@@ -15,8 +15,8 @@ from tests.fakes.real_cluster import (
 )
 from tests.fakes.simulation import graded_total
 
-from embomatrix.rpc.values import Completed
-from embomatrix.trainer.grpo import group_advantages
+from embomatrix.rpc.wire.values import Completed
+from embomatrix.trainer.grpo.objective import group_advantages
 
 pytestmark = [pytest.mark.timeout(240), pytest.mark.slow]
 

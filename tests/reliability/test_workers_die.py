@@ -18,7 +18,7 @@ from tests.fakes.real_cluster import (
 )
 from tests.fakes.worker import completed
 
-from embomatrix.rpc.values import Completed
+from embomatrix.rpc.wire.values import Completed
 
 pytestmark = pytest.mark.timeout(900)
 

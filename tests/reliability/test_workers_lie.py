@@ -5,8 +5,8 @@ import asyncio
 from tests.fakes.real_cluster import RealCluster, batch_of, connected, opened, outcomes, tally, tell
 from tests.fakes.simulation import graded_total
 
-from embomatrix.manager.intake import TICK_S
-from embomatrix.rpc.values import GroupPolicy, RunTerms
+from embomatrix.manager.runtime.intake import TICK_S
+from embomatrix.rpc.wire.values import GroupPolicy, RunTerms
 
 HONEST = ("w1", "w2", "w3")
 LIAR = "liar"

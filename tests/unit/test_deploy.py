@@ -14,8 +14,8 @@ import typer
 import yaml
 from tests.fakes.systemd import assert_valid_unit, needs_systemd
 
-from embomatrix.manager.cli import app as manager_app
-from embomatrix.worker.cli import app as worker_app
+from embomatrix.manager.commands.app import app as manager_app
+from embomatrix.worker.commands.app import app as worker_app
 
 ROOT = Path(__file__).parents[2]
 DEPLOY = ROOT / "deploy"

@@ -26,7 +26,6 @@ from embomatrix.skills.prompt import Codec
 from embomatrix.trainer.eai.exam import CODEC as EAI_CODEC
 from embomatrix.trainer.eai.exam import NAME as NATIVE
 from embomatrix.trainer.eai.exam import NativeExam
-from embomatrix.trainer.errors import TrainerError
 from embomatrix.trainer.evaluation.answers import (
     FILE,
     MOST_SAMPLES,
@@ -43,6 +42,7 @@ from embomatrix.trainer.evaluation.cluster import ClusterExecutor
 from embomatrix.trainer.evaluation.exam import WorldExam
 from embomatrix.trainer.evaluation.page import evaluation_page
 from embomatrix.trainer.evaluation.table import read_row, report_of, text_report
+from embomatrix.trainer.run.errors import TrainerError
 from embomatrix.world.task import Profile
 from embomatrix.world.whole_file import write_whole
 
@@ -73,7 +73,7 @@ class Place:
 
     def executor(self, bench: Benchmark) -> Executor:
         if not self.manager:
-            from embomatrix.worker.rollout_pool import RolloutPool
+            from embomatrix.worker.slots.rollout_pool import RolloutPool
 
             return RolloutPool(bench.folder, self.jobs or usable_cores())
         from embomatrix.rpc.client import ClusterClient

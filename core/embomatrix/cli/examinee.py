@@ -14,10 +14,10 @@ from embomatrix.skills.parse import plan_to_json
 from embomatrix.skills.prompt import Codec
 from embomatrix.trainer.eai.exam import NAME as NATIVE
 from embomatrix.trainer.eai.exam import NativeExam
-from embomatrix.trainer.errors import TrainerError
 from embomatrix.trainer.evaluation.asking import EndpointAsker, PolicyAsker, WriterAsker
 from embomatrix.trainer.evaluation.baselines import BaselineName, baseline_for
 from embomatrix.trainer.evaluation.exam import WorldExam
+from embomatrix.trainer.run.errors import TrainerError
 from embomatrix.world.task import MAX_TABLE
 
 if TYPE_CHECKING:

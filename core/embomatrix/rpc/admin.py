@@ -5,16 +5,16 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from embomatrix.proto.v1 import admin_service_pb2 as pb
-from embomatrix.rpc.convert import each, inside
-from embomatrix.rpc.convert_log import event_page_from_proto, run_summary_from_proto
-from embomatrix.rpc.convert_session import plan_cell_from_proto
 from embomatrix.rpc.fleet_client import FleetClient
 from embomatrix.rpc.managers import of_the_leader
 from embomatrix.rpc.status import cluster_errors
+from embomatrix.rpc.wire.rollout import each, inside
+from embomatrix.rpc.wire.run_log import event_page_from_proto, run_summary_from_proto
+from embomatrix.rpc.wire.session import plan_cell_from_proto
 
 if TYPE_CHECKING:
     from embomatrix.rpc.run_log import EventPage, RunEvent, RunSummary
-    from embomatrix.rpc.values import PlanCell
+    from embomatrix.rpc.wire.values import PlanCell
 
 
 class AdminClient(FleetClient):

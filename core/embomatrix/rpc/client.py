@@ -19,17 +19,6 @@ from embomatrix.proto.v1 import (
 )
 from embomatrix.rpc.capabilities import version_with
 from embomatrix.rpc.channel import DEFAULT_ADDRESS, chunks_of
-from embomatrix.rpc.convert import each, inside
-from embomatrix.rpc.convert_batch import batch_to_proto
-from embomatrix.rpc.convert_outcome import rollout_result_from_proto
-from embomatrix.rpc.convert_run import (
-    group_done_from_proto,
-    lookahead_answer_from_proto,
-    lookahead_entry_to_proto,
-    run_stats_from_proto,
-    run_terms_to_proto,
-)
-from embomatrix.rpc.convert_training import training_report_to_proto
 from embomatrix.rpc.fleet_client import FleetClient
 from embomatrix.rpc.managers import PATIENCE_S, of_the_leader
 from embomatrix.rpc.status import (
@@ -42,15 +31,26 @@ from embomatrix.rpc.status import (
     cluster_error,
     cluster_errors,
 )
-from embomatrix.rpc.values import RolloutResult, RunTerms
 from embomatrix.rpc.versions import SCORES_SINCE
+from embomatrix.rpc.wire.batch import batch_to_proto
+from embomatrix.rpc.wire.outcome import rollout_result_from_proto
+from embomatrix.rpc.wire.rollout import each, inside
+from embomatrix.rpc.wire.run import (
+    group_done_from_proto,
+    lookahead_answer_from_proto,
+    lookahead_entry_to_proto,
+    run_stats_from_proto,
+    run_terms_to_proto,
+)
+from embomatrix.rpc.wire.training import training_report_to_proto
+from embomatrix.rpc.wire.values import RolloutResult, RunTerms
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator, AsyncIterator, Iterable, Mapping, Sequence
 
     from embomatrix.rpc.status import ClusterError
     from embomatrix.rpc.training import TrainingReport
-    from embomatrix.rpc.values import (
+    from embomatrix.rpc.wire.values import (
         Batch,
         GroupDone,
         LookaheadAnswer,

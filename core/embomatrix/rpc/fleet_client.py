@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.proto.v1 import admin_service_pb2 as pb
 from embomatrix.proto.v1 import admin_service_pb2_grpc
 from embomatrix.rpc.channel import DEFAULT_ADDRESS
-from embomatrix.rpc.convert import each
-from embomatrix.rpc.convert_session import run_info_from_proto, worker_info_from_proto
 from embomatrix.rpc.leader_client import LeaderClient
 from embomatrix.rpc.managers import PATIENCE_S, of_the_leader
 from embomatrix.rpc.status import cluster_errors
-from embomatrix.rpc.values import Fleet
+from embomatrix.rpc.wire.rollout import each
+from embomatrix.rpc.wire.session import run_info_from_proto, worker_info_from_proto
+from embomatrix.rpc.wire.values import Fleet
 
 if TYPE_CHECKING:
-    from embomatrix.rpc.values import RunInfo, WorkerInfo
+    from embomatrix.rpc.wire.values import RunInfo, WorkerInfo
 
 CALL_S: Final = 10.0
 """For the answer to one call."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from embomatrix.reward.settings import PAPER, RewardSettings
 
 if TYPE_CHECKING:
-    from embomatrix.rpc.values import Completed, InfraFailure, Resident, Rollout
+    from embomatrix.rpc.wire.values import Completed, InfraFailure, Resident, Rollout
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from embomatrix.rpc.values import RunInfo, Timings
+    from embomatrix.rpc.wire.values import RunInfo, Timings
 
 
 class Phase(StrEnum):

@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.proto.v1 import admin_service_pb2 as pb
-from embomatrix.rpc.convert import ConvertError, each, finite, required
 from embomatrix.rpc.fleet_client import FleetClient
 from embomatrix.rpc.managers import of_the_leader
 from embomatrix.rpc.roles import Role, TokenInfo
 from embomatrix.rpc.status import cluster_errors
+from embomatrix.rpc.wire.rollout import ConvertError, each, finite, required
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Protocol
 
 from embomatrix.sim.actions import CachedActor
 from embomatrix.sim.bullet.engine import BulletEngine
-from embomatrix.sim.draws import Draws
 from embomatrix.sim.live_world import LiveWorld
+from embomatrix.sim.placing.draws import Draws
 from embomatrix.skills.check import check
 from embomatrix.skills.describe import Sight, done, final_lines, gained
 from embomatrix.skills.syntax import Skill
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     import numpy as np
 
     from embomatrix.sim.engine import PhysicsEngine
-    from embomatrix.sim.facts import SceneFacts
-    from embomatrix.sim.thermal import Change
+    from embomatrix.sim.state.facts import SceneFacts
+    from embomatrix.sim.state.thermal import Change
     from embomatrix.skills.syntax import Plan, SkillCall
     from embomatrix.skills.view import Refusal
     from embomatrix.world.bundle import Bundle

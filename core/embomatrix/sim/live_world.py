@@ -5,17 +5,17 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from embomatrix.sim.facts import SceneFacts
-from embomatrix.sim.hand import Hand
-from embomatrix.sim.navigation import Navigator
-from embomatrix.sim.news import News
-from embomatrix.sim.placement import Placer
-from embomatrix.sim.prepared import Prepared
-from embomatrix.sim.relations import Relations
-from embomatrix.sim.swings import Swings
-from embomatrix.sim.symbols import Symbols
-from embomatrix.sim.thermal import Thermal
-from embomatrix.sim.water import Water
+from embomatrix.sim.floor.navigation import Navigator
+from embomatrix.sim.floor.prepared import Prepared
+from embomatrix.sim.joints.swings import Swings
+from embomatrix.sim.placing.placement import Placer
+from embomatrix.sim.state.facts import SceneFacts
+from embomatrix.sim.state.hand import Hand
+from embomatrix.sim.state.news import News
+from embomatrix.sim.state.relations import Relations
+from embomatrix.sim.state.symbols import Symbols
+from embomatrix.sim.state.thermal import Thermal
+from embomatrix.sim.state.water import Water
 from embomatrix.skills.appliance import cold_source, heat_source
 from embomatrix.skills.view import Reach
 from embomatrix.world.state import State
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Set
 
     from embomatrix.sim.engine import PhysicsEngine
-    from embomatrix.sim.thermal import Change
+    from embomatrix.sim.state.thermal import Change
     from embomatrix.world.asset import Asset
     from embomatrix.world.bundle import Bundle
     from embomatrix.world.state import SubstanceFact

@@ -10,9 +10,9 @@ import typer
 from rich.console import Console
 
 from embomatrix.factory.asked_model import Key, Tape, model_asked
+from embomatrix.factory.layout.agent_io import DOORS, MODELLED, AgentName, BriefError
 from embomatrix.factory.layout.baselines import lay_at_random, lay_by_poses
 from embomatrix.factory.layout.distribution import DistributionError
-from embomatrix.factory.layout.doors import DOORS, MODELLED, AgentName, BriefError
 from embomatrix.factory.layout.generator import lay as lay_by_tree
 from embomatrix.factory.layout.jobs import LayoutAgents
 from embomatrix.factory.layout.model_agents import ModelLayoutAgents

@@ -19,11 +19,11 @@ from embomatrix.factory.pictures.film import Caption, FilmError, check_suffix, d
 from embomatrix.reward.hierarchy import score, unparsable
 from embomatrix.sim.engine import EngineError
 from embomatrix.sim.executor import Simulator
-from embomatrix.sim.facts import FactError
 from embomatrix.sim.film import film_cached
 from embomatrix.sim.physical.actor import PhysicalActor
 from embomatrix.sim.physical.film import film_physical
 from embomatrix.sim.planner.oracle import PlanNotFound, find_plan
+from embomatrix.sim.state.facts import FactError
 from embomatrix.skills.describe import call_in_words
 from embomatrix.skills.parse import PlanError, parse_plan
 from embomatrix.skills.syntax import MAX_PLAN_BYTES

@@ -13,7 +13,7 @@ from embomatrix.rpc.run_log import (
     RunSummary,
     RunWorker,
 )
-from embomatrix.rpc.values import RunInfo, RunStats, Timings
+from embomatrix.rpc.wire.values import RunInfo, RunStats, Timings
 
 STATS = RunStats(
     delivered=3, infra_failures=1, redispatched=2, prewarm_hits=9, prewarm_misses=1, prewarm_wasted=2

@@ -3,7 +3,7 @@
 import pytest
 
 from embomatrix.cli.cluster.tables import plan_table, run_table, show, worker_table
-from embomatrix.rpc.values import PlanCell, Resources, RunInfo, RunStats, Warmth, WorkerInfo
+from embomatrix.rpc.wire.values import PlanCell, Resources, RunInfo, RunStats, Warmth, WorkerInfo
 
 STATS = RunStats(1_234_567, 12, 345, 6, prewarm_hits=1999, prewarm_misses=2, prewarm_wasted=7)
 WORKER = "a-worker-with-a-name-as-long-as-names-of-machines-get.example"

@@ -20,8 +20,8 @@ from embomatrix.cli.doctor.manager import (
 from embomatrix.manager.access.folder import prepare
 from embomatrix.rpc.admin import AdminClient
 from embomatrix.rpc.capabilities import Capabilities
-from embomatrix.rpc.values import Fleet
 from embomatrix.rpc.versions import PROTOCOL_VERSION, VersionRange
+from embomatrix.rpc.wire.values import Fleet
 
 
 def levels(findings):

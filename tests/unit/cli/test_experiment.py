@@ -8,10 +8,10 @@ from datetime import date
 import pytest
 from typer.testing import CliRunner
 
-from embomatrix.cli.experiment.app import app
-from embomatrix.cli.experiment.benchmarks import Stage, bench_rows, benchmark_section
-from embomatrix.cli.experiment.conduct import IMITATED, Conductor, Venue
-from embomatrix.cli.experiment.design import (
+from embomatrix.bench.experiments.app import app
+from embomatrix.bench.experiments.benchmarks import Stage, bench_rows, benchmark_section
+from embomatrix.bench.experiments.conduct import IMITATED, Conductor, Venue
+from embomatrix.bench.experiments.design import (
     RELEVANCE_ARMS,
     Arm,
     Budget,
@@ -22,12 +22,12 @@ from embomatrix.cli.experiment.design import (
     parse_settings,
     toml_of,
 )
-from embomatrix.cli.experiment.findings import Run, curve, figures_of, findings_of
-from embomatrix.cli.experiment.section import add_section, learning_section
+from embomatrix.bench.experiments.findings import Run, curve, figures_of, findings_of
+from embomatrix.bench.experiments.section import add_section, learning_section
 from embomatrix.cli.foreground import no_problem
-from embomatrix.trainer.errors import TrainerError
-from embomatrix.trainer.outcome import RunOutcome, TaskRate, read_outcome, write_outcome
-from embomatrix.trainer.settings import read_settings
+from embomatrix.trainer.run.errors import TrainerError
+from embomatrix.trainer.run.outcome import RunOutcome, TaskRate, read_outcome, write_outcome
+from embomatrix.trainer.run.settings import read_settings
 
 DESIGN = Design(
     name="learning",

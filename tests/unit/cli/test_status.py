@@ -13,7 +13,7 @@ from embomatrix.cli.status.app import status, top
 from embomatrix.cli.status.live import Glance, earliest, rate, screen
 from embomatrix.cli.status.words import sentences
 from embomatrix.rpc.admin import AdminClient
-from embomatrix.rpc.values import (
+from embomatrix.rpc.wire.values import (
     Fleet,
     PlanCell,
     Resident,

@@ -12,7 +12,7 @@ from embomatrix.factory.task_import.task import Imported, import_problem
 from embomatrix.sim.engine import FLOOR
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.physical.survey import Foresight
-from embomatrix.sim.pose_cache import PlacementLibrary
+from embomatrix.sim.placing.pose_cache import PlacementLibrary
 from embomatrix.world.bddl import parse_formula, parse_problem
 from embomatrix.world.bundle import Bundle, decode_bundle, encode_bundle
 from embomatrix.world.evaluate import evaluate

@@ -10,7 +10,7 @@ from tests.fakes.problems import source
 from embomatrix.factory.pipeline.pairs import Beside
 from embomatrix.factory.task_import.batch import Verified, verify_first
 from embomatrix.factory.task_import.neighbours import neighbours_of
-from embomatrix.sim.pose_cache import PlacementLibrary
+from embomatrix.sim.placing.pose_cache import PlacementLibrary
 from embomatrix.world.bddl import parse_formula
 
 if TYPE_CHECKING:

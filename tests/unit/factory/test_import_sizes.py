@@ -12,7 +12,7 @@ from embomatrix.factory.furnish.roles import is_portable
 from embomatrix.factory.task_import.binding import Addition
 from embomatrix.factory.task_import.demands import Demand
 from embomatrix.factory.task_import.sizes import sized
-from embomatrix.sim.candidates import candidates, surfaces_for
+from embomatrix.sim.geometry.candidates import candidates, surfaces_for
 from embomatrix.sim.planner.ways import CANDIDATES, MIDDLE
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.state import Relation

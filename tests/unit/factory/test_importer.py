@@ -11,7 +11,7 @@ from embomatrix.factory.task_import.kinds import category_of, instruction_of
 from embomatrix.factory.task_import.scene import with_states
 from embomatrix.factory.task_import.task import Imported, Manner, import_problem
 from embomatrix.sim.physical.survey import Foresight
-from embomatrix.sim.pose_cache import PlacementLibrary
+from embomatrix.sim.placing.pose_cache import PlacementLibrary
 from embomatrix.world.bddl import BddlError, Literal, parse_formula, parse_problem
 from embomatrix.world.goal import Atom
 from embomatrix.world.scene import Scene

@@ -10,9 +10,9 @@ from tests.fakes.chat_server import ChatServer
 from embomatrix.factory.assets.library import build_asset
 from embomatrix.factory.editor import SceneEditor
 from embomatrix.factory.furnish.roles import wall_height_m
+from embomatrix.factory.layout.agent_io import DOORS, AgentName, BriefError
 from embomatrix.factory.layout.baselines import lay_at_random, lay_by_poses
 from embomatrix.factory.layout.distribution import DistributionError, distribute
-from embomatrix.factory.layout.doors import DOORS, AgentName, BriefError
 from embomatrix.factory.layout.generator import lay
 from embomatrix.factory.layout.hanging import Hanger
 from embomatrix.factory.layout.jobs import Item

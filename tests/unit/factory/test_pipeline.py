@@ -31,7 +31,7 @@ from embomatrix.factory.writer.tasks import is_heldout_signature
 from embomatrix.factory.writer.view import SceneView
 from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.reward.hierarchy import score
-from embomatrix.rpc.values import Completed, InfraCode, InfraFailure, Outcome, RolloutResult, Timings
+from embomatrix.rpc.wire.values import Completed, InfraCode, InfraFailure, Outcome, RolloutResult, Timings
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.physical.actor import physical_simulator
 from embomatrix.skills.parse import plan_from_json

@@ -9,8 +9,8 @@ from typer.testing import CliRunner
 
 from embomatrix.factory.agents_cli import EVERY
 from embomatrix.factory.cli import app
-from embomatrix.factory.layout.doors import AgentName
-from embomatrix.factory.social.doors import SOCIAL_DOORS, SocialAgent
+from embomatrix.factory.layout.agent_io import AgentName
+from embomatrix.factory.social.agent_io import SOCIAL_DOORS, SocialAgent
 from embomatrix.factory.social.values import SummaryBrief, TalkBrief
 
 BRIEF = '{"scene": "Rs_int", "seed": 1}'

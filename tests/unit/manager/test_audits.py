@@ -7,11 +7,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.fakes.worker import completed
 
-from embomatrix.manager.assignments import DispatchLimits
-from embomatrix.manager.auditor import AuditRules
-from embomatrix.manager.cluster_state import ClusterState
-from embomatrix.manager.commands import CancelLease, DeliverResult, GiveLease, QuarantineWorker
-from embomatrix.manager.events import (
+from embomatrix.manager.control.audit.auditor import AuditRules
+from embomatrix.manager.control.cluster_state import ClusterState
+from embomatrix.manager.control.commands import CancelLease, DeliverResult, GiveLease, QuarantineWorker
+from embomatrix.manager.control.dispatch.assignments import DispatchLimits
+from embomatrix.manager.control.events import (
     BatchCancelled,
     BatchSubmitted,
     LeaseFinished,
@@ -26,7 +26,7 @@ from embomatrix.manager.events import (
 )
 from embomatrix.manager.simulation.run import simulate
 from embomatrix.manager.simulation.scenario import LOCAL, Faults, Scenario, Trainer
-from embomatrix.rpc.values import (
+from embomatrix.rpc.wire.values import (
     Batch,
     Cancelled,
     Completed,

@@ -7,7 +7,7 @@ import zlib
 import pytest
 from tests.fakes.manager import chunks_of
 
-from embomatrix.manager.bundles import BundleStore
+from embomatrix.manager.runtime.bundles import BundleStore
 from embomatrix.rpc.status import OverloadedError
 
 SIZE = 1000

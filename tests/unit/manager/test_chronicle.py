@@ -4,13 +4,13 @@ from dataclasses import replace
 
 from tests.fakes.worker import completed
 
-from embomatrix.manager.archive import RunArchive
-from embomatrix.manager.chronicle import EVENTS_KEPT, LEAST_KEPT, Chronicle
-from embomatrix.manager.commands import GiveLease
-from embomatrix.manager.ledger import LeaseRecord, RolloutKey, RolloutRecord
+from embomatrix.manager.control.commands import GiveLease
+from embomatrix.manager.control.dispatch.ledger import LeaseRecord, RolloutKey, RolloutRecord
+from embomatrix.manager.observe.archive import RunArchive
+from embomatrix.manager.observe.chronicle import EVENTS_KEPT, LEAST_KEPT, Chronicle
 from embomatrix.rpc.leases import LeaseOrigin, LeaseRef, LeaseResult
 from embomatrix.rpc.run_log import EventKind, PhaseSummary, RunSeries, RunSummary
-from embomatrix.rpc.values import (
+from embomatrix.rpc.wire.values import (
     InfraCode,
     InfraFailure,
     Resident,

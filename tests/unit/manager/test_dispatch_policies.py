@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given
 from tests.fakes.worker import completed
 
-from embomatrix.manager.assignments import DispatchLimits
-from embomatrix.manager.commands import CancelLease, DeliverResult, FinishBatch, GiveLease
-from embomatrix.manager.dispatcher import Dispatcher
-from embomatrix.manager.events import (
+from embomatrix.manager.control.commands import CancelLease, DeliverResult, FinishBatch, GiveLease
+from embomatrix.manager.control.dispatch.assignments import DispatchLimits
+from embomatrix.manager.control.dispatch.dispatcher import Dispatcher
+from embomatrix.manager.control.events import (
     BatchSubmitted,
     DispatchPaused,
     DispatchResumed,
@@ -22,9 +22,9 @@ from embomatrix.manager.events import (
     WorkerResumed,
     WorkerSuspected,
 )
-from embomatrix.manager.shares import Share, in_turns, quotas
+from embomatrix.manager.control.shares import Share, in_turns, quotas
 from embomatrix.rpc.leases import LeaseProgress
-from embomatrix.rpc.values import (
+from embomatrix.rpc.wire.values import (
     Batch,
     Cancelled,
     Completed,

@@ -4,8 +4,8 @@ import pytest
 from tests.fakes.dispatch import Table, crash, leases
 from tests.fakes.worker import completed
 
-from embomatrix.manager.commands import AcknowledgeLease, CancelLease, FinishBatch
-from embomatrix.manager.events import (
+from embomatrix.manager.control.commands import AcknowledgeLease, CancelLease, FinishBatch
+from embomatrix.manager.control.events import (
     BatchCancelled,
     BatchSubmitted,
     LeaseFinished,
@@ -20,7 +20,7 @@ from embomatrix.manager.events import (
     WorkerSuspected,
 )
 from embomatrix.rpc.leases import LeaseRef
-from embomatrix.rpc.values import (
+from embomatrix.rpc.wire.values import (
     Batch,
     Cancelled,
     Completed,

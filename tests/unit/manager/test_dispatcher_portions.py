@@ -5,13 +5,13 @@ from dataclasses import replace
 import pytest
 from tests.fakes.dispatch import LIMITS, Table, crash, leases
 
-from embomatrix.manager.commands import FinishBatch
-from embomatrix.manager.events import (
+from embomatrix.manager.control.commands import FinishBatch
+from embomatrix.manager.control.events import (
     BatchCancelled,
     BatchContinued,
     Tick,
 )
-from embomatrix.rpc.values import (
+from embomatrix.rpc.wire.values import (
     Cancelled,
     InfraCode,
 )

@@ -2,10 +2,10 @@
 
 import pytest
 
-from embomatrix.manager.fleet import CANDIDATES, SEEKERS, Fleet
-from embomatrix.manager.ledger import AHEAD_S, BEHIND, LeaseRecord, RolloutKey, RolloutRecord
+from embomatrix.manager.control.dispatch.fleet import CANDIDATES, SEEKERS, Fleet
+from embomatrix.manager.control.dispatch.ledger import AHEAD_S, BEHIND, LeaseRecord, RolloutKey, RolloutRecord
 from embomatrix.rpc.leases import LeaseRef
-from embomatrix.rpc.values import Rollout
+from embomatrix.rpc.wire.values import Rollout
 
 MANY = 3 * CANDIDATES
 

@@ -6,10 +6,10 @@ from dataclasses import replace
 import pytest
 from tests.fakes.scenes import kitchen_scene, kitchen_tasks
 
-from embomatrix.manager.floor_plan import floor_plan, played, small_things
-from embomatrix.manager.gallery import Gallery
-from embomatrix.manager.gallery_values import SceneName
-from embomatrix.manager.no_gallery import NO_DATASET, NoGallery
+from embomatrix.manager.web.floor_plan import floor_plan, played, small_things
+from embomatrix.manager.web.gallery import Gallery
+from embomatrix.manager.web.gallery_values import SceneName
+from embomatrix.manager.web.no_gallery import NO_DATASET, NoGallery
 from embomatrix.rpc.status import NotFoundError, UnavailableError
 from embomatrix.skills.parse import parse_plan, plan_to_json
 from embomatrix.world.bundle import Bundle, encode_bundle

@@ -1,6 +1,6 @@
 """Everything is collected when nothing is in flight, once, and rarely while something is."""
 
-from embomatrix.manager.garbage import LONGEST_S, Collector
+from embomatrix.manager.runtime.garbage import LONGEST_S, Collector
 
 
 def test_everything_is_collected_once_after_work():

@@ -3,14 +3,14 @@
 import pytest
 from tests.fakes.worker import completed
 
-from embomatrix.manager.cluster_state import ClusterState
-from embomatrix.manager.commands import CancelLease, GiveLease
-from embomatrix.manager.events import BatchSubmitted
-from embomatrix.manager.intake import Heartbeat, Intake
-from embomatrix.manager.registry import LivenessLimits, Registry
+from embomatrix.manager.control.cluster_state import ClusterState
+from embomatrix.manager.control.commands import CancelLease, GiveLease
+from embomatrix.manager.control.events import BatchSubmitted
+from embomatrix.manager.runtime.intake import Heartbeat, Intake
+from embomatrix.manager.runtime.registry import LivenessLimits, Registry
 from embomatrix.rpc.leases import LeaseResult, WorkerState
 from embomatrix.rpc.status import SupersededError
-from embomatrix.rpc.values import (
+from embomatrix.rpc.wire.values import (
     Batch,
     Resident,
     ResidentState,

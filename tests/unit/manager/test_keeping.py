@@ -13,17 +13,17 @@ from pydantic import ValidationError
 from tests.fakes.worker import completed
 from typer.testing import CliRunner
 
-from embomatrix.manager.bundles import BundleStore
-from embomatrix.manager.cli import app
-from embomatrix.manager.meter import Meter, quantile
-from embomatrix.manager.records import group_and_kind, result_row, timed_row
-from embomatrix.manager.results import PER_MESSAGE, BatchLog, ResultLogs
+from embomatrix.manager.commands.app import app
+from embomatrix.manager.observe.meter import Meter, quantile
+from embomatrix.manager.runtime.bundles import BundleStore
+from embomatrix.manager.runtime.records import group_and_kind, result_row, timed_row
+from embomatrix.manager.runtime.results import PER_MESSAGE, BatchLog, ResultLogs
 from embomatrix.manager.settings import ManagerSettings
 from embomatrix.manager.store.protocol import ResultRow
 from embomatrix.proto.v1.types_pb2 import RolloutResult as RolloutResultMessage
-from embomatrix.rpc.convert_outcome import rollout_result_from_proto
 from embomatrix.rpc.status import InvalidRequestError, NotFoundError, OverloadedError
-from embomatrix.rpc.values import Cancelled, Completed, GroupDone, InfraCode, InfraFailure, RolloutResult
+from embomatrix.rpc.wire.outcome import rollout_result_from_proto
+from embomatrix.rpc.wire.values import Cancelled, Completed, GroupDone, InfraCode, InfraFailure, RolloutResult
 from embomatrix.world.bundle import decode_bundle
 from embomatrix.world.inflation import BundleError
 

@@ -13,10 +13,16 @@ from hypothesis.stateful import (
 )
 from tests.fakes.worker import completed
 
-from embomatrix.manager.assignments import DispatchLimits
-from embomatrix.manager.cluster_state import ClusterState
-from embomatrix.manager.commands import AcknowledgeLease, CancelLease, DeliverResult, GiveLease, SetDesired
-from embomatrix.manager.events import (
+from embomatrix.manager.control.cluster_state import ClusterState
+from embomatrix.manager.control.commands import (
+    AcknowledgeLease,
+    CancelLease,
+    DeliverResult,
+    GiveLease,
+    SetDesired,
+)
+from embomatrix.manager.control.dispatch.assignments import DispatchLimits
+from embomatrix.manager.control.events import (
     BatchCancelled,
     BatchContinued,
     BatchSubmitted,
@@ -36,7 +42,7 @@ from embomatrix.manager.events import (
     WorkerSuspected,
 )
 from embomatrix.rpc.leases import LeaseProgress
-from embomatrix.rpc.values import (
+from embomatrix.rpc.wire.values import (
     Batch,
     Cancelled,
     Completed,

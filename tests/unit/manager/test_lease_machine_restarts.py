@@ -5,10 +5,10 @@ from hypothesis import settings
 from hypothesis.stateful import initialize, invariant, rule
 from tests.unit.manager.test_lease_machine import LIMITS, WORKERS, LeaseMachine
 
-from embomatrix.manager.cluster_state import ClusterState
-from embomatrix.manager.events import BatchRestored, WorkerJoined, WorkerReported, WorkersExpected
+from embomatrix.manager.control.cluster_state import ClusterState
+from embomatrix.manager.control.events import BatchRestored, WorkerJoined, WorkerReported, WorkersExpected
 from embomatrix.rpc.leases import LeaseClaim
-from embomatrix.rpc.values import Resources
+from embomatrix.rpc.wire.values import Resources
 
 
 class RestartedMachine(LeaseMachine):

@@ -2,11 +2,11 @@
 
 import asyncio
 
-from embomatrix.manager.commands import AcknowledgeLease, CancelLease
-from embomatrix.manager.links import WorkerLink
-from embomatrix.manager.registry import LivenessLimits, Registry
+from embomatrix.manager.control.commands import AcknowledgeLease, CancelLease
+from embomatrix.manager.runtime.links import WorkerLink
+from embomatrix.manager.runtime.registry import LivenessLimits, Registry
 from embomatrix.rpc.leases import LeaseRef
-from embomatrix.rpc.values import Resources
+from embomatrix.rpc.wire.values import Resources
 
 FIRST, SECOND = LeaseRef("l-1", 1), LeaseRef("l-2", 2)
 

@@ -5,16 +5,16 @@ from pathlib import Path
 
 import pytest
 
-from embomatrix.manager.archive import RunArchive
-from embomatrix.manager.bundles import BundleStore
-from embomatrix.manager.cluster_state import ClusterState
-from embomatrix.manager.effort import Effort
-from embomatrix.manager.prometheus import metrics_page
-from embomatrix.manager.registry import LivenessLimits, Registry
-from embomatrix.manager.runtime import ManagerRuntime
+from embomatrix.manager.control.cluster_state import ClusterState
+from embomatrix.manager.observe.archive import RunArchive
+from embomatrix.manager.observe.effort import Effort
+from embomatrix.manager.runtime.bundles import BundleStore
+from embomatrix.manager.runtime.event_loop import ManagerRuntime
+from embomatrix.manager.runtime.registry import LivenessLimits, Registry
 from embomatrix.manager.store.memory import MemoryStore
 from embomatrix.manager.store.protocol import Shelf
 from embomatrix.manager.store.timed import timed_store
+from embomatrix.manager.web.prometheus import metrics_page
 
 GUIDE = Path(__file__).parents[3] / "docs" / "operations.md"
 OWN = re.compile(r"# (?:HELP|TYPE) (embo_\w+)")

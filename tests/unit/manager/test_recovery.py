@@ -5,10 +5,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.fakes.worker import completed
 
-from embomatrix.manager.assignments import DispatchLimits
-from embomatrix.manager.commands import AcknowledgeLease, CancelLease, DeliverResult, FinishBatch, GiveLease
-from embomatrix.manager.dispatcher import Dispatcher
-from embomatrix.manager.events import (
+from embomatrix.manager.control.commands import (
+    AcknowledgeLease,
+    CancelLease,
+    DeliverResult,
+    FinishBatch,
+    GiveLease,
+)
+from embomatrix.manager.control.dispatch.assignments import DispatchLimits
+from embomatrix.manager.control.dispatch.dispatcher import Dispatcher
+from embomatrix.manager.control.events import (
     BatchCancelled,
     BatchRestored,
     BatchSubmitted,
@@ -20,7 +26,7 @@ from embomatrix.manager.events import (
     WorkersExpected,
 )
 from embomatrix.rpc.leases import LeaseClaim, LeaseOrigin, LeaseRef
-from embomatrix.rpc.values import (
+from embomatrix.rpc.wire.values import (
     Batch,
     Resident,
     ResidentState,

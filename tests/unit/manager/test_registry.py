@@ -2,16 +2,16 @@
 
 import pytest
 
-from embomatrix.manager.events import (
+from embomatrix.manager.control.events import (
     WorkerDrained,
     WorkerJoined,
     WorkerLost,
     WorkerRecovered,
     WorkerSuspected,
 )
-from embomatrix.manager.registry import LivenessLimits, Registry, Standing
+from embomatrix.manager.runtime.registry import LivenessLimits, Registry, Standing
 from embomatrix.rpc.status import NotFoundError, SupersededError
-from embomatrix.rpc.values import Resources
+from embomatrix.rpc.wire.values import Resources
 
 RESOURCES = Resources(2, 2, 1024)
 LIMITS = LivenessLimits(heartbeat_s=1.0, lost_after_s=10.0, stream_grace_s=1.0, remember_lost_s=60.0)

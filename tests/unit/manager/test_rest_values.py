@@ -2,14 +2,14 @@
 
 from dataclasses import replace
 
-from embomatrix.manager.health import Mood, health
-from embomatrix.manager.meter import FAILURES_KEPT, FailureNote
-from embomatrix.manager.rest_values import run_page, worker_page
-from embomatrix.manager.slot_tracks import TRACKS, timeline
-from embomatrix.manager.snapshot import Snapshot
-from embomatrix.manager.views import Overview, RunView, WorkerView
+from embomatrix.manager.observe.meter import FAILURES_KEPT, FailureNote
+from embomatrix.manager.web.health import Mood, health
+from embomatrix.manager.web.rest_values import run_page, worker_page
+from embomatrix.manager.web.slot_tracks import TRACKS, timeline
+from embomatrix.manager.web.snapshot import Snapshot
+from embomatrix.manager.web.views import Overview, RunView, WorkerView
 from embomatrix.rpc.run_log import EventKind, EventPage, RunEvent
-from embomatrix.rpc.values import RunStats, Timings
+from embomatrix.rpc.wire.values import RunStats, Timings
 
 CALM = Overview(
     uptime_s=60.0,

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from tests.fakes.worker import completed
 
-from embomatrix.manager.commands import SetDesired
-from embomatrix.manager.events import (
+from embomatrix.manager.control.commands import SetDesired
+from embomatrix.manager.control.events import (
     BatchSubmitted,
     DemandObserved,
     LeaseFinished,
@@ -21,10 +21,10 @@ from embomatrix.manager.events import (
     WorkerReported,
     WorkerSuspected,
 )
-from embomatrix.manager.placement import Need, Site, needs_of, place
-from embomatrix.manager.scheduler import ScheduleLimits, Scheduler
+from embomatrix.manager.control.schedule.placement import Need, Site, needs_of, place
+from embomatrix.manager.control.schedule.scheduler import ScheduleLimits, Scheduler
 from embomatrix.rpc.leases import LeaseRef
-from embomatrix.rpc.values import (
+from embomatrix.rpc.wire.values import (
     Batch,
     LookaheadEntry,
     Resident,

@@ -6,8 +6,8 @@ import hypothesis.strategies as st
 import pytest
 from hypothesis import HealthCheck, given, settings
 
-from embomatrix.manager.assignments import DispatchLimits
-from embomatrix.manager.commands import AcknowledgeLease, DeliverResult, FinishBatch, GiveLease
+from embomatrix.manager.control.commands import AcknowledgeLease, DeliverResult, FinishBatch, GiveLease
+from embomatrix.manager.control.dispatch.assignments import DispatchLimits
 from embomatrix.manager.simulation.agenda import Agenda
 from embomatrix.manager.simulation.auditor import Auditor, BrokenInvariantError
 from embomatrix.manager.simulation.line import Line
@@ -15,7 +15,7 @@ from embomatrix.manager.simulation.run import simulate
 from embomatrix.manager.simulation.scenario import LOCAL, MIXED, Faults, Scenario, Scenes, Trainer
 from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.rpc.leases import LeaseOrigin, LeaseRef, WorkerState
-from embomatrix.rpc.values import (
+from embomatrix.rpc.wire.values import (
     Batch,
     Completed,
     InfraCode,

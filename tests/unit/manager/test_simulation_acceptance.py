@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import pytest
 
+from embomatrix.bench.cluster.simulated_sweeps import in_flight
 from embomatrix.manager.simulation.run import Simulation, simulate
 from embomatrix.manager.simulation.scenario import LOCAL, Faults, MachineKind, Scenario, Scenes, Trainer
-from embomatrix.manager.simulation.sweeps import in_flight
-from embomatrix.rpc.values import GroupPolicy, RunTerms
+from embomatrix.rpc.wire.values import GroupPolicy, RunTerms
 
 UNLIKE = tuple(MachineKind(f"{slots} slots", 1.0, slots, 2048, 1.0, 0.0005, 100.0) for slots in (8, 4, 2, 1))
 MEAN_OVER_MEDIAN = math.exp(0.2**2 / 2)

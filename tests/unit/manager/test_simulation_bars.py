@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import pytest
 
+from embomatrix.bench.cluster.simulated_sweeps import in_flight, loaded_slowly
 from embomatrix.manager.simulation.run import Simulation, simulate
 from embomatrix.manager.simulation.scenario import LOCAL, Faults, MachineKind, Scenario, Scenes, Trainer
-from embomatrix.manager.simulation.sweeps import in_flight, loaded_slowly
 
 AT_ONCE = Trainer(steps=2, groups=60, group_size=16, write_s=0.0, update_s=0.0, start_s=5.0)
 """A trainer that sends its steps at once: the cluster is what it waits for."""

@@ -7,10 +7,10 @@ from importlib.metadata import entry_points
 import pytest
 from typer.testing import CliRunner
 
-from embomatrix.manager.simulation.bench import bench_simulated_cluster
-from embomatrix.manager.simulation.charts import Panel, page
-from embomatrix.manager.simulation.sweeps import sweeps
-from embomatrix.worker.bench_cli import app
+from embomatrix.bench.cli import app
+from embomatrix.bench.cluster.simulated import bench_simulated_cluster
+from embomatrix.bench.cluster.simulated_sweeps import sweeps
+from embomatrix.bench.report.line_charts import Panel, page
 
 SVG = "{http://www.w3.org/2000/svg}"
 

@@ -6,7 +6,7 @@ import pytest
 
 from embomatrix.manager.simulation.run import simulate
 from embomatrix.manager.simulation.scenario import LOCAL, Scenario, Scenes, Trainer
-from embomatrix.rpc.values import RunTerms
+from embomatrix.rpc.wire.values import RunTerms
 
 CLUSTER = Scenario(
     workers=4,

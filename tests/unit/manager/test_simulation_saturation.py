@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from embomatrix.manager.simulation.run import simulate
-from embomatrix.manager.simulation.saturation import (
+from embomatrix.bench.cluster.saturation import (
     FULL,
     PACES,
     at_work,
@@ -13,8 +12,9 @@ from embomatrix.manager.simulation.saturation import (
     saturation_figures,
     saturation_panels,
 )
+from embomatrix.bench.cluster.simulated_sweeps import in_flight
+from embomatrix.manager.simulation.run import simulate
 from embomatrix.manager.simulation.scenario import ManagerPace
-from embomatrix.manager.simulation.sweeps import in_flight
 
 SLOTS = 64
 EXECUTIONS_PER_S = 60.0

@@ -3,9 +3,9 @@
 import asyncio
 import contextlib
 
-from embomatrix.manager.events import BatchContinued, BatchSubmitted
-from embomatrix.manager.submissions import PIECE, Submissions
-from embomatrix.rpc.values import Batch, Rollout
+from embomatrix.manager.control.events import BatchContinued, BatchSubmitted
+from embomatrix.manager.runtime.submissions import PIECE, Submissions
+from embomatrix.rpc.wire.values import Batch, Rollout
 
 
 def batch(name, count):

@@ -4,7 +4,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from embomatrix.manager.training import PHASES_KEPT, RUNS_KEPT, STEPS_KEPT, Curves, TrainingBook
+from embomatrix.manager.observe.training_reports import (
+    PHASES_KEPT,
+    RUNS_KEPT,
+    STEPS_KEPT,
+    Curves,
+    TrainingBook,
+)
 from embomatrix.rpc.status import NotFoundError
 from embomatrix.rpc.training import FIGURES, SampledPlan, TrainingReport
 

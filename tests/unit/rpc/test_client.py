@@ -14,7 +14,7 @@ from embomatrix.rpc.status import (
     NotSignedInError,
     PreconditionError,
 )
-from embomatrix.rpc.values import Batch, Rollout
+from embomatrix.rpc.wire.values import Batch, Rollout
 
 LIMITS = ClientLimits(call_s=5.0, retry_first_s=0.01, retry_longest_s=0.05)
 

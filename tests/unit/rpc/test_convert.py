@@ -9,9 +9,13 @@ from hypothesis import strategies as st
 
 from embomatrix.proto.v1 import rollout_service_pb2, types_pb2
 from embomatrix.reward.breakdown import AtomResult, RewardBreakdown
-from embomatrix.rpc import convert, convert_batch, convert_outcome, convert_run, convert_session
-from embomatrix.rpc.convert import ConvertError
-from embomatrix.rpc.values import (
+from embomatrix.rpc.wire import batch as convert_batch
+from embomatrix.rpc.wire import outcome as convert_outcome
+from embomatrix.rpc.wire import rollout as convert
+from embomatrix.rpc.wire import run as convert_run
+from embomatrix.rpc.wire import session as convert_session
+from embomatrix.rpc.wire.rollout import ConvertError
+from embomatrix.rpc.wire.values import (
     Batch,
     Cancelled,
     Completed,

@@ -6,8 +6,6 @@ from hypothesis import strategies as st
 
 from embomatrix.proto.v1 import worker_service_pb2
 from embomatrix.reward.breakdown import RewardBreakdown
-from embomatrix.rpc import convert_session as convert
-from embomatrix.rpc.convert import ConvertError
 from embomatrix.rpc.leases import (
     Lease,
     LeaseClaim,
@@ -17,7 +15,9 @@ from embomatrix.rpc.leases import (
     LeaseResult,
     WorkerState,
 )
-from embomatrix.rpc.values import (
+from embomatrix.rpc.wire import session as convert
+from embomatrix.rpc.wire.rollout import ConvertError
+from embomatrix.rpc.wire.values import (
     Completed,
     InfraCode,
     InfraFailure,

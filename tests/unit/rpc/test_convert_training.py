@@ -3,8 +3,6 @@
 import pytest
 
 from embomatrix.proto.v1 import rollout_service_pb2 as pb
-from embomatrix.rpc.convert import ConvertError
-from embomatrix.rpc.convert_training import training_report_from_proto, training_report_to_proto
 from embomatrix.rpc.training import (
     FIGURES,
     PLANS,
@@ -14,6 +12,8 @@ from embomatrix.rpc.training import (
     SampledStep,
     TrainingReport,
 )
+from embomatrix.rpc.wire.rollout import ConvertError
+from embomatrix.rpc.wire.training import training_report_from_proto, training_report_to_proto
 
 STEPS = (SampledStep("move", True, "went to the table"), SampledStep("open", False, "no free hand"))
 SOLVED = SampledPlan("t1", "tidy up", "move 3", RewardTiers(0.5, 0.4, 15.0, False), -0.7, "", STEPS)

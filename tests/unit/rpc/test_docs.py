@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from embomatrix.manager.server import SERVICES
+from embomatrix.manager.services.server import SERVICES
 from embomatrix.manager.settings import ManagerSettings
 from embomatrix.proto.v1 import (
     admin_service_pb2,
@@ -14,7 +14,7 @@ from embomatrix.proto.v1 import (
     worker_service_pb2,
 )
 from embomatrix.rpc.status import STATUS
-from embomatrix.rpc.values import InfraCode
+from embomatrix.rpc.wire.values import InfraCode
 
 PAGE = (Path(__file__).parents[3] / "docs" / "protocol.md").read_text(encoding="utf-8")
 MODULES = (admin_service_pb2, rollout_service_pb2, scene_service_pb2, worker_service_pb2)

@@ -11,7 +11,7 @@ from tests.fakes.scenes import kitchen_scene
 
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.executor import Simulator
-from embomatrix.sim.pose_cache import analyse_scene
+from embomatrix.sim.placing.pose_cache import analyse_scene
 from embomatrix.world.bundle import Bundle, decode_bundle, encode_bundle
 
 PLANS = (

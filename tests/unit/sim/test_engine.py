@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 from tests.fakes import furniture as make
 from tests.fakes.scenes import kitchen_scene, placed, scene_of, upright
 
-from embomatrix.sim.bounds import AssetBounds
 from embomatrix.sim.bullet.client import ClientPool, connect, pybullet
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.bullet.mini_world import STAGES_KEPT
 from embomatrix.sim.engine import FLOOR, WALL, EngineError
+from embomatrix.sim.geometry.bounds import AssetBounds
 from embomatrix.world.asset import Joint, JointKind, Link
 from embomatrix.world.geometry import Aabb, Part, Pose, Shape
 from embomatrix.world.scene import Scene

@@ -7,7 +7,7 @@ from tests.fakes.plans import plan_of, task_over
 from tests.fakes.scenes import kitchen_scene
 
 from embomatrix.sim.executor import Simulator
-from embomatrix.sim.facts import FactError
+from embomatrix.sim.state.facts import FactError
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.state import Relation, State, SubstanceRelation
 

@@ -6,10 +6,10 @@ from hypothesis import strategies as st
 from tests.fakes import furniture as make
 from tests.fakes.scenes import kitchen_scene
 
-from embomatrix.sim.bounds import IDENTITY, bounds_of
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
-from embomatrix.sim.footprints import (
+from embomatrix.sim.geometry.bounds import IDENTITY, bounds_of
+from embomatrix.sim.geometry.footprints import (
     HEIGHTS_M,
     LEVEL_FLOOR,
     SIDES_M,
@@ -17,9 +17,9 @@ from embomatrix.sim.footprints import (
     footprint_of,
     pose_box_asset,
 )
-from embomatrix.sim.placement import Placer
-from embomatrix.sim.pose_cache import PlacementLibrary, analyse_scene
-from embomatrix.sim.relations import Relations
+from embomatrix.sim.placing.placement import Placer
+from embomatrix.sim.placing.pose_cache import PlacementLibrary, analyse_scene
+from embomatrix.sim.state.relations import Relations
 from embomatrix.world.geometry import Pose
 from embomatrix.world.poses import PlacementKey, StandPose
 from embomatrix.world.state import Relation

@@ -12,7 +12,7 @@ from tests.fakes.plans import executed, plan_of, task_over, with_objects
 from tests.fakes.scenes import NORTH, kitchen_scene, placed, upright
 
 from embomatrix.sim.executor import Simulator
-from embomatrix.sim.leaves import Leaves
+from embomatrix.sim.joints.panels import Leaves
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.bundle import Bundle

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from embomatrix.sim.bounds import bounds_of, square_box
-from embomatrix.sim.lineup import Lineup, Neighbours, PoseSet
-from embomatrix.sim.trial import in_reach
+from embomatrix.sim.geometry.batch_poses import Lineup, Neighbours, PoseSet
+from embomatrix.sim.geometry.bounds import bounds_of, square_box
+from embomatrix.sim.placing.trial import in_reach
 from embomatrix.world.asset import Asset, Joint, JointKind, Link
 from embomatrix.world.geometry import Aabb, Part, Pose, Shape
 from embomatrix.world.placements import pose_rows

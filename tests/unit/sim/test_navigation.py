@@ -13,10 +13,10 @@ from tests.fakes.scenes import kitchen_scene
 
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
-from embomatrix.sim.floor_grid import CELL_M, FloorGrid
-from embomatrix.sim.floor_ways import FLOORS_KEPT, RecentDistances
-from embomatrix.sim.navigation import Navigator
-from embomatrix.sim.relations import Relations
+from embomatrix.sim.floor.grid import CELL_M, FloorGrid
+from embomatrix.sim.floor.navigation import Navigator
+from embomatrix.sim.floor.paths import FLOORS_KEPT, RecentDistances
+from embomatrix.sim.state.relations import Relations
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.geometry import Pose
 from embomatrix.world.poses import StandPose

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.fakes.furniture import cupboard
 
-from embomatrix.sim.lineup import Lineup
-from embomatrix.sim.past_leaves import behind_leaves
+from embomatrix.sim.geometry.batch_poses import Lineup
+from embomatrix.sim.joints.behind_panels import behind_leaves
 from embomatrix.world.geometry import Pose
 from embomatrix.world.poses import StandPose
 

@@ -12,7 +12,7 @@ from tests.fakes.scenes import kitchen_scene, placed, scene_of, upright
 
 from embomatrix.sim.bullet.dynamic import DynamicWorld
 from embomatrix.sim.bullet.engine import BulletEngine
-from embomatrix.sim.navigation import Navigator
+from embomatrix.sim.floor.navigation import Navigator
 from embomatrix.sim.physical import arm, body
 from embomatrix.sim.physical.doors import Leaf
 from embomatrix.sim.physical.floor import Floor
@@ -20,7 +20,7 @@ from embomatrix.sim.physical.grasp import cross
 from embomatrix.sim.physical.motion import Mover
 from embomatrix.sim.physical.space import boxes_of, strikes, struck
 from embomatrix.sim.physical.stage import tucked
-from embomatrix.sim.relations import Relations
+from embomatrix.sim.state.relations import Relations
 from embomatrix.world.asset import Joint, JointKind, Link
 from embomatrix.world.geometry import Aabb, Part, Pose, Shape
 from embomatrix.world.poses import StandPose

@@ -15,7 +15,7 @@ from embomatrix.sim.physical.fold import WAYS
 from embomatrix.sim.physical.press import press, pressing
 from embomatrix.sim.physical.space import struck
 from embomatrix.sim.physical.stage import Stage
-from embomatrix.sim.pose_cache import standing_poses
+from embomatrix.sim.placing.pose_cache import standing_poses
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.poses import PoseCache
 

@@ -8,11 +8,11 @@ from tests.fakes.scenes import kitchen_scene
 
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
-from embomatrix.sim.navigation import Navigator
-from embomatrix.sim.placement import Placer
-from embomatrix.sim.pose_cache import build_pose_cache
-from embomatrix.sim.relations import Relations
-from embomatrix.sim.trial import in_reach
+from embomatrix.sim.floor.navigation import Navigator
+from embomatrix.sim.placing.placement import Placer
+from embomatrix.sim.placing.pose_cache import build_pose_cache
+from embomatrix.sim.placing.trial import in_reach
+from embomatrix.sim.state.relations import Relations
 from embomatrix.skills.failure import FailureReason
 from embomatrix.world.geometry import Aabb, Pose
 from embomatrix.world.poses import PoseCache, StandPose

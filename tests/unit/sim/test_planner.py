@@ -8,8 +8,8 @@ from tests.fakes.plans import awkward_scene, task_over, with_objects, words_of
 from tests.fakes.scenes import kitchen_scene, kitchen_tasks, placed, upright
 
 from embomatrix.sim.executor import Simulator
+from embomatrix.sim.placing.pose_cache import build_pose_cache
 from embomatrix.sim.planner.oracle import PROOF_SEEDS, PlanNotFound, find_plan
-from embomatrix.sim.pose_cache import build_pose_cache
 from embomatrix.skills.syntax import MAX_STEPS, Skill
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.evaluate import evaluate

@@ -7,13 +7,13 @@ import pytest
 from tests.fakes import furniture as make
 from tests.fakes.scenes import kitchen_scene
 
-from embomatrix.sim.bounds import bounds_of
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.bullet.mini_world import MiniWorld, Still
-from embomatrix.sim.candidates import beside, candidates, stands_in
-from embomatrix.sim.pose_cache import POSES, PlacementLibrary, build_pose_cache
-from embomatrix.sim.relations import Relations
+from embomatrix.sim.geometry.bounds import bounds_of
+from embomatrix.sim.geometry.candidates import beside, candidates, stands_in
+from embomatrix.sim.placing.pose_cache import POSES, PlacementLibrary, build_pose_cache
+from embomatrix.sim.state.relations import Relations
 from embomatrix.world.geometry import Aabb, Pose
 from embomatrix.world.poses import PlacementKey
 from embomatrix.world.state import Relation

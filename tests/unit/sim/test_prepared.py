@@ -10,8 +10,8 @@ from tests.fakes.scenes import kitchen_scene
 
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.executor import Simulator
-from embomatrix.sim.floor_grid import grid_shape
-from embomatrix.sim.prepared import Prepared, prepare
+from embomatrix.sim.floor.grid import grid_shape
+from embomatrix.sim.floor.prepared import Prepared, prepare
 from embomatrix.world.bundle import Bundle, decode_bundle, encode_bundle
 
 PLANS = (

@@ -14,7 +14,7 @@ from embomatrix.sim.executor import Simulator
 from embomatrix.sim.live_world import LiveWorld
 from embomatrix.sim.physical.prospects import Placing
 from embomatrix.sim.physical.survey import prospects
-from embomatrix.sim.pose_cache import build_pose_cache
+from embomatrix.sim.placing.pose_cache import build_pose_cache
 from embomatrix.skills.failure import FailureReason
 from embomatrix.world.bundle import Bundle, decode_bundle, encode_bundle
 from embomatrix.world.codec_task import poses_from_json, poses_to_json

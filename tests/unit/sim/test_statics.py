@@ -6,10 +6,10 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from embomatrix.sim.bounds import IDENTITY, bounds_of
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.mini_world import MiniWorld, Still
-from embomatrix.sim.statics import base_of, is_level, rest_pose
+from embomatrix.sim.geometry.bounds import IDENTITY, bounds_of
+from embomatrix.sim.geometry.statics import base_of, is_level, rest_pose
 from embomatrix.world.asset import Asset, Link
 from embomatrix.world.geometry import Part, Pose, Shape
 

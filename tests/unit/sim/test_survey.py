@@ -12,7 +12,7 @@ from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.live_world import LiveWorld
 from embomatrix.sim.physical.survey import Foresight
-from embomatrix.sim.pose_cache import standing_poses
+from embomatrix.sim.placing.pose_cache import standing_poses
 from embomatrix.skills.failure import FailureReason
 from embomatrix.world.bundle import Bundle, decode_bundle, encode_bundle
 from embomatrix.world.geometry import Pose

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from embomatrix.sim import relations, spots, thermal
+from embomatrix.sim.geometry import surfaces as spots
+from embomatrix.sim.state import relations, thermal
 from embomatrix.skills.failure import SENTENCES
 from embomatrix.skills.library import LIBRARY, REASONS
 from embomatrix.skills.limits import ROBOT

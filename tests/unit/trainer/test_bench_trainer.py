@@ -8,12 +8,12 @@ from tests.fakes.datasets import write_kitchen_dataset
 from tests.fakes.symbolic_household import make_tasks
 from typer.testing import CliRunner
 
-from embomatrix.cli.bench_trainer import Shares, bench_trainer, seconds_told
-from embomatrix.trainer.bench.load import load_of, read_load, write_load
-from embomatrix.trainer.bench.own_steps import measure, policy_of
-from embomatrix.trainer.errors import TrainerError
-from embomatrix.worker.bench_cli import app
-from embomatrix.worker.bench_figures import BenchError
+from embomatrix.bench.cli import app
+from embomatrix.bench.report.figures import BenchError
+from embomatrix.bench.trainer.load import load_of, read_load, write_load
+from embomatrix.bench.trainer.measure import Shares, bench_trainer, seconds_told
+from embomatrix.bench.trainer.own_steps import measure, policy_of
+from embomatrix.trainer.run.errors import TrainerError
 
 TASKS = make_tasks(3, 0, objects=6).train
 SMALL = {"tasks": 2, "group": 3, "new": 4, "steps": 2, "layers": 1, "width": 32, "heads": 2, "inner": 32}

@@ -10,15 +10,15 @@ from rich.console import Console
 from tests.fakes.symbolic_household import SymbolicCluster
 from tests.unit.trainer.test_loop import TASKS, run, weights
 
-from embomatrix.trainer.checkpoint import CHECKPOINTS, CheckpointStore
-from embomatrix.trainer.crew.crew import Crew
-from embomatrix.trainer.crew.learner import Learner
-from embomatrix.trainer.crew.shared import SharedTensors
-from embomatrix.trainer.errors import TrainerError
+from embomatrix.trainer.logging.progress import LineDisplay
+from embomatrix.trainer.logging.recorder import read_metrics
+from embomatrix.trainer.parallel.data_parallel import Crew
+from embomatrix.trainer.parallel.learner import Learner
+from embomatrix.trainer.parallel.shared_memory import SharedTensors
 from embomatrix.trainer.policy.choice import new_policy
-from embomatrix.trainer.progress import LineDisplay
-from embomatrix.trainer.recorder import read_metrics
-from embomatrix.trainer.settings import read_settings
+from embomatrix.trainer.run.checkpoint import CHECKPOINTS, CheckpointStore
+from embomatrix.trainer.run.errors import TrainerError
+from embomatrix.trainer.run.settings import read_settings
 
 FAST = {"imitation__steps": 20, "grpo__steps": 4, "checkpoint_every": 2}
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from embomatrix.trainer.evaluate import Evaluation, TaskScore, improvement
+from embomatrix.trainer.evaluation.held_out import Evaluation, TaskScore, improvement
 from embomatrix.trainer.evaluation.intervals import bootstrap
 
 

@@ -12,7 +12,6 @@ from tests.fakes.executors import HereExecutor
 from embomatrix.llm.endpoint import Endpoint, EndpointLimits
 from embomatrix.skills.parse import plan_to_json
 from embomatrix.skills.prompt import Codec
-from embomatrix.trainer.errors import TrainerError
 from embomatrix.trainer.evaluation.answers import Answer, AnswerSheet, Setup, read_answers
 from embomatrix.trainer.evaluation.asking import EndpointAsker, WriterAsker, questions_digest
 from embomatrix.trainer.evaluation.baselines import BaselineName, baseline_for
@@ -22,7 +21,8 @@ from embomatrix.trainer.evaluation.judging import Judge
 from embomatrix.trainer.evaluation.page import evaluation_page
 from embomatrix.trainer.evaluation.scoreboard import Scoreboard
 from embomatrix.trainer.evaluation.table import read_row, report_of, text_report
-from embomatrix.worker.rollout_pool import RolloutPool
+from embomatrix.trainer.run.errors import TrainerError
+from embomatrix.worker.slots.rollout_pool import RolloutPool
 from embomatrix.world.task import Profile
 
 APPLE = "apple_to_counter"

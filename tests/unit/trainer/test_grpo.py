@@ -8,7 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from embomatrix.trainer.grpo import (
+from embomatrix.trainer.grpo.objective import (
     LossKind,
     Objective,
     RatioLevel,

@@ -14,22 +14,22 @@ from tests.fakes.small_llama import random_llama, word_tokenizer
 from tests.fakes.symbolic_household import SymbolicCluster, make_tasks
 
 from embomatrix.skills.prompt import Codec, prompt_for
-from embomatrix.trainer.augment import Variation
-from embomatrix.trainer.checkpoint import CheckpointStore, Progress
-from embomatrix.trainer.errors import TrainerError
 from embomatrix.trainer.evaluation.models import load_model
-from embomatrix.trainer.import_gguf import import_gguf
-from embomatrix.trainer.loop import Parts, TrainingRun
+from embomatrix.trainer.grpo.rollout import Gateway
+from embomatrix.trainer.imitation.augment import Variation
+from embomatrix.trainer.logging.progress import LineDisplay
+from embomatrix.trainer.logging.recorder import read_metrics
 from embomatrix.trainer.policy.choice import saved_policy
 from embomatrix.trainer.policy.hf import HfPolicy
+from embomatrix.trainer.policy.import_gguf import import_gguf
 from embomatrix.trainer.policy.lora import LoraShape
 from embomatrix.trainer.policy.products import multiply_in
-from embomatrix.trainer.progress import LineDisplay
-from embomatrix.trainer.recorder import read_metrics
-from embomatrix.trainer.rollout import Gateway
-from embomatrix.trainer.settings import LANGUAGE_MODEL_DEFAULTS, read_settings
-from embomatrix.trainer.starting import usual_threads
-from embomatrix.trainer.telling import Teller
+from embomatrix.trainer.policy.prompts import Teller
+from embomatrix.trainer.run.checkpoint import CheckpointStore, Progress
+from embomatrix.trainer.run.errors import TrainerError
+from embomatrix.trainer.run.loop import Parts, TrainingRun
+from embomatrix.trainer.run.settings import LANGUAGE_MODEL_DEFAULTS, read_settings
+from embomatrix.trainer.run.starting import usual_threads
 
 TASKS = make_tasks(6, 2, objects=8)
 

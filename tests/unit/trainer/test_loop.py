@@ -10,20 +10,20 @@ import torch
 from rich.console import Console
 from tests.fakes.symbolic_household import SymbolicCluster, make_tasks
 
-from embomatrix.trainer.augment import Variation
-from embomatrix.trainer.checkpoint import CHECKPOINTS, CheckpointStore, read_state
-from embomatrix.trainer.errors import TrainerError
-from embomatrix.trainer.loop import REFERENCE, Parts, TrainingRun
-from embomatrix.trainer.outcome import read_outcome
+from embomatrix.trainer.grpo.rollout import Gateway
+from embomatrix.trainer.grpo.update import Updater
+from embomatrix.trainer.imitation.augment import Variation
+from embomatrix.trainer.logging.progress import LineDisplay, LiveDisplay
+from embomatrix.trainer.logging.recorder import read_metrics
+from embomatrix.trainer.logging.report import success_rows, time_rows
 from embomatrix.trainer.policy.choice import new_policy, saved_policy
-from embomatrix.trainer.progress import LineDisplay, LiveDisplay
-from embomatrix.trainer.recorder import read_metrics
-from embomatrix.trainer.report import success_rows, time_rows
-from embomatrix.trainer.rollout import Gateway
-from embomatrix.trainer.settings import OnLost, read_settings
-from embomatrix.trainer.stopwatch import Activity
-from embomatrix.trainer.telling import Teller
-from embomatrix.trainer.update import Updater
+from embomatrix.trainer.policy.prompts import Teller
+from embomatrix.trainer.run.checkpoint import CHECKPOINTS, CheckpointStore, read_state
+from embomatrix.trainer.run.errors import TrainerError
+from embomatrix.trainer.run.loop import REFERENCE, Parts, TrainingRun
+from embomatrix.trainer.run.outcome import read_outcome
+from embomatrix.trainer.run.settings import OnLost, read_settings
+from embomatrix.trainer.run.stopwatch import Activity
 
 TINY = {"tiny.layers": 2, "tiny.width": 32, "tiny.heads": 2, "tiny.inner": 64}
 SHORT = {

@@ -8,11 +8,11 @@ from tests.fakes.symbolic_household import SymbolicCluster, make_tasks
 
 from embomatrix.reward.settings import RewardSettings
 from embomatrix.rpc.status import DeadlineError, ManagerUnreachableError, UnavailableError
-from embomatrix.rpc.values import RunTerms
+from embomatrix.rpc.wire.values import RunTerms
 from embomatrix.skills.prompt import Codec, plan_in_names
-from embomatrix.trainer.data import Schedule, group_seed
-from embomatrix.trainer.errors import TrainerError
-from embomatrix.trainer.rollout import Gateway, waited
+from embomatrix.trainer.grpo.rollout import Gateway, waited
+from embomatrix.trainer.run.data import Schedule, group_seed
+from embomatrix.trainer.run.errors import TrainerError
 
 TASKS = make_tasks(6, 2)
 TASK = TASKS.train[0]

@@ -11,13 +11,13 @@ import pytest
 from tests.fakes.datasets import write_flats_dataset
 from typer.testing import CliRunner
 
+from embomatrix.bench.cli import app
+from embomatrix.bench.cluster.processes import bench_cluster
+from embomatrix.bench.engine.scenes import scenes_of
+from embomatrix.bench.engine.workload import read_workload, workload_to_text, write_workload
+from embomatrix.bench.report.figures import BenchError
+from embomatrix.bench.report.page import END
 from embomatrix.skills.syntax import Skill
-from embomatrix.worker.bench_cli import app
-from embomatrix.worker.bench_figures import BenchError
-from embomatrix.worker.bench_page import END
-from embomatrix.worker.bench_processes import bench_cluster
-from embomatrix.worker.bench_scenes import scenes_of
-from embomatrix.worker.bench_workload import read_workload, workload_to_text, write_workload
 from embomatrix.world.dataset import Dataset, write_dataset
 
 PLANS = {

@@ -4,16 +4,16 @@ import pytest
 from tests.fakes.datasets import write_flats_dataset
 from typer.testing import CliRunner
 
+from embomatrix.bench.cli import app
+from embomatrix.bench.cluster.ablation import AblationSizes, bench_ablation
+from embomatrix.bench.cluster.ablation_page import ROWS, ablation_lines
+from embomatrix.bench.cluster.cpu import CpuUse
+from embomatrix.bench.cluster.prewarm import PrewarmSizes, bench_prewarm
+from embomatrix.bench.cluster.work import main_work, whole_work
+from embomatrix.bench.engine.workload import workload_to_text, write_workload
+from embomatrix.bench.report.figures import BenchError, BenchResult
+from embomatrix.bench.report.page import render_page
 from embomatrix.pages.figures import Better, Figure
-from embomatrix.worker.bench_ablation import AblationSizes, bench_ablation
-from embomatrix.worker.bench_ablation_page import ROWS, ablation_lines
-from embomatrix.worker.bench_cli import app
-from embomatrix.worker.bench_cpu import CpuUse
-from embomatrix.worker.bench_figures import BenchError, BenchResult
-from embomatrix.worker.bench_page import render_page
-from embomatrix.worker.bench_prewarm import PrewarmSizes, bench_prewarm
-from embomatrix.worker.bench_work import main_work, whole_work
-from embomatrix.worker.bench_workload import workload_to_text, write_workload
 from embomatrix.world.dataset import Dataset
 
 PLANS = {

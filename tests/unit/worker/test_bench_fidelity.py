@@ -7,13 +7,10 @@ from tests.fakes.datasets import write_kitchen_dataset
 from tests.fakes.fidelity import clumsy, dying, hanging, raising
 from typer.testing import CliRunner
 
-from embomatrix.sim.executor import Simulator
-from embomatrix.sim.fidelity.compare import PlanKind, Trial
-from embomatrix.sim.fidelity.records import trial_from_json, trial_to_json
-from embomatrix.sim.fidelity.sampler import SKILLS
-from embomatrix.skills.parse import parse_plan
-from embomatrix.worker.bench_cli import app
-from embomatrix.worker.bench_fidelity import (
+from embomatrix.bench.cli import app
+from embomatrix.bench.fidelity.page import figures_of, read_disagreement, replay
+from embomatrix.bench.fidelity.pool import LOST, FidelityPool, Modes, SceneJob
+from embomatrix.bench.fidelity.suite import (
     DISAGREEMENTS_FILE,
     PLANS_FILE,
     RESULTS_FILE,
@@ -22,9 +19,12 @@ from embomatrix.worker.bench_fidelity import (
     run_fidelity,
     write_all_trials,
 )
-from embomatrix.worker.bench_fidelity_page import figures_of, read_disagreement, replay
-from embomatrix.worker.bench_fidelity_pool import LOST, FidelityPool, Modes, SceneJob
-from embomatrix.worker.bench_figures import BenchError
+from embomatrix.bench.report.figures import BenchError
+from embomatrix.sim.executor import Simulator
+from embomatrix.sim.fidelity.compare import PlanKind, Trial
+from embomatrix.sim.fidelity.records import trial_from_json, trial_to_json
+from embomatrix.sim.fidelity.sampler import SKILLS
+from embomatrix.skills.parse import parse_plan
 from embomatrix.world.dataset import Dataset
 
 QUIET = Progress(written=lambda done, of: None, executed=lambda done, of: None)

@@ -3,9 +3,9 @@
 import pytest
 from tests.fakes.datasets import write_flats_dataset
 
-from embomatrix.worker.bench_flow import FlowSizes, bench_flow
-from embomatrix.worker.bench_work import main_work
-from embomatrix.worker.bench_workload import write_workload
+from embomatrix.bench.cluster.flow import FlowSizes, bench_flow
+from embomatrix.bench.cluster.work import main_work
+from embomatrix.bench.engine.workload import write_workload
 from embomatrix.world.dataset import Dataset
 
 PLANS = {"apple_to_counter": "move apple_1; pick_up apple_1; move countertop_1; place countertop_1 ontop"}

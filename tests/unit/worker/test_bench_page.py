@@ -6,9 +6,8 @@ from dataclasses import replace
 import pytest
 from typer.testing import CliRunner
 
-from embomatrix.pages.figures import Better, Figure, shown
-from embomatrix.worker.bench_cli import app
-from embomatrix.worker.bench_figures import (
+from embomatrix.bench.cli import app
+from embomatrix.bench.report.figures import (
     BenchError,
     BenchResult,
     figure_in,
@@ -17,7 +16,8 @@ from embomatrix.worker.bench_figures import (
     quantile_figure,
     result_to_json,
 )
-from embomatrix.worker.bench_page import END, render_page
+from embomatrix.bench.report.page import END, render_page
+from embomatrix.pages.figures import Better, Figure, shown
 
 MACHINE = {"cpu": "a core", "cores": 2, "load_before": 0.1, "gpu": ""}
 

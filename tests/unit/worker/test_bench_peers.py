@@ -7,16 +7,16 @@ import pytest
 from tests.fakes.contender import FakeContender
 from tests.fakes.datasets import write_flats_dataset
 
+from embomatrix.bench.cluster.work import main_work
+from embomatrix.bench.engine.apart import apart
+from embomatrix.bench.engine.workload import write_workload
+from embomatrix.bench.peers.contender import Chunk, Lost, Mode, Setup, execute, greet
+from embomatrix.bench.peers.contest import Peer, PeerSizes, chunks_of, hold_contest, singles
+from embomatrix.bench.peers.engine_pool import executed_twice, write_bundles
+from embomatrix.bench.peers.page import contest_figures, contest_lines
+from embomatrix.bench.peers.process_pool import process_pool
+from embomatrix.bench.report.figures import BenchError
 from embomatrix.sim.executor import Simulator
-from embomatrix.worker.bench_apart import apart
-from embomatrix.worker.bench_contender import Chunk, Lost, Mode, Setup, execute, greet
-from embomatrix.worker.bench_figures import BenchError
-from embomatrix.worker.bench_peer_engine import executed_twice, write_bundles
-from embomatrix.worker.bench_peer_pool import process_pool
-from embomatrix.worker.bench_peers import Peer, PeerSizes, chunks_of, hold_contest, singles
-from embomatrix.worker.bench_peers_page import contest_figures, contest_lines
-from embomatrix.worker.bench_work import main_work
-from embomatrix.worker.bench_workload import write_workload
 from embomatrix.world.bundle import decode_bundle
 from embomatrix.world.dataset import Dataset
 

@@ -6,13 +6,13 @@ import math
 import pytest
 from tests.fakes.scenes import kitchen_scene, kitchen_tasks
 
+from embomatrix.bench.engine.urdf import roll_pitch_yaw
+from embomatrix.bench.engine.user_world import UrdfFactory, UrdfFiles, UserWorld
 from embomatrix.sim.bullet.bodies import BodyFactory
 from embomatrix.sim.bullet.client import ClientPool, pybullet
 from embomatrix.sim.bullet.dynamic import DynamicWorld
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.physical.actor import PhysicalActor
-from embomatrix.worker.bench_urdf import roll_pitch_yaw
-from embomatrix.worker.bench_user_world import UrdfFactory, UrdfFiles, UserWorld
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.geometry import Pose
 

@@ -10,9 +10,9 @@ import sys
 
 import pytest
 
-from embomatrix.rpc.values import InfraCode
-from embomatrix.worker.cache import BundleCache
-from embomatrix.worker.residents import LoadError
+from embomatrix.rpc.wire.values import InfraCode
+from embomatrix.worker.link.cache import BundleCache
+from embomatrix.worker.slots.residents import LoadError
 from embomatrix.world.inflation import bundle_digest
 
 
@@ -125,7 +125,7 @@ async def test_what_a_killed_daemon_left_half_written_goes_in_time(tmp_path):
 SMALL_DISK = """
 import asyncio, sys
 from pathlib import Path
-from embomatrix.worker.cache import BundleCache
+from embomatrix.worker.link.cache import BundleCache
 from embomatrix.world.inflation import bundle_digest
 
 bundles = {bundle_digest(content): content for content in (b"a" * 30_000, b"b" * 30_000, b"c" * 30_000)}

@@ -7,12 +7,12 @@ import numpy as np
 from tests.fakes.manager import FakeManager, serving
 from tests.fakes.simulation import PROGRAM
 
-from embomatrix.rpc.values import ResidentState, Resources
-from embomatrix.worker.daemon import Daemon
-from embomatrix.worker.pausing import Observation
-from embomatrix.worker.preferences import Preferences
-from embomatrix.worker.settings import WorkerSettings
-from embomatrix.worker.status import running_daemons
+from embomatrix.rpc.wire.values import ResidentState, Resources
+from embomatrix.worker.host.pausing import Observation
+from embomatrix.worker.host.preferences import Preferences
+from embomatrix.worker.host.settings import WorkerSettings
+from embomatrix.worker.host.status import running_daemons
+from embomatrix.worker.link.daemon import Daemon
 
 AWAY = Observation(0, owner_idle_s=1000.0)
 THERE = Observation(0, owner_idle_s=0.0)

@@ -10,10 +10,10 @@ from tests.fakes.manager import FakeManager, serving
 from tests.fakes.simulation import PROGRAM
 
 from embomatrix.rpc.status import ManagerUnreachableError, SupersededError
-from embomatrix.rpc.values import Completed, InfraCode, ResidentState, Resources
-from embomatrix.worker import session
-from embomatrix.worker.daemon import Daemon
-from embomatrix.worker.settings import WorkerSettings
+from embomatrix.rpc.wire.values import Completed, InfraCode, ResidentState, Resources
+from embomatrix.worker.host.settings import WorkerSettings
+from embomatrix.worker.link import session
+from embomatrix.worker.link.daemon import Daemon
 
 
 def _daemon(address, folder, **options):

@@ -10,15 +10,15 @@ from collections import Counter
 import pytest
 from tests.unit.worker.test_slots import running
 
-from embomatrix.rpc.convert_session import lease_from_proto, lease_to_proto
 from embomatrix.rpc.leases import Lease, LeaseRef
-from embomatrix.rpc.values import (
+from embomatrix.rpc.wire.session import lease_from_proto, lease_to_proto
+from embomatrix.rpc.wire.values import (
     Completed,
     InfraCode,
     ResidentState,
     Rollout,
 )
-from embomatrix.worker.execution import AHEAD_S, RECENT
+from embomatrix.worker.slots.execution import AHEAD_S, RECENT
 
 pytestmark = pytest.mark.timeout(60)
 BRIEF_S = AHEAD_S / 12

@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from embomatrix.worker.machine import (
+from embomatrix.worker.host.machine import (
     NEVER_S,
     CpuTimes,
     Machine,
@@ -16,9 +16,9 @@ from embomatrix.worker.machine import (
     family_cpu_s,
     terminal_active_s,
 )
-from embomatrix.worker.pausing import Observation
-from embomatrix.worker.preferences import Preferences
-from embomatrix.worker.resources import free_disk_mb
+from embomatrix.worker.host.pausing import Observation
+from embomatrix.worker.host.preferences import Preferences
+from embomatrix.worker.host.resources import free_disk_mb
 
 BUSY = "import time\nend = time.process_time() + 0.4\nwhile time.process_time() < end: pass\n"
 

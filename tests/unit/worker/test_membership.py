@@ -5,8 +5,8 @@ import stat
 import pytest
 
 from embomatrix.rpc.status import InvalidRequestError
-from embomatrix.worker.membership import Membership, MembershipFile, membership_of
-from embomatrix.worker.settings import WorkerSettings
+from embomatrix.worker.host.settings import WorkerSettings
+from embomatrix.worker.link.membership import Membership, MembershipFile, membership_of
 
 KEPT = Membership("lab.example:50070", "spare", "own.credential", b"PEM")
 

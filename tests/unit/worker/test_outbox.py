@@ -5,10 +5,10 @@ from hypothesis import strategies as st
 from numpy.random import default_rng
 
 from embomatrix.rpc.leases import LeaseRef, LeaseResult
-from embomatrix.rpc.values import InfraCode, InfraFailure
-from embomatrix.worker import outbox as module
-from embomatrix.worker.backoff import Backoff
-from embomatrix.worker.outbox import Outbox
+from embomatrix.rpc.wire.values import InfraCode, InfraFailure
+from embomatrix.worker.link import outbox as module
+from embomatrix.worker.link.backoff import Backoff
+from embomatrix.worker.link.outbox import Outbox
 
 
 def _result(number):

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from embomatrix.worker.pausing import CALM_SHARE, LOADED_S, WORKING, Observation, judge
-from embomatrix.worker.preferences import DAY_MINUTES, Hours, Preferences
+from embomatrix.worker.host.pausing import CALM_SHARE, LOADED_S, WORKING, Observation, judge
+from embomatrix.worker.host.preferences import DAY_MINUTES, Hours, Preferences
 
 WISHES = Preferences(hours="18:00-08:00", idle_s=300, mains_only=True, max_load=0.5, calm_s=30)
 QUIET = Observation(minute=20 * 60, owner_idle_s=1000, on_mains=True, others_load=0.0)

@@ -4,7 +4,7 @@ import contextlib
 
 from embomatrix.sim.executor import Simulator
 from embomatrix.skills.syntax import Skill
-from embomatrix.worker.rehearsal import PLANS, REHEARSAL, rehearsal_bundle
+from embomatrix.worker.slots.rehearsal import PLANS, REHEARSAL, rehearsal_bundle
 from embomatrix.world.bundle import decode_bundle, encode_bundle
 from embomatrix.world.geometry import Shape
 

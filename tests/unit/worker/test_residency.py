@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from embomatrix.worker.residency import NOTHING, UNKNOWN_MB, Decision, Held, decide, surplus
+from embomatrix.worker.slots.residency import NOTHING, UNKNOWN_MB, Decision, Held, decide, surplus
 
 DIGESTS = st.sampled_from([f"d{number}" for number in range(8)])
 HELD = st.dictionaries(

@@ -5,9 +5,9 @@ import os
 import pytest
 from pydantic import ValidationError
 
-from embomatrix.worker.gpu import Gpu, ask_nvml, ask_program, find_gpu
-from embomatrix.worker.resources import fingerprint, measure
-from embomatrix.worker.settings import WorkerSettings
+from embomatrix.worker.host.gpu import Gpu, ask_nvml, ask_program, find_gpu
+from embomatrix.worker.host.resources import fingerprint, measure
+from embomatrix.worker.host.settings import WorkerSettings
 
 
 def test_a_machine_offers_its_cores_and_part_of_its_memory():

@@ -14,16 +14,16 @@ import pytest
 from tests.fakes.simulation import PROGRAM
 
 from embomatrix.rpc.leases import Lease, LeaseRef
-from embomatrix.rpc.values import (
+from embomatrix.rpc.wire.values import (
     Completed,
     InfraCode,
     InfraFailure,
     ResidentState,
     Rollout,
 )
-from embomatrix.worker.processes import ProcessGoneError
-from embomatrix.worker.residents import LoadError, SlotLimits
-from embomatrix.worker.slots import SlotPool
+from embomatrix.worker.slots.pool import SlotPool
+from embomatrix.worker.slots.processes import ProcessGoneError
+from embomatrix.worker.slots.residents import LoadError, SlotLimits
 
 
 class Harness:
@@ -368,7 +368,7 @@ def test_no_process_outlives_a_daemon_that_was_killed(tmp_path):
 
 def test_what_is_forked_has_imported_neither_grpc_nor_pydantic():
     check = (
-        "import sys, embomatrix.worker.slot_program, threading\n"
+        "import sys, embomatrix.worker.slots.slot_program, threading\n"
         "print([name for name in ('grpc', 'pydantic', 'torch', 'fastapi') if name in sys.modules], threading.active_count())"
     )
     result = subprocess.run(

@@ -11,11 +11,11 @@ from tests.fakes.simulation import PROGRAM
 from tests.unit.worker.test_slots import running
 
 from embomatrix.host.cgroup import MIB
-from embomatrix.rpc.values import Completed, ResidentState, Resources
-from embomatrix.worker import spare_memory
-from embomatrix.worker.daemon import Daemon
-from embomatrix.worker.settings import WorkerSettings
-from embomatrix.worker.spare_memory import SCARCE_MEMORY, SpareMemory, spare_memory_mb
+from embomatrix.rpc.wire.values import Completed, ResidentState, Resources
+from embomatrix.worker.host import spare_memory
+from embomatrix.worker.host.settings import WorkerSettings
+from embomatrix.worker.host.spare_memory import SCARCE_MEMORY, SpareMemory, spare_memory_mb
+from embomatrix.worker.link.daemon import Daemon
 
 SCENES = ["ok-1", "ok-2", "ok-3"]
 

@@ -11,11 +11,11 @@ import pytest
 from tests.fakes.systemd import assert_valid_unit, needs_systemd
 from typer.testing import CliRunner
 
-from embomatrix.worker.cli import app
-from embomatrix.worker.install_cli import closed_to_others, quote, unit_text
-from embomatrix.worker.run_cli import settings_of
-from embomatrix.worker.status import StatusFile, WorkerStatus, running_daemons
-from embomatrix.worker.status_cli import describe, spell
+from embomatrix.worker.commands.app import app
+from embomatrix.worker.commands.install import closed_to_others, quote, unit_text
+from embomatrix.worker.commands.run import settings_of
+from embomatrix.worker.commands.status import describe, spell
+from embomatrix.worker.host.status import StatusFile, WorkerStatus, running_daemons
 
 DEPLOY = Path(__file__).parents[3] / "deploy"
 STATUS = WorkerStatus("w1", os.getpid(), time.time(), slots=4, memory_mb=2000, cache_mb=1024)

@@ -3,10 +3,10 @@
 import pytest
 
 from embomatrix.rpc.leases import Lease, LeaseRef
-from embomatrix.rpc.values import ResidentState, Rollout
-from embomatrix.worker.execution import Ticket
-from embomatrix.worker.residents import Scene
-from embomatrix.worker.waiting import OVERTAKEN_S, WaitingLeases
+from embomatrix.rpc.wire.values import ResidentState, Rollout
+from embomatrix.worker.slots.execution import Ticket
+from embomatrix.worker.slots.residents import Scene
+from embomatrix.worker.slots.waiting import OVERTAKEN_S, WaitingLeases
 
 SCENES = ("kitchen", "bath", "hall")
 

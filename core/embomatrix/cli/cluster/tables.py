@@ -13,12 +13,12 @@ from rich.table import Table
 from rich.text import Text
 
 from embomatrix.rpc.run_log import EventKind, RunEvent
-from embomatrix.rpc.values import ResidentState, Warmth
+from embomatrix.rpc.wire.values import ResidentState, Warmth
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from embomatrix.rpc.values import PlanCell, RunInfo, WorkerInfo
+    from embomatrix.rpc.wire.values import PlanCell, RunInfo, WorkerInfo
 
 STATE_STYLES: Final[Mapping[str, str]] = {
     "ready": "green",

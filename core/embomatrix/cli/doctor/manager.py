@@ -23,7 +23,7 @@ from embomatrix.rpc.versions import SPOKEN, agree, software_version
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from embomatrix.rpc.values import Fleet
+    from embomatrix.rpc.wire.values import Fleet
 
 KNOCK_S: Final = 1.0
 """Limit for each of the questions, of which there are four: a doctor is quick."""

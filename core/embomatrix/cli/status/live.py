@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from rich.console import RenderableType
 
-    from embomatrix.rpc.values import Fleet, RunInfo, WorkerInfo
+    from embomatrix.rpc.wire.values import Fleet, RunInfo, WorkerInfo
 
 OTHER_LINES: Final = 7
 """Lines that are no run's and no worker's: two of the head, two empty ones, the heads of two tables, how many more."""

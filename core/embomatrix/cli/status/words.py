@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections import Counter
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.rpc.values import Warmth
+from embomatrix.rpc.wire.values import Warmth
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from embomatrix.rpc.values import Fleet, PlanCell, RunInfo, WorkerInfo
+    from embomatrix.rpc.wire.values import Fleet, PlanCell, RunInfo, WorkerInfo
 
 WORKING: Final = frozenset(("ready", "suspect"))
 """States in which a worker may hold rollouts that go on."""

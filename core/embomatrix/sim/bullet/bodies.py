@@ -10,8 +10,8 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from embomatrix.sim.bounds import IDENTITY, joint_motion
 from embomatrix.sim.bullet.client import pybullet
+from embomatrix.sim.geometry.bounds import IDENTITY, joint_motion
 from embomatrix.world.asset import JointKind
 from embomatrix.world.geometry import Pose, Shape, Vec3
 

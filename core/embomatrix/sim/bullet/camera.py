@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.sim.bounds import IDENTITY
 from embomatrix.sim.bullet.stage import Stage
+from embomatrix.sim.geometry.bounds import IDENTITY
 from embomatrix.sim.physical.stage import tucked
 from embomatrix.world.geometry import Pose
 from embomatrix.world.poses import StandPose

@@ -10,7 +10,6 @@ import math
 import struct
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.sim.bounds import IDENTITY, bounds_of, forget
 from embomatrix.sim.bullet.bodies import PART_LIMIT
 from embomatrix.sim.bullet.client import ClientPool, pybullet
 from embomatrix.sim.bullet.mini_world import MiniWorld, Still
@@ -25,14 +24,15 @@ from embomatrix.sim.engine import (
     Journal,
     Settled,
 )
-from embomatrix.sim.neighbourhood import Neighbourhood
+from embomatrix.sim.geometry.bounds import IDENTITY, bounds_of, forget
+from embomatrix.sim.geometry.neighbourhood import Neighbourhood
 from embomatrix.sim.validation import check_fractions, check_pose, check_scene
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-    from embomatrix.sim.bounds import AssetBounds
-    from embomatrix.sim.prepared import Prepared
+    from embomatrix.sim.floor.prepared import Prepared
+    from embomatrix.sim.geometry.bounds import AssetBounds
     from embomatrix.world.geometry import Aabb, Pose
     from embomatrix.world.scene import Scene
 

@@ -6,10 +6,10 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.sim.bounds import parts_of
 from embomatrix.sim.bullet.bodies import BodyFactory
 from embomatrix.sim.bullet.client import ClientPool, pybullet
 from embomatrix.sim.engine import SETTLE_STEPS, Settled
+from embomatrix.sim.geometry.bounds import parts_of
 from embomatrix.world.geometry import Aabb, Part, Pose, Shape
 
 if TYPE_CHECKING:

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from embomatrix.sim.bounds import IDENTITY, joint_motion
 from embomatrix.sim.bullet.client import pybullet
 from embomatrix.sim.bullet.robot_figure import RobotFigure
 from embomatrix.sim.engine import EngineError
+from embomatrix.sim.geometry.bounds import IDENTITY, joint_motion
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.geometry import Pose, Shape
 

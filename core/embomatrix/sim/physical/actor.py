@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.sim.actions import ACTIONS
-from embomatrix.sim.barriers import no_way_into, no_way_to
 from embomatrix.sim.bullet.dynamic import DynamicWorld
 from embomatrix.sim.executor import Simulator
+from embomatrix.sim.floor.barriers import no_way_into, no_way_to
 from embomatrix.sim.physical.doors import close_all, open_all
 from embomatrix.sim.physical.hands import pick_up
 from embomatrix.sim.physical.place import place

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.sim.actions import other_stands
-from embomatrix.sim.bounds import IDENTITY, joint_motion
+from embomatrix.sim.geometry.bounds import IDENTITY, joint_motion
 from embomatrix.sim.physical import body
 from embomatrix.sim.physical.fold import WAYS, approach, fold, unfold
 from embomatrix.sim.physical.grasp import cross, facing

@@ -6,16 +6,16 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.sim.obstacles import FLAT_M
+from embomatrix.sim.floor.obstacles import FLAT_M
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.poses import StandPose
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from embomatrix.sim.floor_grid import FloorGrid
-    from embomatrix.sim.floor_ways import Cell
-    from embomatrix.sim.navigation import Navigator
+    from embomatrix.sim.floor.grid import FloorGrid
+    from embomatrix.sim.floor.navigation import Navigator
+    from embomatrix.sim.floor.paths import Cell
     from embomatrix.sim.physical.space import Boxes
     from embomatrix.world.geometry import FloatArray, Vec2
 

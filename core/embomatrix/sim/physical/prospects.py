@@ -11,12 +11,12 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.sim.leaves import swing_leaves
+from embomatrix.sim.joints.panels import swing_leaves
+from embomatrix.sim.joints.swings import SWING
 from embomatrix.sim.physical.hands import ways_to
 from embomatrix.sim.physical.place import PLACES
 from embomatrix.sim.physical.put import Delivery
-from embomatrix.sim.placement import Placer
-from embomatrix.sim.swings import SWING
+from embomatrix.sim.placing.placement import Placer
 from embomatrix.skills.failure import FailureReason
 from embomatrix.world.state import Relation
 

@@ -13,7 +13,7 @@ from embomatrix.sim.physical.fold import fold
 from embomatrix.sim.physical.grasp import grasp_tracks
 from embomatrix.sim.physical.hands import bases_at, take_by, way_in
 from embomatrix.sim.physical.put import Delivery, put
-from embomatrix.sim.trial import in_reach
+from embomatrix.sim.placing.trial import in_reach
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.geometry import Aabb, Pose

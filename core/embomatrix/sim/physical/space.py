@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.sim.bounds import IDENTITY, joint_motion
 from embomatrix.sim.engine import FLOOR, WALL
+from embomatrix.sim.geometry.bounds import IDENTITY, joint_motion
 from embomatrix.world.geometry import Aabb, Pose, Shape
 
 if TYPE_CHECKING:

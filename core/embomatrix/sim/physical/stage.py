@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.sim.bullet.robot import Posture
-from embomatrix.sim.leaves import swing_leaves
+from embomatrix.sim.joints.panels import swing_leaves
+from embomatrix.sim.joints.swings import SWING
 from embomatrix.sim.physical import arm, body
 from embomatrix.sim.physical.floor import Floor
 from embomatrix.sim.physical.motion import Mover
 from embomatrix.sim.physical.reach import Held, Reach
 from embomatrix.sim.physical.space import boxes_around, object_balls
-from embomatrix.sim.swings import SWING
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.geometry import Aabb, Pose
 from embomatrix.world.poses import StandPose

@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.sim.bounds import IDENTITY
 from embomatrix.sim.bullet.dynamic import DynamicWorld
-from embomatrix.sim.contents import Contents
-from embomatrix.sim.leaves import Leaves, swing_leaves
+from embomatrix.sim.geometry.bounds import IDENTITY
+from embomatrix.sim.geometry.contents import Contents
+from embomatrix.sim.joints.panels import Leaves, swing_leaves
+from embomatrix.sim.joints.swings import SWING
 from embomatrix.sim.physical.doors import STRETCHES, close_all, in_turn, leading, open_all
 from embomatrix.sim.physical.fold import WAYS, approach
 from embomatrix.sim.physical.hands import ways_to
@@ -25,7 +26,6 @@ from embomatrix.sim.physical.press import pressing
 from embomatrix.sim.physical.prospects import Prospects
 from embomatrix.sim.physical.stage import AROUND_M, Stage
 from embomatrix.sim.physical.travel import SOMETHING
-from embomatrix.sim.swings import SWING
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.poses import Handling, PoseCache
 

@@ -11,7 +11,7 @@ import numpy as np
 from embomatrix.sim.physical import body
 from embomatrix.sim.physical.space import struck
 from embomatrix.sim.physical.stage import compact
-from embomatrix.sim.trial import in_reach
+from embomatrix.sim.placing.trial import in_reach
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.view import refuse
 from embomatrix.world.poses import StandPose

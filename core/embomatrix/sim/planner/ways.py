@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.sim.candidates import candidates
+from embomatrix.sim.geometry.candidates import candidates
 from embomatrix.skills.syntax import PlaceRelation
 from embomatrix.world.asset import FLOOR_CATEGORY
 from embomatrix.world.state import Relation

@@ -16,7 +16,7 @@ import numpy as np
 from embomatrix.factory.assets.families import Family
 from embomatrix.factory.assets.naming import family_of_model
 from embomatrix.factory.assets.shapes import mesh_of
-from embomatrix.sim.bounds import IDENTITY, joint_motion
+from embomatrix.sim.geometry.bounds import IDENTITY, joint_motion
 from embomatrix.world.geometry import Aabb, Pose, Shape
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from embomatrix.factory.assets.shapes import mesh_of
-from embomatrix.sim.bounds import IDENTITY, joint_motion
+from embomatrix.sim.geometry.bounds import IDENTITY, joint_motion
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

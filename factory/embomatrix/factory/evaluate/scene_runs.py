@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from embomatrix.factory.evaluate.scenes import Method, Outcome, SceneTask, evaluation_of, judge
 from embomatrix.factory.outcome_log import LineLog
 from embomatrix.factory.scenes.build import build_base_scene
-from embomatrix.sim.pose_cache import PlacementLibrary
+from embomatrix.sim.placing.pose_cache import PlacementLibrary
 from embomatrix.sim.process_pool import process_pool
 
 if TYPE_CHECKING:

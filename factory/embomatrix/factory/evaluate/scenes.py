@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from embomatrix.factory.editor import SceneEditor
     from embomatrix.factory.layout.jobs import Item, Layout
     from embomatrix.factory.task_import.task import Lay
-    from embomatrix.sim.pose_cache import PlacementLibrary
+    from embomatrix.sim.placing.pose_cache import PlacementLibrary
     from embomatrix.world.scene import Scene
 
 LIST: Final = "scene_tasks.json"

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.factory.layout.organization import HIGHEST_M, LOWEST_M
 from embomatrix.factory.layout.values import HostFacts, HostOffer, LayoutRelation, RoomFacts
 from embomatrix.factory.writer.tables import HOST_GROUPS
-from embomatrix.sim.candidates import EDGE_M, surfaces_for
+from embomatrix.sim.geometry.candidates import EDGE_M, surfaces_for
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.state import Relation
 

@@ -9,7 +9,7 @@ from embomatrix.factory.editor import PlacementError, box_at
 from embomatrix.factory.floorplan.walls import WALL_HEIGHT_M
 from embomatrix.factory.furnish.roles import HUNG_BOTTOM_M, Role, role_of, wall_height_m
 from embomatrix.factory.layout.values import LayoutReason
-from embomatrix.sim.bounds import bounds_of
+from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.geometry import Pose
 from embomatrix.world.scene import Doorway

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Final, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from embomatrix.factory.layout.agent_io import DOORS, AgentName
 from embomatrix.factory.layout.distribution import distribute
-from embomatrix.factory.layout.doors import DOORS, AgentName
 from embomatrix.factory.layout.jobs import LayoutAgents
 from embomatrix.factory.layout.organization import choices, described, organize
 from embomatrix.factory.layout.prompts import DISTRIBUTOR, ORGANIZER, PLANNER, USER

@@ -11,8 +11,8 @@ import numpy as np
 from embomatrix.factory.layout.arrangement import half_extents
 from embomatrix.factory.layout.sampling import LIFT_M
 from embomatrix.factory.layout.values import Footprint, PlaneBrief, PlaneThing, Wish
-from embomatrix.sim.bounds import bounds_of
-from embomatrix.sim.candidates import surfaces_for
+from embomatrix.sim.geometry.bounds import bounds_of
+from embomatrix.sim.geometry.candidates import surfaces_for
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.geometry import Pose
 from embomatrix.world.state import Relation

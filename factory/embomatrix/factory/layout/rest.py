@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.writer.rehearsal import Rehearsal
 from embomatrix.sim.bullet.engine import BulletEngine
-from embomatrix.sim.navigation import Navigator
-from embomatrix.sim.relations import Relations
-from embomatrix.sim.statics import base_of, is_level, rest_pose
+from embomatrix.sim.floor.navigation import Navigator
+from embomatrix.sim.geometry.statics import base_of, is_level, rest_pose
+from embomatrix.sim.state.relations import Relations
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.factory.assets.library import build_asset
 from embomatrix.factory.editor import PlacementError
 from embomatrix.factory.layout.values import LayoutReason
-from embomatrix.sim.bounds import bounds_of
-from embomatrix.sim.candidates import candidates, patches, stands_in
+from embomatrix.sim.geometry.bounds import bounds_of
+from embomatrix.sim.geometry.candidates import candidates, patches, stands_in
 from embomatrix.world.catalog import Catalog, CatalogError
 from embomatrix.world.geometry import Pose
 from embomatrix.world.state import Relation

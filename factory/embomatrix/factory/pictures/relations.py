@@ -9,10 +9,10 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from embomatrix.factory.assets.library import build_asset
-from embomatrix.sim.bounds import AssetBounds
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.bullet.stage import Stage
-from embomatrix.sim.relations import Relations
+from embomatrix.sim.geometry.bounds import AssetBounds
+from embomatrix.sim.state.relations import Relations
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.geometry import Aabb, Pose
 from embomatrix.world.scene import RobotStart, Room, Scene, SceneObject

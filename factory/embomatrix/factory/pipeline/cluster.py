@@ -10,7 +10,7 @@ from embomatrix.factory.admission import SEED
 from embomatrix.factory.pipeline.store import Rejection
 from embomatrix.factory.refusal import RefusalReason
 from embomatrix.rpc.client import ClusterClient
-from embomatrix.rpc.values import Batch, Completed, Rollout, RolloutResult
+from embomatrix.rpc.wire.values import Batch, Completed, Rollout, RolloutResult
 from embomatrix.skills.parse import plan_from_json
 from embomatrix.world.dataset import DatasetError
 

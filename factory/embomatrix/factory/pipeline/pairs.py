@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from embomatrix.factory.scenes.solids import Solids, placed_parts
-from embomatrix.sim.bounds import bounds_of
+from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.world.poses import PlacementKey
 from embomatrix.world.state import Relation
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
     from embomatrix.factory.writer.view import SceneView
-    from embomatrix.sim.pose_cache import PlacementLibrary
+    from embomatrix.sim.placing.pose_cache import PlacementLibrary
     from embomatrix.world.asset import Asset
     from embomatrix.world.geometry import Aabb, Pose
     from embomatrix.world.poses import StandPose

@@ -14,7 +14,7 @@ from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.live_world import LiveWorld
 from embomatrix.sim.physical.prospects import Placing
 from embomatrix.sim.physical.survey import prospects
-from embomatrix.sim.pose_cache import PLACE_RELATIONS, footprint_placements, standing_poses
+from embomatrix.sim.placing.pose_cache import PLACE_RELATIONS, footprint_placements, standing_poses
 from embomatrix.skills.appliance import cold_source, heat_source
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.poses import Handling, PlacementKey, PoseCache
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from embomatrix.factory.pipeline.pairs import Beside
     from embomatrix.factory.writer.view import SceneView
     from embomatrix.sim.physical.survey import Foresight
-    from embomatrix.sim.pose_cache import PlacementLibrary
+    from embomatrix.sim.placing.pose_cache import PlacementLibrary
     from embomatrix.world.asset import Asset
     from embomatrix.world.geometry import Pose
     from embomatrix.world.poses import StandPose

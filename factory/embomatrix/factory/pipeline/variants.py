@@ -23,11 +23,11 @@ from embomatrix.factory.writer.tasks import DraftOrder, ManyAtOnce, PlainWriter,
 from embomatrix.factory.writer.variant import Variant, build_variant
 from embomatrix.factory.writer.view import SceneView
 from embomatrix.sim.executor import Simulator
+from embomatrix.sim.floor.prepared import prepare
 from embomatrix.sim.physical.actor import physical_simulator
 from embomatrix.sim.physical.survey import Foresight
+from embomatrix.sim.placing.pose_cache import PlacementLibrary
 from embomatrix.sim.planner.oracle import find_plan
-from embomatrix.sim.pose_cache import PlacementLibrary
-from embomatrix.sim.prepared import prepare
 from embomatrix.skills.parse import plan_to_json
 from embomatrix.world.bundle import Bundle, encode_bundle
 from embomatrix.world.dataset import TaskRecord

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.sim.bounds import joint_motion
-from embomatrix.sim.floor_grid import CELL_M, FloorGrid
+from embomatrix.sim.floor.grid import CELL_M, FloorGrid
+from embomatrix.sim.geometry.bounds import joint_motion
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.geometry import Aabb, Pose
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from embomatrix.factory.scenes.solids import placed_parts
-from embomatrix.sim.bounds import bounds_of
-from embomatrix.sim.spots import link_frame, link_under, links_with_spots
+from embomatrix.sim.geometry.bounds import bounds_of
+from embomatrix.sim.geometry.surfaces import link_frame, link_under, links_with_spots
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from embomatrix.sim.bounds import joint_motion
+from embomatrix.sim.geometry.bounds import joint_motion
 from embomatrix.world.geometry import Pose, Shape
 
 if TYPE_CHECKING:

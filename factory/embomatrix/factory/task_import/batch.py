@@ -17,8 +17,8 @@ from embomatrix.factory.task_import.sources import BEHAVIOR, EAI
 from embomatrix.factory.task_import.task import Imported, Manner, import_problem
 from embomatrix.factory.writer.view import SceneView
 from embomatrix.sim.executor import Simulator
+from embomatrix.sim.floor.prepared import prepare
 from embomatrix.sim.planner.oracle import find_plan
-from embomatrix.sim.prepared import prepare
 from embomatrix.skills.parse import plan_to_json
 from embomatrix.world.bundle import Bundle, encode_bundle
 from embomatrix.world.dataset import TaskRecord
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from embomatrix.factory.task_import.sources import SourceText
     from embomatrix.sim.physical.survey import Foresight
-    from embomatrix.sim.pose_cache import PlacementLibrary
+    from embomatrix.sim.placing.pose_cache import PlacementLibrary
     from embomatrix.world.poses import PoseCache
     from embomatrix.world.scene import Scene
     from embomatrix.world.task import Task

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.task_import.reach import literals
 from embomatrix.factory.writer.view import is_liftable
-from embomatrix.sim.candidates import surfaces_for
+from embomatrix.sim.geometry.candidates import surfaces_for
 from embomatrix.world.catalog import Catalog, CatalogError
 from embomatrix.world.state import Relation
 

@@ -13,7 +13,7 @@ from embomatrix.factory.task_import.batch import Verified, bind_first, verify_fi
 from embomatrix.factory.task_import.report import Outcome, outcome_of
 from embomatrix.factory.task_import.task import Imported, Manner
 from embomatrix.sim.physical.survey import Foresight
-from embomatrix.sim.pose_cache import PlacementLibrary
+from embomatrix.sim.placing.pose_cache import PlacementLibrary
 from embomatrix.sim.process_pool import shared_work
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.factory.assets.library import build_asset
 from embomatrix.factory.task_import.demands import Demand, Room, floor_needed_m2, room_for
 from embomatrix.factory.writer.view import is_liftable
-from embomatrix.sim.candidates import candidates, surfaces_for
+from embomatrix.sim.geometry.candidates import candidates, surfaces_for
 from embomatrix.sim.planner.ways import CANDIDATES, MIDDLE
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.state import Relation

@@ -10,7 +10,7 @@ from embomatrix.factory.scenes.joints import bumped_into
 from embomatrix.factory.scenes.solids import Solids
 from embomatrix.factory.writer.robot import AnyRobot
 from embomatrix.factory.writer.tables import NEVER_SWITCHED
-from embomatrix.sim.swings import SWING
+from embomatrix.sim.joints.swings import SWING
 from embomatrix.skills.appliance import cold_source, cooks, freezes, heat_source, heats
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.asset import FLOOR_CATEGORY

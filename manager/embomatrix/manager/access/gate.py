@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     import grpc
 
-    from embomatrix.manager.registry import Session
+    from embomatrix.manager.runtime.registry import Session
     from embomatrix.manager.store.protocol import StateStore
     from embomatrix.rpc.roles import TokenInfo
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.manager.commands import (
+from embomatrix.manager.control.commands import (
     AcknowledgeLease,
     CancelLease,
     Command,
@@ -13,14 +13,14 @@ from embomatrix.manager.commands import (
     FinishBatch,
     GiveLease,
 )
-from embomatrix.rpc.values import Completed, GroupPolicy, InfraFailure, ResidentState
+from embomatrix.rpc.wire.values import Completed, GroupPolicy, InfraFailure, ResidentState
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from embomatrix.manager.simulation.agenda import Agenda
     from embomatrix.rpc.leases import LeaseRef, WorkerState
-    from embomatrix.rpc.values import Batch, RolloutResult
+    from embomatrix.rpc.wire.values import Batch, RolloutResult
 
 
 HEDGE_SHARE: Final = 0.05

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.manager.commands import (
+from embomatrix.manager.control.commands import (
     AcknowledgeLease,
     CancelLease,
     DeliverResult,
@@ -14,22 +14,22 @@ from embomatrix.manager.commands import (
     QuarantineWorker,
     SetDesired,
 )
-from embomatrix.manager.events import BatchSubmitted, LookaheadAnnounced, RunOpened
-from embomatrix.manager.intake import TICK_S, Heartbeat
+from embomatrix.manager.control.events import BatchSubmitted, LookaheadAnnounced, RunOpened
+from embomatrix.manager.runtime.intake import TICK_S, Heartbeat
 from embomatrix.rpc.leases import Lease
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
-    from embomatrix.manager.commands import Command
-    from embomatrix.manager.intake import Intake
-    from embomatrix.manager.registry import Session
+    from embomatrix.manager.control.commands import Command
+    from embomatrix.manager.runtime.intake import Intake
+    from embomatrix.manager.runtime.registry import Session
     from embomatrix.manager.simulation.agenda import Agenda
     from embomatrix.manager.simulation.auditor import Auditor
     from embomatrix.manager.simulation.gauge import Gauge
     from embomatrix.manager.simulation.scenario import ManagerPace
     from embomatrix.rpc.leases import LeaseProgress, LeaseRef, LeaseResult, WorkerState
-    from embomatrix.rpc.values import (
+    from embomatrix.rpc.wire.values import (
         Batch,
         LookaheadEntry,
         Resources,

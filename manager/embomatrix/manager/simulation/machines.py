@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from embomatrix.rpc.values import Resources
+from embomatrix.rpc.wire.values import Resources
 
 if TYPE_CHECKING:
     from embomatrix.manager.simulation.scenario import MachineKind, Scenario

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from statistics import fmean
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.manager.cluster_state import ClusterState
-from embomatrix.manager.histogram import quantile
-from embomatrix.manager.intake import Intake
-from embomatrix.manager.registry import Registry
+from embomatrix.manager.control.cluster_state import ClusterState
+from embomatrix.manager.observe.histogram import quantile
+from embomatrix.manager.runtime.intake import Intake
+from embomatrix.manager.runtime.registry import Registry
 from embomatrix.manager.simulation.agenda import Agenda
 from embomatrix.manager.simulation.auditor import Auditor, BrokenInvariantError
 from embomatrix.manager.simulation.front import Front
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from embomatrix.manager.simulation.gauge import Cost
     from embomatrix.manager.simulation.scenario import Scenario
-    from embomatrix.rpc.values import RunStats
+    from embomatrix.rpc.wire.values import RunStats
 
 SAMPLE_S: Final = 0.1
 """The slots are looked at this often, to see how many are at work while there is work for all."""

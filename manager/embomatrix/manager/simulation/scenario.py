@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-from embomatrix.manager.assignments import DispatchLimits
-from embomatrix.manager.registry import LivenessLimits
-from embomatrix.manager.scheduler import ScheduleLimits
-from embomatrix.rpc.values import RunTerms
+from embomatrix.manager.control.dispatch.assignments import DispatchLimits
+from embomatrix.manager.control.schedule.scheduler import ScheduleLimits
+from embomatrix.manager.runtime.registry import LivenessLimits
+from embomatrix.rpc.wire.values import RunTerms
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.rpc.leases import LeaseProgress, LeaseResult
-from embomatrix.rpc.values import (
+from embomatrix.rpc.wire.values import (
     Completed,
     InfraCode,
     InfraFailure,

@@ -6,7 +6,7 @@ import functools
 import math
 from typing import TYPE_CHECKING
 
-from embomatrix.rpc.values import Batch, Completed, LookaheadEntry, Rollout
+from embomatrix.rpc.wire.values import Batch, Completed, LookaheadEntry, Rollout
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from embomatrix.manager.simulation.front import Front
     from embomatrix.manager.simulation.gauge import Gauge
     from embomatrix.manager.simulation.scenario import Trainer
-    from embomatrix.rpc.values import RolloutResult
+    from embomatrix.rpc.wire.values import RolloutResult
 
 
 class SimulatedTrainer:

@@ -9,13 +9,13 @@ from embomatrix.manager.simulation.line import Line
 from embomatrix.manager.simulation.slots import SimulatedSlots, Surroundings
 from embomatrix.rpc.leases import WorkerState
 from embomatrix.rpc.status import SupersededError
-from embomatrix.rpc.values import Completed
+from embomatrix.rpc.wire.values import Completed
 
 if TYPE_CHECKING:
     import random
     from collections.abc import Callable
 
-    from embomatrix.manager.registry import Session
+    from embomatrix.manager.runtime.registry import Session
     from embomatrix.manager.simulation.agenda import Agenda
     from embomatrix.manager.simulation.auditor import Auditor
     from embomatrix.manager.simulation.front import Front, Letter

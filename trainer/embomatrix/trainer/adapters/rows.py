@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from embomatrix.skills.prompt import Codec, prompt_for
-from embomatrix.trainer.data import load_tasks
-from embomatrix.trainer.errors import TrainerError
+from embomatrix.trainer.run.data import load_tasks
+from embomatrix.trainer.run.errors import TrainerError
 
 if TYPE_CHECKING:
     from embomatrix.skills.prompt import Situation
-    from embomatrix.trainer.data import TrainingTask
+    from embomatrix.trainer.run.data import TrainingTask
 
 SOURCE = "embomatrix"
 

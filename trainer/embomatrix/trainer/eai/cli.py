@@ -11,7 +11,7 @@ from rich.console import Console
 
 from embomatrix.trainer.eai.environment import JudgeEnvironment, default_folder, install
 from embomatrix.trainer.eai.judge import NativeJudge
-from embomatrix.trainer.errors import TrainerError
+from embomatrix.trainer.run.errors import TrainerError
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help=__doc__)
 console = Console(highlight=False, markup=False, soft_wrap=True)

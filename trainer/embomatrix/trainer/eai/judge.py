@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
 
 from embomatrix.trainer.eai.sanitise import sanitised
-from embomatrix.trainer.errors import TrainerError
+from embomatrix.trainer.run.errors import TrainerError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

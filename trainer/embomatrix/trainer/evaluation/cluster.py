@@ -6,13 +6,13 @@ import asyncio
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
-from embomatrix.rpc.values import Batch, GroupPolicy, RunTerms
+from embomatrix.rpc.wire.values import Batch, GroupPolicy, RunTerms
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Sequence
 
     from embomatrix.rpc.client import ClusterClient
-    from embomatrix.rpc.values import Rollout
+    from embomatrix.rpc.wire.values import Rollout
     from embomatrix.trainer.evaluation.judging import OnResult
 
 AT_ONCE: Final = 4

@@ -5,16 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
-from embomatrix.rpc.values import Rollout
+from embomatrix.rpc.wire.values import Rollout
 from embomatrix.skills.parse import PlanError, parse_plan
 from embomatrix.skills.prompt import Codec, limited, with_indices
-from embomatrix.trainer.data import group_seed
 from embomatrix.trainer.evaluation.verdicts import of_plan, of_text
+from embomatrix.trainer.run.data import group_seed
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from embomatrix.rpc.values import Outcome
+    from embomatrix.rpc.wire.values import Outcome
     from embomatrix.skills.syntax import Plan
     from embomatrix.trainer.evaluation.answers import Answer, Setup
     from embomatrix.trainer.evaluation.benchmark import Benchmark

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from embomatrix.rpc.values import Completed
+from embomatrix.rpc.wire.values import Completed
 from embomatrix.trainer.evaluation.taxonomy import Cause, cause_of_text, cause_of_trace
 
 if TYPE_CHECKING:
-    from embomatrix.rpc.values import Outcome
+    from embomatrix.rpc.wire.values import Outcome
     from embomatrix.skills.parse import PlanError
     from embomatrix.skills.syntax import Plan
     from embomatrix.trainer.evaluation.answers import Answer

@@ -5,18 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.trainer.errors import DAMAGE, TrainerError, reason_of
 from embomatrix.trainer.policy.decoder import DecoderShape
 from embomatrix.trainer.policy.hf import HfPolicy
 from embomatrix.trainer.policy.lora import LoraShape, has_adapters
 from embomatrix.trainer.policy.products import type_of
 from embomatrix.trainer.policy.tiny import TinyPolicy
 from embomatrix.trainer.policy.words import build_vocabulary
+from embomatrix.trainer.run.errors import DAMAGE, TrainerError, reason_of
 
 if TYPE_CHECKING:
-    from embomatrix.trainer.data import TaskSet
     from embomatrix.trainer.policy.protocol import Policy
-    from embomatrix.trainer.settings import TrainSettings
+    from embomatrix.trainer.run.data import TaskSet
+    from embomatrix.trainer.run.settings import TrainSettings
 
 TINY: Final = "tiny"
 

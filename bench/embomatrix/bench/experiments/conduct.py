@@ -1,0 +1,117 @@
+"""An experiment's runs, one after the other, each by the command that a person would use. What is done is not done again."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from embomatrix.bench.experiments.design import toml_of
+from embomatrix.cli.foreground import cluster_problem, no_problem, run_command
+from embomatrix.cli.local_cluster import local_cluster
+from embomatrix.trainer.run.errors import TrainerError
+from embomatrix.trainer.run.outcome import OUTCOME
+from embomatrix.world.whole_file import write_whole
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+    from pathlib import Path
+
+    from embomatrix.bench.experiments.design import Arm, Budget, Design
+
+IMITATED = "imitated"
+"""Folder of a seed's imitation, beside those of its arms."""
+
+
+@dataclass(frozen=True, slots=True)
+class Venue:
+    """Where rollouts are executed: what a command is told of it, and why it can't go on (a sentence, or nothing)."""
+
+    arguments: tuple[str, ...]
+    problem: Callable[[], str]
+
+
+@contextlib.contextmanager
+def own_venue(folder: Path, workers: int, slots: int) -> Iterator[Venue]:
+    """A cluster of this machine's own, which ends with the experiment."""
+    cluster = local_cluster(folder / "cluster", workers=workers, slots=slots)
+    with cluster.supervisor:
+        yield Venue((f"--manager={cluster.address}",), lambda: cluster_problem(cluster))
+
+
+@dataclass(frozen=True, slots=True)
+class Conductor:
+    """Conducts a design in a folder; ``tell`` gets the heading of each run. Raises TrainerError, OSError, SystemExit."""
+
+    design: Design
+    dataset: Path
+    folder: Path
+    tell: Callable[[str], None]
+
+    def imitate(self, seed: int) -> None:
+        """The policy that this seed's arms start from."""
+        out = self.folder_of(seed, IMITATED)
+        if (out / "reference").is_dir():
+            return
+        self.tell(f"seed {seed}: imitation")
+        design = self.design
+        self._run(
+            out,
+            design.shared,
+            no_problem,
+            "imitate",
+            f"--model={design.model}",
+            _told("seconds", design.imitation.seconds, design.imitation),
+            f"--patience={design.patience}",
+            f"--seed={seed}",
+        )
+
+    def train(self, seed: int, arm: Arm, place: Venue) -> None:
+        """One arm of one seed."""
+        out = self.folder_of(seed, arm.name)
+        if (out / OUTCOME).is_file():
+            return
+        self.tell(f"seed {seed}: {arm.name}")
+        self._run(
+            out,
+            {**self.design.shared, **arm.settings},
+            place.problem,
+            "train",
+            f"--model={self.folder_of(seed, IMITATED) / 'reference'}",
+            "--imitate-seconds=0",
+            _told("minutes", self.design.grpo.seconds / 60, self.design.grpo),
+            f"--seed={seed}",
+            *place.arguments,
+        )
+        if not (out / OUTCOME).is_file():
+            raise TrainerError(
+                f"the run in {out} ended without an outcome: give the same command again to finish it"
+            )
+
+    def folder_of(self, seed: int, name: str) -> Path:
+        """A run's folder."""
+        return self.folder / f"seed-{seed}" / name
+
+    def _run(
+        self, out: Path, settings: Mapping[str, str], problem: Callable[[], str], *arguments: str
+    ) -> None:
+        out.mkdir(parents=True, exist_ok=True)
+        written = out / "settings.toml"
+        write_whole(written, toml_of(settings).encode("utf-8"))
+        goes_on = any((out / "checkpoints").glob("[!.]*"))
+        # On resuming, the checkpoint has the settings.
+        rest = ("--resume",) if goes_on else (f"--settings={written}",)
+        run_command(
+            "experiment",
+            problem,
+            *arguments,
+            f"--dataset={self.dataset}",
+            f"--out={out}",
+            f"--threads={self.design.threads}",
+            *rest,
+        )
+
+
+def _told(unit: str, amount: float, budget: Budget) -> str:
+    """The option that gives a command its budget."""
+    return f"--{unit}={amount}" if budget.steps is None else f"--steps={budget.steps}"

@@ -1,0 +1,130 @@
+"""What an experiment is: seeds, an imitation that its arms share, and the settings in which the arms differ."""
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.trainer.run.errors import TrainerError
+from embomatrix.world.whole_file import write_whole
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+    from pathlib import Path
+
+WITH_RELEVANCE: Final = "with-relevance"
+WITHOUT_RELEVANCE: Final = "without-relevance"
+_NAME: Final = re.compile(r"[a-z0-9][a-z0-9._-]*")
+_FILE: Final = "design.json"
+
+
+@dataclass(frozen=True, slots=True)
+class Arm:
+    """One way to train. ``settings`` by dotted key, the values as TOML."""
+
+    name: str
+    settings: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class Budget:
+    """Seconds on the clock, or in their place a number of steps: what is found then does not depend on what else runs."""
+
+    seconds: float
+    steps: int | None = None
+
+    def __str__(self) -> str:
+        return f"{self.seconds:g} s" if self.steps is None else f"{self.steps} steps"
+
+
+@dataclass(frozen=True, slots=True)
+class Design:
+    """Everything that decides an experiment but the machine. ``shared`` settings hold for imitation and for all arms.
+
+    For each seed a policy imitates for its budget at most, and ends earlier after ``patience`` measurements without a lower
+    loss; each arm then starts from it. ``dataset`` is the folder's name and the digest of its tasks.
+    """
+
+    name: str
+    dataset: str
+    model: str
+    seeds: tuple[int, ...]
+    imitation: Budget
+    patience: int
+    grpo: Budget
+    threads: int
+    shared: Mapping[str, str]
+    arms: tuple[Arm, ...]
+
+
+RELEVANCE_ARMS: Final = (
+    Arm(WITH_RELEVANCE, {}),
+    Arm(WITHOUT_RELEVANCE, {"grpo.relevance": "0.0"}),
+)
+"""The paper's ablation."""
+
+
+def parse_settings(told: Iterable[str]) -> dict[str, str]:
+    """Settings of ``KEY=VALUE`` texts; a value that is no TOML is a string. Raises TrainerError."""
+    found: dict[str, str] = {}
+    for text in told:
+        key, equals, value = (part.strip() for part in text.partition("="))
+        if not (key and equals and value):
+            raise TrainerError(f"{text!r}: expected KEY=VALUE, for example grpo.learning_rate=4e-4")
+        found[key] = value if _is_toml(value) else json.dumps(value)
+    return found
+
+
+def parse_arm(told: str) -> Arm:
+    """An arm of ``NAME`` or ``NAME:KEY=VALUE,KEY=VALUE``. Raises TrainerError."""
+    name, _, settings = told.partition(":")
+    if not _NAME.fullmatch(name):
+        raise TrainerError(
+            f"the arm {told!r} has the name {name!r}: expected small letters, digits, points and hyphens, then a colon and "
+            "settings, for example fast:grpo.learning_rate=4e-4"
+        )
+    return Arm(name, parse_settings(settings.split(",") if settings else ()))
+
+
+def checked_arms(arms: Sequence[Arm]) -> tuple[Arm, ...]:
+    """The arms, if they can be told apart. Raises TrainerError."""
+    names = [arm.name for arm in arms]
+    if len(set(names)) < len(names) or not names:
+        raise TrainerError(f"the arms are called {', '.join(names) or 'nothing'}: expected one name for each")
+    return tuple(arms)
+
+
+def toml_of(settings: Mapping[str, str]) -> str:
+    """A settings file for `embomatrix train --settings`."""
+    return "".join(f"{key} = {value}\n" for key, value in settings.items())
+
+
+def keep_design(folder: Path, design: Design) -> None:
+    """Write what the experiment in the folder is, or see that it is this one. Raises TrainerError, OSError."""
+    path = folder / _FILE
+    value = json.loads(json.dumps(asdict(design)))
+    if path.exists():
+        try:
+            before = json.loads(path.read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise TrainerError(f"{path} is damaged ({error}): remove it, or pass another --out") from error
+        other = sorted(name for name in value if before.get(name) != value[name])
+        if other:
+            raise TrainerError(
+                f"{folder} holds another experiment: {', '.join(other)} differ; repeat its options to go on with it, or pass "
+                "another --out"
+            )
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    write_whole(path, (json.dumps(value, indent=1) + "\n").encode("utf-8"))
+
+
+def _is_toml(value: str) -> bool:
+    try:
+        tomllib.loads(f"value = {value}")
+    except tomllib.TOMLDecodeError:
+        return False
+    return True

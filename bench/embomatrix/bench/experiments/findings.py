@@ -1,0 +1,114 @@
+"""What the runs of an experiment found: success of each arm over all seeds, curves, and where the time went."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from embomatrix.bench.experiments.design import WITHOUT_RELEVANCE
+from embomatrix.pages.figures import Better, Figure
+from embomatrix.trainer.evaluation.intervals import Interval, bootstrap
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from embomatrix.trainer.run.outcome import RunOutcome, TaskRate
+
+BINS: Final = 10
+"""A curve is told by the means over so many stretches of a run, each of as many steps."""
+MOST_WAIT: Final = 0.05
+MOST_OVERHEAD: Final = 0.10
+SUCCESS_AFTER: Final = 0.70
+LEAST_GAIN: Final = 0.15
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """One finished run: its numbers, and a record for each of its steps."""
+
+    seed: int
+    arm: str
+    outcome: RunOutcome
+    metrics: Sequence[Mapping[str, Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class ArmFindings:
+    """One arm over all seeds. Success is on held-out tasks; ``gain`` is the paired difference after − before."""
+
+    name: str
+    runs: tuple[Run, ...]
+    before: Interval
+    after: Interval
+    gain: Interval
+
+    @property
+    def wait_share(self) -> float:
+        return _mean([run.outcome.wait_share for run in self.runs])
+
+    @property
+    def overhead(self) -> float:
+        return _mean([run.outcome.overhead for run in self.runs])
+
+
+def findings_of(name: str, runs: Sequence[Run]) -> ArmFindings:
+    """Sum up an arm's runs. Tasks are the unit of chance: each counts once, with its mean over the seeds."""
+    before = [by_task(run.outcome.before) for run in runs]
+    after = [by_task(run.outcome.after) for run in runs]
+    gains = [
+        {task: now[task] - then[task] for task in now if task in then}
+        for then, now in zip(before, after, strict=True)
+    ]
+    return ArmFindings(
+        name, tuple(runs), *(bootstrap(_over_seeds(rates)) for rates in (before, after, gains))
+    )
+
+
+def by_task(rates: Sequence[TaskRate]) -> dict[str, float]:
+    """Success by task, of those of which something is known."""
+    return {each.task_id: each.rate for each in rates if each.rate is not None}
+
+
+def _over_seeds(rates: Sequence[Mapping[str, float]]) -> list[float]:
+    found: dict[str, list[float]] = {}
+    for each in rates:
+        for task, rate in each.items():
+            found.setdefault(task, []).append(rate)
+    return [_mean(values) for _, values in sorted(found.items())]
+
+
+def curve(run: Run, key: str) -> tuple[float, ...]:
+    """Means of a metric over ``BINS`` stretches of a run; fewer where it has fewer steps. NaN where no step has the metric."""
+    values = np.array([math.nan if row[key] is None else float(row[key]) for row in run.metrics])
+    parts = np.array_split(values, max(1, min(BINS, len(values))))
+    return tuple(_mean(list(part[~np.isnan(part)])) for part in parts if part.size)
+
+
+def figures_of(arms: Sequence[ArmFindings]) -> tuple[Figure, ...]:
+    """The figures of an experiment; those of the first arm carry the plain names."""
+    first = arms[0]
+    tasks = len(_over_seeds([by_task(run.outcome.after) for run in first.runs]))
+    count = tasks * len(first.runs)
+    found = [
+        Figure("success_before", first.before.value, "", Better.HIGHER, count),
+        Figure("success_after", first.after.value, "", Better.HIGHER, count, SUCCESS_AFTER),
+        Figure("success_gain", first.gain.value, "", Better.HIGHER, count, LEAST_GAIN),
+        Figure("success_gain_low", first.gain.low, "", Better.HIGHER, count, 0.0),
+    ]
+    for arm in arms[1:]:
+        known = {WITHOUT_RELEVANCE: "success_after_no_relevance"}
+        name = known.get(arm.name, f"success_after_{arm.name}")
+        found.append(Figure(name, arm.after.value, "", Better.NEITHER, tasks * len(arm.runs)))
+    steps = sum(run.outcome.steps for run in first.runs)
+    found += [
+        Figure("sim_wait_share", first.wait_share, "", Better.LOWER, steps, MOST_WAIT),
+        Figure("overhead_ratio", first.overhead, "", Better.LOWER, steps, MOST_OVERHEAD),
+    ]
+    return tuple(figure for figure in found if not math.isnan(figure.value))
+
+
+def _mean(values: Sequence[float]) -> float:
+    return float(np.mean(values)) if values else math.nan

@@ -1,0 +1,250 @@
+"""`bench fidelity`: the same plans in both execution modes, and how far they agree.
+
+What is done stands in a folder: the trials, a line for each result, and the disagreements. A suite that was cut short goes on
+where it was.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+from collections import Counter
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+from embomatrix.bench.fidelity.pool import LOST, FidelityPool, Modes, SceneJob
+from embomatrix.bench.report.figures import BenchError
+from embomatrix.sim.fidelity.compare import PlanKind
+from embomatrix.sim.fidelity.plans import Example, Request, write_trials
+from embomatrix.sim.fidelity.records import (
+    comparison_from_json,
+    disagreement_to_json,
+    trial_from_json,
+    trial_to_json,
+)
+from embomatrix.sim.fidelity.sampler import SKILLS
+from embomatrix.skills.parse import PlanError, plan_from_json
+from embomatrix.world.dataset import DatasetError
+from embomatrix.world.whole_file import write_whole
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from pathlib import Path
+
+    from embomatrix.sim.fidelity.compare import Comparison, Trial
+    from embomatrix.skills.syntax import Skill
+    from embomatrix.world.dataset import Dataset, TaskRecord
+
+SHARES: Final[Mapping[PlanKind, float]] = {
+    PlanKind.ORACLE: 0.20,
+    PlanKind.VALID: 0.52,
+    PlanKind.PERTURBED: 0.17,
+    PlanKind.FAILING: 0.11,
+}
+"""Plans of each kind."""
+ROUNDS: Final = 6
+"""Times that plans are written for the skills that still lack calls."""
+LIMIT_S: Final = 180.0
+"""Time that a process may take to load a scene and run a trial, on a busy machine."""
+SETTINGS_FILE: Final = "settings.json"
+PLANS_FILE: Final = "plans.jsonl"
+RESULTS_FILE: Final = "results.jsonl"
+DISAGREEMENTS_FILE: Final = "disagreements.jsonl"
+
+
+@dataclass(frozen=True, slots=True)
+class FidelitySettings:
+    """What decides the trials: at least ``plans`` of them, with at least ``calls`` of every skill, where scenes allow it."""
+
+    plans: int = 1_000
+    calls: int = 200
+    seed: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What a suite yielded. ``lost`` are sentences about trials without a result."""
+
+    comparisons: tuple[Comparison, ...]
+    lost: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """Who is told how far the suite is: scenes whose trials are written, and trials that are executed, each of how many."""
+
+    written: Callable[[int, int], None]
+    executed: Callable[[int, int], None]
+
+
+def run_fidelity(
+    dataset: Dataset,
+    settings: FidelitySettings,
+    folder: Path,
+    processes: int,
+    modes: Modes,
+    progress: Progress,
+) -> Outcome:
+    """Write the trials, or read them; execute those without a result; save the disagreements.
+
+    Trials that were lost before, as a machine was halted in their midst, are tried again. Without processes nothing is
+    executed: the outcome is that of the results so far.
+
+    Raises BenchError when the folder holds a suite of other settings or can't be read, DatasetError and EngineError.
+    """
+    with _told(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        trials = _trials(dataset, settings, folder, modes, progress)
+        path = folder / RESULTS_FILE
+        done = {value["trial"]: value for value in _lines(path)}
+        lost = {name for name, value in done.items() if LOST in value}
+        jobs = _jobs(trial for trial in trials if trial.trial_id in lost or trial.trial_id not in done)
+        if processes:
+            with _appending(path, done.values()) as append:
+
+                def keep(value: Mapping[str, Any]) -> None:
+                    append(value)
+                    done[value["trial"]] = dict(value)
+                    progress.executed(len(done), len(trials))
+
+                FidelityPool(dataset.folder, modes, processes, LIMIT_S).run(jobs, keep)
+        if not done:
+            raise BenchError(f"{folder} holds no result to sum up: run the suite with one process or more")
+        return _outcome(trials, done, folder)
+
+
+def examples_of(dataset: Dataset) -> dict[str, list[Example]]:
+    """Tasks with their oracle plans, by bundle. Raises BenchError for a plan that is none."""
+    found: dict[str, list[Example]] = {}
+    for record in dataset.records:
+        found.setdefault(record.bundle_digest, []).append(_example(record))
+    if not found:
+        raise BenchError(
+            f"the dataset in {dataset.folder} has no tasks: build one with 'embomatrix factory build'"
+        )
+    return found
+
+
+def write_all_trials(
+    dataset: Dataset, settings: FidelitySettings, modes: Modes, progress: Progress
+) -> tuple[Trial, ...]:
+    """Trials over all bundles of the dataset; equal arguments give equal trials."""
+    examples = examples_of(dataset)
+    plans = {kind: math.ceil(settings.plans * share / len(examples)) for kind, share in SHARES.items()}
+    trials: list[Trial] = []
+    extra = 0
+    wanted = dict.fromkeys(SKILLS, math.ceil(settings.calls / len(examples)))
+    for turn in range(ROUNDS):
+        for number, (digest, items) in enumerate(examples.items(), start=1):
+            request = Request(plans, wanted, settings.seed + turn, extra, first=len(trials))
+            with contextlib.closing(modes.cached(dataset.read_bundle(digest))) as simulator:
+                trials += write_trials(simulator, digest, items, request)
+            progress.written(number, len(examples))
+        lacking = {skill: settings.calls - count for skill, count in _calls(trials).items()}
+        if all(count <= 0 for count in lacking.values()):
+            break
+        # Scenes without what a skill needs make no plan for it, so the others are asked for more than their share.
+        wanted = {skill: math.ceil(2 * max(0, lacking[skill]) / len(examples)) for skill in SKILLS}
+        plans, extra = {}, max(wanted.values())
+    return tuple(trials)
+
+
+def _calls(trials: Iterable[Trial]) -> dict[Skill, int]:
+    """Calls of each skill in plans that are to succeed."""
+    sure = (PlanKind.ORACLE, PlanKind.VALID)
+    counts = Counter(call.skill for trial in trials if trial.kind in sure for call in trial.plan)
+    return {skill: counts[skill] for skill in SKILLS}
+
+
+def _example(record: TaskRecord) -> Example:
+    try:
+        return Example(record.task, plan_from_json([*record.oracle], record.task.profile))
+    except PlanError as error:
+        raise BenchError(
+            f"the oracle plan of task {record.task.task_id!r} is no plan: {error}; build the dataset anew"
+        ) from error
+
+
+def _trials(
+    dataset: Dataset, settings: FidelitySettings, folder: Path, modes: Modes, progress: Progress
+) -> tuple[Trial, ...]:
+    """The trials in the folder, written there first when it is empty."""
+    bundles = sorted({record.bundle_digest for record in dataset.records})
+    wanted = {**asdict(settings), "bundles": bundles}
+    path = folder / SETTINGS_FILE
+    if path.exists():
+        if json.loads(path.read_text(encoding="utf-8")) != wanted:
+            raise BenchError(
+                f"{folder} holds a suite of other settings or another dataset: name another folder with --out"
+            )
+        return tuple(trial_from_json(value) for value in _lines(folder / PLANS_FILE))
+    trials = write_all_trials(dataset, settings, modes, progress)
+    text = "".join(json.dumps(trial_to_json(trial)) + "\n" for trial in trials)
+    write_whole(folder / PLANS_FILE, text.encode("utf-8"))
+    write_whole(path, (json.dumps(wanted) + "\n").encode("utf-8"))
+    return trials
+
+
+def _jobs(trials: Iterable[Trial]) -> list[SceneJob]:
+    """One job a bundle, the longest first: two processes then end at about the same time."""
+    by_bundle: dict[str, list[Trial]] = {}
+    for trial in trials:
+        by_bundle.setdefault(trial.bundle_digest, []).append(trial)
+    jobs = [SceneJob(digest, tuple(items)) for digest, items in by_bundle.items()]
+    return sorted(jobs, key=lambda job: -len(job.trials))
+
+
+def _outcome(trials: Sequence[Trial], done: Mapping[str, Mapping[str, Any]], folder: Path) -> Outcome:
+    values = [done[trial.trial_id] for trial in trials if trial.trial_id in done]
+    comparisons = tuple(comparison_from_json(value) for value in values if LOST not in value)
+    lines = [
+        json.dumps(disagreement_to_json(item)) + "\n"
+        for item in comparisons
+        if item.first_difference is not None or item.atoms_of_either != item.equal_atoms
+    ]
+    write_whole(folder / DISAGREEMENTS_FILE, "".join(lines).encode("utf-8"))
+    return Outcome(comparisons, tuple(f"{v['trial']}: {v[LOST]}" for v in values if LOST in v))
+
+
+@contextlib.contextmanager
+def _appending(
+    path: Path, values: Iterable[Mapping[str, Any]]
+) -> Iterator[Callable[[Mapping[str, Any]], None]]:
+    """Adds results to the file, written anew first without a last line that was cut short.
+
+    Only who executes does that: a suite that is summed up meanwhile keeps the file which it writes to.
+    """
+    write_whole(path, "".join(json.dumps(value) + "\n" for value in values).encode("utf-8"))
+    with path.open("a", encoding="utf-8") as file:
+
+        def append(value: Mapping[str, Any]) -> None:
+            file.write(json.dumps(value) + "\n")
+            file.flush()
+
+        yield append
+
+
+def _lines(path: Path) -> Iterator[dict[str, Any]]:
+    """JSON values of a file's lines, none without the file. A last line that was cut short is left out."""
+    if not path.exists():
+        return
+    lines = path.read_text(encoding="utf-8").splitlines()
+    for number, line in enumerate(lines):
+        try:
+            yield json.loads(line)
+        except ValueError as error:
+            if number != len(lines) - 1:
+                raise BenchError(f"{path}:{number + 1} is damaged: remove the folder and run anew") from error
+
+
+@contextlib.contextmanager
+def _told(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except DatasetError:
+        raise
+    except (KeyError, TypeError, ValueError) as error:
+        raise BenchError(
+            f"{folder} holds no suite that this version reads ({error}): name another with --out"
+        ) from error

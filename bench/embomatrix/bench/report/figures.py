@@ -1,0 +1,159 @@
+"""What every bench hands in: figures with their goals, the machine and the commit they were measured on."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import subprocess
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import psutil
+
+from embomatrix.host.cgroup import MIB
+from embomatrix.host.cores import usable_cores
+from embomatrix.pages.figures import Better, Figure, figure_from_json, figure_to_json
+from embomatrix.worker.host.gpu import find_gpu
+from embomatrix.worker.host.resources import measure_score, versions
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+BUSY_SHARE: Final = 0.25
+"""A machine whose cores are busier than this before a bench begins is shared: its figures are worse than they need be."""
+GIT_S: Final = 10.0
+
+
+class BenchError(Exception):
+    """A bench can't be run or has no result. One sentence that names the remedy."""
+
+
+@dataclass(frozen=True, slots=True)
+class BenchResult:
+    """Outcome of one bench. ``machine`` says where it ran, as plain JSON values."""
+
+    bench: str
+    commit: str
+    machine: Mapping[str, Any]
+    figures: tuple[Figure, ...]
+
+    def figure(self, name: str) -> Figure:
+        """The figure of that name. Raises KeyError."""
+        return {figure.name: figure for figure in self.figures}[name]
+
+
+def result_to_json(result: BenchResult) -> dict[str, Any]:
+    """Plain JSON values; numbers with six digits."""
+    return {
+        "bench": result.bench,
+        "commit": result.commit,
+        "machine": dict(result.machine),
+        "figures": [figure_to_json(figure) for figure in result.figures],
+    }
+
+
+def read_result(path: Path) -> BenchResult:
+    """What `result_to_json` made of a result, from a file. Raises BenchError when it is none."""
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+        machine = dict(value["machine"])
+        float(machine["load_before"]), float(machine["cores"])
+        figures = tuple(figure_from_json(item) for item in value["figures"])
+        return BenchResult(str(value["bench"]), str(value["commit"]), machine, figures)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise BenchError(
+            f"{path} holds no figures of a bench ({error}): expected a file that 'embomatrix bench NAME --json' wrote"
+        ) from error
+
+
+def put_together(results: Sequence[BenchResult]) -> list[BenchResult]:
+    """Results of one bench, measured in parts, as one; the later figure of a name counts.
+
+    Raises BenchError when parts of a bench were measured at different commits.
+    """
+    whole: dict[str, BenchResult] = {}
+    for result in results:
+        before = whole.get(result.bench, result)
+        if before.commit != result.commit:
+            raise BenchError(
+                f"files of bench {result.bench!r} are of the commits {before.commit} and {result.commit}: "
+                "expected parts of one commit; measure again"
+            )
+        figures = {figure.name: figure for figure in (*before.figures, *result.figures)}
+        busiest = max((before.machine, result.machine), key=lambda machine: float(machine["load_before"]))
+        whole[result.bench] = BenchResult(result.bench, result.commit, busiest, tuple(figures.values()))
+    return list(whole.values())
+
+
+def figure_in(path: Path, name: str) -> Figure:
+    """A figure of a file that `bench fidelity` wrote. Raises BenchError when it has none of that name."""
+    try:
+        return read_result(path).figure(name)
+    except (BenchError, KeyError) as error:
+        raise BenchError(
+            f"{path} has no figure {name!r}: expected a file that 'embomatrix bench fidelity --json' wrote"
+        ) from error
+
+
+def quantile(values: Sequence[float], share: float) -> float:
+    """The value below which ``share`` of the measurements lie. Raises BenchError when there are none."""
+    if not values:
+        raise BenchError("nothing was measured: expected a dataset with at least one task")
+    return float(np.quantile(np.asarray(values), share))
+
+
+def quantile_figure(
+    name: str, seconds: Sequence[float], share: float, unit: str, goal: float | None = None
+) -> Figure:
+    """A quantile of durations, told in ``unit``: "ms" or "µs"."""
+    value = quantile(seconds, share) * {"ms": 1e3, "µs": 1e6}[unit]
+    return Figure(f"{name}, p{share * 100:.0f}", value, unit, Better.LOWER, len(seconds), goal)
+
+
+def describe_machine() -> dict[str, Any]:
+    """Where the bench runs, and how busy that machine is before it begins."""
+    gpu = find_gpu().name
+    return {
+        "cpu": _cpu_model(),
+        "cores": usable_cores(),
+        "memory_gb": round(psutil.virtual_memory().total / MIB / 1024, 1),
+        "gpu": gpu,
+        "system": f"{platform.system()} {platform.machine()}",
+        "speed": measure_score(),
+        "load_before": round(os.getloadavg()[0], 2),
+        **{name: text for name, text in versions().items() if name != "embomatrix"},
+    }
+
+
+def is_shared(machine: Mapping[str, Any]) -> bool:
+    """Whether others kept the machine busy before the bench began."""
+    return bool(machine["load_before"] > BUSY_SHARE * machine["cores"])
+
+
+def commit_here() -> str:
+    """Commit of the checkout that this code runs from, with ``-dirty`` for changes; else the package's version."""
+    here = Path(__file__).resolve()
+    try:
+        # Without this an install inside another repository's folder would name that repository's commit.
+        _git(here.parent, "ls-files", "--error-unmatch", here.name)
+        return _git(here.parent, "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*")
+    except (OSError, subprocess.SubprocessError):
+        return f"version {versions()['embomatrix']}"
+
+
+def _git(folder: Path, *arguments: str) -> str:
+    command = ("git", "-C", str(folder), *arguments)
+    answer = subprocess.run(command, capture_output=True, text=True, timeout=GIT_S, check=True)
+    return answer.stdout.strip()
+
+
+def _cpu_model() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    models = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(models, platform.processor() or "unknown")

@@ -1,0 +1,228 @@
+"""Outcomes of rollouts to wire messages and back, as ``convert`` does plans."""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.proto.v1 import types_pb2
+from embomatrix.reward.breakdown import AtomResult, RewardBreakdown
+from embomatrix.rpc.wire.rollout import (
+    KNOWN,
+    ConvertError,
+    each_known,
+    finite,
+    inside,
+    required,
+    skill_call_from_proto,
+    skill_call_to_proto,
+)
+from embomatrix.rpc.wire.values import (
+    Cancelled,
+    Completed,
+    InfraCode,
+    InfraFailure,
+    RolloutResult,
+    Timings,
+)
+from embomatrix.skills.failure import FailureReason
+from embomatrix.skills.trace import Step
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from embomatrix.rpc.wire.values import Outcome
+
+_INFRA_CODES: Final[Mapping[InfraCode, types_pb2.InfraCode.ValueType]] = {
+    code: types_pb2.InfraCode.Value(f"INFRA_CODE_{code.name}") for code in InfraCode
+}
+_INFRA_VALUES: Final = {number: code for code, number in _INFRA_CODES.items()}
+
+
+def reward_to_proto(reward: RewardBreakdown) -> types_pb2.Reward:
+    return types_pb2.Reward(
+        format=reward.format,
+        relevance=reward.relevance,
+        goal=reward.goal,
+        atoms=[types_pb2.AtomResult(text=atom.text, holds=atom.holds) for atom in reward.atoms],
+        success=reward.success,
+    )
+
+
+def reward_from_proto(message: types_pb2.Reward) -> RewardBreakdown:
+    _check_reward(message)
+    return RewardBreakdown(
+        format=message.format,
+        relevance=message.relevance,
+        goal=message.goal,
+        atoms=tuple(AtomResult(atom.text, atom.holds) for atom in message.atoms),
+        success=message.success,
+    )
+
+
+def _check_reward(message: types_pb2.Reward) -> None:
+    finite("format", message.format)
+    finite("relevance", message.relevance)
+    finite("goal", message.goal)
+
+
+def step_to_proto(step: Step) -> types_pb2.StepResult:
+    failure = "" if step.failure is None else step.failure.value
+    return types_pb2.StepResult(call=skill_call_to_proto(step.call), failure=failure, message=step.message)
+
+
+@functools.lru_cache(KNOWN)
+def _step_of(data: bytes) -> Step:
+    message = types_pb2.StepResult.FromString(data)
+    call = inside("call", skill_call_from_proto, message.call)
+    return Step(call, _failure_reason(message.failure), message.message)
+
+
+def _failure_reason(text: str) -> FailureReason | None:
+    if not text:
+        return None
+    try:
+        return FailureReason(text)
+    except ValueError:
+        raise ConvertError("failure", f"{text!r} is no known failure reason") from None
+
+
+def timings_to_proto(timings: Timings) -> types_pb2.Timings:
+    message = types_pb2.Timings()
+    _write_timings(timings, message)
+    return message
+
+
+def _write_timings(timings: Timings, message: types_pb2.Timings) -> None:
+    """Replace what the message told."""
+    message.queued_s, message.load_s, message.execute_s = timings.queued_s, timings.load_s, timings.execute_s
+    message.lease_s, message.deliver_s = timings.lease_s, timings.deliver_s
+
+
+def timings_from_proto(message: types_pb2.Timings) -> Timings:
+    told = (message.queued_s, message.load_s, message.execute_s, message.lease_s, message.deliver_s)
+    if not math.isfinite(sum(told)):
+        for name, seconds in zip(Timings.__slots__, told, strict=True):
+            finite(name, seconds)
+    return Timings(*told)
+
+
+def completed_to_proto(completed: Completed) -> types_pb2.Completed:
+    message = types_pb2.Completed()
+    write_completed(completed, message)
+    return message
+
+
+def write_completed(completed: Completed, message: types_pb2.Completed) -> None:
+    """Fill an empty message. What came as a message is passed on as it came, but for what was noted on its way."""
+    if completed.wire:
+        message.MergeFromString(completed.wire)
+    else:
+        message.reward.CopyFrom(reward_to_proto(completed.reward))
+        message.steps.extend(step_to_proto(step) for step in completed.steps)
+        message.final_state.extend(completed.final)
+        message.trace_digest = completed.trace_digest
+    message.worker_id = completed.worker_id
+    message.timings.SetInParent()
+    _write_timings(completed.timings, message.timings)
+    message.warm = completed.warm
+
+
+def completed_from_proto(message: types_pb2.Completed) -> Completed:
+    """The result. A missing reward is a ``ConvertError``, for it is no reward of 0."""
+    wire = message.SerializeToString()
+    completed = Completed(
+        reward=inside("reward", reward_from_proto, _reward_in(message)),
+        steps=_steps_in(wire),
+        final=tuple(message.final_state),
+        trace_digest=message.trace_digest,
+        worker_id=message.worker_id,
+        timings=inside("timings", timings_from_proto, message.timings),
+        warm=message.warm,
+    )
+    object.__setattr__(completed, "wire", wire)
+    return completed
+
+
+def checked_completed(message: types_pb2.Completed) -> Completed:
+    """The same for whoever only passes it on: what would be refused is refused, but values are made when they are asked for."""
+    inside("reward", _check_reward, _reward_in(message))
+    wire = message.SerializeToString()
+    _steps_in(wire)
+    return Completed.unread(
+        wire,
+        _completed_fields,
+        timings=inside("timings", timings_from_proto, message.timings),
+        warm=message.warm,
+        worker_id=message.worker_id,
+    )
+
+
+def _steps_in(wire: bytes) -> tuple[Step, ...]:
+    return each_known("steps", _step_of, types_pb2.CompletedSteps.FromString(wire).steps)
+
+
+def _reward_in(message: types_pb2.Completed) -> types_pb2.Reward:
+    if not message.HasField("reward"):
+        raise ConvertError("reward", "is missing: a completed rollout has one")
+    return message.reward
+
+
+def unread_completed(wire: bytes, *, timings: Timings, warm: bool) -> Completed:
+    """The result in this message for whoever only passes it on: what else it says is found when it is read."""
+    return Completed.unread(wire, _completed_fields, timings=timings, warm=warm)
+
+
+def _completed_fields(wire: bytes) -> Mapping[str, object]:
+    completed = completed_from_proto(types_pb2.Completed.FromString(wire))
+    return {name: getattr(completed, name) for name in ("reward", "steps", "final", "trace_digest")}
+
+
+def infra_failure_to_proto(failure: InfraFailure) -> types_pb2.InfraFailure:
+    return types_pb2.InfraFailure(
+        code=_INFRA_CODES[failure.code], message=failure.message, worker_id=failure.worker_id
+    )
+
+
+def infra_failure_from_proto(message: types_pb2.InfraFailure) -> InfraFailure:
+    code = _INFRA_VALUES.get(message.code)
+    if code is None:
+        raise ConvertError("code", f"{message.code} is no known code: is the sender newer than this side?")
+    return InfraFailure(code, message.message, message.worker_id)
+
+
+def rollout_result_to_proto(result: RolloutResult) -> types_pb2.RolloutResult:
+    message = types_pb2.RolloutResult(
+        rollout_id=result.rollout_id, group_id=result.group_id, cursor=result.cursor, attempt=result.attempt
+    )
+    match result.outcome:
+        case Completed() as completed:
+            write_completed(completed, message.completed)
+        case InfraFailure() as failure:
+            message.infra_failure.CopyFrom(infra_failure_to_proto(failure))
+        case Cancelled() as cancelled:
+            message.cancelled.CopyFrom(types_pb2.Cancelled(reason=cancelled.reason))
+    return message
+
+
+def rollout_result_from_proto(message: types_pb2.RolloutResult) -> RolloutResult:
+    return RolloutResult(
+        rollout_id=required("rollout_id", message.rollout_id),
+        group_id=message.group_id,
+        cursor=message.cursor,
+        attempt=message.attempt,
+        outcome=_outcome(message),
+    )
+
+
+def _outcome(message: types_pb2.RolloutResult) -> Outcome:
+    match message.WhichOneof("outcome"):
+        case "completed":
+            return inside("completed", completed_from_proto, message.completed)
+        case "infra_failure":
+            return inside("infra_failure", infra_failure_from_proto, message.infra_failure)
+        case "cancelled":
+            return Cancelled(message.cancelled.reason)
+        case None:
+            raise ConvertError("outcome", "is missing: a result has exactly one")

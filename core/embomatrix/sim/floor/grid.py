@@ -1,0 +1,350 @@
+"""Where a round robot's centre may be: an occupancy grid of the floor, its components and distances along it."""
+
+from __future__ import annotations
+
+import copy
+import functools
+import math
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from scipy import ndimage
+
+from embomatrix.sim.floor.components import FloorParts, overlap
+from embomatrix.sim.floor.paths import RecentDistances, cheapest_way
+from embomatrix.skills.limits import ROBOT
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from numpy.typing import NDArray
+
+    from embomatrix.sim.floor.components import Window
+    from embomatrix.sim.floor.paths import Cell, Distances
+    from embomatrix.world.geometry import FloatArray, Vec2
+    from embomatrix.world.scene import Scene
+
+    BoolArray = NDArray[np.bool_]
+    IntArray = NDArray[np.int16]
+    Changes = tuple[tuple[FloatArray, int], ...]
+
+CELL_M: Final = 0.05
+SNAP_CELLS: Final = 6
+"""A robot that stands within 30 cm of a free cell counts as standing on it."""
+DOORWAY_DEPTH_M: Final = 0.4
+"""How far the floor of a doorway reaches, centred on the wall: more than any wall's thickness."""
+
+
+class FloorGrid:
+    """Cells of 5 cm over the bounding rectangle of the rooms. What is not room or doorway is no floor.
+
+    Made once for a scene; when something on the floor moves, ``changed`` makes the next one from it, at the cost of the
+    place where it moved.
+    """
+
+    def __init__(self, scene: Scene, boxes: FloatArray) -> None:
+        """Rasterise obstacles, shape (n, 6), and inflate them by the robot's radius."""
+        self._lay_out(scene)
+        covered = (~_floor_of(scene, self._shape, self._window)).astype(np.int16)
+        for box in boxes.tolist():
+            covered[self._window(box[:2], box[2:4])] += 1
+        for edge in (np.s_[0, :], np.s_[-1, :], np.s_[:, 0], np.s_[:, -1]):
+            covered[edge] += 1
+        self._covered = covered
+        self._free: BoolArray | None = _clear(covered)
+
+    @classmethod
+    def restored(cls, scene: Scene, covered: NDArray[np.int16], free: BoolArray) -> FloorGrid:
+        """The grid of the scene that once had these arrays, of shape ``grid_shape``."""
+        grid = cls.__new__(cls)
+        grid._lay_out(scene)
+        grid._covered, grid._free = covered, free
+        return grid
+
+    def _lay_out(self, scene: Scene) -> None:
+        self._origin = _origin_of(scene)
+        self._origin_m = (float(self._origin[0]), float(self._origin[1]))
+        self._shape = grid_shape(scene)
+        self._changes: Changes = ()
+        self._recent, self._own = RecentDistances(CELL_M), object()
+
+    @property
+    def covered(self) -> NDArray[np.int16]:
+        """How many obstacles cover each cell, and one more where there is no floor."""
+        return self._covered_in((slice(0, self._shape[0]), slice(0, self._shape[1])), self._changes)
+
+    def _covered_in(self, window: Window, changes: Changes) -> NDArray[np.int16]:
+        """The same for a window's cells, after changes to the grid that was made first."""
+        covered = self._covered[window].copy()
+        for boxes, step in changes:
+            for box in boxes.tolist():
+                here, _ = overlap(window, self._window(box[:2], box[2:4]))
+                covered[here] += step
+        return covered
+
+    def changed(self, gone: FloatArray, come: FloatArray) -> FloorGrid:
+        """This grid without some of its obstacles and with others, each of shape (n, 6)."""
+        boxes = np.concatenate([gone, come])  # (n, 6)
+        if not len(boxes):
+            return self
+        reach = ROBOT.radius_m + CELL_M
+        edge = reach + CELL_M
+        low, high = boxes[:, :2].min(axis=0) - edge, boxes[:, 2:4].max(axis=0) + edge
+        window = self._window(low.tolist(), high.tolist())
+        free = self.parts.within(window) > 0
+        changes = (*self._changes, (gone, -1), (come, 1))
+        for a, b, c, d in _lots(boxes, reach):
+            here = self._window((a - reach, b - reach), (c + reach, d + reach))
+            around = self._window((a - 2 * reach, b - 2 * reach), (c + 2 * reach, d + 2 * reach))
+            _, inner = overlap(here, around)
+            free[overlap(window, here)[0]] = _clear(self._covered_in(around, changes))[inner]
+        grid = self._with_parts(self.parts.changed(free, window))
+        grid._changes = changes
+        return grid
+
+    def narrowed(self, boxes: FloatArray) -> FloorGrid:
+        """This grid with more obstacles, shape (n, 6), which a ``changed`` grid forgets: for what comes and goes often.
+
+        It is the same grid where they leave as much floor. It costs less than ``changed``, which measures distances anew.
+        """
+        taken: list[tuple[Window, BoolArray]] = []
+        for around, blocked in self._blocked_by(boxes):
+            if (self.parts.within(around)[blocked] > 0).any():
+                taken.append((around, blocked))
+        if not taken:
+            return self
+        low = [max(0, min(around[axis].start for around, _ in taken) - 1) for axis in (0, 1)]
+        high = [max(around[axis].stop for around, _ in taken) + 1 for axis in (0, 1)]
+        window = slice(low[0], min(high[0], self._shape[0])), slice(low[1], min(high[1], self._shape[1]))
+        free = self.parts.within(window) > 0
+        for around, blocked in taken:
+            free[overlap(window, around)[0]] &= ~blocked
+        return self._with_parts(self.parts.changed(free, window))
+
+    def _blocked_by(self, boxes: FloatArray) -> list[tuple[Window, BoolArray]]:
+        """For each lot of cells that boxes cover, the window in which the robot may touch them, and where in it it does."""
+        windows = (self._window(box[:2], box[2:4]) for box in boxes.tolist())
+        lots = sorted({(rows.start, rows.stop, cols.start, cols.stop) for rows, cols in windows})
+        return [_blocked(slice(*lot[:2]), slice(*lot[2:]), self._shape) for lot in lots]
+
+    def _with_parts(self, parts: FloorParts) -> FloorGrid:
+        """This grid with other free cells. It shares all it can: there are dozens of such grids in memory."""
+        grid = copy.copy(self)
+        vars(grid)["parts"] = parts
+        grid._free, grid._own = None, object()
+        return grid
+
+    @functools.cached_property
+    def parts(self) -> FloorParts:
+        """Which of the free cells hang together: of a changed grid this is all that is known of them."""
+        return FloorParts.of(self.free)
+
+    @property
+    def free(self) -> BoolArray:
+        """Where the robot may be, shape (rows, columns). For reading only."""
+        return self._free if self._free is not None else self.parts.numbers > 0
+
+    @property
+    def labels(self) -> IntArray:
+        """Number of the component of each free cell, 0 for the others. For reading only."""
+        return self.parts.numbers
+
+    def cell(self, x_m: float, y_m: float) -> Cell | None:
+        """The free cell at a point, or the nearest one within 30 cm; None when there is none."""
+        if not (math.isfinite(x_m) and math.isfinite(y_m)):
+            return None
+        i, j = self._cell_at(x_m, y_m)
+        if not (0 <= i < self._shape[0] and 0 <= j < self._shape[1]):
+            return None
+        if self.label((i, j)):
+            return (i, j)
+        first_i, first_j = max(0, i - SNAP_CELLS), max(0, j - SNAP_CELLS)
+        around = slice(first_i, i + SNAP_CELLS + 1), slice(first_j, j + SNAP_CELLS + 1)
+        near = np.argwhere(self.parts.within(around) > 0)
+        if not len(near):
+            return None
+        away = (near[:, 0] + first_i - i) ** 2 + (near[:, 1] + first_j - j) ** 2  # (n,) in cells
+        best = int(np.argmin(away))
+        if away[best] > SNAP_CELLS**2:
+            return None
+        return (int(near[best, 0]) + first_i, int(near[best, 1]) + first_j)
+
+    def center(self, cell: Cell) -> Vec2:
+        """World coordinates of the middle of a cell."""
+        return (
+            self._origin_m[0] + (cell[0] + 0.5) * CELL_M,
+            self._origin_m[1] + (cell[1] + 0.5) * CELL_M,
+        )
+
+    def is_free(self, x_m: float, y_m: float) -> bool:
+        """Whether the robot fits at a point."""
+        return self.label_at(x_m, y_m) > 0
+
+    def label(self, cell: Cell) -> int:
+        """Number of the component that a free cell belongs to; 0 for a blocked one."""
+        return self.parts.at(cell)
+
+    def label_at(self, x_m: float, y_m: float) -> int:
+        """Number of the component at a point, 0 where the robot does not fit."""
+        i, j = self._cell_at(x_m, y_m)
+        return self.parts.at((i, j)) if 0 <= i < self._shape[0] and 0 <= j < self._shape[1] else 0
+
+    def may_differ_at(self, wider: FloorGrid, x_m: float, y_m: float) -> bool:
+        """Whether a point may be taken, or cut off as it was not on the grid that this one was narrowed from."""
+        if self is wider:
+            return False
+        renumbered = self.parts.whole is not wider.parts.whole
+        label = self.label_at(x_m, y_m)
+        return renumbered or not label or label != wider.label_at(x_m, y_m)
+
+    def is_like(self, other: FloorGrid, low_m: Vec2, high_m: Vec2) -> bool:
+        """Whether this grid and the one that it came from have the same components in a rectangle, by the same numbers."""
+        here, _ = overlap(self._window(low_m, high_m), self.parts.window)
+        untouched = any(side.start == side.stop for side in here)
+        return self.parts.whole is other.parts.whole and other.parts.inner is None and untouched
+
+    def main_part_of(self, wider: FloorGrid, x_m: float, y_m: float) -> int:
+        """The largest component of this grid in the one that a point belongs to on the grid that it was narrowed from."""
+        cell = wider.cell(x_m, y_m)
+        return self.parts.largest_in(wider.parts, wider.label(cell)) if cell is not None else 0
+
+    def free_centers(self, low_m: Vec2, high_m: Vec2, label: int) -> FloatArray:
+        """Middles of the component's cells in a rectangle, shape (n, 2), in the world."""
+        window = self._window(low_m, high_m)
+        inside = np.argwhere((self.parts.within(window) == label) & (label > 0))
+        corner = np.array([window[0].start, window[1].start])
+        return np.asarray(self._origin + (inside + corner + 0.5) * CELL_M, dtype=np.float64)
+
+    def all_free_centers(self, low_m: Vec2, high_m: Vec2) -> FloatArray:
+        """Middles of the free cells in a rectangle, whatever their component, shape (n, 2), in the world."""
+        window = self._window(low_m, high_m)
+        corner = np.array([window[0].start, window[1].start])
+        inside = np.argwhere(self.parts.within(window) > 0)
+        return np.asarray(self._origin + (inside + corner + 0.5) * CELL_M, dtype=np.float64)
+
+    def distance(self, start: Cell, end: Cell) -> float | None:
+        """Length in metres of the shortest path over free cells, None when there is none."""
+        if not self.label(start) or self.label(start) != self.label(end):
+            return None
+        return float(self._distances.to(end)[start])
+
+    def path(self, start: Cell, end: Cell) -> tuple[Vec2, ...] | None:
+        """Corners of a short way over free cells, both ends included, in the world; None when there is none.
+
+        Steepest descent of the distance to the end, of which the corners are kept that no straight drive can cut.
+        """
+        if self.distance(start, end) is None:
+            return None
+        cells = self._distances.descent(start, end)
+        corners = [self.center(cells[0])]
+        for number in range(2, len(cells)):
+            if not self.drives_straight(corners[-1], self.center(cells[number])):
+                corners.append(self.center(cells[number - 1]))
+        return (*corners, self.center(cells[-1]))
+
+    def crossing(self, start: Cell, low_m: Vec2, high_m: Vec2, floor: BoolArray) -> FloatArray:
+        """Cells that are not free on the way from a cell into a rectangle that has the fewest of them, shape (n, 2).
+
+        The way leads over ``floor`` only, of the grid's shape. Empty when there is none.
+        """
+        free, goal = self.free, self._window(low_m, high_m)
+        way = cheapest_way(free, floor, start, goal)
+        return np.array([self.center(cell) for cell in way if not free[cell]]).reshape(-1, 2)
+
+    def drives_straight(self, start: Vec2, end: Vec2) -> bool:
+        """Whether the robot fits everywhere on the straight line between two points."""
+        count = max(1, math.ceil(math.dist(start, end) / (CELL_M / 2)))
+        shares = np.linspace(0.0, 1.0, count + 1)[:, None]
+        points = np.asarray(start) + shares * (np.asarray(end) - np.asarray(start))  # (n, 2)
+        cells = np.floor((points - self._origin) / CELL_M).astype(int)
+        low, high = cells.min(axis=0), cells.max(axis=0)
+        if (low < 0).any() or (high >= self._shape).any():
+            return False
+        passed = self.parts.within(
+            (slice(int(low[0]), int(high[0]) + 1), slice(int(low[1]), int(high[1]) + 1))
+        )
+        return bool((passed[cells[:, 0] - low[0], cells[:, 1] - low[1]] > 0).all())
+
+    @property
+    def _distances(self) -> Distances:
+        return self._recent.over(self._own, lambda: self.free)
+
+    def _cell_at(self, x_m: float, y_m: float) -> Cell:
+        low_x, low_y = self._origin_m
+        return math.floor((x_m - low_x) / CELL_M), math.floor((y_m - low_y) / CELL_M)
+
+    def _window(self, low: Sequence[float], high: Sequence[float]) -> Window:
+        """Cells that a rectangle touches with more than its edge."""
+        rows, columns = (
+            slice(*_cells_between(*ends)) for ends in zip(low, high, self._origin_m, self._shape, strict=True)
+        )
+        return rows, columns
+
+
+def _floor_of(
+    scene: Scene, shape: tuple[int, int], window: Callable[[Sequence[float], Sequence[float]], Window]
+) -> BoolArray:
+    """Which cells are of a room or of a doorway between two; ``window`` gives the cells of a rectangle."""
+    floor = np.zeros(shape, dtype=np.bool_)
+    for room in scene.rooms:
+        floor[window(room.low_m, room.high_m)] = True
+    for doorway in scene.doorways:
+        half = np.array([doorway.width_m, DOORWAY_DEPTH_M]) / 2
+        if doorway.along == "y":
+            half = half[::-1]
+        if all(doorway.rooms):
+            floor[window((doorway.center_m - half).tolist(), (doorway.center_m + half).tolist())] = True
+    return floor
+
+
+def _lots(boxes: FloatArray, apart_m: float) -> list[list[float]]:
+    """Rectangles that hold all boxes, shape (n, 6), those that are near to one another together: parts of one thing are."""
+    lots: list[list[float]] = []
+    for a, b, c, d in boxes[:, :4].tolist():
+        for lot in lots:
+            e, f, g, h = lot
+            if a <= g + apart_m and e <= c + apart_m and b <= h + apart_m and f <= d + apart_m:
+                lot[:] = min(a, e), min(b, f), max(c, g), max(d, h)
+                break
+        else:
+            lots.append([a, b, c, d])
+    return lots
+
+
+def _cells_between(low_m: float, high_m: float, origin_m: float, count: int) -> tuple[int, int]:
+    """First cell of those that a stretch touches along one axis, and the one after the last. Plain: arrays of two are slow."""
+    first = min(max(math.floor((low_m - origin_m) / CELL_M + 1e-9), 0), count)
+    last = min(max(math.ceil((high_m - origin_m) / CELL_M - 1e-9), first), count)
+    return first, last
+
+
+def _clear(covered: NDArray[np.int16]) -> BoolArray:
+    """Which cells are a robot's radius or more from every covered one; shapes are equal."""
+    clear = covered == 0
+    if clear.all():  # there is nothing to measure the distance from
+        return np.asarray(clear)
+    return np.asarray(np.asarray(ndimage.distance_transform_edt(clear)) * CELL_M >= ROBOT.radius_m)
+
+
+def _blocked(rows: slice, columns: slice, shape: tuple[int, int]) -> tuple[Window, BoolArray]:
+    """The window around a rectangle of cells in which the robot may touch it, and where in it it does."""
+    reach = math.ceil(ROBOT.radius_m / CELL_M)
+    around_i = slice(max(0, rows.start - reach), min(shape[0], rows.stop + reach))
+    around_j = slice(max(0, columns.start - reach), min(shape[1], columns.stop + reach))
+    i, j = np.arange(around_i.start, around_i.stop), np.arange(around_j.start, around_j.stop)
+    off_i = np.maximum(np.maximum(rows.start - i, i - rows.stop + 1), 0)
+    off_j = np.maximum(np.maximum(columns.start - j, j - columns.stop + 1), 0)
+    blocked = off_i[:, None] ** 2 + off_j[None] ** 2 < (ROBOT.radius_m / CELL_M) ** 2
+    return (around_i, around_j), np.asarray(blocked)
+
+
+def grid_shape(scene: Scene) -> tuple[int, int]:
+    """Cells along x and y: over the bounding rectangle of the scene's rooms, and two more on each side."""
+    highs = np.array([room.high_m for room in scene.rooms])
+    span = highs.max(axis=0) + 2 * CELL_M - _origin_of(scene)
+    return math.ceil(span[0] / CELL_M), math.ceil(span[1] / CELL_M)
+
+
+def _origin_of(scene: Scene) -> FloatArray:
+    """Lower corner of the first cell, shape (2,)."""
+    return np.asarray(np.array([room.low_m for room in scene.rooms]).min(axis=0) - 2 * CELL_M)

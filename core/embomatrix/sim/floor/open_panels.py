@@ -1,0 +1,77 @@
+"""Doors, drawers and lids of furniture that stand open: which of them do, and the room that they take.
+
+One that is ajar by no more than what counts as shut takes none.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from embomatrix.sim.floor.obstacles import WALLS, Obstacles
+from embomatrix.sim.geometry.bounds import parts_of
+from embomatrix.world.state import OPEN_FRACTION
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from embomatrix.sim.engine import PhysicsEngine
+
+Ajar = tuple[tuple[int, tuple[float, ...]], ...]
+"""Fixed objects of which a leaf stands open, by their numbers in the scene, and their joint positions."""
+
+
+class OpenLeaves:
+    """The leaves of one engine's fixed objects. Which objects were moved, it must be told."""
+
+    def __init__(self, engine: PhysicsEngine) -> None:
+        self._engine = engine
+        self._objects = engine.scene.objects
+        jointed = [number for number, item in enumerate(self._objects) if item.fixed and item.joints]
+        self._jointed = frozenset(jointed)
+        self._at_start = frozenset(number for number in jointed if any(self._objects[number].joints))
+        self._swung = set(self._at_start)
+
+    def forget(self) -> None:
+        """The engine was reset."""
+        self._swung = set(self._at_start)
+
+    def note(self, number: int) -> None:
+        """Something about the object of this number has changed."""
+        if number in self._jointed:
+            self._swung.add(number)
+
+    def ajar(self) -> Ajar:
+        """What stands open now, in scene order."""
+        if not self._swung:
+            return ()
+        joints = [(number, self._engine.joints(self._objects[number].name)) for number in sorted(self._swung)]
+        return tuple((number, fractions) for number, fractions in joints if max(fractions) > OPEN_FRACTION)
+
+    def each_open(self) -> Iterator[Ajar]:
+        """What stands open at the start, and one object more with all its joints wide open: for each object in turn."""
+        at_start = {number: tuple(self._objects[number].joints) for number in self._at_start}
+        for number in sorted(self._jointed):
+            joints = at_start | {number: (1.0,) * len(self._objects[number].joints)}
+            yield tuple(
+                (other, fractions)
+                for other, fractions in sorted(joints.items())
+                if max(fractions) > OPEN_FRACTION
+            )
+
+    def obstacles(self, ajar: Ajar) -> Obstacles:
+        """Boxes of the parts of leaves that stand open so."""
+        found = [Obstacles.of([], WALLS, [])]
+        for number, fractions in ajar:
+            item = self._objects[number]
+            asset = self._engine.scene.asset_of(item.name)
+            boxes = parts_of(asset).boxes(self._engine.pose(item.name), fractions)
+            out = [box for box, is_out in zip(boxes, self._are_out(number, fractions), strict=True) if is_out]
+            found.append(Obstacles.of(out, number, [True] * len(out)))
+        return Obstacles.joined(found)
+
+    def _are_out(self, number: int, fractions: tuple[float, ...]) -> Iterator[bool]:
+        """For each part of an object, in the order of its links, whether it belongs to a leaf that stands open."""
+        moving = iter(fractions)
+        for link in self._engine.scene.asset_of(self._objects[number].name).links:
+            is_out = link.joint is not None and next(moving, 0.0) > OPEN_FRACTION
+            yield from (is_out for _ in link.parts)

@@ -1,0 +1,138 @@
+"""Ways over the free cells of a floor."""
+
+from __future__ import annotations
+
+import functools
+import heapq
+import math
+from collections import OrderedDict
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from scipy import sparse
+from scipy.sparse import csgraph
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from embomatrix.sim.floor.components import Window
+    from embomatrix.world.geometry import FloatArray
+
+    BoolArray = NDArray[np.bool_]
+
+Cell = tuple[int, int]
+
+FLOORS_KEPT: Final = 3
+CROSSING_COST: Final = 100.0
+"""To drive through a thing is as bad as a detour of this many cells for each of its own."""
+FIELDS_KEPT: Final = 64
+"""Distance fields in memory, 0.2 MB each in a flat of 120 m2."""
+
+
+class Distances:
+    """Metres along the free cells of one floor, none of them at its border, to one cell or another."""
+
+    def __init__(self, free: BoolArray, cell_m: float) -> None:
+        self._free = free
+        self._cell_m = cell_m
+        self._fields: dict[Cell, FloatArray] = {}
+
+    def to(self, cell: Cell) -> FloatArray:
+        """Metres from every cell to this one, of the floor's shape; infinity where no way leads."""
+        field = self._fields.get(cell)
+        if field is None:
+            if len(self._fields) == FIELDS_KEPT:
+                del self._fields[next(iter(self._fields))]
+            source = cell[0] * self._free.shape[1] + cell[1]
+            field = np.asarray(csgraph.dijkstra(self._graph, indices=source), dtype=np.float32)
+            field = self._fields[cell] = field.reshape(self._free.shape)
+        return field
+
+    def descent(self, start: Cell, end: Cell) -> list[Cell]:
+        """The cells of a shortest way between two that hang together, both included."""
+        field = self.to(end)
+        cells = [start]
+        while cells[-1] != end:
+            cells.append(min(self._neighbours(*cells[-1]), key=lambda cell: (float(field[cell]), cell)))
+        return cells
+
+    def _neighbours(self, i: int, j: int) -> list[Cell]:
+        """Free cells next to a cell; those across a corner only where both cells beside it are free."""
+        free = self._free
+        return [
+            (i + di, j + dj)
+            for di in (-1, 0, 1)
+            for dj in (-1, 0, 1)
+            if (di or dj)
+            and free[i + di, j + dj]
+            and (not (di and dj) or (free[i + di, j] and free[i, j + dj]))
+        ]
+
+    @functools.cached_property
+    def _graph(self) -> sparse.csr_matrix:
+        """Eight-neighbour graph of the free cells. Diagonals cut no corners: both cells beside them must be free."""
+        free, (rows, columns) = self._free, self._free.shape
+        number = np.arange(rows * columns).reshape(free.shape)
+        starts, ends, lengths = [], [], []
+        for di, dj in ((1, 0), (0, 1), (1, 1), (1, -1)):
+            a = (slice(0, rows - di), slice(max(0, -dj), columns - max(0, dj)))
+            b = (slice(di, rows), slice(max(0, dj), columns - max(0, -dj)))
+            both = free[a] & free[b]
+            if di and dj:
+                both &= free[a[0], b[1]] & free[b[0], a[1]]
+            starts.append(number[a][both])
+            ends.append(number[b][both])
+            lengths.append(np.full(int(both.sum()), self._cell_m * math.hypot(di, dj)))
+        source, target, weight = (np.concatenate(items) for items in (starts, ends, lengths))
+        size = rows * columns
+        one_way = sparse.coo_matrix((weight, (source, target)), shape=(size, size))
+        return (one_way + one_way.T).tocsr()
+
+
+class RecentDistances:
+    """Distances over the floors that were asked for last, of many that are in memory: a house with a garden takes 20 MB."""
+
+    def __init__(self, cell_m: float) -> None:
+        self._cell_m = cell_m
+        self._kept: OrderedDict[object, Distances] = OrderedDict()
+
+    def over(self, floor: object, free: Callable[[], BoolArray]) -> Distances:
+        """Those over a floor, whose free cells are asked for when it is not known any more."""
+        if floor not in self._kept:
+            if len(self._kept) == FLOORS_KEPT:
+                self._kept.popitem(last=False)
+            self._kept[floor] = Distances(free(), self._cell_m)
+        self._kept.move_to_end(floor)
+        return self._kept[floor]
+
+
+def cheapest_way(free: BoolArray, floor: BoolArray, start: Cell, goal: Window) -> list[Cell]:
+    """The cells back from a free one in the goal to the start, by a way over ``floor`` that has few that are not free.
+
+    Empty when there is none.
+    """
+    cost = np.where(free, 1.0, CROSSING_COST)
+    seen = np.full(free.shape, np.inf)
+    seen[start] = 0.0
+    came: dict[Cell, Cell] = {}
+    queue = [(0.0, start)]
+    rows, columns = goal
+    while queue:
+        spent, (i, j) = heapq.heappop(queue)
+        if spent > seen[i, j]:
+            continue
+        if rows.start <= i < rows.stop and columns.start <= j < columns.stop and free[i, j]:
+            break
+        for cell in ((i + 1, j), (i - 1, j), (i, j + 1), (i, j - 1)):
+            if floor[cell] and spent + cost[cell] < seen[cell]:
+                seen[cell] = spent + cost[cell]
+                came[cell] = (i, j)
+                heapq.heappush(queue, (float(seen[cell]), cell))
+    else:
+        return []
+    way = [(i, j)]
+    while way[-1] in came:
+        way.append(came[way[-1]])
+    return way

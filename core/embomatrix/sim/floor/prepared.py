@@ -1,0 +1,143 @@
+"""What the simulator derives from a scene before anything happens in it, found once and carried in the bundle.
+
+A worker that finds it there measures no box and rasterises no floor when it loads the scene. Without it, or from another
+version of the code that derives it, the same is derived when the scene is loaded.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from embomatrix.sim.floor.grid import grid_shape
+from embomatrix.sim.floor.obstacles import WALLS, Obstacles
+from embomatrix.sim.geometry.bounds import IDENTITY
+from embomatrix.world.geometry import Aabb
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from embomatrix.sim.live_world import LiveWorld
+    from embomatrix.world.bundle import Bundle
+    from embomatrix.world.geometry import FloatArray
+    from embomatrix.world.scene import Scene
+
+VERSION: Final = 1
+"""Counts up with every change of a box's, an obstacle's or the floor grid's definition."""
+MOST_COVERED: Final = 255
+
+
+class Prepared:
+    """Arrays of one scene in its initial state, as a decoded bundle carries them."""
+
+    def __init__(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """``arrays`` must be sound: ``of`` sees to that."""
+        self._arrays = arrays
+
+    @staticmethod
+    def of(bundle: Bundle) -> Prepared | None:
+        """What a decoded bundle carries, None when it carries nothing that this version can use."""
+        found = {name: bundle.prepared[_key(name)] for name in _KINDS if _key(name) in bundle.prepared}
+        if found.keys() != _KINDS.keys():
+            return None
+        return Prepared(found) if _are_sound(found, bundle.scene) else None
+
+    @property
+    def object_boxes(self) -> tuple[Aabb, ...]:
+        """In the order of the scene's objects."""
+        return _aabbs(self._arrays["objects"])
+
+    @property
+    def wall_boxes(self) -> tuple[Aabb, ...]:
+        return _aabbs(self._arrays["walls"])
+
+    @property
+    def obstacles(self) -> Obstacles:
+        """What stands in the robot's way."""
+        leaves = self._arrays["leaves"].astype(np.bool_)
+        return Obstacles(self._arrays["obstacles"], self._arrays["owners"], leaves)
+
+    @property
+    def covered(self) -> NDArray[np.int16]:
+        """How many obstacles cover each cell of the floor grid, shape (rows, columns)."""
+        return self._arrays["covered"].astype(np.int16)
+
+    @property
+    def free(self) -> NDArray[np.bool_]:
+        """Where the robot may be: the cells of the floor grid, shape (rows, columns)."""
+        covered = self._arrays["covered"]
+        bits = np.unpackbits(self._arrays["free"], count=covered.size)
+        return bits.reshape(covered.shape).astype(np.bool_)
+
+
+_KINDS: Final[Mapping[str, str]] = {
+    "objects": "float64",
+    "walls": "float64",
+    "obstacles": "float64",
+    "owners": "int32",
+    "leaves": "uint8",
+    "covered": "uint8",
+    "free": "uint8",
+}
+
+
+def prepare(bundle: Bundle, world: LiveWorld) -> Bundle:
+    """The bundle with what the simulator derives from its scene. ``world`` holds that scene; it is reset.
+
+    A floor where more than 255 obstacles lie over one another is left to the worker.
+    """
+    world.engine.reset()
+    obstacles, grid = world.navigator.ground.at_start
+    if grid.covered.max(initial=0) > MOST_COVERED:
+        return bundle
+    scene = bundle.scene
+    arrays: dict[str, NDArray[Any]] = {
+        "objects": _rows([world.engine.aabb(item.name) for item in scene.objects]),
+        "walls": _rows([wall.aabb(IDENTITY) for wall in scene.walls]),
+        "obstacles": obstacles.boxes,
+        "owners": obstacles.owners,
+        "leaves": obstacles.leaves.astype(np.uint8),
+        "covered": grid.covered.astype(np.uint8),
+        "free": np.packbits(grid.free),
+    }
+    return replace(bundle, prepared={_key(name): array for name, array in arrays.items()})
+
+
+def _key(name: str) -> str:
+    return f"{VERSION}.{name}"
+
+
+def _rows(boxes: Sequence[Aabb]) -> FloatArray:
+    return np.array([(*box.low_m, *box.high_m) for box in boxes], dtype=np.float64).reshape(-1, 6)
+
+
+def _aabbs(rows: FloatArray) -> tuple[Aabb, ...]:
+    return tuple(Aabb((a, b, c), (d, e, f)) for a, b, c, d, e, f in rows.tolist())
+
+
+def _are_sound(arrays: Mapping[str, NDArray[Any]], scene: Scene) -> bool:
+    """Whether the arrays have the shapes that belong to one another and to the scene. What they say is not checked."""
+    obstacles, owners, covered = arrays["obstacles"], arrays["owners"], arrays["covered"]
+    count = len(scene.objects)
+    return (
+        all(array.dtype == _KINDS[name] for name, array in arrays.items())
+        and _are_boxes(arrays["objects"], count)
+        and _are_boxes(arrays["walls"], len(scene.walls))
+        and obstacles.ndim == 2
+        and obstacles.shape[1] == 6
+        and bool(np.isfinite(obstacles).all())
+        and owners.shape == arrays["leaves"].shape == obstacles.shape[:1]
+        and bool(((owners >= WALLS) & (owners < count)).all())
+        and covered.shape == grid_shape(scene)
+        and arrays["free"].shape == (math.ceil(covered.size / 8),)
+    )
+
+
+def _are_boxes(rows: FloatArray, count: int) -> bool:
+    shaped = rows.shape == (count, 6)
+    return shaped and bool(np.isfinite(rows).all()) and bool((rows[:, :3] <= rows[:, 3:]).all())

@@ -1,0 +1,197 @@
+"""Poses at which one asset might stand on, in or under another: spread evenly, by geometry alone."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from embomatrix.sim.geometry.bounds import IDENTITY, bounds_of
+from embomatrix.sim.geometry.surfaces import interior_around, is_under, surface_under
+from embomatrix.world.asset import SupportSurface
+from embomatrix.world.geometry import Aabb, Pose
+from embomatrix.world.state import Relation
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from embomatrix.sim.geometry.bounds import AssetBounds
+    from embomatrix.world.asset import Asset
+    from embomatrix.world.geometry import FloatArray, Vec2, Vec3
+
+GOLDEN: Final = (0.7548776662466927, 0.5698402909980532)
+"""Steps of the R2 sequence: its first n points are spread over the square about as well as Poisson discs."""
+LIFT_M: Final = 0.0005
+"""Objects start this high over their surface, so that none begins in contact."""
+EDGE_M: Final = 0.005
+"""Free strip between an object and the edge of its surface, and below the ceiling of its space."""
+SUPPORTED_SHARE: Final = 0.6
+"""A thing wider than its surface needs at least this share of its width on it."""
+BESIDE_M: Final = 0.02
+"""Gap to what a thing is put beside: less than half of what ``nextto`` allows the smallest, more than contact."""
+YAWS: Final = (0.0, math.pi / 2, math.pi, -math.pi / 2)
+"""Things stand square to what they stand on."""
+
+
+def surfaces_for(asset: Asset, relation: Relation) -> tuple[SupportSurface, ...]:
+    """Where ``relation`` to the asset puts a thing, in the asset's frame; empty when it can't.
+
+    On top: supports that no door shuts off, or the top of the box of an asset without any. Inside: supports within
+    cavities, and the floors of cavities without. Under: the floor that the asset stands on.
+    """
+    doored = {interior.name for interior in asset.interiors if interior.closed_by}
+    x, y, z = asset.size_m
+    match relation:
+        case Relation.ONTOP:
+            if not asset.supports:
+                return (SupportSurface("", (0.0, 0.0, z / 2), (x, y), math.inf),)
+            return tuple(surface for surface in asset.supports if surface.interior not in doored)
+        case Relation.INSIDE:
+            inner = tuple(surface for surface in asset.supports if surface.interior)
+            furnished = {surface.interior for surface in inner}
+            bare = tuple(item for item in asset.interiors if item.name not in furnished)
+            return inner + tuple(
+                SupportSurface(
+                    item.name,
+                    (item.center_m[0], item.center_m[1], item.center_m[2] - item.size_m[2] / 2),
+                    (item.size_m[0], item.size_m[1]),
+                    item.size_m[2] if item.closed_by else math.inf,
+                    item.name,
+                    item.link,
+                )
+                for item in bare
+            )
+        case Relation.UNDER:
+            return (SupportSurface("", (0.0, 0.0, -z / 2), (x, y), math.inf),)
+        case _:
+            return ()
+
+
+@dataclass(frozen=True, slots=True)
+class Patch:
+    """Where an asset may stand on one surface, turned by one yaw.
+
+    ``center_m`` is that of the poses, in the frame of the support's ``link``; they lie up to ``room_m`` from it along x
+    and y.
+    """
+
+    center_m: Vec3
+    room_m: Vec2
+    yaw: float
+    link: str
+
+
+def patches(bounds: AssetBounds, support: Asset, relation: Relation) -> tuple[Patch, ...]:
+    """Where something with these bounds fits in the relation to a support. Yaws turn slowest: each visits every surface."""
+    found: list[Patch] = []
+    for yaw in YAWS:
+        box = bounds.box(Pose.from_xyz_yaw(0.0, 0.0, 0.0, yaw))
+        x, y, _ = box.center_m
+        for surface in surfaces_for(support, relation):
+            room = _room_for(box, surface)
+            if room is not None:
+                cx, cy, cz = surface.center_m
+                center = (cx - x, cy - y, cz - box.low_m[2] + LIFT_M)
+                found.append(Patch(center, room, yaw, surface.link))
+    return tuple(found)
+
+
+def proposals(found: Sequence[Patch], shift: Vec2, tries: int) -> Iterator[tuple[Patch, Pose]]:
+    """At most ``tries`` poses in the frame of a support's link, the patches taken in turn.
+
+    ``shift`` in the unit square moves the whole pattern: equal shifts give equal poses. Whether the relation holds there is
+    not looked at.
+    """
+    for patch, (x, y, z) in zip(
+        itertools.cycle(found), proposed_places(found, shift, tries).tolist(), strict=False
+    ):
+        yield patch, Pose.from_xyz_yaw(x, y, z, patch.yaw)
+
+
+def proposed_places(found: Sequence[Patch], shift: Vec2, tries: int) -> FloatArray:
+    """Positions of ``proposals``, shape (n, 3): of all tries, unless there is no patch."""
+    if not found:
+        return np.zeros((0, 3))
+    rows = np.arange(tries) % len(found)
+    places = np.array([patch.center_m for patch in found])[rows]  # (n, 3)
+    rooms = np.array([patch.room_m for patch in found])[rows]  # (n, 2)
+    spread = (np.array(shift) + np.arange(1, tries + 1)[:, None] * np.array(GOLDEN)) % 1.0
+    places[:, :2] += (2 * spread - 1) * rooms
+    return places
+
+
+def candidates(held: Asset, support: Asset, relation: Relation, shift: Vec2, tries: int) -> Iterator[Pose]:
+    """Those of ``proposals`` at which the relation holds."""
+    bounds = bounds_of(held)
+    for _, pose in proposals(patches(bounds, support, relation), shift, tries):
+        if _stands(bounds.box(pose), support, relation):
+            yield pose
+
+
+def beside(held: Asset, support: Asset, relation: Relation, neighbour: Aabb) -> Iterator[Pose]:
+    """Poses at which the relation holds and the thing's box is a little off a box in the support's frame, along each side."""
+    bounds = bounds_of(held)
+    middle = neighbour.center_m
+    for patch in patches(bounds, support, relation):
+        if patch.link:
+            continue  # what a drawer carries moves away from what stands still
+        box = bounds.box(Pose.from_xyz_yaw(0.0, 0.0, 0.0, patch.yaw))
+        for axis, sign in itertools.product((0, 1), (1, -1)):
+            off = (neighbour.size_m[axis] + box.size_m[axis]) / 2 + BESIDE_M
+            for along in _along(neighbour.size_m[1 - axis], box.size_m[1 - axis]):
+                place = [0.0, 0.0]
+                place[axis] = middle[axis] + sign * off - box.center_m[axis]
+                place[1 - axis] = middle[1 - axis] + along - box.center_m[1 - axis]
+                pose = Pose.from_xyz_yaw(place[0], place[1], patch.center_m[2], patch.yaw)
+                if _within(patch, place) and _stands(bounds.box(pose), support, relation):
+                    yield pose
+
+
+def _along(side_m: float, extent_m: float) -> list[float]:
+    """Offsets along a side at which several things of one extent stand in a row, the middle one first."""
+    step = extent_m + BESIDE_M
+    reach = int(side_m / 2 / step)
+    return sorted((number * step for number in range(-reach, reach + 1)), key=abs)
+
+
+def _within(patch: Patch, place: Sequence[float]) -> bool:
+    return all(
+        abs(at - center) <= room + EDGE_M
+        for at, center, room in zip(place, patch.center_m[:2], patch.room_m, strict=True)
+    )
+
+
+def stands_in(held: Asset, pose_support_held: Pose, support: Asset, relation: Relation) -> bool:
+    """Whether the relation holds between two assets, joints shut, by the definitions of ``relations``."""
+    return _stands(bounds_of(held).box(pose_support_held), support, relation)
+
+
+def _stands(box: Aabb, support: Asset, relation: Relation) -> bool:
+    match relation:
+        case Relation.ONTOP:
+            return bool(surface_under(box, support, IDENTITY, doored=False))
+        case Relation.INSIDE:
+            return interior_around(box, support) is not None
+        case Relation.UNDER:
+            return is_under(box, support, IDENTITY)
+        case _:
+            return False
+
+
+def _room_for(box: Aabb, surface: SupportSurface) -> Vec2 | None:
+    """How far the box's centre may be from the surface's along x and y; None when it does not fit.
+
+    In a cavity the whole footprint must fit; in the open a wide thing may stand over both edges, in the middle.
+    """
+    width, depth, height = box.size_m
+    if height + EDGE_M > surface.clearance_m:
+        return None
+    room = []
+    for extent, free in zip((width, depth), surface.size_m, strict=True):
+        if (surface.interior and extent > free) or free < SUPPORTED_SHARE * extent:
+            return None
+        room.append(max(0.0, (free - extent) / 2 - EDGE_M))
+    return (room[0], room[1])

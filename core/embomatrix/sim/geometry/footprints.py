@@ -1,0 +1,79 @@
+"""Footprint classes: a solid box that stands for every object which stands firmly within it.
+
+Most pairs of a thing and a support are met in no analysis. What can be verified for all of them is where a box of the thing's
+size stands level and free, and, once for each thing, that it stands by itself on a level floor. Both together make a pose.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+from embomatrix.sim.geometry.bounds import bounds_of
+from embomatrix.world.asset import Asset, Link, SupportSurface
+from embomatrix.world.geometry import Part, Pose, Shape
+
+SIDES_M: Final = (0.06, 0.09, 0.13, 0.19, 0.27, 0.38, 0.54)
+"""Sides of footprints are rounded up to these: 40 % from one to the next."""
+HEIGHTS_M: Final = (0.06, 0.12, 0.24, 0.48)
+DENSITY_KG_M3: Final = 300.0
+"""That of the boxes: how heavy they are makes no difference to where they stand."""
+FLOOR_SIZE_M: Final = (4.0, 4.0, 0.1)
+
+
+@dataclass(frozen=True, slots=True)
+class Footprint:
+    """Sides and height of a box, the long side first."""
+
+    long_m: float
+    short_m: float
+    height_m: float
+
+    @property
+    def name(self) -> str:
+        """Name under which a pose cache has the poses of the class, in centimetres."""
+        sides = "x".join(f"{value * 100:.0f}" for value in (self.long_m, self.short_m, self.height_m))
+        return f"footprint-{sides}cm"
+
+
+def footprint_of(asset: Asset, pose_floor_asset: Pose) -> Footprint | None:
+    """Smallest class that the asset fits in as it stands at a pose on a level floor; None for what is too large."""
+    x, y, z = bounds_of(asset).box(pose_floor_asset).size_m
+    sides = [_rounded_up(extent, SIDES_M) for extent in (max(x, y), min(x, y))]
+    height = _rounded_up(z, HEIGHTS_M)
+    if sides[0] is None or sides[1] is None or height is None:
+        return None
+    return Footprint(sides[0], sides[1], height)
+
+
+def _rounded_up(value: float, steps: tuple[float, ...]) -> float | None:
+    return next((step for step in steps if value <= step), None)
+
+
+def box_of(footprint: Footprint) -> Asset:
+    """The box of a class: its long side along x, its origin in the middle."""
+    size = (footprint.long_m, footprint.short_m, footprint.height_m)
+    box = Part(Shape.BOX, Pose((0.0, 0.0, 0.0)), size)
+    mass_kg = DENSITY_KG_M3 * math.prod(size)
+    return Asset(footprint.name, "footprint", "", size, mass_kg, (Link("base", (box,)),))
+
+
+def pose_box_asset(footprint: Footprint, asset: Asset, pose_floor_asset: Pose) -> Pose:
+    """Pose of an asset in the frame of its class's box: standing as on the floor, amid the footprint, long side along it."""
+    box = bounds_of(asset).box(pose_floor_asset)
+    width, depth, _ = box.size_m
+    turn = Pose.from_xyz_yaw(0.0, 0.0, -footprint.height_m / 2, 0.0 if width >= depth else math.pi / 2)
+    x, y, _ = box.center_m
+    return turn @ Pose((-x, -y, -box.low_m[2])) @ pose_floor_asset
+
+
+def level_floor() -> Asset:
+    """A slab to stand on: its name in a pose cache is that of the poses in which things stand by themselves."""
+    size = FLOOR_SIZE_M
+    slab = Part(Shape.BOX, Pose((0.0, 0.0, 0.0)), size)
+    top = SupportSurface("top", (0.0, 0.0, size[2] / 2), (size[0], size[1]), math.inf)
+    return Asset("level-floor", "floor", "", size, 100.0, (Link("base", (slab,)),), (top,))
+
+
+LEVEL_FLOOR: Final = level_floor()

@@ -1,0 +1,198 @@
+"""Where a thing comes to rest by itself, proved by geometry: its base lies on a level top, with its weight over that.
+
+The proof replaces a settle for the common case of a flat thing on a flat surface. It is one-sided: what it does not cover,
+such as a ball, a bowl within a bowl or a thing across two boards, is not known to fall; it has to be settled.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.sim.geometry.bounds import IDENTITY, bounds_of, parts_of
+from embomatrix.world.asset import JointKind
+from embomatrix.world.geometry import Aabb, Pose, Shape
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from embomatrix.world.asset import Asset
+    from embomatrix.world.geometry import Part, Vec2, Vec3
+
+FLAT_M: Final = 5e-5
+"""Points of a base that are this much higher than its lowest still touch what it stands on."""
+FALL_M: Final = 0.001
+"""A thing that is further than this over a top falls too hard for a proof."""
+MARGIN_M: Final = 0.003
+MARGIN_SHARE: Final = 0.15
+"""The weight acts this far within the edge of what bears it, and by this share of the base's width: nearer, things rock."""
+CLEAR_M: Final = 0.001
+"""Nothing of the support but what bears the thing comes as near as this to it."""
+LEVEL_COSINE: Final = math.cos(math.radians(1.0))
+"""Friction holds whatever stands on something that leans by less than a degree."""
+SHORTEST_M: Final = 1e-6
+"""Edges of a polygon that are shorter than this have no direction."""
+RIM_POINTS: Final = 16
+SQUARE: Final = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class Base:
+    """What an upright thing stands on: the corners of a convex polygon, anticlockwise, and its height, in the asset's frame.
+
+    The thing's weight acts at the frame's origin; it has to be borne ``margin_m`` within an edge.
+    """
+
+    corners_m: tuple[Vec2, ...]
+    height_m: float
+    margin_m: float
+
+
+def base_of(asset: Asset) -> Base | None:
+    """The base of an asset without joints; None when it stands on an edge or a point, or its weight is not over its base."""
+    if asset.joints:
+        return None
+    points = [point for link in asset.links for part in link.parts for point in _underside(part)]
+    low = bounds_of(asset).box(IDENTITY).low_m[2]
+    corners = _hull([(x, y) for x, y, z in points if z <= low + FLAT_M])
+    if not corners:
+        return None
+    width = min(max(axis) - min(axis) for axis in zip(*corners, strict=True))
+    base = Base(corners, low, max(MARGIN_M, MARGIN_SHARE * width))
+    return base if _bears((0.0, 0.0), corners, base.margin_m) else None
+
+
+def rest_pose(held: Asset, base: Base, pose: Pose, support: Asset, fractions: Sequence[float]) -> Pose | None:
+    """Where a thing comes to rest that is let go at a pose, in the frame of its support; None when that is not proved.
+
+    It is when the thing stands upright just over the level top of one part, its weight acts over what that part bears of its
+    base, and no other part of the support comes near it. ``fractions`` are the support's joints; the support itself is level.
+    """
+    x, y, z, w = pose.quat_xyzw
+    if x or y:
+        return None
+    cosine, sine = w * w - z * z, 2 * w * z
+    px, py, pz = pose.position_m
+    low = pz + base.height_m
+    corners = [(px + cosine * u - sine * v, py + sine * u + cosine * v) for u, v in base.corners_m]
+    box = bounds_of(held).box(pose)
+    near = Aabb((box.low_m[0], box.low_m[1], low - FALL_M), box.high_m).grown(CLEAR_M)
+    found: float | None = None
+    for part, part_box in _parts_near(support, fractions, near):
+        top = part_box.high_m[2]
+        reaches = 0.0 <= low - top <= FALL_M
+        if reaches and part is not None and _bears((px, py), _borne(corners, part, part_box), base.margin_m):
+            found = top if found is None else max(found, top)
+        elif top > low - FALL_M:
+            return None
+    return Pose((px, py, pz - (low - found)), pose.quat_xyzw) if found is not None else None
+
+
+def is_level(pose: Pose) -> bool:
+    """Whether the vertical axis leans by less than a degree."""
+    x, y, _, _ = pose.quat_xyzw
+    return 1 - 2 * (x * x + y * y) >= LEVEL_COSINE
+
+
+def _parts_near(support: Asset, fractions: Sequence[float], near: Aabb) -> Iterator[tuple[Part | None, Aabb]]:
+    """Boxes of a support's parts, in its own frame, that overlap a box, each with its part; None for one that was turned."""
+    boxes = iter(parts_of(support).boxes(IDENTITY, fractions))
+    moving = iter(fractions)
+    for link in support.links:
+        joint = link.joint
+        turned = joint is not None and next(moving) != 0.0 and joint.kind is JointKind.REVOLUTE
+        for part, box in zip(link.parts, boxes, strict=False):
+            if box.overlaps(near):
+                yield None if turned else part, box
+
+
+def _borne(corners: Sequence[Vec2], part: Part, box: Aabb) -> Sequence[Vec2]:
+    """What of a convex polygon lies on the top of a part with this box; empty where the top is no level face."""
+    (low_x, low_y, _), (high_x, high_y, _) = box.low_m, box.high_m
+    x, y, z, w = (abs(value) for value in part.pose.quat_xyzw)
+    if max(x, y) > SQUARE:
+        return ()
+    if part.shape is Shape.CYLINDER:
+        cx, cy, radius = (low_x + high_x) / 2, (low_y + high_y) / 2, part.size_m[0] / 2
+        return corners if all(math.hypot(u - cx, v - cy) <= radius for u, v in corners) else ()
+    if part.shape is not Shape.BOX or min(z, w, abs(z - w)) > SQUARE:
+        return ()
+    for axis, edge, sign in ((0, low_x, 1), (0, high_x, -1), (1, low_y, 1), (1, high_y, -1)):
+        corners = _clipped(corners, axis, edge, sign)
+    return corners
+
+
+def _clipped(corners: Sequence[Vec2], axis: int, edge: float, sign: int) -> Sequence[Vec2]:
+    """The part of a convex polygon on one side of a line along an axis: Sutherland and Hodgman 1974."""
+    inside = [sign * (corner[axis] - edge) >= 0.0 for corner in corners]
+    if all(inside):
+        return corners
+    found: list[Vec2] = []
+    for number, corner in enumerate(corners):
+        before = corners[number - 1]
+        if inside[number] != inside[number - 1]:
+            share = (edge - before[axis]) / (corner[axis] - before[axis])
+            x, y = (a + share * (b - a) for a, b in zip(before, corner, strict=True))
+            found.append((x, y))
+        if inside[number]:
+            found.append(corner)
+    return found
+
+
+def _bears(point: Vec2, corners: Sequence[Vec2], margin_m: float) -> bool:
+    """Whether a point lies within a convex anticlockwise polygon, away from its edges by a margin."""
+    x, y = point
+    edges = 0
+    for number, (to_x, to_y) in enumerate(corners):
+        from_x, from_y = corners[number - 1]
+        along_x, along_y = to_x - from_x, to_y - from_y
+        length = math.hypot(along_x, along_y)
+        if length < SHORTEST_M:
+            continue
+        edges += 1
+        if along_x * (y - from_y) - along_y * (x - from_x) < margin_m * length:
+            return False
+    return edges > 2
+
+
+def _underside(part: Part) -> list[Vec3]:
+    """Points of a part that may be its lowest, in the asset's frame. A sphere has none: it rests on a point."""
+    x, y, z = (extent / 2 for extent in part.size_m)
+    match part.shape:
+        case Shape.BOX:
+            local = [(u, v, t) for u in (-x, x) for v in (-y, y) for t in (-z, z)]
+        case Shape.CYLINDER:
+            local = [(x * u, x * v, t) for u, v in _circle() for t in (-z, z)]
+        case Shape.HULL:
+            local = list(part.vertices_m)
+        case Shape.SPHERE:
+            local = []
+    return [part.pose.apply(point) for point in local]
+
+
+@functools.cache
+def _circle() -> tuple[Vec2, ...]:
+    angles = (number * math.tau / RIM_POINTS for number in range(RIM_POINTS))
+    return tuple((math.cos(angle), math.sin(angle)) for angle in angles)
+
+
+def _hull(points: Sequence[Vec2]) -> tuple[Vec2, ...]:
+    """Corners of the convex hull, anticlockwise: Andrew's monotone chain."""
+    ordered = sorted(set(points))
+    if len(ordered) < 3:
+        return ()
+    return tuple(_chain(ordered)[:-1] + _chain(ordered[::-1])[:-1])
+
+
+def _chain(points: Sequence[Vec2]) -> list[Vec2]:
+    chain: list[Vec2] = []
+    for x, y in points:
+        while len(chain) > 1:
+            (ax, ay), (bx, by) = chain[-2:]
+            if (bx - ax) * (y - ay) - (by - ay) * (x - ax) > 0:
+                break
+            chain.pop()
+        chain.append((x, y))
+    return chain

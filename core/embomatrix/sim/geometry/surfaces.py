@@ -1,0 +1,155 @@
+"""Where things rest on an asset and lie in it: its surfaces and cavities, each with its tolerance.
+
+Surfaces and cavities that ride on a drawer or a door are where their link is: they are given with every joint at zero, so a
+question about them is asked in the frame that moves along with the link. The frame of the base is the asset's own.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.sim.geometry.bounds import IDENTITY, joint_motion, parts_of
+from embomatrix.world.state import OPEN_FRACTION, Relation
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from embomatrix.world.asset import Asset, Interior
+    from embomatrix.world.geometry import Aabb, Pose
+
+REST_M: Final = 0.01
+"""An underside this near to a surface rests on it."""
+EDGE_M: Final = 0.005
+"""A centre may lie this far outside the rectangle of its surface."""
+INSIDE_M: Final = 0.01
+"""A box may reach this far out of the cavity that it is in."""
+UPRIGHT_COSINE: Final = math.cos(math.radians(10.0))
+"""Nothing rests on or in a thing whose vertical axis leans more than 10 degrees, nor is under it."""
+TOP: Final = "top of the box"
+"""Name of the surface that every asset has: the top of its bounding box."""
+
+
+def is_upright(pose: Pose) -> bool:
+    """Whether the vertical axis leans by 10 degrees or less."""
+    x, y, _, _ = pose.quat_xyzw
+    return 1 - 2 * (x * x + y * y) >= UPRIGHT_COSINE
+
+
+def is_shut(asset: Asset, interior: Interior, fractions: Sequence[float]) -> bool:
+    """Whether every joint that bars the way into the interior is shut. One open door of two is a way in."""
+    positions = {name: fraction for (name, _), fraction in zip(asset.joints, fractions, strict=True)}
+    barring = [positions[name] for name in interior.closed_by if name in positions]
+    return bool(barring) and all(position <= OPEN_FRACTION for position in barring)
+
+
+def link_frame(asset: Asset, pose: Pose, fractions: Sequence[float], link: str) -> Pose:
+    """Frame in which what rides on a link keeps its place, for an asset at ``pose``: the asset's own for the base.
+
+    It coincides with the asset's frame when the link's joint is at zero. Raises KeyError for a link that does not move.
+    """
+    if not link:
+        return pose
+    for (name, joint), fraction in zip(asset.joints, fractions, strict=True):
+        if name == link:
+            return pose @ joint_motion(joint, fraction) if fraction else pose
+    raise KeyError(f"asset {asset.asset_id!r} has no moving link {link!r}: expected one of its joints' links")
+
+
+def surface_under(
+    box: Aabb, asset: Asset, pose: Pose, fractions: Sequence[float] = (), *, doored: bool
+) -> str:
+    """Name of the surface of an asset at ``pose`` that a box rests on, "" when there is none.
+
+    Its underside lies within 1 cm of the surface's height and its centre above the rectangle, 5 mm outside allowed, so a thin
+    thing beside another is not on it.
+    Surfaces are the asset's supports, where the joints' positions take them, and the top of its bounding box; those within a
+    cavity that can be shut only when ``doored``. Without ``fractions`` the joints are shut.
+    """
+    if not is_upright(pose):
+        return ""
+    fractions = fractions or (0.0,) * len(asset.joints)
+    bottom, center = box.low_m[2], box.center_m
+    frames = {"": pose}
+    shut_off = () if doored else {interior.name for interior in asset.interiors if interior.closed_by}
+    for surface in asset.supports:
+        frame = frames.get(surface.link)
+        if frame is None:
+            frame = frames[surface.link] = link_frame(asset, pose, fractions, surface.link)
+        cx, cy, cz = surface.center_m
+        if abs(bottom - frame.position_m[2] - cz) > REST_M or surface.interior in shut_off:
+            continue
+        if center[2] - frame.position_m[2] <= cz or not is_upright(frame):
+            continue
+        x, y, _ = frame.inverse().apply(center)
+        if abs(x - cx) <= surface.size_m[0] / 2 + EDGE_M and abs(y - cy) <= surface.size_m[1] / 2 + EDGE_M:
+            return surface.name
+    return TOP if _on_top(box, asset, pose) else ""
+
+
+def _on_top(box: Aabb, asset: Asset, pose: Pose) -> bool:
+    half_x, half_y, half_z = (extent / 2 for extent in asset.size_m)
+    level = pose.position_m[2] + half_z
+    if abs(box.low_m[2] - level) > REST_M or box.center_m[2] <= level:
+        return False
+    x, y, _ = pose.inverse().apply(box.center_m)
+    return abs(x) <= half_x + EDGE_M and abs(y) <= half_y + EDGE_M
+
+
+def interior_around(box_in_asset: Aabb, asset: Asset, link: str | None = None) -> Interior | None:
+    """The smallest interior of an asset that a box is in: of those that ride on a link, or of all with the joints shut.
+
+    The box is given in the link's frame: "" names the base. Its centre lies in the cavity, and the box within it, 1 cm
+    outside allowed; out of a cavity that is always open it may stick out at the top.
+    """
+    found = [item for item in asset.interiors if link in (None, item.link) and _within(box_in_asset, item)]
+    return min(found, key=lambda interior: math.prod(interior.size_m), default=None)
+
+
+def _within(box: Aabb, interior: Interior) -> bool:
+    for axis, (middle, extent) in enumerate(zip(interior.center_m, interior.size_m, strict=True)):
+        low, high = middle - extent / 2, middle + extent / 2
+        edge_low, edge_high = box.low_m[axis], box.high_m[axis]
+        if not low <= (edge_low + edge_high) / 2 <= high or edge_low < low - INSIDE_M:
+            return False
+        if edge_high > high + INSIDE_M and (axis < 2 or interior.closed_by):
+            return False
+    return True
+
+
+def links_with_spots(asset: Asset) -> set[str]:
+    """Links on which surfaces or cavities ride; "" for the base."""
+    return {surface.link for surface in asset.supports} | {interior.link for interior in asset.interiors}
+
+
+def link_under(box_in_asset: Aabb, asset: Asset, relation: Relation) -> str:
+    """Link on which a box rides that is in the relation to an asset with its joints shut; "" for the base."""
+    if relation is Relation.INSIDE:
+        interior = interior_around(box_in_asset, asset)
+        return interior.link if interior is not None else ""
+    if relation is Relation.ONTOP:
+        surface = surface_under(box_in_asset, asset, IDENTITY, doored=False)
+        return next((item.link for item in asset.supports if item.name == surface), "")
+    return ""
+
+
+def is_under(box: Aabb, asset: Asset, pose: Pose) -> bool:
+    """Whether a box is under an asset at ``pose``.
+
+    Some part of the asset's base lies over the box's centre, and every part that does so begins above the box's top, 1 cm
+    deeper allowed.
+    """
+    over = heights_over(box, asset, pose)
+    return bool(over) and all(bottom >= box.high_m[2] - REST_M for bottom in over)
+
+
+def heights_over(box: Aabb, asset: Asset, pose: Pose) -> list[float]:
+    """Heights in the world at which parts of an asset's base begin that lie over, or below, the centre of a box."""
+    if not is_upright(pose):
+        return []
+    cx, cy, _ = box.center_m
+    return [
+        part_box.low_m[2]
+        for part_box in parts_of(asset).base_boxes(pose)
+        if part_box.low_m[0] <= cx <= part_box.high_m[0] and part_box.low_m[1] <= cy <= part_box.high_m[1]
+    ]

@@ -1,0 +1,242 @@
+"""Offline scene analysis: terminal poses for every pair of assets, each verified by settling, and standing poses."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import itertools
+import math
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.sim.bullet.client import ClientPool
+from embomatrix.sim.bullet.engine import BulletEngine
+from embomatrix.sim.bullet.mini_world import MiniWorld, Still
+from embomatrix.sim.engine import TOLERANCE_M
+from embomatrix.sim.floor.navigation import Navigator
+from embomatrix.sim.geometry.bounds import IDENTITY, bounds_of
+from embomatrix.sim.geometry.candidates import LIFT_M, beside, candidates, stands_in, surfaces_for
+from embomatrix.sim.geometry.contents import Contents
+from embomatrix.sim.geometry.footprints import LEVEL_FLOOR, Footprint, box_of, footprint_of
+from embomatrix.sim.state.relations import Relations
+from embomatrix.world.geometry import Pose
+from embomatrix.world.poses import PlacementKey, PoseCache, StandPose
+from embomatrix.world.state import Relation
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from embomatrix.sim.engine import PhysicsEngine
+    from embomatrix.world.asset import Asset
+    from embomatrix.world.geometry import Aabb
+    from embomatrix.world.scene import Scene
+
+PLACE_RELATIONS: Final = (Relation.ONTOP, Relation.INSIDE, Relation.UNDER)
+POSES: Final = 16
+"""Verified poses that are kept for a pair."""
+TRIES: Final = 40
+"""Candidates that are looked at for a pair."""
+CLASS_POSES: Final = 12
+CLASS_POSES_PER_M2: Final = 16
+CLASS_POSES_MOST: Final = 40
+"""Verified poses that are kept for a footprint class: more on larger surfaces."""
+HOPELESS: Final = 12
+"""A pair none of whose first candidates is stable is given up."""
+
+
+class PlacementLibrary:
+    """Verified placements by the content of the two assets: equal pairs of other scenes are not simulated again."""
+
+    def __init__(self, pool: ClientPool | None = None) -> None:
+        """``pool`` lends the client to settle in; without one the library opens its own and closes it in the end."""
+        self._owns_pool = pool is None
+        self._pool = pool or ClientPool()
+        self._mini = MiniWorld(self._pool)
+        self._known: dict[tuple[str, str, Relation, int], tuple[Pose, ...]] = {}
+        self._standing: dict[str, Pose | None] = {}
+        self._contents = Contents()
+
+    def poses(self, held: Asset, support: Asset, relation: Relation, seed: int) -> tuple[Pose, ...]:
+        """Poses of ``held`` in the frame of ``support``, each stable and in the relation; empty when none was found.
+
+        Depends on nothing but the arguments' content.
+        """
+        key = (self._contents.of(held), self._contents.of(support), relation, seed)
+        if key not in self._known:
+            self._known[key] = tuple(self._verified(held, support, relation, _shift(key), POSES))
+        return self._known[key]
+
+    def footprint_poses(
+        self, footprint: Footprint, support: Asset, relation: Relation, seed: int
+    ) -> tuple[Pose, ...]:
+        """Poses of a class's box in the frame of ``support``, each stable, in the relation, and level all over."""
+        key = (footprint.name, self._contents.of(support), relation, seed)
+        if key not in self._known:
+            box, most = box_of(footprint), _wanted(support, relation)
+            found = self._verified(box, support, relation, _shift(key), most)
+            on_floor = _on_floor(support)
+            bounds = bounds_of(box)
+            level: list[Pose] = []
+            for pose in found:
+                self._mini.lift()
+                if self._mini.is_level_under(bounds.box(on_floor @ pose)):
+                    level.append(pose)
+            self._known[key] = tuple(level)
+        return self._known[key]
+
+    def poses_beside(
+        self, held: Asset, support: Asset, relation: Relation, neighbour: Aabb
+    ) -> tuple[Pose, ...]:
+        """As ``poses``, but each right beside a box in the frame of ``support``: what may be next to what has that box."""
+        return tuple(self._stable(held, support, relation, beside(held, support, relation, neighbour), POSES))
+
+    def standing(self, asset: Asset) -> Pose | None:
+        """Pose in which the asset stands by itself on a level floor at height 0; None when it does not."""
+        key = self._contents.of(asset)
+        if key not in self._standing:
+            low = bounds_of(asset).box(IDENTITY).low_m[2]
+            pose = Pose((0.0, 0.0, LIFT_M - low))
+            self._mini.stage(asset, pose, (0.0,) * len(asset.joints), [])
+            settled = self._mini.drop(pose)
+            self._standing[key] = settled.pose if settled.stable else None
+        return self._standing[key]
+
+    def close(self) -> None:
+        """Give the client back. Known placements can still be read."""
+        self._mini.close()
+        if self._owns_pool:
+            self._pool.close()
+
+    def _verified(
+        self, held: Asset, support: Asset, relation: Relation, shift: tuple[float, float], most: int
+    ) -> Iterator[Pose]:
+        tries = candidates(held, support, relation, shift, max(TRIES, 2 * most))
+        return self._stable(held, support, relation, tries, most)
+
+    def _stable(
+        self, held: Asset, support: Asset, relation: Relation, tries: Iterator[Pose], most: int
+    ) -> Iterator[Pose]:
+        """At most ``most`` poses. While one is looked at, the world in which it was verified stands."""
+        first = next(tries, None)
+        if first is None:
+            return
+        pose_world_support = _on_floor(support)
+        shut = (0.0,) * len(held.joints)
+        still = Still(support, pose_world_support, (0.0,) * len(support.joints))
+        self._mini.stage(held, pose_world_support @ first, shut, [still])
+        back = pose_world_support.inverse()
+        found = 0
+        for number, candidate in enumerate(itertools.chain((first,), tries)):
+            if found == most or (number == HOPELESS and not found):
+                return
+            pose = pose_world_support @ candidate
+            if self._mini.depth_m(pose) > TOLERANCE_M:
+                continue
+            settled = self._mini.drop(pose)
+            if settled.stable and stands_in(held, back @ settled.pose, support, relation):
+                found += 1
+                yield back @ settled.pose
+
+
+def build_pose_cache(
+    scene: Scene,
+    movable: Sequence[str],
+    supports: Sequence[str],
+    *,
+    seed: int,
+    engine: PhysicsEngine | None = None,
+    library: PlacementLibrary | None = None,
+) -> PoseCache:
+    """Placements of every movable object's asset on, in and under every support's, and standing poses for all of them.
+
+    ``engine`` must hold this scene in its initial state; without one the scene is loaded for the occasion. Pairs without a
+    stable pose have no entry. Raises EngineError when the scene is not valid, KeyError for an unknown name.
+    """
+    with contextlib.ExitStack() as owned:
+        if library is None:
+            library = owned.enter_context(contextlib.closing(PlacementLibrary()))
+        if engine is None:
+            engine = owned.enter_context(contextlib.closing(BulletEngine(scene)))
+        return PoseCache(
+            _placements(scene, movable, supports, library, seed),
+            standing_poses(engine, (*movable, *supports)),
+        )
+
+
+def analyse_scene(
+    scene: Scene,
+    *,
+    seed: int,
+    engine: PhysicsEngine | None = None,
+    library: PlacementLibrary | None = None,
+) -> PoseCache:
+    """All that a scene offers: where every portable thing can go by its footprint, and standing poses for all objects.
+
+    ``engine`` must hold this scene in its initial state. Raises EngineError when the scene is not valid.
+    """
+    with contextlib.ExitStack() as owned:
+        if library is None:
+            library = owned.enter_context(contextlib.closing(PlacementLibrary()))
+        if engine is None:
+            engine = owned.enter_context(contextlib.closing(BulletEngine(scene)))
+        names = [item.name for item in scene.objects]
+        movable = [item.name for item in scene.objects if not item.fixed]
+        supports = [name for name in names if scene.asset_of(name).supports or scene.asset_of(name).interiors]
+        placements = footprint_placements(scene, movable, supports, library, seed)
+        return PoseCache(placements, standing_poses(engine, names))
+
+
+def footprint_placements(
+    scene: Scene, movable: Sequence[str], supports: Sequence[str], library: PlacementLibrary, seed: int
+) -> dict[PlacementKey, tuple[Pose, ...]]:
+    """Poses of the classes of the movable objects on, in and under the supports, and how each asset stands by itself."""
+    found: dict[PlacementKey, tuple[Pose, ...]] = {}
+    classes: dict[Footprint, None] = {}
+    for asset_id in sorted({scene.by_name[name].asset_id for name in movable}):
+        asset = scene.assets[asset_id]
+        pose = library.standing(asset)
+        footprint = footprint_of(asset, pose) if pose is not None else None
+        if pose is not None and footprint is not None:
+            found[PlacementKey(asset_id, LEVEL_FLOOR.asset_id, Relation.ONTOP)] = (pose,)
+            classes[footprint] = None
+    under = sorted({scene.by_name[name].asset_id for name in supports})
+    for footprint, support_id, relation in itertools.product(classes, under, PLACE_RELATIONS):
+        poses = library.footprint_poses(footprint, scene.assets[support_id], relation, seed)
+        if poses:
+            found[PlacementKey(footprint.name, support_id, relation)] = poses
+    return found
+
+
+def _placements(
+    scene: Scene, movable: Sequence[str], supports: Sequence[str], library: PlacementLibrary, seed: int
+) -> dict[PlacementKey, tuple[Pose, ...]]:
+    held = sorted({scene.by_name[name].asset_id for name in movable})
+    under = sorted({scene.by_name[name].asset_id for name in supports})
+    found: dict[PlacementKey, tuple[Pose, ...]] = {}
+    for held_id, support_id, relation in itertools.product(held, under, PLACE_RELATIONS):
+        poses = library.poses(scene.assets[held_id], scene.assets[support_id], relation, seed)
+        if poses:
+            found[PlacementKey(held_id, support_id, relation)] = poses
+    return found
+
+
+def standing_poses(engine: PhysicsEngine, names: Sequence[str]) -> dict[str, tuple[StandPose, ...]]:
+    """Where the robot can stand to work on each object, in the scene as it was loaded but with all leaves shut."""
+    navigator = Navigator(engine, Relations(engine))
+    return {name: navigator.stands_past_shut(name, navigator.start) for name in dict.fromkeys(names)}
+
+
+def _on_floor(support: Asset) -> Pose:
+    """Pose at which a support stands on the floor by its box: what it really stands on does not touch what is placed."""
+    return Pose((0.0, 0.0, -bounds_of(support).box(IDENTITY).low_m[2]))
+
+
+def _wanted(support: Asset, relation: Relation) -> int:
+    """How many poses of a footprint class are kept on a support."""
+    area_m2 = sum(math.prod(surface.size_m) for surface in surfaces_for(support, relation))
+    return min(CLASS_POSES_MOST, CLASS_POSES + int(CLASS_POSES_PER_M2 * area_m2))
+
+
+def _shift(key: tuple[str, str, Relation, int]) -> tuple[float, float]:
+    """Two numbers in 0..1 that follow from the content of a pair and the seed."""
+    digest = hashlib.sha256(":".join(map(str, key)).encode()).digest()
+    return (int.from_bytes(digest[:4]) / 2**32, int.from_bytes(digest[4:8]) / 2**32)

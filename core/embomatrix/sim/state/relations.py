@@ -1,0 +1,205 @@
+"""Spatial relations between the objects of a live engine: one definition each, over the geometry of ``spots``.
+
+A parked object stands in no relation.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.sim.geometry.bounds import bounds_of
+from embomatrix.sim.geometry.surfaces import REST_M, heights_over, is_under
+from embomatrix.sim.state.footing import Footings
+from embomatrix.world.state import OPEN_FRACTION, Relation
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from embomatrix.sim.engine import PhysicsEngine
+    from embomatrix.sim.state.footing import Enclosure, Host
+    from embomatrix.world.geometry import Aabb
+
+TOUCH_M: Final = 0.005
+NEXT_SHARE: Final = 1 / 6
+"""Things are next to each other within this share of the mean of their six extents: OmniGibson's rule."""
+NEXT_MIN_M: Final = 0.05
+NEXT_MAX_M: Final = 0.5
+
+
+class Relations:
+    """The relations between the objects of an engine, as they are at the moment of the call.
+
+    How an object stands follows from it and its neighbours alone, so answers are kept until one of these changes. Object
+    names that the engine does not know raise EngineError.
+    """
+
+    def __init__(self, engine: PhysicsEngine) -> None:
+        self._engine = engine
+        self._scene = engine.scene
+        self.footings = Footings(engine)
+        self._kept: dict[tuple[str, str], tuple[str, ...]] = {}
+        self._kept_at = (-1, 0)
+
+    def holds(self, relation: Relation, a: str, b: str) -> bool:
+        """Whether ``relation(a, b)`` holds; ``b`` is a room for INROOM and an object otherwise."""
+        match relation:
+            case Relation.ONTOP:
+                return self.ontop(a, b)
+            case Relation.INSIDE:
+                return self.inside(a, b)
+            case Relation.UNDER:
+                return self.under(a, b)
+            case Relation.NEXTTO:
+                return self.nextto(a, b)
+            case Relation.TOUCHING:
+                return self.touching(a, b)
+            case Relation.INROOM:
+                return self.inroom(a, b)
+
+    def ontop(self, a: str, b: str) -> bool:
+        """``a`` rests on a surface of ``b``: underside within 1 cm of it, centre above its rectangle (5 mm outside allowed).
+
+        Open shelf boards and the bottoms of bowls count, boards behind a door do not: what lies there is inside.
+        """
+        return self._apart(a, b) and self.footings.is_on(a, b)
+
+    def inside(self, a: str, b: str) -> bool:
+        """The centre of ``a`` lies in a cavity of ``b``, and its box within the cavity, 1 cm outside allowed.
+
+        What stands in an open cavity may stick out at the top. Holds through nested containers.
+        """
+        return self._apart(a, b) and self.footings.is_in(a, b)
+
+    def under(self, a: str, b: str) -> bool:
+        """Some part of ``b`` lies over the centre of ``a``, and all that do begin above its top, 1 cm deeper allowed.
+
+        Centre and top are those of ``a`` with its joints shut: a door that is ajar moves nothing out from under a shelf. What
+        lies in a cavity is under nothing beyond that cavity's roof: what is in the oven is not under the worktop.
+        """
+        if not self._apart(a, b):
+            return False
+        box, asset, pose = self.body(a), self._scene.asset_of(b), self._engine.pose(b)
+        if not is_under(box, asset, pose):
+            return False
+        height_m = min(heights_over(box, asset, pose))
+        return not any(
+            self._roof_m(box, item.name) < height_m for item in self.enclosing(a) if item.name != b
+        )
+
+    def _roof_m(self, box: Aabb, name: str) -> float:
+        """Height at which what an object has over a box begins; infinite without anything."""
+        heights = heights_over(box, self._scene.asset_of(name), self._engine.pose(name))
+        return min((height for height in heights if height >= box.high_m[2] - REST_M), default=math.inf)
+
+    def nextto(self, a: str, b: str) -> bool:
+        """Side by side: their heights overlap, neither's centre is over the other, and the gap between them is small.
+
+        Small is a sixth of the mean of their six extents, but at least 5 cm and at most 50 cm.
+        """
+        if not self._apart(a, b):
+            return False
+        box_a, box_b = self._engine.aabb(a), self._engine.aabb(b)
+        if box_a.low_m[2] >= box_b.high_m[2] or box_b.low_m[2] >= box_a.high_m[2]:
+            return False
+        if _over(box_a, box_b) or _over(box_b, box_a):
+            return False
+        mean = (sum(box_a.size_m) + sum(box_b.size_m)) / 6
+        limit = min(max(mean * NEXT_SHARE, NEXT_MIN_M), NEXT_MAX_M)
+        return self._engine.gap(a, b, limit) is not None
+
+    def touching(self, a: str, b: str) -> bool:
+        """Their surfaces are 5 mm apart or less."""
+        return self._apart(a, b) and self._engine.gap(a, b, TOUCH_M) is not None
+
+    def inroom(self, a: str, room: str) -> bool:
+        """The centre of ``a`` is over the floor of the room; in a wall, of the first room within 15 cm."""
+        return not self._engine.is_parked(a) and self.room_of(a) == room
+
+    def open(self, a: str) -> bool:
+        """Any joint of ``a`` is past 5 % of its travel."""
+        return max(self._engine.joints(a), default=0.0) > OPEN_FRACTION
+
+    def body(self, name: str) -> Aabb:
+        """Box of the object with its joints shut: an open door neither brings it nearer nor pushes the robot away."""
+        fractions = self._engine.joints(name)
+        if not any(fractions):
+            return self._engine.aabb(name)
+        return bounds_of(self._scene.asset_of(name)).box(self._engine.pose(name), (0.0,) * len(fractions))
+
+    def room_of(self, name: str) -> str:
+        """Room that the object's centre is over, "" when it is in none."""
+        return self._scene.room_at(self.body(name).center_m)
+
+    def host_of(self, name: str) -> Host | None:
+        """What the object rests on or in; None on the floor, at a wall or in the hand.
+
+        Of several, the smallest: food on a plate on a table is on the plate. Lying in a cavity goes before resting on a
+        surface.
+        """
+        return self.footings.of(name).host
+
+    def hosts_of(self, name: str) -> tuple[str, ...]:
+        """What the object rests on or in, what that rests on or in, and so on."""
+        return self._answer("hosts", name, self._find_hosts)
+
+    def _find_hosts(self, name: str) -> tuple[str, ...]:
+        chain = [name]
+        while (host := self.host_of(chain[-1])) is not None and host.name not in chain:
+            chain.append(host.name)
+        return tuple(chain[1:])
+
+    def resting_on(self, name: str) -> tuple[str, ...]:
+        """Objects whose host is this one, in scene order: on its surfaces and in its cavities."""
+        return self._answer("guests", name, self._find_guests)
+
+    def _find_guests(self, name: str) -> tuple[str, ...]:
+        if self._engine.is_parked(name):
+            return ()
+        around = self._engine.near(self._engine.aabb(name).grown(REST_M), frozenset((name,)))
+        return tuple(other for other in around if self._is_host(name, other))
+
+    def _answer(self, question: str, name: str, find: Callable[[str], tuple[str, ...]]) -> tuple[str, ...]:
+        """What is kept of a question since the last change of anything, or what ``find`` finds: a step asks the same often."""
+        journal = self._engine.journal
+        now = (journal.rounds, len(journal.entries))
+        if now != self._kept_at:
+            self._kept.clear()
+            self._kept_at = now
+        answer = self._kept.get((question, name))
+        if answer is None:
+            answer = self._kept[question, name] = find(name)
+        return answer
+
+    def group_of(self, name: str) -> tuple[str, ...]:
+        """The object and all that moves along with it: what lies in its cavities, and what rests on or in that."""
+        group = {name: None}
+        waiting = [other for other in self.resting_on(name) if self._lies_in(other, name)]
+        while waiting:
+            other = waiting.pop(0)
+            if other not in group:
+                group[other] = None
+                waiting.extend(self.resting_on(other))
+        return tuple(group)
+
+    def enclosing(self, name: str) -> tuple[Enclosure, ...]:
+        """Containers around the object, the innermost first."""
+        return self.footings.of(name).enclosures
+
+    def _lies_in(self, name: str, container: str) -> bool:
+        host = self.host_of(name)
+        return host is not None and host.name == container and host.relation is Relation.INSIDE
+
+    def _is_host(self, name: str, other: str) -> bool:
+        host = self.host_of(other)
+        return host is not None and host.name == name
+
+    def _apart(self, a: str, b: str) -> bool:
+        """Whether both are in the world, and two: nothing stands in a relation to itself."""
+        return a != b and not self._engine.is_parked(a) and not self._engine.is_parked(b)
+
+
+def _over(a: Aabb, b: Aabb) -> bool:
+    """Whether the centre of ``a`` is over or under ``b``."""
+    x, y, _ = a.center_m
+    return b.low_m[0] <= x <= b.high_m[0] and b.low_m[1] <= y <= b.high_m[1]

@@ -1,0 +1,109 @@
+"""What a run comes to, kept in bounded memory while it goes on: phases, workers, outcomes by time, latest failures."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.manager.observe.histogram import Histogram
+from embomatrix.rpc.run_log import Phase, PhaseSummary, RunEvent, RunSeries, RunWorker
+
+if TYPE_CHECKING:
+    from embomatrix.rpc.wire.values import Timings
+
+FAILURES_KEPT: Final = 200
+WORKERS_KEPT: Final = 4096
+OTHERS: Final = "(others)"
+"""Stands for workers beyond those that are kept."""
+STEPS: Final = 600
+FIRST_STEP_S: Final = 0.25
+
+
+@dataclass(slots=True)
+class WorkerFigures:
+    """What one worker did for the run."""
+
+    completed: int = 0
+    failed: int = 0
+    execute_s: float = 0.0
+    load_s: float = 0.0
+
+
+class Series:
+    """Outcomes by time. When it is full, neighbouring steps are put together, and each is twice as long from then on."""
+
+    __slots__ = ("_completed", "_failed", "_first_s", "_step_s")
+
+    def __init__(self, first_s: float) -> None:
+        self._first_s = first_s
+        self._step_s = FIRST_STEP_S
+        self._completed: list[int] = []
+        self._failed: list[int] = []
+
+    def count(self, now_s: float, *, completed: int = 0, failed: int = 0) -> None:
+        """These many rollouts reached their outcome now."""
+        step = int((now_s - self._first_s) / self._step_s)
+        while step >= STEPS:
+            self._step_s *= 2
+            self._completed, self._failed = _paired(self._completed), _paired(self._failed)
+            step //= 2
+        if step >= len(self._completed):
+            more = [0] * (step + 1 - len(self._completed))
+            self._completed += more
+            self._failed += more
+        self._completed[step] += completed
+        self._failed[step] += failed
+
+    def values(self) -> RunSeries:
+        return RunSeries(self._step_s, tuple(self._completed), tuple(self._failed))
+
+
+class RunFigures:
+    """Of one run. ``opened_s`` and every ``now_s`` are of one monotonic clock."""
+
+    __slots__ = ("failures", "phases", "series", "workers")
+
+    def __init__(self, opened_s: float) -> None:
+        self.phases: dict[Phase, Histogram] = {phase: Histogram() for phase in Phase}
+        self.series = Series(opened_s)
+        self.workers: dict[str, WorkerFigures] = {}
+        self.failures: deque[RunEvent] = deque(maxlen=FAILURES_KEPT)
+
+    def completed(self, timings: Timings, now_s: float) -> None:
+        """A rollout has a result; its delivery is timed later."""
+        phases = self.phases
+        phases[Phase.QUEUE].observe(timings.queued_s)
+        phases[Phase.LEASE].observe(timings.lease_s)
+        phases[Phase.LOAD].observe(timings.load_s)
+        phases[Phase.EXECUTE].observe(timings.execute_s)
+        self.series.count(now_s, completed=1)
+
+    def worker(self, worker_id: str) -> WorkerFigures:
+        """The figures of a worker, to be changed."""
+        found = self.workers.get(worker_id)
+        if found is None:
+            name = worker_id if len(self.workers) < WORKERS_KEPT else OTHERS
+            found = self.workers.setdefault(name, WorkerFigures())
+        return found
+
+    def worker_rows(self) -> tuple[RunWorker, ...]:
+        """By name."""
+        return tuple(
+            RunWorker(name, found.completed, found.failed, found.execute_s, found.load_s)
+            for name, found in sorted(self.workers.items())
+        )
+
+
+def summary_of(histogram: Histogram) -> PhaseSummary:
+    return PhaseSummary(
+        histogram.count,
+        histogram.sum_s,
+        histogram.quantile(0.5),
+        histogram.quantile(0.95),
+        histogram.quantile(0.99),
+    )
+
+
+def _paired(counts: list[int]) -> list[int]:
+    return [sum(counts[at : at + 2]) for at in range(0, len(counts), 2)]

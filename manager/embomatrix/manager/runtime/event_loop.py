@@ -1,0 +1,327 @@
+"""The one owner of the state machines: feeds them events, carries out their commands, and keeps the clock going.
+
+Everything here runs on one event loop and never awaits between an event and its commands, so no lock is needed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import gc
+import logging
+import time
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.manager.control.commands import (
+    AcknowledgeLease,
+    CancelLease,
+    Command,
+    DeliverResult,
+    FinishBatch,
+    GiveLease,
+    QuarantineWorker,
+    SetDesired,
+)
+from embomatrix.manager.control.events import DispatchPaused, DispatchResumed
+from embomatrix.manager.observe.chronicle import Chronicle
+from embomatrix.manager.observe.effort import Effort
+from embomatrix.manager.observe.history import RunHistory
+from embomatrix.manager.observe.meter import Meter
+from embomatrix.manager.observe.training_reports import TrainingBook
+from embomatrix.manager.runtime.delivery import Delivery
+from embomatrix.manager.runtime.garbage import Collector
+from embomatrix.manager.runtime.intake import TICK_S, Heartbeat, Intake
+from embomatrix.manager.runtime.keeper import Keeper
+from embomatrix.manager.runtime.links import WorkerLink
+from embomatrix.manager.runtime.registry import Standing
+from embomatrix.manager.runtime.results import ResultLogs
+from embomatrix.manager.runtime.runs import RunLimits, Runs
+from embomatrix.manager.store.timed import timed_store
+from embomatrix.manager.web.views import UNAUDITED
+from embomatrix.rpc.status import SupersededError, UnavailableError
+from embomatrix.rpc.versions import PROTOCOL_VERSION
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+    from embomatrix.manager.control.cluster_state import ClusterState
+    from embomatrix.manager.observe.archive import RunArchive
+    from embomatrix.manager.runtime.bundles import BundleStore
+    from embomatrix.manager.runtime.links import WorkerCommand
+    from embomatrix.manager.runtime.registry import Registry, Session
+    from embomatrix.manager.store.protocol import StateStore
+    from embomatrix.rpc.leases import LeaseResult, WorkerState
+    from embomatrix.rpc.status import ClusterError
+    from embomatrix.rpc.wire.values import Resources
+
+logger = logging.getLogger(__name__)
+
+CLEANUP_S: Final = 5.0
+STOOD_STILL_S: Final = 1.0
+"""A tick that comes so late says that nobody was heard meanwhile."""
+LET_GO_S: Final = 30.0
+"""A manager that is cut off from its store for so long has its workers turn to another. As long as a lease lives."""
+STORE_AWAY: Final = (
+    "the manager is cut off from its store, and another one may lead: try again, or try the others"
+)
+_SUSPENSION: Final = {True: ("suspended", "is away"), False: ("goes on", "is back")}
+
+
+class ManagerRuntime:
+    """What the services call. ``start`` before the first call, ``serve`` for as long as it shall work.
+
+    Results are kept for ``results_ttl_s`` after their batch ended, and at most ``results_kept`` of them. ``lapsed_s`` tells
+    for how long another manager may have had the lead, and ``unrenewed`` why: nothing is dispatched meanwhile.
+    """
+
+    def __init__(
+        self,
+        cluster: ClusterState,
+        registry: Registry,
+        store: StateStore,
+        bundles: BundleStore,
+        archive: RunArchive,
+        *,
+        limits: RunLimits | None = None,
+        results_ttl_s: float = 3600.0,
+        results_kept: int = 500_000,
+        lapsed_s: Callable[[], float] = lambda: 0.0,
+        unrenewed: Callable[[], str] = str,
+    ) -> None:
+        logs = ResultLogs(ttl_s=results_ttl_s, limit=results_kept)
+        self.cluster = cluster
+        self.registry = registry
+        self.bundles = bundles
+        bundles.keep(cluster.needed_scenes)
+        self.meter = Meter()
+        self.training = TrainingBook()
+        self.effort = Effort()
+        store = timed_store(store, self.effort.operated)
+        self.started_s = time.monotonic()
+        self._collector = Collector(self.started_s)
+        self.chronicle = Chronicle(epoch_s=time.time() - self.started_s)
+        self.history = RunHistory(self.chronicle, archive, cluster)
+        self.runs = Runs(cluster, store, bundles, logs, self._carry_out, limits or RunLimits(), self.history)
+        self._intake = Intake(cluster, registry)
+        self._keeper = Keeper(store, registry, cluster)
+        self._delivery = Delivery(store, logs, self._say, self.chronicle.in_log)
+        self._links: dict[str, WorkerLink] = {}
+        self._lapsed_s = lapsed_s
+        self._unrenewed = unrenewed
+        self._suspended = False
+        self._paused = False
+        self._said_unaudited = False
+
+    async def start(self) -> None:
+        """Take the state up where a former manager left it."""
+        self._carry_out(self._intake.feed(await self._keeper.reputes(), now_s=time.monotonic()))
+        self._paused = await self._keeper.paused()
+        self._dispatch_or_not()
+        await self.runs.restore()
+
+    async def serve(self) -> None:
+        """Keep time and write results until cancelled. Ends with ``FencedError`` when another manager took over."""
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self._keep_time())
+            group.create_task(self._clean_up())
+            group.create_task(self._keeper.serve())
+            group.create_task(self._delivery.serve())
+            group.create_task(self.runs.serve())
+
+    async def register(
+        self,
+        worker_id: str,
+        boot_id: str,
+        resources: Resources,
+        *,
+        credential_id: str = "",
+        protocol: int = PROTOCOL_VERSION,
+    ) -> tuple[Session, float]:
+        """Open a session for a worker; returns it and the heartbeat's interval in seconds once the worker is noted."""
+        if self._lapsed_s() > LET_GO_S:
+            raise UnavailableError(STORE_AWAY)
+        session, commands = self._intake.register(
+            worker_id, boot_id, resources, now_s=time.monotonic(), protocol=protocol
+        )
+        session.credential_id = credential_id
+        self._close_link(worker_id)
+        self.chronicle.fleet.joined(worker_id, resources, now_s=time.monotonic())
+        self._carry_out(commands)
+        logger.info("worker registered worker=%s slots=%d", worker_id, resources.slots)
+        await self._keeper.noted(worker_id)
+        return session, self.registry.interval_s
+
+    @contextlib.contextmanager
+    def attached(self, session: Session) -> Iterator[WorkerLink]:
+        """The worker's stream is open for as long as this is held."""
+        self._close_link(session.worker_id)
+        link = self._links[session.worker_id] = WorkerLink(session)
+        self.registry.attach(session, now_s=time.monotonic())
+        if session.drained:
+            link.drain()
+        try:
+            yield link
+        finally:
+            if self._links.get(session.worker_id) is link:
+                del self._links[session.worker_id]
+                self.registry.detach(session, now_s=time.monotonic())
+                logger.info("session stream ended worker=%s", session.worker_id)
+
+    def take_report(
+        self, link: WorkerLink, state: WorkerState | None, results: Sequence[LeaseResult], *, resync: bool
+    ) -> None:
+        """What a worker says on its stream, or a part of it; ``deliver`` follows the last. ``resync`` for the first of all."""
+        now_s, worker_id = time.monotonic(), link.session.worker_id
+        ended = (*state.finished, *results) if state is not None else results
+        self.chronicle.reported(worker_id, ended, self.cluster.dispatcher.live_leases, now_s=now_s)
+        commands = self._intake.report(link.session, state, results, resync=resync, now_s=now_s)
+        if state is not None:
+            self.chronicle.fleet.residents(worker_id, state.residents, now_s=now_s)
+        self._carry_out(commands, more=True)
+
+    def deliver(self) -> None:
+        """A worker's message is heard to its end: results go on their way, in one transaction for all that it brought."""
+        self._delivery.hurry()
+
+    def take_heartbeat(self, session_id: str, epoch: int, beat: Heartbeat) -> float:
+        """Renew the leases that the worker names; returns the seconds until the next heartbeat."""
+        interval_s, commands = self._intake.heartbeat(session_id, epoch, beat, now_s=time.monotonic())
+        self._carry_out(commands)
+        return interval_s
+
+    def end_session(
+        self, session: Session, reason: str, error: ClusterError, standing: Standing = Standing.LOST
+    ) -> None:
+        """The session is over at once: its stream ends with the error, and what it held goes to others."""
+        events = self.registry.end(session, reason, standing)
+        if events:
+            logger.info("session ended worker=%s: %s", session.worker_id, reason)
+            self._carry_out(self._intake.feed(*events, now_s=time.monotonic()))
+            self._close_link(session.worker_id, error)
+
+    def drain_worker(self, worker_id: str) -> None:
+        """The worker gets nothing new, and leaves when it has finished what it holds."""
+        self._carry_out(self._intake.feed(*self.registry.drain(worker_id), now_s=time.monotonic()))
+        if worker_id in self._links:
+            self._links[worker_id].drain()
+
+    def resume_worker(self, worker_id: str) -> None:
+        """Take a drain back; a worker that has left stays away."""
+        self._carry_out(self._intake.feed(*self.registry.resume(worker_id), now_s=time.monotonic()))
+        if worker_id in self._links:
+            self._links[worker_id].resume()
+        self._keeper.hurry()
+
+    @property
+    def paused(self) -> bool:
+        """Whether an operator stopped dispatch."""
+        return self._paused
+
+    @property
+    def store_problem(self) -> str:
+        """Why nothing can be written down, while that is so."""
+        if self._suspended and not self._delivery.problem:
+            return self._unrenewed() or "the state store is away"
+        return self._delivery.problem
+
+    async def pause_dispatch(self) -> None:
+        """No new leases are given, also by the managers that come after this one; what runs goes on.
+
+        UnavailableError where those could not be told.
+        """
+        self._paused = True
+        self._dispatch_or_not()
+        await self._keeper.note_pause(True)
+
+    async def resume_dispatch(self) -> None:
+        """Leases are given again, unless the store is away. UnavailableError as above."""
+        self._paused = False
+        self._dispatch_or_not()
+        await self._keeper.note_pause(False)
+
+    def _dispatch_or_not(self) -> None:
+        event = DispatchPaused() if self._paused or self._suspended else DispatchResumed()
+        self._carry_out(self._intake.feed(event, now_s=time.monotonic()))
+
+    def _carry_out(self, commands: Sequence[Command], *, more: bool = False) -> None:
+        now_s = time.monotonic()
+        for command in commands:
+            match command:
+                case SetDesired() | CancelLease():
+                    self._say(command)
+                case GiveLease():
+                    self._say(command)
+                    if not command.audit:
+                        self.chronicle.leased(command, now_s=now_s)
+                case AcknowledgeLease():
+                    self._delivery.put_acknowledgement(command)
+                case DeliverResult():
+                    self.meter.observe(command.run_id, command.result, now_s)
+                    self.chronicle.delivered(command, now_s=now_s)
+                    self._delivery.put(command)
+                case FinishBatch():
+                    self._delivery.put(command)
+                case QuarantineWorker():
+                    logger.error("worker quarantined worker=%s: %s", command.worker_id, command.reason)
+                    self._keeper.hurry()
+        if not more:
+            self._delivery.hurry()
+
+    def _say(self, command: WorkerCommand) -> None:
+        """Without a stream the command is lost; the worker's next full state shows that, and it is given again."""
+        link = self._links.get(command.worker_id)
+        if link is not None:
+            link.put(command)
+
+    def _close_link(self, worker_id: str, reason: ClusterError | None = None) -> None:
+        link = self._links.pop(worker_id, None)
+        if link is not None:
+            taken = f"another session of worker {worker_id} took over: stop this one"
+            link.close(reason or SupersededError(taken))
+
+    def _watch_the_lead(self) -> None:
+        """Dispatch nothing while another manager may; after some time leave the workers to it."""
+        lapsed_s = self._lapsed_s()
+        if (lapsed_s > 0.0) != self._suspended:
+            self._suspended = not self._suspended
+            logger.warning("dispatch %s: the store %s", *_SUSPENSION[self._suspended])
+            self._dispatch_or_not()
+        if lapsed_s > LET_GO_S:
+            for worker_id in list(self._links):
+                self.registry.detach(self._links[worker_id].session, now_s=time.monotonic())
+                self._close_link(worker_id, UnavailableError(STORE_AWAY))
+
+    def _say_what_is_not_audited(self) -> None:
+        if self.cluster.dispatcher.auditor.lone and not self._said_unaudited:
+            self._said_unaudited = True
+            logger.warning(UNAUDITED)
+
+    async def _keep_time(self) -> None:
+        while True:
+            due_s = time.monotonic() + TICK_S
+            await asyncio.sleep(TICK_S)
+            late_s = time.monotonic() - due_s
+            self.effort.lag.observe(late_s)
+            if late_s >= STOOD_STILL_S:
+                logger.warning(
+                    "the manager stood still for %.1f s: is its machine paused, or short of memory?", late_s
+                )
+                self.registry.stood_still(late_s, now_s=time.monotonic())
+            self._watch_the_lead()
+            self._say_what_is_not_audited()
+            lost, commands = self._intake.tick(now_s=time.monotonic())
+            for event in lost:
+                logger.warning("worker lost worker=%s: %s", event.worker_id, event.reason)
+                self.chronicle.fleet.lost(event.worker_id, event.reason, now_s=time.monotonic())
+                self._close_link(event.worker_id)
+            self._carry_out(commands)
+
+    async def _clean_up(self) -> None:
+        while True:
+            self.effort.sample(time.monotonic(), time.process_time(), self.chronicle.execute_s)
+            await asyncio.sleep(CLEANUP_S)
+            await self._delivery.give_up_outdated(time.monotonic())
+            await self.runs.close_idle(time.monotonic())
+            dispatcher = self.cluster.dispatcher
+            if self._collector.note(dispatcher.queued + len(dispatcher.live_leases), time.monotonic()):
+                gc.collect()

@@ -1,0 +1,129 @@
+"""What a manager notes for those that come after it: who is there, what is known of them, what runs announced, and whether
+dispatch is paused.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.manager.control.events import ReputesKnown
+from embomatrix.manager.runtime.records import repute_of, repute_row, window_row
+from embomatrix.manager.store.protocol import Shelf, ShelfRow, StateError
+from embomatrix.rpc.status import UnavailableError
+
+if TYPE_CHECKING:
+    from embomatrix.manager.control.cluster_state import ClusterState
+    from embomatrix.manager.runtime.registry import Registry
+    from embomatrix.manager.store.protocol import StateStore
+
+logger = logging.getLogger(__name__)
+
+ROSTER_S: Final = 0.5
+NOTED_S: Final = 2.0
+"""A worker that joins waits this long to be noted: while the store is away, workers join all the same."""
+_DISPATCH: Final = "dispatch"
+_PAUSED: Final = b"paused"
+
+
+class Keeper:
+    """Writes beside the decisions, and never holds them up. What the store could not take is written when it is back."""
+
+    def __init__(self, store: StateStore, registry: Registry, cluster: ClusterState) -> None:
+        self._store = store
+        self._registry = registry
+        self._dispatcher = cluster.dispatcher
+        self._windows = cluster.scheduler.windows
+        self._announced: dict[str, int] = {}
+        """Of each run the version of the window that was noted."""
+        self._present: frozenset[str] | None = None
+        self._written = asyncio.Event()
+        """Set when the workers that are there have been noted next."""
+        self._urgent = asyncio.Event()
+
+    async def reputes(self) -> ReputesKnown:
+        """What former managers found out about workers."""
+        rows = await self._store.rows(Shelf.REPUTES)
+        return ReputesKnown({row.key: repute_of(row) for row in rows})
+
+    async def paused(self) -> bool:
+        """Whether an operator paused dispatch and nobody took that back."""
+        return ShelfRow(_DISPATCH, _PAUSED) in await self._store.rows(Shelf.SWITCHES)
+
+    async def note_pause(self, paused: bool) -> None:
+        """Raises UnavailableError where it can't be noted: it then holds as long as this process."""
+        row = ShelfRow(_DISPATCH, _PAUSED if paused else b"")
+        try:
+            await self._store.put_rows(Shelf.SWITCHES, [row])
+        except StateError as error:
+            done = "paused" if paused else "resumed"
+            raise UnavailableError(
+                f"dispatch is {done}, but another manager would not know ({error}): ask again when the store is back"
+            ) from error
+
+    def hurry(self) -> None:
+        """What changed is to be noted at once: a worker was put in quarantine, or taken out of it."""
+        self._urgent.set()
+
+    async def noted(self, worker_id: str) -> None:
+        """Return when the manager that comes after this one would wait for the worker.
+
+        It gets no lease before: what it holds would be given out a second time. Workers that join together are noted together.
+        """
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(NOTED_S):
+                while worker_id not in (self._present or ()):
+                    self.hurry()
+                    await self._written.wait()
+
+    async def serve(self) -> None:
+        """Note what changed, again and again, and once more when this is cancelled: a manager that is killed loses a moment."""
+        try:
+            while True:
+                with contextlib.suppress(TimeoutError):
+                    async with asyncio.timeout(ROSTER_S):
+                        await self._urgent.wait()
+                self._urgent.clear()
+                await self._note_present()
+                await self._note_reputes()
+                await self._note_windows()
+        finally:
+            await self._note_reputes()
+            await self._note_windows()
+
+    async def _note_present(self) -> None:
+        """For the manager that comes after this one: whom it waits for."""
+        present = self._registry.present | self._dispatcher.expected
+        if present != self._present:
+            with contextlib.suppress(StateError):
+                await self._store.put_workers(present)
+                self._present = present
+                self._written.set()
+                self._written = asyncio.Event()
+
+    async def _note_windows(self) -> None:
+        """What runs announced since the last time: scenes go on being loaded ahead though their trainers say nothing anew."""
+        now = {run_id: window.version for run_id, window in self._windows.items()}
+        rows = [
+            window_row(run_id, self._windows[run_id])
+            for run_id, version in now.items()
+            if self._announced.get(run_id) != version
+        ]
+        if not rows:
+            return
+        with contextlib.suppress(StateError):
+            await self._store.put_rows(Shelf.WINDOWS, rows)
+            self._announced = now
+
+    async def _note_reputes(self) -> None:
+        auditor = self._dispatcher.auditor
+        changed = auditor.take_changed()
+        rows = [repute_row(worker_id, auditor.of(worker_id)) for worker_id in changed]
+        if not rows:
+            return
+        try:
+            await self._store.put_rows(Shelf.REPUTES, rows)
+        except StateError:
+            auditor.note(*changed)

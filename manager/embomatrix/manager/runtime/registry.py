@@ -1,0 +1,316 @@
+"""Sessions of workers: who is there, under which epoch, and who fell silent. Decisions only; the clock is an argument."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import secrets
+from collections import OrderedDict
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.manager.control.events import (
+    Event,
+    WorkerDrained,
+    WorkerJoined,
+    WorkerLost,
+    WorkerRecovered,
+    WorkerResumed,
+    WorkerSuspected,
+)
+from embomatrix.rpc.status import NotFoundError, SupersededError, UnknownSessionError
+from embomatrix.rpc.versions import PROTOCOL_VERSION
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping
+
+    from embomatrix.rpc.wire.values import Resources
+
+
+LISTED: Final = 10
+"""Names that a sentence takes."""
+
+
+class Standing(StrEnum):
+    """What a person sees of a worker."""
+
+    READY = "ready"
+    SUSPECT = "suspect"
+    LOST = "lost"
+    DRAINING = "draining"
+    PAUSED = "paused"
+    QUARANTINED = "quarantined"
+    LEFT = "left"
+
+    @property
+    def is_gone(self) -> bool:
+        """It was here, and nothing is to be had of it any more."""
+        return self in (Standing.LOST, Standing.LEFT)
+
+
+@dataclass(frozen=True, slots=True)
+class LivenessLimits:
+    """When a worker is heard, doubted, and given up; seconds, except for counts."""
+
+    heartbeat_s: float = 1.0
+    """Between two heartbeats of a worker, in a small cluster."""
+    heartbeats_per_s: float = 100.0
+    """The interval grows with the cluster, so that the manager gets no more than this …"""
+    longest_heartbeat_s: float = 7.5
+    """… but not beyond this: a quarter of a lease's life, which heartbeats renew."""
+    misses_suspect: int = 3
+    """Intervals of silence after which a worker gets no new leases."""
+    lost_after_s: float = 10.0
+    stream_grace_s: float = 1.0
+    """A worker whose session stream broke may come back within this time."""
+    remember_lost_s: float = 300.0
+    """How long a lost worker stays in the lists for people to see."""
+
+
+@dataclass(slots=True, eq=False)
+class Session:
+    """One registration of a worker. A newer one of the same worker supersedes it."""
+
+    worker_id: str
+    boot_id: str
+    session_id: str
+    epoch: int
+    resources: Resources
+    last_seen_s: float
+    standing: Standing = Standing.READY
+    attached: bool = False
+    detached_s: float | None = None
+    reason: str = ""
+    """Why it was lost, left, or is paused."""
+    drained: bool = False
+    """An operator takes it out."""
+    load: float = 0.0
+    memory_used_mb: int = 0
+    protocol: int = PROTOCOL_VERSION
+    """The version that both sides speak."""
+    credential_id: str = ""
+    """The token that opened it: no other speaks for it."""
+    asked: set[str] = field(default_factory=set)
+    """Bundles that the worker was asked to hold, or to execute in: it may fetch these."""
+
+
+class Registry:
+    """Sessions by worker; ``new_id`` names each, by default as nobody can guess.
+
+    Methods return what the state machines should hear of.
+    """
+
+    def __init__(
+        self,
+        limits: LivenessLimits,
+        *,
+        first_epoch: int = 1,
+        new_id: Callable[[], str] | None = None,
+    ) -> None:
+        self._limits = limits
+        self._new_id = new_id or functools.partial(secrets.token_hex, 8)
+        self._sessions: dict[str, Session] = {}
+        self._by_silence: OrderedDict[str, Session] = OrderedDict()
+        """Sessions that are not lost, those first that were heard longest ago: the silent are found without a search."""
+        self._detached: dict[str, Session] = {}
+        self._lost: OrderedDict[str, Session] = OrderedDict()
+        self._worker_of: dict[str, str] = {}
+        self._epoch = first_epoch - 1
+        self._first_epoch = first_epoch
+
+    @property
+    def sessions(self) -> Mapping[str, Session]:
+        """By worker id; lost ones stay for a while."""
+        return self._sessions
+
+    @property
+    def interval_s(self) -> float:
+        """Seconds between two heartbeats of a worker in a cluster of this size."""
+        fair_s = len(self._by_silence) / self._limits.heartbeats_per_s
+        return max(self._limits.heartbeat_s, min(fair_s, self._limits.longest_heartbeat_s))
+
+    @property
+    def present(self) -> frozenset[str]:
+        """Ids of the workers that are neither lost nor left."""
+        return frozenset(self._by_silence)
+
+    def register(
+        self,
+        worker_id: str,
+        boot_id: str,
+        resources: Resources,
+        *,
+        now_s: float,
+        protocol: int = PROTOCOL_VERSION,
+    ) -> tuple[Session, list[Event]]:
+        """Open a session; an older one of the same worker ends. The same process keeps its leases, another one loses them."""
+        before = self._sessions.get(worker_id)
+        alive = before is not None and not before.standing.is_gone
+        self._epoch += 1
+        session = Session(
+            worker_id=worker_id,
+            boot_id=boot_id,
+            session_id=self._new_id(),
+            epoch=self._epoch,
+            resources=resources,
+            last_seen_s=now_s,
+            protocol=protocol,
+        )
+        self._sessions[worker_id] = self._by_silence[worker_id] = session
+        self._by_silence.move_to_end(worker_id)
+        self._detached.pop(worker_id, None)
+        self._lost.pop(worker_id, None)
+        self._worker_of[session.session_id] = worker_id
+        if before is not None:
+            self._worker_of.pop(before.session_id, None)
+            if alive and boot_id and before.boot_id == boot_id and before.resources == resources:
+                # The same process under a new session: it still holds its leases, and its full state will tell which.
+                session.standing = before.standing
+                return session, []
+        lost = [WorkerLost(worker_id, "a newer session of the same worker took over")] if alive else []
+        return session, [*lost, WorkerJoined(worker_id, resources, protocol)]
+
+    def find(self, session_id: str, epoch: int) -> Session:
+        """The live session of that name; raises ``SupersededError`` for one that ended, so that its worker stops.
+
+        ``UnknownSessionError`` for one that a former manager opened: its worker keeps what it holds, and registers.
+        """
+        if epoch < self._first_epoch:
+            raise UnknownSessionError(
+                "this manager took over from the one that opened the session: register again"
+            )
+        worker_id = self._worker_of.get(session_id, "")
+        session = self._sessions.get(worker_id)
+        if session is None or session.session_id != session_id or session.epoch != epoch:
+            raise SupersededError(
+                "this session is not known or was superseded by a newer one: register again"
+            )
+        if session.standing.is_gone:
+            raise SupersededError(f"worker {worker_id} was given up ({session.reason}): register again")
+        return session
+
+    def holder(self, session_id: str) -> Session:
+        """The live session of that name, for calls that carry no epoch."""
+        session = self._sessions.get(self._worker_of.get(session_id, ""))
+        return self.find(session_id, session.epoch if session is not None else 0)
+
+    def end(self, session: Session, reason: str, standing: Standing = Standing.LOST) -> list[Event]:
+        """The session is over at once, whatever its worker does; what it held goes to others."""
+        if session.standing.is_gone or self._sessions.get(session.worker_id) is not session:
+            return []
+        return [self._lose(session, reason, standing)]
+
+    def attach(self, session: Session, *, now_s: float) -> None:
+        """The worker's stream is open. A suspect gets nothing before its first state was heard on it."""
+        session.attached = True
+        session.detached_s = None
+        self._detached.pop(session.worker_id, None)
+        self._note(session, now_s)
+
+    def detach(self, session: Session, *, now_s: float) -> None:
+        """The worker's stream broke; unless it comes back within the grace, the worker is lost."""
+        session.attached = False
+        session.detached_s = now_s
+        if self._by_silence.get(session.worker_id) is session:
+            self._detached[session.worker_id] = session
+
+    def heard(self, session: Session, *, now_s: float) -> list[Event]:
+        """Any sign of life."""
+        self._note(session, now_s)
+        if session.standing is not Standing.SUSPECT:
+            return []
+        session.standing = Standing.READY
+        return [WorkerRecovered(session.worker_id)]
+
+    def drain(self, worker_id: str) -> list[Event]:
+        """Take a worker out of service once it has finished what it holds."""
+        session = self._there(worker_id)
+        session.drained, session.standing = True, Standing.DRAINING
+        return [WorkerDrained(worker_id)]
+
+    def resume(self, worker_id: str) -> list[Event]:
+        """Take a drain back. The worker says itself whether it still leaves."""
+        session = self._there(worker_id)
+        session.drained, session.standing = False, Standing.READY
+        return [WorkerResumed(worker_id)]
+
+    def told(self, session: Session, *, draining: bool, paused: str) -> None:
+        """The worker itself says whether it will leave, or why it takes nothing new for now."""
+        if draining or session.drained:
+            session.standing = Standing.DRAINING
+        else:
+            session.standing = Standing.PAUSED if paused else Standing.READY
+        session.reason = paused
+
+    def stood_still(self, seconds: float, *, now_s: float) -> None:
+        """For so long, until now, the manager itself did not run and heard nobody: that is no silence of theirs."""
+        for session in self._by_silence.values():
+            session.last_seen_s = min(session.last_seen_s + seconds, now_s)
+        for session in self._detached.values():
+            if session.detached_s is not None:
+                session.detached_s = min(session.detached_s + seconds, now_s)
+
+    def tick(self, *, now_s: float) -> list[Event]:
+        """Suspect the silent, give up the lost, forget the long gone."""
+        self._forget_lost(now_s)
+        events: list[Event] = []
+        suspect_s = self._limits.misses_suspect * self.interval_s
+        for session in self._silent_for(suspect_s, now_s):
+            silent_s = now_s - session.last_seen_s
+            if silent_s >= max(self._limits.lost_after_s, suspect_s):
+                events.append(self._lose(session, f"not heard of for {silent_s:.1f} s"))
+            elif session.standing is Standing.READY:
+                session.standing = Standing.SUSPECT
+                events.append(WorkerSuspected(session.worker_id))
+        for session in list(self._detached.values()):
+            if session.detached_s is not None and now_s - session.detached_s >= self._limits.stream_grace_s:
+                if session.standing is Standing.DRAINING:
+                    events.append(self._lose(session, "it drained and left", Standing.LEFT))
+                else:
+                    events.append(self._lose(session, "its connection broke and it did not come back"))
+        return events
+
+    def _there(self, worker_id: str) -> Session:
+        session = self._sessions.get(worker_id)
+        if session is None:
+            raise NotFoundError(f"there is no worker {worker_id!r}: connected are {listed(self.present)}")
+        if session.standing.is_gone:
+            raise NotFoundError(
+                f"worker {worker_id!r} is gone ({session.reason}): start it again at its machine"
+            )
+        return session
+
+    def _note(self, session: Session, now_s: float) -> None:
+        session.last_seen_s = now_s
+        if self._by_silence.get(session.worker_id) is session:
+            self._by_silence.move_to_end(session.worker_id)
+
+    def _silent_for(self, seconds: float, now_s: float) -> list[Session]:
+        silent = itertools.takewhile(
+            lambda session: now_s - session.last_seen_s >= seconds, self._by_silence.values()
+        )
+        return list(silent)
+
+    def _forget_lost(self, now_s: float) -> None:
+        while self._lost:
+            session = next(iter(self._lost.values()))
+            if now_s - session.last_seen_s <= self._limits.remember_lost_s:
+                return
+            del self._lost[session.worker_id], self._sessions[session.worker_id]
+            self._worker_of.pop(session.session_id, None)
+
+    def _lose(self, session: Session, reason: str, standing: Standing = Standing.LOST) -> WorkerLost:
+        session.standing = standing
+        session.reason = reason
+        del self._by_silence[session.worker_id]
+        self._detached.pop(session.worker_id, None)
+        self._lost[session.worker_id] = session
+        return WorkerLost(session.worker_id, reason)
+
+
+def listed(worker_ids: Iterable[str]) -> str:
+    """The names in a sentence; of very many the first, and how many more there are."""
+    names = sorted(worker_ids)
+    more = f" and {len(names) - LISTED} more" if len(names) > LISTED else ""
+    return (", ".join(names[:LISTED]) or "none") + more

@@ -1,0 +1,283 @@
+"""What trainers may do: open runs, announce scenes, submit batches, and read their results."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import re
+import secrets
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.manager.control.dispatch.group_ends import group_sizes
+from embomatrix.manager.control.events import (
+    BatchCancelled,
+    BatchRestored,
+    LookaheadAnnounced,
+    RunOpened,
+    WorkersExpected,
+)
+from embomatrix.manager.runtime.records import (
+    announced_in,
+    batch_of,
+    batch_row,
+    failed_rows,
+    group_and_kind,
+    terms_of,
+    terms_payload,
+)
+from embomatrix.manager.runtime.results import BatchLog
+from embomatrix.manager.runtime.submissions import Submissions
+from embomatrix.manager.store.protocol import PutOutcome, RunRow, Shelf, StateError, StateFullError
+from embomatrix.reward.settings import PAPER
+from embomatrix.rpc.status import (
+    ConflictError,
+    InvalidRequestError,
+    NotFoundError,
+    OverloadedError,
+    PreconditionError,
+    UnavailableError,
+)
+from embomatrix.rpc.wire.values import RunTerms
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping, Sequence
+
+    from embomatrix.manager.control.cluster_state import ClusterState
+    from embomatrix.manager.control.commands import Command
+    from embomatrix.manager.control.events import Event
+    from embomatrix.manager.observe.history import RunHistory
+    from embomatrix.manager.runtime.bundles import BundleStore
+    from embomatrix.manager.runtime.results import ResultLogs
+    from embomatrix.manager.store.protocol import StateStore
+    from embomatrix.rpc.wire.values import Batch, LookaheadAnswer, LookaheadEntry, RunStats
+
+logger = logging.getLogger(__name__)
+
+DEFAULT_TERMS: Final = RunTerms()
+PAGE: Final = 4096
+_RUN_ID: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
+
+
+@dataclass(frozen=True, slots=True)
+class RunLimits:
+    """Bounds of what trainers may leave here."""
+
+    batch_rollouts: int = 65_536
+    """Of one batch."""
+    queued_rollouts: int = 262_144
+    """Of all batches together."""
+    runs: int = 1024
+    lookahead_entries: int = 65_536
+    idle_s: float = 6 * 3600.0
+    """A run that nobody spoke of for this long, and that waits for nothing, is closed."""
+
+
+class Runs:
+    """Open runs and their batches. ``carry_out`` executes commands of the cluster's state machines at once."""
+
+    def __init__(
+        self,
+        cluster: ClusterState,
+        store: StateStore,
+        bundles: BundleStore,
+        logs: ResultLogs,
+        carry_out: Callable[[Sequence[Command]], None],
+        limits: RunLimits,
+        history: RunHistory,
+    ) -> None:
+        self._cluster = cluster
+        self._store = store
+        self._bundles = bundles
+        self._logs = logs
+        self._carry_out = carry_out
+        self.limits = limits
+        self._history = history
+        self._runs: dict[str, RunRow] = {}
+        self._heard_s: dict[str, float] = {}
+        self._submissions = Submissions(self._feed)
+
+    @property
+    def open(self) -> Mapping[str, RunRow]:
+        """By id, oldest first."""
+        return self._runs
+
+    async def restore(self) -> None:
+        """Take up what a former manager left. Its open batches go on at once, whether their trainer asks for them or not."""
+        announced = {row.key: announced_in(row) for row in await self._store.rows(Shelf.WINDOWS)}
+        for run in await self._store.runs():
+            self._runs[run.run_id] = run
+            terms = terms_of(run)
+            self._feed(RunOpened(run.run_id, terms))
+            self._history.opened(run.run_id, run.name, terms.reward)
+            self._heard_s[run.run_id] = time.monotonic()
+            if run.run_id in announced:
+                self._feed(announced[run.run_id])
+            for row in await self._store.batches(run.run_id):
+                batch = batch_of(row)
+                log = BatchLog(run.run_id, row.batch_id, row.digest, groups=group_sizes(batch))
+                while page := await self._store.results_after(
+                    run.run_id, row.batch_id, log.last_cursor, PAGE
+                ):
+                    for result in page:
+                        log.ends.take(result.cursor, *group_and_kind(result))
+                    log.append(page)
+                self._logs.add(log)
+                delivered = {result.rollout_id: result.cursor for result in log.rows}
+                self._history.submitted(batch)
+                self._feed(BatchRestored(batch, delivered, failed_rows(log.rows)))
+        self._feed(WorkersExpected(await self._store.workers()))
+        if self._runs:
+            logger.info("took up %d runs of a former manager", len(self._runs))
+
+    async def serve(self) -> None:
+        """Take large batches in, until cancelled."""
+        await self._submissions.serve()
+
+    async def open_run(self, name: str, run_id: str, terms: RunTerms = DEFAULT_TERMS) -> str:
+        """Open a run, or attach to the one of that id, which keeps its terms; an empty id gets a new one.
+
+        ConflictError for coefficients of the reward that are not those of the run that is there.
+        """
+        run_id = run_id or f"run-{secrets.token_hex(6)}"
+        if not _RUN_ID.fullmatch(run_id):
+            raise InvalidRequestError(
+                f"run id {run_id[:140]!r}: use up to 128 letters, digits, '.', '_' and '-'"
+            )
+        if run_id not in self._runs:
+            if len(self._runs) >= self.limits.runs:
+                raise OverloadedError(f"{len(self._runs)} runs are open: close some with CloseRun")
+            run = RunRow(run_id, name[:200], terms_payload(terms))
+            with _store_errors():
+                await self._store.open_run(run)
+            if run_id not in self._runs:
+                self._runs[run_id] = run
+                self._feed(RunOpened(run_id, terms))
+            self._history.opened(run_id, run.name, terms.reward)
+        elif terms.reward not in (PAPER, terms_of(self._runs[run_id]).reward):
+            raise ConflictError(
+                f"run {run_id!r} was opened with other reward coefficients: keep those, or open another run"
+            )
+        self._heard_s[run_id] = time.monotonic()
+        return run_id
+
+    def announce(
+        self, run_id: str, version: int, entries: tuple[LookaheadEntry, ...]
+    ) -> list[LookaheadAnswer]:
+        """Replace the run's window; answers how far each scene is."""
+        self._check_run(run_id)
+        if len(entries) > self.limits.lookahead_entries:
+            raise InvalidRequestError(
+                f"{len(entries)} look-ahead entries: at most {self.limits.lookahead_entries}, announce fewer steps"
+            )
+        self._feed(LookaheadAnnounced(run_id, version, entries))
+        scenes = dict.fromkeys(entry.bundle_digest for entry in entries)
+        outlook = self._cluster.scheduler.outlook
+        return [outlook.answer(scene) for scene in scenes]
+
+    async def submit(self, batch: Batch) -> BatchLog:
+        """Have the batch executed, or attach to it when it was submitted before; returns its results' log."""
+        self._check_run(batch.run_id)
+        row = batch_row(batch)
+        taken = ConflictError(
+            f"batch {batch.batch_id!r} was submitted before with other rollouts: use a new id"
+        )
+        log = self._logs.get(batch.run_id, batch.batch_id)
+        if log is not None:
+            if log.digest != row.digest:
+                raise taken
+            return self.log_of(batch.run_id, batch.batch_id)
+        self._check_batch(batch)
+        log = BatchLog(batch.run_id, batch.batch_id, row.digest, groups=group_sizes(batch))
+        self._logs.add(log)
+        try:
+            with _store_errors():
+                outcome = await self._store.put_batch(row)
+            if outcome is PutOutcome.CONFLICT:
+                raise taken
+            self._check_run(batch.run_id)
+        except BaseException:
+            self._logs.remove(log)
+            raise
+        self._history.submitted(batch)
+        self._submissions.enter(batch)
+        return log
+
+    def log_of(self, run_id: str, batch_id: str) -> BatchLog:
+        """The results of a batch that was submitted."""
+        self._check_run(run_id)
+        log = self._logs.get(run_id, batch_id)
+        if log is None:
+            raise NotFoundError(
+                f"batch {batch_id!r} of run {run_id!r} is not known (any more): submit it again"
+            )
+        return log
+
+    def cancel(self, run_id: str, batch_id: str) -> None:
+        """Call a batch off: what has no outcome yet ends as cancelled."""
+        self.log_of(run_id, batch_id)
+        self._feed(BatchCancelled(run_id, batch_id))
+
+    async def close_run(self, run_id: str) -> RunStats:
+        """End the run and forget its results; returns its final counters."""
+        self._check_run(run_id)
+        del self._runs[run_id], self._heard_s[run_id]
+        leads = self._history.leads(run_id)
+        stats, commands = self._cluster.close_run(run_id, now_s=time.monotonic())
+        self._logs.close_run(run_id)
+        self._carry_out(commands)
+        await self._history.closed(run_id, stats, leads)
+        with _store_errors():
+            await self._store.close_run(run_id)
+        return stats
+
+    async def close_idle(self, now_s: float) -> None:
+        """Close runs whose trainers went away without a word."""
+        for run_id, heard_s in list(self._heard_s.items()):
+            if now_s - heard_s > self.limits.idle_s and not self._cluster.dispatcher.pending_of(run_id):
+                logger.info("closing idle run run=%s", run_id)
+                with contextlib.suppress(UnavailableError):
+                    await self.close_run(run_id)
+
+    def hear_of(self, run_id: str) -> RunRow:
+        """The open run, which its trainer has not forgotten. NotFoundError where there is none."""
+        self._check_run(run_id)
+        return self._runs[run_id]
+
+    def _check_run(self, run_id: str) -> None:
+        if run_id not in self._runs:
+            raise NotFoundError(f"run {run_id!r} is not open: open it with OpenRun")
+        self._heard_s[run_id] = time.monotonic()
+
+    def _check_batch(self, batch: Batch) -> None:
+        count, limit = len(batch.rollouts), self.limits.batch_rollouts
+        if not 0 < count <= limit:
+            raise InvalidRequestError(f"batch {batch.batch_id!r} has {count} rollouts: expected 1 to {limit}")
+        if len({rollout.rollout_id for rollout in batch.rollouts}) < count:
+            raise InvalidRequestError(
+                f"batch {batch.batch_id!r} has a rollout id twice: every id must be unique"
+            )
+        queued = self._cluster.dispatcher.queued
+        if queued + count > self.limits.queued_rollouts:
+            raise OverloadedError(f"{queued} rollouts wait already: submit again when some have come back")
+        missing = self._bundles.missing([rollout.bundle_digest for rollout in batch.rollouts])
+        if missing:
+            raise PreconditionError(
+                f"the manager lacks {len(missing)} bundles of batch {batch.batch_id!r}, first {missing[0]}: "
+                f"put them first"
+            )
+
+    def _feed(self, event: Event) -> None:
+        self._carry_out(self._cluster.handle(event, now_s=time.monotonic()))
+
+
+@contextlib.contextmanager
+def _store_errors() -> Iterator[None]:
+    """A store that is away makes the manager unavailable, one that is full makes it refuse; the caller may try again."""
+    try:
+        yield
+    except StateFullError as error:
+        raise OverloadedError(str(error)) from error
+    except StateError as error:
+        raise UnavailableError(str(error)) from error

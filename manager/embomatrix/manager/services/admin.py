@@ -1,0 +1,90 @@
+"""AdminService: what the cluster is doing, and a way to take a worker out."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+from embomatrix.manager.services.tokens import TokenMethods
+from embomatrix.manager.web.health import health
+from embomatrix.manager.web.views import overview, plan, run_infos, worker_infos
+from embomatrix.proto.v1 import admin_service_pb2 as pb
+from embomatrix.rpc.status import translate
+from embomatrix.rpc.wire.run_log import event_page_to_proto, run_summary_to_proto
+from embomatrix.rpc.wire.session import plan_cell_to_proto, run_info_to_proto, worker_info_to_proto
+
+if TYPE_CHECKING:
+    import grpc
+
+    from embomatrix.manager.access.gate import Gate
+    from embomatrix.manager.runtime.event_loop import ManagerRuntime
+    from embomatrix.manager.services.expulsion import Expulsion
+
+
+class AdminServicer(TokenMethods):
+    def __init__(self, runtime: ManagerRuntime, gate: Gate, expulsion: Expulsion) -> None:
+        super().__init__(gate, expulsion)
+        self._runtime = runtime
+
+    async def ListWorkers(
+        self, request: pb.ListWorkersRequest, context: grpc.aio.ServicerContext
+    ) -> pb.ListWorkersResponse:
+        async with translate(context):
+            workers = [worker_info_to_proto(info) for info in worker_infos(self._runtime)]
+            told = health(overview(self._runtime), paused=self._runtime.paused, now_s=time.time())
+        return pb.ListWorkersResponse(workers=workers, health=told.sentence, mood=told.mood)
+
+    async def ListRuns(
+        self, request: pb.ListRunsRequest, context: grpc.aio.ServicerContext
+    ) -> pb.ListRunsResponse:
+        async with translate(context):
+            found = await self._runtime.history.kept() if request.closed else run_infos(self._runtime)
+            runs = [run_info_to_proto(info) for info in found]
+        return pb.ListRunsResponse(runs=runs)
+
+    async def GetRun(self, request: pb.GetRunRequest, context: grpc.aio.ServicerContext) -> pb.GetRunResponse:
+        async with translate(context):
+            summary = await self._runtime.history.summary(request.run_id)
+        return run_summary_to_proto(summary)
+
+    async def ReadEvents(
+        self, request: pb.ReadEventsRequest, context: grpc.aio.ServicerContext
+    ) -> pb.ReadEventsResponse:
+        async with translate(context):
+            page = await self._runtime.history.events(request.run_id, request.after, request.limit)
+        return event_page_to_proto(page)
+
+    async def DrainWorker(
+        self, request: pb.DrainWorkerRequest, context: grpc.aio.ServicerContext
+    ) -> pb.DrainWorkerResponse:
+        async with translate(context):
+            self._runtime.drain_worker(request.worker_id)
+        return pb.DrainWorkerResponse()
+
+    async def ResumeWorker(
+        self, request: pb.ResumeWorkerRequest, context: grpc.aio.ServicerContext
+    ) -> pb.ResumeWorkerResponse:
+        async with translate(context):
+            self._runtime.resume_worker(request.worker_id)
+        return pb.ResumeWorkerResponse()
+
+    async def GetPlan(
+        self, request: pb.GetPlanRequest, context: grpc.aio.ServicerContext
+    ) -> pb.GetPlanResponse:
+        async with translate(context):
+            cells = [plan_cell_to_proto(cell) for cell in plan(self._runtime, request.run_id)]
+        return pb.GetPlanResponse(cells=cells)
+
+    async def PauseDispatch(
+        self, request: pb.PauseDispatchRequest, context: grpc.aio.ServicerContext
+    ) -> pb.PauseDispatchResponse:
+        async with translate(context):
+            await self._runtime.pause_dispatch()
+        return pb.PauseDispatchResponse()
+
+    async def ResumeDispatch(
+        self, request: pb.ResumeDispatchRequest, context: grpc.aio.ServicerContext
+    ) -> pb.ResumeDispatchResponse:
+        async with translate(context):
+            await self._runtime.resume_dispatch()
+        return pb.ResumeDispatchResponse()

@@ -1,0 +1,164 @@
+"""RolloutService: trainers open runs, announce what comes, submit batches, and read results from a cursor."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.proto.v1 import rollout_service_pb2 as pb
+from embomatrix.proto.v1 import rollout_service_pb2_grpc
+from embomatrix.rpc.logs import bind
+from embomatrix.rpc.status import NotFoundError, TrimmedError, translate
+from embomatrix.rpc.versions import PROTOCOL_OLDEST, SPOKEN, VersionRange, agree, software_version
+from embomatrix.rpc.wire.batch import batch_with
+from embomatrix.rpc.wire.rollout import each, rollout_from_proto
+from embomatrix.rpc.wire.run import (
+    group_done_to_proto,
+    lookahead_answer_to_proto,
+    lookahead_entry_from_proto,
+    run_stats_to_proto,
+    run_terms_from_proto,
+)
+from embomatrix.rpc.wire.training import training_report_from_proto
+from embomatrix.world.inflation import DEFAULT_LIMITS
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Sequence
+
+    import grpc
+
+    from embomatrix.manager.access.gate import Gate
+    from embomatrix.manager.observe.training_reports import TrainingBook
+    from embomatrix.manager.runtime.results import BatchLog
+    from embomatrix.manager.runtime.runs import Runs
+    from embomatrix.manager.store.protocol import ResultRow
+    from embomatrix.rpc.wire.values import Batch, Rollout
+
+SLICE: Final = 128
+"""Rollouts of a batch that are converted in one go: about two milliseconds."""
+
+
+class RolloutServicer(rollout_service_pb2_grpc.RolloutServiceServicer):
+    """``gate`` knows who calls; ``authority`` is the certificate (PEM) of who signed the manager's, empty without TLS."""
+
+    def __init__(self, runs: Runs, training: TrainingBook, gate: Gate, *, authority: bytes = b"") -> None:
+        self._runs = runs
+        self._training = training
+        self._gate = gate
+        self._authority = authority.decode("ascii")
+
+    async def GetCapabilities(
+        self, request: pb.GetCapabilitiesRequest, context: grpc.aio.ServicerContext
+    ) -> pb.GetCapabilitiesResponse:
+        return pb.GetCapabilitiesResponse(
+            protocol_low=SPOKEN.oldest,
+            protocol_high=SPOKEN.newest,
+            version=software_version(),
+            batch_rollouts=self._runs.limits.batch_rollouts,
+            bundle_bytes=DEFAULT_LIMITS.compressed_bytes,
+            ca_certificate=self._authority,
+        )
+
+    async def OpenRun(
+        self, request: pb.OpenRunRequest, context: grpc.aio.ServicerContext
+    ) -> pb.OpenRunResponse:
+        async with translate(context):
+            # A trainer of version 1 does not say which it speaks.
+            spoken = request.protocol_version or PROTOCOL_OLDEST
+            agree(SPOKEN, VersionRange(spoken, spoken), us="this manager", them="the trainer")
+            run_id = await self._runs.open_run(request.name, request.run_id, run_terms_from_proto(request))
+        return pb.OpenRunResponse(run_id=run_id)
+
+    async def AnnounceLookahead(
+        self, request: pb.AnnounceLookaheadRequest, context: grpc.aio.ServicerContext
+    ) -> pb.AnnounceLookaheadResponse:
+        async with translate(context):
+            bind("run", request.run_id)
+            entries = each("entries", lookahead_entry_from_proto, request.entries)
+            answers = self._runs.announce(request.run_id, request.version, entries)
+        return pb.AnnounceLookaheadResponse(answers=[lookahead_answer_to_proto(one) for one in answers])
+
+    async def Execute(
+        self, request: pb.ExecuteRequest, context: grpc.aio.ServicerContext
+    ) -> AsyncIterator[pb.ExecuteResponse]:
+        async with translate(context):
+            bind("run", request.run_id)
+            bind("batch", request.batch_id)
+            log = await self._runs.submit(await _batch(request))
+            async for rows in _results(log, 0):
+                self._gate.caller_of(context)  # a token that was revoked meanwhile reads nothing more
+                message = pb.ExecuteResponse()
+                _tell(log, rows, message)
+                yield message
+
+    async def WaitExecution(
+        self, request: pb.WaitExecutionRequest, context: grpc.aio.ServicerContext
+    ) -> AsyncIterator[pb.WaitExecutionResponse]:
+        async with translate(context):
+            bind("run", request.run_id)
+            bind("batch", request.batch_id)
+            log = self._runs.log_of(request.run_id, request.batch_id)
+            async for rows in _results(log, request.after_cursor):
+                self._gate.caller_of(context)
+                message = pb.WaitExecutionResponse()
+                _tell(log, rows, message)
+                yield message
+
+    async def CancelBatch(
+        self, request: pb.CancelBatchRequest, context: grpc.aio.ServicerContext
+    ) -> pb.CancelBatchResponse:
+        async with translate(context):
+            bind("run", request.run_id)
+            bind("batch", request.batch_id)
+            self._runs.cancel(request.run_id, request.batch_id)
+        return pb.CancelBatchResponse()
+
+    async def ReportTraining(
+        self, request: pb.ReportTrainingRequest, context: grpc.aio.ServicerContext
+    ) -> pb.ReportTrainingResponse:
+        async with translate(context):
+            bind("run", request.run_id)
+            report = training_report_from_proto(request)
+            name = self._runs.hear_of(request.run_id).name
+            self._training.note(request.run_id, name, report, at_s=time.time())
+        return pb.ReportTrainingResponse()
+
+    async def CloseRun(
+        self, request: pb.CloseRunRequest, context: grpc.aio.ServicerContext
+    ) -> pb.CloseRunResponse:
+        async with translate(context):
+            bind("run", request.run_id)
+            stats = await self._runs.close_run(request.run_id)
+        return pb.CloseRunResponse(stats=run_stats_to_proto(stats))
+
+
+async def _batch(request: pb.ExecuteRequest) -> Batch:
+    """The batch of a request. A large one takes longer than workers may wait: others have their turn meanwhile."""
+    rollouts: list[Rollout] = []
+    for start in range(0, len(request.rollouts), SLICE):
+        part = request.rollouts[start : start + SLICE]
+        rollouts += each("rollouts", rollout_from_proto, part, first=start)
+        await asyncio.sleep(0)
+    return batch_with(request, tuple(rollouts))
+
+
+async def _results(log: BatchLog, cursor: int) -> AsyncIterator[list[ResultRow]]:
+    """All results beyond the cursor, as they come, to the end of the batch."""
+    if cursor > log.last_cursor and log.ended:
+        raise TrimmedError(
+            f"batch {log.batch_id!r} ends at cursor {log.last_cursor}: {cursor} lies beyond it"
+        )
+    async for rows in log.messages(cursor):
+        yield rows
+    if log.dropped:
+        raise NotFoundError(f"batch {log.batch_id!r} is no longer kept: its run was closed")
+
+
+def _tell(
+    log: BatchLog, rows: Sequence[ResultRow], message: pb.ExecuteResponse | pb.WaitExecutionResponse
+) -> None:
+    """Fill an empty message with these results, as they are kept, and with the groups that end among them."""
+    for row in rows:
+        message.results.add().MergeFromString(row.payload)
+    message.groups.extend(map(group_done_to_proto, log.ends.among(rows)))

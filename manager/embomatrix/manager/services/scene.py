@@ -1,0 +1,53 @@
+"""SceneService: bundles in and out, by digest."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from embomatrix.proto.v1 import scene_service_pb2 as pb
+from embomatrix.proto.v1 import scene_service_pb2_grpc
+from embomatrix.rpc.status import InvalidRequestError, translate
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    import grpc
+
+    from embomatrix.manager.runtime.bundles import BundleStore
+
+
+class SceneServicer(scene_service_pb2_grpc.SceneServiceServicer):
+    def __init__(self, bundles: BundleStore) -> None:
+        self._bundles = bundles
+
+    async def MissingBundles(
+        self, request: pb.MissingBundlesRequest, context: grpc.aio.ServicerContext
+    ) -> pb.MissingBundlesResponse:
+        async with translate(context):
+            missing = await self._bundles.lacking(list(request.bundle_digests))
+        return pb.MissingBundlesResponse(bundle_digests=missing)
+
+    async def PutBundle(
+        self, request_iterator: AsyncIterator[pb.PutBundleRequest], context: grpc.aio.ServicerContext
+    ) -> pb.PutBundleResponse:
+        async with translate(context):
+            first = await anext(request_iterator, None)
+            if first is None:
+                raise InvalidRequestError("a bundle begins with its digest: the stream was empty")
+            await self._bundles.put(first.bundle_digest, _chunks(first, request_iterator))
+        return pb.PutBundleResponse()
+
+    async def GetBundle(
+        self, request: pb.GetBundleRequest, context: grpc.aio.ServicerContext
+    ) -> AsyncIterator[pb.GetBundleResponse]:
+        async with translate(context):
+            async for chunk in self._bundles.get(request.bundle_digest):
+                yield pb.GetBundleResponse(chunk=chunk)
+
+
+async def _chunks(
+    first: pb.PutBundleRequest, rest: AsyncIterator[pb.PutBundleRequest]
+) -> AsyncIterator[bytes]:
+    yield first.chunk
+    async for request in rest:
+        yield request.chunk

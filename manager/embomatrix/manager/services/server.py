@@ -1,0 +1,75 @@
+"""The gRPC server: all services of the manager on one port, with health and reflection."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import grpc
+from grpc_health.v1 import health, health_pb2, health_pb2_grpc
+from grpc_reflection.v1alpha import reflection
+
+from embomatrix.manager.runtime.listen import bind_server
+from embomatrix.manager.services.admin import AdminServicer
+from embomatrix.manager.services.auth import RoleInterceptor
+from embomatrix.manager.services.expulsion import Expulsion
+from embomatrix.manager.services.rollout import RolloutServicer
+from embomatrix.manager.services.scene import SceneServicer
+from embomatrix.manager.services.worker import WorkerServicer
+from embomatrix.proto.v1 import (
+    admin_service_pb2,
+    admin_service_pb2_grpc,
+    rollout_service_pb2,
+    rollout_service_pb2_grpc,
+    scene_service_pb2,
+    scene_service_pb2_grpc,
+    worker_service_pb2,
+    worker_service_pb2_grpc,
+)
+from embomatrix.rpc.channel import SERVER_OPTIONS
+
+if TYPE_CHECKING:
+    from embomatrix.manager.access.gate import Gate
+    from embomatrix.manager.access.protection import Tls
+    from embomatrix.manager.runtime.event_loop import ManagerRuntime
+    from embomatrix.manager.settings import ManagerSettings
+
+SERVICES: Final = tuple(
+    module.DESCRIPTOR.services_by_name[name].full_name
+    for module, name in (
+        (worker_service_pb2, "WorkerService"),
+        (rollout_service_pb2, "RolloutService"),
+        (scene_service_pb2, "SceneService"),
+        (admin_service_pb2, "AdminService"),
+    )
+)
+
+
+async def build_server(
+    runtime: ManagerRuntime, gate: Gate, tls: Tls | None, settings: ManagerSettings
+) -> tuple[grpc.aio.Server, int]:
+    """A server that is bound but not started, and its port (``port`` 0 takes a free one).
+
+    Raises PortInUseError.
+    """
+    server = grpc.aio.server(options=SERVER_OPTIONS, interceptors=[RoleInterceptor(gate)])
+    worker_service_pb2_grpc.add_WorkerServiceServicer_to_server(
+        WorkerServicer(runtime, gate, lease_ttl_s=settings.lease_ttl_s), server
+    )
+    rollout_service_pb2_grpc.add_RolloutServiceServicer_to_server(
+        RolloutServicer(runtime.runs, runtime.training, gate, authority=tls.authority if tls else b""),
+        server,
+    )
+    scene_service_pb2_grpc.add_SceneServiceServicer_to_server(SceneServicer(runtime.bundles), server)
+    admin_service_pb2_grpc.add_AdminServiceServicer_to_server(
+        AdminServicer(runtime, gate, Expulsion(runtime, gate)), server
+    )
+    await _add_health(server)
+    reflection.enable_server_reflection((*SERVICES, health.SERVICE_NAME, reflection.SERVICE_NAME), server)
+    return server, bind_server(server, settings.host, settings.port, tls)
+
+
+async def _add_health(server: grpc.aio.Server) -> None:
+    servicer = health.aio.HealthServicer()
+    health_pb2_grpc.add_HealthServicer_to_server(servicer, server)
+    for name in ("", *SERVICES):
+        await servicer.set(name, health_pb2.HealthCheckResponse.SERVING)

@@ -1,0 +1,233 @@
+"""WorkerService: workers register, hold a session stream, send heartbeats, and fetch bundles."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.manager.runtime.intake import Heartbeat
+from embomatrix.manager.runtime.registry import Standing
+from embomatrix.proto.v1 import worker_service_pb2 as pb
+from embomatrix.proto.v1 import worker_service_pb2_grpc
+from embomatrix.rpc.logs import bind
+from embomatrix.rpc.status import (
+    DeadlineError,
+    InvalidRequestError,
+    NotAllowedError,
+    SupersededError,
+    translate,
+)
+from embomatrix.rpc.versions import SPOKEN, VersionRange, agree
+from embomatrix.rpc.wire.rollout import each, inside
+from embomatrix.rpc.wire.session import (
+    lease_progress_from_proto,
+    lease_ref_from_proto,
+    lease_result_from_proto,
+    resources_from_proto,
+    worker_state_from_proto,
+    write_lease,
+    write_lease_ref,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Coroutine, Sequence
+
+    import grpc
+
+    from embomatrix.manager.access.gate import Gate
+    from embomatrix.manager.runtime.event_loop import ManagerRuntime
+    from embomatrix.manager.runtime.links import Outbox, WorkerLink
+    from embomatrix.rpc.leases import Lease, LeaseResult
+
+FIRST_STATE_S: Final = 10.0
+"""A session stream must begin with the worker's state within this time."""
+SESSION_SHOWN: Final = 6
+"""Letters of an id in log lines: whoever knows all of a session's could speak for its worker."""
+LEASES_PER_MESSAGE: Final = 256
+RESULTS_AT_ONCE: Final = 16
+"""A message's results are heard in slices, and what a slice freed is given away before the next: hearing one takes 0.1 ms, and
+a message that carries hundreds would hold up the leases of every worker."""
+_WORKER_ID: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._:@-]{0,127}")
+
+
+class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
+    """``lease_ttl_s`` is told to workers: whoever can't renew within it must stop. ``gate`` knows who may speak for whom."""
+
+    def __init__(self, runtime: ManagerRuntime, gate: Gate, *, lease_ttl_s: float) -> None:
+        self._runtime = runtime
+        self._gate = gate
+        self._lease_ttl_s = lease_ttl_s
+
+    async def Register(
+        self, request: pb.RegisterRequest, context: grpc.aio.ServicerContext
+    ) -> pb.RegisterResponse:
+        async with translate(context):
+            _check_name(request.worker_id)
+            bind("worker", request.worker_id)
+            # First of all: a version that is refused may mean other things by its fields, and must not use up a token to join.
+            protocol = _agreed(request)
+            resources = inside("resources", resources_from_proto, request.resources)
+            admission = await self._gate.admit(
+                context, request.join_token, request.worker_id, request.boot_id
+            )
+            session, interval_s = await self._runtime.register(
+                request.worker_id,
+                request.boot_id,
+                resources,
+                credential_id=admission.token_id,
+                protocol=protocol,
+            )
+        return pb.RegisterResponse(
+            session_id=session.session_id,
+            session_epoch=session.epoch,
+            heartbeat_interval_s=interval_s,
+            lease_ttl_s=self._lease_ttl_s,
+            protocol_version=session.protocol,
+            credential=admission.credential,
+        )
+
+    async def Session(  # type: ignore[override]  # gRPC also takes a coroutine that writes by the context
+        self, request_iterator: AsyncIterator[pb.SessionRequest], context: grpc.aio.ServicerContext
+    ) -> None:
+        async with translate(context):
+            first = await _first_state(request_iterator)
+            session = self._runtime.registry.find(first.session_id, first.session_epoch)
+            self._gate.check_session(context, session)
+            bind("worker", session.worker_id)
+            bind("session", session.session_id[:SESSION_SHOWN])
+            with self._runtime.attached(session) as link:
+                await self._take(link, first, resync=True)
+                await _until_one_ends(self._listen(link, request_iterator), _speak(link, context))
+
+    async def Heartbeat(
+        self, request: pb.HeartbeatRequest, context: grpc.aio.ServicerContext
+    ) -> pb.HeartbeatResponse:
+        async with translate(context):
+            self._gate.check_session(context, self._runtime.registry.holder(request.session_id))
+            interval_s = self._runtime.take_heartbeat(
+                request.session_id,
+                request.session_epoch,
+                Heartbeat(
+                    each("running", lease_ref_from_proto, request.running),
+                    request.load,
+                    request.memory_used_mb,
+                    each("progress", lease_progress_from_proto, request.progress),
+                ),
+            )
+        return pb.HeartbeatResponse(next_interval_s=interval_s)
+
+    async def FetchBundle(
+        self, request: pb.FetchBundleRequest, context: grpc.aio.ServicerContext
+    ) -> AsyncIterator[pb.FetchBundleResponse]:
+        async with translate(context):
+            session = self._runtime.registry.holder(request.session_id)
+            self._gate.check_session(context, session)
+            if request.bundle_digest not in session.asked:
+                raise NotAllowedError(
+                    f"worker {session.worker_id} was not asked to hold bundle {request.bundle_digest[:80]!r}"
+                )
+            async for chunk in self._runtime.bundles.get(request.bundle_digest):
+                yield pb.FetchBundleResponse(chunk=chunk)
+
+    async def Deregister(
+        self, request: pb.DeregisterRequest, context: grpc.aio.ServicerContext
+    ) -> pb.DeregisterResponse:
+        async with translate(context):
+            session = self._runtime.registry.find(request.session_id, request.session_epoch)
+            self._gate.check_session(context, session)
+            left = SupersededError(f"worker {session.worker_id} said that it leaves: its session is over")
+            self._runtime.end_session(session, "it left", left, Standing.LEFT)
+        return pb.DeregisterResponse()
+
+    async def _listen(self, link: WorkerLink, requests: AsyncIterator[pb.SessionRequest]) -> None:
+        async for request in requests:
+            await self._take(link, request, resync=False)
+
+    async def _take(self, link: WorkerLink, request: pb.SessionRequest, *, resync: bool) -> None:
+        state = inside("state", worker_state_from_proto, request.state) if request.HasField("state") else None
+        try:
+            self._runtime.take_report(link, state, _results(request, 0), resync=resync)
+            for first in range(RESULTS_AT_ONCE, len(request.results), RESULTS_AT_ONCE):
+                await asyncio.sleep(0)  # what was given meanwhile is sent, and others are heard
+                self._runtime.take_report(link, None, _results(request, first), resync=False)
+        finally:
+            self._runtime.deliver()
+
+
+def _results(request: pb.SessionRequest, first: int) -> tuple[LeaseResult, ...]:
+    part = request.results[first : first + RESULTS_AT_ONCE]
+    return each("results", lease_result_from_proto, part, first=first)
+
+
+async def _speak(link: WorkerLink, context: grpc.aio.ServicerContext) -> None:
+    while True:
+        for message in _messages(await link.take()):
+            await context.write(message)
+
+
+def _messages(outbox: Outbox) -> list[pb.SessionResponse]:
+    """The outbox in messages of bounded size: leases carry plans."""
+    leases = outbox.leases
+    parts = [leases[at : at + LEASES_PER_MESSAGE] for at in range(0, len(leases), LEASES_PER_MESSAGE)]
+    messages = [_with_leases(part) for part in parts] or [pb.SessionResponse()]
+    head = messages[0]
+    for ref in outbox.acknowledged:
+        write_lease_ref(ref, head.acknowledged.add())
+    for ref in outbox.cancelled:
+        write_lease_ref(ref, head.cancelled.add())
+    head.drain, head.resume = outbox.drain, outbox.resume
+    if outbox.desired is not None:
+        head.desired.CopyFrom(pb.DesiredResidents(bundle_digests=outbox.desired))
+    return messages
+
+
+def _with_leases(leases: Sequence[Lease]) -> pb.SessionResponse:
+    message = pb.SessionResponse()
+    for lease in leases:
+        write_lease(lease, message.leases.add())
+    return message
+
+
+async def _first_state(requests: AsyncIterator[pb.SessionRequest]) -> pb.SessionRequest:
+    try:
+        async with asyncio.timeout(FIRST_STATE_S):
+            first = await anext(requests)
+    except TimeoutError:
+        raise DeadlineError(
+            f"a session begins with the worker's state: none came in {FIRST_STATE_S:g} s"
+        ) from None
+    except StopAsyncIteration:
+        raise InvalidRequestError(
+            "a session begins with the worker's state: the stream ended before it"
+        ) from None
+    if not first.HasField("state"):
+        raise InvalidRequestError("a session begins with the worker's state: the first message has none")
+    return first
+
+
+async def _until_one_ends(*parts: Coroutine[None, None, None]) -> None:
+    """Run the parts until the first ends, stop the others, and raise what the first raised."""
+    tasks = [asyncio.create_task(part) for part in parts]
+    try:
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+    for task in done:
+        task.result()
+
+
+def _check_name(worker_id: str) -> None:
+    if not _WORKER_ID.fullmatch(worker_id):
+        raise InvalidRequestError(
+            f"worker id {worker_id[:140]!r}: use up to 128 letters, digits, '.', '_', ':', '@' and '-'"
+        )
+
+
+def _agreed(request: pb.RegisterRequest) -> int:
+    """The version that both sides will speak. Raises PreconditionError."""
+    newest = request.protocol_version
+    theirs = VersionRange(request.protocol_low or newest, newest)
+    return agree(SPOKEN, theirs, us="this manager", them=f"worker {request.worker_id}")

@@ -1,0 +1,113 @@
+"""A scene from above, and where things are while a plan goes on: numbers for a page to draw.
+
+The manager has no physics. What a call moves is put where the call says, in the middle of its target; verified poses are seen
+with ``embomatrix factory inspect``.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.manager.web.gallery_values import FloorPlan, Moment
+from embomatrix.skills.describe import call_in_words
+from embomatrix.skills.syntax import Skill
+from embomatrix.world.geometry import Pose
+
+if TYPE_CHECKING:
+    from embomatrix.manager.web.gallery_values import Box
+    from embomatrix.skills.syntax import Plan, SkillCall
+    from embomatrix.world.geometry import Vec2, Vec3
+    from embomatrix.world.scene import Scene
+    from embomatrix.world.task import Task
+
+HUNG_M: Final = 1.6
+"""What begins higher hangs over the robot's way and is left out."""
+SMALL_M: Final = 0.2
+"""Less than this across, an object is a dot where a task names it, and is left out elsewhere."""
+SKIRTING_M: Final = 0.1
+"""Walls that begin higher are lintels, panes and the like: the plan shows an opening there."""
+PIECES: Final = 1500
+_ORIGIN: Final = Pose((0.0, 0.0, 0.0))
+
+
+def floor_plan(scene: Scene) -> FloorPlan:
+    """The whole scene, from above."""
+    walls = [wall.aabb(_ORIGIN) for wall in scene.walls]
+    boxes = [(item, scene.box_of(item.name)) for item in scene.objects if not item.absent]
+    pieces = [
+        _box(item.name, box.low_m, box.high_m)
+        for item, box in sorted(boxes, key=lambda entry: entry[1].low_m[2])
+        if box.low_m[2] < HUNG_M and max(box.size_m[:2]) >= SMALL_M
+    ]
+    return FloorPlan(
+        [_box(room.name, room.low_m, room.high_m) for room in scene.rooms],
+        [_box("", wall.low_m, wall.high_m) for wall in walls if wall.low_m[2] < SKIRTING_M],
+        pieces[:PIECES],
+        _rounded(scene.robot.x_m, scene.robot.y_m),
+    )
+
+
+def small_things(scene: Scene, task: Task) -> dict[str, list[float]]:
+    """Things of the task's table that a robot may carry, and where they are at the start."""
+    found = [scene.by_name[name] for name in task.table if name in scene.by_name]
+    return {item.name: _middle(scene, item.name) for item in found if not item.fixed and not item.absent}
+
+
+def played(scene: Scene, task: Task, plan: Plan) -> list[Moment]:
+    """The plan call by call, each as if it did what it says."""
+    moments = [Moment("", _rounded(scene.robot.x_m, scene.robot.y_m))]
+    for call in plan:
+        moments.append(_after(scene, task, call, moments[-1]))
+    return moments
+
+
+def _after(scene: Scene, task: Task, call: SkillCall, before: Moment) -> Moment:
+    target = _named(scene, task, call.object_index)
+    robot, held, things, active = before.robot, [*before.held], {**before.things}, [*before.active]
+    match call.skill:
+        case Skill.GO_TO_ROOM:
+            room = next((room for room in scene.rooms if room.name == call.room_name), None)
+            robot = robot if room is None else _rounded(*room.center_m)
+        case Skill.MOVE if target:
+            robot = _beside(scene, target, things.get(target), robot)
+        case Skill.PICK_UP if target:
+            held.append(target)
+        case Skill.PLACE if target and held:
+            things[held.pop()] = things.get(target) or _middle(scene, target)
+        case Skill.OPEN | Skill.TOGGLE_ON if target and target not in active:
+            active.append(target)
+        case Skill.CLOSE | Skill.TOGGLE_OFF if target in active:
+            active.remove(target)
+        case _:
+            pass
+    things |= dict.fromkeys(held, robot)
+    return Moment(call_in_words(call, task.table), robot, held, things, active)
+
+
+def _beside(scene: Scene, name: str, at: list[float] | None, robot: list[float]) -> list[float]:
+    """Before the object, on the side that the robot comes from."""
+    if at is not None:
+        return at
+    box = scene.box_of(name)
+    west, south, east, north = box.low_m[0], box.low_m[1], box.high_m[0], box.high_m[1]
+    inside = [min(max(robot[0], west), east), min(max(robot[1], south), north)]
+    return _rounded(*inside)
+
+
+def _named(scene: Scene, task: Task, row: int | None) -> str:
+    """Name of the object in that row; empty where the table or the scene has none."""
+    name = task.table[row] if row is not None and 0 <= row < len(task.table) else ""
+    return name if name in scene.by_name else ""
+
+
+def _middle(scene: Scene, name: str) -> list[float]:
+    return _rounded(*scene.box_of(name).center_m[:2])
+
+
+def _box(name: str, low_m: Vec2 | Vec3, high_m: Vec2 | Vec3) -> Box:
+    return (name, round(low_m[0], 2), round(low_m[1], 2), round(high_m[0], 2), round(high_m[1], 2))
+
+
+def _rounded(*metres: float) -> list[float]:
+    """To the centimetre, which is less than a line of the picture."""
+    return [round(value, 2) for value in metres]

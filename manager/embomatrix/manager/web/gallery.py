@@ -1,0 +1,262 @@
+"""The tasks of a dataset, for the dashboard: looked up by id, in pages, read and never written.
+
+Names in a dataset are foreign text. None becomes a path before it is known to be a plain name, and nothing is read through a
+link that leads out of the folder, or beyond a size.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import re
+from collections import Counter, OrderedDict
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.manager.web.floor_plan import floor_plan, played, small_things
+from embomatrix.manager.web.gallery_values import (
+    ObjectRow,
+    SceneCount,
+    SceneName,
+    TaskCard,
+    TaskDetail,
+    TaskPage,
+)
+from embomatrix.rpc.status import NotFoundError, UnavailableError
+from embomatrix.skills.parse import PlanError, plan_from_json
+from embomatrix.world.dataset import TASKS_FILE, Dataset, DatasetError
+from embomatrix.world.evaluate import GoalError
+from embomatrix.world.whole_file import read_whole
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from embomatrix.manager.web.gallery_values import FloorPlan, Moment
+    from embomatrix.world.dataset import TaskRecord
+    from embomatrix.world.scene import Scene
+
+TASKS_BYTES: Final = 256_000_000
+"""Of ``tasks.jsonl``: some 60,000 tasks."""
+NOTE_BYTES: Final = 262_144
+"""Of a transcript or a tree."""
+PICTURE_BYTES: Final = 2_000_000
+SCENES_KEPT: Final = 8
+"""Decoded: a few tens of MB at most."""
+PLANS_KEPT: Final = 256
+PICTURES_FOLDER: Final = "pictures"
+HANGS_M: Final = 0.05
+"""What begins higher, and rests on nothing, hangs."""
+_PLAIN: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,199}")
+_JPEG: Final = b"\xff\xd8\xff"
+
+
+class Gallery:
+    """Of the dataset in ``folder``. Reading happens in a thread, one reader at a time."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._reading = asyncio.Lock()
+        self._stamp: tuple[int, int] | None = None
+        self._records: dict[str, TaskRecord] = {}
+        self._dataset: Dataset | None = None
+        self._scenes: OrderedDict[str, Scene] = OrderedDict()
+        self._plans: OrderedDict[str, FloorPlan] = OrderedDict()
+
+    async def page(self, *, search: str, scene: str, category: str, offset: int, limit: int) -> TaskPage:
+        """Tasks with the text in their instruction or id, in the order of the file. UnavailableError for a damaged dataset."""
+        records = list((await self._loaded()).values())
+        words = search.lower().split()
+        found = [
+            record
+            for record in records
+            if scene in ("", record.task.scene_id)
+            and category in ("", record.task.category.value)
+            and all(word in f"{record.task.instruction} {record.task.task_id}".lower() for word in words)
+        ]
+        scenes = Counter(record.task.scene_id for record in records)
+        return TaskPage(
+            len(found),
+            offset,
+            [self._card(record) for record in found[offset : offset + limit]],
+            [SceneCount(name, number) for name, number in sorted(scenes.items())],
+            sorted({record.task.category.value for record in records}),
+        )
+
+    async def scenes(self, *, offset: int, limit: int) -> list[SceneName]:
+        """The scene of each bundle, in the order of the tasks. UnavailableError for a damaged dataset."""
+        records = (await self._loaded()).values()
+        names = {record.bundle_digest: record.task.scene_id for record in records}
+        return [SceneName(digest, name) for digest, name in names.items()][offset : offset + limit]
+
+    async def detail(self, task_id: str) -> TaskDetail:
+        """Everything of one task. NotFoundError, or UnavailableError for a damaged dataset."""
+        record = await self._record(task_id)
+        async with self._reading:
+            return await asyncio.to_thread(self._read_detail, record)
+
+    async def floor(self, digest: str) -> FloorPlan:
+        """The scene of a bundle from above. NotFoundError for one that no task is in."""
+        await self._check_bundle(digest)
+        async with self._reading:
+            return await asyncio.to_thread(self._read_floor, digest)
+
+    async def picture(self, digest: str) -> bytes:
+        """A JPEG of the scene of a bundle, as ``embomatrix factory pictures`` leaves it. NotFoundError where there is none."""
+        await self._check_bundle(digest)
+        data = self._file(PICTURES_FOLDER, f"{digest.removeprefix('sha256:')}.jpg", PICTURE_BYTES)
+        if not data.startswith(_JPEG):
+            raise NotFoundError(
+                f"there is no picture of scene {digest}: `embomatrix factory pictures` makes them"
+            )
+        return data
+
+    async def _check_bundle(self, digest: str) -> None:
+        if not any(record.bundle_digest == digest for record in (await self._loaded()).values()):
+            raise NotFoundError(f"no task of the dataset is in a bundle {digest[:80]!r}")
+
+    async def _record(self, task_id: str) -> TaskRecord:
+        record = (await self._loaded()).get(task_id)
+        if record is None:
+            raise NotFoundError(f"the dataset holds no task {task_id[:100]!r}")
+        return record
+
+    async def _loaded(self) -> dict[str, TaskRecord]:
+        """Records by id; read again once the file is another one."""
+        async with self._reading:
+            return await asyncio.to_thread(self._load)
+
+    def _load(self) -> dict[str, TaskRecord]:
+        file = self._folder / TASKS_FILE
+        try:
+            known = file.stat()
+            if known.st_size > TASKS_BYTES:
+                raise UnavailableError(
+                    f"{file} has {known.st_size} bytes: at most {TASKS_BYTES} are shown, name a smaller dataset"
+                )
+            if self._stamp != (known.st_mtime_ns, known.st_size):
+                dataset = Dataset.load(self._folder)
+                self._dataset, self._stamp = dataset, (known.st_mtime_ns, known.st_size)
+                self._records = {record.task.task_id: record for record in dataset.records}
+                self._scenes.clear()
+                self._plans.clear()
+        except OSError as error:
+            raise UnavailableError(
+                f"the dataset {self._folder} can't be read ({error.strerror}): start the manager with another --dataset"
+            ) from error
+        except DatasetError as error:
+            raise UnavailableError(str(error)) from error
+        return self._records
+
+    def _scene(self, digest: str) -> Scene:
+        if digest not in self._scenes and self._dataset is not None:
+            try:
+                self._scenes[digest] = self._dataset.read_bundle(digest).scene
+            except DatasetError as error:
+                raise UnavailableError(str(error)) from error
+            while len(self._scenes) > SCENES_KEPT:
+                self._scenes.popitem(last=False)
+        return self._scenes[digest]
+
+    def _read_floor(self, digest: str) -> FloorPlan:
+        if digest not in self._plans:
+            self._plans[digest] = floor_plan(self._scene(digest))
+            while len(self._plans) > PLANS_KEPT:
+                self._plans.popitem(last=False)
+        return self._plans[digest]
+
+    def _read_detail(self, record: TaskRecord) -> TaskDetail:
+        task, scene = record.task, self._scene(record.bundle_digest)
+        about: frozenset[str] = frozenset()
+        problem, moments = "", [*played(scene, task, ())]
+        try:
+            about = task.goal_objects
+            moments = played(scene, task, plan_from_json(list(record.oracle), task.profile))
+        except (GoalError, PlanError) as error:
+            problem = str(error)
+        tree = self._note("trees", task.task_id, "json")
+        return TaskDetail(
+            card=self._card(record),
+            goal=task.goal_bddl,
+            source=task.source,
+            profile=task.profile.value,
+            signature=record.signature,
+            rooms=_rooms(scene, record, moments),
+            objects=[_row(scene, name, about) for name in task.table if name in scene.by_name],
+            transcript=self._note("transcripts", task.task_id, "md"),
+            tree=_parsed(tree),
+            floor=self._read_floor(record.bundle_digest),
+            things=small_things(scene, task),
+            moments=moments,
+            problem=problem,
+        )
+
+    def _card(self, record: TaskRecord) -> TaskCard:
+        task, hexdigits = record.task, record.bundle_digest.removeprefix("sha256:")
+        return TaskCard(
+            task.task_id,
+            task.instruction,
+            task.category.value,
+            task.scene_id,
+            record.split,
+            len(record.oracle),
+            len(task.table),
+            record.bundle_digest,
+            self._path(PICTURES_FOLDER, f"{hexdigits}.jpg") is not None,
+        )
+
+    def _note(self, folder: str, task_id: str, ending: str) -> str:
+        return self._file(folder, f"{task_id}.{ending}", NOTE_BYTES).decode("utf-8", "replace")
+
+    def _file(self, folder: str, name: str, at_most: int) -> bytes:
+        """Content of a file that a dataset may have; empty where it has none, or one that is too large."""
+        path = self._path(folder, name)
+        try:
+            return b"" if path is None else read_whole(path, at_most=at_most)
+        except OSError:
+            return b""
+
+    def _path(self, folder: str, name: str) -> Path | None:
+        """Of a file that is there, with a plain name, and truly within the dataset's folder."""
+        if not _PLAIN.fullmatch(name):
+            return None
+        path = self._folder / folder / name
+        inside = path.is_file() and path.resolve().is_relative_to(self._folder.resolve())
+        return path if inside else None
+
+
+def _row(scene: Scene, name: str, about: frozenset[str]) -> ObjectRow:
+    item, asset = scene.by_name[name], scene.asset_of(name)
+    told = sorted(state.value for state in item.states)
+    told += ["open"] if any(share > 0 for share in item.joints) else []
+    size = [round(extent, 2) for extent in asset.size_m]
+    return ObjectRow(
+        name,
+        item.room,
+        _where(scene, name),
+        size,
+        float(f"{asset.mass_kg:.3g}"),
+        ", ".join(told),
+        name in about,
+    )
+
+
+def _where(scene: Scene, name: str) -> str:
+    """What it rests on or in; by itself it stands on the floor or hangs on a wall."""
+    item = scene.by_name[name]
+    if item.host and item.relation:
+        return f"{item.relation.value} {item.host}"
+    return "on the wall" if scene.box_of(name).low_m[2] > HANGS_M else "on the floor"
+
+
+def _rooms(scene: Scene, record: TaskRecord, moments: list[Moment]) -> list[str]:
+    """Those that the table's objects are in, and those that the robot comes through."""
+    table = {scene.by_name[name].room for name in record.task.table if name in scene.by_name}
+    visited = {scene.room_at((moment.robot[0], moment.robot[1])) for moment in moments}
+    return sorted((table | visited) - {""})
+
+
+def _parsed(text: str) -> object:
+    """A layout tree; None where there is none, or the file is no JSON."""
+    try:
+        return json.loads(text) if text else None
+    except (ValueError, RecursionError):
+        return None

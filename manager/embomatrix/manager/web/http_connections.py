@@ -1,0 +1,75 @@
+"""How many connections the HTTP port holds, and for how long one may say nothing."""
+
+from __future__ import annotations
+
+import resource
+from typing import TYPE_CHECKING, Any, Final, cast
+
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+if TYPE_CHECKING:
+    import asyncio
+
+    from uvicorn import Config
+    from uvicorn.server import ServerState
+
+    from embomatrix.manager.web.door import Door
+
+CONNECTIONS: Final = 2048
+"""At most. A page opens six, a stream of events holds one."""
+SILENT_S: Final = 10.0
+"""From a connection's beginning to its first whole request."""
+FILES: Final = 65_536
+"""Open files that the manager asks for: sockets of workers, trainers and viewers, bundles, the store."""
+
+
+class BoundedConnections(H11Protocol):
+    """One connection. It is closed at once where too many are open, and soon where nothing is asked on it."""
+
+    most = CONNECTIONS
+    silent_s = SILENT_S
+    door: Door | None = None
+    """Through which they come."""
+
+    def __init__(
+        self,
+        config: Config,
+        server_state: ServerState,
+        app_state: dict[str, Any],
+        _loop: asyncio.AbstractEventLoop | None = None,
+    ) -> None:
+        super().__init__(config, server_state, app_state, _loop)
+        self._patience: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        # A protocol takes any transport; uvicorn's takes a stream's alone, which is what a server opens.
+        super().connection_made(cast("asyncio.Transport", transport))
+        if self.door is not None:
+            self.door.entered(transport.get_extra_info("peername"))
+        if len(self.connections) > self.most:
+            self.transport.abort()
+        else:
+            self._patience = self.loop.call_later(self.silent_s, self._close_silent)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        if self._patience is not None:
+            self._patience.cancel()
+        super().connection_lost(exc)
+
+    def _close_silent(self) -> None:
+        # The first whole request makes it.
+        if self.cycle is None:
+            self.transport.abort()
+
+
+def connections_through(door: Door) -> type[BoundedConnections]:
+    """Those of a server that listens at this door."""
+    return type("ConnectionsThroughADoor", (BoundedConnections,), {"door": door})
+
+
+def allow_files() -> None:
+    """Raise this process's own limit of open files towards ``FILES``, as far as the system lets it."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = FILES if hard == resource.RLIM_INFINITY else min(FILES, hard)
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))

@@ -1,0 +1,113 @@
+"""Who may ask the manager's HTTP port for what: decided from the head of a request, before anything reads its body."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, NamedTuple
+from urllib.parse import urlsplit
+
+from starlette.datastructures import Headers
+from starlette.responses import PlainTextResponse
+
+from embomatrix.manager.settings import is_loopback
+from embomatrix.manager.web.page import STATIC
+from embomatrix.manager.web.rewards import REWARDS
+from embomatrix.rpc.channel import token_of
+from embomatrix.rpc.roles import Role
+from embomatrix.rpc.status import NotSignedInError
+
+if TYPE_CHECKING:
+    from starlette.types import ASGIApp, Receive, Scope, Send
+
+    from embomatrix.manager.access.gate import Gate
+    from embomatrix.manager.access.protection import Tls
+
+OPEN_PATHS: Final = frozenset({"/", "/healthz"})
+"""The empty page, which asks for the token itself, and the health check; the page's own files lie below ``STATIC``."""
+READING: Final = frozenset({"GET", "HEAD", "OPTIONS"})
+VIEWERS: Final = frozenset({Role.VIEWER, Role.TRAINER, Role.ADMIN})
+TRAINERS: Final = frozenset({Role.TRAINER, Role.ADMIN})
+ADMINS: Final = frozenset({Role.ADMIN})
+LOOPBACK_NAMES: Final = frozenset({"localhost", "127.0.0.1", "::1"})
+
+
+class Refusal(NamedTuple):
+    """Why a request gets no answer: the HTTP status, and a sentence for whoever asked."""
+
+    status: int
+    sentence: str
+
+
+@dataclass(frozen=True, slots=True)
+class HttpRules:
+    """``hosts`` are the names that this server answers to; empty: to any."""
+
+    gate: Gate
+    hosts: frozenset[str]
+
+    def refusal(self, method: str, path: str, headers: Headers) -> Refusal | None:
+        """Why the request is refused; None if it isn't."""
+        host = headers.get("host", "")
+        if self.hosts and _name_of(host) not in self.hosts:
+            # A page elsewhere must not reach this one under a name of its own (DNS rebinding).
+            return Refusal(
+                400, f"this server is not called {host[:100]!r}: add the name with `manager init --san`"
+            )
+        changes = method not in READING
+        if changes and _is_foreign(headers, host):
+            return Refusal(403, "a page of another origin asks for a change: open the manager's own page")
+        if (path in OPEN_PATHS or path.startswith(STATIC)) and not changes:
+            return None
+        try:
+            role = self.gate.caller(token_of(headers.get("authorization"))).role
+        except NotSignedInError as error:
+            return Refusal(401, f"{error}; HTTP requests show it as `Authorization: Bearer TOKEN`")
+        if role not in _allowed(path, changes=changes):
+            needed = Role.TRAINER if path == REWARDS else Role.ADMIN if changes else Role.VIEWER
+            return Refusal(403, f"a token of the role {role} may not do this: it takes {needed}")
+        return None
+
+
+class Guard:
+    """ASGI middleware that keeps the rules; what comes over a WebSocket is refused, nothing here speaks it."""
+
+    def __init__(self, app: ASGIApp, rules: HttpRules) -> None:
+        self._app = app
+        self._rules = rules
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await send({"type": "websocket.close", "code": 1008})
+            return
+        refusal = self._rules.refusal(scope["method"], scope["path"], Headers(scope=scope))
+        if refusal is None:
+            await self._app(scope, receive, send)
+        else:
+            challenge = {"www-authenticate": "Bearer"} if refusal.status == 401 else None
+            await PlainTextResponse(refusal.sentence, refusal.status, challenge)(scope, receive, send)
+
+
+def allowed_hosts(bound: str, tls: Tls | None) -> frozenset[str]:
+    """The names to answer to: those in the certificate, those of loopback, or any where neither says."""
+    if tls is not None:
+        return LOOPBACK_NAMES | {name.lower() for name in tls.names}
+    return LOOPBACK_NAMES if is_loopback(bound) else frozenset()
+
+
+def _allowed(path: str, *, changes: bool) -> frozenset[Role]:
+    if path == REWARDS:
+        return TRAINERS
+    return ADMINS if changes else VIEWERS
+
+
+def _is_foreign(headers: Headers, host: str) -> bool:
+    """Whether a page of another origin sent this: browsers say so, other programs send neither header."""
+    origin = headers.get("origin")
+    if origin is not None:
+        return urlsplit(origin).netloc.lower() != host.lower()
+    return headers.get("sec-fetch-site", "none") not in ("same-origin", "none")
+
+
+def _name_of(host: str) -> str:
+    """The ``Host`` header without its port."""
+    return (urlsplit(f"//{host}").hostname or "").lower()

@@ -1,0 +1,175 @@
+"""The metrics page. It is made from the manager's own counters when somebody asks, so it costs nothing between two scrapes.
+
+No label ever carries an id of a run, rollout, worker or scene: each has a closed set of values.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import TYPE_CHECKING, Final
+
+from prometheus_client import CollectorRegistry, ProcessCollector, generate_latest
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily
+from prometheus_client.registry import Collector
+
+from embomatrix.manager.observe.histogram import BOUNDS_S
+from embomatrix.manager.observe.history import manager_version
+from embomatrix.manager.runtime.registry import Standing
+from embomatrix.manager.web.views import standing_counts
+from embomatrix.rpc.wire.values import InfraCode, ResidentState
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Mapping
+
+    from prometheus_client.metrics_core import Metric
+
+    from embomatrix.manager.control.dispatch.ledger import WorkerRecord
+    from embomatrix.manager.observe.histogram import Histogram
+    from embomatrix.manager.runtime.event_loop import ManagerRuntime
+
+CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
+OUTCOMES: Final = ("completed", "cancelled", *(code.value for code in InfraCode))
+SLOT_STATES: Final = ("idle", "warming", "warm", "running", "quarantined")
+
+
+def metrics_page(runtime: ManagerRuntime) -> str:
+    """What Prometheus scrapes: the cluster, and the manager's own process."""
+    registry = CollectorRegistry(auto_describe=False)
+    registry.register(_Cluster(runtime))
+    ProcessCollector(registry=registry)
+    return generate_latest(registry).decode()
+
+
+class _Cluster(Collector):
+    """Metric families of one moment; ``docs/operations.md`` says what each is for."""
+
+    def __init__(self, runtime: ManagerRuntime) -> None:
+        self._runtime = runtime
+
+    def collect(self) -> Iterable[Metric]:
+        yield _gauges("embo_build_info", "Version of the manager.", "version", {manager_version(): 1})
+        yield from self._fleet()
+        yield from self._work()
+        yield from self._prewarming()
+        yield from self._manager()
+
+    def _fleet(self) -> Iterator[Metric]:
+        sessions = self._runtime.registry.sessions
+        standings = standing_counts(self._runtime)
+        states = {standing.value: standings[standing.value] for standing in Standing}
+        yield _gauges("embo_workers", "Workers by state.", "state", states)
+        yield _gauges("embo_slots", "Slots of connected workers by state.", "state", self._slot_states())
+        scheduler = self._runtime.cluster.scheduler
+        residents = Counter(
+            resident.state.value for name in sessions for resident in scheduler.residents(name)
+        )
+        found = {state.value: residents[state.value] for state in ResidentState}
+        yield _gauges("embo_residents", "Scenes on workers by state.", "state", found)
+        loads = self._runtime.chronicle.fleet.scene_load
+        yield _histograms(
+            "embo_scene_load_seconds", "Time that workers took to load a scene.", "", {"": loads}
+        )
+
+    def _work(self) -> Iterator[Metric]:
+        runtime, chronicle = self._runtime, self._runtime.chronicle
+        dispatcher, totals = runtime.cluster.dispatcher, runtime.cluster.totals()
+        yield _gauge("embo_runs", "Open runs.", len(runtime.runs.open))
+        yield _gauge("embo_queue_depth", "Rollouts that wait for a lease.", dispatcher.queued)
+        yield _gauge("embo_leases", "Live leases.", len(dispatcher.live_leases))
+        outcomes = {name: runtime.meter.outcomes[name] for name in OUTCOMES}
+        yield _counters("embo_rollouts", "Rollouts by outcome.", "outcome", outcomes)
+        phases = {phase.value: histogram for phase, histogram in chronicle.phases().items()}
+        yield _histograms("embo_rollout_seconds", "Time of completed rollouts by phase.", "phase", phases)
+        yield _attempts(chronicle.attempts)
+        yield _counter("embo_redispatched", "Leases that were given again.", totals.redispatched)
+        yield _counter("embo_lease_expired", "Leases that nobody renewed or answered.", dispatcher.expired)
+        yield _counter("embo_stale_results", "Late results that were fenced off.", totals.stale_results)
+        won = chronicle.hedges_won
+        hedges = {"true": won, "false": max(0, totals.hedged - won)}
+        yield _counters(
+            "embo_hedges", "Second leases of stragglers, by whether they came first.", "won", hedges
+        )
+        yield _counter("embo_groups_failed", "Groups that were given up.", totals.groups_failed)
+
+    def _prewarming(self) -> Iterator[Metric]:
+        totals = self._runtime.cluster.totals()
+        hits, misses = totals.prewarm_hits, totals.prewarm_misses
+        yield _counter("embo_prewarm_hits", "Scenes that were warm when their batch came.", hits)
+        yield _counter("embo_prewarm_misses", "Scenes that were not warm when their batch came.", misses)
+        yield _counter(
+            "embo_prewarm_wasted", "Loads ahead of demand that nobody used.", totals.prewarm_wasted
+        )
+        leads = {"": self._runtime.cluster.scheduler.prewarm.leads}
+        yield _histograms("embo_prewarm_lead_seconds", "From a scene being warm to its demand.", "", leads)
+
+    def _manager(self) -> Iterator[Metric]:
+        runtime = self._runtime
+        share = runtime.effort.overhead()
+        text = "CPU time of the manager over that of the manager and the slots, in the last minute."
+        yield _gauge("embo_manager_overhead_ratio", text, share)
+        lag = {"": runtime.effort.lag}
+        yield _histograms("embo_manager_lag_seconds", "How late the manager's clock ticked.", "", lag)
+        operations = runtime.effort.store
+        yield _histograms("embo_store_op_seconds", "Time of the state store's operations.", "op", operations)
+        dropped = sum(run.ring.dropped for run in runtime.chronicle.runs.values())
+        dropped += runtime.chronicle.dropped + runtime.chronicle.fleet.ring.dropped
+        yield _counter("embo_events_dropped", "Events of logs that made room for later ones.", dropped)
+
+    def _slot_states(self) -> dict[str, int]:
+        states = Counter[str]()
+        for worker in self._runtime.cluster.dispatcher.workers.values():
+            running = min(len(worker.held), worker.slots)
+            states["running"] += running
+            states[self._state_of_free(worker)] += worker.slots - running
+        return {state: states[state] for state in SLOT_STATES}
+
+    def _state_of_free(self, worker: WorkerRecord) -> str:
+        """What a slot without a rollout could do: start one at once, soon, or not."""
+        if worker.quarantined:
+            return "quarantined"
+        states = {resident.state for resident in self._runtime.cluster.scheduler.residents(worker.worker_id)}
+        if ResidentState.WARM in states:
+            return "warm"
+        return "warming" if ResidentState.LOADING in states else "idle"
+
+
+def _gauge(name: str, text: str, value: float) -> Metric:
+    return GaugeMetricFamily(name, text, value=value)
+
+
+def _gauges(name: str, text: str, label: str, values: Mapping[str, float]) -> Metric:
+    family = GaugeMetricFamily(name, text, labels=[label])
+    for key, value in values.items():
+        family.add_metric([key], value)
+    return family
+
+
+def _counter(name: str, text: str, value: float) -> Metric:
+    return CounterMetricFamily(name, text, value=value)
+
+
+def _counters(name: str, text: str, label: str, values: Mapping[str, float]) -> Metric:
+    family = CounterMetricFamily(name, text, labels=[label])
+    for key, value in values.items():
+        family.add_metric([key], value)
+    return family
+
+
+def _histograms(name: str, text: str, label: str, values: Mapping[str, Histogram]) -> Metric:
+    """One histogram for each value of the label; without a label, the one under the empty name."""
+    family = HistogramMetricFamily(name, text, labels=[label] if label else [])
+    for key, histogram in values.items():
+        counts = zip(BOUNDS_S, histogram.cumulative(), strict=True)
+        buckets = [(f"{bound_s:.6g}", float(count)) for bound_s, count in counts]
+        family.add_metric([key] if label else [], [*buckets, ("+Inf", histogram.count)], histogram.sum_s)
+    return family
+
+
+def _attempts(attempts: Mapping[int, int]) -> Metric:
+    family = HistogramMetricFamily("embo_attempts", "Leases that a rollout took to its outcome.", labels=[])
+    bounds = (1, 2, 3, 5, 10)
+    within = [sum(count for attempt, count in attempts.items() if attempt <= bound) for bound in bounds]
+    buckets = [(str(bound), float(count)) for bound, count in zip(bounds, within, strict=True)]
+    total = sum(attempt * count for attempt, count in attempts.items())
+    family.add_metric([], [*buckets, ("+Inf", float(sum(attempts.values())))], float(total))
+    return family

@@ -1,0 +1,163 @@
+"""Rewards over HTTP, in the shape in which OpenRLHF asks a remote reward model: answers in, numbers out.
+
+A request is one batch of a run that all such requests share. It waits until each answer has its reward.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+from typing import TYPE_CHECKING, Final
+
+from fastapi import APIRouter, HTTPException, Request
+from fastapi.responses import JSONResponse
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from embomatrix.manager.web.rest import PREFIX, answered
+from embomatrix.proto.v1 import types_pb2
+from embomatrix.reward.hierarchy import unparsable
+from embomatrix.rpc.reward_label import RewardLabel, answer_in
+from embomatrix.rpc.status import InvalidRequestError, UnavailableError
+from embomatrix.rpc.wire.outcome import rollout_result_from_proto
+from embomatrix.rpc.wire.values import Batch, Completed, GroupPolicy, Rollout, RunTerms
+from embomatrix.skills.parse import PlanError, parse_plan
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from embomatrix.manager.runtime.results import BatchLog
+    from embomatrix.manager.runtime.runs import Runs
+    from embomatrix.reward.breakdown import RewardBreakdown
+    from embomatrix.rpc.wire.values import Outcome
+
+REWARDS: Final = f"{PREFIX}/rewards"
+RUN_ID: Final = "http-rewards"
+TERMS: Final = RunTerms(GroupPolicy.PARTIAL)
+LARGEST_BYTES: Final = 64 * 1024 * 1024
+MOST_ANSWERS: Final = 4096
+LONGEST_S: Final = 170.0
+"""OpenRLHF's client gives a request up after 180 s, and sends it again."""
+
+
+class RewardRequest(BaseModel):
+    """What OpenRLHF posts. ``query`` is the prompt with the answer after it; other fields are left alone."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+    query: list[str] = Field(min_length=1, max_length=MOST_ANSWERS)
+    prompts: list[str]
+    """The prompts alone, so that the plan that a prompt shows as an example is not taken for an answer."""
+    labels: list[str]
+    """One ``RewardLabel`` as text for each."""
+
+    @model_validator(mode="after")
+    def _as_many(self) -> RewardRequest:
+        if not len(self.query) == len(self.prompts) == len(self.labels):
+            raise ValueError(
+                f"{len(self.query)} queries, {len(self.prompts)} prompts and {len(self.labels)} labels: send as many of each"
+            )
+        return self
+
+
+def rewarding(runs: Runs) -> APIRouter:
+    """What a trainer may ask."""
+    router = APIRouter(prefix=PREFIX, tags=["train"])
+
+    @router.post("/rewards", openapi_extra={"requestBody": _BODY})
+    async def rewards(request: Request) -> JSONResponse:
+        """The reward of each answer, its success as the score, and its tiers; 503 where the infrastructure lost one."""
+        with answered():
+            asked = _request(await _body(request))
+            return JSONResponse(_told(await _rewards(runs, asked)))
+
+    return router
+
+
+_BODY: Final = {"content": {"application/json": {"schema": RewardRequest.model_json_schema()}}}
+
+
+async def _body(request: Request) -> bytes:
+    """The body, as long as it is not too large: the server itself has no limit."""
+    body = bytearray()
+    async for chunk in request.stream():
+        body += chunk
+        if len(body) > LARGEST_BYTES:
+            raise HTTPException(413, f"more than {LARGEST_BYTES >> 20} MiB: send fewer answers at once")
+    return bytes(body)
+
+
+def _request(body: bytes) -> RewardRequest:
+    try:
+        return RewardRequest.model_validate_json(body)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False, include_context=False)[0]
+        field = ".".join(map(str, first["loc"])) or "request"
+        raise InvalidRequestError(f"{field}: {first['msg']}") from error
+
+
+async def _rewards(runs: Runs, asked: RewardRequest) -> list[RewardBreakdown]:
+    """In the order of the answers. Texts that are no plan are scored here and never executed."""
+    batch_id = secrets.token_hex(8)
+    found: dict[int, RewardBreakdown] = {}
+    rollouts: dict[int, Rollout] = {}
+    for index, label in enumerate(map(RewardLabel.parse, asked.labels)):
+        try:
+            plan = parse_plan(answer_in(asked.query[index], asked.prompts[index]), label.profile)
+        except PlanError:
+            found[index] = unparsable()
+            continue
+        group = f"{RUN_ID}/{batch_id}/{label.task_id}"
+        rollouts[index] = Rollout(
+            f"{RUN_ID}/{batch_id}/{index}", group, label.bundle_digest, label.task_id, plan, label.seed
+        )
+    if rollouts:
+        batch = Batch(RUN_ID, batch_id, 0, tuple(rollouts.values()))
+        outcomes = await _executed(runs, batch)
+        for index, rollout in rollouts.items():
+            found[index] = _reward(outcomes.get(rollout.rollout_id))
+    return [found[index] for index in range(len(asked.query))]
+
+
+async def _executed(runs: Runs, batch: Batch) -> dict[str, Outcome]:
+    """The outcome of each rollout. A batch that takes too long, or that nobody waits for any more, is called off."""
+    await runs.open_run("rewards over HTTP", RUN_ID, TERMS)
+    log = await runs.submit(batch)
+    try:
+        async with asyncio.timeout(LONGEST_S):
+            return await _read(log)
+    except TimeoutError as error:
+        raise UnavailableError(
+            f"{len(batch.rollouts)} answers took more than {LONGEST_S:g} s: send fewer at once, or add workers"
+        ) from error
+    finally:
+        if not log.ended:
+            runs.cancel(batch.run_id, batch.batch_id)
+
+
+async def _read(log: BatchLog) -> dict[str, Outcome]:
+    outcomes: dict[str, Outcome] = {}
+    cursor = 0
+    while rows := await log.after(cursor):
+        cursor = rows[-1].cursor
+        for row in rows:
+            result = rollout_result_from_proto(types_pb2.RolloutResult.FromString(row.payload))
+            outcomes[result.rollout_id] = result.outcome
+    return outcomes
+
+
+def _reward(outcome: Outcome | None) -> RewardBreakdown:
+    if not isinstance(outcome, Completed):
+        # There is no number for it: what the infrastructure loses says nothing about the answer.
+        raise UnavailableError("the infrastructure lost an answer's rollout: send the request again")
+    return outcome.reward
+
+
+def _told(rewards: Sequence[RewardBreakdown]) -> Mapping[str, object]:
+    return {
+        "rewards": [reward.total for reward in rewards],
+        "scores": [float(reward.success) for reward in rewards],
+        "extra_logs": {
+            "format": [reward.format for reward in rewards],
+            "relevance": [reward.relevance for reward in rewards],
+            "goal": [reward.goal for reward in rewards],
+        },
+    }

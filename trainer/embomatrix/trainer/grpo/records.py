@@ -1,0 +1,107 @@
+"""What one step of GRPO did, for logs and displays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from embomatrix.rpc.wire.values import Completed
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from embomatrix.trainer.grpo.objective import LossMetrics
+    from embomatrix.trainer.grpo.rollout import PlanOutcome
+    from embomatrix.trainer.run.data import TrainingTask
+
+
+@dataclass(frozen=True, slots=True)
+class StepRecord:
+    """What one step did. Rates are over rollouts that have a result; token means over the plans that moved the policy, None
+    where none did.
+
+    ``reward_format``, ``reward_relevance`` and ``reward_goal`` are the tiers' means, which add up to ``reward``;
+    ``success_by_category`` holds the categories that came up.
+    """
+
+    step: int
+    reward: float
+    reward_format: float
+    reward_relevance: float
+    reward_goal: float
+    success: float
+    success_by_category: Mapping[str, float]
+    well_formed: float
+    plan_steps: float
+    dead_groups: float
+    groups: int
+    entropy: float | None
+    kl: float | None
+    kl_to_old: float | None
+    clipped: float | None
+    gradient_norm: float
+    learning_rate: float
+    rollouts: int
+    lost: int
+    warm: float
+
+
+@dataclass(frozen=True, slots=True)
+class GroupLog:
+    """One task's plans of a step. ``dead``: they carried no signal, as all rewards were equal or too few came back."""
+
+    task: TrainingTask
+    outcomes: tuple[PlanOutcome, ...]
+    advantages: tuple[float, ...]
+    dead: bool
+
+
+def record_of(
+    step: int, logs: Sequence[GroupLog], metrics: Sequence[LossMetrics], norm: float, rate: float
+) -> StepRecord:
+    """Sum up a step: its groups, the metrics of the parts that moved the policy, gradient norm and learning rate."""
+    outcomes = [outcome for log in logs for outcome in log.outcomes]
+    known = [outcome for outcome in outcomes if outcome.reward is not None]
+    rewards = [outcome.reward for outcome in known if outcome.reward is not None]
+    executed = [outcome.outcome for outcome in known if isinstance(outcome.outcome, Completed)]
+    weight = sum(part.weight for part in metrics)
+
+    def over_tokens(name: str) -> float | None:
+        if not weight:
+            return None
+        return float(sum(getattr(part, name) * part.weight for part in metrics) / weight)
+
+    return StepRecord(
+        step=step,
+        reward=_mean([outcome.value for outcome in known]),
+        reward_format=_mean([reward.format for reward in rewards]),
+        reward_relevance=_mean([reward.relevance for reward in rewards]),
+        reward_goal=_mean([reward.goal for reward in rewards]),
+        success=_mean([outcome.success for outcome in known]),
+        success_by_category=_by_category(logs),
+        well_formed=_mean([not outcome.problem for outcome in known]),
+        plan_steps=_mean([len(outcome.steps) for outcome in executed]),
+        dead_groups=_mean([log.dead for log in logs]),
+        groups=len(logs),
+        entropy=over_tokens("entropy"),
+        kl=over_tokens("kl_to_reference"),
+        kl_to_old=over_tokens("kl_to_old"),
+        clipped=over_tokens("clip_fraction"),
+        gradient_norm=norm,
+        learning_rate=rate,
+        rollouts=len(outcomes),
+        lost=len(outcomes) - len(known),
+        warm=_mean([outcome.warm for outcome in executed]),
+    )
+
+
+def _by_category(logs: Sequence[GroupLog]) -> dict[str, float]:
+    successes: dict[str, list[float]] = {}
+    for log in logs:
+        found = successes.setdefault(log.task.task.category.value, [])
+        found += [outcome.success for outcome in log.outcomes if outcome.reward is not None]
+    return {category: _mean(values) for category, values in sorted(successes.items()) if values}
+
+
+def _mean(values: Sequence[float]) -> float:
+    return float(sum(values) / len(values)) if values else 0.0

@@ -1,0 +1,67 @@
+"""Imitation in a run's folder: with a log, checkpoints to go on from, and the policy that it ends with."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Final
+
+from embomatrix.trainer.imitation.imitate import Imitation
+from embomatrix.trainer.logging.recorder import IMITATION
+from embomatrix.trainer.run.checkpoint import CHECKPOINTS, CheckpointStore, restore
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from pathlib import Path
+
+    from embomatrix.trainer.imitation.imitate import ImitationProgress
+    from embomatrix.trainer.logging.recorder import Recorder
+    from embomatrix.trainer.policy.prompts import Teller
+    from embomatrix.trainer.policy.protocol import Policy
+    from embomatrix.trainer.run.checkpoint import Progress
+    from embomatrix.trainer.run.data import TrainingTask
+    from embomatrix.trainer.run.settings import TrainSettings
+
+LOG_EVERY: Final = 10
+"""Steps between two lines of the log, besides those with a measurement."""
+
+
+def warm_up(
+    policy: Policy,
+    teller: Teller,
+    tasks: Sequence[TrainingTask],
+    settings: TrainSettings,
+    out: Path,
+    progress: Progress,
+    recorder: Recorder,
+    report: Callable[[ImitationProgress], None],
+) -> None:
+    """Imitate for the budget, or what is left of it, and keep ``progress.imitation`` true.
+
+    The policy is that of the newest checkpoint in ``out``, where ``progress`` comes from one. However it ends, a checkpoint
+    is left to go on from. Raises TrainerError.
+    """
+    store = CheckpointStore(out / CHECKPOINTS, keep=settings.keep_checkpoints)
+    state = progress.imitation
+    imitation = Imitation(policy, teller, tasks, settings.imitation, seed=settings.seed, state=state)
+    if state.done:
+        return
+    newest = store.latest() if state.step else None
+    if newest is not None:
+        restore(newest, imitation.restore)
+    recorder.forget_after(state.step, IMITATION)
+    saved_s = time.monotonic()
+
+    def told(step: ImitationProgress) -> None:
+        nonlocal saved_s
+        if step.validation is not None or step.step % LOG_EVERY == 1:
+            recorder.imitation(step)
+        report(step)
+        if time.monotonic() - saved_s >= settings.imitation.checkpoint_seconds:
+            store.save(policy, imitation.tensors(), progress, settings)
+            saved_s = time.monotonic()
+
+    try:
+        imitation.run(told)
+    finally:
+        if state.step:
+            store.save(policy, imitation.tensors(), progress, settings)

@@ -1,0 +1,131 @@
+"""What a run writes as it goes: metrics and samples, a JSON object a line, so that nothing is lost with a crash."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+from embomatrix.rpc.wire.values import Cancelled, Completed, InfraFailure
+from embomatrix.trainer.logging.trackers import GRPO_PHASE, IMITATION_PHASE
+from embomatrix.world.whole_file import write_whole
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from pathlib import Path
+
+    from embomatrix.trainer.evaluation.held_out import Evaluation
+    from embomatrix.trainer.grpo.records import GroupLog, StepRecord
+    from embomatrix.trainer.grpo.rollout import PlanOutcome
+    from embomatrix.trainer.imitation.imitate import ImitationProgress
+    from embomatrix.trainer.logging.trackers import Tracker
+
+METRICS = "metrics.jsonl"
+SAMPLES = "samples.jsonl"
+IMITATION = "imitation.jsonl"
+
+
+class Recorder:
+    """Appends to the files of one run's folder, and tells ``trackers``. Raises OSError where that can't be written."""
+
+    def __init__(self, folder: Path, trackers: Sequence[Tracker] = ()) -> None:
+        self._folder = folder
+        self._trackers = tuple(trackers)
+        folder.mkdir(parents=True, exist_ok=True)
+
+    def step(self, record: StepRecord, seconds: float, spent_s: Mapping[str, float]) -> None:
+        """``seconds`` is the wall clock of the step, ``spent_s`` what the run has spent so far, by activity."""
+        spent = {activity: round(value, 4) for activity, value in spent_s.items()}
+        row = {**asdict(record), "seconds": round(seconds, 4), "spent_s": spent}
+        self._append(METRICS, row)
+        self._track(GRPO_PHASE, row)
+
+    def samples(self, step: int, log: GroupLog) -> None:
+        """One task's plans: text, verdict, reward by tier, what each step did."""
+        for outcome, advantage in zip(log.outcomes, log.advantages, strict=True):
+            described = {
+                "step": step,
+                "task": log.task.task.task_id,
+                "instruction": log.task.task.instruction,
+            }
+            self._append(SAMPLES, {**described, "advantage": round(advantage, 4), **_described(outcome)})
+
+    def imitation(self, progress: ImitationProgress) -> None:
+        """One step of imitation."""
+        row = asdict(progress)
+        self._append(IMITATION, row)
+        self._track(IMITATION_PHASE, row)
+
+    def evaluation(self, label: str, result: Evaluation) -> None:
+        """Held-out success, which the run's own files keep in checkpoints and report."""
+        rates = {category: result.success(category).value for category in result.categories}
+        self._track(f"success {label}", {"step": 0, "all": result.success().value, **rates})
+
+    def forget_after(self, step: int, *names: str) -> None:
+        """Drop what those files hold of steps that a run will take again: it is resumed, or had no checkpoint yet."""
+        for name in names:
+            path = self._folder / name
+            if path.exists():
+                kept = [
+                    line for line in path.read_text(encoding="utf-8").splitlines() if _step_of(line) <= step
+                ]
+                write_whole(path, "".join(f"{line}\n" for line in kept).encode("utf-8"))
+
+    def _track(self, phase: str, row: Mapping[str, Any]) -> None:
+        values = dict(numbers_of(row))
+        step = int(values.pop("step"))
+        for tracker in self._trackers:
+            tracker.log(phase, step, values)
+
+    def _append(self, name: str, value: Mapping[str, Any]) -> None:
+        with (self._folder / name).open("a", encoding="utf-8") as file:
+            file.write(json.dumps(value) + "\n")
+
+
+def numbers_of(row: Mapping[str, Any]) -> Iterator[tuple[str, float]]:
+    """The numbers of a row by name; those of a table in it by ``table/name``."""
+    for name, value in row.items():
+        if isinstance(value, Mapping):
+            yield from ((f"{name}/{inner}", number) for inner, number in numbers_of(value))
+        elif value is not None:
+            yield name, float(value)
+
+
+def _step_of(line: str) -> float:
+    """A line that a crash cut short belongs to no step that is kept."""
+    try:
+        return int(json.loads(line)["step"])
+    except ValueError:
+        return math.inf
+
+
+def read_metrics(folder: Path) -> list[dict[str, Any]]:
+    """Every step's record, oldest first; empty before the first step."""
+    path = folder / METRICS
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def _described(outcome: PlanOutcome) -> dict[str, Any]:
+    described: dict[str, Any] = {"text": outcome.text}
+    if outcome.reward is not None:
+        reward = outcome.reward
+        described |= {
+            "reward": reward.total,
+            "format": reward.format,
+            "relevance": reward.relevance,
+            "goal": reward.goal,
+            "success": reward.success,
+            "atoms": [[atom.text, atom.holds] for atom in reward.atoms],
+        }
+    match outcome.outcome:
+        case Completed(steps=steps):
+            described["steps"] = [[step.call.skill.value, step.ok, step.message] for step in steps]
+        case InfraFailure(code=code, message=message):
+            described["lost"] = f"{code.value}: {message}"
+        case Cancelled():
+            described["lost"] = "cancelled"
+        case None:
+            described["unparsable"] = outcome.problem
+    return described

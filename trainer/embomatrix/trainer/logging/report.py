@@ -1,0 +1,179 @@
+"""The report of a run: one HTML file with the learning curves, success before and after, and where the time went."""
+
+from __future__ import annotations
+
+import html
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from embomatrix.trainer.evaluation.held_out import improvement
+from embomatrix.trainer.run.outcome import RunOutcome, TaskRate
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+    from embomatrix.rpc.wire.values import RunStats
+    from embomatrix.trainer.evaluation.held_out import Evaluation
+
+REPORT = "report.html"
+_WIDTH, _HEIGHT, _MARGIN = 640, 220, 44
+_CURVES = (
+    ("reward", "mean reward of a step", "#1b6ca8"),
+    ("success", "share of rollouts that succeed", "#2a7f3f"),
+    ("plan_steps", "executed steps of a plan", "#8a5a00"),
+    ("entropy", "entropy of a token (nats)", "#7a3b8f"),
+    ("dead_groups", "groups without signal", "#a83232"),
+)
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What a finished run has to show. ``checkpoint`` is the newest one; ``after`` is None when nothing was held out."""
+
+    model: str
+    steps: int
+    rollouts: int
+    lost: int
+    imitation_steps: int
+    wall_s: float
+    grpo_s: float
+    spent_s: Mapping[str, float]
+    before: Evaluation | None
+    after: Evaluation | None
+    stats: RunStats
+    checkpoint: Path
+    report: Path
+    peak_mb: float = 0.0
+
+
+def time_rows(summary: Summary) -> list[tuple[str, float, float]]:
+    """Activity, seconds, share of the wall clock; the rest is called so."""
+    total = max(summary.wall_s, 1e-9)
+    rows = [(name, spent, spent / total) for name, spent in summary.spent_s.items()]
+    rest = max(0.0, summary.wall_s - sum(summary.spent_s.values()))
+    return [*rows, ("everything else", rest, rest / total)]
+
+
+def success_rows(summary: Summary) -> list[tuple[str, str, str, str]]:
+    """Category, success before, after, and the paired difference, each with its interval."""
+    if summary.before is None or summary.after is None:
+        return []
+    rows = []
+    for category in ("", *summary.after.categories):
+        change = improvement(_only(summary.before, category), _only(summary.after, category))
+        rows.append(
+            (
+                category or "all tasks",
+                summary.before.success(category).as_percent(),
+                summary.after.success(category).as_percent(),
+                change.as_percent(),
+            )
+        )
+    return rows
+
+
+def outcome_of(summary: Summary) -> RunOutcome:
+    """The summary's numbers, for programs."""
+    return RunOutcome(
+        model=summary.model,
+        imitation_steps=summary.imitation_steps,
+        steps=summary.steps,
+        rollouts=summary.rollouts,
+        lost=summary.lost,
+        wall_s=summary.wall_s,
+        grpo_s=summary.grpo_s,
+        spent_s=dict(summary.spent_s),
+        before=_rates(summary.before),
+        after=_rates(summary.after),
+        peak_mb=summary.peak_mb,
+    )
+
+
+def _rates(evaluation: Evaluation | None) -> tuple[TaskRate, ...]:
+    scores = evaluation.scores if evaluation is not None else ()
+    return tuple(
+        TaskRate(score.task_id, score.category, score.rate if score.samples else None) for score in scores
+    )
+
+
+def _only(evaluation: Evaluation, category: str) -> Evaluation:
+    return type(evaluation)(tuple(s for s in evaluation.scores if category in ("", s.category)))
+
+
+def prewarm_share(stats: RunStats) -> float:
+    """Share of announced scenes that were warm when they were needed; 0 when none was."""
+    asked = stats.prewarm_hits + stats.prewarm_misses
+    return stats.prewarm_hits / asked if asked else 0.0
+
+
+def write_report(summary: Summary, metrics: Sequence[Mapping[str, Any]], machine: str) -> Path:
+    """Write the report where ``summary.report`` says."""
+    parts = [
+        f"<h1>Training of {html.escape(summary.model)}</h1>",
+        f"<p>{summary.imitation_steps} steps of imitation, {summary.steps} steps of GRPO, {summary.rollouts} rollouts, "
+        f"{summary.lost} lost to the infrastructure and masked, "
+        f"{prewarm_share(summary.stats):.0%} of announced scenes warm in time. Machine: {html.escape(machine)}.</p>",
+        "<h2>Success on held-out tasks</h2>",
+        _table(("tasks", "before GRPO", "after", "difference"), success_rows(summary))
+        or "<p>The data set holds no task out.</p>",
+        "<p>95 % intervals, bootstrap over tasks.</p>",
+        "<h2>Learning curves</h2>",
+        *(_curve([row[key] for row in metrics], title, colour) for key, title, colour in _CURVES),
+        "<h2>Where the time went</h2>",
+        _table(
+            ("activity", "seconds", "share"),
+            [(name, f"{spent:.1f}", f"{share:.0%}") for name, spent, share in time_rows(summary)],
+        ),
+        f"<p>Checkpoint: <code>{html.escape(str(summary.checkpoint))}</code></p>",
+    ]
+    page = (
+        '<!doctype html><html lang="en"><meta charset="utf-8"><title>Training report</title><style>'
+        "body{font:15px/1.5 system-ui,sans-serif;max-width:720px;margin:2rem auto;padding:0 1rem;color:#222}"
+        "table{border-collapse:collapse}td,th{padding:.2rem .8rem;border-bottom:1px solid #ddd;text-align:left}"
+        f"svg{{display:block;margin:.5rem 0}}</style>{''.join(parts)}</html>"
+    )
+    summary.report.write_text(page, encoding="utf-8")
+    return summary.report
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    if not rows:
+        return ""
+    cells = "".join(f"<th>{html.escape(cell)}</th>" for cell in head)
+    body = "".join(
+        "<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows
+    )
+    return f"<table><tr>{cells}</tr>{body}</table>"
+
+
+def _curve(told: Sequence[float | None], title: str, colour: str) -> str:
+    """Raw values thin, a moving mean bold, as inline SVG; steps without a value are passed over."""
+    places = [at for at, value in enumerate(told) if value is not None]
+    values = [value for value in told if value is not None]
+    if not values:
+        return ""
+    low, high = min(*values, 0.0), max(values)
+    high = high if high > low else low + 1.0
+    window = max(1, len(values) // 20)
+    means = [sum(values[max(0, at - window + 1) : at + 1]) / min(at + 1, window) for at in range(len(values))]
+
+    def points(line: Sequence[float]) -> str:
+        across = (_WIDTH - 2 * _MARGIN) / max(1, len(told) - 1)
+        up = (_HEIGHT - 2 * _MARGIN) / (high - low)
+        return " ".join(
+            f"{_MARGIN + at * across:.1f},{_HEIGHT - _MARGIN - (value - low) * up:.1f}"
+            for at, value in zip(places, line, strict=True)
+        )
+
+    text = 'font-size="12" fill="#555"'
+    return (
+        f'<svg width="{_WIDTH}" height="{_HEIGHT}" role="img" aria-label="{html.escape(title)}">'
+        f'<text x="{_MARGIN}" y="24" font-size="14">{html.escape(title)}</text>'
+        f'<path d="M{_MARGIN} {_MARGIN}V{_HEIGHT - _MARGIN}H{_WIDTH - _MARGIN}" fill="none" stroke="#999"/>'
+        f'<text x="4" y="{_MARGIN + 4}" {text}>{high:.3g}</text>'
+        f'<text x="4" y="{_HEIGHT - _MARGIN}" {text}>{low:.3g}</text>'
+        f'<text x="{_WIDTH - _MARGIN}" y="{_HEIGHT - _MARGIN + 16}" {text} text-anchor="end">step {len(told)}</text>'
+        f'<polyline points="{points(values)}" fill="none" stroke="{colour}" stroke-opacity=".3"/>'
+        f'<polyline points="{points(means)}" fill="none" stroke="{colour}" stroke-width="2"/></svg>'
+    )

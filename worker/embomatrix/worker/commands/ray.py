@@ -1,0 +1,96 @@
+"""`embomatrix worker ray`: worker daemons as actors on a Ray cluster that is there already.
+
+Ray places them by cores and memory and starts them again where a node is lost; leases, scenes and results are the manager's
+affair, as with any worker.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import typer
+from rich.console import Console
+
+from embomatrix.host.parent import with_this_process
+from embomatrix.worker.commands.options import fail
+
+DRAIN_S: Final = 90.0
+"""Longer than running rollouts may take to end."""
+FINAL: Final = frozenset({0, 2})
+"""The daemon left, or a person must mend something: Ray does not start it again."""
+
+
+class PlacedWorker:
+    """What becomes an actor: one daemon, its child, which dies with it."""
+
+    def __init__(self, name: str, arguments: list[str]) -> None:
+        folder = Path(tempfile.gettempdir()) / f"embomatrix-{os.getuid()}" / name
+        command = [sys.executable, "-m", "embomatrix.cli", "worker", "run", "--name", name]
+        folders = [f"--cache-dir={folder / 'cache'}", f"--state-dir={folder / 'state'}"]
+        self._child = subprocess.Popen([*command, *folders, *arguments], preexec_fn=with_this_process())
+
+    def ended(self) -> int:
+        """Exit status of the daemon, once it is over. Any other than a final one ends the actor: Ray makes it anew."""
+        status = self._child.wait()
+        if status not in FINAL:
+            os._exit(1)
+        return status
+
+    def drain(self) -> None:
+        """What runs ends, and is delivered; then the daemon leaves."""
+        self._child.terminate()
+        try:
+            self._child.wait(DRAIN_S)
+        except subprocess.TimeoutExpired:
+            self._child.kill()
+
+
+def ray_workers(
+    context: typer.Context,
+    workers: Annotated[int, typer.Option(min=1, help="Daemons.")] = 1,
+    cpus: Annotated[int, typer.Option(min=1, help="Cores of each, and rollouts at the same time.")] = 1,
+    memory_mb: Annotated[int, typer.Option(min=256, help="Memory of each.")] = 4096,
+    address: Annotated[str, typer.Option(help="Of the Ray cluster; `local` starts one here.")] = "auto",
+    prefix: Annotated[str, typer.Option(help="Workers are called PREFIX-0, PREFIX-1 and so on.")] = "ray",
+) -> None:
+    """Place workers on a Ray cluster until interrupted; options of `worker run`, as --manager, follow `--`."""
+    try:
+        ray: Any = importlib.import_module("ray")
+    except ModuleNotFoundError:
+        fail("Ray is not installed here: `pip install 'embomatrix[ray]'`, on every node of its cluster too")
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    try:
+        ray.init(address=address, log_to_driver=True, include_dashboard=False if address == "local" else None)
+    except ConnectionError as error:
+        fail(f"no Ray cluster answers at {address!r} ({error}): start one with `ray start --head`")
+    # Two methods at once: one waits for the end, the other asks for it.
+    actor = ray.remote(
+        num_cpus=cpus,
+        memory=memory_mb * 1_000_000,
+        max_restarts=-1,
+        max_task_retries=-1,
+        max_concurrency=2,
+    )(PlacedWorker)
+    limits = [f"--slots={cpus}", f"--memory-mb={memory_mb}", "--nice=0", *context.args]
+    placed = {f"{prefix}-{number}": actor.remote(f"{prefix}-{number}", limits) for number in range(workers)}
+    try:
+        _watch(ray, placed, Console(soft_wrap=True))
+    except KeyboardInterrupt:
+        ray.get([each.drain.remote() for each in placed.values()], timeout=DRAIN_S + 10)
+    finally:
+        ray.shutdown()
+
+
+def _watch(ray: Any, placed: dict[str, Any], console: Console) -> None:
+    """Tell of every daemon that is over for good, until all are."""
+    waiting = {each.ended.remote(): name for name, each in placed.items()}
+    console.print(f"{len(placed)} workers are with Ray; Ctrl-C drains them", highlight=False)
+    while waiting:
+        for over in ray.wait(list(waiting), timeout=1.0)[0]:
+            console.print(f"{waiting.pop(over)} ended with status {ray.get(over)}", highlight=False)

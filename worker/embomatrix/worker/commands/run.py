@@ -1,0 +1,191 @@
+"""`embomatrix worker run`: its options, put over what a file says, and the daemon that they make."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import os
+import signal
+import sys
+import tomllib
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final, Protocol
+
+import numpy as np
+import psutil
+import typer
+
+from embomatrix.rpc.channel import DEFAULT_ADDRESS
+from embomatrix.rpc.logs import LogFormat, bind, hide, log_to_stderr
+from embomatrix.rpc.status import ClusterError
+from embomatrix.worker.commands.options import Ca, Manager, StateDir, Token, check_engine, fail, parse
+from embomatrix.worker.host.machine import Machine
+from embomatrix.worker.host.preferences import Preferences
+from embomatrix.worker.host.resources import measure
+from embomatrix.worker.host.status import daemon_pids
+from embomatrix.worker.link.daemon import Daemon, serve
+from embomatrix.worker.link.membership import membership_of
+from embomatrix.worker.slots.processes import ProcessGoneError
+
+if TYPE_CHECKING:
+    import enum
+    from collections.abc import Sequence
+
+    from embomatrix.worker.host.settings import WorkerSettings
+
+logger = logging.getLogger(__name__)
+
+PREFERENCES: Final = frozenset(Preferences.model_fields)
+NOT_SETTINGS: Final = frozenset({"config", "labels", "verbose", "log_format"})
+"""Options that are no setting of the daemon, or not by that name."""
+
+
+Slots = Annotated[int, typer.Option(help="Rollouts at the same time; 0: one for each core.")]
+Join = Annotated[
+    str,
+    typer.Option(
+        envvar="EMBOMATRIX_JOIN",
+        help="TOKEN@HOST:PORT as the operator got it: all that joining takes.",
+        show_default=False,
+    ),
+]
+Name = Annotated[str, typer.Option(help="Worker id; by default the host's name and a random part.")]
+Labels = Annotated[
+    list[str] | None, typer.Option("--label", help="KEY=VALUE, for operators; may be given again.")
+]
+WorkHours = Annotated[str, typer.Option(help="Work only then: 18:00-08:00, local time.")]
+IdleS = Annotated[float, typer.Option(help="Work only when nobody used this machine for so many seconds.")]
+MainsOnly = Annotated[bool, typer.Option("--mains-only", help="Pause on battery.")]
+MaxLoad = Annotated[
+    float, typer.Option(help="Pause when other programs use more than this share of all cores, as 0.5.")
+]
+MemoryMb = Annotated[int, typer.Option(help="Memory for scenes; 0: a share of what is free.")]
+MemoryShare = Annotated[float, typer.Option(help="That share.")]
+CacheDir = Annotated[Path | None, typer.Option(help="Folder for bundles and the simulator's log.")]
+CacheMb = Annotated[int, typer.Option(help="Disk space for bundles.")]
+Nice = Annotated[int, typer.Option(help="Politeness, 0 to 19; above 0 the disk is left to others too.")]
+Config = Annotated[
+    Path | None, typer.Option(help="TOML file of these options; what is given here goes before it.")
+]
+Once = Annotated[bool, typer.Option("--once", help="End when the manager can't be reached.")]
+Verbose = Annotated[bool, typer.Option("--verbose", help="Log every rollout.")]
+LogLines = Annotated[
+    LogFormat, typer.Option(help="Log lines for people, or as JSON.", envvar="EMBOMATRIX_LOG_FORMAT")
+]
+
+
+def run(
+    context: typer.Context,
+    manager: Manager = DEFAULT_ADDRESS,
+    slots: Slots = 0,
+    token: Token = "",
+    join: Join = "",
+    ca: Ca = None,
+    name: Name = "",
+    labels: Labels = None,
+    hours: WorkHours = "",
+    idle_s: IdleS = 0.0,
+    mains_only: MainsOnly = False,
+    max_load: MaxLoad = 0.0,
+    memory_mb: MemoryMb = 0,
+    memory_share: MemoryShare = 0.4,
+    cache_dir: CacheDir = None,
+    cache_mb: CacheMb = 1024,
+    nice: Nice = 10,
+    state_dir: StateDir = None,
+    config: Config = None,
+    once: Once = False,
+    verbose: Verbose = False,
+    log_format: LogLines = LogFormat.HUMAN,
+) -> None:
+    """Join the manager and execute rollouts until stopped: Ctrl-C drains, a second one leaves at once."""
+    check_engine()
+    settings = parse(values_of(context, config, labels or []))
+    log_to_stderr("debug" if verbose else "info", log_format)
+    hide(settings.token)
+    hide(settings.join)
+    be_polite(settings.nice)
+    try:
+        asyncio.run(_serve(settings))
+    except (ClusterError, ProcessGoneError) as error:
+        fail(str(error))
+    except OSError as error:
+        where = error.filename or settings.cache_dir
+        fail(f"{where} can't be used ({error.strerror or error}): name another folder with --cache-dir")
+
+
+class CommandLine(Protocol):
+    """What was typed: values by the names of options, and where each of them comes from."""
+
+    params: dict[str, Any]
+
+    def get_parameter_source(self, name: str, /) -> enum.Enum | None: ...
+
+
+def settings_of(words: Sequence[str]) -> WorkerSettings:
+    """What `worker run` makes of these words; where one is wrong, the program ends with a sentence."""
+    parser = typer.Typer()
+    parser.command()(run)
+    context = typer.main.get_command(parser).make_context("embomatrix worker run", list(words))
+    return parse(values_of(context, context.params["config"], context.params["labels"] or []))
+
+
+def values_of(context: CommandLine, config: Path | None, labels: list[str]) -> dict[str, Any]:
+    """What the file says, and over it what was given as an option or in the environment."""
+    values = read_config(config) if config is not None else {}
+    wishes = values.setdefault("preferences", {})
+    for name, value in context.params.items():
+        source = context.get_parameter_source(name)
+        if name in NOT_SETTINGS or source is None or source.name.startswith("DEFAULT"):
+            continue
+        if name == "join" and not value:
+            fail(
+                "--join is empty, perhaps a variable that is not set: expected TOKEN@HOST:PORT, as the operator gave it"
+            )
+        (wishes if name in PREFERENCES else values)[name] = value
+    if labels:
+        values["labels"] = {**values.get("labels", {}), **dict(map(split_label, labels))}
+    return values
+
+
+def read_config(path: Path) -> dict[str, Any]:
+    """The options that a TOML file holds; what they may be is checked with the others."""
+    try:
+        values = tomllib.loads(path.expanduser().read_text(encoding="utf-8"))
+    except OSError as error:
+        fail(f"--config {path}: {error.strerror or error}")
+    except ValueError as error:
+        fail(f"--config {path}: {error}")
+    if not isinstance(values.get("preferences", {}), dict):
+        fail(f"--config {path}: preferences is a table, [preferences]")
+    return values
+
+
+def split_label(text: str) -> tuple[str, str]:
+    key, equals, value = text.partition("=")
+    if not key or not equals:
+        fail(f"--label {text!r}: expected KEY=VALUE, as in room=lab")
+    return key, value
+
+
+def be_polite(nice: int) -> None:
+    """Leave processor and disk to others, in this process and in those that it starts."""
+    os.nice(nice)
+    if nice and sys.platform == "linux":
+        # Some containers forbid it, and it is a courtesy only.
+        with contextlib.suppress(psutil.Error, OSError):
+            psutil.Process().ionice(psutil.IOPRIO_CLASS_IDLE)
+
+
+async def _serve(settings: WorkerSettings) -> None:
+    membership = await membership_of(settings)
+    bind("worker", membership.name)
+    machine = Machine(lambda: daemon_pids(settings.state_dir))
+    if not settings.preferences.indifferent:
+        for sentence in machine.blind_to(settings.preferences, await asyncio.to_thread(machine.observe)):
+            logger.warning("%s", sentence)
+    daemon = Daemon(
+        settings, measure(settings), np.random.default_rng(), membership=membership, probe=machine
+    )
+    await serve(daemon, (signal.SIGINT, signal.SIGTERM))

@@ -1,0 +1,202 @@
+"""What this machine shows of its owner, its power and its load. It needs no root, and says what it can't see."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Protocol
+
+import psutil
+
+from embomatrix.worker.host.pausing import Observation
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+    from embomatrix.worker.host.preferences import Preferences
+
+SESSIONS_ASKED_S: Final = 10.0
+"""Asking for the desktop's sessions starts two processes: not more often than this."""
+SESSIONS_ANSWER_S: Final = 5.0
+GRAPHICAL: Final = frozenset({"x11", "wayland", "mir"})
+NEVER_S: Final = 1e9
+"""Since a sign of a person, where nobody is logged in at all."""
+DEVICES: Final = Path("/dev")
+
+
+class Probe(Protocol):
+    """Looks at a machine; it may take some milliseconds, and raises nothing."""
+
+    def observe(self) -> Observation: ...
+
+
+class Machine:
+    """The machine that this runs on. ``ours`` gives the process ids of all worker daemons here: theirs is no load of others."""
+
+    def __init__(self, ours: Callable[[], Iterable[int]], owner: Owner | None = None) -> None:
+        self._owner = owner or (Owner() if sys.platform == "linux" else None)
+        self._load = OthersLoad(ours)
+
+    def observe(self) -> Observation:
+        local = time.localtime()
+        memory = psutil.virtual_memory()
+        return Observation(
+            minute=local.tm_hour * 60 + local.tm_min,
+            owner_idle_s=None if self._owner is None else self._owner.idle_s(time.time()),
+            on_mains=on_mains(),
+            others_load=self._load.share(),
+            free_memory=memory.available / memory.total,
+        )
+
+    def blind_to(self, wishes: Preferences, seen: Observation) -> list[str]:
+        """What the preferences ask for and this machine does not show, in sentences."""
+        sentences = []
+        if wishes.idle_s and seen.owner_idle_s is None:
+            sentences.append(
+                "on this system nobody can be seen at work: idle_s has no effect, use hours or max_load"
+            )
+        if wishes.mains_only and seen.on_mains is None:
+            sentences.append("no battery was found: mains_only has no effect")
+        return sentences
+
+
+def on_mains() -> bool | None:
+    """Whether the machine has power from outside; None where no battery is known."""
+    ask = getattr(psutil, "sensors_battery", None)
+    battery = ask() if ask is not None else None
+    return None if battery is None else battery.power_plugged
+
+
+class Owner:
+    """The last sign of a person: what was typed in a terminal, and what the desktop tells logind."""
+
+    def __init__(self, devices: Path = DEVICES, sessions: Callable[[], str] | None = None) -> None:
+        self._devices = devices
+        self._sessions = sessions or ask_sessions
+        self._desktop_active_s: float | None = None
+        self._asked_s = float("-inf")
+
+    def idle_s(self, now_s: float) -> float:
+        """Seconds since the last sign; ``now_s`` is wall time. Where nobody is logged in, very many."""
+        if now_s - self._asked_s >= SESSIONS_ASKED_S:
+            self._asked_s = now_s
+            self._desktop_active_s = desktop_active_s(self._sessions(), now_s)
+        signs = [terminal_active_s(self._devices), self._desktop_active_s]
+        return max(0.0, now_s - max((sign for sign in signs if sign is not None), default=now_s - NEVER_S))
+
+
+def terminal_active_s(devices: Path = DEVICES) -> float | None:
+    """Wall time at which somebody last typed in any terminal, local or remote: reading moves a terminal's access time.
+
+    It is what `w` shows as idle. The kernel rounds it to eight seconds.
+    """
+    times = []
+    for path in (*devices.glob("pts/[0-9]*"), *devices.glob("tty[0-9]*")):
+        try:
+            times.append(path.stat().st_atime)
+        except OSError:
+            continue  # closed meanwhile
+    return max(times, default=None)
+
+
+def ask_sessions() -> str:
+    """Properties of all of logind's sessions, as ``loginctl`` prints them; empty where there is no logind."""
+    program = shutil.which("loginctl")
+    if program is None:
+        return ""
+    try:
+        listed = _answer_of(program, "list-sessions", "--no-legend", "--no-pager")
+        names = [line.split()[0] for line in listed.splitlines() if line.split()]
+        properties = "Type,Class,State,IdleHint,IdleSinceHint"
+        return _answer_of(program, "show-session", f"--property={properties}", *names) if names else ""
+    except (OSError, subprocess.SubprocessError):
+        return ""
+
+
+def _answer_of(*command: str) -> str:
+    return subprocess.run(
+        command,
+        capture_output=True,
+        text=True,
+        timeout=SESSIONS_ANSWER_S,
+        check=True,
+        stdin=subprocess.DEVNULL,
+    ).stdout
+
+
+def desktop_active_s(sessions: str, now_s: float) -> float | None:
+    """Wall time at which a desktop was last used; None when no person has one.
+
+    A desktop sets its hint when the screen falls idle. One that never does counts as used for as long as it is there.
+    Sessions in terminals are left to the terminals: logind itself takes half an hour to call them idle.
+    """
+    times = []
+    for block in sessions.strip().split("\n\n"):
+        session = dict(line.split("=", 1) for line in block.splitlines() if "=" in line)
+        if session.get("Type") not in GRAPHICAL or session.get("Class") != "user":
+            continue
+        if session.get("State") == "closing":
+            continue
+        since_us = session.get("IdleSinceHint", "")
+        idle = session.get("IdleHint") == "yes" and since_us.isdigit()
+        times.append(int(since_us) / 1e6 if idle else now_s)
+    return max(times, default=None)
+
+
+@dataclass(frozen=True, slots=True)
+class CpuTimes:
+    """Processor seconds since boot: of all, of those that were busy, and of those that were busy for us."""
+
+    total_s: float
+    busy_s: float
+    ours_s: float
+
+    def others_share_since(self, before: CpuTimes) -> float:
+        """Share of all cores that others kept busy in between, 0 to 1."""
+        total_s = self.total_s - before.total_s
+        # A process of ours that dies with its parent takes its count along: less than before means nothing.
+        ours_s = max(0.0, self.ours_s - before.ours_s)
+        return min(1.0, max(0.0, self.busy_s - before.busy_s - ours_s) / total_s) if total_s > 0 else 0.0
+
+
+class OthersLoad:
+    """How busy others keep the processor, between one question and the next."""
+
+    def __init__(self, ours: Callable[[], Iterable[int]]) -> None:
+        self._ours = ours
+        self._before = self._times()
+
+    def share(self) -> float:
+        """Share of all cores since the last question, 0 to 1."""
+        now = self._times()
+        share = now.others_share_since(self._before)
+        self._before = now
+        return share
+
+    def _times(self) -> CpuTimes:
+        whole = psutil.cpu_times()
+        # Guests are counted among the users already.
+        total_s = sum(whole) - getattr(whole, "guest", 0.0) - getattr(whole, "guest_nice", 0.0)
+        idle_s = whole.idle + getattr(whole, "iowait", 0.0)
+        return CpuTimes(total_s, total_s - idle_s, sum(map(family_cpu_s, set(self._ours()))))
+
+
+def family_cpu_s(pid: int) -> float:
+    """Processor seconds of a process and of all below it, those that ended and were collected included."""
+    try:
+        root = psutil.Process(pid)
+        family = [root, *root.children(recursive=True)]
+    except psutil.Error:
+        return 0.0
+    seconds = 0.0
+    for process in family:
+        try:
+            times = process.cpu_times()
+        except psutil.Error:
+            continue
+        seconds += times.user + times.system + times.children_user + times.children_system
+    return seconds

@@ -1,0 +1,98 @@
+"""What this machine offers: cores, memory, GPU, versions, and how fast it is."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import platform
+import shutil
+import time
+from importlib.metadata import PackageNotFoundError, version
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+import psutil
+
+from embomatrix.host.cgroup import MIB, find_limits
+from embomatrix.host.cores import usable_cores
+from embomatrix.rpc.wire.values import Resources
+from embomatrix.worker.host.gpu import find_gpu
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from embomatrix.worker.host.settings import WorkerSettings
+
+REFERENCE_S: Final = 0.0065
+"""Seconds that the probe takes on a machine of score 1: a core of a cloud machine of 2026."""
+
+
+def measure(settings: WorkerSettings) -> Resources:
+    """Resources of this machine; what the settings name is taken from there."""
+    limits = find_limits()
+    cores = usable_cores(limits)
+    slots = settings.slots or cores
+    gpu = find_gpu()
+    free_mb = min(psutil.virtual_memory().available / MIB, limits.memory_mb)
+    return Resources(
+        slots=slots,
+        cores=cores,
+        memory_mb=settings.memory_mb or max(1, int(free_mb * settings.memory_share)),
+        score=measure_score(),
+        gpu=gpu.name,
+        vram_mb=gpu.vram_mb,
+        versions=versions(),
+        render_slots=gpu.render_slots(slots),
+        disk_mb=free_disk_mb(settings.cache_dir.expanduser()),
+        labels=settings.labels,
+    )
+
+
+def free_disk_mb(folder: Path) -> int:
+    """Free space where this folder is, or will be."""
+    existing = next(parent for parent in (folder.absolute(), *folder.absolute().parents) if parent.exists())
+    return shutil.disk_usage(existing).free // MIB
+
+
+def measure_score() -> float:
+    """Speed of one core, 1 for the reference machine: the best of three short probes of plain Python."""
+    seconds = []
+    for _ in range(3):
+        started_s = time.perf_counter()
+        total = 0.0
+        for number in range(200_000):
+            total += number * 0.5
+        seconds.append(time.perf_counter() - started_s)
+    return round(REFERENCE_S / min(seconds), 2)
+
+
+def versions() -> dict[str, str]:
+    """Versions that results depend on, and the platform's fingerprint."""
+    return {
+        "embomatrix": _version_of("embomatrix"),
+        "python": platform.python_version(),
+        "pybullet": _version_of("pybullet"),
+        "numpy": np.__version__,
+        "platform": fingerprint(),
+    }
+
+
+def fingerprint() -> str:
+    """Equal on machines where equal rollouts have bit-equal traces: engine wheel, libm and numpy are probed."""
+    probe = hashlib.sha256()
+    probe.update(f"{platform.machine()} {_version_of('pybullet')} {np.__version__}".encode())
+    for number in (0.1, 0.7, 1.3, 2.9, 1e5):
+        values = (math.sin(number), math.cos(number), math.atan2(number, 3.0), math.exp(-number), number**0.3)
+        probe.update(" ".join(value.hex() for value in values).encode())
+    ramp = np.linspace(0.0, 3.0, 257)
+    probe.update(np.sin(ramp).tobytes())
+    probe.update(np.float64(np.sqrt(ramp).sum()).tobytes())
+    probe.update((ramp[:256].reshape(16, 16) @ ramp[1:].reshape(16, 16)).tobytes())
+    return probe.hexdigest()[:16]
+
+
+def _version_of(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return ""

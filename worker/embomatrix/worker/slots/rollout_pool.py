@@ -1,0 +1,99 @@
+"""Rollouts in processes of this machine, without a cluster: a scene at a time, with the code that workers run.
+
+Processes are spawned, never forked: the parent may hold threads. One that dies takes its scene's rollouts along; that scene is
+tried once more by itself, and then given up.
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import functools
+from concurrent.futures.process import BrokenProcessPool
+from typing import TYPE_CHECKING
+
+from embomatrix.rpc.wire.values import InfraCode, InfraFailure
+from embomatrix.sim.bullet.client import ClientPool
+from embomatrix.sim.engine import EngineError, EngineMissingError
+from embomatrix.sim.process_pool import process_pool
+from embomatrix.worker.slots.physics import CLIENTS_PER_SCENE, PhysicsScene
+from embomatrix.world.dataset import Dataset, DatasetError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from pathlib import Path
+
+    from embomatrix.rpc.wire.values import Outcome, Rollout
+
+    OnResult = Callable[[str, Outcome], None]
+    Results = list[tuple[str, Outcome]]
+    Waiting = dict[concurrent.futures.Future[Results], list[Rollout]]
+
+
+class RolloutPool:
+    """Executes rollouts in the bundles of a dataset's folder."""
+
+    def __init__(self, folder: Path, processes: int) -> None:
+        self._folder = folder
+        self._processes = processes
+
+    def execute(self, rollouts: Sequence[Rollout], on_result: OnResult) -> None:
+        """Execute each once; ``on_result`` gets a rollout's id and its outcome, scene by scene in the order of their end.
+
+        Raises EngineMissingError.
+        """
+        scenes: dict[str, list[Rollout]] = {}
+        for rollout in rollouts:
+            scenes.setdefault(rollout.bundle_digest, []).append(rollout)
+        broken = self._run(list(scenes.values()), min(self._processes, len(scenes)), on_result)
+        for scene in broken:
+            if self._run([scene], 1, on_result):
+                for rollout in scene:
+                    on_result(
+                        rollout.rollout_id, _failure(InfraCode.SLOT_CRASHED, "the simulator died, twice")
+                    )
+
+    def _run(
+        self, scenes: Sequence[list[Rollout]], processes: int, on_result: OnResult
+    ) -> list[list[Rollout]]:
+        """Execute scenes; returns those whose process died, or that waited behind it."""
+        broken: list[list[Rollout]] = []
+        with process_pool(processes) as pool:
+            waiting: Waiting = {pool.submit(execute_scene, self._folder, scene): scene for scene in scenes}
+            for future in concurrent.futures.as_completed(waiting):
+                try:
+                    results = future.result()
+                except BrokenProcessPool:
+                    broken.append(waiting[future])
+                    continue
+                for rollout_id, outcome in results:
+                    on_result(rollout_id, outcome)
+        return broken
+
+
+def execute_scene(folder: Path, rollouts: Sequence[Rollout]) -> Results:
+    """Execute rollouts of one bundle in this process; a scene that can't be loaded is the outcome of each of them.
+
+    Raises EngineMissingError where there is no physics engine.
+    """
+    try:
+        bundle = Dataset(folder, ()).read_bundle(rollouts[0].bundle_digest)
+        scene = PhysicsScene(bundle, _clients())
+    except EngineMissingError:
+        raise
+    except (DatasetError, EngineError) as error:
+        failure = _failure(InfraCode.SCENE_LOAD_FAILED, str(error))
+        return [(rollout.rollout_id, failure) for rollout in rollouts]
+    try:
+        return [(rollout.rollout_id, scene.execute(rollout)) for rollout in rollouts]
+    finally:
+        scene.close()
+
+
+@functools.cache
+def _clients() -> ClientPool:
+    """Of this process, for one scene after another."""
+    return ClientPool(spare=CLIENTS_PER_SCENE)
+
+
+def _failure(code: InfraCode, message: str) -> InfraFailure:
+    return InfraFailure(code, message)

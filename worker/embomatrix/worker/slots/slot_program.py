@@ -1,0 +1,169 @@
+"""What runs in the simulator's processes: a root that imported the engine, forks of it that hold one scene each, and
+forks of those, the slots, that execute rollouts.
+
+``embomatrix.worker.slots.physics`` runs it with the real engine. It imports neither gRPC nor anything else that starts
+threads: a thread does not survive a fork, but the locks that it held do.
+"""
+
+from __future__ import annotations
+
+import functools
+import gc
+import itertools
+import select
+import signal
+import socket
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Protocol
+
+from embomatrix.host.parent import die_with_parent
+from embomatrix.proto.v1 import types_pb2
+from embomatrix.reward.settings import PAPER, RewardSettings
+from embomatrix.rpc.wire.outcome import completed_to_proto
+from embomatrix.rpc.wire.rollout import rollout_from_proto
+from embomatrix.rpc.wire.values import InfraCode
+from embomatrix.sim.zygote import (
+    Frame,
+    give_back_memory,
+    limit_memory,
+    private_mb,
+    receive,
+    resident_mb,
+    send,
+    serve_forks,
+    take_small_pages,
+)
+from embomatrix.worker.slots.progress import ProgressBoard
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping
+
+    from embomatrix.rpc.wire.values import Completed, Rollout
+
+MAX_ERROR_CHARS: Final = 500
+IDLE_S: Final = 0.1
+"""A slot that waits this long for its next rollout gives free memory back, which takes some milliseconds."""
+
+COLLECT_EVERY: Final = 32
+"""Rollouts between two collections of garbage in a slot that never waits."""
+
+
+class LoadedScene(Protocol):
+    """A scene in memory, ready to execute plans. It leaves nothing behind from one rollout to the next."""
+
+    def execute(self, rollout: Rollout, on_step: Callable[[int], None], reward: RewardSettings) -> Completed:
+        """Execute the plan and score it; ``on_step`` is told after each step how many are done."""
+
+    def complete(self) -> Iterator[None]:
+        """Steps of a millisecond or two that make later executions faster and change nothing else."""
+
+
+class Simulation(Protocol):
+    """Where scenes come from: the physics engine, or a test's stand-in."""
+
+    def prepare(self) -> None:
+        """Import and connect whatever every scene needs, before the first fork."""
+
+    def load(self, path: Path, digest: str) -> LoadedScene:
+        """Load the bundle in this file. Raises BundleCorruptError when the content is not what the digest says."""
+
+
+class BundleCorruptError(Exception):
+    """The bundle's content is damaged: fetch it again."""
+
+
+def run_program(simulation: Simulation) -> None:
+    """Serve as root until the daemon goes away.
+
+    Arguments: the control socket's descriptor, the daemon's process id, and the descriptor of a board of progress, if
+    anybody reads one.
+    """
+    die_with_parent(int(sys.argv[2]))
+    # Ctrl-C is for the daemon: it drains first, and ends this process when it is done.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    control = socket.socket(fileno=int(sys.argv[1]))
+    board = ProgressBoard(int(sys.argv[3])) if len(sys.argv) > 3 else ProgressBoard.create(0)
+    try:
+        simulation.prepare()
+    except Exception as error:  # noqa: BLE001  # the daemon tells the person
+        send(control, Frame(_failure(InfraCode.SCENE_LOAD_FAILED, error)))
+        return
+    send(control, Frame({"memory_mb": private_mb()}))
+    gc.collect()
+    serve_forks(control, lambda connection: _hold_scene(simulation, connection, board))
+
+
+def _hold_scene(simulation: Simulation, connection: socket.socket, board: ProgressBoard) -> None:
+    """Load the scene that the first frame names, then fork slots from it. It executes nothing itself: it stays pristine."""
+    request = receive(connection)
+    if request is None:
+        return
+    # A scene is a hundred thousand objects and no garbage: looking through them again and again would cost half of loading.
+    gc.disable()
+    started_s, core_s = time.perf_counter(), time.thread_time()
+    try:
+        scene = simulation.load(Path(request.header["path"]), request.header["digest"])
+    except BundleCorruptError as error:
+        send(connection, Frame(_failure(InfraCode.BUNDLE_CORRUPT, error)))
+        return
+    except Exception as error:  # noqa: BLE001  # a scene that can't be loaded is a result
+        send(connection, Frame(_failure(InfraCode.SCENE_LOAD_FAILED, error)))
+        return
+    load_s, cpu_s = time.perf_counter() - started_s, time.thread_time() - core_s
+    send(connection, Frame({"load_s": load_s, "cpu_s": cpu_s, "memory_mb": private_mb()}))
+    memory_mb = int(request.header["slot_memory_mb"])
+    gc.enable()
+    serve_forks(connection, lambda slot: _run_slot(scene, slot, memory_mb, board), scene.complete())
+
+
+def _run_slot(scene: LoadedScene, connection: socket.socket, memory_mb: int, board: ProgressBoard) -> None:
+    """Execute rollouts, one after another, until the daemon closes the stream or one fails.
+
+    The next ones may lie in the stream already: what an exception left behind in this process must not execute them.
+    """
+    limit_memory(memory_mb)
+    take_small_pages()
+    # A rollout leaves few cycles behind: they are looked for between rollouts, not many times within each.
+    gc.disable()
+    for number in itertools.count(1):
+        if number % COLLECT_EVERY == 0:
+            gc.collect()
+        if not select.select([connection], [], [], IDLE_S)[0]:
+            gc.collect()
+            give_back_memory()
+        request = receive(connection)
+        if request is None:
+            return
+        on_step = functools.partial(board.set, int(request.header.get("slot", 0)))
+        on_step(0)
+        answer = _answer(scene, request, on_step)
+        send(connection, answer)
+        if "error" in answer.header:
+            return
+
+
+def _answer(scene: LoadedScene, request: Frame, on_step: Callable[[int], None]) -> Frame:
+    started_s, core_s = time.perf_counter(), time.thread_time()
+    try:
+        own = request.header.get("reward")
+        reward = PAPER if own is None else RewardSettings(**own)
+        rollout = rollout_from_proto(types_pb2.Rollout.FromString(request.body))
+        completed = scene.execute(rollout, on_step, reward)
+        result = completed_to_proto(completed).SerializeToString()
+    except MemoryError as error:
+        return Frame(_failure(InfraCode.SLOT_OOM, error))
+    except Exception as error:  # noqa: BLE001  # a defect is a failure of the infrastructure, never a reward
+        return Frame(_failure(InfraCode.SLOT_CRASHED, error))
+    header = {
+        "execute_s": time.perf_counter() - started_s,
+        "cpu_s": time.thread_time() - core_s,
+        "resident_mb": resident_mb(),
+    }
+    return Frame(header, result)
+
+
+def _failure(code: InfraCode, error: Exception) -> Mapping[str, Any]:
+    text = f"{type(error).__name__}: {error}"
+    return {"code": code.value, "error": text[:MAX_ERROR_CHARS]}
