@@ -14,7 +14,7 @@ from embomatrix.rpc.status import InvalidRequestError
 from embomatrix.rpc.wire.values import Batch, Completed, Rollout
 from embomatrix.skills.parse import plan_from_json
 from embomatrix.trainer.policy.choice import new_policy
-from embomatrix.trainer.run.checkpoint import CheckpointStore, Progress
+from embomatrix.trainer.run.checkpoint import CheckpointStore, TrainingProgress
 from embomatrix.trainer.run.data import load_tasks
 from embomatrix.trainer.run.settings import read_settings
 from embomatrix.world.dataset import Dataset
@@ -64,7 +64,7 @@ def checkpoint(kitchen, tmp_path_factory):
     settings = read_settings(None, {"tiny.layers": 1, "tiny.width": 16, "tiny.heads": 1, "tiny.inner": 16})
     policy = new_policy(settings, load_tasks(kitchen))
     store = CheckpointStore(tmp_path_factory.mktemp("run") / "checkpoints", keep=1)
-    return store.save(policy, {}, Progress(), settings)
+    return store.save(policy, {}, TrainingProgress(), settings)
 
 
 @pytest.mark.parametrize(

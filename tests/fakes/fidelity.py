@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 
     from embomatrix.sim.live_world import LiveWorld
     from embomatrix.skills.syntax import SkillCall
-    from embomatrix.skills.view import Refusal
+    from embomatrix.skills.view import SkillRefusal
     from embomatrix.world.bundle import Bundle
 
 
 class ClumsyActor(CachedActor):
     """Never gets a switch pressed."""
 
-    def act(self, world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+    def act(self, world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
         if call.skill is Skill.TOGGLE_ON:
             target = target_of(world, call)
             return refuse(FailureReason.ARM_BLOCKED, target=target, other=target)
@@ -36,7 +36,7 @@ class ClumsyActor(CachedActor):
 class SloppyActor(CachedActor):
     """Places things as it should, after which they lie in the far corner of the kitchen."""
 
-    def act(self, world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+    def act(self, world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
         held = world.carried[:1]
         refusal = super().act(world, call, rng)
         if call.skill is Skill.PLACE and refusal is None:
@@ -47,7 +47,7 @@ class SloppyActor(CachedActor):
 class DyingActor(CachedActor):
     """Takes the process with it when it opens something."""
 
-    def act(self, world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+    def act(self, world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
         if call.skill is Skill.OPEN:
             os._exit(7)
         return super().act(world, call, rng)
@@ -56,7 +56,7 @@ class DyingActor(CachedActor):
 class HangingActor(CachedActor):
     """Never comes back from opening something."""
 
-    def act(self, world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+    def act(self, world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
         if call.skill is Skill.OPEN:
             time.sleep(600.0)
         return super().act(world, call, rng)
@@ -65,7 +65,7 @@ class HangingActor(CachedActor):
 class RaisingActor(CachedActor):
     """Breaks down with an error when it opens something."""
 
-    def act(self, world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+    def act(self, world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
         if call.skill is Skill.OPEN:
             raise ArithmeticError("the door is not a number")
         return super().act(world, call, rng)

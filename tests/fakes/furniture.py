@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 from embomatrix.world.asset import Asset, Interior, Joint, JointKind, Link, SupportSurface
-from embomatrix.world.geometry import Part, Pose, Shape
+from embomatrix.world.geometry import ConvexPart, Pose, Shape
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -19,15 +19,15 @@ FOOD = {"cookable": {"cook_temperature": 70.0}, "freezable": {}, "heatable": {}}
 """Abilities of what can be cooked, frozen and heated, with BEHAVIOR-1K's parameters."""
 
 
-def box(center: Vec3, size: Vec3) -> Part:
-    return Part(Shape.BOX, Pose(center), size)
+def box(center: Vec3, size: Vec3) -> ConvexPart:
+    return ConvexPart(Shape.BOX, Pose(center), size)
 
 
 def asset(
     category: str,
     synset: str,
     size: Vec3,
-    parts: Sequence[Part],
+    parts: Sequence[ConvexPart],
     *,
     mass_kg: float = 20.0,
     links: Sequence[Link] = (),
@@ -180,7 +180,7 @@ def tub(
 
 
 def apple() -> Asset:
-    ball = Part(Shape.SPHERE, Pose((0, 0, 0)), (0.08, 0.08, 0.08))
+    ball = ConvexPart(Shape.SPHERE, Pose((0, 0, 0)), (0.08, 0.08, 0.08))
     return asset("apple", "apple.n.01", (0.08, 0.08, 0.08), [ball], mass_kg=0.2, abilities=FOOD)
 
 
@@ -189,7 +189,7 @@ def chicken_leg() -> Asset:
     size = (0.14, 0.06, 0.05)
     rings = ((-0.025, 0.8), (0.0, 1.0), (0.025, 0.8))
     vertices = tuple((sx * 0.07 * k, sy * 0.03 * k, z) for z, k in rings for sx in (-1, 1) for sy in (-1, 1))
-    hull = Part(Shape.HULL, Pose((0, 0, 0)), size, vertices)
+    hull = ConvexPart(Shape.HULL, Pose((0, 0, 0)), size, vertices)
     return asset("chicken_leg", "chicken_leg.n.01", size, [hull], mass_kg=0.15, abilities=FOOD)
 
 
@@ -199,7 +199,7 @@ def mug() -> Asset:
         "mug",
         "mug.n.04",
         size,
-        [Part(Shape.CYLINDER, Pose((0, 0, 0)), size)],
+        [ConvexPart(Shape.CYLINDER, Pose((0, 0, 0)), size)],
         mass_kg=0.3,
         abilities={"heatable": {}},
     )
@@ -207,9 +207,9 @@ def mug() -> Asset:
 
 def table_lamp() -> Asset:
     parts = [
-        Part(Shape.CYLINDER, Pose((0, 0, -0.19)), (0.16, 0.16, 0.02)),
-        Part(Shape.CYLINDER, Pose((0, 0, -0.05)), (0.02, 0.02, 0.26)),
-        Part(Shape.CYLINDER, Pose((0, 0, 0.14)), (0.2, 0.2, 0.12)),
+        ConvexPart(Shape.CYLINDER, Pose((0, 0, -0.19)), (0.16, 0.16, 0.02)),
+        ConvexPart(Shape.CYLINDER, Pose((0, 0, -0.05)), (0.02, 0.02, 0.26)),
+        ConvexPart(Shape.CYLINDER, Pose((0, 0, 0.14)), (0.2, 0.2, 0.12)),
     ]
     toggle = {"toggleable": {"requires_closed": 0.0}}
     return asset("table_lamp", "table_lamp.n.01", (0.2, 0.2, 0.4), parts, mass_kg=1.5, abilities=toggle)

@@ -12,7 +12,7 @@ from embomatrix.manager.access.folder import AccessFolder, prepare
 from embomatrix.manager.runtime.app import running
 from embomatrix.manager.settings import ManagerSettings
 from embomatrix.rpc.client import ClusterClient
-from embomatrix.rpc.roles import Role
+from embomatrix.rpc.roles import AccessRole
 from embomatrix.rpc.token_client import TokenClient
 from embomatrix.rpc.wire.values import Batch, Rollout
 from embomatrix.world.inflation import bundle_digest
@@ -31,7 +31,7 @@ class Guarded:
         return self.folder.token(role).read_text().strip()
 
     def operator(self):
-        return TokenClient(self.address, self.token(Role.ADMIN), ca=self.ca)
+        return TokenClient(self.address, self.token(AccessRole.ADMIN), ca=self.ca)
 
     async def issue(self, role, **options):
         async with self.operator() as operator:
@@ -41,7 +41,7 @@ class Guarded:
 @contextlib.asynccontextmanager
 async def guarded(data_dir: Path, **changes):
     """Prepared once for the folder, and served as often as one likes; other options are those of the manager."""
-    prepare(data_dir, sans=("127.0.0.1",), roles=tuple(Role))
+    prepare(data_dir, sans=("127.0.0.1",), roles=tuple(AccessRole))
     folder = AccessFolder(data_dir)
     options = {
         "port": 0,
@@ -77,7 +77,7 @@ async def until(condition, within_s=10.0):
 
 @contextlib.asynccontextmanager
 async def trainer(at):
-    async with ClusterClient(at.address, at.token(Role.TRAINER), ca=at.ca) as client:
+    async with ClusterClient(at.address, at.token(AccessRole.TRAINER), ca=at.ca) as client:
         await client.open_run("test", "r1")
         await client.put_bundles({KITCHEN: KITCHEN_DATA, BEDROOM: BEDROOM_DATA})
         yield client
@@ -89,7 +89,7 @@ def worker(at, name, **options):
 
 async def joined(at, name, **options):
     """A worker that joined with a token of its own."""
-    return worker(at, name, join_token=await at.issue(Role.JOIN), **options)
+    return worker(at, name, join_token=await at.issue(AccessRole.JOIN), **options)
 
 
 async def collect(client, count):

@@ -9,7 +9,7 @@ from tests.fakes import furniture as make
 from tests.fakes.plans import with_objects
 from tests.fakes.scenes import kitchen_scene, placed, upright
 
-from embomatrix.world.geometry import Part, Pose, Shape
+from embomatrix.world.geometry import ConvexPart, Pose, Shape
 from embomatrix.world.state import Relation, State, SubstanceFact, SubstanceRelation
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ def half_melon() -> Asset:
 
 
 def loaf() -> Asset:
-    ball = Part(Shape.BOX, Pose((0, 0, 0)), (0.18, 0.08, 0.08))
+    ball = ConvexPart(Shape.BOX, Pose((0, 0, 0)), (0.18, 0.08, 0.08))
     return make.asset(
         "loaf",
         "loaf_of_bread.n.01",

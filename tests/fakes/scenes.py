@@ -21,7 +21,7 @@ from embomatrix.world.task import Task, TaskCategory
 
 if TYPE_CHECKING:
     from embomatrix.world.asset import Asset
-    from embomatrix.world.geometry import Part
+    from embomatrix.world.geometry import ConvexPart
 
 WALL_HEIGHT_M = 2.4
 WALL_M = 0.1
@@ -30,7 +30,7 @@ SOUTH, WEST, NORTH = -math.pi / 2, math.pi, math.pi / 2
 """Yaws of furniture whose front looks there."""
 
 
-def walls() -> tuple[Part, ...]:
+def walls() -> tuple[ConvexPart, ...]:
     """Four outer walls, and one between the rooms with a doorway 0.9 m wide."""
     z, h, t = WALL_HEIGHT_M / 2, WALL_HEIGHT_M, WALL_M
     side = (4.0 - DOOR_M) / 2

@@ -13,7 +13,7 @@ from tests.fakes.scenes import kitchen_scene
 
 from embomatrix.factory.social.facts import facts_of
 from embomatrix.factory.social.model_agents import ModelAgents
-from embomatrix.factory.social.values import ROBOT, Act, Cast, Conversation, DaySlot, Person, Turn
+from embomatrix.factory.social.values import ROBOT, Act, Cast, Conversation, DaySlot, DialogueTurn, Person
 from embomatrix.factory.writer.view import SceneView
 from embomatrix.llm.cassette import Cassette, CassetteMode
 from embomatrix.llm.endpoint import Endpoint, EndpointLimits
@@ -35,10 +35,10 @@ CAST = Cast(
 TALK = Conversation(
     slot=SLOT,
     turns=(
-        Turn(speaker="Ann", act=Act.NEED, text="The apple is lying about on the table."),
-        Turn(speaker=ROBOT, act=Act.CLARIFY, text="Where shall it go?"),
-        Turn(speaker="Ann", act=Act.ANSWER, text="Into the fridge, please."),
-        Turn(speaker=ROBOT, act=Act.CONFIRM, text="Then I will put the apple in the fridge."),
+        DialogueTurn(speaker="Ann", act=Act.NEED, text="The apple is lying about on the table."),
+        DialogueTurn(speaker=ROBOT, act=Act.CLARIFY, text="Where shall it go?"),
+        DialogueTurn(speaker="Ann", act=Act.ANSWER, text="Into the fridge, please."),
+        DialogueTurn(speaker=ROBOT, act=Act.CONFIRM, text="Then I will put the apple in the fridge."),
     ),
     first_wish="put the apple in the fridge",
     last_wishes=("put the apple in the fridge",),

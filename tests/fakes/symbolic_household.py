@@ -23,7 +23,7 @@ from embomatrix.rpc.wire.values import (
     Timings,
 )
 from embomatrix.skills.failure import FailureReason
-from embomatrix.skills.prompt import Row, Situation
+from embomatrix.skills.prompt import PromptRow, Situation
 from embomatrix.skills.syntax import PlaceRelation, Skill, SkillCall
 from embomatrix.skills.trace import Step
 from embomatrix.trainer.run.data import TaskSet, TrainingTask
@@ -111,7 +111,7 @@ class House:
             self.touched.add(row.index)
         return failure
 
-    def _act_on(self, call: SkillCall, row: Row) -> FailureReason | None:
+    def _act_on(self, call: SkillCall, row: PromptRow) -> FailureReason | None:
         at = row.index
         closable = bool({"open", "closed"} & set(row.states))
         host = self.parent.get(at, (at, None))[0]
@@ -148,7 +148,7 @@ class House:
     def _closed(self, index: int) -> bool:
         return "closed" in self.by_index[index].states and index not in self.open
 
-    def _place(self, row: Row, relation: PlaceRelation | None) -> FailureReason | None:
+    def _place(self, row: PromptRow, relation: PlaceRelation | None) -> FailureReason | None:
         if self.held < 0:
             return FailureReason.HAND_EMPTY
         fits = CONTAINERS if relation is PlaceRelation.INSIDE else SURFACES
@@ -205,14 +205,16 @@ def _pick(rng: np.random.Generator, words: tuple[str, ...] | list[str], count: i
     return [str(word) for word in rng.choice(words, size=min(count, len(words)), replace=False)]
 
 
-def _row(index: int, name: str, host: dict[str, str], room: dict[str, str], is_open: dict[str, bool]) -> Row:
+def _row(
+    index: int, name: str, host: dict[str, str], room: dict[str, str], is_open: dict[str, bool]
+) -> PromptRow:
     if name in host:
         relation = Relation.INSIDE if host[name] in CONTAINERS else Relation.ONTOP
-        return Row(index, f"{name}_1", name, room[host[name]], f"{host[name]}_1", relation)
+        return PromptRow(index, f"{name}_1", name, room[host[name]], f"{host[name]}_1", relation)
     states = (("open" if is_open[name] else "closed"),) if name in CONTAINERS else ()
     if name in SWITCHES or name in RUNNING:
         states = (*states, "off")
-    return Row(index, f"{name}_1", name, room[name], states=states, fixed=True)
+    return PromptRow(index, f"{name}_1", name, room[name], states=states, fixed=True)
 
 
 def _goal(rng, names, small, host, is_open, index):

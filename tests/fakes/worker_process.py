@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from embomatrix.rpc.wire.values import Resources
-from embomatrix.worker.host.machine import Machine, Owner
+from embomatrix.worker.host.machine import HostMachine, Owner
 from embomatrix.worker.host.preferences import Preferences
 from embomatrix.worker.host.settings import WorkerSettings
 from embomatrix.worker.link.daemon import Daemon, serve
@@ -34,7 +34,7 @@ def main():
         manager=manager, name=name, cache_dir=Path(folder), state_dir=Path(folder), preferences=wishes
     )
     resources = Resources(int(slots), int(slots), 500, versions={"platform": "fake"})
-    machine = Machine(lambda: [os.getpid()], Owner(Path(folder) / "devices", sessions=str))
+    machine = HostMachine(lambda: [os.getpid()], Owner(Path(folder) / "devices", sessions=str))
     program = (sys.executable, str(SIMULATION))
     daemon = Daemon(settings, resources, np.random.default_rng(), program=program, probe=machine)
     asyncio.run(serve(daemon, (signal.SIGTERM, signal.SIGINT)))

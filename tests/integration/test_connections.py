@@ -10,7 +10,7 @@ import pytest
 import uvicorn
 
 from embomatrix.manager.access.folder import prepare
-from embomatrix.manager.web.door import Door
+from embomatrix.manager.web.door import BoundedListener
 from embomatrix.manager.web.http_connections import BoundedConnections, connections_through
 
 pytestmark = pytest.mark.timeout(120)
@@ -27,12 +27,12 @@ class Patient(BoundedConnections):
     silent_s = 60.0
 
 
-class NarrowDoor(Door):
+class NarrowDoor(BoundedListener):
     most = MOST
     patience_s = 0.5
 
 
-class PatientDoor(Door):
+class PatientDoor(BoundedListener):
     most = MOST
     patience_s = 60.0
 

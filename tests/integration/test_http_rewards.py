@@ -11,7 +11,7 @@ from tests.integration.test_rest import http_at
 
 from embomatrix.manager.web.rewards import REWARDS, RUN_ID
 from embomatrix.rpc.reward_label import RewardLabel
-from embomatrix.rpc.roles import Role
+from embomatrix.rpc.roles import AccessRole
 from embomatrix.world.task import Profile
 
 pytestmark = pytest.mark.timeout(60)
@@ -114,10 +114,15 @@ async def test_it_takes_a_token_of_the_trainer_role(tmp_path):
             role: (
                 await http.post(REWARDS, json={}, headers={"authorization": f"Bearer {at.token(role)}"})
             ).status_code
-            for role in (Role.WORKER, Role.VIEWER, Role.TRAINER, Role.ADMIN)
+            for role in (AccessRole.WORKER, AccessRole.VIEWER, AccessRole.TRAINER, AccessRole.ADMIN)
         }
         anonymous = await http.post(REWARDS, json={})
-    assert told == {Role.WORKER: 403, Role.VIEWER: 403, Role.TRAINER: 422, Role.ADMIN: 422}
+    assert told == {
+        AccessRole.WORKER: 403,
+        AccessRole.VIEWER: 403,
+        AccessRole.TRAINER: 422,
+        AccessRole.ADMIN: 422,
+    }
     assert anonymous.status_code == 401
 
 

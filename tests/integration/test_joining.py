@@ -15,7 +15,7 @@ from tests.fakes.guarded import (
 )
 
 from embomatrix.rpc.client import ClusterClient
-from embomatrix.rpc.roles import Role
+from embomatrix.rpc.roles import AccessRole
 from embomatrix.rpc.trust import Invitation, fingerprint_of
 from embomatrix.rpc.wire.values import Resources
 from embomatrix.worker.host.settings import WorkerSettings
@@ -66,9 +66,9 @@ def daemon(membership, folder):
 async def test_a_daemon_joins_once_and_shows_its_credential_from_then_on(tmp_path):
     async with (
         guarded(tmp_path / "manager", stream_grace_s=60.0) as at,
-        ClusterClient(at.address, at.token(Role.VIEWER), ca=at.ca) as viewer,
+        ClusterClient(at.address, at.token(AccessRole.VIEWER), ca=at.ca) as viewer,
     ):
-        invitation = Invitation(at.address, await at.issue(Role.JOIN), fingerprint_of(at.ca.decode()))
+        invitation = Invitation(at.address, await at.issue(AccessRole.JOIN), fingerprint_of(at.ca.decode()))
         settings = WorkerSettings(join=str(invitation), name="spare", state_dir=tmp_path / "pc" / "state")
         for joining in (True, False):
             membership = await membership_of(settings)
@@ -95,7 +95,7 @@ async def test_a_spare_pc_joins_with_one_string_and_is_known_from_then_on(tmp_pa
     home = tmp_path / "pc"
     async with guarded(tmp_path / "manager") as at:
         ca = at.folder.ca
-        options = (f"--manager={at.address}", f"--token=@{at.folder.token(Role.ADMIN)}", f"--ca={ca}")
+        options = (f"--manager={at.address}", f"--token=@{at.folder.token(AccessRole.ADMIN)}", f"--ca={ca}")
         told = await asyncio.to_thread(
             run, "manager", "token", "issue", "--role=join", "--label=spare PC", *options
         )

@@ -9,7 +9,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from tests.fakes.worker import FakeWorker
 from tests.integration.test_manager_service import KITCHEN, batch, manager, open_run, outcomes, until
 
-from embomatrix.rpc.run_log import Phase
+from embomatrix.rpc.run_log import RolloutPhase
 from embomatrix.rpc.wire.values import Batch, LookaheadEntry, Warmth
 
 pytestmark = pytest.mark.timeout(60)
@@ -55,7 +55,7 @@ async def test_metrics_of_a_manager_under_load_add_up(tmp_path):
     assert after["embo_slots", ("state", "warm")] == 4
     assert after["embo_rollouts_total", ("outcome", "completed")] == 200
     assert after["embo_rollouts_total", ("outcome", "slot_crashed")] == 1
-    for phase in Phase:
+    for phase in RolloutPhase:
         assert after["embo_rollout_seconds_count", ("phase", phase.value)] == 200
     assert after["embo_rollout_seconds_sum", ("phase", "execute")] == pytest.approx(0.2)
     assert after["embo_attempts_bucket", ("le", "1")] == 200

@@ -5,7 +5,7 @@ from tests.fakes.worker import FakeWorker
 from tests.integration.test_manager_service import KITCHEN, batch, manager, open_run, outcomes, until
 
 from embomatrix.rpc.admin import AdminClient
-from embomatrix.rpc.run_log import EventKind, Phase
+from embomatrix.rpc.run_log import EventKind, RolloutPhase
 from embomatrix.rpc.status import NotFoundError
 from embomatrix.rpc.wire.values import Batch, LookaheadEntry
 
@@ -21,11 +21,11 @@ async def test_every_phase_of_every_rollout_is_timed_and_nothing_is_counted_twic
     assert all(
         timing.execute_s == 0.001 and timing.deliver_s > 0 and timing.lease_s >= 0 for timing in timings
     )
-    assert {phase: found.count for phase, found in summary.phases.items()} == dict.fromkeys(Phase, 40)
+    assert {phase: found.count for phase, found in summary.phases.items()} == dict.fromkeys(RolloutPhase, 40)
     sums = {phase: found.sum_s for phase, found in summary.phases.items()}
-    assert sums[Phase.QUEUE] == pytest.approx(sum(timing.queued_s for timing in timings))
-    assert sums[Phase.LEASE] == pytest.approx(sum(timing.lease_s for timing in timings))
-    assert sums[Phase.DELIVER] == pytest.approx(sum(timing.deliver_s for timing in timings))
+    assert sums[RolloutPhase.QUEUE] == pytest.approx(sum(timing.queued_s for timing in timings))
+    assert sums[RolloutPhase.LEASE] == pytest.approx(sum(timing.lease_s for timing in timings))
+    assert sums[RolloutPhase.DELIVER] == pytest.approx(sum(timing.deliver_s for timing in timings))
 
 
 async def test_the_log_has_each_lease_and_its_end_in_order(tmp_path):

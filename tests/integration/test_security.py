@@ -23,7 +23,7 @@ from tests.fakes.worker import completed
 from embomatrix.proto.v1 import admin_service_pb2, rollout_service_pb2, types_pb2, worker_service_pb2
 from embomatrix.rpc.client import ClientLimits, ClusterClient
 from embomatrix.rpc.leases import LeaseRef, LeaseResult
-from embomatrix.rpc.roles import Role
+from embomatrix.rpc.roles import AccessRole
 from embomatrix.rpc.status import (
     ERROR_KEY,
     InvalidRequestError,
@@ -98,10 +98,10 @@ def long_plan(size):
 
 async def grpc_cases(at, victim, other):
     """(what is tried, the documented status, what it answered)."""
-    viewer, trainer_token = at.token(Role.VIEWER), at.token(Role.TRAINER)
-    expired = await at.issue(Role.TRAINER, valid_s=0.05)
-    late_join = await at.issue(Role.JOIN, valid_s=0.05)
-    revoked = await at.issue(Role.TRAINER)
+    viewer, trainer_token = at.token(AccessRole.VIEWER), at.token(AccessRole.TRAINER)
+    expired = await at.issue(AccessRole.TRAINER, valid_s=0.05)
+    late_join = await at.issue(AccessRole.JOIN, valid_s=0.05)
+    revoked = await at.issue(AccessRole.TRAINER)
     async with at.operator() as operator:
         await operator.revoke(revoked.partition(".")[0])
     await asyncio.sleep(0.06)
@@ -162,7 +162,7 @@ async def grpc_cases(at, victim, other):
             "another's name, joining",
             "PERMISSION_DENIED",
             "WorkerService.Register",
-            register("victim", join_token=await at.issue(Role.JOIN)),
+            register("victim", join_token=await at.issue(AccessRole.JOIN)),
             "",
             False,
         ),
@@ -244,7 +244,7 @@ async def bundle_cases(at):
         ("a bundle of 9 MiB", zlib.compress(os.urandom(9 * MIB), level=0)),
         ("noise for a bundle", os.urandom(1000)),
     ]
-    async with ClusterClient(at.address, at.token(Role.TRAINER), ca=at.ca) as client:
+    async with ClusterClient(at.address, at.token(AccessRole.TRAINER), ca=at.ca) as client:
         for what, data in tries:
             with pytest.raises(InvalidRequestError) as caught:
                 await client.put_bundles({bundle_digest(data): data})
@@ -262,22 +262,22 @@ async def http_cases(at):
     tries = [
         ("GET figures, no token", 401, "GET", "/api/v1/workers", {}),
         ("GET metrics, no token", 401, "GET", "/metrics", {}),
-        ("GET figures, a worker's token", 403, "GET", "/api/v1/workers", bearer(Role.WORKER)),
+        ("GET figures, a worker's token", 403, "GET", "/api/v1/workers", bearer(AccessRole.WORKER)),
         ("DELETE, no token", 401, "DELETE", "/api/v1/workers/victim", {}),
-        ("DELETE, a viewer", 403, "DELETE", "/api/v1/workers/victim", bearer(Role.VIEWER)),
+        ("DELETE, a viewer", 403, "DELETE", "/api/v1/workers/victim", bearer(AccessRole.VIEWER)),
         (
             "DELETE from another origin",
             403,
             "DELETE",
             "/api/v1/workers/victim",
-            {**bearer(Role.ADMIN), "origin": "https://evil.example"},
+            {**bearer(AccessRole.ADMIN), "origin": "https://evil.example"},
         ),
         (
             "DELETE by a form elsewhere",
             403,
             "DELETE",
             "/api/v1/workers/victim",
-            {**bearer(Role.ADMIN), "sec-fetch-site": "cross-site"},
+            {**bearer(AccessRole.ADMIN), "sec-fetch-site": "cross-site"},
         ),
         ("a foreign name (rebinding)", 400, "GET", "/", {"host": "evil.example"}),
     ]
@@ -286,7 +286,7 @@ async def http_cases(at):
         for what, status, method, path, headers in tries:
             answer = await http.request(method, path, headers=headers)
             yield what, str(status), (str(answer.status_code), answer.text, True)
-        assert (await http.get("/api/v1/workers", headers=bearer(Role.VIEWER))).status_code == 200
+        assert (await http.get("/api/v1/workers", headers=bearer(AccessRole.VIEWER))).status_code == 200
         assert (await http.get("/")).status_code == 200
 
 
@@ -328,7 +328,7 @@ async def test_who_does_not_trust_the_manager_says_nothing_to_it(tmp_path):
     async with guarded(tmp_path / "one") as at, guarded(tmp_path / "two") as elsewhere:
         quick = ClientLimits(call_s=5.0)
         for ca, sentence in ((b"", "pass --ca"), (elsewhere.ca, "not signed by the authority in --ca")):
-            async with ClusterClient(at.address, at.token(Role.VIEWER), ca=ca, limits=quick) as client:
+            async with ClusterClient(at.address, at.token(AccessRole.VIEWER), ca=ca, limits=quick) as client:
                 with pytest.raises(ManagerUnreachableError, match=sentence):
                     await client.list_workers()
 

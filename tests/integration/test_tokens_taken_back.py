@@ -23,7 +23,7 @@ from embomatrix.cli.local_cluster import free_port
 from embomatrix.manager.runtime.app import running
 from embomatrix.manager.settings import ManagerSettings
 from embomatrix.rpc.client import ClusterClient
-from embomatrix.rpc.roles import Role
+from embomatrix.rpc.roles import AccessRole
 from embomatrix.rpc.status import (
     NotFoundError,
     NotSignedInError,
@@ -70,7 +70,7 @@ async def test_a_name_that_nobody_knows_is_not_revoked_and_those_that_are_there_
 
 async def test_a_worker_whose_token_is_revoked_ends_as_well(tmp_path):
     async with guarded(tmp_path) as at:
-        fleet = await at.issue(Role.WORKER, label="the lab")
+        fleet = await at.issue(AccessRole.WORKER, label="the lab")
         async with worker(at, "pod-1", token=fleet) as pod:
             async with at.operator() as operator:
                 known = {info.token_id: info for info in await operator.listed()}
@@ -81,7 +81,7 @@ async def test_a_worker_whose_token_is_revoked_ends_as_well(tmp_path):
 
 async def test_a_trainer_whose_token_is_revoked_reads_no_further(tmp_path):
     async with guarded(tmp_path) as at, trainer(at) as client, await joined(at, "w1", execute_s=0.05):
-        token = await at.issue(Role.TRAINER)
+        token = await at.issue(AccessRole.TRAINER)
         async with ClusterClient(at.address, token, ca=at.ca) as revoked:
             stream = revoked.execute(Batch("r1", "b1", 1, rollouts(40)), deadline_s=30)
             await anext(stream)
@@ -100,7 +100,7 @@ async def test_tokens_and_credentials_outlive_the_manager_and_what_was_revoked_s
         async with first:
             await asyncio.sleep(0.05)
         async with at.operator() as operator:
-            await operator.revoke(at.token(Role.VIEWER).partition(".")[0])
+            await operator.revoke(at.token(AccessRole.VIEWER).partition(".")[0])
     async with guarded(tmp_path) as at:
         async with worker(at, "w1", token=first.token) as again:
             await asyncio.sleep(0.05)
@@ -108,7 +108,7 @@ async def test_tokens_and_credentials_outlive_the_manager_and_what_was_revoked_s
         with pytest.raises(grpc.aio.AioRpcError) as caught:
             await worker(at, "w2", join_token=first.join_token).__aenter__()
         assert "used already, by worker w1" in caught.value.details()
-        async with ClusterClient(at.address, at.token(Role.VIEWER), ca=at.ca) as client:
+        async with ClusterClient(at.address, at.token(AccessRole.VIEWER), ca=at.ca) as client:
             with pytest.raises(NotSignedInError, match="revoked"):
                 await client.list_workers()
     stored = b"".join(path.read_bytes() for path in tmp_path.glob("state.sqlite*"))
@@ -134,7 +134,7 @@ async def test_who_takes_a_cluster_over_knows_its_tokens(tmp_path):
                 over.set()
 
         async with guarded(tmp_path / "data", **options) as at:
-            given, taken = await at.issue(Role.TRAINER), await at.issue(Role.TRAINER)
+            given, taken = await at.issue(AccessRole.TRAINER), await at.issue(AccessRole.TRAINER)
             async with at.operator() as operator:
                 await operator.revoke(taken.partition(".")[0])
             async with await joined(at, "w1") as first:
@@ -161,7 +161,7 @@ async def test_one_shared_token_is_an_admins_for_everybody_beside_the_others(tmp
             assert len(await collect(client, 4)) == 4
             await client.drain_worker("w1")
         assert len(w1.executed) == 4
-        async with ClusterClient(at.address, at.token(Role.VIEWER), ca=at.ca) as client:
+        async with ClusterClient(at.address, at.token(AccessRole.VIEWER), ca=at.ca) as client:
             assert [found.worker_id for found in await client.list_workers()] == ["w1"]
 
 
@@ -169,4 +169,4 @@ async def test_an_open_manager_has_no_tokens_to_hand_out(tmp_path):
     settings = ManagerSettings(port=0, http_port=0, data_dir=tmp_path, state="memory:")
     async with running(settings) as at, TokenClient(at.address) as operator:
         with pytest.raises(PreconditionError, match="embomatrix manager init"):
-            await operator.issue(Role.TRAINER)
+            await operator.issue(AccessRole.TRAINER)

@@ -10,7 +10,7 @@ import pytest
 from embomatrix.trainer.eai.environment import install
 from embomatrix.trainer.eai.exam import NativeExam
 from embomatrix.trainer.eai.judge import NativeJudge
-from embomatrix.trainer.evaluation.answers import Answer, Setup
+from embomatrix.trainer.evaluation.answers import Answer, EvaluationSetup
 from embomatrix.trainer.evaluation.taxonomy import Cause
 
 pytestmark = [pytest.mark.eai, pytest.mark.timeout(900)]
@@ -37,7 +37,7 @@ def exam(judge):
 
 def marked(exam, texts):
     """Marks of one answer for each of these tasks."""
-    setup = Setup(exam.name, exam.digest, "all", len(texts), "me", "eai", 60, 1, 0.0, 1, 0)
+    setup = EvaluationSetup(exam.name, exam.digest, "all", len(texts), "me", "eai", 60, 1, 0.0, 1, 0)
     answers = [Answer(task_id, 0, text) for task_id, text in texts.items()]
     return exam.judge(setup, answers, lambda *_: None)
 

@@ -37,7 +37,7 @@ from embomatrix.bench.fidelity.suite import (
     DISAGREEMENTS_FILE,
     RESULTS_FILE,
     FidelitySettings,
-    Progress,
+    SuiteProgress,
     run_fidelity,
 )
 from embomatrix.bench.operations.cli import operations
@@ -252,7 +252,7 @@ def _fidelity(dataset: Dataset, settings: FidelitySettings, out: Path, jobs: int
     started_s = time.monotonic()
     fresh = not (out / RESULTS_FILE).exists()
     with errors.status("fidelity") as status:
-        progress = Progress(
+        progress = SuiteProgress(
             written=lambda done, of: status.update(f"fidelity: plans for {done} of {of} scenes"),
             executed=lambda done, of: status.update(f"fidelity: {done} of {of} plans in both modes"),
         )

@@ -30,7 +30,7 @@ from embomatrix.trainer.evaluation.answers import (
     FILE,
     MOST_SAMPLES,
     AnswerSheet,
-    Setup,
+    EvaluationSetup,
     check_asked_for,
     ordered,
     read_answers,
@@ -49,12 +49,12 @@ from embomatrix.world.whole_file import write_whole
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from embomatrix.cli.examinee import Asked
+    from embomatrix.cli.examinee import EvaluationSubject
     from embomatrix.trainer.evaluation.answers import Answer
     from embomatrix.trainer.evaluation.benchmark import Benchmark
     from embomatrix.trainer.evaluation.exam import Exam
     from embomatrix.trainer.evaluation.judging import Executor
-    from embomatrix.trainer.evaluation.table import Row
+    from embomatrix.trainer.evaluation.table import ScoreRow
 
 DEFAULT_BENCH: Final = "build/dataset"
 DEFAULT_OUT: Final = Path("runs/eval")
@@ -63,7 +63,7 @@ console = Console(highlight=False, markup=False, soft_wrap=True)
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class ExecutionTarget:
     """Where plans are executed: on a cluster if ``manager`` is given, else in ``jobs`` processes of this machine."""
 
     manager: str
@@ -172,11 +172,13 @@ def evaluate(
     with _problems_shown():
         _check((model, endpoint, baseline, answers), bench, in_part=bool(split or tasks))
         if answers is not None:
-            _judge_stored(answers, bench, out, Place(manager, token, ca, jobs), beside or [])
+            _judge_stored(answers, bench, out, ExecutionTarget(manager, token, ca, jobs), beside or [])
             return
         chosen = Chosen(model, endpoint, baseline, model_name, key, concurrent, attempts, threads, device)
         how = Questions(samples, temperature, seed, max_tokens, codec, profile)
-        with _exam(Place(manager, token, ca, jobs), bench or DEFAULT_BENCH, split, tasks, profile) as exam:
+        with _exam(
+            ExecutionTarget(manager, token, ca, jobs), bench or DEFAULT_BENCH, split, tasks, profile
+        ) as exam:
             _measure(exam, chosen, how, out, beside or [])
 
 
@@ -217,7 +219,9 @@ def _problems_shown() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _exam(place: Place, named: str, split: str, limit: int | None, profile: Profile) -> Iterator[Exam]:
+def _exam(
+    place: ExecutionTarget, named: str, split: str, limit: int | None, profile: Profile
+) -> Iterator[Exam]:
     """The benchmark of this name, ready to ask and to judge."""
     if named == NATIVE:
         from embomatrix.trainer.eai.environment import JudgeEnvironment
@@ -230,10 +234,12 @@ def _exam(place: Place, named: str, split: str, limit: int | None, profile: Prof
     yield WorldExam(bench, place.executor(bench))
 
 
-def _ask(exam: Exam, asked: Asked, how: Questions, folder: Path) -> tuple[Setup, tuple[Answer, ...]]:
+def _ask(
+    exam: Exam, asked: EvaluationSubject, how: Questions, folder: Path
+) -> tuple[EvaluationSetup, tuple[Answer, ...]]:
     """Fill the answer sheet."""
     questions = exam.questions(asked.codec, asked.rows)
-    setup = Setup(
+    setup = EvaluationSetup(
         bench=exam.name,
         bench_digest=exam.digest,
         split=exam.split,
@@ -260,7 +266,9 @@ def _ask(exam: Exam, asked: Asked, how: Questions, folder: Path) -> tuple[Setup,
     return setup, given
 
 
-def _judge_stored(path: Path, bench: str, out: Path | None, place: Place, beside: Sequence[Path]) -> None:
+def _judge_stored(
+    path: Path, bench: str, out: Path | None, place: ExecutionTarget, beside: Sequence[Path]
+) -> None:
     setup, stored = read_answers(path)
     with _exam(place, bench or setup.bench, setup.split, setup.tasks, _profile(setup, path)) as exam:
         if exam.digest != setup.bench_digest:
@@ -277,7 +285,7 @@ def _judge_stored(path: Path, bench: str, out: Path | None, place: Place, beside
         _judge(exam, setup, given, out or path.parent, [read_row(row, exam.digest) for row in beside])
 
 
-def _profile(setup: Setup, path: Path) -> Profile:
+def _profile(setup: EvaluationSetup, path: Path) -> Profile:
     if setup.profile not in set(Profile):
         raise TrainerError(
             f"{path} names the unknown profile {setup.profile!r}: expected {' or '.join(Profile)}"
@@ -285,7 +293,9 @@ def _profile(setup: Setup, path: Path) -> Profile:
     return Profile(setup.profile)
 
 
-def _judge(exam: Exam, setup: Setup, given: Sequence[Answer], folder: Path, rows: Sequence[Row]) -> None:
+def _judge(
+    exam: Exam, setup: EvaluationSetup, given: Sequence[Answer], folder: Path, rows: Sequence[ScoreRow]
+) -> None:
     began_s = time.monotonic()
     with _bar("plans judged") as report:
         marked = exam.judge(setup, given, report)

@@ -62,7 +62,7 @@ class Chosen:
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class EvaluationSubject:
     """Who is asked, and what its setup says of it."""
 
     asker: Asker
@@ -72,7 +72,7 @@ class Asked:
     max_tokens: int
 
 
-def asked_of(exam: Exam, chosen: Chosen, questions: Questions, folder: Path) -> Asked:
+def asked_of(exam: Exam, chosen: Chosen, questions: Questions, folder: Path) -> EvaluationSubject:
     """Whoever is chosen, ready to answer an exam; ``folder`` takes an endpoint's ledger. Raises TrainerError."""
     if chosen.model:
         from embomatrix.trainer.evaluation.models import load_model
@@ -83,11 +83,13 @@ def asked_of(exam: Exam, chosen: Chosen, questions: Questions, folder: Path) -> 
                 f"{chosen.model} is a word-level policy and can't read the prompts of {NATIVE}"
             )
         tokens = questions.max_tokens or loaded.max_tokens
-        return Asked(PolicyAsker(loaded.policy), chosen.model, loaded.policy.codec, loaded.rows, tokens)
+        return EvaluationSubject(
+            PolicyAsker(loaded.policy), chosen.model, loaded.policy.codec, loaded.rows, tokens
+        )
     if chosen.endpoint:
         return _endpoint(chosen, questions, folder)
     name = chosen.baseline or BaselineName.ORACLE
-    return Asked(WriterAsker(_writer(exam, name)), name.value, Codec.JSON, MAX_TABLE, 1)
+    return EvaluationSubject(WriterAsker(_writer(exam, name)), name.value, Codec.JSON, MAX_TABLE, 1)
 
 
 def _writer(exam: Exam, name: BaselineName) -> Callable[[str, np.random.Generator], str]:
@@ -104,7 +106,7 @@ def _writer(exam: Exam, name: BaselineName) -> Callable[[str, np.random.Generato
     return lambda task_id, rng: json.dumps(plan_to_json(plan(tasks[task_id], rng)))
 
 
-def _endpoint(chosen: Chosen, questions: Questions, folder: Path) -> Asked:
+def _endpoint(chosen: Chosen, questions: Questions, folder: Path) -> EvaluationSubject:
     if not chosen.model_name:
         raise TrainerError("the endpoint's model has no name: pass --model-name as the endpoint calls it")
     if questions.codec is Codec.NAMES:
@@ -117,4 +119,4 @@ def _endpoint(chosen: Chosen, questions: Questions, folder: Path) -> Asked:
     )
     tokens = questions.max_tokens or ENDPOINT_TOKENS
     asker = EndpointAsker(opened, folder / "ledger.jsonl")
-    return Asked(asker, chosen.model_name, questions.codec or Codec.JSON, MAX_TABLE, tokens)
+    return EvaluationSubject(asker, chosen.model_name, questions.codec or Codec.JSON, MAX_TABLE, tokens)

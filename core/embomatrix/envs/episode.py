@@ -32,7 +32,7 @@ SCENES_KEPT: Final = 4
 
 
 @dataclass(frozen=True, slots=True)
-class Turn:
+class EpisodeStep:
     """What one call came to. ``gain`` is what it added to the reward; ``reward`` is that of the state reached."""
 
     step: Step
@@ -70,13 +70,13 @@ class Episode:
         self._calls = 0
         self._total = 0.0
 
-    def act(self, call: SkillCall) -> Turn:
+    def act(self, call: SkillCall) -> EpisodeStep:
         """Execute one call in the state reached."""
         step = self._simulator.run_step(call)
         self._calls += 1
         reward = self._score()
         gain, self._total = reward.total - self._total, reward.total
-        return Turn(step, reward, gain, over=self._calls >= MAX_STEPS)
+        return EpisodeStep(step, reward, gain, over=self._calls >= MAX_STEPS)
 
     def prompt(self, codec: Codec = Codec.JSON) -> Prompt:
         """What a language model is told of the task at its start."""

@@ -22,7 +22,7 @@ from embomatrix.world.task import MAX_TABLE, Profile
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from embomatrix.envs.episode import Episode, Turn
+    from embomatrix.envs.episode import Episode, EpisodeStep
 
 SKILLS: Final = PROFILES[Profile.HOUSEHOLD]
 RELATIONS: Final = tuple(PlaceRelation)
@@ -144,7 +144,7 @@ def action_of(call: SkillCall, rooms: tuple[str, ...]) -> dict[str, Any]:
     }
 
 
-def told(turn: Turn) -> dict[str, Any]:
+def told(turn: EpisodeStep) -> dict[str, Any]:
     """What ``info`` says of a step."""
     reward = turn.reward
     return {

@@ -11,7 +11,7 @@ MOST_UNANSWERED: Final = 3
 """Questions in a row that nobody answers, each asked several times, after which the endpoint counts as dead."""
 
 
-class Patience:
+class FailureLimit:
     """Counts questions in a row that nobody answered."""
 
     def __init__(self, most: int = MOST_UNANSWERED) -> None:

@@ -26,7 +26,7 @@ _BRACKET: Final = re.compile(r"[{\[]")
 
 
 @dataclass(frozen=True, slots=True)
-class Answer(Generic[T]):
+class StructuredReply(Generic[T]):
     """A valid answer, and every reply on the way to it."""
 
     value: T
@@ -40,7 +40,7 @@ async def ask(
     *,
     check: Callable[[T], None] | None = None,
     attempts: int = 3,
-) -> Answer[T]:
+) -> StructuredReply[T]:
     """Ask until the answer has the shape and passes ``check``, which raises ValueError with a sentence for the model.
 
     Raises UnusableReplyError after ``attempts`` answers, EndpointError where none came.
@@ -55,7 +55,7 @@ async def ask(
             value = read_json(reply.text, shape)
             if check is not None:
                 check(value)
-            return Answer(value, tuple(replies))
+            return StructuredReply(value, tuple(replies))
         except ValueError as error:
             problem = str(error)
         if reply.finish == "length":

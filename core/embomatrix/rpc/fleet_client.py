@@ -12,7 +12,7 @@ from embomatrix.rpc.managers import PATIENCE_S, of_the_leader
 from embomatrix.rpc.status import cluster_errors
 from embomatrix.rpc.wire.rollout import each
 from embomatrix.rpc.wire.session import run_info_from_proto, worker_info_from_proto
-from embomatrix.rpc.wire.values import Fleet
+from embomatrix.rpc.wire.values import FleetStatus
 
 if TYPE_CHECKING:
     from embomatrix.rpc.wire.values import RunInfo, WorkerInfo
@@ -45,11 +45,13 @@ class FleetClient(LeaderClient):
         return (await self.fleet()).workers
 
     @of_the_leader
-    async def fleet(self) -> Fleet:
+    async def fleet(self) -> FleetStatus:
         """The same, and how the cluster does."""
         with cluster_errors(self._address):
             answer = await self._admin.ListWorkers(pb.ListWorkersRequest(), timeout=self._call_s)
-            return Fleet(each("workers", worker_info_from_proto, answer.workers), answer.health, answer.mood)
+            return FleetStatus(
+                each("workers", worker_info_from_proto, answer.workers), answer.health, answer.mood
+            )
 
     @of_the_leader
     async def list_runs(self, *, closed: bool = False) -> tuple[RunInfo, ...]:

@@ -23,7 +23,7 @@ PATIENCE_S: Final = 20.0
 """For another manager to take over, where several were told."""
 P = ParamSpec("P")
 T = TypeVar("T")
-C = TypeVar("C", bound="Caller")
+C = TypeVar("C", bound="ManagerClient")
 
 
 def addresses_of(text: str) -> tuple[str, ...]:
@@ -58,7 +58,7 @@ class Channels:
             await channel.close()
 
 
-class Caller(Protocol):
+class ManagerClient(Protocol):
     """A client of several managers."""
 
     @property

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 
-class Role(StrEnum):
+class AccessRole(StrEnum):
     """An admin may do everything."""
 
     JOIN = "join"
@@ -22,7 +22,7 @@ class TokenInfo:
     """A token as people see it: never the token itself."""
 
     token_id: str
-    role: Role
+    role: AccessRole
     label: str = ""
     left_s: float = 0.0
     """Seconds that it is still valid; 0: until revoked."""

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from embomatrix.rpc.wire.values import RunInfo, Timings
 
 
-class Phase(StrEnum):
+class RolloutPhase(StrEnum):
     """Where the time of a rollout goes, in the order in which it goes there."""
 
     QUEUE = "queue"
@@ -98,7 +98,7 @@ class RunSummary:
     """What a run came to. ``manager_cpu_s`` is the manager's CPU time meanwhile, for whatever run."""
 
     run: RunInfo
-    phases: Mapping[Phase, PhaseSummary]
+    phases: Mapping[RolloutPhase, PhaseSummary]
     workers: tuple[RunWorker, ...]
     series: RunSeries
     failures: tuple[RunEvent, ...]

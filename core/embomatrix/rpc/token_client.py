@@ -7,21 +7,23 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.proto.v1 import admin_service_pb2 as pb
 from embomatrix.rpc.fleet_client import FleetClient
 from embomatrix.rpc.managers import of_the_leader
-from embomatrix.rpc.roles import Role, TokenInfo
+from embomatrix.rpc.roles import AccessRole, TokenInfo
 from embomatrix.rpc.status import cluster_errors
 from embomatrix.rpc.wire.rollout import ConvertError, each, finite, required
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-_ROLES: Final[Mapping[Role, pb.Role.ValueType]] = {role: pb.Role.Value(f"ROLE_{role.name}") for role in Role}
+_ROLES: Final[Mapping[AccessRole, pb.Role.ValueType]] = {
+    role: pb.Role.Value(f"ROLE_{role.name}") for role in AccessRole
+}
 _ROLE_VALUES: Final = {number: role for role, number in _ROLES.items()}
 
 
-def role_from_proto(number: pb.Role.ValueType) -> Role:
+def role_from_proto(number: pb.Role.ValueType) -> AccessRole:
     role = _ROLE_VALUES.get(number)
     if role is None:
-        raise ConvertError("role", f"{number} is none of {', '.join(Role)}")
+        raise ConvertError("role", f"{number} is none of {', '.join(AccessRole)}")
     return role
 
 
@@ -49,7 +51,7 @@ class TokenClient(FleetClient):
     """Async context manager over channels to a cluster. Every failure is a ``ClusterError``."""
 
     @of_the_leader
-    async def issue(self, role: Role, *, valid_s: float = 0.0, label: str = "") -> tuple[str, str]:
+    async def issue(self, role: AccessRole, *, valid_s: float = 0.0, label: str = "") -> tuple[str, str]:
         """A new token and its id; the manager keeps only its hash. ``valid_s`` 0: until revoked."""
         request = pb.IssueTokenRequest(role=_ROLES[role], valid_s=valid_s, label=label)
         with cluster_errors(self._address):

@@ -24,9 +24,9 @@ if TYPE_CHECKING:
 
     from embomatrix.sim.live_world import LiveWorld
     from embomatrix.skills.syntax import SkillCall
-    from embomatrix.skills.view import Refusal
+    from embomatrix.skills.view import SkillRefusal
 
-    Action = Callable[[LiveWorld, SkillCall, np.random.Generator], Refusal | None]
+    Action = Callable[[LiveWorld, SkillCall, np.random.Generator], SkillRefusal | None]
 
 OTHER_STANDS: Final = 2
 APART_M: Final = 0.4
@@ -41,7 +41,7 @@ class CachedActor:
     def reset(self, world: LiveWorld) -> None:
         """Nothing to do: all there is, is in the world."""
 
-    def act(self, world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+    def act(self, world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
         """Carry out a call whose preconditions hold. A refusal leaves the world as it was."""
         handling = HANDLINGS.get(call.skill)
         refusal = no_way_for_arm(world, handling, target_of(world, call)) if handling is not None else None
@@ -51,7 +51,7 @@ class CachedActor:
         """Nothing to free."""
 
 
-def _move(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+def _move(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
     target = target_of(world, call)
     stand = world.navigator.nearest_stand(target, world.robot)
     if stand is None:
@@ -60,12 +60,12 @@ def _move(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusa
     return None
 
 
-def _turn(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+def _turn(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
     world.robot = StandPose(world.robot.x_m, world.robot.y_m, _heading(world, call))
     return None
 
 
-def _move_forward(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+def _move_forward(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
     heading, distance_m = _heading(world, call), call.distance or 0.0
     course = heading if distance_m >= 0 else heading + math.pi
     free_m = world.navigator.forward(world.robot, course, abs(distance_m))
@@ -82,7 +82,7 @@ def _heading(world: LiveWorld, call: SkillCall) -> float:
     return math.remainder(world.robot.yaw + math.remainder(call.yaw or 0.0, math.tau), math.tau)
 
 
-def _go_to_room(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+def _go_to_room(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
     room = call.room_name or ""
     entry = world.navigator.room_entry(room, world.robot)
     if entry is None:
@@ -91,13 +91,13 @@ def _go_to_room(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> 
     return None
 
 
-def _pick_up(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+def _pick_up(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
     world.hand.take(world.cargo(target_of(world, call)))
     world.navigator.refresh()
     return None
 
 
-def _place(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+def _place(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
     assert call.relation is not None
     target, held = target_of(world, call), world.carried[0]
     relation = Relation(call.relation.value)
@@ -127,7 +127,7 @@ def other_stands(world: LiveWorld, target: str) -> Iterator[StandPose]:
     yield from away[:OTHER_STANDS]
 
 
-def _open(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+def _open(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
     target = target_of(world, call)
     other = world.swings.open(target)
     if other:
@@ -137,7 +137,7 @@ def _open(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusa
     return None
 
 
-def _close(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+def _close(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
     target = target_of(world, call)
     before = world.engine.joints(target)
     leaves = Leaves(world.engine, world.relations, target)
@@ -150,17 +150,17 @@ def _close(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refus
     return refuse(FailureReason.DOOR_BLOCKED, target=target, other=other)
 
 
-def _toggle_on(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+def _toggle_on(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
     world.states[target_of(world, call)].add(State.TOGGLED_ON)
     return None
 
 
-def _toggle_off(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+def _toggle_off(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
     world.states[target_of(world, call)].discard(State.TOGGLED_ON)
     return None
 
 
-def _wait(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+def _wait(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
     """The source acts by itself as soon as its conditions hold: waiting changes nothing more."""
     return None
 

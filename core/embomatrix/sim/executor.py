@@ -10,7 +10,7 @@ from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.live_world import LiveWorld
 from embomatrix.sim.placing.draws import Draws
 from embomatrix.skills.check import check
-from embomatrix.skills.describe import Sight, done, final_lines, gained
+from embomatrix.skills.describe import ObjectDescription, done, final_lines, gained
 from embomatrix.skills.syntax import Skill
 from embomatrix.skills.trace import Step, Trace
 from embomatrix.skills.view import source_of, target_of
@@ -23,10 +23,10 @@ if TYPE_CHECKING:
     import numpy as np
 
     from embomatrix.sim.engine import PhysicsEngine
-    from embomatrix.sim.state.facts import SceneFacts
+    from embomatrix.sim.state.facts import EngineFacts
     from embomatrix.sim.state.thermal import Change
     from embomatrix.skills.syntax import Plan, SkillCall
-    from embomatrix.skills.view import Refusal
+    from embomatrix.skills.view import SkillRefusal
     from embomatrix.world.bundle import Bundle
     from embomatrix.world.task import Task
 
@@ -55,7 +55,7 @@ class Actor(Protocol):
     def reset(self, world: LiveWorld) -> None:
         """A rollout begins: ``world`` is at the scene's start."""
 
-    def act(self, world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+    def act(self, world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
         """Carry out a call whose preconditions hold and leave in ``world`` what became of it.
 
         None for a success, else why it failed. ``rng`` decides between outcomes that are equally good.
@@ -88,7 +88,7 @@ class Simulator:
         self._touched: set[str] = set()
 
     @property
-    def facts(self) -> SceneFacts:
+    def facts(self) -> EngineFacts:
         """Facts of the state reached, live until the next reset."""
         return self._world.facts
 
@@ -191,7 +191,7 @@ class Simulator:
             by_object.setdefault(change.name, []).append(change.words)
         return f"{sentence}; {gained(by_object)}"
 
-    def _sight(self, name: str) -> Sight:
+    def _sight(self, name: str) -> ObjectDescription:
         world = self._world
         host = world.relations.host_of(name)
         asset = world.asset(name)
@@ -204,7 +204,7 @@ class Simulator:
             states += sorted(state.value for state in symbols if state is not State.TOGGLED_ON)
         if facts := world.substances.get(name):
             states += [in_words(fact) for fact in sorted(facts)]
-        return Sight(
+        return ObjectDescription(
             name=name,
             room=world.room_of(name),
             host=host.name if host is not None else "",

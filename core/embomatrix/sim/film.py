@@ -37,7 +37,7 @@ HAND_HIGH_M: Final = 0.95
 
 
 @dataclass(frozen=True, slots=True)
-class Frame:
+class FilmFrame:
     """One moment of a film.
 
     ``poses`` and ``joints`` hold every object that is not as the scene has it at the start, ``hidden`` those out of the world.
@@ -61,7 +61,7 @@ class Film:
     task: Task
     plan: Plan
     steps: tuple[Step, ...]
-    frames: tuple[Frame, ...]
+    frames: tuple[FilmFrame, ...]
 
 
 def film_cached(simulator: Simulator, task: Task, plan: Plan, seed: int) -> Film:
@@ -83,7 +83,7 @@ def film_cached(simulator: Simulator, task: Task, plan: Plan, seed: int) -> Film
     return Film(world.scene, task, plan, tuple(steps), tuple(frames))
 
 
-def snapshot(world: LiveWorld, step: int) -> Frame:
+def snapshot(world: LiveWorld, step: int) -> FilmFrame:
     """The state of a world as a frame. What the robot holds is shown before its chest."""
     engine = world.engine
     poses: dict[str, Pose] = {}
@@ -101,7 +101,7 @@ def snapshot(world: LiveWorld, step: int) -> Frame:
     for name, offset in world.hand.offsets.items():
         poses[name] = hand_pose(world.robot) @ offset
         hidden.discard(name)
-    return Frame(world.robot, step, poses, joints, frozenset(hidden))
+    return FilmFrame(world.robot, step, poses, joints, frozenset(hidden))
 
 
 def hand_pose(robot: StandPose) -> Pose:
@@ -111,7 +111,7 @@ def hand_pose(robot: StandPose) -> Pose:
     return Pose.from_xyz_yaw(x, y, HAND_HIGH_M, robot.yaw)
 
 
-def _between(world: LiveWorld, before: Frame, after: Frame) -> Iterator[Frame]:
+def _between(world: LiveWorld, before: FilmFrame, after: FilmFrame) -> Iterator[FilmFrame]:
     """Frames that lead from one state to the next, without both ends."""
     if before.robot != after.robot:
         yield from _driving(world, before, after)
@@ -121,14 +121,14 @@ def _between(world: LiveWorld, before: Frame, after: Frame) -> Iterator[Frame]:
         yield _mixed(world.scene, before, after, number / REACH_FRAMES)
 
 
-def _driving(world: LiveWorld, before: Frame, after: Frame) -> Iterator[Frame]:
+def _driving(world: LiveWorld, before: FilmFrame, after: FilmFrame) -> Iterator[FilmFrame]:
     """The robot on its way. What it carries keeps its place before it."""
     held = {name: hand_pose(before.robot).inverse() @ before.poses[name] for name in world.carried}
     for robot in along(world.navigator.path(before.robot, after.robot), before.robot, after.robot):
         poses = dict(after.poses)
         for name, offset in held.items():
             poses[name] = hand_pose(robot) @ offset
-        yield Frame(robot, after.step, poses, after.joints, after.hidden)
+        yield FilmFrame(robot, after.step, poses, after.joints, after.hidden)
 
 
 def along(points: Sequence[tuple[float, float]], start: StandPose, end: StandPose) -> Iterator[StandPose]:
@@ -156,7 +156,7 @@ def _turning(x: float, y: float, before: float, after: float) -> Iterator[StandP
         yield StandPose(x, y, before + angle * number / count)
 
 
-def _mixed(scene: Scene, before: Frame, after: Frame, share: float) -> Frame:
+def _mixed(scene: Scene, before: FilmFrame, after: FilmFrame, share: float) -> FilmFrame:
     """A frame between two: joints and positions in proportion, headings of the latter."""
     poses: dict[str, Pose] = {}
     for name in {*before.poses, *after.poses} - after.hidden:
@@ -167,12 +167,12 @@ def _mixed(scene: Scene, before: Frame, after: Frame, share: float) -> Frame:
     for name in {*before.joints, *after.joints}:
         pairs = zip(_joints_in(scene, before, name), _joints_in(scene, after, name), strict=True)
         joints[name] = tuple(a + (b - a) * share for a, b in pairs)
-    return Frame(after.robot, after.step, poses, joints, after.hidden)
+    return FilmFrame(after.robot, after.step, poses, joints, after.hidden)
 
 
-def _pose_in(scene: Scene, frame: Frame, name: str) -> Pose:
+def _pose_in(scene: Scene, frame: FilmFrame, name: str) -> Pose:
     return frame.poses.get(name, scene.by_name[name].pose_world_asset)
 
 
-def _joints_in(scene: Scene, frame: Frame, name: str) -> tuple[float, ...]:
+def _joints_in(scene: Scene, frame: FilmFrame, name: str) -> tuple[float, ...]:
     return frame.joints.get(name, tuple(scene.by_name[name].joints))

@@ -6,10 +6,10 @@ import math
 from typing import TYPE_CHECKING
 
 from embomatrix.sim.floor.navigation import Navigator
-from embomatrix.sim.floor.prepared import Prepared
+from embomatrix.sim.floor.prepared import PreparedScene
 from embomatrix.sim.joints.swings import Swings
 from embomatrix.sim.placing.placement import Placer
-from embomatrix.sim.state.facts import SceneFacts
+from embomatrix.sim.state.facts import EngineFacts
 from embomatrix.sim.state.hand import Hand
 from embomatrix.sim.state.news import News
 from embomatrix.sim.state.relations import Relations
@@ -17,7 +17,7 @@ from embomatrix.sim.state.symbols import Symbols
 from embomatrix.sim.state.thermal import Thermal
 from embomatrix.sim.state.water import Water
 from embomatrix.skills.appliance import cold_source, heat_source
-from embomatrix.skills.view import Reach
+from embomatrix.skills.view import ObjectReach
 from embomatrix.world.state import State
 from embomatrix.world.substances import MEANINGS, facts_of
 
@@ -42,7 +42,7 @@ class LiveWorld:
         self.scene = bundle.scene
         self.engine = engine
         self.relations = Relations(engine)
-        self.navigator = Navigator(engine, self.relations, bundle.poses.stands, Prepared.of(bundle))
+        self.navigator = Navigator(engine, self.relations, bundle.poses.stands, PreparedScene.of(bundle))
         self.swings = Swings(engine, self.relations)
         self.placer = Placer(engine, self.relations, bundle.poses, self.navigator)
         self.barred = bundle.poses.barred
@@ -56,7 +56,7 @@ class LiveWorld:
         self._news = News(engine)
         self.thermal = Thermal(engine, self.relations, self.states)
         self.water = Water(engine, self.relations, self.states, self.substances)
-        self.facts = SceneFacts(self.relations, self.states, self.substances, self.absent, self._future)
+        self.facts = EngineFacts(self.relations, self.states, self.substances, self.absent, self._future)
         self.table: tuple[str, ...] = ()
         self.rooms = tuple(room.name for room in self.scene.rooms)
         self.robot = self.navigator.start
@@ -114,14 +114,14 @@ class LiveWorld:
         """The innermost closed container that the object is in, "" when there is none."""
         return next((item.name for item in self.relations.enclosing(name) if item.closed), "")
 
-    def reach(self, name: str) -> Reach:
+    def reach(self, name: str) -> ObjectReach:
         """How the robot, where it stands, reaches the object's box with doors shut. What is in the hand is at hand."""
         box = self.relations.body(name)
         if name in self.carried:
-            return Reach(0.0, box.center_m[2])
+            return ObjectReach(0.0, box.center_m[2])
         dx = max(box.low_m[0] - self.robot.x_m, self.robot.x_m - box.high_m[0], 0.0)
         dy = max(box.low_m[1] - self.robot.y_m, self.robot.y_m - box.high_m[1], 0.0)
-        return Reach(math.hypot(dx, dy), box.center_m[2])
+        return ObjectReach(math.hypot(dx, dy), box.center_m[2])
 
     def is_approachable(self, name: str) -> bool:
         """Whether no wall and nothing much taller than the object stands between the robot and it."""

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from embomatrix.world.asset import Asset, Joint, Link
-    from embomatrix.world.geometry import Part, Pose
+    from embomatrix.world.geometry import ConvexPart, Pose
     from embomatrix.world.scene import Scene, SceneObject
 
 PART_LIMIT: Final = 16
@@ -115,7 +115,7 @@ def _check_joint(joint: Joint, what: str) -> None:
         raise EngineError(f"{what} has the joint axis {joint.axis}: expected a vector of length 1")
 
 
-def _check_part(part: Part, what: str) -> None:
+def _check_part(part: ConvexPart, what: str) -> None:
     check_pose(part.pose, what)
     if not all(MIN_EXTENT_M <= extent <= WORLD_LIMIT_M for extent in part.size_m):
         raise EngineError(

@@ -40,7 +40,7 @@ class FrameError(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Frame:
+class PipeMessage:
     """One message between processes: a JSON header, and bytes that the header says how to read."""
 
     header: Mapping[str, Any]
@@ -49,7 +49,7 @@ class Frame:
     """File descriptors that came along; the receiver owns them."""
 
 
-def pack(frame: Frame) -> bytes:
+def pack(frame: PipeMessage) -> bytes:
     """The frame as bytes: two lengths, header, body. File descriptors travel beside it, with its first byte."""
     header = _written(frame.header).encode()
     return _PREFIX.pack(len(header), len(frame.body)) + header + frame.body
@@ -63,7 +63,7 @@ def frame_lengths(prefix: bytes) -> tuple[int, int]:
     return header_bytes, body_bytes
 
 
-def unpack(content: bytes, header_bytes: int, fds: tuple[int, ...] = ()) -> Frame:
+def unpack(content: bytes, header_bytes: int, fds: tuple[int, ...] = ()) -> PipeMessage:
     """The frame whose header is the first ``header_bytes`` of the content."""
     try:
         header = json.loads(content[:header_bytes])
@@ -71,15 +71,15 @@ def unpack(content: bytes, header_bytes: int, fds: tuple[int, ...] = ()) -> Fram
         raise FrameError(f"the header of a frame is no JSON: {error}") from error
     if not isinstance(header, dict):
         raise FrameError(f"the header of a frame is a {type(header).__name__}: it must be an object")
-    return Frame(header, content[header_bytes:], fds)
+    return PipeMessage(header, content[header_bytes:], fds)
 
 
-def send(connection: socket.socket, frame: Frame) -> None:
+def send(connection: socket.socket, frame: PipeMessage) -> None:
     """Send a frame, blocking."""
     connection.sendall(pack(frame))
 
 
-def receive(connection: socket.socket) -> Frame | None:
+def receive(connection: socket.socket) -> PipeMessage | None:
     """The next frame, blocking, with the descriptors that came with it; None at the end of the stream."""
     prefix, fds, _, _ = socket.recv_fds(connection, PREFIX_BYTES, 4)
     if not prefix:
@@ -111,15 +111,15 @@ def serve_forks(
     while (request := _next_request(control, spare)) is not None:
         match request.header.get("op"):
             case "fork" if len(request.fds) == 1:
-                send(control, Frame({"pid": _fork(control, request.fds[0], child)}))
+                send(control, PipeMessage({"pid": _fork(control, request.fds[0], child)}))
             case "reap":
                 _, status = os.waitpid(int(request.header["pid"]), 0)
-                send(control, Frame({"status": status}))
+                send(control, PipeMessage({"status": status}))
             case unknown:
                 raise FrameError(f"a zygote can't {unknown!r}: it takes fork (with a descriptor) and reap")
 
 
-def _next_request(control: socket.socket, spare: Iterator[None] | None) -> Frame | None:
+def _next_request(control: socket.socket, spare: Iterator[None] | None) -> PipeMessage | None:
     if spare is not None:
         while not select.select([control], [], [], 0)[0]:
             try:

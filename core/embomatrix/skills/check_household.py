@@ -26,48 +26,48 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from embomatrix.skills.syntax import SkillCall
-    from embomatrix.skills.view import Refusal, WorldView
+    from embomatrix.skills.view import SkillRefusal, WorldView
 
-    Check = Callable[[WorldView, SkillCall], Refusal | None]
+    Check = Callable[[WorldView, SkillCall], SkillRefusal | None]
 
 
-def _source_cuts(world: WorldView, call: SkillCall) -> Refusal | None:
+def _source_cuts(world: WorldView, call: SkillCall) -> SkillRefusal | None:
     source = source_of(world, call)
     return None if cuts(world.asset(source)) else refuse(FailureReason.NOT_A_SLICER, source=source)
 
 
-def _sliceable(world: WorldView, call: SkillCall) -> Refusal | None:
+def _sliceable(world: WorldView, call: SkillCall) -> SkillRefusal | None:
     target = target_of(world, call)
     return None if is_sliceable(world.asset(target)) else refuse(FailureReason.NOT_SLICEABLE, target=target)
 
 
-def _not_sliced(world: WorldView, call: SkillCall) -> Refusal | None:
+def _not_sliced(world: WorldView, call: SkillCall) -> SkillRefusal | None:
     target = target_of(world, call)
     return refuse(FailureReason.ALREADY_SLICED, target=target) if world.is_sliced(target) else None
 
 
-def _source_held(world: WorldView, call: SkillCall) -> Refusal | None:
+def _source_held(world: WorldView, call: SkillCall) -> SkillRefusal | None:
     source = source_of(world, call)
     if source in world.carried[:1] or washing(world.asset(source)) is not None:
         return None
     return refuse(FailureReason.TOOL_NOT_HELD, source=source)
 
 
-def _source_cleans(world: WorldView, call: SkillCall) -> Refusal | None:
+def _source_cleans(world: WorldView, call: SkillCall) -> SkillRefusal | None:
     source = source_of(world, call)
     if is_cleaner(world.asset(source), world.facts_about(source)):
         return None
     return refuse(FailureReason.NOT_A_CLEANER, source=source)
 
 
-def _worked_on(world: WorldView, call: SkillCall) -> Refusal | None:
+def _worked_on(world: WorldView, call: SkillCall) -> SkillRefusal | None:
     if washing(world.asset(source_of(world, call))) is not None:
         return None
     target = target_of(world, call)
     return out_of_reach(world, target) or hidden(world, target) or shut_in(world, target)
 
 
-def _washed(world: WorldView, call: SkillCall) -> Refusal | None:
+def _washed(world: WorldView, call: SkillCall) -> SkillRefusal | None:
     target, source = target_of(world, call), source_of(world, call)
     machine = washing(world.asset(source))
     if machine is None:
@@ -81,7 +81,7 @@ def _washed(world: WorldView, call: SkillCall) -> Refusal | None:
     return None
 
 
-def _comes_off(world: WorldView, call: SkillCall) -> Refusal | None:
+def _comes_off(world: WorldView, call: SkillCall) -> SkillRefusal | None:
     """A clean object is no reason to refuse: running water cleans before it is asked to."""
     target, source = target_of(world, call), source_of(world, call)
     asset, covering = world.asset(source), coverings(world.facts_about(target))
@@ -109,30 +109,30 @@ def _comes_off(world: WorldView, call: SkillCall) -> Refusal | None:
     )
 
 
-def _source_wets(world: WorldView, call: SkillCall) -> Refusal | None:
+def _source_wets(world: WorldView, call: SkillCall) -> SkillRefusal | None:
     source = source_of(world, call)
     if gives_liquid(world.asset(source), world.facts_about(source)):
         return None
     return refuse(FailureReason.GIVES_NO_LIQUID, source=source)
 
 
-def _soakable(world: WorldView, call: SkillCall) -> Refusal | None:
+def _soakable(world: WorldView, call: SkillCall) -> SkillRefusal | None:
     target = target_of(world, call)
     return None if soaks_up(world.asset(target)) else refuse(FailureReason.NOT_SOAKABLE, target=target)
 
 
-def _source_accessible(world: WorldView, call: SkillCall) -> Refusal | None:
+def _source_accessible(world: WorldView, call: SkillCall) -> SkillRefusal | None:
     return shut_in(world, source_of(world, call))
 
 
-def _under_source(world: WorldView, call: SkillCall) -> Refusal | None:
+def _under_source(world: WorldView, call: SkillCall) -> SkillRefusal | None:
     target, source = target_of(world, call), source_of(world, call)
     if (target in world.carried[:1] and target != source) or world.is_inside(target, source):
         return None
     return refuse(FailureReason.NOT_AT_SOURCE, target=target, source=source, relation="in the hand or inside")
 
 
-def _source_flows(world: WorldView, call: SkillCall) -> Refusal | None:
+def _source_flows(world: WorldView, call: SkillCall) -> SkillRefusal | None:
     source = source_of(world, call)
     given = liquids_given(world.asset(source), world.facts_about(source), on=world.is_on(source))
     return None if given else refuse(FailureReason.SOURCE_OFF, source=source)

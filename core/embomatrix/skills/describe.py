@@ -49,7 +49,7 @@ WORDS: Final[Mapping[Relation, str]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Sight:
+class ObjectDescription:
     """One object as it is described: where it is, and ``states`` in words in the order in which they are told.
 
     ``gone`` is True for what is not in the world: a piece that is still to come, or a thing that was cut up.
@@ -82,7 +82,7 @@ def gained(changes: Mapping[str, Sequence[str]]) -> str:
     return "; ".join(f"{name} is now {listed(states)}" for name, states in changes.items())
 
 
-def line(sight: Sight) -> str:
+def line(sight: ObjectDescription) -> str:
     """One object on one line: ``apple_1: on table_1 in kitchen_0, hot``."""
     if sight.gone:
         return f"{sight.name}: not there"
@@ -95,7 +95,7 @@ def line(sight: Sight) -> str:
     return f"{sight.name}: {', '.join([place, *sight.states])}"
 
 
-def final_lines(sights: Sequence[Sight]) -> tuple[str, ...]:
+def final_lines(sights: Sequence[ObjectDescription]) -> tuple[str, ...]:
     """The first objects, one a line, and how many more there are."""
     lines = tuple(line(sight) for sight in sights[:MAX_FINAL_LINES])
     left = len(sights) - len(lines)

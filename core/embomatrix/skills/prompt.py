@@ -51,7 +51,7 @@ ABSENT: Final = "absent"
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class PromptRow:
     """One row of the object table as a prompt tells it. ``host`` is the name of another row, or empty."""
 
     index: int
@@ -74,7 +74,7 @@ class Situation:
 
     rooms: tuple[str, ...]
     robot_room: str
-    rows: tuple[Row, ...]
+    rows: tuple[PromptRow, ...]
     instruction: str
     table_size: int
     profile: Profile = Profile.PAPER
@@ -96,10 +96,10 @@ def situation_of(scene: Scene, task: Task) -> Situation:
     return Situation(rooms, scene.robot.room, rows, task.instruction, len(task.table), task.profile)
 
 
-def _row(index: int, item: SceneObject, scene: Scene, listed: set[str]) -> Row:
+def _row(index: int, item: SceneObject, scene: Scene, listed: set[str]) -> PromptRow:
     asset = scene.asset_of(item.name)
     hosted = item.host in listed and item.relation in PREPOSITIONS
-    return Row(
+    return PromptRow(
         index=index,
         name=item.name,
         category=asset.category,
@@ -175,14 +175,14 @@ def prompt_for(situation: Situation, codec: Codec) -> Prompt:
     return Prompt(_SYSTEM[codec, situation.profile], _indexed_text(situation))
 
 
-def _tree(situation: Situation) -> dict[str, list[tuple[Row, list[Row]]]]:
+def _tree(situation: Situation) -> dict[str, list[tuple[PromptRow, list[PromptRow]]]]:
     """Room to its rows, each with its contents. A row that rests on another one is listed with it, and again
     by itself only when it hosts something."""
-    contents: dict[str, list[Row]] = {}
+    contents: dict[str, list[PromptRow]] = {}
     for row in situation.rows:
         if row.host:
             contents.setdefault(row.host, []).append(row)
-    tree: dict[str, list[tuple[Row, list[Row]]]] = {}
+    tree: dict[str, list[tuple[PromptRow, list[PromptRow]]]] = {}
     for row in situation.rows:
         inside = contents.get(row.name, [])
         if inside or not row.host:
@@ -190,8 +190,8 @@ def _tree(situation: Situation) -> dict[str, list[tuple[Row, list[Row]]]]:
     return tree
 
 
-def _by_relation(contents: list[Row]) -> list[tuple[str, list[Row]]]:
-    groups: dict[str, list[Row]] = {}
+def _by_relation(contents: list[PromptRow]) -> list[tuple[str, list[PromptRow]]]:
+    groups: dict[str, list[PromptRow]] = {}
     for row in contents:
         if row.relation is not None:
             groups.setdefault(PREPOSITIONS[row.relation], []).append(row)
@@ -201,7 +201,7 @@ def _by_relation(contents: list[Row]) -> list[tuple[str, list[Row]]]:
 def _names_text(situation: Situation) -> str:
     label = labels(situation)
 
-    def told(row: Row) -> str:
+    def told(row: PromptRow) -> str:
         return " ".join([label[row.index], *row.states])
 
     lines: list[str] = []
@@ -214,7 +214,7 @@ def _names_text(situation: Situation) -> str:
 
 
 def _indexed_text(situation: Situation) -> str:
-    def told(row: Row) -> str:
+    def told(row: PromptRow) -> str:
         return " ".join([row.category.replace("_", " "), str(row.index), *row.states])
 
     lines = ["Scene:"]

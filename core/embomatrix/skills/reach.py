@@ -9,10 +9,10 @@ from embomatrix.skills.limits import ROBOT
 from embomatrix.skills.view import metres, refuse
 
 if TYPE_CHECKING:
-    from embomatrix.skills.view import Refusal, WorldView
+    from embomatrix.skills.view import SkillRefusal, WorldView
 
 
-def out_of_reach(world: WorldView, name: str) -> Refusal | None:
+def out_of_reach(world: WorldView, name: str) -> SkillRefusal | None:
     """Refusal when the object is too high or too far away."""
     reach = world.reach(name)
     if reach.height_m > ROBOT.reach_high_m:
@@ -32,12 +32,12 @@ def out_of_reach(world: WorldView, name: str) -> Refusal | None:
     return None
 
 
-def hidden(world: WorldView, name: str) -> Refusal | None:
+def hidden(world: WorldView, name: str) -> SkillRefusal | None:
     """Refusal when a wall or furniture lies between the robot and the object."""
     return None if world.is_approachable(name) else refuse(FailureReason.NO_LINE_OF_APPROACH, target=name)
 
 
-def shut_in(world: WorldView, name: str) -> Refusal | None:
+def shut_in(world: WorldView, name: str) -> SkillRefusal | None:
     """Refusal when a closed container is around the object."""
     container = world.closed_around(name)
     return refuse(FailureReason.CONTAINER_CLOSED, container=container) if container else None

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Refusal:
+class SkillRefusal:
     """Why a call can't be carried out, and the same as a sentence about the things at hand."""
 
     reason: FailureReason
@@ -25,7 +25,7 @@ class Refusal:
 
 
 @dataclass(frozen=True, slots=True)
-class Reach:
+class ObjectReach:
     """How far an object is from the robot.
 
     ``distance_m`` is horizontal, from the base's centre to the nearest point of the object; ``height_m`` is that of its
@@ -67,7 +67,7 @@ class WorldView(Protocol):
     def closed_around(self, name: str) -> str:
         """A closed container that the object is in; "" when there is none."""
 
-    def reach(self, name: str) -> Reach: ...
+    def reach(self, name: str) -> ObjectReach: ...
 
     def is_approachable(self, name: str) -> bool:
         """Whether no wall and no furniture lies between the robot and the object."""
@@ -86,9 +86,9 @@ class WorldView(Protocol):
         """What the object is covered, filled and soaked with."""
 
 
-def refuse(reason: FailureReason, **values: str) -> Refusal:
+def refuse(reason: FailureReason, **values: str) -> SkillRefusal:
     """Refusal with the reason's sentence filled in. Raises KeyError for a value that the sentence lacks."""
-    return Refusal(reason, SENTENCES[reason].format(**values))
+    return SkillRefusal(reason, SENTENCES[reason].format(**values))
 
 
 def target_of(world: WorldView, call: SkillCall) -> str:

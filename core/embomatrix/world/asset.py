@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from embomatrix.world.geometry import Part, Vec2, Vec3
+    from embomatrix.world.geometry import ConvexPart, Vec2, Vec3
 
 FLOOR_CATEGORY: Final = "floors"
 """Category of a room's floor, where it is an object that plans and goals can name."""
@@ -39,7 +39,7 @@ class Link:
     """Rigid group of convex parts. The first link of an asset is its base and has no joint."""
 
     name: str
-    parts: tuple[Part, ...]
+    parts: tuple[ConvexPart, ...]
     joint: Joint | None = None
 
 

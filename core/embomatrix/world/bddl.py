@@ -74,7 +74,7 @@ class BddlError(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Literal:
+class InitLiteral:
     """An atom of ``:init``; ``positive`` is False under ``not``."""
 
     atom: Atom
@@ -82,12 +82,12 @@ class Literal:
 
 
 @dataclass(frozen=True, slots=True)
-class Problem:
+class BddlProblem:
     """One BDDL problem. ``objects`` maps the name of an object to its type, in the order of the text."""
 
     name: str
     objects: Mapping[str, str]
-    init: tuple[Literal, ...]
+    init: tuple[InitLiteral, ...]
     goal: Formula
 
     @property
@@ -106,7 +106,7 @@ class Problem:
             item.atom.args[0]: item.atom.args[1] for item in self.init if item.atom.args[0].endswith(WILDCARD)
         }
 
-    def spelt_out(self, members: Mapping[str, tuple[str, ...]]) -> Problem:
+    def spelt_out(self, members: Mapping[str, tuple[str, ...]]) -> BddlProblem:
         """The problem with each wildcard replaced by objects of these names, which may be none."""
         objects: dict[str, str] = {}
         for name, type_name in self.objects.items():
@@ -137,7 +137,7 @@ class _Node:
         return self.items[0].word.lower() if self.items else self.word.lower()
 
 
-def parse_problem(text: str) -> Problem:
+def parse_problem(text: str) -> BddlProblem:
     """Read a whole ``(define (problem ...) ...)``. Raises BddlError."""
     root = _read(text)
     if root.head != "define":
@@ -161,7 +161,7 @@ def parse_problem(text: str) -> Problem:
         name_node.fail("expected (problem NAME), one word")
     objects = _parse_objects(sections[":objects"])
     reader = _Reader(objects)
-    return Problem(
+    return BddlProblem(
         name=name_node.items[1].word,
         objects=objects,
         init=tuple(reader.literal(node) for node in sections[":init"].items[1:]),
@@ -174,7 +174,7 @@ def parse_formula(text: str, objects: Mapping[str, str]) -> Formula:
     return _Reader(objects).formula(_read(text), {})
 
 
-def render_problem(problem: Problem) -> str:
+def render_problem(problem: BddlProblem) -> str:
     """BDDL text that ``parse_problem`` reads back to an equal problem."""
     grouped: dict[str, list[str]] = {}
     for name, type_name in problem.objects.items():
@@ -272,11 +272,11 @@ class _Reader:
 
     objects: Mapping[str, str]
 
-    def literal(self, node: _Node) -> Literal:
+    def literal(self, node: _Node) -> InitLiteral:
         if node.head == "not" and not node.word:
             self._expect(node, 1)
-            return Literal(self._atom(node.items[1], {}), positive=False)
-        return Literal(self._atom(node, {}))
+            return InitLiteral(self._atom(node.items[1], {}), positive=False)
+        return InitLiteral(self._atom(node, {}))
 
     def goal(self, section: _Node) -> Formula:
         parts = tuple(self.formula(node, {}) for node in section.items[1:])

@@ -9,7 +9,7 @@ import numpy as np
 
 from embomatrix.world.asset import Asset, Credit, Interior, Joint, JointKind, Link, SupportSurface
 from embomatrix.world.field import Field
-from embomatrix.world.geometry import Part, Pose, Shape
+from embomatrix.world.geometry import ConvexPart, Pose, Shape
 from embomatrix.world.tables import (
     FLAT_HULL,
     MAX_COORDINATE_M,
@@ -109,7 +109,7 @@ def pose_from_field(field: Field) -> Pose:
     return Pose((x, y, z), (qx, qy, qz, qw))
 
 
-def part_to_json(part: Part, tables: TableWriter | None = None) -> Json | int:
+def part_to_json(part: ConvexPart, tables: TableWriter | None = None) -> Json | int:
     """JSON values, or the row of ``tables`` that holds the part."""
     if tables is not None:
         return tables.part(part)
@@ -119,7 +119,7 @@ def part_to_json(part: Part, tables: TableWriter | None = None) -> Json | int:
     return value
 
 
-def part_from_field(field: Field) -> Part:
+def part_from_field(field: Field) -> ConvexPart:
     """A part with extents above 1 mm, and vertices where it is a hull."""
     if field.tables is not None:
         return field.tables.part(field)
@@ -134,7 +134,7 @@ def part_from_field(field: Field) -> Part:
         )
     if shape is Shape.HULL and not has_volume(np.asarray(vertices)):
         fields["vertices_m"].fail(FLAT_HULL)
-    return Part(shape, pose_from_field(fields["pose"]), _extent(fields["size_m"]), vertices)
+    return ConvexPart(shape, pose_from_field(fields["pose"]), _extent(fields["size_m"]), vertices)
 
 
 def _extent(field: Field) -> Vec3:

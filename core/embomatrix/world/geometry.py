@@ -206,7 +206,7 @@ class Shape(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class ConvexPart:
     """One convex piece of a link, in the asset's frame with every joint at zero.
 
     ``size_m`` is the full extent: (x, y, z) of a box, (d, d, height) of a cylinder, (d, d, d) of a sphere and the

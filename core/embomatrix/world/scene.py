@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from embomatrix.world.asset import Asset
-    from embomatrix.world.geometry import Part, Pose, Vec2, Vec3
+    from embomatrix.world.geometry import ConvexPart, Pose, Vec2, Vec3
     from embomatrix.world.state import Relation, State, SubstanceFact
 
 
@@ -119,7 +119,7 @@ class Scene:
     base: str
     seed: int
     rooms: tuple[Room, ...]
-    walls: tuple[Part, ...]
+    walls: tuple[ConvexPart, ...]
     doorways: tuple[Doorway, ...]
     objects: tuple[SceneObject, ...]
     assets: Mapping[str, Asset]

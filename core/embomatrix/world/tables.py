@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.world.field import Field, SceneInvalidError
-from embomatrix.world.geometry import Part, Pose, Shape
+from embomatrix.world.geometry import ConvexPart, Pose, Shape
 from embomatrix.world.placements import SET_NUMBERS, Placements, Stands
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ class TableWriter:
     """Collects rows while a scene is put into JSON. Equal poses and equal parts share a row."""
 
     _poses: dict[bytes, int] = field(default_factory=dict)
-    _parts: dict[bytes, tuple[int, Part]] = field(default_factory=dict)
+    _parts: dict[bytes, tuple[int, ConvexPart]] = field(default_factory=dict)
     _stands: list[Vec3] = field(default_factory=list)
     _placements: dict[str, NDArray[np.generic]] = field(default_factory=dict)
 
@@ -55,7 +55,7 @@ class TableWriter:
         row = struct.pack("<7d", *pose.position_m, *pose.quat_xyzw)
         return self._poses.setdefault(row, len(self._poses))
 
-    def part(self, part: Part) -> int:
+    def part(self, part: ConvexPart) -> int:
         numbers = [*part.pose.position_m, *part.pose.quat_xyzw, *part.size_m]
         numbers += [value for vertex in part.vertices_m for value in vertex]
         key = struct.pack(f"<{len(numbers)}d", *numbers) + part.shape.encode()
@@ -119,7 +119,7 @@ class Tables:
         """The pose whose row the field names."""
         return self._poses[_row(field, len(self._poses))]
 
-    def part(self, field: Field) -> Part:
+    def part(self, field: Field) -> ConvexPart:
         """The part whose row the field names."""
         return self._parts[_row(field, len(self._parts))]
 
@@ -128,7 +128,7 @@ class Tables:
         _check_are_rows(rows, len(self._poses))
         return [self._poses[row] for row in rows]
 
-    def parts_at(self, rows: Sequence[int]) -> tuple[Part, ...]:
+    def parts_at(self, rows: Sequence[int]) -> tuple[ConvexPart, ...]:
         """The parts of these rows. Raises ValueError where one is no row."""
         _check_are_rows(rows, len(self._parts))
         return tuple([self._parts[row] for row in rows])
@@ -245,13 +245,13 @@ def _sets(arrays: Arrays) -> NDArray[np.int32]:
     return np.asarray(sets, dtype=np.int32)
 
 
-def _parts(rows: FloatArray, kinds: list[tuple[int, int]], vertices: FloatArray) -> list[Part]:
+def _parts(rows: FloatArray, kinds: list[tuple[int, int]], vertices: FloatArray) -> list[ConvexPart]:
     points = [(x, y, z) for x, y, z in vertices.tolist()]
     _check_hulls(kinds, vertices)
-    parts: list[Part] = []
+    parts: list[ConvexPart] = []
     first = 0
     for (x, y, z, a, b, c, d, width, depth, height), (shape, count) in zip(rows.tolist(), kinds, strict=True):
         own = tuple(points[first : first + count])
         first += count
-        parts.append(Part(SHAPES[shape], Pose((x, y, z), (a, b, c, d)), (width, depth, height), own))
+        parts.append(ConvexPart(SHAPES[shape], Pose((x, y, z), (a, b, c, d)), (width, depth, height), own))
     return parts

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Protocol, TypeVar
 
-from embomatrix.factory.refusal import Refusal, RefusalReason
+from embomatrix.factory.refusal import RefusalReason, TaskRefusal
 from embomatrix.reward.hierarchy import score
 from embomatrix.sim.planner.oracle import PlanNotFound
 from embomatrix.world.evaluate import evaluate, render, scored_atoms
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from embomatrix.skills.syntax import Plan
     from embomatrix.skills.trace import Trace
-    from embomatrix.world.bddl import Literal
+    from embomatrix.world.bddl import InitLiteral
     from embomatrix.world.goal import Facts
     from embomatrix.world.task import Task
 
@@ -31,7 +31,7 @@ MOST_HELD: Final = 0.5
 """Share of a goal's atoms that may hold at the start: "leave it closed" is asked beside other things, not in their place."""
 
 
-class Stage(Protocol):
+class PlanExecutor(Protocol):
     """What executes plans: ``sim.executor.Simulator``, or a table in a test."""
 
     @property
@@ -40,7 +40,7 @@ class Stage(Protocol):
     def execute(self, task: Task, plan: Plan, seed: int) -> Trace: ...
 
 
-S = TypeVar("S", bound=Stage)
+S = TypeVar("S", bound=PlanExecutor)
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,11 +55,11 @@ def admit(
     stage: S,
     task: Task,
     find_plan: Callable[[S, Task], Plan | PlanNotFound],
-    init: Sequence[Literal] = (),
+    init: Sequence[InitLiteral] = (),
     *,
     most_held: float = MOST_HELD,
-    physics: Stage | None = None,
-) -> Admitted | Refusal:
+    physics: PlanExecutor | None = None,
+) -> Admitted | TaskRefusal:
     """Judge a task by execution. ``init`` are atoms that must hold at the start, as the task's source says.
 
     No more than the share ``most_held`` of the goal's atoms may hold then; 1: all but one. In ``physics``, where there is one,
@@ -69,31 +69,35 @@ def admit(
     for literal in init:
         if stage.facts.holds(literal.atom.predicate, literal.atom.args) is not literal.positive:
             wanted = render(literal.atom if literal.positive else Not(literal.atom))
-            return Refusal(RefusalReason.INIT_NOT_MET, f"{wanted} does not hold in the scene that was built")
+            return TaskRefusal(
+                RefusalReason.INIT_NOT_MET, f"{wanted} does not hold in the scene that was built"
+            )
     if evaluate(task.goal, stage.facts, task.types):
-        return Refusal(RefusalReason.GOAL_HOLDS, f"the goal holds at the start: {task.goal_bddl}")
+        return TaskRefusal(RefusalReason.GOAL_HOLDS, f"the goal holds at the start: {task.goal_bddl}")
     atoms = scored_atoms(task.goal, task.types)
     held = tuple(render(atom) for atom in atoms if evaluate(atom, stage.facts, task.types))
     if len(held) > most_held * len(atoms):
-        return Refusal(
+        return TaskRefusal(
             RefusalReason.MOSTLY_DONE,
             f"{len(held)} of {len(atoms)} atoms hold at the start, at most {most_held:.0%} may: {' '.join(held)}",
         )
     plan = find_plan(stage, task)
     if isinstance(plan, PlanNotFound):
-        return Refusal(RefusalReason.NO_PLAN, f"the oracle planner found no plan: {plan.reason}")
+        return TaskRefusal(RefusalReason.NO_PLAN, f"the oracle planner found no plan: {plan.reason}")
     trace = stage.execute(task, plan, SEED)
     reward = score(task, trace.touched, stage.facts)
     if trace.failure is not None or not reward.success:
         last = trace.steps[-1].message if trace.steps else "it is empty"
-        return Refusal(RefusalReason.ORACLE_FAILED, f"the oracle's plan earns {reward.total:.1f}: {last}")
+        return TaskRefusal(RefusalReason.ORACLE_FAILED, f"the oracle's plan earns {reward.total:.1f}: {last}")
     against = objection(physics, task, plan) if physics is not None else ""
     if against:
-        return Refusal(RefusalReason.PHYSICS_FAILED, f"the oracle's plan fails in stepped physics: {against}")
+        return TaskRefusal(
+            RefusalReason.PHYSICS_FAILED, f"the oracle's plan fails in stepped physics: {against}"
+        )
     return Admitted(plan, held)
 
 
-def objection(stage: Stage, task: Task, plan: Plan) -> str:
+def objection(stage: PlanExecutor, task: Task, plan: Plan) -> str:
     """What speaks against a plan when it is executed on a stage; empty where it reaches the goal."""
     trace = stage.execute(task, plan, SEED)
     if trace.failure is None:

@@ -20,9 +20,9 @@ from embomatrix.factory.terminal import fail
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from embomatrix.factory.layout.agent_io import Door
+    from embomatrix.factory.layout.agent_io import AgentInterface
 
-EVERY: Final[Mapping[str, Door]] = {
+EVERY: Final[Mapping[str, AgentInterface]] = {
     **{name.value: door for name, door in SOCIAL_DOORS.items()},
     **{name.value: door for name, door in DOORS.items()},
 }

@@ -18,7 +18,7 @@ from embomatrix.factory.assets.naming import family_of
 from embomatrix.factory.assets.standing import GLANCE_STEPS, STEPS, check_standing
 from embomatrix.factory.importers.assemble import import_model, read_model
 from embomatrix.factory.importers.convex import Coacd, by_components
-from embomatrix.factory.importers.model import Frame, ModelFileError
+from embomatrix.factory.importers.model import AxisConvention, ModelFileError
 from embomatrix.factory.importers.shelf import save_asset
 from embomatrix.sim.engine import EngineError
 from embomatrix.world.asset import Credit
@@ -28,7 +28,7 @@ from embomatrix.world.field import SceneInvalidError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from embomatrix.factory.importers.assemble import Imported
+    from embomatrix.factory.importers.assemble import ImportedAsset
     from embomatrix.world.asset import Asset
 
 app = typer.Typer(
@@ -128,7 +128,7 @@ def import_(
     ] = "",
     source: Annotated[str, typer.Option(help="Where it comes from; by default the file's name.")] = "",
     up: Annotated[
-        Frame | None, typer.Option(help="Axis that points up: y (OBJ, GLB) or z (STL, URDF).")
+        AxisConvention | None, typer.Option(help="Axis that points up: y (OBJ, GLB) or z (STL, URDF).")
     ] = None,
     cut: Annotated[Cut, typer.Option(help="How meshes are cut into convex parts.")] = Cut.COACD,
 ) -> None:
@@ -147,7 +147,7 @@ def import_(
     Console(soft_wrap=True).print(_stands_in(imported.asset.asset_id), highlight=False)
 
 
-def _tell(imported: Imported, path: Path) -> None:
+def _tell(imported: ImportedAsset, path: Path) -> None:
     """What the asset has, what it lacks of what its category's things do, and which rule of `assets check` it breaks."""
     asset, console = imported.asset, Console(soft_wrap=True)
     parts = sum(len(link.parts) for link in asset.links)

@@ -51,7 +51,7 @@ UNIVERSAL: Final = frozenset(
 """Abilities that every solid thing has: they tell nothing apart and would double the table."""
 
 
-class SourceError(Exception):
+class CatalogSourceError(Exception):
     """The ``bddl`` package is missing or is not the version that the tables are derived from."""
 
 
@@ -59,10 +59,12 @@ def source_folder() -> Path:
     """Folder of the installed package's generated data. Raises SourceError when it is absent or another version."""
     spec = importlib.util.find_spec("bddl")
     if spec is None or spec.origin is None:
-        raise SourceError(f"the package bddl is not installed: try `pip install bddl=={BDDL_VERSION}`")
+        raise CatalogSourceError(f"the package bddl is not installed: try `pip install bddl=={BDDL_VERSION}`")
     found = importlib.metadata.version("bddl")
     if found != BDDL_VERSION:
-        raise SourceError(f"bddl is {found}, the tables come from {BDDL_VERSION}: install that version")
+        raise CatalogSourceError(
+            f"bddl is {found}, the tables come from {BDDL_VERSION}: install that version"
+        )
     return Path(spec.origin).parent / "generated_data"
 
 
@@ -232,7 +234,7 @@ def _licence_text() -> str:
     for file in files:
         if file.name.upper().startswith("LICENSE"):
             return Path(str(file.locate())).read_text(encoding="utf-8")
-    raise SourceError("the installed bddl carries no licence text: reinstall it with pip")
+    raise CatalogSourceError("the installed bddl carries no licence text: reinstall it with pip")
 
 
 def write_tables(out: Path) -> tuple[Path, ...]:
@@ -259,7 +261,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     try:
         paths = write_tables(options.out)
-    except SourceError as error:
+    except CatalogSourceError as error:
         parser.exit(2, f"{error}\n")
     for path in paths:
         print(f"{path}  {path.stat().st_size} bytes")  # noqa: T201 - this is the command line

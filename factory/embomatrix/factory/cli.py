@@ -24,17 +24,17 @@ from embomatrix.factory.layout_cli import (
     modelled_agents,
     modelled_names,
 )
-from embomatrix.factory.pipeline.build import Check, Summary, build_dataset
+from embomatrix.factory.pipeline.build import BuildSummary, Check, build_dataset
 from embomatrix.factory.pipeline.cluster import ClusterJudge
 from embomatrix.factory.pipeline.corpus_cli import app as corpus_app
 from embomatrix.factory.pipeline.options import Jobs, Physical, is_proved, processes
 from embomatrix.factory.pipeline.settings import SCENE_EXTRACTOR, BuildSettings, WriterKind, scene_ids
-from embomatrix.factory.social.asking import Asked, asked_writer
+from embomatrix.factory.social.asking import ModelSource, asked_writer
 from embomatrix.factory.task_import.cli import app as import_app
 from embomatrix.factory.terminal import fail, mended, progress
 from embomatrix.factory.verification.cli import app as verify_app
 from embomatrix.llm.ledger import Price
-from embomatrix.llm.patience import Patience
+from embomatrix.llm.patience import FailureLimit
 from embomatrix.world.dataset import Dataset
 from embomatrix.world.task import TaskCategory
 from embomatrix.world.whole_file import write_whole
@@ -161,7 +161,7 @@ def generate(
         if kind is WriterKind.SOCIAL:
             _make(out, settings, jobs=jobs, check=check, layout=layout)
             return
-        asked = Asked(llm, model, key, cassette, Price(*price), out / "ledger.jsonl", look)
+        asked = ModelSource(llm, model, key, cassette, Price(*price), out / "ledger.jsonl", look)
         writer, ledger = stack.enter_context(asked_writer(asked))
         _make(out, settings, writer, check=check, layout=layout)
         _print_account(ledger)
@@ -186,7 +186,7 @@ def _layout(
     """Layout agents of which these are a language model; None where all are rules."""
     if not names:
         return None
-    return stack.enter_context(modelled_agents(url, model, key, cassette, Patience())).agents(names)
+    return stack.enter_context(modelled_agents(url, model, key, cassette, FailureLimit())).agents(names)
 
 
 def _print_account(ledger: Ledger) -> None:
@@ -277,7 +277,7 @@ def export(
     )
 
 
-def _print_summary(console: Console, summary: Summary) -> None:
+def _print_summary(console: Console, summary: BuildSummary) -> None:
     table = Table("category", "train", "held out")
     for category in TaskCategory:
         table.add_row(

@@ -20,7 +20,7 @@ from embomatrix.factory.scenes.solids import Solids, placed_parts
 from embomatrix.factory.writer.view import SceneView
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.asset import FLOOR_CATEGORY, Asset, Link, SupportSurface
-from embomatrix.world.geometry import Aabb, Part, Pose, Shape
+from embomatrix.world.geometry import Aabb, ConvexPart, Pose, Shape
 from embomatrix.world.scene import SceneObject
 
 if TYPE_CHECKING:
@@ -271,6 +271,6 @@ def floor_asset(room: Room) -> Asset:
         synset="floor.n.01",
         size_m=size,
         mass_kg=100.0,
-        links=(Link("base", (Part(Shape.BOX, Pose((0.0, 0.0, 0.0)), size),)),),
+        links=(Link("base", (ConvexPart(Shape.BOX, Pose((0.0, 0.0, 0.0)), size),)),),
         supports=(SupportSurface("floor", (0.0, 0.0, _PLATE_M / 2 + _SUNK_M), room.size_m, 2.0),),
     )

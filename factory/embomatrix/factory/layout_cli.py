@@ -17,9 +17,9 @@ from embomatrix.factory.layout.generator import lay as lay_by_tree
 from embomatrix.factory.layout.jobs import LayoutAgents
 from embomatrix.factory.layout.model_agents import ModelLayoutAgents
 from embomatrix.factory.pictures.scene import draw_plan
-from embomatrix.factory.refusal import Refusal
+from embomatrix.factory.refusal import TaskRefusal
 from embomatrix.factory.scenes.build import build_base_scene
-from embomatrix.factory.task_import.sources import SourceError, read_activity, read_file
+from embomatrix.factory.task_import.sources import ProblemSourceError, read_activity, read_file
 from embomatrix.factory.task_import.task import Manner, import_problem
 from embomatrix.llm.values import LlmError
 from embomatrix.world.bddl import BddlError
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from embomatrix.factory.editor import SceneEditor
-    from embomatrix.factory.layout.jobs import Item, Layout, Record
-    from embomatrix.llm.patience import Patience
+    from embomatrix.factory.layout.jobs import Layout, Record, RequestedObject
+    from embomatrix.llm.patience import FailureLimit
 
 METHODS = ("tree", "random", "poses")
 Forms = Annotated[
@@ -73,7 +73,7 @@ def lay(
             agents = stack.enter_context(modelled_agents(llm, model, key, cassette)).agents(names)
         kept: list[Layout] = []
 
-        def laying(editor: SceneEditor, items: Sequence[Item], seed: int) -> Layout:
+        def laying(editor: SceneEditor, items: Sequence[RequestedObject], seed: int) -> Layout:
             by_name = {"random": lay_at_random, "poses": lay_by_poses}
             other = by_name.get(method)
             kept.append(other(editor, items, seed) if other else lay_by_tree(editor, items, seed, agents))
@@ -81,7 +81,7 @@ def lay(
 
         imported = import_problem(source, build_base_scene(scene), seed=seed, manner=Manner(laying))
         _hand_out(kept, out)
-        if isinstance(imported, Refusal):
+        if isinstance(imported, TaskRefusal):
             _fail(f"{source.name} is refused ({imported.reason}): {imported.sentence}")
         if out is not None:
             draw_plan(imported.scene).save(out / "plan.png")
@@ -138,7 +138,7 @@ def modelled_names(forms: list[str]) -> frozenset[AgentName]:
 
 @contextlib.contextmanager
 def modelled_agents(
-    url: str, model: str, key: str, cassette: Path | None, patience: Patience | None = None
+    url: str, model: str, key: str, cassette: Path | None, patience: FailureLimit | None = None
 ) -> Iterator[ModelLayoutAgents]:
     """Agents on an endpoint, on a recording, or on both. Raises LlmError."""
     asked, endpoint = model_asked(url, model, key, cassette)
@@ -151,7 +151,7 @@ def mended_layout() -> Iterator[None]:
     """What a person can mend is one sentence and exit status 2."""
     try:
         yield
-    except (BddlError, BriefError, CatalogError, DistributionError, LlmError, SourceError) as error:
+    except (BddlError, BriefError, CatalogError, DistributionError, LlmError, ProblemSourceError) as error:
         _fail(str(error))
     except OSError as error:
         _fail(f"{error.filename}: {error.strerror}: name a file or folder that can be used")

@@ -46,7 +46,7 @@ NO_PLAN: Final = 1
 console = Console(highlight=False)
 
 
-class Mode(StrEnum):
+class PlayMode(StrEnum):
     """How a plan is carried out."""
 
     CACHED = "cached"
@@ -57,7 +57,7 @@ class Mode(StrEnum):
 class Take:
     """How a plan is to be executed, and where a film of it goes."""
 
-    mode: Mode
+    mode: PlayMode
     seed: int
     film: Path | None
 
@@ -78,8 +78,9 @@ def play(
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Decides between outcomes that are equally good.")] = 0,
     mode: Annotated[
-        Mode, typer.Option(help="cached: verified outcomes; physical: a robot does it in stepped physics.")
-    ] = Mode.CACHED,
+        PlayMode,
+        typer.Option(help="cached: verified outcomes; physical: a robot does it in stepped physics."),
+    ] = PlayMode.CACHED,
     film: Annotated[
         Path | None, typer.Option(help="Draw the plan as an animation: a .gif, .webp or .png file.")
     ] = None,
@@ -140,7 +141,7 @@ def _text_of(plan: str) -> str:
 
 
 def _run(bundle: Bundle, task: Task, plan: Plan, take: Take) -> None:
-    actor = PhysicalActor(bundle) if take.mode is Mode.PHYSICAL else None
+    actor = PhysicalActor(bundle) if take.mode is PlayMode.PHYSICAL else None
     simulator = Simulator(bundle, actor=actor)
     trace = simulator.execute(task, plan, take.seed)
     _show_steps(task, trace)

@@ -30,7 +30,7 @@ class RefusalReason(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Refusal:
+class TaskRefusal:
     """A task that is left out, and why."""
 
     reason: RefusalReason
@@ -42,4 +42,4 @@ class RefusedError(Exception):
 
     def __init__(self, reason: RefusalReason, sentence: str) -> None:
         super().__init__(sentence)
-        self.refusal = Refusal(reason, sentence)
+        self.refusal = TaskRefusal(reason, sentence)

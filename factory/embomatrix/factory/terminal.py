@@ -17,7 +17,7 @@ from rich.progress import (
 )
 
 from embomatrix.factory.evaluate.figures import EvaluationError
-from embomatrix.factory.task_import.sources import SourceError
+from embomatrix.factory.task_import.sources import ProblemSourceError
 from embomatrix.llm.values import LlmError
 from embomatrix.rpc.status import ClusterError
 from embomatrix.sim.engine import EngineMissingError
@@ -55,7 +55,7 @@ def mended(out: Path | None = None, kept: str = "") -> Iterator[None]:
         DatasetError,
         EngineMissingError,
         EvaluationError,
-        SourceError,
+        ProblemSourceError,
     ) as error:
         fail(str(error))
     except (ClusterError, LlmError) as error:

@@ -6,8 +6,8 @@ from html.parser import HTMLParser
 from embomatrix.cli.cluster.report import report_page, seconds_text
 from embomatrix.rpc.run_log import (
     EventKind,
-    Phase,
     PhaseSummary,
+    RolloutPhase,
     RunEvent,
     RunSeries,
     RunSummary,
@@ -25,7 +25,7 @@ def summary(**changes):
     found = PhaseSummary(3, 1.5, 0.5, 0.6, 0.7)
     values = {
         "run": RunInfo("r1", "<evening>", STATS, 0, 1_000.0, 1_060.0),
-        "phases": dict.fromkeys(Phase, found),
+        "phases": dict.fromkeys(RolloutPhase, found),
         "workers": (RunWorker("office & lab", 3, 1, 1.5, 0.2),),
         "series": RunSeries(0.25, (1, 2, 0), (0, 0, 1)),
         "failures": (
@@ -115,7 +115,7 @@ def test_figures_stand_on_the_page_as_they_were_counted():
 
 
 def test_a_run_without_anything_has_a_report_all_the_same():
-    nothing = dict.fromkeys(Phase, PhaseSummary())
+    nothing = dict.fromkeys(RolloutPhase, PhaseSummary())
     empty = summary(
         run=RunInfo("r1", "", RunStats(), 0, 1_000.0),
         phases=nothing,

@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from embomatrix.bench.experiments.app import app
-from embomatrix.bench.experiments.benchmarks import Stage, bench_rows, benchmark_section
+from embomatrix.bench.experiments.benchmarks import PolicyStage, bench_rows, benchmark_section
 from embomatrix.bench.experiments.conduct import IMITATED, Conductor, Venue
 from embomatrix.bench.experiments.design import (
     RELEVANCE_ARMS,
@@ -252,7 +252,7 @@ def test_an_experiment_that_can_not_be_made_is_told_why_at_once(dataset, tmp_pat
     ],
 )
 def test_a_bench_has_a_line_for_each_stage(tmp_path, bench, figure):
-    stages = (Stage("imitation", tmp_path / "a"), Stage("GRPO", tmp_path / "b"))
+    stages = (PolicyStage("imitation", tmp_path / "a"), PolicyStage("GRPO", tmp_path / "b"))
     for stage, value in zip(stages, (0.25, 0.5), strict=True):
         estimate = {"value": value, "low": 0.1, "high": 0.8}
         overall = {"success": estimate, "partial": estimate, "tasks": 4}

@@ -14,7 +14,7 @@ from embomatrix.cli.status.live import Glance, earliest, rate, screen
 from embomatrix.cli.status.words import sentences
 from embomatrix.rpc.admin import AdminClient
 from embomatrix.rpc.wire.values import (
-    Fleet,
+    FleetStatus,
     PlanCell,
     Resident,
     ResidentState,
@@ -32,21 +32,21 @@ def worker(name="w1", state="ready", *, running=0, completed=0, reason="", resid
 
 def test_words_begin_with_the_verdict():
     run_info = RunInfo("r1", "evening", RunStats(), pending=3)
-    nobody = sentences(Fleet(()), (), ())
+    nobody = sentences(FleetStatus(()), (), ())
     assert nobody[0] == "No worker is there."
     assert nobody[1].startswith("Start a worker with `embomatrix worker run`")
-    assert sentences(Fleet((worker(),)), (), ())[0] == "The cluster is ready, and no run is open."
-    assert sentences(Fleet((worker(),)), (run_info,), ())[0] == "The cluster works."
-    assert sentences(Fleet((worker(state="paused"),)), (run_info,), ())[0].startswith(
+    assert sentences(FleetStatus((worker(),)), (), ())[0] == "The cluster is ready, and no run is open."
+    assert sentences(FleetStatus((worker(),)), (run_info,), ())[0] == "The cluster works."
+    assert sentences(FleetStatus((worker(state="paused"),)), (run_info,), ())[0].startswith(
         "No worker works, and 3 rollouts wait"
     )
 
 
 def test_what_the_manager_says_of_itself_is_the_verdict():
     full = "Nothing can be written down, so nothing goes on: no space left on device."
-    assert sentences(Fleet((worker(),), full), (), ())[0] == full
-    assert sentences(Fleet((), full), (), ())[0] == full, "also where nobody is there"
-    assert full in "\n".join(drawn(Glance(0.0, Fleet((worker(),), full), ()), 24))
+    assert sentences(FleetStatus((worker(),), full), (), ())[0] == full
+    assert sentences(FleetStatus((), full), (), ())[0] == full, "also where nobody is there"
+    assert full in "\n".join(drawn(Glance(0.0, FleetStatus((worker(),), full), ()), 24))
 
 
 def test_words_tell_what_runs_what_is_warm_and_who_does_not_work():
@@ -57,7 +57,9 @@ def test_words_tell_what_runs_what_is_warm_and_who_does_not_work():
         PlanCell("r1", 7, "sha256:bb", 8, Warmth.UNPLACEABLE),
     ]
     told = sentences(
-        Fleet((worker(running=1, residents=(warm,)), worker("w2", "paused", reason="somebody uses it"))),
+        FleetStatus(
+            (worker(running=1, residents=(warm,)), worker("w2", "paused", reason="somebody uses it"))
+        ),
         (RunInfo("r1", "evening", stats, pending=3),),
         plan,
     )
@@ -70,16 +72,16 @@ def test_words_tell_what_runs_what_is_warm_and_who_does_not_work():
 
 
 def test_who_left_in_order_is_counted_and_no_trouble():
-    told = sentences(Fleet((worker(), worker("w2", "left", reason="it left"))), (), ())
+    told = sentences(FleetStatus((worker(), worker("w2", "left", reason="it left"))), (), ())
     assert told == [
         "The cluster is ready, and no run is open.",
         "Workers: 1 ready, 1 left; 0 of 2 slots busy; 0 scenes are in memory.",
     ]
-    assert sentences(Fleet((worker(state="left"),)), (), ())[0] == "No worker is there."
+    assert sentences(FleetStatus((worker(state="left"),)), (), ())[0] == "No worker is there."
 
 
 def test_words_of_a_thousand_workers_fit_on_a_screen():
-    assert len(sentences(Fleet(tuple(worker(f"w{n}", "lost") for n in range(1000))), (), ())) < 16
+    assert len(sentences(FleetStatus(tuple(worker(f"w{n}", "lost") for n in range(1000))), (), ())) < 16
 
 
 def drawn(now, lines):
@@ -90,7 +92,7 @@ def drawn(now, lines):
 
 def test_the_screen_shows_those_that_do_not_work_first_and_no_more_than_fits():
     crowd = (*(worker(f"w{n:04}", running=n % 3) for n in range(1000)), worker("broken", "lost"))
-    lines = drawn(Glance(0.0, Fleet(crowd, "All is well."), ()), 24)
+    lines = drawn(Glance(0.0, FleetStatus(crowd, "All is well."), ()), 24)
     assert len(lines) <= 24
     (first,) = [line for line in lines if line.startswith("broken")]
     assert lines.index(first) < min(n for n, line in enumerate(lines) if line.startswith("w0"))
@@ -98,14 +100,14 @@ def test_the_screen_shows_those_that_do_not_work_first_and_no_more_than_fits():
 
 
 def test_who_left_has_no_slots_on_the_screen():
-    (head, *_) = drawn(Glance(0.0, Fleet((worker(running=1), worker("w2", "left"))), ()), 24)
+    (head, *_) = drawn(Glance(0.0, FleetStatus((worker(running=1), worker("w2", "left"))), ()), 24)
     assert head.split("   ")[1:] == ["1 of 2 slots busy", "1 of 2 workers at work", "0 runs"]
 
 
 def test_throughput_is_that_of_the_last_seconds_and_never_negative():
-    glances = [Glance(float(at_s), Fleet((worker(completed=100 * at_s),)), ()) for at_s in range(10)]
+    glances = [Glance(float(at_s), FleetStatus((worker(completed=100 * at_s),)), ()) for at_s in range(10)]
     assert rate(earliest(glances, 5.0), glances[-1]) == 100.0
-    assert rate(glances[-1], Glance(10.0, Fleet(()), ())) == 0.0
+    assert rate(glances[-1], Glance(10.0, FleetStatus(()), ())) == 0.0
     assert rate(glances[-1], glances[-1]) == 0.0
 
 

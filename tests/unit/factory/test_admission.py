@@ -3,12 +3,12 @@
 import pytest
 
 from embomatrix.factory.admission import Admitted, admit
-from embomatrix.factory.refusal import Refusal, RefusalReason
+from embomatrix.factory.refusal import RefusalReason, TaskRefusal
 from embomatrix.sim.planner.oracle import PlanNotFound
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.syntax import Plan, Skill, SkillCall
 from embomatrix.skills.trace import Step, Trace
-from embomatrix.world.bddl import Literal, parse_formula
+from embomatrix.world.bddl import InitLiteral, parse_formula
 from embomatrix.world.goal import Atom
 from embomatrix.world.task import Task, TaskCategory
 
@@ -101,7 +101,7 @@ def test_task_is_turned_away_for_one_reason(
     stage: Boxes, goal: str, plan: Plan, reason: RefusalReason
 ) -> None:
     verdict = admit(stage, task(goal), oracle(*plan))
-    assert isinstance(verdict, Refusal)
+    assert isinstance(verdict, TaskRefusal)
     assert verdict.reason is reason
     assert len(verdict.sentence) > 20
 
@@ -110,12 +110,12 @@ def test_plan_that_a_robot_can_not_carry_out_in_physics_is_turned_away_with_what
     goal = task("(open box_1)")
     assert isinstance(admit(Boxes(), goal, oracle(OPEN_1), physics=Boxes()), Admitted)
     verdict = admit(Boxes(), goal, oracle(OPEN_1), physics=Stuck())
-    assert verdict == Refusal(
+    assert verdict == TaskRefusal(
         RefusalReason.PHYSICS_FAILED,
         "the oracle's plan fails in stepped physics: arm_blocked: step 1, open: box_2 bars it",
     )
     unmoved = admit(Boxes(), goal, oracle(OPEN_1), physics=Stuck(says_so=False))
-    assert isinstance(unmoved, Refusal)
+    assert isinstance(unmoved, TaskRefusal)
     assert "the goal does not hold in the end" in unmoved.sentence
 
 
@@ -123,15 +123,15 @@ def test_planner_s_own_reason_is_passed_on() -> None:
     verdict = admit(
         Boxes(), task("(open box_1)"), lambda _stage, _task: PlanNotFound("box_1 is behind a wall")
     )
-    assert verdict == Refusal(
+    assert verdict == TaskRefusal(
         RefusalReason.NO_PLAN, "the oracle planner found no plan: box_1 is behind a wall"
     )
 
 
 def test_start_that_is_not_as_the_source_says_is_turned_away() -> None:
-    init = (Literal(Atom("open", ("box_1",)), positive=False), Literal(Atom("open", ("box_2",))))
+    init = (InitLiteral(Atom("open", ("box_1",)), positive=False), InitLiteral(Atom("open", ("box_2",))))
     verdict = admit(Boxes("box_1"), task("(open box_3)"), oracle(OPEN_1), init)
-    assert isinstance(verdict, Refusal)
+    assert isinstance(verdict, TaskRefusal)
     assert verdict.reason is RefusalReason.INIT_NOT_MET
     assert "(not (open box_1))" in verdict.sentence
 
@@ -141,9 +141,9 @@ def test_of_a_benchmark_more_than_half_may_hold_at_the_start_and_never_all() -> 
     held = Boxes("box_1", "box_2")
     opened = oracle(SkillCall(Skill.OPEN, object_index=goal.index_of["box_3"]))
     usual = admit(held, goal, opened)
-    assert isinstance(usual, Refusal)
+    assert isinstance(usual, TaskRefusal)
     assert "2 of 3 atoms hold at the start, at most 50% may" in usual.sentence
     assert isinstance(admit(held, goal, opened, most_held=1.0), Admitted)
     done = admit(Boxes("box_1", "box_2", "box_3"), goal, opened, most_held=1.0)
-    assert isinstance(done, Refusal)
+    assert isinstance(done, TaskRefusal)
     assert done.reason is RefusalReason.GOAL_HOLDS

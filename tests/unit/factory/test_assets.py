@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from embomatrix.world.asset import Asset, Joint, Link
-    from embomatrix.world.geometry import FloatArray, Part, Vec3
+    from embomatrix.world.geometry import ConvexPart, FloatArray, Vec3
 
 SCENES = ("Rs_int", "Wainscott_0_int", "restaurant_diner", "house_single_floor")
 SMALL = (
@@ -58,13 +58,13 @@ ASSETS = [build_asset(CATALOG, category, model) for category, model in chosen_mo
 WITH_JOINTS = [asset for asset in ASSETS if asset.joints]
 
 
-def planes_of(part: Part) -> tuple[FloatArray, FloatArray]:
+def planes_of(part: ConvexPart) -> tuple[FloatArray, FloatArray]:
     """Outer half spaces of a part: normals (n, 3) and offsets, in the asset's frame."""
     mesh = mesh_of(part)
     return mesh.face_normals, np.einsum("ij,ij->i", mesh.face_normals, mesh.triangles[:, 0])
 
 
-def corners_of(part: Part) -> FloatArray:
+def corners_of(part: ConvexPart) -> FloatArray:
     if part.vertices_m:
         return part.pose.apply_all(np.asarray(part.vertices_m))
     return np.asarray(mesh_of(part).vertices)
@@ -81,7 +81,7 @@ def box_corners(box: Aabb) -> FloatArray:
     )
 
 
-def overlap_m(part: Part, corners: FloatArray, axes: FloatArray) -> float:
+def overlap_m(part: ConvexPart, corners: FloatArray, axes: FloatArray) -> float:
     """Least depth over the separating axes tried: an upper bound of the penetration, negative when apart."""
     normals, _ = planes_of(part)
     tried = np.vstack((normals, axes))
@@ -112,7 +112,7 @@ def corners_at(link: Link, fraction: float) -> FloatArray:
     return np.vstack([corners for corners, _ in parts_at(link, fraction)])
 
 
-def parts_of(asset: Asset, link: str) -> tuple[Part, ...]:
+def parts_of(asset: Asset, link: str) -> tuple[ConvexPart, ...]:
     """Parts of a link by its name, of the base for ""."""
     return next(item.parts for item in asset.links if item.name == (link or "base"))
 
@@ -208,7 +208,7 @@ def test_interiors_are_empty() -> None:
             assert_free(asset, space, 2e-4, parts_of(asset, interior.link))
 
 
-def assert_free(asset: Asset, free: Aabb, tolerance_m: float, riding: tuple[Part, ...] = ()) -> None:
+def assert_free(asset: Asset, free: Aabb, tolerance_m: float, riding: tuple[ConvexPart, ...] = ()) -> None:
     corners = box_corners(free)
     for part in (*asset.links[0].parts, *riding):
         if part.aabb(HERE).overlaps(free, -tolerance_m):

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 from typer.testing import CliRunner
 
-from embomatrix.factory.assets.check import EXCUSED_FROM_PROBE, PROBE_M, Finding, Rule, check_asset
+from embomatrix.factory.assets.check import EXCUSED_FROM_PROBE, PROBE_M, AssetFinding, Rule, check_asset
 from embomatrix.factory.assets.contact_sheet import TILE_PX, draw_sheet
 from embomatrix.factory.assets.families import Family
 from embomatrix.factory.assets.library import build_asset
@@ -15,7 +15,7 @@ from embomatrix.factory.assets.naming import family_of
 from embomatrix.factory.assets_cli import app
 from embomatrix.world.asset import Asset, Interior, Joint, JointKind, Link
 from embomatrix.world.catalog import Catalog
-from embomatrix.world.geometry import Part, Pose, Shape
+from embomatrix.world.geometry import ConvexPart, Pose, Shape
 
 CATALOG = Catalog.load()
 PLAIN_BOXES = 160
@@ -26,11 +26,11 @@ def first_of(category: str) -> Asset:
     return build_asset(CATALOG, category, CATALOG.models_of(category)[0].model_id)
 
 
-def box_at(center: tuple[float, float, float], size: tuple[float, float, float]) -> Part:
-    return Part(Shape.BOX, Pose(center), size)
+def box_at(center: tuple[float, float, float], size: tuple[float, float, float]) -> ConvexPart:
+    return ConvexPart(Shape.BOX, Pose(center), size)
 
 
-def wrong(findings: tuple[Finding, ...]) -> list[Rule]:
+def wrong(findings: tuple[AssetFinding, ...]) -> list[Rule]:
     return [finding.rule for finding in findings if not finding.excused]
 
 

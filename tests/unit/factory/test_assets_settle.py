@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from embomatrix.factory.assets.check import Finding, Rule
+from embomatrix.factory.assets.check import AssetFinding, Rule
 from embomatrix.factory.assets.library import build_asset
 from embomatrix.factory.assets.standing import GLANCE_STEPS, check_standing
 from embomatrix.factory.assets.standing import STEPS as STEPS_OF_TWO_SECONDS
@@ -80,7 +80,7 @@ def test_a_thing_on_its_edge_is_found() -> None:
     assert not finding.excused
 
 
-def fallen(categories: Sequence[str], least_steps: int) -> list[Finding]:
+def fallen(categories: Sequence[str], least_steps: int) -> list[AssetFinding]:
     """What does not stand, of the first model of each category, and is not excused."""
     assets = [build_asset(CATALOG, name, CATALOG.models_of(name)[0].model_id) for name in categories]
     return [f for f in check_standing(CATALOG, assets, least_steps) if not f.excused]

@@ -14,7 +14,7 @@ from embomatrix.factory.catalog_tables import (
     NOTICE_FILE,
     SCENES_FILE,
     SUBSTANCES_FILE,
-    SourceError,
+    CatalogSourceError,
     encode,
     main,
     source_folder,
@@ -30,7 +30,7 @@ SHIPPED = resources.files("embomatrix.world").joinpath("data")
 def rebuilt(tmp_path_factory: pytest.TempPathFactory) -> Path:
     try:
         source_folder()
-    except SourceError as error:
+    except CatalogSourceError as error:
         pytest.skip(str(error))
     out = tmp_path_factory.mktemp("tables")
     main(["--out", str(out)])

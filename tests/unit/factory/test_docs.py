@@ -12,7 +12,7 @@ from embomatrix.factory.refusal import RefusalReason
 from embomatrix.factory.scenes import cli as scene_cli
 from embomatrix.factory.task_import.reach import HELD
 from embomatrix.factory.task_import.sources import SourceText
-from embomatrix.factory.task_import.task import Imported, import_problem
+from embomatrix.factory.task_import.task import ImportedTask, import_problem
 from embomatrix.skills.parse import plan_to_json
 from embomatrix.skills.syntax import Skill, SkillCall
 from embomatrix.world.codec_task import task_to_json
@@ -30,12 +30,12 @@ def rows(first_heading: str) -> dict[str, str]:
     return {name.strip(" `"): value for name, value in cells}
 
 
-def imported() -> Imported:
+def imported() -> ImportedTask:
     """The problem of the page, bound to a kitchen."""
     text = re.search(r"```lisp\n(.*?)```", PAGE, re.DOTALL)
     assert text
     outcome = import_problem(SourceText("apple", text[1], "file"), kitchen_scene())
-    assert isinstance(outcome, Imported), outcome
+    assert isinstance(outcome, ImportedTask), outcome
     return outcome
 
 

@@ -14,16 +14,16 @@ from typer.testing import CliRunner
 from embomatrix.factory.cli import app
 from embomatrix.factory.evaluate.admissions import admitted_share, evaluate_admissions
 from embomatrix.factory.evaluate.aesthetics import Calibration, auc, features_of, fit, score_room
-from embomatrix.factory.evaluate.drafts import Asked, asked_in
+from embomatrix.factory.evaluate.drafts import DraftFeatures, asked_in
 from embomatrix.factory.evaluate.figures import (
-    Evaluation,
     EvaluationError,
+    EvaluationFigures,
     evaluation_to_json,
     read_evaluation,
 )
-from embomatrix.factory.evaluate.judge import Verdict
+from embomatrix.factory.evaluate.judge import DiversityScores
 from embomatrix.factory.evaluate.page import BEGIN, END, with_factory
-from embomatrix.factory.evaluate.rooms import FLOOR, Item, RoomPlan, plan_of, read_rooms
+from embomatrix.factory.evaluate.rooms import FLOOR, RoomBox, RoomPlan, plan_of, read_rooms
 from embomatrix.factory.evaluate.spoiling import SPOILERS
 from embomatrix.factory.evaluate.tasks import evenness, panel, people_of
 from embomatrix.factory.pipeline.corpus import HELDOUT_SCENES, training_scenes
@@ -32,11 +32,11 @@ from embomatrix.factory.social.writer import SocialWriter
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.world.catalog import Catalog
 
-BED = Item("bed", (1.0, 0.8), (1.0, 0.8), 0.0, 0.0, 0.6, FLOOR)
-DESK = Item("desk", (3.7, 3.0), (0.3, 0.7), 0.0, 0.0, 0.75, FLOOR)
-CHAIR = Item("chair", (3.2, 3.0), (0.25, 0.25), 0.0, 0.0, 0.9, FLOOR)
-BOOK = Item("book", (3.7, 3.2), (0.1, 0.1), 0.0, 0.75, 0.8, "desk")
-PILLOW = Item("pillow", (0.4, 0.8), (0.2, 0.3), 0.0, 0.6, 0.7, "bed")
+BED = RoomBox("bed", (1.0, 0.8), (1.0, 0.8), 0.0, 0.0, 0.6, FLOOR)
+DESK = RoomBox("desk", (3.7, 3.0), (0.3, 0.7), 0.0, 0.0, 0.75, FLOOR)
+CHAIR = RoomBox("chair", (3.2, 3.0), (0.25, 0.25), 0.0, 0.0, 0.9, FLOOR)
+BOOK = RoomBox("book", (3.7, 3.2), (0.1, 0.1), 0.0, 0.75, 0.8, "desk")
+PILLOW = RoomBox("pillow", (0.4, 0.8), (0.2, 0.3), 0.0, 0.6, 0.7, "bed")
 ROOM = RoomPlan("bedroom_0", (0.0, 0.0), (4.0, 4.0), (BED, DESK, CHAIR), (BOOK, PILLOW), (1, 0))
 HOSTS = {"book": {"desk": 1.0, "bed": 0.2}, "pillow": {"bed": 1.0}}
 
@@ -152,8 +152,8 @@ def test_evenness_is_1_where_all_kinds_come_up_equally_often(values):
 
 def test_the_panel_measures_each_writer_and_sets_goals_for_one():
     tasks = [
-        Asked("Mia is cooking: put the mug in the oven.", "inside(mug,oven)", ("kitchen_0",), False),
-        Asked("For Hugo, open a fridge.", "open(fridge)", ("kitchen_0", "bar_0"), True),
+        DraftFeatures("Mia is cooking: put the mug in the oven.", "inside(mug,oven)", ("kitchen_0",), False),
+        DraftFeatures("For Hugo, open a fridge.", "open(fridge)", ("kitchen_0", "bar_0"), True),
     ]
     figures = {figure.name: figure for figure in panel({"Rs_int": tasks}, NAMES)}
     assert figures["named_share"].value == 1
@@ -188,7 +188,7 @@ def test_scenes_to_train_in_and_held_out_ones_are_all_scenes_and_share_none():
     }
 
 
-EVALUATION = Evaluation(
+EVALUATION = EvaluationFigures(
     "tasks",
     {"scenes": 45, "seed": 0},
     (
@@ -308,7 +308,7 @@ def test_what_is_no_build_is_told_in_a_sentence(tmp_path):
 
 def test_a_judge_gives_points_of_ten():
     with pytest.raises(ValueError, match="less than or equal to 10"):
-        Verdict.model_validate({"variety": 8, "characters": 9, "overall": 11, "explanation": "x"})
+        DiversityScores.model_validate({"variety": 8, "characters": 9, "overall": 11, "explanation": "x"})
 
 
 def test_the_command_tells_in_a_sentence_what_is_wrong(tmp_path):

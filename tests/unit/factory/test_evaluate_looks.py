@@ -15,10 +15,10 @@ from embomatrix.factory.editor import SceneEditor
 from embomatrix.factory.evaluate.figures import EvaluationError
 from embomatrix.factory.evaluate.looks import Impression, evaluate_looks, impression_of
 from embomatrix.factory.evaluate.page import with_factory
-from embomatrix.factory.evaluate.scenes import LIST, Method, SceneTask
+from embomatrix.factory.evaluate.scenes import LIST, LayoutMethod, SceneTask
 from embomatrix.factory.evaluate.side_by_side import LEAST_PX, draw_side_by_side, named
 from embomatrix.factory.layout.generator import lay
-from embomatrix.factory.layout.jobs import Item
+from embomatrix.factory.layout.jobs import RequestedObject
 from embomatrix.factory.pictures.sights import alone
 from embomatrix.factory.task_import.sources import SourceText
 from embomatrix.llm.endpoint import Endpoint
@@ -26,7 +26,9 @@ from embomatrix.llm.values import UnusableReplyError
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.scene import Scene
 
-MUG = Item("mug", (("mug", Catalog.load().models_of("mug")[0].model_id),), rooms=("living_room_0",))
+MUG = RequestedObject(
+    "mug", (("mug", Catalog.load().models_of("mug")[0].model_id),), rooms=("living_room_0",)
+)
 POINTS = {"correspondence": 0, "clutter": 1, "placement": 0.5, "explanation": "tidy, but for the corner"}
 APPLE = """(define (problem apple)
     (:domain omnigibson)
@@ -83,7 +85,9 @@ async def test_every_method_has_its_mean_and_unusable_answers_are_counted() -> N
     done: list[int] = []
     with server.serving() as url:
         async with Endpoint(url, "sees-1") as endpoint:
-            found = await evaluate_looks(endpoint, [task], [Method.TREE, Method.RANDOM], 0, done.append)
+            found = await evaluate_looks(
+                endpoint, [task], [LayoutMethod.TREE, LayoutMethod.RANDOM], 0, done.append
+            )
     assert found.figure("judge tree").value == 8.5
     assert found.notes == ("1 scenes got no usable answer.",)
     assert done == [1, 2]
@@ -96,7 +100,7 @@ def test_a_task_is_drawn_by_every_method_side_by_side_with_the_reason_where_one_
         draw_side_by_side(SceneTask(SourceText("apple", text, "embomatrix"), "Rs_int"), 0)
         for text in (APPLE, huge)
     )
-    assert none.width == LEAST_PX * len(Method)
+    assert none.width == LEAST_PX * len(LayoutMethod)
     assert one.width > none.width
     assert len(none.getcolors(1 << 16)) > 1
     with pytest.raises(EvaluationError, match="none of the 1 fixed tasks"):

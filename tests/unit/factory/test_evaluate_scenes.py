@@ -14,14 +14,14 @@ from embomatrix.factory.evaluate.scene_geometry import Flaw, flaws_of
 from embomatrix.factory.evaluate.scene_runs import OutcomeLog, evaluate_scenes
 from embomatrix.factory.evaluate.scenes import (
     LIST,
-    Method,
-    Outcome,
+    LayoutMethod,
+    LayoutOutcome,
     SceneTask,
     evaluation_of,
     fixed_tasks,
 )
 from embomatrix.factory.layout.generator import lay
-from embomatrix.factory.layout.jobs import Item
+from embomatrix.factory.layout.jobs import RequestedObject
 from embomatrix.factory.task_import.sources import SourceText
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.geometry import Pose
@@ -51,7 +51,7 @@ def test_a_sample_that_lacks_the_fixed_tasks_is_told(tmp_path: "Path") -> None:
 
 def test_what_the_generator_lays_has_no_flaw(flat: "Scene") -> None:
     editor = SceneEditor(flat)
-    layout = lay(editor, [Item("mug", (("mug", Catalog.load().models_of("mug")[0].model_id),))], 0)
+    layout = lay(editor, [RequestedObject("mug", (("mug", Catalog.load().models_of("mug")[0].model_id),))], 0)
     assert flaws_of(editor.freeze("sound"), tuple(layout.names.values())) == ()
 
 
@@ -82,16 +82,18 @@ def test_each_flaw_of_a_thing_is_seen(flat: "Scene") -> None:
     assert Flaw.UNREACHED in placed(flat, x, y, 2.1)
 
 
-def outcome(method: Method, reason: str = "", *, generated: bool = True, verified: bool = True) -> Outcome:
-    return Outcome("task", "Rs_int", method, generated, verified, verified, reason, 1.0, (0.01,), 8.0)
+def outcome(
+    method: LayoutMethod, reason: str = "", *, generated: bool = True, verified: bool = True
+) -> LayoutOutcome:
+    return LayoutOutcome("task", "Rs_int", method, generated, verified, verified, reason, 1.0, (0.01,), 8.0)
 
 
 def test_rates_are_shares_and_only_the_tree_has_goals() -> None:
     found = [
-        outcome(Method.TREE),
-        outcome(Method.TREE, "geometry: a floats", verified=False),
-        outcome(Method.TREE, "does_not_fit: full", generated=False, verified=False),
-        outcome(Method.RANDOM),
+        outcome(LayoutMethod.TREE),
+        outcome(LayoutMethod.TREE, "geometry: a floats", verified=False),
+        outcome(LayoutMethod.TREE, "does_not_fit: full", generated=False, verified=False),
+        outcome(LayoutMethod.RANDOM),
     ]
     evaluation = evaluation_of(found, {})
     assert evaluation.figure("generation_rate").value == pytest.approx(200 / 3)
@@ -102,9 +104,11 @@ def test_rates_are_shares_and_only_the_tree_has_goals() -> None:
 
 
 def test_aesthetics_are_compared_over_the_tasks_that_every_method_laid_out() -> None:
-    crowded = replace(outcome(Method.TREE), task="crowded", aesthetics=6.0)
-    failed = replace(outcome(Method.RANDOM, "does_not_fit", generated=False), task="crowded", aesthetics=None)
-    found = evaluation_of([outcome(Method.TREE), outcome(Method.RANDOM), crowded, failed], {})
+    crowded = replace(outcome(LayoutMethod.TREE), task="crowded", aesthetics=6.0)
+    failed = replace(
+        outcome(LayoutMethod.RANDOM, "does_not_fit", generated=False), task="crowded", aesthetics=None
+    )
+    found = evaluation_of([outcome(LayoutMethod.TREE), outcome(LayoutMethod.RANDOM), crowded, failed], {})
     assert found.figure("aesthetics").value == 7.0
     assert found.figure("aesthetics_shared").value == 8.0
     assert found.figure("aesthetics_shared random").n == 1
@@ -112,7 +116,8 @@ def test_aesthetics_are_compared_over_the_tasks_that_every_method_laid_out() -> 
 
 
 KNOWN = [
-    Outcome("known", "Rs_int", method, True, True, True, "", 1.0, (0.01, 0.02), 8.0) for method in Method
+    LayoutOutcome("known", "Rs_int", method, True, True, True, "", 1.0, (0.01, 0.02), 8.0)
+    for method in LayoutMethod
 ]
 UNICORN = """(define (problem unicorn)
     (:domain omnigibson)
@@ -129,9 +134,9 @@ def test_a_run_that_was_stopped_makes_only_what_is_missing_and_keeps_it(tmp_path
         log.add(outcome)
     tasks = [SceneTask(SourceText(name, UNICORN, "embomatrix"), "Rs_int") for name in ("known", "new")]
     told: list[int] = []
-    _, outcomes = evaluate_scenes(tasks, list(Method), 0, 1, told.append, OutcomeLog.open(path, 0))
+    _, outcomes = evaluate_scenes(tasks, list(LayoutMethod), 0, 1, told.append, OutcomeLog.open(path, 0))
     assert outcomes[:3] == KNOWN
-    assert [(each.task, each.method) for each in outcomes[3:]] == [("new", method) for method in Method]
+    assert [(each.task, each.method) for each in outcomes[3:]] == [("new", method) for method in LayoutMethod]
     assert all("unicorn" in each.reason for each in outcomes[3:])
     assert told == [3, 4, 5, 6]
     assert OutcomeLog.open(path, 0).outcomes == outcomes

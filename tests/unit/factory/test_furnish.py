@@ -13,15 +13,21 @@ from embomatrix.factory.floorplan.spec import RoomSpec
 from embomatrix.factory.furnish.groups import room_groups
 from embomatrix.factory.furnish.hosts import hosts_of, kept_behind_doors
 from embomatrix.factory.furnish.panel import panel_of
-from embomatrix.factory.furnish.pieces import REST_GAP_M, Group, Piece, around_table, front_depth_m
-from embomatrix.factory.furnish.roles import HUNG_BOTTOM_M, Role, role_of
+from embomatrix.factory.furnish.pieces import (
+    REST_GAP_M,
+    FurnitureGroup,
+    FurniturePiece,
+    around_table,
+    front_depth_m,
+)
+from embomatrix.factory.furnish.roles import HUNG_BOTTOM_M, FurnitureRole, role_of
 from embomatrix.factory.furnish.rooms import MAX_EQUAL, furnish
 from embomatrix.factory.furnish.space import RoomSpace, Target
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.floor import box_of
 from embomatrix.world.asset import Asset, Joint, JointKind, Link, SupportSurface
 from embomatrix.world.catalog import Catalog
-from embomatrix.world.geometry import Part, Pose, Shape, Vec3
+from embomatrix.world.geometry import ConvexPart, Pose, Shape, Vec3
 from embomatrix.world.scene import Doorway, Room, Scene, Window
 from embomatrix.world.state import Relation
 
@@ -34,9 +40,9 @@ DOOR = Doorway(("kitchen_0", "hall_0"), (2.0, -0.06), 0.9, 2.0, "x")
 
 def block(category: str, size: Vec3, *, door: bool = False) -> Asset:
     """A solid box with a top to put things on, and a hinged front if it opens."""
-    links = [Link("base", (Part(Shape.BOX, Pose((0.0, 0.0, 0.0)), size),))]
+    links = [Link("base", (ConvexPart(Shape.BOX, Pose((0.0, 0.0, 0.0)), size),))]
     if door:
-        leaf = Part(Shape.BOX, Pose((size[0] / 2 - 0.01, 0.0, 0.0)), (0.02, size[1], size[2]))
+        leaf = ConvexPart(Shape.BOX, Pose((size[0] / 2 - 0.01, 0.0, 0.0)), (0.02, size[1], size[2]))
         hinge = Joint(JointKind.REVOLUTE, (size[0] / 2, size[1] / 2, 0.0), (0.0, 0.0, 1.0), math.pi / 2)
         links.append(Link("door", (leaf,), hinge))
     top = SupportSurface("top", (0.0, 0.0, size[2] / 2), size[:2], 1.0)
@@ -46,8 +52,11 @@ def block(category: str, size: Vec3, *, door: bool = False) -> Asset:
     )
 
 
-def pieces(*assets: Asset) -> list[Piece]:
-    return [Piece(i, a.category, a, role_of(a.category, a.size_m, a.mass_kg)) for i, a in enumerate(assets)]
+def pieces(*assets: Asset) -> list[FurniturePiece]:
+    return [
+        FurniturePiece(i, a.category, a, role_of(a.category, a.size_m, a.mass_kg))
+        for i, a in enumerate(assets)
+    ]
 
 
 def furnished(*assets: Asset, floor: tuple[float, float] = (4.0, 3.0), seed: int = 0) -> Furnishing:
@@ -74,7 +83,7 @@ def test_a_counter_slab_lies_on_its_tallest_cabinet() -> None:
     )
     groups, left_out = room_groups(pieces(block("countertop", (0.6, 1.0, 0.03)), cabinet, lower))
     (counter,) = groups
-    assert isinstance(counter, Group)
+    assert isinstance(counter, FurnitureGroup)
     slab = counter.members[-1]
     assert slab.piece.category == "countertop"
     assert slab.bottom == pytest.approx(0.55 + REST_GAP_M)
@@ -152,9 +161,9 @@ def test_small_things_of_one_model_are_capped() -> None:
 
 
 def test_an_unknown_category_gets_a_role_by_its_size() -> None:
-    assert role_of("gadget", (0.1, 0.1, 0.1), 0.2) is Role.SURFACE
-    assert role_of("contraption", (0.6, 1.4, 1.0), 40.0) is Role.BACKED
-    assert role_of("obelisk", (5.0, 5.0, 9.0), 4000.0) is Role.STRUCTURE
+    assert role_of("gadget", (0.1, 0.1, 0.1), 0.2) is FurnitureRole.SURFACE
+    assert role_of("contraption", (0.6, 1.4, 1.0), 40.0) is FurnitureRole.BACKED
+    assert role_of("obelisk", (5.0, 5.0, 9.0), 4000.0) is FurnitureRole.STRUCTURE
 
 
 def test_the_same_seed_builds_the_same_scene() -> None:

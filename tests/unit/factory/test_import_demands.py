@@ -5,13 +5,20 @@ import pytest
 from tests.fakes.problems import PROBLEM, source
 
 from embomatrix.factory.assets.library import build_asset
-from embomatrix.factory.refusal import Refusal, RefusalReason
+from embomatrix.factory.refusal import RefusalReason, TaskRefusal
 from embomatrix.factory.task_import import batch
 from embomatrix.factory.task_import.binding import Addition
-from embomatrix.factory.task_import.demands import Demand, Room, demand_on, demands_of, room_for, smallest_m
+from embomatrix.factory.task_import.demands import (
+    CavityFit,
+    Demand,
+    demand_on,
+    demands_of,
+    room_for,
+    smallest_m,
+)
 from embomatrix.factory.task_import.models import models_for
 from embomatrix.factory.task_import.sources import NAMESAKES, activity_names
-from embomatrix.factory.task_import.task import Imported, Manner, import_problem
+from embomatrix.factory.task_import.task import ImportedTask, Manner, import_problem
 from embomatrix.factory.writer.view import is_liftable
 from embomatrix.world.bddl import parse_problem
 from embomatrix.world.catalog import Catalog
@@ -61,9 +68,9 @@ def test_what_must_not_stay_is_carried_and_what_must_not_go_in_needs_no_room() -
 def test_a_container_has_floor_for_all_that_goes_in() -> None:
     plates = ("plate.n.04",) * 4
     model = model_of(Demand(bears=True, contents=plates))
-    assert room_for(asset_of(model), plates) is Room.FOR_ALL
+    assert room_for(asset_of(model), plates) is CavityFit.FOR_ALL
     small = asset_of(model_of(Demand(bears=True)))
-    assert room_for(small, plates) > Room.FOR_ALL
+    assert room_for(small, plates) > CavityFit.FOR_ALL
 
 
 def test_a_container_that_is_carried_can_be_lifted_whatever_goes_in() -> None:
@@ -73,9 +80,13 @@ def test_a_container_that_is_carried_can_be_lifted_whatever_goes_in() -> None:
 
 @pytest.mark.parametrize(
     ("contents", "room"),
-    [((), Room.FOR_ALL), (("rag.n.01",), Room.FOR_SOME), (("apple.n.01",) * 30, Room.FOR_EACH)],
+    [
+        ((), CavityFit.FOR_ALL),
+        (("rag.n.01",), CavityFit.FOR_SOME),
+        (("apple.n.01",) * 30, CavityFit.FOR_EACH),
+    ],
 )
-def test_room_is_told_by_footprints(contents: tuple[str, ...], room: Room) -> None:
+def test_room_is_told_by_footprints(contents: tuple[str, ...], room: CavityFit) -> None:
     catalog = Catalog.load()
     bucket = min(catalog.models_of("bucket"), key=lambda model: model.size_m)
     assert room_for(build_asset(catalog, "bucket", bucket.model_id), contents) is room
@@ -90,7 +101,7 @@ def test_the_scene_of_a_problem_comes_first_with_other_draws(home: Scene, flat: 
     item = source(PROBLEM)
     at_home = type(item)(item.name, item.text, item.source, item.request, scene=home.base)
     asked = list(batch.imports(at_home, [flat, home], seed=0, manner=Manner(), draws=2))
-    first = [found.scene.base for found in asked[:2] if isinstance(found, Imported)]
+    first = [found.scene.base for found in asked[:2] if isinstance(found, ImportedTask)]
     assert first == [home.base] * 2
     one, other = (found.scene for found in asked[:2])
     assert one.scene_id != other.scene_id
@@ -103,7 +114,7 @@ def test_what_no_skill_reaches_is_tried_in_no_further_scene(home: Scene, flat: S
     item = source(text)
     at_home = type(item)(item.name, item.text, item.source, item.request, scene=home.base)
     (only,) = batch.imports(at_home, [flat, home], seed=0, manner=Manner(), draws=3)
-    assert isinstance(only, Refusal)
+    assert isinstance(only, TaskRefusal)
     assert only.reason is RefusalReason.INEXPRESSIBLE
 
 
@@ -111,8 +122,8 @@ def test_a_tap_joins_the_table_where_something_must_be_wet(home: Scene) -> None:
     text = PROBLEM.replace("(not (open ?electric_refrigerator.n.01_1))", "(soaked ?apple.n.01_1)")
     wet = import_problem(source(text.replace("apple.n.01", "rag.n.01")), home)
     dry = import_problem(source(PROBLEM.replace("apple.n.01", "rag.n.01")), home)
-    assert isinstance(wet, Imported)
-    assert isinstance(dry, Imported)
+    assert isinstance(wet, ImportedTask)
+    assert isinstance(dry, ImportedTask)
     assert not any("sink" in name for name in dry.about)
     assert any("sink" in name for name in wet.task.table)
 
@@ -129,7 +140,7 @@ def test_a_tap_joins_the_table_where_something_must_be_wet(home: Scene) -> None:
 def test_what_examines_is_not_trained_on(home: Scene, name: str, origin: str, examines: bool) -> None:
     item = type(source())(name, PROBLEM, origin)
     imported = import_problem(item, home)
-    assert isinstance(imported, Imported)
+    assert isinstance(imported, ImportedTask)
     assert imported.examines is examines
 
 

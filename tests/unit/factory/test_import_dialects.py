@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from tests.fakes.problems import PROBLEM, source
 
-from embomatrix.factory.refusal import Refusal, RefusalReason
+from embomatrix.factory.refusal import RefusalReason, TaskRefusal
 from embomatrix.factory.task_import.batch import bind_first
 from embomatrix.factory.task_import.dialects import (
     GROUPS,
@@ -19,7 +19,7 @@ from embomatrix.factory.task_import.dialects import (
 )
 from embomatrix.factory.task_import.reach import unreachable_atoms
 from embomatrix.factory.task_import.report import (
-    Outcome,
+    ProblemOutcome,
     evaluation_of,
     outcome_of,
     report_to_json,
@@ -29,11 +29,11 @@ from embomatrix.factory.task_import.report import (
 from embomatrix.factory.task_import.sources import (
     EAI_INSTRUCTIONS,
     EAI_PROBLEMS,
-    SourceError,
+    ProblemSourceError,
     read_eai,
 )
-from embomatrix.factory.task_import.task import Imported, Manner, import_problem
-from embomatrix.world.bddl import Literal, parse_formula, parse_problem
+from embomatrix.factory.task_import.task import ImportedTask, Manner, import_problem
+from embomatrix.world.bddl import InitLiteral, parse_formula, parse_problem
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.goal import Atom
 from embomatrix.world.scene import Scene
@@ -73,7 +73,7 @@ def test_a_driveway_is_ground_that_things_stand_on(home: Scene) -> None:
     imported = import_problem(
         source(text.replace("apple.n.01_2 breakfast_table.n.01_1", "apple.n.01_2 driveway.n.01_1")), home
     )
-    assert isinstance(imported, Imported)
+    assert isinstance(imported, ImportedTask)
     apple = imported.scene.by_name[imported.about[imported.instances.index("apple.n.01_2")]]
     assert (apple.room, apple.host) == ("kitchen_0", "")
 
@@ -89,7 +89,7 @@ def test_every_word_is_read_as_types_that_have_models() -> None:
 def test_what_a_problem_leaves_unsaid_is_said() -> None:
     text = PROBLEM.replace("(ontop apple.n.01_2 breakfast_table.n.01_1)", "(inside apple.n.01_2 closet_1)")
     problem, notes = said_whole(parse_problem(text))
-    assert Literal(Atom("inroom", ("apple.n.01_2", "closet_1"))) in problem.init
+    assert InitLiteral(Atom("inroom", ("apple.n.01_2", "closet_1"))) in problem.init
     assert notes == ("(inside apple.n.01_2 closet_1) is read as being in the room",)
     assert said_whole(problem) == (problem, ())
 
@@ -99,7 +99,7 @@ def test_a_floor_without_a_room_is_that_of_what_stands_on_it() -> None:
         "(inroom floor.n.01_1 kitchen)", "(inroom apple.n.01_1 kitchen) (ontop apple.n.01_1 floor.n.01_1)"
     )
     problem, notes = said_whole(parse_problem(text))
-    assert Literal(Atom("inroom", ("floor.n.01_1", "kitchen"))) in problem.init
+    assert InitLiteral(Atom("inroom", ("floor.n.01_1", "kitchen"))) in problem.init
     assert len(notes) == 1
 
 
@@ -108,11 +108,11 @@ def test_a_goal_that_no_skill_reaches_is_bound_where_it_need_only_be_told(home: 
         PROBLEM.replace("(not (open ?electric_refrigerator.n.01_1))", "(sliced ?breakfast_table.n.01_1)")
     )
     refused = import_problem(item, home)
-    assert isinstance(refused, Refusal)
+    assert isinstance(refused, TaskRefusal)
     assert refused.reason is RefusalReason.INEXPRESSIBLE
-    assert isinstance(import_problem(item, home, manner=EVALUABLE), Imported)
+    assert isinstance(import_problem(item, home, manner=EVALUABLE), ImportedTask)
     folded = import_problem(source(PROBLEM.replace("(not (open ?", "(not (folded ?")), home, manner=EVALUABLE)
-    assert isinstance(folded, Refusal)
+    assert isinstance(folded, TaskRefusal)
 
 
 def test_atoms_beyond_a_profile_are_listed_with_their_sign() -> None:
@@ -156,7 +156,7 @@ def test_eai_s_tasks_are_bound_to_the_scene_that_they_were_written_for(
 ) -> None:
     (item,) = read_eai(eai)
     imported = bind_first(item, [home, flat], manner=EVALUABLE)
-    assert isinstance(imported, Imported)
+    assert isinstance(imported, ImportedTask)
     assert imported.scene.base == "Rs_int"
     assert imported.task.instruction == "Put the toys on the dusted table."
     outcome = outcome_of(item, imported)
@@ -167,7 +167,7 @@ def test_eai_s_tasks_are_bound_to_the_scene_that_they_were_written_for(
 def test_the_report_counts_refusals_and_lists_what_no_skill_reaches(eai: Path, flat: Scene) -> None:
     (item,) = read_eai(eai)
     bound = outcome_of(item, bind_first(item, [flat], manner=EVALUABLE))
-    refused = outcome_of(item, Refusal(RefusalReason.DOES_NOT_FIT, "no room"))
+    refused = outcome_of(item, TaskRefusal(RefusalReason.DOES_NOT_FIT, "no room"))
     told = report_to_json([bound, refused])
     assert (told["problems"], told["bound"], told["refused"]) == (2, 1, {"does_not_fit": 1})
     text = report_to_markdown([bound, refused])
@@ -179,7 +179,7 @@ def test_the_report_counts_refusals_and_lists_what_no_skill_reaches(eai: Path, f
 
 def test_solved_are_counted_among_the_goals_that_a_profile_reaches() -> None:
     solved, stuck, beyond = (
-        Outcome(name, "behavior-1k", "", reason, "", {"paper": atoms, "household": ()}, ())
+        ProblemOutcome(name, "behavior-1k", "", reason, "", {"paper": atoms, "household": ()}, ())
         for name, reason, atoms in (("a", "", ()), ("b", "no_plan", ()), ("c", "", ("(cut apple)",)))
     )
     evaluation = solved_of([solved, stuck, beyond], 0)
@@ -193,15 +193,15 @@ def test_solved_are_counted_among_the_goals_that_a_profile_reaches() -> None:
 
 
 def test_a_folder_without_eai_s_files_is_one_sentence(tmp_path: Path) -> None:
-    with pytest.raises(SourceError, match=r"can't be read|holds no tasks of EAI"):
+    with pytest.raises(ProblemSourceError, match=r"can't be read|holds no tasks of EAI"):
         read_eai(tmp_path)
 
 
 def test_rooms_of_other_worlds_may_be_counted_otherwise(home: Scene) -> None:
     other = source(PROBLEM.replace(" kitchen)", " kitchen_7)"))
-    assert isinstance(import_problem(other, home), Refusal)
+    assert isinstance(import_problem(other, home), TaskRefusal)
     found = bind_first(other, [home])
-    assert isinstance(found, Imported)
+    assert isinstance(found, ImportedTask)
     assert "kitchen_7 is read as kitchen_0" in found.notes
 
 
@@ -210,5 +210,5 @@ def test_a_room_that_a_scene_lacks_is_one_like_it_at_the_last(home: Scene) -> No
         "(ontop apple.n.01_2 breakfast_table.n.01_1)", "(inroom apple.n.01_2 television_room_0)"
     )
     found = bind_first(source(text), [home])
-    assert isinstance(found, Imported)
+    assert isinstance(found, ImportedTask)
     assert "television_room_0 is read as living_room_0" in found.notes

@@ -8,7 +8,7 @@ from tests.fakes.problems import PROBLEM, source
 
 from embomatrix.factory.task_import.batch import Verified, verify
 from embomatrix.factory.task_import.reach import Horizon
-from embomatrix.factory.task_import.task import Imported, import_problem
+from embomatrix.factory.task_import.task import ImportedTask, import_problem
 from embomatrix.sim.engine import FLOOR
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.physical.survey import Foresight
@@ -64,7 +64,7 @@ HOUSEHOLD = """(define (problem slice_an_apple_and_wipe_the_bowl)
 
 def test_substances_and_halves_of_a_problem_are_in_the_scene_that_is_made(home: Scene) -> None:
     imported = import_problem(source(HOUSEHOLD), home)
-    assert isinstance(imported, Imported), imported
+    assert isinstance(imported, ImportedTask), imported
     task, scene = imported.task, imported.scene
     assert task.profile is Profile.HOUSEHOLD
     assert task.goal_bddl == (
@@ -85,7 +85,7 @@ def test_substances_and_halves_of_a_problem_are_in_the_scene_that_is_made(home: 
 
 def test_a_household_task_is_read_back_and_can_be_done(home: Scene) -> None:
     imported = import_problem(source(HOUSEHOLD), home)
-    assert isinstance(imported, Imported)
+    assert isinstance(imported, ImportedTask)
     data = encode_bundle(Bundle(imported.scene, {imported.task.task_id: imported.task}))
     bundle = decode_bundle(data, digest=bundle_digest(data))
     task = bundle.tasks[imported.task.task_id]
@@ -114,7 +114,7 @@ def test_a_floor_that_the_goal_is_about_becomes_an_object_that_can_be_wiped_and_
         "(not (covered ?floor.n.01_1 ?dust.n.01_1)) (ontop ?plate.n.04_1 ?floor.n.01_1)",
     )
     imported = import_problem(source(text), home)
-    assert isinstance(imported, Imported), imported
+    assert isinstance(imported, ImportedTask), imported
     task = imported.task
     assert "(not (covered floors_1 dust.n.01)) (ontop plate_1 floors_1)" in task.goal_bddl
     assert imported.scene.by_name["floors_1"].fixed
@@ -130,7 +130,7 @@ def test_a_floor_is_no_obstacle_and_what_stands_in_its_room_is_on_it(home: Scene
         "(not (open ?electric_refrigerator.n.01_1))", "(not (ontop ?apple.n.01_1 ?floor.n.01_1))"
     )
     imported = import_problem(source(text), home)
-    assert isinstance(imported, Imported)
+    assert isinstance(imported, ImportedTask)
     with contextlib.closing(Simulator(Bundle(imported.scene, {}))) as simulator:
         engine = simulator.world.engine
         simulator.reset(imported.task, 0)

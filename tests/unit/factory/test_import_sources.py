@@ -11,19 +11,19 @@ from tests.fakes.problems import PROBLEM
 from typer.testing import CliRunner
 
 from embomatrix.factory.cli import app
-from embomatrix.factory.refusal import Refusal, RefusedError
+from embomatrix.factory.refusal import RefusedError, TaskRefusal
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.task_import.batch import bind_first
 from embomatrix.factory.task_import.expressible import check_expressible
 from embomatrix.factory.task_import.sources import (
-    SourceError,
+    ProblemSourceError,
     SourceText,
     activity_names,
     read_activity,
     read_file,
     read_jsonl,
 )
-from embomatrix.factory.task_import.task import Imported, import_problem
+from embomatrix.factory.task_import.task import ImportedTask, import_problem
 from embomatrix.world.bddl import parse_problem
 
 SAMPLE = Path(__file__).parents[4] / "shared" / "data" / "embomatrix_tasks_sample.jsonl"
@@ -49,23 +49,23 @@ def test_as_many_goals_are_expressible_as_the_documentation_says() -> None:
 
 def test_unknown_activity_suggests_a_close_name() -> None:
     pytest.importorskip("bddl", reason="the bddl package is not installed")
-    with pytest.raises(SourceError, match="did you mean bringing_water"):
+    with pytest.raises(ProblemSourceError, match="did you mean bringing_water"):
         read_activity("bringin_water")
     assert read_activity("bringing_water").request == "bringing water"
     assert len(activity_names()) >= 1016
 
 
 def test_unreadable_sources_are_one_sentence(tmp_path: Path) -> None:
-    with pytest.raises(SourceError, match="can't be read"):
+    with pytest.raises(ProblemSourceError, match="can't be read"):
         read_file(tmp_path / "missing.bddl")
-    with pytest.raises(SourceError, match="can't be read"):
+    with pytest.raises(ProblemSourceError, match="can't be read"):
         list(read_jsonl(tmp_path / "missing.jsonl"))
     with (tmp_path / "huge.bddl").open("wb") as file:
         file.truncate(1 << 30)
-    with pytest.raises(SourceError, match="over 1,048,576 bytes"):
+    with pytest.raises(ProblemSourceError, match="over 1,048,576 bytes"):
         read_file(tmp_path / "huge.bddl")
     (tmp_path / "bad.jsonl").write_text(json.dumps({"name": "a", "bddl": PROBLEM}) + "\n{}\n")
-    with pytest.raises(SourceError, match=r"bad.jsonl:2: expected an object"):
+    with pytest.raises(ProblemSourceError, match=r"bad.jsonl:2: expected an object"):
         list(read_jsonl(tmp_path / "bad.jsonl"))
 
 
@@ -75,7 +75,7 @@ def test_unreadable_sources_are_one_sentence(tmp_path: Path) -> None:
 def test_tasks_of_the_paper_s_factory_are_bound_or_refused() -> None:
     bases = [build_base_scene("Rs_int"), build_base_scene("Wainscott_0_int")]
     outcomes = [bind_first(item, bases) for item in list(read_jsonl(SAMPLE))[::8]]
-    counts = Counter(item.reason if isinstance(item, Refusal) else "bound" for item in outcomes)
+    counts = Counter(item.reason if isinstance(item, TaskRefusal) else "bound" for item in outcomes)
     assert counts["bound"] >= 3
     assert sum(counts.values()) == 50
 
@@ -85,7 +85,7 @@ def test_activities_of_behavior_1k_are_bound_or_refused() -> None:
     base = build_base_scene("Wainscott_0_int")
     names = activity_names()[::32]
     outcomes = [import_problem(read_activity(name), base) for name in names]
-    bound = [item for item in outcomes if isinstance(item, Imported)]
+    bound = [item for item in outcomes if isinstance(item, ImportedTask)]
     assert len(bound) >= 2
     for item in bound:
         assert item.task.source == "behavior-1k"

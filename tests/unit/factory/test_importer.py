@@ -4,30 +4,30 @@ import numpy as np
 import pytest
 from tests.fakes.problems import PROBLEM, source
 
-from embomatrix.factory.refusal import Refusal, RefusalReason, RefusedError
+from embomatrix.factory.refusal import RefusalReason, RefusedError, TaskRefusal
 from embomatrix.factory.task_import.batch import Verified, verify
 from embomatrix.factory.task_import.binding import bind
 from embomatrix.factory.task_import.kinds import category_of, instruction_of
 from embomatrix.factory.task_import.scene import with_states
-from embomatrix.factory.task_import.task import Imported, Manner, import_problem
+from embomatrix.factory.task_import.task import ImportedTask, Manner, import_problem
 from embomatrix.sim.physical.survey import Foresight
 from embomatrix.sim.placing.pose_cache import PlacementLibrary
-from embomatrix.world.bddl import BddlError, Literal, parse_formula, parse_problem
+from embomatrix.world.bddl import BddlError, InitLiteral, parse_formula, parse_problem
 from embomatrix.world.goal import Atom
 from embomatrix.world.scene import Scene
 from embomatrix.world.state import State
 from embomatrix.world.task import TaskCategory
 
 
-def refusal(text: str, scene: Scene) -> Refusal:
+def refusal(text: str, scene: Scene) -> TaskRefusal:
     outcome = import_problem(source(text), scene, manner=Manner(furnishing=False))
-    assert isinstance(outcome, Refusal)
+    assert isinstance(outcome, TaskRefusal)
     return outcome
 
 
 def test_problem_becomes_a_task_in_a_scene_of_its_own(home: Scene) -> None:
     imported = import_problem(source(), home)
-    assert isinstance(imported, Imported)
+    assert isinstance(imported, ImportedTask)
     task, scene = imported.task, imported.scene
     added = [item for item in scene.objects if item.name not in home.by_name]
     assert [(item.name, item.host) for item in added] == [
@@ -89,7 +89,7 @@ def test_what_can_t_be_bound_is_refused_for_its_reason(home: Scene, reason: Refu
 
 def test_furniture_of_which_no_model_can_do_what_is_asked_is_refused_with_what_that_is(home: Scene) -> None:
     outcome = import_problem(source(PROBLEM.replace("electric_refrigerator", "sofa")), home)
-    assert isinstance(outcome, Refusal)
+    assert isinstance(outcome, TaskRefusal)
     assert outcome.reason is RefusalReason.DOES_NOT_FIT
     assert outcome.sentence == (
         "'sofa.n.01_1' has no place: its type has no model that can do what the task asks of it: container, openable"
@@ -125,7 +125,7 @@ def test_small_thing_of_the_room_that_the_scene_lacks_is_put_on_furniture_there(
         "tennis_ball.n.01_1 - apple.n.01", "- apple.n.01\n        tennis_ball.n.01_1 - tennis_ball.n.01"
     )
     imported = import_problem(source(text), home)
-    assert isinstance(imported, Imported)
+    assert isinstance(imported, ImportedTask)
     ball = imported.scene.by_name["tennis_ball_1"]
     assert ball.room == "living_room_0"
     assert ball.host in imported.scene.by_name
@@ -135,7 +135,7 @@ def test_what_the_start_places_nowhere_is_put_where_such_things_are(home: Scene)
     imported = import_problem(
         source(PROBLEM.replace("(ontop apple.n.01_2 breakfast_table.n.01_1)\n", "\n")), home
     )
-    assert isinstance(imported, Imported)
+    assert isinstance(imported, ImportedTask)
     assert imported.scene.by_name["apple_4"].room == "kitchen_0"
     assert imported.scene.by_name["apple_4"].host
 
@@ -143,26 +143,28 @@ def test_what_the_start_places_nowhere_is_put_where_such_things_are(home: Scene)
 def test_furniture_that_the_room_lacks_is_brought_in_where_that_is_allowed(home: Scene) -> None:
     text = PROBLEM.replace("breakfast_table.n.01", "armchair.n.01")
     imported = import_problem(source(text), home)
-    assert isinstance(imported, Imported)
+    assert isinstance(imported, ImportedTask)
     chair = imported.scene.by_name["armchair_1"]
     assert (chair.room, chair.fixed) == ("kitchen_0", True)
     assert imported.scene.by_name["apple_3"].host == "armchair_1"
-    assert isinstance(import_problem(source(text), home, manner=Manner(furnishing=False)), Refusal)
+    assert isinstance(import_problem(source(text), home, manner=Manner(furnishing=False)), TaskRefusal)
 
 
 def test_states_of_the_start_are_set_and_taken_away(home: Scene) -> None:
     literals = [
-        Literal(Atom("hot", ("apple_1",))),
-        Literal(Atom("open", ("fridge_1",))),
-        Literal(Atom("open", ("microwave_1",)), positive=False),
-        Literal(Atom("ontop", ("apple_1", "fridge_1"))),
+        InitLiteral(Atom("hot", ("apple_1",))),
+        InitLiteral(Atom("open", ("fridge_1",))),
+        InitLiteral(Atom("open", ("microwave_1",)), positive=False),
+        InitLiteral(Atom("ontop", ("apple_1", "fridge_1"))),
     ]
     changed = with_states(home, literals)
     assert changed.by_name["apple_1"].states == {State.HOT}
     assert changed.by_name["fridge_1"].joints == (1.0,)
     assert changed.by_name["microwave_1"].joints == (0.0,)
     assert (
-        with_states(changed, [Literal(Atom("hot", ("apple_1",)), positive=False)]).by_name["apple_1"].states
+        with_states(changed, [InitLiteral(Atom("hot", ("apple_1",)), positive=False)])
+        .by_name["apple_1"]
+        .states
         == set()
     )
 
@@ -202,7 +204,7 @@ def test_imported_task_is_verified_by_execution(home: Scene) -> None:
     )
     text = text.replace("(ontop apple.n.01_2 breakfast_table.n.01_1)\n", "")
     imported = import_problem(source(text), home)
-    assert isinstance(imported, Imported)
+    assert isinstance(imported, ImportedTask)
     outcome = verify(imported, PlacementLibrary(), Foresight())
     assert isinstance(outcome, Verified), outcome
     assert [call["action"] for call in outcome.record.oracle][-1] == "close"
@@ -218,7 +220,7 @@ def test_an_appliance_that_the_goal_wants_carried_is_loose_and_another_is_not(ho
     loose = {}
     for host in ("breakfast_table.n.01_1", "stove.n.01_1"):
         imported = import_problem(source(text.format(host=host)), home)
-        assert isinstance(imported, Imported), imported
+        assert isinstance(imported, ImportedTask), imported
         loose[host] = not imported.scene.by_name["toaster_1"].fixed
     assert loose == {"breakfast_table.n.01_1": True, "stove.n.01_1": False}
 

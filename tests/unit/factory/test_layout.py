@@ -15,7 +15,7 @@ from embomatrix.factory.layout.baselines import lay_at_random, lay_by_poses
 from embomatrix.factory.layout.distribution import DistributionError, distribute
 from embomatrix.factory.layout.generator import lay
 from embomatrix.factory.layout.hanging import Hanger
-from embomatrix.factory.layout.jobs import Item
+from embomatrix.factory.layout.jobs import RequestedObject
 from embomatrix.factory.layout.model_agents import ModelLayoutAgents
 from embomatrix.factory.layout.organization import organize
 from embomatrix.factory.layout.tree import LayoutTree, TreeError
@@ -28,13 +28,13 @@ from embomatrix.factory.layout.values import (
     HostOffer,
     LayoutReason,
     LayoutRelation,
+    LayoutRoomFacts,
+    ObjectBrief,
     RoomBrief,
-    RoomFacts,
-    Thing,
 )
 from embomatrix.factory.scenes.check import check_scene
 from embomatrix.llm.endpoint import Endpoint, EndpointLimits
-from embomatrix.llm.patience import Patience
+from embomatrix.llm.patience import FailureLimit
 from embomatrix.llm.values import EndpointError
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.catalog import Catalog
@@ -43,11 +43,11 @@ if TYPE_CHECKING:
     from embomatrix.world.scene import Scene
 
 ON, IN = LayoutRelation.ONTOP, LayoutRelation.INSIDE
-KITCHEN = RoomFacts("kitchen_0", "kitchen", (4.0, 4.0), ("countertop", "fridge"))
-BEDROOM = RoomFacts("bedroom_0", "bedroom", (4.0, 4.0), ("bed", "nightstand"))
+KITCHEN = LayoutRoomFacts("kitchen_0", "kitchen", (4.0, 4.0), ("countertop", "fridge"))
+BEDROOM = LayoutRoomFacts("bedroom_0", "bedroom", (4.0, 4.0), ("bed", "nightstand"))
 TABLE = HostFacts("breakfast_table_1", "breakfast_table", (HostOffer(ON, ((0.8, 1.2, 9.0),), 0.7),))
 FRIDGE = HostFacts("fridge_1", "fridge", (HostOffer(IN, ((0.5, 0.5, 0.4),), 0.6),), shut=True)
-PLATE = Thing("plate_1", "plate", (0.24, 0.24, 0.02))
+PLATE = ObjectBrief("plate_1", "plate", (0.24, 0.24, 0.02))
 
 
 def test_every_relation_of_a_tree_has_its_means():
@@ -85,8 +85,8 @@ def test_branches_that_make_no_tree_are_told(branches, problem):
 def test_things_go_where_people_keep_them_and_with_what_they_belong_to():
     things = (
         PLATE,
-        Thing("alarm_clock_1", "alarm_clock", (0.05, 0.1, 0.1)),
-        Thing("apple_1", "apple", (0.07, 0.07, 0.07), relation=ON, host="plate_1"),
+        ObjectBrief("alarm_clock_1", "alarm_clock", (0.05, 0.1, 0.1)),
+        ObjectBrief("apple_1", "apple", (0.07, 0.07, 0.07), relation=ON, host="plate_1"),
     )
     found = distribute(DistributionBrief((KITCHEN, BEDROOM), things)).rooms
     assert found == {"plate_1": "kitchen_0", "alarm_clock_1": "bedroom_0", "apple_1": "kitchen_0"}
@@ -94,8 +94,10 @@ def test_things_go_where_people_keep_them_and_with_what_they_belong_to():
 
 def test_what_belongs_together_and_is_wanted_apart_is_told():
     things = (
-        Thing("plate_1", "plate", (0.24, 0.24, 0.02), rooms=("kitchen_0",)),
-        Thing("apple_1", "apple", (0.07, 0.07, 0.07), rooms=("bedroom_0",), relation=ON, host="plate_1"),
+        ObjectBrief("plate_1", "plate", (0.24, 0.24, 0.02), rooms=("kitchen_0",)),
+        ObjectBrief(
+            "apple_1", "apple", (0.07, 0.07, 0.07), rooms=("bedroom_0",), relation=ON, host="plate_1"
+        ),
     )
     with pytest.raises(DistributionError, match="belong together"):
         distribute(DistributionBrief((KITCHEN, BEDROOM), things))
@@ -112,7 +114,7 @@ def test_a_host_that_failed_is_not_asked_again_and_what_fits_nowhere_is_left_out
 
 
 def test_what_the_task_demands_is_no_choice():
-    milk = Thing("milk_1", "carton_of_milk", (0.1, 0.1, 0.2), relation=IN, host="fridge_1")
+    milk = ObjectBrief("milk_1", "carton_of_milk", (0.1, 0.1, 0.2), relation=IN, host="fridge_1")
     assert organize(RoomBrief(KITCHEN, (TABLE, FRIDGE), (milk,))).parent_of("milk_1") == Branch(
         "fridge_1", IN, "milk_1"
     )
@@ -122,14 +124,14 @@ def models(category: str) -> tuple[tuple[str, str], ...]:
     return tuple((category, model.model_id) for model in Catalog.load().models_of(category)[:3])
 
 
-def items(flat: "Scene") -> list[Item]:
+def items(flat: "Scene") -> list[RequestedObject]:
     table = next(item.name for item in flat.objects if item.name.startswith("breakfast_table"))
     return [
-        Item("bowl", models("bowl"), ON, table),
-        Item("apple", models("apple"), beside=("bowl",)),
-        Item("book", models("hardback")),
-        Item("chair", models("armchair"), rooms=("living_room_0",)),
-        Item("mirror", models("mirror"), rooms=("bathroom_0",)),
+        RequestedObject("bowl", models("bowl"), ON, table),
+        RequestedObject("apple", models("apple"), beside=("bowl",)),
+        RequestedObject("book", models("hardback")),
+        RequestedObject("chair", models("armchair"), rooms=("living_room_0",)),
+        RequestedObject("mirror", models("mirror"), rooms=("bathroom_0",)),
     ]
 
 
@@ -150,7 +152,11 @@ def test_a_task_is_laid_out_soundly_and_equally_for_equal_seeds(flat: "Scene") -
 
 def test_what_fits_nowhere_is_left_out_with_its_reason_and_the_rest_is_laid(flat: "Scene") -> None:
     fridge = next(item.name for item in flat.objects if item.name.startswith("fridge"))
-    layout = lay(SceneEditor(flat), [Item("bed", models("bed"), IN, fridge), Item("mug", models("mug"))], 0)
+    layout = lay(
+        SceneEditor(flat),
+        [RequestedObject("bed", models("bed"), IN, fridge), RequestedObject("mug", models("mug"))],
+        0,
+    )
     (failure,) = layout.failures
     assert (failure.thing, failure.reason) == ("bed", LayoutReason.TOO_LARGE)
     assert "mug" in layout.names
@@ -187,7 +193,7 @@ def test_a_brief_goes_through_its_door_unchanged():
     assert json.loads(door.written(door.rules(brief)))[-1]["child"] == "plate_1"
 
 
-def organized(*script: object, patience: Patience | None = None) -> tuple[LayoutTree, ChatServer]:
+def organized(*script: object, patience: FailureLimit | None = None) -> tuple[LayoutTree, ChatServer]:
     server = ChatServer(*script)
     with server.serving() as url:
         endpoint = Endpoint(
@@ -222,7 +228,7 @@ def test_a_dead_endpoint_is_told_of_and_where_patience_is_had_rules_stand_in():
     broken = (500, {}, "broken", 0.0)
     with pytest.raises(EndpointError, match=r"room-organizer: the endpoint .* answered 500"):
         organized(broken)
-    tree, server = organized(broken, patience=Patience(most=2))
+    tree, server = organized(broken, patience=FailureLimit(most=2))
     assert tree.parent_of("plate_1") == Branch("breakfast_table_1", ON, "plate_1")
     assert len(server.requests) == 2
 

@@ -6,11 +6,11 @@ import pytest
 
 from embomatrix.factory.editor import SceneEditor
 from embomatrix.factory.layout.generator import lay
-from embomatrix.factory.layout.jobs import Item
+from embomatrix.factory.layout.jobs import RequestedObject
 from embomatrix.factory.layout.seating import MOVES, Seat, Seating
 from embomatrix.factory.layout.values import Failure, LayoutReason, LayoutRelation
 from embomatrix.factory.task_import.sources import SourceText
-from embomatrix.factory.task_import.task import REDRAWN, Imported, Manner, import_problem
+from embomatrix.factory.task_import.task import REDRAWN, ImportedTask, Manner, import_problem
 from embomatrix.factory.writer.rehearsal import Rehearsal
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.geometry import Pose
@@ -34,10 +34,10 @@ def named(scene: Scene, category: str) -> str:
 def seating(flat: Scene) -> Seating:
     bowls = sorted(models("bowl"), key=lambda each: -Catalog.load().model(*each).size_m[0])
     items = [
-        Item("backpack", models("backpack")[:1]),
-        Item("book", models("hardback")[:1], IN, "backpack"),
-        Item("wide", (bowls[0], bowls[-1]), IN, "cabinet_1"),
-        Item("other", bowls[:1], IN, "cabinet_1"),
+        RequestedObject("backpack", models("backpack")[:1]),
+        RequestedObject("book", models("hardback")[:1], IN, "backpack"),
+        RequestedObject("wide", (bowls[0], bowls[-1]), IN, "cabinet_1"),
+        RequestedObject("other", bowls[:1], IN, "cabinet_1"),
     ]
     return Seating(SceneEditor(flat), "living_room_0", items)
 
@@ -47,9 +47,9 @@ def test_shoes_under_a_bed_and_food_in_a_box_with_a_lid_are_at_hand(flat: Scene)
     layout = lay(
         editor,
         [
-            Item("shoe", models("sandal"), UNDER, named(flat, "bed")),
-            Item("box", (("carton", "cdmmwy"),), ON, "living_room_0"),
-            Item("apple", models("apple")[:3], IN, "box"),
+            RequestedObject("shoe", models("sandal"), UNDER, named(flat, "bed")),
+            RequestedObject("box", (("carton", "cdmmwy"),), ON, "living_room_0"),
+            RequestedObject("apple", models("apple")[:3], IN, "box"),
         ],
         0,
     )
@@ -93,7 +93,9 @@ def test_a_wide_thing_makes_way_for_another_at_the_host_that_both_need(seating: 
 
 def test_what_a_task_puts_into_a_full_room_makes_furniture_of_the_room_go(flat: Scene) -> None:
     editor = SceneEditor(flat)
-    seating = Seating(editor, "living_room_0", [Item("bed", models("bed")[:1], rooms=("living_room_0",))])
+    seating = Seating(
+        editor, "living_room_0", [RequestedObject("bed", models("bed")[:1], rooms=("living_room_0",))]
+    )
     before = [item for item in flat.objects if item.room == "living_room_0" and item.fixed]
     seating.refuse("bed", ON, "living_room_0", LayoutReason.NO_FREE_SPOT, "full")
     seating.next_model("bed")
@@ -109,8 +111,8 @@ def test_furniture_goes_for_what_the_robot_does_not_get_at_on_a_full_floor_but_n
     editor = SceneEditor(flat)
     table = next(name for name, item in editor.objects.items() if item.room == "living_room_0" and item.fixed)
     items = [
-        Item("bag", models("backpack")[:1], ON, "living_room_0"),
-        Item("cup", models("mug")[:1], ON, table),
+        RequestedObject("bag", models("backpack")[:1], ON, "living_room_0"),
+        RequestedObject("cup", models("mug")[:1], ON, table),
     ]
     seating = Seating(editor, "living_room_0", items)
     before = len(editor.objects)
@@ -127,7 +129,7 @@ def test_furniture_that_the_task_is_about_stays_reachable_when_the_rest_may_be_b
     editor = SceneEditor(flat)
     editor.keep([named(flat, "fridge")])
     kitchen = editor.objects[named(flat, "fridge")].room
-    seating = Seating(editor, kitchen, [Item("booth", models("booth"), ON, kitchen)])
+    seating = Seating(editor, kitchen, [RequestedObject("booth", models("booth"), ON, kitchen)])
     stove = next(
         name for name, item in editor.objects.items() if item.room == kitchen and editor.is_spare(name)
     )
@@ -140,8 +142,10 @@ def test_furniture_that_the_task_is_about_stays_reachable_when_the_rest_may_be_b
 
 def test_many_things_for_one_basket_are_packed(flat: Scene) -> None:
     """Four oranges of 8.5 cm in a basket whose floor is 20 cm wide: only beside one another they fit."""
-    oranges = [Item(f"orange_{number}", (("orange", "ucstpm"),), IN, "basket") for number in range(4)]
-    basket = Item("basket", BASKET, ON, "living_room_0")
+    oranges = [
+        RequestedObject(f"orange_{number}", (("orange", "ucstpm"),), IN, "basket") for number in range(4)
+    ]
+    basket = RequestedObject("basket", BASKET, ON, "living_room_0")
     layout = lay(SceneEditor(flat), [basket, *oranges], 0)
     assert layout.failures == ()
 
@@ -175,12 +179,12 @@ def test_furniture_at_which_nobody_reaches_a_thing_is_left_for_other_and_kept_as
 
     text = SourceText("shoes", SHOE, "embomatrix")
     second = import_problem(text, flat, manner=Manner(out_of_hand_at(1), reachable=False))
-    assert isinstance(second, Imported)
+    assert isinstance(second, ImportedTask)
     assert len(asked) == 2
     assert asked[0] != asked[1]
     asked.clear()
     assert isinstance(
-        import_problem(text, flat, manner=Manner(out_of_hand_at(99), reachable=False)), Imported
+        import_problem(text, flat, manner=Manner(out_of_hand_at(99), reachable=False)), ImportedTask
     )
     assert len(asked) > 1
 
@@ -199,7 +203,7 @@ def test_a_layout_in_which_something_stays_out_of_hand_is_drawn_anew_and_the_bes
     imported = import_problem(
         SourceText("shoes", SHOE_ON_FLOOR, "embomatrix"), flat, manner=Manner(worst_at_first)
     )
-    assert isinstance(imported, Imported)
+    assert isinstance(imported, ImportedTask)
     assert len(drawn) == len(set(drawn)) == 1 + REDRAWN
     sandal = dict(zip(imported.instances, imported.about, strict=True))["sandal.n.01_1"]
     assert imported.scene.by_name[sandal].pose_world_asset == drawn[1]

@@ -6,27 +6,34 @@ import math
 import numpy as np
 import pytest
 
-from embomatrix.factory.layout.arrangement import WEIGHTS, Candidates, half_extents, holds, near_m, next_to_m
+from embomatrix.factory.layout.arrangement import (
+    WEIGHTS,
+    SpotCandidates,
+    half_extents,
+    holds,
+    near_m,
+    next_to_m,
+)
 from embomatrix.factory.layout.planar import arrange
 from embomatrix.factory.layout.values import (
     Arrangement,
-    Footprint,
     LayoutReason,
+    PlacementConstraint,
     PlaneBrief,
+    PlaneFootprint,
     PlaneThing,
-    Wish,
 )
 from embomatrix.skills.limits import ROBOT
 
 PLANE = (2.0, 1.2)
 CUP = (0.1, 0.1, 0.12)
-EAST = Footprint("laptop", (0.0, 0.0), 0.0, (0.3, 0.4), 0.0, 0.2)
+EAST = PlaneFootprint("laptop", (0.0, 0.0), 0.0, (0.3, 0.4), 0.0, 0.2)
 """A thing in the middle whose front looks along the plane's x."""
 
 
 def held(kind, x, y, yaw=0.0, other=EAST, size_m=CUP):
-    spots = Candidates.of(np.array([[x, y]]), np.array([yaw]), size_m)
-    return bool(holds(Wish(kind, other.name if other else ""), spots, PLANE, size_m, other)[0])
+    spots = SpotCandidates.of(np.array([[x, y]]), np.array([yaw]), size_m)
+    return bool(holds(PlacementConstraint(kind, other.name if other else ""), spots, PLANE, size_m, other)[0])
 
 
 def test_every_constraint_has_a_weight():
@@ -86,9 +93,9 @@ def test_next_to_is_within_what_the_engine_calls_so_and_at_the_same_height():
 
 
 def test_nothing_holds_about_what_is_not_there():
-    spots = Candidates.of(np.zeros((1, 2)), np.zeros(1), CUP)
+    spots = SpotCandidates.of(np.zeros((1, 2)), np.zeros(1), CUP)
     for kind in set(Arrangement) - {Arrangement.EDGE, Arrangement.MIDDLE}:
-        assert not holds(Wish(kind, "nobody"), spots, PLANE, CUP, None)[0]
+        assert not holds(PlacementConstraint(kind, "nobody"), spots, PLANE, CUP, None)[0]
 
 
 def a_brief(seed: int) -> PlaneBrief:
@@ -98,13 +105,13 @@ def a_brief(seed: int) -> PlaneBrief:
         PlaneThing(
             f"thing_{n}",
             tuple(rng.uniform(0.04, 0.3, 3).tolist()),
-            (Wish(kinds[int(rng.integers(len(kinds)))], f"thing_{int(rng.integers(4))}"),),
+            (PlacementConstraint(kinds[int(rng.integers(len(kinds)))], f"thing_{int(rng.integers(4))}"),),
             bool(rng.integers(2)),
         )
         for n in range(4)
     )
     obstacles = tuple(
-        Footprint(
+        PlaneFootprint(
             f"old_{n}",
             tuple(rng.uniform(-0.5, 0.5, 2).tolist()),
             float(rng.uniform(0, 3)),
@@ -118,14 +125,14 @@ def a_brief(seed: int) -> PlaneBrief:
     return PlaneBrief("table", PLANE, things, obstacles, stands=stands, seed=seed)
 
 
-def corners(item: Footprint) -> np.ndarray:
+def corners(item: PlaneFootprint) -> np.ndarray:
     x, y = item.size_m
     square = np.array([(x, y), (-x, y), (-x, -y), (x, -y)]) / 2
     turn = np.array([[math.cos(item.yaw), math.sin(item.yaw)], [-math.sin(item.yaw), math.cos(item.yaw)]])
     return square @ turn + item.center_m
 
 
-def apart(a: Footprint, b: Footprint) -> bool:
+def apart(a: PlaneFootprint, b: PlaneFootprint) -> bool:
     """Whether an axis of either rectangle separates the two."""
     return any(
         (corners(a) @ axis).max() <= (corners(b) @ axis).min()
@@ -141,7 +148,9 @@ def test_what_is_arranged_meets_nothing_lies_on_the_plane_and_is_in_reach(seed):
     for way in arrange(brief):
         sizes = {thing.name: thing.size_m for thing in brief.things}
         placed = [
-            Footprint(spot.thing, spot.center_m, spot.yaw, sizes[spot.thing][:2], 0.0, sizes[spot.thing][2])
+            PlaneFootprint(
+                spot.thing, spot.center_m, spot.yaw, sizes[spot.thing][:2], 0.0, sizes[spot.thing][2]
+            )
             for spot in way.spots
         ]
         assert {spot.thing for spot in way.spots} | way.left_out.keys() == sizes.keys()
@@ -159,9 +168,11 @@ def test_equal_briefs_are_arranged_equally_and_other_seeds_otherwise():
 
 
 def test_wishes_that_can_hold_do():
-    plate = PlaneThing("plate", (0.24, 0.24, 0.02), (Wish(Arrangement.EDGE),))
-    fork = PlaneThing("fork", (0.18, 0.03, 0.02), (Wish(Arrangement.NEXT_TO, "plate", required=True),))
-    vase = PlaneThing("vase", (0.1, 0.1, 0.3), (Wish(Arrangement.MIDDLE),))
+    plate = PlaneThing("plate", (0.24, 0.24, 0.02), (PlacementConstraint(Arrangement.EDGE),))
+    fork = PlaneThing(
+        "fork", (0.18, 0.03, 0.02), (PlacementConstraint(Arrangement.NEXT_TO, "plate", required=True),)
+    )
+    vase = PlaneThing("vase", (0.1, 0.1, 0.3), (PlacementConstraint(Arrangement.MIDDLE),))
     best = arrange(PlaneBrief("table", PLANE, (fork, plate, vase)))[0]
     assert all(spot.held for spot in best.spots)
     assert not best.left_out
@@ -174,7 +185,11 @@ def test_wishes_that_can_hold_do():
         ({"zones": ((-1.0, -0.6, 1.0, 0.6),)}, LayoutReason.NO_FREE_SPOT),
         ({"stands": ((9.0, 9.0),)}, LayoutReason.OUT_OF_REACH),
         (
-            {"things": (PlaneThing("cup", CUP, (Wish(Arrangement.NEXT_TO, "x", required=True),)),)},
+            {
+                "things": (
+                    PlaneThing("cup", CUP, (PlacementConstraint(Arrangement.NEXT_TO, "x", required=True),)),
+                )
+            },
             LayoutReason.RELATION_NOT_HELD,
         ),
     ],

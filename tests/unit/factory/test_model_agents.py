@@ -11,12 +11,12 @@ from tests.fakes.chat_server import ChatServer, completion
 from embomatrix.factory.pictures.sights import sight_of_room
 from embomatrix.factory.pipeline.settings import BuildSettings
 from embomatrix.factory.pipeline.variants import VariantMaker, VariantOrder
-from embomatrix.factory.refusal import Refusal, RefusalReason
+from embomatrix.factory.refusal import RefusalReason, TaskRefusal
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.social.facts import MOST_IN_ROOM, facts_of
 from embomatrix.factory.social.model_agents import ModelAgents
 from embomatrix.factory.social.model_writer import ModelWriter
-from embomatrix.factory.social.requests import TaskRequest, Wanted, Wish, check_request, piece_of
+from embomatrix.factory.social.requests import RequestedAtom, TaskRequest, Wanted, check_request, piece_of
 from embomatrix.factory.social.values import DaySlot
 from embomatrix.factory.writer.tasks import Draft, DraftOrder, PlainWriter
 from embomatrix.factory.writer.variant import build_variant
@@ -169,7 +169,9 @@ def test_of_drafts_that_are_asked_for_at_once_one_that_fails_costs_the_others_no
     with server.serving() as url, ModelWriter(ModelAgents(Endpoint(url, "small-1"))) as writer:
         found = writer.write_all(VARIANT, VIEW, orders)
     assert sorted(isinstance(draft, Draft) for draft in found) == [False, True]
-    assert next(each for each in found if isinstance(each, Refusal)).reason is RefusalReason.UNUSABLE_ANSWER
+    assert (
+        next(each for each in found if isinstance(each, TaskRefusal)).reason is RefusalReason.UNUSABLE_ANSWER
+    )
 
 
 def test_a_build_names_drafts_of_one_time_in_the_order_in_which_they_are_kept():
@@ -244,22 +246,22 @@ def a_door():
 @pytest.mark.parametrize(
     ("wish", "sentence"),
     [
-        (lambda: Wish(predicate=Wanted.ONTOP, thing=THING), "it takes a place"),
-        (lambda: Wish(predicate=Wanted.ONTOP, thing=HOST, place=HOST), "can't be carried"),
+        (lambda: RequestedAtom(predicate=Wanted.ONTOP, thing=THING), "it takes a place"),
+        (lambda: RequestedAtom(predicate=Wanted.ONTOP, thing=HOST, place=HOST), "can't be carried"),
         (
-            lambda: Wish(predicate=Wanted.ONTOP, thing=THING, place=VIEW.item(THING).host),
+            lambda: RequestedAtom(predicate=Wanted.ONTOP, thing=THING, place=VIEW.item(THING).host),
             "is there already|does not go",
         ),
-        (lambda: Wish(predicate=Wanted.INSIDE, thing=THING, place=THING), "does not go into"),
+        (lambda: RequestedAtom(predicate=Wanted.INSIDE, thing=THING, place=THING), "does not go into"),
         (
-            lambda: Wish(predicate=Wanted.ONTOP, thing=THING, place=HOST, holds=False),
+            lambda: RequestedAtom(predicate=Wanted.ONTOP, thing=THING, place=HOST, holds=False),
             "not where it is not to be",
         ),
-        (lambda: Wish(predicate=Wanted.OPEN, thing=a_door(), place=HOST), "it takes no place"),
-        (lambda: Wish(predicate=Wanted.OPEN, thing=a_door(), holds=False), "is so already"),
-        (lambda: Wish(predicate=Wanted.TOGGLED_ON, thing=HOST), "can't be switched"),
-        (lambda: Wish(predicate=Wanted.COOKED, thing=HOST), "nothing to cook"),
-        (lambda: Wish(predicate=Wanted.HOT, thing=HOST, holds=False), "not the contrary"),
+        (lambda: RequestedAtom(predicate=Wanted.OPEN, thing=a_door(), place=HOST), "it takes no place"),
+        (lambda: RequestedAtom(predicate=Wanted.OPEN, thing=a_door(), holds=False), "is so already"),
+        (lambda: RequestedAtom(predicate=Wanted.TOGGLED_ON, thing=HOST), "can't be switched"),
+        (lambda: RequestedAtom(predicate=Wanted.COOKED, thing=HOST), "nothing to cook"),
+        (lambda: RequestedAtom(predicate=Wanted.HOT, thing=HOST, holds=False), "not the contrary"),
     ],
 )
 def test_wishes_that_the_scene_does_not_allow_are_told_apart(wish, sentence):
@@ -269,7 +271,7 @@ def test_wishes_that_the_scene_does_not_allow_are_told_apart(wish, sentence):
 
 
 def test_a_wish_becomes_a_piece_of_a_goal():
-    piece = piece_of(Wish(predicate=Wanted.OPEN, thing=a_door(), holds=False), VIEW)
+    piece = piece_of(RequestedAtom(predicate=Wanted.OPEN, thing=a_door(), holds=False), VIEW)
     assert piece.goal == Not(Atom("open", (a_door(),)))
     assert piece.signs == (f"not open({VIEW.category(a_door())})",)
 

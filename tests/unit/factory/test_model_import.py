@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 from embomatrix.factory.assets.check import check_asset
 from embomatrix.factory.assets_cli import app
-from embomatrix.factory.importers.assemble import Imported, convex_part, import_model, read_model
+from embomatrix.factory.importers.assemble import ImportedAsset, convex_part, import_model, read_model
 from embomatrix.factory.importers.convex import MAX_HULLS, MAX_VERTICES, Coacd, by_components
 from embomatrix.factory.importers.model import Mesh, ModelFileError
 from embomatrix.factory.importers.shelf import read_assets, save_asset
@@ -54,7 +54,7 @@ def obj_text(boxes: tuple[tuple[str, tuple[float, ...], tuple[float, ...]], ...]
     return "\n".join(lines)
 
 
-def imported(path: Path, category: str, model: str = "") -> Imported:
+def imported(path: Path, category: str, model: str = "") -> ImportedAsset:
     return import_model(CATALOG, read_model(path), category, model, CREDIT, by_components)
 
 

@@ -12,7 +12,7 @@ from embomatrix.factory.pictures.sheet import draw_sheet, draw_views
 from embomatrix.factory.scenes.cli import app
 from embomatrix.sim.bullet.camera import render_oblique
 from embomatrix.world.asset import Asset, Link
-from embomatrix.world.geometry import Part, Pose, Shape
+from embomatrix.world.geometry import ConvexPart, Pose, Shape
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -50,7 +50,7 @@ def test_a_crown_hides_nothing_that_stands_under_it(home: Scene) -> None:
     box = home.box_of(fridge.name)
     size = tuple(2 * extent for extent in box.size_m)
     tree = Asset(
-        "tree-crown", "tree", "tree.n.01", size, 10.0, (Link("base", (Part(Shape.BOX, HERE, size),)),)
+        "tree-crown", "tree", "tree.n.01", size, 10.0, (Link("base", (ConvexPart(Shape.BOX, HERE, size),)),)
     )
     crown = replace(
         fridge, name="tree_1", asset_id="tree-crown", joints=(), pose_world_asset=Pose(box.center_m)

@@ -20,7 +20,7 @@ from embomatrix.factory.layout.jobs import LayoutAgents
 from embomatrix.factory.layout.organization import organize
 from embomatrix.factory.layout.tree import LayoutTree
 from embomatrix.factory.layout.values import RoomBrief
-from embomatrix.factory.pipeline.build import Summary, build_dataset, split_rooms
+from embomatrix.factory.pipeline.build import BuildSummary, build_dataset, split_rooms
 from embomatrix.factory.pipeline.cluster import admitted_by
 from embomatrix.factory.pipeline.settings import BuildSettings, WriterKind
 from embomatrix.factory.pipeline.store import BuildStore, VariantResult
@@ -59,17 +59,17 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def summary(folder: Path) -> Summary:
+def summary(folder: Path) -> BuildSummary:
     return build_dataset(folder, SETTINGS)
 
 
 @pytest.fixture(scope="module")
-def dataset(folder: Path, summary: Summary) -> Dataset:
+def dataset(folder: Path, summary: BuildSummary) -> Dataset:
     assert summary.total("train") == 8
     return Dataset.load(folder)
 
 
-def test_every_category_has_its_share(dataset: Dataset, summary: Summary) -> None:
+def test_every_category_has_its_share(dataset: Dataset, summary: BuildSummary) -> None:
     assert (len(dataset.train), len(dataset.heldout)) == (8, 4)
     for category in TaskCategory:
         assert summary.admitted["train", category.value] == 2
@@ -77,7 +77,7 @@ def test_every_category_has_its_share(dataset: Dataset, summary: Summary) -> Non
 
 
 def test_heldout_tasks_are_in_other_rooms_and_ask_for_other_kinds_of_goal(
-    dataset: Dataset, summary: Summary
+    dataset: Dataset, summary: BuildSummary
 ) -> None:
     for record in dataset.records:
         rooms = summary.rooms[record.split][record.task.scene_id.split("-")[0]]
@@ -211,7 +211,7 @@ def test_who_lays_things_out_is_chosen_and_is_part_of_the_settings(tmp_path: Pat
         BuildStore.open(tmp_path, asdict(replace(settings, modelled=())))
 
 
-def test_the_ledger_has_a_line_for_every_attempt_and_its_reason(folder: Path, summary: Summary) -> None:
+def test_the_ledger_has_a_line_for_every_attempt_and_its_reason(folder: Path, summary: BuildSummary) -> None:
     lines = [json.loads(line) for line in (folder / "attempts.jsonl").read_text().splitlines()]
     outcomes = Counter(line["outcome"] for line in lines)
     assert outcomes.pop("admitted") == sum(summary.admitted.values())
@@ -378,7 +378,7 @@ def test_several_processes_make_the_same_data_set_as_one(folder, dataset, tmp_pa
 
 
 def test_the_cluster_keeps_what_its_slots_solve_and_says_what_the_others_earn(
-    folder: Path, summary: Summary
+    folder: Path, summary: BuildSummary
 ) -> None:
     first = BuildStore.open(folder, asdict(SETTINGS)).results[0]
     made = VariantYield(first, b"", {})

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from embomatrix.factory.pipeline.poses import SceneSurvey
-from embomatrix.factory.social.requests import TaskRequest, Wanted, Wish, check_request
+from embomatrix.factory.social.requests import RequestedAtom, TaskRequest, Wanted, check_request
 from embomatrix.factory.writer.rehearsal import Rehearsal
 from embomatrix.factory.writer.robot import AnyRobot
 from embomatrix.factory.writer.tasks import PlainWriter
@@ -100,12 +100,12 @@ def test_a_survey_answers_alike_whatever_was_asked_before(home: Scene) -> None:
 @pytest.mark.parametrize(
     ("wish", "sentence"),
     [
-        (Wish(predicate=Wanted.TOGGLED_ON, thing="stove_1"), "does not get at stove_1"),
-        (Wish(predicate=Wanted.HOT, thing="apple_1"), "does not get at apple_1"),
-        (Wish(predicate=Wanted.ONTOP, thing="mug_1", place="stove_1"), "can't bring mug_1 there"),
+        (RequestedAtom(predicate=Wanted.TOGGLED_ON, thing="stove_1"), "does not get at stove_1"),
+        (RequestedAtom(predicate=Wanted.HOT, thing="apple_1"), "does not get at apple_1"),
+        (RequestedAtom(predicate=Wanted.ONTOP, thing="mug_1", place="stove_1"), "can't bring mug_1 there"),
     ],
 )
-def test_a_model_is_told_what_the_robot_cannot_do(home: Scene, wish: Wish, sentence: str) -> None:
+def test_a_model_is_told_what_the_robot_cannot_do(home: Scene, wish: RequestedAtom, sentence: str) -> None:
     request = TaskRequest(instruction="Please do this for me.", wishes=(wish,))
     with pytest.raises(ValueError, match=f"the robot tried, and {sentence}"):
         check_request(request, SceneView(home, Clumsy()), frozenset(home.by_name))

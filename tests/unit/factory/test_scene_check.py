@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from embomatrix.factory.scenes.check import ProblemKind, check_in_engine, check_scene
 from embomatrix.factory.scenes.solids import convex_of, depth_m
-from embomatrix.world.geometry import Part, Pose, Shape
+from embomatrix.world.geometry import ConvexPart, Pose, Shape
 
 if TYPE_CHECKING:
     from embomatrix.world.scene import Scene, SceneObject
@@ -67,7 +67,7 @@ def test_a_robot_shut_in_a_cupboard_reaches_nothing(flat: Scene) -> None:
 
 
 def test_boxes_side_by_side_do_not_overlap_and_shifted_ones_do() -> None:
-    part = Part(Shape.BOX, HERE, (1.0, 0.5, 0.2))
+    part = ConvexPart(Shape.BOX, HERE, (1.0, 0.5, 0.2))
     one = convex_of(part, HERE)
     assert depth_m(one, convex_of(part, Pose((1.0, 0.0, 0.0)))) == pytest.approx(0.0, abs=1e-9)
     assert depth_m(one, convex_of(part, Pose((0.99, 0.0, 0.0)))) == pytest.approx(0.01)
@@ -81,7 +81,7 @@ def test_round_things_overlap_by_the_sum_of_their_radii_less_their_distance(
     away = r1 + r2 + gap
     pose = Pose((away * np.cos(angle), away * np.sin(angle), 0.0))
     for shape in (Shape.CYLINDER, Shape.SPHERE):
-        a = convex_of(Part(shape, HERE, (2 * r1, 2 * r1, 2 * r1)), HERE)
-        b = convex_of(Part(shape, HERE, (2 * r2, 2 * r2, 2 * r2)), pose)
+        a = convex_of(ConvexPart(shape, HERE, (2 * r1, 2 * r1, 2 * r1)), HERE)
+        b = convex_of(ConvexPart(shape, HERE, (2 * r2, 2 * r2, 2 * r2)), pose)
         if abs(gap) < min(r1, r2):
             assert depth_m(a, b) == pytest.approx(-gap, abs=0.01 * (r1 + r2))

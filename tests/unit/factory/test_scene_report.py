@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
-from embomatrix.factory.scenes.batch import SceneJob, run_batch
+from embomatrix.factory.scenes.batch import SceneBuildJob, run_batch
 from embomatrix.factory.scenes.check import STABLE_SHARE, ProblemKind, check_scene, check_settled
 from embomatrix.factory.scenes.cli import app
 from embomatrix.factory.scenes.floor import ReachableFloor
@@ -20,7 +20,7 @@ from embomatrix.factory.scenes.tables import TABLE_COLUMNS, report_table
 from embomatrix.host.cores import usable_cores
 from embomatrix.world.catalog import Catalog, CatalogError
 from embomatrix.world.codec import scene_from_json
-from embomatrix.world.geometry import Part, Pose, Shape
+from embomatrix.world.geometry import ConvexPart, Pose, Shape
 
 if TYPE_CHECKING:
     from embomatrix.world.scene import Scene
@@ -79,7 +79,7 @@ def test_a_barred_aisle_is_reported(flat: Scene) -> None:
     room = max(flat.rooms, key=lambda r: min(r.size_m))
     middle = room.center_m[1]
     x0, x1 = room.low_m[0] - 0.1, room.high_m[0] + 0.1
-    bar = Part(Shape.BOX, Pose(((x0 + x1) / 2, middle, 0.5)), (x1 - x0, 0.1, 1.0))
+    bar = ConvexPart(Shape.BOX, Pose(((x0 + x1) / 2, middle, 0.5)), (x1 - x0, 0.1, 1.0))
     barred = replace(flat, walls=(*flat.walls, bar), objects=(), doorways=flat.doorways[-1:])
     start = replace(flat.robot, x_m=room.center_m[0], y_m=middle + 0.6, room=room.name)
     assert (room.name,) in problems(replace(barred, robot=start), ProblemKind.AISLE)
@@ -141,7 +141,7 @@ def test_an_unknown_scene_is_a_report_not_a_crash() -> None:
 
 
 def test_scenes_are_built_side_by_side_and_written(tmp_path: Path) -> None:
-    jobs = [SceneJob(SMALL, seed, tmp_path / f"{seed}.json") for seed in (0, 1)]
+    jobs = [SceneBuildJob(SMALL, seed, tmp_path / f"{seed}.json") for seed in (0, 1)]
     reports = sorted(run_batch(jobs, processes=2), key=lambda report: report.seed)
     assert [report.seed for report in reports] == [0, 1]
     assert all(report.sound for report in reports), [report.problems for report in reports]
@@ -153,7 +153,7 @@ def test_scenes_are_built_side_by_side_and_written(tmp_path: Path) -> None:
 
 def test_a_wrong_name_stops_a_batch_before_anything_is_built() -> None:
     with pytest.raises(CatalogError, match="Rs_int"):
-        list(run_batch([SceneJob("Rs_itn", 0), SceneJob(SMALL, 0)], processes=1))
+        list(run_batch([SceneBuildJob("Rs_itn", 0), SceneBuildJob(SMALL, 0)], processes=1))
 
 
 def test_check_writes_a_report_and_names_what_is_missing(tmp_path: Path) -> None:
@@ -191,7 +191,7 @@ def test_the_page_names_every_rule() -> None:
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_all_51_scenes_are_built_and_keep_every_rule(seed: int) -> None:
-    jobs = [SceneJob(scene_id, seed) for scene_id in Catalog.load().scene_ids]
+    jobs = [SceneBuildJob(scene_id, seed) for scene_id in Catalog.load().scene_ids]
     reports = list(run_batch(jobs, processes=usable_cores()))
     assert len(reports) == 51
     assert sum(report.rooms for report in reports) == 374

@@ -28,7 +28,7 @@ from embomatrix.factory.social.phrases import (
 )
 from embomatrix.factory.social.values import ROBOT, Act, Cast, DaySlot, Person
 from embomatrix.factory.social.writer import SocialWriter
-from embomatrix.factory.writer.goals import Piece
+from embomatrix.factory.writer.goals import GoalConjunct
 from embomatrix.factory.writer.variant import build_variant
 from embomatrix.factory.writer.view import SceneView
 from embomatrix.factory.writer.words import PHRASES
@@ -275,7 +275,9 @@ class Flat:
 
 @pytest.mark.parametrize(("thing", "wanted"), [("salt_shaker", False), ("blender", True), ("urinal", False)])
 def test_nobody_has_a_salt_shaker_switched_on(thing, wanted):
-    piece = Piece(Atom("toggled_on", (thing,)), "", (thing,), (f"toggled_on({thing})",), "switch", "it")
+    piece = GoalConjunct(
+        Atom("toggled_on", (thing,)), "", (thing,), (f"toggled_on({thing})",), "switch", "it"
+    )
     assert bool(themes_of(piece, Flat())) == wanted
 
 
@@ -284,7 +286,7 @@ def test_nobody_wants_the_water_to_run_who_only_tidies_up():
     assert sinks
     for sink in sinks:
         sign = f"toggled_on({sink})"
-        piece = Piece(Atom("toggled_on", (sink,)), "", (sink,), (sign,), "switch", "it", manner="tap")
+        piece = GoalConjunct(Atom("toggled_on", (sink,)), "", (sink,), (sign,), "switch", "it", manner="tap")
         assert Theme.TIDYING not in themes_of(piece, Flat()), sink
 
 
@@ -302,7 +304,7 @@ def test_nobody_wants_the_water_to_run_who_only_tidies_up():
 def test_hot_food_is_served_and_frozen_food_kept_cold(state, relation, host, wanted):
     goal = And((Atom(state, ("potato",)), Atom(relation, ("potato", host))))
     signs = (f"{state}(potato)", f"{relation}(potato,{host})")
-    piece = Piece(goal, "", ("potato", "stove", host), signs, "thermal", "the potato")
+    piece = GoalConjunct(goal, "", ("potato", "stove", host), signs, "thermal", "the potato")
     assert bool(themes_of(piece, Flat())) == wanted
 
 

@@ -11,7 +11,7 @@ from embomatrix.factory.writer.tables import (
     MEMBERS,
     NEVER_SWITCHED,
     ROOM_GROUPS,
-    Group,
+    ItemKind,
     groups_for,
     suits,
 )
@@ -182,15 +182,15 @@ def test_every_word_of_the_writer_is_a_thing_that_the_robot_can_carry(category: 
 
 
 def test_food_can_be_heated_cooked_and_frozen() -> None:
-    for category in (*MEMBERS[Group.FOOD], *MEMBERS[Group.FRUIT]):
+    for category in (*MEMBERS[ItemKind.FOOD], *MEMBERS[ItemKind.FRUIT]):
         assert {"heatable", "cookable", "freezable"} <= set(Catalog.load().category(category).abilities)
 
 
 def test_tables_speak_of_known_rooms_and_groups() -> None:
-    assert set(MEMBERS) == set(Group)
+    assert set(MEMBERS) == set(ItemKind)
     assert set(ROOM_GROUPS) <= ROOM_TYPES
     assert all(groups_for(room) for room in ROOM_TYPES)
-    assert {group for groups in ROOM_GROUPS.values() for group in groups} == set(Group)
+    assert {group for groups in ROOM_GROUPS.values() for group in groups} == set(ItemKind)
 
 
 def test_a_person_puts_food_in_the_fridge_and_not_on_the_bed() -> None:
@@ -204,4 +204,4 @@ def test_a_person_puts_food_in_the_fridge_and_not_on_the_bed() -> None:
     assert not suits("banana", "oven")
     assert not suits("bar_soap", "treadmill")
     assert {"fire_alarm", "fire_extinguisher"} <= NEVER_SWITCHED
-    assert HOST_GROUPS["fridge"] >= HOST_GROUPS["microwave"] - {Group.TABLEWARE}
+    assert HOST_GROUPS["fridge"] >= HOST_GROUPS["microwave"] - {ItemKind.TABLEWARE}

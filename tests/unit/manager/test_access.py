@@ -17,7 +17,7 @@ from embomatrix.proto.v1 import (
     scene_service_pb2,
     worker_service_pb2,
 )
-from embomatrix.rpc.roles import Role
+from embomatrix.rpc.roles import AccessRole
 from embomatrix.rpc.status import InvalidRequestError, NotAllowedError, NotFoundError, NotSignedInError
 
 HOUR = 3600.0
@@ -40,18 +40,18 @@ def test_every_method_of_every_service_says_who_may_call_it():
 
 
 def test_an_admin_may_call_everything_that_is_named_and_nobody_what_is_not():
-    assert all(may_call(Role.ADMIN, method) for method in ROLES)
-    assert not any(may_call(role, "/embomatrix.proto.v1.AdminService/DropEverything") for role in Role)
+    assert all(may_call(AccessRole.ADMIN, method) for method in ROLES)
+    assert not any(may_call(role, "/embomatrix.proto.v1.AdminService/DropEverything") for role in AccessRole)
 
 
 def test_roles_are_kept_apart():
     service = "/embomatrix.proto.v1."
-    allowed = {role: {m.removeprefix(service) for m in methods() if may_call(role, m)} for role in Role}
-    assert allowed[Role.JOIN] == {"WorkerService/Register", "RolloutService/GetCapabilities"}
-    assert not any(m.startswith(("SceneService", "AdminService")) for m in allowed[Role.WORKER])
-    assert {"AdminService/ListWorkers", "RolloutService/GetCapabilities"} <= allowed[Role.VIEWER]
-    assert not any(m.startswith(("WorkerService", "SceneService")) for m in allowed[Role.VIEWER])
-    assert not any(m.startswith("WorkerService") for m in allowed[Role.TRAINER])
+    allowed = {role: {m.removeprefix(service) for m in methods() if may_call(role, m)} for role in AccessRole}
+    assert allowed[AccessRole.JOIN] == {"WorkerService/Register", "RolloutService/GetCapabilities"}
+    assert not any(m.startswith(("SceneService", "AdminService")) for m in allowed[AccessRole.WORKER])
+    assert {"AdminService/ListWorkers", "RolloutService/GetCapabilities"} <= allowed[AccessRole.VIEWER]
+    assert not any(m.startswith(("WorkerService", "SceneService")) for m in allowed[AccessRole.VIEWER])
+    assert not any(m.startswith("WorkerService") for m in allowed[AccessRole.TRAINER])
     assert who_may(f"{service}RolloutService/Execute") == "trainer or admin"
 
 
@@ -73,7 +73,7 @@ def issued(book, role, *, valid_s=0.0, now_s=0.0, label=""):
 
 def test_a_token_is_known_by_its_hash_alone_and_survives_being_written_down():
     book = book_of()
-    credential, token = issued(book, Role.TRAINER, label="ann")
+    credential, token = issued(book, AccessRole.TRAINER, label="ann")
     row = credential.row()
     assert token.encode().partition(b".")[2] not in row.payload
     again = CredentialBook([type(credential).from_row(ShelfRow(row.key, row.payload))])
@@ -85,18 +85,18 @@ def test_a_token_is_known_by_its_hash_alone_and_survives_being_written_down():
 )
 def test_a_token_that_is_not_exactly_right_is_none(wrong):
     book = book_of()
-    issued(book, Role.TRAINER)
+    issued(book, AccessRole.TRAINER)
     with pytest.raises(NotSignedInError, match="no token, or a wrong one"):
         book.find(wrong, now_s=0.0)
 
 
 def test_expired_and_revoked_tokens_say_so():
     book = book_of()
-    first, token = issued(book, Role.TRAINER, valid_s=HOUR, label="ann's laptop")
-    assert book.find(token, now_s=HOUR - 1).role is Role.TRAINER
+    first, token = issued(book, AccessRole.TRAINER, valid_s=HOUR, label="ann's laptop")
+    assert book.find(token, now_s=HOUR - 1).role is AccessRole.TRAINER
     with pytest.raises(NotSignedInError, match=r"ann's laptop\) expired: ask the operator"):
         book.find(token, now_s=HOUR)
-    second, token = issued(book, Role.VIEWER)
+    second, token = issued(book, AccessRole.VIEWER)
     book.keep(book.revoke(second.token_id, "by the operator"))
     with pytest.raises(NotSignedInError, match=r"was revoked \(by the operator\)"):
         book.find(token, now_s=0.0)
@@ -108,10 +108,10 @@ def test_expired_and_revoked_tokens_say_so():
 
 def test_a_token_to_join_is_good_for_a_day_at_most():
     book = book_of()
-    assert book.issue(Role.JOIN, valid_s=0.0, label="", now_s=5.0)[0].expires_s == 5.0 + LONGEST_JOIN_S
+    assert book.issue(AccessRole.JOIN, valid_s=0.0, label="", now_s=5.0)[0].expires_s == 5.0 + LONGEST_JOIN_S
     for seconds in (LONGEST_JOIN_S + 1, -1.0, float("inf"), float("nan")):
         with pytest.raises(InvalidRequestError):
-            book.issue(Role.JOIN, valid_s=seconds, label="", now_s=0.0)
+            book.issue(AccessRole.JOIN, valid_s=seconds, label="", now_s=0.0)
 
 
 def joined(book, join, worker_id="w1", boot_id="b1", now_s=0.0):
@@ -122,10 +122,10 @@ def joined(book, join, worker_id="w1", boot_id="b1", now_s=0.0):
 
 def test_a_token_to_join_is_changed_once_for_a_credential_of_one_worker():
     book = book_of()
-    join, _ = issued(book, Role.JOIN)
+    join, _ = issued(book, AccessRole.JOIN)
     own, token = joined(book, join)
     assert book.find(token, now_s=0.0) == own
-    assert (own.role, own.worker_id) == (Role.WORKER, "w1")
+    assert (own.role, own.worker_id) == (AccessRole.WORKER, "w1")
     used = book.find(f"{join.token_id}.secret1", now_s=0.0)
     for worker_id, boot_id in (("w1", "b2"), ("w2", "b1"), ("w1", "b1"), ("w1", "")):
         with pytest.raises(NotSignedInError, match="used already, by worker w1"):
@@ -134,7 +134,7 @@ def test_a_token_to_join_is_changed_once_for_a_credential_of_one_worker():
 
 def test_a_lost_answer_to_a_join_is_given_again_to_the_same_process_and_voids_the_first():
     book = book_of()
-    join, join_token = issued(book, Role.JOIN)
+    join, join_token = issued(book, AccessRole.JOIN)
     _, lost = joined(book, join)
     _, token = joined(book, book.find(join_token, now_s=0.0))
     with pytest.raises(NotSignedInError, match="revoked"):
@@ -144,10 +144,10 @@ def test_a_lost_answer_to_a_join_is_given_again_to_the_same_process_and_voids_th
 
 def test_a_name_belongs_to_whoever_joined_under_it():
     book = book_of()
-    own, _ = joined(book, issued(book, Role.JOIN)[0])
-    fleet, _ = issued(book, Role.WORKER)
+    own, _ = joined(book, issued(book, AccessRole.JOIN)[0])
+    fleet, _ = issued(book, AccessRole.WORKER)
     with pytest.raises(NotAllowedError, match="another machine joined as worker w1"):
-        book.redeem(issued(book, Role.JOIN)[0], "w1", "b9", now_s=0.0)
+        book.redeem(issued(book, AccessRole.JOIN)[0], "w1", "b9", now_s=0.0)
     with pytest.raises(NotAllowedError, match="belongs to worker w1"):
         book.check_name(own.token_id, own.worker_id, "w2")
     with pytest.raises(NotAllowedError, match="credential of its own"):
@@ -158,22 +158,22 @@ def test_a_name_belongs_to_whoever_joined_under_it():
 
 def test_a_revoked_worker_comes_back_only_by_joining_anew():
     book = book_of()
-    _, token = joined(book, issued(book, Role.JOIN)[0])
+    _, token = joined(book, issued(book, AccessRole.JOIN)[0])
     book.keep(*book.revoke_worker("w1", "its results were wrong"))
     with pytest.raises(NotSignedInError, match="its results were wrong"):
         book.find(token, now_s=0.0)
-    fleet, _ = issued(book, Role.WORKER)
+    fleet, _ = issued(book, AccessRole.WORKER)
     book.keep(*book.revoke_worker("pod-7", "no reason"))
     for name in ("w1", "pod-7"):
         with pytest.raises(NotAllowedError, match="join anew"):
             book.check_name(fleet.token_id, "", name)
-    again, _ = joined(book, issued(book, Role.JOIN)[0], boot_id="b2")
+    again, _ = joined(book, issued(book, AccessRole.JOIN)[0], boot_id="b2")
     book.check_name(again.token_id, "w1", "w1")
 
 
 @dataclass
 class Known:
-    role: Role
+    role: AccessRole
     expires_s: float
     revoked: bool = False
     worker: str = ""
@@ -192,7 +192,7 @@ class TokenMachine(RuleBasedStateMachine):
         known = self.model[token]
         return not known.revoked and not (known.expires_s and self.now_s >= known.expires_s)
 
-    @rule(role=st.sampled_from(Role), valid_s=st.sampled_from([0.0, 10.0, 1000.0]))
+    @rule(role=st.sampled_from(AccessRole), valid_s=st.sampled_from([0.0, 10.0, 1000.0]))
     def issue(self, role, valid_s):
         credential, token = self.book.issue(role, valid_s=valid_s, label="", now_s=self.now_s)
         self.book.keep(credential)
@@ -209,16 +209,16 @@ class TokenMachine(RuleBasedStateMachine):
         self.book.keep(self.book.revoke(token.partition(".")[0], "by the operator"))
         self.model[token].revoked = True
 
-    @precondition(lambda self: any(known.role is Role.JOIN for known in self.model.values()))
+    @precondition(lambda self: any(known.role is AccessRole.JOIN for known in self.model.values()))
     @rule(data=st.data(), worker=st.sampled_from(["w1", "w2"]), boot=st.sampled_from(["b1", "b2", ""]))
     def join(self, data, worker, boot):
         token = data.draw(
-            st.sampled_from(sorted(t for t, known in self.model.items() if known.role is Role.JOIN))
+            st.sampled_from(sorted(t for t, known in self.model.items() if known.role is AccessRole.JOIN))
         )
         if not self.valid(token):
             return
         held = any(
-            known.role is Role.WORKER and known.worker == worker and not known.revoked
+            known.role is AccessRole.WORKER and known.worker == worker and not known.revoked
             for known in self.model.values()
         )
         credential = self.book.find(token, now_s=self.now_s)
@@ -232,7 +232,7 @@ class TokenMachine(RuleBasedStateMachine):
         assert not held
         self.book.keep(*changed)
         self.model[token].worker = worker
-        self.model[own] = Known(Role.WORKER, 0.0, worker=worker)
+        self.model[own] = Known(AccessRole.WORKER, 0.0, worker=worker)
 
     @invariant()
     def the_book_agrees(self):

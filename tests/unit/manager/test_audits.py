@@ -25,7 +25,7 @@ from embomatrix.manager.control.events import (
     WorkerResumed,
 )
 from embomatrix.manager.simulation.run import simulate
-from embomatrix.manager.simulation.scenario import LOCAL, Faults, Scenario, Trainer
+from embomatrix.manager.simulation.scenario import LOCAL, Faults, SimulationScenario, Trainer
 from embomatrix.rpc.wire.values import (
     Batch,
     Cancelled,
@@ -329,7 +329,7 @@ def lose(bench, alive, name):
 
 
 LIARS = 20
-TEST_OF_LIARS = Scenario(
+TEST_OF_LIARS = SimulationScenario(
     seed=5,
     workers=80,
     kinds=(replace(LOCAL, slots=2),),

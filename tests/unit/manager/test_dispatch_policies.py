@@ -22,7 +22,7 @@ from embomatrix.manager.control.events import (
     WorkerResumed,
     WorkerSuspected,
 )
-from embomatrix.manager.control.shares import Share, in_turns, quotas
+from embomatrix.manager.control.shares import RunShare, in_turns, quotas
 from embomatrix.rpc.leases import LeaseProgress
 from embomatrix.rpc.wire.values import (
     Batch,
@@ -378,7 +378,7 @@ def test_a_run_that_comes_when_nobody_knows_how_short_rollouts_are_has_its_share
 def test_claims_keep_their_order_in_each_run_and_no_run_is_ahead_of_its_weight(entries, weights):
     class Claim:
         def __init__(self, run, rank, cost):
-            self.rank, self.cost, self.share = rank, cost, Share(run, weights[run])
+            self.rank, self.cost, self.share = rank, cost, RunShare(run, weights[run])
 
     claims = [Claim(*entry) for entry in sorted(entries, key=lambda entry: entry[1])]
     ordered = in_turns(claims, lambda claim: claim.cost)
@@ -397,7 +397,9 @@ def test_claims_keep_their_order_in_each_run_and_no_run_is_ahead_of_its_weight(e
 
 @given(
     st.dictionaries(
-        st.builds(Share, st.text("abcdef", min_size=1), st.sampled_from([0.5, 1.0, 3.0]), st.integers(0, 1)),
+        st.builds(
+            RunShare, st.text("abcdef", min_size=1), st.sampled_from([0.5, 1.0, 3.0]), st.integers(0, 1)
+        ),
         st.integers(0, 100),
         min_size=1,
     ),

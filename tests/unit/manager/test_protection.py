@@ -16,7 +16,7 @@ from embomatrix.manager.access.protection import protection_of
 from embomatrix.manager.settings import ManagerSettings
 from embomatrix.manager.store.memory import MemoryStore
 from embomatrix.manager.store.protocol import Candidate
-from embomatrix.rpc.roles import Role
+from embomatrix.rpc.roles import AccessRole
 from embomatrix.rpc.status import InvalidRequestError
 from embomatrix.rpc.trust import Invitation, fingerprint_of, read_ca, read_token
 
@@ -105,13 +105,13 @@ def test_a_name_that_is_none_is_refused():
 
 
 def test_what_is_handed_out_holds_no_more_than_one_role(tmp_path):
-    prepare(tmp_path / "data", sans=(), roles=(Role.ADMIN, Role.WORKER))
-    hand_out_to(tmp_path / "data", Role.WORKER, tmp_path / "w")
+    prepare(tmp_path / "data", sans=(), roles=(AccessRole.ADMIN, AccessRole.WORKER))
+    hand_out_to(tmp_path / "data", AccessRole.WORKER, tmp_path / "w")
     assert {path.name for path in (tmp_path / "w").iterdir()} == {"ca.pem", "token"}
-    AccessFolder(tmp_path / "data").token(Role.WORKER).unlink()
-    hand_out_to(tmp_path / "data", Role.WORKER, tmp_path / "w")
+    AccessFolder(tmp_path / "data").token(AccessRole.WORKER).unlink()
+    hand_out_to(tmp_path / "data", AccessRole.WORKER, tmp_path / "w")
     with pytest.raises(AccessError, match="token issue --role worker"):
-        hand_out_to(tmp_path / "data", Role.WORKER, tmp_path / "elsewhere")
+        hand_out_to(tmp_path / "data", AccessRole.WORKER, tmp_path / "elsewhere")
 
 
 async def test_a_token_of_a_role_can_not_become_the_secret_of_all(tmp_path):
@@ -119,7 +119,7 @@ async def test_a_token_of_a_role_can_not_become_the_secret_of_all(tmp_path):
     folder = AccessFolder(tmp_path)
     store = MemoryStore()
     await store.claim(Candidate("test", "127.0.0.1:1", 60.0))
-    gate = Gate(store, guarded=True, shared_token=folder.token(Role.TRAINER).read_text().strip())
+    gate = Gate(store, guarded=True, shared_token=folder.token(AccessRole.TRAINER).read_text().strip())
     with pytest.raises(AccessError, match="would make it an admin's"):
         await gate.open(folder.first_credentials())
 

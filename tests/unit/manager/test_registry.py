@@ -9,7 +9,7 @@ from embomatrix.manager.control.events import (
     WorkerRecovered,
     WorkerSuspected,
 )
-from embomatrix.manager.runtime.registry import LivenessLimits, Registry, Standing
+from embomatrix.manager.runtime.registry import LivenessLimits, Registry, WorkerStanding
 from embomatrix.rpc.status import NotFoundError, SupersededError
 from embomatrix.rpc.wire.values import Resources
 
@@ -114,7 +114,7 @@ def test_heartbeats_slow_down_in_a_large_cluster(registry):
 def test_a_lost_worker_is_remembered_for_a_while(registry):
     join(registry)
     registry.tick(now_s=10.0)
-    assert registry.sessions["w1"].standing is Standing.LOST
+    assert registry.sessions["w1"].standing is WorkerStanding.LOST
     registry.tick(now_s=61.0)
     assert not registry.sessions
 
@@ -122,12 +122,12 @@ def test_a_lost_worker_is_remembered_for_a_while(registry):
 def test_a_worker_that_leaves_in_order_is_not_counted_as_lost(registry):
     said, _ = join(registry, "said")
     drained, _ = join(registry, "drained")
-    assert registry.end(said, "it left", Standing.LEFT) == [WorkerLost("said", "it left")]
+    assert registry.end(said, "it left", WorkerStanding.LEFT) == [WorkerLost("said", "it left")]
     registry.attach(drained, now_s=0.0)
     registry.drain("drained")
     registry.detach(drained, now_s=0.1)
     assert registry.tick(now_s=2.9) == [WorkerLost("drained", "it drained and left")]
-    assert {session.standing for session in registry.sessions.values()} == {Standing.LEFT}
+    assert {session.standing for session in registry.sessions.values()} == {WorkerStanding.LEFT}
     with pytest.raises(SupersededError, match="it left"):
         registry.find(said.session_id, said.epoch)
     with pytest.raises(NotFoundError, match=r"'said' is gone .it left.: start it again"):

@@ -9,10 +9,10 @@ from hypothesis import HealthCheck, given, settings
 from embomatrix.manager.control.commands import AcknowledgeLease, DeliverResult, FinishBatch, GiveLease
 from embomatrix.manager.control.dispatch.assignments import DispatchLimits
 from embomatrix.manager.simulation.agenda import Agenda
-from embomatrix.manager.simulation.auditor import Auditor, BrokenInvariantError
+from embomatrix.manager.simulation.auditor import BrokenInvariantError, InvariantChecker
 from embomatrix.manager.simulation.line import Line
 from embomatrix.manager.simulation.run import simulate
-from embomatrix.manager.simulation.scenario import LOCAL, MIXED, Faults, Scenario, Scenes, Trainer
+from embomatrix.manager.simulation.scenario import LOCAL, MIXED, Faults, Scenes, SimulationScenario, Trainer
 from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.rpc.leases import LeaseOrigin, LeaseRef, WorkerState
 from embomatrix.rpc.wire.values import (
@@ -27,7 +27,7 @@ from embomatrix.rpc.wire.values import (
     Timings,
 )
 
-SMALL = Scenario(
+SMALL = SimulationScenario(
     workers=4,
     scenes=Scenes(count=12, load_s=0.3),
     trainers=(Trainer(steps=3, groups=6, group_size=4, write_s=1.0, update_s=0.5, start_s=3.0),),
@@ -74,7 +74,7 @@ trainers = st.builds(
     surprises=st.sampled_from([0.0, 0.5]),
 )
 scenarios = st.builds(
-    Scenario,
+    SimulationScenario,
     seed=st.integers(0, 10_000),
     workers=st.integers(1, 8),
     kinds=st.sampled_from([(LOCAL,), MIXED]),
@@ -103,7 +103,7 @@ REWARD = RewardBreakdown(0.5, 0.0, 0.0, (), False)
 @pytest.fixture
 def auditor():
     """One rollout was submitted; two workers said that they have its scene."""
-    auditor = Auditor(Agenda())
+    auditor = InvariantChecker(Agenda())
     auditor.submit(Batch("r", "b", 1, (ROLLOUT,)))
     warm = WorkerState((Resident("kitchen", ResidentState.WARM),))
     for worker in ("w1", "w2"):

@@ -6,8 +6,15 @@ from dataclasses import replace
 import pytest
 
 from embomatrix.bench.cluster.simulated_sweeps import in_flight
-from embomatrix.manager.simulation.run import Simulation, simulate
-from embomatrix.manager.simulation.scenario import LOCAL, Faults, MachineKind, Scenario, Scenes, Trainer
+from embomatrix.manager.simulation.run import ClusterSimulation, simulate
+from embomatrix.manager.simulation.scenario import (
+    LOCAL,
+    Faults,
+    MachineKind,
+    Scenes,
+    SimulationScenario,
+    Trainer,
+)
 from embomatrix.rpc.wire.values import GroupPolicy, RunTerms
 
 UNLIKE = tuple(MachineKind(f"{slots} slots", 1.0, slots, 2048, 1.0, 0.0005, 100.0) for slots in (8, 4, 2, 1))
@@ -17,7 +24,7 @@ MEAN_OVER_MEDIAN = math.exp(0.2**2 / 2)
 
 def unlike(trainer, seed=0):
     """Eight workers with 8, 4, 2 and 1 slots, one of them ten times slower than it says."""
-    return Scenario(
+    return SimulationScenario(
         seed=seed,
         workers=8,
         kinds=UNLIKE,
@@ -32,7 +39,7 @@ def unlike(trainer, seed=0):
 def looking_ahead(k, **changes):
     """45 scenes of two seconds on 16 slots, with room for 32 of them at a time."""
     trainer = Trainer(steps=45, groups=4, group_size=16, lookahead=k, write_s=1.0, update_s=1.0, **changes)
-    return Scenario(
+    return SimulationScenario(
         workers=4,
         kinds=(replace(LOCAL, slots=4, memory_mb=256),),
         scenes=Scenes(count=45, load_s=2.0, load_spread=0.1, memory_spread=0.1),
@@ -79,7 +86,7 @@ def test_a_slow_worker_of_any_size_holds_no_group_once_it_is_known(seed):
 def test_unlike_workers_that_are_all_wanted_finish_within_a_quarter_of_the_bound(seed):
     """A12: makespan ≤ 1.25 × the bound of all slots together."""
     at_once = Trainer(steps=2, groups=60, group_size=16, write_s=0.0, update_s=0.0, start_s=5.0)
-    simulation = Simulation(unlike(at_once, seed))
+    simulation = ClusterSimulation(unlike(at_once, seed))
     speed = sum(worker.machine.resources.slots * worker.machine.speed for worker in simulation.workers)
     report = simulation.run()
     bound_s = at_once.rollouts * 0.5 * MEAN_OVER_MEDIAN / speed
@@ -128,8 +135,8 @@ def test_sixty_four_who_ask_for_the_same_scenes_at_once_have_each_loaded_once():
     kinds = (replace(LOCAL, slots=4, latency_s=0.5),)
     scenes = Scenes(count=20, load_s=2.0)
     # Before anything was executed nobody knows what a copy more is worth: the first run tells.
-    simulation = Simulation(
-        Scenario(workers=8, kinds=kinds, scenes=scenes, execute_s=0.02, trainers=trainers)
+    simulation = ClusterSimulation(
+        SimulationScenario(workers=8, kinds=kinds, scenes=scenes, execute_s=0.02, trainers=trainers)
     )
 
     def held():
@@ -148,7 +155,7 @@ def test_a_stuck_slot_is_noticed_by_its_progress_long_before_the_execution_limit
     """A3 on the simulated clock: flat for 10 s is enough, where the limit of an execution is 60 s."""
     alone = RunTerms(GroupPolicy.PARTIAL)
     trainer = Trainer(steps=4, groups=10, group_size=8, write_s=4.0, update_s=1.0, terms=alone)
-    scenario = Scenario(
+    scenario = SimulationScenario(
         workers=4,
         kinds=(replace(LOCAL, slots=4),),
         execute_s=0.5,
@@ -176,16 +183,16 @@ def test_what_renders_runs_where_there_is_a_gpu_and_nowhere_else():
         Trainer(name="drawn", steps=3, groups=4, group_size=8, render=True),
         Trainer(name="plain", steps=3, groups=8, group_size=16),
     )
-    report = simulate(Scenario(workers=8, kinds=(gpu, plain), trainers=trainers, execute_s=0.3))
+    report = simulate(SimulationScenario(workers=8, kinds=(gpu, plain), trainers=trainers, execute_s=0.3))
     assert report.delivered == report.submitted
     assert report.infra_failures == 0
     assert report.counts["rendered without a slot for it"] == 0
 
 
 def test_what_renders_fails_with_the_reason_where_nothing_can():
-    limits = replace(Scenario().dispatch, no_capacity_s=5.0)
+    limits = replace(SimulationScenario().dispatch, no_capacity_s=5.0)
     trainer = Trainer(steps=1, groups=1, group_size=4, render=True)
-    report = simulate(Scenario(workers=2, trainers=(trainer,), dispatch=limits))
+    report = simulate(SimulationScenario(workers=2, trainers=(trainer,), dispatch=limits))
     assert report.infra_failures >= 1
     assert report.stats.groups_failed == 1
 

@@ -6,13 +6,20 @@ from dataclasses import replace
 import pytest
 
 from embomatrix.bench.cluster.simulated_sweeps import in_flight, loaded_slowly
-from embomatrix.manager.simulation.run import Simulation, simulate
-from embomatrix.manager.simulation.scenario import LOCAL, Faults, MachineKind, Scenario, Scenes, Trainer
+from embomatrix.manager.simulation.run import ClusterSimulation, simulate
+from embomatrix.manager.simulation.scenario import (
+    LOCAL,
+    Faults,
+    MachineKind,
+    Scenes,
+    SimulationScenario,
+    Trainer,
+)
 
 AT_ONCE = Trainer(steps=2, groups=60, group_size=16, write_s=0.0, update_s=0.0, start_s=5.0)
 """A trainer that sends its steps at once: the cluster is what it waits for."""
 ROLLOUTS = AT_ONCE.rollouts
-BUSY = Scenario(
+BUSY = SimulationScenario(
     workers=10,
     kinds=(replace(LOCAL, slots=4),),
     execute_s=0.5,
@@ -50,7 +57,7 @@ def test_a_worker_killed_every_two_seconds_costs_a_fifth_of_what_is_left_at_most
 
 
 def test_a_worker_that_falls_silent_is_noticed_in_ten_seconds_and_its_rollouts_go_elsewhere_in_one():
-    simulation = Simulation(spread_out(faults=Faults(respawn_s=60.0)))
+    simulation = ClusterSimulation(spread_out(faults=Faults(respawn_s=60.0)))
     for index, at_s in enumerate((8.0, 14.0, 20.0)):
         after(simulation, at_s, lambda index=index: simulation.workers[index].kill(silent=True))
     report = simulation.run()
@@ -74,7 +81,7 @@ def test_slots_that_crash_or_hang_cost_no_rollout_and_no_worker():
 
 @pytest.mark.parametrize("directions", [{}, {"up": False}, {"down": False}])
 def test_a_short_partition_moves_nothing_that_runs(directions):
-    simulation = Simulation(spread_out())
+    simulation = ClusterSimulation(spread_out())
     after(simulation, 10.0, lambda: simulation.workers[0].cut(5.0, **directions))
     report = simulation.run()
     assert report.delivered == report.submitted
@@ -85,7 +92,7 @@ def test_a_short_partition_moves_nothing_that_runs(directions):
 @pytest.mark.parametrize("directions", [{}, {"up": True, "down": False}])
 def test_a_long_partition_moves_rollouts_once_and_late_results_are_fenced(directions):
     few = Trainer(steps=6, groups=4, group_size=4, write_s=8.0, update_s=4.0)
-    simulation = Simulation(spread_out(few, execute_s=6.0))
+    simulation = ClusterSimulation(spread_out(few, execute_s=6.0))
     # Where the first group goes, so that rollouts run there when the network is gone.
     after(
         simulation, 8.0, lambda: [w.cut(60.0, **directions) for w in simulation.workers if w.slots.executing]
@@ -100,7 +107,7 @@ def test_a_long_partition_moves_rollouts_once_and_late_results_are_fenced(direct
 
 
 def test_a_drained_worker_gets_nothing_new_and_costs_no_attempt():
-    simulation = Simulation(spread_out())
+    simulation = ClusterSimulation(spread_out())
     drained = simulation.workers[0]
     after(simulation, 10.0, lambda: simulation.front.drain(drained.machine.worker_id))
     idle = []
@@ -123,7 +130,7 @@ def test_unlike_workers_finish_within_a_quarter_of_the_bound(slow):
         scenes=Scenes(count=200, load_s=0.2),
         faults=Faults(slow_workers=slow),
     )
-    simulation = Simulation(scenario)
+    simulation = ClusterSimulation(scenario)
     speed = sum(worker.machine.resources.slots * worker.machine.speed for worker in simulation.workers)
     report = simulation.run()
     # The mean of a log-normal duration is above its median by exp(spread² / 2).

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from embomatrix.bench.cli import app
 from embomatrix.bench.cluster.simulated import bench_simulated_cluster
 from embomatrix.bench.cluster.simulated_sweeps import sweeps
-from embomatrix.bench.report.line_charts import Panel, page
+from embomatrix.bench.report.line_charts import LineChart, page
 
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -21,7 +21,9 @@ def texts(svg):
 
 def test_a_page_has_a_line_for_each_series_and_escapes_its_words():
     lines = {"near & far": {1: 0.0, 10: 0.5, 100: 1.0}, "far": {1: 0.2}}
-    svg = page("a <title>", [[Panel("share", "workers", lines, x_logarithmic=True, percent=True, most=1.0)]])
+    svg = page(
+        "a <title>", [[LineChart("share", "workers", lines, x_logarithmic=True, percent=True, most=1.0)]]
+    )
     root = ElementTree.fromstring(svg)
     assert len(list(root.iter(f"{SVG}polyline"))) == 2
     assert len(list(root.iter(f"{SVG}circle"))) == 4
@@ -29,7 +31,7 @@ def test_a_page_has_a_line_for_each_series_and_escapes_its_words():
 
 
 def test_a_higher_value_stands_higher_and_all_points_stand_inside():
-    panel = Panel("cost", "workers", {"x": {10: 3.0, 100: 30.0, 1000: 300.0}}, True, True)
+    panel = LineChart("cost", "workers", {"x": {10: 3.0, 100: 30.0, 1000: 300.0}}, True, True)
     root = ElementTree.fromstring(page("costs", [[panel]]))
     points = [(float(dot.get("cx")), float(dot.get("cy"))) for dot in root.iter(f"{SVG}circle")]
     assert [x for x, _ in points] == sorted(x for x, _ in points)
@@ -38,7 +40,10 @@ def test_a_higher_value_stands_higher_and_all_points_stand_inside():
 
 
 def test_a_line_of_one_value_or_of_zeros_can_be_drawn():
-    page("flat", [[Panel("a", "x", {"x": {5: 0.0}}), Panel("b", "x", {"x": {5: 1.0}}, x_logarithmic=True)]])
+    page(
+        "flat",
+        [[LineChart("a", "x", {"x": {5: 0.0}}), LineChart("b", "x", {"x": {5: 1.0}}, x_logarithmic=True)]],
+    )
 
 
 def test_no_sweep_is_larger_than_it_was_allowed():

@@ -5,10 +5,10 @@ from dataclasses import replace
 import pytest
 
 from embomatrix.manager.simulation.run import simulate
-from embomatrix.manager.simulation.scenario import LOCAL, Scenario, Scenes, Trainer
+from embomatrix.manager.simulation.scenario import LOCAL, Scenes, SimulationScenario, Trainer
 from embomatrix.rpc.wire.values import RunTerms
 
-CLUSTER = Scenario(
+CLUSTER = SimulationScenario(
     workers=4,
     kinds=(replace(LOCAL, slots=4),),
     execute_s=0.5,

@@ -18,7 +18,7 @@ from embomatrix.sim.bullet.mini_world import STAGES_KEPT
 from embomatrix.sim.engine import FLOOR, WALL, EngineError
 from embomatrix.sim.geometry.bounds import AssetBounds
 from embomatrix.world.asset import Joint, JointKind, Link
-from embomatrix.world.geometry import Aabb, Part, Pose, Shape
+from embomatrix.world.geometry import Aabb, ConvexPart, Pose, Shape
 from embomatrix.world.scene import Scene
 
 MOVABLE = ("bowl_1", "apple_1", "chicken_leg_1", "mug_1", "table_lamp_1", "apple_2")
@@ -210,7 +210,7 @@ def test_hull_beside_other_parts_collides(pool) -> None:
 
 def test_drawer_slides_along_its_axis(pool) -> None:
     box = make.block("chest", "chest.n.01", (0.4, 0.4, 0.4), {})
-    front = Part(Shape.BOX, Pose((0.21, 0, 0)), (0.02, 0.4, 0.3))
+    front = ConvexPart(Shape.BOX, Pose((0.21, 0, 0)), (0.02, 0.4, 0.3))
     drawer = Link("drawer", (front,), Joint(JointKind.PRISMATIC, (0.2, 0.0, 0.0), (1.0, 0.0, 0.0), 0.3))
     chest = dataclasses.replace(box, links=(*box.links, drawer))
     item = placed("chest_1", chest, "kitchen_0", upright(2, 2, 0, chest), fixed=True)
@@ -269,7 +269,7 @@ def _with_asset(**changes: object) -> Scene:
     return scene_of("broken", [(placed("apple_1", apple, "kitchen_0", Pose((1, 1, 1))), apple)])
 
 
-def _base(*parts: Part) -> dict[str, object]:
+def _base(*parts: ConvexPart) -> dict[str, object]:
     return {"links": (Link("base", parts),)}
 
 

@@ -10,10 +10,10 @@ from tests.fakes.scenes import kitchen_scene, kitchen_tasks
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.fidelity.compare import (
     Comparison,
+    FidelityTrial,
     ModeRun,
     PlanKind,
     StepRun,
-    Trial,
     compare,
     objects_in,
     run_trial,
@@ -58,7 +58,7 @@ def examples(bundle, cached):
 
 
 def trial_of(task, words):
-    return Trial("t-0", DIGEST, "flat", task.task_id, PlanKind.VALID, 3, plan_of(task, words))
+    return FidelityTrial("t-0", DIGEST, "flat", task.task_id, PlanKind.VALID, 3, plan_of(task, words))
 
 
 def compared(cached, other, words):
@@ -117,7 +117,7 @@ def run_of(*steps, cpu_s=1.0):
 
 def test_figures_are_those_that_one_reckons_by_hand():
     good, bad = None, FailureReason.FELL
-    trial = Trial("t", DIGEST, "flat", "task", PlanKind.ORACLE, 0, ())
+    trial = FidelityTrial("t", DIGEST, "flat", "task", PlanKind.ORACLE, 0, ())
     one = Comparison(
         trial,
         300,

@@ -9,7 +9,7 @@ from tests.fakes.plans import plan_of, task_over
 from tests.fakes.scenes import kitchen_scene
 
 from embomatrix.sim.bullet.camera import furnish_cutaway, render_egocentric, shoot_oblique
-from embomatrix.sim.bullet.stage import Stage
+from embomatrix.sim.bullet.stage import VisualScene
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.film import DRIVE_M_S, FRAMES_PER_S, film_cached
 from embomatrix.world.bundle import Bundle
@@ -72,7 +72,7 @@ def test_a_plan_that_fails_is_shown_up_to_its_failure(scene) -> None:
 
 
 def test_moving_an_object_on_a_stage_changes_the_picture_and_moving_it_back_restores_it(scene) -> None:
-    with Stage(scene) as stage:
+    with VisualScene(scene) as stage:
         furnish_cutaway(stage)
         before = shoot_oblique(stage, scene.rooms, 160, 120)
         stage.hide("breakfast_table_1")

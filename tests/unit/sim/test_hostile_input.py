@@ -20,13 +20,13 @@ from embomatrix.world.asset import Joint, JointKind, Link
 from embomatrix.world.bundle import Bundle, decode_bundle, encode_bundle, read_bundle
 from embomatrix.world.codec import RESERVED_NAMES, check_scene, scene_from_json, scene_to_json
 from embomatrix.world.field import SceneInvalidError
-from embomatrix.world.geometry import Part, Pose, Shape
+from embomatrix.world.geometry import ConvexPart, Pose, Shape
 from embomatrix.world.inflation import BundleError
 
 NAN, INF = math.nan, math.inf
 ORIGIN = (0.0, 0.0, 0.0)
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
-BOX = Part(Shape.BOX, Pose(ORIGIN), (0.1, 0.1, 0.1))
+BOX = ConvexPart(Shape.BOX, Pose(ORIGIN), (0.1, 0.1, 0.1))
 HINGE = Joint(JointKind.REVOLUTE, ORIGIN, (0.0, 0.0, 1.0), 1.0)
 CUBE = tuple((x, y, z) for x in (-0.05, 0.05) for y in (-0.05, 0.05) for z in (-0.05, 0.05))
 
@@ -59,7 +59,7 @@ def with_part(part):
 
 
 def hull(vertices):
-    return with_part(Part(Shape.HULL, Pose(ORIGIN), (0.1, 0.1, 0.1), tuple(vertices)))
+    return with_part(ConvexPart(Shape.HULL, Pose(ORIGIN), (0.1, 0.1, 0.1), tuple(vertices)))
 
 
 def with_joint(**changes):
@@ -142,7 +142,7 @@ PHYSICAL = {
         *(
             Link(
                 f"l{number}",
-                (Part(Shape.HULL, Pose(ORIGIN), (0.1, 0.1, 0.1), CUBE),) * 16,
+                (ConvexPart(Shape.HULL, Pose(ORIGIN), (0.1, 0.1, 0.1), CUBE),) * 16,
                 HINGE if number else None,
             )
             for number in range(7)

@@ -13,7 +13,7 @@ from embomatrix.sim.geometry.batch_poses import Lineup, Neighbours, PoseSet
 from embomatrix.sim.geometry.bounds import bounds_of, square_box
 from embomatrix.sim.placing.trial import in_reach
 from embomatrix.world.asset import Asset, Joint, JointKind, Link
-from embomatrix.world.geometry import Aabb, Part, Pose, Shape
+from embomatrix.world.geometry import Aabb, ConvexPart, Pose, Shape
 from embomatrix.world.placements import pose_rows
 from embomatrix.world.poses import StandPose
 
@@ -24,10 +24,10 @@ LAMP = Asset(
     (0.3, 0.2, 0.4),
     1.0,
     (
-        Link("base", (Part(Shape.CYLINDER, Pose((0.0, 0.0, 0.1)), (0.2, 0.2, 0.2)),)),
+        Link("base", (ConvexPart(Shape.CYLINDER, Pose((0.0, 0.0, 0.1)), (0.2, 0.2, 0.2)),)),
         Link(
             "arm",
-            (Part(Shape.SPHERE, Pose((0.1, 0.0, 0.3)), (0.1, 0.1, 0.1)),),
+            (ConvexPart(Shape.SPHERE, Pose((0.1, 0.0, 0.3)), (0.1, 0.1, 0.1)),),
             Joint(JointKind.REVOLUTE, (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 1.0),
         ),
     ),
@@ -149,7 +149,7 @@ def test_a_box_is_turned_by_right_angles_as_its_solid_is(box, x, y, quarters) ->
         "",
         box.size_m,
         1.0,
-        (Link("base", (Part(Shape.BOX, Pose((0.0, 0.0, 0.0)), box.size_m),)),),
+        (Link("base", (ConvexPart(Shape.BOX, Pose((0.0, 0.0, 0.0)), box.size_m),)),),
     )
     frame = Pose.from_xyz_yaw(x, y, 0.3, quarters * math.pi / 2)
     turned, exact = square_box(box, frame), bounds_of(solid).box(frame @ Pose(box.center_m))

@@ -10,7 +10,7 @@ from tests.fakes.scenes import placed, scene_of, upright
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.world.asset import Link
-from embomatrix.world.geometry import Part, Pose, Shape
+from embomatrix.world.geometry import ConvexPart, Pose, Shape
 from embomatrix.world.scene import Scene
 
 LOADS = 30
@@ -19,7 +19,9 @@ CORNERS = tuple((x, y, z) for x in (-0.1, 0.1) for y in (-0.1, 0.1) for z in (-0
 
 def scene_of_hulls() -> Scene:
     """Two things of one hull each, of new assets at every call, as a decoded bundle has them."""
-    hull = Part(Shape.HULL, Pose((0.0, 0.0, 0.0)), (0.2, 0.2, 0.2), tuple((*corner,) for corner in CORNERS))
+    hull = ConvexPart(
+        Shape.HULL, Pose((0.0, 0.0, 0.0)), (0.2, 0.2, 0.2), tuple((*corner,) for corner in CORNERS)
+    )
     thing = dataclasses.replace(make.apple(), size_m=(0.2, 0.2, 0.2), links=(Link("base", (hull,)),))
     places = {"apple_1": 2.0, "apple_2": 3.0}
     return scene_of(

@@ -22,7 +22,7 @@ from embomatrix.sim.physical.space import boxes_of, strikes, struck
 from embomatrix.sim.physical.stage import tucked
 from embomatrix.sim.state.relations import Relations
 from embomatrix.world.asset import Joint, JointKind, Link
-from embomatrix.world.geometry import Aabb, Part, Pose, Shape
+from embomatrix.world.geometry import Aabb, ConvexPart, Pose, Shape
 from embomatrix.world.poses import StandPose
 
 SHARES = arrays.arrays(np.float64, (5, arm.JOINTS), elements=st.floats(0.02, 0.98))
@@ -99,7 +99,7 @@ def test_who_strikes_nothing_is_told_sooner_and_is_the_same(seed):
 
 
 def test_a_door_is_at_its_front_when_it_is_shut_and_before_it_when_it_is_open():
-    front = Part(Shape.BOX, Pose((0.31, 0.0, 0.0)), (0.02, 0.6, 1.0))
+    front = ConvexPart(Shape.BOX, Pose((0.31, 0.0, 0.0)), (0.02, 0.6, 1.0))
     hinge = Joint(JointKind.REVOLUTE, (0.31, -0.3, 0.0), (0.0, 0.0, 1.0), -np.pi / 2)
     link = Link("door", (front,), hinge)
     fridge = make.asset("fridge", "electric_refrigerator.n.01", (0.6, 0.6, 1.0), [], links=[link])
@@ -174,7 +174,7 @@ def test_the_arm_bears_its_own_weight_stretched_out_in_coarse_steps_too():
 
 def test_the_lift_bears_its_load_beside_a_leaf_that_fits_closely_between_its_neighbours():
     """A contact that can move nothing is one by whose effect Bullet divides: it once ended the solving for the robot too."""
-    front, tall = Part(Shape.BOX, Pose((0.31, 0.0, 0.0)), (0.02, 0.6, 1.0)), (0.6, 0.6, 1.0)
+    front, tall = ConvexPart(Shape.BOX, Pose((0.31, 0.0, 0.0)), (0.02, 0.6, 1.0)), (0.6, 0.6, 1.0)
     door = Link("door", (front,), Joint(JointKind.REVOLUTE, (0.31, 0.0, -0.5), (0.0, 1.0, 0.0), 1.5))
     oven = make.asset("oven", "oven.n.01", tall, [make.box((0.0, 0.0, 0.0), tall)], links=[door])
     side = make.block("countertop", "countertop.n.01", (0.7, 0.6, 1.0), {})

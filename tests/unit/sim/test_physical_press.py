@@ -14,7 +14,7 @@ from embomatrix.sim.physical import body
 from embomatrix.sim.physical.fold import WAYS
 from embomatrix.sim.physical.press import press, pressing
 from embomatrix.sim.physical.space import struck
-from embomatrix.sim.physical.stage import Stage
+from embomatrix.sim.physical.stage import PhysicalStage
 from embomatrix.sim.placing.pose_cache import standing_poses
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.poses import PoseCache
@@ -29,7 +29,7 @@ def stage():
         poses = PoseCache({}, standing_poses(engine, PRESSED))
         world = LiveWorld(Bundle(scene, {}, poses), engine)
         with contextlib.closing(DynamicWorld(scene)) as dynamic:
-            found = Stage(world, dynamic, lambda: None)
+            found = PhysicalStage(world, dynamic, lambda: None)
             found.begin()
             yield found
 

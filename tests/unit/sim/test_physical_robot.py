@@ -9,7 +9,7 @@ from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.robot import Posture, RobotBody
 from embomatrix.sim.physical import arm, body
 from embomatrix.sim.physical.grasp import facing
-from embomatrix.sim.physical.reach import Held, Reach, Track
+from embomatrix.sim.physical.reach import ArmReach, HeldGeometry, Track
 from embomatrix.sim.physical.roadmap import way_between
 from embomatrix.sim.physical.space import boxes_of
 from embomatrix.sim.physical.stage import TOOL, TUCKED
@@ -78,7 +78,7 @@ def test_the_hand_gets_level_under_a_roof_at_any_height(height_m):
         for roll in (0.0, np.pi / 2)
     ]
     bases = np.array([[-away, aside, 0.0] for away in (0.4, 0.5, 0.6, 0.7) for aside in (-0.2, 0.0, 0.2)])
-    way = next(Reach(boxes, boxes).ways(tracks, [bases]), None)
+    way = next(ArmReach(boxes, boxes).ways(tracks, [bases]), None)
     assert way is not None
     np.testing.assert_allclose(body.tools(way.postures)[1], positions, atol=1e-6)
 
@@ -115,6 +115,6 @@ def test_a_bowl_with_food_in_it_is_level_until_it_is_tilted():
     tilted = level.copy()
     tilted[0, 10] += 0.6
     up = body.tools(level)[0][0].T @ np.array([0.0, 0.0, 1.0])
-    bowl = Held(np.zeros((1, 3)), np.array([0.05]), up)
+    bowl = HeldGeometry(np.zeros((1, 3)), np.array([0.05]), up)
     assert bowl.is_level(np.concatenate([level, tilted])).tolist() == [True, False]
-    assert Held(bowl.centres, bowl.radii).is_level(tilted)[0]
+    assert HeldGeometry(bowl.centres, bowl.radii).is_level(tilted)[0]

@@ -12,7 +12,7 @@ from embomatrix.sim.bullet.dynamic import DynamicWorld
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.live_world import LiveWorld
 from embomatrix.sim.physical import body
-from embomatrix.sim.physical.stage import Stage
+from embomatrix.sim.physical.stage import PhysicalStage
 from embomatrix.sim.physical.travel import HEADINGS, drive
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.poses import PoseCache
@@ -32,7 +32,7 @@ def stretched_beside_a_post(turn):
     scene = scene_of("post", [(stands, post)])
     dynamic = DynamicWorld(scene)
     with contextlib.closing(BulletEngine(scene)) as engine, contextlib.closing(dynamic):
-        stage = Stage(LiveWorld(Bundle(scene, {}, PoseCache()), engine), dynamic, lambda: None)
+        stage = PhysicalStage(LiveWorld(Bundle(scene, {}, PoseCache()), engine), dynamic, lambda: None)
         stage.begin()
         stretched = stage.mover.posture
         stretched[body.LIFT :] = STRETCHED

@@ -11,7 +11,7 @@ from tests.fakes.scenes import kitchen_scene
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.floor.grid import grid_shape
-from embomatrix.sim.floor.prepared import Prepared, prepare
+from embomatrix.sim.floor.prepared import PreparedScene, prepare
 from embomatrix.world.bundle import Bundle, decode_bundle, encode_bundle
 
 PLANS = (
@@ -34,11 +34,11 @@ def bundle():
 
 
 def _loaded(bundle):
-    return contextlib.closing(Simulator(bundle, BulletEngine(bundle.scene, None, Prepared.of(bundle))))
+    return contextlib.closing(Simulator(bundle, BulletEngine(bundle.scene, None, PreparedScene.of(bundle))))
 
 
 def test_boxes_obstacles_and_floor_are_those_that_loading_would_derive(bundle):
-    found = Prepared.of(bundle)
+    found = PreparedScene.of(bundle)
     bare = replace(bundle, prepared={})
     with _loaded(bare) as derived, _loaded(bundle) as carried:
         boxes = tuple(derived.world.engine.aabb(item.name) for item in bundle.scene.objects)
@@ -85,7 +85,7 @@ def _without(arrays, name):
 )
 def test_what_does_not_fit_the_scene_is_derived_instead(bundle, spoil):
     spoilt = replace(bundle, prepared=spoil(dict(bundle.prepared)))
-    assert Prepared.of(spoilt) is None
+    assert PreparedScene.of(spoilt) is None
     task = bundle.tasks["test"]
     with _loaded(spoilt) as simulator:
         assert simulator.execute(task, plan_of(task, PLANS[0]), 0).failure is None

@@ -11,7 +11,7 @@ from embomatrix.sim.bullet.mini_world import MiniWorld, Still
 from embomatrix.sim.geometry.bounds import IDENTITY, bounds_of
 from embomatrix.sim.geometry.statics import base_of, is_level, rest_pose
 from embomatrix.world.asset import Asset, Link
-from embomatrix.world.geometry import Part, Pose, Shape
+from embomatrix.world.geometry import ConvexPart, Pose, Shape
 
 LIFT_M = 0.0005
 EXTENT = st.floats(0.03, 0.3)
@@ -24,7 +24,7 @@ def solid(name, *parts):
 
 
 def part(shape, size, at=(0.0, 0.0, 0.0)):
-    return Part(shape, Pose(at), (size[0], size[0] if shape is Shape.CYLINDER else size[1], size[2]))
+    return ConvexPart(shape, Pose(at), (size[0], size[0] if shape is Shape.CYLINDER else size[1], size[2]))
 
 
 def over(held, support, x, y, yaw):
@@ -103,7 +103,7 @@ def test_a_rim_beside_a_block_leaves_it_to_the_settle() -> None:
         solid("ball", part(Shape.SPHERE, (0.1, 0.1, 0.1))),
         solid(
             "rod",
-            Part(
+            ConvexPart(
                 Shape.CYLINDER,
                 Pose((0.0, 0.0, 0.0), (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))),
                 (0.1, 0.1, 0.3),

@@ -13,7 +13,7 @@ from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.library import reasons_of
 from embomatrix.skills.limits import ROBOT
 from embomatrix.skills.syntax import PlaceRelation, Skill, SkillCall
-from embomatrix.skills.view import Reach
+from embomatrix.skills.view import ObjectReach
 from embomatrix.world.asset import Asset
 from embomatrix.world.state import SubstanceFact, SubstanceRelation
 
@@ -26,7 +26,7 @@ ASSETS = {
     "table": make.kitchen_table(),
 }
 TABLE = tuple(ASSETS)
-AT_HAND = Reach(0.5, 0.8)
+AT_HAND = ObjectReach(0.5, 0.8)
 
 
 @dataclass
@@ -41,7 +41,7 @@ class WordWorld:
     on: set[str] = field(default_factory=set)
     inside: dict[str, str] = field(default_factory=dict)
     burdens: dict[str, str] = field(default_factory=dict)
-    reaches: dict[str, Reach] = field(default_factory=dict)
+    reaches: dict[str, ObjectReach] = field(default_factory=dict)
     hidden: set[str] = field(default_factory=set)
     at: set[tuple[str, str]] = field(default_factory=set)
     absent: set[str] = field(default_factory=set)
@@ -129,8 +129,8 @@ def test_steps_up_to_five_metres_either_way_are_allowed(distance):
 
 
 def test_reach_is_checked_to_the_centimetre():
-    near = WordWorld(reaches={"apple": Reach(ROBOT.reach_m, 0.8)})
-    far = WordWorld(reaches={"apple": Reach(ROBOT.reach_m + 0.01, 0.8)})
+    near = WordWorld(reaches={"apple": ObjectReach(ROBOT.reach_m, 0.8)})
+    far = WordWorld(reaches={"apple": ObjectReach(ROBOT.reach_m + 0.01, 0.8)})
     assert reason(near, Skill.PICK_UP, "apple") is None
     assert check(far, call(Skill.PICK_UP, "apple")).sentence == (
         "apple is 1.11 m away and the arm reaches 1.10 m: move to it first"
@@ -138,7 +138,7 @@ def test_reach_is_checked_to_the_centimetre():
 
 
 def test_what_is_too_high_is_not_called_too_far():
-    world = WordWorld(reaches={"apple": Reach(3.0, 2.3)})
+    world = WordWorld(reaches={"apple": ObjectReach(3.0, 2.3)})
     assert reason(world, Skill.PICK_UP, "apple") is FailureReason.TOO_HIGH
 
 

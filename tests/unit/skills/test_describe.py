@@ -1,17 +1,28 @@
 """Observations in words."""
 
-from embomatrix.skills.describe import MAX_FINAL_LINES, Sight, done, final_lines, gained, line, listed
+from embomatrix.skills.describe import (
+    MAX_FINAL_LINES,
+    ObjectDescription,
+    done,
+    final_lines,
+    gained,
+    line,
+    listed,
+)
 from embomatrix.skills.syntax import PlaceRelation, Skill, SkillCall
 from embomatrix.world.state import Relation
 
 
 def test_an_object_is_told_with_its_host_room_and_states():
-    sight = Sight("apple_1", "kitchen_0", "bowl_1", Relation.INSIDE, states=("cooked", "hot"))
+    sight = ObjectDescription("apple_1", "kitchen_0", "bowl_1", Relation.INSIDE, states=("cooked", "hot"))
     assert line(sight) == "apple_1: inside bowl_1 in kitchen_0, cooked, hot"
 
 
 def test_what_stands_on_the_floor_is_told_with_its_room():
-    assert line(Sight("fridge_1", "kitchen_0", states=("closed",))) == "fridge_1: in kitchen_0, closed"
+    assert (
+        line(ObjectDescription("fridge_1", "kitchen_0", states=("closed",)))
+        == "fridge_1: in kitchen_0, closed"
+    )
 
 
 def test_a_place_says_what_went_where():
@@ -35,7 +46,7 @@ def test_states_that_temperature_brought_are_told_by_object():
 
 
 def test_a_long_final_state_is_cut_and_says_so():
-    sights = [Sight(f"apple_{n}", "kitchen_0") for n in range(MAX_FINAL_LINES + 3)]
+    sights = [ObjectDescription(f"apple_{n}", "kitchen_0") for n in range(MAX_FINAL_LINES + 3)]
     lines = final_lines(sights)
     assert len(lines) == MAX_FINAL_LINES + 1
     assert lines[-1] == "and 3 more objects"

@@ -10,7 +10,7 @@ from embomatrix.skills.parse import parse_plan
 from embomatrix.skills.prompt import (
     EXAMPLES,
     Codec,
-    Row,
+    PromptRow,
     Situation,
     labels,
     limited,
@@ -24,13 +24,13 @@ from embomatrix.skills.syntax import PROFILES, PlaceRelation, Skill, SkillCall
 from embomatrix.world.state import Relation
 from embomatrix.world.task import Profile
 
-FRIDGE = Row(2, "fridge_1", "fridge", "kitchen_0", states=("closed",), fixed=True)
-COUNTER = Row(0, "countertop_1", "countertop", "kitchen_0", fixed=True)
-OVEN = Row(6, "oven_1", "oven", "kitchen_0", states=("closed", "off"), fixed=True)
-APPLE = Row(4, "apple_1", "apple", "kitchen_0", "countertop_1", Relation.ONTOP)
-LEG = Row(1, "chicken_leg_1", "chicken_leg", "kitchen_0", "fridge_1", Relation.INSIDE, ("frozen",))
-BOWL = Row(3, "bowl_1", "bowl", "kitchen_0", "countertop_1", Relation.ONTOP)
-OTHER_BOWL = Row(5, "bowl_2", "bowl", "den_0")
+FRIDGE = PromptRow(2, "fridge_1", "fridge", "kitchen_0", states=("closed",), fixed=True)
+COUNTER = PromptRow(0, "countertop_1", "countertop", "kitchen_0", fixed=True)
+OVEN = PromptRow(6, "oven_1", "oven", "kitchen_0", states=("closed", "off"), fixed=True)
+APPLE = PromptRow(4, "apple_1", "apple", "kitchen_0", "countertop_1", Relation.ONTOP)
+LEG = PromptRow(1, "chicken_leg_1", "chicken_leg", "kitchen_0", "fridge_1", Relation.INSIDE, ("frozen",))
+BOWL = PromptRow(3, "bowl_1", "bowl", "kitchen_0", "countertop_1", Relation.ONTOP)
+OTHER_BOWL = PromptRow(5, "bowl_2", "bowl", "den_0")
 SITUATION = Situation(
     ("kitchen_0", "den_0"),
     "den_0",
@@ -124,7 +124,11 @@ def test_limit_keeps_what_the_instruction_names_and_what_it_rests_on():
 def test_limit_does_not_take_a_part_of_a_word_for_a_name():
     told = limited(
         Situation(
-            (), "", (OTHER_BOWL, Row(8, "tablebowls_1", "ta", "den_0"), APPLE), "fetch an apple table", 9
+            (),
+            "",
+            (OTHER_BOWL, PromptRow(8, "tablebowls_1", "ta", "den_0"), APPLE),
+            "fetch an apple table",
+            9,
         ),
         1,
     )

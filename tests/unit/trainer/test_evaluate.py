@@ -5,12 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from embomatrix.trainer.evaluation.held_out import Evaluation, TaskScore, improvement
+from embomatrix.trainer.evaluation.held_out import HeldOutEvaluation, TaskScore, improvement
 from embomatrix.trainer.evaluation.intervals import bootstrap
 
 
 def scored(successes, samples=10, prefix="t", category="pick_and_place"):
-    return Evaluation(
+    return HeldOutEvaluation(
         tuple(
             TaskScore(f"{prefix}{at}", category, samples, count, samples, 3.0 * count, 10 - samples)
             for at, count in enumerate(successes)
@@ -49,11 +49,11 @@ def test_only_tasks_of_both_evaluations_are_paired():
 def test_a_task_whose_rollouts_were_all_lost_is_left_out():
     known = scored([5, 5])
     lost = scored([0], samples=0, prefix="lost")
-    assert Evaluation((*known.scores, *lost.scores)).success().value == 0.5
+    assert HeldOutEvaluation((*known.scores, *lost.scores)).success().value == 0.5
 
 
 def test_categories_are_reported_apart():
-    both = Evaluation((*scored([10]).scores, *scored([0], prefix="c", category="compound").scores))
+    both = HeldOutEvaluation((*scored([10]).scores, *scored([0], prefix="c", category="compound").scores))
     assert both.categories == ("compound", "pick_and_place")
     assert both.success("compound").value == 0
     assert both.success("pick_and_place").value == 1
@@ -61,4 +61,4 @@ def test_categories_are_reported_apart():
 
 def test_scores_survive_their_file():
     result = scored([1, 2, 3])
-    assert Evaluation.from_json(result.as_json()) == result
+    assert HeldOutEvaluation.from_json(result.as_json()) == result

@@ -12,12 +12,12 @@ from tests.fakes.executors import HereExecutor
 from embomatrix.llm.endpoint import Endpoint, EndpointLimits
 from embomatrix.skills.parse import plan_to_json
 from embomatrix.skills.prompt import Codec
-from embomatrix.trainer.evaluation.answers import Answer, AnswerSheet, Setup, read_answers
+from embomatrix.trainer.evaluation.answers import Answer, AnswerSheet, EvaluationSetup, read_answers
 from embomatrix.trainer.evaluation.asking import EndpointAsker, WriterAsker, questions_digest
 from embomatrix.trainer.evaluation.baselines import BaselineName, baseline_for
 from embomatrix.trainer.evaluation.benchmark import find_benchmark
 from embomatrix.trainer.evaluation.exam import WorldExam
-from embomatrix.trainer.evaluation.judging import Judge
+from embomatrix.trainer.evaluation.judging import AnswerJudge
 from embomatrix.trainer.evaluation.page import evaluation_page
 from embomatrix.trainer.evaluation.scoreboard import Scoreboard
 from embomatrix.trainer.evaluation.table import read_row, report_of, text_report
@@ -35,7 +35,7 @@ def bench(tmp_path_factory):
 
 
 def setup_of(bench, samples=2, codec="lines", **changes):
-    setup = Setup(
+    setup = EvaluationSetup(
         bench.name, bench.digest, bench.split, len(bench.records), "me", codec, 60, samples, 1.0, 64, 0
     )
     return replace(setup, **changes)
@@ -43,7 +43,7 @@ def setup_of(bench, samples=2, codec="lines", **changes):
 
 def judged(bench, answers, setup=None):
     executor = HereExecutor(bench.folder)
-    found = Judge(bench, setup or setup_of(bench), executor).judge(answers)
+    found = AnswerJudge(bench, setup or setup_of(bench), executor).judge(answers)
     return found, executor
 
 
@@ -121,7 +121,7 @@ def test_equal_plans_of_a_task_are_executed_once(bench):
 def test_processes_of_this_machine_give_what_this_process_gives(bench):
     answers = asked(bench, BaselineName.RANDOM, 2)
     here, _ = judged(bench, answers)
-    assert Judge(bench, setup_of(bench), RolloutPool(bench.folder, 2)).judge(answers) == here
+    assert AnswerJudge(bench, setup_of(bench), RolloutPool(bench.folder, 2)).judge(answers) == here
 
 
 def test_report_is_made_again_from_the_kept_answers_bit_for_bit(bench, tmp_path):

@@ -8,7 +8,7 @@ import pytest
 from embomatrix.skills.failure import SENTENCES, FailureReason
 from embomatrix.skills.parse import PlanReason, parse_plan
 from embomatrix.skills.trace import Step
-from embomatrix.trainer.evaluation.intervals import Method, mean_over_tasks, pass_at, wilson
+from embomatrix.trainer.evaluation.intervals import IntervalMethod, mean_over_tasks, pass_at, wilson
 from embomatrix.trainer.evaluation.taxonomy import (
     MEANINGS,
     REMEDIES,
@@ -34,7 +34,7 @@ def test_wilson_gives_the_textbook_interval():
 
 def test_tasks_that_are_all_alike_leave_no_false_certainty():
     nothing = mean_over_tasks([0.0] * 20)
-    assert nothing.method is Method.WILSON
+    assert nothing.method is IntervalMethod.WILSON
     assert nothing.interval.low == pytest.approx(0.0)
     assert 0.1 < nothing.interval.high < 0.2
 
@@ -42,14 +42,14 @@ def test_tasks_that_are_all_alike_leave_no_false_certainty():
 def test_tasks_are_resampled_with_all_their_samples():
     """Ten samples of each of ten tasks that either always or never succeed are ten observations, not a hundred."""
     estimate = mean_over_tasks([0.0, 1.0] * 5)
-    assert estimate.method is Method.BOOTSTRAP
+    assert estimate.method is IntervalMethod.BOOTSTRAP
     assert estimate.interval.high - estimate.interval.low > 0.5
 
 
 def test_a_task_of_which_nothing_is_known_is_left_out():
     estimate = mean_over_tasks([1.0, math.nan, 0.5])
     assert (estimate.tasks, estimate.interval.value) == (2, 0.75)
-    assert mean_over_tasks([math.nan]).method is Method.NONE
+    assert mean_over_tasks([math.nan]).method is IntervalMethod.NONE
 
 
 def test_pass_at_k_is_the_share_of_draws_with_a_success():

@@ -25,7 +25,7 @@ from embomatrix.trainer.policy.import_gguf import import_gguf
 from embomatrix.trainer.policy.lora import LoraShape
 from embomatrix.trainer.policy.products import multiply_in
 from embomatrix.trainer.policy.prompts import Teller
-from embomatrix.trainer.run.checkpoint import CheckpointStore, Progress
+from embomatrix.trainer.run.checkpoint import CheckpointStore, TrainingProgress
 from embomatrix.trainer.run.errors import TrainerError
 from embomatrix.trainer.run.loop import Parts, TrainingRun
 from embomatrix.trainer.run.settings import LANGUAGE_MODEL_DEFAULTS, read_settings
@@ -154,12 +154,12 @@ def test_a_model_whose_weights_are_damaged_is_one_sentence(policy, tmp_path):
 def test_a_model_that_finds_no_room_leaves_the_checkpoint_before_it_whole(policy, tmp_path, small_files):
     settings = read_settings(None, {})
     store = CheckpointStore(tmp_path, keep=3)
-    before = store.save(policy, {}, Progress(step=1, prepared=True), settings)
+    before = store.save(policy, {}, TrainingProgress(step=1, prepared=True), settings)
     with (
         small_files(10_000),
         pytest.raises(TrainerError, match=r"step-000002 can't be written .*--resume goes on"),
     ):
-        store.save(policy, {}, Progress(step=2, prepared=True), settings)
+        store.save(policy, {}, TrainingProgress(step=2, prepared=True), settings)
     assert [path.name for path in tmp_path.iterdir()] == ["step-000001"]
     assert torch.equal(weights(saved_policy(before / "policy", settings)), weights(policy))
 

@@ -18,7 +18,7 @@ from embomatrix.trainer.logging.recorder import IMITATION, Recorder
 from embomatrix.trainer.policy.choice import new_policy, saved_policy
 from embomatrix.trainer.policy.prompts import Teller
 from embomatrix.trainer.policy.tiny import TinyPolicy
-from embomatrix.trainer.run.checkpoint import CHECKPOINTS, CheckpointStore, Progress, read_state
+from embomatrix.trainer.run.checkpoint import CHECKPOINTS, CheckpointStore, TrainingProgress, read_state
 from embomatrix.trainer.run.errors import TrainerError
 from embomatrix.trainer.run.settings import read_settings
 
@@ -39,7 +39,7 @@ def settings_of(**changes):
 def imitate(out, settings, cut_after=None, tasks=TASKS, display=None):
     store = CheckpointStore(out / CHECKPOINTS, keep=9)
     newest = store.latest()
-    progress = read_state(newest)[0] if newest else Progress()
+    progress = read_state(newest)[0] if newest else TrainingProgress()
     policy = saved_policy(newest / "policy", settings) if newest else new_policy(settings, tasks)
     teller = Teller(policy, 16, Variation(tasks.kinds, 0.5, 0.5))
     steps = []

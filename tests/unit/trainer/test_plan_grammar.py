@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.fakes.symbolic_household import make_tasks
 
-from embomatrix.skills.prompt import Codec, Row, plan_in_names, prompt_for
+from embomatrix.skills.prompt import Codec, PromptRow, plan_in_names, prompt_for
 from embomatrix.skills.syntax import PROFILES
 from embomatrix.trainer.grpo.rollout import parsed
 from embomatrix.trainer.policy.decoder import DecoderShape
@@ -23,7 +23,7 @@ TASKS = make_tasks(12, 3)
 def twins(situation):
     """A situation with two more things of one category, so that names need numbers."""
     first = situation.rows[0]
-    more = [Row(100 + at, f"{first.category}_{at}", first.category, first.room) for at in (7, 3)]
+    more = [PromptRow(100 + at, f"{first.category}_{at}", first.category, first.room) for at in (7, 3)]
     return replace(situation, rows=(*situation.rows[1:], *more), table_size=102)
 
 

@@ -9,25 +9,25 @@ from typer.testing import CliRunner
 
 from embomatrix.bench.cli import app
 from embomatrix.bench.fidelity.page import figures_of, read_disagreement, replay
-from embomatrix.bench.fidelity.pool import LOST, FidelityPool, Modes, SceneJob
+from embomatrix.bench.fidelity.pool import LOST, FidelityPool, Modes, TrialJob
 from embomatrix.bench.fidelity.suite import (
     DISAGREEMENTS_FILE,
     PLANS_FILE,
     RESULTS_FILE,
     FidelitySettings,
-    Progress,
+    SuiteProgress,
     run_fidelity,
     write_all_trials,
 )
 from embomatrix.bench.report.figures import BenchError
 from embomatrix.sim.executor import Simulator
-from embomatrix.sim.fidelity.compare import PlanKind, Trial
+from embomatrix.sim.fidelity.compare import FidelityTrial, PlanKind
 from embomatrix.sim.fidelity.records import trial_from_json, trial_to_json
 from embomatrix.sim.fidelity.sampler import SKILLS
 from embomatrix.skills.parse import parse_plan
 from embomatrix.world.dataset import Dataset
 
-QUIET = Progress(written=lambda done, of: None, executed=lambda done, of: None)
+QUIET = SuiteProgress(written=lambda done, of: None, executed=lambda done, of: None)
 SMALL = FidelitySettings(plans=20, calls=0, seed=0)
 LIMIT_S = 60.0
 
@@ -72,7 +72,7 @@ def test_a_suite_that_was_cut_short_goes_on_where_it_was(suite, dataset, tmp_pat
     lines = (folder / RESULTS_FILE).read_text().splitlines()
     (tmp_path / RESULTS_FILE).write_text("\n".join(lines[:-2]) + "\n" + lines[-2][:40])
     executed = []
-    progress = Progress(written=QUIET.written, executed=lambda done, of: executed.append(done))
+    progress = SuiteProgress(written=QUIET.written, executed=lambda done, of: executed.append(done))
     again = run_fidelity(dataset, SMALL, tmp_path, 1, Modes(Simulator, clumsy), progress)
     assert executed == [len(lines) - 1, len(lines)]
     assert [item.cached.atoms for item in again.comparisons] == [
@@ -130,7 +130,7 @@ def trials_of(dataset, *texts):
     record = dataset.records[0]
     fridge = record.task.index_of["fridge_1"]
     return tuple(
-        Trial(
+        FidelityTrial(
             f"t-{number}",
             record.bundle_digest,
             "flat",
@@ -155,7 +155,7 @@ def test_a_process_that_fails_costs_only_the_trial_that_it_was_at(dataset, physi
     trials = trials_of(dataset, "move fridge", "move fridge\nopen fridge", "turn 1.0")
     values = []
     pool = FidelityPool(dataset.folder, Modes(Simulator, physical), 1, limit_s)
-    pool.run([SceneJob(trials[0].bundle_digest, trials)], values.append)
+    pool.run([TrialJob(trials[0].bundle_digest, trials)], values.append)
     assert [value["trial"] for value in values] == ["t-0", "t-1", "t-2"]
     assert [LOST in value for value in values] == [False, True, False]
     assert reason in values[1][LOST]

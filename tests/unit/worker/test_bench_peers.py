@@ -10,8 +10,8 @@ from tests.fakes.datasets import write_flats_dataset
 from embomatrix.bench.cluster.work import main_work
 from embomatrix.bench.engine.apart import apart
 from embomatrix.bench.engine.workload import write_workload
-from embomatrix.bench.peers.contender import Chunk, Lost, Mode, Setup, execute, greet
-from embomatrix.bench.peers.contest import Peer, PeerSizes, chunks_of, hold_contest, singles
+from embomatrix.bench.peers.contender import ContenderSetup, LibraryMode, Lost, RolloutChunk, execute, greet
+from embomatrix.bench.peers.contest import PeerSizes, PeerSystem, chunks_of, hold_contest, singles
 from embomatrix.bench.peers.engine_pool import executed_twice, write_bundles
 from embomatrix.bench.peers.page import contest_figures, contest_lines
 from embomatrix.bench.peers.process_pool import process_pool
@@ -25,7 +25,7 @@ SCENES = 2
 PER_SCENE = 4
 MEASURED = SCENES * (PER_SCENE - 1)
 LIMIT_S = 60.0
-SIZES = PeerSizes((Peer.POOL,), chunk=2, warm=1, plain=2, alone=1, waves=1, wave=2, limit_s=LIMIT_S)
+SIZES = PeerSizes((PeerSystem.POOL,), chunk=2, warm=1, plain=2, alone=1, waves=1, wave=2, limit_s=LIMIT_S)
 
 pytestmark = pytest.mark.timeout(240)
 
@@ -56,7 +56,7 @@ def test_chunks_hold_one_scene_each_and_a_scene_stays_in_its_lane(work):
 def test_processes_of_a_pool_execute_what_a_simulator_of_ours_does(work, tmp_path):
     write_bundles(tmp_path, work.bundles)
     theirs = []
-    setup = Setup(Mode.SHARED, tmp_path, slots=1)
+    setup = ContenderSetup(LibraryMode.SHARED, tmp_path, slots=1)
     with process_pool(setup) as contender:
         chunks = chunks_of(work.rollouts, 2, setup.lanes)
         contender.run(chunks, lambda news: theirs.extend(news.results), LIMIT_S)
@@ -76,7 +76,7 @@ def traces(work):
 
 @pytest.mark.slow
 def test_a_contest_measures_ours_and_the_pool_on_all_of_the_work(contest):
-    found = contest.peers[Peer.POOL]
+    found = contest.peers[PeerSystem.POOL]
     assert len(contest.ours.all_at_once.latency_s) == MEASURED
     assert len(found.shared.all_at_once.latency_s) == MEASURED
     assert len(found.affine_cold.latency_s) + len(found.affine.latency_s) == SCENES * PER_SCENE
@@ -94,7 +94,7 @@ def test_a_killed_slot_costs_ours_nothing(contest):
 
 @pytest.mark.slow
 def test_what_the_pool_gives_up_when_a_process_dies_is_counted(contest):
-    killed = contest.peers[Peer.POOL].shared.killed
+    killed = contest.peers[PeerSystem.POOL].shared.killed
     assert len(killed.latency_s) + killed.lost + killed.hung == MEASURED
     assert set(killed.reasons) <= {"BrokenProcessPool"}
 
@@ -102,7 +102,7 @@ def test_what_the_pool_gives_up_when_a_process_dies_is_counted(contest):
 @pytest.mark.slow
 def test_ours_is_told_over_the_better_way_to_tune_a_peer(contest):
     figures = {figure.name: figure for figure in contest_figures(contest)}
-    found = contest.peers[Peer.POOL]
+    found = contest.peers[PeerSystem.POOL]
     best = max(found.shared.all_at_once.rate, found.affine.rate)
     assert figures["vs_process_pool"].value == pytest.approx(contest.ours.all_at_once.rate / best)
     assert "vs_ray" not in figures
@@ -122,7 +122,7 @@ def test_what_is_lost_and_what_never_comes_are_told_apart(work):
 
 
 def test_processes_that_do_not_start_are_an_error_with_the_reason(tmp_path):
-    setup = Setup(Mode.SHARED, tmp_path, slots=2)
+    setup = ContenderSetup(LibraryMode.SHARED, tmp_path, slots=2)
     with pytest.raises(BenchError, match=r"did not start within 0\.1 s: NoModule"):
         greet(FakeContender({0: Lost(0, "NoModule")}), setup, 0.1)
     with pytest.raises(BenchError, match="1 of 2 processes answered"):
@@ -130,7 +130,7 @@ def test_processes_that_do_not_start_are_an_error_with_the_reason(tmp_path):
 
 
 def test_a_greeting_has_no_rollouts():
-    assert Chunk(0, ()).requests == []
+    assert RolloutChunk(0, ()).requests == []
 
 
 def test_what_is_measured_apart_comes_back_or_says_why_not():

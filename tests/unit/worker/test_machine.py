@@ -10,7 +10,7 @@ import pytest
 from embomatrix.worker.host.machine import (
     NEVER_S,
     CpuTimes,
-    Machine,
+    HostMachine,
     Owner,
     desktop_active_s,
     family_cpu_s,
@@ -85,7 +85,7 @@ def test_a_process_that_is_gone_used_nothing():
 
 
 def test_our_own_work_is_no_load_of_others_and_theirs_is():
-    ours, nobody = Machine(lambda: [os.getpid()]), Machine(list)
+    ours, nobody = HostMachine(lambda: [os.getpid()]), HostMachine(list)
     subprocess.run([sys.executable, "-c", BUSY], check=True)
     # Whatever else this machine does, both saw it; between them lies what was ours.
     share, whole = ours.observe().others_load, nobody.observe().others_load
@@ -93,7 +93,7 @@ def test_our_own_work_is_no_load_of_others_and_theirs_is():
 
 
 def test_this_machine_can_be_observed():
-    seen = Machine(lambda: [os.getpid()]).observe()
+    seen = HostMachine(lambda: [os.getpid()]).observe()
     assert 0 <= seen.minute < 24 * 60
     assert 0 <= seen.others_load <= 1
     assert 0 < seen.free_memory < 1
@@ -101,7 +101,7 @@ def test_this_machine_can_be_observed():
 
 
 def test_a_wish_that_this_machine_cannot_heed_is_told():
-    machine = Machine(list)
+    machine = HostMachine(list)
     wishes = Preferences(idle_s=60, mains_only=True)
     assert len(machine.blind_to(wishes, Observation(0))) == 2
     assert machine.blind_to(wishes, Observation(0, owner_idle_s=5.0, on_mains=True)) == []

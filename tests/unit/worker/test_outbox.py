@@ -8,7 +8,7 @@ from embomatrix.rpc.leases import LeaseRef, LeaseResult
 from embomatrix.rpc.wire.values import InfraCode, InfraFailure
 from embomatrix.worker.link import outbox as module
 from embomatrix.worker.link.backoff import Backoff
-from embomatrix.worker.link.outbox import Outbox
+from embomatrix.worker.link.outbox import ResultOutbox
 
 
 def _result(number):
@@ -16,7 +16,7 @@ def _result(number):
 
 
 def _filled(count):
-    outbox = Outbox()
+    outbox = ResultOutbox()
     for number in range(count):
         outbox.put(_result(number))
     return outbox
@@ -52,7 +52,7 @@ def test_the_oldest_result_goes_when_nobody_listens_for_very_long():
 
 @given(st.lists(st.sampled_from(["put", "take", "ack", "stream"]), max_size=40))
 def test_no_result_is_lost_before_it_is_acknowledged(actions):
-    outbox, kept, count = Outbox(), {}, 0
+    outbox, kept, count = ResultOutbox(), {}, 0
     for action in actions:
         match action:
             case "put":

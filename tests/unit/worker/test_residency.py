@@ -3,18 +3,18 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from embomatrix.worker.slots.residency import NOTHING, UNKNOWN_MB, Decision, Held, decide, surplus
+from embomatrix.worker.slots.residency import NOTHING, UNKNOWN_MB, Decision, HeldScene, decide, surplus
 
 DIGESTS = st.sampled_from([f"d{number}" for number in range(8)])
 HELD = st.dictionaries(
-    DIGESTS, st.builds(Held, st.floats(1, 200), st.integers(0, 100), st.booleans()), max_size=8
+    DIGESTS, st.builds(HeldScene, st.floats(1, 200), st.integers(0, 100), st.booleans()), max_size=8
 )
 WANTED = st.lists(DIGESTS, unique=True, max_size=8)
 
 
 def _held(*digests, memory_mb=50.0, busy=()):
     return {
-        digest: Held(memory_mb, last_used=number, busy=digest in busy)
+        digest: HeldScene(memory_mb, last_used=number, busy=digest in busy)
         for number, digest in enumerate(digests)
     }
 

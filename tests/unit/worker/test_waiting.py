@@ -5,7 +5,7 @@ import pytest
 from embomatrix.rpc.leases import Lease, LeaseRef
 from embomatrix.rpc.wire.values import ResidentState, Rollout
 from embomatrix.worker.slots.execution import Ticket
-from embomatrix.worker.slots.residents import Scene
+from embomatrix.worker.slots.residents import ResidentScene
 from embomatrix.worker.slots.waiting import OVERTAKEN_S, WaitingLeases
 
 SCENES = ("kitchen", "bath", "hall")
@@ -13,7 +13,7 @@ SCENES = ("kitchen", "bath", "hall")
 
 @pytest.fixture
 def scenes():
-    return {digest: Scene(digest, ResidentState.WARM) for digest in SCENES}
+    return {digest: ResidentScene(digest, ResidentState.WARM) for digest in SCENES}
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import pytest
 
 from embomatrix.world.asset import Asset, Interior, Joint, JointKind, Link, SupportSurface
 from embomatrix.world.bundle import Bundle
-from embomatrix.world.geometry import Part, Pose, Shape
+from embomatrix.world.geometry import ConvexPart, Pose, Shape
 from embomatrix.world.goal import Atom
 from embomatrix.world.poses import PlacementKey, PoseCache, StandPose
 from embomatrix.world.scene import Doorway, RobotStart, Room, Scene, SceneObject
@@ -14,8 +14,8 @@ from embomatrix.world.state import Relation, State
 from embomatrix.world.task import Task, TaskCategory
 
 
-def box(size: tuple[float, float, float], x: float = 0.0) -> Part:
-    return Part(Shape.BOX, Pose((x, 0.0, 0.0)), size)
+def box(size: tuple[float, float, float], x: float = 0.0) -> ConvexPart:
+    return ConvexPart(Shape.BOX, Pose((x, 0.0, 0.0)), size)
 
 
 FRIDGE = Asset(
@@ -42,7 +42,7 @@ APPLE = Asset(
     "apple.n.01",
     (0.07, 0.07, 0.07),
     0.2,
-    (Link("base", (Part(Shape.SPHERE, Pose((0.0, 0.0, 0.0)), (0.07, 0.07, 0.07)),)),),
+    (Link("base", (ConvexPart(Shape.SPHERE, Pose((0.0, 0.0, 0.0)), (0.07, 0.07, 0.07)),)),),
     abilities={"freezable": {}},
 )
 
@@ -58,7 +58,7 @@ def scene() -> Scene:
             Room("kitchen_0", "kitchen", (0.0, 0.0), (4.0, 3.0)),
             Room("corridor_0", "corridor", (4.1, 0.0), (6.0, 3.0)),
         ),
-        walls=(Part(Shape.BOX, Pose((4.05, 0.5, 1.2)), (0.1, 1.0, 2.4)),),
+        walls=(ConvexPart(Shape.BOX, Pose((4.05, 0.5, 1.2)), (0.1, 1.0, 2.4)),),
         doorways=(Doorway(("kitchen_0", "corridor_0"), (4.05, 1.5), 1.0, 2.1, "y"),),
         objects=(
             SceneObject(

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from embomatrix.world.bddl import BddlError, Problem, parse_formula, parse_problem, render_problem
+from embomatrix.world.bddl import BddlError, BddlProblem, parse_formula, parse_problem, render_problem
 from embomatrix.world.evaluate import render
 from embomatrix.world.goal import (
     And,
@@ -241,7 +241,7 @@ def test_rendered_formula_is_read_back_equal(formula: Formula) -> None:
 
 @given(formulas())
 def test_rendered_problem_is_read_back_equal(goal: Formula) -> None:
-    problem = Problem("p", OBJECTS, parse_problem(TIDY).init[:0], goal)
+    problem = BddlProblem("p", OBJECTS, parse_problem(TIDY).init[:0], goal)
     assert parse_problem(render_problem(problem)) == problem
 
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from embomatrix.world.bddl import WILDCARD, Literal, Problem, parse_problem, render_problem
+from embomatrix.world.bddl import WILDCARD, BddlProblem, InitLiteral, parse_problem, render_problem
 from embomatrix.world.evaluate import evaluate
 from embomatrix.world.goal import (
     And,
@@ -222,12 +222,12 @@ def formulas(draw: st.DrawFn, scope: tuple[str, ...] = (), depth: int = 3) -> Fo
 def test_formulas_of_all_ten_operators_hold_in_the_same_states(
     goal: Formula, seed: int, percent: int
 ) -> None:
-    problem = Problem("p-0", OBJECTS, (Literal(Atom("open", ("box_1",))),), goal)
+    problem = BddlProblem("p-0", OBJECTS, (InitLiteral(Atom("open", ("box_1",))),), goal)
     facts = Coin(seed, percent)
     expected = Package("p", render_problem(problem)).verdict(facts)
     assert evaluate(goal, facts, problem.types) is expected
 
 
 def test_the_types_of_a_problem_keep_the_order_of_the_text() -> None:
-    shuffled = re.sub(r"\s+", " ", render_problem(Problem("p-0", OBJECTS, (), And(()))))
+    shuffled = re.sub(r"\s+", " ", render_problem(BddlProblem("p-0", OBJECTS, (), And(()))))
     assert list(parse_problem(shuffled).types) == [*KINDS]

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from embomatrix.world.geometry import Aabb, Part, Pose, Shape
+from embomatrix.world.geometry import Aabb, ConvexPart, Pose, Shape
 
 METRES = st.floats(-50.0, 50.0)
 POINTS = st.tuples(METRES, METRES, METRES)
@@ -90,7 +90,7 @@ def test_the_box_around_boxes_holds_their_corners_and_touches_them(boxes) -> Non
 
 @given(POSES, SIZES, st.tuples(*[st.floats(-0.5, 0.5)] * 3))
 def test_every_point_of_a_part_lies_in_its_bounding_box(pose, size, share) -> None:
-    part = Part(Shape.BOX, Pose((0.0, 0.0, 0.0)), size)
+    part = ConvexPart(Shape.BOX, Pose((0.0, 0.0, 0.0)), size)
     point = pose.apply(tuple(np.multiply(size, share).tolist()))
     assert part.aabb(pose).contains(point, margin_m=1e-9)
 

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from embomatrix.bench.cluster.cpu import CpuUse
     from embomatrix.bench.cluster.load_generator import Pushed
     from embomatrix.bench.cluster.stepping import Push
-    from embomatrix.bench.cluster.work import Work
+    from embomatrix.bench.cluster.work import ClusterWorkload
 
 FULL_GOAL_MS: Final = 2.0
 RATIO_GOAL: Final = 500.0
@@ -72,7 +72,9 @@ class ClusterRows:
     """Processor time of each round while all went at once."""
 
 
-def bench_ablation(work: Work, sizes: AblationSizes, on_step: Callable[[str], None]) -> tuple[Figure, ...]:
+def bench_ablation(
+    work: ClusterWorkload, sizes: AblationSizes, on_step: Callable[[str], None]
+) -> tuple[Figure, ...]:
     """All rows. Raises BenchError when a process dies or a rollout is lost, EngineError when a scene can't be loaded."""
     on_step("loading and executing physically, rollout by rollout")
     taken = naive(work.sample(sizes.naive), work.bundles)
@@ -108,7 +110,7 @@ def _full_row(rows: ClusterRows, naive_s: Sequence[float], sizes: AblationSizes)
     )
 
 
-def _slowed_rows(work: Work, sizes: AblationSizes) -> tuple[Figure, ...]:
+def _slowed_rows(work: ClusterWorkload, sizes: AblationSizes) -> tuple[Figure, ...]:
     few = work.first(max(1, sizes.singly // len(work.scenes)))
     singly = _slowed(few, sizes, BenchTrainer.push_singly)
     at_once = _slowed(work, sizes, BenchTrainer.push)
@@ -118,7 +120,7 @@ def _slowed_rows(work: Work, sizes: AblationSizes) -> tuple[Figure, ...]:
     )
 
 
-def _cluster_rows(work: Work, sizes: AblationSizes, on_step: Callable[[str], None]) -> ClusterRows:
+def _cluster_rows(work: ClusterWorkload, sizes: AblationSizes, on_step: Callable[[str], None]) -> ClusterRows:
     rounds = []
     for number in range(sizes.rounds):
         on_step(f"executing at once, round {number + 1} of {sizes.rounds}")
@@ -127,7 +129,7 @@ def _cluster_rows(work: Work, sizes: AblationSizes, on_step: Callable[[str], Non
     return ClusterRows(singly[-1], pushed, used)
 
 
-def _round(work: Work, sizes: AblationSizes) -> tuple[Pushed, CpuUse, Pushed]:
+def _round(work: ClusterWorkload, sizes: AblationSizes) -> tuple[Pushed, CpuUse, Pushed]:
     """In a fresh cluster with all scenes warm: most plans at once, then some one by one."""
     deadline_s = time.monotonic() + sizes.limit_s
     with (
@@ -147,7 +149,7 @@ def _round(work: Work, sizes: AblationSizes) -> tuple[Pushed, CpuUse, Pushed]:
         return asyncio.run(measure())
 
 
-def _slowed(work: Work, sizes: AblationSizes, push: Push) -> tuple[Pushed, ...]:
+def _slowed(work: ClusterWorkload, sizes: AblationSizes, push: Push) -> tuple[Pushed, ...]:
     """Steps of a trainer that announces two steps ahead, on a worker that loads slowly."""
     stepping = Stepping(work.steps(sizes.slots), pause_s=PAUSE_OVER_DELAY * sizes.delay_s, push=push)
     return take_steps(work.bundles, stepping, sizes.slots, sizes.delay_s, sizes.limit_s).steps

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class AblationRow:
     """One row: its words, the paper's seconds where it has them, and the figures that stand in it."""
 
     words: str
@@ -24,12 +24,12 @@ class Row:
     slow_name: str = ""
 
 
-USER: Final = Row("as a user would write it, estimated", None, "ablation_user_ms")
+USER: Final = AblationRow("as a user would write it, estimated", None, "ablation_user_ms")
 ROWS: Final = (
-    Row("naive", 3.48, "ablation_naive_ms", "ablation_naive_slow_ms"),
-    Row("+ pre-cached execution", 0.85, "ablation_cached_ms", "ablation_cached_slow_ms"),
-    Row("+ Resource-Scheduler", 0.14, "ablation_scheduler_ms", "ablation_scheduler_slow_ms"),
-    Row("+ Task-Dispatcher", 0.07, "ablation_dispatcher_ms", "ablation_dispatcher_slow_ms"),
+    AblationRow("naive", 3.48, "ablation_naive_ms", "ablation_naive_slow_ms"),
+    AblationRow("+ pre-cached execution", 0.85, "ablation_cached_ms", "ablation_cached_slow_ms"),
+    AblationRow("+ Resource-Scheduler", 0.14, "ablation_scheduler_ms", "ablation_scheduler_slow_ms"),
+    AblationRow("+ Task-Dispatcher", 0.07, "ablation_dispatcher_ms", "ablation_dispatcher_slow_ms"),
 )
 """The rows of EmboMatrix's table on the efficiency of simulation."""
 EXPLANATION: Final = (

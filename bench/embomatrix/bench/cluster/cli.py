@@ -14,7 +14,7 @@ from embomatrix.bench.cluster.overhead import ClusterLoad
 from embomatrix.bench.cluster.parts import ClusterJob, ClusterPart, bench_cluster_parts
 from embomatrix.bench.cluster.prewarm import PrewarmSizes
 from embomatrix.bench.engine.workload import PINNED
-from embomatrix.bench.peers.contest import Peer
+from embomatrix.bench.peers.contest import PeerSystem
 from embomatrix.bench.report.figures import BenchResult, commit_here, describe_machine
 from embomatrix.bench.report.output import console, errors, hand_in, refusals
 
@@ -37,7 +37,8 @@ Parts = Annotated[
     list[ClusterPart] | None, typer.Option("--part", help="What to measure; may be repeated. [default: all]")
 ]
 Peers = Annotated[
-    list[Peer] | None, typer.Option("--peer", help="Whom to compare with; may be repeated. [default: all]")
+    list[PeerSystem] | None,
+    typer.Option("--peer", help="Whom to compare with; may be repeated. [default: all]"),
 ]
 Naive = Annotated[int, typer.Option(min=1, help="Rollouts of the ablation's first row: seconds each.")]
 

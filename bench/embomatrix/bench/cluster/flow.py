@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from embomatrix.bench.cluster.load_generator import BenchTrainer, Pushed
     from embomatrix.bench.cluster.processes import BenchCluster
     from embomatrix.bench.cluster.redis import RedisServer
-    from embomatrix.bench.cluster.work import Work
+    from embomatrix.bench.cluster.work import ClusterWorkload
     from embomatrix.rpc.wire.values import Rollout
 
 MANAGER_GOAL_US: Final = 150.0
@@ -71,7 +71,7 @@ class Flow:
     """Processor time of the store's server; 0 for the embedded one."""
 
 
-def bench_flow(work: Work, sizes: FlowSizes, on_step: Callable[[str], None]) -> tuple[Figure, ...]:
+def bench_flow(work: ClusterWorkload, sizes: FlowSizes, on_step: Callable[[str], None]) -> tuple[Figure, ...]:
     """With the embedded store, and then with Redis where there is a redis-server.
 
     Raises BenchError when the manager dies or the time is up; ClusterError for a call refused.
@@ -93,7 +93,7 @@ def bench_flow(work: Work, sizes: FlowSizes, on_step: Callable[[str], None]) -> 
 
 def _measured(
     folder: Path,
-    work: Work,
+    work: ClusterWorkload,
     sizes: FlowSizes,
     on_step: Callable[[str], None],
     redis: RedisServer | None = None,
@@ -107,7 +107,7 @@ def _measured(
 
 async def _measure(
     cluster: BenchCluster,
-    work: Work,
+    work: ClusterWorkload,
     sizes: FlowSizes,
     on_step: Callable[[str], None],
     deadline_s: float,
@@ -148,7 +148,7 @@ async def _flow(trainer: BenchTrainer, batches: Sequence[Sequence[Rollout]]) -> 
 async def _memory(
     cluster: BenchCluster,
     trainer: BenchTrainer,
-    work: Work,
+    work: ClusterWorkload,
     sizes: FlowSizes,
     on_step: Callable[[str], None],
 ) -> dict[int, float]:
@@ -177,7 +177,7 @@ async def _pending(viewer: ClusterClient, count: int) -> None:
         await asyncio.sleep(POLL_S)
 
 
-def _repeated(work: Work, count: int) -> tuple[Rollout, ...]:
+def _repeated(work: ClusterWorkload, count: int) -> tuple[Rollout, ...]:
     """So many of the workload's rollouts, over and over, each with an id of its own.
 
     They are written as messages here, so that it takes no time of the flow.

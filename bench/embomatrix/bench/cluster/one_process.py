@@ -12,7 +12,7 @@ from embomatrix.reward.hierarchy import score
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.executor import Simulator
-from embomatrix.sim.floor.prepared import Prepared
+from embomatrix.sim.floor.prepared import PreparedScene
 from embomatrix.sim.physical.actor import PhysicalActor
 from embomatrix.worker.slots.physics import CLIENTS_PER_SCENE
 from embomatrix.world.bundle import decode_bundle
@@ -57,7 +57,7 @@ def cached_s(rollouts: Sequence[Rollout], bundles: Mapping[str, bytes]) -> list[
     with contextlib.closing(ClientPool(spare=CLIENTS_PER_SCENE)) as clients:
 
         def make(bundle: Bundle) -> Simulator:
-            return Simulator(bundle, BulletEngine(bundle.scene, clients, Prepared.of(bundle)))
+            return Simulator(bundle, BulletEngine(bundle.scene, clients, PreparedScene.of(bundle)))
 
         return [_seconds(rollout, bundles[rollout.bundle_digest], make) for rollout in rollouts]
 

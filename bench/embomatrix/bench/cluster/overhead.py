@@ -65,7 +65,7 @@ class ClusterLoad:
 
 
 @dataclass(frozen=True, slots=True)
-class Group:
+class RolloutGroup:
     """``count`` rollouts of one scene's first oracle plan."""
 
     scene: BenchScene
@@ -73,7 +73,7 @@ class Group:
 
 
 @dataclass(frozen=True, slots=True)
-class Phase:
+class RunMeasurement:
     """What came of one run. Latency is from a batch's submission to the result of one of its rollouts."""
 
     latency_s: tuple[float, ...]
@@ -142,7 +142,7 @@ async def _measure(
         async with asyncio.timeout(deadline_s - time.monotonic()), ClusterClient(cluster.address) as client:
             await connected(client, cluster)
             await client.put_bundles({scene.bundle_digest: scene.data for scene in scenes})
-            return await _phases(Session(client, load.all_slots), scenes, load, begin)
+            return await _phases(BatchDriver(client, load.all_slots), scenes, load, begin)
     except TimeoutError:
         cluster.check()
         raise BenchError(
@@ -152,7 +152,7 @@ async def _measure(
 
 
 async def _phases(
-    session: Session, scenes: Sequence[BenchScene], load: ClusterLoad, begin: Callable[[str], None]
+    session: BatchDriver, scenes: Sequence[BenchScene], load: ClusterLoad, begin: Callable[[str], None]
 ) -> tuple[Figure, ...]:
     spare = load.all_slots if len(scenes) >= LEAST_SCENES * load.all_slots else 1
     # By turns, so that large and small scenes are shared out alike.
@@ -167,7 +167,7 @@ async def _phases(
     begin("executing in the same scenes again")
     repeated = await session.execute("repeated", steps)
     begin("executing one rollout at a time")
-    alone = await session.execute("alone", [(Group(announced[-1], 1),)] * load.alone)
+    alone = await session.execute("alone", [(RolloutGroup(announced[-1], 1),)] * load.alone)
     begin("executing many plans of one group for each slot")
     steady = await session.execute("steady", session.steps(announced[-load.all_slots :], load.steady))
     loads_s = await session.loads_s()
@@ -186,7 +186,7 @@ async def _phases(
     )
 
 
-def _phase_figures(name: str, phase: Phase, hits_goal: float | None) -> tuple[Figure, ...]:
+def _phase_figures(name: str, phase: RunMeasurement, hits_goal: float | None) -> tuple[Figure, ...]:
     count, scenes = len(phase.latency_s), phase.stats.prewarm_hits + phase.stats.prewarm_misses
     return (
         Figure(f"{name}: latency of a rollout, mean", phase.mean_s * 1e3, "ms", Better.LOWER, count),
@@ -197,7 +197,7 @@ def _phase_figures(name: str, phase: Phase, hits_goal: float | None) -> tuple[Fi
     )
 
 
-def _peak_figures(steady: Phase, alone: Phase, load: ClusterLoad) -> tuple[Figure, ...]:
+def _peak_figures(steady: RunMeasurement, alone: RunMeasurement, load: ClusterLoad) -> tuple[Figure, ...]:
     count, goal = len(steady.latency_s), RATE_GOAL_PER_SLOT * load.all_slots
     between_s = [whole - slot for whole, slot in zip(alone.latency_s, alone.execute_s, strict=True)]
     return (
@@ -212,34 +212,36 @@ def _rate(name: str, value: float, n: int) -> Figure:
     return Figure(name, value, "1/s", Better.HIGHER, n)
 
 
-def _ratio(name: str, value: float, phase: Phase) -> Figure:
+def _ratio(name: str, value: float, phase: RunMeasurement) -> Figure:
     return Figure(name, value, "×", Better.HIGHER, len(phase.latency_s))
 
 
-def _lost(*phases: Phase) -> Figure:
+def _lost(*phases: RunMeasurement) -> Figure:
     count = sum(len(phase.latency_s) + phase.lost for phase in phases)
     return Figure(
         "rollouts without a result", sum(phase.lost for phase in phases), "count", Better.LOWER, count, 0.0
     )
 
 
-class Session:
+class BatchDriver:
     """Pushes batches through one client, as a trainer does: a step's groups at once, the next step when all are in."""
 
     def __init__(self, client: ClusterClient, slots: int) -> None:
         self._client = client
         self._slots = slots
 
-    def steps(self, scenes: Sequence[BenchScene], count: int) -> list[tuple[Group, ...]]:
+    def steps(self, scenes: Sequence[BenchScene], count: int) -> list[tuple[RolloutGroup, ...]]:
         """Steps of one group for each slot, a scene to a group."""
-        groups = [Group(scene, count) for scene in scenes]
+        groups = [RolloutGroup(scene, count) for scene in scenes]
         return [tuple(groups[start : start + self._slots]) for start in range(0, len(groups), self._slots)]
 
-    async def execute(self, name: str, steps: Sequence[tuple[Group, ...]]) -> Phase:
+    async def execute(self, name: str, steps: Sequence[tuple[RolloutGroup, ...]]) -> RunMeasurement:
         """Execute the steps in a run of their own. Raises BenchError when not one rollout has a result."""
         return await self._execute(await self._client.open_run(name), steps)
 
-    async def execute_announced(self, name: str, steps: Sequence[tuple[Group, ...]]) -> tuple[Phase, float]:
+    async def execute_announced(
+        self, name: str, steps: Sequence[tuple[RolloutGroup, ...]]
+    ) -> tuple[RunMeasurement, float]:
         """Announce the steps, wait until their scenes are warm, then execute; also tells the seconds of the wait."""
         run_id = await self._client.open_run(name)
         entries = [
@@ -267,7 +269,7 @@ class Session:
             if resident.state is ResidentState.WARM
         ]
 
-    async def _execute(self, run_id: str, steps: Sequence[tuple[Group, ...]]) -> Phase:
+    async def _execute(self, run_id: str, steps: Sequence[tuple[RolloutGroup, ...]]) -> RunMeasurement:
         answers: list[tuple[float, RolloutResult]] = []
         started_s = time.perf_counter()
         for step, groups in enumerate(steps, start=1):
@@ -277,7 +279,7 @@ class Session:
         done = [(s, result.outcome) for s, result in answers if isinstance(result.outcome, Completed)]
         if not done:
             raise BenchError(f"no rollout of {len(answers)} had a result: {answers[0][1].outcome}")
-        return Phase(
+        return RunMeasurement(
             latency_s=tuple(latency_s for latency_s, _ in done),
             execute_s=tuple(outcome.timings.execute_s for _, outcome in done),
             wall_s=wall_s,
@@ -302,7 +304,7 @@ class Session:
             answers.append((time.perf_counter() - started_s, result))
 
 
-def _batch(run_id: str, step: int, index: int, group: Group) -> Batch:
+def _batch(run_id: str, step: int, index: int, group: RolloutGroup) -> Batch:
     batch_id = f"{step}-{index}"
     shown = group.scene.demonstrations[0]
     first = Rollout(

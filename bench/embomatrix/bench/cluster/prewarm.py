@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from embomatrix.bench.cluster.load_generator import Pushed
     from embomatrix.bench.cluster.stepping import Stepped
-    from embomatrix.bench.cluster.work import Work
+    from embomatrix.bench.cluster.work import ClusterWorkload
     from embomatrix.rpc.wire.values import Rollout
 
 HITS_GOAL: Final = 0.95
@@ -37,7 +37,9 @@ class PrewarmSizes:
     limit_s: float = 120.0
 
 
-def bench_prewarm(work: Work, sizes: PrewarmSizes, on_step: Callable[[str], None]) -> tuple[Figure, ...]:
+def bench_prewarm(
+    work: ClusterWorkload, sizes: PrewarmSizes, on_step: Callable[[str], None]
+) -> tuple[Figure, ...]:
     """Take one scene after another without look-ahead, then as many a step as there are slots with it.
 
     Raises BenchError when a process dies, the time is up, or there are too few scenes.
@@ -62,7 +64,12 @@ def bench_prewarm(work: Work, sizes: PrewarmSizes, on_step: Callable[[str], None
 
 
 def _take(
-    work: Work, steps: Sequence[tuple[Rollout, ...]], sizes: PrewarmSizes, *, pause_s: float, lead: int
+    work: ClusterWorkload,
+    steps: Sequence[tuple[Rollout, ...]],
+    sizes: PrewarmSizes,
+    *,
+    pause_s: float,
+    lead: int,
 ) -> Stepped:
     stepping = Stepping(tuple(steps), pause_s, lead)
     return take_steps(work.bundles, stepping, sizes.slots, sizes.delay_s, sizes.limit_s)

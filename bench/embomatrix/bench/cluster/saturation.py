@@ -6,14 +6,14 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 from embomatrix.bench.cluster.simulated_sweeps import in_flight
-from embomatrix.bench.report.line_charts import Panel
+from embomatrix.bench.report.line_charts import LineChart
 from embomatrix.manager.simulation.scenario import ManagerPace
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from embomatrix.manager.simulation.run import Report
-    from embomatrix.manager.simulation.scenario import Scenario
+    from embomatrix.manager.simulation.scenario import SimulationScenario
 
 PACES: Final = {
     "75 µs a rollout": ManagerPace(75e-6, 300e-6),
@@ -29,13 +29,15 @@ FULL: Final = 0.9
 """A manager is full when less than this share of the slots is at work while there is work for all."""
 
 
-def saturation(pace: ManagerPace, most_workers: int) -> dict[float, Scenario]:
+def saturation(pace: ManagerPace, most_workers: int) -> dict[float, SimulationScenario]:
     """By slots: servers that execute rollouts of a second under such a manager."""
     counts = [count for count in WORKERS if count <= most_workers] or [most_workers]
     return {8 * count: replace(in_flight(count, 8 * count * EACH), manager=pace) for count in counts}
 
 
-def saturated(run: Callable[[str, Scenario], Report], most_workers: int) -> dict[str, dict[float, Report]]:
+def saturated(
+    run: Callable[[str, SimulationScenario], Report], most_workers: int
+) -> dict[str, dict[float, Report]]:
     """Simulate the sweep of each pace. Past the first cluster for which a manager is too slow there is nothing to learn."""
     found: dict[str, dict[float, Report]] = {}
     for name, pace in PACES.items():
@@ -52,10 +54,10 @@ def at_work(report: Report) -> float:
     return report.pressed_utilisation or 0.0
 
 
-def saturation_panels(found: Mapping[str, Mapping[float, Report]]) -> list[Panel]:
+def saturation_panels(found: Mapping[str, Mapping[float, Report]]) -> list[LineChart]:
     """Slots at work, and how far the manager lags behind, against slots."""
     return [
-        Panel(
+        LineChart(
             "slots at work, rollouts of 1 s",
             "slots",
             {
@@ -67,7 +69,7 @@ def saturation_panels(found: Mapping[str, Mapping[float, Report]]) -> list[Panel
             most=1.0,
             mark=FULL,
         ),
-        Panel(
+        LineChart(
             "messages wait, p99, s",
             "slots",
             {

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from embomatrix.bench.cluster.saturation import saturated, saturation_figures, saturation_panels
 from embomatrix.bench.cluster.simulated_sweeps import in_flight, loaded_slowly, sweeps
-from embomatrix.bench.report.line_charts import Panel, page
+from embomatrix.bench.report.line_charts import LineChart, page
 from embomatrix.manager.simulation.run import Report, simulate
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from embomatrix.bench.cluster.simulated_sweeps import Sweep
-    from embomatrix.manager.simulation.scenario import Scenario
+    from embomatrix.manager.simulation.scenario import SimulationScenario
 
 FLIGHTS: Final = {512: 32, 4_096: 256, 16_000: 1_000}
 """Rollouts in flight, and the workers of eight slots that execute them: two rollouts for each slot."""
@@ -53,7 +53,7 @@ class _Bench:
     failures: int = 0
     simulations: int = 0
 
-    def run(self, what: str, scenario: Scenario) -> Report:
+    def run(self, what: str, scenario: SimulationScenario) -> Report:
         self.on_step(what)
         report = simulate(scenario)
         self.rollouts += report.delivered
@@ -115,7 +115,7 @@ def _simulated(bench: _Bench, sweep: Sweep) -> dict[str, dict[float, Report]]:
 def _cluster_page(swept: list[tuple[Sweep, dict[str, dict[float, Report]]]]) -> str:
     rows = [
         [
-            Panel(
+            LineChart(
                 measure.title,
                 sweep.axis,
                 {
@@ -138,28 +138,28 @@ def _manager_page(workers: Mapping[str, Mapping[float, Report]], flights: Mappin
     local = workers["own network"]
     kinds = _dearest_kinds(local)
     row = [
-        Panel(
+        LineChart(
             "CPU of all decisions, µs a rollout",
             "workers",
             {name: {x: r.cpu_us_per_rollout for x, r in found.items()} for name, found in workers.items()},
             x_logarithmic=True,
             mark=MOST_CPU_US,
         ),
-        Panel(
+        LineChart(
             "CPU of a message, µs",
             "workers",
             {kind: {x: 1e6 * r.costs[kind].mean_s for x, r in local.items()} for kind in kinds},
             x_logarithmic=True,
             y_logarithmic=True,
         ),
-        Panel(
+        LineChart(
             "one core at work on decisions",
             "workers",
             {name: {x: r.manager_load for x, r in found.items()} for name, found in workers.items()},
             x_logarithmic=True,
             percent=True,
         ),
-        Panel(
+        LineChart(
             "CPU of all decisions, µs a rollout",
             "rollouts in flight",
             {"own network": {count: report.cpu_us_per_rollout for count, report in flights.items()}},

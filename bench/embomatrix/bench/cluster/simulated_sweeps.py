@@ -5,7 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.manager.simulation.scenario import INTERNET, LOCAL, MIXED, Faults, Scenario, Scenes, Trainer
+from embomatrix.manager.simulation.scenario import (
+    INTERNET,
+    LOCAL,
+    MIXED,
+    Faults,
+    Scenes,
+    SimulationScenario,
+    Trainer,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -23,7 +31,7 @@ class Sweep:
     name: str
     axis: str
     logarithmic: bool
-    points: Mapping[str, Mapping[float, Scenario]]
+    points: Mapping[str, Mapping[float, SimulationScenario]]
 
 
 def sweeps(most_workers: int) -> list[Sweep]:
@@ -37,12 +45,12 @@ def sweeps(most_workers: int) -> list[Sweep]:
     ]
 
 
-def in_flight(workers: int, rollouts: int) -> Scenario:
+def in_flight(workers: int, rollouts: int) -> SimulationScenario:
     """So many rollouts at once on so many servers with 8 slots: what the manager's CPU is measured with."""
     trainer = Trainer(
         steps=2, groups=rollouts // GROUP, group_size=GROUP, write_s=0.0, update_s=1.0, start_s=10.0
     )
-    return Scenario(
+    return SimulationScenario(
         workers=workers,
         kinds=(LOCAL,),
         scenes=Scenes(count=max(200, 2 * trainer.groups)),
@@ -53,10 +61,10 @@ def in_flight(workers: int, rollouts: int) -> Scenario:
     )
 
 
-def loaded_slowly(lookahead: int) -> Scenario:
+def loaded_slowly(lookahead: int) -> SimulationScenario:
     """Scenes that take two seconds to load, each used once on 16 slots: without look-ahead every one is cold."""
     trainer = Trainer(steps=60, groups=4, group_size=16, lookahead=lookahead, write_s=1.0, update_s=1.0)
-    return Scenario(
+    return SimulationScenario(
         workers=4,
         kinds=(replace(LOCAL, slots=4, memory_mb=1024),),
         scenes=Scenes(count=trainer.steps * trainer.groups, load_s=2.0, load_spread=0.1),
@@ -65,7 +73,9 @@ def loaded_slowly(lookahead: int) -> Scenario:
     )
 
 
-def _sweep(name: str, axis: str, scenarios: Mapping[float, Scenario], *, logarithmic: bool) -> Sweep:
+def _sweep(
+    name: str, axis: str, scenarios: Mapping[float, SimulationScenario], *, logarithmic: bool
+) -> Sweep:
     points = {
         network: {value: replace(scenario, kinds=kinds) for value, scenario in scenarios.items()}
         for network, kinds in NETWORKS.items()
@@ -73,7 +83,7 @@ def _sweep(name: str, axis: str, scenarios: Mapping[float, Scenario], *, logarit
     return Sweep(name, axis, logarithmic, points)
 
 
-def _cluster(workers: int) -> Scenario:
+def _cluster(workers: int) -> SimulationScenario:
     """Trainers write and update between steps, and in each there is more than a rollout for each slot."""
     # The largest clusters take fewer and smaller steps: what a step costs is the same in each.
     steps, each = (6, 15) if workers <= 300 else (2, 15) if workers <= 3_000 else (2, 9)
@@ -81,7 +91,7 @@ def _cluster(workers: int) -> Scenario:
     trainer = Trainer(
         steps=steps, groups=groups, group_size=GROUP, lookahead=2, write_s=2.0, update_s=2.0, start_s=12.0
     )
-    return Scenario(
+    return SimulationScenario(
         workers=workers,
         scenes=Scenes(count=max(600, groups), load_s=2.0),
         execute_s=1.0,
@@ -91,21 +101,21 @@ def _cluster(workers: int) -> Scenario:
     )
 
 
-def _by_workers(most: int) -> dict[float, Scenario]:
+def _by_workers(most: int) -> dict[float, SimulationScenario]:
     return {count: _cluster(count) for count in (10, 30, 100, 300, 1_000, 3_000, 10_000) if count <= most}
 
 
-def _by_lookahead(usual: Scenario) -> dict[float, Scenario]:
+def _by_lookahead(usual: SimulationScenario) -> dict[float, SimulationScenario]:
     (trainer,) = usual.trainers
     return {k: replace(usual, trainers=(replace(trainer, lookahead=k),)) for k in range(5)}
 
 
-def _by_load_time(usual: Scenario) -> dict[float, Scenario]:
+def _by_load_time(usual: SimulationScenario) -> dict[float, SimulationScenario]:
     times_s = (0.1, 0.5, 2.0, 8.0, 30.0)
     return {time_s: replace(usual, scenes=replace(usual.scenes, load_s=time_s)) for time_s in times_s}
 
 
-def _by_deaths(usual: Scenario) -> dict[float, Scenario]:
+def _by_deaths(usual: SimulationScenario) -> dict[float, SimulationScenario]:
     return {
         rate: replace(usual, faults=Faults(death_rate=rate / 3600, silent_deaths=0.5, respawn_s=20.0))
         for rate in (0, 6, 20, 60)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Work:
+class ClusterWorkload:
     """Scenes of the workload with their plans, and their bundles by digest."""
 
     scenes: tuple[SceneWork, ...]
@@ -28,15 +28,15 @@ class Work:
         """Every plan once, scene by scene."""
         return tuple(rollout for scene in self.scenes for rollout in rollouts_of(scene))
 
-    def first(self, plans: int) -> Work:
+    def first(self, plans: int) -> ClusterWorkload:
         """The same scenes with so many plans each, at most."""
         scenes = tuple(replace(scene, executions=scene.executions[:plans]) for scene in self.scenes)
-        return Work(scenes, self.bundles)
+        return ClusterWorkload(scenes, self.bundles)
 
-    def after(self, plans: int) -> Work:
+    def after(self, plans: int) -> ClusterWorkload:
         """The same scenes without so many plans, the first of each."""
         scenes = tuple(replace(scene, executions=scene.executions[plans:]) for scene in self.scenes)
-        return Work(scenes, self.bundles)
+        return ClusterWorkload(scenes, self.bundles)
 
     def sample(self, count: int) -> tuple[Rollout, ...]:
         """Up to ``count`` of them, spread over the scenes: the first plan of each, then the second of each."""
@@ -52,19 +52,19 @@ class Work:
         )
 
 
-def main_work(dataset: Dataset, workload: Workload) -> Work:
+def main_work(dataset: Dataset, workload: Workload) -> ClusterWorkload:
     """The scenes of the workload's main size. Raises BenchError when dataset and workload don't belong together."""
     return _work(workload.main, check_scenes(dataset, workload))
 
 
-def whole_work(dataset: Dataset, workload: Workload) -> Work:
+def whole_work(dataset: Dataset, workload: Workload) -> ClusterWorkload:
     """The scenes of all sizes, the main one first. Raises BenchError as ``main_work`` does."""
     others = tuple(scene for scene in workload.scenes if scene not in workload.main)
     return _work((*workload.main, *others), check_scenes(dataset, workload))
 
 
-def _work(scenes: tuple[SceneWork, ...], bundles: Mapping[str, bytes]) -> Work:
-    return Work(scenes, {scene.bundle_digest: bundles[scene.bundle_digest] for scene in scenes})
+def _work(scenes: tuple[SceneWork, ...], bundles: Mapping[str, bytes]) -> ClusterWorkload:
+    return ClusterWorkload(scenes, {scene.bundle_digest: bundles[scene.bundle_digest] for scene in scenes})
 
 
 def rollouts_of(scene: SceneWork) -> tuple[Rollout, ...]:

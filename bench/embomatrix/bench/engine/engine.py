@@ -24,7 +24,7 @@ from embomatrix.reward.hierarchy import score
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.executor import Simulator
-from embomatrix.sim.floor.prepared import Prepared
+from embomatrix.sim.floor.prepared import PreparedScene
 from embomatrix.sim.placing.pose_cache import PlacementLibrary, analyse_scene
 from embomatrix.sim.zygote import resident_mb
 from embomatrix.skills.syntax import Skill
@@ -111,7 +111,7 @@ def _bundle_bytes(dataset: Dataset, scene: SceneWork) -> bytes:
 def _measure_rollouts(scene: SceneWork, data: bytes, samples: EngineSamples) -> None:
     bundle = decode_bundle(data, digest=scene.bundle_digest)
     clients = ClientPool(spare=CLIENTS_PER_SCENE)
-    engine = CountingEngine(bundle.scene, clients, Prepared.of(bundle))
+    engine = CountingEngine(bundle.scene, clients, PreparedScene.of(bundle))
     simulator = Simulator(bundle, engine)
     try:
         with frozen_heap():
@@ -162,7 +162,7 @@ def _leak_kb(data: bytes, scene: SceneWork, cycles: int) -> float:
         bundle = decode_bundle(data)
         execution = scene.executions[cycle % len(scene.executions)]
         with contextlib.closing(
-            Simulator(bundle, BulletEngine(bundle.scene, clients, Prepared.of(bundle)))
+            Simulator(bundle, BulletEngine(bundle.scene, clients, PreparedScene.of(bundle)))
         ) as simulator:
             simulator.execute(bundle.tasks[execution.task_id], execution.plan, execution.seed)
             simulator.reset(bundle.tasks[execution.task_id], execution.seed)

@@ -14,7 +14,7 @@ from embomatrix.reward.hierarchy import score
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.executor import Simulator
-from embomatrix.sim.floor.prepared import Prepared
+from embomatrix.sim.floor.prepared import PreparedScene
 from embomatrix.skills.syntax import Skill
 from embomatrix.worker.slots.physics import CLIENTS_PER_SCENE
 from embomatrix.world.bundle import decode_bundle
@@ -39,7 +39,7 @@ SEED: Final = 0
 
 
 @dataclass(frozen=True, slots=True)
-class Samples:
+class RolloutTimings:
     """Seconds of every single measurement, and how often an oracle plan reached its goal."""
 
     decode_s: list[float] = field(default_factory=list)
@@ -67,7 +67,7 @@ def bench_rollout(
 
     Raises BundleError or EngineError when a scene can't be loaded.
     """
-    samples = Samples()
+    samples = RolloutTimings()
     wall_s, core_s = time.perf_counter(), time.process_time()
     for number, scene in enumerate(scenes, start=1):
         _measure_scene(scene, repeats, samples)
@@ -77,7 +77,7 @@ def bench_rollout(
     return (*_figures(samples), on_core)
 
 
-def _measure_scene(scene: BenchScene, repeats: int, samples: Samples) -> None:
+def _measure_scene(scene: BenchScene, repeats: int, samples: RolloutTimings) -> None:
     started_s = time.perf_counter()
     bundle = decode_bundle(scene.data, digest=scene.bundle_digest)
     decode_s = time.perf_counter() - started_s
@@ -87,7 +87,7 @@ def _measure_scene(scene: BenchScene, repeats: int, samples: Samples) -> None:
     engine.close()
     clients = ClientPool(spare=CLIENTS_PER_SCENE)
     started_s = time.perf_counter()
-    counting = CountingEngine(bundle.scene, clients, Prepared.of(bundle))
+    counting = CountingEngine(bundle.scene, clients, PreparedScene.of(bundle))
     samples.build_connected_s.append(time.perf_counter() - started_s)
     simulator = Simulator(bundle, counting)
     ready_s = decode_s + time.perf_counter() - started_s
@@ -103,7 +103,11 @@ def _measure_scene(scene: BenchScene, repeats: int, samples: Samples) -> None:
 
 
 def _measure_first(
-    simulator: Simulator, bundle: Bundle, demonstration: Demonstration, ready_s: float, samples: Samples
+    simulator: Simulator,
+    bundle: Bundle,
+    demonstration: Demonstration,
+    ready_s: float,
+    samples: RolloutTimings,
 ) -> None:
     """The first rollout of a scene beside the same rollout repeated: cold over warm."""
     task = bundle.tasks[demonstration.task_id]
@@ -121,7 +125,7 @@ def _measure_task(
     bundle: Bundle,
     demonstration: Demonstration,
     repeats: int,
-    samples: Samples,
+    samples: RolloutTimings,
 ) -> None:
     task = bundle.tasks[demonstration.task_id]
     for repeat in range(repeats):
@@ -137,7 +141,11 @@ def _measure_task(
 
 
 def _measure_steps(
-    simulator: Simulator, engine: CountingEngine, task: Task, demonstration: Demonstration, samples: Samples
+    simulator: Simulator,
+    engine: CountingEngine,
+    task: Task,
+    demonstration: Demonstration,
+    samples: RolloutTimings,
 ) -> None:
     """The plan call by call, after a reset that has the last execution to undo."""
     with _timed(samples.reset_s):
@@ -155,7 +163,7 @@ def _measure_steps(
             (samples.settled_place_s if settled else samples.verified_place_s).append(seconds)
 
 
-def _figures(samples: Samples) -> tuple[Figure, ...]:
+def _figures(samples: RolloutTimings) -> tuple[Figure, ...]:
     rollout_s = sum(samples.rollout_s) / max(1, len(samples.rollout_s))
     cold_over_warm = quantile(samples.cold_over_warm, 0.5)
     return (
@@ -195,7 +203,7 @@ def _figures(samples: Samples) -> tuple[Figure, ...]:
     )
 
 
-def _skill_figures(samples: Samples) -> Iterator[Figure]:
+def _skill_figures(samples: RolloutTimings) -> Iterator[Figure]:
     """Skills in the order of the plan language; those that no plan uses have no figure."""
     for skill in Skill:
         seconds = samples.skill_s.get(skill)

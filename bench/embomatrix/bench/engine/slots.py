@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.bench.report.figures import BenchError
 from embomatrix.rpc.wire.rollout import rollout_to_proto
 from embomatrix.rpc.wire.values import Rollout
-from embomatrix.sim.zygote import Frame, private_mb
+from embomatrix.sim.zygote import PipeMessage, private_mb
 from embomatrix.worker.slots.processes import ProcessGoneError, start_root
 from embomatrix.worker.slots.residents import SlotLimits
 
@@ -75,7 +75,7 @@ async def _load(root: Root, scene: SceneWork, path: Path, sample: SlotSample) ->
         "digest": scene.bundle_digest,
         "slot_memory_mb": SlotLimits(1, 0).slot_memory_mb,
     }
-    answer = await _ask(child, Frame(request))
+    answer = await _ask(child, PipeMessage(request))
     sample.load_s.append(float(answer.header["cpu_s"]))
     return child
 
@@ -104,11 +104,11 @@ async def _execute(child: Child, scene: SceneWork, sample: SlotSample) -> None:
     await slot.end()
 
 
-def _frame(rollout: Rollout) -> Frame:
-    return Frame({"op": "execute"}, rollout_to_proto(rollout).SerializeToString())
+def _frame(rollout: Rollout) -> PipeMessage:
+    return PipeMessage({"op": "execute"}, rollout_to_proto(rollout).SerializeToString())
 
 
-async def _ask(child: Child, frame: Frame) -> Frame:
+async def _ask(child: Child, frame: PipeMessage) -> PipeMessage:
     async with asyncio.timeout(ANSWER_S):
         answer = await child.peer.ask(frame)
     if "error" in answer.header:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from embomatrix.world.asset import Asset, Joint
-    from embomatrix.world.geometry import Part, Quat, Vec3
+    from embomatrix.world.geometry import ConvexPart, Quat, Vec3
 
 INERTIA: Final = '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
 """URDF wants one; Bullet finds its own of mass and shape."""
@@ -68,7 +68,7 @@ def _joint(base: str, link: str, joint: Joint, share: float | None) -> str:
     return f'<joint name={name} type="{joint.kind.value}">{ends}{_origin(Pose(joint.origin_m))}{axis}{limit}</joint>'
 
 
-def _collision(part: Part, frame: Pose, mesh: Path) -> str:
+def _collision(part: ConvexPart, frame: Pose, mesh: Path) -> str:
     match part.shape:
         case Shape.BOX:
             shape = f'<box size="{_numbers(part.size_m)}"/>'
@@ -82,7 +82,7 @@ def _collision(part: Part, frame: Pose, mesh: Path) -> str:
     return f"<collision>{_origin(frame @ part.pose)}<geometry>{shape}</geometry></collision>"
 
 
-def _write_mesh(part: Part, path: Path) -> None:
+def _write_mesh(part: ConvexPart, path: Path) -> None:
     hull = ConvexHull(np.asarray(part.vertices_m))
     vertices = [f"v {_numbers(vertex)}" for vertex in part.vertices_m]
     faces = [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in hull.simplices]

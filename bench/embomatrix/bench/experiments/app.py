@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 from rich.console import Console
 
-from embomatrix.bench.experiments.benchmarks import Stage, bench_rows, benchmark_section
+from embomatrix.bench.experiments.benchmarks import PolicyStage, bench_rows, benchmark_section
 from embomatrix.bench.experiments.conduct import Conductor, Venue, own_venue
 from embomatrix.bench.experiments.design import (
     RELEVANCE_ARMS,
@@ -212,14 +212,14 @@ def table(
         _publish(benchmark_section(run, found, _commit(), date.today()), run / "benchmarks.md", page)
 
 
-def _stages(run: Path) -> tuple[Stage, ...]:
+def _stages(run: Path) -> tuple[PolicyStage, ...]:
     read_outcome(run)
     checkpoints = sorted((run / "checkpoints").glob("step-*"))
     if not (run / "reference").is_dir() or not checkpoints:
         raise TrainerError(
             f"{run} holds no policy before and after GRPO: expected the folder of `embomatrix train`"
         )
-    return (Stage("imitation", run / "reference"), Stage("GRPO", checkpoints[-1]))
+    return (PolicyStage("imitation", run / "reference"), PolicyStage("GRPO", checkpoints[-1]))
 
 
 def _design(

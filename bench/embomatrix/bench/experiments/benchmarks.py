@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.pages.figures import Better, Figure
-from embomatrix.trainer.evaluation.table import Row, head
+from embomatrix.trainer.evaluation.table import ScoreRow, head
 from embomatrix.trainer.evaluation.table import table as table_rows
 from embomatrix.trainer.run.errors import TrainerError
 
@@ -22,7 +22,7 @@ _FIGURE_NAMES: Final = {"eai": "eai_world"}
 
 
 @dataclass(frozen=True, slots=True)
-class Stage:
+class PolicyStage:
     """A policy of a run, by what it has been through."""
 
     label: str
@@ -43,7 +43,7 @@ class BenchRows:
     figures: tuple[Figure, ...]
 
 
-def bench_rows(run: Path, bench: str, stages: Sequence[Stage]) -> BenchRows:
+def bench_rows(run: Path, bench: str, stages: Sequence[PolicyStage]) -> BenchRows:
     """Read the reports of a benchmark. Raises TrainerError where one is missing or damaged."""
     reports = []
     for stage in stages:
@@ -54,7 +54,7 @@ def bench_rows(run: Path, bench: str, stages: Sequence[Stage]) -> BenchRows:
             raise TrainerError(
                 f"{path} is no report of `embomatrix eval` ({error}): evaluate again"
             ) from error
-    rows = [Row(stage.label, report) for stage, report in zip(stages, reports, strict=True)]
+    rows = [ScoreRow(stage.label, report) for stage, report in zip(stages, reports, strict=True)]
     name = re.sub(r"[^a-z0-9]+", "_", file_name(bench).lower())
     figures = [
         Figure(

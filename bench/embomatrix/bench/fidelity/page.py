@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from embomatrix.bench.fidelity.pool import Modes
-    from embomatrix.bench.fidelity.suite import Outcome
+    from embomatrix.bench.fidelity.suite import SuiteResult
     from embomatrix.sim.executor import Simulator
-    from embomatrix.sim.fidelity.compare import Trial
+    from embomatrix.sim.fidelity.compare import FidelityTrial
     from embomatrix.sim.fidelity.report import FidelityReport
     from embomatrix.skills.trace import Step
     from embomatrix.world.dataset import Dataset
@@ -38,7 +38,7 @@ SPEEDUP_GOAL: Final = 100.0
 MINUTES_GOAL: Final = 25.0
 
 
-def figures_of(outcome: Outcome, minutes: float | None) -> tuple[Figure, ...]:
+def figures_of(outcome: SuiteResult, minutes: float | None) -> tuple[Figure, ...]:
     """All figures. ``minutes`` is the wall time of the whole suite, None when part of it was done before."""
     report = report_on(outcome.comparisons)
     suite = (
@@ -65,7 +65,7 @@ def _agreement(report: FidelityReport) -> Iterator[Figure]:
         yield Figure(name, value, "share", Better.HIGHER, compared, goal)
 
 
-def _extent(outcome: Outcome, report: FidelityReport) -> Iterator[Figure]:
+def _extent(outcome: SuiteResult, report: FidelityReport) -> Iterator[Figure]:
     """How much was compared, and of what kind."""
     higher, plans, lost = Better.HIGHER, report.plans, len(outcome.lost)
     calls = calls_of(outcome.comparisons)
@@ -124,7 +124,7 @@ def skill_table(report: FidelityReport) -> Table:
     return table
 
 
-def read_disagreement(spot: str) -> Trial:
+def read_disagreement(spot: str) -> FidelityTrial:
     """The trial of a line, given as FILE:N with N from 1. Raises BenchError."""
     name, _, number = spot.rpartition(":")
     if not name or not number.isdecimal() or int(number) < 1:
@@ -141,7 +141,7 @@ def read_disagreement(spot: str) -> Trial:
     raise BenchError(f"{name} has fewer than {number} lines: name one that is there")
 
 
-def replay(dataset: Dataset, trial: Trial, modes: Modes) -> Iterator[str]:
+def replay(dataset: Dataset, trial: FidelityTrial, modes: Modes) -> Iterator[str]:
     """Lines about the trial, executed again in both modes. Raises DatasetError, BenchError and EngineError."""
     bundle = dataset.bundle(trial.bundle_digest)
     task = bundle.tasks.get(trial.task_id)
@@ -170,7 +170,7 @@ def _told(step: Step) -> str:
     return step.message if step.failure is None else f"{step.failure.value}: {step.message}"
 
 
-def _atom_lines(cached: Simulator, physical: Simulator, task: Task, trial: Trial) -> Iterator[str]:
+def _atom_lines(cached: Simulator, physical: Simulator, task: Task, trial: FidelityTrial) -> Iterator[str]:
     names = objects_in(task, trial.plan)
     one, other = true_atoms(cached, names), true_atoms(physical, names)
     yield f"atoms that hold in both: {len(one & other)}"

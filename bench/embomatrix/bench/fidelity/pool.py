@@ -13,7 +13,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from embomatrix.sim.fidelity.compare import Trial, compare
+from embomatrix.sim.fidelity.compare import FidelityTrial, compare
 from embomatrix.sim.fidelity.records import comparison_to_json, trial_to_json
 from embomatrix.world.dataset import Dataset
 
@@ -42,11 +42,11 @@ class Modes:
 
 
 @dataclass(frozen=True, slots=True)
-class SceneJob:
+class TrialJob:
     """Trials of one bundle."""
 
     bundle_digest: str
-    trials: tuple[Trial, ...]
+    trials: tuple[FidelityTrial, ...]
 
 
 class FidelityPool:
@@ -59,7 +59,7 @@ class FidelityPool:
         self._limit_s = limit_s
         self._spawn = multiprocessing.get_context("spawn")
 
-    def run(self, jobs: Sequence[SceneJob], on_result: Callable[[Mapping[str, Any]], None]) -> None:
+    def run(self, jobs: Sequence[TrialJob], on_result: Callable[[Mapping[str, Any]], None]) -> None:
         """Execute every trial once. ``on_result`` gets a JSON value for each: a comparison, or a trial that is lost."""
         waiting = deque(job for job in jobs if job.trials)
         busy: list[_Child] = []
@@ -95,7 +95,7 @@ class FidelityPool:
 class _Child:
     """One process and the trials that it has yet to answer for."""
 
-    def __init__(self, started: tuple[BaseProcess, Connection], job: SceneJob, limit_s: float) -> None:
+    def __init__(self, started: tuple[BaseProcess, Connection], job: TrialJob, limit_s: float) -> None:
         self._process, self.connection = started
         self._digest = job.bundle_digest
         self._left = deque(job.trials)
@@ -103,7 +103,7 @@ class _Child:
         self.deadline = time.monotonic() + limit_s
         self.connection.send(job)
 
-    def hear(self, on_result: Callable[[Mapping[str, Any]], None]) -> SceneJob | None:
+    def hear(self, on_result: Callable[[Mapping[str, Any]], None]) -> TrialJob | None:
         """Take what has come. The rest of the job when the process is of no more use, None while it works."""
         try:
             while self.connection.poll():
@@ -112,11 +112,11 @@ class _Child:
                 self.deadline = time.monotonic() + self._limit_s
                 on_result(value)
                 if LOST in value:
-                    return SceneJob(self._digest, tuple(self._left))
+                    return TrialJob(self._digest, tuple(self._left))
         except (EOFError, ConnectionError):
             return self._lose("the process died", on_result)
         if not self._left:
-            return SceneJob(self._digest, ())
+            return TrialJob(self._digest, ())
         if time.monotonic() >= self.deadline:
             return self._lose(f"no answer in {self._limit_s:g} s", on_result)
         return None
@@ -128,15 +128,15 @@ class _Child:
         if self._process.is_alive():
             self._process.kill()
 
-    def _lose(self, reason: str, on_result: Callable[[Mapping[str, Any]], None]) -> SceneJob:
+    def _lose(self, reason: str, on_result: Callable[[Mapping[str, Any]], None]) -> TrialJob:
         if self._left:
             on_result({**trial_to_json(self._left.popleft()), LOST: reason})
-        return SceneJob(self._digest, tuple(self._left))
+        return TrialJob(self._digest, tuple(self._left))
 
 
 def _serve(connection: Connection, folder: Path, modes: Modes) -> None:
     """Load the job's scene in both modes and answer for its trials one by one."""
-    job: SceneJob = connection.recv()
+    job: TrialJob = connection.recv()
     trial = job.trials[0]
     try:
         bundle = Dataset.load(folder).read_bundle(job.bundle_digest)

@@ -13,7 +13,7 @@ from collections import Counter
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from embomatrix.bench.fidelity.pool import LOST, FidelityPool, Modes, SceneJob
+from embomatrix.bench.fidelity.pool import LOST, FidelityPool, Modes, TrialJob
 from embomatrix.bench.report.figures import BenchError
 from embomatrix.sim.fidelity.compare import PlanKind
 from embomatrix.sim.fidelity.plans import Example, Request, write_trials
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from embomatrix.sim.fidelity.compare import Comparison, Trial
+    from embomatrix.sim.fidelity.compare import Comparison, FidelityTrial
     from embomatrix.skills.syntax import Skill
     from embomatrix.world.dataset import Dataset, TaskRecord
 
@@ -63,7 +63,7 @@ class FidelitySettings:
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class SuiteResult:
     """What a suite yielded. ``lost`` are sentences about trials without a result."""
 
     comparisons: tuple[Comparison, ...]
@@ -71,7 +71,7 @@ class Outcome:
 
 
 @dataclass(frozen=True, slots=True)
-class Progress:
+class SuiteProgress:
     """Who is told how far the suite is: scenes whose trials are written, and trials that are executed, each of how many."""
 
     written: Callable[[int, int], None]
@@ -84,8 +84,8 @@ def run_fidelity(
     folder: Path,
     processes: int,
     modes: Modes,
-    progress: Progress,
-) -> Outcome:
+    progress: SuiteProgress,
+) -> SuiteResult:
     """Write the trials, or read them; execute those without a result; save the disagreements.
 
     Trials that were lost before, as a machine was halted in their midst, are tried again. Without processes nothing is
@@ -127,12 +127,12 @@ def examples_of(dataset: Dataset) -> dict[str, list[Example]]:
 
 
 def write_all_trials(
-    dataset: Dataset, settings: FidelitySettings, modes: Modes, progress: Progress
-) -> tuple[Trial, ...]:
+    dataset: Dataset, settings: FidelitySettings, modes: Modes, progress: SuiteProgress
+) -> tuple[FidelityTrial, ...]:
     """Trials over all bundles of the dataset; equal arguments give equal trials."""
     examples = examples_of(dataset)
     plans = {kind: math.ceil(settings.plans * share / len(examples)) for kind, share in SHARES.items()}
-    trials: list[Trial] = []
+    trials: list[FidelityTrial] = []
     extra = 0
     wanted = dict.fromkeys(SKILLS, math.ceil(settings.calls / len(examples)))
     for turn in range(ROUNDS):
@@ -150,7 +150,7 @@ def write_all_trials(
     return tuple(trials)
 
 
-def _calls(trials: Iterable[Trial]) -> dict[Skill, int]:
+def _calls(trials: Iterable[FidelityTrial]) -> dict[Skill, int]:
     """Calls of each skill in plans that are to succeed."""
     sure = (PlanKind.ORACLE, PlanKind.VALID)
     counts = Counter(call.skill for trial in trials if trial.kind in sure for call in trial.plan)
@@ -167,8 +167,8 @@ def _example(record: TaskRecord) -> Example:
 
 
 def _trials(
-    dataset: Dataset, settings: FidelitySettings, folder: Path, modes: Modes, progress: Progress
-) -> tuple[Trial, ...]:
+    dataset: Dataset, settings: FidelitySettings, folder: Path, modes: Modes, progress: SuiteProgress
+) -> tuple[FidelityTrial, ...]:
     """The trials in the folder, written there first when it is empty."""
     bundles = sorted({record.bundle_digest for record in dataset.records})
     wanted = {**asdict(settings), "bundles": bundles}
@@ -186,16 +186,18 @@ def _trials(
     return trials
 
 
-def _jobs(trials: Iterable[Trial]) -> list[SceneJob]:
+def _jobs(trials: Iterable[FidelityTrial]) -> list[TrialJob]:
     """One job a bundle, the longest first: two processes then end at about the same time."""
-    by_bundle: dict[str, list[Trial]] = {}
+    by_bundle: dict[str, list[FidelityTrial]] = {}
     for trial in trials:
         by_bundle.setdefault(trial.bundle_digest, []).append(trial)
-    jobs = [SceneJob(digest, tuple(items)) for digest, items in by_bundle.items()]
+    jobs = [TrialJob(digest, tuple(items)) for digest, items in by_bundle.items()]
     return sorted(jobs, key=lambda job: -len(job.trials))
 
 
-def _outcome(trials: Sequence[Trial], done: Mapping[str, Mapping[str, Any]], folder: Path) -> Outcome:
+def _outcome(
+    trials: Sequence[FidelityTrial], done: Mapping[str, Mapping[str, Any]], folder: Path
+) -> SuiteResult:
     values = [done[trial.trial_id] for trial in trials if trial.trial_id in done]
     comparisons = tuple(comparison_from_json(value) for value in values if LOST not in value)
     lines = [
@@ -204,7 +206,7 @@ def _outcome(trials: Sequence[Trial], done: Mapping[str, Mapping[str, Any]], fol
         if item.first_difference is not None or item.atoms_of_either != item.equal_atoms
     ]
     write_whole(folder / DISAGREEMENTS_FILE, "".join(lines).encode("utf-8"))
-    return Outcome(comparisons, tuple(f"{v['trial']}: {v[LOST]}" for v in values if LOST in v))
+    return SuiteResult(comparisons, tuple(f"{v['trial']}: {v[LOST]}" for v in values if LOST in v))
 
 
 @contextlib.contextmanager

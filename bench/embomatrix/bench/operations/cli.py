@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from embomatrix.pages.figures import Figure
 
 
-class Part(StrEnum):
+class OperationsPart(StrEnum):
     """What can be measured by itself."""
 
     IMAGES = "images"
@@ -34,12 +34,13 @@ def operations(
     dataset: DataSet = DATASET,
     json_file: Json = None,
     part: Annotated[
-        list[Part] | None, typer.Option("--part", help="Only this; may be given again.", show_default=False)
+        list[OperationsPart] | None,
+        typer.Option("--part", help="Only this; may be given again.", show_default=False),
     ] = None,
     checkout: Annotated[Path, typer.Option(help="Folder of the compose file.")] = Path(),
 ) -> None:
     """Measure `docker compose up` to its first rollout, sizes of images, joining, and what the dashboard costs."""
-    parts = part or list(Part)
+    parts = part or list(OperationsPart)
     with refusals(), errors.status("operations") as status:
         machine = describe_machine()
         figures: list[Figure] = []
@@ -47,15 +48,15 @@ def operations(
         def on_step(what: str) -> None:
             status.update(f"operations: {what}")
 
-        if Part.IMAGES in parts:
+        if OperationsPart.IMAGES in parts:
             compose_at(checkout)
             figures += images()
-        if Part.COMPOSE in parts:
+        if OperationsPart.COMPOSE in parts:
             scene = scenes_of(Dataset.load(dataset), 1)[0]
             figures += first_rollout(compose_at(checkout), scene, on_step)
-        if Part.JOIN in parts:
+        if OperationsPart.JOIN in parts:
             figures += joining(on_step)
-        if Part.DASHBOARD in parts:
+        if OperationsPart.DASHBOARD in parts:
             figures += viewing(on_step)
         result = BenchResult("operations", commit_here(), machine, tuple(figures))
     hand_in(result, json_file)

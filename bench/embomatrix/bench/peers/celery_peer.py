@@ -13,14 +13,14 @@ from celery.result import ResultSet
 from embomatrix.bench.cluster.processes import running_program
 from embomatrix.bench.cluster.redis import redis_server
 from embomatrix.bench.peers.celery_app import BROKER, FRESH, HELD, application
-from embomatrix.bench.peers.contender import Lost, Mode, done_from
+from embomatrix.bench.peers.contender import LibraryMode, Lost, done_from
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from celery import Celery
 
-    from embomatrix.bench.peers.contender import Chunk, Done, Setup, Take
+    from embomatrix.bench.peers.contender import ContenderSetup, Done, RolloutChunk, Take
 
 INTERVAL_S: Final = 0.001
 """Celery looks for results this often; by default twice a second, which would be the latency of a rollout alone."""
@@ -28,7 +28,7 @@ APP: Final = "embomatrix.bench.peers.celery_app"
 
 
 @contextlib.contextmanager
-def celery_on_redis(setup: Setup) -> Iterator[CeleryContender]:
+def celery_on_redis(setup: ContenderSetup) -> Iterator[CeleryContender]:
     """Redis and the workers for as long as the context lasts. Raises BenchError where no redis-server is found."""
     with contextlib.ExitStack() as stack:
         broker = stack.enter_context(redis_server(setup.folder, "--save", "")).url
@@ -52,11 +52,11 @@ def celery_on_redis(setup: Setup) -> Iterator[CeleryContender]:
 class CeleryContender:
     """Submits chunks as tasks."""
 
-    def __init__(self, setup: Setup, made: Celery) -> None:
+    def __init__(self, setup: ContenderSetup, made: Celery) -> None:
         self._setup = setup
         self._application = made
 
-    def run(self, chunks: Sequence[Chunk], take: Take, limit_s: float) -> None:
+    def run(self, chunks: Sequence[RolloutChunk], take: Take, limit_s: float) -> None:
         results = {}
         for chunk in chunks:
             result = self._submit(chunk)
@@ -71,15 +71,15 @@ class CeleryContender:
     def victim(self, pids: Sequence[int]) -> int:
         return pids[-1]
 
-    def _submit(self, chunk: Chunk) -> Any:
+    def _submit(self, chunk: RolloutChunk) -> Any:
         queue, folder = f"lane-{chunk.lane}", str(self._setup.folder)
-        if self._setup.mode is Mode.PLAIN:
+        if self._setup.mode is LibraryMode.PLAIN:
             return self._application.tasks[FRESH].apply_async((folder, *chunk.requests), queue=queue)
         request = (folder, self._setup.preload, chunk.requests)
         return self._application.tasks[HELD].apply_async(request, queue=queue)
 
 
-def _news(answer: dict[str, Any], chunk: Chunk) -> Done | Lost:
+def _news(answer: dict[str, Any], chunk: RolloutChunk) -> Done | Lost:
     result = answer["result"]
     if answer["status"] != "SUCCESS":
         return Lost(len(chunk.rollouts), type(result).__name__)

@@ -23,13 +23,13 @@ if TYPE_CHECKING:
     from embomatrix.rpc.wire.values import Completed, Rollout
 
     Take = Callable[["Done | Lost"], None]
-    Bring = Callable[["Setup"], AbstractContextManager["Contender"]]
+    Bring = Callable[["ContenderSetup"], AbstractContextManager["Contender"]]
 
 GREETINGS: Final = 4
 """Requests for each process at a time, until all have answered one."""
 
 
-class Mode(StrEnum):
+class LibraryMode(StrEnum):
     """How a library is used."""
 
     PLAIN = "plain"
@@ -41,10 +41,10 @@ class Mode(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Setup:
+class ContenderSetup:
     """What a contender is brought up for."""
 
-    mode: Mode
+    mode: LibraryMode
     folder: Path
     """Where the bundles lie, and where processes may write."""
     slots: int
@@ -55,7 +55,7 @@ class Setup:
     @property
     def lanes(self) -> int:
         """Queues."""
-        return self.slots if self.mode is Mode.AFFINE else 1
+        return self.slots if self.mode is LibraryMode.AFFINE else 1
 
     @property
     def processes_each(self) -> int:
@@ -64,7 +64,7 @@ class Setup:
 
 
 @dataclass(frozen=True, slots=True)
-class Chunk:
+class RolloutChunk:
     """Rollouts that are sent together, and the queue that they are sent to."""
 
     lane: int
@@ -99,7 +99,7 @@ class Lost:
 class Contender(Protocol):
     """Executes chunks in processes that it has started."""
 
-    def run(self, chunks: Sequence[Chunk], take: Take, limit_s: float) -> None:
+    def run(self, chunks: Sequence[RolloutChunk], take: Take, limit_s: float) -> None:
         """Submit all at once and tell what becomes of each as soon as it is known; return when all is known.
 
         After ``limit_s`` seconds it returns with what it has.
@@ -135,7 +135,7 @@ class Pass:
 
 def execute(
     contender: Contender,
-    chunks: Sequence[Chunk],
+    chunks: Sequence[RolloutChunk],
     limit_s: float,
     on_done: Callable[[Pass], None] = lambda _: None,
 ) -> Pass:
@@ -161,13 +161,15 @@ def execute(
     return outcome
 
 
-def greet(contender: Contender, setup: Setup, limit_s: float) -> None:
+def greet(contender: Contender, setup: ContenderSetup, limit_s: float) -> None:
     """Wait until every process has started and loaded what it should. Raises BenchError when one does not."""
     deadline_s = time.monotonic() + limit_s
     seen: set[int] = set()
     while len(seen) < setup.slots:
         left_s = deadline_s - time.monotonic()
-        greetings = [Chunk(lane, ()) for lane in range(setup.lanes)] * (GREETINGS * setup.processes_each)
+        greetings = [RolloutChunk(lane, ()) for lane in range(setup.lanes)] * (
+            GREETINGS * setup.processes_each
+        )
         outcome = execute(contender, greetings, max(0.1, left_s))
         seen.update(outcome.pids)
         if left_s <= 0 or outcome.reasons:
@@ -184,7 +186,7 @@ def done_from(answer: Answer | bytes) -> Done:
 
 
 def follow(
-    futures: Mapping[Future[Any], Chunk],
+    futures: Mapping[Future[Any], RolloutChunk],
     take: Take,
     limit_s: float,
 ) -> None:

@@ -1,6 +1,7 @@
 """Our cluster against what one would pick instead, on the same engine, the same plans and the same cores, in one run.
 
-Each peer is used plainly, as its tutorial shows, and tuned in two ways: see ``Mode``. Tuned, its processes hold the scenes and
+Each peer runs as its tutorial shows and tuned in two ways: see ``LibraryMode``. Tuned, its processes hold the scenes
+and
 have loaded them before the clock starts. No plan is executed twice in a process before throughput has been measured.
 """
 
@@ -21,14 +22,14 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.bench.cluster.cpu import descendants_cpu_s
 from embomatrix.bench.engine.apart import apart
-from embomatrix.bench.peers.contender import Chunk, Mode, Pass, Setup, execute, greet
+from embomatrix.bench.peers.contender import ContenderSetup, LibraryMode, Pass, RolloutChunk, execute, greet
 from embomatrix.bench.peers.engine_pool import executed_twice, forget_executions, write_bundles
 from embomatrix.bench.peers.own_cluster import own_cluster
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
-    from embomatrix.bench.cluster.work import Work
+    from embomatrix.bench.cluster.work import ClusterWorkload
     from embomatrix.bench.peers.contender import Bring, Contender
     from embomatrix.rpc.wire.values import Rollout
 
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 
-class Peer(StrEnum):
+class PeerSystem(StrEnum):
     """What one would pick instead."""
 
     POOL = "process_pool"
@@ -53,10 +54,10 @@ class Library:
     needs: str
 
 
-LIBRARIES: Final[Mapping[Peer, Library]] = {
-    Peer.POOL: Library("embomatrix.bench.peers.process_pool", "process_pool", "concurrent"),
-    Peer.RAY: Library("embomatrix.bench.peers.ray_peer", "ray_cluster", "ray"),
-    Peer.CELERY: Library("embomatrix.bench.peers.celery_peer", "celery_on_redis", "celery"),
+LIBRARIES: Final[Mapping[PeerSystem, Library]] = {
+    PeerSystem.POOL: Library("embomatrix.bench.peers.process_pool", "process_pool", "concurrent"),
+    PeerSystem.RAY: Library("embomatrix.bench.peers.ray_peer", "ray_cluster", "ray"),
+    PeerSystem.CELERY: Library("embomatrix.bench.peers.celery_peer", "celery_on_redis", "celery"),
 }
 
 
@@ -64,7 +65,7 @@ LIBRARIES: Final[Mapping[Peer, Library]] = {
 class PeerSizes:
     """Rollouts of each measurement."""
 
-    peers: tuple[Peer, ...] = tuple(Peer)
+    peers: tuple[PeerSystem, ...] = tuple(PeerSystem)
     slots: int = 2
     chunk: int = 10
     """Rollouts of one scene that are sent together when a peer is tuned: some 25 ms of work."""
@@ -122,19 +123,19 @@ class Contest:
     """Ours, the peers that could be measured, and why the others could not."""
 
     ours: Tuned
-    peers: Mapping[Peer, PeerOutcome] = field(default_factory=dict)
-    skipped: Mapping[Peer, str] = field(default_factory=dict)
+    peers: Mapping[PeerSystem, PeerOutcome] = field(default_factory=dict)
+    skipped: Mapping[PeerSystem, str] = field(default_factory=dict)
 
 
-def hold_contest(work: Work, sizes: PeerSizes, on_step: Callable[[str], None]) -> Contest:
+def hold_contest(work: ClusterWorkload, sizes: PeerSizes, on_step: Callable[[str], None]) -> Contest:
     """Measure ours and every peer that is installed. Raises BenchError when a contender does not come up."""
     on_step("the contest: ours")
     with _folder(work) as folder:
-        setup = Setup(Mode.SHARED, folder, sizes.slots, tuple(work.bundles))
+        setup = ContenderSetup(LibraryMode.SHARED, folder, sizes.slots, tuple(work.bundles))
         with own_cluster(setup, work) as contender:
             ours = _tuned(contender, setup, work, sizes)
-    peers: dict[Peer, PeerOutcome] = {}
-    skipped: dict[Peer, str] = {}
+    peers: dict[PeerSystem, PeerOutcome] = {}
+    skipped: dict[PeerSystem, str] = {}
     for peer in sizes.peers:
         on_step(f"the contest: {peer.value}")
         outcome = missing(peer) or apart(measure_peer, (peer, work, sizes), sizes.peer_s)
@@ -146,7 +147,7 @@ def hold_contest(work: Work, sizes: PeerSizes, on_step: Callable[[str], None]) -
     return Contest(ours, peers, skipped)
 
 
-def missing(peer: Peer) -> str:
+def missing(peer: PeerSystem) -> str:
     """Why a peer can't be measured here; "" when it can."""
     needs = LIBRARIES[peer].needs
     if importlib.util.find_spec(needs) is None:
@@ -154,18 +155,18 @@ def missing(peer: Peer) -> str:
     return ""
 
 
-def measure_peer(peer: Peer, work: Work, sizes: PeerSizes) -> PeerOutcome:
+def measure_peer(peer: PeerSystem, work: ClusterWorkload, sizes: PeerSizes) -> PeerOutcome:
     """Bring the peer up in each mode and measure it. Raises what the library raises."""
     library = LIBRARIES[peer]
     bring: Bring = getattr(importlib.import_module(library.module), library.function)
-    with _brought(bring, Mode.PLAIN, work, sizes) as (contender, _):
+    with _brought(bring, LibraryMode.PLAIN, work, sizes) as (contender, _):
         # The first calls start the processes.
         execute(contender, singles(work.sample(2 * sizes.slots)), sizes.limit_s)
         plain = execute(contender, singles(work.sample(sizes.plain)), sizes.limit_s)
-    with _brought(bring, Mode.SHARED, work, sizes, preload=tuple(work.bundles)) as (contender, setup):
+    with _brought(bring, LibraryMode.SHARED, work, sizes, preload=tuple(work.bundles)) as (contender, setup):
         greet(contender, setup, sizes.start_s)
         shared = _tuned(contender, setup, work, sizes)
-    with _brought(bring, Mode.AFFINE, work, sizes) as (contender, setup):
+    with _brought(bring, LibraryMode.AFFINE, work, sizes) as (contender, setup):
         greet(contender, setup, sizes.start_s)
         first, second = (
             chunks_of(part, sizes.chunk, setup.lanes) for part in (work.rollouts[0::2], work.rollouts[1::2])
@@ -175,7 +176,7 @@ def measure_peer(peer: Peer, work: Work, sizes: PeerSizes) -> PeerOutcome:
     return PeerOutcome(plain, shared, cold, affine)
 
 
-def _tuned(contender: Contender, setup: Setup, work: Work, sizes: PeerSizes) -> Tuned:
+def _tuned(contender: Contender, setup: ContenderSetup, work: ClusterWorkload, sizes: PeerSizes) -> Tuned:
     execute(contender, chunks_of(work.first(sizes.warm).rollouts, sizes.chunk, setup.lanes), sizes.limit_s)
     chunks = chunks_of(work.after(sizes.warm).rollouts, sizes.chunk, setup.lanes)
     before_s, own_s = descendants_cpu_s(), time.process_time()
@@ -193,7 +194,7 @@ def _tuned(contender: Contender, setup: Setup, work: Work, sizes: PeerSizes) -> 
     return Tuned(all_at_once, cpu_s, alone, waves, killed, repeated)
 
 
-def _killed(contender: Contender, chunks: Sequence[Chunk], sizes: PeerSizes) -> Pass:
+def _killed(contender: Contender, chunks: Sequence[RolloutChunk], sizes: PeerSizes) -> Pass:
     """Once more everything at once; a process that executes is killed in the middle."""
     due = sizes.kill_at * sum(len(chunk.rollouts) for chunk in chunks)
     victims: list[int] = []
@@ -206,39 +207,39 @@ def _killed(contender: Contender, chunks: Sequence[Chunk], sizes: PeerSizes) -> 
     return execute(contender, chunks, sizes.limit_s, kill)
 
 
-def chunks_of(rollouts: Sequence[Rollout], size: int, lanes: int) -> list[Chunk]:
+def chunks_of(rollouts: Sequence[Rollout], size: int, lanes: int) -> list[RolloutChunk]:
     """Chunks of one scene each. The scenes are shared out over the lanes, and the lanes' chunks take turns."""
     by_scene: dict[str, list[Rollout]] = {}
     for rollout in rollouts:
         by_scene.setdefault(rollout.bundle_digest, []).append(rollout)
-    queues: list[list[Chunk]] = [[] for _ in range(lanes)]
+    queues: list[list[RolloutChunk]] = [[] for _ in range(lanes)]
     for number, scene in enumerate(by_scene.values()):
         lane = number % lanes
         queues[lane] += [
-            Chunk(lane, tuple(scene[start : start + size])) for start in range(0, len(scene), size)
+            RolloutChunk(lane, tuple(scene[start : start + size])) for start in range(0, len(scene), size)
         ]
     longest = max(map(len, queues), default=0)
     return [queue[turn] for turn in range(longest) for queue in queues if turn < len(queue)]
 
 
-def singles(rollouts: Sequence[Rollout]) -> list[Chunk]:
+def singles(rollouts: Sequence[Rollout]) -> list[RolloutChunk]:
     """Every rollout for itself, in the first queue."""
-    return [Chunk(0, (rollout,)) for rollout in rollouts]
+    return [RolloutChunk(0, (rollout,)) for rollout in rollouts]
 
 
 @contextlib.contextmanager
 def _brought(
-    bring: Bring, mode: Mode, work: Work, sizes: PeerSizes, preload: tuple[str, ...] = ()
-) -> Iterator[tuple[Contender, Setup]]:
+    bring: Bring, mode: LibraryMode, work: ClusterWorkload, sizes: PeerSizes, preload: tuple[str, ...] = ()
+) -> Iterator[tuple[Contender, ContenderSetup]]:
     """A contender in a folder of its own with the bundles."""
     with _folder(work) as folder:
-        setup = Setup(mode, folder, sizes.slots, preload)
+        setup = ContenderSetup(mode, folder, sizes.slots, preload)
         with bring(setup) as contender:
             yield contender, setup
 
 
 @contextlib.contextmanager
-def _folder(work: Work) -> Iterator[Path]:
+def _folder(work: ClusterWorkload) -> Iterator[Path]:
     # What is killed may still write when the folder is removed.
     with tempfile.TemporaryDirectory(prefix="embo-", ignore_cleanup_errors=True) as name:
         folder = Path(name)

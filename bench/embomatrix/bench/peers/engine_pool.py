@@ -83,11 +83,11 @@ def execute_held(folder: str, digests: Sequence[str], requests: Sequence[bytes])
 
 
 @functools.cache
-def _holder(folder: str, digests: tuple[str, ...]) -> Holder:
-    return Holder(folder, digests)
+def _holder(folder: str, digests: tuple[str, ...]) -> SceneProcess:
+    return SceneProcess(folder, digests)
 
 
-class Holder:
+class SceneProcess:
     """The scenes of one process."""
 
     def __init__(self, folder: str, digests: Sequence[str]) -> None:

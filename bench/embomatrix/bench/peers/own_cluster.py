@@ -20,15 +20,15 @@ if TYPE_CHECKING:
 
     from embomatrix.bench.cluster.load_generator import Arrival
     from embomatrix.bench.cluster.processes import BenchCluster
-    from embomatrix.bench.cluster.work import Work
-    from embomatrix.bench.peers.contender import Chunk, Setup, Take
+    from embomatrix.bench.cluster.work import ClusterWorkload
+    from embomatrix.bench.peers.contender import ContenderSetup, RolloutChunk, Take
 
 LIMIT_S: Final = 120.0
 """For the whole life of the cluster."""
 
 
 @contextlib.contextmanager
-def own_cluster(setup: Setup, work: Work) -> Iterator[OwnContender]:
+def own_cluster(setup: ContenderSetup, work: ClusterWorkload) -> Iterator[OwnContender]:
     """A cluster for as long as the context lasts, with the scenes of the work announced and warm."""
     deadline_s = time.monotonic() + LIMIT_S
     with (
@@ -42,7 +42,9 @@ def own_cluster(setup: Setup, work: Work) -> Iterator[OwnContender]:
             runner.run(stack.aclose())
 
 
-async def _join(stack: contextlib.AsyncExitStack, cluster: BenchCluster, work: Work) -> BenchTrainer:
+async def _join(
+    stack: contextlib.AsyncExitStack, cluster: BenchCluster, work: ClusterWorkload
+) -> BenchTrainer:
     """A trainer whose client lasts as long as the stack, with every scene warm."""
     client = await stack.enter_async_context(ClusterClient(cluster.address))
     try:
@@ -67,7 +69,7 @@ class OwnContender:
         self._runner = runner
         self._trainer = trainer
 
-    def run(self, chunks: Sequence[Chunk], take: Take, limit_s: float) -> None:
+    def run(self, chunks: Sequence[RolloutChunk], take: Take, limit_s: float) -> None:
         rollouts = [rollout for chunk in chunks for rollout in chunk.rollouts]
 
         async def submit() -> None:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.bench.peers.contest import Peer
+from embomatrix.bench.peers.contest import PeerSystem
 from embomatrix.bench.report.figures import quantile
 from embomatrix.pages.figures import Better, Figure, shown
 
@@ -127,7 +127,7 @@ def contest_lines(figures: Sequence[Figure]) -> list[str]:
         f"| | {' | '.join(COLUMNS)} | ours over it |",
         f"| --- | {' | '.join(['---:'] * len(COLUMNS))} | ---: |",
     ]
-    for who in (OURS, *Peer):
+    for who in (OURS, *PeerSystem):
         measured = who == OURS or f"vs_{who}" in values
         cells = [_cell(values, _name(who, what)) for what in COLUMNS.values()]
         lead = _cell(values, f"vs_{who}") if measured else "not measured"

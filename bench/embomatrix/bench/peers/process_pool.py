@@ -13,17 +13,17 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from typing import TYPE_CHECKING, Any
 
-from embomatrix.bench.peers.contender import Lost, Mode, follow
+from embomatrix.bench.peers.contender import LibraryMode, Lost, follow
 from embomatrix.bench.peers.engine_pool import execute_fresh, execute_held
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from embomatrix.bench.peers.contender import Chunk, Setup, Take
+    from embomatrix.bench.peers.contender import ContenderSetup, RolloutChunk, Take
 
 
 @contextlib.contextmanager
-def process_pool(setup: Setup) -> Iterator[PoolContender]:
+def process_pool(setup: ContenderSetup) -> Iterator[PoolContender]:
     """Executors for as long as the context lasts, one for each queue."""
     context = multiprocessing.get_context("spawn")
     with contextlib.ExitStack() as stack:
@@ -39,11 +39,11 @@ def process_pool(setup: Setup) -> Iterator[PoolContender]:
 class PoolContender:
     """Submits chunks to executors."""
 
-    def __init__(self, setup: Setup, executors: Sequence[ProcessPoolExecutor]) -> None:
+    def __init__(self, setup: ContenderSetup, executors: Sequence[ProcessPoolExecutor]) -> None:
         self._setup = setup
         self._executors = executors
 
-    def run(self, chunks: Sequence[Chunk], take: Take, limit_s: float) -> None:
+    def run(self, chunks: Sequence[RolloutChunk], take: Take, limit_s: float) -> None:
         futures = {}
         for chunk in chunks:
             try:
@@ -55,8 +55,8 @@ class PoolContender:
     def victim(self, pids: Sequence[int]) -> int:
         return pids[-1]
 
-    def _submit(self, chunk: Chunk) -> Future[Any]:
+    def _submit(self, chunk: RolloutChunk) -> Future[Any]:
         executor, folder = self._executors[chunk.lane], str(self._setup.folder)
-        if self._setup.mode is Mode.PLAIN:
+        if self._setup.mode is LibraryMode.PLAIN:
             return executor.submit(execute_fresh, folder, *chunk.requests)
         return executor.submit(execute_held, folder, self._setup.preload, chunk.requests)

@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any, Final
 
 import ray
 
-from embomatrix.bench.peers.contender import Mode, follow
-from embomatrix.bench.peers.engine_pool import Holder, execute_fresh, execute_held
+from embomatrix.bench.peers.contender import LibraryMode, follow
+from embomatrix.bench.peers.engine_pool import SceneProcess, execute_fresh, execute_held
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from embomatrix.bench.peers.contender import Chunk, Setup, Take
+    from embomatrix.bench.peers.contender import ContenderSetup, RolloutChunk, Take
     from embomatrix.bench.peers.engine_pool import Answer
 
 STORE_BYTES: Final = 100 * 1024 * 1024
@@ -28,7 +28,7 @@ STORE_BYTES: Final = 100 * 1024 * 1024
 
 
 @contextlib.contextmanager
-def ray_cluster(setup: Setup) -> Iterator[RayContender]:
+def ray_cluster(setup: ContenderSetup) -> Iterator[RayContender]:
     """Ray on this machine for as long as the context lasts."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     ray.init(
@@ -50,7 +50,7 @@ class SceneActor:
     """Holds scenes and executes chunks."""
 
     def __init__(self, folder: str, digests: Sequence[str]) -> None:
-        self._holder = Holder(folder, digests)
+        self._holder = SceneProcess(folder, digests)
 
     def answer(self, requests: Sequence[bytes]) -> Answer:
         return self._holder.answer(requests)
@@ -59,27 +59,27 @@ class SceneActor:
 class RayContender:
     """Submits chunks to tasks or actors."""
 
-    def __init__(self, setup: Setup) -> None:
+    def __init__(self, setup: ContenderSetup) -> None:
         self._setup = setup
         folder, preload = str(setup.folder), setup.preload
         self._fresh = ray.remote(num_cpus=1)(execute_fresh)
         self._held = ray.remote(num_cpus=1)(execute_held)
         actor = ray.remote(num_cpus=1, max_restarts=-1, max_task_retries=-1)(SceneActor)
-        count = setup.slots if setup.mode is Mode.AFFINE else 0
+        count = setup.slots if setup.mode is LibraryMode.AFFINE else 0
         self._actors = [actor.remote(folder, preload) for _ in range(count)]
 
-    def run(self, chunks: Sequence[Chunk], take: Take, limit_s: float) -> None:
+    def run(self, chunks: Sequence[RolloutChunk], take: Take, limit_s: float) -> None:
         follow({self._submit(chunk).future(): chunk for chunk in chunks}, take, limit_s)
 
     def victim(self, pids: Sequence[int]) -> int:
         return pids[-1]
 
-    def _submit(self, chunk: Chunk) -> Any:
+    def _submit(self, chunk: RolloutChunk) -> Any:
         folder = str(self._setup.folder)
         match self._setup.mode:
-            case Mode.PLAIN:
+            case LibraryMode.PLAIN:
                 return self._fresh.remote(folder, *chunk.requests)
-            case Mode.SHARED:
+            case LibraryMode.SHARED:
                 return self._held.remote(folder, self._setup.preload, chunk.requests)
-            case Mode.AFFINE:
+            case LibraryMode.AFFINE:
                 return self._actors[chunk.lane].answer.remote(chunk.requests)

@@ -22,7 +22,7 @@ GRID: Final = "#ddd"
 
 
 @dataclass(frozen=True, slots=True)
-class Panel:
+class LineChart:
     """One chart. ``lines`` hold the values of each series by x, None where nothing was measured; ``most`` tops the axis."""
 
     title: str
@@ -56,7 +56,7 @@ class _Scale:
         return self.first_px + share * (self.last_px - self.first_px)
 
 
-def page(title: str, rows: Sequence[Sequence[Panel]]) -> str:
+def page(title: str, rows: Sequence[Sequence[LineChart]]) -> str:
     """The panels in rows, with one legend for all of them."""
     columns = max(len(row) for row in rows)
     width, height = columns * WIDTH, len(rows) * HEIGHT + 44
@@ -85,7 +85,7 @@ def _legend(colours: Mapping[str, str]) -> list[str]:
     return parts
 
 
-def _panel(panel: Panel, colours: Mapping[str, str]) -> list[str]:
+def _panel(panel: LineChart, colours: Mapping[str, str]) -> list[str]:
     x, y = _scales(panel)
     parts = [f'<text x="{LEFT}" y="{TOP - 9}" font-size="12">{html.escape(panel.title)}</text>']
     for tick in _ticks(y.least, y.most, logarithmic=panel.y_logarithmic):
@@ -121,7 +121,7 @@ def _line(points: Sequence[tuple[float, float]], colour: str) -> list[str]:
     return [f'<polyline points="{path}" fill="none" stroke="{colour}" stroke-width="1.8"/>', *dots]
 
 
-def _scales(panel: Panel) -> tuple[_Scale, _Scale]:
+def _scales(panel: LineChart) -> tuple[_Scale, _Scale]:
     xs = [x for line in panel.lines.values() for x in line]
     ys = [y for line in panel.lines.values() for y in line.values() if y is not None]
     ys += [] if panel.mark is None else [panel.mark]
@@ -142,7 +142,7 @@ def _ticks(least: float, most: float, *, logarithmic: bool) -> list[float]:
     return [least + (most - least) * quarter / 4 for quarter in range(5)]
 
 
-def _x_ticks(panel: Panel, x: _Scale) -> list[float]:
+def _x_ticks(panel: LineChart, x: _Scale) -> list[float]:
     """Where values are, as far as their labels don't meet."""
     ticks: list[float] = []
     for value in sorted({value for line in panel.lines.values() for value in line}):

@@ -10,7 +10,7 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
-from embomatrix.rpc.run_log import Phase
+from embomatrix.rpc.run_log import RolloutPhase
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -78,11 +78,11 @@ def busy_chart(shares: Sequence[float], step_s: float) -> str:
         return _svg(figure, "busy", "Share of slots at work over the run")
 
 
-def phase_chart(phases: Mapping[Phase, PhaseSummary]) -> str:
+def phase_chart(phases: Mapping[RolloutPhase, PhaseSummary]) -> str:
     """Median, 95th and 99th percentile of each phase, on a logarithmic axis."""
     with mpl.rc_context(STYLE):
         figure, axes = _chart("")
-        for row, phase in enumerate(reversed(Phase)):
+        for row, phase in enumerate(reversed(RolloutPhase)):
             found = phases[phase]
             # A logarithmic axis has no zero: what took no time worth telling stands at its left end.
             points_ms = [max(value * 1e3, 0.01) for value in (found.p50_s, found.p95_s, found.p99_s)]
@@ -91,8 +91,8 @@ def phase_chart(phases: Mapping[Phase, PhaseSummary]) -> str:
                 label = shown if row == 0 else None
                 axes.plot(value, row, marker, color=SECOND, markersize=7, markeredgewidth=1.8, label=label)
         axes.set_xscale("log")
-        axes.set_yticks(range(len(Phase)), [phase.value for phase in reversed(Phase)])
-        axes.set_ylim(-0.6, len(Phase) - 0.4)
+        axes.set_yticks(range(len(RolloutPhase)), [phase.value for phase in reversed(RolloutPhase)])
+        axes.set_ylim(-0.6, len(RolloutPhase) - 0.4)
         axes.grid(visible=False, axis="y")
         axes.grid(visible=True, axis="x", linewidth=0.8)
         axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: _milliseconds(value)))

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.cli.cluster.charts import busy_chart, phase_chart, throughput_chart
 from embomatrix.pages.head import page_head
 from embomatrix.reward.settings import PAPER
-from embomatrix.rpc.run_log import EventKind, Phase
+from embomatrix.rpc.run_log import EventKind, RolloutPhase
 from embomatrix.rpc.timeline import busy_share, slot_spans
 
 if TYPE_CHECKING:
@@ -25,12 +25,12 @@ if TYPE_CHECKING:
 STEPS: Final = 240
 """Points in time at which the share of slots at work is told."""
 NONE: Final = "–"
-PHASES: Final[Mapping[Phase, str]] = {
-    Phase.QUEUE: "waited for a lease",
-    Phase.LEASE: "network, and wait for a slot behind another rollout",
-    Phase.LOAD: "waited for the scene to be loaded",
-    Phase.EXECUTE: "in the slot",
-    Phase.DELIVER: "from the result's arrival to the trainer's log",
+PHASES: Final[Mapping[RolloutPhase, str]] = {
+    RolloutPhase.QUEUE: "waited for a lease",
+    RolloutPhase.LEASE: "network, and wait for a slot behind another rollout",
+    RolloutPhase.LOAD: "waited for the scene to be loaded",
+    RolloutPhase.EXECUTE: "in the slot",
+    RolloutPhase.DELIVER: "from the result's arrival to the trainer's log",
 }
 
 
@@ -96,7 +96,7 @@ def _tiles(summary: RunSummary) -> str:
     stats, phases = summary.run.stats, summary.phases
     completed = sum(summary.series.completed)
     active_s = summary.series.step_s * sum(count > 0 for count in summary.series.completed)
-    execute_s = phases[Phase.EXECUTE].sum_s
+    execute_s = phases[RolloutPhase.EXECUTE].sum_s
     cpu_s = summary.manager_cpu_s + execute_s
     asked = stats.prewarm_hits + stats.prewarm_misses
     tiles = (
@@ -108,8 +108,8 @@ def _tiles(summary: RunSummary) -> str:
         ("Throughput", f"{completed / active_s:,.0f}/s" if active_s else NONE, "while there was work"),
         (
             "Execute p50",
-            seconds_text(phases[Phase.EXECUTE].p50_s),
-            f"p99 {seconds_text(phases[Phase.EXECUTE].p99_s)}",
+            seconds_text(phases[RolloutPhase.EXECUTE].p50_s),
+            f"p99 {seconds_text(phases[RolloutPhase.EXECUTE].p99_s)}",
         ),
         ("Prewarm hits", _share(stats.prewarm_hits, asked), f"{stats.prewarm_hits:,} of {asked:,} scenes"),
         (
@@ -141,7 +141,7 @@ def _busy(summary: RunSummary, events: Sequence[RunEvent]) -> str:
 def _phase_rows(summary: RunSummary) -> str:
     whole_s = sum(found.sum_s for found in summary.phases.values())
     rows = []
-    for phase in Phase:
+    for phase in RolloutPhase:
         found = summary.phases[phase]
         quantiles = (found.p50_s, found.p95_s, found.p99_s)
         share = found.sum_s / whole_s if whole_s else 0.0

@@ -23,7 +23,7 @@ from embomatrix.rpc.versions import SPOKEN, agree, software_version
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from embomatrix.rpc.wire.values import Fleet
+    from embomatrix.rpc.wire.values import FleetStatus
 
 KNOCK_S: Final = 1.0
 """Limit for each of the questions, of which there are four: a doctor is quick."""
@@ -204,7 +204,7 @@ async def _token(visit: Visit) -> list[Finding]:
     return [found, *cluster(fleet)]
 
 
-def cluster(fleet: Fleet) -> list[Finding]:
+def cluster(fleet: FleetStatus) -> list[Finding]:
     """How the cluster does, if its manager says so. It is no fault of this machine: never worse than a note."""
     if not fleet.health:
         return []

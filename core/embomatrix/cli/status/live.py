@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from rich.console import RenderableType
 
-    from embomatrix.rpc.wire.values import Fleet, RunInfo, WorkerInfo
+    from embomatrix.rpc.wire.values import FleetStatus, RunInfo, WorkerInfo
 
 OTHER_LINES: Final = 7
 """Lines that are no run's and no worker's: two of the head, two empty ones, the heads of two tables, how many more."""
@@ -27,7 +27,7 @@ class Glance:
     """The cluster at one moment. ``at_s`` is on a clock that only goes forward."""
 
     at_s: float
-    fleet: Fleet
+    fleet: FleetStatus
     runs: tuple[RunInfo, ...]
 
     @property

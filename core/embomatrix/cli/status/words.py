@@ -10,7 +10,7 @@ from embomatrix.rpc.wire.values import Warmth
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from embomatrix.rpc.wire.values import Fleet, PlanCell, RunInfo, WorkerInfo
+    from embomatrix.rpc.wire.values import FleetStatus, PlanCell, RunInfo, WorkerInfo
 
 WORKING: Final = frozenset(("ready", "suspect"))
 """States in which a worker may hold rollouts that go on."""
@@ -20,7 +20,7 @@ NAMED: Final = 8
 """Workers and runs that are named; there may be thousands."""
 
 
-def sentences(fleet: Fleet, runs: Sequence[RunInfo], plan: Sequence[PlanCell]) -> list[str]:
+def sentences(fleet: FleetStatus, runs: Sequence[RunInfo], plan: Sequence[PlanCell]) -> list[str]:
     """What there is, what it does, and what stands in its way.
 
     The first sentence is the verdict: the manager's own, which knows more than can be seen from here, as a full disk.

@@ -8,8 +8,8 @@ from embomatrix.proto.v1 import admin_service_pb2 as pb
 from embomatrix.rpc.run_log import (
     EventKind,
     EventPage,
-    Phase,
     PhaseSummary,
+    RolloutPhase,
     RunEvent,
     RunSeries,
     RunSummary,
@@ -103,12 +103,12 @@ def _phase_from_proto(message: pb.PhaseSummary) -> PhaseSummary:
     )
 
 
-def _named_phase_from_proto(message: pb.PhaseSummary) -> tuple[Phase, PhaseSummary]:
-    if message.phase not in list(Phase):
+def _named_phase_from_proto(message: pb.PhaseSummary) -> tuple[RolloutPhase, PhaseSummary]:
+    if message.phase not in list(RolloutPhase):
         raise ConvertError(
-            "phase", f"{message.phase!r} is no known phase: expected one of {', '.join(Phase)}"
+            "phase", f"{message.phase!r} is no known phase: expected one of {', '.join(RolloutPhase)}"
         )
-    return Phase(message.phase), _phase_from_proto(message)
+    return RolloutPhase(message.phase), _phase_from_proto(message)
 
 
 def _worker_from_proto(message: pb.RunWorker) -> RunWorker:

@@ -349,7 +349,7 @@ class WorkerInfo:
 
 
 @dataclass(frozen=True, slots=True)
-class Fleet:
+class FleetStatus:
     """The workers, and how the cluster does, in the manager's own sentence; a manager of an earlier release says nothing.
 
     ``mood`` is how much somebody should care: good, idle, warning or bad.

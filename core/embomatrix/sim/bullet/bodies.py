@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from embomatrix.world.asset import Asset, Joint
-    from embomatrix.world.geometry import Part
+    from embomatrix.world.geometry import ConvexPart
 
 HULL_MARGIN_M = 0.001
 """Bullet rounds hulls outwards by this much; their vertices are drawn in by the same."""
@@ -33,7 +33,7 @@ LEAST_LEAF_KG = 0.2
 
 
 @dataclass(frozen=True, slots=True)
-class Piece:
+class CollisionPiece:
     """One collision shape of an asset, in the frame of its link. ``parent`` is a piece's index; -1 marks the base."""
 
     shape: int
@@ -67,7 +67,7 @@ class BodyFactory:
         self._client = client
         self._flags = flags
         self._plain = plain
-        self._pieces: dict[int, tuple[Asset, tuple[Piece, ...]]] = {}
+        self._pieces: dict[int, tuple[Asset, tuple[CollisionPiece, ...]]] = {}
 
     def forget_shapes(self) -> None:
         """Drop the shapes' ids: resetting a client frees the shapes themselves."""
@@ -118,7 +118,7 @@ class BodyFactory:
         masses = [leaves[owner] / owners.count(owner) if owner else 0.0 for owner in owners]
         return self._create(masses, pieces, pose)
 
-    def walls(self, parts: Sequence[Part]) -> tuple[int, ...]:
+    def walls(self, parts: Sequence[ConvexPart]) -> tuple[int, ...]:
         """Immovable bodies that hold 16 walls each; wall ``i`` is in body ``i // 16``."""
         chunks = [parts[i : i + PART_LIMIT] for i in range(0, len(parts), PART_LIMIT)]
         made = [self._link_pieces(chunk, (0.0, 0.0, 0.0), None, 0) for chunk in chunks]
@@ -129,17 +129,19 @@ class BodyFactory:
         slab = self._bullet.createCollisionShape(
             self._bullet.GEOM_BOX, halfExtents=(half_m, half_m, 0.25), physicsClientId=self._client
         )
-        return self._create([0.0], (Piece(slab, (0.0, 0.0, 0.0), -1, None),), Pose((x_m, y_m, -0.25)))
+        return self._create(
+            [0.0], (CollisionPiece(slab, (0.0, 0.0, 0.0), -1, None),), Pose((x_m, y_m, -0.25))
+        )
 
     def joint_indices(self, asset: Asset) -> tuple[int, ...]:
         """Bullet's index of each joint of the asset, in the asset's order."""
         pieces = self._pieces_of(asset)
         return tuple(i - 1 for i, piece in enumerate(pieces) if piece.joint is not None)
 
-    def _pieces_of(self, asset: Asset) -> tuple[Piece, ...]:
+    def _pieces_of(self, asset: Asset) -> tuple[CollisionPiece, ...]:
         """Shapes of an asset. It is kept beside them, so that its id can't pass to another one."""
         if id(asset) not in self._pieces:
-            pieces: list[Piece] = []
+            pieces: list[CollisionPiece] = []
             for link in asset.links:
                 origin = link.joint.origin_m if link.joint is not None else (0.0, 0.0, 0.0)
                 pieces += self._link_pieces(link.parts, origin, link.joint, len(pieces))
@@ -147,18 +149,18 @@ class BodyFactory:
         return self._pieces[id(asset)][1]
 
     def _link_pieces(
-        self, parts: Sequence[Part], origin: Vec3, joint: Joint | None, first: int
-    ) -> tuple[Piece, ...]:
+        self, parts: Sequence[ConvexPart], origin: Vec3, joint: Joint | None, first: int
+    ) -> tuple[CollisionPiece, ...]:
         """Pieces of one link, the first of which takes index ``first`` and bears the joint."""
         ox, oy, oz = origin
         frame = Pose((-ox, -oy, -oz))
         plain = [part for part in parts if part.shape is not Shape.HULL]
         shapes = [self._compound(plain, frame)] if plain else []
         shapes += [self._hull(part, frame) for part in parts if part.shape is Shape.HULL]
-        head = Piece(shapes[0] if shapes else NO_SHAPE, origin, 0 if first else -1, joint)
-        return (head, *(Piece(shape, (0.0, 0.0, 0.0), first, None) for shape in shapes[1:]))
+        head = CollisionPiece(shapes[0] if shapes else NO_SHAPE, origin, 0 if first else -1, joint)
+        return (head, *(CollisionPiece(shape, (0.0, 0.0, 0.0), first, None) for shape in shapes[1:]))
 
-    def _compound(self, parts: Sequence[Part], frame: Pose) -> int:
+    def _compound(self, parts: Sequence[ConvexPart], frame: Pose) -> int:
         bullet = self._bullet
         kinds = {
             Shape.BOX: bullet.GEOM_BOX,
@@ -178,7 +180,7 @@ class BodyFactory:
             )
         )
 
-    def _hull(self, part: Part, frame: Pose) -> int:
+    def _hull(self, part: ConvexPart, frame: Pose) -> int:
         scale = [max(0.1, 1 - 2 * HULL_MARGIN_M / extent) for extent in part.size_m]
         pose = frame @ part.pose
         return int(
@@ -196,7 +198,7 @@ class BodyFactory:
     def _create(
         self,
         masses_kg: Sequence[float],
-        pieces: Sequence[Piece],
+        pieces: Sequence[CollisionPiece],
         pose: Pose,
         motions: Sequence[Pose] | None = None,
     ) -> int:
@@ -216,7 +218,7 @@ class BodyFactory:
         )
 
     def _links(
-        self, masses_kg: Sequence[float], pieces: Sequence[Piece], motions: Sequence[Pose] | None
+        self, masses_kg: Sequence[float], pieces: Sequence[CollisionPiece], motions: Sequence[Pose] | None
     ) -> dict[str, Any]:
         if not pieces:
             return {}

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.sim.bullet.stage import Stage
+from embomatrix.sim.bullet.stage import VisualScene
 from embomatrix.sim.geometry.bounds import IDENTITY
 from embomatrix.sim.physical.stage import tucked
 from embomatrix.world.geometry import Pose
@@ -17,7 +17,7 @@ from embomatrix.world.poses import StandPose
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from embomatrix.world.geometry import Part
+    from embomatrix.world.geometry import ConvexPart
     from embomatrix.world.scene import Room, Scene, SceneObject
 
     FloatArray = NDArray[np.float64]
@@ -44,7 +44,7 @@ def render_oblique(scene: Scene, *, width_px: int = 1280, height_px: int = 960) 
 
     Returns RGB values, shape (height, width, 3). Raises EngineError where pybullet is missing.
     """
-    with Stage(scene) as stage:
+    with VisualScene(scene) as stage:
         furnish_cutaway(stage)
         stage.add_robot().stand(tucked(_start(scene)))
         return shoot_oblique(stage, scene.rooms, width_px, height_px)
@@ -58,27 +58,29 @@ def render_egocentric(
     Returns RGB values, shape (4, height, width, 3). Raises EngineError where pybullet is missing.
     """
     start = stand or _start(scene)
-    with Stage(scene) as stage:
+    with VisualScene(scene) as stage:
         furnish_whole(stage)
         quarters = (replace(start, yaw=start.yaw + turns * math.pi / 2) for turns in range(4))
         return np.stack([shoot_egocentric(stage, quarter, width_px, height_px) for quarter in quarters])
 
 
-def furnish_cutaway(stage: Stage) -> None:
+def furnish_cutaway(stage: VisualScene) -> None:
     """Fill a stage for pictures from above and aside: no ceiling, near walls cut low."""
     stage.add_floors()
     stage.add_walls(lambda wall: _cut(stage.scene, wall))
     stage.add_objects(lambda item: not _hangs_at_ceiling(stage.scene, item))
 
 
-def furnish_whole(stage: Stage) -> None:
+def furnish_whole(stage: VisualScene) -> None:
     """Fill a stage for pictures from within: all walls in full, and what hangs at the ceiling."""
     stage.add_floors()
     stage.add_walls(lambda wall: wall)
     stage.add_objects()
 
 
-def shoot_oblique(stage: Stage, rooms: tuple[Room, ...], width_px: int, height_px: int) -> NDArray[np.uint8]:
+def shoot_oblique(
+    stage: VisualScene, rooms: tuple[Room, ...], width_px: int, height_px: int
+) -> NDArray[np.uint8]:
     """These rooms from above and aside, filling the picture."""
     low = np.min([room.low_m for room in rooms], axis=0)
     high = np.max([room.high_m for room in rooms], axis=0)
@@ -89,7 +91,9 @@ def shoot_oblique(stage: Stage, rooms: tuple[Room, ...], width_px: int, height_p
     return stage.shoot(view, lens, width_px, height_px)
 
 
-def shoot_egocentric(stage: Stage, stand: StandPose, width_px: int, height_px: int) -> NDArray[np.uint8]:
+def shoot_egocentric(
+    stage: VisualScene, stand: StandPose, width_px: int, height_px: int
+) -> NDArray[np.uint8]:
     """The view of the robot's camera at a standing pose."""
     flat = math.cos(EYE_PITCH)
     eye = (stand.x_m, stand.y_m, EYE_M)
@@ -108,7 +112,7 @@ def _hangs_at_ceiling(scene: Scene, item: SceneObject) -> bool:
     return item.pose_world_asset.position_m[2] + height / 2 > CEILING_M and height < 1.8
 
 
-def _cut(scene: Scene, wall: Part) -> Part | None:
+def _cut(scene: Scene, wall: ConvexPart) -> ConvexPart | None:
     """Walls with a room behind them, seen from the camera, are cut low; the others stand in full."""
     if not _hides(scene, wall):
         return wall
@@ -121,7 +125,7 @@ def _cut(scene: Scene, wall: Part) -> Part | None:
     return replace(wall, size_m=size, pose=Pose((x, y, (low_m + high_m) / 2), wall.pose.quat_xyzw))
 
 
-def _hides(scene: Scene, wall: Part) -> bool:
+def _hides(scene: Scene, wall: ConvexPart) -> bool:
     """Whether a room lies right behind any stretch of the wall."""
     look = _direction()
     length = max(wall.size_m[:2])

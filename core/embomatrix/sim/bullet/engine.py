@@ -31,7 +31,7 @@ from embomatrix.sim.validation import check_fractions, check_pose, check_scene
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-    from embomatrix.sim.floor.prepared import Prepared
+    from embomatrix.sim.floor.prepared import PreparedScene
     from embomatrix.sim.geometry.bounds import AssetBounds
     from embomatrix.world.geometry import Aabb, Pose
     from embomatrix.world.scene import Scene
@@ -46,7 +46,7 @@ class BulletEngine:
     """One scene in one Bullet client, with a second one to settle objects in. Not for use by several threads."""
 
     def __init__(
-        self, scene: Scene, pool: ClientPool | None = None, prepared: Prepared | None = None
+        self, scene: Scene, pool: ClientPool | None = None, prepared: PreparedScene | None = None
     ) -> None:
         """Load the scene into clients of the pool, or into new ones that are closed with the engine.
 

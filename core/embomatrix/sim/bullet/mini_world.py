@@ -10,7 +10,7 @@ from embomatrix.sim.bullet.bodies import BodyFactory
 from embomatrix.sim.bullet.client import ClientPool, pybullet
 from embomatrix.sim.engine import SETTLE_STEPS, Settled
 from embomatrix.sim.geometry.bounds import parts_of
-from embomatrix.world.geometry import Aabb, Part, Pose, Shape
+from embomatrix.world.geometry import Aabb, ConvexPart, Pose, Shape
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -79,7 +79,7 @@ class MiniWorld:
         pose: Pose,
         fractions: Sequence[float],
         stills: Sequence[Still],
-        walls: Sequence[Part] = (),
+        walls: Sequence[ConvexPart] = (),
         region: Aabb | None = None,
     ) -> None:
         """Build a world of one object that moves, others that do not, some walls and the floor.
@@ -88,7 +88,9 @@ class MiniWorld:
         """
         self._clear()
         x, y, _ = pose.position_m
-        slab = Part(Shape.BOX, Pose((x, y, -FLOOR_THICKNESS_M / 2)), (FLOOR_M, FLOOR_M, FLOOR_THICKNESS_M))
+        slab = ConvexPart(
+            Shape.BOX, Pose((x, y, -FLOOR_THICKNESS_M / 2)), (FLOOR_M, FLOOR_M, FLOOR_THICKNESS_M)
+        )
         parts = [slab, *walls]
         for item in stills:
             box = region if region is not None else EVERYWHERE

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from embomatrix.world.asset import Asset
-    from embomatrix.world.geometry import Part, Vec3
+    from embomatrix.world.geometry import ConvexPart, Vec3
     from embomatrix.world.scene import Scene, SceneObject
 
     FloatArray = NDArray[np.float64]
@@ -58,7 +58,7 @@ _PANE_M: Final = 0.03
 """Walls thinner than the first are leaves of doors, thinner than the second panes of windows."""
 
 
-class Stage:
+class VisualScene:
     """Visual bodies of one scene in one client. Use as a context manager: leaving it frees the client."""
 
     def __init__(self, scene: Scene) -> None:
@@ -69,9 +69,9 @@ class Stage:
         if self._client < 0:
             raise EngineError("Bullet opened no physics client: close engines that are not in use")
         self._shapes: dict[tuple[object, ...], int] = {}
-        self._solids: dict[str, list[tuple[int, Part]]] = {}
+        self._solids: dict[str, list[tuple[int, ConvexPart]]] = {}
 
-    def __enter__(self) -> Stage:
+    def __enter__(self) -> VisualScene:
         return self
 
     def __exit__(
@@ -85,7 +85,7 @@ class Stage:
             size = (room.size_m[0] + 0.12, room.size_m[1] + 0.12, 0.04)
             self.add_solid(Shape.BOX, size, Pose((*room.center_m, -0.02)), _FLOORS[number % len(_FLOORS)])
 
-    def add_walls(self, seen_as: Callable[[Part], Part | None]) -> None:
+    def add_walls(self, seen_as: Callable[[ConvexPart], ConvexPart | None]) -> None:
         """The walls, each as ``seen_as`` wants to see it; None leaves it out."""
         for wall in self.scene.walls:
             seen = seen_as(wall)
@@ -170,7 +170,7 @@ class Stage:
         """Projection matrix of a perspective camera; the field of view is vertical."""
         return list(self._bullet.computeProjectionMatrixFOV(field_of_view_deg, aspect, near_m, far_m))
 
-    def _add_part(self, part: Part, frame: Pose, color: Rgba) -> int:
+    def _add_part(self, part: ConvexPart, frame: Pose, color: Rgba) -> int:
         return self.add_solid(part.shape, part.size_m, frame @ part.pose, color, part.vertices_m)
 
     def _place(self, body: int, pose: Pose) -> None:
@@ -221,7 +221,7 @@ def _faces(points: FloatArray) -> dict[str, list[Any]]:
     }
 
 
-def _material(wall: Part) -> Rgba:
+def _material(wall: ConvexPart) -> Rgba:
     """Colour of a wall's part by what its thickness makes it."""
     thickness = min(wall.size_m[:2])
     if thickness < _PANE_M:

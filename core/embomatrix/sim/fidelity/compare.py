@@ -38,7 +38,7 @@ class PlanKind(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Trial:
+class FidelityTrial:
     """One plan to be executed in both modes. ``base`` is the base scene that the bundle's scene was made from."""
 
     trial_id: str
@@ -84,7 +84,7 @@ class ModeRun:
 class Comparison:
     """A trial in both modes. ``bodies`` counts the objects of the scene."""
 
-    trial: Trial
+    trial: FidelityTrial
     bodies: int
     cached: ModeRun
     physical: ModeRun
@@ -119,7 +119,7 @@ class Comparison:
         return self.cached.atoms & self.physical.atoms
 
 
-def run_trial(simulator: Simulator, task: Task, trial: Trial) -> ModeRun:
+def run_trial(simulator: Simulator, task: Task, trial: FidelityTrial) -> ModeRun:
     """Execute the trial's plan up to its first failure."""
     started_s = time.thread_time()
     simulator.reset(task, trial.seed)
@@ -134,7 +134,7 @@ def run_trial(simulator: Simulator, task: Task, trial: Trial) -> ModeRun:
     return ModeRun(tuple(steps), true_atoms(simulator, objects_in(task, trial.plan)), cpu_s)
 
 
-def compare(cached: Simulator, physical: Simulator, task: Task, trial: Trial) -> Comparison:
+def compare(cached: Simulator, physical: Simulator, task: Task, trial: FidelityTrial) -> Comparison:
     """Execute the trial in both modes."""
     return Comparison(
         trial,

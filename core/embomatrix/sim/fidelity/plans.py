@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.sim.fidelity.compare import PlanKind, Trial
+from embomatrix.sim.fidelity.compare import FidelityTrial, PlanKind
 from embomatrix.sim.fidelity.sampler import ABILITY, SKILLS, PlanSampler, work_pairs
 from embomatrix.skills.syntax import Skill
 
@@ -55,7 +55,7 @@ class Example:
 
 def write_trials(
     simulator: Simulator, digest: str, examples: Sequence[Example], request: Request
-) -> tuple[Trial, ...]:
+) -> tuple[FidelityTrial, ...]:
     """Trials for a scene that is loaded in cached mode; equal arguments give equal trials.
 
     Skills that lack calls come more often in valid plans.
@@ -91,7 +91,7 @@ class _Writer:
         self._missing: Counter[Skill] = Counter(request.calls)
         self._base: list[tuple[Task, Plan]] = []
 
-    def write(self) -> Iterator[Trial]:
+    def write(self) -> Iterator[FidelityTrial]:
         wanted = self._request.plans
         for number in range(wanted.get(PlanKind.ORACLE, 0)):
             example = self._examples[number % len(self._examples)]
@@ -101,7 +101,7 @@ class _Writer:
             for _ in range(wanted.get(kind, 0)):
                 yield self._trial(kind, *change())
 
-    def _valid_trials(self, count: int) -> Iterator[Trial]:
+    def _valid_trials(self, count: int) -> Iterator[FidelityTrial]:
         """As many as asked for, and more while they bring calls of skills that lack some."""
         made = idle = 0
         most = count + self._request.extra
@@ -115,18 +115,18 @@ class _Writer:
             after = sum(self._missing[skill] for skill in self._lacking())
             idle = 0 if after < before else idle + 1
 
-    def _counted(self, kind: PlanKind, task: Task, plan: Plan, seed: int) -> Trial:
+    def _counted(self, kind: PlanKind, task: Task, plan: Plan, seed: int) -> FidelityTrial:
         self._base.append((task, plan))
         for step in self._simulator.execute(task, plan, seed).steps:
             if step.ok:
                 self._missing[step.call.skill] -= 1
         return self._trial(kind, task, plan, seed)
 
-    def _trial(self, kind: PlanKind, task: Task, plan: Plan, seed: int) -> Trial:
+    def _trial(self, kind: PlanKind, task: Task, plan: Plan, seed: int) -> FidelityTrial:
         scene = self._simulator.world.scene
         trial_id = f"{scene.scene_id}-{self._digest.partition(':')[2][:8]}-{self._number:04d}"
         self._number += 1
-        return Trial(trial_id, self._digest, scene.base, task.task_id, kind, seed, plan)
+        return FidelityTrial(trial_id, self._digest, scene.base, task.task_id, kind, seed, plan)
 
     def _lacking(self) -> list[Skill]:
         """Skills that some task of the scene allows and that have too few calls, those that lack most first."""

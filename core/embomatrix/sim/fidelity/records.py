@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from embomatrix.sim.fidelity.compare import Comparison, ModeRun, PlanKind, StepRun, Trial
+from embomatrix.sim.fidelity.compare import Comparison, FidelityTrial, ModeRun, PlanKind, StepRun
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.parse import plan_from_json, plan_to_json
 from embomatrix.skills.syntax import Skill
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 
-def trial_to_json(trial: Trial) -> dict[str, Any]:
+def trial_to_json(trial: FidelityTrial) -> dict[str, Any]:
     return {
         "trial": trial.trial_id,
         "bundle": trial.bundle_digest,
@@ -26,9 +26,9 @@ def trial_to_json(trial: Trial) -> dict[str, Any]:
     }
 
 
-def trial_from_json(value: Mapping[str, Any]) -> Trial:
+def trial_from_json(value: Mapping[str, Any]) -> FidelityTrial:
     """Raises KeyError, TypeError or ValueError (PlanError among them) for what is no trial."""
-    return Trial(
+    return FidelityTrial(
         value["trial"],
         value["bundle"],
         value["base"],

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from embomatrix.sim.floor.grid import FloorGrid
     from embomatrix.sim.live_world import LiveWorld
-    from embomatrix.skills.view import Refusal
+    from embomatrix.skills.view import SkillRefusal
     from embomatrix.world.geometry import FloatArray, Vec2
     from embomatrix.world.poses import Handling
     from embomatrix.world.state import Relation
@@ -28,7 +28,7 @@ RASTER_M: Final = 0.1
 WALL: Final = "a wall"
 
 
-def no_way_for_arm(world: LiveWorld, handling: Handling, target: str) -> Refusal | None:
+def no_way_for_arm(world: LiveWorld, handling: Handling, target: str) -> SkillRefusal | None:
     """Refusal when the scene's analysis found no way of the arm to do this; while all stays where it was."""
     other = world.barred.get(handling, {}).get(target, "")
     if not other or not _are_as_loaded(world, target, other):
@@ -36,7 +36,7 @@ def no_way_for_arm(world: LiveWorld, handling: Handling, target: str) -> Refusal
     return refuse(FailureReason.ARM_BLOCKED, target=target, other=other)
 
 
-def no_way_to_place(world: LiveWorld, held: str, target: str, relation: Relation) -> Refusal | None:
+def no_way_to_place(world: LiveWorld, held: str, target: str, relation: Relation) -> SkillRefusal | None:
     """Refusal when the scene's analysis found that the arm gets nowhere with this there; while all stays where it was."""
     other = world.barred_places.get(relation, {}).get(held, {}).get(target, "")
     if not other or not _are_as_loaded(world, target, other):
@@ -67,7 +67,7 @@ def _is_led_out(world: LiveWorld, name: str) -> bool:
     return False
 
 
-def no_way_to(world: LiveWorld, target: str) -> Refusal:
+def no_way_to(world: LiveWorld, target: str) -> SkillRefusal:
     """Why the robot does not get to an object that it has no standing pose for, and who is in the way."""
     room = world.room_of(target)
     service = world.navigator.service(target)
@@ -84,7 +84,7 @@ def no_way_to(world: LiveWorld, target: str) -> Refusal:
     return refuse(FailureReason.NO_STANDING_POSE, target=target, other=other)
 
 
-def no_way_into(world: LiveWorld, room: str) -> Refusal:
+def no_way_into(world: LiveWorld, room: str) -> SkillRefusal:
     """Why the robot does not get into a room that no path leads to, and who is in the way."""
     return refuse(FailureReason.NO_PATH, target=room, other=_between(world, room))
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from embomatrix.sim.engine import PhysicsEngine
     from embomatrix.sim.floor.open_panels import Ajar
-    from embomatrix.sim.floor.prepared import Prepared
+    from embomatrix.sim.floor.prepared import PreparedScene
 
 ON_FLOOR_M: Final = 0.05
 """A movable object whose underside is lower than this stands on the floor."""
@@ -42,7 +42,7 @@ class Laid:
 class Ground:
     """The floor in an engine's present state. Call ``refresh`` after anything on it has moved, or a leaf."""
 
-    def __init__(self, engine: PhysicsEngine, prepared: Prepared | None = None) -> None:
+    def __init__(self, engine: PhysicsEngine, prepared: PreparedScene | None = None) -> None:
         """``prepared`` was found before, in this scene as it was loaded."""
         self._engine = engine
         self._scene = engine.scene

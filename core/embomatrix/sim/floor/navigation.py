@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from embomatrix.sim.engine import PhysicsEngine
     from embomatrix.sim.floor.open_panels import Ajar
     from embomatrix.sim.floor.paths import Cell
-    from embomatrix.sim.floor.prepared import Prepared
+    from embomatrix.sim.floor.prepared import PreparedScene
     from embomatrix.sim.state.relations import Relations
     from embomatrix.world.asset import Asset
     from embomatrix.world.geometry import Aabb, FloatArray, Vec2
@@ -49,7 +49,7 @@ class Navigator:
         engine: PhysicsEngine,
         relations: Relations,
         stands: Mapping[str, tuple[StandPose, ...]] | None = None,
-        prepared: Prepared | None = None,
+        prepared: PreparedScene | None = None,
     ) -> None:
         """``stands`` and ``prepared`` were found before, in this scene as it was loaded."""
         self._engine = engine

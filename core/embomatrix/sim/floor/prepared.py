@@ -32,7 +32,7 @@ VERSION: Final = 1
 MOST_COVERED: Final = 255
 
 
-class Prepared:
+class PreparedScene:
     """Arrays of one scene in its initial state, as a decoded bundle carries them."""
 
     def __init__(self, arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -40,12 +40,12 @@ class Prepared:
         self._arrays = arrays
 
     @staticmethod
-    def of(bundle: Bundle) -> Prepared | None:
+    def of(bundle: Bundle) -> PreparedScene | None:
         """What a decoded bundle carries, None when it carries nothing that this version can use."""
         found = {name: bundle.prepared[_key(name)] for name in _KINDS if _key(name) in bundle.prepared}
         if found.keys() != _KINDS.keys():
             return None
-        return Prepared(found) if _are_sound(found, bundle.scene) else None
+        return PreparedScene(found) if _are_sound(found, bundle.scene) else None
 
     @property
     def object_boxes(self) -> tuple[Aabb, ...]:

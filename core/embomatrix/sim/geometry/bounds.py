@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.world.asset import JointKind
-from embomatrix.world.geometry import IDENTITY_QUAT, Aabb, Part, Pose, Shape
+from embomatrix.world.geometry import IDENTITY_QUAT, Aabb, ConvexPart, Pose, Shape
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -152,7 +152,7 @@ class AssetParts:
         self._leaves: dict[tuple[Quat, tuple[float, ...]], list[tuple[Vec3, Vec3]]] = {}
 
     def boxes(self, pose: Pose, fractions: Sequence[float]) -> list[Aabb]:
-        """Box of every part in the world, in the order of the links, as ``Part.aabb`` has it."""
+        """Box of every part in the world, in the order of the links, as ``ConvexPart.aabb`` has it."""
         x, y, z = pose.position_m
         return [
             Aabb((x + a, y + b, z + c), (x + d, y + e, z + f))
@@ -174,12 +174,12 @@ class AssetParts:
             known = self._leaves[key] = self._reckon_leaves(*key)
         return [Aabb((x + a, y + b, z + c), (x + d, y + e, z + f)) for (a, b, c), (d, e, f) in known]
 
-    def within(self, pose: Pose, fractions: Sequence[float], box: Aabb) -> list[Part]:
+    def within(self, pose: Pose, fractions: Sequence[float], box: Aabb) -> list[ConvexPart]:
         """Parts whose boxes overlap a box of the world, each at its pose in the world."""
         x, y, z = pose.position_m
         (low_x, low_y, low_z), (high_x, high_y, high_z) = box.low_m, box.high_m
         extents = iter(self._extents_at(pose.quat_xyzw, tuple(fractions)))
-        found: list[Part] = []
+        found: list[ConvexPart] = []
         for frame, parts in self._frames(pose, fractions):
             for part, ((a, b, c), (d, e, f)) in zip(parts, extents, strict=False):
                 if (
@@ -190,7 +190,7 @@ class AssetParts:
                     and y + e >= low_y
                     and z + f >= low_z
                 ):
-                    found.append(Part(part.shape, frame @ part.pose, part.size_m, part.vertices_m))
+                    found.append(ConvexPart(part.shape, frame @ part.pose, part.size_m, part.vertices_m))
         return found
 
     def _extents_at(self, quat_xyzw: Quat, fractions: tuple[float, ...]) -> list[tuple[Vec3, Vec3]]:
@@ -231,7 +231,9 @@ class AssetParts:
         highs = np.maximum.reduceat(world, starts).tolist()
         return [((a, b, c), (d, e, f)) for (a, b, c), (d, e, f) in zip(lows, highs, strict=True)]
 
-    def _frames(self, pose: Pose, fractions: Sequence[float]) -> Iterator[tuple[Pose, tuple[Part, ...]]]:
+    def _frames(
+        self, pose: Pose, fractions: Sequence[float]
+    ) -> Iterator[tuple[Pose, tuple[ConvexPart, ...]]]:
         """Frame of each link that has parts, and those."""
         moving = iter(fractions)
         for joint, parts in self._links:
@@ -269,7 +271,7 @@ def _known(asset: Asset) -> tuple[AssetBounds, AssetParts]:
     return known[1], known[2]
 
 
-def _cloud(parts: Sequence[Part]) -> tuple[FloatArray, FloatArray]:
+def _cloud(parts: Sequence[ConvexPart]) -> tuple[FloatArray, FloatArray]:
     """Points, shape (n, 3), and the radius of the ball around each, shape (n, 1), in the asset's frame."""
     points = [part.pose.apply_all(_points(part)) for part in parts]
     radii = [
@@ -279,7 +281,7 @@ def _cloud(parts: Sequence[Part]) -> tuple[FloatArray, FloatArray]:
     return np.concatenate(points), np.concatenate(radii)
 
 
-def _enclosing_points(part: Part) -> FloatArray:
+def _enclosing_points(part: ConvexPart) -> FloatArray:
     """Vertices of a hull, corners of the box around the other shapes; in the part's frame."""
     if part.vertices_m:
         return np.asarray(part.vertices_m, dtype=np.float64)
@@ -291,7 +293,7 @@ def _signs(size_m: Vec3) -> list[Vec3]:
     return [(sx * x, sy * y, sz * z) for sx in (-1.0, 1.0) for sy in (-1.0, 1.0) for sz in (-1.0, 1.0)]
 
 
-def _points(part: Part) -> FloatArray:
+def _points(part: ConvexPart) -> FloatArray:
     x, y, z = (extent / 2 for extent in part.size_m)
     match part.shape:
         case Shape.SPHERE:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from embomatrix.world.asset import Asset
-    from embomatrix.world.geometry import Part, Vec2, Vec3
+    from embomatrix.world.geometry import ConvexPart, Vec2, Vec3
 
 FLAT_M: Final = 5e-5
 """Points of a base that are this much higher than its lowest still touch what it stands on."""
@@ -96,7 +96,9 @@ def is_level(pose: Pose) -> bool:
     return 1 - 2 * (x * x + y * y) >= LEVEL_COSINE
 
 
-def _parts_near(support: Asset, fractions: Sequence[float], near: Aabb) -> Iterator[tuple[Part | None, Aabb]]:
+def _parts_near(
+    support: Asset, fractions: Sequence[float], near: Aabb
+) -> Iterator[tuple[ConvexPart | None, Aabb]]:
     """Boxes of a support's parts, in its own frame, that overlap a box, each with its part; None for one that was turned."""
     boxes = iter(parts_of(support).boxes(IDENTITY, fractions))
     moving = iter(fractions)
@@ -108,7 +110,7 @@ def _parts_near(support: Asset, fractions: Sequence[float], near: Aabb) -> Itera
                 yield None if turned else part, box
 
 
-def _borne(corners: Sequence[Vec2], part: Part, box: Aabb) -> Sequence[Vec2]:
+def _borne(corners: Sequence[Vec2], part: ConvexPart, box: Aabb) -> Sequence[Vec2]:
     """What of a convex polygon lies on the top of a part with this box; empty where the top is no level face."""
     (low_x, low_y, _), (high_x, high_y, _) = box.low_m, box.high_m
     x, y, z, w = (abs(value) for value in part.pose.quat_xyzw)
@@ -157,7 +159,7 @@ def _bears(point: Vec2, corners: Sequence[Vec2], margin_m: float) -> bool:
     return edges > 2
 
 
-def _underside(part: Part) -> list[Vec3]:
+def _underside(part: ConvexPart) -> list[Vec3]:
     """Points of a part that may be its lowest, in the asset's frame. A sphere has none: it rests on a point."""
     x, y, z = (extent / 2 for extent in part.size_m)
     match part.shape:

@@ -20,7 +20,7 @@ from embomatrix.sim.physical.doors import close_all, open_all
 from embomatrix.sim.physical.hands import pick_up
 from embomatrix.sim.physical.place import place
 from embomatrix.sim.physical.press import press
-from embomatrix.sim.physical.stage import Stage
+from embomatrix.sim.physical.stage import PhysicalStage
 from embomatrix.sim.physical.travel import drive, travel
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.syntax import Skill
@@ -32,10 +32,10 @@ if TYPE_CHECKING:
 
     from embomatrix.sim.live_world import LiveWorld
     from embomatrix.skills.syntax import SkillCall
-    from embomatrix.skills.view import Refusal
+    from embomatrix.skills.view import SkillRefusal
     from embomatrix.world.bundle import Bundle
 
-    Motion = Callable[[Stage, SkillCall, np.random.Generator], Refusal | None]
+    Motion = Callable[[PhysicalStage, SkillCall, np.random.Generator], SkillRefusal | None]
 
 
 def physical_simulator(bundle: Bundle) -> Simulator:
@@ -51,7 +51,7 @@ class PhysicalActor:
     def __init__(self, bundle: Bundle, dynamic: DynamicWorld | None = None) -> None:
         """Take a physics client, or the world that is given; it is built when a rollout begins, and closed with the actor."""
         self._dynamic = dynamic if dynamic is not None else DynamicWorld(bundle.scene)
-        self._stage: Stage | None = None
+        self._stage: PhysicalStage | None = None
         self._watch: Callable[[], None] | None = None
 
     @property
@@ -65,10 +65,10 @@ class PhysicalActor:
 
     def reset(self, world: LiveWorld) -> None:
         """Build the dynamic world as the scene is at its start."""
-        self._stage = Stage(world, self._dynamic, self._tick)
+        self._stage = PhysicalStage(world, self._dynamic, self._tick)
         self._stage.begin()
 
-    def act(self, world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+    def act(self, world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
         """Carry out a call whose preconditions hold, let the world settle, and copy what moved."""
         assert self._stage is not None
         refusal = MOTIONS[call.skill](self._stage, call, rng)
@@ -84,7 +84,7 @@ class PhysicalActor:
             self._watch()
 
 
-def _move(stage: Stage, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+def _move(stage: PhysicalStage, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
     world = stage.world
     target = target_of(world, call)
     stands = world.navigator.stands(target, world.robot)
@@ -93,14 +93,14 @@ def _move(stage: Stage, call: SkillCall, rng: np.random.Generator) -> Refusal | 
     return no_way_to(world, target)
 
 
-def _turn(stage: Stage, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+def _turn(stage: PhysicalStage, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
     heading, told = _heading(stage, call), stage.told
     refusal = drive(stage, stage.mover.posture[None, :2], heading)
     stage.told = StandPose(told.x_m, told.y_m, heading)
     return refusal
 
 
-def _move_forward(stage: Stage, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+def _move_forward(stage: PhysicalStage, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
     heading, distance_m = _heading(stage, call), call.distance or 0.0
     course = heading if distance_m >= 0 else heading + math.pi
     told = stage.told
@@ -112,11 +112,11 @@ def _move_forward(stage: Stage, call: SkillCall, rng: np.random.Generator) -> Re
     return drive(stage, here[None], heading) or drive(stage, np.array([here, (x, y)]), heading)
 
 
-def _heading(stage: Stage, call: SkillCall) -> float:
+def _heading(stage: PhysicalStage, call: SkillCall) -> float:
     return math.remainder(stage.told.yaw + math.remainder(call.yaw or 0.0, math.tau), math.tau)
 
 
-def _go_to_room(stage: Stage, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+def _go_to_room(stage: PhysicalStage, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
     room = call.room_name or ""
     entry = stage.world.navigator.room_entry(room, stage.world.robot)
     if entry is None:
@@ -124,29 +124,29 @@ def _go_to_room(stage: Stage, call: SkillCall, rng: np.random.Generator) -> Refu
     return travel(stage, entry)
 
 
-def _pick_up(stage: Stage, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+def _pick_up(stage: PhysicalStage, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
     return pick_up(stage, target_of(stage.world, call))
 
 
-def _place(stage: Stage, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+def _place(stage: PhysicalStage, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
     assert call.relation is not None
     return place(stage, target_of(stage.world, call), call.relation, rng)
 
 
-def _open(stage: Stage, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+def _open(stage: PhysicalStage, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
     return open_all(stage, target_of(stage.world, call))
 
 
-def _close(stage: Stage, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+def _close(stage: PhysicalStage, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
     return close_all(stage, target_of(stage.world, call))
 
 
-def _toggle(stage: Stage, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+def _toggle(stage: PhysicalStage, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
     """Press the switch; what that means is the same as in cached mode."""
     return press(stage, target_of(stage.world, call)) or ACTIONS[call.skill](stage.world, call, rng)
 
 
-def _work(stage: Stage, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+def _work(stage: PhysicalStage, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
     """Touch what is cut, wiped or wetted; what that does to it is the same as in cached mode."""
     world = stage.world
     target = target_of(world, call)
@@ -159,7 +159,7 @@ def _work(stage: Stage, call: SkillCall, rng: np.random.Generator) -> Refusal | 
     return refusal
 
 
-def _wait(stage: Stage, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+def _wait(stage: PhysicalStage, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
     """The source acts by itself; the world only settles."""
     stage.mover.wait(60)
     return None

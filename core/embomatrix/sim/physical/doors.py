@@ -17,7 +17,7 @@ from embomatrix.sim.physical import body
 from embomatrix.sim.physical.fold import WAYS, approach, fold, unfold
 from embomatrix.sim.physical.grasp import cross, facing
 from embomatrix.sim.physical.hands import GENTLE, TOUCH_M
-from embomatrix.sim.physical.reach import JUMP_RAD, Reach, Track
+from embomatrix.sim.physical.reach import JUMP_RAD, ArmReach, Track
 from embomatrix.sim.physical.reach import TOUCH_M as PRESS_M
 from embomatrix.sim.physical.space import Boxes, boxes_of, part_boxes, struck
 from embomatrix.sim.physical.stage import compact
@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from embomatrix.sim.physical.reach import Way
-    from embomatrix.sim.physical.stage import Stage
-    from embomatrix.skills.view import Refusal
+    from embomatrix.sim.physical.stage import PhysicalStage
+    from embomatrix.skills.view import SkillRefusal
     from embomatrix.world.asset import Asset, Joint, Link
     from embomatrix.world.geometry import FloatArray
 
@@ -67,7 +67,7 @@ FAR_M: Final = 1.7
 """So far the base may go to lead a leaf."""
 
 
-class Spot(Enum):
+class GraspSpot(Enum):
     """Where the hand takes a hinged leaf: on the face that looks out when it is shut, on the other, or at its free edge."""
 
     OUTSIDE = "outside"
@@ -99,7 +99,9 @@ class Leaf:
         frame = self.pose @ joint_motion(self.joint, fraction)
         return Aabb.around(part.aabb(frame) for part in self.link.parts)
 
-    def grips(self, fraction: float, along: float, spot: Spot) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def grips(
+        self, fraction: float, along: float, spot: GraspSpot
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Point on the leaf in the world at a share of its travel, the way out of its surface there, and the edge's line."""
         centre, half = np.array(self.box.center_m), np.array(self.box.size_m) / 2
         axis = np.array(self.joint.axis)
@@ -114,18 +116,18 @@ class Leaf:
             edge = axis
             hinge = np.array(self.joint.origin_m) @ free
             width = centre @ free + np.abs(free) @ half - hinge
-            share = 1.0 if spot is Spot.EDGE else EDGE
+            share = 1.0 if spot is GraspSpot.EDGE else EDGE
             point = (
                 centre + free * (hinge + share * width - centre @ free) + along * axis * (np.abs(axis) @ half)
             )
-            out = {Spot.OUTSIDE: face, Spot.WITHIN: -face, Spot.EDGE: free}[spot]
-            point = point + out * (np.abs(face) @ half) * (0.0 if spot is Spot.EDGE else 1.0)
+            out = {GraspSpot.OUTSIDE: face, GraspSpot.WITHIN: -face, GraspSpot.EDGE: free}[spot]
+            point = point + out * (np.abs(face) @ half) * (0.0 if spot is GraspSpot.EDGE else 1.0)
         frame = self.pose @ joint_motion(self.joint, fraction)
         turn = frame.rotation
         return np.array(frame.apply((point[0], point[1], point[2]))), turn @ out, turn @ edge
 
 
-def leaves_of(stage: Stage, name: str) -> list[Leaf]:
+def leaves_of(stage: PhysicalStage, name: str) -> list[Leaf]:
     """The moving leaves of an object, in the order of its joints."""
     asset, pose = stage.world.asset(name), stage.world.engine.pose(name)
     moving = [link for link in asset.links if link.joint is not None]
@@ -144,17 +146,17 @@ def leaves_of(stage: Stage, name: str) -> list[Leaf]:
     ]
 
 
-def open_all(stage: Stage, name: str) -> Refusal | None:
+def open_all(stage: PhysicalStage, name: str) -> SkillRefusal | None:
     """Open every leaf, the low ones first. It fails, and leaves what it did, when one does not get half open."""
     return _lead_all(stage, name, 1.0)
 
 
-def close_all(stage: Stage, name: str) -> Refusal | None:
+def close_all(stage: PhysicalStage, name: str) -> SkillRefusal | None:
     """Shut every leaf, the high ones first."""
     return _lead_all(stage, name, 0.0)
 
 
-def _lead_all(stage: Stage, name: str, goal: float) -> Refusal | None:
+def _lead_all(stage: PhysicalStage, name: str, goal: float) -> SkillRefusal | None:
     if not stage.dynamic.bodies.has_leaves(name):
         return refuse(FailureReason.ARM_BLOCKED, target=name, other=name)
     home = stage.told
@@ -176,7 +178,7 @@ def _lead_all(stage: Stage, name: str, goal: float) -> Refusal | None:
     return refusal
 
 
-def in_turn(stage: Stage, name: str, goal: float) -> list[Leaf]:
+def in_turn(stage: PhysicalStage, name: str, goal: float) -> list[Leaf]:
     """The leaves of an object in the order in which they are led: to open it the low ones first, to shut it the high ones."""
     return sorted(leaves_of(stage, name), key=lambda leaf: leaf.height_m, reverse=not goal)
 
@@ -186,7 +188,7 @@ def _is_done(reached: float, goal: float) -> bool:
     return reached >= ENOUGH if goal else reached <= SHUT
 
 
-def _lead_from_anywhere(stage: Stage, leaf: Leaf, goal: float) -> Refusal | None:
+def _lead_from_anywhere(stage: PhysicalStage, leaf: Leaf, goal: float) -> SkillRefusal | None:
     """Move one leaf to a share of its travel from here, else from where else its object is served."""
     refusal = _lead(stage, leaf, goal)
     if refusal is not None:
@@ -197,12 +199,12 @@ def _lead_from_anywhere(stage: Stage, leaf: Leaf, goal: float) -> Refusal | None
     return refusal
 
 
-def _lead(stage: Stage, leaf: Leaf, goal: float) -> Refusal | None:
+def _lead(stage: PhysicalStage, leaf: Leaf, goal: float) -> SkillRefusal | None:
     """Move one leaf to a share of its travel: in one stretch, else in ever more of them with steps between.
 
     Where it is open, or shut, far enough by then it stays: who tries for the rest may push it back.
     """
-    refusal: Refusal | None = None
+    refusal: SkillRefusal | None = None
     for stretches in STRETCHES:
         start = stage.dynamic.bodies.joints(leaf.name)[leaf.number]
         for number in range(stretches):
@@ -216,7 +218,7 @@ def _lead(stage: Stage, leaf: Leaf, goal: float) -> Refusal | None:
     return refusal
 
 
-def _stretch(stage: Stage, leaf: Leaf, start: float, goal: float) -> Refusal | None:
+def _stretch(stage: PhysicalStage, leaf: Leaf, start: float, goal: float) -> SkillRefusal | None:
     """Take the leaf where it is and lead it to a share of its travel."""
     reach, ways = leading(stage, leaf, start, goal)
     for way in itertools.islice(ways, WAYS):
@@ -227,7 +229,7 @@ def _stretch(stage: Stage, leaf: Leaf, start: float, goal: float) -> Refusal | N
     return refuse(FailureReason.ARM_BLOCKED, target=leaf.name, other=reach.hindrance or SOMETHING)
 
 
-def leading(stage: Stage, leaf: Leaf, start: float, goal: float) -> tuple[Reach, Iterator[Way]]:
+def leading(stage: PhysicalStage, leaf: Leaf, start: float, goal: float) -> tuple[ArmReach, Iterator[Way]]:
     """Free ways to lead a leaf from one share of its travel to another, and what judges them."""
     boxes = stage.boxes()
     fractions = np.linspace(start, goal, WAYPOINTS)
@@ -245,7 +247,7 @@ def leading(stage: Stage, leaf: Leaf, start: float, goal: float) -> tuple[Reach,
             for row, number in enumerate(course.tolist())
         )
 
-    reach = Reach(boxes, fixed, None, clear)
+    reach = ArmReach(boxes, fixed, None, clear)
     tracks = _tracks(leaf, fractions)
     first = next(tracks)
     bases = stage.bases(first.position[2], 0.75, walk_m=FAR_M)
@@ -256,14 +258,14 @@ def leading(stage: Stage, leaf: Leaf, start: float, goal: float) -> tuple[Reach,
     return reach, reach.ways(itertools.chain([first], tracks), bases)
 
 
-def _draw_in(stage: Stage, way: Way) -> None:
+def _draw_in(stage: PhysicalStage, way: Way) -> None:
     """Fold the arm where the last pull left it, before the base goes elsewhere: out it sweeps all that stands around."""
     now = stage.mover.posture
     if math.dist(now[:2], way.postures[0, :2]) > 0.01 and not compact(stage, now):
         fold(stage, StandPose(*now[:3].tolist()))
 
 
-def _pull(stage: Stage, way: Way, leaf: Leaf, goal: float) -> Refusal | None:
+def _pull(stage: PhysicalStage, way: Way, leaf: Leaf, goal: float) -> SkillRefusal | None:
     """Touch the leaf, lead it along the way, let go and step back."""
     # Not what stands in the furniture: bottles in a fridge rest until something comes to them, and awake they are dear.
     stage.wake_around(leaf.at(stage.dynamic.bodies.joints(leaf.name)[leaf.number]))
@@ -306,7 +308,7 @@ def _pushes(start: FloatArray, end: FloatArray) -> bool:
     return bool((position[1] - position[0]) @ rotation[0, :, 2] > 0.0)
 
 
-def _lean_off(stage: Stage, way: Way, leaf: Leaf) -> None:
+def _lean_off(stage: PhysicalStage, way: Way, leaf: Leaf) -> None:
     """Draw the arm back as it came, as far as it leans on the leaf and does not take the leaf along."""
     let_go = stage.dynamic.bodies.joints(leaf.name)[leaf.number]
 
@@ -320,15 +322,15 @@ def _lean_off(stage: Stage, way: Way, leaf: Leaf) -> None:
 def _tracks(leaf: Leaf, fractions: FloatArray) -> Iterator[Track]:
     """Ways of the tool: to the leaf, along its arc, and off it."""
     if leaf.joint.kind is JointKind.PRISMATIC:
-        spots: tuple[Spot, ...] = (Spot.OUTSIDE,)
+        spots: tuple[GraspSpot, ...] = (GraspSpot.OUTSIDE,)
     elif fractions[0] > AJAR:
         spots = (
-            (Spot.EDGE, Spot.OUTSIDE, Spot.WITHIN)
+            (GraspSpot.EDGE, GraspSpot.OUTSIDE, GraspSpot.WITHIN)
             if fractions[-1] < fractions[0]
-            else (Spot.WITHIN, Spot.EDGE, Spot.OUTSIDE)
+            else (GraspSpot.WITHIN, GraspSpot.EDGE, GraspSpot.OUTSIDE)
         )
     else:
-        spots = (Spot.OUTSIDE, Spot.EDGE)
+        spots = (GraspSpot.OUTSIDE, GraspSpot.EDGE)
     turns = FOLLOWED if leaf.joint.kind is JointKind.REVOLUTE else FOLLOWED[:1]
     grips = functools.cache(leaf.grips)  # many ways go by the same points
     for spot, tilt, along, followed in itertools.product(spots, TILTS, ALONG, turns):
@@ -336,11 +338,11 @@ def _tracks(leaf: Leaf, fractions: FloatArray) -> Iterator[Track]:
 
 
 def _track(
-    grips: Callable[[float, float, Spot], tuple[FloatArray, FloatArray, FloatArray]],
+    grips: Callable[[float, float, GraspSpot], tuple[FloatArray, FloatArray, FloatArray]],
     fractions: FloatArray,
     along: float,
     followed: float,
-    spot: Spot,
+    spot: GraspSpot,
     tilt: float,
 ) -> Track:
     down = np.array([0.0, 0.0, -math.sin(math.radians(tilt))])
@@ -377,7 +379,7 @@ def _leaf_boxes(leaf: Leaf, fraction: float) -> Boxes:
     return boxes_of([(frame @ part.pose, part.size_m, leaf.name) for part in leaf.link.parts])
 
 
-def _body_boxes(stage: Stage, leaf: Leaf) -> Boxes:
+def _body_boxes(stage: PhysicalStage, leaf: Leaf) -> Boxes:
     """The object's parts but those of the leaf."""
     fractions = stage.world.engine.joints(leaf.name)
     parts = part_boxes(leaf.asset, leaf.pose, fractions)

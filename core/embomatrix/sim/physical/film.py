@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.sim.film import FRAMES_PER_S, Film, Frame
+from embomatrix.sim.film import FRAMES_PER_S, Film, FilmFrame
 from embomatrix.world.poses import StandPose
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ class _Camera:
         self._scene = scene
         self._dynamic = actor.dynamic
         self._next = 0
-        self.frames: list[Frame] = []
+        self.frames: list[FilmFrame] = []
         self.step = 0
 
     def tick(self) -> None:
@@ -77,7 +77,7 @@ class _Camera:
                 joints[item.name] = self._dynamic.bodies.joints(item.name)
         posture = self._dynamic.robot.posture
         base = StandPose(posture.x_m, posture.y_m, posture.yaw)
-        self.frames.append(Frame(base, self.step, poses, joints, frozenset(hidden), posture))
+        self.frames.append(FilmFrame(base, self.step, poses, joints, frozenset(hidden), posture))
 
 
 def _moved(now: Pose, before: Pose) -> bool:

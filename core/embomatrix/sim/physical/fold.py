@@ -23,10 +23,10 @@ from embomatrix.world.poses import StandPose
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from embomatrix.sim.physical.reach import Held, Reach, Way
+    from embomatrix.sim.physical.reach import ArmReach, HeldGeometry, Way
     from embomatrix.sim.physical.space import Boxes
-    from embomatrix.sim.physical.stage import Stage
-    from embomatrix.skills.view import Refusal
+    from embomatrix.sim.physical.stage import PhysicalStage
+    from embomatrix.skills.view import SkillRefusal
     from embomatrix.world.geometry import FloatArray
 
 WAYS: Final = 16
@@ -49,7 +49,7 @@ OVER_M: Final = 1.0
 """Loads are carried higher than this where that is possible: over counters."""
 
 
-def approach(stage: Stage, way: Way, reach: Reach, *, loaded: bool) -> FloatArray | None:
+def approach(stage: PhysicalStage, way: Way, reach: ArmReach, *, loaded: bool) -> FloatArray | None:
     """Postures that lead to the start of a way, (w, 11), None when none are found.
 
     The arm unfolds where it will work, or some way back from there, whence the base then drives on with the arm ready.
@@ -68,8 +68,8 @@ def approach(stage: Stage, way: Way, reach: Reach, *, loaded: bool) -> FloatArra
 
 
 def arrivals(
-    stage: Stage, ways: Iterable[Way], reach: Reach, *, loaded: bool
-) -> Iterator[tuple[Way, Refusal | None]]:
+    stage: PhysicalStage, ways: Iterable[Way], reach: ArmReach, *, loaded: bool
+) -> Iterator[tuple[Way, SkillRefusal | None]]:
     """Bring the arm to the start of one way after another, each with why it did not get there; it tries a few, no more."""
     attempts = 0
     for way in itertools.islice(ways, WAYS):
@@ -82,7 +82,7 @@ def arrivals(
             return
 
 
-def unfold(stage: Stage, swing: FloatArray) -> Refusal | None:
+def unfold(stage: PhysicalStage, swing: FloatArray) -> SkillRefusal | None:
     """Drive to where a swing begins, and make it."""
     now = stage.mover.posture
     turns = abs(math.remainder(now[body.YAW] - swing[0, body.YAW], math.tau)) > TURN_RAD
@@ -101,7 +101,7 @@ def _pair(point: FloatArray) -> tuple[float, float]:
     return float(point[0]), float(point[1])
 
 
-def fold(stage: Stage, home: StandPose, target: str = "") -> Refusal | None:
+def fold(stage: PhysicalStage, home: StandPose, target: str = "") -> SkillRefusal | None:
     """Bring the arm, with what it holds, over the base, and the base back to where it stood to serve a target.
 
     Where the arm has no room to fold, the base first draws it back. What the hand still touches does not keep it there.
@@ -119,7 +119,7 @@ def fold(stage: Stage, home: StandPose, target: str = "") -> Refusal | None:
     return None
 
 
-def _drawn_over_base(stage: Stage) -> bool:
+def _drawn_over_base(stage: PhysicalStage) -> bool:
     """Whether the arm is over the base, or finds no way there; not where something stopped it on the way it took."""
     now = stage.mover.posture
     reach = stage.reach(stage.boxes().drawn_in(*_limbs(stage, now), AIR_M))
@@ -133,7 +133,7 @@ def _drawn_over_base(stage: Stage) -> bool:
     return True
 
 
-def _limbs(stage: Stage, now: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _limbs(stage: PhysicalStage, now: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Balls of the arm and of what it holds: centres (k, 3) and radii (k,)."""
     points, radii = body.balls(now[None])[0], body.RADII
     if stage.grip is not None:
@@ -142,7 +142,7 @@ def _limbs(stage: Stage, now: FloatArray) -> tuple[FloatArray, FloatArray]:
     return points, radii
 
 
-def _retreats(reach: Reach, now: FloatArray, loaded: bool) -> Iterator[FloatArray]:
+def _retreats(reach: ArmReach, now: FloatArray, loaded: bool) -> Iterator[FloatArray]:
     """Bases, (3,), at which the arm may fold: here, then where the base gets to straight on, back before aside."""
     yield now[:3]
     for away, aside in itertools.product(RETREATS_M, ASIDES):
@@ -152,7 +152,7 @@ def _retreats(reach: Reach, now: FloatArray, loaded: bool) -> Iterator[FloatArra
             yield spot
 
 
-def carrying(stage: Stage, now: FloatArray) -> FloatArray:
+def carrying(stage: PhysicalStage, now: FloatArray) -> FloatArray:
     """The posture in which the robot drives: folded when the hand is empty, else with the load upright and near."""
     if stage.grip is None:
         folded = with_arm(now, TUCKED)
@@ -194,7 +194,7 @@ def _carried_to(now: FloatArray) -> tuple[FloatArray, FloatArray]:
     return arm.about_z(turns) @ rotation[0], where
 
 
-def _carrying_cost(rows: FloatArray, now: FloatArray, held: Held, boxes: Boxes) -> FloatArray:
+def _carrying_cost(rows: FloatArray, now: FloatArray, held: HeldGeometry, boxes: Boxes) -> FloatArray:
     """How ill postures, (n, 11), suit a drive: wide, high, low over counters, far from now, in things; shape (n,)."""
     load, arms = held.placed(rows), body.balls(rows)
     wide = np.linalg.norm(load[:, :, :2] - now[:2], axis=2) + held.radii

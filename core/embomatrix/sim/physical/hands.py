@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
     from embomatrix.sim.physical.reach import Track, Way
     from embomatrix.sim.physical.space import Boxes
-    from embomatrix.sim.physical.stage import Stage
-    from embomatrix.skills.view import Refusal
+    from embomatrix.sim.physical.stage import PhysicalStage
+    from embomatrix.skills.view import SkillRefusal
     from embomatrix.world.geometry import Aabb, FloatArray, Pose
 
 GENTLE: Final = 0.25
@@ -37,13 +37,13 @@ ROOM_M: Final = 0.45
 """From the base's centre to where the hand is before its way in."""
 
 
-def bases_at(stage: Stage, pose: Pose, course: float, out_m: float | None) -> list[FloatArray]:
+def bases_at(stage: PhysicalStage, pose: Pose, course: float, out_m: float | None) -> list[FloatArray]:
     """Where to stand to work at a pose: before the way in, far enough to hold the thing outside."""
     point = np.array(pose.position_m)
     return stage.bases(point) if out_m is None else stage.bases(point, out_m + ROOM_M, course)
 
 
-def pick_up(stage: Stage, target: str) -> Refusal | None:
+def pick_up(stage: PhysicalStage, target: str) -> SkillRefusal | None:
     """Take an object that lies where the robot can reach it."""
     home = stage.told
     for _ in range(ATTEMPTS):
@@ -60,18 +60,18 @@ def pick_up(stage: Stage, target: str) -> Refusal | None:
     return refusal
 
 
-def _was_pushed(stage: Stage, name: str) -> bool:
+def _was_pushed(stage: PhysicalStage, name: str) -> bool:
     """Whether an object is not where the planning scene has it, so that ways to it lead past it."""
     now, then = stage.dynamic.bodies.pose(name), stage.world.engine.pose(name)
     return stage.grip is None and math.dist(now.position_m, then.position_m) > PUSHED_M
 
 
-def _take(stage: Stage, target: str) -> Refusal | None:
+def _take(stage: PhysicalStage, target: str) -> SkillRefusal | None:
     tracks, roofed, bases = ways_to(stage, target)
     return take_by(stage, target, tracks, roofed, bases)
 
 
-def ways_to(stage: Stage, target: str) -> tuple[list[Track], int, list[FloatArray]]:
+def ways_to(stage: PhysicalStage, target: str) -> tuple[list[Track], int, list[FloatArray]]:
     """Ways of the tool to an object, how many of the first lead in under a roof, and bases, (b, 3), to go them from."""
     world = stage.world
     pose, joints = world.engine.pose(target), world.engine.joints(target)
@@ -85,12 +85,12 @@ def ways_to(stage: Stage, target: str) -> tuple[list[Track], int, list[FloatArra
 
 
 def take_by(
-    stage: Stage,
+    stage: PhysicalStage,
     target: str,
     tracks: Sequence[Track],
     roofed: int,
     bases: Sequence[FloatArray],
-) -> Refusal | None:
+) -> SkillRefusal | None:
     """Take an object on any of some ways, the first ``roofed`` of which lead in under a roof, from any of the bases, (b, 3)."""
     reach = stage.reach(stage.boxes(), target)
     refusal = None
@@ -104,7 +104,7 @@ def take_by(
     return refusal or refuse(FailureReason.ARM_BLOCKED, target=target, other=reach.hindrance or SOMETHING)
 
 
-def _touch(stage: Stage, way: Way, target: str) -> Refusal | None:
+def _touch(stage: PhysicalStage, way: Way, target: str) -> SkillRefusal | None:
     """Go along a way until the hand touches the target, and hold it."""
     stage.wake_around(stage.world.engine.aabb(target))
     hit = stage.mover.advance(way.postures[1:-2]) if len(way.postures) > 3 else None
@@ -116,7 +116,7 @@ def _touch(stage: Stage, way: Way, target: str) -> Refusal | None:
     return None
 
 
-def _lift(stage: Stage, way: Way, target: str, by_m: float) -> Refusal | None:
+def _lift(stage: PhysicalStage, way: Way, target: str, by_m: float) -> SkillRefusal | None:
     """Raise what is held, with what lies in it, and go back along the way."""
     world = stage.world
     world.hand.take(world.cargo(target))
@@ -131,7 +131,7 @@ def _lift(stage: Stage, way: Way, target: str, by_m: float) -> Refusal | None:
     return None
 
 
-def way_in(stage: Stage, name: str, box: Aabb, boxes: Boxes) -> tuple[float, float | None]:
+def way_in(stage: PhysicalStage, name: str, box: Aabb, boxes: Boxes) -> tuple[float, float | None]:
     """Heading in which the hand goes to a place, and how long its way under a roof is; None in the open.
 
     Under a roof the way follows the front of what roofs the place over, when the thing is in or on that; what hangs over

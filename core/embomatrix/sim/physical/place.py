@@ -16,16 +16,18 @@ from embomatrix.world.state import Relation
 if TYPE_CHECKING:
     import numpy as np
 
-    from embomatrix.sim.physical.stage import Stage
+    from embomatrix.sim.physical.stage import PhysicalStage
     from embomatrix.skills.syntax import PlaceRelation
-    from embomatrix.skills.view import Refusal
+    from embomatrix.skills.view import SkillRefusal
     from embomatrix.world.geometry import Pose
     from embomatrix.world.poses import StandPose
 
 PLACES: Final = 24
 
 
-def place(stage: Stage, target: str, asked: PlaceRelation, rng: np.random.Generator) -> Refusal | None:
+def place(
+    stage: PhysicalStage, target: str, asked: PlaceRelation, rng: np.random.Generator
+) -> SkillRefusal | None:
     """Put what the hand holds where the planning scene has room for it, and see whether it stays."""
     world, grip = stage.world, stage.grip
     assert grip is not None
@@ -61,7 +63,7 @@ def place(stage: Stage, target: str, asked: PlaceRelation, rng: np.random.Genera
 
 
 def _places(
-    stage: Stage, target: str, relation: Relation, rng: np.random.Generator
+    stage: PhysicalStage, target: str, relation: Relation, rng: np.random.Generator
 ) -> tuple[tuple[Pose, ...] | FailureReason, StandPose]:
     """Poses for what is held, or why there are none, and where to stand for them: as in cached mode, here if there are any."""
     world = stage.world

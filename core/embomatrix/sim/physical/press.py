@@ -20,9 +20,9 @@ from embomatrix.skills.view import refuse
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from embomatrix.sim.physical.reach import Reach, Way
-    from embomatrix.sim.physical.stage import Stage
-    from embomatrix.skills.view import Refusal
+    from embomatrix.sim.physical.reach import ArmReach, Way
+    from embomatrix.sim.physical.stage import PhysicalStage
+    from embomatrix.skills.view import SkillRefusal
     from embomatrix.world.geometry import FloatArray
 
 HEIGHTS: Final = (0.85, 0.97, 0.65, 0.45, 0.25)
@@ -33,7 +33,7 @@ OFF_M: Final = 0.08
 BEYOND_M: Final = 0.02
 
 
-def press(stage: Stage, target: str) -> Refusal | None:
+def press(stage: PhysicalStage, target: str) -> SkillRefusal | None:
     """Touch a thing with the empty hand."""
     home = stage.told
     refusal = _press(stage, target)
@@ -41,7 +41,7 @@ def press(stage: Stage, target: str) -> Refusal | None:
     return refusal
 
 
-def _press(stage: Stage, target: str) -> Refusal | None:
+def _press(stage: PhysicalStage, target: str) -> SkillRefusal | None:
     reach, ways = pressing(stage, target)
     refusal = None
     for way, refusal in arrivals(stage, ways, reach, loaded=False):
@@ -58,7 +58,7 @@ def _press(stage: Stage, target: str) -> Refusal | None:
     return refusal or refuse(FailureReason.ARM_BLOCKED, target=target, other=reach.hindrance or SOMETHING)
 
 
-def pressing(stage: Stage, target: str) -> tuple[Reach, Iterator[Way]]:
+def pressing(stage: PhysicalStage, target: str) -> tuple[ArmReach, Iterator[Way]]:
     """Free ways to touch a thing, and what judges them.
 
     Nothing but the hand may meet it: an arm that leant on it would keep the hand off.
@@ -74,7 +74,7 @@ def pressing(stage: Stage, target: str) -> tuple[Reach, Iterator[Way]]:
     return reach, reach.ways(_tracks(stage, target), stage.bases(point))
 
 
-def _tracks(stage: Stage, target: str) -> Iterator[Track]:
+def _tracks(stage: PhysicalStage, target: str) -> Iterator[Track]:
     """Ways to the side that faces the robot, from the switch's usual height on downwards."""
     world = stage.world
     robot = world.robot

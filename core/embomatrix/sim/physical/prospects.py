@@ -15,7 +15,7 @@ from embomatrix.sim.joints.panels import swing_leaves
 from embomatrix.sim.joints.swings import SWING
 from embomatrix.sim.physical.hands import ways_to
 from embomatrix.sim.physical.place import PLACES
-from embomatrix.sim.physical.put import Delivery
+from embomatrix.sim.physical.put import PutRequest
 from embomatrix.sim.placing.placement import Placer
 from embomatrix.skills.failure import FailureReason
 from embomatrix.world.state import Relation
@@ -23,7 +23,7 @@ from embomatrix.world.state import Relation
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
-    from embomatrix.sim.physical.stage import Grip, Stage
+    from embomatrix.sim.physical.stage import Grip, PhysicalStage
     from embomatrix.world.geometry import Pose
     from embomatrix.world.poses import PoseCache, StandPose
 
@@ -49,7 +49,7 @@ class Placing:
 class Prospects:
     """Asks the arm about places in a scene as it was loaded. Nothing is stepped."""
 
-    def __init__(self, stage: Stage, poses: PoseCache) -> None:
+    def __init__(self, stage: PhysicalStage, poses: PoseCache) -> None:
         """``poses`` are placements and standing poses of the stage's scene."""
         self._stage = stage
         self._world = stage.world
@@ -92,7 +92,7 @@ class Prospects:
         def counts() -> bool:
             return self._world.relations.holds(placing.relation, placing.held, placing.target)
 
-        delivery = Delivery(self._stage, grip, [pose for _, pose in poses], counts)
+        delivery = PutRequest(self._stage, grip, [pose for _, pose in poses], counts)
         way = next(delivery.ways(), None)
         index = len(poses) - 1
         if way is not None:
@@ -114,7 +114,7 @@ class Prospects:
         places = _apart(poses)
         if len(places) > FEW:
             return ""
-        delivery = Delivery(self._stage, grip, poses, counts)
+        delivery = PutRequest(self._stage, grip, poses, counts)
         if any(self._could_take(held, pose) for pose in places):
             return ""
         if any(True for _ in itertools.chain(delivery.drops(), delivery.ways())):

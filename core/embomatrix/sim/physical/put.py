@@ -12,7 +12,7 @@ import numpy as np
 from embomatrix.sim.physical.fold import arrivals
 from embomatrix.sim.physical.hands import GENTLE, ROOFED_RAISE_M, bases_at, way_in
 from embomatrix.sim.physical.motion import raised
-from embomatrix.sim.physical.reach import Reach, Track
+from embomatrix.sim.physical.reach import ArmReach, Track
 from embomatrix.sim.physical.travel import SOMETHING
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.view import refuse
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from embomatrix.sim.physical.reach import Way
-    from embomatrix.sim.physical.stage import Grip, Stage
-    from embomatrix.skills.view import Refusal
+    from embomatrix.sim.physical.stage import Grip, PhysicalStage
+    from embomatrix.skills.view import SkillRefusal
 
 CHUNKS: Final = (0, 1, 4, 9, 16, 24)
 """Poses are looked at a few at a time: the robot stands elsewhere for each lot."""
@@ -52,19 +52,21 @@ class Fit:
     out_m: float | None
 
 
-class Delivery:
+class PutRequest:
     """What is held, how, and where it is to go: poses of which the first is preferred, at which ``counts`` must hold.
 
     ``counts`` is asked with the thing standing at a pose in the planning scene.
     """
 
-    def __init__(self, stage: Stage, grip: Grip, poses: Sequence[Pose], counts: Callable[[], bool]) -> None:
+    def __init__(
+        self, stage: PhysicalStage, grip: Grip, poses: Sequence[Pose], counts: Callable[[], bool]
+    ) -> None:
         self._stage = stage
         self._grip = grip
         self._poses = poses
         self._counts = counts
         self._boxes = stage.boxes()
-        self.reach = Reach(self._boxes, self._boxes, grip.held)
+        self.reach = ArmReach(self._boxes, self._boxes, grip.held)
 
     def ways(self) -> Iterator[Way]:
         """Ways to put it down, to the first pose while there are any."""
@@ -155,30 +157,34 @@ def _at(fit: Fit) -> tuple[Pose, float, float | None]:
     return fit.pose, fit.course, fit.out_m
 
 
-def put(stage: Stage, poses: Sequence[Pose], counts: Callable[[], bool], target: str) -> Refusal | None:
+def put(
+    stage: PhysicalStage, poses: Sequence[Pose], counts: Callable[[], bool], target: str
+) -> SkillRefusal | None:
     """Bring what is held to the first of several poses that the arm gets at, let go, and draw the hand back.
 
     ``counts`` tells whether what is held may stay where it stands in the planning scene. A refusal names the target where
     nothing else is known to bar the way; what is held may be in the hand still.
     """
     assert stage.grip is not None
-    delivery = Delivery(stage, stage.grip, poses, counts)
+    delivery = PutRequest(stage, stage.grip, poses, counts)
     return _bring(stage, delivery, delivery.ways(), target)
 
 
-def drop(stage: Stage, poses: Sequence[Pose], counts: Callable[[], bool], target: str) -> Refusal | None:
+def drop(
+    stage: PhysicalStage, poses: Sequence[Pose], counts: Callable[[], bool], target: str
+) -> SkillRefusal | None:
     """As ``put``, but let it fall from as little above one of the poses as the hand can come."""
     assert stage.grip is not None
-    delivery = Delivery(stage, stage.grip, poses, counts)
+    delivery = PutRequest(stage, stage.grip, poses, counts)
     return _bring(stage, delivery, delivery.drops(), target)
 
 
 def _bring(
-    stage: Stage,
-    delivery: Delivery,
+    stage: PhysicalStage,
+    delivery: PutRequest,
     ways: Iterator[Way],
     target: str,
-) -> Refusal | None:
+) -> SkillRefusal | None:
     grip = stage.grip
     assert grip is not None
     refusal = None
@@ -211,7 +217,7 @@ def _put_tracks(grip: Grip, fits: Sequence[Fit]) -> Iterator[Track]:
         yield Track(np.tile(rotation, (len(positions), 1, 1)), positions, loaded, len(before))
 
 
-def _set_down(stage: Stage, way: Way) -> Refusal | None:
+def _set_down(stage: PhysicalStage, way: Way) -> SkillRefusal | None:
     """Follow a way down to where the thing touches, let go, and follow it out."""
     grip, world = stage.grip, stage.world
     assert grip is not None
@@ -234,7 +240,7 @@ def _set_down(stage: Stage, way: Way) -> Refusal | None:
     return None
 
 
-def _let_go(stage: Stage) -> None:
+def _let_go(stage: PhysicalStage) -> None:
     """Put what the hand held, and what lay in it, into the planning scene where it now is."""
     world = stage.world
     group = world.carried

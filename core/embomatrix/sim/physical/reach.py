@@ -63,7 +63,7 @@ DRAWS: Final = 24
 
 
 @dataclass(frozen=True, slots=True)
-class Held:
+class HeldGeometry:
     """Balls of what the hand holds, in the tool's frame: centres (k, 3), radii (k,).
 
     ``up``, (3,), is the way up in that frame where something lies in what is held, so that it must stay level.
@@ -113,14 +113,14 @@ class Way:
     track: Track
 
 
-class Reach:
+class ArmReach:
     """Ways of one hand, empty or not, among boxes."""
 
     def __init__(
         self,
         boxes: Boxes,
         at_work: Boxes,
-        held: Held | None = None,
+        held: HeldGeometry | None = None,
         also: Callable[[FloatArray], bool] | None = None,
     ) -> None:
         """``at_work`` are the boxes without those that the hand may touch at the end of its way.
@@ -191,7 +191,7 @@ class Reach:
         hit = struck(self._standing, trunk, radii, 0.0)
         return not hit.any() and self._is_free(line, self._held if loaded else None)
 
-    def _is_free(self, postures: FloatArray, held: Held | None) -> bool:
+    def _is_free(self, postures: FloatArray, held: HeldGeometry | None) -> bool:
         """Whether all but the first and the last posture keep clear: these are where the robot is, and where it must be."""
         return bool(self._free(postures[1:-1], self._boxes, held, AIR_M).all())
 
@@ -274,7 +274,9 @@ class Reach:
             free[number[rows[~clear]]] = False
         return list(zip(free.tolist(), hits, strict=True))
 
-    def _free(self, postures: FloatArray, boxes: Boxes, held: Held | None, margin_m: float) -> BoolArray:
+    def _free(
+        self, postures: FloatArray, boxes: Boxes, held: HeldGeometry | None, margin_m: float
+    ) -> BoolArray:
         """Whether arm and load keep a margin from the boxes and from the robot's own trunk, shape (n,)."""
         if not len(postures):
             return np.zeros(0, dtype=np.bool_)
@@ -284,7 +286,7 @@ class Reach:
         return free
 
     def _compared(
-        self, postures: FloatArray, boxes: Boxes, held: Held | None, margin_m: float
+        self, postures: FloatArray, boxes: Boxes, held: HeldGeometry | None, margin_m: float
     ) -> tuple[BoolArray, Struck | None]:
         """As ``_free`` of at least one posture, with those that boxes bar, if there are any."""
         centres, radii = body.balls(postures), body.RADII

@@ -12,7 +12,7 @@ import numpy as np
 from embomatrix.sim.physical.fold import fold
 from embomatrix.sim.physical.grasp import grasp_tracks
 from embomatrix.sim.physical.hands import bases_at, take_by, way_in
-from embomatrix.sim.physical.put import Delivery, put
+from embomatrix.sim.physical.put import PutRequest, put
 from embomatrix.sim.placing.trial import in_reach
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.limits import ROBOT
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from embomatrix.sim.physical.reach import Track
-    from embomatrix.sim.physical.stage import Grip, Stage
+    from embomatrix.sim.physical.stage import Grip, PhysicalStage
     from embomatrix.world.geometry import FloatArray
     from embomatrix.world.poses import StandPose
 
@@ -53,7 +53,7 @@ class Turns(Enum):
 
 
 def regrasp(
-    stage: Stage,
+    stage: PhysicalStage,
     poses: Sequence[Pose],
     counts: Callable[[], bool],
     home: StandPose,
@@ -131,7 +131,7 @@ def _kinds(offered: Sequence[Track], *, by_heading: bool = False) -> list[Track]
 
 
 def _foresee(
-    stage: Stage,
+    stage: PhysicalStage,
     grip: Grip,
     offered: Sequence[Track],
     rest: Pose,
@@ -142,13 +142,13 @@ def _foresee(
     goals = poses[:FORESEEN]
     found = _leading(stage, grip, _kinds(offered)[:LOOKED_AT], rest, goals, counts)
     if found:
-        return found, Turns.ANY if Delivery(stage, grip, poses, counts).may_turn() else Turns.HALF
+        return found, Turns.ANY if PutRequest(stage, grip, poses, counts).may_turn() else Turns.HALF
     # Where the thing hardly fits, the hand may have to be at one certain side of it.
     return _leading(stage, grip, _kinds(offered, by_heading=True), rest, goals, counts), Turns.NONE
 
 
 def _leading(
-    stage: Stage,
+    stage: PhysicalStage,
     grip: Grip,
     offered: Sequence[Track],
     rest: Pose,
@@ -162,13 +162,13 @@ def _leading(
     found: dict[tuple[float, float], list[FloatArray]] = {}
     for track in offered:
         tool = track.key_pose
-        delivery = Delivery(stage, grip.otherwise(tool.inverse() @ rest), poses, counts)
+        delivery = PutRequest(stage, grip.otherwise(tool.inverse() @ rest), poses, counts)
         if next(delivery.ways(), None) is not None:
             found.setdefault(_kind(track), []).append(rest.rotation.T @ tool.rotation)
     return found
 
 
-def _rests(stage: Stage, name: str, upright: Pose) -> Iterator[Pose]:
+def _rests(stage: PhysicalStage, name: str, upright: Pose) -> Iterator[Pose]:
     """Where what is held may stand for a while: on furniture in reach, the nearest first, then on the floor."""
     world, robot = stage.world, stage.world.robot
     x, y, wide = robot.x_m, robot.y_m, ROBOT.reach_m
@@ -184,7 +184,7 @@ def _rests(stage: Stage, name: str, upright: Pose) -> Iterator[Pose]:
     yield from _on_floor(stage, name, upright)
 
 
-def _on_floor(stage: Stage, name: str, upright: Pose) -> Iterator[Pose]:
+def _on_floor(stage: PhysicalStage, name: str, upright: Pose) -> Iterator[Pose]:
     """Free places on the floor around the robot, for a thing that stands as it does at a pose."""
     engine, robot = stage.world.engine, stage.world.robot
     engine.set_pose(name, upright)

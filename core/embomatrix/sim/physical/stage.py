@@ -17,7 +17,7 @@ from embomatrix.sim.joints.swings import SWING
 from embomatrix.sim.physical import arm, body
 from embomatrix.sim.physical.floor import Floor
 from embomatrix.sim.physical.motion import Mover
-from embomatrix.sim.physical.reach import Held, Reach
+from embomatrix.sim.physical.reach import ArmReach, HeldGeometry
 from embomatrix.sim.physical.space import boxes_around, object_balls
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.geometry import Aabb, Pose
@@ -54,13 +54,13 @@ class Grip:
 
     name: str
     pose_tool_object: Pose
-    held: Held
+    held: HeldGeometry
 
     def otherwise(self, pose_tool_object: Pose) -> Grip:
         """What it would be to hold the same in another way."""
         change = pose_tool_object @ self.pose_tool_object.inverse()
         up = None if self.held.up is None else change.rotation @ self.held.up
-        held = Held(change.apply_all(self.held.centres), self.held.radii, up)
+        held = HeldGeometry(change.apply_all(self.held.centres), self.held.radii, up)
         return Grip(self.name, pose_tool_object, held)
 
 
@@ -69,7 +69,7 @@ def tucked(at: StandPose) -> Posture:
     return Posture(at.x_m, at.y_m, at.yaw, TUCKED_LIFT_M, tuple(TUCKED.tolist()))
 
 
-class Stage:
+class PhysicalStage:
     """One rollout's two worlds and the robot. ``begin`` starts the next."""
 
     def __init__(self, world: LiveWorld, dynamic: DynamicWorld, watch: Callable[[], None]) -> None:
@@ -114,10 +114,10 @@ class Stage:
 
     def reach(
         self, boxes: Boxes, target: str = "", also: Callable[[FloatArray], bool] | None = None
-    ) -> Reach:
+    ) -> ArmReach:
         """Ways of the hand as it is, among boxes; it may touch the target. ``also`` has a say in which of them are free."""
         held = self.grip.held if self.grip is not None else None
-        return Reach(boxes, boxes.without((target,)) if target else boxes, held, also)
+        return ArmReach(boxes, boxes.without((target,)) if target else boxes, held, also)
 
     def bases(
         self,
@@ -171,7 +171,7 @@ class Stage:
         local = pose_tool.inverse() @ pose_object
         centres, radii = self._balls(name, local)
         up = local.rotation @ pose_object.rotation[2] if len(self.world.cargo(name)) > 1 else None
-        return Grip(name, local, Held(centres, radii, up))
+        return Grip(name, local, HeldGeometry(centres, radii, up))
 
     def _balls(self, name: str, pose_tool_object: Pose) -> tuple[FloatArray, FloatArray]:
         """Balls of an object and of all that lies in it, in the tool's frame."""
@@ -247,7 +247,7 @@ class Stage:
             world.navigator.refresh()
 
 
-def compact(stage: Stage, posture: FloatArray) -> bool:
+def compact(stage: PhysicalStage, posture: FloatArray) -> bool:
     """Whether arm and load stay over the base's disc."""
     row = posture[None]
     points, radii = body.balls(row)[0], body.RADII

@@ -24,7 +24,7 @@ from embomatrix.sim.physical.fold import WAYS, approach
 from embomatrix.sim.physical.hands import ways_to
 from embomatrix.sim.physical.press import pressing
 from embomatrix.sim.physical.prospects import Prospects
-from embomatrix.sim.physical.stage import AROUND_M, Stage
+from embomatrix.sim.physical.stage import AROUND_M, PhysicalStage
 from embomatrix.sim.physical.travel import SOMETHING
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.poses import Handling, PoseCache
@@ -35,8 +35,8 @@ if TYPE_CHECKING:
     from embomatrix.sim.live_world import LiveWorld
     from embomatrix.sim.physical.doors import Leaf
     from embomatrix.sim.physical.prospects import Placing
-    from embomatrix.sim.physical.reach import Reach, Way
-    from embomatrix.skills.view import Refusal
+    from embomatrix.sim.physical.reach import ArmReach, Way
+    from embomatrix.skills.view import SkillRefusal
     from embomatrix.world.asset import Asset
     from embomatrix.world.geometry import FloatArray
     from embomatrix.world.poses import StandPose
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 
 STANDS: Final = 2
 """Standing poses that are looked at: the robot steps aside to work, so that the others add little."""
-TRIALS: Final[Mapping[Handling, Callable[[Stage, str], Refusal | None]]] = {
+TRIALS: Final[Mapping[Handling, Callable[[PhysicalStage, str], SkillRefusal | None]]] = {
     Handling.OPEN: open_all,
     Handling.CLOSE: close_all,
 }
@@ -82,11 +82,11 @@ def prospects(world: LiveWorld, poses: PoseCache, placings: Iterable[Placing]) -
 
 
 @contextlib.contextmanager
-def _staged(world: LiveWorld) -> Iterator[Stage]:
+def _staged(world: LiveWorld) -> Iterator[PhysicalStage]:
     """A robot in a world at the start of its scene, which is there again in the end."""
     dynamic = DynamicWorld(world.scene)
     try:
-        stage = Stage(world, dynamic, _idle)
+        stage = PhysicalStage(world, dynamic, _idle)
         stage.begin()
         yield stage
     finally:
@@ -117,7 +117,7 @@ def _preferring(first: StandPose, stands: Sequence[StandPose]) -> tuple[StandPos
 class _Surveyor:
     """Puts the robot where it may stand, and looks for ways of the arm."""
 
-    def __init__(self, stage: Stage, known: dict[bytes, Look], contents: Contents) -> None:
+    def __init__(self, stage: PhysicalStage, known: dict[bytes, Look], contents: Contents) -> None:
         self._stage = stage
         self._world = stage.world
         self._known = known
@@ -216,7 +216,7 @@ class _Surveyor:
             case Handling.CLOSE:
                 return self._bars_leaves(name, 0.0)
 
-    def _bars_all(self, reach: Reach, ways: Iterator[Way]) -> str:
+    def _bars_all(self, reach: ArmReach, ways: Iterator[Way]) -> str:
         """What bars all of some ways; "" when the arm gets to the start of one of them, which it then may go."""
         for way in itertools.islice(ways, WAYS):
             if approach(self._stage, way, reach, loaded=False) is not None:

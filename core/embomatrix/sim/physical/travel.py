@@ -19,8 +19,8 @@ from embomatrix.world.poses import StandPose
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from embomatrix.sim.physical.stage import Stage
-    from embomatrix.skills.view import Refusal
+    from embomatrix.sim.physical.stage import PhysicalStage
+    from embomatrix.skills.view import SkillRefusal
     from embomatrix.world.geometry import FloatArray
 
     BoolArray = NDArray[np.bool_]
@@ -45,7 +45,7 @@ BESIDE_M: Final = 0.05
 SOMETHING: Final = "something"
 
 
-def travel(stage: Stage, goal: StandPose, target: str = "") -> Refusal | None:
+def travel(stage: PhysicalStage, goal: StandPose, target: str = "") -> SkillRefusal | None:
     """Drive to a pose on the floor, or where an open door takes that place beside it, where the target is in reach too."""
     here = stage.mover.posture[:3]
     way = stage.floor.way((float(here[0]), float(here[1])), goal, lambda spot: _serves(stage, spot, target))
@@ -56,7 +56,7 @@ def travel(stage: Stage, goal: StandPose, target: str = "") -> Refusal | None:
     return drive(stage, np.array([here[:2], *corners, (goal.x_m, goal.y_m)]), goal.yaw)
 
 
-def _serves(stage: Stage, spot: StandPose, target: str) -> bool:
+def _serves(stage: PhysicalStage, spot: StandPose, target: str) -> bool:
     """Whether a target is in reach from a spot, with nothing between; without a target any spot will do."""
     if not target or target in stage.world.carried:
         return True
@@ -64,7 +64,7 @@ def _serves(stage: Stage, spot: StandPose, target: str) -> bool:
     return in_reach(box, spot) and stage.world.navigator.line_is_clear(spot, target)
 
 
-def drive(stage: Stage, points: FloatArray, yaw: float) -> Refusal | None:
+def drive(stage: PhysicalStage, points: FloatArray, yaw: float) -> SkillRefusal | None:
     """Drive along straight lines between points, (n, 2), the first of which is here, and end with a heading.
 
     What the robot was told is the end, and the heading even where its load keeps it from facing there.
@@ -82,7 +82,9 @@ def drive(stage: Stage, points: FloatArray, yaw: float) -> Refusal | None:
     return None
 
 
-def _course(stage: Stage, start: FloatArray, points: FloatArray, yaw: float) -> tuple[FloatArray, FloatArray]:
+def _course(
+    stage: PhysicalStage, start: FloatArray, points: FloatArray, yaw: float
+) -> tuple[FloatArray, FloatArray]:
     """Marks, (n, 2), and headings, (n,), along lines between points: where a load finds no room to turn, back out first."""
     marks, headings, struck = _headings(stage, start, _resampled(points), yaw)
     grid, here = stage.floor.grid, (float(points[0, 0]), float(points[0, 1]))
@@ -107,7 +109,7 @@ def _resampled(points: FloatArray) -> FloatArray:
 
 
 def _headings(
-    stage: Stage, start: FloatArray, marks: FloatArray, yaw: float
+    stage: PhysicalStage, start: FloatArray, marks: FloatArray, yaw: float
 ) -> tuple[FloatArray, FloatArray, int]:
     """Marks, (n, 2), a heading at each, (n,), and at how many something is struck all the same.
 
@@ -143,7 +145,9 @@ def _headings(
     return marks, found, struck
 
 
-def _turns_striking(stage: Stage, start: FloatArray, marks: FloatArray, headings: FloatArray) -> BoolArray:
+def _turns_striking(
+    stage: PhysicalStage, start: FloatArray, marks: FloatArray, headings: FloatArray
+) -> BoolArray:
     """Where arm or load strike something on the turn from one mark to the next, (marks - 1,).
 
     An outstretched arm goes far between two headings, past what is at neither.
@@ -180,13 +184,13 @@ def _cheapest_chain(danger: FloatArray, swept: FloatArray, off: FloatArray) -> l
     return chosen[::-1]
 
 
-def _danger(stage: Stage, start: FloatArray, marks: FloatArray, options: FloatArray) -> FloatArray:
+def _danger(stage: PhysicalStage, start: FloatArray, marks: FloatArray, options: FloatArray) -> FloatArray:
     """What it costs to have arm and load at marks with headings, (marks, headings): much in things, little beside them."""
     bases = np.column_stack([np.repeat(marks, len(options), axis=0), np.tile(options, len(marks))])
     return _cost_at(stage, start, bases).reshape(len(marks), len(options))
 
 
-def _cost_at(stage: Stage, start: FloatArray, bases: FloatArray) -> FloatArray:
+def _cost_at(stage: PhysicalStage, start: FloatArray, bases: FloatArray) -> FloatArray:
     """The same for bases, (n, 3): shape (n,)."""
     rows = np.tile(start, (len(bases), 1))
     rows[:, : body.LIFT] = bases

@@ -12,7 +12,7 @@ from embomatrix.sim.geometry.candidates import candidates
 from embomatrix.sim.geometry.surfaces import is_shut, is_upright, link_frame, links_with_spots
 from embomatrix.sim.joints.behind_panels import behind_leaves
 from embomatrix.sim.placing.repertoire import Repertoire
-from embomatrix.sim.placing.trial import NEAR_M, Errand, Trial
+from embomatrix.sim.placing.trial import NEAR_M, Errand, PoseTrial
 from embomatrix.skills.failure import FailureReason
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.state import Relation
@@ -61,7 +61,7 @@ class Placer:
         self._navigator = navigator
         self._scene = engine.scene
         self._repertoire = Repertoire(engine.scene, cache)
-        self._trial = Trial(engine, relations, self._repertoire)
+        self._trial = PoseTrial(engine, relations, self._repertoire)
         self._reached = cache.reached
 
     def complete(self) -> Iterator[None]:

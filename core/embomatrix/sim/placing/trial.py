@@ -40,7 +40,7 @@ class Errand:
     passed_over: tuple[StandPose, ...] = ()
 
 
-class Trial:
+class PoseTrial:
     """Tries poses of a held object in an engine: it is left where it was tried last.
 
     A pose that is given back has the errand's relation, penetrates nothing, is within the robot's reach and stable.

@@ -33,14 +33,14 @@ WIDTH: Final = 12
 
 
 @dataclass(frozen=True, slots=True)
-class Literal:
+class GroundLiteral:
     """A ground atom that must hold, or must not."""
 
     atom: Atom
     positive: bool
 
 
-Choice = tuple[Literal, ...]
+Choice = tuple[GroundLiteral, ...]
 
 
 def choices(
@@ -48,7 +48,7 @@ def choices(
     types: Types,
     facts: Facts,
     liking: Callable[[str], int] = lambda name: 0,
-    hopeless: Callable[[Literal], bool] = lambda literal: False,
+    hopeless: Callable[[GroundLiteral], bool] = lambda literal: False,
 ) -> tuple[Choice, ...]:
     """Up to ``WIDTH`` ways to make the goal true, by how many of their literals do not hold yet.
 
@@ -64,18 +64,18 @@ class _Choices:
         types: Types,
         facts: Facts,
         liking: Callable[[str], int],
-        hopeless: Callable[[Literal], bool],
+        hopeless: Callable[[GroundLiteral], bool],
     ) -> None:
         self._types = types
         self._facts = facts
         self._liking = liking
         self._hopeless = hopeless
-        self._known: dict[Literal, tuple[bool, bool]] = {}
+        self._known: dict[GroundLiteral, tuple[bool, bool]] = {}
 
     def of(self, formula: Formula, *, positive: bool) -> list[Choice]:
         match formula:
             case Atom():
-                return [(Literal(formula, positive),)]
+                return [(GroundLiteral(formula, positive),)]
             case Not(body):
                 return self.of(body, positive=not positive)
             case And(parts):
@@ -157,7 +157,7 @@ class _Choices:
     def _cost(self, choice: Choice) -> int:
         return sum(self._judge(item)[0] for item in choice)
 
-    def _judge(self, item: Literal) -> tuple[bool, bool]:
+    def _judge(self, item: GroundLiteral) -> tuple[bool, bool]:
         """Whether the literal is still to be made true, and whether that is hopeless."""
         if item not in self._known:
             missing = self._facts.holds(item.atom.predicate, item.atom.args) != item.positive
@@ -185,7 +185,7 @@ def _chained(choice: Choice) -> int:
 def _merge(left: Choice, right: Choice) -> Choice | None:
     """Both conjunctions, without repetition; None when one denies what the other asks."""
     known = {item.atom: item.positive for item in left}
-    extra: list[Literal] = []
+    extra: list[GroundLiteral] = []
     for item in right:
         if item.atom not in known:
             extra.append(item)

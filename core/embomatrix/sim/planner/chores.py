@@ -28,13 +28,13 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
     from embomatrix.sim.live_world import LiveWorld
-    from embomatrix.sim.planner.choices import Literal
+    from embomatrix.sim.planner.choices import GroundLiteral
     from embomatrix.sim.planner.script import PlanScript
 
 REAL = "real"
 
 
-class Work(StrEnum):
+class ChoreKind(StrEnum):
     """Kinds of chores, in the order in which they are done."""
 
     SLICE = "slice"
@@ -46,13 +46,13 @@ class Work(StrEnum):
 class Chore:
     """An object must be sliced, or rid of a substance, or soaked or filled with one."""
 
-    work: Work
+    work: ChoreKind
     name: str
     substance: str = ""
 
 
 @dataclass(frozen=True, slots=True)
-class Means:
+class ChoreMethod:
     """How a chore is done: with a ``tool`` in the hand, soaked at ``source`` first if that is named.
 
     Without a tool the object itself is taken to ``source``: held under it, or washed in it if ``inside``.
@@ -63,7 +63,7 @@ class Means:
     inside: bool = False
 
 
-def chores_for(world: LiveWorld, missing: Iterable[Literal]) -> tuple[Chore, ...]:
+def chores_for(world: LiveWorld, missing: Iterable[GroundLiteral]) -> tuple[Chore, ...]:
     """What must be cut, cleaned and wetted so that the literals hold. Literals about pieces ask for the cut."""
     found: dict[Chore, None] = {}
     for literal in missing:
@@ -72,7 +72,7 @@ def chores_for(world: LiveWorld, missing: Iterable[Literal]) -> tuple[Chore, ...
             found[chore] = None
         elif literal.positive:
             found |= dict.fromkeys(_cuts_for(world, literal.atom.args))
-    order = list(Work)
+    order = list(ChoreKind)
     return tuple(sorted(found, key=lambda chore: order.index(chore.work)))
 
 
@@ -81,22 +81,22 @@ def is_about_chores(predicate: str) -> bool:
     return predicate in (State.SLICED, REAL, *MEANINGS, *SubstanceRelation)
 
 
-def chore_for(world: LiveWorld, literal: Literal) -> Chore | None:
+def chore_for(world: LiveWorld, literal: GroundLiteral) -> Chore | None:
     """The chore that makes a literal true; None when none does."""
     predicate, args = literal.atom.predicate, literal.atom.args
     if predicate in set(MEANINGS):
         fact = MEANINGS[State(predicate)]
         predicate, args = fact.relation.value, (args[0], fact.substance)
     if predicate == State.SLICED:
-        return Chore(Work.SLICE, args[0]) if literal.positive else None
+        return Chore(ChoreKind.SLICE, args[0]) if literal.positive else None
     if predicate == REAL:
         if literal.positive:
             return next(_cuts_for(world, args), None)
-        return Chore(Work.SLICE, args[0]) if world.scene.by_name[args[0]].pieces else None
+        return Chore(ChoreKind.SLICE, args[0]) if world.scene.by_name[args[0]].pieces else None
     if predicate == SubstanceRelation.COVERED:
-        return None if literal.positive else Chore(Work.CLEAN, *args)
+        return None if literal.positive else Chore(ChoreKind.CLEAN, *args)
     if predicate in set(SubstanceRelation):
-        return Chore(Work.WET, *args) if literal.positive else None
+        return Chore(ChoreKind.WET, *args) if literal.positive else None
     return None
 
 
@@ -106,49 +106,58 @@ def _cuts_for(world: LiveWorld, names: Sequence[str]) -> Iterator[Chore]:
         if name in world.scene.by_name and not world.is_real(name):
             for item in world.scene.objects:
                 if name in item.pieces and world.is_real(item.name):
-                    yield Chore(Work.SLICE, item.name)
+                    yield Chore(ChoreKind.SLICE, item.name)
 
 
-def means_for(world: LiveWorld, rows: Sequence[str], chore: Chore, portable: frozenset[str]) -> list[Means]:
+def means_for(
+    world: LiveWorld, rows: Sequence[str], chore: Chore, portable: frozenset[str]
+) -> list[ChoreMethod]:
     """Ways to do a chore with what stands in the object table, the simplest first. ``portable`` can be carried."""
     match chore.work:
-        case Work.SLICE:
+        case ChoreKind.SLICE:
             if not is_sliceable(world.asset(chore.name)):
                 return []
-            return [Means(tool) for tool in rows if tool in portable and cuts(world.asset(tool))]
-        case Work.CLEAN:
+            return [ChoreMethod(tool) for tool in rows if tool in portable and cuts(world.asset(tool))]
+        case ChoreKind.CLEAN:
             return [*_wipes(world, rows, chore, portable), *_washes(world, rows, chore, portable)]
-        case Work.WET:
+        case ChoreKind.WET:
             if chore.name not in portable or not soaks_up(world.asset(chore.name)):
                 return []
             taps = _giving(world, rows, (chore.substance,), chore.name)
             sinks = [tap for tap in taps if world.asset(tap).interiors and world.is_fixed(tap)]
-            return [*(Means(source=tap) for tap in taps), *(Means(source=tap, inside=True) for tap in sinks)]
+            return [
+                *(ChoreMethod(source=tap) for tap in taps),
+                *(ChoreMethod(source=tap, inside=True) for tap in sinks),
+            ]
 
 
-def _wipes(world: LiveWorld, rows: Sequence[str], chore: Chore, portable: frozenset[str]) -> Iterator[Means]:
+def _wipes(
+    world: LiveWorld, rows: Sequence[str], chore: Chore, portable: frozenset[str]
+) -> Iterator[ChoreMethod]:
     """With a tool that is ready, then with one that must be switched on or soaked."""
     lacking = {
         tool: missing_for(world.asset(tool), world.facts_about(tool), chore.substance, on=world.is_on(tool))
         for tool in rows
         if tool in portable and tool != chore.name
     }
-    yield from (Means(tool) for tool, missing in lacking.items() if missing == ())
+    yield from (ChoreMethod(tool) for tool, missing in lacking.items() if missing == ())
     for tool, missing in lacking.items():
         if not missing:
             continue
         if RUNNING in missing:
-            yield Means(tool)
-        yield from (Means(tool, source) for source in _giving(world, rows, missing, tool))
+            yield ChoreMethod(tool)
+        yield from (ChoreMethod(tool, source) for source in _giving(world, rows, missing, tool))
 
 
-def _washes(world: LiveWorld, rows: Sequence[str], chore: Chore, portable: frozenset[str]) -> Iterator[Means]:
+def _washes(
+    world: LiveWorld, rows: Sequence[str], chore: Chore, portable: frozenset[str]
+) -> Iterator[ChoreMethod]:
     if chore.name not in portable:
         return
     for row in rows:
         machine = washing(world.asset(row))
         if machine is not None and washed_away(machine, (chore.substance,)):
-            yield Means(source=row, inside=True)
+            yield ChoreMethod(source=row, inside=True)
 
 
 def _giving(world: LiveWorld, rows: Sequence[str], liquids: Sequence[str], other: str) -> list[str]:
@@ -165,15 +174,15 @@ def _giving(world: LiveWorld, rows: Sequence[str], liquids: Sequence[str], other
 def nothing_for(chore: Chore) -> str:
     """Sentence about a chore for which the object table has no means."""
     match chore.work:
-        case Work.SLICE:
+        case ChoreKind.SLICE:
             return f"nothing in the object table slices {chore.name}: expected a knife, and a thing that can be cut"
-        case Work.CLEAN:
+        case ChoreKind.CLEAN:
             return f"nothing in the object table takes {word_of(chore.substance)} off {chore.name}"
-        case Work.WET:
+        case ChoreKind.WET:
             return f"nothing in the object table soaks or fills {chore.name} with {word_of(chore.substance)}"
 
 
-def do_chores(script: PlanScript, world: LiveWorld, chores: Sequence[tuple[Chore, Means]]) -> None:
+def do_chores(script: PlanScript, world: LiveWorld, chores: Sequence[tuple[Chore, ChoreMethod]]) -> None:
     """Do them, all that one means serves together. Raises StuckError."""
     waiting = list(chores)
     while waiting:
@@ -190,8 +199,8 @@ def do_chores(script: PlanScript, world: LiveWorld, chores: Sequence[tuple[Chore
             _hold_under(script, world, name, [other.source for _, other in same])
 
 
-def _with_tool(script: PlanScript, world: LiveWorld, means: Means, chores: Sequence[Chore]) -> None:
-    skill = Skill.SLICE if chores[0].work is Work.SLICE else Skill.CLEAN
+def _with_tool(script: PlanScript, world: LiveWorld, means: ChoreMethod, chores: Sequence[Chore]) -> None:
+    skill = Skill.SLICE if chores[0].work is ChoreKind.SLICE else Skill.CLEAN
     for chore in chores:
         script.clear_way_to(chore.name)
         if skill is Skill.SLICE:
@@ -215,7 +224,7 @@ def _must_run(world: LiveWorld, tool: str, chores: Sequence[Chore]) -> bool:
     return any(missing is not None and RUNNING in missing for missing in lacking)
 
 
-def _is_held(pair: tuple[Chore, Means], name: str) -> bool:
+def _is_held(pair: tuple[Chore, ChoreMethod], name: str) -> bool:
     """Whether the chore is done with the object itself in the hand."""
     chore, means = pair
     return chore.name == name and not means.tool and not means.inside
@@ -249,9 +258,9 @@ def _run_tap(script: PlanScript, world: LiveWorld, source: str) -> None:
 
 def chosen(
     world: LiveWorld, rows: Sequence[str], chores: Sequence[Chore], portable: frozenset[str], rank: int
-) -> list[tuple[Chore, Means]]:
+) -> list[tuple[Chore, ChoreMethod]]:
     """Each chore with its means of this rank. Raises StuckError for a chore without any."""
-    pairs: list[tuple[Chore, Means]] = []
+    pairs: list[tuple[Chore, ChoreMethod]] = []
     for chore in chores:
         found = means_for(world, rows, chore, portable)
         if not found:

@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 
     from embomatrix.sim.executor import Simulator
     from embomatrix.sim.live_world import LiveWorld
-    from embomatrix.sim.planner.chores import Chore, Means
+    from embomatrix.sim.planner.chores import Chore, ChoreMethod
     from embomatrix.sim.planner.script import PlanScript
-    from embomatrix.sim.planner.ways import Placement
+    from embomatrix.sim.planner.ways import PlacementGoal
     from embomatrix.skills.appliance import Source
 
 
@@ -44,12 +44,12 @@ class Errands:
     ``way`` is the rank of the way in which relations are brought about; ``singly`` has sources work on one thing at a time.
     """
 
-    placements: tuple[Placement, ...]
+    placements: tuple[PlacementGoal, ...]
     warmings: tuple[Warming, ...]
     open: Mapping[str, bool]
     on: Mapping[str, bool]
-    leave: tuple[Placement, ...]
-    chores: tuple[tuple[Chore, Means], ...] = ()
+    leave: tuple[PlacementGoal, ...]
+    chores: tuple[tuple[Chore, ChoreMethod], ...] = ()
     way: int = 0
     singly: bool = False
 
@@ -100,7 +100,7 @@ class Errands:
         if parameters.requires_on:
             script.switch_on(source)
 
-    def _place(self, item: Placement, script: PlanScript, world: LiveWorld) -> None:
+    def _place(self, item: PlacementGoal, script: PlanScript, world: LiveWorld) -> None:
         if script.holds(item.relation, item.name, item.target):
             return
         if item.relation is Relation.INROOM:
@@ -131,7 +131,7 @@ class Errands:
                 kept = carried
         return kept
 
-    def _part(self, item: Placement, script: PlanScript, world: LiveWorld) -> None:
+    def _part(self, item: PlacementGoal, script: PlanScript, world: LiveWorld) -> None:
         """End a relation: carry the first object elsewhere, or the second where the first can't be carried."""
         if item.relation is Relation.INROOM:
             here = frozenset(name for name in world.scene.by_name if world.room_of(name) == item.target)
@@ -152,7 +152,7 @@ class Errands:
             script.switch_on(name)
 
 
-def _carried_of(item: Placement, world: LiveWorld) -> str:
+def _carried_of(item: PlacementGoal, world: LiveWorld) -> str:
     """Which of two objects is carried away from the other: the first, unless it is fixed."""
     return item.target if world.is_fixed(item.name) else item.name
 

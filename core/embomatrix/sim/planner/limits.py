@@ -15,17 +15,17 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from embomatrix.sim.live_world import LiveWorld
-    from embomatrix.sim.planner.choices import Literal
+    from embomatrix.sim.planner.choices import GroundLiteral
     from embomatrix.world.asset import Asset
     from embomatrix.world.task import Task
 
-    Limit = Callable[[LiveWorld, Task, Literal], str]
+    Limit = Callable[[LiveWorld, Task, GroundLiteral], str]
 
 EITHER: Final = frozenset({Relation.NEXTTO, Relation.TOUCHING, Relation.UNDER})
 """Relations that come about by carrying either object."""
 
 
-def why_impossible(world: LiveWorld, task: Task, literal: Literal) -> str:
+def why_impossible(world: LiveWorld, task: Task, literal: GroundLiteral) -> str:
     """A sentence about why no skill makes the literal true, "" when nothing speaks against it.
 
     The literal must not hold at the moment. What is let pass may still turn out impossible.
@@ -53,7 +53,7 @@ def carries(world: LiveWorld, name: str) -> str:
     return ""
 
 
-def _relation_limit(world: LiveWorld, task: Task, literal: Literal) -> str:
+def _relation_limit(world: LiveWorld, task: Task, literal: GroundLiteral) -> str:
     """Something of a relation must be carried: the first object, or either of both where that does too."""
     relation, (first, second) = Relation(literal.atom.predicate), literal.atom.args
     if first == second:
@@ -77,28 +77,28 @@ def _unlisted(task: Task, name: str) -> str:
     return "" if name in task.index_of else f"{name} is not in the object table: no plan can name it"
 
 
-def _open_limit(world: LiveWorld, task: Task, literal: Literal) -> str:
+def _open_limit(world: LiveWorld, task: Task, literal: GroundLiteral) -> str:
     (name,) = literal.atom.args
     if not world.asset(name).joints:
         return f"{name} has no door, drawer or lid that opens"
     return _unlisted(task, name)
 
 
-def _switch_limit(world: LiveWorld, task: Task, literal: Literal) -> str:
+def _switch_limit(world: LiveWorld, task: Task, literal: GroundLiteral) -> str:
     (name,) = literal.atom.args
     if not world.asset(name).can("toggleable"):
         return f"{name} has no switch"
     return _unlisted(task, name)
 
 
-def _no_skill(world: LiveWorld, task: Task, literal: Literal) -> str:
+def _no_skill(world: LiveWorld, task: Task, literal: GroundLiteral) -> str:
     name, *substance = literal.atom.args
     change = "made" if literal.positive else "undone"
     what = " ".join((literal.atom.predicate, *map(word_of, substance)))
     return f"none of the skills can do this: {name} must be {change} {what}"
 
 
-def _chore_limit(world: LiveWorld, task: Task, literal: Literal) -> str:
+def _chore_limit(world: LiveWorld, task: Task, literal: GroundLiteral) -> str:
     """Chores need their own skills, and something in the table to do them with."""
     chore = chore_for(world, literal)
     if chore is None or task.profile is Profile.PAPER:
@@ -113,7 +113,7 @@ def portables(world: LiveWorld, task: Task) -> frozenset[str]:
     return frozenset(name for name in task.table if not carries(world, name))
 
 
-def _temperature_limit(world: LiveWorld, task: Task, literal: Literal) -> str:
+def _temperature_limit(world: LiveWorld, task: Task, literal: GroundLiteral) -> str:
     (name,), state = literal.atom.args, State(literal.atom.predicate)
     if state is State.COOKED and not literal.positive:
         return _no_skill(world, task, literal)
@@ -123,7 +123,7 @@ def _temperature_limit(world: LiveWorld, task: Task, literal: Literal) -> str:
     return f"no object in the table makes {name} {change}{state.value}: expected a heat or cold source"
 
 
-def is_hot_work(literal: Literal) -> bool:
+def is_hot_work(literal: GroundLiteral) -> bool:
     """Whether a heat source brings the literal about, not a cold one."""
     state = State(literal.atom.predicate)
     return state is State.COOKED or (state is State.HOT) == literal.positive

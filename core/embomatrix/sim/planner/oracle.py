@@ -18,8 +18,8 @@ from embomatrix.sim.planner.chores import chores_for, chosen, is_about_chores
 from embomatrix.sim.planner.errands import Errands, Warming
 from embomatrix.sim.planner.limits import is_hot_work, portables, sources_for, why_impossible
 from embomatrix.sim.planner.script import PlanScript
-from embomatrix.sim.planner.ways import Placement
-from embomatrix.sim.planner.wishes import Wishes
+from embomatrix.sim.planner.ways import PlacementGoal
+from embomatrix.sim.planner.wishes import GoalLiterals
 from embomatrix.sim.planner.wording import Wording
 from embomatrix.world.evaluate import evaluate, render
 from embomatrix.world.goal import Not
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from embomatrix.sim.executor import Simulator
-    from embomatrix.sim.planner.choices import Choice, Literal
+    from embomatrix.sim.planner.choices import Choice, GroundLiteral
     from embomatrix.skills.syntax import Plan
     from embomatrix.world.task import Task
 
@@ -88,7 +88,7 @@ def find_plan(simulator: Simulator, task: Task) -> Plan | PlanNotFound:
     return _first_proven(simulator, task, hopeful)
 
 
-def _limit(simulator: Simulator, task: Task, item: Literal) -> str:
+def _limit(simulator: Simulator, task: Task, item: GroundLiteral) -> str:
     """Why the literal, which does not hold yet, never will; "" otherwise."""
     missing = simulator.facts.holds(item.atom.predicate, item.atom.args) != item.positive
     return why_impossible(simulator.world, task, item) if missing else ""
@@ -165,7 +165,7 @@ def _short_enough(simulator: Simulator, task: Task, choice: Choice, strategy: St
 
 def _write(simulator: Simulator, task: Task, choice: Choice, strategy: Strategy) -> Plan:
     """Execute what the literals ask for, and return the calls that it took. Raises StuckError."""
-    script = PlanScript(simulator, task, strategy.seed, Wishes(choice), thrifty=strategy.thrifty)
+    script = PlanScript(simulator, task, strategy.seed, GoalLiterals(choice), thrifty=strategy.thrifty)
     for _ in range(ROUNDS):
         missing = _missing(simulator, choice)
         if not missing:
@@ -174,14 +174,14 @@ def _write(simulator: Simulator, task: Task, choice: Choice, strategy: Strategy)
     return script.plan
 
 
-def _missing(simulator: Simulator, choice: Choice) -> list[Literal]:
+def _missing(simulator: Simulator, choice: Choice) -> list[GroundLiteral]:
     return [
         item for item in choice if simulator.facts.holds(item.atom.predicate, item.atom.args) != item.positive
     ]
 
 
 def _errands(
-    simulator: Simulator, task: Task, choice: Choice, missing: list[Literal], strategy: Strategy
+    simulator: Simulator, task: Task, choice: Choice, missing: list[GroundLiteral], strategy: Strategy
 ) -> Errands:
     return Errands(
         placements=_placements(choice, strategy),
@@ -203,24 +203,24 @@ def _errands(
     )
 
 
-def _is_relation(item: Literal) -> bool:
+def _is_relation(item: GroundLiteral) -> bool:
     return item.atom.predicate in set(Relation)
 
 
-def _relation_of(item: Literal) -> Placement:
-    return Placement(item.atom.args[0], Relation(item.atom.predicate), item.atom.args[1])
+def _relation_of(item: GroundLiteral) -> PlacementGoal:
+    return PlacementGoal(item.atom.args[0], Relation(item.atom.predicate), item.atom.args[1])
 
 
-def _in_words(item: Literal) -> str:
+def _in_words(item: GroundLiteral) -> str:
     return render(item.atom if item.positive else Not(item.atom))
 
 
-def _placements(choice: Choice, strategy: Strategy) -> tuple[Placement, ...]:
+def _placements(choice: Choice, strategy: Strategy) -> tuple[PlacementGoal, ...]:
     """Where things must be, what others go on or in before those; what is there and stays there is not carried."""
     wanted = [_relation_of(item) for item in choice if item.positive and _is_relation(item)]
     if strategy.reverse:
         wanted.reverse()
-    ordered: list[Placement] = []
+    ordered: list[PlacementGoal] = []
     while wanted:
         moving = {item.name for item in wanted}
         ready = next((item for item in wanted if item.target not in moving), wanted[0])
@@ -230,7 +230,7 @@ def _placements(choice: Choice, strategy: Strategy) -> tuple[Placement, ...]:
 
 
 def _warmings(
-    simulator: Simulator, task: Task, choice: Choice, missing: list[Literal], strategy: Strategy
+    simulator: Simulator, task: Task, choice: Choice, missing: list[GroundLiteral], strategy: Strategy
 ) -> tuple[Warming, ...]:
     """Sources that objects are taken to, hot ones before cold ones. Raises StuckError for what no source does."""
     homes = {

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from embomatrix.sim.executor import Simulator
-    from embomatrix.sim.planner.wishes import Wishes
+    from embomatrix.sim.planner.wishes import GoalLiterals
     from embomatrix.skills.syntax import Plan
     from embomatrix.skills.trace import Step
     from embomatrix.world.task import Task
@@ -37,7 +37,7 @@ class PlanScript:
     """One attempt at a task, from its start. Every routine raises StuckError when a call of it fails for good."""
 
     def __init__(
-        self, simulator: Simulator, task: Task, seed: int, wishes: Wishes, *, thrifty: bool = False
+        self, simulator: Simulator, task: Task, seed: int, wishes: GoalLiterals, *, thrifty: bool = False
     ) -> None:
         """A ``thrifty`` attempt goes nowhere for what is in reach already."""
         self._calls = PlanCalls(simulator, task, seed, thrifty=thrifty)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Placement:
+class PlacementGoal:
     """``relation(name, target)`` must hold. The target of INROOM is a room."""
 
     name: str
@@ -45,7 +45,7 @@ CANDIDATES: Final = 16
 """Poses that are looked at before a thing is taken to fit nowhere on another."""
 
 
-def ways(item: Placement, world: LiveWorld, rows: tuple[str, ...]) -> tuple[Way, ...]:
+def ways(item: PlacementGoal, world: LiveWorld, rows: tuple[str, ...]) -> tuple[Way, ...]:
     """Ways by which the relation between two objects may come about, the surest first; none when nothing fits.
 
     What is asked for is tried as it is asked. Then what means the same: a thing is under another that is put on it, on or in
@@ -55,7 +55,7 @@ def ways(item: Placement, world: LiveWorld, rows: tuple[str, ...]) -> tuple[Way,
     return tuple(dict.fromkeys(_ways(item, world, rows)))
 
 
-def _ways(item: Placement, world: LiveWorld, rows: tuple[str, ...]) -> Iterator[Way]:
+def _ways(item: PlacementGoal, world: LiveWorld, rows: tuple[str, ...]) -> Iterator[Way]:
     match item.relation:
         case Relation.ONTOP:
             yield from _placed(item, world, PlaceRelation.ONTOP, PlaceRelation.INSIDE)
@@ -64,7 +64,7 @@ def _ways(item: Placement, world: LiveWorld, rows: tuple[str, ...]) -> Iterator[
             for other in rows:
                 if other != item.name and world.relations.inside(other, item.target):
                     yield from _placed(
-                        Placement(item.name, Relation.ONTOP, other), world, PlaceRelation.ONTOP
+                        PlacementGoal(item.name, Relation.ONTOP, other), world, PlaceRelation.ONTOP
                     )
         case Relation.UNDER:
             yield from _placed(item, world, PlaceRelation.UNDER)
@@ -79,13 +79,15 @@ def _ways(item: Placement, world: LiveWorld, rows: tuple[str, ...]) -> Iterator[
             return
 
 
-def _placed(item: Placement, world: LiveWorld, *relations: PlaceRelation, near: str = "") -> Iterator[Way]:
+def _placed(
+    item: PlacementGoal, world: LiveWorld, *relations: PlaceRelation, near: str = ""
+) -> Iterator[Way]:
     for relation in relations:
         if _fits(world, item.name, item.target, relation):
             yield (Carry(item.name, item.target, relation, near),)
 
 
-def _beside(item: Placement, world: LiveWorld, rows: tuple[str, ...]) -> Iterator[Way]:
+def _beside(item: PlacementGoal, world: LiveWorld, rows: tuple[str, ...]) -> Iterator[Way]:
     """On or in what either stands on or in, be it the floor, then both on or in anything of the table, small surfaces first."""
     one, other = item, _turned(item)
     pair = (item.name, item.target)
@@ -93,12 +95,12 @@ def _beside(item: Placement, world: LiveWorld, rows: tuple[str, ...]) -> Iterato
         for host, relation in _borne_by(mover.target, world, rows):
             if host not in pair:
                 yield from _placed(
-                    Placement(mover.name, Relation.ONTOP, host), world, relation, near=mover.target
+                    PlacementGoal(mover.name, Relation.ONTOP, host), world, relation, near=mover.target
                 )
     surfaces = [name for name in rows if name not in pair and world.asset(name).supports]
     for host_name in sorted(surfaces, key=lambda name: _least_area_m2(world, name)):
         placed = [
-            next(_placed(Placement(name, Relation.ONTOP, host_name), world, *LYING), ())
+            next(_placed(PlacementGoal(name, Relation.ONTOP, host_name), world, *LYING), ())
             for name in pair
             if not world.is_fixed(name)
         ]
@@ -117,8 +119,8 @@ def _borne_by(name: str, world: LiveWorld, rows: tuple[str, ...]) -> Iterator[tu
             yield floor, PlaceRelation.ONTOP
 
 
-def _turned(item: Placement) -> Placement:
-    return Placement(item.target, item.relation, item.name)
+def _turned(item: PlacementGoal) -> PlacementGoal:
+    return PlacementGoal(item.target, item.relation, item.name)
 
 
 def _least_area_m2(world: LiveWorld, name: str) -> float:

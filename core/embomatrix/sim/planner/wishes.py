@@ -15,7 +15,7 @@ AT: Final = frozenset({Relation.ONTOP, Relation.INSIDE, Relation.TOUCHING})
 
 
 @dataclass(frozen=True, slots=True)
-class Wishes:
+class GoalLiterals:
     """The literals that a plan is to make true. Without any, everything may be left anywhere."""
 
     choice: Choice = ()

@@ -23,7 +23,7 @@ class FactError(ValueError):
     """A goal asks something that the simulator can't answer."""
 
 
-class SceneFacts:
+class EngineFacts:
     """Facts of the present moment: they change as the engine and the states do."""
 
     def __init__(

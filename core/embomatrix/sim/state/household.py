@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from embomatrix.sim.live_world import LiveWorld
     from embomatrix.sim.state.footing import Host
     from embomatrix.skills.syntax import SkillCall
-    from embomatrix.skills.view import Refusal
+    from embomatrix.skills.view import SkillRefusal
     from embomatrix.world.geometry import Aabb
 
 CLEARANCE_M: Final = 0.002
@@ -37,7 +37,7 @@ INHERITED: Final = frozenset({State.HOT, State.COOKED, State.FROZEN})
 """States that the pieces of a thing take over from it, beside what it is covered and soaked with."""
 
 
-def cut(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+def cut(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
     """Slice the call's target. Changes nothing when there is no room for its pieces."""
     target = target_of(world, call)
     pieces = world.scene.by_name[target].pieces
@@ -49,7 +49,7 @@ def cut(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal 
     return None
 
 
-def clean(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+def clean(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
     """Take off what the tool in the hand takes off. A sink or a machine has done it already."""
     target, tool = target_of(world, call), source_of(world, call)
     if tool in world.carried:
@@ -59,7 +59,7 @@ def clean(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusa
     return None
 
 
-def soak(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal | None:
+def soak(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> SkillRefusal | None:
     """Let what the source gives run over the target."""
     target, source = target_of(world, call), source_of(world, call)
     given = liquids_given(world.asset(source), world.substances[source], on=world.is_on(source))
@@ -69,7 +69,7 @@ def soak(world: LiveWorld, call: SkillCall, rng: np.random.Generator) -> Refusal
 
 def _break_up(
     world: LiveWorld, whole: str, pieces: tuple[str, ...], rng: np.random.Generator
-) -> Refusal | None:
+) -> SkillRefusal | None:
     host = world.relations.host_of(whole)
     box, base = world.engine.aabb(whole), world.engine.pose(whole)
     world.engine.park(whole)

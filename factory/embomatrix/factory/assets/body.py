@@ -15,7 +15,7 @@ from embomatrix.world.asset import Interior, Joint, JointKind, Link, SupportSurf
 from embomatrix.world.geometry import Aabb, Pose
 
 if TYPE_CHECKING:
-    from embomatrix.world.geometry import Part, Vec2, Vec3
+    from embomatrix.world.geometry import ConvexPart, Vec2, Vec3
 
 OPEN_ABOVE_M: Final = 2.0
 """Clearance of a surface in the open: nothing of the asset is above it, and rooms end soon after."""
@@ -27,7 +27,7 @@ FIT_M: Final = 0.002
 class Body:
     """What a generator has built so far; the library turns it into an asset."""
 
-    parts: list[Part] = field(default_factory=list)
+    parts: list[ConvexPart] = field(default_factory=list)
     moving: list[Link] = field(default_factory=list)
     supports: list[SupportSurface] = field(default_factory=list)
     interiors: list[Interior] = field(default_factory=list)
@@ -92,7 +92,7 @@ class Walls:
     top: float
 
 
-def shell(outer: Aabb, walls: Walls) -> tuple[list[Part], Aabb]:
+def shell(outer: Aabb, walls: Walls) -> tuple[list[ConvexPart], Aabb]:
     """Boards around a cavity, edge to edge without overlap, and the cavity."""
     (x0, y0, z0), (x1, y1, z1) = outer.low_m, outer.high_m
     inner = region(
@@ -188,5 +188,5 @@ def _raised(point: Vec3, lift_m: float) -> Vec3:
     return rounded(point[0], point[1], point[2] + lift_m)
 
 
-def _raised_part(part: Part, lift_m: float) -> Part:
+def _raised_part(part: ConvexPart, lift_m: float) -> ConvexPart:
     return replace(part, pose=Pose(_raised(part.pose.position_m, lift_m), part.pose.quat_xyzw))

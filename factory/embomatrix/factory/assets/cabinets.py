@@ -25,7 +25,7 @@ from embomatrix.factory.assets.shapes import box, box_of
 from embomatrix.world.geometry import Aabb
 
 if TYPE_CHECKING:
-    from embomatrix.world.geometry import Part, Vec2, Vec3
+    from embomatrix.world.geometry import ConvexPart, Vec2, Vec3
 
 MAX_PARTS: Final = 16
 """Bullet drops further parts of one link without a word."""
@@ -33,7 +33,7 @@ _BOARD_M: Final = 0.012
 """Thickness of the board between drawers and what is below them."""
 
 
-class Front(StrEnum):
+class FrontKind(StrEnum):
     """What closes the front."""
 
     OPEN = "open"
@@ -50,7 +50,7 @@ class CabinetStyle:
     that a control panel takes at the left. ``drawer_share`` is the share of the height, from the top, that drawers take.
     """
 
-    front: Front
+    front: FrontKind
     wall_m: float
     tier_m: float
     plinth_m: float = 0.0
@@ -61,26 +61,28 @@ class CabinetStyle:
     drawer_share: float = 0.0
 
 
-CUPBOARD: Final = CabinetStyle(Front.SIDE_HINGED, wall_m=0.018, tier_m=0.34, plinth_m=0.06)
+CUPBOARD: Final = CabinetStyle(FrontKind.SIDE_HINGED, wall_m=0.018, tier_m=0.34, plinth_m=0.06)
 DRAWER_CUPBOARD: Final = replace(CUPBOARD, drawer_share=0.26)
 CHEST_OF_DRAWERS: Final = replace(CUPBOARD, drawer_share=1.0)
-WALL_CUPBOARD: Final = CabinetStyle(Front.SIDE_HINGED, wall_m=0.018, tier_m=0.36)
-LOCKER: Final = CabinetStyle(Front.SIDE_HINGED, wall_m=0.018, tier_m=0.9, plinth_m=0.04, bay_m=0.5)
-FRIDGE: Final = CabinetStyle(Front.SIDE_HINGED, wall_m=0.045, tier_m=0.38, plinth_m=0.08, single_door_m=0.85)
+WALL_CUPBOARD: Final = CabinetStyle(FrontKind.SIDE_HINGED, wall_m=0.018, tier_m=0.36)
+LOCKER: Final = CabinetStyle(FrontKind.SIDE_HINGED, wall_m=0.018, tier_m=0.9, plinth_m=0.04, bay_m=0.5)
+FRIDGE: Final = CabinetStyle(
+    FrontKind.SIDE_HINGED, wall_m=0.045, tier_m=0.38, plinth_m=0.08, single_door_m=0.85
+)
 MICROWAVE: Final = CabinetStyle(
-    Front.SIDE_HINGED, wall_m=0.018, tier_m=1.0, panel_share=0.2, single_door_m=9.0, bay_m=9.0
+    FrontKind.SIDE_HINGED, wall_m=0.018, tier_m=1.0, panel_share=0.2, single_door_m=9.0, bay_m=9.0
 )
 WASHER: Final = CabinetStyle(
-    Front.SIDE_HINGED, wall_m=0.045, tier_m=2.0, plinth_m=0.1, head_m=0.12, single_door_m=9.0, bay_m=9.0
+    FrontKind.SIDE_HINGED, wall_m=0.045, tier_m=2.0, plinth_m=0.1, head_m=0.12, single_door_m=9.0, bay_m=9.0
 )
-FREEZER: Final = CabinetStyle(Front.OPEN, wall_m=0.045, tier_m=0.4, plinth_m=0.08)
+FREEZER: Final = CabinetStyle(FrontKind.OPEN, wall_m=0.045, tier_m=0.4, plinth_m=0.08)
 """Without a door: BEHAVIOR-1K does not call these categories openable, yet things are kept inside them."""
-OVEN: Final = CabinetStyle(Front.DROP_DOWN, wall_m=0.03, tier_m=0.3, plinth_m=0.05, head_m=0.07)
-DISHWASHER: Final = CabinetStyle(Front.DROP_DOWN, wall_m=0.03, tier_m=0.28, plinth_m=0.08, head_m=0.05)
-SHELVING: Final = CabinetStyle(Front.OPEN, wall_m=0.02, tier_m=0.32, plinth_m=0.05, bay_m=1.3)
-CUBBY: Final = CabinetStyle(Front.OPEN, wall_m=0.018, tier_m=0.35, plinth_m=0.06, bay_m=1.3)
+OVEN: Final = CabinetStyle(FrontKind.DROP_DOWN, wall_m=0.03, tier_m=0.3, plinth_m=0.05, head_m=0.07)
+DISHWASHER: Final = CabinetStyle(FrontKind.DROP_DOWN, wall_m=0.03, tier_m=0.28, plinth_m=0.08, head_m=0.05)
+SHELVING: Final = CabinetStyle(FrontKind.OPEN, wall_m=0.02, tier_m=0.32, plinth_m=0.05, bay_m=1.3)
+CUBBY: Final = CabinetStyle(FrontKind.OPEN, wall_m=0.018, tier_m=0.35, plinth_m=0.06, bay_m=1.3)
 DRAWER_CUBBY: Final = replace(CUBBY, drawer_share=0.34)
-WARDROBE: Final = CabinetStyle(Front.OPEN, wall_m=0.022, tier_m=1.1, plinth_m=0.06, bay_m=1.3)
+WARDROBE: Final = CabinetStyle(FrontKind.OPEN, wall_m=0.022, tier_m=1.1, plinth_m=0.06, bay_m=1.3)
 
 
 def cabinet(size_m: Vec3, style: CabinetStyle) -> Body:
@@ -88,7 +90,7 @@ def cabinet(size_m: Vec3, style: CabinetStyle) -> Body:
     body = Body()
     outer = centred(size_m)
     wall = min(style.wall_m, 0.08 * min(size_m))
-    plain = style.front is Front.OPEN and not style.drawer_share
+    plain = style.front is FrontKind.OPEN and not style.drawer_share
     door_m = 0.0 if plain else clamp(0.06 * size_m[0], min(0.006, wall), min(0.02, wall))
     frame = Aabb(outer.low_m, (outer.high_m[0] - door_m, *outer.high_m[1:]))
     walls = _walls(size_m, style, wall)
@@ -169,18 +171,18 @@ def _bays(cavity: Aabb, style: CabinetStyle, divider_m: float) -> list[Vec2]:
     return [(low + k * (width + divider_m), low + k * (width + divider_m) + width) for k in range(count)]
 
 
-def _upright(cavity: Aabb, before: float, after: float) -> Part:
+def _upright(cavity: Aabb, before: float, after: float) -> ConvexPart:
     return box((cavity.low_m[0], before, cavity.low_m[2]), (cavity.high_m[0], after, cavity.high_m[2]))
 
 
 def _doors(body: Body, style: CabinetStyle, front: Aabb, prefix: str) -> tuple[str, ...]:
     """Add the doors of one bay and return their names."""
-    if style.front is Front.OPEN:
+    if style.front is FrontKind.OPEN:
         return ()
     (x0, y0, z0), (x1, y1, z1) = front.low_m, front.high_m
     gap = min(FIT_M, 0.2 * (x1 - x0))
     x = (x0 + gap, x1)
-    if style.front is Front.DROP_DOWN:
+    if style.front is FrontKind.DROP_DOWN:
         doors = [hinged(f"{prefix}door", region(x, (y0, y1), (z0, z1)), Hinge.BOTTOM)]
     elif y1 - y0 <= style.single_door_m:
         doors = [hinged(f"{prefix}door", region(x, (y0, y1), (z0, z1)), Hinge.RIGHT)]

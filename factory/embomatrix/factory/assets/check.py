@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from embomatrix.world.asset import Asset, Link
     from embomatrix.world.catalog import Catalog
-    from embomatrix.world.geometry import FloatArray, Part
+    from embomatrix.world.geometry import ConvexPart, FloatArray
 
 SIZE_TOLERANCE: Final = 0.05
 PROBE_M: Final = 0.03
@@ -45,7 +45,7 @@ class Rule(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class AssetFinding:
     """A rule that an asset does not keep. ``excused`` tells that it need not, for the reason in ``detail``."""
 
     asset_id: str
@@ -64,23 +64,23 @@ EXCUSED_FROM_PROBE: Final[Mapping[Family, str]] = {
 """Families of fillable categories that have no cavity, and why."""
 
 
-def check_asset(catalog: Catalog, asset: Asset) -> tuple[Finding, ...]:
+def check_asset(catalog: Catalog, asset: Asset) -> tuple[AssetFinding, ...]:
     """What is wrong with the geometry of an asset, and what is excused. Empty for most."""
     return (*_size(asset), *_fillable(catalog, asset), *_openable(asset))
 
 
-def _size(asset: Asset) -> Iterator[Finding]:
+def _size(asset: Asset) -> Iterator[AssetFinding]:
     box = Aabb.around(part.aabb(IDENTITY) for link in asset.links for part in link.parts)
     for axis, found, wanted in zip("xyz", box.size_m, asset.size_m, strict=True):
         if abs(found - wanted) > SIZE_TOLERANCE * wanted:
-            yield Finding(
+            yield AssetFinding(
                 asset.asset_id,
                 Rule.SIZE,
                 f"{found:.4f} m along {axis}, the table has {wanted:.4f} m: expected within {SIZE_TOLERANCE:.0%}",
             )
 
 
-def _fillable(catalog: Catalog, asset: Asset) -> Iterator[Finding]:
+def _fillable(catalog: Catalog, asset: Asset) -> Iterator[AssetFinding]:
     if not asset.can("fillable"):
         return
     widest = max((min(interior.size_m) for interior in asset.interiors), default=0.0)
@@ -89,17 +89,17 @@ def _fillable(catalog: Catalog, asset: Asset) -> Iterator[Finding]:
     model = asset.asset_id.removeprefix(f"{asset.category}-")
     family = family_of_model(catalog, asset.category, model)
     if not asset.interiors and family in EXCUSED_FROM_PROBE:
-        yield Finding(asset.asset_id, Rule.FILLABLE, EXCUSED_FROM_PROBE[family], excused=True)
+        yield AssetFinding(asset.asset_id, Rule.FILLABLE, EXCUSED_FROM_PROBE[family], excused=True)
         return
     # A cavity is as large as its box but for the walls: what is under two probes wide may be too small for one.
     small = min(asset.size_m) < 2 * PROBE_M
     detail = f"its largest cavity is {widest:.3f} m wide, the probe {PROBE_M} m; the table's box is {asset.size_m} m"
-    yield Finding(asset.asset_id, Rule.FILLABLE, detail, excused=small)
+    yield AssetFinding(asset.asset_id, Rule.FILLABLE, detail, excused=small)
 
 
-def _openable(asset: Asset) -> Iterator[Finding]:
+def _openable(asset: Asset) -> Iterator[AssetFinding]:
     if asset.can("openable") != bool(asset.joints):
-        yield Finding(
+        yield AssetFinding(
             asset.asset_id, Rule.OPENABLE, "openable without a joint, or a joint without being openable"
         )
     base, moving = asset.links[0], asset.links[1:]
@@ -115,7 +115,7 @@ def _openable(asset: Asset) -> Iterator[Finding]:
             others += [part for k, parts_of in enumerate(shut) if k != number for part in parts_of]
             depth = max((_depth(a, b) for a, b in itertools.product(parts, others)), default=0.0)
             if depth > DEPTH_M:
-                yield Finding(
+                yield AssetFinding(
                     asset.asset_id,
                     Rule.OPENABLE,
                     f"{link.name} at {share:.0%} of its travel is {depth * 1000:.1f} mm deep in another part",
@@ -133,7 +133,7 @@ class _Solid:
     high: FloatArray
 
     @staticmethod
-    def of(part: Part, motion: Pose = IDENTITY) -> _Solid:
+    def of(part: ConvexPart, motion: Pose = IDENTITY) -> _Solid:
         pose = motion @ part.pose
         if part.shape is Shape.BOX:
             normals = pose.rotation.T

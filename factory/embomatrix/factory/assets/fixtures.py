@@ -22,7 +22,7 @@ from embomatrix.factory.assets.shapes import box, lump, octagon
 from embomatrix.world.geometry import Aabb
 
 if TYPE_CHECKING:
-    from embomatrix.world.geometry import Part, Vec2, Vec3
+    from embomatrix.world.geometry import ConvexPart, Vec2, Vec3
 
 _ON_LEGS_M: Final = 0.6
 """A grill as high as this is one to stand at."""
@@ -68,7 +68,7 @@ def _sink(size_m: Vec3, basins: int, basin_width_m: float) -> Body:
     return body
 
 
-def _tap(foot: Vec2, reach: float, z: Vec2) -> list[Part]:
+def _tap(foot: Vec2, reach: float, z: Vec2) -> list[ConvexPart]:
     """A post behind the basin and a spout over it."""
     x, y = foot
     r = _tap_radius(z)

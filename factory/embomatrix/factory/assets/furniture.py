@@ -8,10 +8,10 @@ from embomatrix.factory.assets.body import Body, centred, clamp
 from embomatrix.factory.assets.shapes import box, octagon
 
 if TYPE_CHECKING:
-    from embomatrix.world.geometry import Part, Vec2, Vec3
+    from embomatrix.world.geometry import ConvexPart, Vec2, Vec3
 
 
-def legs(low: Vec2, high: Vec2, z: Vec2, thickness_m: float) -> list[Part]:
+def legs(low: Vec2, high: Vec2, z: Vec2, thickness_m: float) -> list[ConvexPart]:
     """Four square legs at the corners of a rectangle."""
     (x0, y0), (x1, y1), t = low, high, thickness_m
     return [box((x, y, z[0]), (x + t, y + t, z[1])) for x in (x0, x1 - t) for y in (y0, y1 - t)]

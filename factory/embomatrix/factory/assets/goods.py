@@ -25,7 +25,7 @@ from embomatrix.factory.assets.shapes import (
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from embomatrix.world.geometry import Aabb, Part, Vec3
+    from embomatrix.world.geometry import Aabb, ConvexPart, Vec3
 
 
 LEAST_ROUND_M: Final = 0.01
@@ -118,7 +118,7 @@ def dumbbell(size_m: Vec3) -> Body:
     return Body(parts=ends)
 
 
-def _of(shape: Callable[[Aabb], Part], size_m: Vec3) -> Body:
+def _of(shape: Callable[[Aabb], ConvexPart], size_m: Vec3) -> Body:
     """One convex piece that fills the box, or the box itself where that is thin."""
     outer = centred(size_m)
     return Body(parts=[shape(outer) if min(size_m) >= LEAST_ROUND_M else box_of(outer)])

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 import trimesh
 
-from embomatrix.world.geometry import Aabb, Part, Pose, Shape
+from embomatrix.world.geometry import Aabb, ConvexPart, Pose, Shape
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -38,28 +38,28 @@ def rounded(*values: float) -> Vec3:
     return (x, y, z)
 
 
-def box(low: Sequence[float], high: Sequence[float]) -> Part:
+def box(low: Sequence[float], high: Sequence[float]) -> ConvexPart:
     """Axis-aligned box between two corners. Raises ValueError when it is thinner than 0.1 mm somewhere."""
     size = [b - a for a, b in zip(low, high, strict=True)]
     if min(size) < 1e-4:
         raise ValueError(f"box from {tuple(low)} to {tuple(high)} m has no volume: expected low < high")
     centre = rounded(*((a + b) / 2 for a, b in zip(low, high, strict=True)))
-    return Part(Shape.BOX, Pose(centre), rounded(*size))
+    return ConvexPart(Shape.BOX, Pose(centre), rounded(*size))
 
 
-def box_of(region: Aabb) -> Part:
+def box_of(region: Aabb) -> ConvexPart:
     return box(region.low_m, region.high_m)
 
 
-def hull(points: FloatArray) -> Part:
+def hull(points: FloatArray) -> ConvexPart:
     """Convex part from points, shape (n, 3), that are all corners of their hull; its own origin is their box's centre."""
     low, high = points.min(axis=0), points.max(axis=0)
     centre = rounded(*((low + high) / 2))
     vertices = tuple(rounded(*point) for point in (points - np.asarray(centre)))
-    return Part(Shape.HULL, Pose(centre), rounded(*(high - low)), vertices)
+    return ConvexPart(Shape.HULL, Pose(centre), rounded(*(high - low)), vertices)
 
 
-def prism(centre: Vec2, radii: Vec2, z: Vec2, *, sides: int = 12) -> Part:
+def prism(centre: Vec2, radii: Vec2, z: Vec2, *, sides: int = 12) -> ConvexPart:
     """Upright elliptic cylinder as a polygon prism; ``radii`` are its half extents along x and y.
 
     With ``sides`` a multiple of four its box is exactly twice the radii.
@@ -68,14 +68,14 @@ def prism(centre: Vec2, radii: Vec2, z: Vec2, *, sides: int = 12) -> Part:
     return hull(np.vstack([np.column_stack((rim, np.full(sides, height))) for height in z]))
 
 
-def shouldered(radii: Vec2, neck_share: float, z: Vec3) -> Part:
+def shouldered(radii: Vec2, neck_share: float, z: Vec3) -> ConvexPart:
     """Bottle: upright to the shoulder at the second height, then narrowing to the neck's share of the radii."""
     rims = ((1.0, z[0]), (1.0, z[1]), (neck_share, z[2]))
     levels = [np.column_stack((_polygon(12) * radii * share, np.full(12, height))) for share, height in rims]
     return hull(np.vstack(levels))
 
 
-def octagon(centre: Vec2, radii: Vec2, z: Vec2) -> list[Part]:
+def octagon(centre: Vec2, radii: Vec2, z: Vec2) -> list[ConvexPart]:
     """Flat disc as three boxes that cover an octagon, its flats at the ends of both axes, but for slivers at its slants.
 
     Boxes share one compound in Bullet and rest on each other without rocking; hulls and cylinders do neither.
@@ -87,7 +87,7 @@ def octagon(centre: Vec2, radii: Vec2, z: Vec2) -> list[Part]:
     ]
 
 
-def ring(centre: Vec2, radii: Vec2, z: Vec2, wall_m: float) -> list[Part]:
+def ring(centre: Vec2, radii: Vec2, z: Vec2, wall_m: float) -> list[ConvexPart]:
     """Wall of a round vessel: eight turned boards whose outer faces are the sides of the octagon."""
     corners = np.array(_OCTAGON) * radii + centre  # (8, 2)
     boards = []
@@ -99,7 +99,7 @@ def ring(centre: Vec2, radii: Vec2, z: Vec2, wall_m: float) -> list[Part]:
         yaw = math.atan2(outward[1], outward[0])
         turn = (0.0, 0.0, round(math.sin(yaw / 2), 9), round(math.cos(yaw / 2), 9))
         size = rounded(wall_m, length, z[1] - z[0])
-        boards.append(Part(Shape.BOX, Pose(rounded(x, y, (z[0] + z[1]) / 2), turn), size))
+        boards.append(ConvexPart(Shape.BOX, Pose(rounded(x, y, (z[0] + z[1]) / 2), turn), size))
     return boards
 
 
@@ -110,7 +110,7 @@ def inscribed(radii: Vec2, wall_m: float) -> Vec2:
     return (share * rx, share * ry)
 
 
-def lump(region: Aabb) -> Part:
+def lump(region: Aabb) -> ConvexPart:
     """Ellipsoid-like hull that fills a box, with a flat base.
 
     A true ellipsoid would roll for ever on a table in a rigid-body engine; a fruit rests in a dent of its own.
@@ -118,39 +118,39 @@ def lump(region: Aabb) -> Part:
     return _stretched(_unit_lump(), region)
 
 
-def dome(region: Aabb) -> Part:
+def dome(region: Aabb) -> ConvexPart:
     """Half an ellipsoid on its cut face: halves of fruit, buns, heaps."""
     return _stretched(_unit_dome(), region)
 
 
-def cushion(region: Aabb) -> Part:
+def cushion(region: Aabb) -> ConvexPart:
     """Box with its edges cut: pillows, bags, shoes."""
     return _stretched(_unit_cushion(), region)
 
 
-def loaf(region: Aabb) -> Part:
+def loaf(region: Aabb) -> ConvexPart:
     """Bread: a bar along the longer side with an arched back."""
     return _extruded(region, _LOAF, ((0.0, 1.0), (1.0, 1.0)))
 
 
-def log(region: Aabb) -> Part:
+def log(region: Aabb) -> ConvexPart:
     """Round bar lying along the longer side; its eighth side is flat on the ground, so it does not roll."""
     return _extruded(region, _ROUND, ((0.0, 1.0), (1.0, 1.0)))
 
 
-def capsule(region: Aabb) -> Part:
+def capsule(region: Aabb) -> ConvexPart:
     """Lying bar with rounded ends: sausages, carrots, bananas."""
     return _extruded(
         region, _ROUND, ((0.0, 0.45), (0.15, 0.9), (0.3, 1.0), (0.7, 1.0), (0.85, 0.9), (1.0, 0.45))
     )
 
 
-def ridge(region: Aabb) -> Part:
+def ridge(region: Aabb) -> ConvexPart:
     """Prism with a ridge along the longer side: tents and roofs."""
     return _extruded(region, ((0.0, 0.0), (1.0, 0.0), (0.5, 1.0)), ((0.0, 1.0), (1.0, 1.0)))
 
 
-def frustum(region: Aabb, top_share: float) -> Part:
+def frustum(region: Aabb, top_share: float) -> ConvexPart:
     """Block that narrows to a share of its base towards the top: folded cloth, heaps, boulders."""
     (x0, y0, z0), (x1, y1, z1) = region.low_m, region.high_m
     (cx, cy, _), share = region.center_m, top_share
@@ -158,7 +158,7 @@ def frustum(region: Aabb, top_share: float) -> Part:
     return hull(np.array([*((x, y, z0) for x in (x0, x1) for y in (y0, y1)), *top]))
 
 
-def wedge(region: Aabb) -> Part:
+def wedge(region: Aabb) -> ConvexPart:
     """Slice of a cake: a triangle seen from above, its tip at the end of the longer side."""
     (x0, y0, z0), (x1, y1, z1) = region.low_m, region.high_m
     cx, cy, _ = region.center_m
@@ -166,7 +166,7 @@ def wedge(region: Aabb) -> Part:
     return hull(np.array([(x, y, z) for z in (z0, z1) for x, y in tip]))
 
 
-def half_disc(region: Aabb) -> Part:
+def half_disc(region: Aabb) -> ConvexPart:
     """Half a flat round: its straight edge is the longer side."""
     turn = np.linspace(0.0, math.pi, 9)
     along, out = (1 - np.cos(turn)) / 2, np.sin(turn)
@@ -180,7 +180,7 @@ _LOAF: Final = ((0.0, 0.0), (1.0, 0.0), (1.0, 0.55), (0.78, 0.92), (0.5, 1.0), (
 _ROUND: Final = tuple((0.5 + x / 2, 0.5 + y / 2) for x, y in _OCTAGON)
 
 
-def _extruded(region: Aabb, section: Sequence[Vec2], stations: Sequence[Vec2]) -> Part:
+def _extruded(region: Aabb, section: Sequence[Vec2], stations: Sequence[Vec2]) -> ConvexPart:
     """A section in the unit square (across, up), drawn along the longer horizontal side.
 
     ``stations`` lists (share of the length, scale of the section about its centre).
@@ -194,7 +194,7 @@ def _extruded(region: Aabb, section: Sequence[Vec2], stations: Sequence[Vec2]) -
     return hull(points * size + np.asarray(region.center_m))
 
 
-def _stretched(unit: FloatArray, region: Aabb) -> Part:
+def _stretched(unit: FloatArray, region: Aabb) -> ConvexPart:
     return hull(unit * np.asarray(region.size_m) + np.asarray(region.center_m))
 
 
@@ -236,7 +236,7 @@ def _hull_corners(points: FloatArray) -> FloatArray:
     return np.asarray(kept, dtype=np.float64)
 
 
-def mesh_of(part: Part) -> trimesh.Trimesh:
+def mesh_of(part: ConvexPart) -> trimesh.Trimesh:
     """Closed triangle mesh of a part in the asset's frame."""
     match part.shape:
         case Shape.BOX:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.assets.check import Finding, Rule
+from embomatrix.factory.assets.check import AssetFinding, Rule
 from embomatrix.factory.assets.naming import FLAT_ON_WALL, HUNG, family_of
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.mini_world import MiniWorld
@@ -32,7 +32,9 @@ SHEET_SHARE: Final = 0.025
 """A sheet whose thickness is less than this share of its height stands because it is fixed: walls, panels, fences."""
 
 
-def check_standing(catalog: Catalog, assets: Iterable[Asset], least_steps: int = STEPS) -> Iterator[Finding]:
+def check_standing(
+    catalog: Catalog, assets: Iterable[Asset], least_steps: int = STEPS
+) -> Iterator[AssetFinding]:
     """Let each asset go on a floor, doors shut, and yield a finding for each that moves, tips or does not come to rest.
 
     With fewer ``least_steps``, at least `GLANCE_STEPS`, a thing that is slow by then is watched no further. Excused is what
@@ -45,7 +47,7 @@ def check_standing(catalog: Catalog, assets: Iterable[Asset], least_steps: int =
             excuse = _excuse(catalog, asset)
             problem = "" if excuse else _let_go(world, asset, least_steps)
             if excuse or problem:
-                yield Finding(asset.asset_id, Rule.STANDS, excuse or problem, excused=bool(excuse))
+                yield AssetFinding(asset.asset_id, Rule.STANDS, excuse or problem, excused=bool(excuse))
     finally:
         world.close()
         pool.close()

@@ -10,7 +10,7 @@ from embomatrix.factory.assets.shapes import box, octagon
 from embomatrix.world.geometry import Aabb
 
 if TYPE_CHECKING:
-    from embomatrix.world.geometry import Part, Vec3
+    from embomatrix.world.geometry import ConvexPart, Vec3
 
 COUNTER_M: Final = 0.9
 """Height of a stall's counter."""
@@ -64,7 +64,7 @@ def _across(
     low: tuple[float, float],
     high: tuple[float, float],
     z: tuple[float, float],
-) -> Part:
+) -> ConvexPart:
     """Box over an interval of one horizontal axis, and over what two corners span on the other."""
     if along == 0:
         return box((span[0], low[1], z[0]), (span[1], high[1], z[1]))

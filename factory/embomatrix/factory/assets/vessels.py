@@ -22,7 +22,7 @@ from embomatrix.factory.assets.shapes import box, inscribed, octagon, prism, rin
 from embomatrix.world.geometry import Aabb
 
 if TYPE_CHECKING:
-    from embomatrix.world.geometry import Part, Vec2, Vec3
+    from embomatrix.world.geometry import ConvexPart, Vec2, Vec3
 
 
 class Handle(StrEnum):
@@ -102,7 +102,7 @@ def _round(outer: Aabb, handle: Handle) -> _Round:
     return _Round((centre[0], centre[1]), (half[0], half[1]))
 
 
-def _handles(outer: Aabb, shape: _Round, handle: Handle) -> list[Part]:
+def _handles(outer: Aabb, shape: _Round, handle: Handle) -> list[ConvexPart]:
     """Bars from the body to the ends of the box, near the rim."""
     long = 0 if outer.size_m[0] > outer.size_m[1] else 1
     reach = shape.centre[long] + shape.radii[long]

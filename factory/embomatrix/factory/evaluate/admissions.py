@@ -6,7 +6,7 @@ import json
 from collections import Counter
 from typing import TYPE_CHECKING, Any, Final
 
-from embomatrix.factory.evaluate.figures import Evaluation, EvaluationError
+from embomatrix.factory.evaluate.figures import EvaluationError, EvaluationFigures
 from embomatrix.factory.pipeline.settings import WriterKind
 from embomatrix.factory.pipeline.store import ATTEMPTS_FILE, BUILD_FILE, TIMES_FILE, settings_of
 from embomatrix.pages.figures import Better, Figure
@@ -32,7 +32,7 @@ def admitted_share(folder: Path, label: str = "") -> tuple[Figure, ...]:
     return (Figure(name, share, "%", Better.HIGHER, len(attempts), goal),)
 
 
-def evaluate_admissions(folder: Path) -> Evaluation:
+def evaluate_admissions(folder: Path) -> EvaluationFigures:
     """Share and pace of what a build admitted, with the reasons against the rest. Raises EvaluationError."""
     attempts = _attempts(folder)
     if not attempts:
@@ -50,7 +50,7 @@ def evaluate_admissions(folder: Path) -> Evaluation:
         "look ahead": "yes" if settings["look_ahead"] else "no",
         "in physics": "yes" if settings["physical"] else "no",
     }
-    return Evaluation(
+    return EvaluationFigures(
         "admission", conditions, figures, (f"Against drafts{f' of {label}' if label else ''}: {told}.",)
     )
 

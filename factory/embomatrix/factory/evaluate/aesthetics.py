@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from scipy import ndimage
 
-from embomatrix.factory.evaluate.rooms import FLOOR, Item, RoomPlan
+from embomatrix.factory.evaluate.rooms import FLOOR, RoomBox, RoomPlan
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -187,12 +187,12 @@ def auc(good: FloatArray, spoilt: FloatArray) -> float:
     return float(above + (good[:, None] == spoilt[None, :]).mean() / 2)
 
 
-def _bumps(items: Sequence[Item], at: int) -> bool:
+def _bumps(items: Sequence[RoomBox], at: int) -> bool:
     """Whether the item is in another one; what is drawn up to a table, or stands on a carpet, is not."""
     return any(_overlap(items[at], other) for number, other in enumerate(items) if number != at)
 
 
-def _overlap(one: Item, other: Item) -> bool:
+def _overlap(one: RoomBox, other: RoomBox) -> bool:
     if FLOOR in (one.host, other.host) and ({one.kind, other.kind} & (SEATS | {"carpet"})):
         return False
     if min(one.high_m, other.high_m) - max(one.low_m, other.low_m) <= SLACK_M:
@@ -200,7 +200,7 @@ def _overlap(one: Item, other: Item) -> bool:
     return _gap_m(one, other) < -SLACK_M
 
 
-def _gap_m(one: Item, other: Item) -> float:
+def _gap_m(one: RoomBox, other: RoomBox) -> float:
     """Distance of the two boxes' shadows on the room's axes; below 0 how deep one is in the other."""
     gaps = [
         abs(a - b) - c - d
@@ -209,11 +209,11 @@ def _gap_m(one: Item, other: Item) -> float:
     return math.hypot(*(max(0.0, gap) for gap in gaps)) if max(gaps) > 0 else max(gaps)
 
 
-def _wall_gap_m(item: Item, plan: RoomPlan) -> float:
+def _wall_gap_m(item: RoomBox, plan: RoomPlan) -> float:
     """From the box to the nearest edge of the room."""
     (x, y), (a, b) = item.center_m, item.reach_m
     return min(x - a - plan.low_m[0], plan.high_m[0] - x - a, y - b - plan.low_m[1], plan.high_m[1] - y - b)
 
 
-def _is_within(item: Item, plan: RoomPlan) -> bool:
+def _is_within(item: RoomBox, plan: RoomPlan) -> bool:
     return _wall_gap_m(item, plan) >= -5 * SLACK_M

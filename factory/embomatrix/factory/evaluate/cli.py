@@ -16,8 +16,8 @@ from embomatrix.factory.asked_model import Key, Tape, chat_model
 from embomatrix.factory.evaluate.admissions import admitted_share, evaluate_admissions
 from embomatrix.factory.evaluate.drafts import asked_of
 from embomatrix.factory.evaluate.figures import (
-    Evaluation,
     EvaluationError,
+    EvaluationFigures,
     read_evaluation,
 )
 from embomatrix.factory.evaluate.judge import judged
@@ -26,7 +26,7 @@ from embomatrix.factory.evaluate.measure import evaluate_aesthetics, evaluate_ta
 from embomatrix.factory.evaluate.output import hand_in
 from embomatrix.factory.evaluate.page import with_factory
 from embomatrix.factory.evaluate.scene_runs import OutcomeLog, evaluate_scenes
-from embomatrix.factory.evaluate.scenes import Method, fixed_tasks
+from embomatrix.factory.evaluate.scenes import LayoutMethod, fixed_tasks
 from embomatrix.factory.evaluate.side_by_side import draw_side_by_side, named
 from embomatrix.factory.evaluate.tasks import panel, people_of
 from embomatrix.factory.pipeline.corpus import training_scenes
@@ -39,7 +39,7 @@ from embomatrix.world.whole_file import write_whole
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping, Sequence
 
-    from embomatrix.factory.evaluate.drafts import Asked
+    from embomatrix.factory.evaluate.drafts import DraftFeatures
     from embomatrix.llm.values import ChatModel
 
 app = typer.Typer(
@@ -52,7 +52,7 @@ PAGE = Path("docs/benchmarks.md")
 JsonFile = Annotated[Path | None, typer.Option("--json", help="File for the figures.")]
 Seed = Annotated[int, typer.Option(min=0, help="Equal seeds give equal figures.")]
 Methods = Annotated[
-    list[Method] | None,
+    list[LayoutMethod] | None,
     typer.Option("--method", help="One of them; give it again for more. Default: all."),
 ]
 Only = Annotated[int, typer.Option(min=1, help="Every so manieth task of the 140, for a quick look.")]
@@ -119,7 +119,7 @@ def scenes(
     kept = "; what was found is kept, and the same command goes on from there" if outcomes is not None else ""
     with mended(outcomes, kept):
         chosen = fixed_tasks(sample)[::only]
-        told = methods or list(Method)
+        told = methods or list(LayoutMethod)
         log = OutcomeLog.open(outcomes, seed) if outcomes is not None else None
         with progress(Console(stderr=True)) as bars:
             bar = bars.add_task("trials", total=len(chosen) * len(told))
@@ -160,9 +160,9 @@ def looks(
 ) -> None:
     """The paper's judge of aesthetics: a language model that is shown the plan of each laid out room, with its tree."""
     with mended():
-        chosen, told = fixed_tasks(sample)[::only], methods or list(Method)
+        chosen, told = fixed_tasks(sample)[::only], methods or list(LayoutMethod)
 
-        async def looked(judge: ChatModel) -> Evaluation:
+        async def looked(judge: ChatModel) -> EvaluationFigures:
             with progress(Console(stderr=True)) as bars:
                 bar = bars.add_task("trials", total=len(chosen) * len(told))
                 return await evaluate_looks(
@@ -214,13 +214,13 @@ def page(
     Console().print(f"page: {out}", highlight=False)
 
 
-def _of_dataset(folder: Path, each: int) -> tuple[Mapping[str, Sequence[Asked]], Evaluation]:
+def _of_dataset(folder: Path, each: int) -> tuple[Mapping[str, Sequence[DraftFeatures]], EvaluationFigures]:
     groups = asked_of(Dataset.load(folder).records, each)
     if not groups:
         raise EvaluationError(f"no base scene of {folder} has {each} tasks: ask for fewer with --each")
     figures = (*panel(groups, people_of(folder / TRANSCRIPTS_FOLDER)), *admitted_share(folder))
     conditions = {"dataset": folder.name, "scenes": len(groups), "tasks a scene": each}
-    return groups, Evaluation("tasks", conditions, figures)
+    return groups, EvaluationFigures("tasks", conditions, figures)
 
 
 async def _asked(
@@ -231,7 +231,9 @@ async def _asked(
         return await question(judge)
 
 
-async def _judged(judge: ChatModel, groups: Mapping[str, Sequence[Asked]], seed: int) -> tuple[Figure, ...]:
+async def _judged(
+    judge: ChatModel, groups: Mapping[str, Sequence[DraftFeatures]], seed: int
+) -> tuple[Figure, ...]:
     """Mean scores of a language model over the scenes."""
     verdicts = [
         await judged(judge, [asked.instruction for asked in group], seed) for group in groups.values()

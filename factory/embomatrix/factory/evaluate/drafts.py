@@ -30,7 +30,7 @@ MOST_VARIANTS: Final = 12
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class DraftFeatures:
     """What is measured of one task: its words, its goal's kind, its rooms, and whether its goal means any of several things."""
 
     instruction: str
@@ -39,9 +39,9 @@ class Asked:
     quantified: bool
 
 
-def asked_in(base: Scene, writer: TaskWriter, count: int, seed: int) -> list[Asked]:
+def asked_in(base: Scene, writer: TaskWriter, count: int, seed: int) -> list[DraftFeatures]:
     """So many different tasks over variants of a base scene, the categories in turns; fewer where it holds no more."""
-    found: dict[str, Asked] = {}
+    found: dict[str, DraftFeatures] = {}
     for number in range(MOST_VARIANTS):
         for draft in _drafts(base, writer, number, seed):
             found.setdefault(f"{draft.signature}|{draft.task.instruction}", _asked(draft))
@@ -66,15 +66,17 @@ def _drafts(base: Scene, writer: TaskWriter, number: int, seed: int) -> Iterator
             return
 
 
-def _asked(draft: Draft) -> Asked:
-    return Asked(draft.task.instruction, draft.signature, draft.rooms, bool(draft.task.types))
+def _asked(draft: Draft) -> DraftFeatures:
+    return DraftFeatures(draft.task.instruction, draft.signature, draft.rooms, bool(draft.task.types))
 
 
-def asked_of(records: Sequence[TaskRecord], count: int) -> dict[str, list[Asked]]:
+def asked_of(records: Sequence[TaskRecord], count: int) -> dict[str, list[DraftFeatures]]:
     """The first so many tasks of a dataset in each base scene that has as many, by base scene."""
-    groups: dict[str, list[Asked]] = {}
+    groups: dict[str, list[DraftFeatures]] = {}
     for record in records:
         base = record.task.scene_id.split("-")[0]
-        asked = Asked(record.task.instruction, record.signature, record.rooms, bool(record.task.types))
+        asked = DraftFeatures(
+            record.task.instruction, record.signature, record.rooms, bool(record.task.types)
+        )
         groups.setdefault(base, []).append(asked)
     return {base: group[:count] for base, group in groups.items() if len(group) >= count}

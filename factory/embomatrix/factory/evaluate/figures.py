@@ -20,7 +20,7 @@ class EvaluationError(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Evaluation:
+class EvaluationFigures:
     """Figures of one part. ``conditions`` say what was measured, as plain JSON values; ``notes`` are sentences for the page."""
 
     part: str
@@ -33,7 +33,7 @@ class Evaluation:
         return {figure.name: figure for figure in self.figures}[name]
 
 
-def evaluation_to_json(evaluation: Evaluation) -> dict[str, Any]:
+def evaluation_to_json(evaluation: EvaluationFigures) -> dict[str, Any]:
     """Plain JSON values; numbers with six digits."""
     return {
         "part": evaluation.part,
@@ -43,11 +43,11 @@ def evaluation_to_json(evaluation: Evaluation) -> dict[str, Any]:
     }
 
 
-def read_evaluation(path: Path) -> Evaluation:
+def read_evaluation(path: Path) -> EvaluationFigures:
     """What `evaluation_to_json` made, from a file. Raises EvaluationError when it is none."""
     try:
         value = json.loads(path.read_text(encoding="utf-8"))
-        return Evaluation(
+        return EvaluationFigures(
             str(value["part"]),
             dict(value["conditions"]),
             tuple(figure_from_json(item) for item in value["figures"]),

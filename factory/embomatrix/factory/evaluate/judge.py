@@ -35,7 +35,7 @@ Answer with JSON: variety, characters, overall (numbers from 0 to 10), explanati
 """As printed in the paper's appendix, with the form of the answer added. Commands are data and stand last."""
 
 
-class Verdict(BaseModel):
+class DiversityScores(BaseModel):
     """Scores of 0 to 10."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
@@ -46,10 +46,10 @@ class Verdict(BaseModel):
     explanation: str = Field(min_length=1)
 
 
-async def judged(model: ChatModel, commands: Sequence[str], seed: int, attempts: int = 3) -> Verdict:
+async def judged(model: ChatModel, commands: Sequence[str], seed: int, attempts: int = 3) -> DiversityScores:
     """What the model thinks of one scene's commands. Raises LlmError."""
     listed = "\n".join(f"{number}. {command}" for number, command in enumerate(commands, start=1))
     request = ChatRequest(
         JUDGE, (Message(Speaker.USER, PROMPT.format(commands=f"\n{listed}\n")),), temperature=0.0, seed=seed
     )
-    return (await ask(model, request, Verdict, attempts=attempts)).value
+    return (await ask(model, request, DiversityScores, attempts=attempts)).value

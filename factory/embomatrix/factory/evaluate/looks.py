@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from embomatrix.factory.evaluate.figures import Evaluation
+from embomatrix.factory.evaluate.figures import EvaluationFigures
 from embomatrix.factory.evaluate.scenes import METHODS
 from embomatrix.factory.layout.tree import tree_in
 from embomatrix.factory.pictures.sights import sight_of_room
 from embomatrix.factory.scenes.build import build_base_scene
-from embomatrix.factory.task_import.task import Imported, Manner, import_problem
+from embomatrix.factory.task_import.task import ImportedTask, Manner, import_problem
 from embomatrix.llm.structured import ask
 from embomatrix.llm.values import ChatRequest, Message, Speaker, UnusableReplyError
 from embomatrix.pages.figures import Better, Figure
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from embomatrix.factory.editor import SceneEditor
-    from embomatrix.factory.evaluate.scenes import Method, SceneTask
-    from embomatrix.factory.layout.jobs import Item, Layout
+    from embomatrix.factory.evaluate.scenes import LayoutMethod, SceneTask
+    from embomatrix.factory.layout.jobs import Layout, RequestedObject
     from embomatrix.factory.task_import.task import Lay
     from embomatrix.llm.values import ChatModel
     from embomatrix.world.scene import Scene
@@ -103,12 +103,12 @@ async def impression_of(
 async def evaluate_looks(
     model: ChatModel,
     tasks: Sequence[SceneTask],
-    methods: Sequence[Method],
+    methods: Sequence[LayoutMethod],
     seed: int,
     progress: Callable[[int], None] = lambda _done: None,
-) -> Evaluation:
+) -> EvaluationFigures:
     """Mean points of the scenes that each method gave; nothing is executed. Raises EndpointError where nobody answers."""
-    points: defaultdict[Method, list[float]] = defaultdict(list)
+    points: defaultdict[LayoutMethod, list[float]] = defaultdict(list)
     unusable = 0
     for done, task in enumerate(tasks):
         base = build_base_scene(task.scene)
@@ -116,7 +116,7 @@ async def evaluate_looks(
             names: list[str] = []
             laid = _noting(method, names)
             imported = import_problem(task.source, base, seed=seed, manner=Manner(laid))
-            if isinstance(imported, Imported) and names:
+            if isinstance(imported, ImportedTask) and names:
                 try:
                     impression = await impression_of(model, imported.scene, names, seed)
                 except UnusableReplyError:
@@ -130,13 +130,13 @@ async def evaluate_looks(
     )
     notes = (f"{unusable} scenes got no usable answer.",) if unusable else ()
     conditions = {"tasks": len(tasks), "methods": ", ".join(methods), "seed": seed}
-    return Evaluation("looks", conditions, figures, notes)
+    return EvaluationFigures("looks", conditions, figures, notes)
 
 
-def _noting(method: Method, names: list[str]) -> Lay:
+def _noting(method: LayoutMethod, names: list[str]) -> Lay:
     """The method; ``names`` are what it added last."""
 
-    def laying(editor: SceneEditor, items: Sequence[Item], seed: int) -> Layout:
+    def laying(editor: SceneEditor, items: Sequence[RequestedObject], seed: int) -> Layout:
         layout = METHODS[method](editor, items, seed)
         names[:] = layout.names.values()
         return layout

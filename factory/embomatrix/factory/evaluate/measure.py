@@ -9,7 +9,7 @@ import numpy as np
 
 from embomatrix.factory.evaluate.aesthetics import Calibration, auc, fit, score_room
 from embomatrix.factory.evaluate.drafts import asked_in
-from embomatrix.factory.evaluate.figures import Evaluation, EvaluationError
+from embomatrix.factory.evaluate.figures import EvaluationError, EvaluationFigures
 from embomatrix.factory.evaluate.rooms import read_rooms
 from embomatrix.factory.evaluate.spoiling import SPOILERS
 from embomatrix.factory.evaluate.tasks import panel
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
-    from embomatrix.factory.evaluate.drafts import Asked
+    from embomatrix.factory.evaluate.drafts import DraftFeatures
     from embomatrix.factory.evaluate.rooms import RoomPlan
 
 SOCIAL: Final = ""
@@ -36,39 +36,39 @@ SPLITS: Final = 10
 
 
 @dataclass(frozen=True, slots=True)
-class Written:
+class WrittenTasks:
     """Tasks by base scene, as each writer made them for the same scenes."""
 
-    social: Mapping[str, Sequence[Asked]]
-    plain: Mapping[str, Sequence[Asked]]
+    social: Mapping[str, Sequence[DraftFeatures]]
+    plain: Mapping[str, Sequence[DraftFeatures]]
 
 
 def written_for(
     scene_ids: Sequence[str], each: int, seed: int, progress: Callable[[int], None] = lambda _done: None
-) -> Written:
+) -> WrittenTasks:
     """So many tasks of each writer for each base scene. Raises CatalogError for an unknown scene."""
     social, plain = SocialWriter(seed), PlainWriter()
-    asked: dict[str, tuple[list[Asked], list[Asked]]] = {}
+    asked: dict[str, tuple[list[DraftFeatures], list[DraftFeatures]]] = {}
     for done, scene_id in enumerate(scene_ids, start=1):
         base = build_base_scene(scene_id, seed=seed)
         asked[base.base] = (asked_in(base, social, each, seed), asked_in(base, plain, each, seed))
         progress(done)
-    return Written(
+    return WrittenTasks(
         {base: social for base, (social, _) in asked.items()},
         {base: plain for base, (_, plain) in asked.items()},
     )
 
 
-def evaluate_tasks(written: Written, each: int, seed: int) -> Evaluation:
+def evaluate_tasks(written: WrittenTasks, each: int, seed: int) -> EvaluationFigures:
     """The panel of both writers. Scenes that gave fewer tasks than asked for are named, and count with what they gave."""
     short = [base for base, group in written.social.items() if len(group) < each]
     figures = (*panel(written.social, NAMES), *panel(written.plain, NAMES, PLAIN))
     notes = (f"Fewer than {each} tasks were found in {', '.join(short)}.",) if short else ()
     conditions = {"scenes": len(written.social), "tasks a scene": each, "seed": seed}
-    return Evaluation("tasks", conditions, figures, notes)
+    return EvaluationFigures("tasks", conditions, figures, notes)
 
 
-def evaluate_aesthetics(rooms_file: Path, seed: int) -> tuple[Evaluation, Calibration]:
+def evaluate_aesthetics(rooms_file: Path, seed: int) -> tuple[EvaluationFigures, Calibration]:
     """How well fitted scores tell rooms that the fit did not see, and the calibration of all rooms. Raises EvaluationError."""
     rooms = [room for room in read_rooms(rooms_file) if len(room.pieces) >= FEWEST_PIECES]
     if len(rooms) < 4:
@@ -102,7 +102,7 @@ def evaluate_aesthetics(rooms_file: Path, seed: int) -> tuple[Evaluation, Calibr
         Figure("aesthetics spoilt", float(np.mean(bad)), "of 10", Better.NEITHER, 3 * n),
     )
     conditions = {"rooms": len(rooms), "halvings": SPLITS, "seed": seed}
-    return Evaluation("aesthetics", conditions, figures), fit(rooms, _spoilt(rooms, rng))
+    return EvaluationFigures("aesthetics", conditions, figures), fit(rooms, _spoilt(rooms, rng))
 
 
 def _spoilt(rooms: Sequence[RoomPlan], rng: np.random.Generator) -> list[RoomPlan]:

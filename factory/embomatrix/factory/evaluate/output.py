@@ -15,10 +15,10 @@ from embomatrix.world.whole_file import write_whole
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from embomatrix.factory.evaluate.figures import Evaluation
+    from embomatrix.factory.evaluate.figures import EvaluationFigures
 
 
-def hand_in(evaluation: Evaluation, json_file: Path | None) -> None:
+def hand_in(evaluation: EvaluationFigures, json_file: Path | None) -> None:
     """A table of the figures, the notes below it, and all of it in the file where one is given. Ends what can't be written."""
     table = Table("figure", "value", "goal", "", "n")
     for figure in evaluation.figures:

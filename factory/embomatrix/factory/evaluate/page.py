@@ -15,7 +15,7 @@ from embomatrix.pages.figures import shown
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from embomatrix.factory.evaluate.figures import Evaluation
+    from embomatrix.factory.evaluate.figures import EvaluationFigures
     from embomatrix.pages.figures import Figure
 
 WIDTH: Final = 128
@@ -71,7 +71,7 @@ PARTS: Final[Mapping[str, tuple[str, str]]] = {
 """Heading and explanation of each part, in the order of the page."""
 
 
-def with_factory(page: str, evaluations: Sequence[Evaluation]) -> str:
+def with_factory(page: str, evaluations: Sequence[EvaluationFigures]) -> str:
     """The page with these evaluations in the factory's part, which is added at the end where it is not there yet.
 
     Raises EvaluationError where a mark lacks its other, for an unknown part, or a figure that two files of a part give.
@@ -109,7 +109,7 @@ def _render(sections: Mapping[str, str]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _measured(evaluations: Sequence[Evaluation]) -> dict[str, str]:
+def _measured(evaluations: Sequence[EvaluationFigures]) -> dict[str, str]:
     """What stands under the headings of these evaluations; files of one part are put together."""
     sections = {}
     for part, mine in _by_part(evaluations).items():
@@ -126,7 +126,7 @@ def _measured(evaluations: Sequence[Evaluation]) -> dict[str, str]:
     return sections
 
 
-def _by_part(evaluations: Sequence[Evaluation]) -> dict[str, list[Evaluation]]:
+def _by_part(evaluations: Sequence[EvaluationFigures]) -> dict[str, list[EvaluationFigures]]:
     """Evaluations by part, in the order of the page. Raises EvaluationError."""
     for evaluation in evaluations:
         if evaluation.part not in PARTS:

@@ -46,7 +46,7 @@ _ALIASES: Final[Mapping[str, str]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Item:
+class RoomBox:
     """A box. ``half_m`` are half its extents in its own frame, ``tilt_rad`` its angle off the room's axes, in ±π/4.
 
     ``host`` is the kind of thing that it rests on or in; `FLOOR` for furniture.
@@ -74,8 +74,8 @@ class RoomPlan:
     name: str
     low_m: tuple[float, float]
     high_m: tuple[float, float]
-    pieces: tuple[Item, ...]
-    things: tuple[Item, ...]
+    pieces: tuple[RoomBox, ...]
+    things: tuple[RoomBox, ...]
     carried: tuple[int, ...]
 
 
@@ -87,8 +87,8 @@ def kind_of(category: str) -> str:
 def plan_of(scene: Scene, room_name: str) -> RoomPlan:
     """One room of a scene. Raises KeyError for a room that is not there."""
     room = {item.name: item for item in scene.rooms}[room_name]
-    pieces: list[Item] = []
-    things: list[tuple[Item, str]] = []
+    pieces: list[RoomBox] = []
+    things: list[tuple[RoomBox, str]] = []
     number: dict[str, int] = {}
     for item in scene.objects:
         if item.room != room_name:
@@ -101,10 +101,10 @@ def plan_of(scene: Scene, room_name: str) -> RoomPlan:
         box = (z - asset.size_m[2] / 2, z + asset.size_m[2] / 2)
         if item.host and item.host in scene.by_name:
             host = kind_of(scene.asset_of(item.host).category)
-            things.append((Item(kind_of(asset.category), (x, y), half, tilt, *box, host), item.host))
+            things.append((RoomBox(kind_of(asset.category), (x, y), half, tilt, *box, host), item.host))
         elif item.fixed and 2 * max(half) >= MIN_PIECE_M and box[0] < 0.1:
             number[item.name] = len(pieces)
-            pieces.append(Item(kind_of(asset.category), (x, y), half, tilt, *box, FLOOR))
+            pieces.append(RoomBox(kind_of(asset.category), (x, y), half, tilt, *box, FLOOR))
     return RoomPlan(
         room_name,
         (room.low_m[0], room.low_m[1]),
@@ -141,7 +141,7 @@ def _room_from(value: Mapping[str, Any], number: int) -> RoomPlan:
         host = _snake(hosts[0]) if hosts else FLOOR
         tilt = _quarter(math.radians(yaw_deg))[1]
         half = (size[0] / 2, size[2] / 2)
-        item = Item(kind, (center[0], center[2]), half, tilt, *box, host)
+        item = RoomBox(kind, (center[0], center[2]), half, tilt, *box, host)
         if host != FLOOR:
             things.append(replace(item, tilt_rad=0.0))
         elif 2 * max(half) >= MIN_PIECE_M:
@@ -158,7 +158,7 @@ def _room_from(value: Mapping[str, Any], number: int) -> RoomPlan:
     )
 
 
-def _bearer(thing: Item, pieces: Sequence[Item]) -> int:
+def _bearer(thing: RoomBox, pieces: Sequence[RoomBox]) -> int:
     """The piece of the host's kind above whose floor the thing is, -1 where none is."""
     for index, piece in enumerate(pieces):
         inside = all(

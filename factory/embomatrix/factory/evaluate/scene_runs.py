@@ -6,7 +6,7 @@ import contextlib
 from collections import defaultdict
 from typing import TYPE_CHECKING, Any
 
-from embomatrix.factory.evaluate.scenes import Method, Outcome, SceneTask, evaluation_of, judge
+from embomatrix.factory.evaluate.scenes import LayoutMethod, LayoutOutcome, SceneTask, evaluation_of, judge
 from embomatrix.factory.outcome_log import LineLog
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.sim.placing.pose_cache import PlacementLibrary
@@ -16,12 +16,12 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
-    from embomatrix.factory.evaluate.figures import Evaluation
+    from embomatrix.factory.evaluate.figures import EvaluationFigures
 
-    Trial = tuple[SceneTask, Method]
+    Trial = tuple[SceneTask, LayoutMethod]
 
 
-class OutcomeLog(LineLog[Outcome]):
+class OutcomeLog(LineLog[LayoutOutcome]):
     """Outcomes of trials; their seed decides them."""
 
     @staticmethod
@@ -32,19 +32,19 @@ class OutcomeLog(LineLog[Outcome]):
         return log
 
 
-def _outcome(value: dict[str, Any]) -> Outcome:
-    told = {**value, "method": Method(value["method"]), "planar_s": tuple(value["planar_s"])}
-    return Outcome(**told)
+def _outcome(value: dict[str, Any]) -> LayoutOutcome:
+    told = {**value, "method": LayoutMethod(value["method"]), "planar_s": tuple(value["planar_s"])}
+    return LayoutOutcome(**told)
 
 
 def evaluate_scenes(
     tasks: Sequence[SceneTask],
-    methods: Sequence[Method],
+    methods: Sequence[LayoutMethod],
     seed: int,
     jobs: int,
     progress: Callable[[int], None] = lambda _done: None,
     log: OutcomeLog | None = None,
-) -> tuple[Evaluation, list[Outcome]]:
+) -> tuple[EvaluationFigures, list[LayoutOutcome]]:
     """Every task by every method; ``progress`` hears how many trials are done. Equal arguments, equal outcomes.
 
     Trials that the ``log`` holds are not made again; the others are added to it as they come.
@@ -75,7 +75,7 @@ def evaluate_scenes(
 
 def _made(
     orders: Sequence[tuple[Sequence[Trial], int]], jobs: int, stack: contextlib.ExitStack
-) -> Iterator[Outcome]:
+) -> Iterator[LayoutOutcome]:
     """Outcomes, one by one in this process, scene by scene from several."""
     if jobs == 1:
         for order in orders:
@@ -86,11 +86,11 @@ def _made(
         yield from group
 
 
-def _all_judged(order: tuple[Sequence[Trial], int]) -> list[Outcome]:
+def _all_judged(order: tuple[Sequence[Trial], int]) -> list[LayoutOutcome]:
     return list(_judged(order))
 
 
-def _judged(order: tuple[Sequence[Trial], int]) -> Iterator[Outcome]:
+def _judged(order: tuple[Sequence[Trial], int]) -> Iterator[LayoutOutcome]:
     trials, seed = order
     base = build_base_scene(trials[0][0].scene)
     with contextlib.closing(PlacementLibrary()) as library:

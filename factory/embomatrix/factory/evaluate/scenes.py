@@ -22,16 +22,16 @@ import numpy as np
 
 from embomatrix.factory.admission import Admitted, admit
 from embomatrix.factory.evaluate.aesthetics import Calibration, score_room
-from embomatrix.factory.evaluate.figures import Evaluation, EvaluationError
+from embomatrix.factory.evaluate.figures import EvaluationError, EvaluationFigures
 from embomatrix.factory.evaluate.manipulation import out_of_hand
 from embomatrix.factory.evaluate.rooms import plan_of
 from embomatrix.factory.evaluate.scene_geometry import flaws_of
 from embomatrix.factory.layout.baselines import lay_at_random, lay_by_poses
 from embomatrix.factory.layout.generator import lay
-from embomatrix.factory.refusal import Refusal, RefusalReason
+from embomatrix.factory.refusal import RefusalReason, TaskRefusal
 from embomatrix.factory.task_import.batch import poses_for
 from embomatrix.factory.task_import.sources import SourceText, read_activity
-from embomatrix.factory.task_import.task import Imported, Manner, import_problem
+from embomatrix.factory.task_import.task import ImportedTask, Manner, import_problem
 from embomatrix.factory.writer.view import SceneView
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.sim.executor import Simulator
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from embomatrix.factory.editor import SceneEditor
-    from embomatrix.factory.layout.jobs import Item, Layout
+    from embomatrix.factory.layout.jobs import Layout, RequestedObject
     from embomatrix.factory.task_import.task import Lay
     from embomatrix.sim.placing.pose_cache import PlacementLibrary
     from embomatrix.world.scene import Scene
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 LIST: Final = "scene_tasks.json"
 
 
-class Method(StrEnum):
+class LayoutMethod(StrEnum):
     """How a task is laid out."""
 
     TREE = "tree"
@@ -59,10 +59,10 @@ class Method(StrEnum):
     POSES = "poses"
 
 
-METHODS: Final[Mapping[Method, Lay]] = {
-    Method.TREE: lay,
-    Method.RANDOM: lay_at_random,
-    Method.POSES: lay_by_poses,
+METHODS: Final[Mapping[LayoutMethod, Lay]] = {
+    LayoutMethod.TREE: lay,
+    LayoutMethod.RANDOM: lay_at_random,
+    LayoutMethod.POSES: lay_by_poses,
 }
 
 
@@ -75,7 +75,7 @@ class SceneTask:
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class LayoutOutcome:
     """What came of one task by one method; ``solved`` tells that the oracle's plan reaches the goal.
 
     ``scene_s`` and ``planar_s`` are CPU seconds, the latter by room.
@@ -83,7 +83,7 @@ class Outcome:
 
     task: str
     scene: str
-    method: Method
+    method: LayoutMethod
     generated: bool
     verified: bool
     solved: bool
@@ -125,7 +125,7 @@ class _Timed:
         self.names: tuple[str, ...] = ()
         self.planar_s: tuple[float, ...] = ()
 
-    def __call__(self, editor: SceneEditor, items: Sequence[Item], seed: int) -> Layout:
+    def __call__(self, editor: SceneEditor, items: Sequence[RequestedObject], seed: int) -> Layout:
         layout = self._method(editor, items, seed)
         self.names = tuple(layout.names.values())
         self.planar_s = tuple(layout.record.planar_s.values())
@@ -133,8 +133,8 @@ class _Timed:
 
 
 def judge(
-    task: SceneTask, method: Method, base: Scene, library: PlacementLibrary, *, seed: int = 0
-) -> Outcome:
+    task: SceneTask, method: LayoutMethod, base: Scene, library: PlacementLibrary, *, seed: int = 0
+) -> LayoutOutcome:
     """Lay a task out by a method, look at the scene, and execute the oracle's plan in it."""
     timed = _Timed(METHODS[method])
     began = time.process_time()
@@ -148,11 +148,11 @@ def judge(
         verified: bool = False,
         solved: bool = False,
         beauty: float | None = None,
-    ) -> Outcome:
+    ) -> LayoutOutcome:
         facts = (task.source.name, task.scene, method, generated, verified, solved, reason)
-        return Outcome(*facts, spent, timed.planar_s, beauty)
+        return LayoutOutcome(*facts, spent, timed.planar_s, beauty)
 
-    if isinstance(imported, Refusal):
+    if isinstance(imported, TaskRefusal):
         return outcome(f"{imported.reason}: {imported.sentence}")
     beauty = _beauty(imported)
     refusal, lost = _executed(imported, library, seed)
@@ -170,8 +170,8 @@ def judge(
 
 
 def _executed(
-    imported: Imported, library: PlacementLibrary, seed: int
-) -> tuple[Refusal | None, tuple[str, ...]]:
+    imported: ImportedTask, library: PlacementLibrary, seed: int
+) -> tuple[TaskRefusal | None, tuple[str, ...]]:
     """What speaks against a task when its oracle's plan is executed, None: nothing; and what the robot can't get at."""
     view = SceneView(imported.scene)
     poses = poses_for(imported, view, library, None, seed)
@@ -181,17 +181,17 @@ def _executed(
     return (None if isinstance(verdict, Admitted) else verdict), lost
 
 
-def _beauty(imported: Imported) -> float:
+def _beauty(imported: ImportedTask) -> float:
     """Mean geometric score of the rooms that the task is about."""
     calibration = Calibration.load()
     return float(np.mean([score_room(plan_of(imported.scene, r), calibration).total for r in imported.rooms]))
 
 
-def evaluation_of(outcomes: Sequence[Outcome], conditions: Mapping[str, Any]) -> Evaluation:
+def evaluation_of(outcomes: Sequence[LayoutOutcome], conditions: Mapping[str, Any]) -> EvaluationFigures:
     """Figures of all methods that were measured, the tree's with its goals, and the commonest reasons."""
     figures: list[Figure] = []
     notes: list[str] = []
-    for method in Method:
+    for method in LayoutMethod:
         mine = [outcome for outcome in outcomes if outcome.method is method]
         if mine:
             figures += _figures(mine, method)
@@ -199,12 +199,12 @@ def evaluation_of(outcomes: Sequence[Outcome], conditions: Mapping[str, Any]) ->
             reasons = Counter(outcome.reason.split(":")[0] for outcome in mine if outcome.reason)
             told = ", ".join(f"{reason} {count}" for reason, count in reasons.most_common(5)) or "none"
             notes.append(f"Commonest reasons against a scene, {method}: {told}.")
-    return Evaluation("scenes", conditions, tuple(figures), tuple(notes))
+    return EvaluationFigures("scenes", conditions, tuple(figures), tuple(notes))
 
 
-def _shared_aesthetics(outcomes: Sequence[Outcome], method: Method) -> Iterable[Figure]:
+def _shared_aesthetics(outcomes: Sequence[LayoutOutcome], method: LayoutMethod) -> Iterable[Figure]:
     """Over the tasks that every measured method laid out: what a method fails at is what is hard to lay out well."""
-    scores: defaultdict[tuple[str, str], dict[Method, float]] = defaultdict(dict)
+    scores: defaultdict[tuple[str, str], dict[LayoutMethod, float]] = defaultdict(dict)
     for each in outcomes:
         if each.aesthetics is not None:
             scores[each.task, each.scene][each.method] = each.aesthetics
@@ -215,12 +215,12 @@ def _shared_aesthetics(outcomes: Sequence[Outcome], method: Method) -> Iterable[
         yield Figure(name, float(np.mean(shared)), "of 10", Better.HIGHER, len(shared))
 
 
-def _label(method: Method) -> str:
-    return "" if method is Method.TREE else f" {method}"
+def _label(method: LayoutMethod) -> str:
+    return "" if method is LayoutMethod.TREE else f" {method}"
 
 
-def _figures(outcomes: Sequence[Outcome], method: Method) -> Iterable[Figure]:
-    goals = method is Method.TREE
+def _figures(outcomes: Sequence[LayoutOutcome], method: LayoutMethod) -> Iterable[Figure]:
+    goals = method is LayoutMethod.TREE
     label = _label(method)
     generated = [outcome for outcome in outcomes if outcome.generated]
     planar = [second for outcome in outcomes for second in outcome.planar_s]

@@ -11,7 +11,7 @@ from embomatrix.factory.evaluate.figures import EvaluationError
 from embomatrix.factory.evaluate.scenes import METHODS
 from embomatrix.factory.pictures.scene import draw_plan
 from embomatrix.factory.pictures.sights import alone
-from embomatrix.factory.refusal import Refusal
+from embomatrix.factory.refusal import TaskRefusal
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.task_import.task import Manner, import_problem
 
@@ -43,7 +43,7 @@ def draw_side_by_side(task: SceneTask, seed: int) -> Image.Image:
     panels = []
     for method, lay in METHODS.items():
         imported = import_problem(task.source, base, seed=seed, manner=Manner(lay))
-        if isinstance(imported, Refusal):
+        if isinstance(imported, TaskRefusal):
             panels.append(_reason(method, imported))
         else:
             panels.append(_captioned(method, draw_plan(alone(imported.scene, imported.rooms[0]))))
@@ -64,7 +64,7 @@ def _captioned(words: str, picture: Image.Image) -> Image.Image:
     return panel
 
 
-def _reason(method: str, refusal: Refusal) -> Image.Image:
+def _reason(method: str, refusal: TaskRefusal) -> Image.Image:
     panel = Image.new("RGB", (LEAST_PX, LEAST_PX), "white")
     words = "\n".join(textwrap.wrap(f"{refusal.reason}: {refusal.sentence}", WIDTH))
     ImageDraw.Draw(panel).text((8, CAPTION_PX), words, fill="#b03030", font=ImageFont.load_default(14))

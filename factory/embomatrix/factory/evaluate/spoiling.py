@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-    from embomatrix.factory.evaluate.rooms import Item, RoomPlan
+    from embomatrix.factory.evaluate.rooms import RoomBox, RoomPlan
 
 SHIFT_M: Final = 0.4
 TURN_RAD: Final = math.radians(15)
@@ -62,12 +62,12 @@ def dropped(room: RoomPlan, rng: np.random.Generator) -> RoomPlan:
 SPOILERS: Final = {"shifted": shifted, "swapped": swapped, "dropped": dropped}
 
 
-def _carried(room: RoomPlan, moves: Sequence[tuple[float, ...]]) -> tuple[Item, ...]:
+def _carried(room: RoomPlan, moves: Sequence[tuple[float, ...]]) -> tuple[RoomBox, ...]:
     return tuple(
         _moved(thing, moves[bearer]) if bearer >= 0 else thing
         for thing, bearer in zip(room.things, room.carried, strict=True)
     )
 
 
-def _moved(item: Item, move: tuple[float, ...]) -> Item:
+def _moved(item: RoomBox, move: tuple[float, ...]) -> RoomBox:
     return replace(item, center_m=(item.center_m[0] + move[0], item.center_m[1] + move[1]))

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
     from pathlib import Path
 
-    from embomatrix.factory.evaluate.drafts import Asked
+    from embomatrix.factory.evaluate.drafts import DraftFeatures
 
 GOALS: Final[Mapping[str, tuple[Better, float]]] = {
     "self_bleu4": (Better.LOWER, 0.35),
@@ -28,7 +28,7 @@ _PERSON: Final = re.compile(r"^\* \*\*(.+?)\*\*, \d+,", re.MULTILINE)
 
 
 def panel(
-    groups: Mapping[str, Sequence[Asked]], names: Collection[str], label: str = ""
+    groups: Mapping[str, Sequence[DraftFeatures]], names: Collection[str], label: str = ""
 ) -> tuple[Figure, ...]:
     """Figures of tasks by base scene. ``names`` are those of the people; ``label`` tells writers apart, and has no goals."""
     tasks = [asked for group in groups.values() for asked in group]

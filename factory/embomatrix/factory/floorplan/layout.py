@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from embomatrix.factory.floorplan.packing import Packing
     from embomatrix.factory.floorplan.spec import RoomSpec
-    from embomatrix.world.geometry import Part
+    from embomatrix.world.geometry import ConvexPart
     from embomatrix.world.scene import Doorway, Window
 
 TRIALS: Final = 80
@@ -41,7 +41,7 @@ class FloorPlan:
     """
 
     rooms: tuple[Room, ...]
-    walls: tuple[Part, ...]
+    walls: tuple[ConvexPart, ...]
     doorways: tuple[Doorway, ...]
     windows: tuple[Window, ...] = ()
     left_out: tuple[str, ...] = ()

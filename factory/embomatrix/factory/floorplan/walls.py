@@ -6,7 +6,7 @@ from collections import defaultdict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.world.geometry import Part, Pose, Shape
+from embomatrix.world.geometry import ConvexPart, Pose, Shape
 from embomatrix.world.scene import Doorway, Window
 
 if TYPE_CHECKING:
@@ -141,7 +141,7 @@ def shared_edge(a: Rect, b: Rect) -> Edge | None:
 
 def build_walls(
     rects: Mapping[str, Rect], doors: Sequence[DoorCut], windows: Sequence[WindowCut] = ()
-) -> tuple[Part, ...]:
+) -> tuple[ConvexPart, ...]:
     """Wall panels; lintels over the doorways and the closed leaf of every exterior door; sill, lintel and pane of windows."""
     half = WALL_M / 2
     lines: dict[tuple[str, float], list[Interval]] = defaultdict(list)
@@ -172,12 +172,14 @@ def build_walls(
     return tuple(walls)
 
 
-def _panel(along: str, at: float, span: Interval, low: float, high: float, thickness: float = WALL_M) -> Part:
+def _panel(
+    along: str, at: float, span: Interval, low: float, high: float, thickness: float = WALL_M
+) -> ConvexPart:
     middle, length = (span[0] + span[1]) / 2, span[1] - span[0]
     z = (low + high) / 2
     if along == "x":
-        return Part(Shape.BOX, Pose((middle, at, z)), (length, thickness, high - low))
-    return Part(Shape.BOX, Pose((at, middle, z)), (thickness, length, high - low))
+        return ConvexPart(Shape.BOX, Pose((middle, at, z)), (length, thickness, high - low))
+    return ConvexPart(Shape.BOX, Pose((at, middle, z)), (thickness, length, high - low))
 
 
 def _merge(spans: Iterable[Interval]) -> list[Interval]:

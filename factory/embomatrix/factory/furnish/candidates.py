@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from embomatrix.factory.furnish.pieces import Style
-from embomatrix.factory.furnish.roles import Role
+from embomatrix.factory.furnish.roles import FurnitureRole
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from embomatrix.factory.furnish.boxes import FloatArray
-    from embomatrix.factory.furnish.pieces import Group, Placed
+    from embomatrix.factory.furnish.pieces import FurnitureGroup, Placed
     from embomatrix.factory.furnish.space import RoomSpace
 
 WALL_GAP_M: Final = 0.006
@@ -27,7 +27,7 @@ SIDE_GAP_M: Final = 0.005
 STEP_M: Final = 0.05
 AHEAD: Final = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])
 """The way that a group looks at each number of quarter turns."""
-_RUN_ROLES: Final = (Role.RUN, Role.COUNTERTOP, Role.HUNG_CABINET)
+_RUN_ROLES: Final = (FurnitureRole.RUN, FurnitureRole.COUNTERTOP, FurnitureRole.HUNG_CABINET)
 _SIGHT_M: Final = 0.8
 _MANY: Final = 4
 _BED_SHARE: Final = 0.28
@@ -35,7 +35,7 @@ _BED_SHARE: Final = 0.28
 
 
 @dataclass(frozen=True, slots=True)
-class Candidates:
+class GroupCandidates:
     """Group frames: x, y and quarter turns, with the cost of each. All arrays have n rows."""
 
     x: FloatArray
@@ -46,11 +46,11 @@ class Candidates:
     def __len__(self) -> int:
         return len(self.x)
 
-    def take(self, rows: NDArray[np.int64]) -> Candidates:
-        return Candidates(self.x[rows], self.y[rows], self.turns[rows], self.cost[rows])
+    def take(self, rows: NDArray[np.int64]) -> GroupCandidates:
+        return GroupCandidates(self.x[rows], self.y[rows], self.turns[rows], self.cost[rows])
 
 
-class Surroundings:
+class RoomSurroundings:
     """What stands in a room, looked up by category: middles and headings, and the edges of runs."""
 
     def __init__(self, space: RoomSpace) -> None:
@@ -76,7 +76,7 @@ class Surroundings:
         return boxes[np.abs(boxes[:, 2] - level_m) < 1.0]
 
 
-def candidates_of(group: Group, space: RoomSpace, around: Surroundings) -> Candidates:
+def candidates_of(group: FurnitureGroup, space: RoomSpace, around: RoomSurroundings) -> GroupCandidates:
     """All places that the group's style allows, with their costs; none is checked against what stands there."""
     if group.style in (Style.FREE, Style.OVERHEAD, Style.AISLE):
         x, y, turns = _open_floor(group, space)
@@ -90,15 +90,15 @@ def candidates_of(group: Group, space: RoomSpace, around: Surroundings) -> Candi
         near = _to_edge(space, x, y) <= _BED_SHARE * min(space.room.size_m)
         x, y, turns = x[near], y[near], turns[near]
     if not len(x):
-        return Candidates(x, y, turns, np.empty(0))
+        return GroupCandidates(x, y, turns, np.empty(0))
     cost = _style_cost(group, space, around, x, y, turns)
     cost = cost + 1.2 * _nearest(around.of(group.near), x, y) + _sight(around.of(group.faces), x, y, turns)
     # Equal things keep apart: up to 2.5 m count.
     cost = cost - 1.5 * np.minimum(_nearest(around.of(group.spread), x, y), 2.5)
-    return Candidates(x, y, turns, np.asarray(cost))
+    return GroupCandidates(x, y, turns, np.asarray(cost))
 
 
-def _along_walls(group: Group, space: RoomSpace) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
+def _along_walls(group: FurnitureGroup, space: RoomSpace) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
     gx0, gy0, _, gy1 = group.bounds
     (x0, y0), (x1, y1) = space.room.low_m, space.room.high_m
     xs, ys, ts = [np.empty(0)], [np.empty(0)], [np.empty(0, dtype=np.int64)]
@@ -126,7 +126,7 @@ def _flush(space: RoomSpace, along_y: bool, left: float, right: float) -> FloatA
     return np.concatenate([solids[:, axis + 3] + SIDE_GAP_M - left, solids[:, axis] - SIDE_GAP_M - right])
 
 
-def _open_floor(group: Group, space: RoomSpace) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
+def _open_floor(group: FurnitureGroup, space: RoomSpace) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
     (x0, y0), (x1, y1) = space.room.low_m, space.room.high_m
     # About 60 x 60 places at most, so that a hall takes no longer than a parlour.
     step = max(0.1, math.sqrt((x1 - x0) * (y1 - y0)) / 60)
@@ -137,9 +137,9 @@ def _open_floor(group: Group, space: RoomSpace) -> tuple[FloatArray, FloatArray,
 
 
 def _style_cost(
-    group: Group,
+    group: FurnitureGroup,
     space: RoomSpace,
-    around: Surroundings,
+    around: RoomSurroundings,
     x: FloatArray,
     y: FloatArray,
     turns: NDArray[np.int64],
@@ -184,7 +184,7 @@ def _to_edge(space: RoomSpace, x: FloatArray, y: FloatArray) -> FloatArray:
 
 
 def _gap_to_run(
-    group: Group, around: Surroundings, x: FloatArray, y: FloatArray, turns: NDArray[np.int64]
+    group: FurnitureGroup, around: RoomSurroundings, x: FloatArray, y: FloatArray, turns: NDArray[np.int64]
 ) -> FloatArray:
     """Distance from the group's edge to the nearest counter, cabinet or appliance at its height."""
     boxes = around.runs(group.members[0].bottom)

@@ -11,7 +11,7 @@ from embomatrix.factory.furnish.hung import ceiling_groups, hung_groups, on_wall
 from embomatrix.factory.furnish.kitchen import COOKERS, SINKS, basin, run_groups, worktop
 from embomatrix.factory.furnish.pieces import (
     CORNER_SOFA_M,
-    Group,
+    FurnitureGroup,
     Member,
     Rows,
     Style,
@@ -20,13 +20,13 @@ from embomatrix.factory.furnish.pieces import (
     top_of,
 )
 from embomatrix.factory.furnish.pool import Pool, worth
-from embomatrix.factory.furnish.roles import Role
+from embomatrix.factory.furnish.roles import FurnitureRole
 from embomatrix.factory.furnish.tables import table_groups, work_groups
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from embomatrix.factory.furnish.pieces import Piece
+    from embomatrix.factory.furnish.pieces import FurniturePiece
 
 _COFFEE_GAP_M: Final = 0.38
 _PAIR: Final = 2
@@ -64,18 +64,25 @@ _NEAR: Final[Mapping[str, tuple[str, ...]]] = {
     "cash_register": ("checkout_counter", "reception_desk"),
 }
 _OFF_FLOOR: Final = frozenset(
-    (Role.WALL, Role.CEILING, Role.RUG, Role.HUNG_CABINET, Role.SURFACE, Role.STRUCTURE)
+    (
+        FurnitureRole.WALL,
+        FurnitureRole.CEILING,
+        FurnitureRole.RUG,
+        FurnitureRole.HUNG_CABINET,
+        FurnitureRole.SURFACE,
+        FurnitureRole.STRUCTURE,
+    )
 )
 
 
 def room_groups(
-    pieces: Sequence[Piece], room_type: str = "", floor_m: tuple[float, float] = (5.0, 5.0)
-) -> tuple[list[Group | Rows], list[tuple[Piece, str]]]:
+    pieces: Sequence[FurniturePiece], room_type: str = "", floor_m: tuple[float, float] = (5.0, 5.0)
+) -> tuple[list[FurnitureGroup | Rows], list[tuple[FurniturePiece, str]]]:
     """Everything that stands on the floor, as groups, the important ones first; and what no group takes, with the reason."""
     pool = Pool((p for p in pieces if p.role not in _OFF_FLOOR), room_type, floor_m)
-    left_out: list[tuple[Piece, str]] = []
+    left_out: list[tuple[FurniturePiece, str]] = []
     screens = [p for p in pieces if p.category == "wall_mounted_tv"]
-    found: list[Group | Rows] = [
+    found: list[FurnitureGroup | Rows] = [
         *_television(pool, [p for p in pieces if p.category == "standing_tv"]),
         *(_first(on_wall(p)) for p in screens[:1] if pool.of("sofa")),
         *hall_groups(pool),
@@ -91,48 +98,53 @@ def room_groups(
     return found, left_out
 
 
-def hung_and_laid(pieces: Sequence[Piece], taken: set[int]) -> list[Group | Rows]:
+def hung_and_laid(pieces: Sequence[FurniturePiece], taken: set[int]) -> list[FurnitureGroup | Rows]:
     """What hangs on walls and ceilings, then mats and rugs; without the pieces that a group on the floor has taken."""
     rest = [p for p in pieces if p.number not in taken]
-    rugs = Pool(p for p in rest if p.role is Role.RUG)
+    rugs = Pool(p for p in rest if p.role is FurnitureRole.RUG)
     mats = mat_rows(rugs)
     return [*hung_groups(rest), *ceiling_groups(rest), *mats, *rug_groups(rugs.rest)]
 
 
-def alone(piece: Piece) -> Group:
+def alone(piece: FurniturePiece) -> FurnitureGroup:
     """A piece that its group found no place for, by itself at a wall; a worktop on brackets, a basin at its height."""
-    if piece.role is Role.COUNTERTOP:
+    if piece.role is FurnitureRole.COUNTERTOP:
         return worktop(piece)
-    if piece.role is Role.FITTED:
+    if piece.role is FurnitureRole.FITTED:
         return basin(piece)
-    return Group((_sideways(piece),), Style.ALONG, worth([Member(piece)]), _NEAR.get(piece.category, ()))
+    return FurnitureGroup(
+        (_sideways(piece),), Style.ALONG, worth([Member(piece)]), _NEAR.get(piece.category, ())
+    )
 
 
-def in_the_open(piece: Piece) -> Group | None:
+def in_the_open(piece: FurniturePiece) -> FurnitureGroup | None:
     """A piece that found no wall, in the middle of the room; None for what belongs to a wall."""
-    if piece.role in (Role.TABLE, Role.LOW_TABLE, Role.OPEN) or piece.category in _ISLANDS:
-        return Group((Member(piece),), Style.FREE, worth([Member(piece)]), clear_m=_CLEAR_M)
+    if (
+        piece.role in (FurnitureRole.TABLE, FurnitureRole.LOW_TABLE, FurnitureRole.OPEN)
+        or piece.category in _ISLANDS
+    ):
+        return FurnitureGroup((Member(piece),), Style.FREE, worth([Member(piece)]), clear_m=_CLEAR_M)
     return None
 
 
-def _sideways(piece: Piece) -> Member:
+def _sideways(piece: FurniturePiece) -> Member:
     """The piece in its group: a bathtub and a bench that is modelled end on have their long side at the wall."""
     return Member(piece, turns=1 if piece.category in _LONG_SIDE and piece.size_m[0] > piece.size_m[1] else 0)
 
 
-def _first(group: Group) -> Group:
+def _first(group: FurnitureGroup) -> FurnitureGroup:
     """A screen goes up before the sofa, which then looks at it."""
     return replace(group, style=Style.CENTERED, importance=9.6)
 
 
-def _area(group: Group | Rows) -> float:
+def _area(group: FurnitureGroup | Rows) -> float:
     if isinstance(group, Rows):
         return sum(_area(g) for g in group.groups)
     x0, y0, x1, y1 = group.bounds
     return (x1 - x0) * (y1 - y0)
 
 
-def _television(pool: Pool, screens: Sequence[Piece]) -> list[Group]:
+def _television(pool: Pool, screens: Sequence[FurniturePiece]) -> list[FurnitureGroup]:
     groups = []
     for tv in screens:
         stands = [
@@ -143,11 +155,11 @@ def _television(pool: Pool, screens: Sequence[Piece]) -> list[Group]:
         if stands:
             base = Member(pool.take([stands[0]])[0])
             members = (base, stacked(base, tv, 0))
-            groups.append(Group(members, Style.CENTERED, 9.55, faces=("sofa", "armchair")))
+            groups.append(FurnitureGroup(members, Style.CENTERED, 9.55, faces=("sofa", "armchair")))
     return groups
 
 
-def _beds(pool: Pool) -> list[Group]:
+def _beds(pool: Pool) -> list[FurnitureGroup]:
     groups = []
     for bed in pool.take(pool.of("bed", "hospital_bed", "crib")):
         members = [Member(bed)]
@@ -156,11 +168,11 @@ def _beds(pool: Pool) -> list[Group]:
             x = (stand.size_m[0] - bed.size_m[0]) / 2
             members.append(Member(stand, x, side * (bed.size_m[1] + stand.size_m[1] + 0.08) / 2))
         style = Style.CENTERED if bed.category == "bed" else Style.ALONG
-        groups.append(Group(tuple(members), style, worth(members), spread=(bed.category,)))
+        groups.append(FurnitureGroup(tuple(members), style, worth(members), spread=(bed.category,)))
     return groups
 
 
-def _sofas(pool: Pool) -> list[Group]:
+def _sofas(pool: Pool) -> list[FurnitureGroup]:
     """Sofas with a coffee table before them and armchairs at its ends; corner sofas in a corner, the table in the nook."""
     groups = []
     sofas = pool.take(sorted(pool.of("sofa"), key=lambda p: -p.size_m[1]))
@@ -185,34 +197,38 @@ def _sofas(pool: Pool) -> list[Group]:
                 )
         style = Style.NOOK if nook else Style.CENTERED
         screens = ("standing_tv", "wall_mounted_tv")
-        groups.append(Group(tuple(members), style, worth(members), faces=screens, spread=("sofa",)))
+        groups.append(FurnitureGroup(tuple(members), style, worth(members), faces=screens, spread=("sofa",)))
     return groups if sofas else _armchairs(pool, armchairs)
 
 
-def _armchairs(pool: Pool, armchairs: Sequence[Piece]) -> list[Group]:
+def _armchairs(pool: Pool, armchairs: Sequence[FurniturePiece]) -> list[FurnitureGroup]:
     """Where there is no sofa, armchairs face one another over a coffee table."""
     tables = pool.of("coffee_table", "garden_coffee_table")
     if len(armchairs) < _PAIR or not tables:
         return []
     members = around_table(tables[0], armchairs[:_PAIR], _COFFEE_GAP_M)
     pool.take(m.piece for m in members)
-    return [Group(members, Style.FREE, worth(members), clear_m=_CLEAR_M / 2)]
+    return [FurnitureGroup(members, Style.FREE, worth(members), clear_m=_CLEAR_M / 2)]
 
 
-def _singles(pool: Pool) -> list[Group]:
+def _singles(pool: Pool) -> list[FurnitureGroup]:
     counts = Counter(p.category for p in pool.rest)
     groups = []
     for piece in pool.take(list(pool.rest)):
-        style = Style.CORNER if piece.role is Role.CORNER else Style.ALONG
+        style = Style.CORNER if piece.role is FurnitureRole.CORNER else Style.ALONG
         if piece.category == "commercial_kitchen_table" and piece.size_m[1] > _ISLAND_M:
             style = Style.FREE
         near = _NEAR.get(piece.category, ())
         if near:
             style = Style.ALONG
-        if not near and counts[piece.category] >= _IN_LINE and piece.role in (Role.BACKED, Role.RUN):
+        if (
+            not near
+            and counts[piece.category] >= _IN_LINE
+            and piece.role in (FurnitureRole.BACKED, FurnitureRole.RUN)
+        ):
             near = (piece.category,)
         if pool.room_type == "locker_room" and piece.category == "bench":
             style = Style.FREE
         clear = _CLEAR_M if style is Style.FREE else 0.0
-        groups.append(Group((_sideways(piece),), style, worth([Member(piece)]), near, clear_m=clear))
+        groups.append(FurnitureGroup((_sideways(piece),), style, worth([Member(piece)]), near, clear_m=clear))
     return groups

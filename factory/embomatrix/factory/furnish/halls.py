@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections import defaultdict
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.furnish.pieces import Group, Member, Rows, Style
+from embomatrix.factory.furnish.pieces import FurnitureGroup, Member, Rows, Style
 from embomatrix.factory.furnish.pool import worth
-from embomatrix.factory.furnish.roles import Role
+from embomatrix.factory.furnish.roles import FurnitureRole
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from embomatrix.factory.furnish.pieces import Piece
+    from embomatrix.factory.furnish.pieces import FurniturePiece
     from embomatrix.factory.furnish.pool import Pool
 
 _SHELVES: Final = ("grocery_shelf", "snack_rack", "dry_food_dispenser_shelf", "candy_dispenser_shelf")
@@ -27,69 +27,74 @@ _PLANTS_WORTH: Final = 0.5
 _MATS: Final = 4
 
 
-def hall_groups(pool: Pool) -> list[Group | Rows]:
+def hall_groups(pool: Pool) -> list[FurnitureGroup | Rows]:
     """What fills large rooms: shelves in aisles, machines in the open."""
-    found: list[Group | Rows] = [*_aisles(pool)]
-    standing = pool.take(pool.with_role(Role.OPEN))
+    found: list[FurnitureGroup | Rows] = [*_aisles(pool)]
+    standing = pool.take(pool.with_role(FurnitureRole.OPEN))
     if pool.room_type == "gym" and len(standing) >= _MATS:
-        machines = tuple(Group((Member(p),), Style.FREE, worth([Member(p)])) for p in standing)
+        machines = tuple(FurnitureGroup((Member(p),), Style.FREE, worth([Member(p)])) for p in standing)
         found.append(Rows(machines, 6.0, (_AISLE_M, _AISLE_M)))
         standing = []
     for piece in standing:
         near = ("doorway",) if piece.category == "turnstile" else ()
         members = (Member(piece),)
         found.append(
-            Group(members, Style.FREE, worth(members), near, spread=(piece.category,), clear_m=_AISLE_M)
+            FurnitureGroup(
+                members, Style.FREE, worth(members), near, spread=(piece.category,), clear_m=_AISLE_M
+            )
         )
     return found
 
 
-def planting_groups(pool: Pool) -> list[Group]:
+def planting_groups(pool: Pool) -> list[FurnitureGroup]:
     """Trees, bushes and stones: along the edges first, the small ones last, after all that people use."""
-    plants = pool.take(pool.with_role(Role.PLANTING))
+    plants = pool.take(pool.with_role(FurnitureRole.PLANTING))
     plants.sort(key=lambda p: -p.size_m[0] * p.size_m[1])
-    return [Group((Member(p),), Style.EDGE, _PLANTS_WORTH) for p in plants]
+    return [FurnitureGroup((Member(p),), Style.EDGE, _PLANTS_WORTH) for p in plants]
 
 
 def mat_rows(pool: Pool) -> list[Rows]:
     """Equal mats side by side as one field."""
-    kinds: dict[str, list[Piece]] = defaultdict(list)
+    kinds: dict[str, list[FurniturePiece]] = defaultdict(list)
     for piece in pool.of("gym_mat"):
         kinds[piece.asset.asset_id].append(piece)
     rows = []
     for mats in kinds.values():
         if len(mats) >= _MATS:
             pool.take(mats)
-            rows.append(Rows(tuple(Group((Member(m),), Style.FREE, 1.0) for m in mats), 1.0, (0.02, 0.02)))
+            rows.append(
+                Rows(tuple(FurnitureGroup((Member(m),), Style.FREE, 1.0) for m in mats), 1.0, (0.02, 0.02))
+            )
     return rows
 
 
-def _aisles(pool: Pool) -> list[Group]:
+def _aisles(pool: Pool) -> list[FurnitureGroup]:
     """Shelves of a shop: tall ones along the walls, the others back to back in lines across the hall."""
     shelves = pool.of(*_SHELVES)
     if pool.room_type != "grocery_store" or len(shelves) < 2 * _MATS:
         return []
     pool.take(shelves)
     walls = 2 * sum(pool.floor_m) * 0.6
-    at_wall: list[Piece] = []
+    at_wall: list[FurniturePiece] = []
     for shelf in sorted(shelves, key=lambda p: -p.size_m[2]):
         if shelf.size_m[2] >= _TALL_M and sum(p.size_m[1] for p in at_wall) + shelf.size_m[1] <= walls:
             at_wall.append(shelf)
     wall_numbers = {p.number for p in at_wall}
     free = [p for p in shelves if p.number not in wall_numbers]
     groups = [
-        Group((Member(p),), Style.RUN, 9.0 + 0.1 * p.size_m[1], near=("grocery_shelf",)) for p in at_wall
+        FurnitureGroup((Member(p),), Style.RUN, 9.0 + 0.1 * p.size_m[1], near=("grocery_shelf",))
+        for p in at_wall
     ]
     longest = min(min(pool.floor_m) - _WALKS_M, _LONGEST_LINE_M)
     lines = _lines(sorted(free, key=lambda p: (-p.size_m[0].__round__(1), -p.size_m[1])), longest)
     for front, back in zip(lines[::2], [*lines[1::2], []], strict=False):
         members = (*_line(front, 0), *_line(back, 2))
-        groups.append(Group(members, Style.AISLE, 8.5 + 0.1 * len(members), clear_m=_AISLE_M))
+        groups.append(FurnitureGroup(members, Style.AISLE, 8.5 + 0.1 * len(members), clear_m=_AISLE_M))
     return groups
 
 
-def _lines(shelves: Sequence[Piece], longest: float) -> list[list[Piece]]:
-    lines: list[list[Piece]] = []
+def _lines(shelves: Sequence[FurniturePiece], longest: float) -> list[list[FurniturePiece]]:
+    lines: list[list[FurniturePiece]] = []
     used = 0.0
     for shelf in shelves:
         if lines and used + shelf.size_m[1] + _STEP_M <= longest:
@@ -101,7 +106,7 @@ def _lines(shelves: Sequence[Piece], longest: float) -> list[list[Piece]]:
     return lines
 
 
-def _line(shelves: Sequence[Piece], turns: int) -> list[Member]:
+def _line(shelves: Sequence[FurniturePiece], turns: int) -> list[Member]:
     """Shelves side by side with their backs on the group's y axis, looking along x or against it."""
     total = sum(p.size_m[1] + _STEP_M for p in shelves) - _STEP_M
     side = 1 if turns == 0 else -1

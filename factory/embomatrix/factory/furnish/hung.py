@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.floorplan.walls import WALL_HEIGHT_M
 from embomatrix.factory.furnish.kitchen import COOKERS, SINKS, UNDER_COUNTER
-from embomatrix.factory.furnish.pieces import REST_GAP_M, Group, Member, Rows, Style
-from embomatrix.factory.furnish.roles import HUNG_BOTTOM_M, Role, wall_height_m
+from embomatrix.factory.furnish.pieces import REST_GAP_M, FurnitureGroup, Member, Rows, Style
+from embomatrix.factory.furnish.roles import HUNG_BOTTOM_M, FurnitureRole, wall_height_m
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from embomatrix.factory.furnish.pieces import Piece
+    from embomatrix.factory.furnish.pieces import FurniturePiece
 
 _NEAR_ON_WALL: Final[Mapping[str, tuple[str, ...]]] = {
     "mirror": SINKS,
@@ -57,24 +57,24 @@ _RUGS_NEAR: Final = (
 )
 
 
-def hung_groups(pieces: Sequence[Piece]) -> list[Group]:
+def hung_groups(pieces: Sequence[FurniturePiece]) -> list[FurnitureGroup]:
     """Wall cabinets and hoods over the counters, then what hangs on the walls, big things first."""
     groups = []
     for piece in pieces:
-        if piece.role is Role.HUNG_CABINET:
+        if piece.role is FurnitureRole.HUNG_CABINET:
             hood = piece.category == "range_hood"
             near: tuple[str, ...] = COOKERS if hood else ("countertop", *SINKS, *UNDER_COUNTER)
             highest = WALL_HEIGHT_M - piece.size_m[2] - 0.01
             # A hood too high for the room reaches into the ceiling rather than into the cook's way.
             bottom = _HOOD_M if hood else max(min(HUNG_BOTTOM_M, highest), 0.9)
             member = Member(piece, bottom=bottom)
-            groups.append(Group((member,), Style.RUN, 8.0 if hood else 5.0, near))
-        elif piece.role is Role.WALL:
+            groups.append(FurnitureGroup((member,), Style.RUN, 8.0 if hood else 5.0, near))
+        elif piece.role is FurnitureRole.WALL:
             groups.append(on_wall(piece))
     return sorted(groups, key=lambda g: -g.importance)
 
 
-def on_wall(piece: Piece) -> Group:
+def on_wall(piece: FurniturePiece) -> FurnitureGroup:
     """A thing at its height on a wall; taller than the wall, just above the floor."""
     height = piece.size_m[2]
     bottom = max(0.05, min(wall_height_m(piece.category) - height / 2, WALL_HEIGHT_M - height - 0.02))
@@ -82,20 +82,22 @@ def on_wall(piece: Piece) -> Group:
     faces = _FACES_ON_WALL.get(piece.category, ())
     style = Style.ALONG if near or faces or piece.size_m[1] < _SMALL_M else Style.CENTERED
     spread = () if piece.category == "electric_switch" else (piece.category,)
-    return Group((Member(piece, bottom=bottom),), style, 1.0 + piece.size_m[1], near, faces, spread)
+    return FurnitureGroup((Member(piece, bottom=bottom),), style, 1.0 + piece.size_m[1], near, faces, spread)
 
 
-def ceiling_groups(pieces: Sequence[Piece]) -> list[Group | Rows]:
+def ceiling_groups(pieces: Sequence[FurniturePiece]) -> list[FurnitureGroup | Rows]:
     """Lights, fans and racks under the ceiling: equal ones evenly over the room, those that hang low over a table."""
-    groups: list[Group | Rows] = []
-    kinds: dict[str, list[Group]] = defaultdict(list)
+    groups: list[FurnitureGroup | Rows] = []
+    kinds: dict[str, list[FurnitureGroup]] = defaultdict(list)
     for piece in pieces:
-        if piece.role is Role.CEILING:
+        if piece.role is FurnitureRole.CEILING:
             bottom = WALL_HEIGHT_M - piece.size_m[2]
             low = bottom < _HEAD_ROOM_M
             member = Member(piece, bottom=max(bottom, 0.9))
             tables = _TABLES_UNDER_LIGHTS if low else ()
-            group = Group((member,), Style.OVERHEAD, 1.0 + piece.size_m[1], tables, spread=(piece.category,))
+            group = FurnitureGroup(
+                (member,), Style.OVERHEAD, 1.0 + piece.size_m[1], tables, spread=(piece.category,)
+            )
             if low:
                 groups.append(group)
             else:
@@ -108,9 +110,9 @@ def ceiling_groups(pieces: Sequence[Piece]) -> list[Group | Rows]:
     return sorted(groups, key=lambda g: -g.importance)
 
 
-def rug_groups(pieces: Sequence[Piece]) -> list[Group]:
+def rug_groups(pieces: Sequence[FurniturePiece]) -> list[FurnitureGroup]:
     """Rugs lie on free floor before the sofa, the bed or the sink."""
     return [
-        Group((Member(p, bottom=REST_GAP_M),), Style.FREE, 1.0, _RUGS_NEAR, spread=("carpet",))
+        FurnitureGroup((Member(p, bottom=REST_GAP_M),), Style.FREE, 1.0, _RUGS_NEAR, spread=("carpet",))
         for p in pieces
     ]

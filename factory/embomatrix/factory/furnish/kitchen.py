@@ -7,22 +7,22 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.furnish.pieces import (
     REST_GAP_M,
-    Group,
+    FurnitureGroup,
     Member,
     Style,
     before_table,
     stacked,
     top_of,
 )
-from embomatrix.factory.furnish.roles import Role
+from embomatrix.factory.furnish.roles import FurnitureRole
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from embomatrix.factory.furnish.pieces import Piece
+    from embomatrix.factory.furnish.pieces import FurniturePiece
     from embomatrix.factory.furnish.pool import Pool
 
-    Unplaced = tuple[Piece, str]
+    Unplaced = tuple[FurniturePiece, str]
 
 UNDER_COUNTER: Final = (
     "bottom_cabinet",
@@ -64,7 +64,7 @@ _WORKTOP_M: Final = 0.72
 _BASIN_RIM_M: Final = 0.86
 
 
-def run_groups(pool: Pool, left_out: list[Unplaced]) -> list[Group]:
+def run_groups(pool: Pool, left_out: list[Unplaced]) -> list[FurnitureGroup]:
     """Everything that stands in lines along the walls, in the order of a kitchen: cold, wet, work, hot, and the rest."""
     counters = _counters(pool, left_out)
     _fit(pool, counters)
@@ -72,24 +72,26 @@ def run_groups(pool: Pool, left_out: list[Unplaced]) -> list[Group]:
     basins = [basin(p) for p in pool.take(p for p in pool.of(*FITTED) if p.category != "burner")]
     for burner in pool.take(pool.of("burner")):
         left_out.append((burner, "no counter is left to carry it"))
-    units = [Group((Member(p),), Style.RUN, 0.0) for p in pool.take(pool.with_role(Role.RUN))]
+    units = [
+        FurnitureGroup((Member(p),), Style.RUN, 0.0) for p in pool.take(pool.with_role(FurnitureRole.RUN))
+    ]
     ordered = _in_order([*counters, *units])
     near = ("countertop", *SINKS, "stove", "fridge", *UNDER_COUNTER)
     lined = [
-        Group(g.members, Style.RUN, _RUN_WORTH - 0.01 * i, near=near if i else ())
+        FurnitureGroup(g.members, Style.RUN, _RUN_WORTH - 0.01 * i, near=near if i else ())
         for i, g in enumerate(ordered)
     ]
     return [*lined, *basins]
 
 
-def _in_order(units: Sequence[Group]) -> list[Group]:
+def _in_order(units: Sequence[FurnitureGroup]) -> list[FurnitureGroup]:
     """Fridge in the corner, then by turns counters and what people work at, so that every appliance has a counter beside it."""
     counters = [g for g in units if any(_is_counter(m.piece) for m in g.members)]
     rest = [g for g in units if all(not _is_counter(m.piece) for m in g.members)]
     rank = {"fridge": 0, **dict.fromkeys(SINKS, 1), "dishwasher": 2, **dict.fromkeys(COOKERS, 3)}
     rest.sort(key=lambda g: (rank.get(g.members[0].piece.category, 4), -_width(g)))
     counters.sort(key=lambda g: (all(m.piece.category != "dishwasher" for m in g.members), -_width(g)))
-    ordered: list[Group] = []
+    ordered: list[FurnitureGroup] = []
     for place, unit in enumerate(rest):
         ordered.append(unit)
         hot_or_wet = rank.get(unit.members[0].piece.category, 4) in (0, 1, 3)
@@ -98,24 +100,24 @@ def _in_order(units: Sequence[Group]) -> list[Group]:
     return ordered + counters
 
 
-def _width(group: Group) -> float:
+def _width(group: FurnitureGroup) -> float:
     _, y0, _, y1 = group.bounds
     return y1 - y0
 
 
-def _is_counter(piece: Piece) -> bool:
+def _is_counter(piece: FurniturePiece) -> bool:
     return piece.category in ("countertop", "bar")
 
 
-def _counters(pool: Pool, left_out: list[Unplaced]) -> list[Group]:
+def _counters(pool: Pool, left_out: list[Unplaced]) -> list[FurnitureGroup]:
     """Slabs over base cabinets and low appliances: widest first, close in height."""
-    groups: list[Group] = []
-    left: list[Piece] = []
+    groups: list[FurnitureGroup] = []
+    left: list[FurniturePiece] = []
     for slab in pool.take(sorted(pool.of("countertop"), key=lambda p: -p.size_m[1])):
         row = _carriers(pool, slab)
         if row:
             pool.take(row)
-            groups.append(Group(_counter_members(slab, row), Style.RUN, 0.0))
+            groups.append(FurnitureGroup(_counter_members(slab, row), Style.RUN, 0.0))
         else:
             left.append(slab)
     if left and not groups and pool.room_type != "kitchen":
@@ -123,13 +125,13 @@ def _counters(pool: Pool, left_out: list[Unplaced]) -> list[Group]:
         groups.append(worktop(left.pop(0)))
     left_out += [(slab, "no base cabinets are left to carry it") for slab in left]
     groups += [
-        Group((Member(bar),), Style.RUN, 0.0)
+        FurnitureGroup((Member(bar),), Style.RUN, 0.0)
         for bar in pool.take(p for p in pool.of("bar") if pool.room_type == "kitchen" and p.size_m[0] <= 0.75)
     ]
     return groups
 
 
-def _carriers(pool: Pool, slab: Piece) -> list[Piece]:
+def _carriers(pool: Pool, slab: FurniturePiece) -> list[FurniturePiece]:
     """Cabinets for the slab: those that fill it best, of about one height."""
     width = slab.size_m[1]
     candidates = sorted(
@@ -143,11 +145,11 @@ def _carriers(pool: Pool, slab: Piece) -> list[Piece]:
     return []
 
 
-def _best_row(candidates: Sequence[Piece], width: float) -> list[Piece]:
+def _best_row(candidates: Sequence[FurniturePiece], width: float) -> list[FurniturePiece]:
     """The fullest row of pieces of about one height that fits under a slab."""
-    best: list[Piece] = []
+    best: list[FurniturePiece] = []
     for first in range(len(candidates)):
-        row: list[Piece] = []
+        row: list[FurniturePiece] = []
         used = 0.0
         for piece in candidates[first:]:
             level = row[0].size_m[2] if row else piece.size_m[2]
@@ -159,7 +161,7 @@ def _best_row(candidates: Sequence[Piece], width: float) -> list[Piece]:
     return best
 
 
-def _counter_members(slab: Piece, row: Sequence[Piece]) -> tuple[Member, ...]:
+def _counter_members(slab: FurniturePiece, row: Sequence[FurniturePiece]) -> tuple[Member, ...]:
     """Cabinets side by side, backs aligned with the slab's, the slab on the tallest of them.
 
     Under a deep slab they stand forward: who opens a drawer stands before the slab's edge and reaches under it.
@@ -178,7 +180,7 @@ def _counter_members(slab: Piece, row: Sequence[Piece]) -> tuple[Member, ...]:
     return (*members, Member(slab, bottom=bottom, on=tallest))
 
 
-def _fit(pool: Pool, counters: list[Group]) -> None:
+def _fit(pool: Pool, counters: list[FurnitureGroup]) -> None:
     """Set basins and cooktops on counters, else on base cabinets, as many as stand there side by side."""
     for piece in sorted(pool.of(*FITTED), key=lambda p: -p.size_m[1]):
         for number, group in enumerate(counters):
@@ -188,14 +190,14 @@ def _fit(pool: Pool, counters: list[Group]) -> None:
                 base = group.members[slab]
                 top = stacked(base, piece, slab)
                 member = Member(piece, top.x, spot, top.bottom, on=slab)
-                counters[number] = _evened(Group((*group.members, member), Style.RUN, 0.0))
+                counters[number] = _evened(FurnitureGroup((*group.members, member), Style.RUN, 0.0))
                 pool.take([piece])
                 break
         else:
             _fit_on_cabinet(pool, counters, piece)
 
 
-def _fit_on_cabinet(pool: Pool, counters: list[Group], piece: Piece) -> None:
+def _fit_on_cabinet(pool: Pool, counters: list[FurnitureGroup], piece: FurniturePiece) -> None:
     for cabinet in pool.of("bottom_cabinet", "bottom_cabinet_no_top", "metal_bottom_cabinet"):
         low = cabinet.size_m[2] <= _HIGHEST_M
         if low and cabinet.size_m[1] >= 0.8 * piece.size_m[1] and cabinet.size_m[0] >= 0.7 * piece.size_m[0]:
@@ -203,16 +205,18 @@ def _fit_on_cabinet(pool: Pool, counters: list[Group], piece: Piece) -> None:
             base = Member(cabinet)
             shift = max(0.0, (piece.size_m[0] - cabinet.size_m[0]) / 2)
             top = stacked(base, piece, 0)
-            counters.append(Group((base, Member(piece, shift, 0.0, top.bottom, on=0)), Style.RUN, 0.0))
+            counters.append(
+                FurnitureGroup((base, Member(piece, shift, 0.0, top.bottom, on=0)), Style.RUN, 0.0)
+            )
             return
 
 
-def _carcass(group: Group) -> list[Member]:
+def _carcass(group: FurnitureGroup) -> list[Member]:
     """The group without what is fitted into it: the last one is the slab."""
     return [m for m in group.members if m.piece.category not in FITTED]
 
 
-def _free_span(group: Group, piece: Piece) -> float | None:
+def _free_span(group: FurnitureGroup, piece: FurniturePiece) -> float | None:
     """Where along the counter the piece finds room beside what is fitted there already; None when it doesn't."""
     slab = _carcass(group)[-1]
     if piece.size_m[0] > slab.piece.size_m[0] + 0.1 or top_of(slab.piece) + slab.bottom > _HIGHEST_M + 0.1:
@@ -225,7 +229,7 @@ def _free_span(group: Group, piece: Piece) -> float | None:
     return slab.y - width / 2 + used + piece.size_m[1] / 2
 
 
-def _evened(group: Group) -> Group:
+def _evened(group: FurnitureGroup) -> FurnitureGroup:
     """The counter with equal gaps between the things fitted into it."""
     carcass = _carcass(group)
     fitted = [m for m in group.members if m.piece.category in FITTED]
@@ -239,21 +243,25 @@ def _evened(group: Group) -> Group:
     return replace(group, members=(*carcass, *members))
 
 
-def worktop(slab: Piece) -> Group:
+def worktop(slab: FurniturePiece) -> FurnitureGroup:
     """A slab without cabinets under it, on brackets at the wall."""
-    return Group((Member(slab, bottom=_WORKTOP_M),), Style.RUN, 0.0, near=SINKS)
+    return FurnitureGroup((Member(slab, bottom=_WORKTOP_M),), Style.RUN, 0.0, near=SINKS)
 
 
-def _with_chair(pool: Pool, group: Group) -> Group:
+def _with_chair(pool: Pool, group: FurnitureGroup) -> FurnitureGroup:
     """A worktop on brackets is a desk where a swivel chair has none; a conference needs its chairs itself."""
     slab = group.members[0]
-    if len(group.members) > 1 or slab.piece.role is not Role.COUNTERTOP or pool.of("conference_table"):
+    if (
+        len(group.members) > 1
+        or slab.piece.role is not FurnitureRole.COUNTERTOP
+        or pool.of("conference_table")
+    ):
         return group
     _, *chairs = before_table(slab.piece, pool.take(pool.of("swivel_chair")[:1]))
     return replace(group, members=(slab, *chairs))
 
 
-def basin(piece: Piece) -> Group:
+def basin(piece: FurniturePiece) -> FurnitureGroup:
     """A basin or cooktop without a counter hangs on the wall."""
     bottom = max(0.4, _BASIN_RIM_M - piece.size_m[2])
-    return Group((Member(piece, bottom=bottom),), Style.ALONG, 12.0, near=SINKS)
+    return FurnitureGroup((Member(piece, bottom=bottom),), Style.ALONG, 12.0, near=SINKS)

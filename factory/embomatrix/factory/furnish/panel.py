@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.factory.furnish.roles import Role, role_of
+from embomatrix.factory.furnish.roles import FurnitureRole, role_of
 from embomatrix.factory.furnish.space import LOW_M, RoomSpace
 from embomatrix.factory.scenes.floor import box_of
 
@@ -29,14 +29,14 @@ _WALL_NAMES: Final = (
 )
 WALL_TYPES: Final = frozenset(_WALL_NAMES.split())
 SEATS: Final = frozenset(("straight_chair", "swivel_chair", "taboret", "music_stool"))
-_TABLES: Final = frozenset((Role.TABLE, Role.LOW_TABLE))
+_TABLES: Final = frozenset((FurnitureRole.TABLE, FurnitureRole.LOW_TABLE))
 _TABLE_LIKE: Final = frozenset(
     ("bar", "cubicle", "commercial_kitchen_table", "reception_desk", "checkout_counter")
 )
 
 
 @dataclass(frozen=True, slots=True)
-class Panel:
+class FurnishPanel:
     """Figures of one scene. Shares are in [0, 1]; a share of nothing is 1."""
 
     scene_id: str
@@ -56,7 +56,7 @@ class Panel:
         return self.placed / self.items if self.items else 1.0
 
 
-def panel_of(scene: Scene, inventory: SceneInventory) -> Panel:
+def panel_of(scene: Scene, inventory: SceneInventory) -> FurnishPanel:
     """Measure a scene that was built from this inventory."""
     boxes = {item.name: box_of(scene, item) for item in scene.objects}
     rooms = {room.name: room for room in scene.rooms}
@@ -64,7 +64,7 @@ def panel_of(scene: Scene, inventory: SceneInventory) -> Panel:
     walled = [o for o in standing if scene.assets[o.asset_id].category in WALL_TYPES]
     seats = [o for o in standing if scene.assets[o.asset_id].category in SEATS]
     tables = [boxes[o.name] for o in standing if _is_table(scene, o)]
-    return Panel(
+    return FurnishPanel(
         scene_id=scene.scene_id,
         items=sum(count for room in inventory.rooms for _, _, count in room.items),
         placed=len(scene.objects),

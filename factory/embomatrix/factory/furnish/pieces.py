@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.factory.furnish.roles import Role
+from embomatrix.factory.furnish.roles import FurnitureRole
 from embomatrix.world.geometry import Pose
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from embomatrix.factory.furnish.boxes import Box
     from embomatrix.world.asset import Asset, Joint, Link
-    from embomatrix.world.geometry import Part, Vec3
+    from embomatrix.world.geometry import ConvexPart, Vec3
     from embomatrix.world.state import Relation
 
 CORNER_SOFA_M: Final = 1.4
@@ -45,13 +45,13 @@ class Access(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Piece:
+class FurniturePiece:
     """One item of a room's inventory. ``number`` tells it from its equals; ``upended`` models hang with z to the room."""
 
     number: int
     category: str
     asset: Asset
-    role: Role
+    role: FurnitureRole
     upended: bool = False
 
     @property
@@ -79,7 +79,7 @@ class Piece:
 class Placed:
     """A piece with its place: centre of the footprint, underside, heading, and its host's number (-1: none)."""
 
-    piece: Piece
+    piece: FurniturePiece
     room: str
     x: float
     y: float
@@ -121,7 +121,7 @@ class Placed:
 class Member:
     """A piece in its group's frame: centre of its footprint, underside, quarter turns; ``on`` is its host's position."""
 
-    piece: Piece
+    piece: FurniturePiece
     x: float = 0.0
     y: float = 0.0
     bottom: float = 0.0
@@ -149,7 +149,7 @@ class Style(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Group:
+class FurnitureGroup:
     """Pieces that are placed as one. ``near`` and ``faces`` name categories whose closeness or sight is worth something.
 
     ``spread`` names categories that it keeps away from; ``clear_m`` is free floor on all sides to anything else.
@@ -178,7 +178,7 @@ class Rows:
     They spread over the room up to ``stretch`` times their closest pitch; ``clear_m`` is free floor to what stands already.
     """
 
-    groups: tuple[Group, ...]
+    groups: tuple[FurnitureGroup, ...]
     importance: float
     gap_m: tuple[float, float]
     stretch: float = 1.35
@@ -191,14 +191,14 @@ _FRONTED_NAMES: Final = (
     "vending_machine grocery_shelf photocopier locker wall_mounted_sink"
 )
 _FRONTED: Final = frozenset(_FRONTED_NAMES.split())
-_BESIDE: Final = frozenset((Role.TABLE, Role.LOW_TABLE, Role.FITTED))
+_BESIDE: Final = frozenset((FurnitureRole.TABLE, FurnitureRole.LOW_TABLE, FurnitureRole.FITTED))
 
 
-def access_of(piece: Piece) -> Access:
+def access_of(piece: FurniturePiece) -> Access:
     """What access the piece needs: a free front where it opens or works, a spot beside it where one puts things on it."""
-    if piece.role is Role.SURFACE:
+    if piece.role is FurnitureRole.SURFACE:
         return Access.NONE
-    if piece.role is Role.HUNG_CABINET:
+    if piece.role is FurnitureRole.HUNG_CABINET:
         return Access.HUNG if piece.asset.can("openable") else Access.NONE
     if piece.category in _FRONTED or piece.asset.can("openable"):
         return Access.FRONT
@@ -221,7 +221,7 @@ _OPEN_SHAPES: Final = frozenset(("tree", "low_resolution_tree"))
 
 
 @functools.lru_cache(maxsize=1024)
-def _blocks_of(parts: tuple[Part, ...], half_m: float) -> tuple[Box, ...]:
+def _blocks_of(parts: tuple[ConvexPart, ...], half_m: float) -> tuple[Box, ...]:
     """Boxes around the parts of an asset, with heights above its underside."""
     boxes = [part.aabb(Pose((0.0, 0.0, half_m))) for part in parts]
     return tuple((*box.low_m, *box.high_m) for box in boxes)
@@ -257,19 +257,21 @@ def _joint_pose(joint: Joint, fraction: float) -> Pose:
     return Pose(joint.origin_m) @ turn @ Pose((-ox, -oy, -oz))
 
 
-def top_of(piece: Piece) -> float:
+def top_of(piece: FurniturePiece) -> float:
     """Height of the piece's main top surface above its underside; its full height when it has no surface in the open."""
     half = piece.asset.size_m[2] / 2
     tops = [(s.size_m[0] * s.size_m[1], s.center_m[2] + half) for s in piece.asset.supports if not s.interior]
     return max(tops)[1] if tops else piece.asset.size_m[2]
 
 
-def stacked(base: Member, piece: Piece, index: int) -> Member:
+def stacked(base: Member, piece: FurniturePiece, index: int) -> Member:
     """The piece centred on top of the group's member at ``index``."""
     return Member(piece, base.x, base.y, base.bottom + top_of(base.piece) + REST_GAP_M, base.turns, on=index)
 
 
-def around_table(table: Piece, chairs: Sequence[Piece], gap_m: float = 0.04) -> tuple[Member, ...]:
+def around_table(
+    table: FurniturePiece, chairs: Sequence[FurniturePiece], gap_m: float = 0.04
+) -> tuple[Member, ...]:
     """A table with chairs facing it: along the long sides first, then at the ends."""
     side, end = _places(table, max((c.size_m[1] for c in chairs), default=0.5))
     ends = end if len(chairs) > 2 * side else 0
@@ -282,25 +284,29 @@ def around_table(table: Piece, chairs: Sequence[Piece], gap_m: float = 0.04) -> 
     return tuple(members)
 
 
-def before_table(table: Piece, chairs: Sequence[Piece], gap_m: float = 0.04) -> tuple[Member, ...]:
+def before_table(
+    table: FurniturePiece, chairs: Sequence[FurniturePiece], gap_m: float = 0.04
+) -> tuple[Member, ...]:
     """A table with chairs on its front side only, facing it: a workplace, a row of a class."""
     return (Member(table), *_line(table, list(chairs), 0, gap_m))
 
 
-def seats_around(table: Piece, seat_m: float) -> int:
+def seats_around(table: FurniturePiece, seat_m: float) -> int:
     """How many chairs of this width find a place around the table."""
     side, end = _places(table, seat_m)
     return 2 * (side + end)
 
 
-def _places(table: Piece, seat_m: float) -> tuple[int, int]:
+def _places(table: FurniturePiece, seat_m: float) -> tuple[int, int]:
     """Chairs along a long side and at an end of the table."""
     depth, width, _ = table.size_m
     seat = seat_m + 0.08
     return max(1, int(width / seat)), max(0, int(depth / seat))
 
 
-def _line(table: Piece, chairs: Sequence[Piece], direction: int, gap_m: float) -> list[Member]:
+def _line(
+    table: FurniturePiece, chairs: Sequence[FurniturePiece], direction: int, gap_m: float
+) -> list[Member]:
     """Chairs side by side along the table's side that looks this many quarter turns away from its front."""
     depth, width, _ = table.size_m
     across, run = (depth, width) if direction % 2 == 0 else (width, depth)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from embomatrix.world.asset import Asset
 
 
-class Role(StrEnum):
+class FurnitureRole(StrEnum):
     """How a model is placed."""
 
     RUN = "run"  # shoulder to shoulder along a wall: cabinets, appliances, sinks
@@ -37,46 +37,48 @@ class Role(StrEnum):
     STRUCTURE = "structure"  # part of the building or its surroundings: walls and floors stand for it
 
 
-_BY_ROLE: Final[Mapping[Role, str]] = {
-    Role.RUN: "bottom_cabinet bottom_cabinet_no_top metal_bottom_cabinet fridge freezer oven stove dishwasher washer "
+_BY_ROLE: Final[Mapping[FurnitureRole, str]] = {
+    FurnitureRole.RUN: "bottom_cabinet bottom_cabinet_no_top metal_bottom_cabinet fridge freezer oven stove dishwasher washer "
     "clothes_dryer furniture_sink commercial_kitchen_sink multi_station_furniture_sink flat_top_grill deep_fryer "
     "electric_cauldron wine_fridge display_fridge grocery_fridge lab_exhaust_hood",
-    Role.COUNTERTOP: "countertop",
-    Role.BACKED: "bed sofa bookcase armchair wardrobe cedar_chest console_table nightstand standing_mirror piano toilet "
-    "pedestal_sink bathtub shower_stall grandfather_clock jukebox bar commercial_kitchen_table locker vending_machine "
+    FurnitureRole.COUNTERTOP: "countertop",
+    FurnitureRole.BACKED: "bed sofa bookcase armchair wardrobe cedar_chest console_table nightstand standing_mirror piano "
+    "toilet pedestal_sink bathtub shower_stall grandfather_clock jukebox bar commercial_kitchen_table locker vending_machine "
     "photocopier reception_desk checkout_counter display_case grocery_shelf hall_tree wood_fireplace gas_fireplace "
     "crib hospital_bed magazine_stand snack_rack urinal eames_chair serving_cart "
     "charcoal_grill stadium_stand sauna_bench hammam_bench car recreational_vehicle motorcycle stand dish_rack_cart",
-    Role.TABLE: "breakfast_table dining_table pedestal_table conference_table desk booth lab_table cubicle",
-    Role.SEAT: "straight_chair swivel_chair taboret bench garden_chair music_stool rocking_chair",
-    Role.LOW_TABLE: "coffee_table garden_coffee_table",
-    Role.CORNER: "floor_lamp public_trash_can trash_can coatrack ottoman hamper standing_loudspeaker umbrella_rack "
+    FurnitureRole.TABLE: "breakfast_table dining_table pedestal_table conference_table desk booth lab_table cubicle",
+    FurnitureRole.SEAT: "straight_chair swivel_chair taboret bench garden_chair music_stool rocking_chair",
+    FurnitureRole.LOW_TABLE: "coffee_table garden_coffee_table",
+    FurnitureRole.CORNER: "floor_lamp public_trash_can trash_can coatrack ottoman hamper standing_loudspeaker umbrella_rack "
     "water_cooler radiator electric_fan desktop_computer shredder suitcase shopping_cart",
-    Role.HUNG_CABINET: "top_cabinet range_hood commercial_kitchen_shelf",
-    Role.WALL: "picture painting portrait mirror electric_switch towel_rack wall_mounted_tv wall_clock whiteboard "
+    FurnitureRole.HUNG_CABINET: "top_cabinet range_hood commercial_kitchen_shelf",
+    FurnitureRole.WALL: "picture painting portrait mirror electric_switch towel_rack wall_mounted_tv wall_clock whiteboard "
     "blackboard paper_towel_dispenser toilet_paper_dispenser toilet_paper_holder hand_dryer wall_socket wall_nail hook "
     "wall_mounted_light wall_mounted_sink wall_mounted_soap_dispenser shelf pay_phone wall_mounted_loudspeaker "
     "information_bulletin periodic_table map decorative_sign signpost makeup_mirror showerhead scoreboard "
     "security_camera fire_extinguisher projection_screen hanging_banners multi_station_wall_mounted_sink hanging "
     "architectural_plan",
-    Role.CEILING: "downlight square_light room_light rectangular_light ceiling_fan ceiling_rack room_ventilator "
+    FurnitureRole.CEILING: "downlight square_light room_light rectangular_light ceiling_fan ceiling_rack room_ventilator "
     "fire_alarm fire_sprinkler track_light spotlight chandelier paper_lantern ceiling_air_conditioner hanging_plant "
     "ceiling_mounted_projector motion_sensor",
-    Role.RUG: "carpet gym_mat",
-    Role.SURFACE: "cash_register microwave laptop coffee_maker table_lamp loudspeaker monitor keyboard printer "
+    FurnitureRole.RUG: "carpet gym_mat",
+    FurnitureRole.SURFACE: "cash_register microwave laptop coffee_maker table_lamp loudspeaker monitor keyboard printer "
     "espresso_machine standing_tv popcorn_machine electric_mixer food_slicer crock_pot beer_tap jug stockpot saucepot "
     "frying_pan tray pillow vase desk_phone buret box_of_fruit lid chess_set mousepad place_mat table_runner oden_cooker "
     "dessert_stand terrarium chopping_board carton toy_box blanket quilt guitar",
-    Role.FITTED: "burner drop_in_sink tabletop_sink multi_station_tabletop_sink",
-    Role.OPEN: "pool_table playground swing_set sandbox wading_pool garden_statue hot_tub massage_bed "
+    FurnitureRole.FITTED: "burner drop_in_sink tabletop_sink multi_station_tabletop_sink",
+    FurnitureRole.OPEN: "pool_table playground swing_set sandbox wading_pool garden_statue hot_tub massage_bed "
     "bench_press_machine elliptical_machine exercise_bike flat_bench parallel_bars pommel_horse "
     "treadmill turnstile",
-    Role.PLANTING: "tree low_resolution_tree bush garden_plant boulder garden_light",
-    Role.STRUCTURE: "structural_element baseboard background greenery paver skeletal_frame stone_wall rail_fence stairs "
-    "railing pergola arbor swimming_pool room_divider pedestal wall_panel l_shaped_handle handle classroom_mock_up "
+    FurnitureRole.PLANTING: "tree low_resolution_tree bush garden_plant boulder garden_light",
+    FurnitureRole.STRUCTURE: "structural_element baseboard background greenery paver skeletal_frame stone_wall rail_fence "
+    "stairs railing pergola arbor swimming_pool room_divider pedestal wall_panel l_shaped_handle handle classroom_mock_up "
     "vine shower fairy_light window_blind pillar roof volleyball_net ceiling_mounted_basketball_hoop",
 }
-_ROLE_OF: Final[Mapping[str, Role]] = {c: role for role, names in _BY_ROLE.items() for c in names.split()}
+_ROLE_OF: Final[Mapping[str, FurnitureRole]] = {
+    c: role for role, names in _BY_ROLE.items() for c in names.split()
+}
 
 _IMPORTANCE: Final[Mapping[str, float]] = {
     "fridge": 20, "oven": 14, "stove": 14, "furniture_sink": 20, "pedestal_sink": 20,
@@ -105,33 +107,33 @@ _SMALL_EXTENT_M: Final = 0.65
 _SMALL_VOLUME_M3: Final = 0.06
 
 
-def role_of(category: str, size_m: tuple[float, float, float], mass_kg: float) -> Role:
+def role_of(category: str, size_m: tuple[float, float, float], mass_kg: float) -> FurnitureRole:
     """The role of a model of this size (depth, width, height) and mass."""
     if category == "pot_plant":
-        return Role.CORNER if size_m[2] > 0.6 else Role.SURFACE
+        return FurnitureRole.CORNER if size_m[2] > 0.6 else FurnitureRole.SURFACE
     if category in _ROLE_OF:
         return _ROLE_OF[category]
     volume = size_m[0] * size_m[1] * size_m[2]
     if max(size_m) <= _SMALL_EXTENT_M and volume <= _SMALL_VOLUME_M3 and mass_kg <= 2 * ROBOT.mass_kg:
-        return Role.SURFACE
+        return FurnitureRole.SURFACE
     if max(size_m) > 4.0 or size_m[2] > 3.0:
-        return Role.STRUCTURE
-    return Role.CORNER if max(size_m[:2]) < 0.6 else Role.BACKED
+        return FurnitureRole.STRUCTURE
+    return FurnitureRole.CORNER if max(size_m[:2]) < 0.6 else FurnitureRole.BACKED
 
 
-def importance_of(category: str, role: Role) -> float:
+def importance_of(category: str, role: FurnitureRole) -> float:
     """What dropping one costs: large for what makes the room what it is."""
     if category in _IMPORTANCE:
         return _IMPORTANCE[category]
     return {
-        Role.RUN: 6.0,
-        Role.BACKED: 5.0,
-        Role.TABLE: 6.0,
-        Role.LOW_TABLE: 4.0,
-        Role.SEAT: 2.0,
-        Role.CORNER: 2.0,
-        Role.OPEN: 4.0,
-        Role.PLANTING: 0.1,
+        FurnitureRole.RUN: 6.0,
+        FurnitureRole.BACKED: 5.0,
+        FurnitureRole.TABLE: 6.0,
+        FurnitureRole.LOW_TABLE: 4.0,
+        FurnitureRole.SEAT: 2.0,
+        FurnitureRole.CORNER: 2.0,
+        FurnitureRole.OPEN: 4.0,
+        FurnitureRole.PLANTING: 0.1,
     }.get(role, 1.0)
 
 

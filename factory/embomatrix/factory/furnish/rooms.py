@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.factory.floorplan.walls import WALL_HEIGHT_M
 from embomatrix.factory.furnish.groups import alone, hung_and_laid, in_the_open, room_groups
 from embomatrix.factory.furnish.pieces import Rows
-from embomatrix.factory.furnish.roles import Role, importance_of
+from embomatrix.factory.furnish.roles import FurnitureRole, importance_of
 from embomatrix.factory.furnish.rows import lay_rows
 from embomatrix.factory.furnish.solver import RoomSolver
 from embomatrix.factory.furnish.space import RoomSpace
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from embomatrix.factory.floorplan.layout import FloorPlan
-    from embomatrix.factory.furnish.pieces import Group, Member, Piece, Placed
+    from embomatrix.factory.furnish.pieces import FurnitureGroup, FurniturePiece, Member, Placed
     from embomatrix.world.scene import Doorway, Room
 
 ATTEMPTS: Final = 24
@@ -41,15 +41,17 @@ MAX_FURNITURE: Final = 60
 MAX_SEATS: Final = 120
 MAX_PLANTS: Final = 24
 """Warehouses and woods: so many of a model stand for all of them."""
-_CAPS: Final[Mapping[Role, int]] = {
-    Role.SURFACE: MAX_EQUAL,
-    Role.CEILING: MAX_EQUAL,
-    Role.SEAT: MAX_SEATS,
-    Role.PLANTING: MAX_PLANTS,
+_CAPS: Final[Mapping[FurnitureRole, int]] = {
+    FurnitureRole.SURFACE: MAX_EQUAL,
+    FurnitureRole.CEILING: MAX_EQUAL,
+    FurnitureRole.SEAT: MAX_SEATS,
+    FurnitureRole.PLANTING: MAX_PLANTS,
 }
 _ABOVE_FLOOR_M: Final = 0.1
 _PAST_M: Final = 2 * ROBOT.radius_m + 0.1
-_LIGHT_LOSSES: Final = frozenset((Role.WALL, Role.CEILING, Role.RUG, Role.PLANTING))
+_LIGHT_LOSSES: Final = frozenset(
+    (FurnitureRole.WALL, FurnitureRole.CEILING, FurnitureRole.RUG, FurnitureRole.PLANTING)
+)
 """What finds no place of these is no reason to start again with it, unless the room is none without it: a basin."""
 _WEIGHTY: Final = 10.0
 
@@ -67,8 +69,8 @@ class Furnishing:
 @dataclass(frozen=True, slots=True)
 class _Arrangement:
     placed: tuple[Placed, ...]
-    dropped: tuple[Piece, ...]
-    unfit: tuple[tuple[Piece, str], ...]
+    dropped: tuple[FurniturePiece, ...]
+    unfit: tuple[tuple[FurniturePiece, str], ...]
     """What no group takes, with the reason."""
 
     @property
@@ -76,14 +78,14 @@ class _Arrangement:
         return sum(importance_of(p.category, p.role) for p in self.dropped)
 
 
-def furnish(plan: FloorPlan, pieces: dict[str, list[Piece]], rng: np.random.Generator) -> Furnishing:
+def furnish(plan: FloorPlan, pieces: dict[str, list[FurniturePiece]], rng: np.random.Generator) -> Furnishing:
     """Place the pieces of every room of the plan; ``pieces`` maps room names to their inventories.
 
     Deterministic for a given generator state. What has no place is never dropped silently: see ``left_out``.
     """
     placed: list[Placed] = []
     left_out: list[str] = []
-    small: list[tuple[str, Piece]] = []
+    small: list[tuple[str, FurniturePiece]] = []
     loss = 0.0
     pieces = _moved(plan, pieces)
     for room in plan.rooms:
@@ -102,15 +104,17 @@ def furnish(plan: FloorPlan, pieces: dict[str, list[Piece]], rng: np.random.Gene
             *_unplaced(best.dropped, room),
         ]
         done = {p.piece.number for p in best.placed} | {p.number for p in best.dropped}
-        small += [(room.name, p) for p in wanted if p.role is Role.SURFACE and p.number not in done]
+        small += [(room.name, p) for p in wanted if p.role is FurnitureRole.SURFACE and p.number not in done]
     left_out += _set_small_things(plan, placed, small, rng)
     return Furnishing(tuple(placed), tuple(left_out), loss)
 
 
-def _moved(plan: FloorPlan, pieces: Mapping[str, Sequence[Piece]]) -> dict[str, list[Piece]]:
+def _moved(
+    plan: FloorPlan, pieces: Mapping[str, Sequence[FurniturePiece]]
+) -> dict[str, list[FurniturePiece]]:
     """The inventories; a bar that its own room can't take stands in the room next door, and its stools with it."""
     rooms = {room.name: room for room in plan.rooms}
-    moved: dict[str, list[Piece]] = {name: [] for name in rooms}
+    moved: dict[str, list[FurniturePiece]] = {name: [] for name in rooms}
     for name, mine in pieces.items():
         beside = [_other(d, name) for d in plan.doorways if name in d.rooms and d.rooms[1]]
         large = [p for p in mine if p.category == "bar" and not _has_room(p, rooms[name])]
@@ -121,28 +125,28 @@ def _moved(plan: FloorPlan, pieces: Mapping[str, Sequence[Piece]]) -> dict[str, 
     return moved
 
 
-def _has_room(piece: Piece, room: Room) -> bool:
+def _has_room(piece: FurniturePiece, room: Room) -> bool:
     """Whether the robot gets past the piece when it stands at a wall."""
     short, long = sorted(piece.size_m[:2])
     return short + _PAST_M <= min(room.size_m) and long <= max(room.size_m)
 
 
-def _capped(pieces: Sequence[Piece], room: str) -> tuple[list[Piece], list[str]]:
+def _capped(pieces: Sequence[FurniturePiece], room: str) -> tuple[list[FurniturePiece], list[str]]:
     """As many of each model as `_CAPS` allows, nothing that belongs to the building; with sentences on the rest."""
-    kept: list[Piece] = []
+    kept: list[FurniturePiece] = []
     totals = Counter(p.asset.asset_id for p in pieces)
     seen: Counter[str] = Counter()
     for piece in pieces:
         seen[piece.asset.asset_id] += 1
         most = _CAPS.get(piece.role, MAX_FURNITURE)
-        belongs = piece.role is not Role.STRUCTURE and not _too_high(piece)
+        belongs = piece.role is not FurnitureRole.STRUCTURE and not _too_high(piece)
         if belongs and seen[piece.asset.asset_id] <= most:
             kept.append(piece)
     notes = []
     for piece in {p.asset.asset_id: p for p in pieces}.values():
         asset_id, total = piece.asset.asset_id, totals[piece.asset.asset_id]
         most = _CAPS.get(piece.role, MAX_FURNITURE)
-        if piece.role is Role.STRUCTURE:
+        if piece.role is FurnitureRole.STRUCTURE:
             notes.append(
                 f"{total} {asset_id} in {room}: part of the building, which floor and walls stand for"
             )
@@ -155,17 +159,20 @@ def _capped(pieces: Sequence[Piece], room: str) -> tuple[list[Piece], list[str]]
     return kept, notes
 
 
-def _too_high(piece: Piece) -> bool:
+def _too_high(piece: FurniturePiece) -> bool:
     """Whether a thing for wall or ceiling has no room above the floor: lamps of a hall, screens of a theatre."""
-    return piece.role in (Role.WALL, Role.CEILING) and piece.size_m[2] > WALL_HEIGHT_M - _ABOVE_FLOOR_M
+    return (
+        piece.role in (FurnitureRole.WALL, FurnitureRole.CEILING)
+        and piece.size_m[2] > WALL_HEIGHT_M - _ABOVE_FLOOR_M
+    )
 
 
 def _best_arrangement(
-    room: Room, plan: FloorPlan, pieces: Sequence[Piece], rng: np.random.Generator
+    room: Room, plan: FloorPlan, pieces: Sequence[FurniturePiece], rng: np.random.Generator
 ) -> _Arrangement:
     best: _Arrangement | None = None
     first: set[int] = set()
-    standing = sum(p.role not in (Role.SURFACE, Role.PLANTING) for p in pieces)
+    standing = sum(p.role not in (FurnitureRole.SURFACE, FurnitureRole.PLANTING) for p in pieces)
     attempts = ATTEMPTS if standing < CROWD else CROWDED_ATTEMPTS if standing < HALL else 2
     for attempt in range(attempts):
         tried = _arrange(room, plan, pieces, rng, first, wobble=0.4 + 0.2 * attempt)
@@ -184,7 +191,7 @@ def _best_arrangement(
 def _arrange(
     room: Room,
     plan: FloorPlan,
-    pieces: Sequence[Piece],
+    pieces: Sequence[FurniturePiece],
     rng: np.random.Generator,
     first: set[int],
     *,
@@ -204,10 +211,10 @@ def _arrange(
 
 
 def _place_all(
-    solver: RoomSolver, groups: Iterable[Group | Rows], wobble: float, rng: np.random.Generator
-) -> list[Piece]:
+    solver: RoomSolver, groups: Iterable[FurnitureGroup | Rows], wobble: float, rng: np.random.Generator
+) -> list[FurniturePiece]:
     """Place group after group; returns the pieces that found no place."""
-    dropped: list[Piece] = []
+    dropped: list[FurniturePiece] = []
     hopeless: set[tuple[str, ...]] = set()
     for item in groups:
         for group in lay_rows(solver, item, wobble, rng) if isinstance(item, Rows) else (item,):
@@ -223,21 +230,24 @@ def _place_all(
     return dropped
 
 
-def _matters(piece: Piece) -> bool:
+def _matters(piece: FurniturePiece) -> bool:
     """Whether it is a reason to arrange the room anew that the piece found no place."""
     return piece.role not in _LIGHT_LOSSES or importance_of(piece.category, piece.role) >= _WEIGHTY
 
 
-def _signature(group: Group) -> tuple[str, ...]:
+def _signature(group: FurnitureGroup) -> tuple[str, ...]:
     return (group.style, *(m.piece.asset.asset_id for m in group.members))
 
 
-def _members(item: Group | Rows) -> tuple[Member, ...]:
+def _members(item: FurnitureGroup | Rows) -> tuple[Member, ...]:
     return tuple(m for g in item.groups for m in g.members) if isinstance(item, Rows) else item.members
 
 
 def _set_small_things(
-    plan: FloorPlan, placed: list[Placed], small: Sequence[tuple[str, Piece]], rng: np.random.Generator
+    plan: FloorPlan,
+    placed: list[Placed],
+    small: Sequence[tuple[str, FurniturePiece]],
+    rng: np.random.Generator,
 ) -> list[str]:
     """Put small things on and in the furniture of their room, else of the room next door."""
     placer = SurfacePlacer(placed, rng)
@@ -245,7 +255,7 @@ def _set_small_things(
         r.name: [_other(d, r.name) for d in plan.doorways if r.name in d.rooms and d.rooms[1]]
         for r in plan.rooms
     }
-    dropped: dict[str, list[Piece]] = {}
+    dropped: dict[str, list[FurniturePiece]] = {}
     for room, piece in sorted(small, key=lambda item: -item[1].size_m[0] * item[1].size_m[1]):
         if not placer.place(piece, (room, *beside[room])):
             dropped.setdefault(room, []).append(piece)
@@ -258,7 +268,7 @@ def _other(doorway: Doorway, room: str) -> str:
     return doorway.rooms[1] if doorway.rooms[0] == room else doorway.rooms[0]
 
 
-def _unplaced(pieces: Sequence[Piece], room: Room) -> list[str]:
+def _unplaced(pieces: Sequence[FurniturePiece], room: Room) -> list[str]:
     """Sentences on what found no place on floor or walls: larger than the room, or in the way."""
     large = [
         p for p in pieces if max(p.size_m[:2]) > max(room.size_m) or min(p.size_m[:2]) > min(room.size_m)
@@ -270,12 +280,14 @@ def _unplaced(pieces: Sequence[Piece], room: Room) -> list[str]:
             large, room.name, f"larger than the room of {room.size_m[0]:.1f} x {room.size_m[1]:.1f} m"
         ),
         *_sentences(
-            [p for p in rest if p.role is Role.PLANTING], room.name, "the edges of the garden are full"
+            [p for p in rest if p.role is FurnitureRole.PLANTING],
+            room.name,
+            "the edges of the garden are full",
         ),
-        *_sentences([p for p in rest if p.role is not Role.PLANTING], room.name, _IN_THE_WAY),
+        *_sentences([p for p in rest if p.role is not FurnitureRole.PLANTING], room.name, _IN_THE_WAY),
     ]
 
 
-def _sentences(pieces: Sequence[Piece], room: str, reason: str) -> list[str]:
+def _sentences(pieces: Sequence[FurniturePiece], room: str, reason: str) -> list[str]:
     counts = Counter(p.asset.asset_id for p in pieces)
     return [f"{count} {asset_id} in {room}: {reason}" for asset_id, count in counts.items()]

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.factory.furnish.candidates import Candidates
+from embomatrix.factory.furnish.candidates import GroupCandidates
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from embomatrix.factory.furnish.boxes import FloatArray
-    from embomatrix.factory.furnish.pieces import Group, Rect4, Rows
+    from embomatrix.factory.furnish.pieces import FurnitureGroup, Rect4, Rows
     from embomatrix.factory.furnish.solver import RoomSolver
 
 _MARGINS_M: Final = ((0.75, 0.75), (0.75, 0.05), (0.05, 0.75), (0.05, 0.05))
@@ -24,13 +24,13 @@ _LATTICES: Final = 4
 """Numbers of columns that are tried for each heading and margin, the closest to the room's own shape."""
 
 
-def lay_rows(solver: RoomSolver, rows: Rows, wobble: float, rng: np.random.Generator) -> list[Group]:
+def lay_rows(solver: RoomSolver, rows: Rows, wobble: float, rng: np.random.Generator) -> list[FurnitureGroup]:
     """Place the groups on the lattice that has room for the most of them. Returns the groups that found no place."""
     unit = _unit(rows.groups)
-    best: tuple[float, Candidates] | None = None
+    best: tuple[float, GroupCandidates] | None = None
     for turns in range(4):
         for lattice in _lattices(solver, unit, rows, turns):
-            nodes = Candidates(
+            nodes = GroupCandidates(
                 lattice[:, 0], lattice[:, 1], np.full(len(lattice), turns), np.zeros(len(lattice))
             )
             free = nodes.take(np.flatnonzero(_all_free(solver, rows, nodes)))
@@ -44,7 +44,9 @@ def lay_rows(solver: RoomSolver, rows: Rows, wobble: float, rng: np.random.Gener
     return _fill(solver, rows.groups, best[1])
 
 
-def _fill(solver: RoomSolver, groups: Sequence[Group], nodes: Candidates) -> list[Group]:
+def _fill(
+    solver: RoomSolver, groups: Sequence[FurnitureGroup], nodes: GroupCandidates
+) -> list[FurnitureGroup]:
     left = list(groups)
     for index in range(len(nodes)):
         if not left:
@@ -56,14 +58,14 @@ def _fill(solver: RoomSolver, groups: Sequence[Group], nodes: Candidates) -> lis
 
 
 def _all_free(
-    solver: RoomSolver, rows: Rows, nodes: Candidates
+    solver: RoomSolver, rows: Rows, nodes: GroupCandidates
 ) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
     """Nodes where the largest group stands free: what fits it, fits all."""
     largest = max(rows.groups, key=lambda g: len(g.members))
     return solver.free(replace(largest, clear_m=rows.clear_m), nodes)
 
 
-def _unit(groups: Sequence[Group]) -> Rect4:
+def _unit(groups: Sequence[FurnitureGroup]) -> Rect4:
     """Bounds that hold each of the groups in its own frame."""
     bounds = np.array([g.bounds for g in groups])
     low, high = bounds[:, :2].min(axis=0), bounds[:, 2:].max(axis=0)

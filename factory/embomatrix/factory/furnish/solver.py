@@ -8,9 +8,15 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.factory.furnish.candidates import AHEAD, WALL_GAP_M, Candidates, Surroundings, candidates_of
+from embomatrix.factory.furnish.candidates import (
+    AHEAD,
+    WALL_GAP_M,
+    GroupCandidates,
+    RoomSurroundings,
+    candidates_of,
+)
 from embomatrix.factory.furnish.pieces import Access, Placed, access_of, front_depth_m
-from embomatrix.factory.furnish.roles import Role
+from embomatrix.factory.furnish.roles import FurnitureRole
 from embomatrix.factory.furnish.space import LOW_M, Target
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.state import Relation
@@ -21,7 +27,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from embomatrix.factory.furnish.boxes import BoolArray, Box, FloatArray
-    from embomatrix.factory.furnish.pieces import Group, Member, Piece
+    from embomatrix.factory.furnish.pieces import FurnitureGroup, FurniturePiece, Member
     from embomatrix.factory.furnish.space import RoomSpace
 
 TRIES: Final = 12
@@ -42,10 +48,10 @@ class RoomSolver:
     def __init__(self, space: RoomSpace, rng: np.random.Generator) -> None:
         self.space = space
         self.placed: list[Placed] = []
-        self._around = Surroundings(space)
+        self._around = RoomSurroundings(space)
         self._rng = rng
 
-    def place(self, group: Group, *, wobble: float = 1.0) -> bool:
+    def place(self, group: FurnitureGroup, *, wobble: float = 1.0) -> bool:
         """Place the group at its best free candidate; False when none leaves the room passable.
 
         ``wobble`` scales the noise on the costs: more of it makes attempts differ more. Where no place has the clearance that
@@ -54,7 +60,7 @@ class RoomSolver:
         shares = _CLEAR_SHARES if group.clear_m else (0.0,)
         return any(self._place(replace(group, clear_m=share * group.clear_m), wobble) for share in shares)
 
-    def _place(self, group: Group, wobble: float) -> bool:
+    def _place(self, group: FurnitureGroup, wobble: float) -> bool:
         options = candidates_of(group, self.space, self._around)
         if not len(options):
             return False
@@ -73,7 +79,7 @@ class RoomSolver:
                 break
         return False
 
-    def place_at(self, group: Group, x: float, y: float, turns: int) -> bool:
+    def place_at(self, group: FurnitureGroup, x: float, y: float, turns: int) -> bool:
         """Place the group in a frame known to be free, unless that takes something out of the robot's reach."""
         items = self._items(group, x, y, turns)
         boxes = [_with_knee_room(item, box) for item in items for box in item.boxes]
@@ -86,26 +92,26 @@ class RoomSolver:
         self.space.occupy(boxes, zones, fronts, targets)
         return True
 
-    def is_free_at(self, group: Group, x: float, y: float, turns: int) -> bool:
+    def is_free_at(self, group: FurnitureGroup, x: float, y: float, turns: int) -> bool:
         """Whether the group stands free in this frame, its fronts included."""
-        spot = Candidates(np.array([x]), np.array([y]), np.array([turns]), np.zeros(1))
+        spot = GroupCandidates(np.array([x]), np.array([y]), np.array([turns]), np.zeros(1))
         return bool(self.free(group, spot)[0])
 
-    def free(self, group: Group, options: Candidates) -> BoolArray:
+    def free(self, group: FurnitureGroup, options: GroupCandidates) -> BoolArray:
         """Which candidates stand free of everything, with their fronts free too; shape (n,)."""
         free = self._looks_free(group, options)
         rows = np.flatnonzero(free)
         free[rows] = self._is_free(group, options.take(rows))
         return free
 
-    def _free(self, group: Group, options: Candidates) -> Iterator[int]:
+    def _free(self, group: FurnitureGroup, options: GroupCandidates) -> Iterator[int]:
         """Numbers of the free candidates in their order, checked a few at a time."""
         rows = np.flatnonzero(self._looks_free(group, options))
         for start in range(0, len(rows), _CHUNK):
             chunk = rows[start : start + _CHUNK]
             yield from (int(row) for row in chunk[self._is_free(group, options.take(chunk))])
 
-    def _looks_free(self, group: Group, options: Candidates) -> BoolArray:
+    def _looks_free(self, group: FurnitureGroup, options: GroupCandidates) -> BoolArray:
         """Candidates inside the room that the quick look does not rule out."""
         (x0, y0), (x1, y1) = self.space.room.low_m, self.space.room.high_m
         gap = WALL_GAP_M - 1e-6 + group.clear_m
@@ -121,7 +127,7 @@ class RoomSolver:
                 free &= ~self.space.surely_collides(front)
         return free
 
-    def _is_free(self, group: Group, options: Candidates) -> BoolArray:
+    def _is_free(self, group: FurnitureGroup, options: GroupCandidates) -> BoolArray:
         free = np.ones(len(options), dtype=bool)
         for member in group.members:
             for boxes in _boxes(member, options):
@@ -135,7 +141,7 @@ class RoomSolver:
                 free &= ~self.space.collides(front)
         return free
 
-    def _items(self, group: Group, x: float, y: float, turns: int) -> list[Placed]:
+    def _items(self, group: FurnitureGroup, x: float, y: float, turns: int) -> list[Placed]:
         start = len(self.placed)
         c, s = (int(v) for v in AHEAD[turns])
         return [
@@ -155,7 +161,7 @@ class RoomSolver:
 
 def _hangs(member: Member) -> bool:
     """Whether it is a flat thing on a wall, which takes no floor before what stands opposite."""
-    return member.piece.role is Role.WALL and member.piece.size_m[0] <= _FLAT_M
+    return member.piece.role is FurnitureRole.WALL and member.piece.size_m[0] <= _FLAT_M
 
 
 def _access(items: Sequence[Placed]) -> tuple[list[Target], list[Box], list[Box]]:
@@ -200,9 +206,9 @@ def _yaw(turns: int) -> float:
     return (0.0, math.pi / 2, math.pi, -math.pi / 2)[turns % 4]
 
 
-def _on_brackets(piece: Piece, host: int) -> bool:
+def _on_brackets(piece: FurniturePiece, host: int) -> bool:
     """Whether it is a worktop on brackets, with room for knees under it rather than for other furniture."""
-    return piece.role is Role.COUNTERTOP and host < 0
+    return piece.role is FurnitureRole.COUNTERTOP and host < 0
 
 
 def _with_knee_room(item: Placed, box: Box) -> Box:
@@ -212,7 +218,7 @@ def _with_knee_room(item: Placed, box: Box) -> Box:
 
 def _seen(member: Member, boxes: FloatArray) -> FloatArray:
     """The boxes with the space over a rug that keeps it in sight."""
-    if member.piece.role is not Role.RUG:
+    if member.piece.role is not FurnitureRole.RUG:
         return boxes
     return np.concatenate([boxes[:, :5], np.maximum(boxes[:, 5:], _RUG_SEEN_M)], axis=1)
 
@@ -221,7 +227,7 @@ def _grown(boxes: FloatArray, by_m: float) -> FloatArray:
     return boxes + np.array([-by_m, -by_m, 0.0, by_m, by_m, 0.0]) if by_m else boxes
 
 
-def _boxes(member: Member, options: Candidates) -> Iterator[FloatArray]:
+def _boxes(member: Member, options: GroupCandidates) -> Iterator[FloatArray]:
     """World boxes of the member's blocks for every candidate, each (n, 6)."""
     x, y, yaw = _frames(member, options)
     for x0, y0, z0, x1, y1, z1 in member.piece.blocks:
@@ -229,7 +235,7 @@ def _boxes(member: Member, options: Candidates) -> Iterator[FloatArray]:
         yield _turned(x, y, yaw, (x0, y0, x1, y1), (low, member.bottom + z1))
 
 
-def _front(member: Member, options: Candidates) -> FloatArray | None:
+def _front(member: Member, options: GroupCandidates) -> FloatArray | None:
     """Free space that the member needs before it for every candidate, (n, 6); None when it needs none."""
     kind = access_of(member.piece)
     if kind not in (Access.FRONT, Access.HUNG):
@@ -241,7 +247,7 @@ def _front(member: Member, options: Candidates) -> FloatArray | None:
     return _turned(*_frames(member, options), (depth / 2, -width / 2, depth / 2 + reach, width / 2), span)
 
 
-def _frames(member: Member, options: Candidates) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
+def _frames(member: Member, options: GroupCandidates) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
     c, s = AHEAD[options.turns, 0], AHEAD[options.turns, 1]
     x = options.x + c * member.x - s * member.y
     y = options.y + s * member.x + c * member.y

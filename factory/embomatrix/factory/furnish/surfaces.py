@@ -12,7 +12,7 @@ import numpy as np
 from embomatrix.factory.furnish.boxes import BoxStack
 from embomatrix.factory.furnish.hosts import NO_HOSTS, hosts_of, kept_behind_doors
 from embomatrix.factory.furnish.pieces import REST_GAP_M, Placed
-from embomatrix.factory.furnish.roles import Role
+from embomatrix.factory.furnish.roles import FurnitureRole
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from embomatrix.factory.furnish.pieces import Piece
+    from embomatrix.factory.furnish.pieces import FurniturePiece
 
     FloatArray = NDArray[np.float64]
 
@@ -81,7 +81,7 @@ class SurfacePlacer:
         self._used = Counter(p.host for p in placed)
         self._holds: set[tuple[str, int, str]] = set()
 
-    def place(self, piece: Piece, rooms: Sequence[str]) -> bool:
+    def place(self, piece: FurniturePiece, rooms: Sequence[str]) -> bool:
         """Set the piece on the best surface with room, in the first of the rooms that has one. False when none has."""
         for room in rooms:
             for surface in self._ranked(piece, room):
@@ -91,18 +91,24 @@ class SurfacePlacer:
 
     def _usable(self, placed: Placed, number: int) -> Iterable[Surface]:
         flat = not placed.piece.upended and abs(math.sin(2 * placed.yaw)) < 1e-6
-        if placed.piece.role in (Role.RUG, Role.CEILING, Role.SURFACE, Role.STRUCTURE) or not flat:
+        if (
+            placed.piece.role
+            in (FurnitureRole.RUG, FurnitureRole.CEILING, FurnitureRole.SURFACE, FurnitureRole.STRUCTURE)
+            or not flat
+        ):
             return []
-        if placed.piece.role is Role.WALL and placed.piece.category != "shelf":
+        if placed.piece.role is FurnitureRole.WALL and placed.piece.category != "shelf":
             return []
-        tall = placed.bottom + placed.piece.size_m[2] > _TALL_M and placed.piece.role is not Role.WALL
+        tall = (
+            placed.bottom + placed.piece.size_m[2] > _TALL_M and placed.piece.role is not FurnitureRole.WALL
+        )
         return [
             s
             for s in surfaces_of(placed, number)
             if 0.05 < s.z < _HIGHEST_M and not (tall and s.z > _TALL_M and not s.interior)
         ]
 
-    def _ranked(self, piece: Piece, room: str) -> list[Surface]:
+    def _ranked(self, piece: FurniturePiece, room: str) -> list[Surface]:
         """Surfaces of the room in the order of preference: the listed hosts, then any other in the open."""
         wanted = {host: rank for rank, host in enumerate(hosts_of(piece.category))}
         surfaces = self._surfaces[room]
@@ -122,7 +128,7 @@ class SurfacePlacer:
             ranked.append((cost, surface))
         return [s for _, s in sorted(ranked, key=lambda item: item[0])]
 
-    def _set_on(self, piece: Piece, surface: Surface) -> bool:
+    def _set_on(self, piece: FurniturePiece, surface: Surface) -> bool:
         """Try sampled spots on the surface and take the first that is free."""
         if piece.size_m[2] + 0.01 > surface.clearance_m:
             return False
@@ -157,7 +163,7 @@ class SurfacePlacer:
         return True
 
     def _spots(
-        self, piece: Piece, surface: Surface, host: Placed, yaw: FloatArray
+        self, piece: FurniturePiece, surface: Surface, host: Placed, yaw: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
         """Random middles on the surface, the half extents there (n, 2), and which of them keep to its edges."""
         overhang = 0.2 if piece.category == "standing_tv" else 0.0

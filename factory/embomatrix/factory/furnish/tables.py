@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.furnish.pieces import (
-    Group,
+    FurnitureGroup,
     Member,
     Rows,
     Style,
@@ -15,12 +15,12 @@ from embomatrix.factory.furnish.pieces import (
     top_of,
 )
 from embomatrix.factory.furnish.pool import worth
-from embomatrix.factory.furnish.roles import Role
+from embomatrix.factory.furnish.roles import FurnitureRole
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from embomatrix.factory.furnish.pieces import Piece
+    from embomatrix.factory.furnish.pieces import FurniturePiece
     from embomatrix.factory.furnish.pool import Pool
 
 STOOLS: Final = ("music_stool", "taboret")
@@ -48,27 +48,27 @@ _SEAT_M: Final = 0.45
 _BESIDE_DESK_M: Final = 0.65
 
 
-def work_groups(pool: Pool) -> list[Group | Rows]:
+def work_groups(pool: Pool) -> list[FurnitureGroup | Rows]:
     """Desks and cubicles with their chairs and drawers."""
     desks = pool.take(pool.of(*_WORK))
-    others = [p for p in pool.rest if p.role is Role.TABLE]
+    others = [p for p in pool.rest if p.role is FurnitureRole.TABLE]
     swivels = not others or len(pool.of("swivel_chair")) <= 2 * len(desks)
     return _in_rows(_workplaces(pool, desks, swivels=swivels), pool)
 
 
-def table_groups(pool: Pool) -> list[Group | Rows]:
+def table_groups(pool: Pool) -> list[FurnitureGroup | Rows]:
     """Everything else that people sit at, with what they sit on; seats that are left over stay in the pool."""
-    groups: list[Group] = [*_booths(pool), *_bars(pool)]
+    groups: list[FurnitureGroup] = [*_booths(pool), *_bars(pool)]
     tables = sorted(_tables(pool), key=lambda t: -t.size_m[0] * t.size_m[1])
     found = _in_rows([*groups, *_sets(pool, tables)], pool)
     if len(pool.of("armchair")) >= 3 * ROW_OF and pool.room_type in _FACING:
-        audience = [Group((Member(p),), Style.FREE, 6.0) for p in pool.take(pool.of("armchair"))]
+        audience = [FurnitureGroup((Member(p),), Style.FREE, 6.0) for p in pool.take(pool.of("armchair"))]
         found.append(Rows(tuple(audience), 6.0, (_ROW_M + 0.3, 0.06)))
     return found
 
 
-def _tables(pool: Pool) -> list[Piece]:
-    tables = pool.take(p for p in pool.rest if p.role is Role.TABLE)
+def _tables(pool: Pool) -> list[FurniturePiece]:
+    tables = pool.take(p for p in pool.rest if p.role is FurnitureRole.TABLE)
     tables += pool.take(p for p in pool.of("coffee_table") if top_of(p) > _DINING_TOP_M)
     chairs = len(pool.of("straight_chair", "swivel_chair", "garden_chair"))
     if not tables and chairs >= 2:
@@ -76,7 +76,7 @@ def _tables(pool: Pool) -> list[Piece]:
     return tables
 
 
-def _workplaces(pool: Pool, desks: Sequence[Piece], *, swivels: bool) -> list[Group]:
+def _workplaces(pool: Pool, desks: Sequence[FurniturePiece], *, swivels: bool) -> list[FurnitureGroup]:
     """A desk at the wall with its chair at the room's side; deep double desks with a chair on either side."""
     kinds = ("swivel_chair",) if swivels else ()
     kinds = (*kinds, "eames_chair", "straight_chair", "armchair" if pool.room_type in _EATING else "taboret")
@@ -93,11 +93,11 @@ def _workplaces(pool: Pool, desks: Sequence[Piece], *, swivels: bool) -> list[Gr
         members = (*members, *_drawers_beside(desk, pool.take(drawers[: min(spare, each)])))
         drawers = drawers[min(spare, each) :]
         style = Style.FREE if pool.room_type in _FACING and len(desks) >= ROW_OF else Style.ALONG
-        groups.append(Group(members, style, worth(members), spread=(desk.category,)))
+        groups.append(FurnitureGroup(members, style, worth(members), spread=(desk.category,)))
     return groups
 
 
-def _drawers_beside(desk: Piece, drawers: Sequence[Piece]) -> list[Member]:
+def _drawers_beside(desk: FurniturePiece, drawers: Sequence[FurniturePiece]) -> list[Member]:
     """Low cabinets at the sides of the desk: the first opens to the chair's side, the second to the other."""
     found = []
     for drawer, side in zip(drawers, (1, -1), strict=False):
@@ -107,7 +107,7 @@ def _drawers_beside(desk: Piece, drawers: Sequence[Piece]) -> list[Member]:
     return found
 
 
-def _sets(pool: Pool, tables: Sequence[Piece]) -> list[Group]:
+def _sets(pool: Pool, tables: Sequence[FurniturePiece]) -> list[FurnitureGroup]:
     """Tables with seats shared out among them, in the middle of the room; those without seats go to a wall."""
     high = [t for t in tables if top_of(t) > _HIGH_TABLE_M]
     stools = pool.of(*STOOLS)
@@ -123,7 +123,9 @@ def _sets(pool: Pool, tables: Sequence[Piece]) -> list[Group]:
     ]
 
 
-def _shared(pool: Pool, tables: Sequence[Piece], seats: list[Piece], one_side: bool) -> list[Group]:
+def _shared(
+    pool: Pool, tables: Sequence[FurniturePiece], seats: list[FurniturePiece], one_side: bool
+) -> list[FurnitureGroup]:
     """Seats of one kind to each table, as evenly as they go."""
     pool.take(seats)
     groups = []
@@ -136,14 +138,14 @@ def _shared(pool: Pool, tables: Sequence[Piece], seats: list[Piece], one_side: b
         seats = [s for s in mine if s.number not in seated] + seats
         style = Style.FREE if len(members) > 2 or (one_side and mine) else Style.ALONG
         clear = _SET_CLEAR_M if style is Style.FREE else 0.0
-        groups.append(Group(members, style, worth(members), spread=(table.category,), clear_m=clear))
+        groups.append(FurnitureGroup(members, style, worth(members), spread=(table.category,), clear_m=clear))
     pool.rest += seats
     return groups
 
 
-def _in_rows(groups: Sequence[Group], pool: Pool) -> list[Group | Rows]:
+def _in_rows(groups: Sequence[FurnitureGroup], pool: Pool) -> list[FurnitureGroup | Rows]:
     """Sets of about one size, four or more, as rows."""
-    found: list[Group | Rows] = []
+    found: list[FurnitureGroup | Rows] = []
     for equal in _alike(groups):
         if len(equal) < ROW_OF or len(equal[0].members) < 2:
             found += equal
@@ -155,9 +157,9 @@ def _in_rows(groups: Sequence[Group], pool: Pool) -> list[Group | Rows]:
     return found
 
 
-def _alike(groups: Sequence[Group]) -> list[list[Group]]:
+def _alike(groups: Sequence[FurnitureGroup]) -> list[list[FurnitureGroup]]:
     """Groups of one style whose sides differ by less than ALIKE, the larger ones first."""
-    kinds: list[list[Group]] = []
+    kinds: list[list[FurnitureGroup]] = []
     for group in sorted(groups, key=lambda g: -_side(g)):
         for kind in kinds:
             work = group.members[0].piece.category in _WORK
@@ -170,12 +172,12 @@ def _alike(groups: Sequence[Group]) -> list[list[Group]]:
     return kinds
 
 
-def _side(group: Group) -> float:
+def _side(group: FurnitureGroup) -> float:
     x0, y0, x1, y1 = group.bounds
     return max(x1 - x0, y1 - y0)
 
 
-def _booths(pool: Pool) -> list[Group]:
+def _booths(pool: Pool) -> list[FurnitureGroup]:
     """A table end-on to the wall, with a bench on either side facing it."""
     groups = []
     benches = pool.of("bench")
@@ -190,11 +192,11 @@ def _booths(pool: Pool) -> list[Group]:
         for bench, side in zip(mine, (1, -1), strict=False):
             offset = table.size_m[0] / 2 + _KNEE_M + bench.size_m[0] / 2
             members.append(Member(bench, 0.0, side * offset, turns=3 if side > 0 else 1))
-        groups.append(Group(tuple(members), Style.ALONG, worth(members), near=("booth", "bench")))
+        groups.append(FurnitureGroup(tuple(members), Style.ALONG, worth(members), near=("booth", "bench")))
     return groups
 
 
-def _bars(pool: Pool) -> list[Group]:
+def _bars(pool: Pool) -> list[FurnitureGroup]:
     """Bars along a wall with stools before the longest."""
     groups = []
     bars = pool.take(sorted(pool.of("bar"), key=lambda p: -p.size_m[1]))
@@ -206,5 +208,5 @@ def _bars(pool: Pool) -> list[Group]:
         for place, stool in enumerate(stools):
             x = bar.size_m[0] / 2 + _STOOL_GAP_M + stool.size_m[0] / 2
             members.append(Member(stool, x, (place + 1) * pitch - bar.size_m[1] / 2, turns=2))
-        groups.append(Group(tuple(members), Style.ALONG, worth(members)))
+        groups.append(FurnitureGroup(tuple(members), Style.ALONG, worth(members)))
     return groups

@@ -20,7 +20,7 @@ from embomatrix.factory.importers.cavities import cavities, solid_cells, top_sur
 from embomatrix.factory.importers.convex import MAX_HULLS, MAX_VERTICES, merged
 from embomatrix.factory.importers.hinges import linked
 from embomatrix.factory.importers.meshes import GROUPED, read_groups
-from embomatrix.factory.importers.model import Frame, Mesh, ModelFileError, RawModel
+from embomatrix.factory.importers.model import AxisConvention, Mesh, ModelFileError, RawModel
 from embomatrix.factory.importers.urdf import read_urdf
 from embomatrix.world.asset import Asset, Joint, JointKind, Link
 from embomatrix.world.codec_asset import asset_from_json, asset_to_json
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from embomatrix.factory.importers.convex import Decomposer
     from embomatrix.world.asset import Credit
     from embomatrix.world.catalog import Catalog, Model
-    from embomatrix.world.geometry import FloatArray, Part, Vec3
+    from embomatrix.world.geometry import ConvexPart, FloatArray, Vec3
 
 THIN_M: Final = 0.002
 """Parts are grown to this thickness: a sheet without any is no body for an engine."""
@@ -43,13 +43,13 @@ BARRING_SHARE: Final = 0.25
 """A link that covers this share of a cavity's mouth bars the way in."""
 TURN: Final = {
     # asset x, y, z in terms of the file's axes: its front is +z there, its width x, its height y
-    Frame.Y_UP: np.array(((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))),
-    Frame.Z_UP: np.eye(3),
+    AxisConvention.Y_UP: np.array(((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))),
+    AxisConvention.Z_UP: np.eye(3),
 }
 
 
 @dataclass(frozen=True, slots=True)
-class Imported:
+class ImportedAsset:
     """An imported asset; ``stretch`` is the ratio of its largest to its smallest scale: 1 keeps the proportions.
 
     ``lacks`` says what the category's things can do and this model can't.
@@ -60,7 +60,7 @@ class Imported:
     lacks: tuple[str, ...]
 
 
-def read_model(path: Path, frame: Frame | None = None) -> RawModel:
+def read_model(path: Path, frame: AxisConvention | None = None) -> RawModel:
     """The model of an OBJ, STL, GLB or URDF file. ``frame`` overrules what its kind says of its axes.
 
     Raises ModelFileError for a file that is of another kind, damaged or too large.
@@ -69,7 +69,9 @@ def read_model(path: Path, frame: Frame | None = None) -> RawModel:
     if suffix == ".urdf":
         model = read_urdf(path)
     elif suffix in GROUPED:
-        model = linked(read_groups(path), frame or (Frame.Z_UP if suffix == ".stl" else Frame.Y_UP))
+        model = linked(
+            read_groups(path), frame or (AxisConvention.Z_UP if suffix == ".stl" else AxisConvention.Y_UP)
+        )
     else:
         kinds = ", ".join(sorted((*GROUPED, ".urdf")))
         raise ModelFileError(f"{path} ends in {suffix!r}: expected one of {kinds}")
@@ -78,7 +80,7 @@ def read_model(path: Path, frame: Frame | None = None) -> RawModel:
 
 def import_model(
     catalog: Catalog, raw: RawModel, category: str, model_id: str, credit: Credit, decompose: Decomposer
-) -> Imported:
+) -> ImportedAsset:
     """The asset of a model file in the place of one of the catalog's models; without a ``model_id``, of the one most like it.
 
     Raises CatalogError for an unknown category or model, ModelFileError when the model can't be made an asset.
@@ -109,7 +111,7 @@ def import_model(
         credit=credit,
     )
     sound = asset_from_json(asset_to_json(asset))
-    return Imported(sound, float(scale.max() / scale.min()), tuple(_lacks(sound, kind.abilities)))
+    return ImportedAsset(sound, float(scale.max() / scale.min()), tuple(_lacks(sound, kind.abilities)))
 
 
 def _lacks(asset: Asset, wanted: Mapping[str, Mapping[str, float]]) -> Iterator[str]:
@@ -178,7 +180,7 @@ def _together(meshes: Sequence[Mesh]) -> Mesh:
     return Mesh(np.vstack([mesh.vertices for mesh in meshes]), np.vstack(faces))
 
 
-def convex_part(points: FloatArray) -> Part:
+def convex_part(points: FloatArray) -> ConvexPart:
     """The convex hull of points as a box, where it nearly is one, or as a hull of at most 64 corners."""
     low, high = points.min(axis=0), points.max(axis=0)
     thin = np.maximum(0.0, THIN_M - (high - low)) / 2
@@ -219,7 +221,7 @@ def _exactly(links: Sequence[Link], entry: Model) -> tuple[Link, ...]:
     scale = np.asarray(entry.size_m) / np.asarray(whole.size_m)
     middle = np.asarray(whole.center_m)
 
-    def drawn(part: Part) -> Part:
+    def drawn(part: ConvexPart) -> ConvexPart:
         points = (
             part.pose.apply_all(np.asarray(part.vertices_m)) if part.vertices_m else _corners(part)
         ) - middle
@@ -229,12 +231,12 @@ def _exactly(links: Sequence[Link], entry: Model) -> tuple[Link, ...]:
     return tuple(Link(link.name, tuple(drawn(part) for part in link.parts), link.joint) for link in links)
 
 
-def _corners(part: Part) -> FloatArray:
+def _corners(part: ConvexPart) -> FloatArray:
     found = _box_of(part)
     return np.array([found.low_m, found.high_m])
 
 
-def _box_of(part: Part) -> Aabb:
+def _box_of(part: ConvexPart) -> Aabb:
     points = part.pose.apply_all(np.asarray(part.vertices_m)) if part.vertices_m else None
     if points is None:
         half = np.asarray(part.size_m) / 2
@@ -272,7 +274,7 @@ def _bars(link: Link, inside: Aabb) -> bool:
     ) >= BARRING_SHARE
 
 
-def _planes(part: Part) -> tuple[FloatArray, FloatArray]:
+def _planes(part: ConvexPart) -> tuple[FloatArray, FloatArray]:
     """Outer half spaces of a part: normals (n, 3) and offsets (n,)."""
     mesh = mesh_of(part)
     return mesh.face_normals, np.einsum("ij,ij->i", mesh.face_normals, mesh.triangles[:, 0])

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.factory.importers.model import Frame, Mesh, ModelFileError, Motion, RawLink, RawModel
+from embomatrix.factory.importers.model import AxisConvention, Mesh, ModelFileError, Motion, RawLink, RawModel
 from embomatrix.world.asset import JointKind
 
 if TYPE_CHECKING:
@@ -25,11 +25,11 @@ _OPENING: Final = re.compile(r"sweethome3d_opening_on_(hinge|rail)_(\d+)")
 _HINGE: Final = re.compile(r"sweethome3d_hinge_(\d+)")
 _RAIL: Final = re.compile(r"sweethome3d_(?:unique_rail|rail_(\d+))")
 TRAVEL_SHARE: Final = 0.8
-FORWARD: Final = {Frame.Y_UP: 2, Frame.Z_UP: 0}
+FORWARD: Final = {AxisConvention.Y_UP: 2, AxisConvention.Z_UP: 0}
 """The axis along which a model's front lies, at its positive end."""
 
 
-def linked(groups: Mapping[str, Mesh], frame: Frame) -> RawModel:
+def linked(groups: Mapping[str, Mesh], frame: AxisConvention) -> RawModel:
     """A model whose named openings move, and all else is its base. Raises ModelFileError when nothing else is left."""
     openings: dict[tuple[str, str], list[Mesh]] = {}
     hinges: dict[str, Mesh] = {}
@@ -60,7 +60,7 @@ def linked(groups: Mapping[str, Mesh], frame: Frame) -> RawModel:
     return RawModel(tuple(links), frame)
 
 
-def _turn(rod: Mesh, meshes: Iterable[Mesh], frame: Frame) -> Motion:
+def _turn(rod: Mesh, meshes: Iterable[Mesh], frame: AxisConvention) -> Motion:
     """A quarter turn about the rod's middle line, towards the front."""
     origin, axis = _line(rod)
     low, high = _box(meshes)
@@ -70,7 +70,7 @@ def _turn(rod: Mesh, meshes: Iterable[Mesh], frame: Frame) -> Motion:
     return Motion(JointKind.REVOLUTE, _triple(origin), _triple(sign * axis), math.pi / 2)
 
 
-def _slide(rod: Mesh, meshes: Iterable[Mesh], frame: Frame) -> Motion:
+def _slide(rod: Mesh, meshes: Iterable[Mesh], frame: AxisConvention) -> Motion:
     """Along the rod: towards the front, or to the side on which there is more of it."""
     origin, axis = _line(rod)
     low, high = _box(meshes)

@@ -26,7 +26,7 @@ class ModelFileError(Exception):
     """A model file that can't be imported: the message names the file, what was found, and what was expected."""
 
 
-class Frame(StrEnum):
+class AxisConvention(StrEnum):
     """Which way a file's axes point."""
 
     Y_UP = "y"  # x width, y up, z towards the viewer of its front: OBJ of Sweet Home 3D, glTF
@@ -80,7 +80,7 @@ class RawModel:
     """A model as its file has it."""
 
     links: tuple[RawLink, ...]
-    frame: Frame
+    frame: AxisConvention
 
 
 def read_bytes(path: Path) -> bytes:

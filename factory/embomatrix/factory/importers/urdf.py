@@ -17,7 +17,7 @@ import trimesh
 
 from embomatrix.factory.importers.meshes import read_groups
 from embomatrix.factory.importers.model import (
-    Frame,
+    AxisConvention,
     Mesh,
     ModelFileError,
     Motion,
@@ -141,7 +141,8 @@ def _gathered(
     if empty:
         raise ModelFileError(f"the link {empty[0]!r} has no shape: give it a collision or a visual element")
     return RawModel(
-        tuple(RawLink(name, tuple(found), motions.get(name)) for name, found in meshes.items()), Frame.Z_UP
+        tuple(RawLink(name, tuple(found), motions.get(name)) for name, found in meshes.items()),
+        AxisConvention.Z_UP,
     )
 
 

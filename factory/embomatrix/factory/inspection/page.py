@@ -25,7 +25,7 @@ from embomatrix.sim.bullet.camera import render_oblique
 from embomatrix.world.evaluate import objects_of
 
 if TYPE_CHECKING:
-    from embomatrix.factory.inspection.playing import Moment, Show
+    from embomatrix.factory.inspection.playing import PlayMoment, Show
     from embomatrix.world.dataset import TaskRecord
     from embomatrix.world.scene import Scene
 
@@ -167,7 +167,7 @@ def scene_picture(scene: Scene) -> str:
     return f'<img alt="the scene from above, at an angle" src="data:image/jpeg;base64,{encoded}">'
 
 
-def _moment_json(moment: Moment, view: PlanView) -> dict[str, Any]:
+def _moment_json(moment: PlayMoment, view: PlanView) -> dict[str, Any]:
     return {
         "robot": [*view.at(*moment.robot_m), round(-np.degrees(moment.yaw))],
         "held": list(moment.held),

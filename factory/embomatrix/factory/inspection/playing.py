@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Moment:
+class PlayMoment:
     """The state after a call; the first moment, without a call, is the start.
 
     ``things_m`` are the middles of the table's small things in the world, ``held`` what the hand carries, ``goal`` the goal's
@@ -42,7 +42,7 @@ class Moment:
 class Show:
     """The oracle's plan from start to end. ``final`` describes the end in words, ``reward`` what it earns."""
 
-    moments: tuple[Moment, ...]
+    moments: tuple[PlayMoment, ...]
     final: tuple[str, ...]
     reward: float
     success: bool
@@ -65,9 +65,9 @@ def play_oracle(record: TaskRecord, bundle: Bundle) -> Show:
     return Show(tuple(moments), trace.final, reward.total, reward.success)
 
 
-def _moment(simulator: Simulator, record: TaskRecord, call: str, said: str) -> Moment:
+def _moment(simulator: Simulator, record: TaskRecord, call: str, said: str) -> PlayMoment:
     world, task = simulator.world, record.task
-    return Moment(
+    return PlayMoment(
         call=call,
         said=said,
         robot_m=(world.robot.x_m, world.robot.y_m),

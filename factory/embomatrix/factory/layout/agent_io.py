@@ -21,12 +21,12 @@ from embomatrix.factory.layout.values import (
     Branch,
     Distribution,
     DistributionBrief,
+    PlacementConstraints,
     PlaneBrief,
     PlaneCompany,
     RoomBrief,
     SampleBrief,
     Sampled,
-    Wishes,
 )
 from embomatrix.factory.layout.wishes import wish
 from embomatrix.factory.scenes.build import build_base_scene
@@ -53,7 +53,7 @@ class BriefError(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Door:
+class AgentInterface:
     """What an agent takes and gives, and its rules."""
 
     about: str
@@ -94,32 +94,32 @@ def sample(brief: SampleBrief) -> Sampled:
     return Sampled(name, pose.position_m, pose.quat_xyzw, editor.objects[name].room)
 
 
-DOORS: Final[Mapping[AgentName, Door]] = {
-    AgentName.DISTRIBUTOR: Door(
+DOORS: Final[Mapping[AgentName, AgentInterface]] = {
+    AgentName.DISTRIBUTOR: AgentInterface(
         "Scene-level Distribution Agent: a room for each thing",
         TypeAdapter(DistributionBrief),
         TypeAdapter(Distribution),
         distribute,
     ),
-    AgentName.ORGANIZER: Door(
+    AgentName.ORGANIZER: AgentInterface(
         "Room-level Organization Agent: a layout tree, as branches",
         TypeAdapter(RoomBrief),
         TypeAdapter(tuple[Branch, ...]),
         _branches,
     ),
-    AgentName.PLANNER: Door(
+    AgentName.PLANNER: AgentInterface(
         "Planar-Level Placement Generator, first half: constraints",
         TypeAdapter(PlaneCompany),
-        TypeAdapter(Wishes),
+        TypeAdapter(PlacementConstraints),
         wish,
     ),
-    AgentName.SOLVER: Door(
+    AgentName.SOLVER: AgentInterface(
         "Planar-Level Placement Generator, second half: spots on a plane",
         TypeAdapter(PlaneBrief),
         TypeAdapter(tuple[Arranged, ...]),
         arrange,
     ),
-    AgentName.SAMPLER: Door(
+    AgentName.SAMPLER: AgentInterface(
         "Object-level Sampling Agent: a pose in a base scene",
         TypeAdapter(SampleBrief),
         TypeAdapter(Sampled),

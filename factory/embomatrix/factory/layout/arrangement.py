@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from embomatrix.factory.layout.values import Footprint, Size2, Size3, Wish
+    from embomatrix.factory.layout.values import PlacementConstraint, PlaneFootprint, Size2, Size3
 
     FloatArray = NDArray[np.float64]
     BoolArray = NDArray[np.bool_]
@@ -57,7 +57,7 @@ SHADE: Final = 0.3
 
 
 @dataclass(frozen=True, slots=True)
-class Candidates:
+class SpotCandidates:
     """n spots of one thing: middles (n, 2), yaws (n,), and half extents (n, 2) of the box around the turned footprint."""
 
     center: FloatArray
@@ -65,12 +65,12 @@ class Candidates:
     half: FloatArray
 
     @staticmethod
-    def of(center: FloatArray, yaw: FloatArray, size_m: Size3) -> Candidates:
+    def of(center: FloatArray, yaw: FloatArray, size_m: Size3) -> SpotCandidates:
         """Spots of a thing of this size."""
-        return Candidates(center, yaw, half_extents(yaw, (size_m[0], size_m[1])))
+        return SpotCandidates(center, yaw, half_extents(yaw, (size_m[0], size_m[1])))
 
-    def at(self, rows: FloatArray | BoolArray | NDArray[np.int64]) -> Candidates:
-        return Candidates(self.center[rows], self.yaw[rows], self.half[rows])
+    def at(self, rows: FloatArray | BoolArray | NDArray[np.int64]) -> SpotCandidates:
+        return SpotCandidates(self.center[rows], self.yaw[rows], self.half[rows])
 
     def __len__(self) -> int:
         return len(self.yaw)
@@ -83,12 +83,12 @@ def half_extents(yaw: FloatArray, size_m: Size2) -> FloatArray:
     return np.stack([cosine * x + sine * y, sine * x + cosine * y], axis=-1)
 
 
-def margins(spots: Candidates, plane_m: Size2) -> FloatArray:
+def margins(spots: SpotCandidates, plane_m: Size2) -> FloatArray:
     """Free strip between each spot and the nearest side of the plane, shape (n,); negative where it juts out."""
     return np.asarray((np.asarray(plane_m) / 2 - np.abs(spots.center) - spots.half).min(axis=1))
 
 
-def gaps(spots: Candidates, other: Footprint) -> FloatArray:
+def gaps(spots: SpotCandidates, other: PlaneFootprint) -> FloatArray:
     """Distance between the boxes around each spot and around another footprint, shape (n,); 0 where they overlap."""
     apart = np.abs(spots.center - np.asarray(other.center_m)) - spots.half - _half(other)
     return np.asarray(np.hypot(*np.maximum(apart, 0.0).T))
@@ -99,7 +99,13 @@ def near_m(plane_m: Size2) -> float:
     return min(NEAR_M, NEAR_SHARE * math.hypot(*plane_m))
 
 
-def holds(wish: Wish, spots: Candidates, plane_m: Size2, size_m: Size3, other: Footprint | None) -> BoolArray:
+def holds(
+    wish: PlacementConstraint,
+    spots: SpotCandidates,
+    plane_m: Size2,
+    size_m: Size3,
+    other: PlaneFootprint | None,
+) -> BoolArray:
     """At which spots a wish holds, shape (n,). A wish about an object that is not on the plane holds nowhere."""
     if wish.kind is Arrangement.EDGE:
         return margins(spots, plane_m) <= min(EDGE_M, EDGE_SHARE * min(plane_m))
@@ -126,7 +132,11 @@ def holds(wish: Wish, spots: Candidates, plane_m: Size2, size_m: Size3, other: F
 
 
 def degrees(
-    wish: Wish, spots: Candidates, plane_m: Size2, size_m: Size3, other: Footprint | None
+    wish: PlacementConstraint,
+    spots: SpotCandidates,
+    plane_m: Size2,
+    size_m: Size3,
+    other: PlaneFootprint | None,
 ) -> FloatArray:
     """How far a wish is met, from 0 to 1, shape (n,): falls off gently where it does not hold."""
     if wish.kind is Arrangement.EDGE:
@@ -150,13 +160,13 @@ def degrees(
             return np.asarray(np.cos(_off_axis(spots, other)) ** 8)
 
 
-def next_to_m(size_m: Size3, other: Footprint) -> float:
+def next_to_m(size_m: Size3, other: PlaneFootprint) -> float:
     """The largest gap at which the engine calls two boxes next to each other."""
     mean = (sum(size_m) + sum(other.size_m) + other.high_m - other.low_m) / 6
     return min(max(NEXT_SHARE * mean, NEXT_M[0]), NEXT_M[1])
 
 
-def _beside(spots: Candidates, size_m: Size3, other: Footprint) -> BoolArray:
+def _beside(spots: SpotCandidates, size_m: Size3, other: PlaneFootprint) -> BoolArray:
     """Side by side: their heights overlap, they face each other along one axis, and the gap is small."""
     if other.low_m >= size_m[2] or other.high_m <= 0.0:
         return np.zeros(len(spots), dtype=bool)
@@ -166,19 +176,19 @@ def _beside(spots: Candidates, size_m: Size3, other: Footprint) -> BoolArray:
     return np.asarray(faces & (gaps(spots, other) <= NEXT_SLACK * next_to_m(size_m, other)))
 
 
-def _off_front(spots: Candidates, other: Footprint) -> FloatArray:
+def _off_front(spots: SpotCandidates, other: PlaneFootprint) -> FloatArray:
     """Angle, 0 to pi, between where another's front looks and the way from it to each spot."""
     way = spots.center - np.asarray(other.center_m)
     return _turn(np.arctan2(way[:, 1], way[:, 0]) - other.yaw)
 
 
-def _off_gaze(spots: Candidates, other: Footprint) -> FloatArray:
+def _off_gaze(spots: SpotCandidates, other: PlaneFootprint) -> FloatArray:
     """Angle, 0 to pi, between where the thing's own front looks and the way to another's middle."""
     way = np.asarray(other.center_m) - spots.center
     return _turn(np.arctan2(way[:, 1], way[:, 0]) - spots.yaw)
 
 
-def _off_axis(spots: Candidates, other: Footprint) -> FloatArray:
+def _off_axis(spots: SpotCandidates, other: PlaneFootprint) -> FloatArray:
     """Angle, 0 to pi/4, between the way from another to each spot and the nearest of the other's four axes."""
     way = spots.center - np.asarray(other.center_m)
     angle = np.arctan2(way[:, 1], way[:, 0]) - other.yaw
@@ -190,5 +200,5 @@ def _turn(angle: FloatArray) -> FloatArray:
     return np.asarray(np.abs((angle + math.pi) % (2 * math.pi) - math.pi))
 
 
-def _half(other: Footprint) -> FloatArray:
+def _half(other: PlaneFootprint) -> FloatArray:
     return half_extents(np.asarray(other.yaw), other.size_m)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from embomatrix.factory.editor import SceneEditor
-    from embomatrix.factory.layout.jobs import Item
+    from embomatrix.factory.layout.jobs import RequestedObject
     from embomatrix.world.asset import Asset
 
 TRIES: Final = 10
@@ -34,7 +34,7 @@ SPREAD: Final = 0.3
 """Written poses lie this share of a side around the middle of what they are on."""
 
 
-def lay_at_random(editor: SceneEditor, items: Sequence[Item], seed: int) -> Layout:
+def lay_at_random(editor: SceneEditor, items: Sequence[RequestedObject], seed: int) -> Layout:
     """Without tree: each thing at the first random pose that is free, in the relation that the task demands or on a floor."""
     rng = np.random.default_rng((seed, 17))
     sampler = ObjectSampler(editor, rng)
@@ -48,7 +48,7 @@ def lay_at_random(editor: SceneEditor, items: Sequence[Item], seed: int) -> Layo
     return _laid(editor, items, sampler, rng, first_free)
 
 
-def lay_by_poses(editor: SceneEditor, items: Sequence[Item], seed: int) -> Layout:
+def lay_by_poses(editor: SceneEditor, items: Sequence[RequestedObject], seed: int) -> Layout:
     """As LayoutGPT has a model write them: round absolute poses at what the task names, which nothing looks at."""
     rng = np.random.default_rng((seed, 19))
 
@@ -63,7 +63,7 @@ def lay_by_poses(editor: SceneEditor, items: Sequence[Item], seed: int) -> Layou
 
 def _laid(
     editor: SceneEditor,
-    items: Sequence[Item],
+    items: Sequence[RequestedObject],
     sampler: ObjectSampler,
     rng: np.random.Generator,
     pose_for: Callable[[Asset, Relation | None, str], Pose],
@@ -108,14 +108,14 @@ def _rounded(value: float) -> float:
     return round(value / ROUNDED_M) * ROUNDED_M
 
 
-def _hosts_first(items: Sequence[Item]) -> Iterator[Item]:
+def _hosts_first(items: Sequence[RequestedObject]) -> Iterator[RequestedObject]:
     by_name = {item.name: item for item in items}
     for thing in in_order([thing_of(item, item.asset(0), {}) for item in items]):
         yield by_name[thing.name]
 
 
 def _demand(
-    editor: SceneEditor, item: Item, names: dict[str, str], rng: np.random.Generator
+    editor: SceneEditor, item: RequestedObject, names: dict[str, str], rng: np.random.Generator
 ) -> tuple[Relation | None, str]:
     """What the task demands of an item, in the scene's names; else the floor of a room that it may be in."""
     if item.relation is not None:

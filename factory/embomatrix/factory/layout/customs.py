@@ -6,23 +6,23 @@ import functools
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.furnish.hosts import NO_HOSTS, hosts_of
-from embomatrix.factory.writer.tables import HOST_GROUPS, MEMBERS, Group, suits
+from embomatrix.factory.writer.tables import HOST_GROUPS, MEMBERS, ItemKind, suits
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
 _TABLES: Final = "breakfast_table dining_table pedestal_table"
-_BY_GROUP: Final[Mapping[Group, str]] = {
-    Group.FOOD: f"countertop fridge {_TABLES} commercial_kitchen_table bar bottom_cabinet plate",
-    Group.FRUIT: f"countertop {_TABLES} fridge bar bottom_cabinet coffee_table bowl",
-    Group.TABLEWARE: f"{_TABLES} countertop bar bottom_cabinet top_cabinet coffee_table booth",
-    Group.PACKAGES: f"countertop bottom_cabinet top_cabinet grocery_shelf shelf {_TABLES} bar",
-    Group.BOOKS: f"bookcase desk nightstand coffee_table shelf console_table {_TABLES}",
-    Group.TOYS: f"bed bookcase toy_box sofa coffee_table shelf {_TABLES}",
-    Group.DEVICES: f"coffee_table desk console_table nightstand bookcase sofa bottom_cabinet {_TABLES}",
-    Group.OFFICE: f"desk conference_table reception_desk bookcase shelf console_table {_TABLES} bottom_cabinet",
-    Group.TOILETRIES: "countertop furniture_sink pedestal_sink shelf bottom_cabinet multi_station_furniture_sink",
-    Group.DECORATION: f"console_table bookcase nightstand coffee_table bottom_cabinet shelf desk {_TABLES}",
+_BY_GROUP: Final[Mapping[ItemKind, str]] = {
+    ItemKind.FOOD: f"countertop fridge {_TABLES} commercial_kitchen_table bar bottom_cabinet plate",
+    ItemKind.FRUIT: f"countertop {_TABLES} fridge bar bottom_cabinet coffee_table bowl",
+    ItemKind.TABLEWARE: f"{_TABLES} countertop bar bottom_cabinet top_cabinet coffee_table booth",
+    ItemKind.PACKAGES: f"countertop bottom_cabinet top_cabinet grocery_shelf shelf {_TABLES} bar",
+    ItemKind.BOOKS: f"bookcase desk nightstand coffee_table shelf console_table {_TABLES}",
+    ItemKind.TOYS: f"bed bookcase toy_box sofa coffee_table shelf {_TABLES}",
+    ItemKind.DEVICES: f"coffee_table desk console_table nightstand bookcase sofa bottom_cabinet {_TABLES}",
+    ItemKind.OFFICE: f"desk conference_table reception_desk bookcase shelf console_table {_TABLES} bottom_cabinet",
+    ItemKind.TOILETRIES: "countertop furniture_sink pedestal_sink shelf bottom_cabinet multi_station_furniture_sink",
+    ItemKind.DECORATION: f"console_table bookcase nightstand coffee_table bottom_cabinet shelf desk {_TABLES}",
 }
 _APPLIANCES: Final = frozenset(
     (

@@ -19,7 +19,7 @@ from embomatrix.factory.writer.tables import belongs
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from embomatrix.factory.layout.values import DistributionBrief, RoomFacts, Thing
+    from embomatrix.factory.layout.values import DistributionBrief, LayoutRoomFacts, ObjectBrief
 
 FUNCTION: Final = 1.0
 """What it is worth that a room of such a type is where people keep the thing."""
@@ -58,7 +58,7 @@ def distribute(brief: DistributionBrief) -> Distribution:
     return Distribution(found, reasons)
 
 
-def families(things: Sequence[Thing]) -> list[tuple[Thing, ...]]:
+def families(things: Sequence[ObjectBrief]) -> list[tuple[ObjectBrief, ...]]:
     """Things grouped by the relations that the task puts them in, directly or through others: each group in one room."""
     leader = {thing.name: thing.name for thing in things}
 
@@ -73,14 +73,14 @@ def families(things: Sequence[Thing]) -> list[tuple[Thing, ...]]:
             # what is there already ties together all that the task puts at it
             tied = other if other in leader else anchors.setdefault(other, thing.name)
             leader[head(thing.name)] = head(tied)
-    grouped: dict[str, list[Thing]] = {}
+    grouped: dict[str, list[ObjectBrief]] = {}
     for thing in things:
         grouped.setdefault(head(thing.name), []).append(thing)
     return [tuple(group) for group in grouped.values()]
 
 
 def _allowed(
-    family: Sequence[Thing], brief: DistributionBrief, rooms: Mapping[str, RoomFacts]
+    family: Sequence[ObjectBrief], brief: DistributionBrief, rooms: Mapping[str, LayoutRoomFacts]
 ) -> tuple[list[str], str]:
     """Rooms that all of the family may be in, and why there is no choice where there is none."""
     names = {thing.name for thing in family}
@@ -106,14 +106,14 @@ def _allowed(
     return allowed, "as the task says" if len(allowed) == 1 < len(rooms) else ""
 
 
-def _score(family: Sequence[Thing], room: RoomFacts, given: int) -> float:
+def _score(family: Sequence[ObjectBrief], room: LayoutRoomFacts, given: int) -> float:
     liking = sum(
         FUNCTION * belongs(thing.category, room.type) + HOST * _welcome(thing, room) for thing in family
     )
     return liking / len(family) + SIZE * math.log(max(room.area_m2, 1.0)) - CROWD * given
 
 
-def _welcome(thing: Thing, room: RoomFacts) -> float:
+def _welcome(thing: ObjectBrief, room: LayoutRoomFacts) -> float:
     """How much of what the thing likes to stand on or in the room has, from 0 to 1; less where it has nothing at all."""
     if thing.kind is not Kind.GOODS:
         return 0.5
@@ -124,7 +124,7 @@ def _welcome(thing: Thing, room: RoomFacts) -> float:
     return max((1.0 - rank / len(wanted) for rank, host in enumerate(wanted) if host in here), default=0.2)
 
 
-def _because(thing: Thing, room: RoomFacts) -> str:
+def _because(thing: ObjectBrief, room: LayoutRoomFacts) -> str:
     liked = next((host for host in likes(thing.category) if host in room.furniture), "")
     if liked:
         return f"{room.name} has a {liked}"

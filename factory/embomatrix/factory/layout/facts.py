@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.layout.organization import HIGHEST_M, LOWEST_M
-from embomatrix.factory.layout.values import HostFacts, HostOffer, LayoutRelation, RoomFacts
+from embomatrix.factory.layout.values import HostFacts, HostOffer, LayoutRelation, LayoutRoomFacts
 from embomatrix.factory.writer.tables import HOST_GROUPS
 from embomatrix.sim.geometry.candidates import EDGE_M, surfaces_for
 from embomatrix.skills.limits import ROBOT
@@ -25,7 +25,7 @@ LOW_SKIRT_M: Final = 0.05
 """Things go under what leaves this much over the floor."""
 
 
-def rooms_of(editor: SceneEditor) -> tuple[RoomFacts, ...]:
+def rooms_of(editor: SceneEditor) -> tuple[LayoutRoomFacts, ...]:
     """All rooms of the scene, with the categories of what could hold things there."""
     furniture: dict[str, list[str]] = {name: [] for name in editor.rooms}
     for item in editor.objects.values():
@@ -33,7 +33,7 @@ def rooms_of(editor: SceneEditor) -> tuple[RoomFacts, ...]:
         if item.fixed and (asset.supports or asset.interiors):
             furniture.setdefault(item.room, []).append(asset.category)
     return tuple(
-        RoomFacts(name, room.type, room.size_m, tuple(sorted(furniture[name])))
+        LayoutRoomFacts(name, room.type, room.size_m, tuple(sorted(furniture[name])))
         for name, room in editor.rooms.items()
     )
 

@@ -41,10 +41,10 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
     from embomatrix.factory.editor import SceneEditor
-    from embomatrix.factory.layout.jobs import Item
+    from embomatrix.factory.layout.jobs import RequestedObject
     from embomatrix.factory.layout.planes import Plane
     from embomatrix.factory.layout.tree import LayoutTree
-    from embomatrix.factory.layout.values import Spot, Thing, Wish
+    from embomatrix.factory.layout.values import ObjectBrief, PlacementConstraint, PlaneSpot
     from embomatrix.world.asset import Asset
     from embomatrix.world.geometry import Pose
     from embomatrix.world.scene import Room
@@ -65,7 +65,9 @@ SQUARE: Final = frozenset(
 )
 
 
-def lay(editor: SceneEditor, items: Sequence[Item], seed: int, agents: LayoutAgents | None = None) -> Layout:
+def lay(
+    editor: SceneEditor, items: Sequence[RequestedObject], seed: int, agents: LayoutAgents | None = None
+) -> Layout:
     """Put the items into the scene. What finds no place is left out, with a failure each. Equal arguments, equal layouts.
 
     Raises LlmError where an agent is a language model that nobody answers for.
@@ -92,7 +94,7 @@ def lay(editor: SceneEditor, items: Sequence[Item], seed: int, agents: LayoutAge
 
 
 def _distributed(
-    editor: SceneEditor, items: Sequence[Item], seed: int, agents: LayoutAgents, record: Record
+    editor: SceneEditor, items: Sequence[RequestedObject], seed: int, agents: LayoutAgents, record: Record
 ) -> dict[str, str]:
     """The room of each item, by name. Raises DistributionError."""
     things = tuple(_first_look(item) for item in items)
@@ -104,11 +106,11 @@ def _distributed(
     return answer.rooms
 
 
-def _first_look(item: Item) -> Thing:
+def _first_look(item: RequestedObject) -> ObjectBrief:
     return thing_of(item, item.asset(0), {})
 
 
-def _with_carrier(editor: SceneEditor, thing: Thing) -> Thing:
+def _with_carrier(editor: SceneEditor, thing: ObjectBrief) -> ObjectBrief:
     """What must stand beside an object that is there goes where that one stands."""
     other = next((editor.objects[name] for name in thing.beside if name in editor.objects), None)
     if other is None or thing.relation is not None:
@@ -125,7 +127,7 @@ class _RoomJob:
         editor: SceneEditor,
         agents: LayoutAgents,
         room: Room,
-        items: Sequence[Item],
+        items: Sequence[RequestedObject],
         seed: int,
         record: Record,
     ) -> None:
@@ -237,7 +239,7 @@ class _RoomJob:
             else:
                 self._sample(name, None if host in self._editor.rooms else Relation.ONTOP, host)
 
-    def _wishes(self, plane: Plane, children: Sequence[str]) -> dict[str, tuple[Wish, ...]]:
+    def _wishes(self, plane: Plane, children: Sequence[str]) -> dict[str, tuple[PlacementConstraint, ...]]:
         category = self._editor.asset_of(plane.host).category if plane.host else ""
         company = PlaneCompany(
             plane.host or plane.room,
@@ -251,11 +253,13 @@ class _RoomJob:
         self._record.company.append((company, answer))
         return answer.of
 
-    def _thing(self, name: str) -> Thing:
+    def _thing(self, name: str) -> ObjectBrief:
         waiting = self._seating.waiting[name]
         return thing_of(waiting.item, waiting.asset, self.names)
 
-    def _arrange(self, plane: Plane, children: Sequence[str], wishes: dict[str, tuple[Wish, ...]]) -> None:
+    def _arrange(
+        self, plane: Plane, children: Sequence[str], wishes: dict[str, tuple[PlacementConstraint, ...]]
+    ) -> None:
         things = [(self._thing(name), self._seating.waiting[name].asset) for name in children]
         brief = brief_for(self._editor, plane, things, wishes, self._seed * 31 + self._round)
         began = time.process_time()
@@ -273,7 +277,7 @@ class _RoomJob:
                     spot.thing, pose, (relation, plane.host), Seat(relation, plane.host or plane.room)
                 )
 
-    def _near(self, plane: Plane, asset: Asset, spots: Iterable[Spot]) -> Iterator[Pose]:
+    def _near(self, plane: Plane, asset: Asset, spots: Iterable[PlaneSpot]) -> Iterator[Pose]:
         """Poses at and around spots: off the grid first where nothing aligns the thing."""
         for spot in spots:
             if not SQUARE & {wish.kind for wish in spot.held}:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.editor import PlacementError, box_at
 from embomatrix.factory.floorplan.walls import WALL_HEIGHT_M
-from embomatrix.factory.furnish.roles import HUNG_BOTTOM_M, Role, role_of, wall_height_m
+from embomatrix.factory.furnish.roles import HUNG_BOTTOM_M, FurnitureRole, role_of, wall_height_m
 from embomatrix.factory.layout.values import LayoutReason
 from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.skills.limits import ROBOT
@@ -69,7 +69,7 @@ class Hanger:
 
     def _on_walls(self, asset: Asset) -> Iterator[Pose]:
         depth, width, height = asset.size_m
-        if role_of(asset.category, asset.size_m, asset.mass_kg) is Role.HUNG_CABINET:
+        if role_of(asset.category, asset.size_m, asset.mass_kg) is FurnitureRole.HUNG_CABINET:
             middle = HUNG_BOTTOM_M + height / 2
         else:
             middle = min(wall_height_m(asset.category), ROBOT.reach_high_m - SPARE_M)

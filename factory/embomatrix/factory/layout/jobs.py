@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.assets.library import build_asset
-from embomatrix.factory.furnish.roles import Role, role_of
+from embomatrix.factory.furnish.roles import FurnitureRole, role_of
 from embomatrix.factory.layout.distribution import distribute
 from embomatrix.factory.layout.organization import organize
 from embomatrix.factory.layout.planar import arrange
@@ -18,11 +18,11 @@ from embomatrix.factory.layout.values import (
     Kind,
     LayoutReason,
     LayoutRelation,
+    ObjectBrief,
+    PlacementConstraints,
     PlaneBrief,
     PlaneCompany,
     RoomBrief,
-    Thing,
-    Wishes,
 )
 from embomatrix.factory.layout.wishes import wish
 from embomatrix.world.catalog import Catalog
@@ -42,17 +42,17 @@ FRONTED: Final = frozenset(_FRONTED.split())
 
 
 _KINDS: Final = {
-    Role.SURFACE: Kind.GOODS,
-    Role.FITTED: Kind.GOODS,
-    Role.WALL: Kind.HUNG,
-    Role.HUNG_CABINET: Kind.HUNG,
-    Role.CEILING: Kind.OVERHEAD,
+    FurnitureRole.SURFACE: Kind.GOODS,
+    FurnitureRole.FITTED: Kind.GOODS,
+    FurnitureRole.WALL: Kind.HUNG,
+    FurnitureRole.HUNG_CABINET: Kind.HUNG,
+    FurnitureRole.CEILING: Kind.OVERHEAD,
 }
 """Roles of what does not stand on the floor."""
 
 
 @dataclass(frozen=True, slots=True)
-class Item:
+class RequestedObject:
     """An object that a task brings into a scene. ``models`` are (category, model), the best first.
 
     ``relation`` and ``host`` are what the task demands: another item, a scene object, or a room, whose floor it is; None and
@@ -75,11 +75,11 @@ class Item:
         return Failure(self.name, self.relation or LayoutRelation.ONTOP, host, reason, detail)
 
 
-def thing_of(item: Item, asset: Asset, names: Mapping[str, str]) -> Thing:
+def thing_of(item: RequestedObject, asset: Asset, names: Mapping[str, str]) -> ObjectBrief:
     """An item as agents see it; ``names`` are those in the scene of what was placed already."""
     kind = kind_of(asset)
     x, y, z = asset.size_m
-    return Thing(
+    return ObjectBrief(
         name=item.name,
         category=asset.category,
         size_m=(round(x, 3), round(y, 3), round(z, 3)),
@@ -105,7 +105,7 @@ class LayoutAgents:
     """Scene-level Distribution Agent."""
     organize: Callable[[RoomBrief], LayoutTree] = organize
     """Room-level Organization Agent."""
-    wish: Callable[[PlaneCompany], Wishes] = wish
+    wish: Callable[[PlaneCompany], PlacementConstraints] = wish
     """Planar-Level Placement Generator: which constraints."""
     arrange: Callable[[PlaneBrief], tuple[Arranged, ...]] = arrange
     """Planar-Level Placement Generator: the solver."""
@@ -117,7 +117,7 @@ class Record:
 
     distribution: tuple[DistributionBrief, Distribution] | None = None
     rooms: list[tuple[RoomBrief, LayoutTree]] = field(default_factory=list)
-    company: list[tuple[PlaneCompany, Wishes]] = field(default_factory=list)
+    company: list[tuple[PlaneCompany, PlacementConstraints]] = field(default_factory=list)
     planes: list[tuple[PlaneBrief, tuple[Arranged, ...]]] = field(default_factory=list)
     planar_s: dict[str, float] = field(default_factory=dict)
     """Seconds of CPU that the planar solver took, by room."""

@@ -23,12 +23,12 @@ from embomatrix.factory.layout.values import (
     Branch,
     Distribution,
     LayoutRelation,
-    Wish,
-    Wishes,
+    PlacementConstraint,
+    PlacementConstraints,
 )
 from embomatrix.factory.layout.wishes import wish
 from embomatrix.llm.loop import OnOneLoop
-from embomatrix.llm.patience import Patience
+from embomatrix.llm.patience import FailureLimit
 from embomatrix.llm.structured import ask
 from embomatrix.llm.values import ChatRequest, EndpointError, Message, Speaker, UnusableReplyError
 
@@ -89,12 +89,12 @@ class ModelLayoutAgents(OnOneLoop):
         endpoint: AbstractAsyncContextManager[object] | None = None,
         *,
         attempts: int = 3,
-        patience: Patience | None = None,
+        patience: FailureLimit | None = None,
     ) -> None:
         super().__init__(endpoint)
         self._model = model
         self._attempts = attempts
-        self._patience = patience or Patience(most=1)
+        self._patience = patience or FailureLimit(most=1)
 
     def agents(self, modelled: Collection[AgentName]) -> LayoutAgents:
         """Agents of which these are the model and the others rules."""
@@ -154,7 +154,7 @@ class ModelLayoutAgents(OnOneLoop):
         )
         return organize(brief) if answer is None else tree_of(answer)
 
-    def wish(self, company: PlaneCompany) -> Wishes:
+    def wish(self, company: PlaneCompany) -> PlacementConstraints:
         """Planar-Level Placement Generator: constraints. Raises EndpointError."""
         names = {thing.name for thing in company.things}
         known = names | {name for name, _ in company.others}
@@ -176,11 +176,11 @@ class ModelLayoutAgents(OnOneLoop):
         if answer is None:
             return wish(company)
         demanded = wish(company).of
-        return Wishes(
+        return PlacementConstraints(
             {
                 thing.name: (
                     *(each for each in demanded[thing.name] if each.required),
-                    *(Wish(each.kind, each.other) for each in answer.of.get(thing.name, ())),
+                    *(PlacementConstraint(each.kind, each.other) for each in answer.of.get(thing.name, ())),
                 )
                 for thing in company.things
             }

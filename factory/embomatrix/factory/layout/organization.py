@@ -15,13 +15,13 @@ import numpy as np
 from embomatrix.factory.furnish.hosts import NO_HOSTS, kept_behind_doors
 from embomatrix.factory.layout.customs import likes, on_appliance
 from embomatrix.factory.layout.tree import LayoutTree
-from embomatrix.factory.layout.values import MEANS, Branch, Kind, LayoutReason, LayoutRelation, Means
+from embomatrix.factory.layout.values import MEANS, Branch, Kind, LayoutReason, LayoutRelation, RelationMethod
 from embomatrix.factory.writer.tables import suits
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from embomatrix.factory.layout.values import Failure, HostFacts, HostOffer, RoomBrief, Size3, Thing
+    from embomatrix.factory.layout.values import Failure, HostFacts, HostOffer, ObjectBrief, RoomBrief, Size3
 
 CHANCES: Final = 3
 AFTERWARDS: Final = frozenset({LayoutReason.UNSTABLE, LayoutReason.NOT_AT_HAND})
@@ -73,9 +73,9 @@ def organize(brief: RoomBrief) -> LayoutTree:
     return LayoutTree.of(brief.room.name, hung.values())
 
 
-def in_order(things: Sequence[Thing]) -> list[Thing]:
+def in_order(things: Sequence[ObjectBrief]) -> list[ObjectBrief]:
     """Things such that each comes after what the task puts it at, as far as that is one of them; the given order else."""
-    order: list[Thing] = []
+    order: list[ObjectBrief] = []
     waiting = list(things)
     while waiting:
         names = {thing.name for thing in waiting}
@@ -85,7 +85,7 @@ def in_order(things: Sequence[Thing]) -> list[Thing]:
     return order
 
 
-def choices(brief: RoomBrief, thing: Thing, hung: Mapping[str, Branch]) -> Iterator[Branch]:
+def choices(brief: RoomBrief, thing: ObjectBrief, hung: Mapping[str, Branch]) -> Iterator[Branch]:
     """Branches that a thing may hang on: what the task demands, else every host that has room for it; none that failed.
 
     ``hung`` are the branches of the tree so far, by child.
@@ -107,10 +107,10 @@ def _chances(branch: Branch, brief: RoomBrief) -> int:
     return CHANCES if reasons and reasons <= AFTERWARDS else 1
 
 
-def _open_choices(brief: RoomBrief, thing: Thing, hung: Mapping[str, Branch]) -> Iterator[Branch]:
+def _open_choices(brief: RoomBrief, thing: ObjectBrief, hung: Mapping[str, Branch]) -> Iterator[Branch]:
     floor = Branch(brief.room.name, LayoutRelation.ONTOP, thing.name)
     if thing.relation is not None:
-        if MEANS[thing.relation] is not Means.NONE:
+        if MEANS[thing.relation] is not RelationMethod.NONE:
             yield Branch(thing.host or brief.room.name, thing.relation, thing.name)
         return
     beside = next((hung[other] for other in thing.beside if other in hung), None)
@@ -139,7 +139,7 @@ def takes(offer: HostOffer, size_m: Size3) -> bool:
     )
 
 
-def _worth(brief: RoomBrief, thing: Thing, branch: Branch, guests: Mapping[str, Counter[str]]) -> float:
+def _worth(brief: RoomBrief, thing: ObjectBrief, branch: Branch, guests: Mapping[str, Counter[str]]) -> float:
     host = next((item for item in brief.hosts if item.name == branch.parent), None)
     if host is None:
         return LIKED if thing.kind is not Kind.GOODS or thing.category in FLOOR_GOODS else FLOOR

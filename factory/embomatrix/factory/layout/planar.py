@@ -16,7 +16,7 @@ import numpy as np
 from embomatrix.factory.layout.arrangement import (
     SHADE,
     WEIGHTS,
-    Candidates,
+    SpotCandidates,
     degrees,
     gaps,
     half_extents,
@@ -26,11 +26,11 @@ from embomatrix.factory.layout.arrangement import (
 from embomatrix.factory.layout.values import (
     Arranged,
     Arrangement,
-    Footprint,
     LayoutReason,
     PlaneBrief,
+    PlaneFootprint,
+    PlaneSpot,
     PlaneThing,
-    Spot,
 )
 from embomatrix.skills.limits import ROBOT
 
@@ -71,8 +71,8 @@ REACH_M: Final = ROBOT.reach_m - 0.05
 
 @dataclass(frozen=True, slots=True)
 class _Beam:
-    spots: tuple[Spot, ...] = ()
-    footprints: tuple[Footprint, ...] = ()
+    spots: tuple[PlaneSpot, ...] = ()
+    footprints: tuple[PlaneFootprint, ...] = ()
     score: float = 0.0
     left_out: tuple[tuple[str, LayoutReason], ...] = ()
 
@@ -127,17 +127,17 @@ def _grown(brief: PlaneBrief, thing: PlaneThing, beam: _Beam) -> list[_Beam]:
 class _Search:
     """The spots of one thing, given where the others are."""
 
-    def __init__(self, brief: PlaneBrief, thing: PlaneThing, placed: tuple[Footprint, ...]) -> None:
+    def __init__(self, brief: PlaneBrief, thing: PlaneThing, placed: tuple[PlaneFootprint, ...]) -> None:
         self._brief = brief
         self._thing = thing
         self._others = {item.name: item for item in (*brief.obstacles, *placed)}
         self._rng = np.random.default_rng((brief.seed, len(placed), 11))
 
-    def footprint(self, spot: Spot) -> Footprint:
+    def footprint(self, spot: PlaneSpot) -> PlaneFootprint:
         x, y, height = self._thing.size_m
-        return Footprint(self._thing.name, spot.center_m, spot.yaw, (x, y), 0.0, height)
+        return PlaneFootprint(self._thing.name, spot.center_m, spot.yaw, (x, y), 0.0, height)
 
-    def best(self) -> list[tuple[Spot, float]] | LayoutReason:
+    def best(self) -> list[tuple[PlaneSpot, float]] | LayoutReason:
         """The best spots with their scores, apart from one another; the reason where there is none."""
         spots = self._candidates()
         spots = spots.at(margins(spots, self._brief.size_m) >= self._brief.rim_m - 1e-9)
@@ -155,7 +155,7 @@ class _Search:
             return LayoutReason.RELATION_NOT_HELD
         return self._chosen(spots, held, self._scores(spots, held))
 
-    def _candidates(self) -> Candidates:
+    def _candidates(self) -> SpotCandidates:
         """Grid points, with lines through the middles of what wishes are about, at all turns; gazes at what is to be faced."""
         brief = self._brief
         width, depth = brief.size_m
@@ -174,9 +174,9 @@ class _Search:
         ]
         turns = TURNS if self._thing.has_front else TURNS[:2]
         yaws = np.concatenate([*(np.full(len(points), turn) for turn in turns), *gazes])
-        return Candidates.of(np.tile(points, (len(turns) + len(gazes), 1)), yaws, self._thing.size_m)
+        return SpotCandidates.of(np.tile(points, (len(turns) + len(gazes), 1)), yaws, self._thing.size_m)
 
-    def _taken(self, spots: Candidates) -> BoolArray:
+    def _taken(self, spots: SpotCandidates) -> BoolArray:
         """Which spots meet something, or a zone that stays clear."""
         height = self._thing.size_m[2]
         rows = [
@@ -192,12 +192,12 @@ class _Search:
             meets &= apart < spots.half[:, axis, None] + table[None, :, axis + 2]
         return np.asarray(meets.any(axis=1))
 
-    def _holds(self, number: int, spots: Candidates) -> BoolArray:
+    def _holds(self, number: int, spots: SpotCandidates) -> BoolArray:
         wish = self._thing.wishes[number]
         other = self._others.get(wish.other)
         return holds(wish, spots, self._brief.size_m, self._thing.size_m, other)
 
-    def _scores(self, spots: Candidates, held: Sequence[BoolArray]) -> FloatArray:
+    def _scores(self, spots: SpotCandidates, held: Sequence[BoolArray]) -> FloatArray:
         brief, thing = self._brief, self._thing
         score = CHANCE * self._rng.random(len(spots))
         kinds = {wish.kind for wish in thing.wishes}
@@ -217,11 +217,11 @@ class _Search:
         return np.asarray(score)
 
     def _chosen(
-        self, spots: Candidates, held: Sequence[BoolArray], scores: FloatArray
-    ) -> list[tuple[Spot, float]] | LayoutReason:
+        self, spots: SpotCandidates, held: Sequence[BoolArray], scores: FloatArray
+    ) -> list[tuple[PlaneSpot, float]] | LayoutReason:
         """The best spots in reach, none within a quarter of the plane's shorter side of a better one."""
         apart = 0.25 * min(self._brief.size_m)
-        chosen: list[tuple[Spot, float]] = []
+        chosen: list[tuple[PlaneSpot, float]] = []
         order = np.argsort(-scores, kind="stable")[:SCANNED]
         for start in range(0, len(order), BATCH):
             rows = order[start : start + BATCH]
@@ -231,7 +231,7 @@ class _Search:
                     continue
                 kept = tuple(w for w, h in zip(self._thing.wishes, held, strict=True) if h[row])
                 chosen.append(
-                    (Spot(self._thing.name, (x, y), float(spots.yaw[row]), kept), float(scores[row]))
+                    (PlaneSpot(self._thing.name, (x, y), float(spots.yaw[row]), kept), float(scores[row]))
                 )
                 if len(chosen) == BRANCHES:
                     return chosen
@@ -239,7 +239,7 @@ class _Search:
                 break
         return chosen or LayoutReason.OUT_OF_REACH
 
-    def _reached(self, spots: Candidates) -> BoolArray:
+    def _reached(self, spots: SpotCandidates) -> BoolArray:
         """Which spots the arm reaches from some place where the robot can stand, shape (n,)."""
         if not self._brief.stands:
             return np.ones(len(spots), dtype=bool)
@@ -249,7 +249,7 @@ class _Search:
         return np.asarray(((away >= ROBOT.shoulder_m) & (away <= REACH_M)).any(axis=1))
 
 
-def _inwards(spots: Candidates, plane_m: Size2) -> FloatArray:
+def _inwards(spots: SpotCandidates, plane_m: Size2) -> FloatArray:
     """Cosine between where each spot's front looks and the way inwards from the nearest side, shape (n,)."""
     strips = np.asarray(plane_m) / 2 - np.abs(spots.center) - spots.half  # (n, 2)
     axis = np.argmin(strips, axis=1)

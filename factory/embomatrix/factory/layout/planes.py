@@ -10,7 +10,7 @@ import numpy as np
 
 from embomatrix.factory.layout.arrangement import half_extents
 from embomatrix.factory.layout.sampling import LIFT_M
-from embomatrix.factory.layout.values import Footprint, PlaneBrief, PlaneThing, Wish
+from embomatrix.factory.layout.values import PlacementConstraint, PlaneBrief, PlaneFootprint, PlaneThing
 from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.sim.geometry.candidates import surfaces_for
 from embomatrix.skills.limits import ROBOT
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from embomatrix.factory.editor import SceneEditor
-    from embomatrix.factory.layout.values import Size2, Spot, Thing
+    from embomatrix.factory.layout.values import ObjectBrief, PlaneSpot, Size2
     from embomatrix.world.asset import Asset
     from embomatrix.world.geometry import Aabb
 
@@ -86,8 +86,8 @@ def planes_of(editor: SceneEditor, host: str) -> list[Plane]:
 def brief_for(
     editor: SceneEditor,
     plane: Plane,
-    things: Sequence[tuple[Thing, Asset]],
-    wishes: Mapping[str, tuple[Wish, ...]],
+    things: Sequence[tuple[ObjectBrief, Asset]],
+    wishes: Mapping[str, tuple[PlacementConstraint, ...]],
     seed: int,
 ) -> PlaneBrief:
     """What the planar generator is told of a plane, as things stand. Wishes name objects as the scene does."""
@@ -108,7 +108,9 @@ def brief_for(
     )
 
 
-def pose_at(plane: Plane, asset: Asset, spot: Spot, shift_m: Size2 = (0.0, 0.0), turn: float = 0.0) -> Pose:
+def pose_at(
+    plane: Plane, asset: Asset, spot: PlaneSpot, shift_m: Size2 = (0.0, 0.0), turn: float = 0.0
+) -> Pose:
     """Pose in the world of an asset whose box's middle is at a spot, moved and turned a little, its underside on the plane."""
     box = bounds_of(asset).box(_IDENTITY)
     yaw = spot.yaw + turn
@@ -136,7 +138,7 @@ def _extent(asset: Asset) -> tuple[float, float, float]:
     return bounds_of(asset).box(_IDENTITY).size_m
 
 
-def _obstacles(editor: SceneEditor, plane: Plane, height_m: float) -> Iterator[Footprint]:
+def _obstacles(editor: SceneEditor, plane: Plane, height_m: float) -> Iterator[PlaneFootprint]:
     """Whatever reaches into the space over the plane: objects by their turned boxes, the host by its parts."""
     ground = plane.pose.position_m[2]
     inverse = plane.pose.inverse()
@@ -162,10 +164,10 @@ def _obstacles(editor: SceneEditor, plane: Plane, height_m: float) -> Iterator[F
                 yield _footprint(f"{name}#{number}", pose, part_box)
 
 
-def _footprint(name: str, pose: Pose, box: Aabb) -> Footprint:
+def _footprint(name: str, pose: Pose, box: Aabb) -> PlaneFootprint:
     x, y, _ = pose.apply(box.center_m)
     z = pose.position_m[2]
-    return Footprint(name, (x, y), pose.yaw, box.size_m[:2], z + box.low_m[2], z + box.high_m[2])
+    return PlaneFootprint(name, (x, y), pose.yaw, box.size_m[:2], z + box.low_m[2], z + box.high_m[2])
 
 
 def _zones(editor: SceneEditor, plane: Plane) -> Iterator[tuple[float, float, float, float]]:

@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.furnish.roles import Role, role_of
+from embomatrix.factory.furnish.roles import FurnitureRole, role_of
 from embomatrix.factory.layout.jobs import kind_of
 from embomatrix.factory.layout.values import Failure, Kind, LayoutReason, LayoutRelation
 from embomatrix.world.state import Relation
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from embomatrix.factory.editor import SceneEditor
-    from embomatrix.factory.layout.jobs import Item
+    from embomatrix.factory.layout.jobs import RequestedObject
     from embomatrix.world.asset import Asset
     from embomatrix.world.geometry import Pose
 
@@ -31,7 +31,16 @@ RESIGNED: Final = 2
 """After so many places at which the robot does not get at a thing, one is taken as it is: verification tells."""
 STANDS_M: Final = 0.05
 """What begins below this stands on the floor."""
-MOVABLE: Final = frozenset({Role.SEAT, Role.LOW_TABLE, Role.TABLE, Role.CORNER, Role.BACKED, Role.OPEN})
+MOVABLE: Final = frozenset(
+    {
+        FurnitureRole.SEAT,
+        FurnitureRole.LOW_TABLE,
+        FurnitureRole.TABLE,
+        FurnitureRole.CORNER,
+        FurnitureRole.BACKED,
+        FurnitureRole.OPEN,
+    }
+)
 PLUMBED: Final = frozenset({"toilet", "urinal", "pedestal_sink"})
 """Furniture of these roles people would carry out of a room to make place for other, but for what a bathroom needs."""
 FULL: Final = frozenset({LayoutReason.NO_FREE_SPOT, LayoutReason.TOO_LARGE})
@@ -51,7 +60,7 @@ class Seat:
 class Guest:
     """An item, which of its models is tried, where it is, and why it had no place before."""
 
-    item: Item
+    item: RequestedObject
     asset: Asset
     choice: int = 0
     cleared: int = 0
@@ -91,7 +100,7 @@ class Guest:
 class Seating:
     """The items of one room: ``waiting`` and ``placed`` by name, ``names`` of the placed in the scene, what failed so far."""
 
-    def __init__(self, editor: SceneEditor, room: str, items: Sequence[Item]) -> None:
+    def __init__(self, editor: SceneEditor, room: str, items: Sequence[RequestedObject]) -> None:
         self.names: dict[str, str] = {}
         self.waiting = {item.name: Guest(item, item.asset(0)) for item in items}
         self.placed: dict[str, Guest] = {}

@@ -29,7 +29,7 @@ class LayoutRelation(StrEnum):
     SATURATED = "saturated"
 
 
-class Means(StrEnum):
+class RelationMethod(StrEnum):
     """What makes a relation of the tree true in a scene."""
 
     POSE = "pose"  # the child is placed
@@ -38,15 +38,15 @@ class Means(StrEnum):
 
 
 MEANS: Final = {
-    LayoutRelation.ONTOP: Means.POSE,
-    LayoutRelation.INSIDE: Means.POSE,
-    LayoutRelation.UNDER: Means.POSE,
-    LayoutRelation.COVERED: Means.FACT,
-    LayoutRelation.FILLED: Means.FACT,
-    LayoutRelation.SATURATED: Means.FACT,
-    LayoutRelation.ATTACHED: Means.POSE,
-    LayoutRelation.DRAPED: Means.NONE,
-    LayoutRelation.OVERLAID: Means.NONE,
+    LayoutRelation.ONTOP: RelationMethod.POSE,
+    LayoutRelation.INSIDE: RelationMethod.POSE,
+    LayoutRelation.UNDER: RelationMethod.POSE,
+    LayoutRelation.COVERED: RelationMethod.FACT,
+    LayoutRelation.FILLED: RelationMethod.FACT,
+    LayoutRelation.SATURATED: RelationMethod.FACT,
+    LayoutRelation.ATTACHED: RelationMethod.POSE,
+    LayoutRelation.DRAPED: RelationMethod.NONE,
+    LayoutRelation.OVERLAID: RelationMethod.NONE,
 }
 
 
@@ -88,7 +88,7 @@ class Failure:
 
 
 @dataclass(frozen=True, slots=True)
-class RoomFacts:
+class LayoutRoomFacts:
     """A room, its floor in metres along the world's x and y, and the categories of what can hold things there, one by one."""
 
     name: str
@@ -103,7 +103,7 @@ class RoomFacts:
 
 
 @dataclass(frozen=True, slots=True)
-class Thing:
+class ObjectBrief:
     """An object that a task brings. What is empty is left to the agents.
 
     ``size_m`` is the extent along the asset's x (depth), y (width) and z; ``has_front`` says that it matters where its front,
@@ -127,8 +127,8 @@ class Thing:
 class DistributionBrief:
     """What the Scene-level Distribution Agent decides on. ``homes`` are the rooms of objects that are there already."""
 
-    rooms: tuple[RoomFacts, ...]
-    things: tuple[Thing, ...]
+    rooms: tuple[LayoutRoomFacts, ...]
+    things: tuple[ObjectBrief, ...]
     homes: dict[str, str] = field(default_factory=dict)
     seed: int = 0
     __pydantic_config__: ClassVar = _STRICT
@@ -173,9 +173,9 @@ class HostFacts:
 class RoomBrief:
     """What the Room-level Organization Agent decides on: things assigned to a room, what could hold them, what has failed."""
 
-    room: RoomFacts
+    room: LayoutRoomFacts
     hosts: tuple[HostFacts, ...]
-    things: tuple[Thing, ...]
+    things: tuple[ObjectBrief, ...]
     failures: tuple[Failure, ...] = ()
     seed: int = 0
     __pydantic_config__: ClassVar = _STRICT
@@ -209,7 +209,7 @@ ABOUT_THE_PLANE: Final = frozenset({Arrangement.EDGE, Arrangement.MIDDLE})
 
 
 @dataclass(frozen=True, slots=True)
-class Wish:
+class PlacementConstraint:
     """A constraint on a thing, against another object of the plane; ``required`` ones must hold."""
 
     kind: Arrangement
@@ -227,7 +227,7 @@ class PlaneCompany:
 
     plane: str
     host: str
-    things: tuple[Thing, ...]
+    things: tuple[ObjectBrief, ...]
     others: tuple[tuple[str, str], ...] = ()
     on_floor: bool = False
     seed: int = 0
@@ -235,15 +235,15 @@ class PlaneCompany:
 
 
 @dataclass(frozen=True, slots=True)
-class Wishes:
+class PlacementConstraints:
     """Constraints by thing, the most important first."""
 
-    of: dict[str, tuple[Wish, ...]]
+    of: dict[str, tuple[PlacementConstraint, ...]]
     __pydantic_config__: ClassVar = _STRICT
 
 
 @dataclass(frozen=True, slots=True)
-class Footprint:
+class PlaneFootprint:
     """A box that stands on a plane, in the plane's frame: its centre, its yaw, extents along its own x and y, heights over it.
 
     Its front looks along its own +x.
@@ -264,7 +264,7 @@ class PlaneThing:
 
     name: str
     size_m: Size3
-    wishes: tuple[Wish, ...] = ()
+    wishes: tuple[PlacementConstraint, ...] = ()
     has_front: bool = False
     __pydantic_config__: ClassVar = _STRICT
 
@@ -281,7 +281,7 @@ class PlaneBrief:
     plane: str
     size_m: Size2
     things: tuple[PlaneThing, ...]
-    obstacles: tuple[Footprint, ...] = ()
+    obstacles: tuple[PlaneFootprint, ...] = ()
     zones: tuple[tuple[float, float, float, float], ...] = ()
     stands: tuple[Size2, ...] = ()
     rim_m: float = 0.01
@@ -291,13 +291,13 @@ class PlaneBrief:
 
 
 @dataclass(frozen=True, slots=True)
-class Spot:
+class PlaneSpot:
     """Where a thing's middle goes on a plane, how it is turned, and which of its wishes hold there."""
 
     thing: str
     center_m: Size2
     yaw: float
-    held: tuple[Wish, ...] = ()
+    held: tuple[PlacementConstraint, ...] = ()
     __pydantic_config__: ClassVar = _STRICT
 
 
@@ -334,7 +334,7 @@ class Sampled:
 class Arranged:
     """One joint arrangement of a plane's things with its score, and what found no place, with the reason."""
 
-    spots: tuple[Spot, ...]
+    spots: tuple[PlaneSpot, ...]
     score: float
     left_out: dict[str, LayoutReason] = field(default_factory=dict)
     __pydantic_config__: ClassVar = _STRICT

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.furnish.roles import Role, role_of
-from embomatrix.factory.layout.values import Arrangement, Kind, Wish, Wishes
+from embomatrix.factory.furnish.roles import FurnitureRole, role_of
+from embomatrix.factory.layout.values import Arrangement, Kind, PlacementConstraint, PlacementConstraints
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from embomatrix.factory.layout.values import PlaneCompany, Thing
+    from embomatrix.factory.layout.values import ObjectBrief, PlaneCompany
 
 _COMPANIONS: Final[Mapping[str, str]] = {
     "tablefork table_knife tablespoon teaspoon chopstick dinner_napkin": "plate bowl place_mat",
@@ -52,46 +52,48 @@ BACKED: Final = frozenset(_BACKED.split())
 """What stands or lies at an edge, out of the way."""
 
 
-def wish(company: PlaneCompany) -> Wishes:
+def wish(company: PlaneCompany) -> PlacementConstraints:
     """Constraints for each thing of a plane, the most important first; none for what may stand anywhere."""
-    return Wishes({thing.name: tuple(dict.fromkeys(_wishes(thing, company))) for thing in company.things})
+    return PlacementConstraints(
+        {thing.name: tuple(dict.fromkeys(_wishes(thing, company))) for thing in company.things}
+    )
 
 
-def _wishes(thing: Thing, company: PlaneCompany) -> Iterator[Wish]:
+def _wishes(thing: ObjectBrief, company: PlaneCompany) -> Iterator[PlacementConstraint]:
     others = dict(company.others)
     rank = company.things.index(thing)
     before = {**others, **{each.name: each.category for each in company.things[:rank]}}
     for other in thing.beside:
-        yield Wish(Arrangement.NEXT_TO, other, required=True)
+        yield PlacementConstraint(Arrangement.NEXT_TO, other, required=True)
     if company.on_floor:
         yield from _on_floor(thing, before)
         return
     alike = next((name for name, category in before.items() if category == thing.category), "")
     if alike:
-        yield Wish(Arrangement.NEXT_TO, alike)
-        yield Wish(Arrangement.CENTER_ALIGNED, alike)
+        yield PlacementConstraint(Arrangement.NEXT_TO, alike)
+        yield PlacementConstraint(Arrangement.CENTER_ALIGNED, alike)
         return
     everyone = {**before, **{each.name: each.category for each in company.things[rank + 1 :]}}
     likes = COMPANIONS.get(thing.category, frozenset())
     friend = next((name for name, category in everyone.items() if category in likes), "")
     if friend:
-        yield Wish(Arrangement.NEXT_TO, friend)
-        yield Wish(Arrangement.SIDE_OF, friend)
+        yield PlacementConstraint(Arrangement.NEXT_TO, friend)
+        yield PlacementConstraint(Arrangement.SIDE_OF, friend)
         return
     if company.host in BOARDS and thing.category in CENTREPIECES:
-        yield Wish(Arrangement.MIDDLE)
+        yield PlacementConstraint(Arrangement.MIDDLE)
     elif thing.category in BACKED or (company.host in BOARDS and thing.category in SEATED):
-        yield Wish(Arrangement.EDGE)
+        yield PlacementConstraint(Arrangement.EDGE)
 
 
-def _on_floor(thing: Thing, before: Mapping[str, str]) -> Iterator[Wish]:
+def _on_floor(thing: ObjectBrief, before: Mapping[str, str]) -> Iterator[PlacementConstraint]:
     """Seats go to a table, tables stand in the open, the rest at a wall."""
     role = role_of(thing.category, thing.size_m, 0.0) if thing.kind is Kind.FURNITURE else None
     table = next((name for name, category in before.items() if category in TABLES), "")
-    if role is Role.SEAT and table:
-        yield Wish(Arrangement.FACE_TO, table)
-        yield Wish(Arrangement.NEXT_TO, table)
-    elif role in (Role.LOW_TABLE, Role.OPEN) or thing.category in BOARDS:
-        yield Wish(Arrangement.MIDDLE)
+    if role is FurnitureRole.SEAT and table:
+        yield PlacementConstraint(Arrangement.FACE_TO, table)
+        yield PlacementConstraint(Arrangement.NEXT_TO, table)
+    elif role in (FurnitureRole.LOW_TABLE, FurnitureRole.OPEN) or thing.category in BOARDS:
+        yield PlacementConstraint(Arrangement.MIDDLE)
     else:
-        yield Wish(Arrangement.EDGE)
+        yield PlacementConstraint(Arrangement.EDGE)

@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from embomatrix.sim.bullet.camera import furnish_cutaway, furnish_whole, shoot_egocentric, shoot_oblique
-from embomatrix.sim.bullet.stage import Stage
+from embomatrix.sim.bullet.stage import VisualScene
 from embomatrix.sim.film import FRAMES_PER_S
 from embomatrix.sim.physical.stage import tucked
 from embomatrix.sim.process_pool import process_pool
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
-    from embomatrix.sim.film import Film, Frame
+    from embomatrix.sim.film import Film, FilmFrame
     from embomatrix.world.scene import Room, Scene
 
 ROOM_PX: Final = (640, 480)
@@ -93,14 +93,14 @@ class _Cutter:
 
     def __init__(self, scene: Scene, rooms: Mapping[int, tuple[Room, ...]]) -> None:
         self._scene = scene
-        self._open, self._whole = Stage(scene), Stage(scene)
+        self._open, self._whole = VisualScene(scene), VisualScene(scene)
         furnish_cutaway(self._open)
         furnish_whole(self._whole)
         self._rooms = rooms
         self._robot = self._open.add_robot()
         self._changed: set[str] = set()
 
-    def shoot(self, frame: Frame) -> tuple[Image.Image, Image.Image]:
+    def shoot(self, frame: FilmFrame) -> tuple[Image.Image, Image.Image]:
         """The rooms of the frame's step from above and aside, and what the robot sees."""
         changed = {*frame.poses, *frame.joints, *frame.hidden}
         for name in sorted(changed | self._changed):
@@ -111,7 +111,7 @@ class _Cutter:
         eye = shoot_egocentric(self._whole, frame.robot, *EYE_PX)
         return Image.fromarray(np.asarray(room)), Image.fromarray(np.asarray(eye))
 
-    def _show(self, frame: Frame, name: str) -> None:
+    def _show(self, frame: FilmFrame, name: str) -> None:
         item = self._scene.by_name[name]
         gone = name in frame.hidden or (item.absent and name not in frame.poses)
         pose = frame.poses.get(name, item.pose_world_asset)
@@ -130,7 +130,7 @@ def _open_stage(scene: Scene, rooms: Mapping[int, tuple[Room, ...]]) -> None:
     _cutter = _Cutter(scene, rooms)
 
 
-def _draw(frames: Sequence[Frame]) -> list[tuple[Image.Image, Image.Image]]:
+def _draw(frames: Sequence[FilmFrame]) -> list[tuple[Image.Image, Image.Image]]:
     assert _cutter is not None
     return [_cutter.shoot(frame) for frame in frames]
 

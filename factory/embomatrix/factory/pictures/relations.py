@@ -10,7 +10,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from embomatrix.factory.assets.library import build_asset
 from embomatrix.sim.bullet.engine import BulletEngine
-from embomatrix.sim.bullet.stage import Stage
+from embomatrix.sim.bullet.stage import VisualScene
 from embomatrix.sim.geometry.bounds import AssetBounds
 from embomatrix.sim.state.relations import Relations
 from embomatrix.world.catalog import Catalog
@@ -47,7 +47,7 @@ LEAST_SPAN_M: Final = 0.3
 
 
 @dataclass(frozen=True, slots=True)
-class Panel:
+class RelationPicture:
     """One case. ``at_m`` is the middle of the first object's underside, from the second's middle and from ``on``.
 
     The second may be one of `ROOMS`: then ``at_m`` is in the world. ``on`` names a surface of the second, "top" its top;
@@ -69,9 +69,11 @@ class Panel:
 
 
 PANELS: Final = (
-    Panel("ontop", "apple", "table", (0.1, 0.2, 0.0), "rests on its top", "top", above=0.06),
-    Panel("ontop", "bowl", "bookcase", (0.05, 0.0, 0.0), "an open board is a surface", "shelf2_floor"),
-    Panel(
+    RelationPicture("ontop", "apple", "table", (0.1, 0.2, 0.0), "rests on its top", "top", above=0.06),
+    RelationPicture(
+        "ontop", "bowl", "bookcase", (0.05, 0.0, 0.0), "an open board is a surface", "shelf2_floor"
+    ),
+    RelationPicture(
         "ontop",
         "apple",
         "fridge",
@@ -81,23 +83,27 @@ PANELS: Final = (
         1.0,
         0.9,
     ),
-    Panel("ontop", "apple", "table", (0.1, 0.2, 0.05), "5 cm above its top", "top", above=0.06),
-    Panel("inside", "apple", "fridge", (0.1, 0.0, 0.0), "its box is in a cavity", "shelf2_floor", 1.0, 0.9),
-    Panel("inside", "apple", "bowl", (0.0, 0.0, 0.0), "it may stick out of an open cavity", "inside_floor"),
-    Panel(
+    RelationPicture("ontop", "apple", "table", (0.1, 0.2, 0.05), "5 cm above its top", "top", above=0.06),
+    RelationPicture(
+        "inside", "apple", "fridge", (0.1, 0.0, 0.0), "its box is in a cavity", "shelf2_floor", 1.0, 0.9
+    ),
+    RelationPicture(
+        "inside", "apple", "bowl", (0.0, 0.0, 0.0), "it may stick out of an open cavity", "inside_floor"
+    ),
+    RelationPicture(
         "inside", "apple", "microwave", (0.0, 0.0, 0.0), "a closed microwave has an inside", "inside_floor"
     ),
-    Panel("inside", "apple", "fridge", (0.0, 0.0, 0.0), "on top of it", "top"),
-    Panel("under", "carton", "table", (0.1, 0.2, 0.0), "the table is over its middle"),
-    Panel("under", "carton", "table", (0.0, 1.0, 0.0), "beside it"),
-    Panel("nextto", "apple", "mug", (0.0, 0.15, 0.0), "5 cm apart or less"),
-    Panel("nextto", "apple", "mug", (0.0, 0.35, 0.0), "too far for their sizes"),
-    Panel("touching", "apple", "carton", (0.0, -0.147, 0.0), "5 mm apart or less", side=0.0),
-    Panel("touching", "apple", "carton", (0.0, -0.19, 0.0), "nextto, and not touching", side=0.0),
-    Panel("inroom", "carton", "kitchen_0", (0.0, -0.11, 0.0), "its middle is over the floor"),
-    Panel("inroom", "carton", "kitchen_0", (0.0, 0.11, 0.0), "its middle is over the next room's"),
-    Panel("open", "", "cabinet", (0.0, 0.0, 0.0), "a joint past 5 % of its travel", open=0.5),
-    Panel("open", "", "cabinet", (0.0, 0.0, 0.0), "ajar by 4 %", open=0.04),
+    RelationPicture("inside", "apple", "fridge", (0.0, 0.0, 0.0), "on top of it", "top"),
+    RelationPicture("under", "carton", "table", (0.1, 0.2, 0.0), "the table is over its middle"),
+    RelationPicture("under", "carton", "table", (0.0, 1.0, 0.0), "beside it"),
+    RelationPicture("nextto", "apple", "mug", (0.0, 0.15, 0.0), "5 cm apart or less"),
+    RelationPicture("nextto", "apple", "mug", (0.0, 0.35, 0.0), "too far for their sizes"),
+    RelationPicture("touching", "apple", "carton", (0.0, -0.147, 0.0), "5 mm apart or less", side=0.0),
+    RelationPicture("touching", "apple", "carton", (0.0, -0.19, 0.0), "nextto, and not touching", side=0.0),
+    RelationPicture("inroom", "carton", "kitchen_0", (0.0, -0.11, 0.0), "its middle is over the floor"),
+    RelationPicture("inroom", "carton", "kitchen_0", (0.0, 0.11, 0.0), "its middle is over the next room's"),
+    RelationPicture("open", "", "cabinet", (0.0, 0.0, 0.0), "a joint past 5 % of its travel", open=0.5),
+    RelationPicture("open", "", "cabinet", (0.0, 0.0, 0.0), "ajar by 4 %", open=0.04),
 )
 
 
@@ -111,7 +117,7 @@ def draw_relations() -> Image.Image:
     return sheet
 
 
-def verdict(panel: Panel) -> bool:
+def verdict(panel: RelationPicture) -> bool:
     """What the simulator says of a panel's scene."""
     scene = panel_scene(panel)
     engine = BulletEngine(scene)
@@ -124,7 +130,7 @@ def verdict(panel: Panel) -> bool:
         engine.close()
 
 
-def panel_scene(panel: Panel) -> Scene:
+def panel_scene(panel: RelationPicture) -> Scene:
     """The objects of a panel on an empty floor."""
     catalog = Catalog.load()
     assets = {name: build_asset(catalog, *MODELS[name]) for name in (panel.b, panel.a) if name in MODELS}
@@ -145,7 +151,7 @@ def panel_scene(panel: Panel) -> Scene:
     return Scene("relations", "relations", 0, ROOMS, (), (), objects, by_id, start)
 
 
-def _at(panel: Panel, assets: Mapping[str, Asset]) -> Vec3:
+def _at(panel: RelationPicture, assets: Mapping[str, Asset]) -> Vec3:
     """Where the first object's underside is in the world; the second one's lies on the floor."""
     x, y, z = panel.at_m
     if not panel.on:
@@ -161,9 +167,9 @@ def _standing(asset: Asset, at_m: Vec3) -> Pose:
     return Pose((x, y, z - AssetBounds(asset).box(Pose((0.0, 0.0, 0.0))).low_m[2]))
 
 
-def _drawn(panel: Panel) -> Image.Image:
+def _drawn(panel: RelationPicture) -> Image.Image:
     scene = panel_scene(panel)
-    with Stage(scene) as stage:
+    with VisualScene(scene) as stage:
         if panel.predicate == Relation.INROOM:
             stage.add_floors()
         stage.add_objects()
@@ -181,7 +187,7 @@ def _drawn(panel: Panel) -> Image.Image:
     return whole
 
 
-def _framed(scene: Scene, panel: Panel) -> Aabb:
+def _framed(scene: Scene, panel: RelationPicture) -> Aabb:
     """What the camera looks at: all of the second object where it counts or hides the first, the first, or both."""
     boxes = {
         item.name: AssetBounds(scene.asset_of(item.name)).box(item.pose_world_asset) for item in scene.objects
@@ -197,7 +203,9 @@ def _framed(scene: Scene, panel: Panel) -> Aabb:
             return boxes[panel.a]
 
 
-def _photographed(stage: Stage, box: Aabb, panel: Panel) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
+def _photographed(
+    stage: VisualScene, box: Aabb, panel: RelationPicture
+) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
     span = max(LEAST_SPAN_M, *box.size_m)
     x, y, z = box.center_m
     eye = (x + 2.6 * span, y + panel.side * span, z + panel.above * span)

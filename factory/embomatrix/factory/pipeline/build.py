@@ -45,7 +45,7 @@ VARIANTS_FOR: Final = 4
 
 
 @dataclass(frozen=True, slots=True)
-class Summary:
+class BuildSummary:
     """What a build yielded. Counters by (split, category), (split, scene) and reason."""
 
     admitted: Mapping[tuple[str, str], int]
@@ -144,7 +144,7 @@ def build_dataset(
     jobs: int = 1,
     check: Check | None = None,
     layout: LayoutAgents | None = None,
-) -> Summary:
+) -> BuildSummary:
     """Write a data set, or go on with one that was cut short. ``progress`` hears of each split's admitted tasks.
 
     ``check`` is a second judge, who leaves of each variant what is to be kept: a cluster, say.
@@ -278,10 +278,10 @@ def _share(target: int, index: int) -> int:
     return target // kinds + (index < target % kinds)
 
 
-def _summary(store: BuildStore, rooms: Mapping[str, Mapping[str, tuple[str, ...]]]) -> Summary:
+def _summary(store: BuildStore, rooms: Mapping[str, Mapping[str, tuple[str, ...]]]) -> BuildSummary:
     records = [record for result in store.results for record in result.records]
     rejections: Iterable[Rejection] = (item for result in store.results for item in result.rejections)
-    return Summary(
+    return BuildSummary(
         admitted=Counter((record.split, record.task.category.value) for record in records),
         scenes=Counter((record.split, record.task.scene_id.split("-")[0]) for record in records),
         rejected=Counter(item.reason.value for item in rejections),

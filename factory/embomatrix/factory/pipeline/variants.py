@@ -15,7 +15,7 @@ from embomatrix.factory.admission import Admitted, admit
 from embomatrix.factory.pipeline.poses import Needs, SceneSurvey, cache_poses
 from embomatrix.factory.pipeline.settings import WriterKind
 from embomatrix.factory.pipeline.store import Rejection, VariantResult
-from embomatrix.factory.refusal import Refusal
+from embomatrix.factory.refusal import TaskRefusal
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.social.writer import SocialWriter
 from embomatrix.factory.writer.rehearsal import Rehearsal
@@ -197,7 +197,7 @@ class _VariantJob:
         turns = itertools.islice(itertools.cycle(wanted), WRITE_TRIES)
         while len(drafts) < DRAFTS and (written := self._written(turns, view, len(drafts), rng)):
             for category, draft in written:
-                if isinstance(draft, Refusal):
+                if isinstance(draft, TaskRefusal):
                     self._reject(category, draft)
                 elif draft is not None and self._is_new(draft):
                     named = replace(draft.task, task_id=self._task_id(len(drafts)))
@@ -207,7 +207,7 @@ class _VariantJob:
 
     def _written(
         self, turns: Iterator[TaskCategory], view: SceneView, known: int, rng: np.random.Generator
-    ) -> list[tuple[TaskCategory, Draft | Refusal | None]]:
+    ) -> list[tuple[TaskCategory, Draft | TaskRefusal | None]]:
         """What comes of the next turn, or of several at once where a writer waits for answers; nothing at their end."""
         if not isinstance(self._writer, ManyAtOnce):
             return [
@@ -259,7 +259,7 @@ class _VariantJob:
         return False
 
     def _reject(
-        self, category: TaskCategory, refusal: Refusal, instruction: str = "", goal: str = ""
+        self, category: TaskCategory, refusal: TaskRefusal, instruction: str = "", goal: str = ""
     ) -> None:
         self._rejections.append(
             Rejection(

@@ -6,8 +6,8 @@ import math
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.furnish.pieces import Access, Piece, access_of
-from embomatrix.factory.furnish.roles import Role, role_of
+from embomatrix.factory.furnish.pieces import Access, FurniturePiece, access_of
+from embomatrix.factory.furnish.roles import FurnitureRole, role_of
 from embomatrix.factory.scenes.floor import ReachableFloor, box_of
 
 if TYPE_CHECKING:
@@ -65,7 +65,9 @@ def _seat_in_the_way(scene: Scene, table: SceneObject) -> str:
     seats = [
         (math.dist(box_of(scene, item).center_m, box.center_m), item.name)
         for item in scene.objects
-        if _role(scene, item) is Role.SEAT and item.name not in hosts and box_of(scene, item).overlaps(near)
+        if _role(scene, item) is FurnitureRole.SEAT
+        and item.name not in hosts
+        and box_of(scene, item).overlaps(near)
     ]
     for _, name in sorted(seats):
         if len(ReachableFloor(_without(scene, {name})).spots(box)):
@@ -83,9 +85,9 @@ def _without(scene: Scene, names: Container[str]) -> Scene:
 
 def _access(scene: Scene, item: SceneObject) -> Access:
     asset = scene.assets[item.asset_id]
-    return access_of(Piece(0, asset.category, asset, _role(scene, item)))
+    return access_of(FurniturePiece(0, asset.category, asset, _role(scene, item)))
 
 
-def _role(scene: Scene, item: SceneObject) -> Role:
+def _role(scene: Scene, item: SceneObject) -> FurnitureRole:
     asset = scene.assets[item.asset_id]
     return role_of(asset.category, asset.size_m, asset.mass_kg)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class SceneJob:
+class SceneBuildJob:
     """One scene to build and check; ``path`` is the file to write it to, ``assets`` a folder of imported ones.
 
     One with a ``source``, a file that an earlier build wrote, is only checked.
@@ -31,7 +31,7 @@ class SceneJob:
     source: Path | None = None
 
 
-def run_batch(jobs: Sequence[SceneJob], *, processes: int) -> Iterator[SceneReport]:
+def run_batch(jobs: Sequence[SceneBuildJob], *, processes: int) -> Iterator[SceneReport]:
     """Reports in the order in which they are finished; a single scene is built here.
 
     Raises CatalogError for an unknown scene before anything is built, ModelFileError for a damaged asset, OSError when a file
@@ -54,7 +54,7 @@ def run_batch(jobs: Sequence[SceneJob], *, processes: int) -> Iterator[SceneRepo
                 yield SceneReport(job.scene_id, job.seed, error="its process died: is memory short?")
 
 
-def _run(job: SceneJob) -> SceneReport:
+def _run(job: SceneBuildJob) -> SceneReport:
     if job.source is not None:
         return report_on_file(job.scene_id, job.seed, job.source)
     imported = read_assets(job.assets) if job.assets is not None else {}
@@ -68,7 +68,7 @@ def _run(job: SceneJob) -> SceneReport:
     return report
 
 
-def _things(catalog: Catalog, job: SceneJob) -> int:
+def _things(catalog: Catalog, job: SceneBuildJob) -> int:
     """How much there is to place: the time that a scene takes follows it."""
     if job.source is not None:
         return 0

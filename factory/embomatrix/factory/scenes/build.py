@@ -13,8 +13,8 @@ import numpy as np
 from embomatrix.factory.assets.library import build_asset
 from embomatrix.factory.floorplan.layout import FloorPlan, plan_floor
 from embomatrix.factory.floorplan.spec import DoorSpec, RoomSpec, WindowSpec
-from embomatrix.factory.furnish.pieces import Piece
-from embomatrix.factory.furnish.roles import Role, is_portable, role_of
+from embomatrix.factory.furnish.pieces import FurniturePiece
+from embomatrix.factory.furnish.roles import FurnitureRole, is_portable, role_of
 from embomatrix.factory.furnish.rooms import Furnishing, furnish
 from embomatrix.factory.furnish.space import RoomSpace
 from embomatrix.factory.scenes.access import with_all_served
@@ -84,7 +84,7 @@ def build_base_scene(
 
 
 def _best_plan(
-    specs: Sequence[RoomSpec], pieces: dict[str, list[Piece]], rng: np.random.Generator
+    specs: Sequence[RoomSpec], pieces: dict[str, list[FurniturePiece]], rng: np.random.Generator
 ) -> tuple[FloorPlan, Furnishing]:
     """Furnish a few plans until one loses nothing of importance; houses with much to place get one."""
     best: tuple[FloorPlan, Furnishing] | None = None
@@ -118,10 +118,10 @@ def room_spec(catalog: Catalog, room: RoomInventory) -> RoomSpec:
 
 def _pieces(
     catalog: Catalog, inventory: SceneInventory, imported: Mapping[str, Asset]
-) -> tuple[dict[str, list[Piece]], list[str]]:
+) -> tuple[dict[str, list[FurniturePiece]], list[str]]:
     """The items of every room as pieces, and sentences on what is listed twice or not modelled."""
     notes = [note for room in inventory.rooms for note in _floor_notes(room)]
-    pieces: dict[str, list[Piece]] = {}
+    pieces: dict[str, list[FurniturePiece]] = {}
     seen: set[str] = set()
     number = 0
     # Large rooms first: what spans two rooms, a bar, is listed in both and stands where it fits.
@@ -138,7 +138,9 @@ def _pieces(
             role = role_of(category, asset.size_m, asset.mass_kg)
             flat = category in _FLAT_ON_WALL and asset.size_m[2] < min(asset.size_m[:2])
             for _ in range(count):
-                mine.append(Piece(number, category, asset, role, upended=flat and role is Role.WALL))
+                mine.append(
+                    FurniturePiece(number, category, asset, role, upended=flat and role is FurnitureRole.WALL)
+                )
                 number += 1
     return pieces, notes
 
@@ -168,7 +170,7 @@ def _objects(placed: Sequence[Placed]) -> tuple[tuple[SceneObject, ...], dict[st
             asset_id=item.piece.asset.asset_id,
             room=item.room,
             pose_world_asset=item.pose,
-            fixed=item.piece.role is not Role.SURFACE or not is_portable(item.piece.asset),
+            fixed=item.piece.role is not FurnitureRole.SURFACE or not is_portable(item.piece.asset),
             joints=(0.0,) * len(item.piece.asset.joints),
             host=names[item.host] if item.host >= 0 else "",
             relation=item.relation,

@@ -54,7 +54,7 @@ class ProblemKind(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Problem:
+class SceneProblem:
     """One broken rule: which objects (or rooms) break it and by how much, in words."""
 
     kind: ProblemKind
@@ -62,7 +62,7 @@ class Problem:
     detail: str
 
 
-def check_scene(scene: Scene) -> tuple[Problem, ...]:
+def check_scene(scene: Scene) -> tuple[SceneProblem, ...]:
     """All broken rules by geometry alone; empty for a good scene."""
     return (
         *_names(scene),
@@ -74,7 +74,7 @@ def check_scene(scene: Scene) -> tuple[Problem, ...]:
     )
 
 
-def check_in_engine(scene: Scene) -> tuple[Problem, ...]:
+def check_in_engine(scene: Scene) -> tuple[SceneProblem, ...]:
     """Penetrations of more than 1 mm that Bullet finds. Raises EngineError where the engine is missing."""
     engine = BulletEngine(scene)
     try:
@@ -82,7 +82,7 @@ def check_in_engine(scene: Scene) -> tuple[Problem, ...]:
         for item in scene.objects:
             other = engine.penetrates(item.name, ignore=frozenset({FLOOR}))
             if other:
-                found.append(Problem(ProblemKind.PENETRATION, (item.name, other), "found by the engine"))
+                found.append(SceneProblem(ProblemKind.PENETRATION, (item.name, other), "found by the engine"))
         return tuple(found)
     finally:
         engine.close()
@@ -94,7 +94,7 @@ class Settlement:
 
     movable: int
     unstable: tuple[str, ...]
-    problems: tuple[Problem, ...]
+    problems: tuple[SceneProblem, ...]
 
     @property
     def stable_share(self) -> float:
@@ -106,7 +106,7 @@ def check_settled(scene: Scene) -> Settlement:
     """Let go of everything that can move, at once. Raises EngineError where the engine is missing."""
     settled = settle_scene(scene)
     problems = [
-        Problem(ProblemKind.SUNKEN, pair, f"{depth * 1000:.1f} mm into one another after settling")
+        SceneProblem(ProblemKind.SUNKEN, pair, f"{depth * 1000:.1f} mm into one another after settling")
         for pair, depth in settled.overlaps.items()
     ]
     found = Settlement(len(settled.objects), settled.unstable, ())
@@ -116,21 +116,23 @@ def check_settled(scene: Scene) -> Settlement:
             f"{found.stable_share:.1%} of {found.movable} movable objects stay, one moves {moved:.2f} m: "
             f"expected {STABLE_SHARE:.0%}"
         )
-        problems.append(Problem(ProblemKind.UNSTABLE, found.unstable, detail))
+        problems.append(SceneProblem(ProblemKind.UNSTABLE, found.unstable, detail))
     return replace(found, problems=tuple(problems))
 
 
-def _names(scene: Scene) -> Iterator[Problem]:
+def _names(scene: Scene) -> Iterator[SceneProblem]:
     for name, count in Counter(item.name for item in scene.objects).items():
         if count > 1:
-            yield Problem(ProblemKind.NAME, (name,), f"the name stands {count} times: expected unique names")
+            yield SceneProblem(
+                ProblemKind.NAME, (name,), f"the name stands {count} times: expected unique names"
+            )
     known = {item.name for item in scene.objects}
     for item in scene.objects:
         if item.host and item.host not in known:
-            yield Problem(ProblemKind.NAME, (item.name,), f"its host {item.host!r} is not in the scene")
+            yield SceneProblem(ProblemKind.NAME, (item.name,), f"its host {item.host!r} is not in the scene")
 
 
-def _penetrations(scene: Scene) -> Iterator[Problem]:
+def _penetrations(scene: Scene) -> Iterator[SceneProblem]:
     solids = Solids.of_scene(scene)
     seen: set[frozenset[str]] = set()
     for item in scene.objects:
@@ -140,21 +142,21 @@ def _penetrations(scene: Scene) -> Iterator[Problem]:
             if pair not in seen:
                 seen.add(pair)
                 detail = f"{item.name} and {other} overlap by {depth * 1000:.1f} mm"
-                yield Problem(ProblemKind.PENETRATION, (item.name, other), detail)
+                yield SceneProblem(ProblemKind.PENETRATION, (item.name, other), detail)
 
 
-def _supports(scene: Scene) -> Iterator[Problem]:
+def _supports(scene: Scene) -> Iterator[SceneProblem]:
     for item in scene.objects:
         box = box_of(scene, item)
         if box.low_m[2] < -REST_M:
-            yield Problem(ProblemKind.FLOATING, (item.name,), f"{-box.low_m[2]:.3f} m below the floor")
+            yield SceneProblem(ProblemKind.FLOATING, (item.name,), f"{-box.low_m[2]:.3f} m below the floor")
         elif item.host:
             if item.host in scene.by_name and not _rests(scene, item, box):
                 detail = f"underside at {box.low_m[2]:.3f} m rests on no surface of {item.host}"
-                yield Problem(ProblemKind.FLOATING, (item.name, item.host), detail)
+                yield SceneProblem(ProblemKind.FLOATING, (item.name, item.host), detail)
         elif box.low_m[2] > REST_M and not _hangs(scene, item, box):
             detail = f"underside at {box.low_m[2]:.3f} m, no host, no wall or ceiling within {HANG_M} m"
-            yield Problem(ProblemKind.FLOATING, (item.name,), detail)
+            yield SceneProblem(ProblemKind.FLOATING, (item.name,), detail)
 
 
 def _rests(scene: Scene, item: SceneObject, box: Aabb) -> bool:
@@ -185,45 +187,47 @@ def _hangs(scene: Scene, item: SceneObject, box: Aabb) -> bool:
     return min(gaps) <= HANG_M
 
 
-def _rooms(scene: Scene) -> Iterator[Problem]:
+def _rooms(scene: Scene) -> Iterator[SceneProblem]:
     rooms = {room.name: room for room in scene.rooms}
     for item in scene.objects:
         x, y, _ = item.pose_world_asset.position_m
         if item.room not in rooms or not rooms[item.room].contains(x, y):
-            yield Problem(ProblemKind.ROOM, (item.name,), f"its middle lies outside its room {item.room!r}")
+            yield SceneProblem(
+                ProblemKind.ROOM, (item.name,), f"its middle lies outside its room {item.room!r}"
+            )
 
 
-def reach_problems(scene: Scene) -> Iterator[Problem]:
+def reach_problems(scene: Scene) -> Iterator[SceneProblem]:
     """Rooms that no free floor leads into, and furniture that the robot can't get at."""
     floor = ReachableFloor(scene)
     if not floor.has_start:
-        yield Problem(
+        yield SceneProblem(
             ProblemKind.UNREACHABLE_ROOM, (scene.robot.room,), "the robot's start is not free floor"
         )
         return
     for room in scene.rooms:
         if not floor.enters(room):
-            yield Problem(ProblemKind.UNREACHABLE_ROOM, (room.name,), "no free floor leads into it")
+            yield SceneProblem(ProblemKind.UNREACHABLE_ROOM, (room.name,), "no free floor leads into it")
             continue
         cut_off_m2 = floor.cut_off_m2(room)
         if cut_off_m2 > max(CUT_OFF_M2, CUT_OFF_SHARE * room.size_m[0] * room.size_m[1]):
             detail = f"furniture cuts off {cut_off_m2:.1f} m2 of floor where the robot fits"
-            yield Problem(ProblemKind.AISLE, (room.name,), detail)
+            yield SceneProblem(ProblemKind.AISLE, (room.name,), detail)
     for item, access in unserved(scene, floor):
         where = "beside it" if access is Access.BESIDE else "before its front"
-        yield Problem(ProblemKind.ACCESS, (item.name,), f"no reachable spot {where}")
+        yield SceneProblem(ProblemKind.ACCESS, (item.name,), f"no reachable spot {where}")
 
 
-def _openings(scene: Scene) -> Iterator[Problem]:
+def _openings(scene: Scene) -> Iterator[SceneProblem]:
     for doorway in scene.doorways:
         if doorway.width_m < MIN_DOOR_M - _EDGE_M:
             detail = f"{doorway.width_m:.2f} m wide: expected {MIN_DOOR_M} m"
-            yield Problem(ProblemKind.DOORWAY, doorway.rooms, detail)
+            yield SceneProblem(ProblemKind.DOORWAY, doorway.rooms, detail)
     clearance = Clearance(scene)
     for doorway, room, names in clearance.before_doorways():
         if names:
             beyond = next((other for other in doorway.rooms if other != room), "") or "outside"
-            yield Problem(ProblemKind.DOORWAY, names, f"before the doorway from {room} to {beyond}")
+            yield SceneProblem(ProblemKind.DOORWAY, names, f"before the doorway from {room} to {beyond}")
     for _, room, names in clearance.before_windows():
         if names:
-            yield Problem(ProblemKind.WINDOW, names, f"before a window of {room}")
+            yield SceneProblem(ProblemKind.WINDOW, names, f"before a window of {room}")

@@ -22,7 +22,7 @@ from embomatrix.factory.importers.shelf import read_assets
 from embomatrix.factory.pictures.relations import draw_relations
 from embomatrix.factory.pictures.scene import draw_plan
 from embomatrix.factory.pictures.sheet import draw_eyes, draw_sheet, draw_views
-from embomatrix.factory.scenes.batch import SceneJob, run_batch
+from embomatrix.factory.scenes.batch import SceneBuildJob, run_batch
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.scene_file import SUFFIX, SceneFileError, read_scene
 from embomatrix.factory.scenes.tables import TABLE_COLUMNS, problem_lines, report_table
@@ -105,7 +105,7 @@ def build(
     folder = _folder(out)
     several = len(set(seeds or ())) > 1
     orders = [
-        SceneJob(name, seed, folder / (f"{name}-{seed}.json" if several else f"{name}.json"), assets)
+        SceneBuildJob(name, seed, folder / (f"{name}-{seed}.json" if several else f"{name}.json"), assets)
         for name in chosen
         for seed in dict.fromkeys(seeds or (0,))
     ]
@@ -236,7 +236,7 @@ def _check_writable(path: Path | None) -> None:
         raise _unwritable(path, error) from None
 
 
-def _run(orders: Sequence[SceneJob], jobs: int) -> list[SceneReport]:
+def _run(orders: Sequence[SceneBuildJob], jobs: int) -> list[SceneReport]:
     reports = []
     with _progress(len(orders)) as bar:
         try:
@@ -275,16 +275,16 @@ def _chosen(names: Sequence[str] | None, every: bool) -> tuple[str, ...]:
     return Catalog.load().scene_ids if every else tuple(dict.fromkeys(names or ()))
 
 
-def _to_check(names: Sequence[str], seeds: Sequence[int]) -> list[SceneJob]:
+def _to_check(names: Sequence[str], seeds: Sequence[int]) -> list[SceneBuildJob]:
     """Each file once, as it has its own seed, and each inventory with all seeds."""
     orders = []
     for name in names:
         if _is_file(name):
             scene = _read(name)
-            orders.append(SceneJob(scene.scene_id, scene.seed, source=Path(name)))
+            orders.append(SceneBuildJob(scene.scene_id, scene.seed, source=Path(name)))
         else:
             _known([name])
-            orders += [SceneJob(name, seed) for seed in seeds]
+            orders += [SceneBuildJob(name, seed) for seed in seeds]
     return orders
 
 

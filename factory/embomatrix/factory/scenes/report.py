@@ -12,7 +12,13 @@ from typing import TYPE_CHECKING, Any, Final
 from embomatrix.factory.floorplan.layout import compactness
 from embomatrix.factory.floorplan.spec import FloorPlanError
 from embomatrix.factory.scenes.build import build_base_scene
-from embomatrix.factory.scenes.check import Problem, ProblemKind, check_in_engine, check_scene, check_settled
+from embomatrix.factory.scenes.check import (
+    ProblemKind,
+    SceneProblem,
+    check_in_engine,
+    check_scene,
+    check_settled,
+)
 from embomatrix.factory.scenes.floor import ReachableFloor
 from embomatrix.factory.scenes.scene_file import SceneFileError, read_scene
 from embomatrix.sim.engine import EngineError
@@ -57,7 +63,7 @@ class SceneReport:
     unstable: tuple[str, ...] = ()
     placed_by_room: tuple[tuple[str, int], ...] = ()
     left_out: tuple[str, ...] = ()
-    problems: tuple[Problem, ...] = ()
+    problems: tuple[SceneProblem, ...] = ()
 
     @property
     def sound(self) -> bool:
@@ -131,7 +137,7 @@ def report_of(scene: Scene, *, build_s: float = 0.0) -> SceneReport:
     )
 
 
-def unaccounted(scene: Scene) -> tuple[Problem, ...]:
+def unaccounted(scene: Scene) -> tuple[SceneProblem, ...]:
     """Models of the base inventory of which fewer stand in the scene or among the left-out than are listed.
 
     A scene that is no base scene of the catalog has no inventory to compare with: nothing is unaccounted for.
@@ -143,7 +149,7 @@ def unaccounted(scene: Scene) -> tuple[Problem, ...]:
         if match is not None:
             told[match[2]] += int(match[1])
     return tuple(
-        Problem(
+        SceneProblem(
             ProblemKind.UNACCOUNTED,
             (asset_id,),
             f"{count} are listed, {placed[asset_id]} stand in the scene, "

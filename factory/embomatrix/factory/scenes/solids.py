@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from embomatrix.world.asset import Asset
-    from embomatrix.world.geometry import FloatArray, Part
+    from embomatrix.world.geometry import ConvexPart, FloatArray
     from embomatrix.world.scene import Scene
 
 TOLERANCE_M: Final = 0.001
@@ -48,7 +48,7 @@ class Convex:
         return np.asarray(self.vertices.max(axis=0) + self.radius_m)
 
 
-def convex_of(part: Part, pose_world_asset: Pose) -> Convex:
+def convex_of(part: ConvexPart, pose_world_asset: Pose) -> Convex:
     """The part of an asset at a pose."""
     local, axes, radius = _template(part.shape, part.size_m, part.vertices_m)
     placed = pose_world_asset @ part.pose

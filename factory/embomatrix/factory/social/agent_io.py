@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from pydantic import TypeAdapter
 
-from embomatrix.factory.layout.agent_io import BriefError, Door
+from embomatrix.factory.layout.agent_io import AgentInterface, BriefError
 from embomatrix.factory.pictures.sights import sights_of
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.social.conversing import starting_slots
 from embomatrix.factory.social.facts import SceneFacts, facts_of, with_sights
 from embomatrix.factory.social.fitting import why_of
 from embomatrix.factory.social.summary import instruction_of
-from embomatrix.factory.social.values import SceneBrief, Summary, SummaryBrief, TalkBrief
+from embomatrix.factory.social.values import RequestSummary, SceneBrief, SummaryBrief, TalkBrief
 from embomatrix.factory.social.writer import SocialWriter
 from embomatrix.factory.writer.variant import build_variant
 from embomatrix.factory.writer.view import SceneView
@@ -87,14 +87,14 @@ def simulate(brief: TalkBrief) -> SummaryBrief:
     )
 
 
-def summarise(brief: SummaryBrief) -> Summary:
+def summarise(brief: SummaryBrief) -> RequestSummary:
     """Summarization Agent. Raises CatalogError."""
     rng = _rng(brief.scene, brief.seed)
     view = SceneView(build_base_scene(brief.scene, seed=brief.seed))
     voice = Voice(rng)
     why = voice.choose(why_of(brief.conversation.slot.activity) or (NO_REASON,))
     instruction = instruction_of(brief.conversation, brief.cast, view, voice, why)
-    return Summary(instruction=instruction, wishes=brief.conversation.last_wishes)
+    return RequestSummary(instruction=instruction, wishes=brief.conversation.last_wishes)
 
 
 async def asked(agents: ModelAgents, name: SocialAgent, brief: Any) -> Any:
@@ -116,7 +116,7 @@ async def asked(agents: ModelAgents, name: SocialAgent, brief: Any) -> Any:
         return SummaryBrief(scene=brief.scene, cast=brief.cast, conversation=conversation, seed=brief.seed)
     request = await agents.summarise(facts, view, brief.conversation, brief.seed)
     wishes = tuple(wish.model_dump_json() for wish in request.wishes)
-    return Summary(instruction=request.instruction, wishes=wishes)
+    return RequestSummary(instruction=request.instruction, wishes=wishes)
 
 
 def _facts(scene: Scene) -> SceneFacts:
@@ -134,29 +134,29 @@ def _variant(name: str, seed: int, rng: np.random.Generator) -> Variant:
     return build_variant(base, rooms, f"{base.base}-alone", rng)
 
 
-SOCIAL_DOORS: Final[Mapping[SocialAgent, Door]] = {
-    SocialAgent.EXTRACTOR: Door(
+SOCIAL_DOORS: Final[Mapping[SocialAgent, AgentInterface]] = {
+    SocialAgent.EXTRACTOR: AgentInterface(
         "scene information extraction: rooms, things and what can be done with them",
         TypeAdapter(SceneBrief),
         TypeAdapter(SceneFacts),
         extract,
     ),
-    SocialAgent.PLAYER: Door(
+    SocialAgent.PLAYER: AgentInterface(
         "Role-Playing Agent: the people of a scene and their day",
         TypeAdapter(SceneBrief),
         TypeAdapter(TalkBrief),
         play,
     ),
-    SocialAgent.SIMULATOR: Door(
+    SocialAgent.SIMULATOR: AgentInterface(
         "Social Simulation Agent: a conversation that comes to a request",
         TypeAdapter(TalkBrief),
         TypeAdapter(SummaryBrief),
         simulate,
     ),
-    SocialAgent.SUMMARIZER: Door(
+    SocialAgent.SUMMARIZER: AgentInterface(
         "Summarization Agent: one instruction",
         TypeAdapter(SummaryBrief),
-        TypeAdapter(Summary),
+        TypeAdapter(RequestSummary),
         summarise,
     ),
 }

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class ModelSource:
     """Whom to ask. Without a ``url`` only the cassette answers; without a cassette nothing is recorded.
 
     ``looks`` tells that it is shown pictures of the scenes.
@@ -37,7 +37,7 @@ class Asked:
 
 
 @contextlib.contextmanager
-def asked_writer(asked: Asked) -> Iterator[tuple[ModelWriter, Ledger]]:
+def asked_writer(asked: ModelSource) -> Iterator[tuple[ModelWriter, Ledger]]:
     """A writer and what it costs. Raises CassetteError where only a cassette is given and it can't be read."""
     look = sights_of if asked.looks else None
     if not asked.url:

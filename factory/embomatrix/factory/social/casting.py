@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-    from embomatrix.factory.social.milieus import Milieu, Role
+    from embomatrix.factory.social.milieus import Milieu, SocialRole
     from embomatrix.factory.social.occasions import Occasion
     from embomatrix.world.scene import Room, Scene
 
@@ -51,7 +51,12 @@ class GrammarRolePlayer:
 
 
 def _person(
-    role: Role, name: str, hobby: str, first: Person | None, rooms: Sequence[Room], rng: np.random.Generator
+    role: SocialRole,
+    name: str,
+    hobby: str,
+    first: Person | None,
+    rooms: Sequence[Room],
+    rng: np.random.Generator,
 ) -> Person:
     low, high = role.age
     if first is not None and role.apart > 0:

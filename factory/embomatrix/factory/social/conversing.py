@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 from embomatrix.factory.social.chores import impossible_chore
 from embomatrix.factory.social.fitting import themes_of
 from embomatrix.factory.social.phrases import AGREEMENTS, JOINS, MATTERS, QUESTIONS, TURNS, filled, said_once
-from embomatrix.factory.social.values import ROBOT, Act, Conversation, Turn
+from embomatrix.factory.social.values import ROBOT, Act, Conversation, DialogueTurn
 from embomatrix.factory.writer.goals import placed_elsewhere
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from embomatrix.factory.social.values import Cast, DaySlot
-    from embomatrix.factory.writer.goals import Piece, Workshop
+    from embomatrix.factory.writer.goals import GoalConjunct, Workshop
     from embomatrix.factory.writer.words import Voice
 
 REFUSED_SHARE: Final = 0.35
@@ -32,24 +32,24 @@ INTERJECTED_SHARE: Final = 0.4
 
 
 @dataclass(frozen=True, slots=True)
-class Scenario:
+class ConversationScenario:
     """Who needs what, where, when, and why. ``pieces`` are the wishes that the conversation is to end with."""
 
     cast: Cast
     slot: DaySlot
-    pieces: tuple[Piece, ...]
+    pieces: tuple[GoalConjunct, ...]
     why: str
 
 
 class GrammarConversation:
     """One conversation, turn by turn."""
 
-    def __init__(self, scenario: Scenario, shop: Workshop, voice: Voice) -> None:
+    def __init__(self, scenario: ConversationScenario, shop: Workshop, voice: Voice) -> None:
         self._scenario = scenario
         self._shop = shop
         self._rng = shop.rng
         self._voice = voice
-        self._turns: list[Turn] = []
+        self._turns: list[DialogueTurn] = []
 
     def run(self) -> Conversation:
         """Need, question, answer, changes, what the robot can't do and offers in its place, wishes more, confirmation."""
@@ -70,7 +70,7 @@ class GrammarConversation:
             last_wishes=tuple(piece.clause for piece in pieces),
         )
 
-    def _open(self, first: Piece) -> None:
+    def _open(self, first: GoalConjunct) -> None:
         sign = "place" if first.kind == "place" else first.signs[0].partition("(")[0]
         matters = MATTERS.get(f"{sign} {first.manner}", MATTERS[sign])
         matter = filled(self._voice.choose(matters), thing=first.thing)
@@ -79,7 +79,7 @@ class GrammarConversation:
         question = filled(self._voice.choose(QUESTIONS[first.kind]), thing=first.thing)
         self._say(ROBOT, Act.CLARIFY, question=question)
 
-    def _earlier(self, first: Piece) -> Piece | None:
+    def _earlier(self, first: GoalConjunct) -> GoalConjunct | None:
         """Another place for the same thing, where a person would put it too."""
         for _ in range(PLACES_TRIED):
             other = placed_elsewhere(self._shop, first)
@@ -87,7 +87,7 @@ class GrammarConversation:
                 return other
         return None
 
-    def _refuse(self, further: list[Piece]) -> None:
+    def _refuse(self, further: list[GoalConjunct]) -> None:
         """Somebody asks for what the robot can't do; it offers the next wish, which is then no longer among the ``further``."""
         slot = self._scenario.slot
         chore, reason = impossible_chore(self._shop.view, slot.room, self._rng)
@@ -95,9 +95,11 @@ class GrammarConversation:
         self._say(ROBOT, Act.REFUSE, chore=chore, reason=reason)
         if further:
             self._say(ROBOT, Act.PROPOSE, clause=further.pop(0).clause)
-            self._turns.append(Turn(speaker=slot.person, act=Act.ANSWER, text=self._voice.choose(AGREEMENTS)))
+            self._turns.append(
+                DialogueTurn(speaker=slot.person, act=Act.ANSWER, text=self._voice.choose(AGREEMENTS))
+            )
 
-    def _settle(self, first: Piece, earlier: Piece | None) -> str:
+    def _settle(self, first: GoalConjunct, earlier: GoalConjunct | None) -> str:
         """The first wish is agreed on, at once or after a change; returns what was wished at first."""
         person = self._scenario.slot.person
         if earlier is None:
@@ -117,7 +119,7 @@ class GrammarConversation:
         ]
         return near[int(self._rng.integers(len(near)))] if near and self._rng.random() < 0.5 else slot.person
 
-    def _joined(self, pieces: Sequence[Piece]) -> str:
+    def _joined(self, pieces: Sequence[GoalConjunct]) -> str:
         text = pieces[0].clause
         for piece in pieces[1:]:
             text += self._voice.choose(JOINS) + piece.clause
@@ -125,7 +127,7 @@ class GrammarConversation:
 
     def _say(self, speaker: str, act: Act, **words: str) -> None:
         text = said_once(filled(self._voice.choose(TURNS[act]), **words), self._shop.view)
-        self._turns.append(Turn(speaker=speaker, act=act, text=text))
+        self._turns.append(DialogueTurn(speaker=speaker, act=act, text=text))
 
 
 def starting_slots(cast: Cast, rooms: Sequence[str], rng: np.random.Generator) -> list[DaySlot]:

@@ -17,7 +17,7 @@ MOST_IN_ROOM: Final = 40
 
 
 @dataclass(frozen=True, slots=True)
-class Thing:
+class ObjectFacts:
     """One object: what a person calls it, what it rests on or in, and what can be done with it."""
 
     name: str
@@ -34,7 +34,7 @@ class RoomFacts:
     name: str
     type: str
     area_m2: float
-    things: tuple[Thing, ...]
+    things: tuple[ObjectFacts, ...]
     left_out: int
     sight: str = ""
     """What it looks like, in words, where a model has seen it."""
@@ -48,7 +48,7 @@ class SceneFacts:
     rooms: tuple[RoomFacts, ...]
 
     @property
-    def things(self) -> dict[str, Thing]:
+    def things(self) -> dict[str, ObjectFacts]:
         """By name."""
         return {thing.name: thing for room in self.rooms for thing in room.things}
 
@@ -75,8 +75,10 @@ def with_sights(facts: SceneFacts, sights: Mapping[str, str]) -> SceneFacts:
     return replace(facts, rooms=tuple(replace(room, sight=sights.get(room.name, "")) for room in facts.rooms))
 
 
-def _thing(view: SceneView, name: str) -> Thing:
-    return Thing(name, view.category(name), view.room(name), view.whereabouts(name), _abilities(view, name))
+def _thing(view: SceneView, name: str) -> ObjectFacts:
+    return ObjectFacts(
+        name, view.category(name), view.room(name), view.whereabouts(name), _abilities(view, name)
+    )
 
 
 def _abilities(view: SceneView, name: str) -> tuple[str, ...]:

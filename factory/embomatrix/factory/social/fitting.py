@@ -5,16 +5,16 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.social.occasions import Occasion, Theme, occasion_of
-from embomatrix.factory.writer.tables import COOKWARE, FOR_DRINKS, MEMBERS, Group
+from embomatrix.factory.writer.tables import COOKWARE, FOR_DRINKS, MEMBERS, ItemKind
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from embomatrix.factory.social.values import Cast, DaySlot
-    from embomatrix.factory.writer.goals import Piece
+    from embomatrix.factory.writer.goals import GoalConjunct
     from embomatrix.factory.writer.view import SceneView
 
-_GROUP_OF: Final[Mapping[str, Group]] = {
+_GROUP_OF: Final[Mapping[str, ItemKind]] = {
     category: group for group, members in MEMBERS.items() for category in members
 }
 
@@ -23,17 +23,17 @@ def _themes(words: str) -> frozenset[Theme]:
     return frozenset(map(Theme, words.split()))
 
 
-GROUP_THEMES: Final[Mapping[Group, frozenset[Theme]]] = {
-    Group.FOOD: _themes("cooking meals stock guests"),
-    Group.FRUIT: _themes("cooking meals stock guests"),
-    Group.TABLEWARE: _themes("cooking meals guests tidying"),
-    Group.PACKAGES: _themes("cooking meals stock guests screens"),
-    Group.BOOKS: _themes("reading papers sleep tidying"),
-    Group.TOYS: _themes("play tidying"),
-    Group.DEVICES: _themes("screens papers leaving tidying"),
-    Group.OFFICE: _themes("papers teaching tidying"),
-    Group.TOILETRIES: _themes("washing"),
-    Group.DECORATION: _themes("guests tidying leaving"),
+GROUP_THEMES: Final[Mapping[ItemKind, frozenset[Theme]]] = {
+    ItemKind.FOOD: _themes("cooking meals stock guests"),
+    ItemKind.FRUIT: _themes("cooking meals stock guests"),
+    ItemKind.TABLEWARE: _themes("cooking meals guests tidying"),
+    ItemKind.PACKAGES: _themes("cooking meals stock guests screens"),
+    ItemKind.BOOKS: _themes("reading papers sleep tidying"),
+    ItemKind.TOYS: _themes("play tidying"),
+    ItemKind.DEVICES: _themes("screens papers leaving tidying"),
+    ItemKind.OFFICE: _themes("papers teaching tidying"),
+    ItemKind.TOILETRIES: _themes("washing"),
+    ItemKind.DECORATION: _themes("guests tidying leaving"),
 }
 """What somebody has in mind who wants a thing of the group elsewhere."""
 
@@ -56,27 +56,34 @@ _WASHING: Final = frozenset(
     }
 )
 _WORKING: Final = frozenset({"private_office", "shared_office", "meeting_room", "lobby"})
-GROUP_ROOMS: Final[Mapping[Group, frozenset[str]]] = {
-    Group.FOOD: _EATING,
-    Group.FRUIT: _EATING | _WORKING,
-    Group.PACKAGES: _EATING | _WORKING | {"storage_room"},
-    Group.TABLEWARE: _EATING | _WORKING | {"storage_room"},
-    Group.TOILETRIES: _WASHING,
+GROUP_ROOMS: Final[Mapping[ItemKind, frozenset[str]]] = {
+    ItemKind.FOOD: _EATING,
+    ItemKind.FRUIT: _EATING | _WORKING,
+    ItemKind.PACKAGES: _EATING | _WORKING | {"storage_room"},
+    ItemKind.TABLEWARE: _EATING | _WORKING | {"storage_room"},
+    ItemKind.TOILETRIES: _WASHING,
 }
 """Types of rooms that people take things of a group to; of the groups that are not listed, to any but those of `NOT_IN`."""
 _WET: Final = frozenset({"bathroom", "spa", "hammam", "sauna", "locker_room"})
-NOT_IN: Final[Mapping[Group, frozenset[str]]] = {
-    **dict.fromkeys((Group.DEVICES, Group.OFFICE, Group.TOYS), _WET),
-    Group.BOOKS: frozenset({"hammam", "sauna"}),
+NOT_IN: Final[Mapping[ItemKind, frozenset[str]]] = {
+    **dict.fromkeys((ItemKind.DEVICES, ItemKind.OFFICE, ItemKind.TOYS), _WET),
+    ItemKind.BOOKS: frozenset({"hammam", "sauna"}),
 }
 """Types of rooms that nobody takes things of a group to."""
 FOR_DISHES: Final = frozenset({"dishwasher", "dish_rack", "dish_rack_cart"})
 NOT_FOR_FOOD: Final = frozenset({"bookcase", "bookshelf", "piano"})
-_EATEN: Final = frozenset({Group.FOOD, Group.FRUIT, Group.PACKAGES})
+_EATEN: Final = frozenset({ItemKind.FOOD, ItemKind.FRUIT, ItemKind.PACKAGES})
 NOT_NAMED: Final = frozenset({"eyeglasses"})
 """Words that take a plural verb, which the sentences have not."""
 NOT_ON_SOFT: Final = frozenset(
-    {Group.DECORATION, Group.TABLEWARE, Group.FOOD, Group.FRUIT, Group.PACKAGES, Group.OFFICE}
+    {
+        ItemKind.DECORATION,
+        ItemKind.TABLEWARE,
+        ItemKind.FOOD,
+        ItemKind.FRUIT,
+        ItemKind.PACKAGES,
+        ItemKind.OFFICE,
+    }
 )
 SOFT: Final = frozenset({"bed", "sofa", "armchair", "ottoman", "carpet", "hospital_bed"})
 SEATS: Final = frozenset(
@@ -118,8 +125,8 @@ OVENS: Final = frozenset({"oven", "microwave", "toaster_oven"})
 HOBS: Final = frozenset({"stove", "flat_top_grill", "burner", "charcoal_grill"})
 _INTO_BASINS: Final = frozenset(
     {
-        *MEMBERS[Group.FRUIT],
-        *MEMBERS[Group.TABLEWARE],
+        *MEMBERS[ItemKind.FRUIT],
+        *MEMBERS[ItemKind.TABLEWARE],
         "sponge",
         "hand_towel",
         "bar_soap",
@@ -128,7 +135,7 @@ _INTO_BASINS: Final = frozenset(
         "potato",
     }
 )
-_ON_OVENS: Final = frozenset({Group.PACKAGES, Group.TABLEWARE})
+_ON_OVENS: Final = frozenset({ItemKind.PACKAGES, ItemKind.TABLEWARE})
 _PANS: Final = frozenset({"frying_pan", "saucepan"})
 NOT_COOKED: Final = frozenset({"avocado", "banana", "lemon", "orange", "bagel", "croissant"})
 
@@ -200,13 +207,13 @@ STORAGE_THEMES: Final[Mapping[str, frozenset[Theme]]] = {
 _PLAIN: Final = _themes("tidying leaving")
 
 
-def fits(piece: Piece, view: SceneView, slot: DaySlot) -> bool:
+def fits(piece: GoalConjunct, view: SceneView, slot: DaySlot) -> bool:
     """Whether somebody who does this would wish for that, for a slot that the grammar made."""
     occasion = occasion_of(slot.activity)
     return occasion is not None and bool(themes_of(piece, view) & occasion.themes)
 
 
-def themes_of(piece: Piece, view: SceneView) -> frozenset[Theme]:
+def themes_of(piece: GoalConjunct, view: SceneView) -> frozenset[Theme]:
     """What a wish can be for; nothing for what no person would ask for."""
     thing = view.category(piece.objects[0])
     if thing in NOT_NAMED:
@@ -230,7 +237,7 @@ def themes_of(piece: Piece, view: SceneView) -> frozenset[Theme]:
     return GROUP_THEMES.get(_GROUP_OF[thing], _PLAIN) if thing in _GROUP_OF else _PLAIN
 
 
-def _is_served_well(piece: Piece, view: SceneView, *, warmed: bool) -> bool:
+def _is_served_well(piece: GoalConjunct, view: SceneView, *, warmed: bool) -> bool:
     """Whether food that was heated, cooked or frozen ends up where a person would want it; true where nobody says where."""
     for sign in piece.signs:
         relation, _, names = sign.rstrip(")").partition("(")
@@ -260,20 +267,20 @@ def is_plausible(thing: str, host: str, room_type: str, *, inside: bool) -> bool
     if host in SEATS or host in SOFT or host.endswith("_chair"):
         return host in SOFT and group not in NOT_ON_SOFT
     if host in FOR_DISHES:
-        return group is Group.TABLEWARE
+        return group is ItemKind.TABLEWARE
     if host in NO_HOSTS:
         return False
     if host in BASINS or host.endswith("_sink"):
         return inside and thing in _INTO_BASINS
     if host in COLD:
-        return not inside or group in {Group.FOOD, Group.FRUIT, Group.PACKAGES}
+        return not inside or group in {ItemKind.FOOD, ItemKind.FRUIT, ItemKind.PACKAGES}
     if host in OVENS:
-        return group is Group.FOOD or thing in _PANS if inside else group in _ON_OVENS
+        return group is ItemKind.FOOD or thing in _PANS if inside else group in _ON_OVENS
     return host not in HOBS or thing in _PANS
 
 
 def best_slot(
-    cast: Cast, pieces: Sequence[Piece], view: SceneView, asked: Mapping[str, int]
+    cast: Cast, pieces: Sequence[GoalConjunct], view: SceneView, asked: Mapping[str, int]
 ) -> tuple[float, DaySlot] | None:
     """The slot of the day in which somebody would wish for all of it, with a score; None where nobody would.
 

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Household:
+class CastSetting:
     """A setting for a cast in which all of some ties to the first one are found."""
 
     words: str
@@ -18,7 +18,7 @@ class Household:
 
 
 @dataclass(frozen=True, slots=True)
-class Role:
+class SocialRole:
     """A part that a person can play. ``tie`` is what they are to the first of the cast, ``back`` what that one is to them.
 
     ``apart`` is how many years older they are than the first at least, younger where it is negative; 0: any.
@@ -38,10 +38,10 @@ class Milieu:
     """The first role is always played; others are drawn. The first household whose ties a cast has is its setting."""
 
     setting: tuple[str, ...]
-    roles: tuple[Role, ...]
+    roles: tuple[SocialRole, ...]
     lived_in: bool = False
     """Whether people sleep and wash there."""
-    households: tuple[Household, ...] = ()
+    households: tuple[CastSetting, ...] = ()
 
 
 GENERATION: Final = 20
@@ -50,23 +50,23 @@ _OFFICES: Final = ("private_office", "shared_office", "meeting_room", "break_roo
 _HOME: Final = Milieu(
     ("a home",),
     (
-        Role(("nurse", "architect", "bus driver", "tax adviser", "carpenter"), (36, 55), "partner", "partner",
+        SocialRole(("nurse", "architect", "bus driver", "tax adviser", "carpenter"), (36, 55), "partner", "partner",
              ("bedroom", "kitchen", "private_office")),
-        Role(("teacher", "cook", "translator", "electrician", "librarian"), (30, 58), "partner", "partner",
+        SocialRole(("teacher", "cook", "translator", "electrician", "librarian"), (30, 58), "partner", "partner",
              ("bedroom", "living_room", "garden")),
-        Role(("pupil",), (6, 12), "child", "parent", ("childs_room", "playroom", "bedroom"), -GENERATION),
-        Role(("student", "apprentice"), (16, 22), "child", "parent", ("childs_room", "bedroom", "television_room"),
+        SocialRole(("pupil",), (6, 12), "child", "parent", ("childs_room", "playroom", "bedroom"), -GENERATION),
+        SocialRole(("student", "apprentice"), (16, 22), "child", "parent", ("childs_room", "bedroom", "television_room"),
              -GENERATION),
-        Role(("pensioner",), (66, 84), "parent", "grown-up child", ("bedroom", "living_room", "garden"), GENERATION),
-        Role(("student", "musician", "paramedic"), (21, 34), "lodger", "landlord", ("bedroom", "bathroom")),
+        SocialRole(("pensioner",), (66, 84), "parent", "grown-up child", ("bedroom", "living_room", "garden"), GENERATION),
+        SocialRole(("student", "musician", "paramedic"), (21, 34), "lodger", "landlord", ("bedroom", "bathroom")),
     ),
     lived_in=True,
     households=(
-        Household("a home that three generations share", frozenset({"parent", "child"})),
-        Household("a family home", frozenset({"child"})),
-        Household("a home that somebody shares with a parent", frozenset({"parent"})),
-        Household("a house with a lodger", frozenset({"lodger"})),
-        Household("a home that two people share", frozenset({"partner"})),
+        CastSetting("a home that three generations share", frozenset({"parent", "child"})),
+        CastSetting("a family home", frozenset({"child"})),
+        CastSetting("a home that somebody shares with a parent", frozenset({"parent"})),
+        CastSetting("a house with a lodger", frozenset({"lodger"})),
+        CastSetting("a home that two people share", frozenset({"partner"})),
     ),
 )  # fmt: skip
 _RESTAURANT: Final = Milieu(
@@ -76,48 +76,54 @@ _RESTAURANT: Final = Milieu(
         "a restaurant that opens at noon",
     ),
     (
-        Role(("head chef",), (30, 58), "colleague", "colleague", ("kitchen", "pantry_room", "storage_room")),
-        Role(("waiter", "waitress"), (19, 45), "waiter", "chef", ("dining_room", "bar", "lobby")),
-        Role(("kitchen hand",), (18, 40), "kitchen hand", "chef", ("kitchen", "bathroom", "storage_room")),
-        Role(("owner",), (38, 66), "boss", "chef", ("private_office", "dining_room", "bar")),
-        Role(("regular guest",), (25, 80), "guest", "chef", ("dining_room", "bathroom")),
+        SocialRole(
+            ("head chef",), (30, 58), "colleague", "colleague", ("kitchen", "pantry_room", "storage_room")
+        ),
+        SocialRole(("waiter", "waitress"), (19, 45), "waiter", "chef", ("dining_room", "bar", "lobby")),
+        SocialRole(
+            ("kitchen hand",), (18, 40), "kitchen hand", "chef", ("kitchen", "bathroom", "storage_room")
+        ),
+        SocialRole(("owner",), (38, 66), "boss", "chef", ("private_office", "dining_room", "bar")),
+        SocialRole(("regular guest",), (25, 80), "guest", "chef", ("dining_room", "bathroom")),
     ),
 )
 _GROCERY: Final = Milieu(
     ("a grocery store before it opens", "a grocery store on a Saturday"),
     (
-        Role(
+        SocialRole(
             ("shop manager",),
             (30, 60),
             "colleague",
             "colleague",
             ("grocery_store", "private_office", "storage_room"),
         ),
-        Role(("cashier",), (18, 50), "cashier", "manager", ("grocery_store", "break_room")),
-        Role(
+        SocialRole(("cashier",), (18, 50), "cashier", "manager", ("grocery_store", "break_room")),
+        SocialRole(
             ("shelf stacker",),
             (18, 45),
             "shelf stacker",
             "manager",
             ("grocery_store", "storage_room", "corridor"),
         ),
-        Role(("customer",), (20, 85), "customer", "manager", ("grocery_store", "bathroom")),
+        SocialRole(("customer",), (20, 85), "customer", "manager", ("grocery_store", "bathroom")),
     ),
 )
 _OFFICE: Final = Milieu(
     ("an office on a Monday morning", "an office before a visit of clients", "an office late in the day"),
     (
-        Role(("team lead",), (32, 58), "colleague", "colleague", _OFFICES),
-        Role(("programmer", "accountant", "designer"), (23, 50), "colleague", "team lead", _OFFICES),
-        Role(
+        SocialRole(("team lead",), (32, 58), "colleague", "colleague", _OFFICES),
+        SocialRole(("programmer", "accountant", "designer"), (23, 50), "colleague", "team lead", _OFFICES),
+        SocialRole(
             ("receptionist",),
             (22, 60),
             "receptionist",
             "team lead",
             ("lobby", "copy_room", "break_room", "entryway"),
         ),
-        Role(("trainee",), (17, 24), "trainee", "team lead", ("shared_office", "copy_room", "corridor")),
-        Role(
+        SocialRole(
+            ("trainee",), (17, 24), "trainee", "team lead", ("shared_office", "copy_room", "corridor")
+        ),
+        SocialRole(
             ("caretaker",), (35, 63), "caretaker", "team lead", ("utility_room", "storage_room", "bathroom")
         ),
     ),
@@ -125,33 +131,35 @@ _OFFICE: Final = Milieu(
 _SCHOOL: Final = Milieu(
     ("a school before the first lesson", "a school during the long break", "a school on the eve of an open day"),
     (
-        Role(("teacher",), (26, 62), "colleague", "colleague",
+        SocialRole(("teacher",), (26, 62), "colleague", "colleague",
              ("classroom", "biology_lab", "chemistry_lab", "computer_lab", "gym", "private_office")),
-        Role(("pupil",), (11, 17), "pupil", "teacher", ("classroom", "gym", "locker_room", "corridor")),
-        Role(("school nurse",), (28, 60), "school nurse", "teacher", ("infirmary", "bathroom")),
-        Role(("caretaker",), (35, 63), "caretaker", "teacher", ("utility_room", "storage_room", "locker_room")),
-        Role(("head teacher",), (42, 64), "head", "teacher", ("private_office", "meeting_room")),
+        SocialRole(("pupil",), (11, 17), "pupil", "teacher", ("classroom", "gym", "locker_room", "corridor")),
+        SocialRole(("school nurse",), (28, 60), "school nurse", "teacher", ("infirmary", "bathroom")),
+        SocialRole(("caretaker",), (35, 63), "caretaker", "teacher", ("utility_room", "storage_room", "locker_room")),
+        SocialRole(("head teacher",), (42, 64), "head", "teacher", ("private_office", "meeting_room")),
     ),
 )  # fmt: skip
 _HOTEL: Final = Milieu(
     ("a hotel on the day of arrival", "a hotel between two conferences"),
     (
-        Role(
+        SocialRole(
             ("housekeeper",),
             (22, 58),
             "colleague",
             "colleague",
             ("bedroom", "bathroom", "closet", "living_room"),
         ),
-        Role(
+        SocialRole(
             ("receptionist",),
             (20, 50),
             "receptionist",
             "housekeeper",
             ("lobby", "entryway", "private_office"),
         ),
-        Role(("guest",), (24, 75), "guest", "housekeeper", ("bedroom", "bathroom", "spa", "sauna", "gym")),
-        Role(
+        SocialRole(
+            ("guest",), (24, 75), "guest", "housekeeper", ("bedroom", "bathroom", "spa", "sauna", "gym")
+        ),
+        SocialRole(
             ("masseur", "fitness coach"),
             (24, 50),
             "coach",
@@ -164,14 +172,14 @@ _HOTEL: Final = Milieu(
 _HALL: Final = Milieu(
     ("a hall on the morning of a conference", "a hall while a fair is being set up"),
     (
-        Role(
+        SocialRole(
             ("organiser",), (28, 58), "colleague", "colleague", ("conference_hall", "lobby", "meeting_room")
         ),
-        Role(
+        SocialRole(
             ("sound engineer",), (22, 55), "sound engineer", "organiser", ("conference_hall", "storage_room")
         ),
-        Role(("speaker",), (26, 70), "speaker", "organiser", ("conference_hall", "bathroom")),
-        Role(("visitor",), (18, 75), "visitor", "organiser", ("lobby", "corridor", "bar")),
+        SocialRole(("speaker",), (26, 70), "speaker", "organiser", ("conference_hall", "bathroom")),
+        SocialRole(("visitor",), (18, 75), "visitor", "organiser", ("lobby", "corridor", "bar")),
     ),
 )
 _BY_STEM: Final[Mapping[str, Milieu]] = {

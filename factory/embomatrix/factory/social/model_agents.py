@@ -23,7 +23,7 @@ from embomatrix.factory.social.prompts import (
     TALK_USER,
 )
 from embomatrix.factory.social.requests import TaskRequest, check_request
-from embomatrix.factory.social.values import ROBOT, Act, Cast, Conversation, Turn
+from embomatrix.factory.social.values import ROBOT, Act, Cast, Conversation, DialogueTurn
 from embomatrix.llm.structured import ask
 from embomatrix.llm.values import ChatRequest, Message, Speaker
 
@@ -41,7 +41,7 @@ SUMMARY: Final = "summarization agent"
 """Who asks, for ledgers and errors."""
 
 
-class Sight(BaseModel):
+class RoomSighting(BaseModel):
     """What a model that sees says of each room."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -54,7 +54,7 @@ class Talk(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    turns: tuple[Turn, ...] = Field(min_length=4, max_length=14)
+    turns: tuple[DialogueTurn, ...] = Field(min_length=4, max_length=14)
     first_wish: str = Field(min_length=3, max_length=200)
     last_wishes: tuple[str, ...] = Field(min_length=1, max_length=6)
 
@@ -70,11 +70,11 @@ class ModelAgents:
         self._attempts = attempts
         self._max_tokens = max_tokens
 
-    async def describe(self, facts: SceneFacts, pictures: tuple[bytes, ...], seed: int) -> Sight:
+    async def describe(self, facts: SceneFacts, pictures: tuple[bytes, ...], seed: int) -> RoomSighting:
         """Scene information extraction: what rooms look like, from pictures of them as PNG files. Raises LlmError."""
         rooms = [room.name for room in facts.rooms]
 
-        def check(sight: Sight) -> None:
+        def check(sight: RoomSighting) -> None:
             if unknown := sorted(set(sight.rooms) - set(rooms)):
                 raise ValueError(f"there is no room {unknown[0]!r}: the rooms are {', '.join(rooms)}")
             if missing := [room for room in rooms if room not in sight.rooms]:
@@ -83,7 +83,7 @@ class ModelAgents:
         user = Message(Speaker.USER, SIGHT_USER.format(scene=facts.described()), pictures)
         messages = (Message(Speaker.SYSTEM, SIGHT_SYSTEM), user)
         request = ChatRequest(SIGHT, messages, self._max_tokens, 0.2, seed)
-        return (await ask(self._model, request, Sight, check=check, attempts=self._attempts)).value
+        return (await ask(self._model, request, RoomSighting, check=check, attempts=self._attempts)).value
 
     async def cast(self, facts: SceneFacts, seed: int) -> Cast:
         """People who fit the scene and are found in every room of it. Raises LlmError."""

@@ -6,7 +6,7 @@ import asyncio
 import logging
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.refusal import Refusal, RefusalReason
+from embomatrix.factory.refusal import RefusalReason, TaskRefusal
 from embomatrix.factory.social.conversing import starting_slots
 from embomatrix.factory.social.facts import facts_of, with_sights
 from embomatrix.factory.social.requests import piece_of
@@ -14,7 +14,7 @@ from embomatrix.factory.social.transcript import transcript_of
 from embomatrix.factory.writer.goals import Workshop
 from embomatrix.factory.writer.tasks import Draft, DraftOrder, draft_of
 from embomatrix.llm.loop import OnOneLoop
-from embomatrix.llm.patience import Patience
+from embomatrix.llm.patience import FailureLimit
 from embomatrix.llm.values import EndpointError, LlmError, UnusableReplyError
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ class ModelWriter(OnOneLoop):
         super().__init__(endpoint)
         self._agents = agents
         self._look = look
-        self._patience = Patience()
+        self._patience = FailureLimit()
         self._casts: dict[str, Cast] = {}
         self._sights: dict[str, Mapping[str, str]] = {}
 
@@ -65,13 +65,13 @@ class ModelWriter(OnOneLoop):
         category: TaskCategory,
         task_id: str,
         rng: np.random.Generator,
-    ) -> Draft | Refusal:
+    ) -> Draft | TaskRefusal:
         """A draft, or why the model gave none. Raises EndpointError where nobody answered a few times in a row."""
         return self.write_all(variant, view, [DraftOrder(category, task_id, rng)])[0]
 
     def write_all(
         self, variant: Variant, view: SceneView, orders: Sequence[DraftOrder]
-    ) -> list[Draft | Refusal]:
+    ) -> list[Draft | TaskRefusal]:
         """What comes of orders that are asked for at once; of the first alone where nobody makes up the people.
 
         Raises EndpointError where nobody answered a few times in a row.
@@ -79,7 +79,7 @@ class ModelWriter(OnOneLoop):
         answers = self._runner.run(self._answers(variant, view, orders))
         return [self._told(order, answer) for order, answer in zip(orders, answers, strict=False)]
 
-    def _told(self, order: DraftOrder, answer: Draft | LlmError) -> Draft | Refusal:
+    def _told(self, order: DraftOrder, answer: Draft | LlmError) -> Draft | TaskRefusal:
         if isinstance(answer, EndpointError):
             self._patience.unanswered(answer)
             return _refused(order.task_id, RefusalReason.NO_ANSWER, answer)
@@ -135,6 +135,6 @@ class ModelWriter(OnOneLoop):
             return {}
 
 
-def _refused(task_id: str, reason: RefusalReason, error: LlmError) -> Refusal:
+def _refused(task_id: str, reason: RefusalReason, error: LlmError) -> TaskRefusal:
     logger.warning("no draft %s: %s", task_id, error)
-    return Refusal(reason, str(error))
+    return TaskRefusal(reason, str(error))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from embomatrix.factory.writer.goals import Piece
+from embomatrix.factory.writer.goals import GoalConjunct
 from embomatrix.world.goal import Atom, Formula, Not
 from embomatrix.world.state import Relation
 
@@ -31,7 +31,7 @@ PLACED: Final = frozenset({Wanted.ONTOP, Wanted.INSIDE})
 THERMAL: Final = frozenset({Wanted.COOKED, Wanted.HOT, Wanted.FROZEN})
 
 
-class Wish(BaseModel):
+class RequestedAtom(BaseModel):
     """One atom. ``place`` is the host of a relation; ``holds`` false asks for the contrary: closed, switched off."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -48,7 +48,7 @@ class TaskRequest(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     instruction: str = Field(min_length=10, max_length=400)
-    wishes: tuple[Wish, ...] = Field(min_length=1, max_length=6)
+    wishes: tuple[RequestedAtom, ...] = Field(min_length=1, max_length=6)
 
 
 def check_request(request: TaskRequest, view: SceneView, known: frozenset[str]) -> None:
@@ -61,7 +61,7 @@ def check_request(request: TaskRequest, view: SceneView, known: frozenset[str]) 
         raise ValueError("the same wish stands there twice")
 
 
-def _problem(wish: Wish, view: SceneView, known: frozenset[str]) -> str:
+def _problem(wish: RequestedAtom, view: SceneView, known: frozenset[str]) -> str:
     for name in (wish.thing, *([wish.place] if wish.place else [])):
         if name not in known:
             return f"there is no {name!r}: use a name from the list, such as {min(known)!r}"
@@ -88,7 +88,7 @@ def _problem(wish: Wish, view: SceneView, known: frozenset[str]) -> str:
     return "" if works else _beyond(wish.thing)
 
 
-def _placing_problem(wish: Wish, view: SceneView) -> str:
+def _placing_problem(wish: RequestedAtom, view: SceneView) -> str:
     if not wish.holds:
         return "say where the thing is to be, not where it is not to be"
     if not wish.place:
@@ -112,11 +112,11 @@ def _beyond(name: str) -> str:
     return f"the robot tried, and does not get at {name}: ask for something else"
 
 
-def piece_of(wish: Wish, view: SceneView) -> Piece:
+def piece_of(wish: RequestedAtom, view: SceneView) -> GoalConjunct:
     """The wish as a piece of a goal. Its words stand in the request's instruction."""
     names = (wish.thing, wish.place) if wish.place else (wish.thing,)
     atom: Formula = Atom(wish.predicate.value, names)
     categories = ",".join(view.category(name) for name in names)
     kind = "place" if wish.predicate in PLACED else "thermal" if wish.predicate in THERMAL else "switch"
     sign = f"{'' if wish.holds else 'not '}{wish.predicate.value}({categories})"
-    return Piece(atom if wish.holds else Not(atom), "", names, (sign,), kind, wish.thing)
+    return GoalConjunct(atom if wish.holds else Not(atom), "", names, (sign,), kind, wish.thing)

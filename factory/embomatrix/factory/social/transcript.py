@@ -10,10 +10,12 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from embomatrix.factory.social.values import Cast, Conversation
-    from embomatrix.factory.writer.goals import Piece
+    from embomatrix.factory.writer.goals import GoalConjunct
 
 
-def transcript_of(cast: Cast, conversation: Conversation, instruction: str, pieces: Sequence[Piece]) -> str:
+def transcript_of(
+    cast: Cast, conversation: Conversation, instruction: str, pieces: Sequence[GoalConjunct]
+) -> str:
     """All that led to the task, for a reader."""
     slot = conversation.slot
     people = "\n".join(

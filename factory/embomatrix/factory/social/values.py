@@ -90,7 +90,7 @@ class Act(StrEnum):
     CONFIRM = "confirm"  # the robot says what it will do
 
 
-class Turn(_Value):
+class DialogueTurn(_Value):
     speaker: str
     act: Act
     text: str
@@ -100,7 +100,7 @@ class Conversation(_Value):
     """A dialogue about one request. ``first_wish`` and ``last_wishes`` tell how the request changed, clause by clause."""
 
     slot: DaySlot
-    turns: tuple[Turn, ...] = Field(min_length=2)
+    turns: tuple[DialogueTurn, ...] = Field(min_length=2)
     first_wish: str
     last_wishes: tuple[str, ...] = Field(min_length=1)
 
@@ -143,7 +143,7 @@ class SummaryBrief(_Value):
     seed: int = 0
 
 
-class Summary(_Value):
+class RequestSummary(_Value):
     """One instruction, and what it asks for: clauses of the conversation, or a model's wishes as JSON."""
 
     instruction: str

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.factory.social.casting import GrammarRolePlayer
-from embomatrix.factory.social.conversing import GrammarConversation, Scenario
+from embomatrix.factory.social.conversing import ConversationScenario, GrammarConversation
 from embomatrix.factory.social.fitting import best_slot, why_of
 from embomatrix.factory.social.phrases import CLAUSES, MANNERS, NOUNS, WHENCE, WHERE, room_called
 from embomatrix.factory.social.summary import instruction_of
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from embomatrix.factory.social.casting import RolePlayingAgent
     from embomatrix.factory.social.values import Cast, Conversation, DaySlot
-    from embomatrix.factory.writer.goals import Piece
+    from embomatrix.factory.writer.goals import GoalConjunct
     from embomatrix.factory.writer.variant import Variant
     from embomatrix.factory.writer.view import SceneView
     from embomatrix.world.scene import Scene
@@ -41,7 +41,7 @@ GOALS_TRIED: Final = 10
 class Talked:
     """A conversation with what led to it; ``shop`` and ``voice`` are for what is still to be said."""
 
-    scenario: Scenario
+    scenario: ConversationScenario
     conversation: Conversation
     shop: Workshop
     voice: FreshVoice
@@ -116,17 +116,19 @@ class SocialWriter:
         return Talked(chosen, talk, shop, voice)
 
 
-def _wish_of(pieces: Sequence[Piece]) -> str:
+def _wish_of(pieces: Sequence[GoalConjunct]) -> str:
     """The kind of a goal: nobody asks for the same again while there is something else to ask for."""
     return " ".join(sign for piece in pieces for sign in piece.signs)
 
 
-def _scenario(cast: Cast, shop: Workshop, category: TaskCategory, said: Counter[str]) -> Scenario | None:
+def _scenario(
+    cast: Cast, shop: Workshop, category: TaskCategory, said: Counter[str]
+) -> ConversationScenario | None:
     """Of some goals that the scene allows, that which suits best somebody's day; None where nobody would wish for any.
 
     The clauses of goals that are not taken count as said: so the words stay fresh for whatever is tried next.
     """
-    best: tuple[float, tuple[Piece, ...], DaySlot] | None = None
+    best: tuple[float, tuple[GoalConjunct, ...], DaySlot] | None = None
     for _ in range(GOALS_TRIED):
         pieces = tuple(pieces_of(shop, category))
         found = best_slot(cast, pieces, shop.view, said) if pieces else None
@@ -138,4 +140,4 @@ def _scenario(cast: Cast, shop: Workshop, category: TaskCategory, said: Counter[
     if best is None:
         return None
     _, pieces, slot = best
-    return Scenario(cast, slot, pieces, FreshVoice(shop.rng, said).choose(why_of(slot.activity)))
+    return ConversationScenario(cast, slot, pieces, FreshVoice(shop.rng, said).choose(why_of(slot.activity)))

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Final, TypeVar
 
 from embomatrix.factory.admission import MOST_HELD, Admitted, admit
 from embomatrix.factory.pipeline.poses import Needs, SceneSurvey, cache_poses
-from embomatrix.factory.refusal import Refusal, RefusalReason
+from embomatrix.factory.refusal import RefusalReason, TaskRefusal
 from embomatrix.factory.task_import.demands import demands_of
 from embomatrix.factory.task_import.dialects import read_problem
 from embomatrix.factory.task_import.neighbours import neighbours_of
 from embomatrix.factory.task_import.sources import BEHAVIOR, EAI
-from embomatrix.factory.task_import.task import Imported, Manner, import_problem
+from embomatrix.factory.task_import.task import ImportedTask, Manner, import_problem
 from embomatrix.factory.writer.view import SceneView
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.floor.prepared import prepare
@@ -74,7 +74,7 @@ class Verified:
 
 def bind_first(
     source: SourceText, bases: Sequence[Scene], *, seed: int = 0, manner: Manner | None = None
-) -> Imported | Refusal:
+) -> ImportedTask | TaskRefusal:
     """The problem in the first scene that it can be bound to, else the refusal that came furthest. Raises BddlError.
 
     The scene that it was written for comes first, then those that have all furniture, then those that lack some.
@@ -84,7 +84,7 @@ def bind_first(
 
 def imports(
     source: SourceText, bases: Sequence[Scene], *, seed: int, manner: Manner, draws: int = 1
-) -> Iterator[Imported | Refusal]:
+) -> Iterator[ImportedTask | TaskRefusal]:
     """The problem in each scene as it is, then, where the manner says so, in each with the furniture that it lacks.
 
     Last come the same scenes with their rooms counted otherwise. The scene that it was written for comes before all that,
@@ -97,9 +97,9 @@ def imports(
         drawn = seed + draw * STRIDE
         outcome = import_problem(source, base, seed=drawn, manner=as_it_is)
         yield outcome
-        if isinstance(outcome, Refusal) and outcome.reason in OF_THE_PROBLEM:
+        if isinstance(outcome, TaskRefusal) and outcome.reason in OF_THE_PROBLEM:
             return
-        if isinstance(outcome, Refusal) and manner.furnishing:
+        if isinstance(outcome, TaskRefusal) and manner.furnishing:
             yield import_problem(source, base, seed=drawn, manner=manner)
     rounds = [(as_it_is, others)]
     if manner.furnishing:
@@ -109,7 +109,7 @@ def imports(
         for base in scenes:
             outcome = import_problem(source, base, seed=seed, manner=tried)
             yield outcome
-            if not isinstance(outcome, Refusal):
+            if not isinstance(outcome, TaskRefusal):
                 continue
             if outcome.reason in OF_THE_PROBLEM:
                 return
@@ -126,25 +126,25 @@ def verify_first(
     *,
     seed: int = 0,
     manner: Manner | None = None,
-) -> Verified | Refusal:
+) -> Verified | TaskRefusal:
     """The problem in the first scene in which it is admitted, else the refusal that came furthest. Raises BddlError.
 
     The scene that it was written for comes first, then those that have all furniture, then those that lack some.
     """
 
-    def judged() -> Iterator[Verified | Refusal]:
+    def judged() -> Iterator[Verified | TaskRefusal]:
         given = manner or Manner()
         for tried in (given, replace(given, snug=True)) if shares_room(source) else (given,):
             laid_out, misfits, told = 0, 0, list[str]()
             for imported in imports(source, bases, seed=seed, manner=tried, draws=DRAWS):
-                if isinstance(imported, Refusal):
+                if isinstance(imported, TaskRefusal):
                     misfits += imported.reason is RefusalReason.DOES_NOT_FIT
                     yield imported
                     continue
                 judged = verify(imported, library, foresight, seed=seed)
                 yield judged
                 laid_out += 1
-                told.append(judged.sentence if isinstance(judged, Refusal) else "")
+                told.append(judged.sentence if isinstance(judged, TaskRefusal) else "")
                 alike = told[-MOST_ALIKE:].count(told[-1])
                 if laid_out == MOST_UNSOLVED or alike == MOST_ALIKE:
                     break
@@ -160,13 +160,13 @@ def shares_room(source: SourceText) -> bool:
     return any(max(len(each.contents), len(each.burden)) > 1 for each in demands_of(problem).values())
 
 
-T = TypeVar("T", Imported, Verified)
+T = TypeVar("T", ImportedTask, Verified)
 
 
-def _first(outcomes: Iterable[T | Refusal]) -> T | Refusal:
-    refusals: list[Refusal] = []
+def _first(outcomes: Iterable[T | TaskRefusal]) -> T | TaskRefusal:
+    refusals: list[TaskRefusal] = []
     for outcome in outcomes:
-        if not isinstance(outcome, Refusal):
+        if not isinstance(outcome, TaskRefusal):
             return outcome
         refusals.append(outcome)
     if not refusals:
@@ -176,8 +176,8 @@ def _first(outcomes: Iterable[T | Refusal]) -> T | Refusal:
 
 
 def verify(
-    imported: Imported, library: PlacementLibrary, foresight: Foresight | None, *, seed: int = 0
-) -> Verified | Refusal:
+    imported: ImportedTask, library: PlacementLibrary, foresight: Foresight | None, *, seed: int = 0
+) -> Verified | TaskRefusal:
     """Judge an imported task by execution, and pack it when it is admitted. Without ``foresight`` the arm is not asked."""
     poses = poses_for(imported, SceneView(imported.scene), library, foresight, seed)
     with contextlib.closing(Simulator(Bundle(imported.scene, {}, poses))) as stage:
@@ -198,7 +198,7 @@ def verify(
 
 
 def poses_for(
-    imported: Imported, view: SceneView, library: PlacementLibrary, foresight: Foresight | None, seed: int
+    imported: ImportedTask, view: SceneView, library: PlacementLibrary, foresight: Foresight | None, seed: int
 ) -> PoseCache:
     """The pose cache of an imported task's scene."""
     task = imported.task

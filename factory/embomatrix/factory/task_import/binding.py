@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-    from embomatrix.world.bddl import Problem
+    from embomatrix.world.bddl import BddlProblem
     from embomatrix.world.scene import Scene
 
 PLACING: Final = (Relation.INSIDE, Relation.ONTOP, Relation.UNDER, Relation.NEXTTO)
@@ -56,7 +56,7 @@ class Binding:
     ``problem`` is the one that was bound, with its wildcards spelt out.
     """
 
-    problem: Problem
+    problem: BddlProblem
     found: Mapping[str, str]
     floors: Mapping[str, str]
     additions: tuple[Addition, ...]
@@ -66,7 +66,7 @@ class Binding:
 
 
 def bind(
-    problem: Problem,
+    problem: BddlProblem,
     scene: Scene,
     rng: np.random.Generator,
     *,
@@ -107,7 +107,9 @@ def bind(
     return Binding(problem, found, floors, additions, rooms, _robot_room(problem, placed, floors, scene))
 
 
-def _spelt_out(problem: Problem, view: SceneView, rooms: Mapping[str, str], found: dict[str, str]) -> Problem:
+def _spelt_out(
+    problem: BddlProblem, view: SceneView, rooms: Mapping[str, str], found: dict[str, str]
+) -> BddlProblem:
     """The problem with wildcards replaced by all further objects of the type in the room, which are added to ``found``."""
     catalog = Catalog.load()
     members: dict[str, tuple[str, ...]] = {}
@@ -126,7 +128,7 @@ def _spelt_out(problem: Problem, view: SceneView, rooms: Mapping[str, str], foun
     return problem.spelt_out(members)
 
 
-def _placements(problem: Problem) -> dict[str, tuple[Relation, str]]:
+def _placements(problem: BddlProblem) -> dict[str, tuple[Relation, str]]:
     """How ``:init`` places each object that it places."""
     placed: dict[str, tuple[Relation, str]] = {}
     for relation in PLACING:
@@ -137,7 +139,7 @@ def _placements(problem: Problem) -> dict[str, tuple[Relation, str]]:
 
 
 def _in_order(
-    problem: Problem,
+    problem: BddlProblem,
     placed: Mapping[str, tuple[Relation, str]],
     found: Mapping[str, str],
     floors: Mapping[str, str],
@@ -167,7 +169,7 @@ def _in_order(
     return tuple(additions)
 
 
-def _neighbours(problem: Problem, name: str, ready: Container[str]) -> tuple[str, ...]:
+def _neighbours(problem: BddlProblem, name: str, ready: Container[str]) -> tuple[str, ...]:
     """Objects that are there before and that the start puts next to one, in either order."""
     pairs = (
         item.atom.args for item in problem.init if item.positive and item.atom.predicate == Relation.NEXTTO
@@ -176,7 +178,7 @@ def _neighbours(problem: Problem, name: str, ready: Container[str]) -> tuple[str
     return tuple(dict.fromkeys(other for other in others if other in ready))
 
 
-def _to_add(problem: Problem, ready: Container[str]) -> list[str]:
+def _to_add(problem: BddlProblem, ready: Container[str]) -> list[str]:
     """The problem's objects that the scene lacks: no halves, which come of slicing, and nothing without a body."""
     absent = {half for halves in pieces_of(problem).values() for half in halves}
     return [
@@ -199,7 +201,7 @@ def _place_of(at: tuple[Relation, str], floors: Mapping[str, str]) -> tuple[Rela
 
 
 def _robot_room(
-    problem: Problem, placed: Mapping[str, tuple[Relation, str]], floors: Mapping[str, str], scene: Scene
+    problem: BddlProblem, placed: Mapping[str, tuple[Relation, str]], floors: Mapping[str, str], scene: Scene
 ) -> str:
     for name, type_name in problem.objects.items():
         if type_name == AGENT and name in placed:

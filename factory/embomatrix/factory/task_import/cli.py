@@ -15,13 +15,13 @@ from embomatrix.factory.evaluate.figures import EvaluationError, evaluation_to_j
 from embomatrix.factory.outcome_log import LineLog
 from embomatrix.factory.pipeline.options import Jobs, processes
 from embomatrix.factory.pipeline.settings import scene_ids
-from embomatrix.factory.refusal import Refusal
+from embomatrix.factory.refusal import TaskRefusal
 from embomatrix.factory.task_import.batch import Verified
 from embomatrix.factory.task_import.dialects import read_problem
 from embomatrix.factory.task_import.judges import Depth, Docket, judging
 from embomatrix.factory.task_import.reach import unreachable_atoms
 from embomatrix.factory.task_import.report import (
-    Outcome,
+    ProblemOutcome,
     evaluation_of,
     outcome_from_json,
     report_to_json,
@@ -29,7 +29,7 @@ from embomatrix.factory.task_import.report import (
     solved_of,
 )
 from embomatrix.factory.task_import.sources import (
-    SourceError,
+    ProblemSourceError,
     SourceText,
     activity_names,
     read_activity,
@@ -47,8 +47,8 @@ from embomatrix.world.whole_file import check_writable, write_whole
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from embomatrix.factory.evaluate.figures import Evaluation
-    from embomatrix.factory.task_import.task import Imported
+    from embomatrix.factory.evaluate.figures import EvaluationFigures
+    from embomatrix.factory.task_import.task import ImportedTask
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 EVERY_ACTIVITY = "all"
@@ -125,7 +125,7 @@ def import_(
         fail(f"no problem was admitted, so {out} was not written: `--bind-only` shows which could be bound")
 
 
-def _written(out: Path, made: Sequence[Imported | Verified | Refusal]) -> bool:
+def _written(out: Path, made: Sequence[ImportedTask | Verified | TaskRefusal]) -> bool:
     """Whether there was any task to put into the dataset."""
     verified = [item for item in made if isinstance(item, Verified)]
     if verified:
@@ -138,9 +138,9 @@ def _taken_up(
     path: Path | None,
     sources: Sequence[SourceText],
     docket: Docket,
-) -> LineLog[Outcome]:
+) -> LineLog[ProblemOutcome]:
     """What is known already of the first of the problems. Raises EvaluationError where a file tells of others."""
-    log = LineLog[Outcome](path)
+    log = LineLog[ProblemOutcome](path)
     told = {
         "seed": docket.seed,
         "depth": docket.depth,
@@ -160,7 +160,7 @@ def _wanted(sources: Sequence[SourceText], profile: Profile | None, *, solids: b
     if profile is not None:
         found = [(source, problem) for source, problem in found if not unreachable_atoms(problem, profile)]
         if not found:
-            raise SourceError(
+            raise ProblemSourceError(
                 f"no goal of {len(sources)} problems is reached by the profile {profile.value!r}: leave out --reached-by"
             )
     if solids:
@@ -170,12 +170,15 @@ def _wanted(sources: Sequence[SourceText], profile: Profile | None, *, solids: b
             if not any(map(is_substance, problem.objects.values()))
         ]
         if not found:
-            raise SourceError("each of the problems names a liquid or a powder: leave out --solids")
+            raise ProblemSourceError("each of the problems names a liquid or a powder: leave out --solids")
     return [source for source, _ in found] if profile or solids else sources
 
 
 def _write(
-    outcomes: Sequence[Outcome], evaluation: Evaluation, report: Path | None, json_file: Path | None
+    outcomes: Sequence[ProblemOutcome],
+    evaluation: EvaluationFigures,
+    report: Path | None,
+    json_file: Path | None,
 ) -> None:
     if report is not None:
         write_whole(report, (json.dumps(report_to_json(outcomes), indent=1) + "\n").encode("ascii"))
@@ -187,13 +190,15 @@ def _write(
 def _check_free(out: Path, depth: Depth, outcomes: Path | None) -> None:
     """Nothing that is already there is overwritten, and nothing that could not be written is begun."""
     if depth is not Depth.VERIFY:
-        raise SourceError(
+        raise ProblemSourceError(
             f"to {depth.value} admits no task that could be written: leave out --out, or --bind-only and --instantiate"
         )
     if outcomes is not None:
-        raise SourceError("an import into a dataset is not taken up again: leave out --out, or --outcomes")
+        raise ProblemSourceError(
+            "an import into a dataset is not taken up again: leave out --out, or --outcomes"
+        )
     if (out / TASKS_FILE).exists():
-        raise SourceError(f"{out} holds a dataset already: name another folder with --out")
+        raise ProblemSourceError(f"{out} holds a dataset already: name another folder with --out")
     out.mkdir(parents=True, exist_ok=True)
 
 
@@ -202,7 +207,7 @@ def _parsed(source: SourceText) -> SourceText:
     try:
         read_problem(source)
     except BddlError as error:
-        raise SourceError(f"{source.name}: {error}") from error
+        raise ProblemSourceError(f"{source.name}: {error}") from error
     return source
 
 
@@ -214,7 +219,7 @@ def _sources(bddl: Path | None, activity: str, jsonl: Path | None, eai: Path | N
 def _given(bddl: Path | None, activity: str, jsonl: Path | None, eai: Path | None) -> Iterator[SourceText]:
     given = sum(map(bool, (bddl, activity, jsonl, eai)))
     if given != 1:
-        raise SourceError(
+        raise ProblemSourceError(
             f"found {given} sources: expected exactly one of --bddl FILE, --activity NAME, --jsonl FILE and --eai FOLDER"
         )
     if bddl is not None:
@@ -234,10 +239,10 @@ def _judged(
     sources: Sequence[SourceText],
     docket: Docket,
     jobs: int,
-    log: LineLog[Outcome],
-) -> list[Imported | Verified | Refusal]:
+    log: LineLog[ProblemOutcome],
+) -> list[ImportedTask | Verified | TaskRefusal]:
     """What becomes of these problems, but for those that another process has bound; each is added to the log."""
-    made: list[Imported | Verified | Refusal] = []
+    made: list[ImportedTask | Verified | TaskRefusal] = []
     done = len(log.outcomes)
     with progress(console) as bars, judging(docket, min(jobs, len(sources) or 1)) as judge:
         bar = bars.add_task("problems", total=done + len(sources), completed=done)
@@ -249,8 +254,8 @@ def _judged(
     return made
 
 
-def _print_one(console: Console, source: SourceText, outcome: Imported | Verified | Refusal) -> None:
-    if isinstance(outcome, Refusal):
+def _print_one(console: Console, source: SourceText, outcome: ImportedTask | Verified | TaskRefusal) -> None:
+    if isinstance(outcome, TaskRefusal):
         fail(f"{source.name} is refused ({outcome.reason}): {outcome.sentence}")
     for note in outcome.notes:
         console.print(note, highlight=False, markup=False)
@@ -263,7 +268,7 @@ def _print_one(console: Console, source: SourceText, outcome: Imported | Verifie
             console.print("  " + " ".join(map(str, call.values())), highlight=False, markup=False)
 
 
-def _print_outcomes(console: Console, outcomes: Sequence[Outcome], depth: Depth) -> None:
+def _print_outcomes(console: Console, outcomes: Sequence[ProblemOutcome], depth: Depth) -> None:
     done = "verified" if depth is Depth.VERIFY else "imported"
     counts = Counter(f"refused: {each.reason}" if each.reason else done for each in outcomes)
     table = Table("outcome", "problems")

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from embomatrix.world.asset import Asset, SupportSurface
-    from embomatrix.world.bddl import Problem
+    from embomatrix.world.bddl import BddlProblem
     from embomatrix.world.geometry import Vec3
     from embomatrix.world.goal import Atom
 
@@ -48,7 +48,7 @@ class Demand:
     """Types of what goes on top of it, one for each thing, as ``contents``."""
 
 
-def demands_of(problem: Problem) -> Mapping[str, Demand]:
+def demands_of(problem: BddlProblem) -> Mapping[str, Demand]:
     """Demands on objects, and on types that the goal's variables range over, by name."""
     fixtures = {item.atom.args[0] for item in problem.init if item.atom.predicate == Relation.INROOM}
     bears: set[str] = set()
@@ -100,7 +100,7 @@ def demand_on(demands: Mapping[str, Demand], name: str, type_name: str) -> Deman
     )
 
 
-class Room(IntEnum):
+class CavityFit(IntEnum):
     """What an asset has for things that are to go in, the best first."""
 
     FOR_ALL = 0  # floor for all of them, side by side
@@ -108,16 +108,16 @@ class Room(IntEnum):
     FOR_SOME = 2  # not even that
 
 
-def room_for(asset: Asset, contents: tuple[str, ...], relation: Relation = Relation.INSIDE) -> Room:
+def room_for(asset: Asset, contents: tuple[str, ...], relation: Relation = Relation.INSIDE) -> CavityFit:
     """What the cavities of an asset, or its surfaces, have for some types' smallest models."""
     floors = surfaces_for(asset, relation)
     sizes_m = [size_m for size_m in map(smallest_m, contents) if size_m is not None]
     if not all(any(_fits(size_m, floor) for floor in floors) for size_m in sizes_m):
-        return Room.FOR_SOME
+        return CavityFit.FOR_SOME
     return (
-        Room.FOR_ALL
+        CavityFit.FOR_ALL
         if floor_needed_m2(contents) <= sum(math.prod(floor.size_m) for floor in floors)
-        else Room.FOR_EACH
+        else CavityFit.FOR_EACH
     )
 
 
@@ -150,7 +150,7 @@ def smallest_m(type_name: str) -> Vec3 | None:
     return min(models, key=lambda pair: (pair[0], math.prod(pair[1][:2])))[1]
 
 
-def _is_so(problem: Problem, atom: Atom) -> bool:
+def _is_so(problem: BddlProblem, atom: Atom) -> bool:
     """Whether the start says so of everything that an atom of the goal is about."""
     first, second = (problem.types.get(name.lstrip("?"), (name.lstrip("?"),)) for name in atom.args)
     told = {
@@ -159,7 +159,7 @@ def _is_so(problem: Problem, atom: Atom) -> bool:
     return all(any((one, other) in told for other in second) for one in first)
 
 
-def _share(problem: Problem, thing: str, host: str) -> list[str]:
+def _share(problem: BddlProblem, thing: str, host: str) -> list[str]:
     """Types of what one host gets of things that may be many, as hosts may be: as many for each."""
     things = problem.types.get(thing, (thing,))
     hosts = problem.types.get(host, (host,))

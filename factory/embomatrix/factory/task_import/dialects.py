@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.task_import.expressible import FLOORS
 from embomatrix.factory.task_import.sources import EAI
-from embomatrix.world.bddl import Literal, is_room_instance, parse_problem
+from embomatrix.world.bddl import InitLiteral, is_room_instance, parse_problem
 from embomatrix.world.evaluate import map_atoms
 from embomatrix.world.goal import Atom
 from embomatrix.world.state import Relation
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from embomatrix.factory.task_import.sources import SourceText
-    from embomatrix.world.bddl import Problem
+    from embomatrix.world.bddl import BddlProblem
 
 
 RENAMED: Final[Mapping[str, tuple[str, ...]]] = {
@@ -143,7 +143,7 @@ _SWITCHED: Final = re.compile(r"\(\s*toggled_on\s+\??([a-z_\-]+\.n\.\d+)", re.IG
 
 
 @functools.lru_cache(maxsize=16)
-def read_problem(source: SourceText) -> tuple[Problem, tuple[str, ...]]:
+def read_problem(source: SourceText) -> tuple[BddlProblem, tuple[str, ...]]:
     """The problem of a source in the words of the catalog, whole, and what was read into it. Raises BddlError."""
     words = GROUPS if source.source == EAI else RENAMED
     text, replaced = in_catalog_words(source.text, {**words, **_lamps_for(source.text)})
@@ -170,7 +170,7 @@ def in_catalog_words(text: str, words: Mapping[str, tuple[str, ...]]) -> tuple[s
     return _TYPE.sub(lambda match: chosen.get(match[1].lower(), match[1]), text), notes
 
 
-def said_whole(problem: Problem) -> tuple[Problem, tuple[str, ...]]:
+def said_whole(problem: BddlProblem) -> tuple[BddlProblem, tuple[str, ...]]:
     """The problem with what it leaves unsaid, and a sentence for each addition.
 
     A room in the place of a host is the room that the thing is in. A floor whose room is not told is the floor of the room
@@ -181,7 +181,7 @@ def said_whole(problem: Problem) -> tuple[Problem, tuple[str, ...]]:
     return _placed(problem, notes), tuple(notes)
 
 
-def _rooms_as_rooms(problem: Problem, notes: list[str]) -> Problem:
+def _rooms_as_rooms(problem: BddlProblem, notes: list[str]) -> BddlProblem:
     def read(atom: Atom) -> Atom:
         host = atom.args[-1]
         names_room = host not in problem.objects and is_room_instance(host)
@@ -190,11 +190,11 @@ def _rooms_as_rooms(problem: Problem, notes: list[str]) -> Problem:
             return Atom(Relation.INROOM.value, atom.args)
         return atom
 
-    init = tuple(Literal(read(item.atom), item.positive) for item in problem.init)
+    init = tuple(InitLiteral(read(item.atom), item.positive) for item in problem.init)
     return dataclasses.replace(problem, init=init, goal=map_atoms(problem.goal, read))
 
 
-def _placed(problem: Problem, notes: list[str]) -> Problem:
+def _placed(problem: BddlProblem, notes: list[str]) -> BddlProblem:
     known = {
         item.atom.args[0]: item.atom.args[1]
         for item in problem.init
@@ -209,11 +209,11 @@ def _placed(problem: Problem, notes: list[str]) -> Problem:
     }
     if not known:
         return problem
-    added: list[Literal] = []
+    added: list[InitLiteral] = []
 
     def put(name: str, room: str) -> None:
         known[name] = room
-        added.append(Literal(Atom(Relation.INROOM.value, (name, room))))
+        added.append(InitLiteral(Atom(Relation.INROOM.value, (name, room))))
         notes.append(f"of {name} no room is told: it is taken to be that of {room}")
 
     first = next(iter(known.values()))

@@ -14,7 +14,7 @@ from embomatrix.world.state import Relation
 from embomatrix.world.substances import is_substance
 
 if TYPE_CHECKING:
-    from embomatrix.world.bddl import Problem
+    from embomatrix.world.bddl import BddlProblem
     from embomatrix.world.goal import Atom
 
 FLOORS: Final = frozenset({"floor.n.01", "driveway.n.01", "lawn.n.01"})
@@ -22,14 +22,14 @@ FLOORS: Final = frozenset({"floor.n.01", "driveway.n.01", "lawn.n.01"})
 AGENT: Final = "agent.n.01"
 
 
-def check_expressible(problem: Problem) -> None:
+def check_expressible(problem: BddlProblem) -> None:
     """Raise RefusedError for what no scene could hold and no skill could reach, whatever the scene."""
     _check_types(problem)
     _check_goal(problem)
     _check_start(problem)
 
 
-def check_evaluable(problem: Problem) -> None:
+def check_evaluable(problem: BddlProblem) -> None:
     """Raise RefusedError for what no scene could hold, or of which nobody could tell whether it holds. Reach is not asked."""
     _check_types(problem)
     for atom in atoms_of(problem.goal):
@@ -42,7 +42,7 @@ def check_evaluable(problem: Problem) -> None:
     _check_start(problem)
 
 
-def _check_types(problem: Problem) -> None:
+def _check_types(problem: BddlProblem) -> None:
     catalog = Catalog.load()
     for name, type_name in problem.objects.items():
         if type_name == AGENT or type_name in FLOORS:
@@ -63,7 +63,7 @@ def _close_synsets(type_name: str) -> str:
     return f": did you mean {', '.join(close)}?" if close else ""
 
 
-def _check_goal(problem: Problem) -> None:
+def _check_goal(problem: BddlProblem) -> None:
     obstacle = Horizon(problem).obstacle(problem.goal)
     if obstacle is not None:
         solid = not any(
@@ -77,7 +77,7 @@ def _check_goal(problem: Problem) -> None:
         _check_goal_args(problem, atom)
 
 
-def _check_start(problem: Problem) -> None:
+def _check_start(problem: BddlProblem) -> None:
     pieces = {half for halves in pieces_of(problem).values() for half in halves}
     for item in problem.init:
         predicate, args = item.atom.predicate, item.atom.args
@@ -99,12 +99,12 @@ def _check_start(problem: Problem) -> None:
             _check_no_room(problem, arg)
 
 
-def _type(problem: Problem, arg: str) -> str:
+def _type(problem: BddlProblem, arg: str) -> str:
     """Type of an object, or of a bound variable that is called by it, ``?water.n.06``."""
     return problem.objects.get(arg, arg.lstrip("?"))
 
 
-def _check_goal_args(problem: Problem, atom: Atom) -> None:
+def _check_goal_args(problem: BddlProblem, atom: Atom) -> None:
     objects = atom.args[:1] if atom.predicate == Relation.INROOM else atom.args
     for arg in objects:
         if arg.startswith("?"):
@@ -114,7 +114,7 @@ def _check_goal_args(problem: Problem, atom: Atom) -> None:
             raise RefusedError(RefusalReason.AGENT_IN_GOAL, "the goal is about where the robot stands")
 
 
-def _check_no_room(problem: Problem, arg: str) -> None:
+def _check_no_room(problem: BddlProblem, arg: str) -> None:
     if arg not in problem.objects and is_room_instance(arg):
         raise RefusedError(
             RefusalReason.ROOM_AS_OBJECT, f"{arg!r} is a room and stands where an object should"

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 from embomatrix.factory.evaluate.figures import EvaluationError
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.task_import.batch import Verified, bind_first, verify_first
-from embomatrix.factory.task_import.report import Outcome, outcome_of
-from embomatrix.factory.task_import.task import Imported, Manner
+from embomatrix.factory.task_import.report import ProblemOutcome, outcome_of
+from embomatrix.factory.task_import.task import ImportedTask, Manner
 from embomatrix.sim.physical.survey import Foresight
 from embomatrix.sim.placing.pose_cache import PlacementLibrary
 from embomatrix.sim.process_pool import shared_work
@@ -19,10 +19,10 @@ from embomatrix.sim.process_pool import shared_work
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from embomatrix.factory.refusal import Refusal
+    from embomatrix.factory.refusal import TaskRefusal
     from embomatrix.factory.task_import.sources import SourceText
 
-    Judging = Callable[[Sequence[SourceText]], Iterator["Judged"]]
+    Judging = Callable[[Sequence[SourceText]], Iterator["ImportOutcome"]]
     """Imports problems; what comes of them comes in their order."""
 
 
@@ -45,14 +45,14 @@ class Docket:
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
+class ImportOutcome:
     """What became of a problem, as a report tells it and as a value. What was only bound stays where it was made."""
 
-    outcome: Outcome
-    item: Imported | Verified | Refusal | None
+    outcome: ProblemOutcome
+    item: ImportedTask | Verified | TaskRefusal | None
 
 
-class Judge:
+class ProblemImporter:
     """Imports problems one after the other, with the base scenes and a client to settle things in. Close it after use."""
 
     def __init__(self, docket: Docket) -> None:
@@ -61,15 +61,15 @@ class Judge:
         self._foresight = Foresight() if docket.look_ahead else None
         self._library = PlacementLibrary()
 
-    def judge(self, source: SourceText) -> Judged:
+    def judge(self, source: SourceText) -> ImportOutcome:
         """Import one problem. Raises BddlError where it is none."""
         item = self._imported(source)
-        return Judged(outcome_of(source, item), item)
+        return ImportOutcome(outcome_of(source, item), item)
 
     def close(self) -> None:
         self._library.close()
 
-    def _imported(self, source: SourceText) -> Imported | Verified | Refusal:
+    def _imported(self, source: SourceText) -> ImportedTask | Verified | TaskRefusal:
         seed = self._docket.seed
         match self._docket.depth:
             case Depth.INSTANTIATE:
@@ -86,11 +86,13 @@ def judging(docket: Docket, jobs: int) -> Iterator[Judging]:
     died = EvaluationError(
         "a process that imports problems died, perhaps for want of memory: call the same command with fewer --jobs"
     )
-    with shared_work(jobs, Judge, Judge.judge if jobs == 1 else _sent, docket, died=died) as judge:
+    with shared_work(
+        jobs, ProblemImporter, ProblemImporter.judge if jobs == 1 else _sent, docket, died=died
+    ) as judge:
         yield judge
 
 
-def _sent(judge: Judge, source: SourceText) -> Judged:
+def _sent(judge: ProblemImporter, source: SourceText) -> ImportOutcome:
     """What another process tells."""
     judged = judge.judge(source)
-    return Judged(judged.outcome, None) if isinstance(judged.item, Imported) else judged
+    return ImportOutcome(judged.outcome, None) if isinstance(judged.item, ImportedTask) else judged

@@ -15,7 +15,7 @@ from embomatrix.world.task import TaskCategory
 if TYPE_CHECKING:
     from embomatrix.factory.task_import.sources import SourceText
     from embomatrix.factory.writer.view import SceneView
-    from embomatrix.world.bddl import Problem
+    from embomatrix.world.bddl import BddlProblem
     from embomatrix.world.goal import Formula
 
 KITCHEN: Final = frozenset({State.COOKED, State.FROZEN, State.HOT, State.SLICED, REAL})
@@ -27,7 +27,7 @@ _ROOM_OR_TEXT: Final = re.compile(
 )
 
 
-def instruction_of(source: SourceText, problem: Problem) -> str:
+def instruction_of(source: SourceText, problem: BddlProblem) -> str:
     """What a person asks for. The paper's tasks carry it as the problem's name, with underscores for spaces."""
     words = source.request or problem.name
     words = re.sub(r"-\d+$", "", words)

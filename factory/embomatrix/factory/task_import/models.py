@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from embomatrix.factory.task_import.binding import Addition
-    from embomatrix.factory.task_import.demands import Demand, Room
+    from embomatrix.factory.task_import.demands import CavityFit, Demand
     from embomatrix.world.asset import Asset
     from embomatrix.world.catalog import Model
 
@@ -57,7 +57,7 @@ def models_for(addition: Addition, rng: np.random.Generator, demand: Demand) -> 
     return able[:MODEL_TRIES]
 
 
-def _room(model: Model, demand: Demand) -> Room:
+def _room(model: Model, demand: Demand) -> CavityFit:
     return room_for(_asset(model), demand.contents)
 
 

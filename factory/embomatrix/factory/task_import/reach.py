@@ -41,7 +41,7 @@ from embomatrix.world.task import Profile
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from embomatrix.world.bddl import Problem
+    from embomatrix.world.bddl import BddlProblem
 
 INSOURCE: Final = "insource"
 REAL, FUTURE = "real", "future"
@@ -56,7 +56,7 @@ def profile_for(goal: Formula) -> Profile:
     return Profile.HOUSEHOLD if any(atom.predicate in HOUSEHOLD for atom in atoms_of(goal)) else Profile.PAPER
 
 
-def pieces_of(problem: Problem) -> Mapping[str, tuple[str, ...]]:
+def pieces_of(problem: BddlProblem) -> Mapping[str, tuple[str, ...]]:
     """Objects that can be sliced, and the absent objects of the problem that are their two halves."""
     future = [item.atom.args[0] for item in problem.init if item.positive and item.atom.predicate == FUTURE]
     waiting: dict[str, list[str]] = {}
@@ -71,7 +71,7 @@ def pieces_of(problem: Problem) -> Mapping[str, tuple[str, ...]]:
     return found
 
 
-def unreachable_atoms(problem: Problem, profile: Profile) -> tuple[str, ...]:
+def unreachable_atoms(problem: BddlProblem, profile: Profile) -> tuple[str, ...]:
     """Literals of the goal that no skill of the profile can make hold, in BDDL, each once.
 
     A literal about a variable counts when that is so for all that the variable ranges over.
@@ -112,7 +112,7 @@ def literals(
 class Horizon:
     """What can become of the objects of one problem by the skills of a profile."""
 
-    def __init__(self, problem: Problem, profile: Profile = Profile.HOUSEHOLD) -> None:
+    def __init__(self, problem: BddlProblem, profile: Profile = Profile.HOUSEHOLD) -> None:
         self._problem = problem
         self._profile = profile
         self._true = {_meaning(item.atom, problem) for item in problem.init if item.positive}
@@ -244,7 +244,7 @@ def _type_can(type_name: str, ability: str) -> bool:
     return any(ability in catalog.category(name).abilities for name in catalog.categories_of(type_name))
 
 
-def _meaning(atom: Atom, problem: Problem) -> Atom:
+def _meaning(atom: Atom, problem: BddlProblem) -> Atom:
     """The atom in one dialect: substances by their synsets, ``dusty`` and the like as facts about them, sources as holders."""
     names = tuple(
         problem.objects[arg] if is_substance(problem.objects.get(arg, "")) and index else arg

@@ -7,8 +7,8 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from embomatrix.factory.evaluate.figures import Evaluation
-from embomatrix.factory.refusal import Refusal
+from embomatrix.factory.evaluate.figures import EvaluationFigures
+from embomatrix.factory.refusal import TaskRefusal
 from embomatrix.factory.task_import.batch import Verified
 from embomatrix.factory.task_import.dialects import read_problem
 from embomatrix.factory.task_import.reach import unreachable_atoms
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from embomatrix.factory.task_import.sources import SourceText
-    from embomatrix.factory.task_import.task import Imported
+    from embomatrix.factory.task_import.task import ImportedTask
 
 FIGURES: Final[Mapping[str, tuple[str, float]]] = {
     "embomatrix": ("import_rate_sample", 0.97),
@@ -32,7 +32,7 @@ SOLVED_GOAL: Final = 0.95
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class ProblemOutcome:
     """One problem. ``scene`` is the base scene that it is bound to; empty, with reason and sentence, where it is refused.
 
     ``unreachable`` are the goal's literals that no skill makes hold, by profile; ``notes`` what was read into the problem.
@@ -51,27 +51,27 @@ class Outcome:
         return not self.reason
 
 
-def outcome_from_json(value: dict[str, Any]) -> Outcome:
+def outcome_from_json(value: dict[str, Any]) -> ProblemOutcome:
     """What `dataclasses.asdict` made of an outcome, read back from JSON. Raises KeyError, TypeError."""
     unreachable = {profile: tuple(atoms) for profile, atoms in value["unreachable"].items()}
-    return Outcome(**{**value, "unreachable": unreachable, "notes": tuple(value["notes"])})
+    return ProblemOutcome(**{**value, "unreachable": unreachable, "notes": tuple(value["notes"])})
 
 
-def outcome_of(source: SourceText, judged: Imported | Verified | Refusal) -> Outcome:
+def outcome_of(source: SourceText, judged: ImportedTask | Verified | TaskRefusal) -> ProblemOutcome:
     """What is told of a problem. Raises BddlError where the source is no BDDL."""
     problem, notes = read_problem(source)
     unreachable = {profile.value: unreachable_atoms(problem, profile) for profile in Profile}
-    if isinstance(judged, Refusal):
-        return Outcome(
+    if isinstance(judged, TaskRefusal):
+        return ProblemOutcome(
             source.name, source.source, "", judged.reason.value, judged.sentence, unreachable, notes
         )
     if isinstance(judged, Verified):
         scene = judged.record.task.scene_id.split("-")[0]
-        return Outcome(source.name, source.source, scene, "", "", unreachable, judged.notes)
-    return Outcome(source.name, source.source, judged.scene.base, "", "", unreachable, judged.notes)
+        return ProblemOutcome(source.name, source.source, scene, "", "", unreachable, judged.notes)
+    return ProblemOutcome(source.name, source.source, judged.scene.base, "", "", unreachable, judged.notes)
 
 
-def report_to_json(outcomes: Sequence[Outcome]) -> dict[str, Any]:
+def report_to_json(outcomes: Sequence[ProblemOutcome]) -> dict[str, Any]:
     """Plain JSON values: counts by outcome, then every problem."""
     return {
         "problems": len(outcomes),
@@ -81,7 +81,7 @@ def report_to_json(outcomes: Sequence[Outcome]) -> dict[str, Any]:
     }
 
 
-def report_to_markdown(outcomes: Sequence[Outcome]) -> str:
+def report_to_markdown(outcomes: Sequence[ProblemOutcome]) -> str:
     """The same for a reader: counts, what is refused and why, then what each profile can't reach, and what was read in."""
     bound = sum(outcome.is_bound for outcome in outcomes)
     lines = ["# Imported problems", "", f"{bound} of {len(outcomes)} are bound to a scene.", ""]
@@ -109,7 +109,7 @@ def report_to_markdown(outcomes: Sequence[Outcome]) -> str:
     return "\n".join(lines).rstrip() + "\n"
 
 
-def evaluation_of(outcomes: Sequence[Outcome], seed: int) -> Evaluation:
+def evaluation_of(outcomes: Sequence[ProblemOutcome], seed: int) -> EvaluationFigures:
     """Import rates by source, and how many goals each profile reaches."""
     figures: list[Figure] = []
     for source, (name, goal) in FIGURES.items():
@@ -121,10 +121,10 @@ def evaluation_of(outcomes: Sequence[Outcome], seed: int) -> Evaluation:
         for profile in Profile:
             reached = sum(not each.unreachable[profile.value] for each in mine)
             figures.append(Figure(f"{name} reached by {profile.value}", reached / n, "", Better.NEITHER, n))
-    return Evaluation("imports", {"seed": seed}, tuple(figures))
+    return EvaluationFigures("imports", {"seed": seed}, tuple(figures))
 
 
-def solved_of(outcomes: Sequence[Outcome], seed: int, *, solids: bool = False) -> Evaluation:
+def solved_of(outcomes: Sequence[ProblemOutcome], seed: int, *, solids: bool = False) -> EvaluationFigures:
     """By source, how many of the goals that a profile reaches the oracle solved in a scene: of problems that were verified.
 
     ``solids`` says that those with substances were left out.
@@ -143,4 +143,4 @@ def solved_of(outcomes: Sequence[Outcome], seed: int, *, solids: bool = False) -
                 goal = SOLVED_GOAL if profile is Profile.PAPER else None
                 share = sum(each.is_bound for each in mine) / len(mine)
                 figures.append(Figure(told, share, "", Better.HIGHER, len(mine), goal))
-    return Evaluation("imports", {"seed": seed}, tuple(figures))
+    return EvaluationFigures("imports", {"seed": seed}, tuple(figures))

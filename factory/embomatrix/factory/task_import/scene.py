@@ -16,7 +16,7 @@ from embomatrix.world.state import State, SubstanceFact, SubstanceRelation
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from embomatrix.world.bddl import Literal
+    from embomatrix.world.bddl import InitLiteral
     from embomatrix.world.scene import Scene, SceneObject
 
 
@@ -34,7 +34,7 @@ def with_robot_in(scene: Scene, room_name: str) -> Scene:
     return dataclasses.replace(scene, robot=RobotStart(float(x), float(y), 0.0, room_name))
 
 
-def with_states(scene: Scene, literals: Iterable[Literal]) -> Scene:
+def with_states(scene: Scene, literals: Iterable[InitLiteral]) -> Scene:
     """The scene with doors, symbolic states and substances as the literals say. Relations are passed over."""
     shares: dict[str, float] = {}
     facts: dict[str, set[SubstanceFact]] = {}

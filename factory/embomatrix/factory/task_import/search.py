@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from embomatrix.factory.writer.view import SceneView
     from embomatrix.world.asset import Asset
-    from embomatrix.world.bddl import Problem
+    from embomatrix.world.bddl import BddlProblem
     from embomatrix.world.scene import Scene
 
 MAX_STEPS: Final = 20_000
@@ -42,7 +42,7 @@ MAX_CHOICES: Final = 200
 
 
 def search(
-    problem: Problem,
+    problem: BddlProblem,
     view: SceneView,
     inroom: Mapping[str, str],
     fixtures: list[str],
@@ -112,7 +112,7 @@ def _room_choices(words: list[str], options: Mapping[str, list[str]]) -> Iterato
                 yield {words[0]: room, **rest}
 
 
-def needs_of(problem: Problem) -> Mapping[str, frozenset[str]]:
+def needs_of(problem: BddlProblem) -> Mapping[str, frozenset[str]]:
     """What an object, or a whole type, must be able to do for start and goal to make sense."""
     needs: defaultdict[str, set[str]] = defaultdict(set)
     for atom in (*atoms_of(problem.goal), *(item.atom for item in problem.init if item.positive)):
@@ -126,7 +126,7 @@ def needs_of(problem: Problem) -> Mapping[str, frozenset[str]]:
 
 
 def _assign(
-    problem: Problem,
+    problem: BddlProblem,
     view: SceneView,
     wanted: Mapping[str, str],
     needs: Mapping[str, frozenset[str]],
@@ -148,7 +148,7 @@ def _assign(
 
 
 def _domains(
-    problem: Problem,
+    problem: BddlProblem,
     view: SceneView,
     wanted: Mapping[str, str],
     needs: Mapping[str, frozenset[str]],

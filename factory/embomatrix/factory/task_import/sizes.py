@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.assets.library import build_asset
-from embomatrix.factory.task_import.demands import Demand, Room, floor_needed_m2, room_for
+from embomatrix.factory.task_import.demands import CavityFit, Demand, floor_needed_m2, room_for
 from embomatrix.factory.writer.view import is_liftable
 from embomatrix.sim.geometry.candidates import candidates, surfaces_for
 from embomatrix.sim.planner.ways import CANDIDATES, MIDDLE
@@ -34,7 +34,7 @@ KEPT: Final = 2
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class HostPlacement:
     """Where a thing is, or is to be: in ``relation`` to a host, at most at this share of its size."""
 
     relation: Relation
@@ -60,7 +60,7 @@ def sized(
     for addition in sorted(additions, key=lambda each: not demands[each.name].bears):
         demand = demands[addition.name] if snug else replace(demands[addition.name], burden=())
         places = [
-            Place(relation, host, _share_of_all(host, demands[name]) if snug else math.inf)
+            HostPlacement(relation, host, _share_of_all(host, demands[name]) if snug else math.inf)
             for relation, name in demand.places
             if (host := found.get(name) or _first(chosen.get(name, ()))) is not None
         ]
@@ -82,7 +82,7 @@ def _share_of_all(host: Asset, demand: Demand) -> float:
     return least
 
 
-def _ordered(models: list[Model], demand: Demand, places: Sequence[Place]) -> list[Model]:
+def _ordered(models: list[Model], demand: Demand, places: Sequence[HostPlacement]) -> list[Model]:
     most = max(SMALLER[-1], min((place.share for place in places), default=math.inf))
     fit = [model for model in models if model.share <= most and _suits(model, demand, places)]
     if fit:
@@ -96,7 +96,7 @@ def _ordered(models: list[Model], demand: Demand, places: Sequence[Place]) -> li
     return [*made[:KEPT], *models]
 
 
-def _grown(models: Sequence[Model], demand: Demand, places: Sequence[Place]) -> list[Model]:
+def _grown(models: Sequence[Model], demand: Demand, places: Sequence[HostPlacement]) -> list[Model]:
     """The models as large as can be, for more than any has room for: what goes in is made smaller too."""
     largest = [model.at(LARGER[-1]) for model in models if model.share == 1]
     less = replace(demand, contents=(), burden=())
@@ -110,13 +110,13 @@ def _resized(models: Sequence[Model], demand: Demand) -> Iterator[Model]:
             yield model.at(share)
 
 
-def _suits(model: Model, demand: Demand, places: Sequence[Place]) -> bool:
+def _suits(model: Model, demand: Demand, places: Sequence[HostPlacement]) -> bool:
     asset = _asset(model)
     if demand.carried and not _is_liftable(model):
         return False
-    if demand.contents and room_for(asset, demand.contents) is not Room.FOR_ALL:
+    if demand.contents and room_for(asset, demand.contents) is not CavityFit.FOR_ALL:
         return False
-    if demand.burden and room_for(asset, demand.burden, Relation.ONTOP) is not Room.FOR_ALL:
+    if demand.burden and room_for(asset, demand.burden, Relation.ONTOP) is not CavityFit.FOR_ALL:
         return False
     return all(_goes(asset, place) for place in places)
 
@@ -126,7 +126,7 @@ def _is_liftable(model: Model) -> bool:
     return is_liftable(asset.size_m, asset.mass_kg)
 
 
-def _goes(asset: Asset, place: Place) -> bool:
+def _goes(asset: Asset, place: HostPlacement) -> bool:
     """Whether a thing has a pose on or in its host, by geometry alone."""
     return next(candidates(asset, place.host, place.relation, MIDDLE, CANDIDATES), None) is not None
 

@@ -45,7 +45,7 @@ NAMESAKES: Final = frozenset(_NAMESAKES.split())
 """Activities of BEHAVIOR-1K that are called as tasks of EAI's: who was trained on them could not be examined by those."""
 
 
-class SourceError(ValueError):
+class ProblemSourceError(ValueError):
     """A source can't be read. The message is a sentence with the remedy."""
 
 
@@ -79,7 +79,7 @@ def read_activity(name: str) -> SourceText:
     if "/" in name or not path.is_file():
         close = difflib.get_close_matches(name, activity_names(), n=3)
         hint = f"did you mean {', '.join(close)}?" if close else "see the package's activity_manifest.txt"
-        raise SourceError(f"there is no activity {name!r} in the bddl package: {hint}")
+        raise ProblemSourceError(f"there is no activity {name!r} in the bddl package: {hint}")
     return SourceText(name, path.read_text(encoding="utf-8"), BEHAVIOR, request=name.replace("_", " "))
 
 
@@ -97,7 +97,7 @@ def read_jsonl(path: Path) -> Iterator[SourceText]:
             record = json.loads(line)
             name, text = record["name"], record["bddl"]
         except (ValueError, KeyError, TypeError) as error:
-            raise SourceError(f"{path}:{number}: expected an object with 'name' and 'bddl'") from error
+            raise ProblemSourceError(f"{path}:{number}: expected an object with 'name' and 'bddl'") from error
         yield SourceText(str(name), str(text), "embomatrix")
 
 
@@ -121,7 +121,7 @@ def read_eai(folder: Path) -> tuple[SourceText, ...]:
             for name, demo in sorted(stats.items())
         )
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise SourceError(
+        raise ProblemSourceError(
             f"{folder} holds no tasks of EAI ({error!r}): unpack the wheel of eai-eval 1.0.5 and name the folder that holds "
             f"{EAI_FOLDER}"
         ) from error
@@ -135,13 +135,17 @@ def _read(path: Path, *, at_most: int = MAX_RECORDS_BYTES) -> str:
     try:
         return read_whole(path, at_most=at_most).decode("utf-8")
     except OSError as error:
-        raise SourceError(f"{path} can't be read ({error.strerror}): name a file of BDDL problems") from error
+        raise ProblemSourceError(
+            f"{path} can't be read ({error.strerror}): name a file of BDDL problems"
+        ) from error
     except UnicodeDecodeError as error:
-        raise SourceError(f"{path} is no text in UTF-8: expected BDDL problems") from error
+        raise ProblemSourceError(f"{path} is no text in UTF-8: expected BDDL problems") from error
 
 
 def _definitions() -> Path:
     spec = importlib.util.find_spec("bddl")
     if spec is None or spec.origin is None:
-        raise SourceError("the activities of BEHAVIOR-1K are in the bddl package: pip install 'bddl==3.6.0'")
+        raise ProblemSourceError(
+            "the activities of BEHAVIOR-1K are in the bddl package: pip install 'bddl==3.6.0'"
+        )
     return Path(spec.origin).parent / "activity_definitions"

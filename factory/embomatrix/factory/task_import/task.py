@@ -15,9 +15,9 @@ from embomatrix.factory.assets.library import build_asset
 from embomatrix.factory.editor import SceneEditor, add_floor
 from embomatrix.factory.furnish.roles import is_portable
 from embomatrix.factory.layout.generator import lay
-from embomatrix.factory.layout.jobs import Item
+from embomatrix.factory.layout.jobs import RequestedObject
 from embomatrix.factory.layout.values import LayoutRelation
-from embomatrix.factory.refusal import Refusal, RefusalReason, RefusedError
+from embomatrix.factory.refusal import RefusalReason, RefusedError, TaskRefusal
 from embomatrix.factory.task_import.binding import bind
 from embomatrix.factory.task_import.demands import demand_on, demands_of
 from embomatrix.factory.task_import.dialects import read_problem
@@ -31,7 +31,7 @@ from embomatrix.factory.task_import.sizes import sized
 from embomatrix.factory.task_import.thermal import sources_for, taps_for
 from embomatrix.factory.writer.tasks import object_table
 from embomatrix.factory.writer.view import SceneView, is_liftable
-from embomatrix.world.bddl import Literal, is_room_instance
+from embomatrix.world.bddl import InitLiteral, is_room_instance
 from embomatrix.world.catalog import Catalog, share_of
 from embomatrix.world.evaluate import atoms_of, objects_of, render, substitute, types_of
 from embomatrix.world.goal import Atom
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from embomatrix.factory.task_import.binding import Addition, Binding
     from embomatrix.factory.task_import.sources import SourceText
     from embomatrix.world.asset import Asset
-    from embomatrix.world.bddl import Problem
+    from embomatrix.world.bddl import BddlProblem
     from embomatrix.world.catalog import Model
     from embomatrix.world.scene import Scene
 
@@ -55,7 +55,7 @@ if TYPE_CHECKING:
 class Lay(Protocol):
     """What puts a task's objects into a scene: ``layout.generator.lay``, or another method that it is compared with."""
 
-    def __call__(self, editor: SceneEditor, items: Sequence[Item], seed: int) -> Layout: ...
+    def __call__(self, editor: SceneEditor, items: Sequence[RequestedObject], seed: int) -> Layout: ...
 
 
 SHUNNED: Final = 3
@@ -65,12 +65,12 @@ REDRAWN: Final = 3
 
 
 @dataclass(frozen=True, slots=True)
-class Imported:
+class ImportedTask:
     """A task bound to a scene. ``init`` is what must hold at the start; the simulator has not seen it yet."""
 
     scene: Scene
     task: Task
-    init: tuple[Literal, ...]
+    init: tuple[InitLiteral, ...]
     about: tuple[str, ...]
     """The problem's objects, by their names in the scene."""
     rooms: tuple[str, ...]
@@ -99,7 +99,7 @@ class Manner:
 
 def import_problem(
     source: SourceText, base: Scene, *, seed: int = 0, manner: Manner | None = None
-) -> Imported | Refusal:
+) -> ImportedTask | TaskRefusal:
     """Bind a problem to a base scene and lay out what the scene lacks. Raises BddlError when the text can't be read."""
     problem, notes = read_problem(source)
     digest = hashlib.sha256(f"{seed} {base.scene_id} {source.text}".encode()).digest()
@@ -117,7 +117,7 @@ class _Binder:
     def __init__(
         self,
         source: SourceText,
-        problem: Problem,
+        problem: BddlProblem,
         base: Scene,
         rng: np.random.Generator,
         key: str,
@@ -132,7 +132,7 @@ class _Binder:
         self._scene_id = f"{base.base}-{_slug(source.name)}-{key}"
         self._demands = demands_of(problem)
 
-    def imported(self) -> Imported:
+    def imported(self) -> ImportedTask:
         binding, editor, names = self._bound()
         self._problem = binding.problem
         for whole, halves in pieces_of(self._problem).items():
@@ -261,11 +261,11 @@ class _Binder:
         found = {name: editor.asset_of(there) for name, there in binding.found.items()}
         return sized(orders, binding.additions, demands, found, snug=self._manner.snug)
 
-    def _item(self, addition: Addition, binding: Binding, models: Sequence[Model]) -> Item:
+    def _item(self, addition: Addition, binding: Binding, models: Sequence[Model]) -> RequestedObject:
         rooms = (addition.room,) if addition.room else tuple(dict.fromkeys(binding.rooms.values()))
         demanded = addition.relation is not None
         host = binding.found.get(addition.host, addition.host) or (addition.room if demanded else "")
-        return Item(
+        return RequestedObject(
             name=addition.name,
             models=tuple((model.category, model.model_id) for model in models),
             relation=LayoutRelation(addition.relation.value) if addition.relation else None,
@@ -287,8 +287,8 @@ class _Binder:
         return editor.add_pieces(whole, build_asset(catalog, model.category, model.model_id), len(halves))
 
     def _task(
-        self, scene: Scene, names: dict[str, str], binding: Binding, start: tuple[Literal, ...]
-    ) -> Imported:
+        self, scene: Scene, names: dict[str, str], binding: Binding, start: tuple[InitLiteral, ...]
+    ) -> ImportedTask:
         view = SceneView(scene)
         types = {
             type_name: tuple({**names, **self._substances}[name] for name in self._problem.types[type_name])
@@ -320,7 +320,7 @@ class _Binder:
         rooms = tuple(sorted({view.room(name) for name in about}))
         notes = self._notes(view, names, binding)
         signature = signature_of(goal, view)
-        return Imported(scene, task, start, tuple(names.values()), rooms, signature, tuple(names), notes)
+        return ImportedTask(scene, task, start, tuple(names.values()), rooms, signature, tuple(names), notes)
 
     def _notes(self, view: SceneView, names: Mapping[str, str], binding: Binding) -> tuple[str, ...]:
         """What was done to scene and problem to bring them together, a sentence each."""
@@ -346,7 +346,7 @@ class _Binder:
         )
         return (*added, *moved, *gone, *resized)
 
-    def _start(self, names: dict[str, str], binding: Binding) -> tuple[Literal, ...]:
+    def _start(self, names: dict[str, str], binding: Binding) -> tuple[InitLiteral, ...]:
         """``:init`` in the scene's names, without the floors that are no objects, the robot, and what is not the case.
 
         What a thing is the source of, a shaker of its salt, it contains; water flows out of a sink by itself.
@@ -358,7 +358,7 @@ class _Binder:
         }
         scene_names = {**names, **self._substances, **binding.rooms}
         return tuple(
-            Literal(_renamed(literal, scene_names), literal.positive)
+            InitLiteral(_renamed(literal, scene_names), literal.positive)
             for literal in self._problem.init
             if not skipped & set(literal.atom.args)
             and (literal.positive or literal.atom.predicate in SWITCHED)
@@ -377,7 +377,7 @@ def _is_liftable(asset: Asset) -> bool:
     return is_liftable(asset.size_m, asset.mass_kg)
 
 
-def _renamed(literal: Literal, names: dict[str, str]) -> Atom:
+def _renamed(literal: InitLiteral, names: dict[str, str]) -> Atom:
     predicate = literal.atom.predicate
     return Atom(
         SubstanceRelation.CONTAINS.value if predicate == INSOURCE else predicate,

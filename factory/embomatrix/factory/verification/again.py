@@ -48,7 +48,7 @@ class Look:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class VerificationOutcome:
     """What became of a task: the sentences of both modes, and whether two processes agree with each other and the dataset."""
 
     task: str
@@ -80,7 +80,7 @@ def verify_again(
     physical: bool,
     jobs: int,
     progress: Callable[[int], None] = lambda _done: None,
-) -> list[Verdict]:
+) -> list[VerificationOutcome]:
     """Judge records of a dataset, in their order; ``progress`` hears how many looks are done, two for each task.
 
     Raises DatasetError where a bundle can't be read, or a process dies.
@@ -103,11 +103,11 @@ def verify_again(
     return [verdict_of(first[task], second[task]) for task in (record.task.task_id for record in records)]
 
 
-def verdict_of(first: Look, second: Look) -> Verdict:
+def verdict_of(first: Look, second: Look) -> VerificationOutcome:
     """What two looks at one task come to."""
     same = (first.cached, first.digest) == (second.cached, second.digest)
     equal = same and first.same_plan and second.same_plan
-    return Verdict(first.task, first.cached or second.cached, equal, second.physical)
+    return VerificationOutcome(first.task, first.cached or second.cached, equal, second.physical)
 
 
 def _looked(orders: Sequence[_Order], jobs: int) -> Iterator[list[Look]]:

@@ -5,19 +5,21 @@ from __future__ import annotations
 from collections import Counter
 from typing import TYPE_CHECKING, Any, Final
 
-from embomatrix.factory.evaluate.figures import Evaluation
+from embomatrix.factory.evaluate.figures import EvaluationFigures
 from embomatrix.pages.figures import Better, Figure
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from embomatrix.factory.verification.again import Verdict
+    from embomatrix.factory.verification.again import VerificationOutcome
 
 GOAL_PERCENT: Final = 100.0
 PHYSICAL_GOAL_PERCENT: Final = 97.0
 
 
-def evaluation_of(verdicts: Sequence[Verdict], conditions: Mapping[str, Any]) -> Evaluation:
+def evaluation_of(
+    verdicts: Sequence[VerificationOutcome], conditions: Mapping[str, Any]
+) -> EvaluationFigures:
     """Shares in percent of the tasks, and the reasons against plans in physics, the commonest first."""
     physical = [verdict.physical for verdict in verdicts if verdict.physical is not None]
     figures = [
@@ -31,10 +33,10 @@ def evaluation_of(verdicts: Sequence[Verdict], conditions: Mapping[str, Any]) ->
     reasons = Counter(sentence.split(":")[0] for sentence in physical if sentence)
     told = ", ".join(f"{reason} {count}" for reason, count in reasons.most_common())
     notes = (f"Against plans in physics: {told}.",) if told else ()
-    return Evaluation("verification", conditions, tuple(figures), notes)
+    return EvaluationFigures("verification", conditions, tuple(figures), notes)
 
 
-def objections(verdicts: Sequence[Verdict]) -> Iterator[str]:
+def objections(verdicts: Sequence[VerificationOutcome]) -> Iterator[str]:
     """A line for each thing that speaks against a task."""
     for verdict in verdicts:
         if verdict.cached:

@@ -30,7 +30,7 @@ PICKS: Final = 4
 
 
 @dataclass(frozen=True, slots=True)
-class Piece:
+class GoalConjunct:
     """One conjunct of a goal. ``objects`` are all that it is about, ``signs`` its part of the goal's signature.
 
     ``clause`` asks for it; ``thing`` is what it is about, in words; ``kind`` is "place", "switch" or "thermal"; ``manner``
@@ -113,7 +113,7 @@ class Workshop:
         return [name for name in self.variant.added if self.view.is_portable(name) and name not in hosts]
 
 
-def place_piece(shop: Workshop) -> Piece | None:
+def place_piece(shop: Workshop) -> GoalConjunct | None:
     """Put a thing on or in another: furniture, an appliance or a basket."""
     thing = shop.pick(
         [name for name in shop.things() if not shop.view.is_basket(name)], shop.view.robot.fetches
@@ -123,7 +123,7 @@ def place_piece(shop: Workshop) -> Piece | None:
     return _placed(shop, thing, shop.refer_taken(thing))
 
 
-def _placed(shop: Workshop, thing: str, called: str) -> Piece | None:
+def _placed(shop: Workshop, thing: str, called: str) -> GoalConjunct | None:
     """Put the thing, called so in the request, on or in something that it is not at already and that is large enough."""
     view, rng = shop.view, shop.rng
     inside = rng.random() < 0.5
@@ -148,7 +148,7 @@ def _placed(shop: Workshop, thing: str, called: str) -> Piece | None:
         return None
     predicate = relation.value
     goal, types, objects, place = _one_of(shop, target, lambda host: Atom(predicate, (thing, host)))
-    return Piece(
+    return GoalConjunct(
         goal=goal,
         clause=shop.phrase(predicate, thing=called, place=place),
         objects=(thing, *objects),
@@ -159,7 +159,7 @@ def _placed(shop: Workshop, thing: str, called: str) -> Piece | None:
     )
 
 
-def placed_elsewhere(shop: Workshop, piece: Piece) -> Piece | None:
+def placed_elsewhere(shop: Workshop, piece: GoalConjunct) -> GoalConjunct | None:
     """The thing of a piece put in another place than the piece says; None where it is about no thing to be placed."""
     if piece.kind != "place":
         return None
@@ -185,7 +185,7 @@ def _one_of(
     )
 
 
-def switch_piece(shop: Workshop) -> Piece | None:
+def switch_piece(shop: Workshop) -> GoalConjunct | None:
     """Open or close a door, switch an appliance or a light on or off."""
     view, rng = shop.view, shop.rng
     name = shop.pick(shop.fixtures(view.is_switchable))
@@ -211,7 +211,7 @@ def switch_piece(shop: Workshop) -> Piece | None:
 
     goal, types, objects, words = _one_of(shop, name, atom)
     manner = _manner(view, name, predicate)
-    return Piece(
+    return GoalConjunct(
         goal=goal,
         clause=shop.phrase(kind, thing=words, manner=manner),
         objects=objects,
@@ -235,7 +235,7 @@ def _holds(view: SceneView, predicate: str, name: str) -> bool:
     return view.is_open(name) if predicate == "open" else view.is_on(name)
 
 
-def thermal_piece(shop: Workshop) -> Piece | None:
+def thermal_piece(shop: Workshop) -> GoalConjunct | None:
     """Heat, cook or freeze food with a source of the variant's rooms, and now and then leave it there."""
     view, rng = shop.view, shop.rng
     foods = [name for name in shop.things() if view.asset(name).can("cookable")]
@@ -253,7 +253,7 @@ def thermal_piece(shop: Workshop) -> Piece | None:
     return _thermal(shop, food, source, effects[int(rng.integers(len(effects)))].value)
 
 
-def _thermal(shop: Workshop, food: str, source: str, predicate: str) -> Piece:
+def _thermal(shop: Workshop, food: str, source: str, predicate: str) -> GoalConjunct:
     view, rng = shop.view, shop.rng
     place = shop.refer(source)
     goal: Formula = Atom(predicate, (food,))
@@ -266,10 +266,10 @@ def _thermal(shop: Workshop, food: str, source: str, predicate: str) -> Piece:
         objects = (food, source)
         signs = (*signs, f"inside({view.category(food)},{view.category(source)})")
         clause += f" and leave it in the {shop.noun(source)}"
-    return Piece(goal, clause, (*objects, *(view.alike(source))), signs, "thermal", called)
+    return GoalConjunct(goal, clause, (*objects, *(view.alike(source))), signs, "thermal", called)
 
 
-def serve_piece(shop: Workshop) -> Piece | None:
+def serve_piece(shop: Workshop) -> GoalConjunct | None:
     """Heat, cook or freeze food, then put it somewhere else."""
     first = thermal_piece(shop)
     if first is None or isinstance(first.goal, And):
@@ -278,7 +278,7 @@ def serve_piece(shop: Workshop) -> Piece | None:
     second = _placed(shop, food, "it")
     if second is None or set(second.objects[1:]) & set(first.objects[1:]):
         return None
-    return Piece(
+    return GoalConjunct(
         goal=And((first.goal, second.goal)),
         clause=f"{first.clause}, then {second.clause}",
         objects=tuple(dict.fromkeys((*first.objects, *second.objects))),

@@ -15,8 +15,8 @@ from embomatrix.sim.executor import Simulator
 from embomatrix.sim.planner.calls import StuckError
 from embomatrix.sim.planner.errands import Errands, Warming
 from embomatrix.sim.planner.script import PlanScript
-from embomatrix.sim.planner.ways import Placement
-from embomatrix.sim.planner.wishes import Wishes
+from embomatrix.sim.planner.ways import PlacementGoal
+from embomatrix.sim.planner.wishes import GoalLiterals
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.evaluate import evaluate, render
 from embomatrix.world.goal import Atom, Not
@@ -61,7 +61,7 @@ class Rehearsal:
 
     def puts(self, thing: str, relation: Relation, host: str) -> bool:
         """Whether it brings the thing on or into another, where it is not yet."""
-        placed = Errands((Placement(thing, relation, host),), (), {}, {}, ())
+        placed = Errands((PlacementGoal(thing, relation, host),), (), {}, {}, ())
         return self._brings_about(Atom(relation.value, (thing, host)), placed, thing, host)
 
     def swings(self, name: str, *, shut: bool) -> bool:
@@ -100,7 +100,7 @@ class Rehearsal:
         self, names: tuple[str, ...], goal: Formula | None, do: Callable[[PlanScript], None]
     ) -> bool:
         task = self._task_about(names)
-        script = PlanScript(self._simulator, task, SEED, Wishes())
+        script = PlanScript(self._simulator, task, SEED, GoalLiterals())
         if goal is not None and evaluate(goal, self._simulator.facts, {}):
             return False
         try:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 
-class Group(StrEnum):
+class ItemKind(StrEnum):
     """Kinds of small things that are found together."""
 
     FOOD = "food"
@@ -28,50 +28,50 @@ class Group(StrEnum):
     DECORATION = "decoration"
 
 
-MEMBERS: Final[Mapping[Group, tuple[str, ...]]] = {
-    Group.FOOD: (
+MEMBERS: Final[Mapping[ItemKind, tuple[str, ...]]] = {
+    ItemKind.FOOD: (
         "chicken_leg", "steak", "potato", "sweet_corn", "salmon", "hotdog", "pizza", "carrot", "bagel", "hamburger",
         "croissant", "broccoli", "mushroom", "eggplant", "beefsteak_tomato",
     ),
-    Group.FRUIT: ("apple", "banana", "orange", "pear", "peach", "lemon", "avocado"),
-    Group.TABLEWARE: (
+    ItemKind.FRUIT: ("apple", "banana", "orange", "pear", "peach", "lemon", "avocado"),
+    ItemKind.TABLEWARE: (
         "mug", "bowl", "plate", "teacup", "water_glass", "wineglass", "tablefork", "table_knife", "tablespoon",
         "chopping_board", "frying_pan", "saucepan",
     ),
-    Group.PACKAGES: (
+    ItemKind.PACKAGES: (
         "can_of_soda", "box_of_crackers", "box_of_cereal", "bottle_of_water", "carton_of_milk", "jar_of_jam",
         "bag_of_chips", "bottle_of_wine",
     ),
-    Group.BOOKS: ("hardback", "paperback_book", "comic_book", "notebook", "magazine", "newspaper"),
-    Group.TOYS: ("teddy_bear", "toy_car", "tennis_ball", "board_game", "jigsaw_puzzle", "toy_figure"),
-    Group.DEVICES: ("cell_phone", "digital_camera", "gaming_controller", "headset", "radio", "calculator"),
-    Group.OFFICE: ("pencil_case", "stapler", "folder", "envelope", "clipboard"),
-    Group.TOILETRIES: (
+    ItemKind.BOOKS: ("hardback", "paperback_book", "comic_book", "notebook", "magazine", "newspaper"),
+    ItemKind.TOYS: ("teddy_bear", "toy_car", "tennis_ball", "board_game", "jigsaw_puzzle", "toy_figure"),
+    ItemKind.DEVICES: ("cell_phone", "digital_camera", "gaming_controller", "headset", "radio", "calculator"),
+    ItemKind.OFFICE: ("pencil_case", "stapler", "folder", "envelope", "clipboard"),
+    ItemKind.TOILETRIES: (
         "toothbrush", "tube_of_toothpaste", "bar_soap", "hairbrush", "bottle_of_shampoo", "hand_towel", "sponge",
         "box_of_tissues", "toilet_paper", "comb",
     ),
-    Group.DECORATION: ("vase", "picture_frame", "alarm_clock", "pillar_candle", "snow_globe", "wallet", "eyeglasses"),
+    ItemKind.DECORATION: ("vase", "picture_frame", "alarm_clock", "pillar_candle", "snow_globe", "wallet", "eyeglasses"),
 }  # fmt: skip
 """Categories of each group. All of them can be carried; the food can be heated, cooked and frozen."""
 
-_KITCHEN: Final = (Group.FOOD, Group.FOOD, Group.FRUIT, Group.TABLEWARE, Group.PACKAGES)
-_DINING: Final = (Group.FRUIT, Group.TABLEWARE, Group.PACKAGES, Group.FOOD, Group.DECORATION)
-_LIVING: Final = (Group.BOOKS, Group.TOYS, Group.DEVICES, Group.DECORATION, Group.TABLEWARE)
-_OFFICE: Final = (Group.OFFICE, Group.BOOKS, Group.DEVICES, Group.TABLEWARE)
-_BATH: Final = (Group.TOILETRIES, Group.TOILETRIES, Group.DECORATION)
+_KITCHEN: Final = (ItemKind.FOOD, ItemKind.FOOD, ItemKind.FRUIT, ItemKind.TABLEWARE, ItemKind.PACKAGES)
+_DINING: Final = (ItemKind.FRUIT, ItemKind.TABLEWARE, ItemKind.PACKAGES, ItemKind.FOOD, ItemKind.DECORATION)
+_LIVING: Final = (ItemKind.BOOKS, ItemKind.TOYS, ItemKind.DEVICES, ItemKind.DECORATION, ItemKind.TABLEWARE)
+_OFFICE: Final = (ItemKind.OFFICE, ItemKind.BOOKS, ItemKind.DEVICES, ItemKind.TABLEWARE)
+_BATH: Final = (ItemKind.TOILETRIES, ItemKind.TOILETRIES, ItemKind.DECORATION)
 
-ROOM_GROUPS: Final[Mapping[str, tuple[Group, ...]]] = {
+ROOM_GROUPS: Final[Mapping[str, tuple[ItemKind, ...]]] = {
     "kitchen": _KITCHEN,
     "break_room": _KITCHEN,
     "pantry_room": _KITCHEN,
     "bar": _DINING,
     "dining_room": _DINING,
-    "grocery_store": (Group.PACKAGES, Group.FRUIT, Group.FOOD),
+    "grocery_store": (ItemKind.PACKAGES, ItemKind.FRUIT, ItemKind.FOOD),
     "living_room": _LIVING,
     "television_room": _LIVING,
-    "playroom": (Group.TOYS, Group.BOOKS),
-    "childs_room": (Group.TOYS, Group.BOOKS, Group.DECORATION),
-    "bedroom": (Group.BOOKS, Group.DECORATION, Group.DEVICES, Group.TOYS),
+    "playroom": (ItemKind.TOYS, ItemKind.BOOKS),
+    "childs_room": (ItemKind.TOYS, ItemKind.BOOKS, ItemKind.DECORATION),
+    "bedroom": (ItemKind.BOOKS, ItemKind.DECORATION, ItemKind.DEVICES, ItemKind.TOYS),
     "bathroom": _BATH,
     "spa": _BATH,
     "locker_room": _BATH,
@@ -82,16 +82,18 @@ ROOM_GROUPS: Final[Mapping[str, tuple[Group, ...]]] = {
     "meeting_room": _OFFICE,
     "copy_room": _OFFICE,
 }
-DEFAULT_GROUPS: Final = (Group.DECORATION, Group.BOOKS, Group.OFFICE)
+DEFAULT_GROUPS: Final = (ItemKind.DECORATION, ItemKind.BOOKS, ItemKind.OFFICE)
 
-_KITCHEN_GOODS: Final = frozenset({Group.FOOD, Group.FRUIT, Group.TABLEWARE, Group.PACKAGES})
-_SOFT_GOODS: Final = frozenset({Group.BOOKS, Group.TOYS, Group.DEVICES, Group.OFFICE, Group.DECORATION})
-_WASHABLE: Final = frozenset({Group.FRUIT, Group.FOOD, Group.TABLEWARE, Group.TOILETRIES})
-_COOKING: Final = frozenset({Group.FOOD, Group.FRUIT, Group.TABLEWARE})
-_ROASTED: Final = frozenset({Group.FOOD, Group.TABLEWARE})
-_NOTHING: Final[frozenset[Group]] = frozenset()
+_KITCHEN_GOODS: Final = frozenset({ItemKind.FOOD, ItemKind.FRUIT, ItemKind.TABLEWARE, ItemKind.PACKAGES})
+_SOFT_GOODS: Final = frozenset(
+    {ItemKind.BOOKS, ItemKind.TOYS, ItemKind.DEVICES, ItemKind.OFFICE, ItemKind.DECORATION}
+)
+_WASHABLE: Final = frozenset({ItemKind.FRUIT, ItemKind.FOOD, ItemKind.TABLEWARE, ItemKind.TOILETRIES})
+_COOKING: Final = frozenset({ItemKind.FOOD, ItemKind.FRUIT, ItemKind.TABLEWARE})
+_ROASTED: Final = frozenset({ItemKind.FOOD, ItemKind.TABLEWARE})
+_NOTHING: Final[frozenset[ItemKind]] = frozenset()
 
-HOST_GROUPS: Final[Mapping[str, frozenset[Group]]] = {
+HOST_GROUPS: Final[Mapping[str, frozenset[ItemKind]]] = {
     **dict.fromkeys(
         (
             "sofa", "armchair", "bed", "straight_chair", "swivel_chair", "ottoman", "taboret", "bench", "booth",
@@ -103,9 +105,9 @@ HOST_GROUPS: Final[Mapping[str, frozenset[Group]]] = {
     **dict.fromkeys(("stove", "flat_top_grill", "oven", "toaster_oven"), _ROASTED),
     "microwave": _COOKING,
     **dict.fromkeys(("fridge", "freezer", "cooler", "wine_fridge"), _KITCHEN_GOODS),
-    "dishwasher": frozenset({Group.TABLEWARE}),
-    **dict.fromkeys(MEMBERS[Group.TABLEWARE], frozenset({Group.FOOD, Group.FRUIT})),
-    **dict.fromkeys(MEMBERS[Group.DECORATION], _NOTHING),
+    "dishwasher": frozenset({ItemKind.TABLEWARE}),
+    **dict.fromkeys(MEMBERS[ItemKind.TABLEWARE], frozenset({ItemKind.FOOD, ItemKind.FRUIT})),
+    **dict.fromkeys(MEMBERS[ItemKind.DECORATION], _NOTHING),
     **dict.fromkeys(
         (
             "coffee_maker", "deep_fryer", "popcorn_machine", "toilet", "shower_stall", "bathtub", "pot_plant",
@@ -139,7 +141,7 @@ BASKETS: Final = ("wicker_basket", "storage_box")
 """Open containers that a variant may put on the floor or on a table."""
 
 
-def groups_for(room_type: str) -> tuple[Group, ...]:
+def groups_for(room_type: str) -> tuple[ItemKind, ...]:
     """Groups of small things that suit a room; the first are the most likely."""
     return ROOM_GROUPS.get(room_type, DEFAULT_GROUPS)
 

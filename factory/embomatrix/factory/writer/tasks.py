@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Protocol, runtime_checkable
 
 from embomatrix.factory.writer.goals import (
-    Piece,
+    GoalConjunct,
     Workshop,
     place_piece,
     serve_piece,
@@ -25,11 +25,11 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-    from embomatrix.factory.refusal import Refusal
+    from embomatrix.factory.refusal import TaskRefusal
     from embomatrix.factory.writer.variant import Variant
     from embomatrix.factory.writer.view import SceneView
 
-    Maker = Callable[[Workshop], Piece | None]
+    Maker = Callable[[Workshop], GoalConjunct | None]
 
 ROWS: Final = (16, 24)
 """Rows of an object table, least and most, where the rooms hold enough."""
@@ -95,7 +95,7 @@ class TaskWriter(Protocol):
         category: TaskCategory,
         task_id: str,
         rng: np.random.Generator,
-    ) -> Draft | Refusal | None:
+    ) -> Draft | TaskRefusal | None:
         """A task of the category, None when the variant's rooms hold nothing for one. The generator decides all.
 
         A refusal tells why whoever was asked for a task gave none.
@@ -112,7 +112,7 @@ class ManyAtOnce(Protocol):
 
     def write_all(
         self, variant: Variant, view: SceneView, orders: Sequence[DraftOrder]
-    ) -> Sequence[Draft | Refusal]:
+    ) -> Sequence[Draft | TaskRefusal]:
         """What came of the first so many of the orders, of one at least: a draft, or why there is none."""
         ...
 
@@ -135,7 +135,7 @@ class PlainWriter:
         return draft_of(shop, category, task_id, pieces, sentence([piece.clause for piece in pieces], rng))
 
 
-def pieces_of(shop: Workshop, category: TaskCategory) -> list[Piece]:
+def pieces_of(shop: Workshop, category: TaskCategory) -> list[GoalConjunct]:
     """Pieces that make up a goal of the category; none where the variant's rooms hold nothing for one."""
     recipes = _RECIPES[category]
     for _ in range(TRIES):
@@ -145,9 +145,9 @@ def pieces_of(shop: Workshop, category: TaskCategory) -> list[Piece]:
     return []
 
 
-def _made(shop: Workshop, recipe: Sequence[Maker]) -> list[Piece]:
+def _made(shop: Workshop, recipe: Sequence[Maker]) -> list[GoalConjunct]:
     """One piece by each maker about objects of its own, or none at all."""
-    pieces: list[Piece] = []
+    pieces: list[GoalConjunct] = []
     for make in recipe:
         used = frozenset(name for piece in pieces for name in piece.objects)
         piece = make(dataclasses.replace(shop, used=used))
@@ -163,7 +163,7 @@ def draft_of(
     shop: Workshop,
     category: TaskCategory,
     task_id: str,
-    pieces: Sequence[Piece],
+    pieces: Sequence[GoalConjunct],
     instruction: str,
     transcript: str = "",
 ) -> Draft:

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.editor import SceneEditor
 from embomatrix.factory.layout.generator import lay
-from embomatrix.factory.layout.jobs import Item
+from embomatrix.factory.layout.jobs import RequestedObject
 from embomatrix.factory.writer.starts import OpenStarts
-from embomatrix.factory.writer.tables import BASKETS, MEMBERS, Group, belongs, groups_for, is_left_on
+from embomatrix.factory.writer.tables import BASKETS, MEMBERS, ItemKind, belongs, groups_for, is_left_on
 from embomatrix.factory.writer.view import SceneView, is_liftable
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.state import State
@@ -75,7 +75,7 @@ def _is_in_its_place(editor: SceneEditor, name: str) -> bool:
     return bool(host) and is_left_on(category, editor.asset_of(host).category)
 
 
-def _things(view: SceneView, rooms: Sequence[str], rng: np.random.Generator) -> list[Item]:
+def _things(view: SceneView, rooms: Sequence[str], rng: np.random.Generator) -> list[RequestedObject]:
     """What goes into the rooms: a basket now and then, and things that suit them, each of another category than what is there.
 
     So words can tell them apart. Which of the rooms that suit a thing it goes to is not decided here.
@@ -90,13 +90,13 @@ def _things(view: SceneView, rooms: Sequence[str], rng: np.random.Generator) -> 
         fresh = (name for name in _categories(types[room], rng) if name not in present | chosen.keys())
         for name in itertools.islice(fresh, share):
             chosen[name] = tuple(each for each in rooms if belongs(name, types[each]))
-    return [Item(name, _models(name, rng), rooms=where) for name, where in chosen.items()]
+    return [RequestedObject(name, _models(name, rng), rooms=where) for name, where in chosen.items()]
 
 
 def _categories(room_type: str, rng: np.random.Generator) -> list[str]:
     """Categories that suit a room, in random order, the likelier groups first."""
     groups = groups_for(room_type)
-    pools: dict[Group, list[str]] = {
+    pools: dict[ItemKind, list[str]] = {
         group: [str(name) for name in rng.permutation(MEMBERS[group])] for group in dict.fromkeys(groups)
     }
     order: list[str] = []

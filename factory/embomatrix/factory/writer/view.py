@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import cached_property
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.furnish.roles import Role, role_of
+from embomatrix.factory.furnish.roles import FurnitureRole, role_of
 from embomatrix.factory.scenes.joints import bumped_into
 from embomatrix.factory.scenes.solids import Solids
 from embomatrix.factory.writer.robot import AnyRobot
@@ -89,7 +89,7 @@ class SceneView:
         if item.host and item.relation is not None:
             return f"{item.relation.value} {item.host}"
         asset = self.asset(name)
-        if role_of(asset.category, asset.size_m, asset.mass_kg) is Role.CEILING:
+        if role_of(asset.category, asset.size_m, asset.mass_kg) is FurnitureRole.CEILING:
             return "under the ceiling"
         return "on the wall" if self.scene.box_of(name).low_m[2] > HUNG_M else "on the floor"
 

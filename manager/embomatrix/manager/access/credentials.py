@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.store.protocol import ShelfRow
-from embomatrix.rpc.roles import Role, TokenInfo
+from embomatrix.rpc.roles import AccessRole, TokenInfo
 from embomatrix.rpc.status import (
     InvalidRequestError,
     NotAllowedError,
@@ -45,7 +45,7 @@ class Credential:
     """A token without its secret. Times are seconds since 1970, by the manager's clock."""
 
     token_id: str
-    role: Role
+    role: AccessRole
     secret_hash: str
     label: str = ""
     expires_s: float = 0.0
@@ -62,7 +62,7 @@ class Credential:
     @classmethod
     def from_row(cls, row: ShelfRow) -> Credential:
         fields = json.loads(row.payload)
-        return cls(**{**fields, "role": Role(fields["role"])})
+        return cls(**{**fields, "role": AccessRole(fields["role"])})
 
     def row(self) -> ShelfRow:
         return ShelfRow(self.token_id, json.dumps(asdict(self), separators=(",", ":")).encode())
@@ -105,7 +105,7 @@ class CredentialBook:
     def keep(self, *credentials: Credential) -> None:
         for credential in credentials:
             self._by_id[credential.token_id] = credential
-            if credential.role is Role.WORKER and credential.worker_id:
+            if credential.role is AccessRole.WORKER and credential.worker_id:
                 self._of_worker.setdefault(credential.worker_id, {})[credential.token_id] = credential
 
     def find(self, token: str, *, now_s: float) -> Credential:
@@ -129,12 +129,12 @@ class CredentialBook:
         return credential
 
     def issue(
-        self, role: Role, *, valid_s: float, label: str, now_s: float, worker_id: str = ""
+        self, role: AccessRole, *, valid_s: float, label: str, now_s: float, worker_id: str = ""
     ) -> tuple[Credential, str]:
         """A new credential, and the token that is told once. ``valid_s`` 0: until revoked, or a day for one to join."""
         if not 0.0 <= valid_s < float("inf"):
             raise InvalidRequestError(f"a token's validity is {valid_s} s: expected 0 or more")
-        if role is Role.JOIN:
+        if role is AccessRole.JOIN:
             valid_s = valid_s or LONGEST_JOIN_S
             if valid_s > LONGEST_JOIN_S:
                 raise InvalidRequestError(
@@ -180,7 +180,9 @@ class CredentialBook:
             raise NotAllowedError(
                 f"another machine joined as worker {worker_id}: pass another --name, or have its credential revoked first"
             )
-        own, token = self.issue(Role.WORKER, valid_s=0.0, label=join.label, now_s=now_s, worker_id=worker_id)
+        own, token = self.issue(
+            AccessRole.WORKER, valid_s=0.0, label=join.label, now_s=now_s, worker_id=worker_id
+        )
         own = replace(own, joined_by=join.token_id)
         used = replace(join, worker_id=worker_id, boot_id=boot_id)
         return (own, used, *changed), token
@@ -215,7 +217,9 @@ class CredentialBook:
         own = self._credentials_of(worker_id)
         if own:
             return tuple(replace(c, revoked=reason) for c in own)
-        return (Credential(self._make_id(), Role.WORKER, _NOTHING, worker_id=worker_id, revoked=reason),)
+        return (
+            Credential(self._make_id(), AccessRole.WORKER, _NOTHING, worker_id=worker_id, revoked=reason),
+        )
 
     def knows_worker(self, worker_id: str) -> bool:
         """Whether a credential belongs to this name, be it void."""
@@ -228,7 +232,7 @@ class CredentialBook:
             for c in self._by_id.values()
             if not c.revoked
             and not (c.expires_s and now_s >= c.expires_s)
-            and not (c.role is Role.JOIN and c.worker_id)
+            and not (c.role is AccessRole.JOIN and c.worker_id)
         )
 
     def _credentials_of(self, worker_id: str) -> list[Credential]:

@@ -19,14 +19,14 @@ from embomatrix.manager.access.certificates import (
 )
 from embomatrix.manager.access.credentials import LONGEST_JOIN_S, Credential, CredentialBook
 from embomatrix.manager.store.protocol import ShelfRow
-from embomatrix.rpc.roles import Role
+from embomatrix.rpc.roles import AccessRole
 from embomatrix.rpc.trust import fingerprint_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
     from pathlib import Path
 
-FIRST_ROLES: Final = (Role.ADMIN, Role.TRAINER, Role.VIEWER, Role.JOIN)
+FIRST_ROLES: Final = (AccessRole.ADMIN, AccessRole.TRAINER, AccessRole.VIEWER, AccessRole.JOIN)
 LOCAL_NAMES: Final = ("localhost", "127.0.0.1", "::1")
 _PRIVATE: Final = 0o600
 
@@ -36,7 +36,7 @@ class AccessError(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Prepared:
+class PreparedAccess:
     """What ``prepare`` did: sentences for a person, in order."""
 
     made: tuple[str, ...]
@@ -55,7 +55,7 @@ class AccessFolder:
         self.hashes = self.path / "tokens.json"
         """First tokens as the manager reads them: hashed."""
 
-    def token(self, role: Role) -> Path:
+    def token(self, role: AccessRole) -> Path:
         """The file with the first token of a role, for whom it is meant."""
         return self.path / "tokens" / role.value
 
@@ -79,8 +79,12 @@ class AccessFolder:
 
 
 def prepare(
-    data_dir: Path, *, sans: Iterable[str], roles: Sequence[Role] = FIRST_ROLES, now: datetime | None = None
-) -> Prepared:
+    data_dir: Path,
+    *,
+    sans: Iterable[str],
+    roles: Sequence[AccessRole] = FIRST_ROLES,
+    now: datetime | None = None,
+) -> PreparedAccess:
     """Make what is missing, and leave alone what is there: an authority is never overwritten.
 
     The server's certificate is made anew when it lacks one of ``sans`` or will expire soon. Raises AccessError.
@@ -98,10 +102,10 @@ def prepare(
         raise AccessError(
             f"{error.filename or folder.path} can't be written ({error.strerror}): pass another --data-dir"
         ) from error
-    return Prepared(tuple(made), tuple(found))
+    return PreparedAccess(tuple(made), tuple(found))
 
 
-def hand_out_to(data_dir: Path, role: Role, target: Path) -> None:
+def hand_out_to(data_dir: Path, role: AccessRole, target: Path) -> None:
     """Put what a client of this role needs into a folder of its own: the authority's certificate and the role's token.
 
     A token that was handed out there before stays. Raises AccessError.
@@ -185,7 +189,7 @@ def _own_names() -> tuple[str, ...]:
 
 
 def _first_tokens(
-    folder: AccessFolder, roles: Sequence[Role], now: datetime, made: list[str], found: list[str]
+    folder: AccessFolder, roles: Sequence[AccessRole], now: datetime, made: list[str], found: list[str]
 ) -> None:
     credentials = list(folder.first_credentials())
     known = {credential.role for credential in credentials}
@@ -196,11 +200,11 @@ def _first_tokens(
             continue
         path = folder.token(role)
         path.parent.mkdir(exist_ok=True, mode=0o700)
-        valid_s = LONGEST_JOIN_S if role is Role.JOIN else 0.0
+        valid_s = LONGEST_JOIN_S if role is AccessRole.JOIN else 0.0
         credential, token = book.issue(
             role, valid_s=valid_s, label="made by manager init", now_s=now.timestamp()
         )
-        pinned = f".{fingerprint_of(folder.ca.read_text())}" if role is Role.JOIN else ""
+        pinned = f".{fingerprint_of(folder.ca.read_text())}" if role is AccessRole.JOIN else ""
         write_private(path, f"{token}{pinned}\n".encode())
         credentials.append(credential)
         made.append(

@@ -19,7 +19,7 @@ from embomatrix.manager.access.folder import AccessError
 from embomatrix.manager.access.roles import OPEN, may_call, who_may
 from embomatrix.manager.store.protocol import Shelf, StateError
 from embomatrix.rpc.channel import TOKEN_KEY, token_of
-from embomatrix.rpc.roles import Role
+from embomatrix.rpc.roles import AccessRole
 from embomatrix.rpc.status import (
     ClusterError,
     NotAllowedError,
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     import grpc
 
-    from embomatrix.manager.runtime.registry import Session
+    from embomatrix.manager.runtime.registry import WorkerSession
     from embomatrix.manager.store.protocol import StateStore
     from embomatrix.rpc.roles import TokenInfo
 
@@ -47,13 +47,13 @@ SHARED_ID: Final = "shared"
 class Caller:
     """Who calls, as far as the token tells. Sessions remember ``token_id``, and only it may speak for them."""
 
-    role: Role
+    role: AccessRole
     token_id: str = ""
     worker_id: str = ""
     """The worker that the credential belongs to; empty for tokens of several."""
 
 
-ANYONE: Final = Caller(Role.ADMIN)
+ANYONE: Final = Caller(AccessRole.ADMIN)
 """The caller where no token is asked for."""
 
 
@@ -106,11 +106,11 @@ class Gate:
         if not self._guarded:
             return ANYONE
         if self._shared and hmac.compare_digest(token.encode(), self._shared.encode()):
-            return Caller(Role.ADMIN, SHARED_ID)
+            return Caller(AccessRole.ADMIN, SHARED_ID)
         if not token:
             raise NotSignedInError(NO_TOKEN)
         found = self._book.find(token, now_s=self._clock())
-        return Caller(found.role, found.token_id, found.worker_id if found.role is Role.WORKER else "")
+        return Caller(found.role, found.token_id, found.worker_id if found.role is AccessRole.WORKER else "")
 
     def refusal(self, method: str, header: str | None) -> ClusterError | None:
         """Why ``/package.Service/Method`` may not be called with this ``authorization`` header; None if it may."""
@@ -139,20 +139,20 @@ class Gate:
             raise NotAllowedError(
                 f"a token of the role {caller.role} may not register workers: it takes {who_may(_REGISTER)}"
             )
-        if caller.role is Role.JOIN:
+        if caller.role is AccessRole.JOIN:
             return await self._join(token_of(_header(context)) or join_token, worker_id, boot_id)
         if self._guarded:
             self._book.check_name(caller.token_id, caller.worker_id, worker_id)
         return Admission(caller.token_id)
 
-    def check_session(self, context: grpc.aio.ServicerContext, session: Session) -> None:
+    def check_session(self, context: grpc.aio.ServicerContext, session: WorkerSession) -> None:
         """Raises NotAllowedError unless the caller's credential is the one that opened the session."""
         if self.caller_of(context).token_id != session.credential_id:
             raise NotAllowedError(
                 f"the session of worker {session.worker_id} was opened with another credential: register with this one"
             )
 
-    async def issue(self, role: Role, *, valid_s: float, label: str) -> tuple[str, str]:
+    async def issue(self, role: AccessRole, *, valid_s: float, label: str) -> tuple[str, str]:
         """A new token and its id."""
         self._need_guard()
         async with self._lock:

@@ -4,28 +4,28 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.rpc.roles import Role
+from embomatrix.rpc.roles import AccessRole
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
 _PACKAGE: Final = "embomatrix.proto.v1"
-_WORKER: Final = frozenset({Role.WORKER})
-_TRAINER: Final = frozenset({Role.TRAINER})
-_VIEWER: Final = frozenset({Role.VIEWER, Role.TRAINER})
-_ADMIN: Final[frozenset[Role]] = frozenset()
+_WORKER: Final = frozenset({AccessRole.WORKER})
+_TRAINER: Final = frozenset({AccessRole.TRAINER})
+_VIEWER: Final = frozenset({AccessRole.VIEWER, AccessRole.TRAINER})
+_ADMIN: Final[frozenset[AccessRole]] = frozenset()
 
 # An admin may call every one of them, and is not repeated.
-_TABLE: Final[Mapping[str, Mapping[str, frozenset[Role]]]] = {
+_TABLE: Final[Mapping[str, Mapping[str, frozenset[AccessRole]]]] = {
     f"{_PACKAGE}.WorkerService": {
-        "Register": frozenset({Role.JOIN, Role.WORKER}),
+        "Register": frozenset({AccessRole.JOIN, AccessRole.WORKER}),
         "Session": _WORKER,
         "Heartbeat": _WORKER,
         "FetchBundle": _WORKER,
         "Deregister": _WORKER,
     },
     f"{_PACKAGE}.RolloutService": {
-        "GetCapabilities": frozenset(Role),
+        "GetCapabilities": frozenset(AccessRole),
         "OpenRun": _TRAINER,
         "AnnounceLookahead": _TRAINER,
         "Execute": _TRAINER,
@@ -56,7 +56,7 @@ _TABLE: Final[Mapping[str, Mapping[str, frozenset[Role]]]] = {
     },
     "grpc.reflection.v1alpha.ServerReflection": {"ServerReflectionInfo": _VIEWER},
 }
-ROLES: Final[Mapping[str, frozenset[Role]]] = {
+ROLES: Final[Mapping[str, frozenset[AccessRole]]] = {
     f"/{service}/{method}": roles for service, methods in _TABLE.items() for method, roles in methods.items()
 }
 OPEN: Final = frozenset(
@@ -72,13 +72,13 @@ OPEN: Final = frozenset(
 """Methods that may be called without a token; one that is shown is checked nevertheless."""
 
 
-def may_call(role: Role, method: str) -> bool:
+def may_call(role: AccessRole, method: str) -> bool:
     """Whether the role may call ``/package.Service/Method``; nobody may call what the table lacks."""
     roles = ROLES.get(method)
-    return roles is not None and (role is Role.ADMIN or role in roles)
+    return roles is not None and (role is AccessRole.ADMIN or role in roles)
 
 
 def who_may(method: str) -> str:
     """The roles that may call it, in words."""
-    others = sorted(ROLES.get(method, _ADMIN) - {Role.ADMIN})
-    return " or ".join([*others, Role.ADMIN])
+    others = sorted(ROLES.get(method, _ADMIN) - {AccessRole.ADMIN})
+    return " or ".join([*others, AccessRole.ADMIN])

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from embomatrix.manager.settings import ManagerSettings
-    from embomatrix.rpc.roles import Role
+    from embomatrix.rpc.roles import AccessRole
 
 app = typer.Typer(
     help="Serve a Simulation Manager, or ask one how the cluster does.",
@@ -167,16 +167,16 @@ def init(
         print(f"there  {sentence}")
 
 
-def _parcel(text: str) -> tuple[Role, Path]:
+def _parcel(text: str) -> tuple[AccessRole, Path]:
     """What ``ROLE:FOLDER`` asks for."""
     from pathlib import Path
 
-    from embomatrix.rpc.roles import Role
+    from embomatrix.rpc.roles import AccessRole
 
     name, _, target = text.partition(":")
-    if name not in (Role.WORKER, Role.TRAINER, Role.VIEWER, Role.ADMIN) or not target:
+    if name not in (AccessRole.WORKER, AccessRole.TRAINER, AccessRole.VIEWER, AccessRole.ADMIN) or not target:
         _refuse(f"--hand-out {text!r}: expected worker:FOLDER, trainer:FOLDER, viewer:FOLDER or admin:FOLDER")
-    return Role(name), Path(target)
+    return AccessRole(name), Path(target)
 
 
 def _token(text: str) -> str:

@@ -50,16 +50,16 @@ def issue(
     ca: Ca = None,
 ) -> None:
     """Hand out a token. It is told once: the manager keeps only its hash."""
-    from embomatrix.rpc.roles import Role
+    from embomatrix.rpc.roles import AccessRole
     from embomatrix.rpc.trust import Invitation, fingerprint_of, read_ca
 
-    if role not in list(Role):
-        _refuse(f"--role {role!r}: expected {', '.join(Role)}")
-    wanted = Role(role)
+    if role not in list(AccessRole):
+        _refuse(f"--role {role!r}: expected {', '.join(AccessRole)}")
+    wanted = AccessRole(role)
     new, token_id = _ask(
         manager, token, ca, lambda client: client.issue(wanted, valid_s=hours * 3600.0, label=label)
     )
-    if wanted is not Role.JOIN:
+    if wanted is not AccessRole.JOIN:
         print(new)
         typer.echo(f"id {token_id}; it is not told again", err=True)
         return

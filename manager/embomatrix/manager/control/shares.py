@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Share:
+class RunShare:
     """What a run may claim beside others."""
 
     run_id: str = ""
@@ -25,7 +25,7 @@ class Claim(Protocol):
     def rank(self) -> int: ...
 
     @property
-    def share(self) -> Share: ...
+    def share(self) -> RunShare: ...
 
 
 ClaimT = TypeVar("ClaimT", bound=Claim)
@@ -46,10 +46,10 @@ def in_turns(claims: Iterable[ClaimT], cost: Callable[[ClaimT], float]) -> list[
     return [claim for *_, claim in sorted(keyed, key=lambda entry: entry[:4])]
 
 
-def quotas(wanted: Mapping[Share, int], slots: int) -> dict[Share, float]:
+def quotas(wanted: Mapping[RunShare, int], slots: int) -> dict[RunShare, float]:
     """How many of the slots each run may use: none more than it wants, the rest by weight, the higher priority first."""
     left = float(slots)
-    given: dict[Share, float] = {}
+    given: dict[RunShare, float] = {}
     for priority in sorted({share.priority for share in wanted}, reverse=True):
         weights = sum(share.weight for share in wanted if share.priority == priority)
         equals = [share for share in wanted if share.priority == priority]

@@ -17,7 +17,7 @@ from embomatrix.manager.observe.fleet_log import FleetLog
 from embomatrix.manager.observe.histogram import Histogram, merged
 from embomatrix.manager.observe.run_figures import RunFigures
 from embomatrix.reward.settings import PAPER, RewardSettings
-from embomatrix.rpc.run_log import EventKind, Phase, RunEvent
+from embomatrix.rpc.run_log import EventKind, RolloutPhase, RunEvent
 from embomatrix.rpc.wire.values import Cancelled, Completed, InfraFailure
 
 if TYPE_CHECKING:
@@ -71,17 +71,17 @@ class Chronicle:
         self.dropped = 0
         """Events that logs of runs which are closed by now had dropped."""
         self._runs: dict[str, RunRecord] = {}
-        self._closed: dict[Phase, Histogram] = {phase: Histogram() for phase in Phase}
+        self._closed: dict[RolloutPhase, Histogram] = {phase: Histogram() for phase in RolloutPhase}
 
     @property
     def runs(self) -> Mapping[str, RunRecord]:
         """Those that are open."""
         return self._runs
 
-    def phases(self) -> dict[Phase, Histogram]:
+    def phases(self) -> dict[RolloutPhase, Histogram]:
         """Of all runs that this manager has seen."""
         every = [self._closed, *(run.figures.phases for run in self._runs.values())]
-        return {phase: merged(phases[phase] for phases in every) for phase in Phase}
+        return {phase: merged(phases[phase] for phases in every) for phase in RolloutPhase}
 
     def page(self, run_id: str, after: int, limit: int = PAGE) -> EventPage | None:
         """Events of an open run, or of the fleet for an empty id; None when no such run is open."""
@@ -175,7 +175,7 @@ class Chronicle:
         """So long after their arrival, results of the run were in the log for its trainer."""
         run = self._runs.get(run_id)
         if run is not None:
-            histogram = run.figures.phases[Phase.DELIVER]
+            histogram = run.figures.phases[RolloutPhase.DELIVER]
             for seconds in durations_s:
                 histogram.observe(seconds)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.observe.histogram import Histogram
-from embomatrix.rpc.run_log import Phase, PhaseSummary, RunEvent, RunSeries, RunWorker
+from embomatrix.rpc.run_log import PhaseSummary, RolloutPhase, RunEvent, RunSeries, RunWorker
 
 if TYPE_CHECKING:
     from embomatrix.rpc.wire.values import Timings
@@ -65,7 +65,7 @@ class RunFigures:
     __slots__ = ("failures", "phases", "series", "workers")
 
     def __init__(self, opened_s: float) -> None:
-        self.phases: dict[Phase, Histogram] = {phase: Histogram() for phase in Phase}
+        self.phases: dict[RolloutPhase, Histogram] = {phase: Histogram() for phase in RolloutPhase}
         self.series = Series(opened_s)
         self.workers: dict[str, WorkerFigures] = {}
         self.failures: deque[RunEvent] = deque(maxlen=FAILURES_KEPT)
@@ -73,10 +73,10 @@ class RunFigures:
     def completed(self, timings: Timings, now_s: float) -> None:
         """A rollout has a result; its delivery is timed later."""
         phases = self.phases
-        phases[Phase.QUEUE].observe(timings.queued_s)
-        phases[Phase.LEASE].observe(timings.lease_s)
-        phases[Phase.LOAD].observe(timings.load_s)
-        phases[Phase.EXECUTE].observe(timings.execute_s)
+        phases[RolloutPhase.QUEUE].observe(timings.queued_s)
+        phases[RolloutPhase.LEASE].observe(timings.lease_s)
+        phases[RolloutPhase.LOAD].observe(timings.load_s)
+        phases[RolloutPhase.EXECUTE].observe(timings.execute_s)
         self.series.count(now_s, completed=1)
 
     def worker(self, worker_id: str) -> WorkerFigures:

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from embomatrix.manager.access.protection import Tls
     from embomatrix.manager.settings import ManagerSettings
     from embomatrix.manager.store.protocol import StateStore
-    from embomatrix.manager.web.door import Door
+    from embomatrix.manager.web.door import BoundedListener
     from embomatrix.manager.web.gallery import Gallery
 
 logger = logging.getLogger(__name__)
@@ -244,7 +244,7 @@ async def _start_runtime(
 class _HttpServer:
     """Uvicorn on a socket that is bound already, without its signal handlers: the manager has its own."""
 
-    def __init__(self, app: FastAPI, bound: Door, tls: Tls | None) -> None:
+    def __init__(self, app: FastAPI, bound: BoundedListener, tls: Tls | None) -> None:
         self._socket = bound
         self._app = app
         config = uvicorn.Config(

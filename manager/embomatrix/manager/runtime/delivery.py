@@ -28,7 +28,7 @@ STORE_RETRY_S: Final = 0.5
 """Between two attempts to write while the store is away."""
 
 
-class Delivery:
+class ResultDelivery:
     """Owns the way of results. What a trainer saw, a restarted manager knows, so no cursor is ever given twice.
 
     A worker hears that it may forget a result (``acknowledge``) only after the store has it: until then it is not lost

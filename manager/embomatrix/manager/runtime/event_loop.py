@@ -28,12 +28,12 @@ from embomatrix.manager.observe.effort import Effort
 from embomatrix.manager.observe.history import RunHistory
 from embomatrix.manager.observe.meter import Meter
 from embomatrix.manager.observe.training_reports import TrainingBook
-from embomatrix.manager.runtime.delivery import Delivery
+from embomatrix.manager.runtime.delivery import ResultDelivery
 from embomatrix.manager.runtime.garbage import Collector
 from embomatrix.manager.runtime.intake import TICK_S, Heartbeat, Intake
 from embomatrix.manager.runtime.keeper import Keeper
 from embomatrix.manager.runtime.links import WorkerLink
-from embomatrix.manager.runtime.registry import Standing
+from embomatrix.manager.runtime.registry import WorkerStanding
 from embomatrix.manager.runtime.results import ResultLogs
 from embomatrix.manager.runtime.runs import RunLimits, Runs
 from embomatrix.manager.store.timed import timed_store
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from embomatrix.manager.observe.archive import RunArchive
     from embomatrix.manager.runtime.bundles import BundleStore
     from embomatrix.manager.runtime.links import WorkerCommand
-    from embomatrix.manager.runtime.registry import Registry, Session
+    from embomatrix.manager.runtime.registry import Registry, WorkerSession
     from embomatrix.manager.store.protocol import StateStore
     from embomatrix.rpc.leases import LeaseResult, WorkerState
     from embomatrix.rpc.status import ClusterError
@@ -104,7 +104,7 @@ class ManagerRuntime:
         self.runs = Runs(cluster, store, bundles, logs, self._carry_out, limits or RunLimits(), self.history)
         self._intake = Intake(cluster, registry)
         self._keeper = Keeper(store, registry, cluster)
-        self._delivery = Delivery(store, logs, self._say, self.chronicle.in_log)
+        self._delivery = ResultDelivery(store, logs, self._say, self.chronicle.in_log)
         self._links: dict[str, WorkerLink] = {}
         self._lapsed_s = lapsed_s
         self._unrenewed = unrenewed
@@ -136,7 +136,7 @@ class ManagerRuntime:
         *,
         credential_id: str = "",
         protocol: int = PROTOCOL_VERSION,
-    ) -> tuple[Session, float]:
+    ) -> tuple[WorkerSession, float]:
         """Open a session for a worker; returns it and the heartbeat's interval in seconds once the worker is noted."""
         if self._lapsed_s() > LET_GO_S:
             raise UnavailableError(STORE_AWAY)
@@ -152,7 +152,7 @@ class ManagerRuntime:
         return session, self.registry.interval_s
 
     @contextlib.contextmanager
-    def attached(self, session: Session) -> Iterator[WorkerLink]:
+    def attached(self, session: WorkerSession) -> Iterator[WorkerLink]:
         """The worker's stream is open for as long as this is held."""
         self._close_link(session.worker_id)
         link = self._links[session.worker_id] = WorkerLink(session)
@@ -190,7 +190,11 @@ class ManagerRuntime:
         return interval_s
 
     def end_session(
-        self, session: Session, reason: str, error: ClusterError, standing: Standing = Standing.LOST
+        self,
+        session: WorkerSession,
+        reason: str,
+        error: ClusterError,
+        standing: WorkerStanding = WorkerStanding.LOST,
     ) -> None:
         """The session is over at once: its stream ends with the error, and what it held goes to others."""
         events = self.registry.end(session, reason, standing)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from embomatrix.manager.control.cluster_state import ClusterState
     from embomatrix.manager.control.commands import Command
-    from embomatrix.manager.runtime.registry import Registry, Session
+    from embomatrix.manager.runtime.registry import Registry, WorkerSession
     from embomatrix.rpc.leases import LeaseProgress, LeaseRef, LeaseResult, WorkerState
     from embomatrix.rpc.wire.values import Resources
 
@@ -61,7 +61,7 @@ class Intake:
         *,
         now_s: float,
         protocol: int = PROTOCOL_VERSION,
-    ) -> tuple[Session, list[Command]]:
+    ) -> tuple[WorkerSession, list[Command]]:
         """Open a session for a worker, which speaks this version."""
         session, events = self.registry.register(
             worker_id, boot_id, resources, now_s=now_s, protocol=protocol
@@ -70,7 +70,7 @@ class Intake:
 
     def report(
         self,
-        session: Session,
+        session: WorkerSession,
         state: WorkerState | None,
         results: Sequence[LeaseResult],
         *,

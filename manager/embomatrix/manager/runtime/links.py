@@ -10,7 +10,7 @@ from embomatrix.manager.control.commands import AcknowledgeLease, CancelLease, G
 from embomatrix.rpc.leases import Lease
 
 if TYPE_CHECKING:
-    from embomatrix.manager.runtime.registry import Session
+    from embomatrix.manager.runtime.registry import WorkerSession
     from embomatrix.rpc.leases import LeaseRef
     from embomatrix.rpc.status import ClusterError
 
@@ -22,7 +22,7 @@ WorkerCommand = SetDesired | GiveLease | CancelLease | AcknowledgeLease
 
 
 @dataclass(slots=True)
-class Outbox:
+class OutgoingMessage:
     """One message to a worker. ``desired`` is None when it did not change."""
 
     desired: tuple[str, ...] | None = None
@@ -36,9 +36,9 @@ class Outbox:
 class WorkerLink:
     """An open session stream. Its outbox is bounded by the worker's credits; a later desired set replaces an earlier."""
 
-    def __init__(self, session: Session) -> None:
+    def __init__(self, session: WorkerSession) -> None:
         self.session = session
-        self._outbox = Outbox()
+        self._outbox = OutgoingMessage()
         self._ready = asyncio.Event()
         self._later: asyncio.TimerHandle | None = None
         self._closed: ClusterError | None = None
@@ -76,7 +76,7 @@ class WorkerLink:
         self._closed = reason
         self._ready.set()
 
-    async def take(self) -> Outbox:
+    async def take(self) -> OutgoingMessage:
         """Waits until there is something to say; the wait ends with the stream."""
         await self._ready.wait()
         if self._closed is not None:
@@ -85,5 +85,5 @@ class WorkerLink:
         if self._later is not None:
             self._later.cancel()
             self._later = None
-        outbox, self._outbox = self._outbox, Outbox()
+        outbox, self._outbox = self._outbox, OutgoingMessage()
         return outbox

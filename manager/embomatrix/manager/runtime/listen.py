@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 import grpc
 
-from embomatrix.manager.web.door import Door
+from embomatrix.manager.web.door import BoundedListener
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -29,13 +29,13 @@ REMEDIES: Final[Mapping[int, str]] = {
 
 
 @contextlib.contextmanager
-def bound_socket(host: str, port: int, *, option: str = "") -> Iterator[Door]:
+def bound_socket(host: str, port: int, *, option: str = "") -> Iterator[BoundedListener]:
     """A socket bound to the address, closed on exit; ``option`` is what the names of its options begin with.
 
     Raises PortInUseError.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    with Door(family, socket.SOCK_STREAM) as bound:
+    with BoundedListener(family, socket.SOCK_STREAM) as bound:
         bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             bound.bind((host, port))

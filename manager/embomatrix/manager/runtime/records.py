@@ -28,7 +28,7 @@ from embomatrix.rpc.wire.values import Cancelled, Completed, InfraFailure
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from embomatrix.manager.control.schedule.lookahead_window import Window
+    from embomatrix.manager.control.schedule.lookahead_window import LookaheadWindow
     from embomatrix.manager.store.protocol import RunRow
     from embomatrix.rpc.wire.values import Batch, Outcome, RolloutResult, RunTerms
 
@@ -91,7 +91,7 @@ def repute_of(row: ShelfRow) -> Repute:
     return Repute(**json.loads(row.payload))
 
 
-def window_row(run_id: str, window: Window) -> ShelfRow:
+def window_row(run_id: str, window: LookaheadWindow) -> ShelfRow:
     """What the run announced last, as far as it has not come."""
     entries = [lookahead_entry_to_proto(entry) for entry in window.entries]
     message = rollout_service_pb2.AnnounceLookaheadRequest(version=window.version, entries=entries)

@@ -32,7 +32,7 @@ LISTED: Final = 10
 """Names that a sentence takes."""
 
 
-class Standing(StrEnum):
+class WorkerStanding(StrEnum):
     """What a person sees of a worker."""
 
     READY = "ready"
@@ -46,7 +46,7 @@ class Standing(StrEnum):
     @property
     def is_gone(self) -> bool:
         """It was here, and nothing is to be had of it any more."""
-        return self in (Standing.LOST, Standing.LEFT)
+        return self in (WorkerStanding.LOST, WorkerStanding.LEFT)
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +69,7 @@ class LivenessLimits:
 
 
 @dataclass(slots=True, eq=False)
-class Session:
+class WorkerSession:
     """One registration of a worker. A newer one of the same worker supersedes it."""
 
     worker_id: str
@@ -78,7 +78,7 @@ class Session:
     epoch: int
     resources: Resources
     last_seen_s: float
-    standing: Standing = Standing.READY
+    standing: WorkerStanding = WorkerStanding.READY
     attached: bool = False
     detached_s: float | None = None
     reason: str = ""
@@ -110,17 +110,17 @@ class Registry:
     ) -> None:
         self._limits = limits
         self._new_id = new_id or functools.partial(secrets.token_hex, 8)
-        self._sessions: dict[str, Session] = {}
-        self._by_silence: OrderedDict[str, Session] = OrderedDict()
+        self._sessions: dict[str, WorkerSession] = {}
+        self._by_silence: OrderedDict[str, WorkerSession] = OrderedDict()
         """Sessions that are not lost, those first that were heard longest ago: the silent are found without a search."""
-        self._detached: dict[str, Session] = {}
-        self._lost: OrderedDict[str, Session] = OrderedDict()
+        self._detached: dict[str, WorkerSession] = {}
+        self._lost: OrderedDict[str, WorkerSession] = OrderedDict()
         self._worker_of: dict[str, str] = {}
         self._epoch = first_epoch - 1
         self._first_epoch = first_epoch
 
     @property
-    def sessions(self) -> Mapping[str, Session]:
+    def sessions(self) -> Mapping[str, WorkerSession]:
         """By worker id; lost ones stay for a while."""
         return self._sessions
 
@@ -143,12 +143,12 @@ class Registry:
         *,
         now_s: float,
         protocol: int = PROTOCOL_VERSION,
-    ) -> tuple[Session, list[Event]]:
+    ) -> tuple[WorkerSession, list[Event]]:
         """Open a session; an older one of the same worker ends. The same process keeps its leases, another one loses them."""
         before = self._sessions.get(worker_id)
         alive = before is not None and not before.standing.is_gone
         self._epoch += 1
-        session = Session(
+        session = WorkerSession(
             worker_id=worker_id,
             boot_id=boot_id,
             session_id=self._new_id(),
@@ -171,7 +171,7 @@ class Registry:
         lost = [WorkerLost(worker_id, "a newer session of the same worker took over")] if alive else []
         return session, [*lost, WorkerJoined(worker_id, resources, protocol)]
 
-    def find(self, session_id: str, epoch: int) -> Session:
+    def find(self, session_id: str, epoch: int) -> WorkerSession:
         """The live session of that name; raises ``SupersededError`` for one that ended, so that its worker stops.
 
         ``UnknownSessionError`` for one that a former manager opened: its worker keeps what it holds, and registers.
@@ -190,57 +190,59 @@ class Registry:
             raise SupersededError(f"worker {worker_id} was given up ({session.reason}): register again")
         return session
 
-    def holder(self, session_id: str) -> Session:
+    def holder(self, session_id: str) -> WorkerSession:
         """The live session of that name, for calls that carry no epoch."""
         session = self._sessions.get(self._worker_of.get(session_id, ""))
         return self.find(session_id, session.epoch if session is not None else 0)
 
-    def end(self, session: Session, reason: str, standing: Standing = Standing.LOST) -> list[Event]:
+    def end(
+        self, session: WorkerSession, reason: str, standing: WorkerStanding = WorkerStanding.LOST
+    ) -> list[Event]:
         """The session is over at once, whatever its worker does; what it held goes to others."""
         if session.standing.is_gone or self._sessions.get(session.worker_id) is not session:
             return []
         return [self._lose(session, reason, standing)]
 
-    def attach(self, session: Session, *, now_s: float) -> None:
+    def attach(self, session: WorkerSession, *, now_s: float) -> None:
         """The worker's stream is open. A suspect gets nothing before its first state was heard on it."""
         session.attached = True
         session.detached_s = None
         self._detached.pop(session.worker_id, None)
         self._note(session, now_s)
 
-    def detach(self, session: Session, *, now_s: float) -> None:
+    def detach(self, session: WorkerSession, *, now_s: float) -> None:
         """The worker's stream broke; unless it comes back within the grace, the worker is lost."""
         session.attached = False
         session.detached_s = now_s
         if self._by_silence.get(session.worker_id) is session:
             self._detached[session.worker_id] = session
 
-    def heard(self, session: Session, *, now_s: float) -> list[Event]:
+    def heard(self, session: WorkerSession, *, now_s: float) -> list[Event]:
         """Any sign of life."""
         self._note(session, now_s)
-        if session.standing is not Standing.SUSPECT:
+        if session.standing is not WorkerStanding.SUSPECT:
             return []
-        session.standing = Standing.READY
+        session.standing = WorkerStanding.READY
         return [WorkerRecovered(session.worker_id)]
 
     def drain(self, worker_id: str) -> list[Event]:
         """Take a worker out of service once it has finished what it holds."""
         session = self._there(worker_id)
-        session.drained, session.standing = True, Standing.DRAINING
+        session.drained, session.standing = True, WorkerStanding.DRAINING
         return [WorkerDrained(worker_id)]
 
     def resume(self, worker_id: str) -> list[Event]:
         """Take a drain back. The worker says itself whether it still leaves."""
         session = self._there(worker_id)
-        session.drained, session.standing = False, Standing.READY
+        session.drained, session.standing = False, WorkerStanding.READY
         return [WorkerResumed(worker_id)]
 
-    def told(self, session: Session, *, draining: bool, paused: str) -> None:
+    def told(self, session: WorkerSession, *, draining: bool, paused: str) -> None:
         """The worker itself says whether it will leave, or why it takes nothing new for now."""
         if draining or session.drained:
-            session.standing = Standing.DRAINING
+            session.standing = WorkerStanding.DRAINING
         else:
-            session.standing = Standing.PAUSED if paused else Standing.READY
+            session.standing = WorkerStanding.PAUSED if paused else WorkerStanding.READY
         session.reason = paused
 
     def stood_still(self, seconds: float, *, now_s: float) -> None:
@@ -260,18 +262,18 @@ class Registry:
             silent_s = now_s - session.last_seen_s
             if silent_s >= max(self._limits.lost_after_s, suspect_s):
                 events.append(self._lose(session, f"not heard of for {silent_s:.1f} s"))
-            elif session.standing is Standing.READY:
-                session.standing = Standing.SUSPECT
+            elif session.standing is WorkerStanding.READY:
+                session.standing = WorkerStanding.SUSPECT
                 events.append(WorkerSuspected(session.worker_id))
         for session in list(self._detached.values()):
             if session.detached_s is not None and now_s - session.detached_s >= self._limits.stream_grace_s:
-                if session.standing is Standing.DRAINING:
-                    events.append(self._lose(session, "it drained and left", Standing.LEFT))
+                if session.standing is WorkerStanding.DRAINING:
+                    events.append(self._lose(session, "it drained and left", WorkerStanding.LEFT))
                 else:
                     events.append(self._lose(session, "its connection broke and it did not come back"))
         return events
 
-    def _there(self, worker_id: str) -> Session:
+    def _there(self, worker_id: str) -> WorkerSession:
         session = self._sessions.get(worker_id)
         if session is None:
             raise NotFoundError(f"there is no worker {worker_id!r}: connected are {listed(self.present)}")
@@ -281,12 +283,12 @@ class Registry:
             )
         return session
 
-    def _note(self, session: Session, now_s: float) -> None:
+    def _note(self, session: WorkerSession, now_s: float) -> None:
         session.last_seen_s = now_s
         if self._by_silence.get(session.worker_id) is session:
             self._by_silence.move_to_end(session.worker_id)
 
-    def _silent_for(self, seconds: float, now_s: float) -> list[Session]:
+    def _silent_for(self, seconds: float, now_s: float) -> list[WorkerSession]:
         silent = itertools.takewhile(
             lambda session: now_s - session.last_seen_s >= seconds, self._by_silence.values()
         )
@@ -300,7 +302,9 @@ class Registry:
             del self._lost[session.worker_id], self._sessions[session.worker_id]
             self._worker_of.pop(session.session_id, None)
 
-    def _lose(self, session: Session, reason: str, standing: Standing = Standing.LOST) -> WorkerLost:
+    def _lose(
+        self, session: WorkerSession, reason: str, standing: WorkerStanding = WorkerStanding.LOST
+    ) -> WorkerLost:
         session.standing = standing
         session.reason = reason
         del self._by_silence[session.worker_id]

@@ -7,7 +7,7 @@ import re
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.runtime.intake import Heartbeat
-from embomatrix.manager.runtime.registry import Standing
+from embomatrix.manager.runtime.registry import WorkerStanding
 from embomatrix.proto.v1 import worker_service_pb2 as pb
 from embomatrix.proto.v1 import worker_service_pb2_grpc
 from embomatrix.rpc.logs import bind
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
     from embomatrix.manager.access.gate import Gate
     from embomatrix.manager.runtime.event_loop import ManagerRuntime
-    from embomatrix.manager.runtime.links import Outbox, WorkerLink
+    from embomatrix.manager.runtime.links import OutgoingMessage, WorkerLink
     from embomatrix.rpc.leases import Lease, LeaseResult
 
 FIRST_STATE_S: Final = 10.0
@@ -137,7 +137,7 @@ class WorkerServicer(worker_service_pb2_grpc.WorkerServiceServicer):
             session = self._runtime.registry.find(request.session_id, request.session_epoch)
             self._gate.check_session(context, session)
             left = SupersededError(f"worker {session.worker_id} said that it leaves: its session is over")
-            self._runtime.end_session(session, "it left", left, Standing.LEFT)
+            self._runtime.end_session(session, "it left", left, WorkerStanding.LEFT)
         return pb.DeregisterResponse()
 
     async def _listen(self, link: WorkerLink, requests: AsyncIterator[pb.SessionRequest]) -> None:
@@ -166,7 +166,7 @@ async def _speak(link: WorkerLink, context: grpc.aio.ServicerContext) -> None:
             await context.write(message)
 
 
-def _messages(outbox: Outbox) -> list[pb.SessionResponse]:
+def _messages(outbox: OutgoingMessage) -> list[pb.SessionResponse]:
     """The outbox in messages of bounded size: leases carry plans."""
     leases = outbox.leases
     parts = [leases[at : at + LEASES_PER_MESSAGE] for at in range(0, len(leases), LEASES_PER_MESSAGE)]

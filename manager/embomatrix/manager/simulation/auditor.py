@@ -31,7 +31,7 @@ class BrokenInvariantError(Exception):
     """The manager promised otherwise; says what happened to which rollout."""
 
 
-class Auditor:
+class InvariantChecker:
     """Watches from outside: it sees what is submitted, executed and ordered, and nothing of the manager's own books."""
 
     def __init__(self, agenda: Agenda) -> None:

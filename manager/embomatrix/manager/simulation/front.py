@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 
     from embomatrix.manager.control.commands import Command
     from embomatrix.manager.runtime.intake import Intake
-    from embomatrix.manager.runtime.registry import Session
+    from embomatrix.manager.runtime.registry import WorkerSession
     from embomatrix.manager.simulation.agenda import Agenda
-    from embomatrix.manager.simulation.auditor import Auditor
+    from embomatrix.manager.simulation.auditor import InvariantChecker
     from embomatrix.manager.simulation.gauge import Gauge
     from embomatrix.manager.simulation.scenario import ManagerPace
     from embomatrix.rpc.leases import LeaseProgress, LeaseRef, LeaseResult, WorkerState
@@ -59,14 +59,14 @@ class Stream:
     ended: Callable[[], None]
 
 
-class Front:
+class SimulatedManager:
     """Calls arrive here in simulated time; deciding costs real CPU, which the gauge notes.
 
     They are answered at once, or, by a manager that takes time, one after the other.
     """
 
     def __init__(
-        self, agenda: Agenda, intake: Intake, auditor: Auditor, gauge: Gauge, pace: ManagerPace
+        self, agenda: Agenda, intake: Intake, auditor: InvariantChecker, gauge: Gauge, pace: ManagerPace
     ) -> None:
         self._agenda = agenda
         self._pace = pace
@@ -102,7 +102,7 @@ class Front:
         self._carry_out(commands, lost=names)
         self._agenda.after(TICK_S, self.keep_time)
 
-    def register(self, worker_id: str, boot_id: str, resources: Resources) -> Session:
+    def register(self, worker_id: str, boot_id: str, resources: Resources) -> WorkerSession:
         with self._gauge.deciding("register"):
             session, commands = self._intake.register(worker_id, boot_id, resources, now_s=self._agenda.now_s)
         self._gauge.lost(worker_id, self._agenda.now_s)
@@ -115,7 +115,7 @@ class Front:
         events = self._intake.registry.drain(worker_id)
         self._carry_out(self._intake.feed(*events, now_s=self._agenda.now_s))
 
-    def attach(self, session: Session, state: WorkerState, stream: Stream) -> None:
+    def attach(self, session: WorkerSession, state: WorkerState, stream: Stream) -> None:
         """A stream opens with the worker's full state. Raises SupersededError."""
         session = self._intake.registry.find(session.session_id, session.epoch)
         self._end_stream(session.worker_id)
@@ -123,14 +123,14 @@ class Front:
         self._intake.registry.attach(session, now_s=self._agenda.now_s)
         self.report(session, state, (), resync=True)
 
-    def detach(self, session: Session, stream: Stream) -> None:
+    def detach(self, session: WorkerSession, stream: Stream) -> None:
         if self._streams.get(session.worker_id) is stream:
             del self._streams[session.worker_id]
             self._intake.registry.detach(session, now_s=self._agenda.now_s)
 
     def report(
         self,
-        session: Session,
+        session: WorkerSession,
         state: WorkerState | None,
         results: Sequence[LeaseResult],
         *,
@@ -144,7 +144,7 @@ class Front:
         self._carry_out(commands)
 
     def heartbeat(
-        self, session: Session, held: tuple[LeaseRef, ...], progress: tuple[LeaseProgress, ...]
+        self, session: WorkerSession, held: tuple[LeaseRef, ...], progress: tuple[LeaseProgress, ...]
     ) -> float:
         """Raises SupersededError."""
         with self._gauge.deciding("heartbeat"):

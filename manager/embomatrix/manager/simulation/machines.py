@@ -11,7 +11,7 @@ import numpy as np
 from embomatrix.rpc.wire.values import Resources
 
 if TYPE_CHECKING:
-    from embomatrix.manager.simulation.scenario import MachineKind, Scenario
+    from embomatrix.manager.simulation.scenario import MachineKind, SimulationScenario
 
 DURATIONS = 4096
 """Distinct execution times: rollouts take them in turn, which costs less than drawing one for each."""
@@ -21,7 +21,7 @@ RENDER_MB = 2048
 
 
 @dataclass(frozen=True, slots=True)
-class Machine:
+class SimulatedMachine:
     """A worker's hardware and its way to the manager. ``speed`` is the true one; ``resources`` say what it claims."""
 
     worker_id: str
@@ -48,7 +48,7 @@ class SceneSize:
 class Setting:
     """A scenario with its dice thrown. ``execute_s`` are the durations that rollouts take in turn."""
 
-    machines: tuple[Machine, ...]
+    machines: tuple[SimulatedMachine, ...]
     scenes: dict[str, SceneSize]
     execute_s: tuple[float, ...]
     lengths: dict[str, float]
@@ -64,12 +64,12 @@ class Setting:
         return sum(machine.resources.slots for machine in self.machines)
 
 
-def rng_for(scenario: Scenario, *key: int) -> np.random.Generator:
+def rng_for(scenario: SimulationScenario, *key: int) -> np.random.Generator:
     """The generator of one part of the scenario: parts do not disturb one another."""
     return np.random.default_rng(np.random.SeedSequence((scenario.seed, *key)))
 
 
-def setting_of(scenario: Scenario) -> Setting:
+def setting_of(scenario: SimulationScenario) -> Setting:
     """Draw machines, scenes and durations."""
     rng = rng_for(scenario, 1)
     sizes = scenario.scenes
@@ -86,7 +86,7 @@ def setting_of(scenario: Scenario) -> Setting:
     return Setting(_machines(scenario, rng), scenes, durations, lengths)
 
 
-def _machines(scenario: Scenario, rng: np.random.Generator) -> tuple[Machine, ...]:
+def _machines(scenario: SimulationScenario, rng: np.random.Generator) -> tuple[SimulatedMachine, ...]:
     shares = np.array([kind.share for kind in scenario.kinds])
     # The shares hold as exactly as whole machines allow, in an order that the seed gives.
     edges = np.round(np.cumsum(shares) / shares.sum() * scenario.workers).astype(int)
@@ -100,7 +100,7 @@ def _machines(scenario: Scenario, rng: np.random.Generator) -> tuple[Machine, ..
         kind = kinds[at]
         speed = kind.speed * float(rng.uniform(0.9, 1.1))
         machines.append(
-            Machine(
+            SimulatedMachine(
                 worker_id=f"w{index:05d}",
                 kind=kind.name,
                 resources=Resources(

@@ -14,8 +14,8 @@ from embomatrix.manager.observe.histogram import quantile
 from embomatrix.manager.runtime.intake import Intake
 from embomatrix.manager.runtime.registry import Registry
 from embomatrix.manager.simulation.agenda import Agenda
-from embomatrix.manager.simulation.auditor import Auditor, BrokenInvariantError
-from embomatrix.manager.simulation.front import Front
+from embomatrix.manager.simulation.auditor import BrokenInvariantError, InvariantChecker
+from embomatrix.manager.simulation.front import SimulatedManager
 from embomatrix.manager.simulation.gauge import Gauge
 from embomatrix.manager.simulation.machines import rng_for, setting_of
 from embomatrix.manager.simulation.trainer import SimulatedTrainer
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from embomatrix.manager.simulation.gauge import Cost
-    from embomatrix.manager.simulation.scenario import Scenario
+    from embomatrix.manager.simulation.scenario import SimulationScenario
     from embomatrix.rpc.wire.values import RunStats
 
 SAMPLE_S: Final = 0.1
@@ -36,7 +36,7 @@ SAMPLE_S: Final = 0.1
 class Report:
     """What came of a simulation. Times are simulated seconds, but for CPU times, which are real."""
 
-    scenario: Scenario
+    scenario: SimulationScenario
     slots: int
     submitted: int
     delivered: int
@@ -95,20 +95,20 @@ class Report:
         return self.cpu_s / (self.elapsed_s + self.scenario.trainers[0].start_s)
 
 
-class Simulation:
+class ClusterSimulation:
     """One cluster. ``run`` once; before it, ``agenda`` takes what shall happen to ``workers`` and ``front``."""
 
-    def __init__(self, scenario: Scenario) -> None:
+    def __init__(self, scenario: SimulationScenario) -> None:
         self._scenario = scenario
         self._setting = setting_of(scenario)
         self.agenda = Agenda()
-        self._auditor = Auditor(self.agenda)
+        self._auditor = InvariantChecker(self.agenda)
         self._gauge = Gauge()
         self._cluster = ClusterState(scenario.dispatch, scenario.schedule, boot_id="simulated")
         numbers = iter(range(1 << 62))
         registry = Registry(scenario.liveness, new_id=lambda: f"session-{next(numbers)}")
         intake = Intake(self._cluster, registry)
-        self.front = Front(self.agenda, intake, self._auditor, self._gauge, scenario.manager)
+        self.front = SimulatedManager(self.agenda, intake, self._auditor, self._gauge, scenario.manager)
         self.workers = self._hire()
         self._trainers = [
             SimulatedTrainer(
@@ -229,6 +229,6 @@ def _without_collector() -> Iterator[None]:
             gc.enable()
 
 
-def simulate(scenario: Scenario) -> Report:
+def simulate(scenario: SimulationScenario) -> Report:
     """Run it to its end. Raises BrokenInvariantError."""
-    return Simulation(scenario).run()
+    return ClusterSimulation(scenario).run()

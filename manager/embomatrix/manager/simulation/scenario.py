@@ -120,7 +120,7 @@ class ManagerPace:
 
 
 @dataclass(frozen=True, slots=True)
-class Scenario:
+class SimulationScenario:
     """All that a simulation depends on: equal scenarios give equal histories."""
 
     seed: int = 0

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from embomatrix.manager.simulation.agenda import Agenda
     from embomatrix.manager.simulation.gauge import Gauge
-    from embomatrix.manager.simulation.machines import Machine, Setting
+    from embomatrix.manager.simulation.machines import Setting, SimulatedMachine
     from embomatrix.manager.simulation.scenario import Faults
     from embomatrix.rpc.leases import Lease, LeaseRef
 
@@ -47,7 +47,7 @@ class _Scene:
 
 
 @dataclass(frozen=True, slots=True)
-class Surroundings:
+class SlotEnvironment:
     """What slots need of the simulation, and whom they tell."""
 
     agenda: Agenda
@@ -62,7 +62,7 @@ class Surroundings:
 class SimulatedSlots:
     """One life of a worker's process. After ``stop`` nothing happens any more; ``fetched`` bundles outlive it on disk."""
 
-    def __init__(self, machine: Machine, around: Surroundings, fetched: set[str]) -> None:
+    def __init__(self, machine: SimulatedMachine, around: SlotEnvironment, fetched: set[str]) -> None:
         self._machine = machine
         self._around = around
         self._fetched = fetched

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from embomatrix.manager.simulation.agenda import Agenda
-    from embomatrix.manager.simulation.front import Front
+    from embomatrix.manager.simulation.front import SimulatedManager
     from embomatrix.manager.simulation.gauge import Gauge
     from embomatrix.manager.simulation.scenario import Trainer
     from embomatrix.rpc.wire.values import RolloutResult
@@ -28,7 +28,7 @@ class SimulatedTrainer:
         plan: Trainer,
         scenes: Sequence[str],
         agenda: Agenda,
-        front: Front,
+        front: SimulatedManager,
         gauge: Gauge,
         rng: np.random.Generator,
     ) -> None:

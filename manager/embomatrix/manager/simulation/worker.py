@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Final, TypeVar
 
 from embomatrix.manager.simulation.front import Stream
 from embomatrix.manager.simulation.line import Line
-from embomatrix.manager.simulation.slots import SimulatedSlots, Surroundings
+from embomatrix.manager.simulation.slots import SimulatedSlots, SlotEnvironment
 from embomatrix.rpc.leases import WorkerState
 from embomatrix.rpc.status import SupersededError
 from embomatrix.rpc.wire.values import Completed
@@ -15,13 +15,13 @@ if TYPE_CHECKING:
     import random
     from collections.abc import Callable
 
-    from embomatrix.manager.runtime.registry import Session
+    from embomatrix.manager.runtime.registry import WorkerSession
     from embomatrix.manager.simulation.agenda import Agenda
-    from embomatrix.manager.simulation.auditor import Auditor
-    from embomatrix.manager.simulation.front import Front, Letter
+    from embomatrix.manager.simulation.auditor import InvariantChecker
+    from embomatrix.manager.simulation.front import Letter, SimulatedManager
     from embomatrix.manager.simulation.gauge import Gauge
-    from embomatrix.manager.simulation.machines import Machine, Setting
-    from embomatrix.manager.simulation.scenario import Scenario
+    from embomatrix.manager.simulation.machines import Setting, SimulatedMachine
+    from embomatrix.manager.simulation.scenario import SimulationScenario
     from embomatrix.rpc.leases import LeaseRef, LeaseResult
 
 ANSWER_S: Final = 2.0
@@ -40,12 +40,12 @@ class SimulatedWorker:
 
     def __init__(
         self,
-        machine: Machine,
-        scenario: Scenario,
+        machine: SimulatedMachine,
+        scenario: SimulationScenario,
         setting: Setting,
         agenda: Agenda,
-        front: Front,
-        auditor: Auditor,
+        front: SimulatedManager,
+        auditor: InvariantChecker,
         gauge: Gauge,
         dice: random.Random,
     ) -> None:
@@ -57,7 +57,7 @@ class SimulatedWorker:
         self._gauge = gauge
         self._dice = dice
         self._line = Line(agenda, machine.latency_s)
-        self._around = Surroundings(
+        self._around = SlotEnvironment(
             agenda, setting, scenario.faults, dice, gauge, self._take_result, self._residents_changed
         )
         self._fetched: set[str] = set()
@@ -66,7 +66,7 @@ class SimulatedWorker:
         self._renewed_s = 0.0
         self._report_due = False
         self.slots: SimulatedSlots | None = None
-        self._session: Session | None = None
+        self._session: WorkerSession | None = None
         self._stream: Stream | None = None
         self._outbox: dict[LeaseRef, LeaseResult] = {}
 
@@ -128,7 +128,7 @@ class SimulatedWorker:
     def _register(self) -> None:
         boot_id = f"{self.machine.worker_id}.{self._life}"
 
-        def welcome(session: Session) -> None:
+        def welcome(session: WorkerSession) -> None:
             self._session = session
             self._attach()
 

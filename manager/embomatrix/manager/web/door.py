@@ -18,7 +18,7 @@ TURNED_AWAY_AT_A_TIME: Final = 256
 """Then other work of the process gets its turn."""
 
 
-class Door(socket.socket):
+class BoundedListener(socket.socket):
     """For an asyncio server, which calls ``accept`` within its loop. Who comes when it is full is turned away at once."""
 
     most = WAITING

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.manager.web.gallery_values import FloorPlan, Moment
+from embomatrix.manager.web.gallery_values import FloorPlanView, MomentView
 from embomatrix.skills.describe import call_in_words
 from embomatrix.skills.syntax import Skill
 from embomatrix.world.geometry import Pose
@@ -30,7 +30,7 @@ PIECES: Final = 1500
 _ORIGIN: Final = Pose((0.0, 0.0, 0.0))
 
 
-def floor_plan(scene: Scene) -> FloorPlan:
+def floor_plan(scene: Scene) -> FloorPlanView:
     """The whole scene, from above."""
     walls = [wall.aabb(_ORIGIN) for wall in scene.walls]
     boxes = [(item, scene.box_of(item.name)) for item in scene.objects if not item.absent]
@@ -39,7 +39,7 @@ def floor_plan(scene: Scene) -> FloorPlan:
         for item, box in sorted(boxes, key=lambda entry: entry[1].low_m[2])
         if box.low_m[2] < HUNG_M and max(box.size_m[:2]) >= SMALL_M
     ]
-    return FloorPlan(
+    return FloorPlanView(
         [_box(room.name, room.low_m, room.high_m) for room in scene.rooms],
         [_box("", wall.low_m, wall.high_m) for wall in walls if wall.low_m[2] < SKIRTING_M],
         pieces[:PIECES],
@@ -53,15 +53,15 @@ def small_things(scene: Scene, task: Task) -> dict[str, list[float]]:
     return {item.name: _middle(scene, item.name) for item in found if not item.fixed and not item.absent}
 
 
-def played(scene: Scene, task: Task, plan: Plan) -> list[Moment]:
+def played(scene: Scene, task: Task, plan: Plan) -> list[MomentView]:
     """The plan call by call, each as if it did what it says."""
-    moments = [Moment("", _rounded(scene.robot.x_m, scene.robot.y_m))]
+    moments = [MomentView("", _rounded(scene.robot.x_m, scene.robot.y_m))]
     for call in plan:
         moments.append(_after(scene, task, call, moments[-1]))
     return moments
 
 
-def _after(scene: Scene, task: Task, call: SkillCall, before: Moment) -> Moment:
+def _after(scene: Scene, task: Task, call: SkillCall, before: MomentView) -> MomentView:
     target = _named(scene, task, call.object_index)
     robot, held, things, active = before.robot, [*before.held], {**before.things}, [*before.active]
     match call.skill:
@@ -81,7 +81,7 @@ def _after(scene: Scene, task: Task, call: SkillCall, before: Moment) -> Moment:
         case _:
             pass
     things |= dict.fromkeys(held, robot)
-    return Moment(call_in_words(call, task.table), robot, held, things, active)
+    return MomentView(call_in_words(call, task.table), robot, held, things, active)
 
 
 def _beside(scene: Scene, name: str, at: list[float] | None, robot: list[float]) -> list[float]:

@@ -30,7 +30,7 @@ from embomatrix.world.whole_file import read_whole
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from embomatrix.manager.web.gallery_values import FloorPlan, Moment
+    from embomatrix.manager.web.gallery_values import FloorPlanView, MomentView
     from embomatrix.world.dataset import TaskRecord
     from embomatrix.world.scene import Scene
 
@@ -59,7 +59,7 @@ class Gallery:
         self._records: dict[str, TaskRecord] = {}
         self._dataset: Dataset | None = None
         self._scenes: OrderedDict[str, Scene] = OrderedDict()
-        self._plans: OrderedDict[str, FloorPlan] = OrderedDict()
+        self._plans: OrderedDict[str, FloorPlanView] = OrderedDict()
 
     async def page(self, *, search: str, scene: str, category: str, offset: int, limit: int) -> TaskPage:
         """Tasks with the text in their instruction or id, in the order of the file. UnavailableError for a damaged dataset."""
@@ -93,7 +93,7 @@ class Gallery:
         async with self._reading:
             return await asyncio.to_thread(self._read_detail, record)
 
-    async def floor(self, digest: str) -> FloorPlan:
+    async def floor(self, digest: str) -> FloorPlanView:
         """The scene of a bundle from above. NotFoundError for one that no task is in."""
         await self._check_bundle(digest)
         async with self._reading:
@@ -156,7 +156,7 @@ class Gallery:
                 self._scenes.popitem(last=False)
         return self._scenes[digest]
 
-    def _read_floor(self, digest: str) -> FloorPlan:
+    def _read_floor(self, digest: str) -> FloorPlanView:
         if digest not in self._plans:
             self._plans[digest] = floor_plan(self._scene(digest))
             while len(self._plans) > PLANS_KEPT:
@@ -247,7 +247,7 @@ def _where(scene: Scene, name: str) -> str:
     return "on the wall" if scene.box_of(name).low_m[2] > HANGS_M else "on the floor"
 
 
-def _rooms(scene: Scene, record: TaskRecord, moments: list[Moment]) -> list[str]:
+def _rooms(scene: Scene, record: TaskRecord, moments: list[MomentView]) -> list[str]:
     """Those that the table's objects are in, and those that the robot comes through."""
     table = {scene.by_name[name].room for name in record.task.table if name in scene.by_name}
     visited = {scene.room_at((moment.robot[0], moment.robot[1])) for moment in moments}

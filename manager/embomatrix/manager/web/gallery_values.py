@@ -8,7 +8,7 @@ Box = tuple[str, float, float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
-class FloorPlan:
+class FloorPlanView:
     """Rooms, walls and what stands about, as boxes in the world's xy plane."""
 
     rooms: list[Box]
@@ -18,7 +18,7 @@ class FloorPlan:
 
 
 @dataclass(frozen=True, slots=True)
-class Moment:
+class MomentView:
     """After a call; the first is the start. ``things`` are those that are elsewhere than at the start, ``active`` what the plan
     opened or switched on. Metres in the world's xy plane.
     """
@@ -106,7 +106,7 @@ class TaskDetail:
     objects: list[ObjectRow]
     transcript: str
     tree: Any
-    floor: FloorPlan
+    floor: FloorPlanView
     things: dict[str, list[float]]
-    moments: list[Moment] = field(default_factory=list)
+    moments: list[MomentView] = field(default_factory=list)
     problem: str = ""

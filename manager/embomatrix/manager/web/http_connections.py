@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from uvicorn import Config
     from uvicorn.server import ServerState
 
-    from embomatrix.manager.web.door import Door
+    from embomatrix.manager.web.door import BoundedListener
 
 CONNECTIONS: Final = 2048
 """At most. A page opens six, a stream of events holds one."""
@@ -28,7 +28,7 @@ class BoundedConnections(H11Protocol):
 
     most = CONNECTIONS
     silent_s = SILENT_S
-    door: Door | None = None
+    door: BoundedListener | None = None
     """Through which they come."""
 
     def __init__(
@@ -62,7 +62,7 @@ class BoundedConnections(H11Protocol):
             self.transport.abort()
 
 
-def connections_through(door: Door) -> type[BoundedConnections]:
+def connections_through(door: BoundedListener) -> type[BoundedConnections]:
     """Those of a server that listens at this door."""
     return type("ConnectionsThroughADoor", (BoundedConnections,), {"door": door})
 

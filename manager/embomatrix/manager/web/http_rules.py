@@ -13,7 +13,7 @@ from embomatrix.manager.settings import is_loopback
 from embomatrix.manager.web.page import STATIC
 from embomatrix.manager.web.rewards import REWARDS
 from embomatrix.rpc.channel import token_of
-from embomatrix.rpc.roles import Role
+from embomatrix.rpc.roles import AccessRole
 from embomatrix.rpc.status import NotSignedInError
 
 if TYPE_CHECKING:
@@ -25,13 +25,13 @@ if TYPE_CHECKING:
 OPEN_PATHS: Final = frozenset({"/", "/healthz"})
 """The empty page, which asks for the token itself, and the health check; the page's own files lie below ``STATIC``."""
 READING: Final = frozenset({"GET", "HEAD", "OPTIONS"})
-VIEWERS: Final = frozenset({Role.VIEWER, Role.TRAINER, Role.ADMIN})
-TRAINERS: Final = frozenset({Role.TRAINER, Role.ADMIN})
-ADMINS: Final = frozenset({Role.ADMIN})
+VIEWERS: Final = frozenset({AccessRole.VIEWER, AccessRole.TRAINER, AccessRole.ADMIN})
+TRAINERS: Final = frozenset({AccessRole.TRAINER, AccessRole.ADMIN})
+ADMINS: Final = frozenset({AccessRole.ADMIN})
 LOOPBACK_NAMES: Final = frozenset({"localhost", "127.0.0.1", "::1"})
 
 
-class Refusal(NamedTuple):
+class HttpRefusal(NamedTuple):
     """Why a request gets no answer: the HTTP status, and a sentence for whoever asked."""
 
     status: int
@@ -45,26 +45,28 @@ class HttpRules:
     gate: Gate
     hosts: frozenset[str]
 
-    def refusal(self, method: str, path: str, headers: Headers) -> Refusal | None:
+    def refusal(self, method: str, path: str, headers: Headers) -> HttpRefusal | None:
         """Why the request is refused; None if it isn't."""
         host = headers.get("host", "")
         if self.hosts and _name_of(host) not in self.hosts:
             # A page elsewhere must not reach this one under a name of its own (DNS rebinding).
-            return Refusal(
+            return HttpRefusal(
                 400, f"this server is not called {host[:100]!r}: add the name with `manager init --san`"
             )
         changes = method not in READING
         if changes and _is_foreign(headers, host):
-            return Refusal(403, "a page of another origin asks for a change: open the manager's own page")
+            return HttpRefusal(403, "a page of another origin asks for a change: open the manager's own page")
         if (path in OPEN_PATHS or path.startswith(STATIC)) and not changes:
             return None
         try:
             role = self.gate.caller(token_of(headers.get("authorization"))).role
         except NotSignedInError as error:
-            return Refusal(401, f"{error}; HTTP requests show it as `Authorization: Bearer TOKEN`")
+            return HttpRefusal(401, f"{error}; HTTP requests show it as `Authorization: Bearer TOKEN`")
         if role not in _allowed(path, changes=changes):
-            needed = Role.TRAINER if path == REWARDS else Role.ADMIN if changes else Role.VIEWER
-            return Refusal(403, f"a token of the role {role} may not do this: it takes {needed}")
+            needed = (
+                AccessRole.TRAINER if path == REWARDS else AccessRole.ADMIN if changes else AccessRole.VIEWER
+            )
+            return HttpRefusal(403, f"a token of the role {role} may not do this: it takes {needed}")
         return None
 
 
@@ -94,7 +96,7 @@ def allowed_hosts(bound: str, tls: Tls | None) -> frozenset[str]:
     return LOOPBACK_NAMES if is_loopback(bound) else frozenset()
 
 
-def _allowed(path: str, *, changes: bool) -> frozenset[Role]:
+def _allowed(path: str, *, changes: bool) -> frozenset[AccessRole]:
     if path == REWARDS:
         return TRAINERS
     return ADMINS if changes else VIEWERS

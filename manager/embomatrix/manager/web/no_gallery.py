@@ -11,7 +11,7 @@ from embomatrix.manager.web.gallery_values import TaskPage
 from embomatrix.rpc.status import NotFoundError
 
 if TYPE_CHECKING:
-    from embomatrix.manager.web.gallery_values import FloorPlan, SceneName, TaskDetail
+    from embomatrix.manager.web.gallery_values import FloorPlanView, SceneName, TaskDetail
 
 NO_DATASET: Final = "no dataset is shown: start the manager with --dataset FOLDER"
 
@@ -30,7 +30,7 @@ class NoGallery:
     async def detail(self, task_id: str) -> TaskDetail:
         raise NotFoundError(NO_DATASET)
 
-    async def floor(self, digest: str) -> FloorPlan:
+    async def floor(self, digest: str) -> FloorPlanView:
         raise NotFoundError(NO_DATASET)
 
     async def picture(self, digest: str) -> bytes:

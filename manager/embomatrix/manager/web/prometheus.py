@@ -14,7 +14,7 @@ from prometheus_client.registry import Collector
 
 from embomatrix.manager.observe.histogram import BOUNDS_S
 from embomatrix.manager.observe.history import manager_version
-from embomatrix.manager.runtime.registry import Standing
+from embomatrix.manager.runtime.registry import WorkerStanding
 from embomatrix.manager.web.views import standing_counts
 from embomatrix.rpc.wire.values import InfraCode, ResidentState
 
@@ -56,7 +56,7 @@ class _Cluster(Collector):
     def _fleet(self) -> Iterator[Metric]:
         sessions = self._runtime.registry.sessions
         standings = standing_counts(self._runtime)
-        states = {standing.value: standings[standing.value] for standing in Standing}
+        states = {standing.value: standings[standing.value] for standing in WorkerStanding}
         yield _gauges("embo_workers", "Workers by state.", "state", states)
         yield _gauges("embo_slots", "Slots of connected workers by state.", "state", self._slot_states())
         scheduler = self._runtime.cluster.scheduler

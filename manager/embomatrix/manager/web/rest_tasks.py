@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import JSONResponse
 
-from embomatrix.manager.web.gallery_values import FloorPlan, SceneName, TaskDetail, TaskPage
+from embomatrix.manager.web.gallery_values import FloorPlanView, SceneName, TaskDetail, TaskPage
 from embomatrix.manager.web.packing import packed
 from embomatrix.manager.web.rest import PREFIX, Limit, Offset, answered
 from embomatrix.manager.web.rest_values import PAGE
@@ -60,7 +60,7 @@ def _scenes(router: APIRouter, gallery: Gallery | NoGallery) -> None:
         with answered():
             return _json(request, await gallery.scenes(offset=offset, limit=limit))
 
-    @router.get("/scenes/{digest}/floor", response_model=FloorPlan)
+    @router.get("/scenes/{digest}/floor", response_model=FloorPlanView)
     async def floor(request: Request, digest: str) -> Response:
         """A scene from above."""
         with answered():
@@ -73,6 +73,6 @@ def _scenes(router: APIRouter, gallery: Gallery | NoGallery) -> None:
             return Response(await gallery.picture(digest), media_type="image/jpeg")
 
 
-def _json(request: Request, value: TaskDetail | FloorPlan | list[SceneName]) -> Response:
+def _json(request: Request, value: TaskDetail | FloorPlanView | list[SceneName]) -> Response:
     told = json.dumps(value, default=dataclasses.asdict, separators=(",", ":"))
     return packed(request, told.encode())

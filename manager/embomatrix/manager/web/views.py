@@ -7,20 +7,20 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.manager.control.schedule.lookahead_window import Window
+from embomatrix.manager.control.schedule.lookahead_window import LookaheadWindow
 from embomatrix.manager.observe.meter import FailureNote  # noqa: TC001  # the OpenAPI page is made of annotations
 from embomatrix.manager.observe.run_figures import summary_of
-from embomatrix.manager.runtime.registry import Standing
+from embomatrix.manager.runtime.registry import WorkerStanding
 from embomatrix.rpc.run_log import PhaseSummary  # noqa: TC001  # the OpenAPI page is made of annotations
 from embomatrix.rpc.status import NotFoundError
 from embomatrix.rpc.wire.values import Resident, ResidentState, RunInfo, RunStats, Warmth, WorkerInfo
 
 if TYPE_CHECKING:
     from embomatrix.manager.runtime.event_loop import ManagerRuntime
-    from embomatrix.manager.runtime.registry import Session
+    from embomatrix.manager.runtime.registry import WorkerSession
     from embomatrix.rpc.wire.values import PlanCell
 
-NOTHING: Final = Window(0, ())
+NOTHING: Final = LookaheadWindow(0, ())
 UNAUDITED: Final = "results are not audited: that takes a second worker"
 
 
@@ -211,17 +211,17 @@ def run_infos(runtime: ManagerRuntime) -> list[RunInfo]:
 def standing_counts(runtime: ManagerRuntime) -> Counter[str]:
     """How many workers are in each state, in the order of the states."""
     found = Counter(_standing(runtime, session) for session in runtime.registry.sessions.values())
-    return Counter({standing.value: found[standing] for standing in Standing if found[standing]})
+    return Counter({standing.value: found[standing] for standing in WorkerStanding if found[standing]})
 
 
-def _standing(runtime: ManagerRuntime, session: Session) -> Standing:
+def _standing(runtime: ManagerRuntime, session: WorkerSession) -> WorkerStanding:
     """As people shall see it: what was decided about a worker comes before what it says itself."""
     if session.standing.is_gone:
         return session.standing
     if runtime.cluster.dispatcher.auditor.quarantined(session.worker_id):
-        return Standing.QUARANTINED
+        return WorkerStanding.QUARANTINED
     record = runtime.cluster.dispatcher.workers.get(session.worker_id)
-    return Standing.DRAINING if record is not None and record.draining else session.standing
+    return WorkerStanding.DRAINING if record is not None and record.draining else session.standing
 
 
 def _worker(runtime: ManagerRuntime, worker_id: str) -> WorkerView:

@@ -124,7 +124,7 @@ class PlanScorer:
             atexit.unregister(self.close)
             opened.gateway.__exit__()
 
-    def submit(self, task_ids: Sequence[str], texts: Sequence[str]) -> list[Share]:
+    def submit(self, task_ids: Sequence[str], texts: Sequence[str]) -> list[ScoredTexts]:
         """Start the rollouts of these texts, one batch for each task. Raises TrainerError for an unknown task."""
         opened = self.open()
         members: dict[str, list[int]] = {}
@@ -139,7 +139,7 @@ class PlanScorer:
             future = opened.gateway.submit(
                 f"score-{number}", number, task, task.situation, chosen, Codec.JSON
             )
-            shares.append(Share(tuple(indices), future))
+            shares.append(ScoredTexts(tuple(indices), future))
         return shares
 
     async def score(self, task_ids: Sequence[str], texts: Sequence[str]) -> list[PlanOutcome]:
@@ -185,7 +185,7 @@ class PlanScorer:
 
 
 @dataclass(frozen=True, slots=True)
-class Share:
+class ScoredTexts:
     """One task's texts: where they stood among all, and what becomes of them."""
 
     indices: tuple[int, ...]

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from embomatrix.rpc.client import ClusterClient
     from embomatrix.trainer.grpo.rollout import Gateway
     from embomatrix.trainer.imitation.imitate import ImitationState
-    from embomatrix.trainer.logging.report import Summary
+    from embomatrix.trainer.logging.report import TrainingSummary
     from embomatrix.trainer.run.data import TaskSet
     from embomatrix.trainer.run.settings import OnLost, TrainSettings
     from embomatrix.trainer.run.starting import Start
@@ -218,7 +218,7 @@ def _gateway(
     return Gateway(connect, tasks.bundle_bytes, run_name=name, run_seed=settings.seed, terms=terms)
 
 
-def _run(start: Start, connect: Connect, out: Path) -> Summary:
+def _run(start: Start, connect: Connect, out: Path) -> TrainingSummary:
     from embomatrix.trainer.logging.progress import display_for
     from embomatrix.trainer.logging.trackers import trackers_of
     from embomatrix.trainer.policy.choice import saved_policy
@@ -279,7 +279,7 @@ def _show_imitation(state: ImitationState, out: Path) -> None:
     )
 
 
-def _show_summary(summary: Summary) -> None:
+def _show_summary(summary: TrainingSummary) -> None:
     from embomatrix.trainer.logging.report import prewarm_share, success_rows, time_rows
 
     console = Console()

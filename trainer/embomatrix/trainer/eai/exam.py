@@ -13,7 +13,7 @@ from embomatrix.trainer.evaluation.exam import Marked, Question
 from embomatrix.trainer.evaluation.intervals import mean_over_tasks
 from embomatrix.trainer.evaluation.scoreboard import Scoreboard
 from embomatrix.trainer.evaluation.taxonomy import Cause
-from embomatrix.trainer.evaluation.verdicts import Verdict
+from embomatrix.trainer.evaluation.verdicts import AnswerVerdict
 from embomatrix.world.task import TaskCategory
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from embomatrix.skills.prompt import Codec
     from embomatrix.trainer.eai.judge import NativeJudge, NativeResult, NativeTask
-    from embomatrix.trainer.evaluation.answers import Answer, Setup
+    from embomatrix.trainer.evaluation.answers import Answer, EvaluationSetup
     from embomatrix.trainer.evaluation.intervals import Estimate
 
 NAME: Final = "eai-native"
@@ -72,7 +72,9 @@ class NativeExam:
         """The human plan that the package publishes."""
         return self._tasks[task_id].human
 
-    def judge(self, setup: Setup, answers: Sequence[Answer], report: Callable[[int, int], None]) -> Marked:
+    def judge(
+        self, setup: EvaluationSetup, answers: Sequence[Answer], report: Callable[[int, int], None]
+    ) -> Marked:
         """Equal answers of a task are judged once. Raises TrainerError where the judge can't start."""
         categories = {task.demo: TaskCategory(task.category) for task in self._tasks.values()}
         known: dict[tuple[str, str], NativeResult | None] = {}
@@ -102,13 +104,13 @@ def _share(
     return mean_over_tasks([sum(values) / len(values) for values in by_task.values()])
 
 
-def _verdict(answer: Answer, result: NativeResult | None) -> Verdict:
+def _verdict(answer: Answer, result: NativeResult | None) -> AnswerVerdict:
     """An answer that the judge did not survive is lost: it is no evidence. ``partial`` is over the goal's conjuncts."""
     if result is None:
-        return Verdict(answer.task_id, answer.sample, success=False, partial=0.0, lost=True)
+        return AnswerVerdict(answer.task_id, answer.sample, success=False, partial=0.0, lost=True)
     partial = sum(result.goals) / len(result.goals) if result.goals else 0.0
     cause, reason = (None, "") if result.official else _cause(result)
-    return Verdict(
+    return AnswerVerdict(
         answer.task_id, answer.sample, success=result.official, partial=partial, cause=cause, reason=reason
     )
 

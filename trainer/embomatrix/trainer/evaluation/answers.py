@@ -29,7 +29,7 @@ CODECS: Final = frozenset({*(codec.value for codec in Codec), "eai"})
 
 
 @dataclass(frozen=True, slots=True)
-class Setup:
+class EvaluationSetup:
     """What was asked, and of whom. Equal setups ask equal questions.
 
     ``bench_digest`` names the tasks; ``questions`` is a hash of all prompts, empty where a baseline was not asked in words.
@@ -67,7 +67,7 @@ class Answer:
 class AnswerSheet:
     """Context manager over the file: what is there already, and where more goes."""
 
-    def __init__(self, path: Path, setup: Setup) -> None:
+    def __init__(self, path: Path, setup: EvaluationSetup) -> None:
         """Raises TrainerError when the file holds answers to other questions, or can't be read or written."""
         self.path = path
         self.setup = setup
@@ -115,7 +115,7 @@ class AnswerSheet:
         setup, answers, whole = _read(self.path)
         differing = [
             f"{entry.name} {getattr(setup, entry.name)!r}, now {getattr(self.setup, entry.name)!r}"
-            for entry in fields(Setup)
+            for entry in fields(EvaluationSetup)
             if getattr(setup, entry.name) != getattr(self.setup, entry.name)
         ]
         if differing:
@@ -138,7 +138,7 @@ class AnswerSheet:
             ) from error
 
 
-def read_answers(path: Path) -> tuple[Setup, dict[tuple[str, int], Answer]]:
+def read_answers(path: Path) -> tuple[EvaluationSetup, dict[tuple[str, int], Answer]]:
     """What a file holds. Raises TrainerError when it can't be read or is of another version."""
     try:
         setup, answers, _ = _read(path)
@@ -158,7 +158,7 @@ def ordered(
 
 
 def check_asked_for(
-    stored: Iterable[tuple[str, int]], task_ids: Iterable[str], setup: Setup, path: Path
+    stored: Iterable[tuple[str, int]], task_ids: Iterable[str], setup: EvaluationSetup, path: Path
 ) -> None:
     """Raises TrainerError where a (task, sample) that was answered was never asked for."""
     known = set(task_ids)
@@ -170,7 +170,7 @@ def check_asked_for(
             )
 
 
-def _read(path: Path) -> tuple[Setup, list[Answer], int]:
+def _read(path: Path) -> tuple[EvaluationSetup, list[Answer], int]:
     """The setup, the answers, and the length in bytes of the lines that are whole."""
     data = path.read_bytes()
     whole = data.rfind(b"\n") + 1
@@ -188,7 +188,7 @@ def _read(path: Path) -> tuple[Setup, list[Answer], int]:
             f"{path} is of another version (found {version!r}, expected {VERSION}): ask the model again, or judge it with the "
             "version of embomatrix that wrote it"
         )
-    setup = _made(Setup, header, path, 1)
+    setup = _made(EvaluationSetup, header, path, 1)
     _check(setup, path)
     answers = [
         _made(Answer, _line(line, path, number), path, number) for number, line in enumerate(lines[1:], 2)
@@ -196,7 +196,7 @@ def _read(path: Path) -> tuple[Setup, list[Answer], int]:
     return setup, answers, whole
 
 
-def _check(setup: Setup, path: Path) -> None:
+def _check(setup: EvaluationSetup, path: Path) -> None:
     """What were options of the command is what it takes. Raises TrainerError."""
     for name, sound, expected in (
         ("samples", 1 <= setup.samples <= MOST_SAMPLES, f"1 to {MOST_SAMPLES}"),

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from embomatrix.llm.endpoint import Endpoint
-    from embomatrix.trainer.evaluation.answers import AnswerSheet, Setup
+    from embomatrix.trainer.evaluation.answers import AnswerSheet, EvaluationSetup
     from embomatrix.trainer.evaluation.exam import Question
     from embomatrix.trainer.policy.protocol import Policy
 
@@ -139,7 +139,7 @@ class WriterAsker:
             report(len(sheet), len(questions) * sheet.setup.samples)
 
 
-def _request(question: Question, setup: Setup, sample: int) -> ChatRequest:
+def _request(question: Question, setup: EvaluationSetup, sample: int) -> ChatRequest:
     prompt = question.prompt
     messages = [Message(Speaker.SYSTEM, prompt.system)] if prompt.system else []
     return ChatRequest(

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     import numpy as np
 
-    from embomatrix.skills.prompt import Row
+    from embomatrix.skills.prompt import PromptRow
     from embomatrix.skills.syntax import Plan
     from embomatrix.trainer.run.data import TrainingTask
     from embomatrix.world.goal import Formula
@@ -165,7 +165,7 @@ class _Script:
         elif predicate == State.TOGGLED_ON and "on" in row.states:
             yield from _at(row, Skill.TOGGLE_OFF)
 
-    def carry(self, thing: Row, place: Row, relation: PlaceRelation) -> Iterator[SkillCall]:
+    def carry(self, thing: PromptRow, place: PromptRow, relation: PlaceRelation) -> Iterator[SkillCall]:
         """Calls that put a thing somewhere, none where it is there already."""
         if thing.host == place.name and thing.relation is not None and thing.relation.value == relation:
             return
@@ -175,13 +175,13 @@ class _Script:
         yield SkillCall(Skill.MOVE, place.index)
         yield SkillCall(Skill.PLACE, place.index, relation=relation)
 
-    def _fetch(self, thing: Row) -> Iterator[SkillCall]:
+    def _fetch(self, thing: PromptRow) -> Iterator[SkillCall]:
         host = self._rows.get(thing.host)
         if host is not None and thing.relation is Relation.INSIDE:
             yield from _opened(host)
         yield from _at(thing, Skill.PICK_UP)
 
-    def _process(self, thing: Row, kinds: Sequence[str], *, switch: bool) -> Iterator[SkillCall]:
+    def _process(self, thing: PromptRow, kinds: Sequence[str], *, switch: bool) -> Iterator[SkillCall]:
         """Into the first machine of these kinds, shut, and switched on where it has to be."""
         found = [row for kind in kinds for row in self._rows.values() if kind in row.category]
         if not found:
@@ -194,12 +194,12 @@ class _Script:
             yield SkillCall(Skill.TOGGLE_ON, machine.index)
 
 
-def _at(row: Row, skill: Skill) -> Iterator[SkillCall]:
+def _at(row: PromptRow, skill: Skill) -> Iterator[SkillCall]:
     yield SkillCall(Skill.MOVE, row.index)
     yield SkillCall(skill, row.index)
 
 
-def _opened(row: Row) -> Iterator[SkillCall]:
+def _opened(row: PromptRow) -> Iterator[SkillCall]:
     if "closed" in row.states:
         yield from _at(row, Skill.OPEN)
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
 from embomatrix.skills.prompt import limited, prompt_for
-from embomatrix.trainer.evaluation.judging import Judge
+from embomatrix.trainer.evaluation.judging import AnswerJudge
 from embomatrix.trainer.evaluation.pictures import chosen_pictures
 from embomatrix.trainer.evaluation.scoreboard import Scoreboard
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from embomatrix.skills.prompt import Codec, Prompt
-    from embomatrix.trainer.evaluation.answers import Answer, Setup
+    from embomatrix.trainer.evaluation.answers import Answer, EvaluationSetup
     from embomatrix.trainer.evaluation.benchmark import Benchmark
     from embomatrix.trainer.evaluation.intervals import Estimate
     from embomatrix.trainer.evaluation.judging import Executor
@@ -60,7 +60,9 @@ class Exam(Protocol):
         """A question for each task, with so many rows of its object table at most. Raises TrainerError."""
         ...
 
-    def judge(self, setup: Setup, answers: Sequence[Answer], report: Callable[[int, int], None]) -> Marked:
+    def judge(
+        self, setup: EvaluationSetup, answers: Sequence[Answer], report: Callable[[int, int], None]
+    ) -> Marked:
         """Mark answers; ``report`` is told of plans done and in all. Raises TrainerError and ClusterError."""
         ...
 
@@ -81,8 +83,10 @@ class WorldExam:
             for task_id, task in self.bench.tasks.items()
         )
 
-    def judge(self, setup: Setup, answers: Sequence[Answer], report: Callable[[int, int], None]) -> Marked:
-        judged = Judge(self.bench, setup, self._executor).judge(answers, report)
+    def judge(
+        self, setup: EvaluationSetup, answers: Sequence[Answer], report: Callable[[int, int], None]
+    ) -> Marked:
+        judged = AnswerJudge(self.bench, setup, self._executor).judge(answers, report)
         categories = {record.task.task_id: record.task.category for record in self.bench.records}
         board = Scoreboard.of(categories, judged.verdicts, self.by_rule)
         return Marked(board, chosen_pictures(self.bench, board, judged.plans))

@@ -44,7 +44,7 @@ class TaskScore:
 
 
 @dataclass(frozen=True)
-class Evaluation:
+class HeldOutEvaluation:
     """Scores of every task, in the order of the tasks."""
 
     scores: tuple[TaskScore, ...]
@@ -73,11 +73,11 @@ class Evaluation:
         ]
 
     @staticmethod
-    def from_json(values: Sequence[Mapping[str, Any]]) -> Evaluation:
-        return Evaluation(tuple(TaskScore(**value) for value in values))
+    def from_json(values: Sequence[Mapping[str, Any]]) -> HeldOutEvaluation:
+        return HeldOutEvaluation(tuple(TaskScore(**value) for value in values))
 
 
-def improvement(before: Evaluation, after: Evaluation) -> Interval:
+def improvement(before: HeldOutEvaluation, after: HeldOutEvaluation) -> Interval:
     """Mean paired difference in success over the tasks that both evaluations hold."""
     earlier = {score.task_id: score.rate for score in before.scores}
     pairs = [score.rate - earlier[score.task_id] for score in after.scores if score.task_id in earlier]
@@ -95,7 +95,7 @@ def evaluate_policy(
     seed: int,
     label: str,
     report: Callable[[int, int], None],
-) -> Evaluation:
+) -> HeldOutEvaluation:
     """Sample ``settings.samples`` plans of every task and execute each once. ``report`` gets tasks done and in all."""
     device = next(iter(policy.parameters())).device
     generator = torch.Generator(device).manual_seed(seed)
@@ -117,7 +117,7 @@ def evaluate_policy(
         outcomes: tuple[PlanOutcome, ...] = waited(future)
         scores.append(_task_score(task, outcomes))
         report(len(scores), len(tasks))
-    return Evaluation(tuple(scores))
+    return HeldOutEvaluation(tuple(scores))
 
 
 def _task_score(task: TrainingTask, outcomes: Sequence[PlanOutcome]) -> TaskScore:

@@ -30,7 +30,7 @@ class Interval:
         return f"{self.value:.1%} [{self.low:.1%}, {self.high:.1%}]"
 
 
-class Method(StrEnum):
+class IntervalMethod(StrEnum):
     """How an interval was made."""
 
     BOOTSTRAP = "bootstrap"
@@ -43,7 +43,7 @@ class Estimate:
     """A mean over tasks. ``tasks`` are those of which something is known."""
 
     interval: Interval
-    method: Method
+    method: IntervalMethod
     tasks: int
 
 
@@ -77,10 +77,10 @@ def mean_over_tasks(shares: Sequence[float]) -> Estimate:
     """
     known = [share for share in shares if share == share]
     if not known:
-        return Estimate(NOTHING, Method.NONE, 0)
+        return Estimate(NOTHING, IntervalMethod.NONE, 0)
     if min(known) == max(known):
-        return Estimate(wilson(known[0], len(known)), Method.WILSON, len(known))
-    return Estimate(bootstrap(known), Method.BOOTSTRAP, len(known))
+        return Estimate(wilson(known[0], len(known)), IntervalMethod.WILSON, len(known))
+    return Estimate(bootstrap(known), IntervalMethod.BOOTSTRAP, len(known))
 
 
 def pass_at(k: int, samples: int, successes: int) -> float:

@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 
     from embomatrix.rpc.wire.values import Outcome
     from embomatrix.skills.syntax import Plan
-    from embomatrix.trainer.evaluation.answers import Answer, Setup
+    from embomatrix.trainer.evaluation.answers import Answer, EvaluationSetup
     from embomatrix.trainer.evaluation.benchmark import Benchmark
-    from embomatrix.trainer.evaluation.verdicts import Verdict
+    from embomatrix.trainer.evaluation.verdicts import AnswerVerdict
 
     OnResult = Callable[[str, Outcome], None]
 
@@ -32,17 +32,17 @@ class Executor(Protocol):
 
 
 @dataclass(frozen=True)
-class Judged:
+class JudgedAnswers:
     """A verdict for each answer, in their order, and by (task, sample) the plans of those texts that are one."""
 
-    verdicts: tuple[Verdict, ...]
+    verdicts: tuple[AnswerVerdict, ...]
     plans: Mapping[tuple[str, int], Plan]
 
 
-class Judge:
+class AnswerJudge:
     """Judges the answers to one benchmark. ``setup`` says how they name objects, and seeds the execution."""
 
-    def __init__(self, bench: Benchmark, setup: Setup, executor: Executor) -> None:
+    def __init__(self, bench: Benchmark, setup: EvaluationSetup, executor: Executor) -> None:
         self._bench = bench
         self._setup = setup
         self._executor = executor
@@ -50,13 +50,13 @@ class Judge:
 
     def judge(
         self, answers: Sequence[Answer], report: Callable[[int, int], None] = lambda done, total: None
-    ) -> Judged:
+    ) -> JudgedAnswers:
         """Judge every answer. ``report`` is told of plans executed and in all.
 
         Equal plans of a task are executed once: they share a seed, so their outcomes are equal.
         """
         plans: dict[tuple[str, int], Plan] = {}
-        refused: dict[tuple[str, int], Verdict] = {}
+        refused: dict[tuple[str, int], AnswerVerdict] = {}
         for answer in answers:
             try:
                 plans[answer.task_id, answer.sample] = self._plan(answer)
@@ -72,7 +72,7 @@ class Judge:
                 continue
             task, plan = self._records[answer.task_id].task, plans[key]
             verdicts.append(of_plan(answer, task, plan, outcomes.get((answer.task_id, plan))))
-        return Judged(tuple(verdicts), plans)
+        return JudgedAnswers(tuple(verdicts), plans)
 
     def _plan(self, answer: Answer) -> Plan:
         record = self._records[answer.task_id]

@@ -15,7 +15,7 @@ from embomatrix.trainer.evaluation.table import (
     COLUMNS,
     INTERVALS,
     NONE,
-    Row,
+    ScoreRow,
     cause_rows,
     head,
     pass_rows,
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from embomatrix.skills.syntax import Plan
-    from embomatrix.trainer.evaluation.verdicts import Verdict
+    from embomatrix.trainer.evaluation.verdicts import AnswerVerdict
     from embomatrix.world.scene import Scene
     from embomatrix.world.task import Task
 
@@ -45,16 +45,16 @@ class Picture:
     task: Task
     plan: Plan
     lines: tuple[str, ...]
-    verdict: Verdict
+    verdict: AnswerVerdict
 
 
 def evaluation_page(
-    report: Mapping[str, Any], pictures: Sequence[Picture], beside: Sequence[Row] = ()
+    report: Mapping[str, Any], pictures: Sequence[Picture], beside: Sequence[ScoreRow] = ()
 ) -> str:
     """The page of a report, with other rows on the same tasks under its own."""
     template = files("embomatrix.trainer.evaluation").joinpath("page.html").read_text(encoding="utf-8")
     setup = report["setup"]
-    rows = [Row(setup["model"], report), *beside]
+    rows = [ScoreRow(setup["model"], report), *beside]
     title = f"{setup['model']} on {PurePath(setup['bench']).name}"
     return string.Template(template).substitute(
         head=page_head(f"{title} · EmboMatrix evaluation"),

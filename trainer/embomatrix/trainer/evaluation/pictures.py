@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from embomatrix.skills.syntax import Plan
     from embomatrix.trainer.evaluation.benchmark import Benchmark
     from embomatrix.trainer.evaluation.scoreboard import Scoreboard
-    from embomatrix.trainer.evaluation.verdicts import Verdict
+    from embomatrix.trainer.evaluation.verdicts import AnswerVerdict
 
 MOST: Final = 8
 
@@ -38,7 +38,7 @@ def chosen_pictures(
     )
 
 
-def _chosen(board: Scoreboard, plans: Mapping[tuple[str, int], Plan]) -> Iterator[Verdict]:
+def _chosen(board: Scoreboard, plans: Mapping[tuple[str, int], Plan]) -> Iterator[AnswerVerdict]:
     """The first of each kind, in the order of the benchmark."""
     for category in board.categories:
         verdicts = [

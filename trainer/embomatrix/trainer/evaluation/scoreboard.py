@@ -15,7 +15,7 @@ from embomatrix.world.task import TaskCategory
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from embomatrix.trainer.evaluation.verdicts import Verdict
+    from embomatrix.trainer.evaluation.verdicts import AnswerVerdict
 
 KS: Final = (1, 2, 3, 5, 10, 20, 50, 100)
 """The k of pass@k, as far as there are samples."""
@@ -27,10 +27,10 @@ class TaskResult:
 
     task_id: str
     category: TaskCategory
-    verdicts: tuple[Verdict, ...]
+    verdicts: tuple[AnswerVerdict, ...]
 
     @cached_property
-    def known(self) -> tuple[Verdict, ...]:
+    def known(self) -> tuple[AnswerVerdict, ...]:
         return tuple(verdict for verdict in self.verdicts if not verdict.lost)
 
     @property
@@ -56,9 +56,11 @@ class Scoreboard:
     by_rule: int = 0
 
     @staticmethod
-    def of(tasks: Mapping[str, TaskCategory], verdicts: Sequence[Verdict], by_rule: int = 0) -> Scoreboard:
+    def of(
+        tasks: Mapping[str, TaskCategory], verdicts: Sequence[AnswerVerdict], by_rule: int = 0
+    ) -> Scoreboard:
         """Verdicts in any order, sorted to their tasks; ``tasks`` are the ids and categories of all that were asked."""
-        found: dict[str, list[Verdict]] = {task_id: [] for task_id in tasks}
+        found: dict[str, list[AnswerVerdict]] = {task_id: [] for task_id in tasks}
         for verdict in verdicts:
             found[verdict.task_id].append(verdict)
         return Scoreboard(

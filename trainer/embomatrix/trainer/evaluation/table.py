@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
-    from embomatrix.trainer.evaluation.answers import Setup
+    from embomatrix.trainer.evaluation.answers import EvaluationSetup
     from embomatrix.trainer.evaluation.exam import Marked
 
 VERSION: Final = 1
@@ -34,20 +34,20 @@ INTERVALS: Final = (
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class ScoreRow:
     """One line of the table: a model's name and its figures as a report holds them."""
 
     label: str
     figures: Mapping[str, Any]
 
 
-def report_of(setup: Setup, marked: Marked) -> dict[str, Any]:
+def report_of(setup: EvaluationSetup, marked: Marked) -> dict[str, Any]:
     """The evaluation as JSON. Equal answers give equal bytes, wherever their plans are executed."""
     others = {name: estimate_to_json(found) for name, found in marked.others.items()}
     return {"report": VERSION, "setup": asdict(setup), **marked.board.as_json(), "others": others}
 
 
-def read_row(path: Path, bench_digest: str) -> Row:
+def read_row(path: Path, bench_digest: str) -> ScoreRow:
     """The row of another evaluation's report on the same tasks. Raises TrainerError."""
     try:
         value = json.loads(path.read_bytes())
@@ -57,7 +57,7 @@ def read_row(path: Path, bench_digest: str) -> Row:
                 f"the report {path} is of another version (found {version!r}, expected {VERSION}): evaluate its answers again"
             )
         label, digest = str(setup["model"]), setup["bench_digest"]
-        row = Row(label, {"overall": value["overall"], "categories": value["categories"]})
+        row = ScoreRow(label, {"overall": value["overall"], "categories": value["categories"]})
         table([row], "success")
     except OSError as error:
         raise TrainerError(
@@ -78,7 +78,7 @@ def head(figures: Mapping[str, Any]) -> tuple[str, ...]:
     return ("model", f"all ({figures['overall']['tasks']})", *counts)
 
 
-def table(rows: Iterable[Row], figure: str) -> list[tuple[str, ...]]:
+def table(rows: Iterable[ScoreRow], figure: str) -> list[tuple[str, ...]]:
     """A line for each row with "success" or "partial" of all tasks and of each category, in percent."""
     return [
         (
@@ -127,10 +127,10 @@ def cause_rows(report: Mapping[str, Any]) -> list[tuple[str, str, str, str]]:
     return rows
 
 
-def text_report(report: Mapping[str, Any], beside: Sequence[Row] = ()) -> str:
+def text_report(report: Mapping[str, Any], beside: Sequence[ScoreRow] = ()) -> str:
     """The whole evaluation as plain text, for a terminal, a log or an e-mail."""
     setup = report["setup"]
-    rows = [Row(setup["model"], report), *beside]
+    rows = [ScoreRow(setup["model"], report), *beside]
     parts = [
         f"{setup['bench']} ({setup['split']}): {report['tasks']} tasks, {setup['samples']} samples each, temperature "
         f"{setup['temperature']:g}, {report['lost']} of {report['samples']} plans lost by the infrastructure",

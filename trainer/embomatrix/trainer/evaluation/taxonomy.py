@@ -55,7 +55,7 @@ MEANINGS: Final[Mapping[Cause, str]] = {
 """Each cause in words."""
 
 
-class Role(StrEnum):
+class ObjectRole(StrEnum):
     """Which object another step would have had to be about, by its place in the failed step's sentence."""
 
     TARGET = "target"
@@ -70,7 +70,7 @@ class Remedy:
     """The call that makes a precondition true: a skill, and which object it is about."""
 
     skill: Skill
-    about: Role
+    about: ObjectRole
 
 
 _PLAN_CAUSES: Final[Mapping[PlanReason, Cause]] = {
@@ -83,20 +83,20 @@ _PLAN_CAUSES: Final[Mapping[PlanReason, Cause]] = {
 }
 
 REMEDIES: Final[Mapping[FailureReason, Remedy]] = {
-    FailureReason.NOT_THERE: Remedy(Skill.SLICE, Role.ANY),
-    FailureReason.OUT_OF_REACH: Remedy(Skill.MOVE, Role.TARGET),
-    FailureReason.NO_LINE_OF_APPROACH: Remedy(Skill.MOVE, Role.TARGET),
-    FailureReason.HAND_FULL: Remedy(Skill.PLACE, Role.ANY),
-    FailureReason.HAND_EMPTY: Remedy(Skill.PICK_UP, Role.ANY),
-    FailureReason.SUPPORTS_OTHERS: Remedy(Skill.PICK_UP, Role.OTHER),
-    FailureReason.CONTAINER_CLOSED: Remedy(Skill.OPEN, Role.CONTAINER),
-    FailureReason.OPENED_WHILE_ON: Remedy(Skill.TOGGLE_OFF, Role.TARGET),
-    FailureReason.MUST_BE_CLOSED: Remedy(Skill.CLOSE, Role.TARGET),
-    FailureReason.SOURCE_OFF: Remedy(Skill.TOGGLE_ON, Role.SOURCE),
-    FailureReason.SOURCE_OPEN: Remedy(Skill.CLOSE, Role.SOURCE),
-    FailureReason.NOT_AT_SOURCE: Remedy(Skill.PLACE, Role.SOURCE),
-    FailureReason.TOOL_NOT_HELD: Remedy(Skill.PICK_UP, Role.SOURCE),
-    FailureReason.NEEDS_SOAKING: Remedy(Skill.SOAK, Role.SOURCE),
+    FailureReason.NOT_THERE: Remedy(Skill.SLICE, ObjectRole.ANY),
+    FailureReason.OUT_OF_REACH: Remedy(Skill.MOVE, ObjectRole.TARGET),
+    FailureReason.NO_LINE_OF_APPROACH: Remedy(Skill.MOVE, ObjectRole.TARGET),
+    FailureReason.HAND_FULL: Remedy(Skill.PLACE, ObjectRole.ANY),
+    FailureReason.HAND_EMPTY: Remedy(Skill.PICK_UP, ObjectRole.ANY),
+    FailureReason.SUPPORTS_OTHERS: Remedy(Skill.PICK_UP, ObjectRole.OTHER),
+    FailureReason.CONTAINER_CLOSED: Remedy(Skill.OPEN, ObjectRole.CONTAINER),
+    FailureReason.OPENED_WHILE_ON: Remedy(Skill.TOGGLE_OFF, ObjectRole.TARGET),
+    FailureReason.MUST_BE_CLOSED: Remedy(Skill.CLOSE, ObjectRole.TARGET),
+    FailureReason.SOURCE_OFF: Remedy(Skill.TOGGLE_ON, ObjectRole.SOURCE),
+    FailureReason.SOURCE_OPEN: Remedy(Skill.CLOSE, ObjectRole.SOURCE),
+    FailureReason.NOT_AT_SOURCE: Remedy(Skill.PLACE, ObjectRole.SOURCE),
+    FailureReason.TOOL_NOT_HELD: Remedy(Skill.PICK_UP, ObjectRole.SOURCE),
+    FailureReason.NEEDS_SOAKING: Remedy(Skill.SOAK, ObjectRole.SOURCE),
 }
 """Preconditions that another call makes true. Whether the plan holds that call later tells wrong order from missing step."""
 
@@ -170,7 +170,7 @@ def cause_of_trace(plan: Plan, steps: Sequence[Step], table: Sequence[str]) -> C
 
 def _is_about(call: SkillCall, remedy: Remedy, failed: Step, table: Sequence[str]) -> bool:
     """Whether the call is about the object that the failed step lacked something of."""
-    if remedy.about is Role.ANY:
+    if remedy.about is ObjectRole.ANY:
         return True
     assert failed.failure is not None
     found = _PATTERNS[failed.failure].fullmatch(failed.message)
@@ -194,5 +194,7 @@ def _pattern(sentence: str) -> re.Pattern[str]:
 
 
 _PATTERNS: Final = {
-    reason: _pattern(SENTENCES[reason]) for reason, remedy in REMEDIES.items() if remedy.about is not Role.ANY
+    reason: _pattern(SENTENCES[reason])
+    for reason, remedy in REMEDIES.items()
+    if remedy.about is not ObjectRole.ANY
 }

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class AnswerVerdict:
     """What became of one answer.
 
     ``partial`` is the share of the goal's atoms that hold at the end, 0 for a text that is no plan. ``cause`` says why the goal
@@ -40,9 +40,9 @@ class Verdict:
     lost: bool = False
 
 
-def of_text(answer: Answer, error: PlanError) -> Verdict:
+def of_text(answer: Answer, error: PlanError) -> AnswerVerdict:
     """The verdict on a text that is no plan: it is not executed."""
-    return Verdict(
+    return AnswerVerdict(
         answer.task_id,
         answer.sample,
         success=False,
@@ -53,16 +53,18 @@ def of_text(answer: Answer, error: PlanError) -> Verdict:
     )
 
 
-def of_plan(answer: Answer, task: Task, plan: Plan, outcome: Outcome | None) -> Verdict:
+def of_plan(answer: Answer, task: Task, plan: Plan, outcome: Outcome | None) -> AnswerVerdict:
     """The verdict on a plan that was executed, or that the infrastructure lost."""
     if not isinstance(outcome, Completed):
-        return Verdict(answer.task_id, answer.sample, success=False, partial=0.0, steps=len(plan), lost=True)
+        return AnswerVerdict(
+            answer.task_id, answer.sample, success=False, partial=0.0, steps=len(plan), lost=True
+        )
     reward, steps = outcome.reward, outcome.steps
     partial = sum(atom.holds for atom in reward.atoms) / len(reward.atoms) if reward.atoms else 0.0
     done = sum(step.ok for step in steps)
     last = steps[-1] if steps else None
     failure = last.failure if last is not None else None
-    return Verdict(
+    return AnswerVerdict(
         answer.task_id,
         answer.sample,
         success=reward.success,

@@ -31,7 +31,7 @@ _SEEDS: Final = 2**62
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Chunk:
+class SampledChunk:
     """Tasks sampled together, and the rewards to come. ``part`` numbers the chunks of a step from 0.
 
     ``reference``: log-probabilities of the reference policy, (plans, tokens) as ``samples``; None where no KL is asked for.
@@ -82,7 +82,7 @@ class Sampler:
         generator: torch.Generator,
         *,
         first_part: int = 0,
-    ) -> list[Chunk]:
+    ) -> list[SampledChunk]:
         """The tasks in chunks; each is under way before a process samples its next.
 
         What a chunk draws depends on its number and on ``generator`` alone, whichever process samples it.
@@ -108,7 +108,7 @@ class Sampler:
         told: Sequence[tuple[TrainingTask, Told]],
         seed: int,
         learner: Sampling,
-    ) -> Chunk:
+    ) -> SampledChunk:
         group = self._settings.group
         samples = learner.sample([each.prompt for _, each in told], seed)
         futures = [
@@ -123,16 +123,16 @@ class Sampler:
             for row, (task, each) in enumerate(told)
         ]
         tasks, tellings = zip(*told, strict=True)
-        return Chunk(part, tasks, tellings, samples, futures, None)
+        return SampledChunk(part, tasks, tellings, samples, futures, None)
 
 
-def _with_reference(chunk: Chunk, learner: Sampling) -> Chunk:
+def _with_reference(chunk: SampledChunk, learner: Sampling) -> SampledChunk:
     prompts = [each.prompt for each in chunk.told]
     scored = learner.of_reference(prompts, chunk.samples.tokens, chunk.samples.mask)
     return replace(chunk, reference=scored)
 
 
-def next_back(chunks: Sequence[Chunk]) -> Chunk:
+def next_back(chunks: Sequence[SampledChunk]) -> SampledChunk:
     """The first of the chunks whose rewards are all there; waits until there is one."""
     while True:
         for chunk in chunks:

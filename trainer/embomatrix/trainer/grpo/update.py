@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from embomatrix.trainer.grpo.rollout import PlanOutcome, Submitting
-    from embomatrix.trainer.grpo.sampling import Chunk
+    from embomatrix.trainer.grpo.sampling import SampledChunk
     from embomatrix.trainer.parallel.data_parallel import Crew, RemoteLearner
     from embomatrix.trainer.policy.prompts import Teller
     from embomatrix.trainer.policy.protocol import Policy
@@ -84,7 +84,7 @@ class Updater:
         self._stopwatch = stopwatch
         self._crew = crew
         self._sampler = Sampler(crew, policy.codec, teller, gateway, settings)
-        self._ahead: tuple[int, list[Chunk]] | None = None
+        self._ahead: tuple[int, list[SampledChunk]] | None = None
         self._bad_gradients = 0
         self.optimiser = torch.optim.AdamW(
             policy.parameters(), lr=settings.learning_rate, betas=(0.9, 0.95), weight_decay=0.0
@@ -108,7 +108,7 @@ class Updater:
             norm, rate = self._apply(work)
         return record_of(plan.step, work.logs, work.metrics, norm, rate), work.logs
 
-    def _chunks(self, plan: StepPlan) -> list[Chunk]:
+    def _chunks(self, plan: StepPlan) -> list[SampledChunk]:
         """This step's chunks, sampled now or a step ago; those of the next step are sent on their way too."""
         ready, self._ahead = self._ahead, None
         if ready is not None and ready[0] == plan.step:
@@ -123,7 +123,7 @@ class Updater:
             )
         return chunks
 
-    def _scale(self, chunks: Sequence[Chunk]) -> Scale:
+    def _scale(self, chunks: Sequence[SampledChunk]) -> Scale:
         return Scale(
             plans=sum(chunk.plans for chunk in chunks),
             tokens=sum(chunk.tokens for chunk in chunks),
@@ -131,7 +131,7 @@ class Updater:
             parts=len(chunks),
         )
 
-    def _learn_all(self, chunks: Sequence[Chunk], work: _Work) -> None:
+    def _learn_all(self, chunks: Sequence[SampledChunk], work: _Work) -> None:
         """Back-propagate every chunk, as its rewards arrive where that is wanted."""
         if self._settings.overlap is Overlap.NONE:
             with self._stopwatch.spending(Activity.WAITING):
@@ -152,7 +152,7 @@ class Updater:
         for part in sorted(logs):
             work.logs += logs[part]
 
-    def _learn_here(self, chunks: Sequence[Chunk], work: _Work) -> dict[int, list[GroupLog]]:
+    def _learn_here(self, chunks: Sequence[SampledChunk], work: _Work) -> dict[int, list[GroupLog]]:
         """Back-propagate this process's chunks, the first that is back first."""
         logs: dict[int, list[GroupLog]] = {}
         waiting = list(chunks)
@@ -172,7 +172,7 @@ class Updater:
         if lesson is not None:
             work.count(self._crew.own.learn(lesson), len(lesson.tokens))
 
-    def _learn_elsewhere(self, chunk: Chunk, work: _Work, helper: RemoteLearner) -> _Elsewhere:
+    def _learn_elsewhere(self, chunk: SampledChunk, work: _Work, helper: RemoteLearner) -> _Elsewhere:
         """A chunk's share, once its rewards are there, as a helper finds it."""
         lesson, logs = self._lesson(chunk, chunk.outcomes(), work)
         if lesson is None:
@@ -210,7 +210,7 @@ class Updater:
                 work.gradients.scale(divisor(kind, work.scale) / divisor(kind, final))
 
     def _lesson(
-        self, chunk: Chunk, outcomes: Sequence[tuple[PlanOutcome, ...]], work: _Work
+        self, chunk: SampledChunk, outcomes: Sequence[tuple[PlanOutcome, ...]], work: _Work
     ) -> tuple[Lesson | None, list[GroupLog]]:
         """What the groups of a chunk that carry a signal have to teach; None where none does."""
         rewards = torch.tensor(
@@ -232,7 +232,7 @@ class Updater:
 
     def _lesson_of(
         self,
-        chunk: Chunk,
+        chunk: SampledChunk,
         live: Sequence[int],
         rewards: torch.Tensor,
         advantages: torch.Tensor,
@@ -255,7 +255,7 @@ class Updater:
             scale=self._scale_of(chunk, scale),
         )
 
-    def _scale_of(self, chunk: Chunk, scale: Scale) -> Scale:
+    def _scale_of(self, chunk: SampledChunk, scale: Scale) -> Scale:
         """BNPO divides by the part's own tokens, and averages over parts."""
         if self._settings.loss is not LossKind.BNPO:
             return scale
@@ -296,7 +296,7 @@ class _Sent:
     """A chunk that goes to a helper as soon as its rewards are there, whoever sees that first."""
 
     def __init__(
-        self, chunk: Chunk, helper: RemoteLearner, job: Callable[[RemoteLearner], _Elsewhere]
+        self, chunk: SampledChunk, helper: RemoteLearner, job: Callable[[RemoteLearner], _Elsewhere]
     ) -> None:
         self._chunk = chunk
         self._helper = helper

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from embomatrix.trainer.logging.recorder import Recorder
     from embomatrix.trainer.policy.prompts import Teller
     from embomatrix.trainer.policy.protocol import Policy
-    from embomatrix.trainer.run.checkpoint import Progress
+    from embomatrix.trainer.run.checkpoint import TrainingProgress
     from embomatrix.trainer.run.data import TrainingTask
     from embomatrix.trainer.run.settings import TrainSettings
 
@@ -31,7 +31,7 @@ def warm_up(
     tasks: Sequence[TrainingTask],
     settings: TrainSettings,
     out: Path,
-    progress: Progress,
+    progress: TrainingProgress,
     recorder: Recorder,
     report: Callable[[ImitationProgress], None],
 ) -> None:

@@ -14,7 +14,7 @@ from rich.text import Text
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from embomatrix.trainer.evaluation.held_out import Evaluation
+    from embomatrix.trainer.evaluation.held_out import HeldOutEvaluation
     from embomatrix.trainer.grpo.records import StepRecord
     from embomatrix.trainer.imitation.imitate import ImitationProgress
 
@@ -33,7 +33,7 @@ class Display(Protocol):
 
     def evaluating(self, label: str, done: int, total: int) -> None: ...
 
-    def evaluated(self, label: str, result: Evaluation) -> None: ...
+    def evaluated(self, label: str, result: HeldOutEvaluation) -> None: ...
 
     def stepped(self, record: StepRecord, share: float, rollouts_per_s: float) -> None: ...
 
@@ -63,7 +63,7 @@ class LineDisplay:
     def evaluating(self, label: str, done: int, total: int) -> None:
         self._say(f"evaluation {label}: {done} of {total} tasks")
 
-    def evaluated(self, label: str, result: Evaluation) -> None:
+    def evaluated(self, label: str, result: HeldOutEvaluation) -> None:
         self._say(f"evaluation {label}: success {result.success().as_percent()}", always=True)
 
     def stepped(self, record: StepRecord, share: float, rollouts_per_s: float) -> None:
@@ -103,7 +103,7 @@ class LiveDisplay:
     def evaluating(self, label: str, done: int, total: int) -> None:
         self._draw(f"held-out evaluation {label}", done / total, {"tasks": f"{done} of {total}"})
 
-    def evaluated(self, label: str, result: Evaluation) -> None:
+    def evaluated(self, label: str, result: HeldOutEvaluation) -> None:
         self._console.print(
             f"held-out success {label}: {result.success().as_percent()}", highlight=False, markup=False
         )

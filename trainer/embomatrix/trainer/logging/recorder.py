@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
-    from embomatrix.trainer.evaluation.held_out import Evaluation
+    from embomatrix.trainer.evaluation.held_out import HeldOutEvaluation
     from embomatrix.trainer.grpo.records import GroupLog, StepRecord
     from embomatrix.trainer.grpo.rollout import PlanOutcome
     from embomatrix.trainer.imitation.imitate import ImitationProgress
@@ -58,7 +58,7 @@ class Recorder:
         self._append(IMITATION, row)
         self._track(IMITATION_PHASE, row)
 
-    def evaluation(self, label: str, result: Evaluation) -> None:
+    def evaluation(self, label: str, result: HeldOutEvaluation) -> None:
         """Held-out success, which the run's own files keep in checkpoints and report."""
         rates = {category: result.success(category).value for category in result.categories}
         self._track(f"success {label}", {"step": 0, "all": result.success().value, **rates})

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from embomatrix.rpc.wire.values import RunStats
-    from embomatrix.trainer.evaluation.held_out import Evaluation
+    from embomatrix.trainer.evaluation.held_out import HeldOutEvaluation
 
 REPORT = "report.html"
 _WIDTH, _HEIGHT, _MARGIN = 640, 220, 44
@@ -28,7 +28,7 @@ _CURVES = (
 
 
 @dataclass(frozen=True)
-class Summary:
+class TrainingSummary:
     """What a finished run has to show. ``checkpoint`` is the newest one; ``after`` is None when nothing was held out."""
 
     model: str
@@ -39,15 +39,15 @@ class Summary:
     wall_s: float
     grpo_s: float
     spent_s: Mapping[str, float]
-    before: Evaluation | None
-    after: Evaluation | None
+    before: HeldOutEvaluation | None
+    after: HeldOutEvaluation | None
     stats: RunStats
     checkpoint: Path
     report: Path
     peak_mb: float = 0.0
 
 
-def time_rows(summary: Summary) -> list[tuple[str, float, float]]:
+def time_rows(summary: TrainingSummary) -> list[tuple[str, float, float]]:
     """Activity, seconds, share of the wall clock; the rest is called so."""
     total = max(summary.wall_s, 1e-9)
     rows = [(name, spent, spent / total) for name, spent in summary.spent_s.items()]
@@ -55,7 +55,7 @@ def time_rows(summary: Summary) -> list[tuple[str, float, float]]:
     return [*rows, ("everything else", rest, rest / total)]
 
 
-def success_rows(summary: Summary) -> list[tuple[str, str, str, str]]:
+def success_rows(summary: TrainingSummary) -> list[tuple[str, str, str, str]]:
     """Category, success before, after, and the paired difference, each with its interval."""
     if summary.before is None or summary.after is None:
         return []
@@ -73,7 +73,7 @@ def success_rows(summary: Summary) -> list[tuple[str, str, str, str]]:
     return rows
 
 
-def outcome_of(summary: Summary) -> RunOutcome:
+def outcome_of(summary: TrainingSummary) -> RunOutcome:
     """The summary's numbers, for programs."""
     return RunOutcome(
         model=summary.model,
@@ -90,14 +90,14 @@ def outcome_of(summary: Summary) -> RunOutcome:
     )
 
 
-def _rates(evaluation: Evaluation | None) -> tuple[TaskRate, ...]:
+def _rates(evaluation: HeldOutEvaluation | None) -> tuple[TaskRate, ...]:
     scores = evaluation.scores if evaluation is not None else ()
     return tuple(
         TaskRate(score.task_id, score.category, score.rate if score.samples else None) for score in scores
     )
 
 
-def _only(evaluation: Evaluation, category: str) -> Evaluation:
+def _only(evaluation: HeldOutEvaluation, category: str) -> HeldOutEvaluation:
     return type(evaluation)(tuple(s for s in evaluation.scores if category in ("", s.category)))
 
 
@@ -107,7 +107,7 @@ def prewarm_share(stats: RunStats) -> float:
     return stats.prewarm_hits / asked if asked else 0.0
 
 
-def write_report(summary: Summary, metrics: Sequence[Mapping[str, Any]], machine: str) -> Path:
+def write_report(summary: TrainingSummary, metrics: Sequence[Mapping[str, Any]], machine: str) -> Path:
     """Write the report where ``summary.report`` says."""
     parts = [
         f"<h1>Training of {html.escape(summary.model)}</h1>",

@@ -83,7 +83,7 @@ class PromptMemory:
 
 
 @dataclass(frozen=True, slots=True)
-class Written:
+class DecoderCache:
     """Plans as far as they are run: what each layer keeps of them; ``tokens`` (rows, S); ``pointers`` (rows, S, C), what their
     words are pointed at by."""
 
@@ -91,9 +91,9 @@ class Written:
     tokens: Tensor
     pointers: Tensor
 
-    def of_rows(self, rows: Tensor) -> Written:
+    def of_rows(self, rows: Tensor) -> DecoderCache:
         layers = tuple(layer.of_rows(rows) for layer in self.layers)
-        return Written(layers, self.tokens[rows], self.pointers[rows])
+        return DecoderCache(layers, self.tokens[rows], self.pointers[rows])
 
 
 class _Block(nn.Module):
@@ -160,7 +160,9 @@ class Decoder(nn.Module):
                 parameter.data /= (2 * shape.layers) ** 0.5
         nn.init.zeros_(self.point_share.bias)
 
-    def scores(self, states: Tensor, prompt: PromptMemory, written: Written | None, barred: Tensor) -> Tensor:
+    def scores(
+        self, states: Tensor, prompt: PromptMemory, written: DecoderCache | None, barred: Tensor
+    ) -> Tensor:
         """Scores (Q * G, T, V), whose softmax says what comes after hidden states (Q * G, T, C); words in ``barred``, of that
         shape, get none.
 
@@ -175,7 +177,7 @@ class Decoder(nn.Module):
         return mixed.clamp(min=_LEAST).log().masked_fill(barred, _HIDDEN_KEY)
 
     def _pointed(
-        self, x: Tensor, prompt: PromptMemory, written: Written | None, barred: Tensor
+        self, x: Tensor, prompt: PromptMemory, written: DecoderCache | None, barred: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Where normed states point: probabilities of places, those of the prompt first, and the words there; both
         (Q * G, T, P + S). Where all words are barred, nowhere."""
@@ -222,7 +224,9 @@ class Decoder(nn.Module):
         pointers = self.point_to(self.norm(x))
         return PromptMemory(tuple(memories), tokens, hidden, lengths, x[:, -1:], pointers)
 
-    def extend(self, prompt: PromptMemory, tokens: Tensor, written: Written | None) -> tuple[Tensor, Written]:
+    def extend(
+        self, prompt: PromptMemory, tokens: Tensor, written: DecoderCache | None
+    ) -> tuple[Tensor, DecoderCache]:
         """Hidden states (Q * G, T, C) of tokens (Q * G, T) that follow what is ``written`` after their prompts.
 
         ``written`` is what ``extend`` gave for the samples' own earlier tokens, None at the first.
@@ -249,7 +253,7 @@ class Decoder(nn.Module):
         if written:
             tokens = torch.cat([written.tokens, tokens], dim=1)
             pointers = torch.cat([written.pointers, pointers], dim=1)
-        return x, Written(tuple(memories), tokens, pointers)
+        return x, DecoderCache(tuple(memories), tokens, pointers)
 
 
 def _attend(

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from torch import Tensor, nn
 
     from embomatrix.skills.prompt import Prompt
-    from embomatrix.trainer.policy.decoder import PromptMemory, Written
+    from embomatrix.trainer.policy.decoder import DecoderCache, PromptMemory
     from embomatrix.trainer.policy.grammar import Cursor, Names
     from embomatrix.trainer.policy.protocol import Tokens
 
@@ -51,7 +51,7 @@ class _Writing:
     memory: PromptMemory
     names: Names
     cursor: Cursor
-    own: Written | None
+    own: DecoderCache | None
 
     def after(self, choice: Tensor, grammar: PlanGrammar) -> _Writing:
         """With one more word of each plan (rows,)."""

@@ -33,7 +33,7 @@ FULL_BYTES = 8 * 1024 * 1024
 
 
 @dataclass
-class Progress:
+class TrainingProgress:
     """Where a run stands. ``cursor`` is the schedule's, ``reserve_cursor`` that of the reserve.
 
     ``prepared``: imitation and the evaluation after it are done, and the reference is kept. Seconds are of GRPO and, by
@@ -61,7 +61,7 @@ class CheckpointStore:
         self._keep = keep
 
     def save(
-        self, policy: Policy, tensors: Mapping[str, Any], progress: Progress, settings: TrainSettings
+        self, policy: Policy, tensors: Mapping[str, Any], progress: TrainingProgress, settings: TrainSettings
     ) -> Path:
         """Write beside, sync, then rename: a crash leaves the last checkpoint as it was. Raises TrainerError."""
         number = progress.step if progress.prepared else progress.imitation.step
@@ -123,7 +123,7 @@ def _sync(folder: Path) -> None:
                 os.fsync(file.fileno())
 
 
-def read_state(folder: Path) -> tuple[Progress, TrainSettings]:
+def read_state(folder: Path) -> tuple[TrainingProgress, TrainSettings]:
     """What a checkpoint says of the run. Raises TrainerError where it is none, or of another version."""
     try:
         state = json.loads((folder / _STATE).read_text(encoding="utf-8"))
@@ -131,7 +131,7 @@ def read_state(folder: Path) -> tuple[Progress, TrainSettings]:
             raise TrainerError(
                 f"the checkpoint {folder} has schema {state['schema']}, this version reads {SCHEMA}: start a new run"
             )
-        progress = Progress(**state["progress"])
+        progress = TrainingProgress(**state["progress"])
         progress.imitation = ImitationState(**state["progress"]["imitation"])
         return progress, TrainSettings.model_validate(_of_today(state["settings"]))
     except (OSError, ValueError, KeyError, TypeError) as error:

@@ -15,15 +15,21 @@ import numpy as np
 import torch
 
 from embomatrix.host.cores import usable_cores
-from embomatrix.trainer.evaluation.held_out import Evaluation, evaluate_policy
+from embomatrix.trainer.evaluation.held_out import HeldOutEvaluation, evaluate_policy
 from embomatrix.trainer.grpo.update import StepPlan, Updater
 from embomatrix.trainer.imitation.phase import warm_up
 from embomatrix.trainer.logging.recorder import METRICS, SAMPLES, Recorder, read_metrics
-from embomatrix.trainer.logging.report import REPORT, Summary, outcome_of, write_report
+from embomatrix.trainer.logging.report import REPORT, TrainingSummary, outcome_of, write_report
 from embomatrix.trainer.logging.reporting import Reporter
 from embomatrix.trainer.parallel.data_parallel import Crew
 from embomatrix.trainer.parallel.learner import Learner
-from embomatrix.trainer.run.checkpoint import CHECKPOINTS, CheckpointStore, Progress, restore, whole_folder
+from embomatrix.trainer.run.checkpoint import (
+    CHECKPOINTS,
+    CheckpointStore,
+    TrainingProgress,
+    restore,
+    whole_folder,
+)
 from embomatrix.trainer.run.data import Curriculum, Schedule
 from embomatrix.trainer.run.interrupts import Interrupts
 from embomatrix.trainer.run.outcome import write_outcome
@@ -68,13 +74,13 @@ class TrainingRun:
         parts: Parts,
         settings: TrainSettings,
         out: Path,
-        progress: Progress | None = None,
+        progress: TrainingProgress | None = None,
         trackers: Sequence[Tracker] = (),
     ) -> None:
         self._parts = parts
         self._settings = settings
         self._out = out
-        self._progress = progress or Progress()
+        self._progress = progress or TrainingProgress()
         self._restores = self._progress.prepared
         self._stopwatch = Stopwatch()
         self._stopwatch.spent_s.update(self._progress.spent_s)
@@ -84,7 +90,7 @@ class TrainingRun:
         device = next(iter(parts.policy.parameters())).device
         self._generator = torch.Generator(device).manual_seed(settings.seed)
 
-    def run(self) -> Summary:
+    def run(self) -> TrainingSummary:
         """Everything. An interrupt saves a checkpoint, from which ``--resume`` goes on, and is raised again."""
         began_s = time.monotonic()
         earlier_s = sum(self._progress.spent_s.values())
@@ -137,7 +143,7 @@ class TrainingRun:
         progress.prepared = True
         return parts.policy.frozen_copy()
 
-    def _evaluate(self, label: str) -> Evaluation | None:
+    def _evaluate(self, label: str) -> HeldOutEvaluation | None:
         parts, settings = self._parts, self._settings
         if not parts.tasks.heldout:
             return None
@@ -260,9 +266,9 @@ class TrainingRun:
             }
             return self._store.save(self._parts.policy, tensors, self._progress, self._settings)
 
-    def _summary(self, checkpoint: Path, after: Evaluation | None, wall_s: float) -> Summary:
+    def _summary(self, checkpoint: Path, after: HeldOutEvaluation | None, wall_s: float) -> TrainingSummary:
         progress = self._progress
-        return Summary(
+        return TrainingSummary(
             model=self._parts.policy.name,
             steps=progress.step,
             rollouts=progress.rollouts,
@@ -271,7 +277,7 @@ class TrainingRun:
             wall_s=wall_s,
             grpo_s=progress.grpo_s,
             spent_s=dict(self._stopwatch.spent_s),
-            before=Evaluation.from_json(progress.before) if progress.before else None,
+            before=HeldOutEvaluation.from_json(progress.before) if progress.before else None,
             after=after,
             stats=self._parts.gateway.close_run(),
             checkpoint=checkpoint,

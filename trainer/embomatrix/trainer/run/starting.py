@@ -14,7 +14,7 @@ from embomatrix.trainer.imitation.augment import Variation
 from embomatrix.trainer.policy.choice import TINY, is_tiny, new_policy, saved_policy
 from embomatrix.trainer.policy.hf import HfPolicy
 from embomatrix.trainer.policy.prompts import Teller
-from embomatrix.trainer.run.checkpoint import CHECKPOINTS, CheckpointStore, Progress, read_state
+from embomatrix.trainer.run.checkpoint import CHECKPOINTS, CheckpointStore, TrainingProgress, read_state
 from embomatrix.trainer.run.data import load_tasks
 from embomatrix.trainer.run.errors import TrainerError, reason_of
 from embomatrix.trainer.run.settings import LANGUAGE_MODEL_DEFAULTS, read_settings, with_changes
@@ -45,7 +45,7 @@ class Start:
     settings: TrainSettings
     tasks: TaskSet
     policy: Policy
-    progress: Progress
+    progress: TrainingProgress
 
     @property
     def teller(self) -> Teller:
@@ -70,7 +70,7 @@ def started(
         raise TrainerError(
             f"the folder {out} can't be made ({error.strerror}): pass another --out"
         ) from error
-    return Start(settings, tasks, policy, Progress(dataset=digest_of(tasks)))
+    return Start(settings, tasks, policy, TrainingProgress(dataset=digest_of(tasks)))
 
 
 def usual_threads() -> int:

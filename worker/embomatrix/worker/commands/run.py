@@ -20,7 +20,7 @@ from embomatrix.rpc.channel import DEFAULT_ADDRESS
 from embomatrix.rpc.logs import LogFormat, bind, hide, log_to_stderr
 from embomatrix.rpc.status import ClusterError
 from embomatrix.worker.commands.options import Ca, Manager, StateDir, Token, check_engine, fail, parse
-from embomatrix.worker.host.machine import Machine
+from embomatrix.worker.host.machine import HostMachine
 from embomatrix.worker.host.preferences import Preferences
 from embomatrix.worker.host.resources import measure
 from embomatrix.worker.host.status import daemon_pids
@@ -181,7 +181,7 @@ def be_polite(nice: int) -> None:
 async def _serve(settings: WorkerSettings) -> None:
     membership = await membership_of(settings)
     bind("worker", membership.name)
-    machine = Machine(lambda: daemon_pids(settings.state_dir))
+    machine = HostMachine(lambda: daemon_pids(settings.state_dir))
     if not settings.preferences.indifferent:
         for sentence in machine.blind_to(settings.preferences, await asyncio.to_thread(machine.observe)):
             logger.warning("%s", sentence)

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from embomatrix.worker.host.machine import Probe
-    from embomatrix.worker.host.pausing import Observation, Standing
+    from embomatrix.worker.host.pausing import Observation, PauseState
     from embomatrix.worker.host.preferences import Preferences
     from embomatrix.worker.slots.pool import SlotPool
 
@@ -71,7 +71,7 @@ class Courtesy:
         if reason and seen.free_memory < SCARCE_MEMORY:
             self._pool.shed()
 
-    def _hand_back(self, standing: Standing, now_s: float) -> None:
+    def _hand_back(self, standing: PauseState, now_s: float) -> None:
         """Drop what waits, and what still runs when its grace is over."""
         held = set(self._pool.held())
         if now_s - standing.since_s < self._wishes.grace_s:

@@ -34,7 +34,7 @@ class Probe(Protocol):
     def observe(self) -> Observation: ...
 
 
-class Machine:
+class HostMachine:
     """The machine that this runs on. ``ours`` gives the process ids of all worker daemons here: theirs is no load of others."""
 
     def __init__(self, ours: Callable[[], Iterable[int]], owner: Owner | None = None) -> None:

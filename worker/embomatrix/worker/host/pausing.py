@@ -32,7 +32,7 @@ class Observation:
 
 
 @dataclass(frozen=True, slots=True)
-class Standing:
+class PauseState:
     """Whether a worker is paused: ``reason`` is empty while it works. Times are seconds of one monotonic clock."""
 
     reason: str = ""
@@ -44,10 +44,10 @@ class Standing:
     """Since when others have kept the machine busier than the limit."""
 
 
-WORKING: Final = Standing()
+WORKING: Final = PauseState()
 
 
-def judge(before: Standing, seen: Observation, wishes: Preferences, now_s: float) -> Standing:
+def judge(before: PauseState, seen: Observation, wishes: Preferences, now_s: float) -> PauseState:
     """The standing after this observation.
 
     A pause begins at once, for load after ``LOADED_S`` of it, and ends when nothing has spoken against work for ``calm_s``.
@@ -55,7 +55,7 @@ def judge(before: Standing, seen: Observation, wishes: Preferences, now_s: float
     loaded_since_s = _loaded_since_s(before, seen, wishes, now_s)
     reason = _objection(before, seen, wishes, loaded_since_s, now_s)
     if not before.reason:
-        return Standing(reason, now_s if reason else 0.0, None, loaded_since_s)
+        return PauseState(reason, now_s if reason else 0.0, None, loaded_since_s)
     if reason:
         return replace(before, reason=reason, calm_since_s=None, loaded_since_s=loaded_since_s)
     calm_since_s = now_s if before.calm_since_s is None else before.calm_since_s
@@ -64,14 +64,14 @@ def judge(before: Standing, seen: Observation, wishes: Preferences, now_s: float
     return replace(before, calm_since_s=calm_since_s, loaded_since_s=loaded_since_s)
 
 
-def _loaded_since_s(before: Standing, seen: Observation, wishes: Preferences, now_s: float) -> float | None:
+def _loaded_since_s(before: PauseState, seen: Observation, wishes: Preferences, now_s: float) -> float | None:
     if not wishes.max_load or seen.others_load is None or seen.others_load <= wishes.max_load:
         return None
     return now_s if before.loaded_since_s is None else before.loaded_since_s
 
 
 def _objection(
-    before: Standing, seen: Observation, wishes: Preferences, loaded_since_s: float | None, now_s: float
+    before: PauseState, seen: Observation, wishes: Preferences, loaded_since_s: float | None, now_s: float
 ) -> str:
     """What speaks against work, in words; empty when nothing does."""
     if wishes.hours and not Hours.parse(wishes.hours).has(seen.minute):

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from embomatrix.worker.host.settings import WorkerSettings
     from embomatrix.worker.link.cache import BundleCache
     from embomatrix.worker.link.membership import Membership
-    from embomatrix.worker.link.outbox import Outbox
+    from embomatrix.worker.link.outbox import ResultOutbox
     from embomatrix.worker.slots.pool import SlotPool
 
 logger = logging.getLogger(__name__)
@@ -98,7 +98,7 @@ class StatusReport:
         resources: Resources,
         pool: SlotPool,
         cache: BundleCache,
-        outbox: Outbox,
+        outbox: ResultOutbox,
     ) -> None:
         self._file = StatusFile(settings.state_dir, membership.name)
         self._status = WorkerStatus(

@@ -26,14 +26,14 @@ from embomatrix.rpc.status import (
 )
 from embomatrix.rpc.wire.values import Completed, InfraCode
 from embomatrix.worker.host.courtesy import Courtesy
-from embomatrix.worker.host.machine import Machine
+from embomatrix.worker.host.machine import HostMachine
 from embomatrix.worker.host.spare_memory import SpareMemory
 from embomatrix.worker.host.status import StatusReport, daemon_pids
 from embomatrix.worker.link.backoff import Backoff
 from embomatrix.worker.link.cache import BundleCache
 from embomatrix.worker.link.membership import Membership, MembershipFile
-from embomatrix.worker.link.outbox import Outbox
-from embomatrix.worker.link.session import Session, register
+from embomatrix.worker.link.outbox import ResultOutbox
+from embomatrix.worker.link.session import ManagerSession, register
 from embomatrix.worker.link.takeovers import Takeovers
 from embomatrix.worker.slots.pool import SlotPool
 from embomatrix.worker.slots.processes import SIMULATOR_PROGRAM
@@ -85,12 +85,12 @@ class Daemon:
         self._managers = Managers(self._membership.manager)
         # Each of several managers is asked as often as one would be.
         self._backoff = Backoff(rng, longest_s=LONGEST_WAIT_S / self._managers.count)
-        self._outbox = Outbox()
+        self._outbox = ResultOutbox()
         self._cache = self._opened_cache()
         self._pool = self._new_pool(program)
         self._courtesy = Courtesy(
             settings.preferences,
-            probe or Machine(lambda: daemon_pids(settings.state_dir)),
+            probe or HostMachine(lambda: daemon_pids(settings.state_dir)),
             self._pool,
             on_pause=self._pause,
             on_hand_back=self._hand_back,
@@ -98,7 +98,7 @@ class Daemon:
         self._report = StatusReport(
             self._membership, settings, resources, self._pool, self._cache, self._outbox
         )
-        self._session: Session | None = None
+        self._session: ManagerSession | None = None
         self._renewed_s = time.monotonic()
         self._lease_ttl_s = math.inf
         self._registration: Registration | None = None
@@ -242,7 +242,7 @@ class Daemon:
     async def _serve(self, registration: Registration) -> None:
         bind("session", registration.session_id[:SESSION_SHOWN])
         self._lease_ttl_s = registration.lease_ttl_s
-        session = Session(
+        session = ManagerSession(
             self._present_membership(),
             registration,
             self._pool,
@@ -261,7 +261,7 @@ class Daemon:
             attached.cancel()
             self._report.disconnected()
 
-    async def _note_attached(self, session: Session) -> None:
+    async def _note_attached(self, session: ManagerSession) -> None:
         await session.attached.wait()
         self._report.connected(self._managers.current)
         self._backoff.reset()
@@ -329,7 +329,7 @@ def signed(result: LeaseResult, name: str) -> LeaseResult:
     return replace(result, outcome=outcome)
 
 
-async def fetch(session_now: Callable[[], Session | None], digest: str) -> bytes:
+async def fetch(session_now: Callable[[], ManagerSession | None], digest: str) -> bytes:
     """Fetch a bundle over the present session; a broken connection is tried once more on the next. Raises LoadError."""
     for last in (False, True):
         session = session_now()

@@ -16,7 +16,7 @@ LIMIT: Final = 10_000
 """Results kept at most: more means that nobody has listened for very long."""
 
 
-class Outbox:
+class ResultOutbox:
     """Results in the order in which they came."""
 
     def __init__(self) -> None:

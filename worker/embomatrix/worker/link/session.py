@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
     from embomatrix.rpc.wire.values import Resources
     from embomatrix.worker.link.membership import Membership
-    from embomatrix.worker.link.outbox import Outbox
+    from embomatrix.worker.link.outbox import ResultOutbox
     from embomatrix.worker.slots.pool import SlotPool
 
 logger = logging.getLogger(__name__)
@@ -116,7 +116,7 @@ async def _announce(
     return answer
 
 
-class Session:
+class ManagerSession:
     """The streams of one connection. ``serve`` ends with a ClusterError, or without one once the worker has drained."""
 
     def __init__(
@@ -124,7 +124,7 @@ class Session:
         membership: Membership,
         registration: Registration,
         pool: SlotPool,
-        outbox: Outbox,
+        outbox: ResultOutbox,
         *,
         renewed_s: float,
     ) -> None:

@@ -18,7 +18,7 @@ from embomatrix.reward.settings import PAPER
 from embomatrix.rpc.wire.outcome import unread_completed
 from embomatrix.rpc.wire.rollout import rollout_to_proto
 from embomatrix.rpc.wire.values import InfraCode, InfraFailure, Timings
-from embomatrix.sim.zygote import Frame
+from embomatrix.sim.zygote import PipeMessage
 from embomatrix.worker.slots.processes import ProcessGoneError
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from embomatrix.rpc.leases import Lease
     from embomatrix.rpc.wire.values import Completed
-    from embomatrix.worker.slots.residents import Residents, Scene, Slot
+    from embomatrix.worker.slots.residents import Residents, ResidentScene, Slot
 
     More = Callable[[int], Sequence["Ticket"]]
     Done = Callable[["Ticket", Completed | InfraFailure], None]
@@ -77,7 +77,7 @@ class Ticket:
 class Shift:
     """One permit at work in one scene: the leases in its slot's stream, of which the first is executed."""
 
-    def __init__(self, permit: int, scene: Scene) -> None:
+    def __init__(self, permit: int, scene: ResidentScene) -> None:
         self.permit = permit
         self.scene = scene
         self.given: deque[Ticket] = deque()
@@ -140,7 +140,7 @@ class Shift:
                 return False
         return True
 
-    def _take(self, answer: Frame, slot: Slot, done: Done) -> bool:
+    def _take(self, answer: PipeMessage, slot: Slot, done: Done) -> bool:
         """Tells whether the process may execute more: what an exception left behind in it is unknown."""
         ticket = self.given.popleft()
         if "error" in answer.header:
@@ -152,7 +152,7 @@ class Shift:
             self.given[0].turn_s = time.monotonic()
         return True
 
-    async def _answers(self, slot: Slot, pause_s: float) -> list[Frame]:
+    async def _answers(self, slot: Slot, pause_s: float) -> list[PipeMessage]:
         """What has come after the pause, or without one is waited for. Raises TimeoutError at the first lease's deadline."""
         peer = slot.child.peer
         if pause_s:
@@ -181,7 +181,7 @@ class Shift:
         common_s = GATHER_S - (time.monotonic() + LEAST_GATHER_S) % GATHER_S + LEAST_GATHER_S
         return min(common_s, longest_s)
 
-    def _completed(self, ticket: Ticket, answer: Frame) -> Completed:
+    def _completed(self, ticket: Ticket, answer: PipeMessage) -> Completed:
         scene, execute_s = self.scene, float(answer.header["execute_s"])
         scene.pace_s += (execute_s - scene.pace_s) * (RECENT if scene.pace_s else 1.0)
         # Loading may have begun before the lease came.
@@ -196,11 +196,11 @@ async def _order(slot: Slot, tickets: Iterable[Ticket]) -> None:
         await slot.child.peer.post(_frame(ticket) for ticket in tickets)
 
 
-def _frame(ticket: Ticket) -> Frame:
+def _frame(ticket: Ticket) -> PipeMessage:
     lease = ticket.lease
     own = {} if lease.reward is PAPER else {"reward": dataclasses.asdict(lease.reward)}
     header: dict[str, Any] = {"op": "execute", "slot": ticket.slot, **own}
-    return Frame(header, lease.rollout.wire or rollout_to_proto(lease.rollout).SerializeToString())
+    return PipeMessage(header, lease.rollout.wire or rollout_to_proto(lease.rollout).SerializeToString())
 
 
 def _wear(slot: Slot, resident_mb: float) -> None:

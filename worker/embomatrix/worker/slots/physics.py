@@ -15,7 +15,7 @@ from embomatrix.rpc.wire.values import Completed, Rollout, Timings
 from embomatrix.sim.bullet.client import ClientPool
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.executor import Simulator
-from embomatrix.sim.floor.prepared import Prepared
+from embomatrix.sim.floor.prepared import PreparedScene
 from embomatrix.worker.slots.rehearsal import PLANS, REHEARSAL, TIMES, rehearsal_bundle
 from embomatrix.worker.slots.slot_program import BundleCorruptError, run_program
 from embomatrix.world.bundle import decode_bundle, encode_bundle, read_bundle
@@ -67,7 +67,7 @@ class PhysicsScene:
 
     def __init__(self, bundle: Bundle, clients: ClientPool) -> None:
         self._tasks = bundle.tasks
-        self._engine = BulletEngine(bundle.scene, clients, Prepared.of(bundle))
+        self._engine = BulletEngine(bundle.scene, clients, PreparedScene.of(bundle))
         self._simulator = Simulator(bundle, self._engine)
         for task in list(bundle.tasks.values())[:1]:
             # An empty plan: what the simulator makes when it is first needed is made before the slots are forked.

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from embomatrix.rpc.leases import Lease, LeaseRef
     from embomatrix.rpc.wire.values import Resident
-    from embomatrix.worker.slots.residents import Scene, SlotLimits
+    from embomatrix.worker.slots.residents import ResidentScene, SlotLimits
 
 logger = logging.getLogger(__name__)
 
@@ -211,7 +211,7 @@ class SlotPool:
         over = self._residents.memory_used_mb > self._budget_mb
         self._unsettled = over or any(self._residents.warm(digest) is None for digest in wanted)
 
-    def _scene_changed(self, scene: Scene) -> None:
+    def _scene_changed(self, scene: ResidentScene) -> None:
         if scene.state is ResidentState.FAILED:
             for ticket in self._waiting.take_of(scene.digest):
                 self._finish(ticket, InfraFailure(scene.code, f"scene {scene.digest}: {scene.error}"))
@@ -227,7 +227,7 @@ class SlotPool:
             # A task that is cancelled before its first step runs no `finally` of its own.
             shift.task.add_done_callback(functools.partial(self._vacate, permit))
 
-    def _next_lease(self) -> tuple[Ticket, Scene] | None:
+    def _next_lease(self) -> tuple[Ticket, ResidentScene] | None:
         return None if self._resting else self._waiting.take(time.monotonic())
 
     def _more_for(self, shift: Shift, count: int) -> list[Ticket]:
@@ -236,7 +236,7 @@ class SlotPool:
             shift.give(ticket)
         return tickets
 
-    def _occupy(self, permit: int, ticket: Ticket, scene: Scene) -> Shift:
+    def _occupy(self, permit: int, ticket: Ticket, scene: ResidentScene) -> Shift:
         self._clock += 1
         scene.last_used = self._clock
         scene.running += 1

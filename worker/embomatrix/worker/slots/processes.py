@@ -11,7 +11,7 @@ import socket
 import sys
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.sim.zygote import PREFIX_BYTES, Frame, frame_lengths, pack, unpack
+from embomatrix.sim.zygote import PREFIX_BYTES, PipeMessage, frame_lengths, pack, unpack
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -39,7 +39,7 @@ class ProcessGoneError(Exception):
     """The process at the other end has died."""
 
 
-class Peer:
+class ProcessChannel:
     """Asks one process, one question at a time. Made and used on one event loop, which it stays registered with."""
 
     def __init__(self, connection: socket.socket) -> None:
@@ -52,7 +52,7 @@ class Peer:
         self._listening = False
         self._listen()
 
-    async def ask(self, frame: Frame) -> Frame:
+    async def ask(self, frame: PipeMessage) -> PipeMessage:
         """Send the frame with its descriptors and wait for the answer. Raises ProcessGoneError.
 
         After a cancelled question the stream is out of step: the process must be ended.
@@ -64,19 +64,19 @@ class Peer:
                 raise ProcessGoneError(str(error)) from error
             return await self.hear()
 
-    async def hear(self) -> Frame:
+    async def hear(self) -> PipeMessage:
         """The next frame that comes unasked."""
         header_bytes, body_bytes = frame_lengths(await self._take(PREFIX_BYTES))
         return unpack(await self._take(header_bytes + body_bytes), header_bytes)
 
-    async def post(self, frames: Iterable[Frame]) -> None:
+    async def post(self, frames: Iterable[PipeMessage]) -> None:
         """Send questions whose answers are ``gathered``, in one write. Raises ProcessGoneError."""
         try:
             await self._send_all(b"".join(map(pack, frames)))
         except OSError as error:
             raise ProcessGoneError(str(error)) from error
 
-    async def gathered(self, pause_s: float) -> list[Frame]:
+    async def gathered(self, pause_s: float) -> list[PipeMessage]:
         """All that came when the pause is over: none perhaps; without a pause, one frame at least is waited for.
 
         Raises ProcessGoneError when nothing came and nothing can come.
@@ -93,7 +93,7 @@ class Peer:
             await self._news()
         return frames
 
-    def arrived(self) -> list[Frame]:
+    def arrived(self) -> list[PipeMessage]:
         """All whole frames that have come. Raises ProcessGoneError when there is none and the stream has ended."""
         while not self._gone and self._receive() == READ_BYTES:
             pass
@@ -130,7 +130,7 @@ class Peer:
             asyncio.get_running_loop().remove_reader(self._connection)
             self._listening = False
 
-    async def _send(self, frame: Frame) -> None:
+    async def _send(self, frame: PipeMessage) -> None:
         data = pack(frame)
         # A question finds the buffer empty: all but the largest are taken at once. Descriptors go with the first byte.
         sent = socket.send_fds(self._connection, [data], list(frame.fds)) if frame.fds else 0
@@ -189,24 +189,24 @@ class Peer:
 class Zygote:
     """A process that forks children: the root, or one that holds a scene."""
 
-    def __init__(self, peer: Peer) -> None:
+    def __init__(self, peer: ProcessChannel) -> None:
         self.peer = peer
-        self._questions: set[asyncio.Task[Frame]] = set()
+        self._questions: set[asyncio.Task[PipeMessage]] = set()
 
     async def fork(self, limit_s: float = FORK_S) -> Child:
         """Have a child forked and speak to it. Raises ProcessGoneError when the zygote has died or does not answer."""
         ours, theirs = socket.socketpair()
         try:
             with theirs:
-                answer = await self._ask(Frame({"op": "fork"}, fds=(os.dup(theirs.fileno()),)), limit_s)
+                answer = await self._ask(PipeMessage({"op": "fork"}, fds=(os.dup(theirs.fileno()),)), limit_s)
         except BaseException:
             ours.close()
             raise
-        return Child(self, Peer(ours), int(answer.header["pid"]))
+        return Child(self, ProcessChannel(ours), int(answer.header["pid"]))
 
     async def reap(self, pid: int) -> str:
         """Collect a child that has ended and say how."""
-        answer = await self._ask(Frame({"op": "reap", "pid": pid}), REAP_S)
+        answer = await self._ask(PipeMessage({"op": "reap", "pid": pid}), REAP_S)
         return describe_status(int(answer.header["status"]))
 
     def close(self) -> None:
@@ -215,7 +215,7 @@ class Zygote:
             question.cancel()
         self.peer.close()
 
-    async def _ask(self, frame: Frame, limit_s: float) -> Frame:
+    async def _ask(self, frame: PipeMessage, limit_s: float) -> PipeMessage:
         """Ask to the end even when the caller is cancelled: other slots depend on this stream staying in step."""
         question = asyncio.create_task(self.peer.ask(frame))
         self._questions.add(question)
@@ -230,7 +230,7 @@ class Zygote:
             raise ProcessGoneError("it was ended")
         return question.result()
 
-    def _answered(self, frame: Frame, question: asyncio.Task[Frame]) -> None:
+    def _answered(self, frame: PipeMessage, question: asyncio.Task[PipeMessage]) -> None:
         self._questions.discard(question)
         for fd in frame.fds:
             os.close(fd)
@@ -241,7 +241,7 @@ class Zygote:
 class Child(Zygote):
     """A forked process: it answers, and it may fork children of its own."""
 
-    def __init__(self, parent: Zygote, peer: Peer, pid: int) -> None:
+    def __init__(self, parent: Zygote, peer: ProcessChannel, pid: int) -> None:
         super().__init__(peer)
         self.pid = pid
         self._parent = parent
@@ -264,7 +264,7 @@ class Child(Zygote):
 class Root(Zygote):
     """The process that imported the engine, spawned afresh: nothing of the daemon's threads or locks is in it."""
 
-    def __init__(self, peer: Peer, process: asyncio.subprocess.Process, memory_mb: float) -> None:
+    def __init__(self, peer: ProcessChannel, process: asyncio.subprocess.Process, memory_mb: float) -> None:
         super().__init__(peer)
         self.memory_mb = memory_mb
         self._process = process
@@ -305,7 +305,7 @@ async def start_root(
             # Ctrl-C reaches every process of the terminal's group: the simulator must outlive a drain.
             start_new_session=True,
         )
-    peer = Peer(ours)
+    peer = ProcessChannel(ours)
     try:
         async with asyncio.timeout(START_S):
             answer = await peer.hear()

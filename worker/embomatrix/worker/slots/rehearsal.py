@@ -12,7 +12,7 @@ from embomatrix.skills.parse import parse_plan
 from embomatrix.world.asset import Asset, Interior, Joint, JointKind, Link, SupportSurface
 from embomatrix.world.bundle import Bundle
 from embomatrix.world.evaluate import render
-from embomatrix.world.geometry import Part, Pose, Shape
+from embomatrix.world.geometry import ConvexPart, Pose, Shape
 from embomatrix.world.goal import And, Atom, Not
 from embomatrix.world.poses import PlacementKey, PoseCache, StandPose
 from embomatrix.world.scene import Doorway, RobotStart, Room, Scene, SceneObject, Window
@@ -119,16 +119,16 @@ def _cupboard() -> Asset:
 
 
 def _ball() -> Asset:
-    part = Part(Shape.SPHERE, Pose((0.0, 0.0, 0.0)), (0.08, 0.08, 0.08))
+    part = ConvexPart(Shape.SPHERE, Pose((0.0, 0.0, 0.0)), (0.08, 0.08, 0.08))
     return Asset("ball-a", "ball", "ball.n.01", (0.08, 0.08, 0.08), 0.1, (Link("base", (part,)),))
 
 
 def _wedge() -> Asset:
     corners = ((-0.1, -0.1, -0.05), (0.1, -0.1, -0.05), (0.1, 0.1, -0.05), (-0.1, 0.1, -0.05))
     ridge = ((-0.1, 0.0, 0.05), (0.1, 0.0, 0.05))
-    part = Part(Shape.HULL, Pose((0.0, 0.0, 0.0)), (0.2, 0.2, 0.1), (*corners, *ridge))
+    part = ConvexPart(Shape.HULL, Pose((0.0, 0.0, 0.0)), (0.2, 0.2, 0.1), (*corners, *ridge))
     return Asset("wedge-a", "wedge", "cake.n.03", (0.2, 0.2, 0.1), 0.3, (Link("base", (part,)),))
 
 
-def _box(center: Vec3, size: Vec3) -> Part:
-    return Part(Shape.BOX, Pose(center), size)
+def _box(center: Vec3, size: Vec3) -> ConvexPart:
+    return ConvexPart(Shape.BOX, Pose(center), size)

@@ -13,7 +13,7 @@ UNKNOWN_MB: Final = 60.0
 
 
 @dataclass(frozen=True, slots=True)
-class Held:
+class HeldScene:
     """A scene that is held or being loaded. ``last_used`` grows with every use; ``busy`` ones can't be evicted."""
 
     memory_mb: float
@@ -34,7 +34,7 @@ NOTHING: Final = Decision()
 
 def decide(
     wanted: Sequence[str],
-    held: Mapping[str, Held],
+    held: Mapping[str, HeldScene],
     *,
     budget_mb: float,
     known_mb: Mapping[str, float],
@@ -63,7 +63,7 @@ def decide(
     return NOTHING
 
 
-def surplus(wanted: Sequence[str], held: Mapping[str, Held], *, budget_mb: float) -> tuple[str, ...]:
+def surplus(wanted: Sequence[str], held: Mapping[str, HeldScene], *, budget_mb: float) -> tuple[str, ...]:
     """What to evict because the scenes held turned out larger than the budget; the most urgent one always stays."""
     used_mb = sum(scene.memory_mb for scene in held.values())
     evict: list[str] = []
@@ -75,7 +75,7 @@ def surplus(wanted: Sequence[str], held: Mapping[str, Held], *, budget_mb: float
     return tuple(evict)
 
 
-def _victims(wanted: Sequence[str], place: int, held: Mapping[str, Held]) -> list[str]:
+def _victims(wanted: Sequence[str], place: int, held: Mapping[str, HeldScene]) -> list[str]:
     """Scenes that may go for the one at ``place``, the most dispensable first."""
     kept = set(wanted)
     unwanted = [digest for digest in held if digest not in kept and not held[digest].busy]

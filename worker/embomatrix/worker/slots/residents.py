@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.rpc.wire.values import InfraCode, Resident, ResidentState
-from embomatrix.sim.zygote import Frame
+from embomatrix.sim.zygote import PipeMessage
 from embomatrix.worker.slots.processes import FORK_S, SIMULATOR_PROGRAM, ProcessGoneError, start_root
-from embomatrix.worker.slots.residency import Held, decide, surplus
+from embomatrix.worker.slots.residency import HeldScene, decide, surplus
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Sequence
@@ -74,7 +74,7 @@ class Slot:
 
 
 @dataclass(slots=True, eq=False)
-class Scene:
+class ResidentScene:
     """A scene that is loading, warm or failed. ``idle`` are slots that wait for its next rollout."""
 
     digest: str
@@ -120,7 +120,7 @@ class Residents:
         limits: SlotLimits,
         *,
         bundle_path: Callable[[str], Awaitable[Path]],
-        on_change: Callable[[Scene], None],
+        on_change: Callable[[ResidentScene], None],
         log: Path,
         program: tuple[str, ...] = SIMULATOR_PROGRAM,
         board: ProgressBoard | None = None,
@@ -133,7 +133,7 @@ class Residents:
         self._program = program
         self._root: Root | None = None
         self._root_turn = asyncio.Lock()
-        self._scenes: dict[str, Scene] = {}
+        self._scenes: dict[str, ResidentScene] = {}
         self._known_mb: dict[str, float] = {}
         self._ending: set[asyncio.Task[str]] = set()
 
@@ -148,7 +148,7 @@ class Residents:
             for scene in self._scenes.values()
         )
 
-    def warm(self, digest: str) -> Scene | None:
+    def warm(self, digest: str) -> ResidentScene | None:
         """The scene, if rollouts can be executed in it now."""
         scene = self._scenes.get(digest)
         return scene if scene is not None and scene.state is ResidentState.WARM else None
@@ -191,7 +191,7 @@ class Residents:
                 self._evict(digest)
             if not decision.load:
                 break
-            scene = Scene(decision.load, memory_mb=self._known_mb.get(decision.load, 0.0))
+            scene = ResidentScene(decision.load, memory_mb=self._known_mb.get(decision.load, 0.0))
             self._scenes[scene.digest] = scene
             self._on_change(scene)
             tasks.create_task(self._load(scene))
@@ -202,7 +202,7 @@ class Residents:
             if not held.busy:
                 self._evict(digest)
 
-    def lost(self, scene: Scene, reason: str) -> None:
+    def lost(self, scene: ResidentScene, reason: str) -> None:
         """The scene's process forks no more: forget the scene, so that it is loaded anew when it is wanted.
 
         It may be stopped and not dead, and rollouts may run in slots that it forked before and that would die with it: it is
@@ -212,17 +212,17 @@ class Residents:
             logger.warning("scene lost scene=%s: %s", scene.digest, reason)
             self._forget(scene)
 
-    def release(self, scene: Scene) -> None:
+    def release(self, scene: ResidentScene) -> None:
         """A rollout in the scene is done."""
         scene.running -= 1
         if not scene.running and not self.keeps(scene):
             self._end(scene)
 
-    def keeps(self, scene: Scene) -> bool:
+    def keeps(self, scene: ResidentScene) -> bool:
         """Whether this very scene is still held, not evicted or loaded anew."""
         return self._scenes.get(scene.digest) is scene
 
-    def keep_slot(self, scene: Scene, slot: Slot) -> None:
+    def keep_slot(self, scene: ResidentScene, slot: Slot) -> None:
         """Keep a slot for its scene's next rollout, unless the scene was dropped meanwhile.
 
         When too many are idle, the scene that was not used for longest gives one up.
@@ -246,9 +246,9 @@ class Residents:
         self._ending.add(task)
         task.add_done_callback(self._ending.discard)
 
-    def _held(self) -> dict[str, Held]:
+    def _held(self) -> dict[str, HeldScene]:
         return {
-            scene.digest: Held(
+            scene.digest: HeldScene(
                 scene.memory_mb, scene.last_used, scene.running > 0 or scene.state is ResidentState.LOADING
             )
             for scene in self._scenes.values()
@@ -258,7 +258,7 @@ class Residents:
     def _loading(self) -> int:
         return sum(scene.state is ResidentState.LOADING for scene in self._scenes.values())
 
-    async def _load(self, scene: Scene) -> None:
+    async def _load(self, scene: ResidentScene) -> None:
         started_s = time.monotonic()
         try:
             async with asyncio.timeout(LOAD_S):
@@ -277,7 +277,7 @@ class Residents:
             )
         self._on_change(scene)
 
-    async def _load_child(self, scene: Scene) -> None:
+    async def _load_child(self, scene: ResidentScene) -> None:
         path = await self._bundle_path(scene.digest)
         child = await self._fork_scene()
         request = {
@@ -286,7 +286,7 @@ class Residents:
             "slot_memory_mb": self._limits.slot_memory_mb,
         }
         try:
-            answer = await child.peer.ask(Frame(request))
+            answer = await child.peer.ask(PipeMessage(request))
         except ProcessGoneError as error:
             how = await child.end()
             raise ProcessGoneError(f"the simulator ended while loading it: {how}") from error
@@ -321,19 +321,19 @@ class Residents:
         logger.info("scene evicted scene=%s", digest)
         self._drop(self._scenes[digest])
 
-    def _drop(self, scene: Scene) -> None:
+    def _drop(self, scene: ResidentScene) -> None:
         """Forget a scene and end its process; its slots die with it."""
         self._forget(scene)
         self._end(scene)
 
-    def _forget(self, scene: Scene) -> None:
+    def _forget(self, scene: ResidentScene) -> None:
         del self._scenes[scene.digest]
         for slot in scene.idle:
             slot.child.close()
         scene.idle.clear()
         self._on_change(scene)
 
-    def _end(self, scene: Scene) -> None:
+    def _end(self, scene: ResidentScene) -> None:
         if scene.child is not None:
             self.end_later(scene.child)
             scene.child = None

@@ -25,7 +25,7 @@ from embomatrix.rpc.wire.outcome import completed_to_proto
 from embomatrix.rpc.wire.rollout import rollout_from_proto
 from embomatrix.rpc.wire.values import InfraCode
 from embomatrix.sim.zygote import (
-    Frame,
+    PipeMessage,
     give_back_memory,
     limit_memory,
     private_mb,
@@ -60,7 +60,7 @@ class LoadedScene(Protocol):
         """Steps of a millisecond or two that make later executions faster and change nothing else."""
 
 
-class Simulation(Protocol):
+class SimulationBackend(Protocol):
     """Where scenes come from: the physics engine, or a test's stand-in."""
 
     def prepare(self) -> None:
@@ -74,7 +74,7 @@ class BundleCorruptError(Exception):
     """The bundle's content is damaged: fetch it again."""
 
 
-def run_program(simulation: Simulation) -> None:
+def run_program(simulation: SimulationBackend) -> None:
     """Serve as root until the daemon goes away.
 
     Arguments: the control socket's descriptor, the daemon's process id, and the descriptor of a board of progress, if
@@ -88,14 +88,14 @@ def run_program(simulation: Simulation) -> None:
     try:
         simulation.prepare()
     except Exception as error:  # noqa: BLE001  # the daemon tells the person
-        send(control, Frame(_failure(InfraCode.SCENE_LOAD_FAILED, error)))
+        send(control, PipeMessage(_failure(InfraCode.SCENE_LOAD_FAILED, error)))
         return
-    send(control, Frame({"memory_mb": private_mb()}))
+    send(control, PipeMessage({"memory_mb": private_mb()}))
     gc.collect()
     serve_forks(control, lambda connection: _hold_scene(simulation, connection, board))
 
 
-def _hold_scene(simulation: Simulation, connection: socket.socket, board: ProgressBoard) -> None:
+def _hold_scene(simulation: SimulationBackend, connection: socket.socket, board: ProgressBoard) -> None:
     """Load the scene that the first frame names, then fork slots from it. It executes nothing itself: it stays pristine."""
     request = receive(connection)
     if request is None:
@@ -106,13 +106,13 @@ def _hold_scene(simulation: Simulation, connection: socket.socket, board: Progre
     try:
         scene = simulation.load(Path(request.header["path"]), request.header["digest"])
     except BundleCorruptError as error:
-        send(connection, Frame(_failure(InfraCode.BUNDLE_CORRUPT, error)))
+        send(connection, PipeMessage(_failure(InfraCode.BUNDLE_CORRUPT, error)))
         return
     except Exception as error:  # noqa: BLE001  # a scene that can't be loaded is a result
-        send(connection, Frame(_failure(InfraCode.SCENE_LOAD_FAILED, error)))
+        send(connection, PipeMessage(_failure(InfraCode.SCENE_LOAD_FAILED, error)))
         return
     load_s, cpu_s = time.perf_counter() - started_s, time.thread_time() - core_s
-    send(connection, Frame({"load_s": load_s, "cpu_s": cpu_s, "memory_mb": private_mb()}))
+    send(connection, PipeMessage({"load_s": load_s, "cpu_s": cpu_s, "memory_mb": private_mb()}))
     memory_mb = int(request.header["slot_memory_mb"])
     gc.enable()
     serve_forks(connection, lambda slot: _run_slot(scene, slot, memory_mb, board), scene.complete())
@@ -144,7 +144,7 @@ def _run_slot(scene: LoadedScene, connection: socket.socket, memory_mb: int, boa
             return
 
 
-def _answer(scene: LoadedScene, request: Frame, on_step: Callable[[int], None]) -> Frame:
+def _answer(scene: LoadedScene, request: PipeMessage, on_step: Callable[[int], None]) -> PipeMessage:
     started_s, core_s = time.perf_counter(), time.thread_time()
     try:
         own = request.header.get("reward")
@@ -153,15 +153,15 @@ def _answer(scene: LoadedScene, request: Frame, on_step: Callable[[int], None]) 
         completed = scene.execute(rollout, on_step, reward)
         result = completed_to_proto(completed).SerializeToString()
     except MemoryError as error:
-        return Frame(_failure(InfraCode.SLOT_OOM, error))
+        return PipeMessage(_failure(InfraCode.SLOT_OOM, error))
     except Exception as error:  # noqa: BLE001  # a defect is a failure of the infrastructure, never a reward
-        return Frame(_failure(InfraCode.SLOT_CRASHED, error))
+        return PipeMessage(_failure(InfraCode.SLOT_CRASHED, error))
     header = {
         "execute_s": time.perf_counter() - started_s,
         "cpu_s": time.thread_time() - core_s,
         "resident_mb": resident_mb(),
     }
-    return Frame(header, result)
+    return PipeMessage(header, result)
 
 
 def _failure(code: InfraCode, error: Exception) -> Mapping[str, Any]:

@@ -12,7 +12,7 @@ from embomatrix.worker.slots.execution import Ticket
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
-    from embomatrix.worker.slots.residents import Scene
+    from embomatrix.worker.slots.residents import ResidentScene
 
 OVERTAKEN_S: Final = 0.5
 """A lease that has waited for this long is not overtaken by one whose scene a slot has at hand."""
@@ -21,7 +21,7 @@ OVERTAKEN_S: Final = 0.5
 class WaitingLeases:
     """``slots`` share what waits; ``warm`` tells the scene of a bundle digest that can execute."""
 
-    def __init__(self, slots: int, warm: Callable[[str], Scene | None]) -> None:
+    def __init__(self, slots: int, warm: Callable[[str], ResidentScene | None]) -> None:
         self._slots = slots
         self._warm = warm
         self._tickets: deque[Ticket] = deque()
@@ -45,7 +45,7 @@ class WaitingLeases:
         """All of one scene wait no longer."""
         return self._take([ticket for ticket in self._tickets if ticket.digest == digest])
 
-    def take(self, now_s: float) -> tuple[Ticket, Scene] | None:
+    def take(self, now_s: float) -> tuple[Ticket, ResidentScene] | None:
         """One whose scene is warm, with this.
 
         It is the first, or, until that has waited for long, the first for which no process must be forked beside one that is
@@ -64,7 +64,7 @@ class WaitingLeases:
         self._tickets.remove(found[0])
         return found
 
-    def take_more(self, scene: Scene, count: int, now_s: float) -> list[Ticket]:
+    def take_more(self, scene: ResidentScene, count: int, now_s: float) -> list[Ticket]:
         """Leases of this scene, up to a count, while it is warm: no more than a slot's share of all that wait.
 
         They may overtake those of other scenes, until one of these has waited for long.

@@ -87,7 +87,7 @@ class Ruling(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class AuditVerdict:
     """``right`` and ``wrong`` are places in the list of opinions; both are empty unless it was agreed."""
 
     ruling: Ruling
@@ -95,15 +95,17 @@ class Verdict:
     wrong: tuple[int, ...] = ()
 
 
-def judge(opinions: Sequence[Opinion]) -> Verdict:
+def judge(opinions: Sequence[Opinion]) -> AuditVerdict:
     """Two that agree are right. Wrong is only who contradicts both of them: without that nobody is blamed."""
     for one, two in combinations(range(len(opinions)), 2):
         if opinions[one].agrees(opinions[two]):
             others = [at for at in range(len(opinions)) if at not in (one, two)]
             right = [opinions[one], opinions[two]]
             wrong = tuple(at for at in others if not any(opinions[at].agrees(o) for o in right))
-            return Verdict(Ruling.AGREED, tuple(at for at in range(len(opinions)) if at not in wrong), wrong)
-    return Verdict(Ruling.SPLIT if len(opinions) >= OPINIONS else Ruling.OPEN)
+            return AuditVerdict(
+                Ruling.AGREED, tuple(at for at in range(len(opinions)) if at not in wrong), wrong
+            )
+    return AuditVerdict(Ruling.SPLIT if len(opinions) >= OPINIONS else Ruling.OPEN)
 
 
 @dataclass(slots=True)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.manager.control.audit.auditor import Auditor, AuditRules, Opinion, Ruling, judge, opinion_of
 from embomatrix.manager.control.commands import CancelLease, QuarantineWorker
-from embomatrix.manager.control.dispatch.ledger import Phase, RolloutKey, RolloutRecord
+from embomatrix.manager.control.dispatch.ledger import DispatchPhase, RolloutKey, RolloutRecord
 from embomatrix.reward.settings import PAPER
 from embomatrix.rpc.wire.values import Completed, InfraCode, InfraFailure
 
@@ -280,8 +280,8 @@ class Audits:
             self.auditor.of(worker_id).disputed -= 1
         case.disputed = ()
         check = case.check
-        if check.phase is Phase.PENDING:
+        if check.phase is DispatchPhase.PENDING:
             self._desk.pending.remove(check)
         for lease in list(check.leases):
             self._desk.void(lease)
-        check.phase = Phase.DONE
+        check.phase = DispatchPhase.DONE

@@ -21,9 +21,9 @@ from embomatrix.manager.control.dispatch.group_policy import attempts_allowed, f
 from embomatrix.manager.control.dispatch.lease_book import LeaseBook
 from embomatrix.manager.control.dispatch.ledger import (
     BatchRecord,
+    DispatchPhase,
     GroupRecord,
     LeaseRecord,
-    Phase,
     RolloutRecord,
     WorkerRecord,
 )
@@ -180,10 +180,10 @@ class Assignments:
             one.failed = True
         for record in lost:
             self._conclude(record, Cancelled(why))
-        self.queue([record for record in late if record.phase is not Phase.DONE])
+        self.queue([record for record in late if record.phase is not DispatchPhase.DONE])
 
     def _conclude(self, record: RolloutRecord, outcome: Outcome) -> None:
-        if record.phase is Phase.PENDING:
+        if record.phase is DispatchPhase.PENDING:
             self.pending.remove(record)
         for lease in list(record.leases):
             self.void(lease)

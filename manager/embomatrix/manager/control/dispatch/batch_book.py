@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 from embomatrix.manager.control.dispatch.ledger import (
     BatchRecord,
+    DispatchPhase,
     GroupRecord,
-    Phase,
     RolloutKey,
     RolloutRecord,
 )
@@ -93,7 +93,7 @@ class BatchBook:
 
     def conclude(self, record: RolloutRecord) -> int:
         """The rollout has its outcome; returns the cursor of it."""
-        record.phase = Phase.DONE
+        record.phase = DispatchPhase.DONE
         batch = self.of(record)
         for group in (batch.whole, batch.groups[record.rollout.group_id]):
             del group.open[record.key.rollout_id]
@@ -114,7 +114,7 @@ class BatchBook:
             due_s, _, submitted_s, batch = heapq.heappop(self._due)
             self.admit(batch)
             for record in list(batch.open.values()):
-                if record.phase is not Phase.DONE:
+                if record.phase is not DispatchPhase.DONE:
                     yield record, due_s - submitted_s
 
 

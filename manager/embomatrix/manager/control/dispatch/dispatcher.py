@@ -23,7 +23,7 @@ from embomatrix.manager.control.dispatch.assignments import Assignments, Dispatc
 from embomatrix.manager.control.dispatch.attendance import Attendance
 from embomatrix.manager.control.dispatch.hedging import Hedger
 from embomatrix.manager.control.dispatch.lease_ends import LeaseEnds
-from embomatrix.manager.control.dispatch.queue_timeouts import Patience
+from embomatrix.manager.control.dispatch.queue_timeouts import QueueTimeouts
 from embomatrix.manager.control.dispatch.recovery import Recovery
 from embomatrix.manager.control.events import (
     BatchCancelled,
@@ -80,7 +80,7 @@ class Dispatcher:
         self._attendance = Attendance(self._desk, self._recovery)
         self._ends = LeaseEnds(self._desk)
         self._hedger = Hedger(self._desk, limits)
-        self._patience = Patience(self._desk, limits.no_capacity_s)
+        self._patience = QueueTimeouts(self._desk, limits.no_capacity_s)
 
     def handle(self, *events: Event, now_s: float) -> list[Command]:
         """Take in facts of one moment; returns what shall be done about them, in order. Leases are given after all of them."""

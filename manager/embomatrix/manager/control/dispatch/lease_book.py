@@ -7,7 +7,7 @@ import itertools
 from collections import Counter, OrderedDict
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.manager.control.dispatch.ledger import LeaseRecord, Phase, RolloutRecord, WorkerRecord
+from embomatrix.manager.control.dispatch.ledger import DispatchPhase, LeaseRecord, RolloutRecord, WorkerRecord
 from embomatrix.rpc.leases import LeaseRef
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ class LeaseBook:
             expires_s=now_s + self._ttl_s,
             limit_s=now_s + self._limit_s,
         )
-        record.phase = Phase.LEASED
+        record.phase = DispatchPhase.LEASED
         record.leases.append(lease)
         self._runs.charge(lease)
         self.live[lease.ref.lease_id] = lease

@@ -43,7 +43,7 @@ class RolloutKey(NamedTuple):
     rollout_id: str
 
 
-class Phase(Enum):
+class DispatchPhase(Enum):
     """Where a rollout stands: in the queue, taken out of it, or at its one outcome, which is final."""
 
     PENDING = auto()
@@ -64,7 +64,7 @@ class RolloutRecord:
     submitted_s: float
     warm: bool
     """Its scene was warm somewhere when it was submitted."""
-    phase: Phase = Phase.LEASED
+    phase: DispatchPhase = DispatchPhase.LEASED
     attempts: int = 0
     """Leases that were started and did not deliver."""
     leases: list[LeaseRecord] = field(default_factory=list)

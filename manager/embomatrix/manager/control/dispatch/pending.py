@@ -6,7 +6,7 @@ import heapq
 from collections import Counter
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from embomatrix.manager.control.dispatch.ledger import Phase, RolloutRecord
+from embomatrix.manager.control.dispatch.ledger import DispatchPhase, RolloutRecord
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -47,7 +47,7 @@ class PendingQueues:
         """Every waiting rollout, in no order."""
         for lanes in self._heaps.values():
             for heap in lanes.values():
-                yield from (record for _, record in heap if record.phase is Phase.PENDING)
+                yield from (record for _, record in heap if record.phase is DispatchPhase.PENDING)
 
     @property
     def scenes(self) -> int:
@@ -65,7 +65,7 @@ class PendingQueues:
 
     def push(self, record: RolloutRecord) -> None:
         """Queue a rollout that no one holds."""
-        record.phase = Phase.PENDING
+        record.phase = DispatchPhase.PENDING
         heap = self._heaps.setdefault(record.scene, {}).setdefault(_lane(record), [])
         heapq.heappush(heap, (record.sequence, record))
         self._counts[record.scene] += 1
@@ -103,7 +103,7 @@ class PendingQueues:
             heap.remove((record.sequence, record))
             heapq.heapify(heap)
         self._uncount(record)
-        record.phase = Phase.LEASED
+        record.phase = DispatchPhase.LEASED
 
     def _uncount(self, record: RolloutRecord) -> None:
         scene, run_id = record.scene, record.key.run_id
@@ -168,7 +168,7 @@ def _lane(record: RolloutRecord) -> Lane:
 
 
 def _head(heap: _Heap) -> RolloutRecord | None:
-    while heap and heap[0][1].phase is not Phase.PENDING:
+    while heap and heap[0][1].phase is not DispatchPhase.PENDING:
         heapq.heappop(heap)
     return heap[0][1] if heap else None
 
@@ -181,5 +181,5 @@ def _first_taken(heap: _Heap, worker: WorkerRecord, now_s: float) -> RolloutReco
     if head.rollout.render and not worker.free_render_slots:
         return None  # no more than this one would it take another of the lane
     few = heapq.nsmallest(PASSED_OVER, heap)
-    takers = (r for _, r in few if r.phase is Phase.PENDING and worker.takes(r, now_s))
+    takers = (r for _, r in few if r.phase is DispatchPhase.PENDING and worker.takes(r, now_s))
     return next(takers, None)

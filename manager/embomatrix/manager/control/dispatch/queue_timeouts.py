@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from embomatrix.manager.control.dispatch.assignments import Assignments
 
 
-class Patience:
+class QueueTimeouts:
     """Ends rollouts that waited for ``limit_s`` while no worker was there, or none that could hold their scene."""
 
     def __init__(self, desk: Assignments, limit_s: float) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from typing import TYPE_CHECKING
 
-from embomatrix.manager.control.dispatch.ledger import Phase
+from embomatrix.manager.control.dispatch.ledger import DispatchPhase
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -37,7 +37,7 @@ class Recovery:
     @property
     def waiting(self) -> int:
         """Rollouts that somebody may hold."""
-        return sum(record.phase is not Phase.DONE for record in self._awaited.values())
+        return sum(record.phase is not DispatchPhase.DONE for record in self._awaited.values())
 
     def awaited(self) -> Mapping[str, int]:
         """Rollouts that somebody may hold, by scene."""
@@ -83,7 +83,7 @@ class Recovery:
             return False
         for other in others:
             self._desk.void(other)
-        if record.phase is Phase.PENDING:
+        if record.phase is DispatchPhase.PENDING:
             self._desk.pending.remove(record)
         self._forget(record)
         record.attempts = max(record.attempts, origin.attempt - 1)
@@ -95,7 +95,7 @@ class Recovery:
         all_are_back = self._expected is not None and not self._expected
         if not self._awaited or not (all_are_back or self._desk.now_s >= self._until_s):
             return
-        left = [record for record in self._awaited.values() if record.phase is not Phase.DONE]
+        left = [record for record in self._awaited.values() if record.phase is not DispatchPhase.DONE]
         self._awaited.clear()
         self._scenes.clear()
         self._desk.queue(left)

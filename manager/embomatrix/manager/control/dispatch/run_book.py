@@ -54,7 +54,7 @@ class SlotTimes:
 
 
 @dataclass(slots=True, eq=False)
-class RunRecord:
+class RunAccount:
     """One run. ``turn_s`` is slot time over weight."""
 
     times: SlotTimes
@@ -79,7 +79,7 @@ class RunBook:
 
     def __init__(self, known_after: int) -> None:
         self._known_after = known_after
-        self._runs: dict[str, RunRecord] = {}
+        self._runs: dict[str, RunAccount] = {}
         self._served_s: dict[int, float] = {}
         """By priority: what the runs that were given leases had paid by then, the most of it."""
 
@@ -89,10 +89,10 @@ class RunBook:
     def __contains__(self, run_id: str) -> bool:
         return run_id in self._runs
 
-    def of(self, run_id: str) -> RunRecord:
+    def of(self, run_id: str) -> RunAccount:
         run = self._runs.get(run_id)
         if run is None:
-            run = self._runs[run_id] = RunRecord(SlotTimes(self._known_after))
+            run = self._runs[run_id] = RunAccount(SlotTimes(self._known_after))
         return run
 
     def open(self, run_id: str, terms: RunTerms) -> None:

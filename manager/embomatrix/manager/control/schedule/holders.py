@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(slots=True, eq=False)
-class Holder:
+class SchedulerWorker:
     """A worker. ``residents`` run from the most to the least recently used."""
 
     worker_id: str
@@ -123,7 +123,7 @@ class Holders:
     """All of them. Whoever changes a holder calls ``changed`` afterwards: the indices follow, and it is looked at again."""
 
     def __init__(self) -> None:
-        self.by_id: dict[str, Holder] = {}
+        self.by_id: dict[str, SchedulerWorker] = {}
         self.order: list[tuple[float, str]] = []
         """The usable ones, which can be given scenes: their capacity below zero and their ids, ascending."""
         self.slots = 0
@@ -141,7 +141,7 @@ class Holders:
 
     def join(self, worker_id: str, resources: Resources, *, scores: bool = True) -> None:
         self.leave(worker_id)
-        self.by_id[worker_id] = Holder(worker_id, resources, scores=scores)
+        self.by_id[worker_id] = SchedulerWorker(worker_id, resources, scores=scores)
         self._memory_mb[resources.memory_mb] += 1
 
     def leave(self, worker_id: str) -> None:
@@ -168,7 +168,7 @@ class Holders:
         holder = self.by_id.get(worker_id)
         return max(holder.resources.score, 1e-3) if holder is not None else 1.0
 
-    def changed(self, holder: Holder) -> None:
+    def changed(self, holder: SchedulerWorker) -> None:
         """Bring the indices up to date with it."""
         self._index(holder.worker_id, frozenset(holder.standing()), frozenset(holder.warm_since_s))
         self._use(holder, usable=holder.usable)
@@ -200,7 +200,7 @@ class Holders:
         """Who reported the scene warm."""
         return self._warm_on.get(scene, frozenset())
 
-    def having(self, scene: str) -> Sequence[Holder]:
+    def having(self, scene: str) -> Sequence[SchedulerWorker]:
         """The usable ones that have the scene or were told to have it."""
         holders = (self.by_id[worker_id] for worker_id in self._standing_on.get(scene, ()))
         return [holder for holder in holders if holder.usable]
@@ -213,7 +213,7 @@ class Holders:
     def most_memory_mb(self) -> int:
         return max(self._memory_mb, default=0)
 
-    def _use(self, holder: Holder, *, usable: bool) -> None:
+    def _use(self, holder: SchedulerWorker, *, usable: bool) -> None:
         key = (-holder.capacity, holder.worker_id)
         at = bisect.bisect_left(self.order, key)
         listed = at < len(self.order) and self.order[at] == key
@@ -294,7 +294,7 @@ class Places:
             refused=self.refused(holder),
         )
 
-    def refused(self, holder: Holder) -> frozenset[str]:
+    def refused(self, holder: SchedulerWorker) -> frozenset[str]:
         """What failed to load there a moment ago, what can't fit, and what needs a GPU or a version that is not there."""
         failed = {scene for scene, at_s in holder.failed_s.items() if self._now_s - at_s < self._retry_s}
         failed.update(scene for scene, size in self._large if size > holder.resources.memory_mb)

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from embomatrix.rpc.wire.values import Batch, LookaheadEntry
 
 
-class Window:
+class LookaheadWindow:
     """What a run announced last, without what has come."""
 
     def __init__(self, version: int, entries: tuple[LookaheadEntry, ...]) -> None:
@@ -38,7 +38,7 @@ class Window:
             self._steps.get(batch.step, {}).pop(scene, None)
 
 
-def announcers(windows: Mapping[str, Window]) -> dict[str, str]:
+def announcers(windows: Mapping[str, LookaheadWindow]) -> dict[str, str]:
     """Whose look-ahead each scene is in; the run that was there first where it is in several."""
     found: dict[str, str] = {}
     for run_id, window in windows.items():

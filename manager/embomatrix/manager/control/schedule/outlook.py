@@ -9,8 +9,8 @@ from embomatrix.rpc.wire.values import LookaheadAnswer, PlanCell, Warmth
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
 
-    from embomatrix.manager.control.schedule.holders import Holder, Holders
-    from embomatrix.manager.control.schedule.lookahead_window import Window
+    from embomatrix.manager.control.schedule.holders import Holders, SchedulerWorker
+    from embomatrix.manager.control.schedule.lookahead_window import LookaheadWindow
 
 
 class Outlook:
@@ -43,7 +43,7 @@ class Outlook:
             eta_s = min(self._left_s(holder, scene) for holder in self._loading(scene))
         return LookaheadAnswer(scene, warmth, eta_s, self._unplaceable.get(scene, ""))
 
-    def grid(self, windows: Mapping[str, Window]) -> list[PlanCell]:
+    def grid(self, windows: Mapping[str, LookaheadWindow]) -> list[PlanCell]:
         """What the runs announced: by run, step and scene."""
         cells: dict[tuple[str, int, str], int] = {}
         for run_id, window in windows.items():
@@ -55,12 +55,14 @@ class Outlook:
             for key, count in sorted(cells.items())
         ]
 
-    def _loading(self, scene: str) -> list[Holder]:
+    def _loading(self, scene: str) -> list[SchedulerWorker]:
         """Those that were told to load it."""
-        told: Iterable[Holder] = (self._holders.by_id[name] for name in self._holders.standing_on(scene))
+        told: Iterable[SchedulerWorker] = (
+            self._holders.by_id[name] for name in self._holders.standing_on(scene)
+        )
         return [holder for holder in told if scene in (holder.desired or ())]
 
-    def _left_s(self, holder: Holder, scene: str) -> float:
+    def _left_s(self, holder: SchedulerWorker, scene: str) -> float:
         """A worker loads as many scenes at a time as it has slots, in the order in which it was told of them."""
         load_s = self._usual_load_s(scene)
         since_s = holder.loading_since_s.get(scene)

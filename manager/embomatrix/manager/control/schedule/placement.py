@@ -17,7 +17,7 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Protocol
 
-from embomatrix.manager.control.shares import Share, in_turns, quotas
+from embomatrix.manager.control.shares import RunShare, in_turns, quotas
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from embomatrix.rpc.wire.values import LookaheadEntry
 
 
-EVERYONE: Final = Share()
+EVERYONE: Final = RunShare()
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +44,7 @@ class Need:
     load_s: float = 0.0
     work_s: float = 0.0
     turn: int = 0
-    share: Share = EVERYONE
+    share: RunShare = EVERYONE
     """Of the run that needs it."""
     render: bool = False
     """Some of its rollouts need slots that render."""
@@ -98,7 +98,7 @@ class Sites(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Placement:
+class ResidencyPlan:
     """``desired``: what each worker that was looked at should hold, most urgent first; the others keep what they have.
 
     ``homeless`` are needs for which no worker has room.
@@ -228,7 +228,7 @@ class _Shelves:
             self.of(self._border)
 
 
-def place(sites: Sites, needs: Sequence[Need], size_mb: Callable[[str], float]) -> Placement:
+def place(sites: Sites, needs: Sequence[Need], size_mb: Callable[[str], float]) -> ResidencyPlan:
     """What workers should hold. ``size_mb`` estimates the memory of a scene. Deterministic."""
     shelves = _Shelves(sites, needs, size_mb)
     wanted = _SlotsWanted(needs, sites.slots)
@@ -247,14 +247,14 @@ def place(sites: Sites, needs: Sequence[Need], size_mb: Callable[[str], float]) 
         for spread in spreads:
             spread.place_more()
         homeless += [spread.need.bundle_digest for spread in spreads if not spread.placed]
-    return Placement(shelves.close(), tuple(homeless))
+    return ResidencyPlan(shelves.close(), tuple(homeless))
 
 
 class _SlotsWanted:
     """What each need may have of all slots: its part of what its run may have, no more than its rollouts can keep busy."""
 
     def __init__(self, needs: Sequence[Need], slots: int) -> None:
-        self._totals: dict[int, Counter[Share]] = {}
+        self._totals: dict[int, Counter[RunShare]] = {}
         for need in needs:
             self._totals.setdefault(need.rank, Counter())[need.share] += need.count
         # Groups of a step come one by one: those that are here share the slots with those that come next.

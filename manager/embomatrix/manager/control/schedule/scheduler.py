@@ -33,12 +33,12 @@ from embomatrix.manager.control.events import (
     WorkerSuspected,
 )
 from embomatrix.manager.control.schedule.holders import Holders, Places
-from embomatrix.manager.control.schedule.lookahead_window import Window, announcers
+from embomatrix.manager.control.schedule.lookahead_window import LookaheadWindow, announcers
 from embomatrix.manager.control.schedule.outlook import Outlook, why_not
 from embomatrix.manager.control.schedule.placement import Need, needs_of, place
 from embomatrix.manager.control.schedule.prewarm import PrewarmLedger
 from embomatrix.manager.control.schedule.scene_costs import SceneCosts
-from embomatrix.manager.control.shares import Share
+from embomatrix.manager.control.shares import RunShare
 from embomatrix.reward.settings import PAPER
 from embomatrix.rpc.versions import SCORES_SINCE
 from embomatrix.rpc.wire.values import Batch, Completed, Resident, RunTerms
@@ -76,7 +76,7 @@ class Scheduler:
     """Residents by memory. ``windows``, ``prewarm`` and ``unplaceable`` are for reading."""
 
     def __init__(self, limits: ScheduleLimits) -> None:
-        self.windows: dict[str, Window] = {}
+        self.windows: dict[str, LookaheadWindow] = {}
         self.prewarm = PrewarmLedger()
         self.unplaceable: dict[str, str] = {}
         """Scenes that no worker can hold, with the reason."""
@@ -185,7 +185,7 @@ class Scheduler:
     def _on_announced(self, event: LookaheadAnnounced) -> Urgency:
         if event.run_id in self.windows and event.version <= self.windows[event.run_id].version:
             return Urgency.NONE
-        self.windows[event.run_id] = Window(event.version, event.entries)
+        self.windows[event.run_id] = LookaheadWindow(event.version, event.entries)
         return Urgency.NOW
 
     def _on_submitted(self, event: BatchSubmitted) -> Urgency:
@@ -257,11 +257,11 @@ class Scheduler:
         names = self._holders.warm_on(scene)
         return min((self._holders.by_id[name].warm_since_s[scene] for name in names), default=None)
 
-    def _share(self, run_id: str) -> Share:
+    def _share(self, run_id: str) -> RunShare:
         terms = self._terms.get(run_id, DEFAULT_TERMS)
-        return Share(run_id, terms.weight, terms.priority)
+        return RunShare(run_id, terms.weight, terms.priority)
 
-    def _spread(self, need: Need, turn: int, share: Share) -> Need:
+    def _spread(self, need: Need, turn: int, share: RunShare) -> Need:
         """One worker more for a scene whose rollouts wait while others are idle, unless one is loading it already."""
         scene = need.bundle_digest
         waited_s = self._demand.waited_s.get(scene, 0.0)

@@ -39,7 +39,7 @@ def main() -> None:
     from embomatrix.trainer.eai.inside.demo import Package
 
     package = Package(published="--withhold-published" not in sys.argv)
-    judge = Judge(package)
+    judge = EaiEvaluator(package)
     sys.addaudithook(_refuse)
     for line in sys.stdin:
         order = json.loads(line)
@@ -57,7 +57,7 @@ def _refuse(event: str, args: tuple[Any, ...]) -> None:
         raise PermissionError(f"the judge's sandbox refuses {event}")
 
 
-class Judge:
+class EaiEvaluator:
     """Answers orders with the published evaluator over stand-ins."""
 
     def __init__(self, package: Package) -> None:

@@ -90,7 +90,7 @@ def state_class(name: str) -> type:
     return found
 
 
-class State:
+class StandInState:
     """One state of an object: a value of its own, or names of the objects that it is related to."""
 
     def __init__(self) -> None:
@@ -105,5 +105,5 @@ def make_object(module: str, kind: str, name: str, box_m: list[float], unary: se
     """An object of one of iGibson's classes, with every relation and these states of its own, all false."""
     made = getattr(sys.modules[module], kind)()
     made.name, made.bounding_box = name, box_m
-    made.states = {state_class(state): State() for state in (*BINARY, *sorted(unary))}
+    made.states = {state_class(state): StandInState() for state in (*BINARY, *sorted(unary))}
     return made
