@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from embomatrix.factory.cli import app
+from embomatrix.factory.commands.app import app
 from embomatrix.factory.evaluate.admissions import admitted_share, evaluate_admissions
 from embomatrix.factory.evaluate.aesthetics import Calibration, auc, features_of, fit, score_room
 from embomatrix.factory.evaluate.drafts import DraftFeatures, asked_in

@@ -10,7 +10,7 @@ from PIL import Image
 from tests.fakes.chat_server import ChatServer
 from typer.testing import CliRunner
 
-from embomatrix.factory.cli import app
+from embomatrix.factory.commands.app import app
 from embomatrix.factory.editor import SceneEditor
 from embomatrix.factory.evaluate.figures import EvaluationError
 from embomatrix.factory.evaluate.looks import Impression, evaluate_looks, impression_of

@@ -14,7 +14,7 @@ import pytest
 from typer.testing import CliRunner
 
 from embomatrix.factory.admission import objection
-from embomatrix.factory.cli import app
+from embomatrix.factory.commands.app import app
 from embomatrix.factory.evaluate.admissions import evaluate_admissions
 from embomatrix.factory.layout.jobs import LayoutAgents
 from embomatrix.factory.layout.organization import organize

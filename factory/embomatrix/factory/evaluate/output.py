@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.table import Table
 
+from embomatrix.factory.commands.terminal import mended
 from embomatrix.factory.evaluate.figures import evaluation_to_json
-from embomatrix.factory.terminal import mended
 from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:

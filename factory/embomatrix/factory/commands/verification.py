@@ -8,9 +8,9 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from embomatrix.factory.commands.terminal import fail, mended, progress
 from embomatrix.factory.evaluate.output import hand_in
 from embomatrix.factory.pipeline.options import Jobs, processes
-from embomatrix.factory.terminal import fail, mended, progress
 from embomatrix.factory.verification.again import sampled, verify_again
 from embomatrix.factory.verification.figures import evaluation_of, objections
 from embomatrix.world.dataset import Dataset

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
+from embomatrix.factory.commands.terminal import fail, mended, progress
 from embomatrix.factory.pipeline.build import build_dataset
 from embomatrix.factory.pipeline.corpus import HELDOUT_SCENES, CorpusSettings, check_frozen, freeze
 from embomatrix.factory.pipeline.options import Jobs, Physical, is_proved, processes
-from embomatrix.factory.terminal import fail, mended, progress
 
 if TYPE_CHECKING:
     from embomatrix.factory.pipeline.settings import BuildSettings

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
+from embomatrix.factory.commands.terminal import mended, progress
 from embomatrix.factory.inspection.page import scene_jpeg, scene_picture, task_page
 from embomatrix.factory.inspection.playing import play_oracle
 from embomatrix.factory.pipeline.store import TRANSCRIPTS_FOLDER, TREES_FOLDER
-from embomatrix.factory.terminal import mended, progress
 from embomatrix.world.dataset import Dataset, DatasetError, bundle_file
 from embomatrix.world.whole_file import check_writable, write_whole
 

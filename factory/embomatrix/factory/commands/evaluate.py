@@ -13,6 +13,7 @@ import typer
 from rich.console import Console
 
 from embomatrix.factory.asked_model import Key, Tape, chat_model
+from embomatrix.factory.commands.terminal import mended, progress
 from embomatrix.factory.evaluate.admissions import admitted_share, evaluate_admissions
 from embomatrix.factory.evaluate.drafts import asked_of
 from embomatrix.factory.evaluate.figures import (
@@ -31,7 +32,6 @@ from embomatrix.factory.evaluate.side_by_side import draw_side_by_side, named
 from embomatrix.factory.evaluate.tasks import panel, people_of
 from embomatrix.factory.pipeline.corpus import training_scenes
 from embomatrix.factory.pipeline.store import TRANSCRIPTS_FOLDER
-from embomatrix.factory.terminal import mended, progress
 from embomatrix.pages.figures import Better, Figure
 from embomatrix.world.dataset import Dataset
 from embomatrix.world.whole_file import write_whole

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import typer
 
 from embomatrix.factory.asked_model import Key, Tape, chat_model
+from embomatrix.factory.commands.layout import Llm, Model, mended_layout, modelled_agents
+from embomatrix.factory.commands.terminal import fail
 from embomatrix.factory.layout.agent_io import DOORS, MODELLED, AgentName
-from embomatrix.factory.layout_cli import Llm, Model, mended_layout, modelled_agents
 from embomatrix.factory.social.agent_io import SOCIAL_DOORS, SocialAgent, asked
 from embomatrix.factory.social.model_agents import ModelAgents
-from embomatrix.factory.terminal import fail
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

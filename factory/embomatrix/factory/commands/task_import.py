@@ -11,6 +11,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from embomatrix.factory.commands.terminal import fail, mended, progress
 from embomatrix.factory.evaluate.figures import EvaluationError, evaluation_to_json
 from embomatrix.factory.outcome_log import LineLog
 from embomatrix.factory.pipeline.options import Jobs, processes
@@ -37,7 +38,6 @@ from embomatrix.factory.task_import.sources import (
     read_file,
     read_jsonl,
 )
-from embomatrix.factory.terminal import fail, mended, progress
 from embomatrix.world.bddl import BddlError
 from embomatrix.world.dataset import TASKS_FILE, write_dataset
 from embomatrix.world.substances import is_substance
