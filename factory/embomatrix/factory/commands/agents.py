@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from embomatrix.factory.asked_model import Key, Tape, chat_model
+from embomatrix.factory.commands.asked_model import Key, Tape, chat_model
 from embomatrix.factory.commands.layout import Llm, Model, mended_layout, modelled_agents
 from embomatrix.factory.commands.terminal import fail
 from embomatrix.factory.layout.agent_io import DOORS, MODELLED, AgentName

@@ -10,8 +10,8 @@ import typer
 from rich.console import Console
 from rich.table import Column, Table
 
-from embomatrix.factory.asked_model import Key, Tape  # noqa: TC001  typer reads the annotations when a command runs
 from embomatrix.factory.commands.agents import agent
+from embomatrix.factory.commands.asked_model import Key, Tape  # noqa: TC001  typer reads the annotations when a command runs
 from embomatrix.factory.commands.assets import app as assets_app
 from embomatrix.factory.commands.corpus import app as corpus_app
 from embomatrix.factory.commands.evaluate import app as evaluate_app
@@ -27,9 +27,9 @@ from embomatrix.factory.commands.layout import (
 from embomatrix.factory.commands.task_import import app as import_app
 from embomatrix.factory.commands.terminal import fail, mended, progress
 from embomatrix.factory.commands.verification import app as verify_app
-from embomatrix.factory.export import card, encoded, export_rows
 from embomatrix.factory.pipeline.build import BuildSummary, Check, build_dataset
 from embomatrix.factory.pipeline.cluster import ClusterJudge
+from embomatrix.factory.pipeline.export import card, encoded, export_rows
 from embomatrix.factory.pipeline.options import Jobs, Physical, is_proved, processes
 from embomatrix.factory.pipeline.settings import SCENE_EXTRACTOR, BuildSettings, WriterKind, scene_ids
 from embomatrix.factory.social.asking import ModelSource, asked_writer

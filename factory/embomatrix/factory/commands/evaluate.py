@@ -12,24 +12,23 @@ import numpy as np
 import typer
 from rich.console import Console
 
-from embomatrix.factory.asked_model import Key, Tape, chat_model
-from embomatrix.factory.commands.terminal import mended, progress
+from embomatrix.factory.commands.asked_model import Key, Tape, chat_model
+from embomatrix.factory.commands.terminal import mended, progress, report_evaluation
 from embomatrix.factory.evaluate.admissions import admitted_share, evaluate_admissions
 from embomatrix.factory.evaluate.drafts import asked_of
-from embomatrix.factory.evaluate.figures import (
-    EvaluationError,
-    EvaluationFigures,
-    read_evaluation,
-)
 from embomatrix.factory.evaluate.judge import judged
 from embomatrix.factory.evaluate.looks import evaluate_looks
 from embomatrix.factory.evaluate.measure import evaluate_aesthetics, evaluate_tasks, written_for
-from embomatrix.factory.evaluate.output import hand_in
 from embomatrix.factory.evaluate.page import with_factory
 from embomatrix.factory.evaluate.scene_runs import OutcomeLog, evaluate_scenes
 from embomatrix.factory.evaluate.scenes import LayoutMethod, fixed_tasks
 from embomatrix.factory.evaluate.side_by_side import draw_side_by_side, named
 from embomatrix.factory.evaluate.tasks import panel, people_of
+from embomatrix.factory.metrics.figures import (
+    EvaluationError,
+    EvaluationFigures,
+    read_evaluation,
+)
 from embomatrix.factory.pipeline.corpus import training_scenes
 from embomatrix.factory.pipeline.store import TRANSCRIPTS_FOLDER
 from embomatrix.pages.figures import Better, Figure
@@ -94,7 +93,7 @@ def tasks(
                 _asked(lambda judge: _judged(judge, groups, seed), llm, model, key, cassette)
             )
             evaluation = replace(evaluation, figures=(*evaluation.figures, *verdicts))
-        hand_in(evaluation, json_file)
+        report_evaluation(evaluation, json_file)
 
 
 @app.command()
@@ -129,7 +128,7 @@ def scenes(
         if only > 1:
             taken = {"taken": f"one in {only} of the fixed tasks", **evaluation.conditions}
             evaluation = replace(evaluation, conditions=taken)
-        hand_in(evaluation, json_file)
+        report_evaluation(evaluation, json_file)
 
 
 @app.command()
@@ -170,7 +169,7 @@ def looks(
                 )
 
         evaluation = asyncio.run(_asked(looked, llm, model, key, cassette))
-    hand_in(evaluation, json_file)
+    report_evaluation(evaluation, json_file)
 
 
 @app.command()
@@ -181,7 +180,7 @@ def admissions(
     """How many drafts of a build were admitted, how many in an hour of two cores, and why the rest was not."""
     with mended():
         evaluation = evaluate_admissions(folder)
-    hand_in(evaluation, json_file)
+    report_evaluation(evaluation, json_file)
 
 
 @app.command()
@@ -198,7 +197,7 @@ def aesthetics(
         evaluation, fitted = evaluate_aesthetics(rooms, seed)
         if calibration is not None:
             write_whole(calibration, (json.dumps(asdict(fitted), indent=1) + "\n").encode("ascii"))
-        hand_in(evaluation, json_file)
+        report_evaluation(evaluation, json_file)
 
 
 @app.command()

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 import typer
 from rich.console import Console
 
-from embomatrix.factory.asked_model import Key, Tape, model_asked
+from embomatrix.factory.commands.asked_model import Key, Tape, model_asked
 from embomatrix.factory.layout.agent_io import DOORS, MODELLED, AgentName, BriefError
 from embomatrix.factory.layout.baselines import lay_at_random, lay_by_poses
 from embomatrix.factory.layout.distribution import DistributionError
@@ -28,8 +28,8 @@ from embomatrix.world.catalog import CatalogError
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from embomatrix.factory.editor import SceneEditor
     from embomatrix.factory.layout.jobs import Layout, Record, RequestedObject
+    from embomatrix.factory.scenes.editor import SceneEditor
     from embomatrix.llm.patience import FailureLimit
 
 METHODS = ("tree", "random", "poses")

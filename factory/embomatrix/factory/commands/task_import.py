@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from embomatrix.factory.commands.terminal import fail, mended, progress
-from embomatrix.factory.evaluate.figures import EvaluationError, evaluation_to_json
+from embomatrix.factory.metrics.figures import EvaluationError, evaluation_to_json
 from embomatrix.factory.outcome_log import LineLog
 from embomatrix.factory.pipeline.options import Jobs, processes
 from embomatrix.factory.pipeline.settings import scene_ids
@@ -47,7 +47,7 @@ from embomatrix.world.whole_file import check_writable, write_whole
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from embomatrix.factory.evaluate.figures import EvaluationFigures
+    from embomatrix.factory.metrics.figures import EvaluationFigures
     from embomatrix.factory.task_import.task import ImportedTask
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)

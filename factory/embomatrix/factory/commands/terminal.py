@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 from typing import TYPE_CHECKING, NoReturn
 
 import typer
@@ -15,18 +16,22 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.table import Table
 
-from embomatrix.factory.evaluate.figures import EvaluationError
+from embomatrix.factory.metrics.figures import EvaluationError, evaluation_to_json
 from embomatrix.factory.task_import.sources import ProblemSourceError
 from embomatrix.llm.values import LlmError
 from embomatrix.rpc.status import ClusterError
 from embomatrix.sim.engine import EngineMissingError
 from embomatrix.world.catalog import CatalogError
 from embomatrix.world.dataset import DatasetError
+from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
+
+    from embomatrix.factory.metrics.figures import EvaluationFigures
 
 
 def progress(console: Console) -> Progress:
@@ -74,3 +79,21 @@ def fail(sentence: str, status: int = 2) -> NoReturn:
         f"embomatrix factory: {sentence}", highlight=False, markup=False, soft_wrap=True
     )
     raise typer.Exit(status) from None
+
+
+def report_evaluation(evaluation: EvaluationFigures, json_file: Path | None) -> None:
+    """A table of the figures, the notes below it, and all of it in the file where one is given. Ends what can't be written."""
+    table = Table("figure", "value", "goal", "", "n")
+    for figure in evaluation.figures:
+        verdict = "" if figure.goal is None else "reached" if figure.is_reached else "short"
+        table.add_row(
+            figure.name, f"{figure.value:.3g} {figure.unit}".strip(), figure.bound, verdict, str(figure.n)
+        )
+    Console().print(table)
+    for note in evaluation.notes:
+        Console().print(note, highlight=False, markup=False)
+    if json_file is not None:
+        with mended(json_file):
+            write_whole(
+                json_file, (json.dumps(evaluation_to_json(evaluation), indent=1) + "\n").encode("ascii")
+            )

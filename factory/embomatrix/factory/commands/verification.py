@@ -8,8 +8,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from embomatrix.factory.commands.terminal import fail, mended, progress
-from embomatrix.factory.evaluate.output import hand_in
+from embomatrix.factory.commands.terminal import fail, mended, progress, report_evaluation
 from embomatrix.factory.pipeline.options import Jobs, processes
 from embomatrix.factory.verification.again import sampled, verify_again
 from embomatrix.factory.verification.figures import evaluation_of, objections
@@ -59,6 +58,6 @@ def verify(
     console = Console()
     for line in objections(verdicts):
         console.print(line, highlight=False, markup=False, soft_wrap=True)
-    hand_in(evaluation_of(verdicts, conditions), json_file)
+    report_evaluation(evaluation_of(verdicts, conditions), json_file)
     if any(verdict.cached or not verdict.equal for verdict in verdicts):
         raise typer.Exit(1)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final, Self
 
-from embomatrix.factory.writer.view import SceneView
+from embomatrix.factory.scenes.view import SceneView
 from embomatrix.sim.actions import HANDLINGS
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.planner.calls import StuckError

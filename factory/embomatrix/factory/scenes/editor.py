@@ -8,16 +8,16 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
+from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.furnish.roles import is_portable
-from embomatrix.factory.layout.values import LayoutReason
 from embomatrix.factory.scenes.check import reach_problems
 from embomatrix.factory.scenes.clearance import Clearance
 from embomatrix.factory.scenes.floor import ReachableFloor
 from embomatrix.factory.scenes.joints import with_joints
 from embomatrix.factory.scenes.solids import Solids, placed_parts
-from embomatrix.factory.writer.view import SceneView
+from embomatrix.factory.scenes.view import SceneView
 from embomatrix.skills.limits import ROBOT
 from embomatrix.world.asset import FLOOR_CATEGORY, Asset, Link, SupportSurface
 from embomatrix.world.geometry import Aabb, ConvexPart, Pose, Shape
@@ -34,6 +34,22 @@ _FLAT_M: Final = 0.03
 _SUNK_M: Final = 0.008
 """How deep the plate of a floor lies: near enough for things to be on it, too deep for them to touch it (5 mm)."""
 _PLATE_M: Final = 0.01
+
+
+class LayoutReason(StrEnum):
+    """Why a thing found no place."""
+
+    UNKNOWN_HOST = "unknown_host"
+    UNKNOWN_MODEL = "unknown_model"
+    NO_HOST = "no_host"
+    NO_SURFACE = "no_surface"
+    TOO_LARGE = "too_large"
+    NO_FREE_SPOT = "no_free_spot"
+    OUT_OF_REACH = "out_of_reach"
+    BARS_THE_WAY = "bars_the_way"
+    UNSTABLE = "unstable"
+    NOT_AT_HAND = "not_at_hand"
+    RELATION_NOT_HELD = "relation_not_held"
 
 
 class PlacementError(ValueError):

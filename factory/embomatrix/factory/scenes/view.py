@@ -6,10 +6,10 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.furnish.roles import FurnitureRole, role_of
+from embomatrix.factory.furnish.small_objects import NEVER_SWITCHED
 from embomatrix.factory.scenes.joints import bumped_into
+from embomatrix.factory.scenes.robot import AnyRobot
 from embomatrix.factory.scenes.solids import Solids
-from embomatrix.factory.writer.robot import AnyRobot
-from embomatrix.factory.writer.tables import NEVER_SWITCHED
 from embomatrix.sim.joints.swings import SWING
 from embomatrix.skills.appliance import cold_source, cooks, freezes, heat_source, heats
 from embomatrix.skills.limits import ROBOT
@@ -19,7 +19,7 @@ from embomatrix.world.state import OPEN_FRACTION, Relation, State
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from embomatrix.factory.writer.robot import Robot
+    from embomatrix.factory.scenes.robot import Robot
     from embomatrix.world.asset import Asset
     from embomatrix.world.scene import Scene, SceneObject
 
