@@ -1,4 +1,4 @@
-"""Tables, seats, beds, lamps and the like: boards on legs with true free space below."""
+"""Tables, desks, seats, beds and lamps: boards on legs with free space below."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ if TYPE_CHECKING:
 
 
 def legs(low: Vec2, high: Vec2, z: Vec2, thickness_m: float) -> list[ConvexPart]:
-    """Four square legs at the corners of a rectangle."""
+    """Return four square legs at the corners of a rectangle."""
     (x0, y0), (x1, y1), t = low, high, thickness_m
     return [box((x, y, z[0]), (x + t, y + t, z[1])) for x in (x0, x1 - t) for y in (y0, y1 - t)]
 
 
 def top_thickness(size_m: Vec3) -> float:
-    """Thickness of a table's top, in metres."""
+    """Return the thickness of a table's top in metres."""
     return clamp(0.05 * size_m[2], 0.006, 0.04)
 
 
 def leg_thickness(size_m: Vec3) -> float:
-    """Width of a table's square legs, in metres."""
+    """Return the width of a table's square legs in metres."""
     return clamp(0.07 * min(size_m[:2]), 0.008, 0.07)
 
 
@@ -60,7 +60,7 @@ def pedestal_table(size_m: Vec3) -> Body:
         box((-0.12 * x1, -0.12 * y1, z0 + foot), (0.12 * x1, 0.12 * y1, z1 - top)),
         *octagon((0.0, 0.0), (0.6 * x1, 0.6 * y1), (z0, z0 + foot)),
     ]
-    # the square that fits the octagon: corners of a larger one would hang over
+    # Inscribed square of the octagon: a larger rectangle would hang over.
     body.add_support("top", (-0.7 * x1, -0.7 * y1), (0.7 * x1, 0.7 * y1), z1)
     return body
 
@@ -86,13 +86,13 @@ def slab(size_m: Vec3) -> Body:
 
 
 def block(size_m: Vec3) -> Body:
-    """A solid box that is no place for other things; its top is where its box ends."""
+    """A solid box that carries nothing."""
     outer = centred(size_m)
     return Body(parts=[box(outer.low_m, outer.high_m)])
 
 
 def _seat_height(height_m: float) -> float:
-    """Seats are 0.42 m high; stools and children's chairs follow their own height."""
+    """Return the height of a seat: 0.42 m, bounded by shares of the whole height for low and high models."""
     return clamp(0.42, 0.35 * height_m, 0.62 * height_m)
 
 
@@ -138,11 +138,11 @@ def stool(size_m: Vec3) -> Body:
 
 
 CORNER_FROM_M: Final = 1.4
-"""A sofa that exceeds this along both sides is one for a corner: nobody's seat is as deep."""
+"""A sofa larger than this along both sides is a corner sofa: no seat is as deep."""
 
 
 def sofa(size_m: Vec3) -> Body:
-    """Upholstered base on short feet, with back and arms; a deep and wide one goes round a corner."""
+    """Upholstered base on short feet with back and arms; a deep and wide model is a corner sofa."""
     if size_m[0] > CORNER_FROM_M and size_m[1] > CORNER_FROM_M:
         return _corner_sofa(size_m)
     (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
@@ -163,7 +163,7 @@ def sofa(size_m: Vec3) -> Body:
 
 
 def _corner_sofa(size_m: Vec3) -> Body:
-    """Seats along the back and along the right side, with a back behind each; the corner between them is open floor."""
+    """Seats along the back and along the right side with a back rest behind each; open floor between them."""
     (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
     z, feet = z0 + _seat_height(size_m[2]), 0.1 * size_m[2]
     deep, back = 0.95, 0.22
@@ -183,7 +183,7 @@ def _corner_sofa(size_m: Vec3) -> Body:
 
 
 def bed(size_m: Vec3) -> Body:
-    """Mattress on a frame with legs, headboard at the back: the foot of the bed is its front."""
+    """Mattress on a frame with legs and a headboard at the back; the foot of the bed is its front."""
     (x0, y0, z0), (x1, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
     body = Body()
     z = z0 + clamp(0.55, 0.3 * size_m[2], 0.72 * size_m[2])
@@ -226,9 +226,9 @@ def lamp(size_m: Vec3) -> Body:
 
 
 PEDESTAL_FROM_M: Final = 1.15
-"""A desk as wide as this has its drawers in a pedestal: a chair still fits beside it."""
+"""Width from which a desk has its drawers in a pedestal: a chair still fits beside it."""
 TALL_M: Final = 1.05
-"""A desk higher than this is one with a hutch: nobody works at its top."""
+"""Height from which a desk has a hutch: nobody works at such a height."""
 _WORK_M: Final = 0.76
 _PANEL_M: Final = 0.018
 _BOARD_M: Final = 0.012
@@ -236,21 +236,21 @@ _FIT_M: Final = 0.002
 
 
 def desk(size_m: Vec3) -> Body:
-    """A top on four legs; a high one carries a hutch at its back."""
+    """A top on four legs; a high model carries a hutch at its back."""
     if size_m[2] <= TALL_M:
         return table(size_m)
     return _with_hutch(table(_below_hutch(size_m)), size_m)
 
 
 def drawer_desk(size_m: Vec3) -> Body:
-    """A desk with drawers in a pedestal at its left, a narrow one with a drawer under its top."""
+    """A desk with drawers in a pedestal at its left; a narrow model has one drawer under its top."""
     if size_m[2] <= TALL_M:
         return _desk_of_drawers(size_m)
     return _with_hutch(_desk_of_drawers(_below_hutch(size_m)), size_m)
 
 
 def drawer_table(size_m: Vec3) -> Body:
-    """A table with a drawer under its top, one too small for that without."""
+    """A table with a drawer under its top; without the drawer if it is too small."""
     body = table(size_m)
     leg, under = leg_thickness(size_m), size_m[2] / 2 - top_thickness(size_m)
     depth = clamp(0.3 * size_m[2], 0.09, 0.13)
@@ -271,7 +271,7 @@ def _desk_of_drawers(size_m: Vec3) -> Body:
 
 
 def _hang(body: Body, size_m: Vec3, y: Vec2, z: Vec2) -> None:
-    """A carcass of drawers below the top, which closes it above."""
+    """Add a carcass of drawers below the top, which closes it above."""
     x = size_m[0] / 2
     carcass = region((-x, x - _PANEL_M), y, z)
     boards, bay = shell(carcass, Walls(_BOARD_M, 0.0, _BOARD_M, _BOARD_M, _BOARD_M, 0.0))
@@ -284,7 +284,7 @@ def _below_hutch(size_m: Vec3) -> Vec3:
 
 
 def _with_hutch(lower: Body, size_m: Vec3) -> Body:
-    """A shelf between two uprights on the back of a desk, the whole of the size asked for."""
+    """Add a shelf between two uprights at the back of a desk; the result has the given size."""
     (x0, y0, z0), (_, y1, z1) = centred(size_m).low_m, centred(size_m).high_m
     work = _below_hutch(size_m)[2]
     body = raised(lower, (work - size_m[2]) / 2)

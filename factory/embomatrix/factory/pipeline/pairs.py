@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from embomatrix.factory.scenes.solids import Solids, placed_parts
+from embomatrix.factory.assets.solids import Solids, placed_parts
 from embomatrix.sim.geometry.bounds import bounds_of
 from embomatrix.world.poses import PlacementKey
 from embomatrix.world.state import Relation

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.factory.assets.solids import Solids, placed_parts
 from embomatrix.factory.scenes.check import reach_problems
 from embomatrix.factory.scenes.floor import ReachableFloor, box_of
 from embomatrix.factory.scenes.joints import bumped_into, with_joints
-from embomatrix.factory.scenes.solids import Solids, placed_parts
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
