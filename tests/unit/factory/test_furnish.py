@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from embomatrix.factory.floorplan.layout import plan_floor
 from embomatrix.factory.floorplan.spec import RoomSpec
 from embomatrix.factory.furnish.groups import room_groups
-from embomatrix.factory.furnish.hosts import hosts_of, kept_behind_doors
 from embomatrix.factory.furnish.pieces import (
     REST_GAP_M,
     FurnitureGroup,
@@ -21,6 +20,7 @@ from embomatrix.factory.furnish.pieces import (
 )
 from embomatrix.factory.furnish.roles import HUNG_BOTTOM_M, FurnitureRole, role_of
 from embomatrix.factory.furnish.rooms import MAX_EQUAL, furnish
+from embomatrix.factory.furnish.small_objects import hosts_of, kept_behind_doors
 from embomatrix.factory.furnish.space import LOW_M, RoomSpace, Target
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.floor import box_of

@@ -5,8 +5,7 @@ from __future__ import annotations
 import functools
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.furnish.hosts import NO_HOSTS, hosts_of
-from embomatrix.factory.furnish.small_objects import HOST_GROUPS, MEMBERS, ItemKind, suits
+from embomatrix.factory.furnish.small_objects import HOST_GROUPS, MEMBERS, NO_HOSTS, ItemKind, hosts_of, suits
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

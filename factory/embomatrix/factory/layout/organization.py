@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from embomatrix.factory.furnish.hosts import NO_HOSTS, kept_behind_doors
-from embomatrix.factory.furnish.small_objects import suits
+from embomatrix.factory.furnish.small_objects import NO_HOSTS, kept_behind_doors, suits
 from embomatrix.factory.layout.customs import likes, on_appliance
 from embomatrix.factory.layout.tree import LayoutTree
 from embomatrix.factory.layout.values import MEANS, Branch, Kind, LayoutRelation, RelationMethod

@@ -23,7 +23,7 @@ from embomatrix.factory.social.writer import SocialWriter
 from embomatrix.factory.writer.tasks import DraftOrder, ManyAtOnce, PlainWriter, is_heldout_signature
 from embomatrix.factory.writer.variant import Variant, build_variant
 from embomatrix.sim.executor import Simulator
-from embomatrix.sim.floor.prepared import prepare
+from embomatrix.sim.live_world import prepare
 from embomatrix.sim.physical.actor import physical_simulator
 from embomatrix.sim.physical.survey import Foresight
 from embomatrix.sim.placing.pose_cache import PlacementLibrary

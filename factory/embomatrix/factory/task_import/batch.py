@@ -17,7 +17,7 @@ from embomatrix.factory.task_import.neighbours import neighbours_of
 from embomatrix.factory.task_import.sources import BEHAVIOR, EAI
 from embomatrix.factory.task_import.task import ImportedTask, Manner, import_problem
 from embomatrix.sim.executor import Simulator
-from embomatrix.sim.floor.prepared import prepare
+from embomatrix.sim.live_world import prepare
 from embomatrix.sim.planner.oracle import find_plan
 from embomatrix.skills.parse import plan_to_json
 from embomatrix.world.bundle import Bundle, encode_bundle
