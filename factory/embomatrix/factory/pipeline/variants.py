@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from embomatrix.factory.admission import Admitted, admit
-from embomatrix.factory.pipeline.poses import Needs, SceneSurvey, cache_poses
+from embomatrix.factory.admission import Admitted, TaskRefusal, admit
 from embomatrix.factory.pipeline.settings import WriterKind
 from embomatrix.factory.pipeline.store import Rejection, VariantResult
-from embomatrix.factory.refusal import TaskRefusal
+from embomatrix.factory.pipeline.task_poses import Needs, SceneSurvey, cache_poses
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.rehearsal import Rehearsal
 from embomatrix.factory.scenes.view import SceneView
@@ -37,7 +36,7 @@ from embomatrix.world.task import TaskCategory
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from embomatrix.factory.layout.jobs import LayoutAgents
+    from embomatrix.factory.layout.request import LayoutAgents
     from embomatrix.factory.pipeline.settings import BuildSettings
     from embomatrix.factory.writer.tasks import Draft, TaskWriter
     from embomatrix.skills.syntax import Plan

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from embomatrix.factory.refusal import RefusalReason, RefusedError
+from embomatrix.factory.admission import RefusalReason, RefusedError
 from embomatrix.factory.scenes.floor import ReachableFloor
 from embomatrix.factory.scenes.joints import with_joints
 from embomatrix.world.scene import RobotStart

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from pydantic import TypeAdapter
 
-from embomatrix.factory.layout.agent_io import AgentInterface, BriefError
+from embomatrix.factory.layout.agent_interfaces import AgentInterface, BriefError
 from embomatrix.factory.pictures.sights import sights_of
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.view import SceneView

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.assets.library import build_asset
 from embomatrix.factory.furnish.roles import FurnitureRole, role_of
+from embomatrix.factory.layout.constraints import wish
 from embomatrix.factory.layout.distribution import distribute
 from embomatrix.factory.layout.organization import organize
 from embomatrix.factory.layout.planar import arrange
@@ -23,13 +24,12 @@ from embomatrix.factory.layout.values import (
     PlaneCompany,
     RoomBrief,
 )
-from embomatrix.factory.layout.wishes import wish
 from embomatrix.world.catalog import Catalog
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from embomatrix.factory.layout.tree import LayoutTree
+    from embomatrix.factory.layout.organization import LayoutTree
     from embomatrix.factory.scenes.editor import LayoutReason
     from embomatrix.world.asset import Asset
 

@@ -19,7 +19,7 @@ from embomatrix.sim.process_pool import shared_work
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from embomatrix.factory.refusal import TaskRefusal
+    from embomatrix.factory.admission import TaskRefusal
     from embomatrix.factory.task_import.sources import SourceText
 
     Judging = Callable[[Sequence[SourceText]], Iterator["ImportOutcome"]]

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from pydantic import TypeAdapter, ValidationError
 
+from embomatrix.factory.layout.constraints import wish
 from embomatrix.factory.layout.distribution import distribute
 from embomatrix.factory.layout.organization import organize
 from embomatrix.factory.layout.planar import arrange
@@ -27,7 +28,6 @@ from embomatrix.factory.layout.values import (
     SampleBrief,
     Sampled,
 )
-from embomatrix.factory.layout.wishes import wish
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.scenes.editor import PlacementError, SceneEditor
 from embomatrix.world.state import Relation
