@@ -6,7 +6,7 @@ import json
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
-from embomatrix.factory.evaluate.figures import EvaluationError
+from embomatrix.factory.metrics.figures import EvaluationError
 from embomatrix.world.whole_file import write_whole
 
 if TYPE_CHECKING:

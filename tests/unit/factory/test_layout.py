@@ -8,7 +8,6 @@ import pytest
 from tests.fakes.chat_server import ChatServer
 
 from embomatrix.factory.assets.library import build_asset
-from embomatrix.factory.editor import SceneEditor
 from embomatrix.factory.furnish.roles import wall_height_m
 from embomatrix.factory.layout.agent_io import DOORS, AgentName, BriefError
 from embomatrix.factory.layout.baselines import lay_at_random, lay_by_poses
@@ -26,13 +25,13 @@ from embomatrix.factory.layout.values import (
     Failure,
     HostFacts,
     HostOffer,
-    LayoutReason,
     LayoutRelation,
     LayoutRoomFacts,
     ObjectBrief,
     RoomBrief,
 )
 from embomatrix.factory.scenes.check import check_scene
+from embomatrix.factory.scenes.editor import LayoutReason, SceneEditor
 from embomatrix.llm.endpoint import Endpoint, EndpointLimits
 from embomatrix.llm.patience import FailureLimit
 from embomatrix.llm.values import EndpointError

@@ -14,7 +14,7 @@ import pytest
 from typer.testing import CliRunner
 
 from embomatrix.factory.admission import objection
-from embomatrix.factory.cli import app
+from embomatrix.factory.commands.app import app
 from embomatrix.factory.evaluate.admissions import evaluate_admissions
 from embomatrix.factory.layout.jobs import LayoutAgents
 from embomatrix.factory.layout.organization import organize
@@ -27,8 +27,8 @@ from embomatrix.factory.pipeline.store import BuildStore, VariantResult
 from embomatrix.factory.pipeline.variants import VariantYield
 from embomatrix.factory.refusal import RefusalReason
 from embomatrix.factory.scenes.build import build_base_scene
+from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.writer.tasks import is_heldout_signature
-from embomatrix.factory.writer.view import SceneView
 from embomatrix.reward.breakdown import RewardBreakdown
 from embomatrix.reward.hierarchy import score
 from embomatrix.rpc.wire.values import Completed, InfraCode, InfraFailure, Outcome, RolloutResult, Timings

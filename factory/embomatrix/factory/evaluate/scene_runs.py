@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
-    from embomatrix.factory.evaluate.figures import EvaluationFigures
+    from embomatrix.factory.metrics.figures import EvaluationFigures
 
     Trial = tuple[SceneTask, LayoutMethod]
 

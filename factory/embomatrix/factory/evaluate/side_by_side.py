@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Final
 
 from PIL import Image, ImageDraw, ImageFont
 
-from embomatrix.factory.evaluate.figures import EvaluationError
 from embomatrix.factory.evaluate.scenes import METHODS
+from embomatrix.factory.metrics.figures import EvaluationError
 from embomatrix.factory.pictures.scene import draw_plan
 from embomatrix.factory.pictures.sights import alone
 from embomatrix.factory.refusal import TaskRefusal

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 from pydantic import TypeAdapter, ValidationError
 
-from embomatrix.factory.editor import PlacementError, SceneEditor
 from embomatrix.factory.layout.distribution import distribute
 from embomatrix.factory.layout.organization import organize
 from embomatrix.factory.layout.planar import arrange
@@ -30,6 +29,7 @@ from embomatrix.factory.layout.values import (
 )
 from embomatrix.factory.layout.wishes import wish
 from embomatrix.factory.scenes.build import build_base_scene
+from embomatrix.factory.scenes.editor import PlacementError, SceneEditor
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:

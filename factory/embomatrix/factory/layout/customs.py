@@ -6,7 +6,7 @@ import functools
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.furnish.hosts import NO_HOSTS, hosts_of
-from embomatrix.factory.writer.tables import HOST_GROUPS, MEMBERS, ItemKind, suits
+from embomatrix.factory.furnish.small_objects import HOST_GROUPS, MEMBERS, ItemKind, suits
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -16,7 +16,6 @@ from embomatrix.factory.layout.values import (
     DistributionBrief,
     Failure,
     Kind,
-    LayoutReason,
     LayoutRelation,
     ObjectBrief,
     PlacementConstraints,
@@ -31,6 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from embomatrix.factory.layout.tree import LayoutTree
+    from embomatrix.factory.scenes.editor import LayoutReason
     from embomatrix.world.asset import Asset
 
 _FRONTED: Final = (

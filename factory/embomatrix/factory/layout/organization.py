@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from embomatrix.factory.furnish.hosts import NO_HOSTS, kept_behind_doors
+from embomatrix.factory.furnish.small_objects import suits
 from embomatrix.factory.layout.customs import likes, on_appliance
 from embomatrix.factory.layout.tree import LayoutTree
-from embomatrix.factory.layout.values import MEANS, Branch, Kind, LayoutReason, LayoutRelation, RelationMethod
-from embomatrix.factory.writer.tables import suits
+from embomatrix.factory.layout.values import MEANS, Branch, Kind, LayoutRelation, RelationMethod
+from embomatrix.factory.scenes.editor import LayoutReason
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence

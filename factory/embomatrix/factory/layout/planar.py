@@ -26,12 +26,12 @@ from embomatrix.factory.layout.arrangement import (
 from embomatrix.factory.layout.values import (
     Arranged,
     Arrangement,
-    LayoutReason,
     PlaneBrief,
     PlaneFootprint,
     PlaneSpot,
     PlaneThing,
 )
+from embomatrix.factory.scenes.editor import LayoutReason
 from embomatrix.skills.limits import ROBOT
 
 if TYPE_CHECKING:

@@ -20,8 +20,8 @@ from embomatrix.world.state import Relation
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from embomatrix.factory.editor import SceneEditor
     from embomatrix.factory.layout.values import ObjectBrief, PlaneSpot, Size2
+    from embomatrix.factory.scenes.editor import SceneEditor
     from embomatrix.world.asset import Asset
     from embomatrix.world.geometry import Aabb
 

@@ -9,7 +9,7 @@ import contextlib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.writer.rehearsal import Rehearsal
+from embomatrix.factory.scenes.rehearsal import Rehearsal
 from embomatrix.sim.bullet.engine import BulletEngine
 from embomatrix.sim.floor.navigation import Navigator
 from embomatrix.sim.geometry.statics import base_of, is_level, rest_pose
@@ -19,7 +19,7 @@ from embomatrix.world.state import Relation
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
-    from embomatrix.factory.editor import SceneEditor
+    from embomatrix.factory.scenes.editor import SceneEditor
     from embomatrix.world.geometry import Pose
 
     Elsewhere = Callable[[str], Iterable[Pose]]

@@ -12,14 +12,15 @@ from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.furnish.roles import FurnitureRole, role_of
 from embomatrix.factory.layout.jobs import kind_of
-from embomatrix.factory.layout.values import Failure, Kind, LayoutReason, LayoutRelation
+from embomatrix.factory.layout.values import Failure, Kind, LayoutRelation
+from embomatrix.factory.scenes.editor import LayoutReason
 from embomatrix.world.state import Relation
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from embomatrix.factory.editor import SceneEditor
     from embomatrix.factory.layout.jobs import RequestedObject
+    from embomatrix.factory.scenes.editor import SceneEditor
     from embomatrix.world.asset import Asset
     from embomatrix.world.geometry import Pose
 

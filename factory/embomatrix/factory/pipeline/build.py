@@ -18,7 +18,7 @@ from embomatrix.factory.pipeline.makers import makers
 from embomatrix.factory.pipeline.store import BuildStore, Rejection
 from embomatrix.factory.pipeline.variants import TASKS_EACH, VariantOrder, VariantYield, key_of
 from embomatrix.factory.scenes.build import build_base_scene
-from embomatrix.factory.writer.view import SceneView
+from embomatrix.factory.scenes.view import SceneView
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.dataset import DatasetError, write_dataset
 from embomatrix.world.task import TaskCategory

@@ -18,7 +18,7 @@ from embomatrix.world.state import Relation
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
-    from embomatrix.factory.writer.view import SceneView
+    from embomatrix.factory.scenes.view import SceneView
     from embomatrix.sim.placing.pose_cache import PlacementLibrary
     from embomatrix.world.asset import Asset
     from embomatrix.world.geometry import Aabb, Pose

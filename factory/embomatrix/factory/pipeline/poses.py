@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
     from embomatrix.factory.pipeline.pairs import Beside
-    from embomatrix.factory.writer.view import SceneView
+    from embomatrix.factory.scenes.view import SceneView
     from embomatrix.sim.physical.survey import Foresight
     from embomatrix.sim.placing.pose_cache import PlacementLibrary
     from embomatrix.world.asset import Asset

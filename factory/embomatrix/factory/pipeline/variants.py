@@ -17,11 +17,11 @@ from embomatrix.factory.pipeline.settings import WriterKind
 from embomatrix.factory.pipeline.store import Rejection, VariantResult
 from embomatrix.factory.refusal import TaskRefusal
 from embomatrix.factory.scenes.build import build_base_scene
+from embomatrix.factory.scenes.rehearsal import Rehearsal
+from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.writer import SocialWriter
-from embomatrix.factory.writer.rehearsal import Rehearsal
 from embomatrix.factory.writer.tasks import DraftOrder, ManyAtOnce, PlainWriter, is_heldout_signature
 from embomatrix.factory.writer.variant import Variant, build_variant
-from embomatrix.factory.writer.view import SceneView
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.floor.prepared import prepare
 from embomatrix.sim.physical.actor import physical_simulator

@@ -15,6 +15,7 @@ from pydantic import TypeAdapter
 from embomatrix.factory.layout.agent_io import AgentInterface, BriefError
 from embomatrix.factory.pictures.sights import sights_of
 from embomatrix.factory.scenes.build import build_base_scene
+from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.conversing import starting_slots
 from embomatrix.factory.social.facts import SceneFacts, facts_of, with_sights
 from embomatrix.factory.social.fitting import why_of
@@ -22,7 +23,6 @@ from embomatrix.factory.social.summary import instruction_of
 from embomatrix.factory.social.values import RequestSummary, SceneBrief, SummaryBrief, TalkBrief
 from embomatrix.factory.social.writer import SocialWriter
 from embomatrix.factory.writer.variant import build_variant
-from embomatrix.factory.writer.view import SceneView
 from embomatrix.factory.writer.words import Voice
 
 if TYPE_CHECKING:

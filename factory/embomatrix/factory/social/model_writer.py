@@ -23,11 +23,11 @@ if TYPE_CHECKING:
 
     import numpy as np
 
+    from embomatrix.factory.scenes.view import SceneView
     from embomatrix.factory.social.facts import SceneFacts
     from embomatrix.factory.social.model_agents import ModelAgents
     from embomatrix.factory.social.values import Cast
     from embomatrix.factory.writer.variant import Variant
-    from embomatrix.factory.writer.view import SceneView
     from embomatrix.world.scene import Scene
     from embomatrix.world.task import TaskCategory
 

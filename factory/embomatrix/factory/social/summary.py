@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 from embomatrix.factory.social.phrases import INSTRUCTIONS, JOINS, filled, room_called, said_once
 
 if TYPE_CHECKING:
+    from embomatrix.factory.scenes.view import SceneView
     from embomatrix.factory.social.values import Cast, Conversation
-    from embomatrix.factory.writer.view import SceneView
     from embomatrix.factory.writer.words import Voice
 
 

@@ -23,11 +23,11 @@ from embomatrix.factory.writer.words import FreshVoice
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from embomatrix.factory.scenes.view import SceneView
     from embomatrix.factory.social.casting import RolePlayingAgent
     from embomatrix.factory.social.values import Cast, Conversation, DaySlot
     from embomatrix.factory.writer.goals import GoalConjunct
     from embomatrix.factory.writer.variant import Variant
-    from embomatrix.factory.writer.view import SceneView
     from embomatrix.world.scene import Scene
     from embomatrix.world.task import TaskCategory
 

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import TYPE_CHECKING, Final
 
+from embomatrix.factory.scenes.view import is_liftable
 from embomatrix.factory.task_import.reach import literals
-from embomatrix.factory.writer.view import is_liftable
 from embomatrix.sim.geometry.candidates import surfaces_for
 from embomatrix.world.catalog import Catalog, CatalogError
 from embomatrix.world.state import Relation

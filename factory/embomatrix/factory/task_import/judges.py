@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import TYPE_CHECKING
 
-from embomatrix.factory.evaluate.figures import EvaluationError
+from embomatrix.factory.metrics.figures import EvaluationError
 from embomatrix.factory.scenes.build import build_base_scene
 from embomatrix.factory.task_import.batch import Verified, bind_first, verify_first
 from embomatrix.factory.task_import.report import ProblemOutcome, outcome_of

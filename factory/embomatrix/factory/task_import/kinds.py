@@ -13,8 +13,8 @@ from embomatrix.world.substances import MEANINGS
 from embomatrix.world.task import TaskCategory
 
 if TYPE_CHECKING:
+    from embomatrix.factory.scenes.view import SceneView
     from embomatrix.factory.task_import.sources import SourceText
-    from embomatrix.factory.writer.view import SceneView
     from embomatrix.world.bddl import BddlProblem
     from embomatrix.world.goal import Formula
 

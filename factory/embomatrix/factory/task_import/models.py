@@ -6,9 +6,9 @@ import math
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.assets.library import build_asset
+from embomatrix.factory.scenes.view import is_liftable
 from embomatrix.factory.task_import.demands import room_for
 from embomatrix.factory.task_import.search import serves
-from embomatrix.factory.writer.view import is_liftable
 from embomatrix.world.catalog import Catalog
 
 if TYPE_CHECKING:

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from embomatrix.factory.assets.library import build_asset
+from embomatrix.factory.scenes.view import is_liftable
 from embomatrix.factory.task_import.demands import CavityFit, Demand, floor_needed_m2, room_for
-from embomatrix.factory.writer.view import is_liftable
 from embomatrix.sim.geometry.candidates import candidates, surfaces_for
 from embomatrix.sim.planner.ways import CANDIDATES, MIDDLE
 from embomatrix.world.catalog import Catalog

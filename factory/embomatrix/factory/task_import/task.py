@@ -12,12 +12,13 @@ from typing import TYPE_CHECKING, Final, Protocol
 import numpy as np
 
 from embomatrix.factory.assets.library import build_asset
-from embomatrix.factory.editor import SceneEditor, add_floor
 from embomatrix.factory.furnish.roles import is_portable
 from embomatrix.factory.layout.generator import lay
 from embomatrix.factory.layout.jobs import RequestedObject
 from embomatrix.factory.layout.values import LayoutRelation
 from embomatrix.factory.refusal import RefusalReason, RefusedError, TaskRefusal
+from embomatrix.factory.scenes.editor import SceneEditor, add_floor
+from embomatrix.factory.scenes.view import SceneView, is_liftable
 from embomatrix.factory.task_import.binding import bind
 from embomatrix.factory.task_import.demands import demand_on, demands_of
 from embomatrix.factory.task_import.dialects import read_problem
@@ -30,7 +31,6 @@ from embomatrix.factory.task_import.scene import with_robot_in, with_states
 from embomatrix.factory.task_import.sizes import sized
 from embomatrix.factory.task_import.thermal import sources_for, taps_for
 from embomatrix.factory.writer.tasks import object_table
-from embomatrix.factory.writer.view import SceneView, is_liftable
 from embomatrix.world.bddl import InitLiteral, is_room_instance
 from embomatrix.world.catalog import Catalog, share_of
 from embomatrix.world.evaluate import atoms_of, objects_of, render, substitute, types_of

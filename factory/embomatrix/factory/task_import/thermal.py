@@ -13,7 +13,7 @@ from embomatrix.world.substances import WATER
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
-    from embomatrix.factory.writer.view import SceneView
+    from embomatrix.factory.scenes.view import SceneView
     from embomatrix.world.goal import Formula
 
 _THERMAL: Final = frozenset({State.COOKED, State.FROZEN, State.HOT})

@@ -13,7 +13,7 @@ from embomatrix.factory.scenes.solids import Solids, placed_parts
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from embomatrix.factory.editor import SceneEditor
+    from embomatrix.factory.scenes.editor import SceneEditor
     from embomatrix.world.scene import Scene
 
 SWEEP: Final = (1 / 3, 2 / 3, 1.0)

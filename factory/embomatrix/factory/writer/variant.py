@@ -6,12 +6,19 @@ import itertools
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
-from embomatrix.factory.editor import SceneEditor
+from embomatrix.factory.furnish.small_objects import (
+    BASKETS,
+    MEMBERS,
+    ItemKind,
+    belongs,
+    groups_for,
+    is_left_on,
+)
 from embomatrix.factory.layout.generator import lay
 from embomatrix.factory.layout.jobs import RequestedObject
+from embomatrix.factory.scenes.editor import SceneEditor
+from embomatrix.factory.scenes.view import SceneView, is_liftable
 from embomatrix.factory.writer.starts import OpenStarts
-from embomatrix.factory.writer.tables import BASKETS, MEMBERS, ItemKind, belongs, groups_for, is_left_on
-from embomatrix.factory.writer.view import SceneView, is_liftable
 from embomatrix.world.catalog import Catalog
 from embomatrix.world.state import State
 
