@@ -50,7 +50,6 @@ from embomatrix.manager.control.events import (
     WorkersExpected,
     WorkerSuspected,
 )
-from embomatrix.reward.settings import PAPER
 from embomatrix.rpc.wire.values import InfraCode, InfraFailure
 
 if TYPE_CHECKING:
@@ -150,7 +149,6 @@ class Dispatcher:
             lags=dict(desk.fleet.lags),
             runs={heads[0].scene: heads[0].key.run_id for heads in lanes},
             rendering=frozenset(h.scene for heads in lanes for h in heads if h.rollout.render),
-            scored=frozenset(heads[0].scene for heads in lanes if all(h.reward != PAPER for h in heads)),
         )
 
     @property

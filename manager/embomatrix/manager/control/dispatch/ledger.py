@@ -144,8 +144,6 @@ class WorkerRecord:
     """It was found to give wrong results."""
     versions: Mapping[str, str] = field(default_factory=dict)
     """Of what its results depend on."""
-    scores: bool = True
-    """It scores with the coefficients that a lease asks for; workers of protocol 1 know only the paper's."""
     log_lag: float = 0.0
     reluctance_s: float = 0.0
     """It takes only rollouts that have waited for so long: the time that it needs longer than others."""
@@ -215,8 +213,6 @@ class WorkerRecord:
         if record.failed_on == self.worker_id and now_s < record.avoid_until_s:
             return False
         if now_s - record.submitted_s < self.reluctance_s:
-            return False
-        if not self.scores and record.reward != PAPER:
             return False
         if record.rollout.render and self.rendering >= self.render_slots:
             return False
