@@ -152,13 +152,14 @@ def _arrays(described: Mapping[str, list[str | int]], data: memoryview) -> dict[
     """Read-only arrays by name; their bytes follow one another in ``data``."""
     arrays: dict[str, NDArray[np.generic]] = {}
     first = 0
-    for name, (kind, *shape) in described.items():
+    for name, (kind, *extents) in described.items():
         path = f"bundle.arrays[{name!r}]"
         dtype = _DTYPES.get(str(kind))
         if dtype is None:
             raise SceneInvalidError(path, f"found {str(kind)[:20]!r}: expected one of {', '.join(_DTYPES)}")
-        if not all(isinstance(extent, int) and extent >= 0 for extent in shape):
-            raise SceneInvalidError(path, f"found the shape {shape}: expected numbers from 0")
+        shape = [extent for extent in extents if isinstance(extent, int) and extent >= 0]
+        if len(shape) < len(extents):
+            raise SceneInvalidError(path, f"found the shape {extents}: expected numbers from 0")
         count = math.prod(shape)
         size = count * dtype.itemsize
         if size > len(data) - first:

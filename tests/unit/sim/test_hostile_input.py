@@ -19,9 +19,9 @@ from embomatrix.sim.engine import FLOOR, WALL, EngineError
 from embomatrix.world.asset import Joint, JointKind, Link
 from embomatrix.world.bundle import Bundle, decode_bundle, encode_bundle, read_bundle
 from embomatrix.world.codec import RESERVED_NAMES, scene_from_json, scene_to_json
-from embomatrix.world.records import SceneInvalidError
 from embomatrix.world.geometry import ConvexPart, Pose, Shape
 from embomatrix.world.inflation import BundleError
+from embomatrix.world.records import SceneInvalidError
 
 NAN, INF = math.nan, math.inf
 ORIGIN = (0.0, 0.0, 0.0)

@@ -18,9 +18,9 @@ from embomatrix.sim.placing.pose_cache import build_pose_cache
 from embomatrix.skills.failure import FailureReason
 from embomatrix.world.bundle import Bundle, decode_bundle, encode_bundle
 from embomatrix.world.codec_task import poses_from_json, poses_to_json
-from embomatrix.world.records import SceneInvalidError
 from embomatrix.world.geometry import Pose
 from embomatrix.world.poses import PoseCache
+from embomatrix.world.records import SceneInvalidError
 from embomatrix.world.state import Relation
 from embomatrix.world.tables import Tables, TableWriter
 

@@ -4,6 +4,8 @@ import contextlib
 import copy
 import json
 import math
+import subprocess
+import sys
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -220,3 +222,29 @@ SCENE_JSON: dict[str, Any] = {
     "robot": {"x_m": 0.2, "y_m": 0.2, "yaw": 0.0, "room": "r_0"},
     "left_out": [],
 }
+
+
+def test_decoding_survives_garbage_collections() -> None:
+    """msgspec 0.22 crashes in a collection if a record joins a fixed tuple and a bounded integer in one union."""
+    script = (
+        "import gc; gc.set_threshold(1)\n"
+        "from tests.fakes.scenes import kitchen_scene\n"
+        "from embomatrix.world.bundle import Bundle, decode_bundle, encode_bundle\n"
+        "from embomatrix.world.dataset import TaskRecordJson\n"
+        "import msgspec\n"
+        "decode_bundle(encode_bundle(Bundle(kitchen_scene(), {})))\n"
+        "msgspec.json.Decoder(TaskRecordJson)\n"
+        "gc.collect()\n"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True, timeout=60)
+
+
+def test_error_in_a_mapping_names_the_key(scene: Scene) -> None:
+    broken = through_text(scene_to_json(scene))
+    broken["assets"]["fridge-abc"]["mass_kg"] = "heavy"
+    with pytest.raises(SceneInvalidError) as caught:
+        scene_from_json(broken)
+    assert caught.value.field == "scene.assets['fridge-abc'].mass_kg"
+    assert str(caught.value) == (
+        "scene.assets['fridge-abc'].mass_kg: found 'heavy': expected `float`, got `str`"
+    )
