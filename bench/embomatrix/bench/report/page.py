@@ -43,13 +43,15 @@ TITLES: Final[Mapping[str, tuple[str, str]]] = {
         "*private_mb_per_slot* is what a slot that waits holds for itself after fifty rollouts. A rollout checks every "
         "precondition, every placed thing for penetration, relations and the reward. Names without a size are for scenes "
         "of about 300 bodies. What bounds the time of a rollout and the memory of a slot, and what was tried, is told in "
-        "decisions [0023](decisions/0023-what-bounds-a-rollout.md) and [0015](decisions/0015-what-a-slot-holds-for-itself.md).",
+        "decisions [0023](decisions/0023-python-and-bullet-calls-bound-a-rollout-the.md) "
+        "and [0015](decisions/0015-slots-share-the-resident-s-pages-bundles-are.md).",
     ),
     "fidelity": (
         "Fidelity of the two modes",
         "`embomatrix bench fidelity --dataset=build/scenes --json FILE` on the dataset of `embomatrix factory build "
         "--out=build/scenes --scenes=all --train=208 --heldout=0`: the same plans in cached and in physical mode, counted as "
-        "[decision 0010](decisions/0010-how-fidelity-is-counted.md) says. *physical_plan_300_s* is processor time of a plan in "
+        "[decision 0010](decisions/0010-fidelity-counts-steps-reasons-and-final.md) says. "
+        "*physical_plan_300_s* is processor time of a plan in "
         "scenes of about 300 bodies; *speed-up* is that of calls which succeed in both modes.",
     ),
     "rollout": (

@@ -1,4 +1,4 @@
-"""What an asset is made of, as a key: equal content, equal key, whatever scene it is in."""
+"""Content keys of assets: equal content gives an equal key in every scene."""
 
 from __future__ import annotations
 
@@ -16,9 +16,11 @@ class Contents:
         self._known: dict[int, tuple[Asset, str]] = {}
 
     def of(self, asset: Asset) -> str:
-        """Digest of everything in the asset. The asset is kept, so that its id can't pass to another one."""
+        """Return the digest of everything in the asset. The asset is kept, because a freed id could be reused."""
         known = self._known.get(id(asset))
         if known is None:
-            known = (asset, hashlib.sha256(repr(asset).encode()).hexdigest())
+            # Pose caches draw with seeds from this digest. `Part` is the former name of `ConvexPart`: the digest keeps it.
+            content = repr(asset).replace("ConvexPart(", "Part(")
+            known = (asset, hashlib.sha256(content.encode()).hexdigest())
             self._known[id(asset)] = known
         return known[1]

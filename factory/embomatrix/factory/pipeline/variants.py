@@ -11,17 +11,16 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from embomatrix.factory.admission import Admitted, admit
-from embomatrix.factory.pipeline.poses import Needs, SceneSurvey, cache_poses
+from embomatrix.factory.admission import Admitted, TaskRefusal, admit
 from embomatrix.factory.pipeline.settings import WriterKind
 from embomatrix.factory.pipeline.store import Rejection, VariantResult
-from embomatrix.factory.refusal import TaskRefusal
+from embomatrix.factory.pipeline.task_poses import Needs, SceneSurvey, cache_poses
 from embomatrix.factory.scenes.build import build_base_scene
+from embomatrix.factory.scenes.rehearsal import Rehearsal
+from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.social.writer import SocialWriter
-from embomatrix.factory.writer.rehearsal import Rehearsal
 from embomatrix.factory.writer.tasks import DraftOrder, ManyAtOnce, PlainWriter, is_heldout_signature
 from embomatrix.factory.writer.variant import Variant, build_variant
-from embomatrix.factory.writer.view import SceneView
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.floor.prepared import prepare
 from embomatrix.sim.physical.actor import physical_simulator
@@ -37,7 +36,7 @@ from embomatrix.world.task import TaskCategory
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from embomatrix.factory.layout.jobs import LayoutAgents
+    from embomatrix.factory.layout.request import LayoutAgents
     from embomatrix.factory.pipeline.settings import BuildSettings
     from embomatrix.factory.writer.tasks import Draft, TaskWriter
     from embomatrix.skills.syntax import Plan

@@ -7,15 +7,14 @@ import itertools
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from embomatrix.factory.admission import MOST_HELD, Admitted, admit
-from embomatrix.factory.pipeline.poses import Needs, SceneSurvey, cache_poses
-from embomatrix.factory.refusal import RefusalReason, TaskRefusal
-from embomatrix.factory.task_import.demands import demands_of
+from embomatrix.factory.admission import MOST_HELD, Admitted, RefusalReason, TaskRefusal, admit
+from embomatrix.factory.pipeline.task_poses import Needs, SceneSurvey, cache_poses
+from embomatrix.factory.scenes.view import SceneView
 from embomatrix.factory.task_import.dialects import read_problem
 from embomatrix.factory.task_import.neighbours import neighbours_of
+from embomatrix.factory.task_import.size_requirements import demands_of
 from embomatrix.factory.task_import.sources import BEHAVIOR, EAI
 from embomatrix.factory.task_import.task import ImportedTask, Manner, import_problem
-from embomatrix.factory.writer.view import SceneView
 from embomatrix.sim.executor import Simulator
 from embomatrix.sim.floor.prepared import prepare
 from embomatrix.sim.planner.oracle import find_plan
